@@ -24,7 +24,7 @@ Convention = Literal["standard", "modified"]
 CONVENTIONS = ("standard", "modified")
 
 
-def _rotation(axis: int, angle: Array) -> Array:
+def axis_rotation(axis: int, angle: Array) -> Array:
     """Rotations (..., 4, 4) about coordinate axis 0, 1 or 2 by angle (...,) in radians.
 
     Quarter turns are exact: cos 90° is 0, not 6e-17, so a table's right angles stay right.
@@ -38,7 +38,8 @@ def _rotation(axis: int, angle: Array) -> Array:
     return out
 
 
-def _translation(axis: int, length: Array) -> Array:
+def axis_translation(axis: int, length: Array) -> Array:
+    """Translations (..., 4, 4) along coordinate axis 0, 1 or 2 by length (...,) in metres."""
     return se3.translation(np.asarray(length)[..., None] * np.eye(3)[axis])
 
 
@@ -100,9 +101,9 @@ class DHTable:
         q = np.atleast_2d(np.asarray(q, float))
         if q.shape[1] != self.size:
             raise DhcalError(f"q has {q.shape[1]} columns, the table has {self.size} joints")
-        spin = _rotation(2, self.theta + np.where(self.prismatic, 0.0, q))
-        slide = _translation(2, self.d + np.where(self.prismatic, q, 0.0))
-        link = _translation(0, self.a) @ _rotation(0, self.alpha) @ _rotation(1, self.beta)
+        spin = axis_rotation(2, self.theta + np.where(self.prismatic, 0.0, q))
+        slide = axis_translation(2, self.d + np.where(self.prismatic, q, 0.0))
+        link = axis_translation(0, self.a) @ axis_rotation(0, self.alpha) @ axis_rotation(1, self.beta)
         if self.convention == "standard":
             return spin @ slide @ link
         return link @ slide @ spin

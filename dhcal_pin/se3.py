@@ -6,10 +6,12 @@ three angular ones in radians. T_ab is the pose of frame b in frame a.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 
 def skew(w: ArrayLike) -> Array:

@@ -1,0 +1,64 @@
+"""Robot kinematic calibration on Pinocchio: a robot and measurements in, the corrected URDF out.
+
+Lengths are metres and angles radians everywhere. Joint values q are (m, n), one row a sample; poses are
+(m, 4, 4); twists are [v, ω]; T_ab is the pose of frame b in frame a.
+
+Names load on first use, so that importing the package (and `dhcal --help`) costs next to nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .calibration import calibrate as calibrate
+    from .calibration import split as split
+    from .chain import Chain as Chain
+    from .check import crosscheck as crosscheck
+    from .dh import DHTable as DHTable
+    from .dh_files import read_dh as read_dh
+    from .dh_urdf import dh_to_urdf as dh_to_urdf
+    from .errors import DhcalError as DhcalError
+    from .factors import error_factors as error_factors
+    from .measurement_files import read_measurements as read_measurements
+    from .measurements import Noise as Noise
+    from .measurements import Pose as Pose
+    from .measurements import Position as Position
+    from .parameters import extract as extract
+    from .result import Result as Result
+    from .result import accuracy as accuracy
+    from .robot_files import read_robot as read_robot
+    from .robot_files import write_urdf as write_urdf
+
+_HOMES = {
+    "calibrate": "calibration",
+    "split": "calibration",
+    "Chain": "chain",
+    "crosscheck": "check",
+    "DHTable": "dh",
+    "read_dh": "dh_files",
+    "dh_to_urdf": "dh_urdf",
+    "DhcalError": "errors",
+    "error_factors": "factors",
+    "read_measurements": "measurement_files",
+    "Noise": "measurements",
+    "Pose": "measurements",
+    "Position": "measurements",
+    "extract": "parameters",
+    "Result": "result",
+    "accuracy": "result",
+    "read_robot": "robot_files",
+    "write_urdf": "robot_files",
+}
+__all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        return getattr(import_module(f".{_HOMES[name]}", __name__), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOMES})

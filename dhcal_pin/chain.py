@@ -1,0 +1,367 @@
+"""A serial path through a robot: Pinocchio's model, a tip, and kinematics over many samples at once.
+
+The path's bodies are numbered 0 (the base link) to k (behind the last moving joint); its *stations*,
+where errors act as right perturbations M ← M·exp(ξ), lie between them in this order:
+
+    0 base · 1 link 0 · 2 joint 1 · 3 link 1 · 4 joint 2 · … · 2k joint k · 2k+1 link k · 2k+2 tip · 2k+3 tool
+
+`joint j` is that joint's origin before its motion, `link j` the same frame after it. `base` is the
+base link's pose in the measuring frame, `tool` the measured point's pose in the tip frame. A change at
+`base` or `tool` stays outside the robot; every other one belongs into the URDF.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+import pinocchio as pin
+
+from . import se3
+from .dh import DHTable
+from .dh_urdf import dh_to_urdf
+from .errors import DhcalError
+from .se3 import Array
+from .urdf import Urdf, parse_urdf, read_urdf
+
+BASE = 0
+
+
+def joint_station(j: int) -> int:
+    """Station of the j-th moving joint's origin, j from 1."""
+    return 2 * j
+
+
+def link_station(j: int) -> int:
+    """Station behind the j-th moving joint's motion; 0 is the base link."""
+    return 2 * j + 1
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """Frames of a chain at m samples, components first so that the samples are contiguous.
+
+    Attributes:
+        bodies: (k+1, 4, 3, m) columns x, y, z, p of each body's frame in the measuring frame. A body's
+            frame has its joint's axis along z.
+        tool: (4, 3, m) columns of the tool's frame.
+    """
+
+    bodies: Array
+    tool: Array
+
+    def poses(self) -> Array:
+        """Tool poses (m, 4, 4) in the measuring frame."""
+        out = np.zeros((self.tool.shape[-1], 4, 4))
+        out[:, :3, :] = self.tool.transpose(2, 1, 0)
+        out[:, 3, 3] = 1.0
+        return out
+
+
+def _axis_frame(axis: Array) -> Array:
+    """A rotation (4, 4) that carries z onto a unit axis (3,); a permutation for coordinate axes."""
+    i = int(np.argmax(np.abs(axis)))
+    sign = 1.0 if axis[i] > 0 else -1.0
+    x = np.eye(3)[(i + 1) % 3] * sign
+    x = x - (x @ axis) * axis
+    x /= np.linalg.norm(x)
+    return se3.transform(np.stack([x, np.cross(axis, x), axis], -1), np.zeros(3))
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """A base-to-tip path of n independent and k moving joints (k > n only with mimic joints).
+
+    Attributes:
+        urdf: the file it came from.
+        tip: name of the tip link.
+        joint_names: (n,) the columns of q, in path order.
+        moving: (k,) names of the joints that move along the path.
+        origins: (k+1, 4, 4) each moving joint's frame in the moving frame before it (fixed joints
+            merged), then the tip in the last one; metres.
+        axes: (k, 3) unit axes in the joints' frames.
+        prismatic: (k,) True where a joint slides.
+        mixing, shift: (k, n), (k,): the moving joints' values are mixing @ q + shift.
+        lower, upper: (n,) limits, rad or m; infinite where there is none.
+        base: (4, 4) base link in the measuring frame.
+        tool: (4, 4) measured point in the tip frame.
+        parameters: the sets that are identified when nobody says otherwise.
+    """
+
+    urdf: Urdf
+    tip: str
+    joint_names: tuple[str, ...]
+    moving: tuple[str, ...]
+    origins: Array
+    axes: Array
+    prismatic: Array
+    mixing: Array
+    shift: Array
+    lower: Array
+    upper: Array
+    base: Array = field(default_factory=lambda: np.eye(4))
+    tool: Array = field(default_factory=lambda: np.eye(4))
+    parameters: str = "minimal,base,tool"
+
+    @classmethod
+    def from_urdf(cls, source: str | os.PathLike[str] | Urdf, tip: str | None = None) -> Chain:
+        """The path from the root link to `tip` of a URDF file.
+
+        Args:
+            source: a path, or a file already read.
+            tip: a link; without it the deepest leaf.
+
+        Raises:
+            DhcalError: the file is not a sound URDF, the tip is unknown or ambiguous, nothing moves.
+        """
+        urdf = source if isinstance(source, Urdf) else read_urdf(source)
+        tip = tip if tip is not None else _default_tip(urdf)
+        joints = [joint for joint in urdf.path(tip) if joint.type != "fixed"]
+        for joint in joints:
+            if joint.type in ("floating", "planar"):
+                raise DhcalError(
+                    f"{urdf.source}:{joint.line}: joint {joint.name!r} is {joint.type}; "
+                    f"the path to {tip!r} may only have revolute, continuous, prismatic and fixed joints"
+                )
+        if not joints:
+            raise DhcalError(f"{urdf.source}: no moving joint between {urdf.root!r} and {tip!r}")
+        names, rows, shift = _independent(urdf, [joint.name for joint in joints])
+        sources = [urdf.joint(name) for name in names]
+        model = _build(urdf)
+        origins, axes = _path(model, tip, [joint.name for joint in joints])
+        return cls(
+            urdf=urdf,
+            tip=tip,
+            joint_names=tuple(names),
+            moving=tuple(joint.name for joint in joints),
+            origins=origins,
+            axes=axes,
+            prismatic=np.array([joint.type == "prismatic" for joint in joints]),
+            mixing=rows,
+            shift=shift,
+            lower=np.array([joint.lower for joint in sources]),
+            upper=np.array([joint.upper for joint in sources]),
+        )
+
+    @classmethod
+    def from_dh(cls, table: DHTable, name: str = "arm") -> Chain:
+        """The arm of a DH table, through its exact URDF; its tip is `tool0`."""
+        text = dh_to_urdf(table, name)
+        chain = cls.from_urdf(parse_urdf(text.encode(), f"{name}.urdf"), "tool0")
+        return replace(chain, parameters="dh")
+
+    @property
+    def size(self) -> int:
+        """Number n of independent joints, the columns of q."""
+        return len(self.joint_names)
+
+    @property
+    def tip_station(self) -> int:
+        """Station of the tip, before the tool."""
+        return 2 * len(self.moving) + 2
+
+    @property
+    def tool_station(self) -> int:
+        """Station of the measured point."""
+        return 2 * len(self.moving) + 3
+
+    @cached_property
+    def model(self) -> pin.Model:
+        """Pinocchio's model of the whole robot with this chain's joint placements and tip frame."""
+        model = _build(self.urdf)
+        for name, origin in zip(self.moving, self.origins[:-1], strict=True):
+            model.jointPlacements[model.getJointId(name)] = pin.SE3(origin)
+        model.frames[self.frame_id].placement = pin.SE3(self.origins[-1])
+        return model
+
+    @cached_property
+    def frame_id(self) -> int:
+        """Pinocchio's index of the tip's frame; links and joints may share names."""
+        return _build(self.urdf).getFrameId(self.tip, pin.FrameType.BODY)
+
+    def configurations(self, q: Array) -> Array:
+        """Pinocchio's configurations (m, nq) at q (m, n); joints off the path stay at neutral."""
+        q = self.checked(q)
+        model = self.model
+        out = np.tile(pin.neutral(model), (len(q), 1))
+        for name, value in zip(self.moving, (q @ self.mixing.T + self.shift).T, strict=True):
+            joint = model.joints[model.getJointId(name)]
+            if joint.nq == 2:
+                out[:, joint.idx_q], out[:, joint.idx_q + 1] = np.cos(value), np.sin(value)
+            else:
+                out[:, joint.idx_q] = value
+        return out
+
+    def checked(self, q: Array) -> Array:
+        """Joint values as a finite (m, n) array, or DhcalError."""
+        q = np.atleast_2d(np.asarray(q, float))
+        if q.ndim != 2 or q.shape[1] != self.size:
+            raise DhcalError(
+                f"q has shape {q.shape}; this chain needs {self.size} columns: {', '.join(self.joint_names)}"
+            )
+        if not np.isfinite(q).all():
+            raise DhcalError("q: every joint value must be finite")
+        return q
+
+    @cached_property
+    def axis_frames(self) -> Array:
+        """(k+1, 4, 4): body frame (joint axis along z) in each body's URDF frame; body 0 as it is."""
+        return np.stack([np.eye(4), *(_axis_frame(axis) for axis in self.axes)])
+
+    @cached_property
+    def links(self) -> Array:
+        """Constant transforms (k+1, 4, 4) between the motions; every joint moves about its own z.
+
+        The tool's pose is base · links[0] · Z(q_1) · links[1] · … · Z(q_k) · links[k] · tool.
+        """
+        into = se3.inverse(self.axis_frames)
+        out = into @ self.origins
+        out[:-1] = out[:-1] @ self.axis_frames[1:]
+        return out
+
+    def sweep(self, q: Array) -> Sweep:
+        """All frames at joint values q (m, n), vectorised over the samples."""
+        q = self.checked(q)
+        values = self.mixing @ q.T + self.shift[:, None]
+        cos, sin = np.cos(values), np.sin(values)
+        m = len(q)
+        bodies = np.empty((len(self.moving) + 1, 4, 3, m))
+        bodies[0] = self.base[:3].T[:, :, None]
+        before = np.empty((4, 3, m))
+        for j, link in enumerate(self.links[:-1]):
+            # The columns of F·L are the columns of F mixed by L: one small product for all samples.
+            np.matmul(link.T, bodies[j].reshape(4, -1), out=before.reshape(4, -1))
+            after = bodies[j + 1]
+            if self.prismatic[j]:
+                after[:] = before
+                after[3] += before[2] * values[j]
+            else:
+                after[0] = before[0] * cos[j] + before[1] * sin[j]
+                after[1] = before[1] * cos[j] - before[0] * sin[j]
+                after[2:] = before[2:]
+        tool = (self.links[-1] @ self.tool).T @ bodies[-1].reshape(4, -1)
+        return Sweep(bodies, tool.reshape(4, 3, m))
+
+    def poses(self, q: Array) -> Array:
+        """Tool poses (m, 4, 4) in the measuring frame at joint values q (m, n) in rad or m."""
+        return self.sweep(q).poses()
+
+    def station_twists(self, stations: Array, twists: Array) -> tuple[Array, Array]:
+        """Bodies (p,) and the same twists (p, 6) in those bodies' frames, of twists at stations."""
+        k = len(self.moving)
+        frames = np.empty((2 * k + 4, 4, 4))
+        into = se3.inverse(self.axis_frames)
+        frames[0] = frames[1] = np.eye(4)
+        for j in range(k):
+            frames[2 * j + 2] = into[j] @ self.origins[j]
+            frames[2 * j + 3] = into[j + 1]
+        frames[2 * k + 2] = into[k] @ self.origins[k]
+        frames[2 * k + 3] = frames[2 * k + 2] @ self.tool
+        stations = np.asarray(stations, int)
+        bodies = np.clip((stations - 1) // 2, 0, k)
+        return bodies, np.einsum("pij,pj->pi", se3.adjoint(frames[stations]), np.asarray(twists, float))
+
+    def tool_velocities(self, sweep: Sweep, bodies: Array, twists: Array, out: Array | None = None) -> Array:
+        """The tool point's velocity (p, 6, m) per unit of each body twist, axes of the measuring frame.
+
+        Args:
+            sweep: frames at m samples.
+            bodies: (p,) body numbers, ascending.
+            twists: (p, 6) twists in those bodies' frames.
+            out: (p, 6, m) written in place when given.
+        """
+        m = sweep.tool.shape[-1]
+        out = np.empty((len(bodies), 6, m)) if out is None else out
+        starts = np.searchsorted(bodies, np.arange(len(sweep.bodies) + 1))
+        lever = np.empty((3, m))
+        for j, body in enumerate(sweep.bodies):
+            rows = slice(starts[j], starts[j + 1])
+            if rows.start == rows.stop:
+                continue
+            axes = body[:3].reshape(3, -1)
+            count = rows.stop - rows.start
+            spin = (twists[rows, 3:] @ axes).reshape(count, 3, m)
+            block = out[rows]
+            block[:, :3] = (twists[rows, :3] @ axes).reshape(count, 3, m)
+            np.subtract(sweep.tool[3], body[3], out=lever)
+            block[:, 0] += spin[:, 1] * lever[2] - spin[:, 2] * lever[1]
+            block[:, 1] += spin[:, 2] * lever[0] - spin[:, 0] * lever[2]
+            block[:, 2] += spin[:, 0] * lever[1] - spin[:, 1] * lever[0]
+            block[:, 3:] = spin
+        return out
+
+    def displaced(self, motions: Mapping[int, Array]) -> Chain:
+        """The chain with each station's frame moved by a right factor (4, 4), M ← M·motion."""
+        origins, base, tool = self.origins.copy(), self.base, self.tool
+        for station, motion in motions.items():
+            if station == BASE:
+                base = base @ motion
+            elif station == self.tool_station:
+                tool = tool @ motion
+            elif station % 2:
+                j = (station - 1) // 2
+                origins[j] = motion @ origins[j]
+            else:
+                j = station // 2 - 1
+                origins[j] = origins[j] @ motion
+        return replace(self, origins=origins, base=base, tool=tool)
+
+
+def _build(urdf: Urdf) -> pin.Model:
+    try:
+        return pin.buildModelFromXML(urdf.data.decode("utf-8-sig"))
+    except (ValueError, RuntimeError) as error:
+        raise DhcalError(f"{urdf.source}: Pinocchio does not accept this URDF: {error}") from error
+
+
+def _default_tip(urdf: Urdf) -> str:
+    """The leaf behind the most moving joints, then behind the most links; `tool0` breaks a tie."""
+    depth = {leaf: urdf.path(leaf) for leaf in urdf.leaves()}
+    rank = {leaf: (sum(j.type != "fixed" for j in path), len(path)) for leaf, path in depth.items()}
+    best = max(rank.values())
+    deepest = [leaf for leaf, value in rank.items() if value[0] == best[0]]
+    if "tool0" in deepest:
+        return "tool0"
+    farthest = [leaf for leaf in deepest if rank[leaf] == best]
+    if len(farthest) > 1:
+        raise DhcalError(
+            f"{urdf.source}: several tips are equally deep; "
+            f"choose one with --tip: {', '.join(sorted(deepest))}"
+        )
+    return farthest[0]
+
+
+def _independent(urdf: Urdf, moving: list[str]) -> tuple[list[str], Array, Array]:
+    """Independent joints behind the moving ones, with the (k, n) mixing and (k,) shift of mimics."""
+    names: list[str] = []
+    entries = []
+    for name in moving:
+        factor, shift = 1.0, 0.0
+        while (mimic := urdf.joint(name).mimic) is not None:
+            name, shift, factor = mimic[0], shift + factor * mimic[2], factor * mimic[1]
+        if name not in names:
+            names.append(name)
+        entries.append((names.index(name), factor, shift))
+    mixing = np.zeros((len(moving), len(names)))
+    for row, (column, factor, _) in enumerate(entries):
+        mixing[row, column] = factor
+    return names, mixing, np.array([shift for _, _, shift in entries])
+
+
+def _path(model: pin.Model, tip: str, moving: list[str]) -> tuple[Array, Array]:
+    """Origins (k+1, 4, 4) and axes (k, 3) of the path as Pinocchio sees it."""
+    origins, axes = [], []
+    for name in moving:
+        index = model.getJointId(name)
+        origins.append(model.jointPlacements[index].homogeneous)
+        joint = model.joints[index]
+        data = joint.createData()
+        joint.calc(data, pin.neutral(model))
+        subspace = np.asarray(data.S).reshape(6)
+        axes.append(subspace[:3] if np.any(subspace[:3]) else subspace[3:])
+    frame = model.frames[model.getFrameId(tip, pin.FrameType.BODY)]
+    origins.append(frame.placement.homogeneous)
+    return np.array(origins), np.array(axes)

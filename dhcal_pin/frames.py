@@ -1,0 +1,72 @@
+"""Where the instrument stands and where its target sits: starts for base and tool without a guess."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from . import se3
+from .chain import Chain
+from .measurements import Measurement
+from .se3 import Array
+
+# Tool offsets tried where the target's place on the tip is unknown, in metres.
+_REACH = 0.25
+
+
+def align(source: Array, target: Array) -> tuple[Array, float]:
+    """The rigid motion (4, 4) that carries points (m, 3) best onto others, and its RMS distance in m."""
+    centre, goal = source.mean(0), target.mean(0)
+    u, _, vt = np.linalg.svd((target - goal).T @ (source - centre))
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    motion = se3.transform(rotation, goal - rotation @ centre)
+    rest = source @ rotation.T + motion[:3, 3] - target
+    return motion, float(np.sqrt(np.mean(np.sum(rest**2, -1))))
+
+
+def mean_rotation(rotations: Array) -> Array:
+    """The rotation (3, 3) nearest to the mean of others (m, 3, 3)."""
+    u, _, vt = np.linalg.svd(rotations.sum(0))
+    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+
+
+def starts(chain: Chain, data: Sequence[Measurement], base: bool, tool: bool) -> list[Chain]:
+    """Chains with base and tool placed from the measured positions, the most promising first.
+
+    Positions alone carry the base; rotations, where there are any, then give the tool's. The target's
+    offset is tried at places around the tip. Fewer than three positions leave the chain as it is.
+    """
+    readings = [item for item in data if len(item.positions())]
+    tips = [replace(chain, base=np.eye(4), tool=np.eye(4)).poses(item.q) for item in readings]
+    if sum(len(pose) for pose in tips) < 3 or not (base or tool):
+        return [chain]
+    tip = np.concatenate(tips)
+    seen = np.concatenate([item.positions() for item in readings])
+    if tool:
+        grid = np.stack(np.meshgrid(*[[0.0, -_REACH, _REACH]] * 3, indexing="ij"), -1).reshape(-1, 3)
+    else:
+        grid = chain.tool[None, :3, 3]
+    found = []
+    for offset in grid:
+        placed = tip[:, :3, 3] + tip[:, :3, :3] @ offset
+        motion, rest = align(placed, seen) if base else (chain.base, 0.0)
+        if tool and not base:
+            # Known base: the offset is linear in what was seen.
+            local = se3.inverse(chain.base @ tip)
+            offset = np.mean((local[:, :3, :3] @ seen[..., None])[..., 0] + local[:, :3, 3], 0)
+        found.append((rest, motion, offset))
+    found.sort(key=lambda entry: entry[0])
+    out = []
+    for _, motion, offset in found[: 4 if base and tool else 1]:
+        turn = chain.tool[:3, :3]
+        turns = [
+            np.swapaxes((motion @ pose)[:, :3, :3], 1, 2) @ item.rotations()
+            for pose, item in zip(tips, readings, strict=True)
+            if len(item.rotations())
+        ]
+        if tool and turns:
+            turn = mean_rotation(np.concatenate(turns))
+        out.append(replace(chain, base=motion, tool=se3.transform(turn, offset)))
+    return out

@@ -1,0 +1,302 @@
+"""Error parameters as data: each is a twist at a station of a chain.
+
+A set is a function from a chain to its parameters. Changes at one station act in the order of the
+list, M ← M·exp(x₁ξ₁)·exp(x₂ξ₂)…, so a parameter's value is always its whole error from the nominal
+chain, DH's changes are exact (its rotations and translations about one axis commute), and the
+derivative at any value is a twist again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from . import se3
+from .chain import BASE, Chain, joint_station, link_station
+from .dh import Convention
+from .errors import DhcalError
+from .extraction import Extraction, extract_dh
+from .se3 import Array
+
+# Standard deviations that manufacturing and assembly lead one to expect, and frames anywhere in a room.
+LENGTH, ANGLE, OFFSET = 1e-3, 5e-3, np.deg2rad(2.0)
+WIDE_LENGTH, WIDE_ANGLE = 10.0, 10.0
+
+_AXES = np.eye(6)
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One scalar error.
+
+    Attributes:
+        name: what users call it, as `d2` or `elbow_joint.rx`.
+        unit: "m" or "rad".
+        nominal: the value that a drawing would show; zero for a pure error.
+        station: where it acts (see `chain`).
+        twist: (6,) [v, ω] in the station's frame.
+        prior: standard deviation expected before any measurement, in its unit.
+    """
+
+    name: str
+    unit: str
+    nominal: float
+    station: int
+    twist: tuple[float, ...]
+    prior: float
+
+
+def extract(chain: Chain, convention: Convention = "standard", hayati: bool = False) -> Extraction:
+    """The chain's DH table, base and tool apart, by common normals."""
+    if len(chain.moving) != chain.size:
+        raise DhcalError("DH parameters need a path without mimic joints; use --parameters minimal")
+    return extract_dh(
+        chain.links, chain.moving, chain.prismatic, chain.lower, chain.upper, convention, hayati
+    )
+
+
+def _dh_rows(chain: Chain, convention: Convention, hayati: bool) -> list[Parameter]:
+    found = extract(chain, convention, hayati)
+    table = found.table
+    out = []
+    k = len(chain.moving)
+    # DH frames are given where the joint's axis is z; carry their twists into the URDF's own frame.
+    frames = np.concatenate([chain.axis_frames, np.eye(4)[None]])
+    for i in range(k):
+        along = chain.axes[i]
+        spin = (0.0, 0.0, 0.0, *map(float, along))
+        slide = (*map(float, along), 0.0, 0.0, 0.0)
+        if convention == "standard":
+            axial, lateral = link_station(i + 1), joint_station(i + 2)
+            carry = frames[i + 2] @ found.frames[i]
+        else:
+            axial = lateral = joint_station(i + 1)
+            carry = frames[i + 1] @ found.frames[i]
+        sideways = se3.adjoint(carry)
+        label = i + 1
+        rows = [
+            Parameter(f"theta{label}", "rad", float(table.theta[i]), axial, spin, OFFSET),
+            Parameter(f"d{label}", "m", float(table.d[i]), axial, slide, LENGTH),
+            Parameter(f"a{label}", "m", float(table.a[i]), lateral, tuple(sideways[:, 0]), LENGTH),
+            Parameter(f"alpha{label}", "rad", float(table.alpha[i]), lateral, tuple(sideways[:, 3]), ANGLE),
+        ]
+        if hayati and _parallel(chain, i, convention):
+            rows.append(
+                Parameter(f"beta{label}", "rad", float(table.beta[i]), lateral, tuple(sideways[:, 4]), ANGLE)
+            )
+        out += rows if convention == "standard" else rows[2:] + rows[:2]
+    return out
+
+
+def _parallel(chain: Chain, i: int, convention: Convention) -> bool:
+    """Whether row i (from 0) stands between two axes within 5° of parallel."""
+    link = i + 1 if convention == "standard" else i
+    return 0 < link < len(chain.moving) and abs(chain.links[link][2, 2]) > np.cos(np.deg2rad(5.0))
+
+
+def dh(chain: Chain) -> list[Parameter]:
+    """Standard DH, 4 a joint: θ, d, a, α of every row; the columns of the paper's R."""
+    return _dh_rows(chain, "standard", hayati=False)
+
+
+def modified_dh(chain: Chain) -> list[Parameter]:
+    """Modified DH, 4 a joint: a, α of the link before each joint, then d, θ."""
+    return _dh_rows(chain, "modified", hayati=False)
+
+
+def hayati(chain: Chain) -> list[Parameter]:
+    """Standard DH with β in place of d between (nearly) parallel axes."""
+    rows = _dh_rows(chain, "standard", hayati=True)
+    swapped = {f"d{row.name[4:]}" for row in rows if row.name.startswith("beta")}
+    return [row for row in rows if row.name not in swapped]
+
+
+_NAMES = ("x", "y", "z", "rx", "ry", "rz")
+
+
+def _six(prefix: str, station: int, length: float, angle: float) -> list[Parameter]:
+    return [
+        Parameter(f"{prefix}.{name}", unit, 0.0, station, tuple(axis), prior)
+        for name, unit, axis, prior in zip(
+            _NAMES, ("m",) * 3 + ("rad",) * 3, _AXES, (length,) * 3 + (angle,) * 3, strict=True
+        )
+    ]
+
+
+def placement(chain: Chain) -> list[Parameter]:
+    """Six a joint: every joint origin moves freely in its own frame."""
+    return [
+        parameter
+        for j, name in enumerate(chain.moving)
+        for parameter in _six(name, joint_station(j + 1), LENGTH, ANGLE)
+    ]
+
+
+def minimal(chain: Chain) -> list[Parameter]:
+    """The axis line's own freedom: 4 a revolute joint, 2 a prismatic one.
+
+    A joint origin moves in all directions but along and about its axis, which commute with the motion
+    and so pass on to the next joint, and at last to the tool. With `base` and `tool` the set is complete
+    and has no singular arm: 4R + 2P + 6 directions for R revolute and P prismatic joints.
+    """
+    out = []
+    for j, (name, axis, slides) in enumerate(zip(chain.moving, chain.axes, chain.prismatic, strict=True)):
+        if np.isclose(np.abs(axis).max(), 1.0, atol=1e-12):
+            skip = int(np.argmax(np.abs(axis)))
+            kept = [p for i, p in enumerate(_six(name, joint_station(j + 1), LENGTH, ANGLE)) if i % 3 != skip]
+        else:
+            turn = chain.axis_frames[j + 1][:3, :3]
+            zero = (0.0, 0.0, 0.0)
+            u, v = (tuple(map(float, turn[:, i])) for i in (0, 1))
+            kept = [
+                Parameter(f"{name}.u", "m", 0.0, joint_station(j + 1), u + zero, LENGTH),
+                Parameter(f"{name}.v", "m", 0.0, joint_station(j + 1), v + zero, LENGTH),
+                Parameter(f"{name}.ru", "rad", 0.0, joint_station(j + 1), zero + u, ANGLE),
+                Parameter(f"{name}.rv", "rad", 0.0, joint_station(j + 1), zero + v, ANGLE),
+            ]
+        out += [parameter for parameter in kept if not (slides and parameter.unit == "m")]
+    return out
+
+
+def offset(chain: Chain) -> list[Parameter]:
+    """The zero of each moving joint, rad or m."""
+    out = []
+    for j, (name, axis, slides) in enumerate(zip(chain.moving, chain.axes, chain.prismatic, strict=True)):
+        direction = tuple(map(float, axis))
+        zero = (0.0, 0.0, 0.0)
+        twist = direction + zero if slides else zero + direction
+        out.append(
+            Parameter(
+                f"{name}.offset",
+                "m" if slides else "rad",
+                0.0,
+                joint_station(j + 1),
+                twist,
+                LENGTH if slides else OFFSET,
+            )
+        )
+    return out
+
+
+def base(chain: Chain) -> list[Parameter]:
+    """Where the robot stands in the measuring frame, six."""
+    return _six("base", BASE, WIDE_LENGTH, WIDE_ANGLE)
+
+
+def tool(chain: Chain) -> list[Parameter]:
+    """Where the measured point sits on the tip, six."""
+    return _six("tool", chain.tool_station, WIDE_LENGTH, WIDE_ANGLE)
+
+
+SETS: dict[str, Callable[[Chain], list[Parameter]]] = {
+    "dh": dh,
+    "modified-dh": modified_dh,
+    "hayati": hayati,
+    "minimal": minimal,
+    "placement": placement,
+    "base": base,
+    "tool": tool,
+    "offset": offset,
+}
+
+
+def select(
+    chain: Chain, sets: str | Iterable[str], fix: Sequence[str] = (), free: Sequence[str] = ()
+) -> ErrorModel:
+    """The union of named sets on a chain.
+
+    Args:
+        chain: the nominal chain.
+        sets: names, as a comma-separated text or one by one.
+        fix: parameters or whole sets held at nominal.
+        free: parameters of any set added one by one.
+
+    Raises:
+        DhcalError: an unknown set or parameter, or nothing left to identify.
+    """
+    names = [s.strip() for s in sets.split(",")] if isinstance(sets, str) else list(sets)
+    unknown = [name for name in names if name not in SETS]
+    if unknown:
+        raise DhcalError(f"unknown parameter set {unknown[0]!r}; choose from {', '.join(SETS)}")
+    pool = {p.name: p for name in names for p in SETS[name](chain)}
+    fixed = {p.name for name in fix if name in SETS for p in SETS[name](chain)}
+    for name in fix:
+        if name not in pool and name not in SETS:
+            raise DhcalError(f"cannot fix {name!r}: not a parameter here; there are {', '.join(pool)}")
+        fixed.add(name)
+    if missing := [name for name in free if name not in pool]:
+        every = {p.name: p for build in SETS.values() for p in build(chain)}
+        for name in missing:
+            if name not in every:
+                raise DhcalError(f"cannot free {name!r}: there are {', '.join(every)}")
+            pool[name] = every[name]
+    fixed -= set(free)
+    chosen = [p for p in pool.values() if p.name not in fixed]
+    if not chosen:
+        raise DhcalError("no parameter is left to identify; fix fewer of them")
+    ordered = sorted(chosen, key=lambda p: p.station)
+    return ErrorModel(chain, tuple(ordered), tuple(p for p in pool.values() if p.name in fixed))
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorModel:
+    """A nominal chain and p unknown errors, sorted by station.
+
+    Attributes:
+        chain: nominal.
+        parameters: (p,) the unknowns.
+        fixed: parameters of the same sets that are held at nominal.
+    """
+
+    chain: Chain
+    parameters: tuple[Parameter, ...]
+    fixed: tuple[Parameter, ...] = ()
+
+    @cached_property
+    def _twists(self) -> Array:
+        return np.array([parameter.twist for parameter in self.parameters])
+
+    @cached_property
+    def _stations(self) -> Array:
+        return np.array([parameter.station for parameter in self.parameters])
+
+    @property
+    def priors(self) -> Array:
+        """Prior standard deviations (p,), each in its parameter's unit."""
+        return np.array([parameter.prior for parameter in self.parameters])
+
+    def at(self, x: Array) -> Chain:
+        """The chain with errors x (p,) in m and rad."""
+        factors = se3.exp6(self._twists * np.asarray(x, float)[:, None])
+        motions: dict[int, Array] = {}
+        for station, factor in zip(self._stations, factors, strict=True):
+            motions[int(station)] = motions.get(int(station), np.eye(4)) @ factor
+        return self.chain.displaced(motions)
+
+    def derivative(self, x: Array) -> tuple[Chain, Array, Array]:
+        """The chain at x, and for each parameter the body (p,) and twist (p, 6) it moves there.
+
+        A factor behind the k-th at its station turns the k-th twist; a link's motion is taken up by the
+        next origin from the left, so there the factors before it do.
+        """
+        x = np.asarray(x, float)
+        factors = se3.exp6(self._twists * x[:, None])
+        twists = self._twists.copy()
+        for station in np.unique(self._stations):
+            members = np.flatnonzero(self._stations == station)
+            left = station % 2 == 1 and station != self.chain.tool_station
+            carry = np.eye(4)
+            for k in members if left else members[::-1]:
+                twists[k] = se3.adjoint(carry if left else se3.inverse(carry)) @ self._twists[k]
+                carry = carry @ factors[k] if left else factors[k] @ carry
+        chain = self.at(x)
+        return (chain, *chain.station_twists(self._stations, twists))
+
+    def frames(self) -> ErrorModel | None:
+        """Base and tool alone, if any of them is unknown."""
+        outside = (BASE, self.chain.tool_station)
+        kept = tuple(p for p in self.parameters if p.station in outside)
+        return replace(self, parameters=kept) if kept else None

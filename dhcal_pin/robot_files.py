@@ -1,0 +1,147 @@
+"""Robots in and out: URDF or DH file to a chain, a calibrated chain back to URDF and sidecar."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from . import se3
+from .calibration import Priors
+from .chain import Chain
+from .dh_files import is_dh, read_dh, read_frame
+from .errors import DhcalError
+from .files import PathLike, read_toml, save
+from .result import Result
+from .se3 import Array
+from .urdf import parse_urdf, with_origins
+
+# A written URDF must read back as the same robot to this many metres and radians.
+READ_BACK = 1e-12
+
+
+def sidecar_path(path: PathLike) -> str:
+    """`arm.urdf` → `arm.calibration.toml`."""
+    return f"{os.path.splitext(os.fspath(path))[0]}.calibration.toml"
+
+
+def read_robot(path: PathLike, tip: str | None = None, sidecar: PathLike | None = None) -> Chain:
+    """A chain from a URDF or a DH file, with base and tool of its sidecar where there is one.
+
+    Args:
+        path: `.urdf`, or a DH table as `.toml` or `.csv`.
+        tip: the tip link of a URDF.
+        sidecar: another sidecar than the one beside the robot.
+
+    Raises:
+        DhcalError: a file is missing or wrong.
+    """
+    if is_dh(path):
+        if tip is not None:
+            raise DhcalError(f"{os.fspath(path)}: a DH table has one tip; leave out --tip")
+        chain = Chain.from_dh(read_dh(path), Path(path).name.split(".")[0] or "arm")
+    else:
+        chain = Chain.from_urdf(path, tip)
+    beside = sidecar_path(path)
+    if sidecar is None and os.path.exists(beside) and os.fspath(path) != beside:
+        sidecar = beside
+    return chain if sidecar is None else _with_sidecar(chain, sidecar)
+
+
+def _with_sidecar(chain: Chain, path: PathLike) -> Chain:
+    raw = read_toml(path)
+    if unknown := set(raw) - {"base", "tool"}:
+        raise DhcalError(f"{os.fspath(path)}: unknown table [{min(unknown)}]; allowed: [base], [tool]")
+    frames = {key: read_frame(raw[key], os.fspath(path), key) for key in raw}
+    return replace(chain, **frames)
+
+
+def sidecar_text(base: Array, tool: Array) -> str:
+    """The sidecar's TOML of base and tool (4, 4)."""
+    out = [
+        "# What the URDF cannot hold. base: the robot's base link in the measuring frame;",
+        "# tool: the measured point in the tip frame. Metres; rotation vectors in radians.",
+    ]
+    for name, pose in (("base", base), ("tool", tool)):
+        xyz, turn = pose[:3, 3].tolist(), se3.log3(pose[:3, :3]).tolist()
+        out += ["", f"[{name}]", f"xyz_m = {xyz}", f"rotvec_rad = {turn}"]
+    return "\n".join(out) + "\n"
+
+
+def _origins(chain: Chain) -> tuple[dict[str, Array], Array]:
+    """Each changed joint's own origin in its parent link, and the tool (4, 4) with what found no joint.
+
+    Fixed joints before a moving one stay, so that one's own origin takes up the change. A change of the
+    tip goes to the last fixed joint behind the last moving one, or to the tool where there is none.
+    """
+    nominal = Chain.from_urdf(chain.urdf, chain.tip)
+    out: dict[str, Array] = {}
+    before, moving, last = np.eye(4), 0, None
+    for joint in chain.urdf.path(chain.tip):
+        if joint.type != "fixed":
+            if not np.array_equal(chain.origins[moving], nominal.origins[moving]):
+                out[joint.name] = se3.inverse(before) @ chain.origins[moving]
+            before, moving, last = np.eye(4), moving + 1, None
+        else:
+            last = joint.name, before
+            before = before @ joint.origin
+    if np.array_equal(chain.origins[-1], nominal.origins[-1]):
+        return out, chain.tool
+    if last is None:
+        return out, se3.inverse(nominal.origins[-1]) @ chain.origins[-1] @ chain.tool
+    out[last[0]] = se3.inverse(last[1]) @ chain.origins[-1]
+    return out, chain.tool
+
+
+def urdf_files(chain: Chain, path: PathLike) -> dict[PathLike, str | bytes]:
+    """The calibrated URDF, read back and compared, and its sidecar; by path, not yet written.
+
+    Raises:
+        DhcalError: the written text would not be the same robot.
+    """
+    origins, tool = _origins(chain)
+    data = with_origins(chain.urdf, origins)
+    again = replace(Chain.from_urdf(parse_urdf(data, os.fspath(path)), chain.tip), base=chain.base, tool=tool)
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-np.pi, np.pi, (50, chain.size))
+    wanted = chain.poses(q)
+    gap = np.abs(again.poses(q) - wanted).max()
+    if not gap <= READ_BACK * max(1.0, np.abs(wanted).max()):
+        raise DhcalError(
+            f"{os.fspath(path)}: not written: read back, the tool is off by {gap:.2g}; please report it"
+        )
+    out: dict[PathLike, str | bytes] = {path: data}
+    if not (np.array_equal(chain.base, np.eye(4)) and np.array_equal(tool, np.eye(4))):
+        out[sidecar_path(path)] = sidecar_text(chain.base, tool)
+    return out
+
+
+def write_urdf(fit: Result | Chain, path: PathLike) -> None:
+    """Writes the calibrated URDF, and its sidecar where base or tool are not the identity.
+
+    Only the origins of joints that moved change; every other byte is the nominal file's.
+
+    Raises:
+        DhcalError: the path cannot be written, or is the nominal file.
+    """
+    chain = fit.chain if isinstance(fit, Result) else fit
+    if (
+        os.path.exists(path)
+        and os.path.exists(chain.urdf.source)
+        and os.path.samefile(path, chain.urdf.source)
+    ):
+        raise DhcalError(f"{os.fspath(path)}: is the nominal robot itself; write to another file")
+    save(urdf_files(chain, path))
+
+
+def read_priors(choice: str | None) -> Priors | None:
+    """`default`, `none`, or a TOML file of sigmas in m and rad by parameter name or pattern."""
+    if choice is None or choice in ("default", "none"):
+        return choice  # pyright: ignore[reportReturnType]
+    raw = read_toml(choice)
+    for name, value in raw.items():
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise DhcalError(f"{choice}: {name} = {value!r} is not a number; write a sigma in m or rad")
+    return {name: float(value) for name, value in raw.items()}

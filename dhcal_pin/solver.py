@@ -1,0 +1,203 @@
+"""Least squares on one small triangle: the paper's pseudo-inverse loop, and Levenberg-Marquardt.
+
+Whitened rows [J | r] are reduced by QR chunk by chunk, so memory does not grow with the samples. Step,
+rank and predicted cost come from the triangle. Nothing here knows a kind of measurement or a set of
+parameters by name.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import lapack
+
+from . import observability
+from .errors import DhcalError
+from .measurements import Measurement
+from .parameters import ErrorModel
+from .se3 import Array
+
+Progress = Callable[[int, float], None]
+
+CHUNK = 4096
+# A step is the last one when the rows it would still change are below both of these, in sigmas.
+RELATIVE_STEP, ABSOLUTE_STEP = 1e-8, 1e-10
+# An error of so many metres or radians is no error any more.
+RUNAWAY = 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is unknown and what was measured.
+
+    Attributes:
+        errors: the nominal chain and its p unknowns.
+        data: measurements, any mixture of kinds.
+        weights: (p,) one over the prior's sigma; zero where there is none.
+    """
+
+    errors: ErrorModel
+    data: tuple[Measurement, ...]
+    weights: Array
+
+    def chunks(self) -> Iterable[Measurement]:
+        """The data in pieces of at most CHUNK samples."""
+        for data in self.data:
+            for start in range(0, len(data.q), CHUNK):
+                yield data if len(data.q) <= CHUNK else data.take(np.s_[start : start + CHUNK])
+
+    def cost(self, x: Array) -> float:
+        """Sum of squared whitened residuals and priors at x (p,)."""
+        chain = self.errors.at(x)
+        total = float(np.sum((self.weights * x) ** 2))
+        return total + sum(float(np.sum(d.residual(chain.sweep(d.q)) ** 2)) for d in self.chunks())
+
+
+@dataclass(frozen=True, eq=False)
+class Triangle:
+    """QR of the whitened [J | r] at one x: ‖J·δ - r‖² = ‖R·δ - z‖² + rest.
+
+    Attributes:
+        r: (p, p) upper triangular, of the data alone.
+        z: (p,) right-hand side.
+        rest: the part of the cost that no step removes.
+    """
+
+    r: Array
+    z: Array
+    rest: float
+
+
+def _qr(rows: Array) -> Array:
+    """Upper triangle (c, c) of rows (c, k), a C-order array that LAPACK sees as (k, c)."""
+    columns, count = rows.shape
+    out = np.zeros((columns, columns))
+    if count == 0:
+        return out
+    packed = lapack.dgeqrf(rows.T, overwrite_a=1)[0]
+    top = min(columns, count)
+    out[:top] = np.triu(packed[:top])
+    return out
+
+
+def reduce(problem: Problem, x: Array, small_angle: bool) -> Triangle:
+    """The data's triangle at x (p,), without the priors; exact or by the paper's rows."""
+    chain, bodies, twists = problem.errors.derivative(x)
+    p = len(bodies)
+    merged = np.zeros((p + 1, p + 1))
+    for data in problem.chunks():
+        sweep = chain.sweep(data.q)
+        velocities = chain.tool_velocities(sweep, bodies, twists)
+        if small_angle:
+            residual, rows = data.small_angle(sweep, velocities)
+        else:
+            residual, rows = data.residual(sweep), data.whiten(sweep, velocities)
+        block = np.concatenate([rows.reshape(p, -1), residual.reshape(1, -1)])
+        merged = _qr(np.concatenate([merged.T, _qr(block).T], 1)) if merged.any() else _qr(block)
+    return Triangle(merged[:p, :p], merged[:p, p], float(merged[p, p] ** 2))
+
+
+def with_priors(triangle: Triangle, weights: Array, x: Array, damping: Array) -> Triangle:
+    """The triangle with prior rows -x/σ and damping rows below it."""
+    p = len(x)
+    stacked = np.zeros((p + 1, 3 * p))
+    stacked[:p, :p], stacked[p, :p] = triangle.r.T, triangle.z
+    stacked[:p, p : 2 * p], stacked[p, p : 2 * p] = np.diag(weights), -weights * x
+    stacked[:p, 2 * p :] = np.diag(damping)
+    full = _qr(stacked)
+    return Triangle(full[:p, :p], full[:p, p], triangle.rest + float(full[p, p] ** 2))
+
+
+def pseudo_inverse(r: Array, z: Array) -> Array:
+    """Shortest least-squares solution of R·δ = z, singular values cut as in `observability`."""
+    return np.linalg.lstsq(r, z, rcond=observability.RANK_CUT)[0]
+
+
+def _settled(r: Array, step: Array, cost: float, count: int) -> bool:
+    """Whether a step changes the whitened rows by nothing that matters."""
+    change = float(np.linalg.norm(r @ step))
+    return change <= RELATIVE_STEP * math.sqrt(cost) + ABSOLUTE_STEP * math.sqrt(count)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Where a loop ended: x (p,), the data's triangle there, iterations, and every x on the way."""
+
+    x: Array
+    triangle: Triangle
+    iterations: int
+    converged: bool
+    path: Array
+
+
+def gauss_newton(problem: Problem, x: Array, max_iterations: int, progress: Progress | None) -> Solution:
+    """The paper's loop (37) to (39): x ← x + R⁺·DX with a rank-revealing pseudo-inverse.
+
+    Rotation errors are (36) and the derivative is R itself, as printed. Priors join only if given.
+    """
+    path, converged, done = [x], False, 0
+    count = max(1, sum(data.q.shape[0] for data in problem.data))
+    while done < max_iterations and not converged:
+        triangle = reduce(problem, x, small_angle=True)
+        full = with_priors(triangle, problem.weights, x, np.zeros_like(x))
+        step = pseudo_inverse(full.r, full.z)
+        cost = full.rest + float(full.z @ full.z)
+        converged = _settled(full.r, step, cost, count)
+        x = x + step
+        path.append(x)
+        done += 1
+        if progress:
+            progress(done, cost)
+        if not np.abs(x).max() < RUNAWAY:
+            raise DhcalError("the loop diverged; use --method lm, more poses, or fix parameters")
+    return Solution(x, reduce(problem, x, small_angle=False), done, converged, np.array(path))
+
+
+def levenberg_marquardt(
+    problem: Problem, x: Array, max_iterations: int, progress: Progress | None
+) -> Solution:
+    """Levenberg-Marquardt; a retry costs forward kinematics only, the triangle stays."""
+    path, damping, growth = [x], 1e-4, 2.0
+    converged, done = False, 0
+    count = max(1, sum(data.q.shape[0] for data in problem.data))
+    cost = problem.cost(x)
+    scale = np.zeros_like(x)
+    triangle = reduce(problem, x, small_angle=False)
+    while done < max_iterations and not converged:
+        free = with_priors(triangle, problem.weights, x, np.zeros_like(x))
+        scale = np.maximum(scale, np.linalg.norm(free.r, axis=0))
+        floor = np.where(scale > 0, scale, 1.0)
+        done += 1
+        while True:
+            damped = with_priors(triangle, problem.weights, x, np.sqrt(damping) * floor)
+            step = pseudo_inverse(damped.r, damped.z)
+            settled = _settled(free.r, step, cost, count)
+            trial = problem.cost(x + step)
+            expected = float(free.z @ free.z - np.sum((free.r @ step - free.z) ** 2))
+            gain = (cost - trial) / expected if expected > 0 else 0.0
+            if trial <= cost and gain > 1e-3:
+                damping *= max(1e-3, 1 - (2 * gain - 1) ** 3) if gain < 0.9 else 1e-2
+                damping, growth = max(damping, 1e-16), 2.0
+                x, cost, converged = x + step, trial, settled and damping < 1e-3
+                break
+            if settled or damping > 1e16:
+                # Nothing left to gain beyond rounding.
+                converged = settled
+                break
+            damping, growth = damping * growth, growth * 2
+        path.append(x)
+        if progress:
+            progress(done, cost)
+        if damping > 1e16:
+            break
+        triangle = reduce(problem, x, small_angle=False)
+    return Solution(x, triangle, done, converged, np.array(path))
+
+
+METHODS: dict[str, Callable[[Problem, Array, int, Progress | None], Solution]] = {
+    "lm": levenberg_marquardt,
+    "gn": gauss_newton,
+}

@@ -1,0 +1,116 @@
+"""What the command line shows a person: tables and progress on stderr, plain where it is no terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from . import report
+from .check import Agreement
+from .result import Result
+from .screening import Finding
+from .solver import Progress
+
+
+def _console() -> Console:
+    console = Console(stderr=True, highlight=False)
+    if not console.is_terminal:
+        # A file or a pipe has no width of its own: never fold a table there.
+        console.width = 140
+    return console
+
+
+def table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """A table whose first column is text and the others numbers."""
+    console = _console()
+    out = Table(
+        title=title, title_justify="left", title_style="bold", header_style="bold", box=None, pad_edge=False
+    )
+    for i, name in enumerate(header):
+        out.add_column(name, justify="left" if i == 0 else "right")
+    for row in rows:
+        out.add_row(*map(Text, row))
+    console.print()
+    console.print(out)
+
+
+def lines(*texts: str, style: str = "") -> None:
+    """Plain sentences."""
+    console = _console()
+    for text in texts:
+        console.print(Text(text, style=style), soft_wrap=True)
+
+
+@contextmanager
+def progress(title: str) -> Iterator[Progress | None]:
+    """A status line while a loop runs; nothing where stderr is not a terminal."""
+    console = _console()
+    if not console.is_terminal:
+        yield None
+        return
+    with console.status(title) as status:
+        yield lambda iteration, cost: status.update(f"{title}: iteration {iteration}, cost {cost:.6g}")
+
+
+def findings(path: str, found: Sequence[Finding]) -> None:
+    """Impossible rows, one line each."""
+    for finding in found:
+        lines(f"{path}: row {finding.row} is left out: {finding.reason}", style="yellow")
+
+
+def notes(texts: Sequence[str]) -> None:
+    """Remarks on a conversion."""
+    lines(*(f"note: {text}" for text in texts))
+
+
+def agreement(robot: str, rows: Sequence[Agreement]) -> None:
+    """The routes of `dhcal check` against the paper's factors."""
+    table(
+        f"{robot}: largest difference from the paper's factors (m, rad)",
+        ["route", "columns", "difference", "allowed", ""],
+        [
+            [
+                row.route,
+                str(row.columns) if row.columns else "",
+                f"{row.difference:.1e}",
+                f"{row.allowed:.0e}",
+                "agrees" if row.holds else "DISAGREES",
+            ]
+            for row in rows
+        ],
+    )
+
+
+def summary(fit: Result, files: Mapping[str, str]) -> None:
+    """Accuracy, parameters, and what could not be seen."""
+    table("accuracy", ["", "", "before", "after"], report.accuracy_rows(fit))
+    table("parameters", *report.table(fit))
+    state = "converged" if fit.converged else "NOT converged"
+    lines(
+        "",
+        f"{state} after {fit.iterations} iterations; {fit.samples} samples; "
+        f"rank {fit.rank} of {len(fit.parameters)}; condition {fit.condition:.3g}",
+    )
+    for text in fit.unobservable:
+        lines(f"not observable: {text}", style="yellow")
+    for name, path in files.items():
+        lines(f"wrote {name}: {path}")
+
+
+def validation(document: Mapping[str, Any], fitted: bool) -> None:
+    """Accuracy of a model on data."""
+    after = document["after"]
+    rows = []
+    for key, label, unit in report.MEASURES:
+        if key in after:
+            rows.append([label, report.shown(after[key], unit)])
+    table(
+        f"accuracy on {document['samples']} samples" + (", base and tool fitted" if fitted else ""),
+        ["", ""],
+        rows,
+    )
