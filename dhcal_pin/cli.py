@@ -26,11 +26,11 @@ class _Parser(argparse.ArgumentParser):
 class _Version(argparse.Action):
     """Looks the version up only when asked for it."""
 
-    def __call__(self, parser, *_: object) -> NoReturn:
+    def __call__(self, *_: object) -> NoReturn:
         from importlib.metadata import version
 
         print(f"dhcal {version('dhcal-pin')}")
-        parser.exit()
+        sys.exit(0)
 
 
 def _add(commands, name: str, summary: str, example: str) -> argparse.ArgumentParser:

@@ -282,7 +282,8 @@ def _verdict(found: Experiment) -> list[str]:
         f"where fitted ones are missed by {mm['least_squares']}.",
         f"{' and '.join(found.held)} cannot be seen from these positions at the nominal arm, and were held.",
         "The published parameters (Table 4) do not reproduce the measurements of Table 5: with them the "
-        f"model misses the measured points by {missed} RMS, the nominal one by {mm['before']}. Nothing here was adjusted to match them.",
+        f"model misses the measured points by {missed} RMS, the nominal one by {mm['before']}. "
+        "Nothing here was adjusted to match them.",
     ]
 
 

@@ -283,6 +283,10 @@ def _scan(data: bytes, source: str) -> tuple[_Tag, dict[str, _Tag], dict[str, _T
     def doctype(*_: object) -> None:
         raise tag("<!DOCTYPE>", {}).bad("document types and entities are not accepted; remove it")
 
+    def instruction(target: str, _: str) -> None:
+        if depth > 0:  # before the robot they are common and harmless; inside, Pinocchio fails on them
+            raise tag(f"<?{target}?>", {}).bad("processing instructions are not accepted; remove it")
+
     def end(_: str) -> None:
         nonlocal depth
         depth -= 1
@@ -322,6 +326,7 @@ def _scan(data: bytes, source: str) -> tuple[_Tag, dict[str, _Tag], dict[str, _T
 
     parser.XmlDeclHandler, parser.StartDoctypeDeclHandler = declaration, doctype
     parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.ProcessingInstructionHandler = instruction
     try:
         parser.Parse(data, True)
     except expat.ExpatError as error:
