@@ -312,7 +312,8 @@ class Chain:
 
 def _build(urdf: Urdf) -> pin.Model:
     try:
-        return pin.buildModelFromXML(urdf.data.decode("utf-8-sig"))
+        # Pinocchio splits numbers at spaces only; XML allows any white space.
+        return pin.buildModelFromXML(urdf.data.decode("utf-8-sig").translate(dict.fromkeys(b"\t\r\n", " ")))
     except (ValueError, RuntimeError) as error:
         raise DhcalError(f"{urdf.source}: Pinocchio does not accept this URDF: {error}") from error
 

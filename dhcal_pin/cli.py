@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NoReturn
+from typing import NoReturn
 
 from .errors import DhcalError
-
-if TYPE_CHECKING:
-    from .chain import Chain
-    from .measurements import Measurement
 
 
 class _Parser(argparse.ArgumentParser):
     """A parser whose complaint is one line, as every other one is."""
 
     def error(self, message: str) -> NoReturn:
-        print(f"{self.prog}: {message}; see {self.prog} --help", file=sys.stderr)
+        print(f"{self.prog}: {' '.join(message.split())}; see {self.prog} --help", file=sys.stderr)
         sys.exit(2)
 
 
@@ -44,9 +39,20 @@ def _add(commands, name: str, summary: str, example: str) -> argparse.ArgumentPa
 
 
 def _count(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} must be at least 1")
+    return _whole(text, 1)
+
+
+def _seed(text: str) -> int:
+    return _whole(text, 0)
+
+
+def _whole(text: str, least: int) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
+    if not least <= value < 2**63:
+        raise argparse.ArgumentTypeError(f"{text} must be a whole number from {least} on")
     return value
 
 
@@ -65,7 +71,6 @@ def parser() -> argparse.ArgumentParser:
     )
     demo.add_argument("--out", default="demo", metavar="DIR", help="folder for the results (default: demo)")
     demo.add_argument("--json", metavar="FILE", help="the result as JSON to one more place; - for stdout")
-    demo.set_defaults(run=_demo)
 
     calibrate = _add(
         commands,
@@ -91,10 +96,9 @@ def parser() -> argparse.ArgumentParser:
     calibrate.add_argument("--method", choices=("lm", "gn"), default="lm", help="gn is the paper's loop")
     calibrate.add_argument("--priors", metavar="default|none|FILE", help="default for lm, none for gn")
     calibrate.add_argument("--max-iterations", metavar="N", type=_count, default=100)
-    calibrate.add_argument("--seed", metavar="N", type=int, default=0, help="for the choice of the hold-out")
+    calibrate.add_argument("--seed", metavar="N", type=_seed, default=0, help="for the choice of the hold-out")
     calibrate.add_argument("--in-place", action="store_true", help="allow -o to be ROBOT itself")
     calibrate.add_argument("--json", metavar="FILE", help="- for stdout")
-    calibrate.set_defaults(run=_calibrate)
 
     validate = _add(
         commands,
@@ -108,7 +112,6 @@ def parser() -> argparse.ArgumentParser:
     validate.add_argument("--sidecar", metavar="S.toml", help="base and tool (default: the one beside ROBOT)")
     validate.add_argument("--fit-frames", action="store_true", help="fit base and tool first")
     validate.add_argument("--json", metavar="FILE", help="- for stdout")
-    validate.set_defaults(run=_validate)
 
     convert = _add(
         commands,
@@ -119,8 +122,7 @@ def parser() -> argparse.ArgumentParser:
     convert.add_argument("input", metavar="IN")
     convert.add_argument("output", metavar="OUT")
     convert.add_argument("--tip", metavar="F")
-    convert.add_argument("--convention", choices=("standard", "modified"), default="standard")
-    convert.set_defaults(run=_convert)
+    convert.add_argument("--convention", choices=("standard", "modified"), help="of a DH file that is written")
 
     check = _add(
         commands,
@@ -131,7 +133,6 @@ def parser() -> argparse.ArgumentParser:
     check.add_argument("robot", metavar="ROBOT")
     check.add_argument("--tip", metavar="F")
     check.add_argument("--json", metavar="FILE", help="- for stdout")
-    check.set_defaults(run=_check)
 
     simulate = _add(
         commands,
@@ -148,219 +149,22 @@ def parser() -> argparse.ArgumentParser:
     simulate.add_argument("--truth", metavar="T.urdf", help="the robot that is measured (default: ROBOT)")
     simulate.add_argument("--kind", choices=("pose", "position"), default="pose")
     simulate.add_argument("--tip", metavar="F")
-    simulate.add_argument("--seed", metavar="N", type=int, default=0)
-    simulate.set_defaults(run=_simulate)
+    simulate.add_argument("--seed", metavar="N", type=_seed, default=0)
     return out
-
-
-def _names(text: str) -> list[str]:
-    return [name.strip() for name in text.split(",") if name.strip()]
-
-
-def _distinct(output: str, inputs: Sequence[str]) -> None:
-    for path in inputs:
-        if os.path.exists(output) and os.path.exists(path) and os.path.samefile(output, path):
-            raise DhcalError(f"{output}: is an input; name another output")
-
-
-def _emit(target: str | None, content: object) -> None:
-    """JSON to a file, or alone on stdout for `-`."""
-    from .files import save
-    from .report import json_text
-
-    if target == "-":
-        sys.stdout.write(json_text(content))
-    elif target:
-        save({target: json_text(content)})
-
-
-def _calibrate(args: argparse.Namespace) -> int:
-    from . import report, terminal
-    from .calibration import calibrate, split
-    from .files import save
-    from .measurement_files import read_readings
-    from .robot_files import read_priors, read_robot, urdf_files
-    from .screening import screen
-
-    _distinct(args.output, args.data + ([] if args.in_place else [args.robot]))
-    chain = read_robot(args.robot, args.tip)
-    sets = args.parameters or chain.parameters
-    fit_data: list[Measurement] = []
-    holdout: list[Measurement] = []
-    outliers: list[int] = []
-    inputs = [args.robot, *args.data]
-    for path in args.data:
-        readings = read_readings(path, chain)
-        # A row can only be called impossible where base and tool are known.
-        bad = [] if {"base", "tool"} & set(_names(sets)) else screen(chain, readings)
-        terminal.findings(path, bad)
-        outliers += [finding.row for finding in bad]
-        fit_data.append(readings.fit.take(~_member(readings.fit, outliers)))
-        if len(readings.holdout.q):
-            holdout.append(readings.holdout.take(~_member(readings.holdout, outliers)))
-    if args.holdout is not None:
-        if os.path.exists(args.holdout):
-            holdout.append(read_readings(args.holdout, chain).data)
-            inputs.append(args.holdout)
-        else:
-            try:
-                fraction = float(args.holdout)
-            except ValueError:
-                raise DhcalError(
-                    f"--holdout {args.holdout}: neither a file nor a share such as 0.3"
-                ) from None
-            kept, held = split(fit_data, fraction, args.seed)
-            fit_data, holdout = list(kept), holdout + list(held)
-    with terminal.progress("fitting") as progress:
-        fit = calibrate(
-            chain,
-            fit_data,
-            sets,
-            method=args.method,
-            priors=read_priors(args.priors),
-            fix=_names(args.fix),
-            free=_names(args.free),
-            holdout=holdout,
-            max_iterations=args.max_iterations,
-            progress=progress,
-        )
-    contents = urdf_files(fit.chain, args.output)
-    names = ["urdf", "sidecar"]
-    files = dict(zip(names, map(str, contents), strict=False))
-    if args.json and args.json != "-":
-        files["json"] = args.json
-    document = report.document(fit, files, report.fingerprints(inputs), outliers)
-    if args.json and args.json != "-":
-        contents[args.json] = report.json_text(document)
-    save(contents)
-    if args.json == "-":
-        _emit("-", document)
-    terminal.summary(fit, files)
-    return 0
-
-
-def _member(data: Measurement, rows: Sequence[int]):
-    import numpy as np
-
-    return np.isin(data.rows, rows)
-
-
-def _validate(args: argparse.Namespace) -> int:
-    from . import report, terminal
-    from .calibration import calibrate
-    from .measurement_files import read_measurements
-    from .result import accuracy
-    from .robot_files import read_robot
-
-    chain = read_robot(args.robot, args.tip, args.sidecar)
-    data = [read_measurements(path, chain) for path in args.data]
-    inputs = [args.robot, *args.data, *([args.sidecar] if args.sidecar else [])]
-    if args.fit_frames:
-        fit = calibrate(chain, data, "base,tool")
-        document = report.document(fit, {}, report.fingerprints(inputs))
-    else:
-        document = report.plain_document(chain, data, report.fingerprints(inputs))
-    document["before"] = accuracy(chain, data)
-    terminal.validation(document, args.fit_frames)
-    _emit(args.json, document)
-    return 0
-
-
-def _convert(args: argparse.Namespace) -> int:
-    from . import terminal
-    from .chain import Chain
-    from .dh_files import dh_text, is_dh, read_dh
-    from .files import save
-    from .parameters import extract
-
-    _distinct(args.output, [args.input])
-    if is_dh(args.input):
-        table = read_dh(args.input)
-        if is_dh(args.output):
-            save({args.output: dh_text(table, args.output)})
-        else:
-            from .dh_urdf import dh_to_urdf
-
-            _ending(args.output)
-            save({args.output: dh_to_urdf(table, os.path.basename(args.input).split(".")[0])})
-    else:
-        if not is_dh(args.output):
-            raise DhcalError(f"{args.output}: a URDF converts to .dh.toml or .dh.csv")
-        found = extract(Chain.from_urdf(args.input, args.tip), args.convention)
-        save({args.output: dh_text(found.table, args.output)})
-        terminal.notes(found.notes)
-    return 0
-
-
-def _ending(path: str) -> None:
-    if not path.lower().endswith(".urdf"):
-        raise DhcalError(f"{path}: write .urdf, .dh.toml or .dh.csv")
-
-
-def _check(args: argparse.Namespace) -> int:
-    from dataclasses import asdict
-
-    from . import terminal
-    from .check import crosscheck
-    from .robot_files import read_robot
-
-    rows = crosscheck(read_robot(args.robot, args.tip))
-    terminal.agreement(args.robot, rows)
-    agree = all(row.holds for row in rows)
-    _emit(args.json, {"agree": agree, "routes": [asdict(row) | {"holds": row.holds} for row in rows]})
-    return 0 if agree else 1
-
-
-def _simulate(args: argparse.Namespace) -> int:
-    import numpy as np
-
-    from .files import parse_noise, save
-    from .measurement_files import measurement_text
-    from .measurements import KINDS, Noise
-    from .robot_files import read_robot
-
-    _distinct(args.output, [args.robot, *([args.truth] if args.truth else [])])
-    chain = read_robot(args.robot, args.tip)
-    truth = (
-        read_robot(args.truth, None if args.truth.endswith((".toml", ".csv")) else args.tip)
-        if args.truth
-        else chain
-    )
-    if truth.joint_names != chain.joint_names:
-        raise DhcalError(
-            f"{args.truth}: its joints are {', '.join(truth.joint_names)}; "
-            f"{args.robot} has {', '.join(chain.joint_names)}"
-        )
-    noise = Noise(*parse_noise(args.noise))
-    rng = np.random.default_rng(args.seed)
-    q = _configurations(chain, args.samples, rng)
-    data = KINDS[args.kind].simulate(truth, q, noise, rng)
-    comments = [f"simulated {args.kind} of {args.truth or args.robot}, noise {args.noise}, seed {args.seed}"]
-    save({args.output: measurement_text(data, chain, comments)})
-    return 0
-
-
-def _configurations(chain: Chain, count: int, rng):
-    """Uniform joint values within the limits, and within a turn."""
-    import numpy as np
-
-    return rng.uniform(np.maximum(chain.lower, -np.pi), np.minimum(chain.upper, np.pi), (count, chain.size))
-
-
-def _demo(args: argparse.Namespace) -> int:
-    from .demo import run
-
-    _emit(args.json, run(args.out))
-    return 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; 0 done, 1 a check that failed, 2 wrong input, 130 interrupted."""
     args = parser().parse_args(argv)
     try:
-        return args.run(args)
+        from . import commands
+
+        return commands.COMMANDS[args.command](args)
     except DhcalError as error:
         print(f"dhcal: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except MemoryError:
+        print("dhcal: there is not enough memory for this; ask for fewer samples", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("dhcal: interrupted; nothing written", file=sys.stderr)

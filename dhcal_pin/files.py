@@ -5,9 +5,10 @@ from __future__ import annotations
 import csv
 import os
 import re
+import shutil
 import tempfile
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,25 +20,41 @@ from .se3 import Array
 
 PathLike = str | os.PathLike[str]
 
-# Divisors, so that 606.8 mm is the double nearest to 0.6068 m.
-LENGTHS = {"m": 1.0, "cm": 1e2, "mm": 1e3, "um": 1e6, "µm": 1e6}
+# Divisors, so that 606.8 mm is the double nearest to 0.6068 m. Both signs for micro are in use.
+LENGTHS = {"m": 1.0, "cm": 1e2, "mm": 1e3, "um": 1e6, "\u00b5m": 1e6, "\u03bcm": 1e6}
 ANGLES = {"rad": 1.0, "mrad": 1e3, "deg": 180.0 / np.pi}
+# Metres or radians: no reading, but a wrong unit or a typing error.
+_MOST = 1e6
+# Joint names are column names, and one stands in every line of a table.
+_NOT_IN_NAMES = frozenset(",;[]#\"'")
+
+
+def check_place(path: PathLike) -> None:
+    """Complains unless a file can stand at a path.
+
+    Raises:
+        DhcalError: its folder is missing, or it is a folder itself.
+    """
+    folder = os.path.dirname(path) or os.curdir
+    if os.path.isdir(path):
+        raise DhcalError(f"{path}: is a folder; name a file in it")
+    if not os.path.isdir(folder):
+        raise DhcalError(f"{path}: there is no folder {folder}; make it first, or write elsewhere")
 
 
 def save(contents: Mapping[PathLike, str | bytes]) -> None:
     """Writes all files or none: each beside its place first, then renamed over.
 
     Raises:
-        DhcalError: a folder is missing or not writable.
+        DhcalError: a folder is missing or not writable, a disk is full.
     """
     staged: list[tuple[str, PathLike]] = []
+    placed: list[tuple[str, PathLike]] = []
+    path: PathLike = ""
     try:
         for path, content in contents.items():
-            folder = os.path.dirname(os.path.abspath(path))
-            try:
-                handle, name = tempfile.mkstemp(prefix=".dhcal-", dir=folder)
-            except OSError as error:
-                raise DhcalError(f"{path}: cannot write there: {error.strerror}") from error
+            check_place(path)
+            handle, name = tempfile.mkstemp(prefix=".dhcal-", dir=os.path.dirname(os.path.abspath(path)))
             staged.append((name, path))
             with os.fdopen(handle, "wb") as file:
                 file.write(content.encode() if isinstance(content, str) else content)
@@ -45,14 +62,37 @@ def save(contents: Mapping[PathLike, str | bytes]) -> None:
             os.umask(mask)
             os.chmod(name, 0o666 & ~mask)
         for name, path in staged:
-            try:
-                os.replace(name, path)
-            except OSError as error:
-                raise DhcalError(f"{path}: cannot write there: {error.strerror}") from error
+            _keep(path, _spare(name))
+            os.replace(name, path)
+            placed.append((name, path))
+    except BaseException as error:
+        for name, done in reversed(placed):
+            if os.path.exists(_spare(name)):
+                os.replace(_spare(name), done)
+            else:
+                os.unlink(done)
+        if isinstance(error, OSError):
+            raise DhcalError(f"{path}: cannot write there: {error.strerror}; choose another place") from error
+        raise
     finally:
         for name, _ in staged:
-            with suppress(FileNotFoundError):
-                os.unlink(name)
+            for rest in (name, _spare(name)):
+                with suppress(FileNotFoundError):
+                    os.unlink(rest)
+
+
+def _spare(name: str) -> str:
+    return f"{name}-old"
+
+
+def _keep(path: PathLike, spare: str) -> None:
+    """A second name for what stands at a path, if anything does."""
+    try:
+        os.link(path, spare)
+    except FileNotFoundError:
+        pass
+    except OSError:
+        shutil.copy2(path, spare)  # a file system without links
 
 
 def read_text(path: PathLike) -> str:
@@ -60,7 +100,7 @@ def read_text(path: PathLike) -> str:
     try:
         return Path(path).read_bytes().decode("utf-8-sig")
     except OSError as error:
-        raise DhcalError(f"{path}: cannot read it: {error.strerror}") from error
+        raise DhcalError(f"{path}: cannot read it: {error.strerror}; give the path of a file") from error
     except UnicodeDecodeError as error:
         raise DhcalError(f"{path}: byte {error.start} is not UTF-8; save the file as UTF-8") from error
 
@@ -69,26 +109,47 @@ def read_toml(path: PathLike) -> dict:
     """A TOML file, or DhcalError."""
     try:
         return tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
-        raise DhcalError(f"{path}: not TOML: {error}") from error
+    except (ValueError, RecursionError) as error:  # more than TOMLDecodeError: endless numbers and brackets
+        raise DhcalError(f"{path}: not TOML: {error}; correct that line") from error
+
+
+def check_names(names: Sequence[str], source: str) -> None:
+    """Complains about joint names that a table or a measurement file cannot carry.
+
+    Raises:
+        DhcalError: a name is empty, not printable, or has a sign that means something in a header.
+    """
+    for name in names:
+        if not name or name != name.strip() or not name.isprintable() or _NOT_IN_NAMES & set(name):
+            raise DhcalError(
+                f"{source}: joint name {name!r}: a name that heads a column must be printable, "
+                f"without {' '.join(sorted(_NOT_IN_NAMES))}; rename the joint"
+            )
 
 
 def parse_noise(text: str) -> tuple[float, float]:
-    """Standard deviations in m and rad from a text such as `0.1mm` or `0.1mm,0.01deg`."""
-    out = {"length": 0.0, "angle": 0.0}
+    """Standard deviations in m and rad from a text such as `0.1mm` or `0.1mm,0.01deg`.
+
+    Raises:
+        DhcalError: not a number with a unit, a negative one, or one quantity twice.
+    """
+    out: dict[str, float] = {}
     for part in text.split(","):
-        match = re.fullmatch(r"\s*([0-9.eE+-]+)\s*([a-zµ]+)\s*", part)
+        where = f"--noise {part.strip()!r}"
+        match = re.fullmatch(r"\s*([0-9.eE+-]+)\s*([a-z\u00b5\u03bc]+)\s*", part)
         kind = "length" if match and match[2] in LENGTHS else "angle"
         units = LENGTHS if kind == "length" else ANGLES
         if not match or match[2] not in units:
-            raise DhcalError(f"noise {part.strip()!r}: write a number with a unit, as 0.1mm or 0.1mm,0.01deg")
+            raise DhcalError(f"{where}: write a number with a unit, as 0.1mm or 0.1mm,0.01deg")
+        if kind in out:
+            raise DhcalError(f"{where}: a second {kind}; write one length and one angle, as 0.1mm,0.01deg")
         try:
             out[kind] = float(match[1]) / units[match[2]]
         except ValueError:
-            raise DhcalError(f"noise {part.strip()!r}: {match[1]!r} is not a number") from None
-        if not 0 <= out[kind] < float("inf"):
-            raise DhcalError(f"noise {part.strip()!r}: must be zero or more")
-    return out["length"], out["angle"]
+            raise DhcalError(f"{where}: {match[1]!r} is not a number; write one such as 0.1") from None
+        if not 0 <= out[kind] <= _MOST:
+            raise DhcalError(f"{where}: must be between 0 and {_MOST:g} m or rad")
+    return out.get("length", 0.0), out.get("angle", 0.0)
 
 
 @dataclass(frozen=True)
@@ -107,7 +168,7 @@ class Column:
         first = next(iter(units))
         raise DhcalError(
             f"{where}: column {self.name!r} {found}; write one of "
-            f"{', '.join(f'{self.name}[{u}]' for u in units if u != 'µm')} (for example {self.name}[{first}])"
+            f"{', '.join(f'{self.name}[{u}]' for u in units if u.isascii())} (for example {self.name}[{first}])"
         )
 
 
@@ -121,6 +182,18 @@ class Sheet:
     cells: list[list[str]]
     lines: list[int]
     header: int
+
+    def si(self, column: Column, units: Mapping[str, float]) -> Array:
+        """A column's numbers (m,) in metres or radians, or DhcalError naming line and column."""
+        out = self.numbers(column) / column.scale(units, f"{self.source}:{self.header}")
+        bad = np.flatnonzero(np.abs(out) > _MOST)
+        if bad.size:
+            text = self.cells[bad[0]][column.index].strip()
+            raise DhcalError(
+                f"{self.source}:{self.lines[bad[0]]}: column {column.name!r}: {text} {column.unit} is beyond "
+                f"{_MOST:g} {next(iter(units))}; correct the number or the unit"
+            )
+        return out
 
     def numbers(self, column: Column) -> Array:
         """A column's finite numbers (m,), or DhcalError naming line and column."""
@@ -147,7 +220,11 @@ class Sheet:
 
 
 def read_sheet(path: PathLike) -> Sheet:
-    """A comma-separated UTF-8 file with `#` comments and one header line."""
+    """A comma-separated UTF-8 file with `#` comments and one header line.
+
+    Raises:
+        DhcalError: it is empty, its header is none, or a row is too short or too long.
+    """
     source, comments, kept = os.fspath(path), [], []
     for number, line in enumerate(read_text(path).splitlines(), 1):
         if line.lstrip().startswith("#"):
@@ -158,24 +235,38 @@ def read_sheet(path: PathLike) -> Sheet:
         raise DhcalError(
             f"{source}: is empty; the first line must be a header such as joint_1[deg],…,x[mm],y[mm],z[mm]"
         )
-    rows = list(csv.reader(line for _, line in kept))
+    # Line by line, so that a stray quote stays in its own row.
+    rows = [_cells(line, f"{source}:{number}") for number, line in kept]
     first = kept[0][0]
-    columns: dict[str, Column] = {}
-    for index, cell in enumerate(rows[0]):
-        match = re.fullmatch(r"\s*([^\[\]]+?)\s*(?:\[\s*([^\[\]]*?)\s*\])?\s*", cell)
-        if not match:
-            raise DhcalError(f"{source}:{first}: header {cell!r}: write a name, or name[unit]")
-        name, unit = match[1], match[2] or ""
-        if name in columns:
-            raise DhcalError(f"{source}:{first}: column {name!r} stands twice; remove one")
-        columns[name] = Column(name, unit, index)
+    columns = _columns(rows[0], f"{source}:{first}")
     lines = [number for number, _ in kept[1:]]
     for row, line in zip(rows[1:], lines, strict=True):
-        if len(row) != len(rows[0]):
+        if len(row) != len(columns):
             raise DhcalError(
-                f"{source}:{line}: {len(row)} values under a header of {len(rows[0])} columns; "
+                f"{source}:{line}: {len(row)} values under a header of {len(columns)} columns; "
                 "give every row one value a column (decimal point, comma between)"
             )
     if not lines:
-        raise DhcalError(f"{source}: no rows under the header in line {first}; add at least one measurement")
+        raise DhcalError(f"{source}: no rows under the header in line {first}; add at least one row")
     return Sheet(source, tuple(comments), columns, rows[1:], lines, first)
+
+
+def _cells(line: str, where: str) -> list[str]:
+    try:
+        return next(csv.reader([line]))
+    except csv.Error as error:
+        raise DhcalError(f"{where}: not comma-separated text: {error}; correct this line") from error
+
+
+def _columns(header: Sequence[str], where: str) -> dict[str, Column]:
+    columns: dict[str, Column] = {}
+    for index, cell in enumerate(header):
+        match = re.fullmatch(r"\s*([^\[\]]+?)\s*(?:\[\s*([^\[\]]*?)\s*\])?\s*", cell)
+        if not match:
+            shown = cell if len(cell) <= 60 else cell[:57] + "..."
+            raise DhcalError(f"{where}: header {shown!r}: write name or name[unit], with commas between them")
+        name, unit = match[1], match[2] or ""
+        if name in columns:
+            raise DhcalError(f"{where}: column {name!r} stands twice; remove one")
+        columns[name] = Column(name, unit, index)
+    return columns

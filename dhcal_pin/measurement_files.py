@@ -11,7 +11,7 @@ import numpy as np
 from . import se3
 from .chain import Chain
 from .errors import DhcalError
-from .files import ANGLES, LENGTHS, Column, PathLike, Sheet, read_sheet
+from .files import ANGLES, LENGTHS, Column, PathLike, Sheet, check_names, read_sheet
 from .measurements import Measurement, Pose, Position
 from .se3 import Array
 
@@ -23,6 +23,11 @@ _TEXT = ("set", "pose_id")
 # judging a compensation, never fitted.
 _COMMANDED = ("commanded_x", "commanded_y", "commanded_z")
 _AFTER = ("after_x", "after_y", "after_z")
+_SIGMA = tuple(f"sigma_{name}" for name in _XYZ)
+_TURN_SIGMA = tuple(f"sigma_{name}" for name in _ROTVEC)
+# No instrument is that good: m or rad.
+_LEAST_SIGMA = 1e-15
+_KNOWN = frozenset((*_XYZ, *_QUATERNION, *_ROTVEC, *_TEXT, *_COMMANDED, *_AFTER, *_SIGMA, *_TURN_SIGMA))
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,32 +57,24 @@ def _group(sheet: Sheet, names: Sequence[str], units: Mapping[str, float] | None
         return None
     where = f"{sheet.source}:{sheet.header}"
     if missing:
-        raise DhcalError(
-            f"{where}: column {missing[0]!r} is missing beside {', '.join(set(names) - set(missing))}"
-        )
-    out = []
-    for name in names:
-        column = sheet.columns[name]
-        if units is None and column.unit:
-            raise DhcalError(f"{where}: column {name!r} has no unit by nature; write {name}")
-        scale = 1.0 if units is None else column.scale(units, where)
-        out.append(sheet.numbers(column) / scale)
-    return np.stack(out, -1)
+        there = [name for name in names if name in sheet.columns]
+        raise DhcalError(f"{where}: {', '.join(there)} without {missing[0]!r}; give {','.join(names)} or none")
+    if units is None:
+        for name in names:
+            if sheet.columns[name].unit:
+                raise DhcalError(f"{where}: column {name!r} is a pure number; write {name} without a unit")
+        return np.stack([sheet.numbers(sheet.columns[name]) for name in names], -1)
+    return np.stack([sheet.si(sheet.columns[name], units) for name in names], -1)
 
 
 def _joints(sheet: Sheet, chain: Chain) -> Array:
-    where = f"{sheet.source}:{sheet.header}"
     missing = [name for name in chain.joint_names if name not in sheet.columns]
     if missing:
         raise DhcalError(
-            f"{where}: no column for joint {missing[0]!r}; "
-            f"this robot needs {', '.join(f'{name}[{_unit(chain, name)}]' for name in chain.joint_names)}"
+            f"{sheet.source}:{sheet.header}: no column for joint {missing[0]!r}; "
+            f"this robot needs {','.join(f'{name}[{_unit(chain, name)}]' for name in chain.joint_names)}"
         )
-    out = np.empty((len(sheet.cells), chain.size))
-    for j, name in enumerate(chain.joint_names):
-        column = sheet.columns[name]
-        out[:, j] = sheet.numbers(column) / column.scale(_units(chain, name), where)
-    return out
+    return np.stack([sheet.si(sheet.columns[name], _units(chain, name)) for name in chain.joint_names], -1)
 
 
 def _units(chain: Chain, name: str) -> Mapping[str, float]:
@@ -89,17 +86,25 @@ def _unit(chain: Chain, name: str) -> str:
     return "mm" if _units(chain, name) is LENGTHS else "deg"
 
 
-def _check_names(sheet: Sheet, chain: Chain) -> None:
-    readings = (*_XYZ, *_QUATERNION, *_ROTVEC, *_TEXT, *_COMMANDED, *_AFTER)
-    known = {
-        *readings,
-        *(f"sigma_{name}" for name in (*_XYZ, *_ROTVEC)),
-        *(j.name for j in chain.urdf.joints),
-    }
+def _check_joint_names(chain: Chain) -> None:
+    """Complains about joints whose names cannot head a column beside the readings."""
+    check_names(chain.joint_names, chain.urdf.source)
+    if clash := sorted(_KNOWN & set(chain.joint_names)):
+        raise DhcalError(
+            f"{chain.urdf.source}: joint {clash[0]!r} has the name of a reading; rename it in the robot's file"
+        )
+
+
+def _check_columns(sheet: Sheet, chain: Chain) -> None:
+    joints = {joint.name for joint in chain.urdf.joints}
     for name in sheet.columns:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, 1, 0.7)
-            hint = f"did you mean {near[0]!r}?" if near else f"the joints are {', '.join(chain.joint_names)}"
+        if name not in _KNOWN | joints:
+            near = difflib.get_close_matches(name[:100], sorted(_KNOWN | joints), 1, 0.7)
+            hint = (
+                f"did you mean {near[0]!r}?"
+                if near
+                else f"remove it; the joints are {', '.join(chain.joint_names)}"
+            )
             raise DhcalError(
                 f"{sheet.source}:{sheet.header}: column {name!r} is neither a joint of this robot "
                 f"nor a known reading; {hint}"
@@ -113,7 +118,8 @@ def read_readings(path: PathLike, chain: Chain) -> Readings:
         DhcalError: what is wrong, with file, line and column, and what would be right.
     """
     sheet = read_sheet(path)
-    _check_names(sheet, chain)
+    _check_joint_names(chain)
+    _check_columns(sheet, chain)
     where = f"{sheet.source}:{sheet.header}"
     q = _joints(sheet, chain)
     position = _group(sheet, _XYZ, LENGTHS)
@@ -122,12 +128,14 @@ def read_readings(path: PathLike, chain: Chain) -> Readings:
         raise DhcalError(f"{where}: no readings; a position needs the columns x[mm],y[mm],z[mm]")
     if quaternion is not None and rotvec is not None:
         raise DhcalError(f"{where}: both qw… and rx… given; keep one rotation")
-    sigma = _group(sheet, [f"sigma_{name}" for name in _XYZ], LENGTHS)
-    turn_sigma = _group(sheet, [f"sigma_{name}" for name in _ROTVEC], ANGLES)
-    for values, names in ((sigma, _XYZ), (turn_sigma, _ROTVEC)):
-        if values is not None and (bad := np.argwhere(values <= 0)).size:
+    sigma, turn_sigma = _group(sheet, _SIGMA, LENGTHS), _group(sheet, _TURN_SIGMA, ANGLES)
+    for values, names in ((sigma, _SIGMA), (turn_sigma, _TURN_SIGMA)):
+        if values is not None and (bad := np.argwhere(values < _LEAST_SIGMA)).size:
             row, column = bad[0]
-            raise DhcalError(f"{sheet.source}:{sheet.lines[row]}: sigma_{names[column]} must be above zero")
+            raise DhcalError(
+                f"{sheet.source}:{sheet.lines[row]}: column {names[column]!r}: must be above zero; "
+                "leave the sigma columns out where they are not known"
+            )
     if quaternion is None and rotvec is None:
         if turn_sigma is not None:
             raise DhcalError(f"{where}: sigma_rx… without a rotation; remove it or add qw,qx,qy,qz")
@@ -150,7 +158,8 @@ def read_readings(path: PathLike, chain: Chain) -> Readings:
 
 def _from_quaternion(sheet: Sheet, quaternion: Array | None) -> Array:
     assert quaternion is not None
-    norm = np.linalg.norm(quaternion, axis=1)
+    with np.errstate(over="ignore"):
+        norm = np.linalg.norm(quaternion, axis=1)
     bad = np.flatnonzero(np.abs(norm - 1) > 1e-3)
     if bad.size:
         raise DhcalError(
@@ -169,7 +178,7 @@ def _held(sheet: Sheet) -> Array:
     words = sheet.text(column)
     for word, line in zip(words, sheet.lines, strict=True):
         if word not in ("fit", "holdout"):
-            raise DhcalError(f"{sheet.source}:{line}: set {word!r} must be fit or holdout")
+            raise DhcalError(f"{sheet.source}:{line}: column 'set': {word!r} must be fit or holdout")
     return np.array([word == "holdout" for word in words])
 
 
@@ -183,7 +192,12 @@ def read_measurements(path: PathLike, chain: Chain) -> Measurement:
 
 
 def measurement_text(data: Measurement, chain: Chain, comments: Sequence[str] = ()) -> str:
-    """The CSV text of positions or poses in metres and radians, exact to the last digit."""
+    """The CSV text of positions or poses in metres and radians, exact to the last digit.
+
+    Raises:
+        DhcalError: a joint's name cannot head a column.
+    """
+    _check_joint_names(chain)
     columns: list[tuple[str, Array]] = []
     for j, name in enumerate(chain.joint_names):
         columns.append((f"{name}[{'m' if _units(chain, name) is LENGTHS else 'rad'}]", data.q[:, j]))
@@ -192,9 +206,9 @@ def measurement_text(data: Measurement, chain: Chain, comments: Sequence[str] = 
         turn = se3.log3(data.poses[:, :3, :3])
         columns += [(f"{name}[rad]", turn[:, i]) for i, name in enumerate(_ROTVEC)]
     if isinstance(data, Position | Pose) and data.stated:
-        columns += [(f"sigma_{name}[m]", data.sigma[:, i]) for i, name in enumerate(_XYZ)]
+        columns += [(f"{name}[m]", data.sigma[:, i]) for i, name in enumerate(_SIGMA)]
     if isinstance(data, Pose) and data.stated:
-        columns += [(f"sigma_{name}[rad]", data.rotation_sigma[:, i]) for i, name in enumerate(_ROTVEC)]
+        columns += [(f"{name}[rad]", data.rotation_sigma[:, i]) for i, name in enumerate(_TURN_SIGMA)]
     lines = [f"# {comment}" for comment in comments] + [",".join(name for name, _ in columns)]
     lines += [
         ",".join(map(repr, row)) for row in zip(*(values.tolist() for _, values in columns), strict=True)

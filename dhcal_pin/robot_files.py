@@ -16,15 +16,27 @@ from .errors import DhcalError
 from .files import PathLike, read_toml, save
 from .result import Result
 from .se3 import Array
-from .urdf import parse_urdf, with_origins
+from .urdf import parse_urdf
+from .urdf_origins import with_origins
 
 # A written URDF must read back as the same robot to this many metres and radians.
 READ_BACK = 1e-12
+_WIDEST = 1e300
 
 
 def sidecar_path(path: PathLike) -> str:
     """`arm.urdf` → `arm.calibration.toml`."""
     return f"{os.path.splitext(os.fspath(path))[0]}.calibration.toml"
+
+
+def existing_sidecar(path: PathLike) -> str | None:
+    """The sidecar beside a robot, if there is one."""
+    return sidecar_path(path) if os.path.exists(sidecar_path(path)) else None
+
+
+def robot_name(path: PathLike) -> str:
+    """`dir/arm.dh.toml` → `arm`."""
+    return Path(path).name.split(".")[0] or "arm"
 
 
 def read_robot(path: PathLike, tip: str | None = None, sidecar: PathLike | None = None) -> Chain:
@@ -41,12 +53,10 @@ def read_robot(path: PathLike, tip: str | None = None, sidecar: PathLike | None 
     if is_dh(path):
         if tip is not None:
             raise DhcalError(f"{os.fspath(path)}: a DH table has one tip; leave out --tip")
-        chain = Chain.from_dh(read_dh(path), Path(path).name.split(".")[0] or "arm")
+        chain = Chain.from_dh(read_dh(path), robot_name(path))
     else:
         chain = Chain.from_urdf(path, tip)
-    beside = sidecar_path(path)
-    if sidecar is None and os.path.exists(beside) and os.fspath(path) != beside:
-        sidecar = beside
+    sidecar = sidecar or existing_sidecar(path)
     return chain if sidecar is None else _with_sidecar(chain, sidecar)
 
 
@@ -98,6 +108,9 @@ def _origins(chain: Chain) -> tuple[dict[str, Array], Array]:
 def urdf_files(chain: Chain, path: PathLike) -> dict[PathLike, str | bytes]:
     """The calibrated URDF, read back and compared, and its sidecar; by path, not yet written.
 
+    Identity base and tool need no sidecar; one that is there already would be read with the new URDF,
+    and is replaced.
+
     Raises:
         DhcalError: the written text would not be the same robot.
     """
@@ -113,13 +126,14 @@ def urdf_files(chain: Chain, path: PathLike) -> dict[PathLike, str | bytes]:
             f"{os.fspath(path)}: not written: read back, the tool is off by {gap:.2g}; please report it"
         )
     out: dict[PathLike, str | bytes] = {path: data}
-    if not (np.array_equal(chain.base, np.eye(4)) and np.array_equal(tool, np.eye(4))):
+    plain = np.array_equal(chain.base, np.eye(4)) and np.array_equal(tool, np.eye(4))
+    if not plain or existing_sidecar(path):
         out[sidecar_path(path)] = sidecar_text(chain.base, tool)
     return out
 
 
 def write_urdf(fit: Result | Chain, path: PathLike) -> None:
-    """Writes the calibrated URDF, and its sidecar where base or tool are not the identity.
+    """Writes the calibrated URDF, and its sidecar where base or tool are not the identity or an old one lies there.
 
     Only the origins of joints that moved change; every other byte is the nominal file's.
 
@@ -137,11 +151,20 @@ def write_urdf(fit: Result | Chain, path: PathLike) -> None:
 
 
 def read_priors(choice: str | None) -> Priors | None:
-    """`default`, `none`, or a TOML file of sigmas in m and rad by parameter name or pattern."""
+    """`default`, `none`, or a TOML file of sigmas in m and rad by parameter name or pattern.
+
+    Raises:
+        DhcalError: neither, or a sigma is not a positive number.
+    """
     if choice is None or choice in ("default", "none"):
         return choice  # pyright: ignore[reportReturnType]
+    if not os.path.exists(choice):
+        raise DhcalError(f"--priors {choice}: neither default, none, nor a file of sigmas by parameter")
     raw = read_toml(choice)
     for name, value in raw.items():
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise DhcalError(f"{choice}: {name} = {value!r} is not a number; write a sigma in m or rad")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= _WIDEST:
+            raise DhcalError(
+                f"{choice}: {name} = {value!r} is not a sigma; write a positive number in m or rad, "
+                'such as "theta*" = 0.01'
+            )
     return {name: float(value) for name, value in raw.items()}

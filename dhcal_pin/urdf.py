@@ -1,4 +1,4 @@
-"""URDF files, read safely and rewritten without touching a byte outside joint origins.
+"""URDF files, read safely: checked before any library sees them.
 
 Lengths in metres, angles in radians. A joint's origin is the pose of its frame in its parent link,
 Rz(yaw)·Ry(pitch)·Rx(roll) and then the translation, as the URDF specification has it.
@@ -6,28 +6,25 @@ Rz(yaw)·Ry(pitch)·Rx(roll) and then the translation, as the URDF specification
 
 from __future__ import annotations
 
-import difflib
 import math
 import os
-import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from xml.parsers import expat
 
 import numpy as np
 
 from . import se3
 from .errors import DhcalError
 from .se3 import Array
+from .urdf_tags import Tag, instead, numbers, scan, show
 
 _TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
-_MAX_BYTES, _MAX_JOINTS, _MAX_DEPTH = 64 << 20, 20_000, 64
-_MAX_ORIGIN = 1e4  # metres or radians: nobody's robot, somebody's typing error
-_RIGID = 1e-9  # how far from orthonormal a rotation may be before it is no rotation
+_MAX_BYTES = 16 << 20
+MAX_ORIGIN = 1e4  # metres or radians: nobody's robot, somebody's typing error
+_MAX_CHAIN = 500  # Pinocchio recurses along the chain: thousands of joints overflow its stack
 
 # What Pinocchio insists on and would refuse without a line number.
-_ONCE = ("origin", "axis", "parent", "child", "limit", "mimic")
 _NEEDED = {
     "axis": ("xyz",),
     "parent": ("link",),
@@ -44,13 +41,6 @@ _NUMBERS = {
     "safety_controller": ("soft_lower_limit", "soft_upper_limit", "k_position", "k_velocity"),
 }
 
-# float() would also take '1_0', 'nan' and the digits of other scripts.
-_NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
-_BLANKS = " \t\r\n"
-_ELEMENT = re.compile(rb"<[^ \t\r\n/>]+")
-_ATTRIBUTE = re.compile(rb"""[ \t\r\n]+([^ \t\r\n=/>]+)[ \t\r\n]*=[ \t\r\n]*("[^"]*"|'[^']*')""")
-_INDENT = re.compile(rb"(?:\r\n|\n|\r)[ \t]*\Z")
-
 
 @dataclass(frozen=True, eq=False)
 class UrdfJoint:
@@ -65,6 +55,7 @@ class UrdfJoint:
         lower, upper: limits in rad or m; infinite where the file has none and on a continuous joint.
         mimic: (joint, multiplier, offset) that this joint follows, or None.
         line: its line in the file, from 1.
+        start, first_child, origin_start: byte offsets of its tag, its first child and its <origin>.
     """
 
     name: str
@@ -77,10 +68,9 @@ class UrdfJoint:
     upper: float
     mimic: tuple[str, float, float] | None
     line: int
-    # Byte offsets in the file: this tag, its first child, its <origin>.
-    _start: int = field(repr=False)
-    _first_child: int = field(repr=False)
-    _origin_start: int | None = field(repr=False)
+    start: int = field(repr=False)
+    first_child: int = field(repr=False)
+    origin_start: int | None = field(repr=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +107,7 @@ class Urdf:
             DhcalError: there is none; the message names the nearest ones.
         """
         if name not in self._named:
-            raise DhcalError(f"{self.source}: no joint {_show(name)}; {_instead(name, self._named)}")
+            raise DhcalError(f"{self.source}: no joint {show(name)}; {instead(name, self._named)}")
         return self._named[name]
 
     def leaves(self) -> tuple[str, ...]:
@@ -132,54 +122,12 @@ class Urdf:
             DhcalError: there is no such link; the message names the nearest ones.
         """
         if tip != self.root and tip not in self._above:
-            raise DhcalError(f"{self.source}: no link {_show(tip)}; {_instead(tip, self.links)}")
+            raise DhcalError(f"{self.source}: no link {show(tip)}; {instead(tip, self.links)}")
         joints = []
         while tip in self._above:
             joints.append(self._above[tip])
             tip = joints[-1].parent
         return tuple(reversed(joints))
-
-
-@dataclass(frozen=True, eq=False)
-class _Tag:
-    """A start tag: where it is, what to call it, what it says, its direct children by element name."""
-
-    source: str
-    line: int
-    label: str
-    start: int
-    attributes: dict[str, str]
-    children: dict[str, _Tag] = field(default_factory=dict)
-
-    def bad(self, text: str) -> DhcalError:
-        return DhcalError(f"{self.source}:{self.line}: {self.label}: {text}")
-
-
-def _show(text: str) -> str:
-    """The text quoted, on one line and not too long for a message."""
-    return repr(text if len(text) <= 60 else text[:57] + "...")
-
-
-def _instead(name: str, known: Iterable[str]) -> str:
-    """A hint at the names that would have been right."""
-    # Matching is quadratic in the length of a name, and names come from a file.
-    short = [other for other in known if len(other) <= 100]
-    close = difflib.get_close_matches(name[:100], short, 3)
-    if close:
-        return f"did you mean {' or '.join(map(_show, close))}?"
-    return f"there are {', '.join(map(_show, short[:12]))}{', ...' if len(short) > 12 else ''}"
-
-
-def _numbers(tag: _Tag, key: str, count: int) -> list[float]:
-    """The finite numbers of one attribute."""
-    words = [word for word in re.split(f"[{_BLANKS}]+", tag.attributes[key].strip(_BLANKS)) if word]
-    if len(words) != count:
-        plural = "number" if len(words) == 1 else "numbers"
-        raise tag.bad(f"{key} has {len(words)} {plural}; it needs {count}, with blanks between them")
-    for word in words:
-        if not _NUMBER.fullmatch(word) or not math.isfinite(float(word)):
-            raise tag.bad(f"{key} has {_show(word)}; it needs a finite number such as 0.25 or -1e-3")
-    return [float(word) for word in words]
 
 
 def _rotation(roll: float, pitch: float, yaw: float) -> Array:
@@ -194,21 +142,21 @@ def _rotation(roll: float, pitch: float, yaw: float) -> Array:
     )
 
 
-def _origin(tag: _Tag) -> Array:
+def _origin(tag: Tag) -> Array:
     """The pose (4, 4) that an <origin> gives."""
     if "quat_xyzw" in tag.attributes:
         raise tag.bad("quat_xyzw is ignored by most readers of URDF; write the rotation as rpy")
     values = {key: [0.0, 0.0, 0.0] for key in ("xyz", "rpy")}
-    for key in values.keys() & tag.attributes.keys():
-        values[key] = _numbers(tag, key, 3)
-        if max(map(abs, values[key])) > _MAX_ORIGIN:
-            raise tag.bad(f"{key} is beyond ±{_MAX_ORIGIN:g}; it needs metres in xyz and radians in rpy")
+    for key in [key for key in values if key in tag.attributes]:
+        values[key] = numbers(tag, key, 3)
+        if max(map(abs, values[key])) > MAX_ORIGIN:
+            raise tag.bad(f"{key} is beyond ±{MAX_ORIGIN:g}; it needs metres in xyz and radians in rpy")
     return se3.transform(_rotation(*values["rpy"]), values["xyz"])
 
 
-def _axis(tag: _Tag, moving: bool) -> Array:
+def _axis(tag: Tag, moving: bool) -> Array:
     """The unit axis (3,) that an <axis> gives; x, which has no meaning, where nothing moves."""
-    axis = np.array(_numbers(tag, "xyz", 3))
+    axis = np.array(numbers(tag, "xyz", 3))
     norm = math.hypot(*axis)
     if 1e-6 <= norm <= 1e6:
         return axis / norm
@@ -217,26 +165,28 @@ def _axis(tag: _Tag, moving: bool) -> Array:
     return np.array([1.0, 0.0, 0.0])
 
 
-def _joint(tag: _Tag) -> UrdfJoint:
+def _joint(tag: Tag) -> UrdfJoint:
     """A joint from its tag."""
     kind, inside = tag.attributes.get("type"), tag.children
     if kind is None:
         raise tag.bad(f"no type; it needs one of {', '.join(_TYPES)}")
     if kind not in _TYPES:
-        raise tag.bad(f"unknown type {_show(kind)}; it needs one of {', '.join(_TYPES)}")
+        raise tag.bad(f"unknown type {show(kind)}; it needs one of {', '.join(_TYPES)}")
     for name in ("parent", "child"):
         if name not in inside:
             raise tag.bad(f'no <{name}>; it needs <{name} link="..."/>')
-    for name in _NEEDED.keys() & inside.keys():
-        for key in _NEEDED[name]:
-            if key not in inside[name].attributes:
+    for name, keys in _NEEDED.items():
+        for key in keys:
+            if name in inside and key not in inside[name].attributes:
                 raise inside[name].bad(f"no {key}; it needs {key}=...")
     values = {
-        (name, key): _numbers(inside[name], key, 1)[0]
-        for name in _NUMBERS.keys() & inside.keys()
-        for key in _NUMBERS[name]
-        if key in inside[name].attributes
+        (name, key): numbers(inside[name], key, 1)[0]
+        for name, keys in _NUMBERS.items()
+        for key in keys
+        if name in inside and key in inside[name].attributes
     }
+    if "dynamics" in inside and not any(name == "dynamics" for name, _ in values):
+        raise inside["dynamics"].bad("neither damping nor friction; add one or remove it")
     lower, upper = -math.inf, math.inf
     if kind in ("revolute", "prismatic"):
         if "limit" not in inside:
@@ -260,82 +210,10 @@ def _joint(tag: _Tag) -> UrdfJoint:
         upper=upper,
         mimic=mimic,
         line=tag.line,
-        _start=tag.start,
-        _first_child=next(iter(inside.values())).start,
-        _origin_start=inside["origin"].start if "origin" in inside else None,
+        start=tag.start,
+        first_child=next(iter(inside.values())).start,
+        origin_start=inside["origin"].start if "origin" in inside else None,
     )
-
-
-def _scan(data: bytes, source: str) -> tuple[_Tag, dict[str, _Tag], dict[str, _Tag]]:
-    """The tags of the robot, its links and its joints by name, from well-formed XML without entities."""
-    parser = expat.ParserCreate("utf-8")
-    depth, robot, joint = 0, None, None
-    named: dict[str, dict[str, _Tag]] = {"link": {}, "joint": {}}
-
-    def tag(label: str, attributes: dict[str, str]) -> _Tag:
-        return _Tag(source, parser.CurrentLineNumber, label, parser.CurrentByteIndex, attributes)
-
-    def declaration(_version: str, encoding: str | None, _standalone: int) -> None:
-        name = (encoding or "utf-8").lower()
-        if name not in ("utf-8", "utf8") and not (name in ("us-ascii", "ascii") and data.isascii()):
-            raise tag("<?xml>", {}).bad(f"the encoding is {_show(name)}; convert the file to UTF-8")
-
-    def doctype(*_: object) -> None:
-        raise tag("<!DOCTYPE>", {}).bad("document types and entities are not accepted; remove it")
-
-    def instruction(target: str, _: str) -> None:
-        if depth > 0:  # before the robot they are common and harmless; inside, Pinocchio fails on them
-            raise tag(f"<?{target}?>", {}).bad("processing instructions are not accepted; remove it")
-
-    def end(_: str) -> None:
-        nonlocal depth
-        depth -= 1
-
-    def start(name: str, attributes: dict[str, str]) -> None:
-        nonlocal depth, robot, joint
-        depth += 1
-        if depth > _MAX_DEPTH:
-            raise tag(f"<{name}>", {}).bad(f"nested too deep; at most {_MAX_DEPTH} levels are accepted")
-        if name.startswith("xacro:") or any("${" in text or "$(" in text for text in attributes.values()):
-            raise tag(f"<{name}>", {}).bad("unexpanded xacro; expand it first: xacro FILE > out.urdf")
-        if depth == 1:
-            robot = tag(f"<{name}>", attributes)
-            if name != "robot":
-                hint = "this is SDF, not URDF" if name == "sdf" else "this is no URDF"
-                raise robot.bad(f"{hint}; the outermost element must be <robot>")
-            if not attributes.get("name"):
-                raise robot.bad('no name; it needs name="..."')
-        elif depth == 2:
-            joint = None
-            if name not in named:
-                return
-            called, known = attributes.get("name", ""), named[name]
-            joint = tag(f"{name} {_show(called)}", attributes)
-            if not called:
-                raise joint.bad('no name; it needs name="..."')
-            if called in known:
-                raise joint.bad(f"the name is taken on line {known[called].line}; give it another")
-            if len(known) > _MAX_JOINTS:
-                raise joint.bad(f"too many; at most {_MAX_JOINTS} are accepted")
-            known[called] = joint
-        elif depth == 3 and joint is not None:
-            child = tag(f"{joint.label} <{name}>", attributes)
-            if name in _ONCE and name in joint.children:
-                raise child.bad("a second one; keep one")
-            joint.children.setdefault(name, child)
-
-    parser.XmlDeclHandler, parser.StartDoctypeDeclHandler = declaration, doctype
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.ProcessingInstructionHandler = instruction
-    try:
-        parser.Parse(data, True)
-    except expat.ExpatError as error:
-        what = expat.ErrorString(error.code)
-        raise DhcalError(
-            f"{source}:{error.lineno}: broken XML: {what}; export or copy the file again, or mend this line"
-        ) from None
-    assert robot is not None, "expat refuses a document without an element"
-    return robot, named["link"], named["joint"]
 
 
 def _on_loop(after: Mapping[str, str]) -> str | None:
@@ -352,24 +230,21 @@ def _on_loop(after: Mapping[str, str]) -> str | None:
     return None
 
 
-def _root(robot: _Tag, links: dict[str, _Tag], joints: dict[str, UrdfJoint], tags: dict[str, _Tag]) -> str:
+def _root(robot: Tag, links: dict[str, Tag], joints: dict[str, UrdfJoint], tags: dict[str, Tag]) -> str:
     """The root link, after checking that links, joints and mimics are a tree."""
     above: dict[str, UrdfJoint] = {}
     for joint in joints.values():
         tag = tags[joint.name]
         for role, link in (("parent", joint.parent), ("child", joint.child)):
             if link not in links:
-                raise tag.children[role].bad(f"no link {_show(link)}; {_instead(link, links)}")
+                raise tag.children[role].bad(f"no link {show(link)}; {instead(link, links)}")
         if joint.child in above:
             other = above[joint.child].name
             raise tag.bad(
-                f"its child {_show(joint.child)} already hangs on joint {_show(other)}; "
+                f"its child {show(joint.child)} already hangs on joint {show(other)}; "
                 "a link has one parent, so remove one of them"
             )
         above[joint.child] = joint
-        if joint.mimic and joint.mimic[0] not in joints:
-            name = joint.mimic[0]
-            raise tag.children["mimic"].bad(f"no joint {_show(name)}; {_instead(name, joints)}")
     mimics = {joint.name: joint.mimic[0] for joint in joints.values() if joint.mimic}
     if (name := _on_loop(mimics)) is not None:
         raise tags[name].children["mimic"].bad("it mimics itself in a circle; let one joint of it be free")
@@ -380,8 +255,18 @@ def _root(robot: _Tag, links: dict[str, _Tag], joints: dict[str, UrdfJoint], tag
         raise robot.bad('no links; it needs at least one <link name="..."/>')
     if len(roots) > 1:
         raise links[roots[1]].bad(
-            f"no joint leads here nor to link {_show(roots[0])}; join them: a robot has one root"
+            f"no joint leads here nor to link {show(roots[0])}; join them: a robot has one root"
         )
+    depth = {roots[0]: 0}
+    for link in above:
+        trail = []
+        while link not in depth:
+            trail.append(link)
+            link = above[link].parent
+        for below in reversed(trail):
+            depth[below] = depth[above[below].parent] + 1
+            if depth[below] > _MAX_CHAIN:
+                raise tags[above[below].name].bad(f"more than {_MAX_CHAIN} joints in a row; check the file")
     return roots[0]
 
 
@@ -406,7 +291,7 @@ def parse_urdf(data: bytes, source: str) -> Urdf:
         raise DhcalError(f"{source}:{line}: not UTF-8; convert the file to UTF-8") from None
     if b"\0" in data:
         raise DhcalError(f"{source}:1: zero bytes as in UTF-16; convert the file to UTF-8")
-    robot, links, tags = _scan(data, source)
+    robot, links, tags = scan(data, source)
     joints = {name: _joint(tag) for name, tag in tags.items()}
     root = _root(robot, links, joints, tags)
     return Urdf(source, data, robot.attributes["name"], tuple(links), tuple(joints.values()), root)
@@ -426,80 +311,3 @@ def read_urdf(path: str | os.PathLike[str]) -> Urdf:
         what = getattr(error, "strerror", None) or str(error)
         raise DhcalError(f"{source}: cannot be read: {what}; give the path of a URDF file") from None
     return parse_urdf(data, source)
-
-
-def _attributes(data: bytes, start: int) -> tuple[dict[bytes, tuple[int, int]], int, bytes]:
-    """Of the tag at `start`: each value's span between its quotes, where the last ends, a quote.
-
-    The tag is known to be well-formed; expat gives its offset, but values only after normalising them.
-    """
-    element = _ELEMENT.match(data, start)
-    assert element is not None, "expat found a tag here"
-    spans, end, quote = {}, element.end(), b""
-    while found := _ATTRIBUTE.match(data, end):
-        spans[found[1]] = found.start(2) + 1, found.end(2) - 1
-        end, quote = found.end(), found[2][:1]
-    return spans, end, quote
-
-
-def _edits(urdf: Urdf, joint: UrdfJoint, origin: Array) -> list[tuple[int, int, bytes]]:
-    """The (start, end, new bytes) that give a joint a new origin (4, 4)."""
-    import pinocchio as pin
-
-    u, _, vt = np.linalg.svd(origin[:3, :3])
-    rpy, old = pin.rpy.matrixToRpy(u @ vt), joint.origin
-    texts = {
-        key: " ".join(repr(float(x) + 0.0) for x in value).encode()  # + 0.0 turns -0.0 into 0.0
-        for key, value, same in (
-            (b"xyz", origin[:3, 3], np.array_equal(origin[:3, 3], old[:3, 3])),
-            (b"rpy", rpy, np.array_equal(origin[:3, :3], old[:3, :3])),
-        )
-        if not (same and joint._origin_start is not None)
-    }
-    joint_quote = _attributes(urdf.data, joint._start)[2]
-    if joint._origin_start is None:
-        at, quote = joint._first_child, joint_quote
-        inner = b"".join(b" " + key + b"=" + quote + text + quote for key, text in texts.items())
-        indent = _INDENT.search(urdf.data, joint._start, at)
-        return [(at, at, b"<origin" + inner + b"/>" + (indent[0] if indent else b""))]
-    spans, end, quote = _attributes(urdf.data, joint._origin_start)
-    quote = quote or joint_quote
-    return [
-        (*spans[key], text) if key in spans else (end, end, b" " + key + b"=" + quote + text + quote)
-        for key, text in texts.items()
-    ]
-
-
-def with_origins(urdf: Urdf, origins: Mapping[str, Array]) -> bytes:
-    """The URDF's bytes with new joint origins; every other byte stays as it is.
-
-    Args:
-        urdf: the file to start from.
-        origins: by joint name the (4, 4) pose of the joint frame in its parent link, metres. Its
-            position and rotation are each rewritten only if they differ from the file's.
-
-    Raises:
-        DhcalError: an unknown joint, or an origin that is no finite rigid motion.
-    """
-    edits: list[tuple[int, int, bytes]] = []
-    for name, value in origins.items():
-        joint, origin = urdf.joint(name), np.asarray(value, float)
-        where = f"{urdf.source}:{joint.line}: joint {_show(name)}: its new origin"
-        if origin.shape != (4, 4) or not np.isfinite(origin).all():
-            raise DhcalError(f"{where} must be a (4, 4) matrix of finite numbers")
-        rotation = origin[:3, :3]
-        if (
-            np.abs(origin).max() > _MAX_ORIGIN
-            or np.abs(origin[3] - (0, 0, 0, 1)).max() > _RIGID
-            or np.abs(rotation.T @ rotation - np.eye(3)).max() > _RIGID
-            or np.linalg.det(rotation) < 0
-        ):
-            raise DhcalError(f"{where} must be a rotation and a translation within {_MAX_ORIGIN:g} m")
-        if not np.array_equal(origin, joint.origin):
-            edits += _edits(urdf, joint, origin)
-    out, done = [], 0
-    # Stable: two attributes inserted at the same place keep their order.
-    for start, end, text in sorted(edits, key=lambda edit: edit[0]):
-        out += [urdf.data[done:start], text]
-        done = end
-    return b"".join([*out, urdf.data[done:]])

@@ -1,0 +1,259 @@
+"""What each command of `dhcal` does, once the command line is read.
+
+Wrong input is found before anything is written or shown; JSON goes to stdout, all else to stderr.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from argparse import Namespace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from . import calibration, demo, report, terminal
+from .chain import Chain
+from .check import crosscheck
+from .dh_files import dh_text, is_dh, read_dh
+from .dh_urdf import dh_to_urdf
+from .errors import DhcalError
+from .files import check_place, parse_noise, save
+from .measurement_files import measurement_text, read_measurements, read_readings
+from .measurements import KINDS, Measurement, Noise
+from .parameters import extract
+from .result import accuracy
+from .robot_files import existing_sidecar, read_priors, read_robot, robot_name, sidecar_path, urdf_files
+from .screening import Finding, screen
+from .se3 import Array
+
+_STDOUT = "-"
+
+
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def _same(a: str, b: str) -> bool:
+    if os.path.exists(a) and os.path.exists(b):
+        return os.path.samefile(a, b)
+    return os.path.realpath(a) == os.path.realpath(b)
+
+
+def _check_outputs(outputs: Sequence[str | None], inputs: Sequence[str]) -> None:
+    """Complains about an output that cannot be written, or would write over an input or another output."""
+    paths = [path for path in outputs if path and path != _STDOUT]
+    for number, path in enumerate(paths):
+        if any(_same(path, other) for other in inputs):
+            raise DhcalError(f"{path}: is an input; name another output")
+        if any(_same(path, other) for other in paths[:number]):
+            raise DhcalError(f"{path}: is another output already; name a second file")
+        check_place(path)
+
+
+def _emit(target: str | None, content: object) -> None:
+    """JSON to a file, or alone on stdout for `-`."""
+    if target == _STDOUT:
+        sys.stdout.write(report.json_text(content))
+    elif target:
+        save({target: report.json_text(content)})
+
+
+def _sidecars(robots: Sequence[str]) -> list[str]:
+    return [path for path in map(existing_sidecar, robots) if path]
+
+
+# --- calibrate -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Data:
+    """What is fitted and held out, and the impossible rows left out of both, by file."""
+
+    fit: list[Measurement]
+    holdout: list[Measurement]
+    findings: dict[str, list[Finding]]
+
+
+def _read_data(chain: Chain, args: Namespace, known_frames: bool) -> _Data:
+    """All measurements, split as the files' `set` columns and --holdout ask."""
+    held_file = args.holdout if args.holdout is not None and os.path.exists(args.holdout) else None
+    fit: list[Measurement] = []
+    holdout: list[Measurement] = []
+    findings: dict[str, list[Finding]] = {}
+    for path in [*args.data, *([held_file] if held_file else [])]:
+        readings = read_readings(path, chain)
+        # A row can only be called impossible where base and tool are known.
+        findings[path] = screen(chain, readings) if known_frames else []
+        bad = [finding.row for finding in findings[path]]
+        fitted, held = ([], [readings.data]) if path == held_file else ([readings.fit], [readings.holdout])
+        fit += [item.take(~np.isin(item.rows, bad)) for item in fitted]
+        holdout += [item.take(~np.isin(item.rows, bad)) for item in held]
+    if args.holdout is not None and not held_file:
+        try:
+            fraction = float(args.holdout)
+        except ValueError:
+            raise DhcalError(f"--holdout {args.holdout}: neither a file nor a share such as 0.3") from None
+        kept, parted = calibration.split(fit, fraction, args.seed)
+        fit, holdout = list(kept), holdout + list(parted)
+    fit = [item for item in fit if len(item.q)]
+    if not fit:
+        raise DhcalError(f"{', '.join(args.data)}: every row is held out; leave some to fit")
+    return _Data(fit, [item for item in holdout if len(item.q)], findings)
+
+
+def _calibrate(args: Namespace) -> int:
+    held_file = [args.holdout] if args.holdout is not None and os.path.exists(args.holdout) else []
+    measured = [*args.data, *held_file]
+    for number, path in enumerate(measured):
+        if any(_same(path, other) for other in measured[:number]):
+            raise DhcalError(f"{path}: is given twice; each measurement counts once, to fit or to hold out")
+    priors = [args.priors] if args.priors not in (None, "default", "none") else []
+    inputs = [args.robot, *measured, *_sidecars([args.robot]), *priors]
+    _urdf_ending(args.output)
+    own = [args.robot, *_sidecars([args.robot])] if args.in_place else []
+    safe = [path for path in inputs if path not in own]
+    _check_outputs([args.output, sidecar_path(args.output)], safe)
+    _check_outputs([args.json, args.output, sidecar_path(args.output)], inputs if not own else safe)
+    if args.json and args.json != _STDOUT:
+        _check_outputs([args.json], inputs)
+
+    chain = read_robot(args.robot, args.tip)
+    sets = args.parameters or chain.parameters
+    data = _read_data(chain, args, known_frames=not {"base", "tool"} & set(_names(sets)))
+    with terminal.progress("fitting") as progress:
+        fit = calibration.calibrate(
+            chain,
+            data.fit,
+            sets,
+            method=args.method,
+            priors=read_priors(args.priors),
+            fix=_names(args.fix),
+            free=_names(args.free),
+            holdout=data.holdout,
+            max_iterations=args.max_iterations,
+            progress=progress,
+        )
+    contents = urdf_files(fit.chain, args.output)
+    files = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
+    if args.json and args.json != _STDOUT:
+        files["json"] = args.json
+    rows = {path: [finding.row for finding in found] for path, found in data.findings.items() if found}
+    document = report.document(
+        fit, files, report.fingerprints(inputs), [row for found in rows.values() for row in found]
+    ) | {"outliers_by_file": rows}
+    if "json" in files:
+        contents[args.json] = report.json_text(document)
+    save(contents)
+    if args.json == _STDOUT:
+        _emit(args.json, document)
+    for path, found in data.findings.items():
+        terminal.findings(path, found)
+    terminal.summary(fit, files)
+    return 0
+
+
+# --- the other commands ----------------------------------------------------------------------------
+
+
+def _validate(args: Namespace) -> int:
+    sidecar = args.sidecar or existing_sidecar(args.robot)
+    inputs = [args.robot, *args.data, *([sidecar] if sidecar else [])]
+    _check_outputs([args.json], inputs)
+    chain = read_robot(args.robot, args.tip, sidecar)
+    data = [read_measurements(path, chain) for path in args.data]
+    if args.fit_frames:
+        fit = calibration.calibrate(chain, data, "base,tool")
+        document = report.document(fit, {}, report.fingerprints(inputs))
+    else:
+        document = report.plain_document(chain, data, report.fingerprints(inputs))
+    document["before"] = accuracy(chain, data)
+    document["files"] = {"json": args.json} if args.json and args.json != _STDOUT else {}
+    _emit(args.json, document)
+    terminal.validation(args.robot, document, args.fit_frames)
+    return 0
+
+
+def _convert(args: Namespace) -> int:
+    _check_outputs([args.output], [args.input])
+    notes: Sequence[str] = ()
+    if is_dh(args.output):
+        if is_dh(args.input) and args.tip is None and args.convention is None:
+            table = read_dh(args.input)
+        else:
+            found = extract(read_robot(args.input, args.tip, sidecar=""), args.convention or "standard")
+            table, notes = found.table, found.notes
+        save({args.output: dh_text(table, args.output)})
+    else:
+        _urdf_ending(args.output, "or a DH file as .dh.toml or .dh.csv")
+        if not is_dh(args.input):
+            raise DhcalError(f"{args.output}: a URDF converts to .dh.toml or .dh.csv")
+        if args.tip is not None or args.convention is not None:
+            raise DhcalError(f"{args.output}: a DH file has one URDF; leave out --tip and --convention")
+        save({args.output: dh_to_urdf(read_dh(args.input), robot_name(args.input))})
+        if sidecar := existing_sidecar(args.output):
+            notes = [f"{sidecar} lies beside it; its base and tool are read with it"]
+    terminal.lines(f"wrote {args.output}")
+    terminal.notes(notes)
+    return 0
+
+
+def _urdf_ending(path: str, other: str = "") -> None:
+    if not path.lower().endswith(".urdf"):
+        raise DhcalError(f"{path}: unknown ending; write a URDF as .urdf {other}".rstrip())
+
+
+def _check(args: Namespace) -> int:
+    _check_outputs([args.json], [args.robot])
+    rows = crosscheck(read_robot(args.robot, args.tip))
+    agree = all(row.holds for row in rows)
+    _emit(args.json, {"agree": agree, "routes": [asdict(row) | {"holds": row.holds} for row in rows]})
+    terminal.agreement(args.robot, rows)
+    return 0 if agree else 1
+
+
+def _simulate(args: Namespace) -> int:
+    robots = [args.robot, *([args.truth] if args.truth else [])]
+    _check_outputs([args.output], [*robots, *_sidecars(robots)])
+    noise = Noise(*parse_noise(args.noise))
+    chain = truth = read_robot(args.robot, args.tip)
+    if args.truth:
+        truth = read_robot(args.truth, None if is_dh(args.truth) else args.tip)
+        if truth.joint_names != chain.joint_names:
+            raise DhcalError(
+                f"{args.truth}: its joints are {', '.join(truth.joint_names)}; "
+                f"they must be those of {args.robot}: {', '.join(chain.joint_names)}"
+            )
+    rng = np.random.default_rng(args.seed)
+    data = KINDS[args.kind].simulate(truth, _configurations(chain, args.samples, rng), noise, rng)
+    comments = [f"simulated {args.kind} of {args.truth or args.robot}, noise {args.noise}, seed {args.seed}"]
+    save({args.output: measurement_text(data, chain, comments)})
+    terminal.lines(f"wrote {args.output}")
+    return 0
+
+
+def _configurations(chain: Chain, count: int, rng: np.random.Generator) -> Array:
+    """Uniform joint values (count, n) within the limits, and within a turn (or ±π m)."""
+    low, high, pi = chain.lower, chain.upper, np.pi
+    low, high = (
+        np.where(high > -pi, np.maximum(low, -pi), np.maximum(low, high - 2 * pi)),
+        np.where(low < pi, np.minimum(high, pi), np.minimum(high, low + 2 * pi)),
+    )
+    return rng.uniform(low, high, (count, chain.size))
+
+
+def _demo(args: Namespace) -> int:
+    _check_outputs([args.json], [])
+    _emit(args.json, demo.run(args.out))
+    return 0
+
+
+COMMANDS: dict[str, Callable[[Namespace], int]] = {
+    "demo": _demo,
+    "calibrate": _calibrate,
+    "validate": _validate,
+    "convert": _convert,
+    "check": _check,
+    "simulate": _simulate,
+}

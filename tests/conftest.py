@@ -1,0 +1,58 @@
+"""Shared places: the paper's tables, real robots, and arms with what real ones lack."""
+
+from __future__ import annotations
+
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dhcal_pin.chain import Chain
+from dhcal_pin.dh import DHTable
+from dhcal_pin.dh_files import read_dh
+
+URDF = Path(__file__).resolve().parent.parent / "urdf"
+
+
+def paper(name: str) -> DHTable:
+    return read_dh(URDF / f"{name}.dh.toml")
+
+
+def robot_file(path: str) -> Path:
+    """A URDF of example-robot-data, by its path under robots/."""
+    root = metadata.distribution("example-robot-data").locate_file("cmeel.prefix/share/example-robot-data")
+    return Path(str(root)) / "robots" / path
+
+
+def random_table(rng: np.random.Generator, convention: str = "standard", size: int | None = None) -> DHTable:
+    """A table of revolute and prismatic joints, a metre long at most a link."""
+    n = size or int(rng.integers(1, 9))
+    zero = np.zeros(n)
+    return DHTable(
+        convention,  # pyright: ignore[reportArgumentType]
+        tuple(f"j{i + 1}" for i in range(n)),
+        rng.random(n) < 0.3,
+        rng.uniform(-np.pi, np.pi, n),
+        rng.uniform(-0.5, 0.5, n),
+        rng.uniform(-0.5, 0.5, n),
+        rng.uniform(-np.pi, np.pi, n),
+        zero,
+        zero - np.inf,
+        zero + np.inf,
+    )
+
+
+def random_joints(rng: np.random.Generator, table: DHTable, m: int) -> np.ndarray:
+    """Any angle, and half a metre of slide each way."""
+    return rng.uniform(-1, 1, (m, table.size)) * np.where(table.prismatic, 0.5, np.pi)
+
+
+@pytest.fixture(scope="session")
+def sim_6dof() -> Chain:
+    return Chain.from_dh(paper("sim_6dof"))
+
+
+@pytest.fixture(scope="session")
+def sim_6dof_actual() -> Chain:
+    return Chain.from_dh(paper("sim_6dof_actual"))

@@ -1,0 +1,186 @@
+"""The loop's own promises: frames without a guess, honest convergence, spread, and sigmas."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import paper, random_table
+
+from dhcal_pin import observability, se3
+from dhcal_pin.calibration import calibrate, split
+from dhcal_pin.chain import Chain
+from dhcal_pin.errors import DhcalError
+from dhcal_pin.measurements import Noise, Pose, Position
+from dhcal_pin.parameters import select
+from dhcal_pin.solver import CHUNK, Problem, reduce
+
+
+def placed(chain: Chain, rng: np.random.Generator) -> Chain:
+    """The chain with an instrument metres away and a target on an arm's length of tool."""
+    base = se3.exp6(np.concatenate([rng.uniform(-5, 5, 3), rng.uniform(-2, 2, 3)]))
+    tool = se3.exp6(np.concatenate([rng.uniform(-0.4, 0.4, 3), rng.uniform(-2, 2, 3)]))
+    return chain.displaced({0: base, chain.tool_station: tool})
+
+
+@pytest.mark.parametrize("kind", [Pose, Position])
+def test_frames_need_no_guess(kind, sim_6dof, sim_6dof_actual):
+    for seed in range(15):
+        rng = np.random.default_rng(seed)
+        truth = placed(sim_6dof_actual, rng)
+        data = kind.simulate(truth, rng.uniform(-3, 3, (40, 6)), Noise(1e-4, 1e-4), rng)
+        fit = calibrate(sim_6dof, data, "dh,base,tool", priors="none")
+        other = kind.simulate(truth, rng.uniform(-3, 3, (50, 6)), Noise(), rng)
+        assert fit.validate(other)["position_rms_m"] < 5e-4
+
+
+def test_before_differs_from_after_by_the_robot_alone(sim_6dof, sim_6dof_actual):
+    """A far tracker must not count as an error of the nominal robot."""
+    rng = np.random.default_rng(0)
+    data = Pose.simulate(placed(sim_6dof_actual, rng), rng.uniform(-3, 3, (60, 6)), Noise(), rng)
+    fit = calibrate(sim_6dof, data, "minimal,base,tool", priors="none")
+    assert fit.validate(data)["position_rms_m"] < 1e-9
+    assert (
+        1e-3 < np.sqrt(np.mean(np.sum(data.errors(fit.reference.sweep(data.q))["position"] ** 2, 1))) < 0.05
+    )
+
+
+def test_stated_spread_is_the_scatter_over_repeats(sim_6dof, sim_6dof_actual):
+    """Standard deviations of seen parameters cover the truth as normal ones do."""
+    truth = {p.name: p.nominal for p in select(sim_6dof_actual, "dh").parameters}
+    scores = []
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        data = Pose.simulate(sim_6dof_actual, rng.uniform(-3, 3, (40, 6)), Noise(1e-4, 1e-4), rng)
+        fit = calibrate(sim_6dof, data, "dh", priors="none")
+        for p, x, std in zip(fit.parameters, fit.x, fit.std, strict=True):
+            if p.name in ("a1", "a2", "alpha1", "d1", "theta1", "a6", "alpha4"):
+                scores.append((p.nominal + x - truth[p.name]) / std)
+    assert np.std(scores) == pytest.approx(1.0, abs=0.1)
+    assert abs(np.mean(scores)) < 0.15
+
+
+def test_unstated_sigmas_are_found(sim_6dof, sim_6dof_actual):
+    """Positions 20 times worse than the placeholder and rotations 20 times better, none stated."""
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-3, 3, (300, 6))
+    data = Pose.simulate(sim_6dof_actual, q, Noise(2e-2, 5e-5), rng)
+    fit = calibrate(sim_6dof, Pose.of(q, data.poses), "dh")
+    (used,) = fit.problem.data
+    assert used.sigma.mean() == pytest.approx(2e-2, rel=0.1)
+    assert used.rotation_sigma.mean() == pytest.approx(5e-5, rel=0.1)
+
+
+def test_stated_sigmas_stay(sim_6dof, sim_6dof_actual):
+    rng = np.random.default_rng(0)
+    data = Pose.simulate(sim_6dof_actual, rng.uniform(-3, 3, (50, 6)), Noise(2e-2, 5e-5), rng)
+    (used,) = calibrate(sim_6dof, data, "dh").problem.data
+    np.testing.assert_array_equal(used.sigma, data.sigma)
+
+
+def test_unseen_directions_do_not_move(sim_6dof):
+    """With priors or with damping alone, what no pose sees stays nominal."""
+    arm = Chain.from_dh(paper("sim_3dof"))
+    rng = np.random.default_rng(0)
+    data = Position.simulate(
+        Chain.from_dh(paper("sim_3dof_actual")), rng.uniform(-3, 3, (20, 3)), Noise(), rng
+    )
+    for priors in ("default", "none"):
+        fit = calibrate(arm, data, "dh", priors=priors)
+        last = [p.name for p in fit.parameters].index("alpha3")
+        assert abs(fit.x[last]) < 1e-12
+        assert any("alpha3" in text for text in fit.unobservable)
+        assert fit.seen[last] < 1e-9
+    assert np.isinf(calibrate(arm, data, "dh", priors="none").std[last])
+
+
+def test_converged_means_a_fresh_step_moves_nothing(sim_6dof, sim_6dof_actual):
+    rng = np.random.default_rng(0)
+    data = Pose.simulate(sim_6dof_actual, rng.uniform(-3, 3, (30, 6)), Noise(1e-4, 1e-4), rng)
+    fit = calibrate(sim_6dof, data, "dh", priors="none")
+    assert fit.converged
+    assert fit.is_converged(1e-6)
+    short = calibrate(sim_6dof, data, "dh", priors="none", max_iterations=1)
+    assert not short.converged
+    assert not short.is_converged(1e-6)
+
+
+def test_result_is_the_minimum_that_scipy_finds(sim_6dof, sim_6dof_actual):
+    """Another solver, from the answer and from nominal, finds no lower cost."""
+    from scipy.optimize import least_squares
+
+    rng = np.random.default_rng(4)
+    data = Pose.simulate(sim_6dof_actual, rng.uniform(-3, 3, (15, 6)), Noise(1e-4, 1e-4), rng)
+    fit = calibrate(sim_6dof, data, "dh", priors="none")
+    residual = lambda x: data.residual(fit.errors.at(x).sweep(data.q)).ravel()  # noqa: E731
+    other = least_squares(residual, np.zeros(24), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    assert np.sum(residual(fit.x) ** 2) <= 2 * other.cost * (1 + 1e-9)
+
+
+def test_chunks_do_not_change_the_answer(sim_6dof_actual):
+    """The triangle of many chunks equals the QR of all rows at once."""
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-3, 3, (2 * CHUNK + 17, 6))
+    data = Pose.simulate(sim_6dof_actual, q, Noise(1e-4, 1e-4), rng)
+    errors = select(sim_6dof_actual, "dh")
+    zero = np.zeros(24)
+    found = reduce(Problem(errors, (data,), zero), zero, False)
+    chain, bodies, twists = errors.derivative(zero)
+    sweep = chain.sweep(q)
+    rows = data.whiten(sweep, chain.tool_velocities(sweep, bodies, twists)).reshape(24, -1)
+    r = np.linalg.qr(rows.T, mode="r")
+    np.testing.assert_allclose(np.abs(found.r), np.abs(r), atol=1e-9 * np.abs(r).max())
+    assert found.rest + found.z @ found.z == pytest.approx(np.sum(data.residual(sweep) ** 2), rel=1e-12)
+
+
+def test_rank_is_not_taken_from_a_square():
+    """At condition 1e8 the triangle still tells full rank; JᵀJ would not."""
+    rng = np.random.default_rng(0)
+    u, _ = np.linalg.qr(rng.normal(size=(50, 6)))
+    v, _ = np.linalg.qr(rng.normal(size=(6, 6)))
+    triangle = np.linalg.qr(u * np.logspace(0, -8, 6) @ v, mode="r")
+    assert observability.rank(triangle) == 6
+    assert observability.condition(triangle) == pytest.approx(1e8, rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_mixed_kinds_on_random_arms(seed):
+    rng = np.random.default_rng(seed)
+    table = random_table(rng, size=5)
+    nominal = Chain.from_dh(table)
+    errors = select(nominal, "minimal,base,tool")
+    x = np.array([0.02 if p.unit == "rad" else 0.005 for p in errors.parameters]) * rng.normal(
+        size=len(errors.parameters)
+    )
+    truth = errors.at(x)
+    draw = lambda m: rng.uniform(-1, 1, (m, 5)) * np.where(table.prismatic, 0.5, np.pi)  # noqa: E731
+    data = [Pose.simulate(truth, draw(15), Noise(), rng), Position.simulate(truth, draw(25), Noise(), rng)]
+    fit = calibrate(nominal, data, "minimal,base,tool", priors="none")
+    assert fit.validate(Pose.simulate(truth, draw(50), Noise(), rng))["position_max_m"] < 1e-9
+
+
+def test_split_is_a_partition_by_seed(sim_6dof):
+    data = Position.simulate(sim_6dof, np.zeros((10, 6)), Noise(1e-3), np.random.default_rng(0))
+    fit, held = split([data], 0.3, seed=4)
+    assert sorted([*fit[0].rows, *held[0].rows]) == list(range(1, 11))
+    assert len(held[0].q) == 3
+    np.testing.assert_array_equal(split([data], 0.3, seed=4)[1][0].rows, held[0].rows)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"method": "newton"}, "choose from lm, gn"),
+        ({"priors": "weak"}, "choose default, none"),
+        ({"priors": {"x9": 1.0}}, "no such parameter"),
+        ({"priors": {"d*": -1.0}}, "must be positive"),
+    ],
+)
+def test_wrong_choices_are_named(sim_6dof, kwargs, message):
+    data = Position.simulate(sim_6dof, np.zeros((10, 6)), Noise(1e-3), np.random.default_rng(0))
+    with pytest.raises(DhcalError, match=message):
+        calibrate(sim_6dof, data, "dh", **kwargs)
+
+
+def test_no_data_is_said(sim_6dof):
+    with pytest.raises(DhcalError, match="no measurements"):
+        calibrate(sim_6dof, [])

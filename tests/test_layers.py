@@ -1,0 +1,73 @@
+"""No module imports to its right, and heavy or special packages stay in one place."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import dhcal_pin
+
+HOUSE = Path(dhcal_pin.__file__).parent
+LAYERS = (
+    {"errors"},
+    {"se3"},
+    {"urdf_tags", "dh"},
+    {"urdf", "extraction", "dh_urdf"},
+    {"urdf_origins"},
+    {"chain"},
+    {"parameters", "factors", "measurements"},
+    {"frames", "observability"},
+    {"solver"},
+    {"result"},
+    {"calibration"},
+    {"check"},
+    {"files"},
+    {"dh_files", "measurement_files"},
+    {"robot_files", "screening"},
+    {"report"},
+    {"terminal"},
+    {"demo"},
+    {"cli"},
+)
+MODULES = sorted(path.stem for path in HOUSE.glob("*.py") if path.stem != "__init__")
+
+
+def imports(module: str) -> tuple[set[str], set[str]]:
+    """Names of our own modules, and of packages, that a module imports anywhere."""
+    own, others = set(), set()
+    for node in ast.walk(ast.parse((HOUSE / f"{module}.py").read_text())):
+        if isinstance(node, ast.ImportFrom) and node.level:
+            own |= {node.module} if node.module else {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            others.add(node.module.split(".")[0])
+        elif isinstance(node, ast.Import):
+            others |= {alias.name.split(".")[0] for alias in node.names}
+    return own, others
+
+
+def test_every_module_has_its_place():
+    assert sorted(set().union(*LAYERS)) == MODULES
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_imports_only_from_the_left(module):
+    place = next(i for i, layer in enumerate(LAYERS) if module in layer)
+    allowed = set().union(*LAYERS[:place]) if place else set()
+    assert imports(module)[0] <= allowed
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_special_packages_stay_in_one_place(module):
+    homes = {"meshcat": {"viewer"}, "matplotlib": {"report"}, "rich": {"terminal"}, "argparse": {"cli"}}
+    for package, allowed in homes.items():
+        if package in imports(module)[1]:
+            assert module in allowed
+
+
+def test_the_solver_names_no_kind_and_no_set():
+    for module in ("solver", "result", "calibration", "observability"):
+        text = (HOUSE / f"{module}.py").read_text()
+        names = {node.id for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Name)}
+        assert not names & {"Position", "Pose", "KINDS", "SETS", "minimal", "placement"}

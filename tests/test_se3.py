@@ -1,0 +1,69 @@
+"""Rigid motions against Pinocchio and the group's laws."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from dhcal_pin import se3
+
+twists = arrays(float, 6, elements=st.floats(-1.5, 1.5))
+ANGLES = [0.0, 1e-12, 1e-8, 1e-4, 0.099, 0.101, 1.0, 2.0, 3.0, 3.1415, np.pi - 1e-9]
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_equals_pinocchio(angle):
+    rng = np.random.default_rng(0)
+    axes = rng.normal(size=(50, 3))
+    twist = np.concatenate(
+        [rng.normal(size=(50, 3)), angle * axes / np.linalg.norm(axes, axis=1)[:, None]], 1
+    )
+    for x, pose in zip(twist, se3.exp6(twist), strict=True):
+        np.testing.assert_allclose(pose, pin.exp6(x).homogeneous, atol=4e-15)
+        np.testing.assert_allclose(se3.adjoint(pose), pin.SE3(pose).action, atol=4e-15)
+        np.testing.assert_allclose(se3.log6(pose), x, atol=1e-14 * max(1, 1e-9 / (np.pi - angle)))
+        wanted = pin.Jlog3(pin.exp3(x[3:]))
+        np.testing.assert_allclose(se3.right_jacobian_inverse(x[3:]), wanted, atol=1e-13)
+
+
+def test_log_of_half_turns_keeps_its_norm():
+    for axis in (*np.eye(3), np.ones(3) / np.sqrt(3), np.array([0.6, -0.8, 0.0])):
+        turn = 2 * np.outer(axis, axis) - np.eye(3)
+        rotvec = se3.log3(turn)
+        assert np.linalg.norm(rotvec) == pytest.approx(np.pi, abs=1e-14)
+        np.testing.assert_allclose(pin.exp3(rotvec), turn, atol=1e-14)
+
+
+@given(twists, twists)
+@settings(max_examples=100, deadline=None)
+def test_adjoint_carries_twists(x, y):
+    pose = se3.exp6(x)
+    np.testing.assert_allclose(
+        se3.exp6(se3.adjoint(pose) @ y), pose @ se3.exp6(y) @ se3.inverse(pose), atol=1e-13
+    )
+
+
+@given(arrays(float, 3, elements=st.floats(-1.5, 1.5)))
+@settings(max_examples=100, deadline=None)
+def test_right_jacobian_inverse_is_the_derivative_of_the_log(rotvec):
+    h = 1e-6
+    rotation = se3.exp3(rotvec)
+    numeric = np.stack(
+        [
+            (se3.log3(rotation @ se3.exp3(h * e)) - se3.log3(rotation @ se3.exp3(-h * e))) / (2 * h)
+            for e in np.eye(3)
+        ],
+        -1,
+    )
+    np.testing.assert_allclose(se3.right_jacobian_inverse(rotvec), numeric, atol=1e-8)
+
+
+def test_broadcasts_over_leading_axes():
+    twist = np.random.default_rng(1).normal(size=(2, 3, 6))
+    stacked = se3.inverse(se3.exp6(twist))
+    assert stacked.shape == (2, 3, 4, 4)
+    np.testing.assert_allclose(stacked[1, 2], np.linalg.inv(pin.exp6(twist[1, 2]).homogeneous), atol=1e-14)
