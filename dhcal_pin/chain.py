@@ -328,9 +328,12 @@ def _default_tip(urdf: Urdf) -> str:
         return "tool0"
     farthest = [leaf for leaf in deepest if rank[leaf] == best]
     if len(farthest) > 1:
+        shared = set.intersection(*({joint.child for joint in depth[leaf]} for leaf in farthest))
+        common = [joint.child for joint in depth[farthest[0]] if joint.child in shared]
+        also = f" (or {common[-1]}, the last link they share)" if common else ""
         raise DhcalError(
             f"{urdf.source}: several tips are equally deep; "
-            f"choose one with --tip: {', '.join(sorted(deepest))}"
+            f"choose one with --tip: {', '.join(sorted(deepest))}{also}"
         )
     return farthest[0]
 

@@ -96,7 +96,9 @@ def parser() -> argparse.ArgumentParser:
     calibrate.add_argument("--method", choices=("lm", "gn"), default="lm", help="gn is the paper's loop")
     calibrate.add_argument("--priors", metavar="default|none|FILE", help="default for lm, none for gn")
     calibrate.add_argument("--max-iterations", metavar="N", type=_count, default=100)
-    calibrate.add_argument("--seed", metavar="N", type=_seed, default=0, help="for the choice of the hold-out")
+    calibrate.add_argument(
+        "--seed", metavar="N", type=_seed, default=0, help="for the choice of the hold-out"
+    )
     calibrate.add_argument("--in-place", action="store_true", help="allow -o to be ROBOT itself")
     calibrate.add_argument("--json", metavar="FILE", help="- for stdout")
 
@@ -122,7 +124,9 @@ def parser() -> argparse.ArgumentParser:
     convert.add_argument("input", metavar="IN")
     convert.add_argument("output", metavar="OUT")
     convert.add_argument("--tip", metavar="F")
-    convert.add_argument("--convention", choices=("standard", "modified"), help="of a DH file that is written")
+    convert.add_argument(
+        "--convention", choices=("standard", "modified"), help="of a DH file that is written"
+    )
 
     check = _add(
         commands,

@@ -76,9 +76,12 @@ class _Data:
     findings: dict[str, list[Finding]]
 
 
-def _read_data(chain: Chain, args: Namespace, known_frames: bool) -> _Data:
+def _without(data: Measurement, findings: Sequence[Finding]) -> Measurement:
+    return data.take(~np.isin(data.rows, [finding.row for finding in findings]))
+
+
+def _read_data(chain: Chain, args: Namespace, held_file: str | None, known_frames: bool) -> _Data:
     """All measurements, split as the files' `set` columns and --holdout ask."""
-    held_file = args.holdout if args.holdout is not None and os.path.exists(args.holdout) else None
     fit: list[Measurement] = []
     holdout: list[Measurement] = []
     findings: dict[str, list[Finding]] = {}
@@ -86,10 +89,11 @@ def _read_data(chain: Chain, args: Namespace, known_frames: bool) -> _Data:
         readings = read_readings(path, chain)
         # A row can only be called impossible where base and tool are known.
         findings[path] = screen(chain, readings) if known_frames else []
-        bad = [finding.row for finding in findings[path]]
-        fitted, held = ([], [readings.data]) if path == held_file else ([readings.fit], [readings.holdout])
-        fit += [item.take(~np.isin(item.rows, bad)) for item in fitted]
-        holdout += [item.take(~np.isin(item.rows, bad)) for item in held]
+        if path == held_file:
+            holdout.append(_without(readings.data, findings[path]))
+        else:
+            fit.append(_without(readings.fit, findings[path]))
+            holdout.append(_without(readings.holdout, findings[path]))
     if args.holdout is not None and not held_file:
         try:
             fraction = float(args.holdout)
@@ -104,24 +108,22 @@ def _read_data(chain: Chain, args: Namespace, known_frames: bool) -> _Data:
 
 
 def _calibrate(args: Namespace) -> int:
-    held_file = [args.holdout] if args.holdout is not None and os.path.exists(args.holdout) else []
-    measured = [*args.data, *held_file]
+    held_file = args.holdout if args.holdout is not None and os.path.exists(args.holdout) else None
+    measured = [*args.data, *([held_file] if held_file else [])]
     for number, path in enumerate(measured):
         if any(_same(path, other) for other in measured[:number]):
             raise DhcalError(f"{path}: is given twice; each measurement counts once, to fit or to hold out")
+    robot = [args.robot, *_sidecars([args.robot])]
     priors = [args.priors] if args.priors not in (None, "default", "none") else []
-    inputs = [args.robot, *measured, *_sidecars([args.robot]), *priors]
+    inputs = [*robot, *measured, *priors]
     _urdf_ending(args.output)
-    own = [args.robot, *_sidecars([args.robot])] if args.in_place else []
-    safe = [path for path in inputs if path not in own]
-    _check_outputs([args.output, sidecar_path(args.output)], safe)
-    _check_outputs([args.json, args.output, sidecar_path(args.output)], inputs if not own else safe)
-    if args.json and args.json != _STDOUT:
-        _check_outputs([args.json], inputs)
+    _check_outputs([args.json], inputs)
+    kept = [*measured, *priors] if args.in_place else inputs
+    _check_outputs([args.output, sidecar_path(args.output), args.json], kept)
 
     chain = read_robot(args.robot, args.tip)
     sets = args.parameters or chain.parameters
-    data = _read_data(chain, args, known_frames=not {"base", "tool"} & set(_names(sets)))
+    data = _read_data(chain, args, held_file, known_frames=not {"base", "tool"} & set(_names(sets)))
     with terminal.progress("fitting") as progress:
         fit = calibration.calibrate(
             chain,
@@ -136,7 +138,7 @@ def _calibrate(args: Namespace) -> int:
             progress=progress,
         )
     contents = urdf_files(fit.chain, args.output)
-    files = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
+    files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
     if args.json and args.json != _STDOUT:
         files["json"] = args.json
     rows = {path: [finding.row for finding in found] for path, found in data.findings.items() if found}
@@ -177,26 +179,37 @@ def _validate(args: Namespace) -> int:
 
 def _convert(args: Namespace) -> int:
     _check_outputs([args.output], [args.input])
-    notes: Sequence[str] = ()
     if is_dh(args.output):
-        if is_dh(args.input) and args.tip is None and args.convention is None:
-            table = read_dh(args.input)
-        else:
-            found = extract(read_robot(args.input, args.tip, sidecar=""), args.convention or "standard")
-            table, notes = found.table, found.notes
-        save({args.output: dh_text(table, args.output)})
+        text, notes = _to_dh(args)
+    elif is_dh(args.input):
+        text, notes = _to_urdf(args)
     else:
-        _urdf_ending(args.output, "or a DH file as .dh.toml or .dh.csv")
-        if not is_dh(args.input):
-            raise DhcalError(f"{args.output}: a URDF converts to .dh.toml or .dh.csv")
-        if args.tip is not None or args.convention is not None:
-            raise DhcalError(f"{args.output}: a DH file has one URDF; leave out --tip and --convention")
-        save({args.output: dh_to_urdf(read_dh(args.input), robot_name(args.input))})
-        if sidecar := existing_sidecar(args.output):
-            notes = [f"{sidecar} lies beside it; its base and tool are read with it"]
+        raise DhcalError(f"{args.output}: unknown ending; a URDF converts to .dh.toml or .dh.csv")
+    save({args.output: text})
     terminal.lines(f"wrote {args.output}")
     terminal.notes(notes)
     return 0
+
+
+def _to_dh(args: Namespace) -> tuple[str, Sequence[str]]:
+    chain = read_robot(args.input, args.tip)
+    if is_dh(args.input):
+        table = read_dh(args.input)
+        if args.convention in (None, table.convention):
+            return dh_text(table, args.output), ()
+    found = extract(chain, args.convention or "standard")
+    left = [f"base and tool in {path} do not go to the table" for path in _sidecars([args.input])]
+    return dh_text(found.table, args.output), [*found.notes, *left]
+
+
+def _to_urdf(args: Namespace) -> tuple[str, Sequence[str]]:
+    _urdf_ending(args.output, "or a DH table as .dh.toml or .dh.csv")
+    if args.tip is not None or args.convention is not None:
+        raise DhcalError(
+            f"{args.input}: a DH file has one tip and one URDF; leave out --tip and --convention"
+        )
+    beside = [f"{path} lies beside it and is read with it" for path in _sidecars([args.output])]
+    return dh_to_urdf(read_dh(args.input), robot_name(args.input)), beside
 
 
 def _urdf_ending(path: str, other: str = "") -> None:

@@ -52,7 +52,7 @@ def read_frame(values: object, source: str, name: str) -> Array:
         isinstance(item, list) and len(item) == 3 and all(map(_is_number, item)) for item in three
     ):
         raise DhcalError(
-            f"{source}: [{name}] needs xyz_m and rotvec_rad and nothing else, three numbers each as [0.0, 0.0, 0.0]"
+            f"{source}: [{name}] needs xyz_m and rotvec_rad alone, three numbers each as [0.0, 0.0, 0.0]"
         )
     xyz, turn = np.array(three, float)
     return se3.transform(se3.exp3(turn), xyz)
@@ -170,7 +170,7 @@ def _limit(sheet: Sheet, column: Column, row: int, slides: bool, none: float) ->
     if not unit:
         raise DhcalError(
             f"{sheet.source}:{sheet.header}: column {column.name!r} has no unit for a "
-            f"{'sliding' if slides else 'turning'} joint; write {column.name}[deg], [mm], or [deg|mm] for both kinds"
+            f"{'sliding' if slides else 'turning'} joint; write {column.name}[deg], [mm], or [deg|mm]"
         )
     try:
         value = float(cell)

@@ -165,10 +165,9 @@ class Column:
         if self.unit in units:
             return units[self.unit]
         found = f"has unit {self.unit!r}" if self.unit else "has no unit"
-        first = next(iter(units))
         raise DhcalError(
             f"{where}: column {self.name!r} {found}; write one of "
-            f"{', '.join(f'{self.name}[{u}]' for u in units if u.isascii())} (for example {self.name}[{first}])"
+            f"{', '.join(f'{self.name}[{unit}]' for unit in units if unit.isascii())}"
         )
 
 

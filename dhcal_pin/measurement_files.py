@@ -58,7 +58,9 @@ def _group(sheet: Sheet, names: Sequence[str], units: Mapping[str, float] | None
     where = f"{sheet.source}:{sheet.header}"
     if missing:
         there = [name for name in names if name in sheet.columns]
-        raise DhcalError(f"{where}: {', '.join(there)} without {missing[0]!r}; give {','.join(names)} or none")
+        raise DhcalError(
+            f"{where}: {', '.join(there)} without {missing[0]!r}; give {','.join(names)} or none"
+        )
     if units is None:
         for name in names:
             if sheet.columns[name].unit:
@@ -91,7 +93,7 @@ def _check_joint_names(chain: Chain) -> None:
     check_names(chain.joint_names, chain.urdf.source)
     if clash := sorted(_KNOWN & set(chain.joint_names)):
         raise DhcalError(
-            f"{chain.urdf.source}: joint {clash[0]!r} has the name of a reading; rename it in the robot's file"
+            f"{chain.urdf.source}: joint {clash[0]!r} has the name of a reading; rename it there"
         )
 
 

@@ -51,10 +51,10 @@ class Parameter:
 
 def extract(chain: Chain, convention: Convention = "standard", hayati: bool = False) -> Extraction:
     """The chain's DH table, base and tool apart, by common normals."""
-    if len(chain.moving) != chain.size:
+    if not (np.array_equal(chain.mixing, np.eye(chain.size)) and not chain.shift.any()):
         raise DhcalError("DH parameters need a path without mimic joints; use --parameters minimal")
     return extract_dh(
-        chain.links, chain.moving, chain.prismatic, chain.lower, chain.upper, convention, hayati
+        chain.links, chain.joint_names, chain.prismatic, chain.lower, chain.upper, convention, hayati
     )
 
 

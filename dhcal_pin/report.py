@@ -62,12 +62,13 @@ def parameter_rows(fit: Result) -> list[dict[str, Any]]:
         for p, x, std, seen in zip(fit.parameters, fit.x, fit.std, fit.seen, strict=True)
     ]
     for p in fit.errors.fixed:
+        held = _value(fit, p, 0.0)
         rows.append(
             {
                 "name": p.name,
                 "unit": p.unit,
-                "nominal": p.nominal,
-                "value": p.nominal,
+                "nominal": held,
+                "value": held,
                 "std": 0.0,
                 "observability": 0.0,
                 "fixed": True,
@@ -139,7 +140,9 @@ def json_text(content: Any) -> str:
             return None
         return value
 
-    return json.dumps(clean(content), indent=2, ensure_ascii=False) + "\n"
+    text = json.dumps(clean(content), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    # A file's name need not be UTF-8; what is not becomes an escape that JSON knows.
+    return text.encode(errors="backslashreplace").decode()
 
 
 def shown(value: float, unit: str) -> str:
@@ -174,6 +177,9 @@ def accuracy_rows(fit: Result) -> list[list[str]]:
     """Before and after in millimetres and degrees, fitted and held out."""
     rows = []
     for title, data in (("fitted", fit.data), ("held out", fit.holdout)):
+        if not data:
+            continue
+        title = f"{sum(len(item.q) for item in data)} {title}"
         before, after = accuracy(fit.reference, data), accuracy(fit.chain, data)
         for key, label, unit in MEASURES:
             if key in before:

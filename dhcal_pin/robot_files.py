@@ -133,7 +133,7 @@ def urdf_files(chain: Chain, path: PathLike) -> dict[PathLike, str | bytes]:
 
 
 def write_urdf(fit: Result | Chain, path: PathLike) -> None:
-    """Writes the calibrated URDF, and its sidecar where base or tool are not the identity or an old one lies there.
+    """Writes the calibrated URDF, and its sidecar where base or tool need one or an old one lies there.
 
     Only the origins of joints that moved change; every other byte is the nominal file's.
 

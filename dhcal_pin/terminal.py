@@ -25,17 +25,17 @@ def _console() -> Console:
     return console
 
 
-def table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """A table whose first column is text and the others numbers."""
+def table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], texts: int = 1) -> None:
+    """A table whose first columns are text and the others numbers."""
     console = _console()
-    out = Table(
-        title=title, title_justify="left", title_style="bold", header_style="bold", box=None, pad_edge=False
-    )
+    out = Table(header_style="bold", box=None, pad_edge=False)
     for i, name in enumerate(header):
-        out.add_column(name, justify="left" if i == 0 else "right")
+        out.add_column(name, justify="left" if i < texts else "right")
     for row in rows:
         out.add_row(*map(Text, row))
     console.print()
+    # Not the table's own title, which would be folded to the table's width.
+    console.print(Text(title, style="bold"), soft_wrap=True)
     console.print(out)
 
 
@@ -72,7 +72,7 @@ def agreement(robot: str, rows: Sequence[Agreement]) -> None:
     """The routes of `dhcal check` against the paper's factors."""
     table(
         f"{robot}: largest difference from the paper's factors (m, rad)",
-        ["route", "columns", "difference", "allowed", ""],
+        ["route", "columns", "difference", "allowed", "verdict"],
         [
             [
                 row.route,
@@ -88,7 +88,7 @@ def agreement(robot: str, rows: Sequence[Agreement]) -> None:
 
 def summary(fit: Result, files: Mapping[str, str]) -> None:
     """Accuracy, parameters, and what could not be seen."""
-    table("accuracy", ["", "", "before", "after"], report.accuracy_rows(fit))
+    table("accuracy", ["samples", "error", "before", "after"], report.accuracy_rows(fit), texts=2)
     table("parameters", *report.table(fit))
     state = "converged" if fit.converged else "NOT converged"
     lines(
@@ -102,15 +102,13 @@ def summary(fit: Result, files: Mapping[str, str]) -> None:
         lines(f"wrote {name}: {path}")
 
 
-def validation(document: Mapping[str, Any], fitted: bool) -> None:
-    """Accuracy of a model on data."""
-    after = document["after"]
+def validation(robot: str, document: Mapping[str, Any], fitted: bool) -> None:
+    """Accuracy of a model on data, before and after base and tool were fitted if they were."""
+    header = ["error", "base and tool as given", "fitted"] if fitted else ["error", "value"]
+    before, after = document["before"], document["after"]
     rows = []
     for key, label, unit in report.MEASURES:
         if key in after:
-            rows.append([label, report.shown(after[key], unit)])
-    table(
-        f"accuracy on {document['samples']} samples" + (", base and tool fitted" if fitted else ""),
-        ["", ""],
-        rows,
-    )
+            values = [before[key], after[key]] if fitted else [after[key]]
+            rows.append([label, *(report.shown(value, unit) for value in values)])
+    table(f"{robot}: accuracy on {document['samples']} samples", header, rows)

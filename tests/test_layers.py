@@ -29,6 +29,7 @@ LAYERS = (
     {"report"},
     {"terminal"},
     {"demo"},
+    {"commands"},
     {"cli"},
 )
 MODULES = sorted(path.stem for path in HOUSE.glob("*.py") if path.stem != "__init__")
@@ -60,7 +61,12 @@ def test_imports_only_from_the_left(module):
 
 @pytest.mark.parametrize("module", MODULES)
 def test_special_packages_stay_in_one_place(module):
-    homes = {"meshcat": {"viewer"}, "matplotlib": {"report"}, "rich": {"terminal"}, "argparse": {"cli"}}
+    homes = {
+        "meshcat": {"viewer"},
+        "matplotlib": {"report"},
+        "rich": {"terminal"},
+        "argparse": {"cli", "commands"},
+    }
     for package, allowed in homes.items():
         if package in imports(module)[1]:
             assert module in allowed
