@@ -14,6 +14,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from .dh import DHTable
+from .extraction import settled
 from .se3 import Array
 
 # Okabe and Ito's palette: told apart by colour-blind eyes and on grey paper.
@@ -45,6 +46,7 @@ def dh_to_urdf(table: DHTable, name: str) -> str:
 
     Joint i is ``table.names[i-1]``, with parent link_{i-1}, child link_i, axis z and the origin
     ``table.origins()[i-1]``; a fixed joint, ``tool`` or the next free name, carries the last origin.
+    A table whose offsets only cancel each other is settled first (`extraction.settled`).
     Revolute joints without limits get ±2π, prismatic ones ±10 m. The drawing uses primitives only.
 
     Args:
@@ -54,6 +56,7 @@ def dh_to_urdf(table: DHTable, name: str) -> str:
     Returns:
         The whole file, which Pinocchio, MuJoCo and other readers load as it is.
     """
+    table = settled(table)
     origins = table.origins()
     paths = _paths(table)
     tool_joint = next(t for t in _tool_names() if t not in table.names)

@@ -35,6 +35,8 @@ HAYATI = np.radians(5.0)
 OFFSET_LIMIT = 2.0
 # Metres per metre of robot: a tool whose z passes the last axis this closely is meant to be in line with it.
 NEARLY_COINCIDENT = 0.01
+# A chain that sliding its frames shortens to this share had offsets that cancel.
+SHORTER = 2 / 3
 # Radians, and metres per metre of robot. Smaller differences from 0 or a quarter turn are rounding.
 ROUNDING = 5e-15
 
@@ -178,6 +180,29 @@ def extract_dh(
     pairs = zip(axes[standard:], axes[standard + 1 :], strict=False)
     notes = [_note(link, pair) for link, pair in zip(links, pairs, strict=False) if link.beta]
     return Extraction(table, np.array(frames), tuple(notes))
+
+
+def settled(table: DHTable) -> DHTable:
+    """The same arm without offsets of metres that only cancel each other; most tables come back as they are.
+
+    Plain rows hide a milliradian between parallel axes behind feet far outside the robot. Sliding each
+    joint's frame along its own axis, back to where the axis passes the frame before, changes no pose. It is done where
+    it shortens the whole chain by a third or more; the rows then have β. Parallel axes stay as written.
+    """
+    origins = table.origins()
+    slid = origins.copy()
+    back = 0.0
+    for i in range(1, len(origins)):
+        slid[i] = axis_translation(2, np.array(-back)) @ slid[i]
+        last = i == len(origins) - 1
+        back = 0.0
+        if not last and ROUNDING < _tilt(slid[i]) < NEARLY_PARALLEL:
+            back = -slid[i][2, 3] / slid[i][2, 2]
+            slid[i] = slid[i] @ axis_translation(2, np.array(back))
+    before, after = (np.linalg.norm(chain[:, :3, 3], axis=1).sum() for chain in (origins, slid))
+    if after > SHORTER * before:
+        return table
+    return extract_dh(slid, table.names, table.prismatic, table.lower, table.upper, table.convention).table
 
 
 def _mount(origin: Array, reach: float, window: float, standard: bool) -> tuple[Array, _Split]:
