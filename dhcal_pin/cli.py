@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from .errors import DhcalError
 
@@ -28,14 +28,27 @@ class _Version(argparse.Action):
         sys.exit(0)
 
 
+class _Help(argparse.RawDescriptionHelpFormatter):
+    """Help with room for the longest name beside its text."""
+
+    def __init__(self, prog: str, **options: Any):
+        super().__init__(prog, max_help_position=30, **options)
+
+
 def _add(commands, name: str, summary: str, example: str) -> argparse.ArgumentParser:
     return commands.add_parser(
         name,
         help=summary,
         description=summary[0].upper() + summary[1:] + ".",
         epilog=f"example:\n  {example}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=_Help,
     )
+
+
+_ROBOT: dict[str, Any] = {"metavar": "ROBOT", "help": "URDF, or DH file (.toml, .csv)"}
+_DATA: dict[str, Any] = {"metavar": "DATA", "nargs": "+", "help": "measurement CSV files"}
+_TIP: dict[str, Any] = {"metavar": "F", "help": "tip link of a URDF (default: the deepest leaf)"}
+_JSON: dict[str, Any] = {"metavar": "FILE", "help": "the result as JSON; - for stdout"}
 
 
 def _count(text: str) -> int:
@@ -62,6 +75,7 @@ def parser() -> argparse.ArgumentParser:
         prog="dhcal",
         description="Robot kinematic calibration: a robot and measurements in, the corrected URDF out.",
         epilog="ROBOT is a URDF or a DH file (.toml, .csv). Every command has --help with an example.",
+        formatter_class=_Help,
     )
     out.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
     commands = out.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
@@ -78,10 +92,10 @@ def parser() -> argparse.ArgumentParser:
         "identify a robot's errors from measurements and write the corrected URDF",
         "dhcal calibrate ur10.urdf laser.csv --tip tool0 --holdout 0.3 -o ur10_calibrated.urdf",
     )
-    calibrate.add_argument("robot", metavar="ROBOT")
-    calibrate.add_argument("data", metavar="DATA", nargs="+", help="measurement CSV files")
-    calibrate.add_argument("-o", "--output", metavar="OUT.urdf", required=True)
-    calibrate.add_argument("--tip", metavar="F", help="tip link of a URDF (default: the deepest leaf)")
+    calibrate.add_argument("robot", **_ROBOT)
+    calibrate.add_argument("data", **_DATA)
+    calibrate.add_argument("-o", "--output", metavar="OUT.urdf", required=True, help="the corrected URDF")
+    calibrate.add_argument("--tip", **_TIP)
     calibrate.add_argument(
         "--parameters",
         metavar="SET[,SET]",
@@ -92,15 +106,25 @@ def parser() -> argparse.ArgumentParser:
         "--fix", metavar="NAME[,NAME]", default="", help="hold parameters or sets at nominal"
     )
     calibrate.add_argument("--free", metavar="NAME[,NAME]", default="", help="add single parameters")
-    calibrate.add_argument("--holdout", metavar="FRACTION|FILE", help="measurements to judge by, not fitted")
+    calibrate.add_argument(
+        "--holdout",
+        metavar="FRACTION|FILE",
+        help="what is judged by, not fitted: a share such as 0.3, or a measurement file",
+    )
     calibrate.add_argument("--method", choices=("lm", "gn"), default="lm", help="gn is the paper's loop")
     calibrate.add_argument("--priors", metavar="default|none|FILE", help="default for lm, none for gn")
-    calibrate.add_argument("--max-iterations", metavar="N", type=_count, default=100)
+    calibrate.add_argument("--max-iterations", metavar="N", type=_count, default=100, help="most steps (100)")
     calibrate.add_argument(
         "--seed", metavar="N", type=_seed, default=0, help="for the choice of the hold-out"
     )
     calibrate.add_argument("--in-place", action="store_true", help="allow -o to be ROBOT itself")
-    calibrate.add_argument("--json", metavar="FILE", help="- for stdout")
+    calibrate.add_argument(
+        "--world-joint", action="store_true", help="put the base into the URDF, as a joint from `world`"
+    )
+    calibrate.add_argument(
+        "--tool-frame", metavar="NAME", help="put the tool into the URDF, as a link fixed to the tip"
+    )
+    calibrate.add_argument("--json", **_JSON)
 
     validate = _add(
         commands,
@@ -108,22 +132,24 @@ def parser() -> argparse.ArgumentParser:
         "the accuracy of a model on measurements; nothing is fitted but, on request, base and tool",
         "dhcal validate ur10_calibrated.urdf other.csv --tip tool0 --fit-frames",
     )
-    validate.add_argument("robot", metavar="ROBOT")
-    validate.add_argument("data", metavar="DATA", nargs="+")
-    validate.add_argument("--tip", metavar="F")
+    validate.add_argument("robot", **_ROBOT)
+    validate.add_argument("data", **_DATA)
+    validate.add_argument("--tip", **_TIP)
     validate.add_argument("--sidecar", metavar="S.toml", help="base and tool (default: the one beside ROBOT)")
     validate.add_argument("--fit-frames", action="store_true", help="fit base and tool first")
-    validate.add_argument("--json", metavar="FILE", help="- for stdout")
+    validate.add_argument("--json", **_JSON)
 
     convert = _add(
         commands,
         "convert",
-        "a DH file to a URDF, or a URDF to a DH file",
+        "a DH file to a URDF, a URDF to a DH file, to UR's YAML, or to a table of origins",
         "dhcal convert arm.dh.toml arm.urdf",
     )
-    convert.add_argument("input", metavar="IN")
-    convert.add_argument("output", metavar="OUT")
-    convert.add_argument("--tip", metavar="F")
+    convert.add_argument(
+        "input", metavar="IN", help="URDF, DH file (.toml, .csv), or UR's kinematics (.yaml)"
+    )
+    convert.add_argument("output", metavar="OUT", help=".urdf, .dh.toml, .dh.csv, .origins.csv, .yaml")
+    convert.add_argument("--tip", **_TIP)
     convert.add_argument(
         "--convention", choices=("standard", "modified"), help="of a DH file that is written"
     )
@@ -134,9 +160,9 @@ def parser() -> argparse.ArgumentParser:
         "paper factors = vectorised Jacobian = Pinocchio = finite differences, with the figures",
         "dhcal check arm.dh.toml",
     )
-    check.add_argument("robot", metavar="ROBOT")
-    check.add_argument("--tip", metavar="F")
-    check.add_argument("--json", metavar="FILE", help="- for stdout")
+    check.add_argument("robot", **_ROBOT)
+    check.add_argument("--tip", **_TIP)
+    check.add_argument("--json", **_JSON)
 
     simulate = _add(
         commands,
@@ -145,15 +171,17 @@ def parser() -> argparse.ArgumentParser:
         "dhcal simulate arm.dh.toml --truth actual.dh.toml -m 50 --noise 0.1mm,0.01deg -o data.csv",
     )
     simulate.add_argument("robot", metavar="ROBOT", help="the nominal robot")
-    simulate.add_argument("-m", "--samples", type=_count, required=True, metavar="M")
+    simulate.add_argument("-m", "--samples", type=_count, required=True, metavar="M", help="how many poses")
     simulate.add_argument(
         "--noise", default="0mm", metavar="LENGTH[,ANGLE]", help="sigma an axis, as 0.1mm,0.01deg"
     )
-    simulate.add_argument("-o", "--output", metavar="data.csv", required=True)
+    simulate.add_argument("-o", "--output", metavar="data.csv", required=True, help="measurement CSV file")
     simulate.add_argument("--truth", metavar="T.urdf", help="the robot that is measured (default: ROBOT)")
-    simulate.add_argument("--kind", choices=("pose", "position"), default="pose")
-    simulate.add_argument("--tip", metavar="F")
-    simulate.add_argument("--seed", metavar="N", type=_seed, default=0)
+    simulate.add_argument(
+        "--kind", choices=("pose", "position"), default="pose", help="what is measured (pose)"
+    )
+    simulate.add_argument("--tip", **_TIP)
+    simulate.add_argument("--seed", metavar="N", type=_seed, default=0, help="of joint values and noise (0)")
     return out
 
 

@@ -9,22 +9,31 @@ import os
 import sys
 from argparse import Namespace
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from . import calibration, demo, report, terminal
+from . import calibration, demo, exports, report, terminal, ur_kinematics
 from .chain import Chain
 from .check import crosscheck
-from .dh_files import dh_text, is_dh, read_dh
+from .dh_files import dh_text, is_dh
 from .dh_urdf import dh_to_urdf
 from .errors import DhcalError
-from .files import check_place, parse_noise, save
+from .files import PathLike, check_place, parse_noise, save
 from .measurement_files import measurement_text, read_measurements, read_readings
 from .measurements import KINDS, Measurement, Noise
 from .parameters import extract
 from .result import accuracy
-from .robot_files import existing_sidecar, read_priors, read_robot, robot_name, sidecar_path, urdf_files
+from .robot_files import (
+    existing_sidecar,
+    is_table,
+    read_priors,
+    read_robot,
+    read_table,
+    robot_name,
+    sidecar_path,
+    urdf_files,
+)
 from .screening import Finding, screen
 from .se3 import Array
 
@@ -137,7 +146,7 @@ def _calibrate(args: Namespace) -> int:
             max_iterations=args.max_iterations,
             progress=progress,
         )
-    contents = urdf_files(fit.chain, args.output)
+    contents = _written(fit.chain, args)
     files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
     if args.json and args.json != _STDOUT:
         files["json"] = args.json
@@ -154,6 +163,19 @@ def _calibrate(args: Namespace) -> int:
         terminal.findings(path, found)
     terminal.summary(fit, files)
     return 0
+
+
+def _written(chain: Chain, args: Namespace) -> dict[PathLike, str | bytes]:
+    """The calibrated URDF and its sidecar, base and tool moved into the URDF where that was asked for."""
+    # A base that the URDF holds must not stand in the sidecar too.
+    contents = urdf_files(replace(chain, base=np.eye(4)) if args.world_joint else chain, args.output)
+    data = contents[args.output]
+    assert isinstance(data, bytes)
+    if args.world_joint:
+        data = exports.with_world(data, chain.base)
+    if args.tool_frame:
+        data = exports.with_tool_frame(data, chain.tip, args.tool_frame, chain.tool)
+    return contents | {args.output: data}
 
 
 # --- the other commands ----------------------------------------------------------------------------
@@ -179,12 +201,20 @@ def _validate(args: Namespace) -> int:
 
 def _convert(args: Namespace) -> int:
     _check_outputs([args.output], [args.input])
-    if is_dh(args.output):
+    low = args.output.lower()
+    if low.endswith(".origins.csv"):
+        text, notes = exports.origins_text(read_robot(args.input, args.tip)), ()
+    elif low.endswith((".yaml", ".yml")):
+        text, notes = ur_kinematics.ur_kinematics_text(read_robot(args.input, args.tip)), ()
+    elif is_dh(args.output):
         text, notes = _to_dh(args)
-    elif is_dh(args.input):
+    elif is_table(args.input):
         text, notes = _to_urdf(args)
     else:
-        raise DhcalError(f"{args.output}: unknown ending; a URDF converts to .dh.toml or .dh.csv")
+        raise DhcalError(
+            f"{args.output}: unknown ending; "
+            "a URDF converts to .dh.toml, .dh.csv, .origins.csv, or UR's .yaml"
+        )
     save({args.output: text})
     terminal.lines(f"wrote {args.output}")
     terminal.notes(notes)
@@ -193,8 +223,8 @@ def _convert(args: Namespace) -> int:
 
 def _to_dh(args: Namespace) -> tuple[str, Sequence[str]]:
     chain = read_robot(args.input, args.tip)
-    if is_dh(args.input):
-        table = read_dh(args.input)
+    if is_table(args.input):
+        table = read_table(args.input)
         if args.convention in (None, table.convention):
             return dh_text(table, args.output), ()
     found = extract(chain, args.convention or "standard")
@@ -205,11 +235,9 @@ def _to_dh(args: Namespace) -> tuple[str, Sequence[str]]:
 def _to_urdf(args: Namespace) -> tuple[str, Sequence[str]]:
     _urdf_ending(args.output, "or a DH table as .dh.toml or .dh.csv")
     if args.tip is not None or args.convention is not None:
-        raise DhcalError(
-            f"{args.input}: a DH file has one tip and one URDF; leave out --tip and --convention"
-        )
+        raise DhcalError(f"{args.input}: a table has one tip and one URDF; leave out --tip and --convention")
     beside = [f"{path} lies beside it and is read with it" for path in _sidecars([args.output])]
-    return dh_to_urdf(read_dh(args.input), robot_name(args.input)), beside
+    return dh_to_urdf(read_table(args.input), robot_name(args.input)), beside
 
 
 def _urdf_ending(path: str, other: str = "") -> None:
@@ -232,7 +260,7 @@ def _simulate(args: Namespace) -> int:
     noise = Noise(*parse_noise(args.noise))
     chain = truth = read_robot(args.robot, args.tip)
     if args.truth:
-        truth = read_robot(args.truth, None if is_dh(args.truth) else args.tip)
+        truth = read_robot(args.truth, None if is_table(args.truth) else args.tip)
         if truth.joint_names != chain.joint_names:
             raise DhcalError(
                 f"{args.truth}: its joints are {', '.join(truth.joint_names)}; "
@@ -247,11 +275,13 @@ def _simulate(args: Namespace) -> int:
 
 
 def _configurations(chain: Chain, count: int, rng: np.random.Generator) -> Array:
-    """Uniform joint values (count, n) within the limits, and within a turn (or ±π m)."""
-    low, high, pi = chain.lower, chain.upper, np.pi
+    """Uniform joint values (count, n) within the limits, and within a turn or half a metre each way."""
+    low, high = chain.lower, chain.upper
+    slides = [chain.urdf.joint(name).type == "prismatic" for name in chain.joint_names]
+    span = np.where(slides, 0.5, np.pi)
     low, high = (
-        np.where(high > -pi, np.maximum(low, -pi), np.maximum(low, high - 2 * pi)),
-        np.where(low < pi, np.minimum(high, pi), np.minimum(high, low + 2 * pi)),
+        np.where(high > -span, np.maximum(low, -span), np.maximum(low, high - 2 * span)),
+        np.where(low < span, np.minimum(high, span), np.minimum(high, low + 2 * span)),
     )
     return rng.uniform(low, high, (count, chain.size))
 

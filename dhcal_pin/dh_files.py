@@ -170,7 +170,8 @@ def _limit(sheet: Sheet, column: Column, row: int, slides: bool, none: float) ->
     if not unit:
         raise DhcalError(
             f"{sheet.source}:{sheet.header}: column {column.name!r} has no unit for a "
-            f"{'sliding' if slides else 'turning'} joint; write {column.name}[deg], [mm], or [deg|mm]"
+            f"{'sliding' if slides else 'turning'} joint; write {column.name}[{'mm' if slides else 'deg'}], "
+            f"or {column.name}[deg|mm] where there are both kinds"
         )
     try:
         value = float(cell)

@@ -1,44 +1,17 @@
-"""A calibrated robot for those who cannot load its URDF: world joint, tool frame, UR's YAML, a plain table."""
+"""A calibrated robot with the instrument's frames in its URDF, and as a plain table of origins."""
 
 from __future__ import annotations
 
-import hashlib
-import os
-from collections.abc import Mapping
-from typing import Any
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
-import numpy as np
-import pinocchio as pin
-import yaml
-
-from . import se3
 from .chain import Chain
-from .dh import DHTable
 from .errors import DhcalError
-from .extraction import extract_dh
-from .files import PathLike, read_text
-from .parameters import extract
+from .robot_files import joint_origins
 from .se3 import Array
+from .ur_kinematics import ORIGIN_KEYS, six_numbers
 from .urdf import parse_urdf
 from .urdf_origins import with_origins
-
-# UR's joints and what its description calls their origins.
-UR_JOINTS = {
-    "shoulder_pan_joint": "shoulder",
-    "shoulder_lift_joint": "upper_arm",
-    "elbow_joint": "forearm",
-    "wrist_1_joint": "wrist_1",
-    "wrist_2_joint": "wrist_2",
-    "wrist_3_joint": "wrist_3",
-}
-_KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
-
-
-def _six(origin: Array) -> list[float]:
-    """x, y, z in m and roll, pitch, yaw in rad of an origin (4, 4)."""
-    return [float(v) + 0.0 for v in (*origin[:3, 3], *pin.rpy.matrixToRpy(origin[:3, :3]))]
 
 
 def _end_of_robot(data: bytes) -> int:
@@ -52,7 +25,7 @@ def _end_of_robot(data: bytes) -> int:
 
 def _appended(data: bytes, link: str, joint: str, parent: str, child: str, origin: Array) -> bytes:
     """The URDF with one more link and the fixed joint that holds it."""
-    xyz, rpy = (" ".join(map(repr, part)) for part in (_six(origin)[:3], _six(origin)[3:]))
+    xyz, rpy = (" ".join(map(repr, part)) for part in (six_numbers(origin)[:3], six_numbers(origin)[3:]))
     lines = [
         f"  <link name={quoteattr(link)}/>",
         f'  <joint name={quoteattr(joint)} type="fixed">',
@@ -100,82 +73,8 @@ def with_tool_frame(data: bytes, tip: str, name: str, tool: Array) -> bytes:
 
 def origins_text(chain: Chain) -> str:
     """CSV of every joint's own origin on the path, for people who keep their robot in xacro; m and rad."""
-    from .robot_files import _origins as joint_origins
-
     moved, _ = joint_origins(chain)
-    lines = ["joint," + ",".join(f"{k}[{'m' if k in 'xyz' else 'rad'}]" for k in _KEYS)]
+    lines = ["joint," + ",".join(f"{k}[{'m' if k in 'xyz' else 'rad'}]" for k in ORIGIN_KEYS)]
     for joint in chain.urdf.path(chain.tip):
-        lines.append(",".join([joint.name, *map(repr, _six(moved.get(joint.name, joint.origin)))]))
+        lines.append(",".join([joint.name, *map(repr, six_numbers(moved.get(joint.name, joint.origin)))]))
     return "\n".join(lines) + "\n"
-
-
-def _ur_names(chain: Chain) -> Mapping[str, str]:
-    names = [name[len(name) - len(own) :] for name, own in zip(chain.joint_names, UR_JOINTS, strict=False)]
-    if len(chain.joint_names) != 6 or names != list(UR_JOINTS):
-        raise DhcalError(
-            f"UR's kinematics need the joints {', '.join(UR_JOINTS)}; this path has {', '.join(chain.joint_names)}"
-        )
-    return UR_JOINTS
-
-
-def ur_kinematics(chain: Chain) -> dict[str, Any]:
-    """The `kinematics` mapping of UR's robot description: each joint's origin with its axis along z.
-
-    It holds the path from the base link to the flange. What the last axis' turn and slide cannot take
-    up of the tip has no place there.
-
-    Raises:
-        DhcalError: the joints are not UR's, or the tip is not on the last axis.
-    """
-    names = _ur_names(chain)
-    table = extract(chain, "modified").table
-    origins = table.origins()
-    turn = np.arctan2(table.tool[1, 0], table.tool[0, 0])
-    slide = se3.transform(se3.exp3([0.0, 0.0, turn]), [0.0, 0.0, table.tool[2, 3]])
-    rest = np.abs(se3.inverse(slide) @ table.tool - np.eye(4)).max()
-    if rest > 1e-9:
-        raise DhcalError(
-            f"UR's kinematics end on the axis of wrist_3, and the tip {chain.tip!r} is {rest:.2g} off it; "
-            "choose --tip tool0 or flange, and calibrate with tool rather than with the last row"
-        )
-    origins[-2] = origins[-2] @ slide
-    return {
-        key: dict(zip(_KEYS, _six(origin), strict=True))
-        for key, origin in zip(names.values(), origins[:-1], strict=True)
-    }
-
-
-def ur_kinematics_text(chain: Chain) -> str:
-    """UR's kinematics YAML, every digit; its hash is of the numbers, not the controller's own."""
-    content = ur_kinematics(chain)
-    lines = ["kinematics:"]
-    for name, values in content.items():
-        lines += [f"  {name}:", *(f"    {key}: {value!r}" for key, value in values.items())]
-    digest = int(hashlib.sha256("\n".join(lines).encode()).hexdigest()[:15], 16)
-    return "\n".join([*lines, f"  hash: calib_{digest}", ""])
-
-
-def read_ur_kinematics(path: PathLike) -> DHTable:
-    """A modified DH table from UR's kinematics YAML, base and tool being identities or fixed frames.
-
-    Raises:
-        DhcalError: it is not such a file.
-    """
-    source = os.fspath(path)
-    try:
-        raw = yaml.safe_load(read_text(path))
-    except yaml.YAMLError as error:
-        raise DhcalError(f"{source}: not YAML: {' '.join(str(error).split())}") from None
-    content = raw.get("kinematics") if isinstance(raw, dict) else None
-    origins = []
-    for name in UR_JOINTS.values():
-        entry = content.get(name) if isinstance(content, dict) else None
-        values = [entry.get(key) for key in _KEYS] if isinstance(entry, dict) else [None]
-        if not all(isinstance(v, int | float) and np.isfinite(v) for v in values):
-            raise DhcalError(
-                f"{source}: kinematics: {name} needs the numbers {', '.join(_KEYS)} in m and rad"
-            )
-        origins.append(se3.transform(pin.rpy.rpyToMatrix(*map(float, values[3:])), values[:3]))
-    six = np.zeros(6)
-    origins.append(np.eye(4))
-    return extract_dh(origins, list(UR_JOINTS), six, six - np.inf, six + np.inf, "modified").table

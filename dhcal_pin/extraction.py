@@ -186,8 +186,9 @@ def settled(table: DHTable) -> DHTable:
     """The same arm without offsets of metres that only cancel each other; most tables come back as they are.
 
     Plain rows hide a milliradian between parallel axes behind feet far outside the robot. Sliding each
-    joint's frame along its own axis, back to where the axis passes the frame before, changes no pose. It is done where
-    it shortens the whole chain by a third or more; the rows then have β. Parallel axes stay as written.
+    joint's frame along its own axis, back to where the axis passes the frame before, changes no pose. It
+    is done where it shortens the whole chain by a third or more; the rows then have β. Parallel axes stay
+    as written.
     """
     origins = table.origins()
     slid = origins.copy()

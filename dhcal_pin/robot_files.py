@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -11,11 +12,13 @@ import numpy as np
 from . import se3
 from .calibration import Priors
 from .chain import Chain
+from .dh import DHTable
 from .dh_files import is_dh, read_dh, read_frame
 from .errors import DhcalError
 from .files import PathLike, read_toml, save
 from .result import Result
 from .se3 import Array
+from .ur_kinematics import read_ur_kinematics
 from .urdf import parse_urdf
 from .urdf_origins import with_origins
 
@@ -39,21 +42,35 @@ def robot_name(path: PathLike) -> str:
     return Path(path).name.split(".")[0] or "arm"
 
 
+def is_table(path: PathLike) -> bool:
+    """Whether a path names a DH file or UR's kinematics YAML."""
+    return is_dh(path) or os.fspath(path).lower().endswith((".yaml", ".yml"))
+
+
+def read_table(path: PathLike) -> DHTable:
+    """A DH table from a DH file, or from UR's kinematics YAML.
+
+    Raises:
+        DhcalError: the file is missing or wrong.
+    """
+    return read_dh(path) if is_dh(path) else read_ur_kinematics(path)
+
+
 def read_robot(path: PathLike, tip: str | None = None, sidecar: PathLike | None = None) -> Chain:
     """A chain from a URDF or a DH file, with base and tool of its sidecar where there is one.
 
     Args:
-        path: `.urdf`, or a DH table as `.toml` or `.csv`.
+        path: `.urdf`, a DH table as `.toml` or `.csv`, or UR's kinematics as `.yaml`.
         tip: the tip link of a URDF.
         sidecar: another sidecar than the one beside the robot.
 
     Raises:
         DhcalError: a file is missing or wrong.
     """
-    if is_dh(path):
+    if is_table(path):
         if tip is not None:
             raise DhcalError(f"{os.fspath(path)}: a DH table has one tip; leave out --tip")
-        chain = Chain.from_dh(read_dh(path), robot_name(path))
+        chain = Chain.from_dh(read_table(path), robot_name(path))
     else:
         chain = Chain.from_urdf(path, tip)
     sidecar = sidecar or existing_sidecar(path)
@@ -62,17 +79,22 @@ def read_robot(path: PathLike, tip: str | None = None, sidecar: PathLike | None 
 
 def _with_sidecar(chain: Chain, path: PathLike) -> Chain:
     raw = read_toml(path)
+    tip = raw.pop("tip", chain.tip)
     if unknown := set(raw) - {"base", "tool"}:
-        raise DhcalError(f"{os.fspath(path)}: unknown table [{min(unknown)}]; allowed: [base], [tool]")
+        raise DhcalError(f"{os.fspath(path)}: unknown key {min(unknown)!r}; allowed: tip, [base], [tool]")
     frames = {key: read_frame(raw[key], os.fspath(path), key) for key in raw}
+    if tip != chain.tip:
+        # The tool is a place on another link.
+        frames.pop("tool", None)
     return replace(chain, **frames)
 
 
-def sidecar_text(base: Array, tool: Array) -> str:
-    """The sidecar's TOML of base and tool (4, 4)."""
+def sidecar_text(tip: str, base: Array, tool: Array) -> str:
+    """The sidecar's TOML of base and tool (4, 4), the tool being on the link `tip`."""
     out = [
         "# What the URDF cannot hold. base: the robot's base link in the measuring frame;",
         "# tool: the measured point in the tip frame. Metres; rotation vectors in radians.",
+        f"tip = {json.dumps(tip)}",
     ]
     for name, pose in (("base", base), ("tool", tool)):
         xyz, turn = pose[:3, 3].tolist(), se3.log3(pose[:3, :3]).tolist()
@@ -80,7 +102,7 @@ def sidecar_text(base: Array, tool: Array) -> str:
     return "\n".join(out) + "\n"
 
 
-def _origins(chain: Chain) -> tuple[dict[str, Array], Array]:
+def joint_origins(chain: Chain) -> tuple[dict[str, Array], Array]:
     """Each changed joint's own origin in its parent link, and the tool (4, 4) with what found no joint.
 
     Fixed joints before a moving one stay, so that one's own origin takes up the change. A change of the
@@ -114,7 +136,7 @@ def urdf_files(chain: Chain, path: PathLike) -> dict[PathLike, str | bytes]:
     Raises:
         DhcalError: the written text would not be the same robot.
     """
-    origins, tool = _origins(chain)
+    origins, tool = joint_origins(chain)
     data = with_origins(chain.urdf, origins)
     again = replace(Chain.from_urdf(parse_urdf(data, os.fspath(path)), chain.tip), base=chain.base, tool=tool)
     rng = np.random.default_rng(0)
@@ -128,7 +150,7 @@ def urdf_files(chain: Chain, path: PathLike) -> dict[PathLike, str | bytes]:
     out: dict[PathLike, str | bytes] = {path: data}
     plain = np.array_equal(chain.base, np.eye(4)) and np.array_equal(tool, np.eye(4))
     if not plain or existing_sidecar(path):
-        out[sidecar_path(path)] = sidecar_text(chain.base, tool)
+        out[sidecar_path(path)] = sidecar_text(chain.tip, chain.base, tool)
     return out
 
 

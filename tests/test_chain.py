@@ -68,7 +68,8 @@ ROBOT = """<robot name="r">
     <axis xyz="1 2 -3"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
   <joint name="two" type="prismatic"><parent link="a"/><child link="b"/><origin xyz=".1 0 0" rpy="1 0 0"/>
     <axis xyz="0 -1 0"/><limit lower="-.2" upper=".3" effort="1" velocity="1"/></joint>
-  <joint name="glue" type="fixed"><parent link="b"/><child link="c"/><origin xyz="0 .1 0" rpy="0 0 1"/></joint>
+  <joint name="glue" type="fixed"><parent link="b"/><child link="c"/>
+    <origin xyz="0 .1 0" rpy="0 0 1"/></joint>
   <joint name="end" type="continuous"><parent link="c"/><child link="end"/><origin xyz="0 0 .2"/>
     <axis xyz="0 1 0"/>{mimic}</joint>
   <joint name="out" type="revolute"><parent link="a"/><child link="side"/><axis xyz="0 0 1"/>

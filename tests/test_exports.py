@@ -13,16 +13,15 @@ from conftest import paper, robot_file
 
 from dhcal_pin import se3
 from dhcal_pin.chain import Chain
+from dhcal_pin.cli import main
 from dhcal_pin.dh import DHTable
+from dhcal_pin.dh_files import dh_text
 from dhcal_pin.errors import DhcalError
-from dhcal_pin.exports import (
-    origins_text,
-    read_ur_kinematics,
-    ur_kinematics,
-    ur_kinematics_text,
-    with_tool_frame,
-    with_world,
-)
+from dhcal_pin.exports import origins_text, with_tool_frame, with_world
+from dhcal_pin.measurement_files import measurement_text
+from dhcal_pin.measurements import Noise, Pose
+from dhcal_pin.robot_files import read_robot
+from dhcal_pin.ur_kinematics import read_ur_kinematics, ur_kinematics, ur_kinematics_text
 from dhcal_pin.urdf import parse_urdf
 
 FACTORY = (
@@ -188,3 +187,54 @@ def test_table_of_origins_is_what_pinocchio_reads(sim_6dof_actual):
         rotation = pin.rpy.rpyToMatrix(*(float(row[f"{k}[rad]"]) for k in ("roll", "pitch", "yaw")))
         np.testing.assert_allclose(rotation, origin[:3, :3], atol=1e-14)
         np.testing.assert_allclose([float(row[f"{k}[m]"]) for k in "xyz"], origin[:3, 3], atol=0)
+
+
+# --- through the commands --------------------------------------------------------------------------
+
+
+@pytest.fixture
+def measured(tmp_path):
+    """A UR10 somewhere in a hall, with a reflector somewhere on its flange, and its file of poses."""
+    robot = tmp_path / "ur10.urdf"
+    robot.write_bytes(robot_file("ur_description/urdf/ur10_robot.urdf").read_bytes())
+    chain = Chain.from_urdf(robot, "tool0")
+    rng = np.random.default_rng(0)
+    truth = chain.displaced(
+        {0: se3.exp6([1, 2, 0.5, 0.1, 0.2, 2.0]), chain.tool_station: se3.exp6([0.1, 0, 0.05, 0.3, 0, 0])}
+        | {2 * j: se3.exp6(1e-3 * rng.normal(size=6)) for j in range(1, 7)}
+    )
+    q = rng.uniform(-2, 2, (40, 6))
+    data = tmp_path / "laser.csv"
+    data.write_text(measurement_text(Pose.simulate(truth, q, Noise(), rng), chain))
+    return robot, data, truth
+
+
+def test_calibrate_can_put_both_frames_into_the_urdf(measured, tmp_path):
+    robot, data, truth = measured
+    out = tmp_path / "out.urdf"
+    options = ["--tip", "tool0", "--priors", "none", "--world-joint", "--tool-frame", "reflector"]
+    assert main(["calibrate", str(robot), str(data), "-o", str(out), *options]) == 0
+    q = np.random.default_rng(1).uniform(-2, 2, (30, 6))
+    for tip in ("reflector", "tool0"):
+        np.testing.assert_allclose(read_robot(out, tip).poses(q), truth.poses(q), atol=1e-9)
+    lines = out.read_bytes().splitlines()
+    assert set(robot.read_bytes().splitlines()) - set(lines) <= {
+        line for line in robot.read_bytes().splitlines() if b"<origin" in line
+    }
+
+
+def test_convert_writes_and_reads_urs_yaml(tmp_path):
+    table, yaml_file, urdf = (str(tmp_path / name) for name in ("a.dh.toml", "k.yaml", "b.urdf"))
+    Path(table).write_text(dh_text(ur10(factory()), table))
+    assert main(["convert", table, yaml_file]) == 0
+    assert main(["convert", yaml_file, urdf]) == 0
+    q = np.random.default_rng(1).uniform(-2, 2, (30, 6))
+    np.testing.assert_allclose(read_robot(urdf).poses(q), ur10(factory()).poses(q), atol=1e-9)
+
+
+def test_convert_writes_a_table_of_origins(tmp_path):
+    out = tmp_path / "ur10.origins.csv"
+    source = robot_file("ur_description/urdf/ur10_robot.urdf")
+    assert main(["convert", str(source), str(out), "--tip", "tool0"]) == 0
+    rows = {row["joint"]: row for row in csv.DictReader(out.read_text().splitlines())}
+    assert float(rows["shoulder_pan_joint"]["z[m]"]) == 0.1273
