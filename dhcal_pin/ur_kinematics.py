@@ -99,12 +99,13 @@ def read_ur_kinematics(path: PathLike) -> DHTable:
     origins = []
     for name in UR_JOINTS.values():
         entry = content.get(name) if isinstance(content, dict) else None
-        values = [entry.get(key) for key in ORIGIN_KEYS] if isinstance(entry, dict) else [None]
-        if not all(isinstance(v, int | float) and np.isfinite(v) for v in values):
+        values = [entry.get(key) for key in ORIGIN_KEYS] if isinstance(entry, dict) else []
+        numbers = [float(value) for value in values if isinstance(value, int | float)]
+        if len(numbers) != len(ORIGIN_KEYS) or not np.isfinite(numbers).all():
             raise DhcalError(
                 f"{source}: kinematics: {name} needs the numbers {', '.join(ORIGIN_KEYS)} in m and rad"
             )
-        origins.append(se3.transform(pin.rpy.rpyToMatrix(*map(float, values[3:])), values[:3]))
-    six = np.zeros(6)
+        origins.append(se3.transform(pin.rpy.rpyToMatrix(*numbers[3:]), numbers[:3]))
     origins.append(np.eye(4))
+    six = np.zeros(6)
     return extract_dh(origins, list(UR_JOINTS), six, six - np.inf, six + np.inf, "modified").table
