@@ -30,7 +30,6 @@ LAYERS = (
     {"report"},
     {"terminal"},
     {"demo"},
-    {"viewer"},
     {"commands"},
     {"cli"},
 )
