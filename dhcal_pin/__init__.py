@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from .factors import error_factors as error_factors
     from .measurement_files import read_measurements as read_measurements
     from .measurements import Noise as Noise
-    from .measurements import Pose as Pose
-    from .measurements import Position as Position
     from .parameters import extract as extract
+    from .poses import Pose as Pose
+    from .poses import Position as Position
     from .result import Result as Result
     from .result import accuracy as accuracy
     from .robot_files import read_robot as read_robot
@@ -43,8 +43,8 @@ _HOMES = {
     "error_factors": "factors",
     "read_measurements": "measurement_files",
     "Noise": "measurements",
-    "Pose": "measurements",
-    "Position": "measurements",
+    "Pose": "poses",
+    "Position": "poses",
     "extract": "parameters",
     "Result": "result",
     "accuracy": "result",

@@ -17,7 +17,7 @@ from .measurements import Measurement
 from .parameters import ErrorModel, select
 from .result import Result
 from .se3 import Array
-from .solver import METHODS, Problem, Progress, Solution, levenberg_marquardt
+from .solver import METHODS, Problem, Progress, Solution, levenberg_marquardt, shared_unknowns
 
 Method = Literal["lm", "gn"]
 Priors = Literal["default", "none"] | Mapping[str, float]
@@ -52,40 +52,46 @@ def split(
     rng = np.random.default_rng(seed)
     fit, held = [], []
     for item in data:
-        order = rng.permutation(len(item.q))
+        order = rng.permutation(len(item.rows))
         count = round(fraction * len(order))
         held.append(item.take(np.sort(order[:count])))
         fit.append(item.take(np.sort(order[count:])))
-    return tuple(fit), tuple(item for item in held if len(item.q))
+    return tuple(fit), tuple(item for item in held if len(item.rows))
 
 
-def _place(
-    errors: ErrorModel, data: tuple[Measurement, ...], max_iterations: int
-) -> tuple[ErrorModel, Chain]:
-    """The errors about a chain whose unknown base and tool already fit the data as well as they can."""
+def _place(errors: ErrorModel, data: tuple[Measurement, ...], max_iterations: int) -> Chain:
+    """The nominal chain with its unknown base and tool as they fit the data best."""
     frames = errors.frames()
     if frames is None:
-        return errors, errors.chain
+        return errors.chain
     stations = {p.station for p in frames.parameters}
     best: tuple[float, Chain] | None = None
     for start in starts(errors.chain, data, BASE in stations, errors.chain.tool_station in stations):
         placed = replace(frames, chain=start)
-        problem = Problem(placed, data, 1 / placed.priors)
-        solution = levenberg_marquardt(problem, np.zeros(len(placed.parameters)), max_iterations, None)
+        problem = _problem(placed, tuple(item.started(start) for item in data), 1 / placed.priors)
+        solution = levenberg_marquardt(problem, np.zeros(len(problem.weights)), max_iterations, None)
         cost = problem.cost(solution.x)
         if best is None or cost < best[0]:
-            best = cost, placed.at(solution.x)
+            best = cost, placed.at(solution.x[: len(placed.parameters)])
     assert best is not None
-    return replace(errors, chain=best[1]), best[1]
+    return best[1]
 
 
-def _scatter(errors: ErrorModel, solution: Solution, data: tuple[Measurement, ...]) -> Array:
+def _problem(errors: ErrorModel, data: tuple[Measurement, ...], weights: Array) -> Problem:
+    """The problem whose instruments have their own wide priors where the robot has any."""
+    wide = np.array([1 / unknown.prior for unknown in shared_unknowns(data)])
+    return Problem(errors, data, np.concatenate([weights, wide * np.any(weights)]))
+
+
+def _scatter(problem: Problem, solution: Solution, data: tuple[Measurement, ...]) -> Array:
     """How many of its sigmas each group of rows scatters in the fit, all items' groups in a row (g,).
 
     One where the instrument states its sigmas, or where there are not more rows than directions seen.
     """
-    chain = errors.at(solution.x)
-    residuals = [item.residual(chain.sweep(item.q)) for item in data]
+    chain = problem.errors.at(solution.x[: len(problem.errors.parameters)])
+    residuals = [
+        item.residual(chain.sweep(item.configurations()), problem.values(item, solution.x)) for item in data
+    ]
     share = 1 - observability.rank(solution.triangle.r) / sum(r.size for r in residuals)
     return np.array(
         [
@@ -138,22 +144,24 @@ def calibrate(
         DhcalError: no data, unknown names, or a plain Gauss-Newton loop that runs away.
     """
     data = tuple(data) if isinstance(data, Sequence) else (data,)
-    if not sum(len(item.q) for item in data):
+    if not sum(len(item.rows) for item in data):
         raise DhcalError("no measurements to fit")
     if method not in METHODS:
         raise DhcalError(f"method {method!r}: choose from {', '.join(METHODS)}")
     for item in (*data, *holdout):
-        chain.checked(item.q)
+        chain.checked(item.configurations())
     priors = priors if priors is not None else ("none" if method == "gn" else "default")
     errors = select(chain, parameters if parameters is not None else chain.parameters, fix, free)
-    errors, reference = _place(errors, data, max_iterations)
-    problem = Problem(errors, data, _prior_weights(errors, priors))
-    solution = METHODS[method](problem, np.zeros(len(errors.parameters)), max_iterations, progress)
+    reference = _place(errors, data, max_iterations)
+    errors = replace(errors, chain=reference)
+    data = tuple(item.started(reference) for item in data)
+    problem = _problem(errors, data, _prior_weights(errors, priors))
+    solution = METHODS[method](problem, np.zeros(len(problem.weights)), max_iterations, progress)
     if method == "lm":
         # Weights that the fit itself tells: a few rounds settle them.
         scales = np.ones(sum(len(item.groups) for item in data))
         for _ in range(8):
-            found = _scatter(errors, solution, data)
+            found = _scatter(problem, solution, data)
             if np.abs(np.log(found / scales)).max() < 0.01:
                 break
             scales = found
@@ -163,7 +171,7 @@ def calibrate(
     return Result(
         errors=errors,
         x=solution.x,
-        chain=errors.at(solution.x),
+        chain=errors.at(solution.x[: len(errors.parameters)]),
         reference=reference,
         data=data,
         holdout=tuple(holdout),

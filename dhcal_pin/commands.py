@@ -20,8 +20,9 @@ from .dh_files import dh_text, is_dh
 from .dh_urdf import dh_to_urdf
 from .errors import DhcalError
 from .files import PathLike, check_place, parse_noise, save
+from .kinds import KINDS
 from .measurement_files import measurement_text, read_measurements, read_readings
-from .measurements import KINDS, Measurement, Noise
+from .measurements import Measurement, Noise
 from .parameters import extract
 from .result import accuracy
 from .robot_files import (

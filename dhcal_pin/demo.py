@@ -16,8 +16,9 @@ from .chain import Chain
 from .dh_files import read_dh
 from .errors import DhcalError
 from .files import PathLike, save
+from .kinds import KINDS
 from .measurement_files import Readings, read_readings
-from .measurements import KINDS, Measurement, Noise
+from .measurements import Measurement, Noise
 from .parameters import ErrorModel, select
 from .result import Result, accuracy
 from .robot_files import urdf_files
@@ -210,7 +211,7 @@ def simulate(
             off = np.linalg.norm(errors.at(x).poses(test)[:, :3, 3] - goal, axis=1)
             out[:, seed, step] = gap[angles].max(), gap[~angles].max(), off.max()
         chain = errors.at(path[-1])
-        residual[seed] = np.abs(data.residual(chain.sweep(data.q))).max()
+        residual[seed] = np.abs(data.residual(chain.sweep(data.q), np.array([]))).max()
         if seed == 0:
             first_rank = observability.rank(reduce(start, 0 * truth, small_angle=False).r)
     return Simulation(out[0], out[1], out[2], residual, first_rank, hidden)

@@ -12,7 +12,8 @@ from . import se3
 from .chain import Chain
 from .errors import DhcalError
 from .files import ANGLES, LENGTHS, Column, PathLike, Sheet, check_names, read_sheet
-from .measurements import Measurement, Pose, Position
+from .measurements import Measurement
+from .poses import Pose, Position
 from .se3 import Array
 
 _XYZ = ("x", "y", "z")

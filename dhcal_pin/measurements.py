@@ -1,37 +1,64 @@
-"""Kinds of measurement: what an instrument reads of the tool, and how that changes with the tool.
+"""What an instrument reads of the tool, and how that changes with the tool.
 
-A kind holds joint values q (m, n) and its readings in SI. Given a sweep of frames it returns whitened
-residuals, measured minus modelled over sigma, as (k, m); and it turns tool velocities (p, 6, m) into
-the whitened rows' derivative (p, k, m). Components come first, so that (p, k·m) seen from LAPACK is a
-Fortran matrix. The residual's derivative is minus that of the model, so a step solves rows·Δx = residual.
+A kind of measurement holds joint values and readings in SI. Given a sweep of frames and the values u of
+its own unknowns (an anchor, a touched point) it returns whitened residuals, measured minus modelled over
+sigma, as (k, m); it turns tool velocities (p, 6, c·m) into the whitened model's derivative (p, k, m), and
+gives the derivative (s, k, m) by its s unknowns. Components come first, so that (p, k·m) seen from LAPACK is
+a Fortran matrix. A step solves derivative·Δx = residual.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Protocol, Self
+from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
 
-from . import se3
 from .chain import Chain, Sweep
 from .errors import DhcalError
 from .se3 import Array
 
 # Without a sigma a millimetre weighs as much as a milliradian.
-POSITION_SIGMA, ROTATION_SIGMA = 1e-3, 1e-3
+LENGTH_SIGMA, ANGLE_SIGMA = 1e-3, 1e-3
+# An anchor or a touched point may be anywhere in a hall; a wire's zero within arm's length.
+PLACE_PRIOR, ZERO_PRIOR = 10.0, 1.0
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A scalar that an instrument brings with it.
+
+    Attributes:
+        name: what users call it; measurements share the unknowns that they name alike.
+        unit: "m" or "rad".
+        nominal: where the search starts.
+        prior: standard deviation about that, in its unit.
+    """
+
+    name: str
+    unit: str
+    nominal: float
+    prior: float
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations an axis: `position` in m, `rotation` in rad."""
+
+    position: float = 0.0
+    rotation: float = 0.0
 
 
 class Measurement(Protocol):
-    """What the solver asks of a kind."""
+    """What the solver asks of a kind with m samples, c configurations a sample and s unknowns."""
 
     kind: ClassVar[str]
-    groups: ClassVar[dict[str, slice]]
+    groups: ClassVar[Mapping[str, slice]]
 
     @property
     def q(self) -> Array:
-        """Joint values (m, n), rad or m."""
+        """Joint values (m, n) of the samples' first configurations, rad or m."""
         ...
 
     @property
@@ -42,6 +69,39 @@ class Measurement(Protocol):
     @property
     def stated(self) -> bool:
         """Whether the sigmas are the instrument's own, not a placeholder to be estimated."""
+        ...
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        """The s unknowns, in the order of u."""
+        ...
+
+    def configurations(self) -> Array:
+        """Joint values (c·m, n) that a sweep for this measurement has, one configuration after the other."""
+        ...
+
+    def started(self, chain: Chain) -> Self:
+        """The same readings with unknowns that start where a chain puts them."""
+        ...
+
+    def residual(self, sweep: Sweep, u: Array) -> Array:
+        """Whitened residuals (k, m); `groups` names its rows."""
+        ...
+
+    def whiten(self, sweep: Sweep, velocities: Array, u: Array) -> Array:
+        """Derivatives (p, k, m) of the whitened model from tool velocities (p, 6, c·m)."""
+        ...
+
+    def own(self, sweep: Sweep, u: Array) -> Array:
+        """Derivatives (s, k, m) of the whitened model by the unknowns."""
+        ...
+
+    def small_angle(self, sweep: Sweep, velocities: Array, u: Array) -> tuple[Array, Array]:
+        """The paper's rows: residual (k, m) by (35) and (36), derivative (p, k, m) by its R."""
+        ...
+
+    def errors(self, sweep: Sweep, u: Array) -> dict[str, Array]:
+        """Unweighted errors (m, ·): "position" in m, "orientation" in rad, or the kind's own in m."""
         ...
 
     def positions(self) -> Array:
@@ -56,277 +116,136 @@ class Measurement(Protocol):
         """The same readings with each group's sigmas multiplied."""
         ...
 
-    def residual(self, sweep: Sweep) -> Array:
-        """Whitened residuals (k, m); `groups` names its rows."""
-        ...
-
-    def whiten(self, sweep: Sweep, velocities: Array) -> Array:
-        """Derivatives (p, k, m) of the whitened model from tool velocities (p, 6, m)."""
-        ...
-
-    def small_angle(self, sweep: Sweep, velocities: Array) -> tuple[Array, Array]:
-        """The paper's rows: residual (k, m) by (35) and (36), derivative (p, k, m) by its R."""
-        ...
-
-    def errors(self, sweep: Sweep) -> dict[str, Array]:
-        """Errors (m, 3) in m under "position" and in rad under "orientation", unweighted."""
-        ...
-
     def take(self, index: Array | slice) -> Self:
         """The samples of an index or mask."""
         ...
 
     @classmethod
     def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Self:
-        """Readings of a chain with normal noise."""
+        """Readings of a chain with normal noise, the instrument standing somewhere sensible."""
         ...
 
 
-@dataclass(frozen=True)
-class Noise:
-    """Standard deviations an axis: `position` in m, `rotation` in rad."""
-
-    position: float = 0.0
-    rotation: float = 0.0
-
-
-def _sigma(value: Array, m: int, what: str) -> Array:
+def checked_sigma(value: Any, shape: tuple[int, int], what: str) -> Array:
+    """Sigmas of that shape from one number or as many, positive and finite; or DhcalError."""
     value = np.asarray(value, float)
     try:
-        value = np.array(np.broadcast_to(value, (m, 3)))
+        value = np.array(np.broadcast_to(value, shape))
     except ValueError:
-        raise DhcalError(f"{what} has shape {value.shape}; give one number or ({m}, 3)") from None
+        raise DhcalError(f"{what} has shape {value.shape}; give one number or {shape}") from None
     if not (np.isfinite(value).all() and (value > 0).all()):
         raise DhcalError(f"{what} must be positive and finite")
     return value
 
 
-def _finite(value: Array, shape: tuple[int | None, ...], what: str) -> Array:
+def checked(value: Any, shape: tuple[int | None, ...], what: str) -> Array:
+    """A finite array of that shape, None being any size; or DhcalError."""
     value = np.asarray(value, float)
-    if value.ndim != len(shape) or any(
-        w is not None and w != g for w, g in zip(shape, value.shape, strict=True)
-    ):
+    fits = value.ndim == len(shape) and all(w in (None, g) for w, g in zip(shape, value.shape, strict=True))
+    if not fits:
         raise DhcalError(f"{what} has shape {value.shape}, needs {shape}".replace("None", "m"))
     if not np.isfinite(value).all():
         raise DhcalError(f"{what}: every value must be finite")
     return value
 
 
+def places(prefix: str, at: Array) -> tuple[Unknown, ...]:
+    """Three unknown coordinates of a point that is at about (3,) m."""
+    return tuple(
+        Unknown(f"{prefix}.{axis}", "m", float(value), PLACE_PRIOR)
+        for axis, value in zip("xyz", at, strict=True)
+    )
+
+
+def nominals(unknowns: Sequence[Unknown]) -> Array:
+    """Where the unknowns start (s,)."""
+    return np.array([unknown.nominal for unknown in unknowns])
+
+
 @dataclass(frozen=True, eq=False)
-class Position:
-    """Positions of the tool point in the measuring frame: laser tracker, CMM, trilaterated wires.
+class PointReading:
+    """A reading that depends on where the tool point is, in one or two configurations, and on nothing else.
+
+    A kind derives from it and gives `model`; the rest follows.
 
     Attributes:
         q: (m, n) joint values, rad or m.
-        position: (m, 3) m.
-        sigma: (m, 3) standard deviations, m.
-        rows: (m,) row numbers, the first reading being 1.
+        reading: (m, k) m.
+        sigma: (m, k) standard deviations, m.
+        rows: (m,) row numbers.
         stated: whether sigma is the instrument's own.
+        unknowns: (s,).
     """
 
     q: Array
-    position: Array
+    reading: Array
     sigma: Array
     rows: Array
     stated: bool
+    unknowns: tuple[Unknown, ...]
 
-    kind: ClassVar = "position"
-    groups: ClassVar = {"position": slice(0, 3)}
+    kind: ClassVar[str]
+    groups: ClassVar[Mapping[str, slice]]
+    # Fields with an entry a sample.
+    per_row: ClassVar[tuple[str, ...]] = ("q", "reading", "sigma", "rows")
 
-    @classmethod
-    def of(cls, q: Array, position: Array, sigma: Array | float | None = None) -> Position:
-        """Checked positions (m, 3) in m at joint values (m, n).
+    def model(self, points: Array, u: Array) -> tuple[Array, Array, Array]:
+        """Modelled reading (k, m) of tool points (c, 3, m), its derivatives (c, k, 3, m) and (s, k, m)."""
+        raise NotImplementedError
 
-        sigma is one number or (m, 3); without it, it is estimated with the fit.
-        """
-        q = _finite(q, (None, None), "q")
-        m = len(q)
-        position = _finite(position, (m, 3), "position")
-        stated = sigma is not None
-        sigma = _sigma(np.asarray(sigma if stated else POSITION_SIGMA), m, "sigma")
-        return cls(q, position, sigma, np.arange(1, m + 1), stated)
+    def configurations(self) -> Array:
+        """As they are, (m, n)."""
+        return self.q
+
+    def _points(self, sweep: Sweep) -> Array:
+        m = len(self.rows)
+        return sweep.tool[3].reshape(3, -1, m).transpose(1, 0, 2) if m else np.empty((1, 3, 0))
+
+    def started(self, chain: Chain) -> Self:
+        """Nothing to start."""
+        return self
+
+    def residual(self, sweep: Sweep, u: Array) -> Array:
+        """(k, m)."""
+        return (self.reading.T - self.model(self._points(sweep), u)[0]) / self.sigma.T
+
+    def whiten(self, sweep: Sweep, velocities: Array, u: Array) -> Array:
+        """(p, k, m)."""
+        derivative = self.model(self._points(sweep), u)[1]
+        m = len(self.rows)
+        out = np.zeros((len(velocities), *derivative.shape[1:2], m))
+        for i, block in enumerate(derivative):
+            part = velocities[:, :3, i * m : (i + 1) * m]
+            # A sum over x, y, z, written out: einsum would not use the memory's order.
+            for axis in range(3):
+                out += part[:, None, axis] * block[:, axis]
+        return out / self.sigma.T
+
+    def own(self, sweep: Sweep, u: Array) -> Array:
+        """(s, k, m)."""
+        return self.model(self._points(sweep), u)[2] / self.sigma.T
+
+    def small_angle(self, sweep: Sweep, velocities: Array, u: Array) -> tuple[Array, Array]:
+        """The same rows: there is no rotation in them."""
+        return self.residual(sweep, u), self.whiten(sweep, velocities, u)
+
+    def errors(self, sweep: Sweep, u: Array) -> dict[str, Array]:
+        """{group: (m, k)} in m."""
+        return {name: (self.residual(sweep, u) * self.sigma.T)[rows].T for name, rows in self.groups.items()}
 
     def positions(self) -> Array:
-        """As measured, (m, 3)."""
-        return self.position
+        """None, (0, 3)."""
+        return np.empty((0, 3))
 
     def rotations(self) -> Array:
         """None, (0, 3, 3)."""
         return np.empty((0, 3, 3))
 
-    def residual(self, sweep: Sweep) -> Array:
-        """(3, m): x, y, z over sigma."""
-        return (self.position.T - sweep.tool[3]) / self.sigma.T
-
-    def whiten(self, sweep: Sweep, velocities: Array) -> Array:
-        """(p, 3, m)."""
-        return velocities[:, :3] / self.sigma.T
-
-    def small_angle(self, sweep: Sweep, velocities: Array) -> tuple[Array, Array]:
-        """The same rows: a position is linear already."""
-        return self.residual(sweep), self.whiten(sweep, velocities)
-
-    def errors(self, sweep: Sweep) -> dict[str, Array]:
-        """{"position": (m, 3)} in m."""
-        return {"position": self.position - sweep.tool[3].T}
-
-    def take(self, index: Array | slice) -> Position:
-        """The samples of an index or mask."""
-        return replace(
-            self,
-            q=self.q[index],
-            position=self.position[index],
-            sigma=self.sigma[index],
-            rows=self.rows[index],
-        )
-
-    def scaled(self, scales: Mapping[str, float]) -> Position:
+    def scaled(self, scales: Mapping[str, float]) -> Self:
         """The same readings with sigmas multiplied."""
-        return replace(self, sigma=self.sigma * scales["position"])
+        (scale,) = scales.values()
+        return replace(self, sigma=self.sigma * scale)
 
-    @classmethod
-    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Position:
-        """Positions (m, 3) of a chain's tool with normal noise an axis."""
-        q = chain.checked(q)
-        position = chain.sweep(q).tool[3].T + noise.position * rng.standard_normal((len(q), 3))
-        return cls.of(q, position, noise.position or None)
-
-
-@dataclass(frozen=True, eq=False)
-class Pose:
-    """Poses of the tool in the measuring frame: position as above, rotation as rotation vectors.
-
-    The rotation residual is log3(R_measured·R_modelᵀ) in axes of the measuring frame, differentiated
-    exactly.
-
-    Attributes:
-        q: (m, n) joint values, rad or m.
-        poses: (m, 4, 4).
-        sigma: (m, 3) of the position, m.
-        rotation_sigma: (m, 3) about the measuring frame's axes, rad.
-        rows: (m,) row numbers, the first reading being 1.
-        stated: whether the sigmas are the instrument's own.
-    """
-
-    q: Array
-    poses: Array
-    sigma: Array
-    rotation_sigma: Array
-    rows: Array
-    stated: bool
-
-    kind: ClassVar = "pose"
-    groups: ClassVar = {"position": slice(0, 3), "orientation": slice(3, 6)}
-
-    @classmethod
-    def of(
-        cls,
-        q: Array,
-        poses: Array,
-        sigma: Array | float | None = None,
-        rotation_sigma: Array | float | None = None,
-    ) -> Pose:
-        """Checked poses (m, 4, 4) at joint values (m, n).
-
-        Sigmas are one number or (m, 3), m and rad, both or neither; without them they are estimated
-        with the fit.
-        """
-        q = _finite(q, (None, None), "q")
-        poses = _finite(poses, (len(q), 4, 4), "poses")
-        rotation = poses[:, :3, :3]
-        off = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max(axis=(1, 2))
-        bad = np.flatnonzero((off > 1e-6) | (np.linalg.det(rotation) < 0))
-        if bad.size:
-            raise DhcalError(
-                f"poses: number {bad[0] + 1} is not a rotation (RRᵀ differs from I by {off[bad[0]]:.2g})"
-            )
-        if (sigma is None) != (rotation_sigma is None):
-            raise DhcalError("poses need the sigmas of position and of rotation, or neither")
-        m, stated = len(q), sigma is not None
-        return cls(
-            q,
-            poses,
-            _sigma(np.asarray(sigma if stated else POSITION_SIGMA), m, "sigma"),
-            _sigma(np.asarray(rotation_sigma if stated else ROTATION_SIGMA), m, "rotation_sigma"),
-            np.arange(1, m + 1),
-            stated,
-        )
-
-    def positions(self) -> Array:
-        """As measured, (m, 3)."""
-        return self.poses[:, :3, 3]
-
-    def rotations(self) -> Array:
-        """As measured, (m, 3, 3)."""
-        return self.poses[:, :3, :3]
-
-    def _turn(self, sweep: Sweep) -> Array:
-        """R_measured·R_modelᵀ (m, 3, 3)."""
-        return np.einsum("mik,kjm->mij", self.poses[:, :3, :3], sweep.tool[:3])
-
-    def _position(self, sweep: Sweep) -> Array:
-        return (self.poses[:, :3, 3].T - sweep.tool[3]) / self.sigma.T
-
-    def residual(self, sweep: Sweep) -> Array:
-        """(6, m): x, y, z, then the rotation vector, over sigma."""
-        return np.concatenate([self._position(sweep), se3.log3(self._turn(sweep)).T / self.rotation_sigma.T])
-
-    def whiten(self, sweep: Sweep, velocities: Array) -> Array:
-        """(p, 6, m); log3(E·exp(-ω)) = φ - Jr⁻¹(φ)·ω."""
-        out = np.empty_like(velocities)
-        np.divide(velocities[:, :3], self.sigma.T, out=out[:, :3])
-        mix = se3.right_jacobian_inverse(se3.log3(self._turn(sweep))) / self.rotation_sigma[:, :, None]
-        mix = np.ascontiguousarray(mix.transpose(1, 2, 0))
-        for i in range(3):
-            row = mix[i, 0] * velocities[:, 3]
-            row += mix[i, 1] * velocities[:, 4]
-            row += mix[i, 2] * velocities[:, 5]
-            out[:, 3 + i] = row
-        return out
-
-    def small_angle(self, sweep: Sweep, velocities: Array) -> tuple[Array, Array]:
-        """Half the vee of E - Eᵀ, E = R_measured·R_modelᵀ, is (36) seen in the measuring frame."""
-        turn = self._turn(sweep)
-        difference = 0.5 * (turn - np.swapaxes(turn, 1, 2))
-        sine = np.stack([difference[:, 2, 1], difference[:, 0, 2], difference[:, 1, 0]])
-        residual = np.concatenate([self._position(sweep), sine / self.rotation_sigma.T])
-        return residual, velocities / np.concatenate([self.sigma.T, self.rotation_sigma.T])
-
-    def errors(self, sweep: Sweep) -> dict[str, Array]:
-        """{"position": (m, 3) in m, "orientation": (m, 3) rotation vectors in rad}."""
-        return {
-            "position": self.poses[:, :3, 3] - sweep.tool[3].T,
-            "orientation": se3.log3(self._turn(sweep)),
-        }
-
-    def take(self, index: Array | slice) -> Pose:
+    def take(self, index: Array | slice) -> Self:
         """The samples of an index or mask."""
-        return replace(
-            self,
-            q=self.q[index],
-            poses=self.poses[index],
-            sigma=self.sigma[index],
-            rotation_sigma=self.rotation_sigma[index],
-            rows=self.rows[index],
-        )
-
-    def scaled(self, scales: Mapping[str, float]) -> Pose:
-        """The same readings with sigmas multiplied."""
-        return replace(
-            self,
-            sigma=self.sigma * scales["position"],
-            rotation_sigma=self.rotation_sigma * scales["orientation"],
-        )
-
-    @classmethod
-    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Pose:
-        """Poses (m, 4, 4) of a chain's tool with normal noise an axis."""
-        q = chain.checked(q)
-        poses = chain.poses(q)
-        poses[:, :3, 3] += noise.position * rng.standard_normal((len(q), 3))
-        poses[:, :3, :3] = se3.exp3(noise.rotation * rng.standard_normal((len(q), 3))) @ poses[:, :3, :3]
-        known = noise.position > 0 and noise.rotation > 0
-        return cls.of(q, poses, noise.position if known else None, noise.rotation if known else None)
-
-
-KINDS: dict[str, type[Position] | type[Pose]] = {"position": Position, "pose": Pose}
+        return replace(self, **{name: getattr(self, name)[index] for name in self.per_row})

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from .measurements import Unknown
 from .parameters import Parameter
 from .se3 import Array
 
@@ -64,7 +65,7 @@ def unseen_groups(triangle: Array) -> list[tuple[tuple[int, ...], int]]:
     return groups
 
 
-def unobservable(triangle: Array, parameters: Sequence[Parameter]) -> list[str]:
+def unobservable(triangle: Array, parameters: Sequence[Parameter | Unknown]) -> list[str]:
     """One sentence a group of parameters that the data cannot tell apart; empty when all is seen."""
     out = []
     for members, unseen in unseen_groups(triangle):

@@ -257,11 +257,11 @@ class ErrorModel:
 
     @cached_property
     def _twists(self) -> Array:
-        return np.array([parameter.twist for parameter in self.parameters])
+        return np.array([parameter.twist for parameter in self.parameters]).reshape(-1, 6)
 
     @cached_property
     def _stations(self) -> Array:
-        return np.array([parameter.station for parameter in self.parameters])
+        return np.array([parameter.station for parameter in self.parameters], int)
 
     @property
     def priors(self) -> Array:

@@ -15,7 +15,7 @@ import numpy as np
 from . import se3
 from .chain import BASE, Chain
 from .files import PathLike
-from .measurements import Measurement
+from .measurements import Measurement, Unknown
 from .parameters import Parameter
 from .result import Result, accuracy
 
@@ -37,10 +37,10 @@ def versions() -> dict[str, str]:
     return {name: metadata.version(name) for name in ("dhcal-pin", "pin", "numpy", "scipy")}
 
 
-def _value(fit: Result, parameter: Parameter, error: float) -> float:
+def _value(fit: Result, parameter: Parameter | Unknown, error: float) -> float:
     """A parameter's own value; base and tool by component of their place, the others nominal plus error."""
     frames = {BASE: fit.chain.base, fit.chain.tool_station: fit.chain.tool}
-    if parameter.station not in frames:
+    if isinstance(parameter, Unknown) or parameter.station not in frames:
         return parameter.nominal + error
     frame = frames[parameter.station]
     six = np.concatenate([frame[:3, 3], se3.log3(frame[:3, :3])])

@@ -2,35 +2,75 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from . import observability
 from .chain import Chain
-from .measurements import Measurement
+from .measurements import Measurement, Unknown
 from .parameters import ErrorModel, Parameter
 from .se3 import Array
-from .solver import Problem, Solution, pseudo_inverse, reduce, with_priors
+from .solver import (
+    Problem,
+    Solution,
+    levenberg_marquardt,
+    pseudo_inverse,
+    reduce,
+    shared_unknowns,
+    with_priors,
+)
 
 
-def accuracy(chain: Chain, data: Sequence[Measurement]) -> dict[str, float]:
-    """RMS and largest position error in m, and RMS orientation error in rad, of a chain on data."""
+def accuracy(
+    chain: Chain, data: Sequence[Measurement], known: Mapping[str, float] | None = None
+) -> dict[str, Any]:
+    """Errors of a chain on data: RMS and largest position error in m, RMS orientation error in rad.
+
+    What else was measured goes to `residual_rms` and `residual_max`, with `unit`.
+
+    Args:
+        chain: base and tool included.
+        data: measurements of any kinds.
+        known: values of instruments' unknowns; others (a point that only these data touch) are fitted
+            to the data first.
+    """
+    values = _instrument(chain, data, known or {})
     groups: dict[str, list[Array]] = {}
     for item in data:
-        for name, error in item.errors(chain.sweep(item.q)).items():
-            groups.setdefault(name, []).append(np.linalg.norm(error, axis=1))
-    out: dict[str, float] = {}
+        u = np.array([values[unknown.name] for unknown in item.unknowns])
+        for name, error in item.errors(chain.sweep(item.configurations()), u).items():
+            group = name if name in ("position", "orientation") else "residual"
+            groups.setdefault(group, []).append(np.linalg.norm(error, axis=1))
+    out: dict[str, Any] = {}
     if "position" in groups:
         size = np.concatenate(groups["position"])
         out |= {"position_rms_m": float(np.sqrt(np.mean(size**2))), "position_max_m": float(size.max())}
     if "orientation" in groups:
         size = np.concatenate(groups["orientation"])
         out["orientation_rms_rad"] = float(np.sqrt(np.mean(size**2)))
+    if "residual" in groups:
+        size = np.concatenate(groups["residual"])
+        out |= {
+            "residual_rms": float(np.sqrt(np.mean(size**2))),
+            "residual_max": float(size.max()),
+            "unit": "m",
+        }
     return out
+
+
+def _instrument(chain: Chain, data: Sequence[Measurement], known: Mapping[str, float]) -> dict[str, float]:
+    """Values of the data's unknowns by name, those that are not known fitted to the data alone."""
+    started = tuple(item.started(chain) for item in data)
+    free = [unknown for unknown in shared_unknowns(started) if unknown.name not in known]
+    problem = Problem(ErrorModel(chain, ()), started, np.array([1 / u.prior for u in free]), known)
+    if not free:
+        return problem.instruments(np.empty(0))
+    return problem.instruments(levenberg_marquardt(problem, np.zeros(len(free)), 100, None).x)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +79,8 @@ class Result:
 
     Attributes:
         errors: the nominal chain and its unknowns.
-        x: (p,) identified errors, m and rad.
+        x: (p+s,) identified errors of the robot, then the instruments' unknowns from where they
+            started; m and rad.
         chain: the calibrated chain.
         reference: the nominal chain, with base and tool as fitted to the same data where they were
             unknown, so that before and after differ by the robot alone.
@@ -77,7 +118,7 @@ class Result:
     @property
     def samples(self) -> int:
         """Number of fitted samples."""
-        return sum(len(d.q) for d in self.data)
+        return sum(len(d.rows) for d in self.data)
 
     @property
     def rank(self) -> int:
@@ -92,12 +133,13 @@ class Result:
     @property
     def unobservable(self) -> list[str]:
         """What the data cannot tell apart, one sentence a group."""
-        return observability.unobservable(self.solution.triangle.r, self.errors.parameters)
+        return observability.unobservable(self.solution.triangle.r, self.parameters)
 
     @cached_property
     def noise(self) -> float:
         """Standard deviation of the whitened residuals, about 1 where the sigmas are right."""
-        count = sum(d.residual(self.chain.sweep(d.q)).size for d in self.data)
+        sweeps = [(d, self.chain.sweep(d.configurations())) for d in self.data]
+        count = sum(d.residual(sweep, self.problem.values(d, self.x)).size for d, sweep in sweeps)
         cost = self.solution.triangle.rest + float(np.sum(self.solution.triangle.z**2))
         freedom = count - self.rank
         return float(np.sqrt(cost / freedom)) if freedom > 0 else float("nan")
@@ -130,13 +172,19 @@ class Result:
         return observability.seen_share(self.solution.triangle.r)
 
     @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """The unknowns, in the order of x."""
-        return self.errors.parameters
+    def parameters(self) -> tuple[Parameter | Unknown, ...]:
+        """The robot's and the instruments' unknowns, in the order of x."""
+        return (*self.errors.parameters, *self.problem.unknowns)
 
-    def validate(self, data: Measurement | Sequence[Measurement]) -> dict[str, float]:
+    @property
+    def instruments(self) -> dict[str, float]:
+        """Values of the instruments' unknowns by name, m and rad."""
+        return self.problem.instruments(self.x)
+
+    def validate(self, data: Measurement | Sequence[Measurement]) -> dict[str, Any]:
         """Accuracy of the calibrated chain on other data: position in m, orientation in rad."""
-        return accuracy(self.chain, (data,) if not isinstance(data, Sequence) else data)
+        data = (data,) if not isinstance(data, Sequence) else data
+        return accuracy(self.chain, data, self.instruments)
 
     def is_converged(self, eps: float = 1e-6) -> bool:
         """Whether a fresh Gauss-Newton step would change no whitened row by more than eps RMS."""

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from . import se3
-from .chain import Chain, link_station
+from .chain import Chain
+from .inverse import solve, to_positions
 from .measurement_files import Readings
 from .se3 import Array
 
@@ -54,25 +55,11 @@ def _next_axis(chain: Chain, j: int) -> Array:
 
 
 def solve_position(chain: Chain, target: Array, near: Array) -> Array | None:
-    """Joint values (n,) that put the tool point at target (3,), nearest to `near` (n,), or None.
-
-    Damped steps from many starts.
-    """
-    n = chain.size
+    """Joint values (n,) that put the tool point at target (3,), nearest to `near` (n,), or None."""
     rng = np.random.default_rng(0)
-    stations = np.array([link_station(j + 1) for j in range(len(chain.moving))])
-    axes = np.concatenate([np.zeros_like(chain.axes), chain.axes], 1)
-    axes[chain.prismatic] = np.roll(axes[chain.prismatic], 3, axis=1)
-    bodies, twists = chain.station_twists(stations, axes)
-    q = np.concatenate([near[None], rng.uniform(-1.5, 1.5, (63, n))])
-    for _ in range(200):
-        sweep = chain.sweep(q)
-        gap = target[:, None] - sweep.tool[3]
-        jacobian = chain.tool_velocities(sweep, bodies, twists)[:, :3].transpose(2, 1, 0) @ chain.mixing
-        damped = jacobian @ np.swapaxes(jacobian, 1, 2) + 1e-6 * np.eye(3)
-        q = q + (np.swapaxes(jacobian, 1, 2) @ np.linalg.solve(damped, gap.T[..., None]))[..., 0]
+    start = np.concatenate([near[None], rng.uniform(-1.5, 1.5, (63, chain.size))])
+    q, left = solve(chain, to_positions(target), start)
     q = np.where(chain.prismatic @ (chain.mixing != 0), q, (q + np.pi) % (2 * np.pi) - np.pi)
-    left = np.linalg.norm(chain.poses(q)[:, :3, 3] - target, axis=1)
     good = np.flatnonzero(left < 1e-6)
     return q[good[np.argmin(np.abs(q[good] - near).sum(1))]] if good.size else None
 

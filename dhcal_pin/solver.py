@@ -8,15 +8,16 @@ parameters by name.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import lapack
 
 from . import observability
 from .errors import DhcalError
-from .measurements import Measurement
+from .measurements import Measurement, Unknown
 from .parameters import ErrorModel
 from .se3 import Array
 
@@ -33,27 +34,72 @@ RUNAWAY = 1e6
 class Problem:
     """What is unknown and what was measured.
 
+    The unknowns x are the p errors of the robot, then the s unknowns of the instruments as differences
+    from where they start; instruments share what they name alike.
+
     Attributes:
-        errors: the nominal chain and its p unknowns.
+        errors: the nominal chain and its p errors.
         data: measurements, any mixture of kinds.
-        weights: (p,) one over the prior's sigma; zero where there is none.
+        weights: (p+s,) one over the prior's sigma; zero where there is none.
+        known: values of instruments' unknowns, by name, that are no unknowns here.
     """
 
     errors: ErrorModel
     data: tuple[Measurement, ...]
     weights: Array
+    known: Mapping[str, float] = field(default_factory=dict)
+
+    @cached_property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        """The instruments' s unknowns, each once."""
+        return tuple(u for u in shared_unknowns(self.data) if u.name not in self.known)
+
+    def instruments(self, x: Array) -> dict[str, float]:
+        """The values of all the instruments' unknowns at x, by name."""
+        found = x[len(self.errors.parameters) :]
+        return {u.name: u.nominal + float(v) for u, v in zip(self.unknowns, found, strict=True)} | dict(
+            self.known
+        )
+
+    def values(self, item: Measurement, x: Array) -> Array:
+        """The values u of a measurement's unknowns at x."""
+        every = self.instruments(x)
+        return np.array([every[unknown.name] for unknown in item.unknowns])
+
+    def places(self, item: Measurement) -> tuple[list[int], list[int]]:
+        """Which of a measurement's unknowns are unknown here, and where they stand in x."""
+        first = len(self.errors.parameters)
+        place = {unknown.name: first + i for i, unknown in enumerate(self.unknowns)}
+        free = [i for i, unknown in enumerate(item.unknowns) if unknown.name in place]
+        return free, [place[item.unknowns[i].name] for i in free]
 
     def chunks(self) -> Iterable[Measurement]:
         """The data in pieces of at most CHUNK samples."""
         for data in self.data:
-            for start in range(0, len(data.q), CHUNK):
-                yield data if len(data.q) <= CHUNK else data.take(np.s_[start : start + CHUNK])
+            for start in range(0, len(data.rows), CHUNK):
+                yield data if len(data.rows) <= CHUNK else data.take(np.s_[start : start + CHUNK])
 
     def cost(self, x: Array) -> float:
         """Sum of squared whitened residuals and priors at x (p,)."""
-        chain = self.errors.at(x)
+        chain = self.errors.at(x[: len(self.errors.parameters)])
         total = float(np.sum((self.weights * x) ** 2))
-        return total + sum(float(np.sum(d.residual(chain.sweep(d.q)) ** 2)) for d in self.chunks())
+        for data in self.chunks():
+            residual = data.residual(chain.sweep(data.configurations()), self.values(data, x))
+            total += float(np.sum(residual**2))
+        return total
+
+
+def shared_unknowns(data: Sequence[Measurement]) -> tuple[Unknown, ...]:
+    """The unknowns of several measurements, each once; a start that is NaN gives way to one that is not."""
+    found: dict[str, Unknown] = {}
+    for item in data:
+        for unknown in item.unknowns:
+            if unknown.name not in found or math.isnan(found[unknown.name].nominal):
+                found[unknown.name] = unknown
+    return tuple(
+        replace(unknown, nominal=0.0) if math.isnan(unknown.nominal) else unknown
+        for unknown in found.values()
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,17 +131,22 @@ def _qr(rows: Array) -> Array:
 
 def reduce(problem: Problem, x: Array, small_angle: bool) -> Triangle:
     """The data's triangle at x (p,), without the priors; exact or by the paper's rows."""
-    chain, bodies, twists = problem.errors.derivative(x)
-    p = len(bodies)
+    errors = len(problem.errors.parameters)
+    chain, bodies, twists = problem.errors.derivative(x[:errors])
+    p = len(x)
     merged = np.zeros((p + 1, p + 1))
     for data in problem.chunks():
-        sweep = chain.sweep(data.q)
+        sweep, u = chain.sweep(data.configurations()), problem.values(data, x)
         velocities = chain.tool_velocities(sweep, bodies, twists)
         if small_angle:
-            residual, rows = data.small_angle(sweep, velocities)
+            residual, rows = data.small_angle(sweep, velocities, u)
         else:
-            residual, rows = data.residual(sweep), data.whiten(sweep, velocities)
-        block = np.concatenate([rows.reshape(p, -1), residual.reshape(1, -1)])
+            residual, rows = data.residual(sweep, u), data.whiten(sweep, velocities, u)
+        block = np.zeros((p + 1, residual.size))
+        block[:errors] = rows.reshape(errors, residual.size)
+        free, rows_of = problem.places(data)
+        block[rows_of] = data.own(sweep, u).reshape(len(u), residual.size)[free]
+        block[p] = residual.reshape(-1)
         merged = _qr(np.concatenate([merged.T, _qr(block).T], 1)) if merged.any() else _qr(block)
     return Triangle(merged[:p, :p], merged[:p, p], float(merged[p, p] ** 2))
 
@@ -139,7 +190,7 @@ def gauss_newton(problem: Problem, x: Array, max_iterations: int, progress: Prog
     Rotation errors are (36) and the derivative is R itself, as printed. Priors join only if given.
     """
     path, converged, done = [x], False, 0
-    count = max(1, sum(data.q.shape[0] for data in problem.data))
+    count = max(1, sum(len(data.rows) for data in problem.data))
     while done < max_iterations and not converged:
         triangle = reduce(problem, x, small_angle=True)
         full = with_priors(triangle, problem.weights, x, np.zeros_like(x))
@@ -162,7 +213,7 @@ def levenberg_marquardt(
     """Levenberg-Marquardt; a retry costs forward kinematics only, the triangle stays."""
     path, damping, growth = [x], 1e-4, 2.0
     converged, done = False, 0
-    count = max(1, sum(data.q.shape[0] for data in problem.data))
+    count = max(1, sum(len(data.rows) for data in problem.data))
     cost = problem.cost(x)
     scale = np.zeros_like(x)
     triangle = reduce(problem, x, small_angle=False)

@@ -660,7 +660,7 @@ def test_simulated_noise_has_the_size_asked_for(run, place):
     off = readings.positions() * 1e3 - tip(np.degrees(readings.q))
     np.testing.assert_allclose(off.std(0), 0.2, rtol=0.05)
     assert readings.stated
-    errors = readings.errors(Chain.from_urdf("arm.urdf").sweep(readings.q))["orientation"]
+    errors = readings.errors(Chain.from_urdf("arm.urdf").sweep(readings.q), np.empty(0))["orientation"]
     np.testing.assert_allclose(errors.std(0), 1e-3, rtol=0.05)
 
 

@@ -19,7 +19,8 @@ from dhcal_pin.dh_files import dh_text
 from dhcal_pin.errors import DhcalError
 from dhcal_pin.exports import origins_text, with_tool_frame, with_world
 from dhcal_pin.measurement_files import measurement_text
-from dhcal_pin.measurements import Noise, Pose
+from dhcal_pin.measurements import Noise
+from dhcal_pin.poses import Pose
 from dhcal_pin.robot_files import read_robot
 from dhcal_pin.ur_kinematics import read_ur_kinematics, ur_kinematics, ur_kinematics_text
 from dhcal_pin.urdf import parse_urdf

@@ -11,8 +11,9 @@ from conftest import paper, random_table
 from dhcal_pin import observability, se3
 from dhcal_pin.chain import Chain
 from dhcal_pin.errors import DhcalError
-from dhcal_pin.measurements import Noise, Pose, Position
+from dhcal_pin.measurements import Noise
 from dhcal_pin.parameters import SETS, select
+from dhcal_pin.poses import Pose, Position
 from dhcal_pin.solver import Problem, reduce
 
 

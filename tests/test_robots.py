@@ -16,8 +16,9 @@ from dhcal_pin.calibration import calibrate
 from dhcal_pin.chain import Chain
 from dhcal_pin.check import crosscheck, regressor, vectorised
 from dhcal_pin.errors import DhcalError
-from dhcal_pin.measurements import Noise, Pose
+from dhcal_pin.measurements import Noise
 from dhcal_pin.parameters import SETS, extract, select
+from dhcal_pin.poses import Pose
 from dhcal_pin.robot_files import read_robot, write_urdf
 from dhcal_pin.solver import Problem, reduce
 from dhcal_pin.urdf import read_urdf

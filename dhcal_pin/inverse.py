@@ -1,0 +1,77 @@
+"""Joint values that put the tool point where it is asked for, many samples at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from .chain import Chain, link_station
+from .errors import DhcalError
+from .se3 import Array
+
+Gap = Callable[[Array], tuple[Array, Array]]
+
+# Squared metres added to J·Jᵀ: harmless a step away from a singularity, kind at one.
+_DAMPING = 1e-6
+REACHED = 1e-9  # m
+
+
+def joint_velocities(chain: Chain, q: Array) -> tuple[Array, Array]:
+    """Tool points (m, 3) and their Jacobians (m, 3, n) by the independent joints at q (m, n)."""
+    stations = np.array([link_station(j + 1) for j in range(len(chain.moving))])
+    axes = np.concatenate([np.zeros_like(chain.axes), chain.axes], 1)
+    axes[chain.prismatic] = np.roll(axes[chain.prismatic], 3, axis=1)
+    sweep = chain.sweep(q)
+    velocities = chain.tool_velocities(sweep, *chain.station_twists(stations, axes))
+    return sweep.tool[3].T, velocities[:, :3].transpose(2, 1, 0) @ chain.mixing
+
+
+def solve(chain: Chain, gap: Gap, start: Array, steps: int = 200) -> tuple[Array, Array]:
+    """Joint values (m, n) that close gaps of the tool points, and how wide they stay (m,); damped steps.
+
+    Args:
+        chain: base and tool included.
+        gap: from tool points (m, 3) to gaps (m, k) and their derivatives (m, k, 3) by the points.
+        start: (m, n) joint values.
+        steps: most of them.
+    """
+    q = np.array(chain.checked(start))
+    for _ in range(steps):
+        points, jacobian = joint_velocities(chain, q)
+        wide, by_point = gap(points)
+        if np.abs(wide).max(initial=0.0) < 1e-14:
+            break
+        rows = by_point @ jacobian
+        across = np.swapaxes(rows, 1, 2)
+        damped = rows @ across + _DAMPING * np.eye(wide.shape[1])
+        q -= (across @ np.linalg.solve(damped, wide[..., None]))[..., 0]
+    return q, np.linalg.norm(gap(chain.poses(q)[:, :3, 3])[0], axis=1)
+
+
+def to_positions(targets: Array) -> Gap:
+    """The gap to positions (m, 3)."""
+    return lambda points: (points - targets, np.broadcast_to(np.eye(3), (len(points), 3, 3)))
+
+
+def land(chain: Chain, gap: Callable[[Array], Gap], start: Array, rng: np.random.Generator) -> Array:
+    """Joint values (m, n) that close every gap; where one stays open, from another start.
+
+    Args:
+        chain: base and tool included.
+        gap: from sample numbers to their gap.
+        start: (m, n) joint values.
+        rng: draws the other starts.
+
+    Raises:
+        DhcalError: a gap stays open.
+    """
+    every = np.arange(len(start))
+    q, wide = solve(chain, gap(every), start, 60)
+    for _ in range(100):
+        left = np.flatnonzero(wide > REACHED)
+        if not left.size:
+            return q
+        again = start[rng.integers(0, len(start), len(left))] + rng.uniform(-1, 1, (len(left), chain.size))
+        q[left], wide[left] = solve(chain, gap(left), again, 60)
+    raise DhcalError("the simulated instrument is out of this arm's reach; try other joint values")

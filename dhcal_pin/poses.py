@@ -1,0 +1,335 @@
+"""Instruments that read the tool's place itself: positions, single axes, several targets, poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
+
+import numpy as np
+
+from . import se3
+from .chain import Chain, Sweep
+from .errors import DhcalError
+from .measurements import (
+    ANGLE_SIGMA,
+    LENGTH_SIGMA,
+    ZERO_PRIOR,
+    Noise,
+    PointReading,
+    Unknown,
+    checked,
+    checked_sigma,
+)
+from .se3 import Array
+
+_AXES = "xyz"
+
+
+@dataclass(frozen=True, eq=False)
+class Position(PointReading):
+    """Positions (m, 3) of the tool point in the measuring frame: laser tracker, CMM, trilaterated wires.
+
+    Sees the tool's point but not its rotation: one axis' zero and the tool's rotation stay unseen.
+    """
+
+    kind: ClassVar[str] = "position"
+    groups: ClassVar[Mapping[str, slice]] = {"position": slice(0, 3)}
+
+    @classmethod
+    def of(cls, q: Array, position: Array, sigma: Array | float | None = None) -> Position:
+        """Checked positions (m, 3) in m at joint values (m, n).
+
+        sigma is one number or (m, 3); without it, it is estimated with the fit.
+        """
+        q = checked(q, (None, None), "q")
+        m = len(q)
+        position = checked(position, (m, 3), "position")
+        sigmas = checked_sigma(LENGTH_SIGMA if sigma is None else sigma, (m, 3), "sigma")
+        return cls(q, position, sigmas, np.arange(1, m + 1), sigma is not None, ())
+
+    def model(self, points: Array, u: Array) -> tuple[Array, Array, Array]:
+        """The point itself."""
+        m = points.shape[-1]
+        return points[0], np.tile(np.eye(3)[None, :, :, None], (1, 1, 1, m)), np.empty((0, 3, m))
+
+    def whiten(self, sweep: Sweep, velocities: Array, u: Array) -> Array:
+        """(p, 3, m)."""
+        return velocities[:, :3] / self.sigma.T
+
+    def positions(self) -> Array:
+        """As measured, (m, 3)."""
+        return self.reading
+
+    @classmethod
+    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Position:
+        """Positions of a chain's tool with normal noise an axis."""
+        q = chain.checked(q)
+        position = chain.sweep(q).tool[3].T + noise.position * rng.standard_normal((len(q), 3))
+        return cls.of(q, position, noise.position or None)
+
+
+@dataclass(frozen=True, eq=False)
+class Axes(PointReading):
+    """Some of x, y, z of the tool point in the measuring frame: dial gauges, a height gauge.
+
+    Attributes:
+        axes: which of 0, 1, 2, as many as the reading has columns.
+    """
+
+    axes: tuple[int, ...] = (0, 1, 2)
+
+    kind: ClassVar[str] = "axes"
+    groups: ClassVar[Mapping[str, slice]] = {"axes": slice(None)}
+
+    @classmethod
+    def of(cls, q: Array, reading: Array, axes: Sequence[int], sigma: Array | float | None = None) -> Axes:
+        """Checked readings (m, k) in m along k of the axes 0, 1, 2."""
+        q = checked(q, (None, None), "q")
+        shape = (len(q), len(axes))
+        if not axes or not set(axes) <= {0, 1, 2} or len(set(axes)) != len(axes):
+            raise DhcalError(f"axes {tuple(axes)}: choose some of 0, 1, 2, each once")
+        sigmas = checked_sigma(LENGTH_SIGMA if sigma is None else sigma, shape, "sigma")
+        rows = np.arange(1, len(q) + 1)
+        return cls(q, checked(reading, shape, "reading"), sigmas, rows, sigma is not None, (), tuple(axes))
+
+    def model(self, points: Array, u: Array) -> tuple[Array, Array, Array]:
+        """The chosen coordinates."""
+        m, axes = points.shape[-1], list(self.axes)
+        return (
+            points[0][axes],
+            np.tile(np.eye(3)[axes][None, :, :, None], (1, 1, 1, m)),
+            np.empty((0, len(axes), m)),
+        )
+
+    @classmethod
+    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Axes:
+        """X and z of a chain's tool with normal noise."""
+        q = chain.checked(q)
+        position = chain.sweep(q).tool[3].T + noise.position * rng.standard_normal((len(q), 3))
+        return cls.of(q, position[:, [0, 2]], (0, 2), noise.position or None)
+
+
+@dataclass(frozen=True, eq=False)
+class Targets(PointReading):
+    """Positions (m, 3) of several reflectors on the tool, each at an unknown place.
+
+    The first name's place is the tool point itself; the others have three unknowns each, in the tool's
+    frame. Two of them show the tool's rotation about all axes but their line, three all of it.
+
+    Attributes:
+        label: (m,) which of the names.
+        names: reflectors in the order of first appearance.
+    """
+
+    label: Array = None  # pyright: ignore[reportAssignmentType]
+    names: tuple[str, ...] = ()
+
+    kind: ClassVar[str] = "targets"
+    groups: ClassVar[Mapping[str, slice]] = {"position": slice(0, 3)}
+    per_row: ClassVar = (*PointReading.per_row, "label")
+
+    @classmethod
+    def of(
+        cls, q: Array, position: Array, targets: Sequence[str], sigma: Array | float | None = None
+    ) -> Targets:
+        """Checked positions (m, 3) in m of named targets (m,)."""
+        plain = Position.of(q, position, sigma)
+        names, label = labelled(targets, len(plain.q), "targets")
+        unknowns = tuple(
+            Unknown(f"target_{name}.{axis}", "m", 0.0, ZERO_PRIOR) for name in names[1:] for axis in _AXES
+        )
+        return cls(plain.q, plain.reading, plain.sigma, plain.rows, plain.stated, unknowns, label, names)
+
+    def _offsets(self, sweep: Sweep, u: Array) -> Array:
+        """Each sample's target relative to the tool point, (3, m) in axes of the measuring frame."""
+        local = np.concatenate([np.zeros((1, 3)), u.reshape(-1, 3)])[self.label]
+        return np.einsum("crm,mc->rm", sweep.tool[:3], local)
+
+    def residual(self, sweep: Sweep, u: Array) -> Array:
+        """(3, m)."""
+        return (self.reading.T - sweep.tool[3] - self._offsets(sweep, u)) / self.sigma.T
+
+    def whiten(self, sweep: Sweep, velocities: Array, u: Array) -> Array:
+        """(p, 3, m): the target's velocity v + ω × offset."""
+        offset = self._offsets(sweep, u)
+        turned = np.cross(velocities[:, 3:], offset[None], axis=1)
+        return (velocities[:, :3] + turned) / self.sigma.T
+
+    def own(self, sweep: Sweep, u: Array) -> Array:
+        """(s, 3, m): the tool's axes where the sample is of that target."""
+        mine = self.label[None] == np.arange(1, len(self.names))[:, None]
+        out = mine[:, None, None, :] * sweep.tool[:3]
+        return out.reshape(-1, 3, out.shape[-1]) / self.sigma.T
+
+    def positions(self) -> Array:
+        """As measured, (m, 3): good enough to find the instrument by, as reflectors sit close together."""
+        return self.reading
+
+    @classmethod
+    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Targets:
+        """Three targets within 5 cm of each other, in turn."""
+        q = chain.checked(q)
+        label = np.arange(len(q)) % 3
+        places = np.array([[0, 0, 0], [0.05, 0, 0.01], [0, 0.04, -0.02]])[label]
+        pose = chain.poses(q)
+        position = pose[:, :3, 3] + np.einsum("mij,mj->mi", pose[:, :3, :3], places)
+        position += noise.position * rng.standard_normal(position.shape)
+        return cls.of(q, position, [f"t{i + 1}" for i in label], noise.position or None)
+
+
+def labelled(words: Sequence[str], count: int, what: str) -> tuple[tuple[str, ...], Array]:
+    """Distinct words in order of appearance, and which one each sample has (m,)."""
+    if len(words) != count:
+        raise DhcalError(f"{what}: {len(words)} names for {count} samples")
+    names = tuple(dict.fromkeys(words))
+    place = {name: i for i, name in enumerate(names)}
+    return names, np.array([place[word] for word in words], int)
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Poses of the tool in the measuring frame: position as above, rotation as rotation vectors.
+
+    The rotation residual is log3(R_measured·R_modelᵀ) in axes of the measuring frame, differentiated
+    exactly.
+
+    Attributes:
+        q: (m, n) joint values, rad or m.
+        poses: (m, 4, 4).
+        sigma: (m, 3) of the position, m.
+        rotation_sigma: (m, 3) about the measuring frame's axes, rad.
+        rows: (m,) row numbers.
+        stated: whether the sigmas are the instrument's own.
+    """
+
+    q: Array
+    poses: Array
+    sigma: Array
+    rotation_sigma: Array
+    rows: Array
+    stated: bool
+
+    kind: ClassVar[str] = "pose"
+    groups: ClassVar[Mapping[str, slice]] = {"position": slice(0, 3), "orientation": slice(3, 6)}
+
+    @classmethod
+    def of(
+        cls,
+        q: Array,
+        poses: Array,
+        sigma: Array | float | None = None,
+        rotation_sigma: Array | float | None = None,
+    ) -> Pose:
+        """Checked poses (m, 4, 4) at joint values (m, n).
+
+        Sigmas are one number or (m, 3), m and rad, both or neither; without them they are estimated
+        with the fit.
+        """
+        q = checked(q, (None, None), "q")
+        poses = checked(poses, (len(q), 4, 4), "poses")
+        rotation = poses[:, :3, :3]
+        off = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max(axis=(1, 2))
+        bad = np.flatnonzero((off > 1e-6) | (np.linalg.det(rotation) < 0))
+        if bad.size:
+            raise DhcalError(
+                f"poses: number {bad[0] + 1} is not a rotation (RRᵀ differs from I by {off[bad[0]]:.2g})"
+            )
+        if (sigma is None) != (rotation_sigma is None):
+            raise DhcalError("poses need the sigmas of position and of rotation, or neither")
+        m, stated = len(q), sigma is not None
+        return cls(
+            q,
+            poses,
+            checked_sigma(sigma if stated else LENGTH_SIGMA, (m, 3), "sigma"),
+            checked_sigma(rotation_sigma if stated else ANGLE_SIGMA, (m, 3), "rotation_sigma"),
+            np.arange(1, m + 1),
+            stated,
+        )
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        """None."""
+        return ()
+
+    def configurations(self) -> Array:
+        """As they are, (m, n)."""
+        return self.q
+
+    def started(self, chain: Chain) -> Self:
+        """Nothing to start."""
+        return self
+
+    def positions(self) -> Array:
+        """As measured, (m, 3)."""
+        return self.poses[:, :3, 3]
+
+    def rotations(self) -> Array:
+        """As measured, (m, 3, 3)."""
+        return self.poses[:, :3, :3]
+
+    def _turn(self, sweep: Sweep) -> Array:
+        """R_measured·R_modelᵀ (m, 3, 3)."""
+        return np.einsum("mik,kjm->mij", self.poses[:, :3, :3], sweep.tool[:3])
+
+    def _position(self, sweep: Sweep) -> Array:
+        return (self.poses[:, :3, 3].T - sweep.tool[3]) / self.sigma.T
+
+    def residual(self, sweep: Sweep, u: Array) -> Array:
+        """(6, m): x, y, z, then the rotation vector, over sigma."""
+        return np.concatenate([self._position(sweep), se3.log3(self._turn(sweep)).T / self.rotation_sigma.T])
+
+    def whiten(self, sweep: Sweep, velocities: Array, u: Array) -> Array:
+        """(p, 6, m); log3(E·exp(-ω)) = φ - Jr⁻¹(φ)·ω."""
+        out = np.empty_like(velocities)
+        np.divide(velocities[:, :3], self.sigma.T, out=out[:, :3])
+        mix = se3.right_jacobian_inverse(se3.log3(self._turn(sweep))) / self.rotation_sigma[:, :, None]
+        mix = np.ascontiguousarray(mix.transpose(1, 2, 0))
+        for i in range(3):
+            row = mix[i, 0] * velocities[:, 3]
+            row += mix[i, 1] * velocities[:, 4]
+            row += mix[i, 2] * velocities[:, 5]
+            out[:, 3 + i] = row
+        return out
+
+    def own(self, sweep: Sweep, u: Array) -> Array:
+        """Nothing, (0, 6, m)."""
+        return np.empty((0, 6, len(self.q)))
+
+    def small_angle(self, sweep: Sweep, velocities: Array, u: Array) -> tuple[Array, Array]:
+        """Half the vee of E - Eᵀ, E = R_measured·R_modelᵀ, is (36) seen in the measuring frame."""
+        turn = self._turn(sweep)
+        difference = 0.5 * (turn - np.swapaxes(turn, 1, 2))
+        sine = np.stack([difference[:, 2, 1], difference[:, 0, 2], difference[:, 1, 0]])
+        residual = np.concatenate([self._position(sweep), sine / self.rotation_sigma.T])
+        return residual, velocities / np.concatenate([self.sigma.T, self.rotation_sigma.T])
+
+    def errors(self, sweep: Sweep, u: Array) -> dict[str, Array]:
+        """{"position": (m, 3) in m, "orientation": (m, 3) rotation vectors in rad}."""
+        return {
+            "position": self.poses[:, :3, 3] - sweep.tool[3].T,
+            "orientation": se3.log3(self._turn(sweep)),
+        }
+
+    def take(self, index: Array | slice) -> Self:
+        """The samples of an index or mask."""
+        names = ("q", "poses", "sigma", "rotation_sigma", "rows")
+        return replace(self, **{name: getattr(self, name)[index] for name in names})
+
+    def scaled(self, scales: Mapping[str, float]) -> Self:
+        """The same readings with sigmas multiplied."""
+        return replace(
+            self,
+            sigma=self.sigma * scales["position"],
+            rotation_sigma=self.rotation_sigma * scales["orientation"],
+        )
+
+    @classmethod
+    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Pose:
+        """Poses of a chain's tool with normal noise an axis."""
+        q = chain.checked(q)
+        poses = chain.poses(q)
+        poses[:, :3, 3] += noise.position * rng.standard_normal((len(q), 3))
+        poses[:, :3, :3] = se3.exp3(noise.rotation * rng.standard_normal((len(q), 3))) @ poses[:, :3, :3]
+        known = noise.position > 0 and noise.rotation > 0
+        return cls.of(q, poses, noise.position if known else None, noise.rotation if known else None)
