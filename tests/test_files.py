@@ -326,7 +326,7 @@ def test_positions_are_written_to_the_last_digit(tmp_path_factory, rows, data):
     again = read_measurements(write(folder, "a.csv", measurement_text(wrote, chain, ["a", "b"])), chain)
     assert isinstance(again, Position)
     assert again.q.tolist() == wrote.q.tolist()
-    assert again.position.tolist() == wrote.position.tolist()
+    assert again.reading.tolist() == wrote.reading.tolist()
     assert again.stated == (sigma is not None)
     assert again.sigma.tolist() == wrote.sigma.tolist()
 
