@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from .result import accuracy as accuracy
     from .robot_files import read_robot as read_robot
     from .robot_files import write_urdf as write_urdf
+    from .viewer import scene_html as scene_html
+    from .viewer import show as show
 
 _HOMES = {
     "calibrate": "calibration",
@@ -50,6 +52,8 @@ _HOMES = {
     "accuracy": "result",
     "read_robot": "robot_files",
     "write_urdf": "robot_files",
+    "scene_html": "viewer",
+    "show": "viewer",
 }
 __all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .chain import Chain
+from .errors import DhcalError
 from .inverse import Gap, land, to_positions
 from .measurements import (
     LENGTH_SIGMA,
@@ -19,6 +20,9 @@ from .measurements import (
     Unknown,
     checked,
     checked_sigma,
+    gathered,
+    lengths,
+    need,
     places,
 )
 from .poses import labelled
@@ -26,6 +30,14 @@ from .se3 import Array
 from .trilateration import anchors_of
 
 _NOWHERE = np.zeros(3)
+_SIGMAS = ("sigma_x", "sigma_y", "sigma_z")
+
+
+def only(words: Sequence[str], what: str) -> str:
+    """The one word that all of them are, or DhcalError."""
+    if len(set(words)) != 1:
+        raise DhcalError(f"{what}: {', '.join(sorted(set(words)))} in one file; give each a file of its own")
+    return words[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +57,19 @@ class Touch(PointReading):
 
     kind: ClassVar[str] = "point"
     groups: ClassVar[Mapping[str, slice]] = {"position": slice(0, 3)}
+    columns: ClassVar[Mapping[str, str]] = {"point": "text", **dict.fromkeys(_SIGMAS, "length")}
+    needs: ClassVar[tuple[frozenset[str], ...]] = (need("point"),)
     per_row: ClassVar = (*PointReading.per_row, "label")
+
+    @classmethod
+    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> Touch:
+        """`point`, and sigmas."""
+        return cls.of(q[0], values["point"], gathered(values, _SIGMAS))
+
+    def to_columns(self) -> dict[str, Any]:
+        """`point`, and sigmas."""
+        out: dict[str, Any] = {"point": [self.names[i] for i in self.label]}
+        return out | ({name: self.sigma[:, i] for i, name in enumerate(_SIGMAS)} if self.stated else {})
 
     @classmethod
     def of(cls, q: ArrayLike, points: Sequence[str], sigma: ArrayLike | None = None) -> Touch:
@@ -101,6 +125,9 @@ class PointDistance(PointReading):
 
     kind: ClassVar[str] = "point_distance"
     groups: ClassVar[Mapping[str, slice]] = {"length": slice(0, 1)}
+    columns: ClassVar[Mapping[str, str]] = {"point_a": "text", "point_b": "text", **lengths("distance")}
+    needs: ClassVar[tuple[frozenset[str], ...]] = (need("point_a", "point_b", "distance"),)
+    ends: ClassVar[int] = 0
     per_row: ClassVar = (*PointReading.per_row, "label")
 
     @classmethod
@@ -115,6 +142,19 @@ class PointDistance(PointReading):
         unknowns = tuple(u for name in names for u in places(f"point_{name}", np.full(3, np.nan)))
         q, rows = np.zeros((len(pairs), size)), np.arange(1, len(pairs) + 1)
         return cls(q, distance, sigmas, rows, sigma is not None, unknowns, label.reshape(-1, 2), names)
+
+    @classmethod
+    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> PointDistance:
+        """`point_a`, `point_b`, `distance`, and its sigma."""
+        sigma = values.get("sigma_distance")
+        pairs = list(zip(values["point_a"], values["point_b"], strict=True))
+        size = q[0].shape[1]
+        return cls.of(size, pairs, values["distance"], None if sigma is None else sigma[:, None])
+
+    def to_columns(self) -> dict[str, Any]:
+        """`point_a`, `point_b`, `distance`, and its sigma."""
+        ends = {f"point_{end}": [self.names[i] for i in self.label[:, j]] for j, end in enumerate("ab")}
+        return ends | super().to_columns()
 
     def model(self, points: Array, u: Array) -> tuple[Array, Array, Array]:
         """|point_b - point_a|."""
@@ -147,26 +187,42 @@ class Plane(PointReading):
     With u = (s, t, h): (p - origin)·(normal + s·across + t·along) = h·|normal + s·across + t·along|.
 
     Attributes:
+        name: of the plane; measurements with the same name touch the same plane only within one item.
         origin: (3,) a point near the plane, and axes: (3, 3) rows normal, across, along; the chart.
     """
 
+    name: str = "1"
     origin: Array = field(default_factory=lambda: np.zeros(3))
     axes: Array = field(default_factory=lambda: np.eye(3))
 
     kind: ClassVar[str] = "plane"
     groups: ClassVar[Mapping[str, slice]] = {"height": slice(0, 1)}
+    columns: ClassVar[Mapping[str, str]] = {"plane": "text", "sigma_plane": "length"}
+    needs: ClassVar[tuple[frozenset[str], ...]] = (need("plane"),)
 
     @classmethod
-    def of(cls, q: ArrayLike, sigma: ArrayLike | None = None) -> Plane:
-        """Checked contacts at joint values (m, n) with one plane; sigma along its normal in m."""
+    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> Plane:
+        """`plane`, one name a file, and the sigma along its normal."""
+        sigma = values.get("sigma_plane")
+        return cls.of(q[0], None if sigma is None else sigma[:, None], only(values["plane"], "plane"))
+
+    def to_columns(self) -> dict[str, Any]:
+        """`plane`, and the sigma along its normal."""
+        out: dict[str, Any] = {"plane": [self.name] * len(self.rows)}
+        return out | ({"sigma_plane": self.sigma[:, 0]} if self.stated else {})
+
+    @classmethod
+    def of(cls, q: ArrayLike, sigma: ArrayLike | None = None, name: str = "1") -> Plane:
+        """Checked contacts at joint values (m, n) with the plane `name`; sigma along its normal in m."""
         q = checked(q, (None, None), "q")
         sigmas = checked_sigma(LENGTH_SIGMA if sigma is None else sigma, (len(q), 1), "sigma")
         unknowns = (
-            Unknown("plane.tilt_1", "rad", 0.0, PLACE_PRIOR),
-            Unknown("plane.tilt_2", "rad", 0.0, PLACE_PRIOR),
-            Unknown("plane.height", "m", 0.0, PLACE_PRIOR),
+            Unknown(f"plane_{name}.tilt_1", "rad", 0.0, PLACE_PRIOR),
+            Unknown(f"plane_{name}.tilt_2", "rad", 0.0, PLACE_PRIOR),
+            Unknown(f"plane_{name}.height", "m", 0.0, PLACE_PRIOR),
         )
-        return cls(q, np.zeros((len(q), 1)), sigmas, np.arange(1, len(q) + 1), sigma is not None, unknowns)
+        rows = np.arange(1, len(q) + 1)
+        return cls(q, np.zeros((len(q), 1)), sigmas, rows, sigma is not None, unknowns, name=name)
 
     def model(self, points: Array, u: Array) -> tuple[Array, Array, Array]:
         """The point's height over the plane, which is read as zero."""
@@ -206,22 +262,41 @@ class Plane(PointReading):
 
 @dataclass(frozen=True, eq=False)
 class Sphere(PointReading):
-    """The tool point on a sphere of known radius and unknown centre (`sphere.x, .y, .z`).
+    """The tool point on a sphere of known radius and unknown centre (`sphere_NAME.x, .y, .z`).
 
     The reading is the radius.
+
+    Attributes:
+        name: of the sphere.
     """
+
+    name: str = "1"
 
     kind: ClassVar[str] = "sphere"
     groups: ClassVar[Mapping[str, slice]] = {"radius": slice(0, 1)}
+    columns: ClassVar[Mapping[str, str]] = {"sphere": "text", **lengths("radius")}
+    needs: ClassVar[tuple[frozenset[str], ...]] = (need("sphere", "radius"),)
 
     @classmethod
-    def of(cls, q: ArrayLike, radius: ArrayLike, sigma: ArrayLike | None = None) -> Sphere:
+    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> Sphere:
+        """`sphere`, one name a file, `radius`, and its sigma."""
+        sigma = values.get("sigma_radius")
+        name = only(values["sphere"], "sphere")
+        return cls.of(q[0], values["radius"], None if sigma is None else sigma[:, None], name)
+
+    def to_columns(self) -> dict[str, Any]:
+        """`sphere`, `radius`, and its sigma."""
+        return {"sphere": [self.name] * len(self.rows)} | super().to_columns()
+
+    @classmethod
+    def of(cls, q: ArrayLike, radius: ArrayLike, sigma: ArrayLike | None = None, name: str = "1") -> Sphere:
         """Checked contacts at joint values (m, n) with a sphere of radius m, one number or (m,)."""
         q = checked(q, (None, None), "q")
         reading = checked(np.broadcast_to(np.asarray(radius, float), len(q)), (len(q),), "radius")[:, None]
         sigmas = checked_sigma(LENGTH_SIGMA if sigma is None else sigma, reading.shape, "sigma")
         rows = np.arange(1, len(q) + 1)
-        return cls(q, reading.copy(), sigmas, rows, sigma is not None, places("sphere", _NOWHERE))
+        unknowns = places(f"sphere_{name}", _NOWHERE)
+        return cls(q, reading.copy(), sigmas, rows, sigma is not None, unknowns, name)
 
     def model(self, points: Array, u: Array) -> tuple[Array, Array, Array]:
         """|p - centre|."""
@@ -233,7 +308,7 @@ class Sphere(PointReading):
     def started(self, chain: Chain) -> Self:
         """The centre that fits the chain's tool points best."""
         points = chain.poses(self.q)[:, :3, 3]
-        return replace(self, unknowns=places("sphere", anchors_of(points, self.reading[:, 0])))
+        return replace(self, unknowns=places(f"sphere_{self.name}", anchors_of(points, self.reading[:, 0])))
 
     @classmethod
     def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Sphere:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .chain import Chain
+from .errors import DhcalError
 from .measurements import (
     LENGTH_SIGMA,
     ZERO_PRIOR,
@@ -18,10 +19,15 @@ from .measurements import (
     Unknown,
     checked,
     checked_sigma,
+    gathered,
+    lengths,
+    need,
     places,
 )
 from .se3 import Array
 from .trilateration import anchors_of
+
+MOST_WIRES = 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +49,21 @@ class Wires(PointReading):
 
     kind: ClassVar[str] = "wires"
     groups: ClassVar[Mapping[str, slice]] = {"length": slice(None)}
+    columns: ClassVar[Mapping[str, str]] = lengths("length", *(f"L{i}" for i in range(1, MOST_WIRES + 1)))
+    needs: ClassVar[tuple[frozenset[str], ...]] = (need("length"), need("L1"))
+
+    @classmethod
+    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> Wires:
+        """`length`, or L1, L2, … in a row, and sigmas; anchors unknown, zeros zero."""
+        names = ["length"] if "length" in values else [n for n in cls.columns if n[0] == "L" and n in values]
+        if names != ["length"] and names != [f"L{i + 1}" for i in range(len(names))]:
+            raise DhcalError(f"wires {', '.join(names)}: number them L1, L2, … without a gap")
+        return cls.of(q[0], gathered(values, names), gathered(values, [f"sigma_{name}" for name in names]))
+
+    def reads(self) -> tuple[str, ...]:
+        """`length` for one wire, L1, L2, … for more."""
+        count = self.reading.shape[1]
+        return ("length",) if count == 1 else tuple(f"L{i + 1}" for i in range(count))
 
     @classmethod
     def of(
@@ -144,6 +165,9 @@ class Distance(PointReading):
 
     kind: ClassVar[str] = "distance"
     groups: ClassVar[Mapping[str, slice]] = {"length": slice(0, 1)}
+    columns: ClassVar[Mapping[str, str]] = lengths("distance")
+    needs: ClassVar[tuple[frozenset[str], ...]] = (need("distance"),)
+    ends: ClassVar[int] = 2
     per_row: ClassVar = (*PointReading.per_row, "q_to")
 
     @classmethod
@@ -156,6 +180,12 @@ class Distance(PointReading):
         distance = checked(distance, (len(q),), "distance")[:, None]
         sigmas = checked_sigma(LENGTH_SIGMA if sigma is None else sigma, distance.shape, "sigma")
         return cls(q, distance, sigmas, np.arange(1, len(q) + 1), sigma is not None, (), q_to)
+
+    @classmethod
+    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> Distance:
+        """`distance` between the configurations JOINT and to:JOINT."""
+        sigma = values.get("sigma_distance")
+        return cls.of(q[0], q[1], values["distance"], None if sigma is None else sigma[:, None])
 
     def configurations(self) -> Array:
         """First ends, then other ends, (2m, n)."""

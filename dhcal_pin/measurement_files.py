@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 import difflib
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,23 +15,24 @@ from . import se3
 from .chain import Chain
 from .errors import DhcalError
 from .files import ANGLES, LENGTHS, Column, PathLike, Sheet, check_names, read_sheet
+from .kinds import KINDS
 from .measurements import Measurement
-from .poses import Pose, Position
 from .se3 import Array
 
-_XYZ = ("x", "y", "z")
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _ROTVEC = ("rx", "ry", "rz")
-_TEXT = ("set", "pose_id")
 # Where a controller was told to go, and where it went with the calibrated model: for screening and for
 # judging a compensation, never fitted.
 _COMMANDED = ("commanded_x", "commanded_y", "commanded_z")
 _AFTER = ("after_x", "after_y", "after_z")
-_SIGMA = tuple(f"sigma_{name}" for name in _XYZ)
-_TURN_SIGMA = tuple(f"sigma_{name}" for name in _ROTVEC)
+_ASIDE = frozenset(("set", "pose_id", *_COMMANDED, *_AFTER))
 # No instrument is that good: m or rad.
 _LEAST_SIGMA = 1e-15
-_KNOWN = frozenset((*_XYZ, *_QUATERNION, *_ROTVEC, *_TEXT, *_COMMANDED, *_AFTER, *_SIGMA, *_TURN_SIGMA))
+# The second configuration of a row stands under the joints' names with this before them.
+_TO = "to:"
+_READINGS = frozenset(name for kind in KINDS.values() for name in kind.columns) | frozenset(_QUATERNION)
+_KNOWN = _READINGS | _ASIDE
+_QUANTITIES = {"length": LENGTHS, "angle": ANGLES}
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,14 +74,17 @@ def _group(sheet: Sheet, names: Sequence[str], units: Mapping[str, float] | None
     return np.stack([sheet.si(sheet.columns[name], units) for name in names], -1)
 
 
-def _joints(sheet: Sheet, chain: Chain) -> Array:
-    missing = [name for name in chain.joint_names if name not in sheet.columns]
+def _joints(sheet: Sheet, chain: Chain, before: str = "") -> Array:
+    """Joint values (m, n) under the joints' names, each with `before` in front."""
+    missing = [name for name in chain.joint_names if before + name not in sheet.columns]
     if missing:
+        every = ",".join(f"{before}{name}[{_unit(chain, name)}]" for name in chain.joint_names)
         raise DhcalError(
-            f"{sheet.source}:{sheet.header}: no column for joint {missing[0]!r}; "
-            f"this robot needs {','.join(f'{name}[{_unit(chain, name)}]' for name in chain.joint_names)}"
+            f"{sheet.source}:{sheet.header}: no column for joint {before + missing[0]!r}; "
+            f"this robot needs {every}"
         )
-    return np.stack([sheet.si(sheet.columns[name], _units(chain, name)) for name in chain.joint_names], -1)
+    columns = [(sheet.columns[before + name], _units(chain, name)) for name in chain.joint_names]
+    return np.stack([sheet.si(column, units) for column, units in columns], -1)
 
 
 def _units(chain: Chain, name: str) -> Mapping[str, float]:
@@ -99,7 +106,8 @@ def _check_joint_names(chain: Chain) -> None:
 
 
 def _check_columns(sheet: Sheet, chain: Chain) -> None:
-    joints = {joint.name for joint in chain.urdf.joints}
+    names = [joint.name for joint in chain.urdf.joints]
+    joints = {*names, *(_TO + name for name in names)}
     for name in sheet.columns:
         if name not in _KNOWN | joints:
             near = difflib.get_close_matches(name[:100], sorted(_KNOWN | joints), 1, 0.7)
@@ -114,8 +122,72 @@ def _check_columns(sheet: Sheet, chain: Chain) -> None:
             )
 
 
+def _kind(sheet: Sheet) -> type[Measurement]:
+    """The kind with the most of its columns there, or DhcalError if a column does not go with it."""
+    there = set(sheet.columns) & _READINGS
+    if there & set(_QUATERNION):
+        there = there - set(_QUATERNION) | set(_ROTVEC)
+    fits = [
+        (len(wanted), -len(kind.columns), kind)
+        for kind in KINDS.values()
+        for wanted in kind.needs
+        if wanted <= there
+    ]
+    where = f"{sheet.source}:{sheet.header}"
+    if not fits:
+        lone = f"; {', '.join(sorted(there))} alone is not enough" if there else ""
+        raise DhcalError(
+            f"{where}: no readings{lone}; a position needs the columns x[mm],y[mm],z[mm], "
+            "a pose qw,qx,qy,qz beside them"
+        )
+    kind = max(fits, key=lambda fit: fit[:2])[2]
+    if odd := sorted(there - set(kind.columns)):
+        raise DhcalError(
+            f"{where}: column {odd[0]!r} does not go with {', '.join(sorted(there & set(kind.columns)))}; "
+            f"a {kind.kind} file has {', '.join(kind.columns)}"
+        )
+    return kind
+
+
+def _values(sheet: Sheet, kind: type[Measurement]) -> dict[str, Any]:
+    """The kind's columns in SI, or as text; a quaternion as a rotation vector."""
+    out: dict[str, Any] = {}
+    for name, what in kind.columns.items():
+        if name not in sheet.columns:
+            continue
+        column = sheet.columns[name]
+        out[name] = sheet.text(column) if what == "text" else sheet.si(column, _QUANTITIES[what])
+        if "sigma" in name and (bad := np.flatnonzero(out[name] < _LEAST_SIGMA)).size:
+            raise DhcalError(
+                f"{sheet.source}:{sheet.lines[bad[0]]}: column {name!r}: must be above zero; "
+                "leave the sigma columns out where they are not known"
+            )
+        if what == "text" and "" in out[name]:
+            line = sheet.lines[out[name].index("")]
+            raise DhcalError(f"{sheet.source}:{line}: column {name!r}: is empty; write a name")
+    if set(_QUATERNION) & set(sheet.columns):
+        if set(_ROTVEC) & set(sheet.columns):
+            raise DhcalError(f"{sheet.source}:{sheet.header}: both qw… and rx… given; keep one rotation")
+        turn = se3.log3(_from_quaternion(sheet, _group(sheet, _QUATERNION, None)))
+        out |= {name: turn[:, i] for i, name in enumerate(_ROTVEC)}
+    return out
+
+
+def _whole_sigmas(sheet: Sheet, kind: type[Measurement], values: Mapping[str, Any]) -> None:
+    """Complains about some sigmas without the others."""
+    wanted = [f"sigma_{name}" for name in kind.columns if name in values and f"sigma_{name}" in kind.columns]
+    wanted = wanted or [name for name in kind.columns if name.startswith("sigma_")]
+    given = [name for name in wanted if name in values]
+    if given and len(given) < len(wanted):
+        lacking = next(name for name in wanted if name not in values)
+        raise DhcalError(
+            f"{sheet.source}:{sheet.header}: {', '.join(given)} without {lacking!r}; "
+            f"give {','.join(wanted)} or none"
+        )
+
+
 def read_readings(path: PathLike, chain: Chain) -> Readings:
-    """A measurement CSV file of positions or poses, for a chain's joints.
+    """A measurement CSV file of any kind, for a chain's joints.
 
     Raises:
         DhcalError: what is wrong, with file, line and column, and what would be right.
@@ -123,31 +195,14 @@ def read_readings(path: PathLike, chain: Chain) -> Readings:
     sheet = read_sheet(path)
     _check_joint_names(chain)
     _check_columns(sheet, chain)
-    where = f"{sheet.source}:{sheet.header}"
-    q = _joints(sheet, chain)
-    position = _group(sheet, _XYZ, LENGTHS)
-    quaternion, rotvec = _group(sheet, _QUATERNION, None), _group(sheet, _ROTVEC, ANGLES)
-    if position is None:
-        raise DhcalError(f"{where}: no readings; a position needs the columns x[mm],y[mm],z[mm]")
-    if quaternion is not None and rotvec is not None:
-        raise DhcalError(f"{where}: both qw… and rx… given; keep one rotation")
-    sigma, turn_sigma = _group(sheet, _SIGMA, LENGTHS), _group(sheet, _TURN_SIGMA, ANGLES)
-    for values, names in ((sigma, _SIGMA), (turn_sigma, _TURN_SIGMA)):
-        if values is not None and (bad := np.argwhere(values < _LEAST_SIGMA)).size:
-            row, column = bad[0]
-            raise DhcalError(
-                f"{sheet.source}:{sheet.lines[row]}: column {names[column]!r}: must be above zero; "
-                "leave the sigma columns out where they are not known"
-            )
-    if quaternion is None and rotvec is None:
-        if turn_sigma is not None:
-            raise DhcalError(f"{where}: sigma_rx… without a rotation; remove it or add qw,qx,qy,qz")
-        data: Measurement = Position.of(q, position, sigma)
-    else:
-        if (sigma is None) != (turn_sigma is None):
-            raise DhcalError(f"{where}: give sigma_x… and sigma_rx… for a pose, both or neither")
-        turn = se3.exp3(rotvec) if rotvec is not None else _from_quaternion(sheet, quaternion)
-        data = Pose.of(q, se3.transform(turn, position), sigma, turn_sigma)
+    kind = _kind(sheet)
+    values = _values(sheet, kind)
+    _whole_sigmas(sheet, kind, values)
+    q = [_joints(sheet, chain, before) for before in ("", _TO)[: kind.ends]]
+    try:
+        data = kind.from_columns(q or [np.zeros((len(sheet.cells), chain.size))], values)
+    except DhcalError as error:
+        raise DhcalError(f"{sheet.source}: {error}") from None
     held = _held(sheet)
     return Readings(
         sheet.source,
@@ -186,7 +241,7 @@ def _held(sheet: Sheet) -> Array:
 
 
 def read_measurements(path: PathLike, chain: Chain) -> Measurement:
-    """All rows of a measurement CSV file; positions where it has no rotation, poses where it has.
+    """All rows of a measurement CSV file, of the kind that its columns tell.
 
     Raises:
         DhcalError: what is wrong, with file, line and column, and what would be right.
@@ -195,25 +250,24 @@ def read_measurements(path: PathLike, chain: Chain) -> Measurement:
 
 
 def measurement_text(data: Measurement, chain: Chain, comments: Sequence[str] = ()) -> str:
-    """The CSV text of positions or poses in metres and radians, exact to the last digit.
+    """The CSV text of readings of any kind in metres and radians, exact to the last digit.
 
     Raises:
         DhcalError: a joint's name cannot head a column.
     """
     _check_joint_names(chain)
-    columns: list[tuple[str, Array]] = []
-    for j, name in enumerate(chain.joint_names):
-        columns.append((f"{name}[{'m' if _units(chain, name) is LENGTHS else 'rad'}]", data.q[:, j]))
-    columns += [(f"{name}[m]", data.positions()[:, i]) for i, name in enumerate(_XYZ)]
-    if isinstance(data, Pose):
-        turn = se3.log3(data.poses[:, :3, :3])
-        columns += [(f"{name}[rad]", turn[:, i]) for i, name in enumerate(_ROTVEC)]
-    if isinstance(data, Position | Pose) and data.stated:
-        columns += [(f"{name}[m]", data.sigma[:, i]) for i, name in enumerate(_SIGMA)]
-    if isinstance(data, Pose) and data.stated:
-        columns += [(f"{name}[rad]", data.rotation_sigma[:, i]) for i, name in enumerate(_TURN_SIGMA)]
-    lines = [f"# {comment}" for comment in comments] + [",".join(name for name, _ in columns)]
-    lines += [
-        ",".join(map(repr, row)) for row in zip(*(values.tolist() for _, values in columns), strict=True)
-    ]
-    return "\n".join(lines) + "\n"
+    columns: dict[str, Any] = {}
+    for before, q in zip(
+        ("", _TO)[: data.ends], np.split(data.configurations(), max(data.ends, 1)), strict=False
+    ):
+        for j, name in enumerate(chain.joint_names):
+            columns[f"{before}{name}[{'m' if _units(chain, name) is LENGTHS else 'rad'}]"] = q[:, j].tolist()
+    for name, values in data.to_columns().items():
+        unit = {"length": "[m]", "angle": "[rad]", "text": ""}[data.columns[name]]
+        columns[name + unit] = list(values) if unit == "" else values.tolist()
+    out = io.StringIO()
+    out.writelines(f"# {comment}\n" for comment in comments)
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*columns.values(), strict=True))
+    return out.getvalue()

@@ -55,6 +55,12 @@ class Measurement(Protocol):
 
     kind: ClassVar[str]
     groups: ClassVar[Mapping[str, slice]]
+    # The kind's columns in a file and what they hold: "length", "angle" or "text"; sigmas included.
+    columns: ClassVar[Mapping[str, str]]
+    # A file is of this kind if it has all columns of one of these.
+    needs: ClassVar[tuple[frozenset[str], ...]]
+    # Configurations a row: 0, 1, or 2, the second under to:JOINT.
+    ends: ClassVar[int]
 
     @property
     def q(self) -> Array:
@@ -125,6 +131,30 @@ class Measurement(Protocol):
         """Readings of a chain with normal noise, the instrument standing somewhere sensible."""
         ...
 
+    @classmethod
+    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> Self:
+        """The readings of a file: joint values (m, n) an end, and its columns (m,) in SI or as text."""
+        ...
+
+    def to_columns(self) -> dict[str, Any]:
+        """The columns (m,) that a file of these readings has, in SI or as text."""
+        ...
+
+
+def need(*names: str) -> frozenset[str]:
+    """Columns that go together."""
+    return frozenset(names)
+
+
+def gathered(values: Mapping[str, Any], names: Sequence[str]) -> Any:
+    """Columns (m, k), or None where they are not all there."""
+    return np.stack([values[name] for name in names], -1) if all(name in values for name in names) else None
+
+
+def lengths(*names: str) -> dict[str, str]:
+    """Columns of lengths and their sigmas."""
+    return {**dict.fromkeys(names, "length"), **{f"sigma_{name}": "length" for name in names}}
+
 
 def checked_sigma(value: Any, shape: tuple[int, int], what: str) -> Array:
     """Sigmas of that shape from one number or as many, positive and finite; or DhcalError."""
@@ -186,12 +216,27 @@ class PointReading:
 
     kind: ClassVar[str]
     groups: ClassVar[Mapping[str, slice]]
+    columns: ClassVar[Mapping[str, str]]
+    needs: ClassVar[tuple[frozenset[str], ...]]
+    ends: ClassVar[int] = 1
     # Fields with an entry a sample.
     per_row: ClassVar[tuple[str, ...]] = ("q", "reading", "sigma", "rows")
 
     def model(self, points: Array, u: Array) -> tuple[Array, Array, Array]:
         """Modelled reading (k, m) of tool points (c, 3, m), its derivatives (c, k, 3, m) and (s, k, m)."""
         raise NotImplementedError
+
+    def reads(self) -> tuple[str, ...]:
+        """The columns of the reading, as many as it has."""
+        return tuple(name for name, what in self.columns.items() if what == "length" and "sigma" not in name)
+
+    def to_columns(self) -> dict[str, Any]:
+        """The reading's columns, and their sigmas where these are the instrument's own."""
+        names = self.reads()
+        out = {name: self.reading[:, i] for i, name in enumerate(names)}
+        if self.stated:
+            out |= {f"sigma_{name}": self.sigma[:, i] for i, name in enumerate(names)}
+        return out
 
     def configurations(self) -> Array:
         """As they are, (m, n)."""

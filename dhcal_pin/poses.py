@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -20,10 +20,16 @@ from .measurements import (
     Unknown,
     checked,
     checked_sigma,
+    gathered,
+    lengths,
+    need,
 )
 from .se3 import Array
 
-_AXES = "xyz"
+_AXES = ("x", "y", "z")
+_TURNS = ("rx", "ry", "rz")
+_SIGMAS = tuple(f"sigma_{name}" for name in _AXES)
+_TURN_SIGMAS = tuple(f"sigma_{name}" for name in _TURNS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +41,13 @@ class Position(PointReading):
 
     kind: ClassVar[str] = "position"
     groups: ClassVar[Mapping[str, slice]] = {"position": slice(0, 3)}
+    columns: ClassVar[Mapping[str, str]] = lengths(*_AXES)
+    needs: ClassVar[tuple[frozenset[str], ...]] = (need(*_AXES),)
+
+    @classmethod
+    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> Position:
+        """x, y, z and their sigmas."""
+        return cls.of(q[0], gathered(values, _AXES), gathered(values, _SIGMAS))
 
     @classmethod
     def of(cls, q: Array, position: Array, sigma: Array | float | None = None) -> Position:
@@ -81,6 +94,20 @@ class Axes(PointReading):
 
     kind: ClassVar[str] = "axes"
     groups: ClassVar[Mapping[str, slice]] = {"axes": slice(None)}
+    columns: ClassVar[Mapping[str, str]] = lengths(*_AXES)
+    needs: ClassVar[tuple[frozenset[str], ...]] = tuple(need(axis) for axis in _AXES)
+
+    @classmethod
+    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> Axes:
+        """One or two of x, y, z, and their sigmas."""
+        axes = [i for i, axis in enumerate(_AXES) if axis in values]
+        names = [_AXES[i] for i in axes]
+        reading = gathered(values, names)
+        return cls.of(q[0], reading, axes, gathered(values, [f"sigma_{name}" for name in names]))
+
+    def reads(self) -> tuple[str, ...]:
+        """The chosen ones of x, y, z."""
+        return tuple(_AXES[i] for i in self.axes)
 
     @classmethod
     def of(cls, q: Array, reading: Array, axes: Sequence[int], sigma: Array | float | None = None) -> Axes:
@@ -127,7 +154,18 @@ class Targets(PointReading):
 
     kind: ClassVar[str] = "targets"
     groups: ClassVar[Mapping[str, slice]] = {"position": slice(0, 3)}
+    columns: ClassVar[Mapping[str, str]] = lengths(*_AXES) | {"target": "text"}
+    needs: ClassVar[tuple[frozenset[str], ...]] = (need(*_AXES, "target"),)
     per_row: ClassVar = (*PointReading.per_row, "label")
+
+    @classmethod
+    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> Targets:
+        """x, y, z, target, and sigmas."""
+        return cls.of(q[0], gathered(values, _AXES), values["target"], gathered(values, _SIGMAS))
+
+    def to_columns(self) -> dict[str, Any]:
+        """x, y, z, target, and sigmas."""
+        return super().to_columns() | {"target": [self.names[i] for i in self.label]}
 
     @classmethod
     def of(
@@ -212,6 +250,28 @@ class Pose:
 
     kind: ClassVar[str] = "pose"
     groups: ClassVar[Mapping[str, slice]] = {"position": slice(0, 3), "orientation": slice(3, 6)}
+    columns: ClassVar[Mapping[str, str]] = lengths(*_AXES) | {
+        **dict.fromkeys(_TURNS, "angle"),
+        **dict.fromkeys(_TURN_SIGMAS, "angle"),
+    }
+    needs: ClassVar[tuple[frozenset[str], ...]] = (need(*_AXES, *_TURNS),)
+    ends: ClassVar[int] = 1
+
+    @classmethod
+    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> Pose:
+        """x, y, z, the rotation vector rx, ry, rz, and the sigmas of both or neither."""
+        poses = se3.transform(se3.exp3(gathered(values, _TURNS)), gathered(values, _AXES))
+        return cls.of(q[0], poses, gathered(values, _SIGMAS), gathered(values, _TURN_SIGMAS))
+
+    def to_columns(self) -> dict[str, Any]:
+        """x, y, z, rx, ry, rz, and sigmas where these are the instrument's own."""
+        turn = se3.log3(self.poses[:, :3, :3])
+        out = {name: self.poses[:, i, 3] for i, name in enumerate(_AXES)}
+        out |= {name: turn[:, i] for i, name in enumerate(_TURNS)}
+        if self.stated:
+            out |= {name: self.sigma[:, i] for i, name in enumerate(_SIGMAS)}
+            out |= {name: self.rotation_sigma[:, i] for i, name in enumerate(_TURN_SIGMAS)}
+        return out
 
     @classmethod
     def of(

@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from . import se3
 from .chain import Chain, Sweep
-from .measurements import ANGLE_SIGMA, LENGTH_SIGMA, Noise, Unknown, checked, checked_sigma
+from .measurements import (
+    ANGLE_SIGMA,
+    LENGTH_SIGMA,
+    Noise,
+    Unknown,
+    checked,
+    checked_sigma,
+    gathered,
+    lengths,
+    need,
+)
 from .se3 import Array
+
+_SHIFT, _TURN = ("dx", "dy", "dz"), ("drx", "dry", "drz")
+_SHIFT_SIGMA, _TURN_SIGMA = (tuple(f"sigma_{name}" for name in names) for names in (_SHIFT, _TURN))
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +53,28 @@ class RelativePose:
 
     kind: ClassVar[str] = "relative"
     groups: ClassVar[Mapping[str, slice]] = {"position": slice(0, 3), "orientation": slice(3, 6)}
+    columns: ClassVar[Mapping[str, str]] = lengths(*_SHIFT) | {
+        **dict.fromkeys(_TURN, "angle"),
+        **dict.fromkeys(_TURN_SIGMA, "angle"),
+    }
+    needs: ClassVar[tuple[frozenset[str], ...]] = (need(*_SHIFT, *_TURN),)
+    ends: ClassVar[int] = 2
+
+    @classmethod
+    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> RelativePose:
+        """dx, dy, dz and the rotation vector drx, dry, drz from JOINT to to:JOINT, and sigmas."""
+        poses = se3.transform(se3.exp3(gathered(values, _TURN)), gathered(values, _SHIFT))
+        return cls.of(q[0], q[1], poses, gathered(values, _SHIFT_SIGMA), gathered(values, _TURN_SIGMA))
+
+    def to_columns(self) -> dict[str, Any]:
+        """dx, dy, dz, drx, dry, drz, and sigmas where these are the instrument's own."""
+        turn = se3.log3(self.poses[:, :3, :3])
+        out = {name: self.poses[:, i, 3] for i, name in enumerate(_SHIFT)}
+        out |= {name: turn[:, i] for i, name in enumerate(_TURN)}
+        if self.stated:
+            out |= {name: self.sigma[:, i] for i, name in enumerate(_SHIFT_SIGMA)}
+            out |= {name: self.rotation_sigma[:, i] for i, name in enumerate(_TURN_SIGMA)}
+        return out
 
     @classmethod
     def of(

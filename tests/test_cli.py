@@ -162,7 +162,7 @@ DATA = {
         "\n".join(",".join(line.split(",")[:3]) for line in LINES),
         ["data.csv:1:", "x[mm],y[mm],z[mm]"],
     ),
-    "no z": ("\n".join(line[: line.rindex(",")] for line in LINES), ["data.csv:1:", "x, y without 'z'"]),
+    "point beside a position": (column("point", ["a", "b"]), ["data.csv:1:", "'point' does not go with"]),
     "row too short": ("\n".join([*LINES[:3], "1,2,3"]), ["data.csv:4:", "3 values", "6 columns"]),
     "row too long": (
         "\n".join([*LINES[:3], "1,2,3,4,5,6,7"]),
@@ -190,11 +190,11 @@ DATA = {
     "one sigma": (column("sigma_x[mm]", [1]), ["data.csv:1:", "sigma_x without 'sigma_y'"]),
     "sigma of no rotation": (
         column("sigma_rx[rad],sigma_ry[rad],sigma_rz[rad]", ["1,1,1"]),
-        ["data.csv:1:", "without a rotation"],
+        ["data.csv:1:", "'sigma_rx' does not go with"],
     ),
     "sigma of half a pose": (
         column(f"{ROTATION},{SIGMA}", ["0,0,0,1,1,1"]),
-        ["data.csv:1:", "both or neither"],
+        ["data.csv:1:", "without 'sigma_rx'", "or none"],
     ),
     "wrong set": (column("set", ["fit", "train"]), ["data.csv:3:", "'set'", "'train'", "fit or holdout"]),
     "all held out": (column("set", ["holdout", "holdout"]), ["data.csv: every row is held out"]),

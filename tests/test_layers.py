@@ -31,6 +31,7 @@ LAYERS = (
     {"exports"},
     {"report"},
     {"terminal"},
+    {"viewer"},
     {"demo"},
     {"commands"},
     {"cli"},
