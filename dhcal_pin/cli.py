@@ -84,6 +84,7 @@ def parser() -> argparse.ArgumentParser:
         commands, "demo", "the paper's arm and its measured table, end to end", "dhcal demo --out demo"
     )
     demo.add_argument("--out", default="demo", metavar="DIR", help="folder for the results (default: demo)")
+    demo.add_argument("--open", action="store_true", help="open the scene in the browser")
     demo.add_argument("--json", metavar="FILE", help="the result as JSON to one more place; - for stdout")
 
     calibrate = _add(
@@ -154,6 +155,22 @@ def parser() -> argparse.ArgumentParser:
         "--convention", choices=("standard", "modified"), help="of a DH file that is written"
     )
 
+    view = _add(
+        commands,
+        "view",
+        "nominal and calibrated arm in one offline web page, errors enlarged by a slider",
+        "dhcal view ur10.urdf ur10_calibrated.urdf --tip tool0 --data laser.csv --html scene.html",
+    )
+    view.add_argument("nominal", metavar="NOMINAL.urdf", help="URDF or DH file")
+    view.add_argument("calibrated", metavar="CALIBRATED.urdf", nargs="?", help="the same robot, calibrated")
+    view.add_argument("--data", metavar="DATA", nargs="+", default=[], help="measurements to draw and play")
+    view.add_argument("--html", metavar="FILE", help="where to write the page (default: open it)")
+    view.add_argument("--open", action="store_true", help="open the page in the browser")
+    view.add_argument(
+        "--magnification", metavar="S", type=float, default=1.0, help="errors at first, 1 to 500 (1)"
+    )
+    view.add_argument("--tip", **_TIP)
+
     check = _add(
         commands,
         "check",
@@ -177,9 +194,7 @@ def parser() -> argparse.ArgumentParser:
     )
     simulate.add_argument("-o", "--output", metavar="data.csv", required=True, help="measurement CSV file")
     simulate.add_argument("--truth", metavar="T.urdf", help="the robot that is measured (default: ROBOT)")
-    simulate.add_argument(
-        "--kind", choices=("pose", "position"), default="pose", help="what is measured (pose)"
-    )
+    simulate.add_argument("--kind", metavar="KIND", default="pose", help="what is measured (pose)")
     simulate.add_argument("--tip", **_TIP)
     simulate.add_argument("--seed", metavar="N", type=_seed, default=0, help="of joint values and noise (0)")
     return out

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import os
 import sys
+import tempfile
 from argparse import Namespace
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from . import calibration, demo, exports, report, terminal, ur_kinematics
+from . import calibration, demo, exports, report, terminal, ur_kinematics, viewer
 from .chain import Chain
 from .check import crosscheck
 from .dh_files import dh_text, is_dh
@@ -259,6 +260,8 @@ def _simulate(args: Namespace) -> int:
     robots = [args.robot, *([args.truth] if args.truth else [])]
     _check_outputs([args.output], [*robots, *_sidecars(robots)])
     noise = Noise(*parse_noise(args.noise))
+    if args.kind not in KINDS:
+        raise DhcalError(f"--kind {args.kind}: choose from {', '.join(KINDS)}")
     chain = truth = read_robot(args.robot, args.tip)
     if args.truth:
         truth = read_robot(args.truth, None if is_table(args.truth) else args.tip)
@@ -287,9 +290,29 @@ def _configurations(chain: Chain, count: int, rng: np.random.Generator) -> Array
     return rng.uniform(low, high, (count, chain.size))
 
 
+def _view(args: Namespace) -> int:
+    given = [args.nominal, *([args.calibrated] if args.calibrated else [])]
+    page = args.html or os.path.join(tempfile.mkdtemp(prefix="dhcal-"), f"{robot_name(args.nominal)}.html")
+    _check_outputs([page], [*given, *_sidecars(given), *args.data])
+    nominal, *calibrated = (read_robot(path, None if is_table(path) else args.tip) for path in given)
+    data = [read_measurements(path, nominal) for path in args.data]
+    title = " and ".join(robot_name(path) for path in given)
+    text = viewer.scene_html(
+        nominal, *calibrated, measurements=data, title=title, magnification=args.magnification
+    )
+    save({page: text})
+    terminal.lines(f"wrote {page}")
+    if args.open or not args.html:
+        terminal.open_page(page)
+    return 0
+
+
 def _demo(args: Namespace) -> int:
     _check_outputs([args.json], [])
-    _emit(args.json, demo.run(args.out))
+    document = demo.run(args.out)
+    _emit(args.json, document)
+    if args.open:
+        terminal.open_page(document["files"]["scene"])
     return 0
 
 
@@ -298,6 +321,7 @@ COMMANDS: dict[str, Callable[[Namespace], int]] = {
     "calibrate": _calibrate,
     "validate": _validate,
     "convert": _convert,
+    "view": _view,
     "check": _check,
     "simulate": _simulate,
 }

@@ -217,9 +217,9 @@ class Plane(PointReading):
         q = checked(q, (None, None), "q")
         sigmas = checked_sigma(LENGTH_SIGMA if sigma is None else sigma, (len(q), 1), "sigma")
         unknowns = (
-            Unknown(f"plane_{name}.tilt_1", "rad", 0.0, PLACE_PRIOR),
-            Unknown(f"plane_{name}.tilt_2", "rad", 0.0, PLACE_PRIOR),
-            Unknown(f"plane_{name}.height", "m", 0.0, PLACE_PRIOR),
+            Unknown(f"plane_{name}.tilt_1", "rad", 0.0, PLACE_PRIOR, local=True),
+            Unknown(f"plane_{name}.tilt_2", "rad", 0.0, PLACE_PRIOR, local=True),
+            Unknown(f"plane_{name}.height", "m", 0.0, PLACE_PRIOR, local=True),
         )
         rows = np.arange(1, len(q) + 1)
         return cls(q, np.zeros((len(q), 1)), sigmas, rows, sigma is not None, unknowns, name=name)

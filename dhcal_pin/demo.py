@@ -25,6 +25,7 @@ from .robot_files import urdf_files
 from .screening import Finding, screen
 from .se3 import Array
 from .solver import Problem, gauss_newton, reduce
+from .viewer import scene_html
 
 SEEDS, TESTS = 50, 100
 _STEPS = (0, 1, 2, 3, 5, 10)
@@ -320,6 +321,7 @@ def run(out: PathLike) -> dict[str, Any]:
         "nominal": nominal,
         "json": os.path.join(folder, "result.json"),
         "summary": os.path.join(folder, "summary.md"),
+        "scene": os.path.join(folder, "scene.html"),
     }
     inputs = [paper_file("experiment.dh.toml"), paper_file("experiment_table5.csv")]
     document = report.document(
@@ -331,6 +333,9 @@ def run(out: PathLike) -> dict[str, Any]:
         },
         [finding.row for finding in found.findings],
     ) | {"experiment_m": found.figures}
+    contents[files["scene"]] = scene_html(
+        found.chain, found.fit.chain, measurements=[found.data], title="The paper's robot, before and after"
+    )
     contents[files["json"]] = report.json_text(document)
     contents[files["summary"]] = "\n\n".join(
         [

@@ -34,12 +34,14 @@ class Unknown:
         unit: "m" or "rad".
         nominal: where the search starts.
         prior: standard deviation about that, in its unit.
+        local: whether its value only means something to the very measurement that started it.
     """
 
     name: str
     unit: str
     nominal: float
     prior: float
+    local: bool = False
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,8 @@ MEASURES = (
     ("position_rms_m", "position RMS", "m"),
     ("position_max_m", "position, largest", "m"),
     ("orientation_rms_rad", "orientation RMS", "rad"),
+    ("residual_rms", "other residuals, RMS", "m"),
+    ("residual_max", "other residuals, largest", "m"),
 )
 
 
@@ -91,9 +93,9 @@ def document(
         "parameters_total": len(fit.parameters),
         "condition": fit.condition,
         "before": accuracy(fit.reference, fit.data),
-        "after": accuracy(fit.chain, fit.data),
+        "after": accuracy(fit.chain, fit.data, fit.instruments),
         "holdout_before": accuracy(fit.reference, fit.holdout),
-        "holdout_after": accuracy(fit.chain, fit.holdout),
+        "holdout_after": accuracy(fit.chain, fit.holdout, fit.instruments),
         "parameters": parameter_rows(fit),
         "unobservable": fit.unobservable,
         "outliers": list(outliers),
@@ -180,7 +182,7 @@ def accuracy_rows(fit: Result) -> list[list[str]]:
         if not data:
             continue
         title = f"{sum(len(item.q) for item in data)} {title}"
-        before, after = accuracy(fit.reference, data), accuracy(fit.chain, data)
+        before, after = accuracy(fit.reference, data), accuracy(fit.chain, data, fit.instruments)
         for key, label, unit in MEASURES:
             if key in before:
                 rows.append([title, label, shown(before[key], unit), shown(after[key], unit)])

@@ -39,7 +39,8 @@ def accuracy(
         known: values of instruments' unknowns; others (a point that only these data touch) are fitted
             to the data first.
     """
-    values = _instrument(chain, data, known or {})
+    data = [item.started(chain) for item in data]
+    values = _instruments(chain, data, known or {})
     groups: dict[str, list[Array]] = {}
     for item in data:
         u = np.array([values[unknown.name] for unknown in item.unknowns])
@@ -63,14 +64,15 @@ def accuracy(
     return out
 
 
-def _instrument(chain: Chain, data: Sequence[Measurement], known: Mapping[str, float]) -> dict[str, float]:
+def _instruments(chain: Chain, data: Sequence[Measurement], known: Mapping[str, float]) -> dict[str, float]:
     """Values of the data's unknowns by name, those that are not known fitted to the data alone."""
-    started = tuple(item.started(chain) for item in data)
-    free = [unknown for unknown in shared_unknowns(started) if unknown.name not in known]
-    problem = Problem(ErrorModel(chain, ()), started, np.array([1 / u.prior for u in free]), known)
-    if not free:
-        return problem.instruments(np.empty(0))
-    return problem.instruments(levenberg_marquardt(problem, np.zeros(len(free)), 100, None).x)
+    every = shared_unknowns(data)
+    given = {u.name: known[u.name] for u in every if u.name in known and not u.local}
+    weights = np.array([1 / u.prior for u in every if u.name not in given])
+    problem = Problem(ErrorModel(chain, ()), tuple(data), weights, given)
+    if not len(weights):
+        return given
+    return problem.instruments(levenberg_marquardt(problem, np.zeros(len(weights)), 100, None).x)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import webbrowser
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -100,6 +102,13 @@ def summary(fit: Result, files: Mapping[str, str]) -> None:
         lines(f"not observable: {text}", style="yellow")
     for name, path in files.items():
         lines(f"wrote {name}: {path}")
+
+
+def open_page(path: str) -> None:
+    """Shows a page in the browser, or says where it lies."""
+    url = Path(path).resolve().as_uri()
+    if not webbrowser.open(url):
+        lines(f"no browser here; open {url}")
 
 
 def validation(robot: str, document: Mapping[str, Any], fitted: bool) -> None:

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
+from conftest import URDF
 
 from dhcal_pin import se3
 from dhcal_pin.calibration import calibrate
+from dhcal_pin.cli import main
 from dhcal_pin.contacts import Plane, PointDistance, Touch
 from dhcal_pin.errors import DhcalError
 from dhcal_pin.kinds import KINDS
+from dhcal_pin.measurement_files import measurement_text, read_measurements
 from dhcal_pin.measurements import Noise, nominals
 from dhcal_pin.parameters import select
 from dhcal_pin.poses import Pose, Position
-from dhcal_pin.result import _instrument
+from dhcal_pin.result import _instruments
 
 KIND = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 
@@ -61,7 +67,7 @@ def truth_of(kind, chain, m, noise=None, seed=0):
     rng = np.random.default_rng(seed)
     q = rng.uniform(-2.5, 2.5, (m, chain.size))
     data = kind.simulate(chain, q, noise or Noise(), rng).started(chain)
-    names = _instrument(chain, [data], {})
+    names = _instruments(chain, [data], {})
     return data, np.array([names[unknown.name] for unknown in data.unknowns])
 
 
@@ -183,3 +189,48 @@ def test_small_rotation_noise_is_a_rotation(sim_6dof):
     data = Pose.simulate(sim_6dof, np.zeros((50, 6)), Noise(0, 0.2), np.random.default_rng(0))
     spread = se3.log3(data.poses[:, :3, :3] @ np.swapaxes(sim_6dof.poses(np.zeros((50, 6)))[:, :3, :3], 1, 2))
     assert np.std(spread) == pytest.approx(0.2, rel=0.15)
+
+
+@KIND
+def test_file_round_trip_is_exact(kind, sim_6dof_actual, tmp_path):
+    """Every column's every digit, sigmas included; rotations to rounding."""
+    for noise in (Noise(), Noise(1e-4, 2e-4)):
+        q = np.random.default_rng(1).uniform(-2.5, 2.5, (9, 6))
+        data = kind.simulate(sim_6dof_actual, q, noise, np.random.default_rng(0))
+        path = tmp_path / "data.csv"
+        path.write_text(measurement_text(data, sim_6dof_actual, ["a comment"]))
+        again = read_measurements(path, sim_6dof_actual)
+        assert type(again) is kind
+        assert again.stated == data.stated
+        np.testing.assert_array_equal(again.configurations(), data.configurations())
+        for name, values in data.to_columns().items():
+            found = again.to_columns()[name]
+            if data.columns[name] == "angle" and "sigma" not in name:
+                np.testing.assert_allclose(found, values, atol=4e-15)
+            else:
+                assert list(found) == list(values), name
+
+
+@KIND
+def test_simulated_file_calibrates(kind, tmp_path, monkeypatch):
+    """`dhcal simulate` for every kind, then `dhcal calibrate` on its file."""
+    monkeypatch.chdir(tmp_path)
+    nominal, actual = str(URDF / "sim_6dof.dh.toml"), str(URDF / "sim_6dof_actual.dh.toml")
+    assert main(["simulate", nominal, "--truth", actual, "-m", "40", "--kind", kind.kind, "-o", "d.csv",
+                 "--noise", "0.1mm,0.01deg"]) == 0  # fmt: skip
+    assert main(["calibrate", nominal, "d.csv", "-o", "o.urdf", "--json", "r.json"]) == 0
+    result = json.loads(Path("r.json").read_text())
+    assert result["converged"]
+    for key in ("position_rms_m", "residual_rms"):
+        if key in result["after"] and kind is not PointDistance:
+            assert result["after"][key] < 1e-3
+
+
+def test_a_mixture_of_five_kinds_converges(sim_6dof, sim_6dof_actual):
+    rng = np.random.default_rng(0)
+    kinds = [KINDS[name] for name in ("pose", "wires", "plane", "distance", "relative")]
+    draw = lambda m: rng.uniform(-2.5, 2.5, (m, 6))  # noqa: E731
+    data = [kind.simulate(sim_6dof_actual, draw(30), Noise(), rng) for kind in kinds]
+    fit = calibrate(sim_6dof, data, "dh", priors="none")
+    assert fit.converged
+    assert fit.validate(Pose.simulate(sim_6dof_actual, draw(50), Noise(), rng))["position_max_m"] < 1e-9

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import paper, robot_file
+from conftest import URDF, paper, robot_file
 
 from dhcal_pin import se3
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.chain import Chain
+from dhcal_pin.cli import main
 from dhcal_pin.errors import DhcalError
 from dhcal_pin.lengths import Distance
 from dhcal_pin.measurements import Noise
@@ -318,3 +319,13 @@ def test_what_does_not_fit_together_is_said(sim_6dof):
         scene_html(sim_6dof, q=np.zeros((2, 3)))
     with pytest.raises(DhcalError, match="magnification"):
         scene_html(sim_6dof, magnification=0.5)
+
+
+def test_view_writes_the_page(tmp_path):
+    page = tmp_path / "scene.html"
+    arms = [str(URDF / f"{name}.dh.toml") for name in ("experiment", "experiment_published")]
+    data = str(URDF / "experiment_table5.csv")
+    assert main(["view", *arms, "--data", data, "--html", str(page)]) == 0
+    text = page.read_text()
+    assert "experiment and experiment_published" in text
+    assert main(["view", arms[0], "--html", str(tmp_path / "no" / "scene.html")]) == 2
