@@ -1,0 +1,147 @@
+"""The three-wire device: its closed form, its mirror, its dilution, and its geometry found with the robot."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dhcal_pin.calibration import calibrate
+from dhcal_pin.errors import DhcalError
+from dhcal_pin.lengths import Wires, device_anchors
+from dhcal_pin.measurements import Noise
+from dhcal_pin.poses import Position
+from dhcal_pin.trilateration import anchors_of, dilution, three_wires, trilaterate
+
+A, B, C = 0.3, 0.25, -0.1
+# Anchors of an equilateral rig of 300 mm in the plane x = 0.
+RIG = 0.3 * np.array([[0, 0, 1], [0, np.sqrt(3) / 2, -0.5], [0, -np.sqrt(3) / 2, -0.5]])
+
+
+def lengths(points, anchors):
+    return np.linalg.norm(points[:, None] - anchors, axis=2)
+
+
+def somewhere(m, seed=0):
+    """Points more than 10 mm off the anchors' plane."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1, 1, (m, 3))
+    points[:, 0] = np.sign(points[:, 0]) * (0.01 + np.abs(points[:, 0]))
+    return points
+
+
+def test_closed_form_is_exact_on_the_side_it_is_told():
+    points = somewhere(1000)
+    for side in (1, -1):
+        mine = points[np.sign(points[:, 0]) == side]
+        found = three_wires(lengths(mine, device_anchors(A, B, C)), A, B, C, side)
+        np.testing.assert_allclose(found, mine, atol=1e-9)
+
+
+def test_printed_equations_are_wrong():
+    """(41) as printed turns y about, and its z is right only where a² = b² + c²."""
+    points = somewhere(5)
+    l1, l2, l3 = lengths(points, device_anchors(A, B, C)).T
+    np.testing.assert_allclose((l2**2 - l3**2) / (4 * B), -points[:, 1], atol=1e-12)
+    printed = (l2**2 + l3**2 - 2 * (l1**2 + A**2 - B**2 - C**2)) / (4 * (A - C))
+    assert np.abs(printed - points[:, 2]).min() > 1e-3
+
+
+def test_any_number_of_anchors():
+    rng = np.random.default_rng(1)
+    points = somewhere(200)
+    np.testing.assert_allclose(trilaterate(lengths(points, RIG), RIG, 1)[:, 1:], points[:, 1:], atol=1e-9)
+    for count in (4, 6):
+        anchors = rng.uniform(-1, 1, (count, 3))
+        np.testing.assert_allclose(trilaterate(lengths(points, anchors), anchors), points, atol=1e-9)
+
+
+def test_side_is_along_the_anchors_normal():
+    normal = np.cross(RIG[1] - RIG[0], RIG[2] - RIG[0])
+    point = np.array([[0.7, 0.1, -0.2]])
+    side = int(np.sign(normal[0]))
+    np.testing.assert_allclose(trilaterate(lengths(point, RIG), RIG, side), point, atol=1e-12)
+    np.testing.assert_allclose(trilaterate(lengths(point, RIG), RIG, -side)[0, 0], -0.7, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: three_wires([[1, 1, 1]], 0.3, 0.25, 0.3), "on one line"),
+        (lambda: three_wires([[1, 1, 1]], 0.3, 0.0, 0.1), "on one line"),
+        (lambda: three_wires([[1, 1, 1], [0.1, 1, 1]], A, B, C), "sample 2 has lengths that do not meet"),
+        (lambda: trilaterate([[1, 1, 1]], [[0, 0, 0], [0, 0, 1], [0, 0, 2]]), "one line"),
+        (lambda: trilaterate([[1, 1]], [[0, 0, 0], [0, 0, 1]]), "three anchors"),
+        (lambda: trilaterate([[0.01, 0.01, 0.01]], RIG), "do not meet"),
+    ],
+)
+def test_what_cannot_be_is_said(call, message):
+    with pytest.raises(DhcalError, match=message):
+        call()
+
+
+def test_mirror_plane_loses_half_of_all_readings():
+    """At x = 2 mm and 0.1 mm of wire noise 46 % of the radicands are negative."""
+    rng = np.random.default_rng(0)
+    point = np.tile([0.002, 0.1, 0.05], (4000, 1))
+    noisy = lengths(point, device_anchors(A, B, C)) + 1e-4 * rng.standard_normal((4000, 3))
+    lost = 0
+    for row in noisy:
+        try:
+            three_wires(row[None], A, B, C)
+        except DhcalError:
+            lost += 1
+    assert lost / 4000 == pytest.approx(0.46, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("x", "wanted"), [(1.0, (0.71, 2.84, 2.90)), (0.3, (0.84, 1.14, 1.29)), (0.01, (14.1, 0.80, 1.00))]
+)
+def test_dilution_is_what_noise_does(x, wanted):
+    """The verified figures of an equilateral rig, by formula and by noise small enough to be linear."""
+    point = np.array([[x, 0.12, -0.08]])
+    found = dilution(point, RIG)[0]
+    rng = np.random.default_rng(0)
+    noisy = lengths(np.tile(point, (20000, 1)), RIG) + 1e-7 * rng.standard_normal((20000, 3))
+    side = int(np.sign(np.cross(RIG[1] - RIG[0], RIG[2] - RIG[0])[0] * x))
+    seen = np.std(trilaterate(noisy, RIG, side), axis=0) / 1e-7
+    np.testing.assert_allclose(seen, found, rtol=0.03)
+    np.testing.assert_allclose(found, wanted, rtol=0.01)
+
+
+def test_anchor_from_lengths():
+    points = somewhere(20)
+    np.testing.assert_allclose(anchors_of(points, lengths(points, RIG[:1])[:, 0]), RIG[0], atol=1e-12)
+
+
+def test_geometry_is_found_with_the_robot(sim_6dof, sim_6dof_actual):
+    """Raw lengths, nine unknown anchor coordinates, and all the arm's errors, noise-free."""
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-np.pi, np.pi, (60, 6))
+    data = Wires.simulate(sim_6dof_actual, q, Noise(), rng)
+    fit = calibrate(sim_6dof, data, "dh", priors="none", fix=["theta1", "d1"])
+    anchors = np.array([fit.instruments[u.name] for u in data.unknowns]).reshape(3, 3)
+    # The base is not known to the wires: compare what does not move with it.
+    truth = np.array([[np.linalg.norm(a - b) for a in RIG] for b in RIG])
+    found = np.array([[np.linalg.norm(a - b) for a in anchors] for b in anchors])
+    np.testing.assert_allclose(found, truth, rtol=1e-3)
+    other = rng.uniform(-np.pi, np.pi, (50, 6))
+    gaps = [
+        np.linalg.norm(np.diff(chain.poses(other)[:, :3, 3], axis=0), axis=1)
+        for chain in (fit.chain, sim_6dof_actual)
+    ]
+    np.testing.assert_allclose(*gaps, atol=1e-9)
+
+
+def test_trilaterated_positions_calibrate_like_positions(sim_6dof, sim_6dof_actual):
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-np.pi, np.pi, (60, 6))
+    points = sim_6dof_actual.poses(q)[:, :3, 3]
+    anchors = RIG + np.array([-1.2, 0, 0.2])
+    side = int(np.sign(np.cross(RIG[1] - RIG[0], RIG[2] - RIG[0])[0]))
+    found = trilaterate(lengths(points, anchors), anchors, side)
+    np.testing.assert_allclose(found, points, atol=1e-9)
+    fit = calibrate(sim_6dof, Position.of(q, found), "dh", priors="none")
+    assert (
+        np.linalg.norm(fit.chain.poses(-q)[:, :3, 3] - sim_6dof_actual.poses(-q)[:, :3, 3], axis=1).max()
+        < 1e-8
+    )
