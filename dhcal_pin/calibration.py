@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from . import observability
+from . import observability, robust
 from .chain import BASE, Chain
 from .errors import DhcalError
 from .frames import starts
@@ -24,6 +24,7 @@ Priors = Literal["default", "none"] | Mapping[str, float]
 
 # Sigmas are not estimated below a nanometre and a nanoradian.
 LEAST_SCALE = 1e-6
+MOST_ROUNDS = 30
 
 
 def _prior_weights(errors: ErrorModel, priors: Priors) -> Array:
@@ -59,7 +60,9 @@ def split(
     return tuple(fit), tuple(item for item in held if len(item.rows))
 
 
-def _place(errors: ErrorModel, data: tuple[Measurement, ...], max_iterations: int) -> Chain:
+def _place(
+    errors: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float], max_iterations: int
+) -> Chain:
     """The nominal chain with its unknown base and tool as they fit the data best."""
     frames = errors.frames()
     if frames is None:
@@ -68,7 +71,7 @@ def _place(errors: ErrorModel, data: tuple[Measurement, ...], max_iterations: in
     best: tuple[float, Chain] | None = None
     for start in starts(errors.chain, data, BASE in stations, errors.chain.tool_station in stations):
         placed = replace(frames, chain=start)
-        problem = _problem(placed, tuple(item.started(start) for item in data), 1 / placed.priors)
+        problem = _problem(placed, tuple(item.started(start) for item in data), 1 / placed.priors, known)
         solution = levenberg_marquardt(problem, np.zeros(len(problem.weights)), max_iterations, None)
         cost = problem.cost(solution.x)
         if best is None or cost < best[0]:
@@ -77,13 +80,29 @@ def _place(errors: ErrorModel, data: tuple[Measurement, ...], max_iterations: in
     return best[1]
 
 
-def _problem(errors: ErrorModel, data: tuple[Measurement, ...], weights: Array) -> Problem:
+def _problem(
+    errors: ErrorModel, data: tuple[Measurement, ...], weights: Array, known: Mapping[str, float]
+) -> Problem:
     """The problem whose instruments have their own wide priors where the robot has any."""
-    wide = np.array([1 / unknown.prior for unknown in shared_unknowns(data)])
-    return Problem(errors, data, np.concatenate([weights, wide * np.any(weights)]))
+    wide = np.array([1 / unknown.prior for unknown in shared_unknowns(data) if unknown.name not in known])
+    return Problem(errors, data, np.concatenate([weights, wide * np.any(weights)]), known)
 
 
-def _scatter(problem: Problem, solution: Solution, data: tuple[Measurement, ...]) -> Array:
+def _known(data: tuple[Measurement, ...], known: Mapping[str, float]) -> Mapping[str, float]:
+    """The known values, after checking that each belongs to an unknown of the data."""
+    names = [unknown.name for unknown in shared_unknowns(data) if not unknown.local]
+    for name, value in known.items():
+        if name not in names:
+            there = f"there are {', '.join(names)}" if names else "these measurements bring none"
+            raise DhcalError(f"known {name!r}: no unknown of an instrument; {there}")
+        if not np.isfinite(value):
+            raise DhcalError(f"known {name!r}: {value} is not a finite number")
+    return known
+
+
+def _scatter(
+    problem: Problem, solution: Solution, data: tuple[Measurement, ...], weights: Sequence[Array]
+) -> Array:
     """How many of its sigmas each group of rows scatters in the fit, all items' groups in a row (g,).
 
     One where the instrument states its sigmas, or where there are not more rows than directions seen.
@@ -92,13 +111,14 @@ def _scatter(problem: Problem, solution: Solution, data: tuple[Measurement, ...]
     residuals = [
         item.residual(chain.sweep(item.configurations()), problem.values(item, solution.x)) for item in data
     ]
-    share = 1 - observability.rank(solution.triangle.r) / sum(r.size for r in residuals)
+    counted = sum(len(r) * w.sum() for r, w in zip(residuals, weights, strict=True))
+    share = 1 - observability.rank(solution.triangle.r) / counted
     return np.array(
         [
             1.0
             if item.stated or share <= 0
-            else max(float(np.sqrt(np.mean(residual[rows] ** 2) / share)), LEAST_SCALE)
-            for item, residual in zip(data, residuals, strict=True)
+            else max(float(np.sqrt(np.average(np.mean(r[rows] ** 2, 0), weights=w) / share)), LEAST_SCALE)
+            for item, r, w in zip(data, residuals, weights, strict=True)
             for rows in item.groups.values()
         ]
     )
@@ -119,6 +139,8 @@ def calibrate(
     fix: Sequence[str] = (),
     free: Sequence[str] = (),
     holdout: Sequence[Measurement] = (),
+    known: Mapping[str, float] | None = None,
+    loss: str = "linear",
     max_iterations: int = 100,
     progress: Progress | None = None,
 ) -> Result:
@@ -134,6 +156,9 @@ def calibrate(
         fix: parameters or sets held at nominal.
         free: single parameters of any set added.
         holdout: measurements to judge by, not fitted.
+        known: values in m and rad of instruments' unknowns by name, such as a surveyed anchor
+            `wire1.x`; they are held.
+        loss: "linear", or "huber", "cauchy", "tukey", which gross errors bend little or not at all.
         max_iterations: most steps of a loop.
         progress: called with the iteration and the cost.
 
@@ -148,24 +173,35 @@ def calibrate(
         raise DhcalError("no measurements to fit")
     if method not in METHODS:
         raise DhcalError(f"method {method!r}: choose from {', '.join(METHODS)}")
+    if loss not in robust.LOSSES:
+        raise DhcalError(f"loss {loss!r}: choose from {', '.join(robust.LOSSES)}")
+    if loss != "linear" and method != "lm":
+        raise DhcalError(f"loss {loss!r} needs method lm; the paper's loop weighs all rows alike")
     for item in (*data, *holdout):
         chain.checked(item.configurations())
     priors = priors if priors is not None else ("none" if method == "gn" else "default")
     errors = select(chain, parameters if parameters is not None else chain.parameters, fix, free)
-    reference = _place(errors, data, max_iterations)
+    known = _known(data, known or {})
+    reference = _place(errors, data, known, max_iterations)
     errors = replace(errors, chain=reference)
     data = tuple(item.started(reference) for item in data)
-    problem = _problem(errors, data, _prior_weights(errors, priors))
+    problem = _problem(errors, data, _prior_weights(errors, priors), known)
     solution = METHODS[method](problem, np.zeros(len(problem.weights)), max_iterations, progress)
+    weights = [np.ones(len(item.rows)) for item in data]
     if method == "lm":
-        # Weights that the fit itself tells: a few rounds settle them.
+        # Sigmas and weights that the fit itself tells: a few rounds settle them.
         scales = np.ones(sum(len(item.groups) for item in data))
-        for _ in range(8):
-            found = _scatter(problem, solution, data)
-            if np.abs(np.log(found / scales)).max() < 0.01:
+        for _ in range(MOST_ROUNDS):
+            before, found = weights, _scatter(problem, solution, data, weights)
+            scaled = _scaled(data, found)
+            fitted = errors.at(solution.x[: len(errors.parameters)])
+            values = [problem.values(item, solution.x) for item in data]
+            weighed, weights = robust.reweighted(fitted, scaled, values, loss)
+            moved = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(weights, before, strict=True))
+            if np.abs(np.log(found / scales)).max() < 0.01 and moved < 0.01:
                 break
             scales = found
-            problem = replace(problem, data=_scaled(data, scales))
+            problem = replace(problem, data=weighed)
             again = levenberg_marquardt(problem, solution.x, max_iterations, progress)
             solution = replace(again, iterations=solution.iterations + again.iterations)
     return Result(
@@ -178,4 +214,5 @@ def calibrate(
         problem=problem,
         solution=solution,
         method=method,
+        weights=tuple(weights),
     )

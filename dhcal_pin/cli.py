@@ -48,6 +48,7 @@ def _add(commands, name: str, summary: str, example: str) -> argparse.ArgumentPa
 _ROBOT: dict[str, Any] = {"metavar": "ROBOT", "help": "URDF, or DH file (.toml, .csv)"}
 _DATA: dict[str, Any] = {"metavar": "DATA", "nargs": "+", "help": "measurement CSV files"}
 _TIP: dict[str, Any] = {"metavar": "F", "help": "tip link of a URDF (default: the deepest leaf)"}
+_COLUMNS: dict[str, Any] = {"metavar": "MAP.toml", "help": "how to read files of another maker"}
 _JSON: dict[str, Any] = {"metavar": "FILE", "help": "the result as JSON; - for stdout"}
 
 
@@ -97,6 +98,7 @@ def parser() -> argparse.ArgumentParser:
     calibrate.add_argument("data", **_DATA)
     calibrate.add_argument("-o", "--output", metavar="OUT.urdf", required=True, help="the corrected URDF")
     calibrate.add_argument("--tip", **_TIP)
+    calibrate.add_argument("--columns", **_COLUMNS)
     calibrate.add_argument(
         "--parameters",
         metavar="SET[,SET]",
@@ -113,7 +115,16 @@ def parser() -> argparse.ArgumentParser:
         help="what is judged by, not fitted: a share such as 0.3, or a measurement file",
     )
     calibrate.add_argument("--method", choices=("lm", "gn"), default="lm", help="gn is the paper's loop")
+    calibrate.add_argument(
+        "--loss",
+        metavar="LOSS",
+        default="linear",
+        help="linear, huber, cauchy or tukey: what gross errors count",
+    )
     calibrate.add_argument("--priors", metavar="default|none|FILE", help="default for lm, none for gn")
+    calibrate.add_argument(
+        "--instrument", metavar="FILE", help="TOML whose [instrument] table holds surveyed values, as wire1.x"
+    )
     calibrate.add_argument("--max-iterations", metavar="N", type=_count, default=100, help="most steps (100)")
     calibrate.add_argument(
         "--seed", metavar="N", type=_seed, default=0, help="for the choice of the hold-out"
@@ -136,6 +147,7 @@ def parser() -> argparse.ArgumentParser:
     validate.add_argument("robot", **_ROBOT)
     validate.add_argument("data", **_DATA)
     validate.add_argument("--tip", **_TIP)
+    validate.add_argument("--columns", **_COLUMNS)
     validate.add_argument("--sidecar", metavar="S.toml", help="base and tool (default: the one beside ROBOT)")
     validate.add_argument("--fit-frames", action="store_true", help="fit base and tool first")
     validate.add_argument("--json", **_JSON)

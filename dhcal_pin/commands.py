@@ -25,10 +25,12 @@ from .kinds import KINDS
 from .measurement_files import measurement_text, read_measurements, read_readings
 from .measurements import Measurement, Noise
 from .parameters import extract
-from .result import accuracy
+from .plausibility import doubts
+from .result import Result, accuracy
 from .robot_files import (
     existing_sidecar,
     is_table,
+    read_instrument,
     read_priors,
     read_robot,
     read_table,
@@ -80,11 +82,12 @@ def _sidecars(robots: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class _Data:
-    """What is fitted and held out, and the impossible rows left out of both, by file."""
+    """What is fitted and held out, and by file the impossible rows left out of both, and doubts."""
 
-    fit: list[Measurement]
+    fit: dict[str, Measurement]
     holdout: list[Measurement]
     findings: dict[str, list[Finding]]
+    doubts: dict[str, list[str]]
 
 
 def _without(data: Measurement, findings: Sequence[Finding]) -> Measurement:
@@ -96,8 +99,10 @@ def _read_data(chain: Chain, args: Namespace, held_file: str | None, known_frame
     fit: list[Measurement] = []
     holdout: list[Measurement] = []
     findings: dict[str, list[Finding]] = {}
+    doubtful: dict[str, list[str]] = {}
     for path in [*args.data, *([held_file] if held_file else [])]:
-        readings = read_readings(path, chain)
+        readings = read_readings(path, chain, args.columns)
+        doubtful[path] = doubts(chain, readings)
         # A row can only be called impossible where base and tool are known.
         findings[path] = screen(chain, readings) if known_frames else []
         if path == held_file:
@@ -112,10 +117,10 @@ def _read_data(chain: Chain, args: Namespace, held_file: str | None, known_frame
             raise DhcalError(f"--holdout {args.holdout}: neither a file nor a share such as 0.3") from None
         kept, parted = calibration.split(fit, fraction, args.seed)
         fit, holdout = list(kept), holdout + list(parted)
-    fit = [item for item in fit if len(item.q)]
-    if not fit:
+    fitted = {path: item for path, item in zip(args.data, fit, strict=True) if len(item.rows)}
+    if not fitted:
         raise DhcalError(f"{', '.join(args.data)}: every row is held out; leave some to fit")
-    return _Data(fit, [item for item in holdout if len(item.q)], findings)
+    return _Data(fitted, [item for item in holdout if len(item.rows)], findings, doubtful)
 
 
 def _calibrate(args: Namespace) -> int:
@@ -126,10 +131,12 @@ def _calibrate(args: Namespace) -> int:
             raise DhcalError(f"{path}: is given twice; each measurement counts once, to fit or to hold out")
     robot = [args.robot, *_sidecars([args.robot])]
     priors = [args.priors] if args.priors not in (None, "default", "none") else []
-    inputs = [*robot, *measured, *priors]
+    priors += [args.instrument] if args.instrument else []
+    maps = [args.columns] if args.columns else []
+    inputs = [*robot, *measured, *priors, *maps]
     _urdf_ending(args.output)
     _check_outputs([args.json], inputs)
-    kept = [*measured, *priors] if args.in_place else inputs
+    kept = [*measured, *priors, *maps] if args.in_place else inputs
     _check_outputs([args.output, sidecar_path(args.output), args.json], kept)
 
     chain = read_robot(args.robot, args.tip)
@@ -138,21 +145,29 @@ def _calibrate(args: Namespace) -> int:
     with terminal.progress("fitting") as progress:
         fit = calibration.calibrate(
             chain,
-            data.fit,
+            list(data.fit.values()),
             sets,
             method=args.method,
             priors=read_priors(args.priors),
             fix=_names(args.fix),
             free=_names(args.free),
             holdout=data.holdout,
+            known=read_instrument(args.instrument) if args.instrument else None,
+            loss=args.loss,
             max_iterations=args.max_iterations,
             progress=progress,
         )
-    contents = _written(fit.chain, args)
+    contents = _written(fit, args)
     files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
     if args.json and args.json != _STDOUT:
         files["json"] = args.json
-    rows = {path: [finding.row for finding in found] for path, found in data.findings.items() if found}
+    gross = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))
+    impossible = {path: [finding.row for finding in found] for path, found in data.findings.items()}
+    rows = {
+        path: sorted(impossible[path] + gross.get(path, []))
+        for path in impossible
+        if impossible[path] + gross.get(path, [])
+    }
     document = report.document(
         fit, files, report.fingerprints(inputs), [row for found in rows.values() for row in found]
     ) | {"outliers_by_file": rows}
@@ -163,14 +178,19 @@ def _calibrate(args: Namespace) -> int:
         _emit(args.json, document)
     for path, found in data.findings.items():
         terminal.findings(path, found)
+        terminal.gross(path, gross.get(path, []), args.loss)
+    for path, texts in data.doubts.items():
+        terminal.doubts(path, texts)
     terminal.summary(fit, files)
     return 0
 
 
-def _written(chain: Chain, args: Namespace) -> dict[PathLike, str | bytes]:
+def _written(fit: Result, args: Namespace) -> dict[PathLike, str | bytes]:
     """The calibrated URDF and its sidecar, base and tool moved into the URDF where that was asked for."""
+    chain = fit.chain
     # A base that the URDF holds must not stand in the sidecar too.
-    contents = urdf_files(replace(chain, base=np.eye(4)) if args.world_joint else chain, args.output)
+    bare = replace(chain, base=np.eye(4)) if args.world_joint else chain
+    contents = urdf_files(bare, args.output, fit.portable)
     data = contents[args.output]
     assert isinstance(data, bytes)
     if args.world_joint:
@@ -185,18 +205,24 @@ def _written(chain: Chain, args: Namespace) -> dict[PathLike, str | bytes]:
 
 def _validate(args: Namespace) -> int:
     sidecar = args.sidecar or existing_sidecar(args.robot)
-    inputs = [args.robot, *args.data, *([sidecar] if sidecar else [])]
+    inputs = [args.robot, *args.data, *filter(None, (sidecar, args.columns))]
     _check_outputs([args.json], inputs)
     chain = read_robot(args.robot, args.tip, sidecar)
-    data = [read_measurements(path, chain) for path in args.data]
+    readings = [read_readings(path, chain, args.columns) for path in args.data]
+    data = [item.data for item in readings]
+    surveyed = read_instrument(sidecar) if sidecar else {}
+    names = {unknown.name for item in data for unknown in item.unknowns}
+    known = {name: value for name, value in surveyed.items() if name in names}
     if args.fit_frames:
-        fit = calibration.calibrate(chain, data, "base,tool")
+        fit = calibration.calibrate(chain, data, "base,tool", known=known)
         document = report.document(fit, {}, report.fingerprints(inputs))
     else:
-        document = report.plain_document(chain, data, report.fingerprints(inputs))
-    document["before"] = accuracy(chain, data)
+        document = report.plain_document(chain, data, report.fingerprints(inputs), known)
+    document["before"] = accuracy(chain, data, known)
     document["files"] = {"json": args.json} if args.json and args.json != _STDOUT else {}
     _emit(args.json, document)
+    for item in readings:
+        terminal.doubts(item.source, doubts(chain, item))
     terminal.validation(args.robot, document, args.fit_frames)
     return 0
 

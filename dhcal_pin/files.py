@@ -95,14 +95,15 @@ def _keep(path: PathLike, spare: str) -> None:
         shutil.copy2(path, spare)  # a file system without links
 
 
-def read_text(path: PathLike) -> str:
-    """A UTF-8 text file, or DhcalError."""
+def read_text(path: PathLike, encoding: str = "utf-8") -> str:
+    """A text file, in UTF-8 if nothing else is said, or DhcalError."""
     try:
-        return Path(path).read_bytes().decode("utf-8-sig")
+        return Path(path).read_bytes().decode(encoding).removeprefix("\ufeff")
     except OSError as error:
         raise DhcalError(f"{path}: cannot read it: {error.strerror}; give the path of a file") from error
     except UnicodeDecodeError as error:
-        raise DhcalError(f"{path}: byte {error.start} is not UTF-8; save the file as UTF-8") from error
+        name = encoding.upper()
+        raise DhcalError(f"{path}: byte {error.start} is not {name}; save the file as {name}") from error
 
 
 def read_toml(path: PathLike) -> dict:

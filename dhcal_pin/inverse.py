@@ -54,24 +54,40 @@ def to_positions(targets: Array) -> Gap:
     return lambda points: (points - targets, np.broadcast_to(np.eye(3), (len(points), 3, 3)))
 
 
+def within(chain: Chain, q: Array) -> tuple[Array, Array]:
+    """The same configurations (m, n) less whole turns, and which of them (m,) keep the joints' limits."""
+    turning = ~np.any(chain.mixing[chain.prismatic] != 0, 0) & np.all(chain.mixing % 1 == 0, 0)
+    home = (q + np.pi) % (2 * np.pi) - np.pi
+    home = home + 2 * np.pi * ((home < chain.lower).astype(float) - (home > chain.upper))
+    q = np.where(turning, home, q)
+    return q, np.all((q >= chain.lower) & (q <= chain.upper), 1)
+
+
 def land(chain: Chain, gap: Callable[[Array], Gap], start: Array, rng: np.random.Generator) -> Array:
-    """Joint values (m, n) that close every gap; where one stays open, from another start.
+    """Joint values (m, n) that close every gap, within the joints' limits where such are found.
 
     Args:
         chain: base and tool included.
         gap: from sample numbers to their gap.
         start: (m, n) joint values.
-        rng: draws the other starts.
+        rng: draws the other starts, for gaps that stay open and joints beyond their limits.
 
     Raises:
         DhcalError: a gap stays open.
     """
-    every = np.arange(len(start))
-    q, wide = solve(chain, gap(every), start, 60)
+    out, closed, kept = start.copy(), np.zeros(len(start), bool), np.zeros(len(start), bool)
+    again, left = start, np.arange(len(start))
     for _ in range(100):
-        left = np.flatnonzero(wide > REACHED)
+        q, wide = solve(chain, gap(left), again, 60)
+        q, allowed = within(chain, q)
+        good = (wide <= REACHED) & (allowed | ~closed[left])
+        out[left[good]] = q[good]
+        closed[left] |= good
+        kept[left] |= good & allowed
+        left = np.flatnonzero(~kept)
         if not left.size:
-            return q
+            break
         again = start[rng.integers(0, len(start), len(left))] + rng.uniform(-1, 1, (len(left), chain.size))
-        q[left], wide[left] = solve(chain, gap(left), again, 60)
-    raise DhcalError("the simulated instrument is out of this arm's reach; try other joint values")
+    if not closed.all():
+        raise DhcalError("the simulated instrument is out of this arm's reach; try other joint values")
+    return out

@@ -3,36 +3,36 @@
 from __future__ import annotations
 
 import csv
-import difflib
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from . import se3
 from .chain import Chain
+from .column_maps import UNITS, read_map
 from .errors import DhcalError
-from .files import ANGLES, LENGTHS, Column, PathLike, Sheet, check_names, read_sheet
-from .kinds import KINDS
+from .files import LENGTHS, Column, PathLike, Sheet, read_sheet
+from .foreign_files import mapped_sheet
 from .measurements import Measurement
+from .reading_columns import (
+    AFTER,
+    COMMANDED,
+    QUATERNION,
+    ROTVEC,
+    TO,
+    check_columns,
+    check_joint_names,
+    kind_of,
+    quantities,
+    units_of,
+)
 from .se3 import Array
 
-_QUATERNION = ("qw", "qx", "qy", "qz")
-_ROTVEC = ("rx", "ry", "rz")
-# Where a controller was told to go, and where it went with the calibrated model: for screening and for
-# judging a compensation, never fitted.
-_COMMANDED = ("commanded_x", "commanded_y", "commanded_z")
-_AFTER = ("after_x", "after_y", "after_z")
-_ASIDE = frozenset(("set", "pose_id", *_COMMANDED, *_AFTER))
 # No instrument is that good: m or rad.
 _LEAST_SIGMA = 1e-15
-# The second configuration of a row stands under the joints' names with this before them.
-_TO = "to:"
-_READINGS = frozenset(name for kind in KINDS.values() for name in kind.columns) | frozenset(_QUATERNION)
-_KNOWN = _READINGS | _ASIDE
-_QUANTITIES = {"length": LENGTHS, "angle": ANGLES}
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +45,8 @@ class Readings:
         fit, holdout: the rows by the column `set`; all are to be fitted without it.
         commanded: (m, 3) positions the controller was told, m; None without the columns.
         after: (m, 3) positions reached once more with calibrated parameters, m; None without.
+        values: the columns (m,) of the readings as they stood in the file, in SI or as text.
+        units: the unit that each column was written in.
     """
 
     source: str
@@ -53,6 +55,8 @@ class Readings:
     holdout: Measurement
     commanded: Array | None
     after: Array | None
+    values: Mapping[str, Any] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 def _group(sheet: Sheet, names: Sequence[str], units: Mapping[str, float] | None) -> Array | None:
@@ -78,75 +82,14 @@ def _joints(sheet: Sheet, chain: Chain, before: str = "") -> Array:
     """Joint values (m, n) under the joints' names, each with `before` in front."""
     missing = [name for name in chain.joint_names if before + name not in sheet.columns]
     if missing:
-        every = ",".join(f"{before}{name}[{_unit(chain, name)}]" for name in chain.joint_names)
+        units = {name: "mm" if units_of(chain, name) is LENGTHS else "deg" for name in chain.joint_names}
+        every = ",".join(f"{before}{name}[{unit}]" for name, unit in units.items())
         raise DhcalError(
             f"{sheet.source}:{sheet.header}: no column for joint {before + missing[0]!r}; "
             f"this robot needs {every}"
         )
-    columns = [(sheet.columns[before + name], _units(chain, name)) for name in chain.joint_names]
+    columns = [(sheet.columns[before + name], units_of(chain, name)) for name in chain.joint_names]
     return np.stack([sheet.si(column, units) for column, units in columns], -1)
-
-
-def _units(chain: Chain, name: str) -> Mapping[str, float]:
-    joint = chain.urdf.joint(name)
-    return LENGTHS if joint.type == "prismatic" else ANGLES
-
-
-def _unit(chain: Chain, name: str) -> str:
-    return "mm" if _units(chain, name) is LENGTHS else "deg"
-
-
-def _check_joint_names(chain: Chain) -> None:
-    """Complains about joints whose names cannot head a column beside the readings."""
-    check_names(chain.joint_names, chain.urdf.source)
-    if clash := sorted(_KNOWN & set(chain.joint_names)):
-        raise DhcalError(
-            f"{chain.urdf.source}: joint {clash[0]!r} has the name of a reading; rename it there"
-        )
-
-
-def _check_columns(sheet: Sheet, chain: Chain) -> None:
-    names = [joint.name for joint in chain.urdf.joints]
-    joints = {*names, *(_TO + name for name in names)}
-    for name in sheet.columns:
-        if name not in _KNOWN | joints:
-            near = difflib.get_close_matches(name[:100], sorted(_KNOWN | joints), 1, 0.7)
-            hint = (
-                f"did you mean {near[0]!r}?"
-                if near
-                else f"remove it; the joints are {', '.join(chain.joint_names)}"
-            )
-            raise DhcalError(
-                f"{sheet.source}:{sheet.header}: column {name!r} is neither a joint of this robot "
-                f"nor a known reading; {hint}"
-            )
-
-
-def _kind(sheet: Sheet) -> type[Measurement]:
-    """The kind with the most of its columns there, or DhcalError if a column does not go with it."""
-    there = set(sheet.columns) & _READINGS
-    if there & set(_QUATERNION):
-        there = there - set(_QUATERNION) | set(_ROTVEC)
-    fits = [
-        (len(wanted), -len(kind.columns), kind)
-        for kind in KINDS.values()
-        for wanted in kind.needs
-        if wanted <= there
-    ]
-    where = f"{sheet.source}:{sheet.header}"
-    if not fits:
-        lone = f"; {', '.join(sorted(there))} alone is not enough" if there else ""
-        raise DhcalError(
-            f"{where}: no readings{lone}; a position needs the columns x[mm],y[mm],z[mm], "
-            "a pose qw,qx,qy,qz beside them"
-        )
-    kind = max(fits, key=lambda fit: fit[:2])[2]
-    if odd := sorted(there - set(kind.columns)):
-        raise DhcalError(
-            f"{where}: column {odd[0]!r} does not go with {', '.join(sorted(there & set(kind.columns)))}; "
-            f"a {kind.kind} file has {', '.join(kind.columns)}"
-        )
-    return kind
 
 
 def _values(sheet: Sheet, kind: type[Measurement]) -> dict[str, Any]:
@@ -156,7 +99,7 @@ def _values(sheet: Sheet, kind: type[Measurement]) -> dict[str, Any]:
         if name not in sheet.columns:
             continue
         column = sheet.columns[name]
-        out[name] = sheet.text(column) if what == "text" else sheet.si(column, _QUANTITIES[what])
+        out[name] = sheet.text(column) if what == "text" else sheet.si(column, UNITS[what])
         if "sigma" in name and (bad := np.flatnonzero(out[name] < _LEAST_SIGMA)).size:
             raise DhcalError(
                 f"{sheet.source}:{sheet.lines[bad[0]]}: column {name!r}: must be above zero; "
@@ -165,11 +108,11 @@ def _values(sheet: Sheet, kind: type[Measurement]) -> dict[str, Any]:
         if what == "text" and "" in out[name]:
             line = sheet.lines[out[name].index("")]
             raise DhcalError(f"{sheet.source}:{line}: column {name!r}: is empty; write a name")
-    if set(_QUATERNION) & set(sheet.columns):
-        if set(_ROTVEC) & set(sheet.columns):
+    if set(QUATERNION) & set(sheet.columns):
+        if set(ROTVEC) & set(sheet.columns):
             raise DhcalError(f"{sheet.source}:{sheet.header}: both qw… and rx… given; keep one rotation")
-        turn = se3.log3(_from_quaternion(sheet, _group(sheet, _QUATERNION, None)))
-        out |= {name: turn[:, i] for i, name in enumerate(_ROTVEC)}
+        turn = se3.log3(_from_quaternion(sheet, _group(sheet, QUATERNION, None)))
+        out |= {name: turn[:, i] for i, name in enumerate(ROTVEC)}
     return out
 
 
@@ -186,19 +129,32 @@ def _whole_sigmas(sheet: Sheet, kind: type[Measurement], values: Mapping[str, An
         )
 
 
-def read_readings(path: PathLike, chain: Chain) -> Readings:
-    """A measurement CSV file of any kind, for a chain's joints.
+def _sheet(path: PathLike, chain: Chain, columns: PathLike | None) -> Sheet:
+    """A measurement file as it is, or another maker's by its map."""
+    if columns is None:
+        return read_sheet(path)
+    known = quantities(chain)
+    return mapped_sheet(path, read_map(columns, known, chain.joint_names), set(known))
+
+
+def read_readings(path: PathLike, chain: Chain, columns: PathLike | None = None) -> Readings:
+    """A measurement file of any kind, for a chain's joints.
+
+    Args:
+        path: a CSV file of the project's own form, or any table of text that `columns` describes.
+        chain: the robot.
+        columns: a map as in `column_maps`, for a file of another maker.
 
     Raises:
         DhcalError: what is wrong, with file, line and column, and what would be right.
     """
-    sheet = read_sheet(path)
-    _check_joint_names(chain)
-    _check_columns(sheet, chain)
-    kind = _kind(sheet)
+    check_joint_names(chain)
+    sheet = _sheet(path, chain, columns)
+    check_columns(sheet, chain)
+    kind = kind_of(sheet)
     values = _values(sheet, kind)
     _whole_sigmas(sheet, kind, values)
-    q = [_joints(sheet, chain, before) for before in ("", _TO)[: kind.ends]]
+    q = [_joints(sheet, chain, before) for before in ("", TO)[: kind.ends]]
     try:
         data = kind.from_columns(q or [np.zeros((len(sheet.cells), chain.size))], values)
     except DhcalError as error:
@@ -209,8 +165,10 @@ def read_readings(path: PathLike, chain: Chain) -> Readings:
         data,
         data.take(~held),
         data.take(held),
-        _group(sheet, _COMMANDED, LENGTHS),
-        _group(sheet, _AFTER, LENGTHS),
+        _group(sheet, COMMANDED, LENGTHS),
+        _group(sheet, AFTER, LENGTHS),
+        values,
+        {name: column.unit for name, column in sheet.columns.items()},
     )
 
 
@@ -240,13 +198,13 @@ def _held(sheet: Sheet) -> Array:
     return np.array([word == "holdout" for word in words])
 
 
-def read_measurements(path: PathLike, chain: Chain) -> Measurement:
-    """All rows of a measurement CSV file, of the kind that its columns tell.
+def read_measurements(path: PathLike, chain: Chain, columns: PathLike | None = None) -> Measurement:
+    """All rows of a measurement file, of the kind that its columns tell; `columns` as in `read_readings`.
 
     Raises:
         DhcalError: what is wrong, with file, line and column, and what would be right.
     """
-    return read_readings(path, chain).data
+    return read_readings(path, chain, columns).data
 
 
 def measurement_text(data: Measurement, chain: Chain, comments: Sequence[str] = ()) -> str:
@@ -255,13 +213,15 @@ def measurement_text(data: Measurement, chain: Chain, comments: Sequence[str] = 
     Raises:
         DhcalError: a joint's name cannot head a column.
     """
-    _check_joint_names(chain)
+    check_joint_names(chain)
     columns: dict[str, Any] = {}
     for before, q in zip(
-        ("", _TO)[: data.ends], np.split(data.configurations(), max(data.ends, 1)), strict=False
+        ("", TO)[: data.ends], np.split(data.configurations(), max(data.ends, 1)), strict=False
     ):
         for j, name in enumerate(chain.joint_names):
-            columns[f"{before}{name}[{'m' if _units(chain, name) is LENGTHS else 'rad'}]"] = q[:, j].tolist()
+            columns[f"{before}{name}[{'m' if units_of(chain, name) is LENGTHS else 'rad'}]"] = q[
+                :, j
+            ].tolist()
     for name, values in data.to_columns().items():
         unit = {"length": "[m]", "angle": "[rad]", "text": ""}[data.columns[name]]
         columns[name + unit] = list(values) if unit == "" else values.tolist()

@@ -124,6 +124,10 @@ class Measurement(Protocol):
         """The same readings with each group's sigmas multiplied."""
         ...
 
+    def weighted(self, weights: Array) -> Self:
+        """The same readings with each sample counting for a weight (m,), by wider sigmas."""
+        ...
+
     def take(self, index: Array | slice) -> Self:
         """The samples of an index or mask."""
         ...
@@ -292,6 +296,10 @@ class PointReading:
         """The same readings with sigmas multiplied."""
         (scale,) = scales.values()
         return replace(self, sigma=self.sigma * scale)
+
+    def weighted(self, weights: Array) -> Self:
+        """The same readings with each sample counting for a weight (m,), by wider sigmas."""
+        return replace(self, sigma=self.sigma / np.sqrt(weights)[:, None])
 
     def take(self, index: Array | slice) -> Self:
         """The samples of an index or mask."""

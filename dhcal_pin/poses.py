@@ -371,6 +371,11 @@ class Pose:
             "orientation": se3.log3(self._turn(sweep)),
         }
 
+    def weighted(self, weights: Array) -> Self:
+        """The same readings with each sample counting for a weight (m,), by wider sigmas."""
+        wider = 1 / np.sqrt(weights)[:, None]
+        return replace(self, sigma=self.sigma * wider, rotation_sigma=self.rotation_sigma * wider)
+
     def take(self, index: Array | slice) -> Self:
         """The samples of an index or mask."""
         names = ("q", "poses", "sigma", "rotation_sigma", "rows")

@@ -182,6 +182,11 @@ class RelativePose:
             rotation_sigma=self.rotation_sigma * scales["orientation"],
         )
 
+    def weighted(self, weights: Array) -> Self:
+        """The same readings with each sample counting for a weight (m,), by wider sigmas."""
+        wider = 1 / np.sqrt(weights)[:, None]
+        return replace(self, sigma=self.sigma * wider, rotation_sigma=self.rotation_sigma * wider)
+
     def take(self, index: Array | slice) -> Self:
         """The samples of an index or mask."""
         names = ("q", "q_to", "poses", "sigma", "rotation_sigma", "rows")

@@ -105,9 +105,11 @@ def document(
     }
 
 
-def plain_document(chain: Chain, data: Sequence[Measurement], inputs: Mapping[str, str]) -> dict[str, Any]:
-    """The same document of a model that nothing was fitted to."""
-    found = accuracy(chain, data)
+def plain_document(
+    chain: Chain, data: Sequence[Measurement], inputs: Mapping[str, str], known: Mapping[str, float]
+) -> dict[str, Any]:
+    """The same document of a model that nothing was fitted to but instruments' unknown values."""
+    found = accuracy(chain, data, known)
     return {
         "converged": True,
         "iterations": 0,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from . import observability
+from . import observability, robust
 from .chain import Chain
 from .measurements import Measurement, Unknown
 from .parameters import ErrorModel, Parameter
@@ -90,6 +90,7 @@ class Result:
         problem: with the sigmas that were used in the end.
         solution: the loop's end.
         method: "lm" or "gn".
+        weights: (m,) of each fitted measurement's samples, 1 but for a robust loss.
     """
 
     errors: ErrorModel
@@ -101,6 +102,7 @@ class Result:
     problem: Problem
     solution: Solution
     method: str
+    weights: tuple[Array, ...]
 
     @property
     def model(self) -> pin.Model:
@@ -140,8 +142,10 @@ class Result:
     @cached_property
     def noise(self) -> float:
         """Standard deviation of the whitened residuals, about 1 where the sigmas are right."""
-        sweeps = [(d, self.chain.sweep(d.configurations())) for d in self.data]
-        count = sum(d.residual(sweep, self.problem.values(d, self.x)).size for d, sweep in sweeps)
+        count = 0.0
+        for item, weights in zip(self.data, self.weights, strict=True):
+            sweep = self.chain.sweep(item.configurations())
+            count += len(item.residual(sweep, self.problem.values(item, self.x))) * weights.sum()
         cost = self.solution.triangle.rest + float(np.sum(self.solution.triangle.z**2))
         freedom = count - self.rank
         return float(np.sqrt(cost / freedom)) if freedom > 0 else float("nan")
@@ -182,6 +186,25 @@ class Result:
     def instruments(self) -> dict[str, float]:
         """Values of the instruments' unknowns by name, m and rad."""
         return self.problem.instruments(self.x)
+
+    @cached_property
+    def outliers(self) -> tuple[Array, ...]:
+        """Row numbers of gross errors in each fitted measurement.
+
+        None where few samples stand against many unknowns, as then the scatter tells nothing.
+        """
+        return tuple(
+            robust.outliers(self.chain, item, self.problem.values(item, self.x))
+            if len(item.rows) > 2 * len(self.parameters)
+            else np.empty(0, int)
+            for item in self.data
+        )
+
+    @property
+    def portable(self) -> dict[str, float]:
+        """Those of the instruments' values that hold for other measurements with it, too."""
+        local = {unknown.name for unknown in self.problem.unknowns if unknown.local}
+        return {name: value for name, value in self.instruments.items() if name not in local}
 
     def validate(self, data: Measurement | Sequence[Measurement]) -> dict[str, Any]:
         """Accuracy of the calibrated chain on other data: position in m, orientation in rad."""

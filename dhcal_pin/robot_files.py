@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -80,17 +81,34 @@ def read_robot(path: PathLike, tip: str | None = None, sidecar: PathLike | None 
 def _with_sidecar(chain: Chain, path: PathLike) -> Chain:
     raw = read_toml(path)
     tip = raw.pop("tip", chain.tip)
-    if unknown := set(raw) - {"base", "tool"}:
-        raise DhcalError(f"{os.fspath(path)}: unknown key {min(unknown)!r}; allowed: tip, [base], [tool]")
-    frames = {key: read_frame(raw[key], os.fspath(path), key) for key in raw}
+    if unknown := set(raw) - {"base", "tool", "instrument"}:
+        raise DhcalError(
+            f"{os.fspath(path)}: unknown key {min(unknown)!r}; allowed: tip, [base], [tool], [instrument]"
+        )
+    frames = {key: read_frame(raw[key], os.fspath(path), key) for key in ("base", "tool") if key in raw}
     if tip != chain.tip:
         # The tool is a place on another link.
         frames.pop("tool", None)
     return replace(chain, **frames)
 
 
-def sidecar_text(tip: str, base: Array, tool: Array) -> str:
-    """The sidecar's TOML of base and tool (4, 4), the tool being on the link `tip`."""
+def read_instrument(path: PathLike) -> dict[str, float]:
+    """Values in m and rad of instruments' unknowns by name: a file's [instrument] table, or nothing.
+
+    Raises:
+        DhcalError: a value is not a finite number.
+    """
+    values = read_toml(path).get("instrument", {})
+    if not isinstance(values, dict):
+        raise DhcalError(f"{os.fspath(path)}: [instrument] must be a table")
+    for name, value in values.items():
+        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+            raise DhcalError(f"{os.fspath(path)}: [instrument] {name} = {value!r} is not a finite number")
+    return {name: float(value) for name, value in values.items()}
+
+
+def sidecar_text(tip: str, base: Array, tool: Array, instrument: Mapping[str, float]) -> str:
+    """The sidecar's TOML of base and tool (4, 4), the tool being on `tip`, and the instrument's values."""
     out = [
         "# What the URDF cannot hold. base: the robot's base link in the measuring frame;",
         "# tool: the measured point in the tip frame. Metres; rotation vectors in radians.",
@@ -99,6 +117,12 @@ def sidecar_text(tip: str, base: Array, tool: Array) -> str:
     for name, pose in (("base", base), ("tool", tool)):
         xyz, turn = pose[:3, 3].tolist(), se3.log3(pose[:3, :3]).tolist()
         out += ["", f"[{name}]", f"xyz_m = {xyz}", f"rotvec_rad = {turn}"]
+    if instrument:
+        out += [
+            "",
+            "[instrument]",
+            *(f"{json.dumps(name)} = {value!r}" for name, value in instrument.items()),
+        ]
     return "\n".join(out) + "\n"
 
 
@@ -127,7 +151,9 @@ def joint_origins(chain: Chain) -> tuple[dict[str, Array], Array]:
     return out, chain.tool
 
 
-def urdf_files(chain: Chain, path: PathLike) -> dict[PathLike, str | bytes]:
+def urdf_files(
+    chain: Chain, path: PathLike, instrument: Mapping[str, float] | None = None
+) -> dict[PathLike, str | bytes]:
     """The calibrated URDF, read back and compared, and its sidecar; by path, not yet written.
 
     Identity base and tool need no sidecar; one that is there already would be read with the new URDF,
@@ -148,9 +174,9 @@ def urdf_files(chain: Chain, path: PathLike) -> dict[PathLike, str | bytes]:
             f"{os.fspath(path)}: not written: read back, the tool is off by {gap:.2g}; please report it"
         )
     out: dict[PathLike, str | bytes] = {path: data}
-    plain = np.array_equal(chain.base, np.eye(4)) and np.array_equal(tool, np.eye(4))
+    plain = np.array_equal(chain.base, np.eye(4)) and np.array_equal(tool, np.eye(4)) and not instrument
     if not plain or existing_sidecar(path):
-        out[sidecar_path(path)] = sidecar_text(chain.tip, chain.base, tool)
+        out[sidecar_path(path)] = sidecar_text(chain.tip, chain.base, tool, instrument or {})
     return out
 
 
@@ -169,7 +195,7 @@ def write_urdf(fit: Result | Chain, path: PathLike) -> None:
         and os.path.samefile(path, chain.urdf.source)
     ):
         raise DhcalError(f"{os.fspath(path)}: is the nominal robot itself; write to another file")
-    save(urdf_files(chain, path))
+    save(urdf_files(chain, path, fit.portable if isinstance(fit, Result) else None))
 
 
 def read_priors(choice: str | None) -> Priors | None:

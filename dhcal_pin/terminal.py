@@ -65,6 +65,20 @@ def findings(path: str, found: Sequence[Finding]) -> None:
         lines(f"{path}: row {finding.row} is left out: {finding.reason}", style="yellow")
 
 
+def doubts(path: str, texts: Sequence[str]) -> None:
+    """What is hard to believe in a file, one line each."""
+    for text in texts:
+        lines(f"{path}: check: {text}", style="yellow")
+
+
+def gross(path: str, rows: Sequence[int], loss: str) -> None:
+    """Gross errors, on one line."""
+    if rows:
+        shown = ", ".join(map(str, rows[:12])) + (f" and {len(rows) - 12} more" if len(rows) > 12 else "")
+        hint = "; --loss tukey would take their say" if loss == "linear" else ""
+        lines(f"{path}: {len(rows)} gross errors, row {shown}{hint}", style="yellow")
+
+
 def notes(texts: Sequence[str]) -> None:
     """Remarks on a conversion."""
     lines(*(f"note: {text}" for text in texts))

@@ -527,4 +527,4 @@ def test_a_wrong_sidecar_is_refused(tmp_path, text, words):
 
 
 def test_sidecar_text_is_toml():
-    assert set(tomllib.loads(sidecar_text('a "b"', np.eye(4), np.eye(4)))) == {"tip", "base", "tool"}
+    assert set(tomllib.loads(sidecar_text('a "b"', np.eye(4), np.eye(4), {}))) == {"tip", "base", "tool"}

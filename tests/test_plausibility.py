@@ -1,0 +1,209 @@
+"""Doubts about a file: what brings each up, and what must not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import URDF, paper, robot_file
+from scipy.spatial.transform import Rotation
+
+from dhcal_pin import cli, se3
+from dhcal_pin.chain import Chain
+from dhcal_pin.inverse import within
+from dhcal_pin.kinds import KINDS
+from dhcal_pin.measurement_files import measurement_text, read_readings
+from dhcal_pin.measurements import Noise
+from dhcal_pin.plausibility import doubts
+from dhcal_pin.poses import Position
+
+
+@pytest.fixture(scope="module")
+def ur10():
+    return Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+
+
+@pytest.fixture
+def told(tmp_path):
+    def call(chain, text):
+        path = tmp_path / "data.csv"
+        path.write_text(text)
+        return doubts(chain, read_readings(path, chain))
+
+    return call
+
+
+def joints(chain, m=30, seed=0):
+    return np.random.default_rng(seed).uniform(-2.5, 2.5, (m, chain.size))
+
+
+def frames():
+    """An instrument three metres away, and a reflector at arm's length."""
+    return se3.exp6(np.array([3.0, -1, 1, 0.4, 1, -2])), se3.exp6(np.array([0.1, 0.05, 0.2, 1, 1, 0]))
+
+
+def sheet(chain, q, *, joint="rad", length="mm", kind="pose", angle="rad", wrong=None):
+    """A file with the units that a header declares; wrong = {"joint" | "length" | "angle": true unit}."""
+    factor = {"rad": 1.0, "deg": 180 / np.pi, "m": 1.0, "mm": 1e3}
+    true = {"joint": joint, "length": length, "angle": angle} | (wrong or {})
+    base, tool = frames()
+    poses = base @ chain.poses(q) @ tool
+    header = [f"{name}[{joint}]" for name in chain.joint_names] + [f"{axis}[{length}]" for axis in "xyz"]
+    columns = [factor[true["joint"]] * q, factor[true["length"]] * poses[:, :3, 3]]
+    if kind == "pose":
+        header += [f"{axis}[{angle}]" for axis in ("rx", "ry", "rz")]
+        columns.append(factor[true["angle"]] * se3.log3(poses[:, :3, :3]))
+    rows = np.concatenate(columns, 1).tolist()
+    return "\n".join([",".join(header), *(",".join(map(repr, row)) for row in rows)]) + "\n"
+
+
+@pytest.mark.parametrize("kind", ["pose", "position"])
+@pytest.mark.parametrize("joint", ["rad", "deg"])
+@pytest.mark.parametrize("length", ["m", "mm"])
+def test_right_units_bring_up_nothing(told, ur10, kind, joint, length):
+    for m in (1, 2, 3, 30):
+        assert told(ur10, sheet(ur10, joints(ur10, m), joint=joint, length=length, kind=kind)) == []
+
+
+@pytest.mark.parametrize("kind", ["pose", "position"])
+@pytest.mark.parametrize(
+    ("units", "word"),
+    [
+        ({"joint": ("rad", "deg")}, "if these are degrees, say so"),
+        ({"joint": ("deg", "rad")}, "if these are radians, write [rad]"),
+        ({"length": ("m", "mm")}, "if they are mm, write x[mm]"),
+        ({"length": ("mm", "m")}, "if they are metres, write x[m]"),
+    ],
+)
+def test_a_wrong_unit_is_told_once(told, ur10, kind, units, word):
+    said = {name: pair[0] for name, pair in units.items()}
+    wrong = {name: pair[1] for name, pair in units.items()}
+    found = told(ur10, sheet(ur10, joints(ur10), kind=kind, wrong=wrong, **said))
+    assert len([text for text in found if word in text]) == len(found) > 0
+    assert len(found) <= (6 if word.startswith("if these are degrees") else 1)
+
+
+@pytest.mark.parametrize(
+    ("said", "true", "word"), [("rad", "deg", "more than a turn"), ("deg", "rad", "turn")]
+)
+def test_rotation_vectors_in_the_wrong_unit(told, ur10, said, true, word):
+    (text,) = told(ur10, sheet(ur10, joints(ur10), angle=said, wrong={"angle": true}))
+    assert word in text
+
+
+def test_euler_angles_are_no_rotation_vector(told, ur10):
+    base, tool = frames()
+    q = joints(ur10)
+    poses = base @ ur10.poses(q) @ tool
+
+    angles = Rotation.from_matrix(poses[:, :3, :3]).as_euler("XYZ")
+    text = sheet(ur10, q)
+    lines = text.splitlines()
+    rows = [
+        ",".join([*line.split(",")[:9], *map(repr, row)])
+        for line, row in zip(lines[1:], angles.tolist(), strict=True)
+    ]
+    (found,) = told(ur10, "\n".join([lines[0], *rows]))
+    assert "axes and frame of Euler angles" in found
+
+
+def test_small_motions_are_believed(told, ur10):
+    q = np.deg2rad(np.random.default_rng(0).uniform(-5, 5, (30, 6)))
+    assert told(ur10, sheet(ur10, q, joint="deg")) == []
+
+
+def test_one_gross_error_is_no_wrong_unit(told, ur10):
+    lines = sheet(ur10, joints(ur10), kind="position").splitlines()
+    cells = lines[5].split(",")
+    lines[5] = ",".join([*cells[:6], "900000", *cells[7:]])
+    assert told(ur10, "\n".join(lines)) == []
+
+
+def test_a_tool_point_that_stays_is_believed(told, ur10):
+    """The tip moves about a fixed point that the instrument reads: no metres in a column of mm."""
+    data = KINDS["point"].simulate(ur10, joints(ur10), Noise(), np.random.default_rng(0))
+    data = data.take(data.label == 0)
+    seen = ur10.poses(data.q)[:, :3, 3] + 1e-5 * np.random.default_rng(0).normal(size=(len(data.q), 3))
+    assert told(ur10, measurement_text(Position.of(data.q, seen), ur10)) == []
+
+
+@pytest.mark.parametrize(
+    ("header", "value", "word"),
+    [
+        ("length[m]", 1500, "length is 1500 m"),
+        ("length[mm]", 1.5, "write length[m]"),
+        ("length[mm]", 1500, ""),
+        ("plane,sigma_plane[m]", "a,0.1", "sigma_plane is 0.1 m"),
+        ("plane,sigma_plane[mm]", "a,0.1", ""),
+        ("sphere,radius[m]", "a,150", "radius is 150 m"),
+        ("sphere,radius[mm]", "a,150", ""),
+    ],
+)
+def test_lengths_and_sigmas(told, ur10, header, value, word):
+    names = ",".join(f"{name}[rad]" for name in ur10.joint_names)
+    rows = [f"{','.join(map(repr, row))},{value}" for row in joints(ur10, 4).tolist()]
+    found = told(ur10, "\n".join([f"{names},{header}", *rows]))
+    assert [word in text for text in found] == ([True] if word else [])
+
+
+@pytest.mark.parametrize(
+    ("unit", "value", "word"),
+    [("m", 50, "distance is 50 m"), ("mm", 0.05, "write distance[m]"), ("mm", 50, "")],
+)
+def test_known_distances(told, ur10, unit, value, word):
+    found = told(ur10, f"point_a,point_b,distance[{unit}]\na,b,{value}\n")
+    assert [word in text for text in found] == ([True] if word else [])
+
+
+def test_joints_beyond_their_limits(told, ur10):
+    q = joints(ur10)
+    q[[3, 7], 2] = [3.3, -3.15]
+    q[11, 2] = np.pi + 1e-5
+    (text,) = told(ur10, sheet(ur10, q))
+    assert "joint elbow_joint is beyond its limits, -3.142 rad to 3.142 rad, in rows 4, 8;" in text
+
+
+def test_rows_given_twice(told, ur10):
+    lines = sheet(ur10, joints(ur10)).splitlines()
+    (text,) = told(ur10, "\n".join([*lines, lines[3], lines[3], lines[9]]))
+    assert text.startswith("rows 31, 32, 33: the same as others to the last digit (row 31 as row 3)")
+
+
+def test_the_same_configuration_read_again_is_believed(told, ur10):
+    """Repeated standstills differ in what was read."""
+    lines = sheet(ur10, joints(ur10)).splitlines()
+    again = lines[3].split(",")
+    again[6] = repr(float(again[6]) + 0.01)
+    assert told(ur10, "\n".join([*lines, ",".join(again)])) == []
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_simulated_files_bring_up_nothing(told, ur10, sim_6dof, kind):
+    for chain, noise in ((ur10, Noise(1e-4, 1e-4)), (sim_6dof, Noise(1e-3, 1e-3))):
+        rng = np.random.default_rng(1)
+        q = rng.uniform(-2.8, 2.8, (25, chain.size))
+        data = KINDS[kind].simulate(chain, q, noise, rng)
+        configurations = data.configurations()
+        assert within(chain, configurations)[1].all()
+        assert told(chain, measurement_text(data, chain)) == []
+
+
+@pytest.mark.parametrize("command", ["calibrate", "validate"])
+def test_the_command_line_says_so(tmp_path, monkeypatch, capsys, command):
+    monkeypatch.chdir(tmp_path)
+    arm = Chain.from_dh(paper("experiment"))
+    (tmp_path / "arm.dh.toml").write_bytes((URDF / "experiment.dh.toml").read_bytes())
+    q = joints(arm, 12)
+    rows = np.hstack([q, 1e3 * arm.poses(q)[:, :3, 3]]).tolist()
+    lines = [
+        "joint_1[rad],joint_2[rad],joint_3[rad],x[mm],y[mm],z[mm]",
+        *(",".join(map(repr, r)) for r in rows),
+    ]
+    (tmp_path / "data.csv").write_text("\n".join(lines))
+    more = ["-o", "out.urdf"] if command == "calibrate" else []
+    assert cli.main([command, "arm.dh.toml", "data.csv", *more]) == 0
+    assert "check:" not in capsys.readouterr().err
+    (tmp_path / "data.csv").write_text("\n".join([*lines, lines[1]]))
+    assert cli.main([command, "arm.dh.toml", "data.csv", *more]) == 0
+    found = [line for line in capsys.readouterr().err.splitlines() if "check:" in line]
+    assert len(found) == 1
+    assert found[0].startswith("data.csv: check: row 13: the same as others")

@@ -1,0 +1,117 @@
+"""Two real robots, each with one command: no code, no edited file.
+
+The measurements lie beside the project, not in it (see their own licences).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import robot_file
+
+from dhcal_pin import cli
+
+MAPS = Path(__file__).resolve().parent / "maps"
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+SERIES = {
+    "B": DATA / "ipa_ur10/Series_B/measurements_joint_configurations.csv",
+    "D": DATA / "ipa_ur10/Series_D/measurements_iso_cubes.csv",
+}
+PANDA = DATA / "mukca_panda/panda_with_ball.urdf"
+PANDA_2 = "back_left back_right front_center front_left front_right mid-high mid_left mid_right".split()
+PANDA_1 = "back-high front right".split()
+
+
+@pytest.fixture(autouse=True)
+def there():
+    """Without the measurements there is nothing to test, but where all must be tested they must be there."""
+    if not DATA.exists():
+        if os.environ.get("CI") == "true":
+            pytest.fail(f"the measurements are missing: {DATA}")
+        pytest.skip(f"no measurements at {DATA}")
+
+
+@pytest.fixture
+def dhcal(tmp_path, capsys):
+    def call(command, robot, *args):
+        """The JSON of a command that must succeed."""
+        out = tmp_path / "result.json"
+        status = cli.main([command, *map(str, (robot, *args, "--json", out))])
+        said = capsys.readouterr()
+        assert status == 0, said.err
+        assert "check" not in said.err, said.err
+        return json.loads(out.read_text())
+
+    return call
+
+
+def ur10(dhcal, series, sets, folder, *more):
+    robot = robot_file("ur_description/urdf/ur10_robot.urdf")
+    output = folder / f"{series}.urdf"
+    options = ("--columns", MAPS / "ipa_ur10.toml", "--tip", "tool0", "--parameters", sets, "-o", output)
+    return dhcal("calibrate", robot, SERIES[series], *options, *more), output
+
+
+@pytest.mark.parametrize(("series", "frames", "best"), [("B", 1.083e-3, 0.450e-3), ("D", 0.774e-3, 0.412e-3)])
+def test_a_tracker_series_of_a_ur10(dhcal, tmp_path, series, frames, best):
+    placed, _ = ur10(dhcal, series, "base,tool", tmp_path, "--holdout", "0.5")
+    # The reference is one split; another draws other rows.
+    assert placed["holdout_after"]["position_rms_m"] == pytest.approx(frames, rel=0.05)
+    for sets in ("minimal,base,tool", "placement,base,tool"):
+        fit, _ = ur10(dhcal, series, sets, tmp_path, "--holdout", "0.5")
+        assert fit["converged"]
+        assert fit["rank"] == 30
+        assert fit["holdout_after"]["position_rms_m"] <= best
+        assert fit["holdout_after"]["orientation_rms_rad"] < 0.0012
+
+
+@pytest.mark.parametrize(("series", "other", "most"), [("B", "D", 0.53e-3), ("D", "B", 0.50e-3)])
+def test_links_from_one_series_hold_for_another(dhcal, tmp_path, series, other, most):
+    _, output = ur10(dhcal, series, "minimal,base,tool", tmp_path)
+    columns = ("--columns", MAPS / "ipa_ur10.toml", "--tip", "tool0")
+    moved = dhcal("validate", output, SERIES[other], *columns, "--fit-frames")
+    assert moved["after"]["position_rms_m"] <= most
+
+
+def known_distances(path, places):
+    rows = [f"{place}/hole_0,{place}/hole_1,50" for place in places]
+    path.write_text("\n".join(["point_a,point_b,distance[mm]", *rows]) + "\n")
+    return path
+
+
+def judged(dhcal, folder, arm, places, left):
+    """Nominal and calibrated: consistency of a left-out place's points and error of their distance, mm."""
+    holes = {
+        place: [DATA / "mukca_panda" / arm / place / f"hole_{i}.csv" for i in (0, 1)] for place in places
+    }
+    kept = [place for place in places if place != left]
+    common = ("--columns", MAPS / "mukca_panda.toml", "--tip", "ball_link")
+    touched = [path for place in kept for path in holes[place]]
+    output = folder / "panda.urdf"
+    known = known_distances(folder / "known.csv", kept)
+    sets = ("--parameters", "placement,tool", "-o", output)
+    assert dhcal("calibrate", PANDA, *touched, known, *common, *sets)["converged"]
+    judge = (*holes[left], known_distances(folder / "left.csv", [left]), *common)
+    found = [dhcal("validate", robot, *judge)["after"] for robot in (PANDA, output)]
+    return [[1e3 * one[key] for key in ("position_rms_m", "residual_rms")] for one in found]
+
+
+def test_a_panda_that_touched_sockets_at_eight_places(dhcal, tmp_path):
+    nominal, fitted = np.array(
+        [judged(dhcal, tmp_path, "panda_2_clean", PANDA_2, left) for left in PANDA_2]
+    ).swapaxes(0, 1)
+    assert 7 < np.sqrt(np.mean(nominal[:, 0] ** 2)) < 11
+    consistency, distance = fitted.mean(0)
+    assert consistency <= 0.34
+    assert distance <= 0.2
+
+
+@pytest.mark.parametrize(("left", "most"), [("back-high", 1.05), ("front", 0.74), ("right", 0.86)])
+def test_a_panda_that_touched_sockets_at_three_places(dhcal, tmp_path, left, most):
+    (nominal, _), (fitted, _) = judged(dhcal, tmp_path, "panda_1", PANDA_1, left)
+    assert nominal > 7
+    assert fitted <= most
