@@ -24,8 +24,9 @@ from .se3 import Array
 Progress = Callable[[int, float], None]
 
 CHUNK = 4096
-# A step is the last one when the rows it would still change are below both of these, in sigmas.
-RELATIVE_STEP, ABSOLUTE_STEP = 1e-8, 1e-10
+# A step is the last one when it changes the rows by less than this share of what they are, or by no more
+# than the rounding of the model, as a share of the Jacobian's size.
+RELATIVE_STEP, ROUNDING = 1e-8, 1e-15
 # An error of so many metres or radians is no error any more.
 RUNAWAY = 1e6
 
@@ -167,10 +168,10 @@ def pseudo_inverse(r: Array, z: Array) -> Array:
     return np.linalg.lstsq(r, z, rcond=observability.RANK_CUT)[0]
 
 
-def _settled(r: Array, step: Array, cost: float, count: int) -> bool:
+def _settled(r: Array, step: Array, cost: float) -> bool:
     """Whether a step changes the whitened rows by nothing that matters."""
     change = float(np.linalg.norm(r @ step))
-    return change <= RELATIVE_STEP * math.sqrt(cost) + ABSOLUTE_STEP * math.sqrt(count)
+    return change <= RELATIVE_STEP * math.sqrt(cost) + ROUNDING * float(np.linalg.norm(r))
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,13 +191,12 @@ def gauss_newton(problem: Problem, x: Array, max_iterations: int, progress: Prog
     Rotation errors are (36) and the derivative is R itself, as printed. Priors join only if given.
     """
     path, converged, done = [x], False, 0
-    count = max(1, sum(len(data.rows) for data in problem.data))
     while done < max_iterations and not converged:
         triangle = reduce(problem, x, small_angle=True)
         full = with_priors(triangle, problem.weights, x, np.zeros_like(x))
         step = pseudo_inverse(full.r, full.z)
         cost = full.rest + float(full.z @ full.z)
-        converged = _settled(full.r, step, cost, count)
+        converged = _settled(full.r, step, cost)
         x = x + step
         path.append(x)
         done += 1
@@ -213,7 +213,6 @@ def levenberg_marquardt(
     """Levenberg-Marquardt; a retry costs forward kinematics only, the triangle stays."""
     path, damping, growth = [x], 1e-4, 2.0
     converged, done = False, 0
-    count = max(1, sum(len(data.rows) for data in problem.data))
     cost = problem.cost(x)
     scale = np.zeros_like(x)
     triangle = reduce(problem, x, small_angle=False)
@@ -221,16 +220,20 @@ def levenberg_marquardt(
         free = with_priors(triangle, problem.weights, x, np.zeros_like(x))
         scale = np.maximum(scale, np.linalg.norm(free.r, axis=0))
         floor = np.where(scale > 0, scale, 1.0)
+        rounding = ROUNDING * float(np.linalg.norm(free.r))
         done += 1
         while True:
             damped = with_priors(triangle, problem.weights, x, np.sqrt(damping) * floor)
             step = pseudo_inverse(damped.r, damped.z)
-            settled = _settled(free.r, step, cost, count)
+            settled = _settled(free.r, step, cost)
             trial = problem.cost(x + step)
             expected = float(free.z @ free.z - np.sum((free.r @ step - free.z) ** 2))
             gain = (cost - trial) / expected if expected > 0 else 0.0
-            if trial <= cost and gain > 1e-3:
-                damping *= max(1e-3, 1 - (2 * gain - 1) ** 3) if gain < 0.9 else 1e-2
+            # Where all that is left is rounding, costs tell nothing and the step is to be trusted.
+            trusted = expected <= (10 * rounding) ** 2 and trial <= (math.sqrt(cost) + 10 * rounding) ** 2
+            if trusted or (trial <= cost and gain > 1e-3):
+                easier = 1e-2 if trusted or gain > 0.9 else max(1e-3, 1 - (2 * gain - 1) ** 3)
+                damping *= easier
                 damping, growth = max(damping, 1e-16), 2.0
                 x, cost, converged = x + step, trial, settled and damping < 1e-3
                 break
