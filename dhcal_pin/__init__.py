@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from .measurements import Noise as Noise
     from .parameters import extract as extract
     from .poses import Pose as Pose
-    from .poses import Position as Position
+    from .positions import Position as Position
     from .result import Result as Result
     from .result import accuracy as accuracy
     from .robot_files import read_robot as read_robot
@@ -46,7 +46,7 @@ _HOMES = {
     "read_measurements": "measurement_files",
     "Noise": "measurements",
     "Pose": "poses",
-    "Position": "poses",
+    "Position": "positions",
     "extract": "parameters",
     "Result": "result",
     "accuracy": "result",

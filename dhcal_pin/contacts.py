@@ -25,7 +25,7 @@ from .measurements import (
     need,
     places,
 )
-from .poses import labelled
+from .positions import labelled
 from .se3 import Array
 from .trilateration import anchors_of
 

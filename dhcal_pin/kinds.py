@@ -5,7 +5,8 @@ from __future__ import annotations
 from .contacts import Plane, PointDistance, Sphere, Touch
 from .lengths import Distance, Wires
 from .measurements import Measurement
-from .poses import Axes, Pose, Position, Targets
+from .poses import Pose
+from .positions import Axes, Position, Targets
 from .relative import RelativePose
 
 KINDS: dict[str, type[Measurement]] = {

@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from . import se3
 from .chain import Chain, Sweep
-from .measurements import (
-    ANGLE_SIGMA,
-    LENGTH_SIGMA,
-    Noise,
-    Unknown,
-    checked,
-    checked_sigma,
-    gathered,
-    lengths,
-    need,
-)
+from .measurements import ANGLE_SIGMA, LENGTH_SIGMA, Noise, checked, checked_sigma, gathered, need
+from .poses import PoseReading, pose_columns, poses_of
 from .se3 import Array
 
 _SHIFT, _TURN = ("dx", "dy", "dz"), ("drx", "dry", "drz")
@@ -29,52 +20,30 @@ _SHIFT_SIGMA, _TURN_SIGMA = (tuple(f"sigma_{name}" for name in names) for names 
 
 
 @dataclass(frozen=True, eq=False)
-class RelativePose:
+class RelativePose(PoseReading):
     """T_ab (m, 4, 4), the tool's pose in configuration b seen from configuration a.
 
     Residuals are the translation in frame a, and log3(R_measuredᵀ·R_model) with its sign turned, in frame b.
     Sees nothing of the base: six directions stay unseen.
 
     Attributes:
-        q, q_to: (m, n) joint values at a and at b, rad or m.
-        poses: (m, 4, 4).
-        sigma, rotation_sigma: (m, 3) m and rad.
-        rows: (m,) row numbers.
-        stated: whether the sigmas are the instrument's own.
+        q_to: (m, n) joint values at b; `q` are those at a.
     """
 
-    q: Array
-    q_to: Array
-    poses: Array
-    sigma: Array
-    rotation_sigma: Array
-    rows: Array
-    stated: bool
+    q_to: Array = field(default_factory=lambda: np.empty((0, 0)))
 
     kind: ClassVar[str] = "relative"
-    groups: ClassVar[Mapping[str, slice]] = {"position": slice(0, 3), "orientation": slice(3, 6)}
-    columns: ClassVar[Mapping[str, str]] = lengths(*_SHIFT) | {
-        **dict.fromkeys(_TURN, "angle"),
-        **dict.fromkeys(_TURN_SIGMA, "angle"),
-    }
+    reads: ClassVar[tuple[tuple[str, ...], tuple[str, ...]]] = (_SHIFT, _TURN)
+    per_row: ClassVar[tuple[str, ...]] = (*PoseReading.per_row, "q_to")
+    columns: ClassVar[Mapping[str, str]] = pose_columns(_SHIFT, _TURN)
     needs: ClassVar[tuple[frozenset[str], ...]] = (need(*_SHIFT, *_TURN),)
     ends: ClassVar[int] = 2
 
     @classmethod
     def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> RelativePose:
         """dx, dy, dz and the rotation vector drx, dry, drz from JOINT to to:JOINT, and sigmas."""
-        poses = se3.transform(se3.exp3(gathered(values, _TURN)), gathered(values, _SHIFT))
+        poses = poses_of(values, _SHIFT, _TURN)
         return cls.of(q[0], q[1], poses, gathered(values, _SHIFT_SIGMA), gathered(values, _TURN_SIGMA))
-
-    def to_columns(self) -> dict[str, Any]:
-        """dx, dy, dz, drx, dry, drz, and sigmas where these are the instrument's own."""
-        turn = se3.log3(self.poses[:, :3, :3])
-        out = {name: self.poses[:, i, 3] for i, name in enumerate(_SHIFT)}
-        out |= {name: turn[:, i] for i, name in enumerate(_TURN)}
-        if self.stated:
-            out |= {name: self.sigma[:, i] for i, name in enumerate(_SHIFT_SIGMA)}
-            out |= {name: self.rotation_sigma[:, i] for i, name in enumerate(_TURN_SIGMA)}
-        return out
 
     @classmethod
     def of(
@@ -90,7 +59,6 @@ class RelativePose:
         m, stated = len(q), sigma is not None
         return cls(
             q,
-            checked(q_to, q.shape, "q_to"),
             checked(poses, (m, 4, 4), "poses"),
             checked_sigma(LENGTH_SIGMA if sigma is None else sigma, (m, 3), "sigma"),
             checked_sigma(
@@ -98,20 +66,12 @@ class RelativePose:
             ),
             np.arange(1, m + 1),
             stated,
+            checked(q_to, q.shape, "q_to"),
         )
-
-    @property
-    def unknowns(self) -> tuple[Unknown, ...]:
-        """None."""
-        return ()
 
     def configurations(self) -> Array:
         """First configurations, then second ones, (2m, n)."""
         return np.concatenate([self.q, self.q_to])
-
-    def started(self, chain: Chain) -> Self:
-        """Nothing to start."""
-        return self
 
     def _ends(self, sweep: Sweep) -> tuple[Array, Array]:
         poses = sweep.poses()
@@ -148,10 +108,6 @@ class RelativePose:
         turned = np.einsum("mij,pmj->pmi", left, rate)
         return np.concatenate([shift / self.sigma, turned / self.rotation_sigma], -1).transpose(0, 2, 1)
 
-    def own(self, sweep: Sweep, u: Array) -> Array:
-        """Nothing, (0, 6, m)."""
-        return np.empty((0, 6, len(self.rows)))
-
     def small_angle(self, sweep: Sweep, velocities: Array, u: Array) -> tuple[Array, Array]:
         """The rotation as half the vee of E - Eᵀ, and its derivative as the rate itself."""
         gap, turn = self._gap(sweep)
@@ -165,32 +121,6 @@ class RelativePose:
         """{"position": (m, 3) in m, "orientation": (m, 3) in rad}."""
         shift, turn = self._gap(sweep)
         return {"position": shift, "orientation": se3.log3(turn)}
-
-    def positions(self) -> Array:
-        """None, (0, 3)."""
-        return np.empty((0, 3))
-
-    def rotations(self) -> Array:
-        """None, (0, 3, 3)."""
-        return np.empty((0, 3, 3))
-
-    def scaled(self, scales: Mapping[str, float]) -> Self:
-        """The same readings with sigmas multiplied."""
-        return replace(
-            self,
-            sigma=self.sigma * scales["position"],
-            rotation_sigma=self.rotation_sigma * scales["orientation"],
-        )
-
-    def weighted(self, weights: Array) -> Self:
-        """The same readings with each sample counting for a weight (m,), by wider sigmas."""
-        wider = 1 / np.sqrt(weights)[:, None]
-        return replace(self, sigma=self.sigma * wider, rotation_sigma=self.rotation_sigma * wider)
-
-    def take(self, index: Array | slice) -> Self:
-        """The samples of an index or mask."""
-        names = ("q", "q_to", "poses", "sigma", "rotation_sigma", "rows")
-        return replace(self, **{name: getattr(self, name)[index] for name in names})
 
     @classmethod
     def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> RelativePose:

@@ -15,7 +15,8 @@ from dhcal_pin.chain import Chain
 from dhcal_pin.errors import DhcalError
 from dhcal_pin.foreign_files import euler
 from dhcal_pin.measurement_files import measurement_text, read_measurements, read_readings
-from dhcal_pin.poses import Pose, Position
+from dhcal_pin.poses import Pose
+from dhcal_pin.positions import Position
 from dhcal_pin.relative import RelativePose
 
 JOINTS = ("joint_1", "joint_2", "joint_3")

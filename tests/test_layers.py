@@ -18,7 +18,7 @@ LAYERS = (
     {"urdf_origins", "dh_urdf"},
     {"chain"},
     {"parameters", "factors", "measurements", "inverse", "trilateration"},
-    {"poses"},
+    {"poses", "positions"},
     {"lengths", "contacts", "relative"},
     {"frames", "observability", "robust", "kinds"},
     {"solver"},

@@ -18,7 +18,8 @@ from dhcal_pin.kinds import KINDS
 from dhcal_pin.measurement_files import measurement_text, read_measurements
 from dhcal_pin.measurements import Noise, nominals
 from dhcal_pin.parameters import select
-from dhcal_pin.poses import Pose, Position
+from dhcal_pin.poses import Pose
+from dhcal_pin.positions import Position
 from dhcal_pin.result import _instruments
 
 KIND = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)

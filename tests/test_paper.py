@@ -9,7 +9,8 @@ from dhcal_pin import demo
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.measurements import Noise
 from dhcal_pin.parameters import select
-from dhcal_pin.poses import Pose, Position
+from dhcal_pin.poses import Pose
+from dhcal_pin.positions import Position
 from dhcal_pin.result import accuracy
 
 # Medians over 50 seeds: largest angle error in degrees, largest length error in mm, as printed, and the

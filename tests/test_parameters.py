@@ -13,7 +13,8 @@ from dhcal_pin.chain import Chain
 from dhcal_pin.errors import DhcalError
 from dhcal_pin.measurements import Noise
 from dhcal_pin.parameters import SETS, select
-from dhcal_pin.poses import Pose, Position
+from dhcal_pin.poses import Pose
+from dhcal_pin.positions import Position
 from dhcal_pin.solver import Problem, reduce
 
 

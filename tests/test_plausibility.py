@@ -14,7 +14,7 @@ from dhcal_pin.kinds import KINDS
 from dhcal_pin.measurement_files import measurement_text, read_readings
 from dhcal_pin.measurements import Noise
 from dhcal_pin.plausibility import doubts
-from dhcal_pin.poses import Position
+from dhcal_pin.positions import Position
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,8 @@ import pytest
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.errors import DhcalError
 from dhcal_pin.measurements import Noise
-from dhcal_pin.poses import Pose, Position
+from dhcal_pin.poses import Pose
+from dhcal_pin.positions import Position
 from dhcal_pin.robust import scores
 
 

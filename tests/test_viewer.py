@@ -20,7 +20,8 @@ from dhcal_pin.cli import main
 from dhcal_pin.errors import DhcalError
 from dhcal_pin.lengths import Distance
 from dhcal_pin.measurements import Noise
-from dhcal_pin.poses import Pose, Position, Targets
+from dhcal_pin.poses import Pose
+from dhcal_pin.positions import Position, Targets
 from dhcal_pin.urdf import parse_urdf
 from dhcal_pin.viewer import scene_html, show
 

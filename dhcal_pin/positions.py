@@ -1,0 +1,221 @@
+"""Instruments that read where a point of the tool is: positions, single axes, several targets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from .chain import Chain, Sweep
+from .errors import DhcalError
+from .measurements import (
+    LENGTH_SIGMA,
+    ZERO_PRIOR,
+    Noise,
+    PointReading,
+    Unknown,
+    checked,
+    checked_sigma,
+    gathered,
+    lengths,
+    need,
+)
+from .se3 import Array
+
+_AXES = ("x", "y", "z")
+_SIGMAS = tuple(f"sigma_{name}" for name in _AXES)
+
+
+@dataclass(frozen=True, eq=False)
+class Position(PointReading):
+    """Positions (m, 3) of the tool point in the measuring frame: laser tracker, CMM, trilaterated wires.
+
+    Sees the tool's point but not its rotation: one axis' zero and the tool's rotation stay unseen.
+    """
+
+    kind: ClassVar[str] = "position"
+    groups: ClassVar[Mapping[str, slice]] = {"position": slice(0, 3)}
+    columns: ClassVar[Mapping[str, str]] = lengths(*_AXES)
+    needs: ClassVar[tuple[frozenset[str], ...]] = (need(*_AXES),)
+
+    @classmethod
+    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> Position:
+        """x, y, z and their sigmas."""
+        return cls.of(q[0], gathered(values, _AXES), gathered(values, _SIGMAS))
+
+    @classmethod
+    def of(cls, q: Array, position: Array, sigma: Array | float | None = None) -> Position:
+        """Checked positions (m, 3) in m at joint values (m, n).
+
+        sigma is one number or (m, 3); without it, it is estimated with the fit.
+        """
+        q = checked(q, (None, None), "q")
+        m = len(q)
+        position = checked(position, (m, 3), "position")
+        sigmas = checked_sigma(LENGTH_SIGMA if sigma is None else sigma, (m, 3), "sigma")
+        return cls(q, position, sigmas, np.arange(1, m + 1), sigma is not None, ())
+
+    def model(self, points: Array, u: Array) -> tuple[Array, Array, Array]:
+        """The point itself."""
+        m = points.shape[-1]
+        return points[0], np.tile(np.eye(3)[None, :, :, None], (1, 1, 1, m)), np.empty((0, 3, m))
+
+    def whiten(self, sweep: Sweep, velocities: Array, u: Array) -> Array:
+        """(p, 3, m)."""
+        return velocities[:, :3] / self.sigma.T
+
+    def positions(self) -> Array:
+        """As measured, (m, 3)."""
+        return self.reading
+
+    @classmethod
+    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Position:
+        """Positions of a chain's tool with normal noise an axis."""
+        q = chain.checked(q)
+        position = chain.sweep(q).tool[3].T + noise.position * rng.standard_normal((len(q), 3))
+        return cls.of(q, position, noise.position or None)
+
+
+@dataclass(frozen=True, eq=False)
+class Axes(PointReading):
+    """Some of x, y, z of the tool point in the measuring frame: dial gauges, a height gauge.
+
+    Attributes:
+        axes: which of 0, 1, 2, as many as the reading has columns.
+    """
+
+    axes: tuple[int, ...] = (0, 1, 2)
+
+    kind: ClassVar[str] = "axes"
+    groups: ClassVar[Mapping[str, slice]] = {"axes": slice(None)}
+    columns: ClassVar[Mapping[str, str]] = lengths(*_AXES)
+    needs: ClassVar[tuple[frozenset[str], ...]] = tuple(need(axis) for axis in _AXES)
+
+    @classmethod
+    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> Axes:
+        """One or two of x, y, z, and their sigmas."""
+        axes = [i for i, axis in enumerate(_AXES) if axis in values]
+        names = [_AXES[i] for i in axes]
+        reading = gathered(values, names)
+        return cls.of(q[0], reading, axes, gathered(values, [f"sigma_{name}" for name in names]))
+
+    def reads(self) -> tuple[str, ...]:
+        """The chosen ones of x, y, z."""
+        return tuple(_AXES[i] for i in self.axes)
+
+    @classmethod
+    def of(cls, q: Array, reading: Array, axes: Sequence[int], sigma: Array | float | None = None) -> Axes:
+        """Checked readings (m, k) in m along k of the axes 0, 1, 2."""
+        q = checked(q, (None, None), "q")
+        shape = (len(q), len(axes))
+        if not axes or not set(axes) <= {0, 1, 2} or len(set(axes)) != len(axes):
+            raise DhcalError(f"axes {tuple(axes)}: choose some of 0, 1, 2, each once")
+        sigmas = checked_sigma(LENGTH_SIGMA if sigma is None else sigma, shape, "sigma")
+        rows = np.arange(1, len(q) + 1)
+        return cls(q, checked(reading, shape, "reading"), sigmas, rows, sigma is not None, (), tuple(axes))
+
+    def model(self, points: Array, u: Array) -> tuple[Array, Array, Array]:
+        """The chosen coordinates."""
+        m, axes = points.shape[-1], list(self.axes)
+        return (
+            points[0][axes],
+            np.tile(np.eye(3)[axes][None, :, :, None], (1, 1, 1, m)),
+            np.empty((0, len(axes), m)),
+        )
+
+    @classmethod
+    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Axes:
+        """X and z of a chain's tool with normal noise."""
+        q = chain.checked(q)
+        position = chain.sweep(q).tool[3].T + noise.position * rng.standard_normal((len(q), 3))
+        return cls.of(q, position[:, [0, 2]], (0, 2), noise.position or None)
+
+
+@dataclass(frozen=True, eq=False)
+class Targets(PointReading):
+    """Positions (m, 3) of several reflectors on the tool, each at an unknown place.
+
+    The first name's place is the tool point itself; the others have three unknowns each, in the tool's
+    frame. Two of them show the tool's rotation about all axes but their line, three all of it.
+
+    Attributes:
+        label: (m,) which of the names.
+        names: reflectors in the order of first appearance.
+    """
+
+    label: Array = None  # pyright: ignore[reportAssignmentType]
+    names: tuple[str, ...] = ()
+
+    kind: ClassVar[str] = "targets"
+    groups: ClassVar[Mapping[str, slice]] = {"position": slice(0, 3)}
+    columns: ClassVar[Mapping[str, str]] = lengths(*_AXES) | {"target": "text"}
+    needs: ClassVar[tuple[frozenset[str], ...]] = (need(*_AXES, "target"),)
+    per_row: ClassVar = (*PointReading.per_row, "label")
+
+    @classmethod
+    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> Targets:
+        """x, y, z, target, and sigmas."""
+        return cls.of(q[0], gathered(values, _AXES), values["target"], gathered(values, _SIGMAS))
+
+    def to_columns(self) -> dict[str, Any]:
+        """x, y, z, target, and sigmas."""
+        return super().to_columns() | {"target": [self.names[i] for i in self.label]}
+
+    @classmethod
+    def of(
+        cls, q: Array, position: Array, targets: Sequence[str], sigma: Array | float | None = None
+    ) -> Targets:
+        """Checked positions (m, 3) in m of named targets (m,)."""
+        plain = Position.of(q, position, sigma)
+        names, label = labelled(targets, len(plain.q), "targets")
+        unknowns = tuple(
+            Unknown(f"target_{name}.{axis}", "m", 0.0, ZERO_PRIOR) for name in names[1:] for axis in _AXES
+        )
+        return cls(plain.q, plain.reading, plain.sigma, plain.rows, plain.stated, unknowns, label, names)
+
+    def _offsets(self, sweep: Sweep, u: Array) -> Array:
+        """Each sample's target relative to the tool point, (3, m) in axes of the measuring frame."""
+        local = np.concatenate([np.zeros((1, 3)), u.reshape(-1, 3)])[self.label]
+        return np.einsum("crm,mc->rm", sweep.tool[:3], local)
+
+    def residual(self, sweep: Sweep, u: Array) -> Array:
+        """(3, m)."""
+        return (self.reading.T - sweep.tool[3] - self._offsets(sweep, u)) / self.sigma.T
+
+    def whiten(self, sweep: Sweep, velocities: Array, u: Array) -> Array:
+        """(p, 3, m): the target's velocity v + ω × offset."""
+        offset = self._offsets(sweep, u)
+        turned = np.cross(velocities[:, 3:], offset[None], axis=1)
+        return (velocities[:, :3] + turned) / self.sigma.T
+
+    def own(self, sweep: Sweep, u: Array) -> Array:
+        """(s, 3, m): the tool's axes where the sample is of that target."""
+        mine = self.label[None] == np.arange(1, len(self.names))[:, None]
+        out = mine[:, None, None, :] * sweep.tool[:3]
+        return out.reshape(-1, 3, out.shape[-1]) / self.sigma.T
+
+    def positions(self) -> Array:
+        """As measured, (m, 3): good enough to find the instrument by, as reflectors sit close together."""
+        return self.reading
+
+    @classmethod
+    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Targets:
+        """Three targets within 5 cm of each other, in turn."""
+        q = chain.checked(q)
+        label = np.arange(len(q)) % 3
+        places = np.array([[0, 0, 0], [0.05, 0, 0.01], [0, 0.04, -0.02]])[label]
+        pose = chain.poses(q)
+        position = pose[:, :3, 3] + np.einsum("mij,mj->mi", pose[:, :3, :3], places)
+        position += noise.position * rng.standard_normal(position.shape)
+        return cls.of(q, position, [f"t{i + 1}" for i in label], noise.position or None)
+
+
+def labelled(words: Sequence[str], count: int, what: str) -> tuple[tuple[str, ...], Array]:
+    """Distinct words in order of appearance, and which one each sample has (m,)."""
+    if len(words) != count:
+        raise DhcalError(f"{what}: {len(words)} names for {count} samples")
+    names = tuple(dict.fromkeys(words))
+    place = {name: i for i, name in enumerate(names)}
+    return names, np.array([place[word] for word in words], int)
