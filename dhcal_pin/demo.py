@@ -139,8 +139,8 @@ def experiment() -> Experiment:
         ["one pseudo-inverse step, (37) to (39)", mm["one_step"], mm["one_step_left_out"]],
         [f"least squares, {' and '.join(held)} held", mm["least_squares"], mm["least_squares_left_out"]],
         ["parameters as published (Table 4)", mm["published_parameters"], ""],
-        ["the paper's own |measured - object|, before", mm["paper_before"], ""],
-        ["the paper's own |measured - object|, after", mm["paper_after"], ""],
+        ["the paper's own distance from the object, before", mm["paper_before"], ""],
+        ["the paper's own distance from the object, after", mm["paper_after"], ""],
     ]
     return Experiment(chain, readings, findings, data, held, fit, rows, figures)
 
