@@ -174,13 +174,13 @@ class Chain:
         model = _build(self.urdf)
         for name, origin in zip(self.moving, self.origins[:-1], strict=True):
             model.jointPlacements[model.getJointId(name)] = pin.SE3(origin)
-        model.frames[self.frame_id].placement = pin.SE3(self.origins[-1])
+        model.frames[model.getFrameId(self.tip, pin.FrameType.BODY)].placement = pin.SE3(self.origins[-1])
         return model
 
     @cached_property
     def frame_id(self) -> int:
         """Pinocchio's index of the tip's frame; links and joints may share names."""
-        return _build(self.urdf).getFrameId(self.tip, pin.FrameType.BODY)
+        return self.model.getFrameId(self.tip, pin.FrameType.BODY)
 
     def configurations(self, q: Array) -> Array:
         """Pinocchio's configurations (m, nq) at q (m, n); joints off the path stay at neutral."""

@@ -14,22 +14,23 @@ from .se3 import Array
 
 # Tool offsets tried where the target's place on the tip is unknown, in metres.
 _REACH = 0.25
+# The most promising of them are followed to the end.
+_TRIED = 4
+
+
+def nearest_rotation(matrix: Array) -> Array:
+    """The rotation (3, 3) nearest to a matrix (3, 3), such as a sum of rotations."""
+    u, _, vt = np.linalg.svd(matrix)
+    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
 
 
 def align(source: Array, target: Array) -> tuple[Array, float]:
     """The rigid motion (4, 4) that carries points (m, 3) best onto others, and its RMS distance in m."""
     centre, goal = source.mean(0), target.mean(0)
-    u, _, vt = np.linalg.svd((target - goal).T @ (source - centre))
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    rotation = nearest_rotation((target - goal).T @ (source - centre))
     motion = se3.transform(rotation, goal - rotation @ centre)
     rest = source @ rotation.T + motion[:3, 3] - target
     return motion, float(np.sqrt(np.mean(np.sum(rest**2, -1))))
-
-
-def mean_rotation(rotations: Array) -> Array:
-    """The rotation (3, 3) nearest to the mean of others (m, 3, 3)."""
-    u, _, vt = np.linalg.svd(rotations.sum(0))
-    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
 
 
 def starts(chain: Chain, data: Sequence[Measurement], base: bool, tool: bool) -> list[Chain]:
@@ -44,22 +45,20 @@ def starts(chain: Chain, data: Sequence[Measurement], base: bool, tool: bool) ->
         return [chain]
     tip = np.concatenate(tips)
     seen = np.concatenate([item.positions() for item in readings])
-    if tool:
-        grid = np.stack(np.meshgrid(*[[0.0, -_REACH, _REACH]] * 3, indexing="ij"), -1).reshape(-1, 3)
+    if not base:
+        # From a known base the target is seen in the tip's frame directly.
+        local = se3.inverse(chain.base @ tip)
+        offset = np.mean((local[:, :3, :3] @ seen[..., None])[..., 0] + local[:, :3, 3], 0)
+        best = [(chain.base, offset)]
     else:
-        grid = chain.tool[None, :3, 3]
-    found = []
-    for offset in grid:
-        placed = tip[:, :3, 3] + tip[:, :3, :3] @ offset
-        motion, rest = align(placed, seen) if base else (chain.base, 0.0)
-        if tool and not base:
-            # Known base: the offset is linear in what was seen.
-            local = se3.inverse(chain.base @ tip)
-            offset = np.mean((local[:, :3, :3] @ seen[..., None])[..., 0] + local[:, :3, 3], 0)
-        found.append((rest, motion, offset))
-    found.sort(key=lambda entry: entry[0])
+        steps = [0.0, -_REACH, _REACH]
+        grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
+        offsets = grid if tool else chain.tool[None, :3, 3]
+        fits = [align(tip[:, :3, 3] + tip[:, :3, :3] @ offset, seen) for offset in offsets]
+        order = np.argsort([rest for _, rest in fits], kind="stable")[:_TRIED]
+        best = [(fits[k][0], offsets[k]) for k in order]
     out = []
-    for _, motion, offset in found[: 4 if base and tool else 1]:
+    for motion, offset in best:
         turn = chain.tool[:3, :3]
         turns = [
             np.swapaxes((motion @ pose)[:, :3, :3], 1, 2) @ item.rotations()
@@ -67,6 +66,6 @@ def starts(chain: Chain, data: Sequence[Measurement], base: bool, tool: bool) ->
             if len(item.rotations())
         ]
         if tool and turns:
-            turn = mean_rotation(np.concatenate(turns))
+            turn = nearest_rotation(np.concatenate(turns).sum(0))
         out.append(replace(chain, base=motion, tool=se3.transform(turn, offset)))
     return out

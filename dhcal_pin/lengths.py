@@ -206,8 +206,3 @@ class Distance(PointReading):
         other = np.roll(np.arange(len(q)), -1)
         length = np.linalg.norm(points[other] - points, axis=1) + noise.position * rng.standard_normal(len(q))
         return cls.of(q, q[other], length, noise.position or None)
-
-
-def device_anchors(a: float, b: float, c: float) -> Array:
-    """The paper's anchors P1 (0, 0, a), P2 (0, b, c), P3 (0, -b, c) as (3, 3), in m (40)."""
-    return np.array([[0, 0, a], [0, b, c], [0, -b, c]], float)

@@ -193,11 +193,6 @@ def places(prefix: str, at: Array) -> tuple[Unknown, ...]:
     )
 
 
-def nominals(unknowns: Sequence[Unknown]) -> Array:
-    """Where the unknowns start (s,)."""
-    return np.array([unknown.nominal for unknown in unknowns])
-
-
 @dataclass(frozen=True, eq=False)
 class PointReading:
     """A reading that depends on where the tool point is, in one or two configurations, and on nothing else.

@@ -24,21 +24,21 @@ def singular_values(triangle: Array) -> Array:
     return np.linalg.svd(triangle, compute_uv=False)
 
 
-def row_space(triangle: Array, cut: float = RANK_CUT) -> Array:
+def row_space(triangle: Array) -> Array:
     """Orthonormal basis (rank, p) of the directions in parameter space that the data see."""
     _, s, vt = np.linalg.svd(triangle)
-    return vt[: int(np.sum(s > cut * s[0]))] if s.size and s[0] > 0 else vt[:0]
+    return vt[: int(np.sum(s > RANK_CUT * s[0]))] if s.size and s[0] > 0 else vt[:0]
 
 
-def rank(triangle: Array, cut: float = RANK_CUT) -> int:
+def rank(triangle: Array) -> int:
     """Number of independent directions that the data see."""
-    return len(row_space(triangle, cut))
+    return len(row_space(triangle))
 
 
-def condition(triangle: Array, cut: float = RANK_CUT) -> float:
+def condition(triangle: Array) -> float:
     """Largest over smallest singular value among the seen directions; 0 if there is none."""
     s = singular_values(triangle)
-    seen = s[s > cut * s[0]] if s.size else s
+    seen = s[s > RANK_CUT * s[0]] if s.size else s
     return float(seen[0] / seen[-1]) if seen.size else 0.0
 
 

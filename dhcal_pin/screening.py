@@ -45,6 +45,7 @@ def reach(chain: Chain) -> tuple[Array, float]:
         if np.linalg.norm(np.cross(chain.axes[j - 1], _next_axis(chain, j))) > 1e-9:
             break
     stroke = np.max(np.abs(np.stack([chain.lower, chain.upper])), 0)
+    # Not infinite, as other joints' zeros in the mixing would make it NaN.
     moving = np.abs(chain.mixing) @ np.where(np.isfinite(stroke), stroke, np.inf).clip(max=1e300)
     slides = float(np.sum(moving[chain.prismatic]))
     return frame[:3, 3], float(np.linalg.norm(origins[first:, :3, 3], axis=1).sum()) + slides

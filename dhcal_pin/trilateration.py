@@ -9,6 +9,11 @@ from .errors import DhcalError
 from .se3 import Array
 
 
+def device_anchors(a: float, b: float, c: float) -> Array:
+    """The paper's anchors P1 (0, 0, a), P2 (0, b, c), P3 (0, -b, c) as (3, 3), in m (40)."""
+    return np.array([[0, 0, a], [0, b, c], [0, -b, c]], float)
+
+
 def three_wires(lengths: ArrayLike, a: float, b: float, c: float, side: int = 1) -> Array:
     """Positions (m, 3) in the device's frame from L1, L2, L3 (m, 3): the closed form (41), m.
 

@@ -16,7 +16,7 @@ from dhcal_pin.contacts import Plane, PointDistance, Touch
 from dhcal_pin.errors import DhcalError
 from dhcal_pin.kinds import KINDS
 from dhcal_pin.measurement_files import measurement_text, read_measurements
-from dhcal_pin.measurements import Noise, nominals
+from dhcal_pin.measurements import Noise
 from dhcal_pin.parameters import select
 from dhcal_pin.poses import Pose
 from dhcal_pin.positions import Position
@@ -32,7 +32,9 @@ def setting(chain, kind, seed=0, m=8):
     errors = select(chain, "dh,base,tool")
     x = 0.1 * rng.normal(size=len(errors.parameters))
     data = kind.simulate(errors.at(x), q, Noise(1e-3, 1e-3), rng).started(errors.at(x))
-    u = np.nan_to_num(nominals(data.unknowns)) + 0.05 * rng.normal(size=len(data.unknowns))
+    u = np.nan_to_num([unknown.nominal for unknown in data.unknowns]) + 0.05 * rng.normal(
+        size=len(data.unknowns)
+    )
     return data, errors, x, u, rng
 
 
