@@ -6,7 +6,6 @@ Wrong input is found before anything is written or shown; JSON goes to stdout, a
 from __future__ import annotations
 
 import os
-import sys
 import tempfile
 from argparse import Namespace
 from collections.abc import Callable, Sequence
@@ -20,10 +19,11 @@ from .check import crosscheck
 from .dh_files import dh_text, is_dh
 from .dh_urdf import dh_to_urdf
 from .errors import DhcalError
-from .files import PathLike, check_place, parse_noise, save
+from .files import PathLike, parse_noise, save
 from .kinds import KINDS
 from .measurement_files import measurement_text, read_measurements, read_readings
 from .measurements import Measurement, Noise
+from .outputs import STDOUT, check_outputs, emit, names, same, sidecars
 from .parameters import extract
 from .plausibility import doubts
 from .result import Result, accuracy
@@ -40,42 +40,6 @@ from .robot_files import (
 )
 from .screening import Finding, screen
 from .se3 import Array
-
-_STDOUT = "-"
-
-
-def _names(text: str) -> list[str]:
-    return [name.strip() for name in text.split(",") if name.strip()]
-
-
-def _same(a: str, b: str) -> bool:
-    if os.path.exists(a) and os.path.exists(b):
-        return os.path.samefile(a, b)
-    return os.path.realpath(a) == os.path.realpath(b)
-
-
-def _check_outputs(outputs: Sequence[str | None], inputs: Sequence[str]) -> None:
-    """Complains about an output that cannot be written, or would write over an input or another output."""
-    paths = [path for path in outputs if path and path != _STDOUT]
-    for number, path in enumerate(paths):
-        if any(_same(path, other) for other in inputs):
-            raise DhcalError(f"{path}: is an input; name another output")
-        if any(_same(path, other) for other in paths[:number]):
-            raise DhcalError(f"{path}: is another output already; name a second file")
-        check_place(path)
-
-
-def _emit(target: str | None, content: object) -> None:
-    """JSON to a file, or alone on stdout for `-`."""
-    if target == _STDOUT:
-        sys.stdout.write(report.json_text(content))
-    elif target:
-        save({target: report.json_text(content)})
-
-
-def _sidecars(robots: Sequence[str]) -> list[str]:
-    return [path for path in map(existing_sidecar, robots) if path]
-
 
 # --- calibrate -------------------------------------------------------------------------------------
 
@@ -127,21 +91,21 @@ def _calibrate(args: Namespace) -> int:
     held_file = args.holdout if args.holdout is not None and os.path.exists(args.holdout) else None
     measured = [*args.data, *([held_file] if held_file else [])]
     for number, path in enumerate(measured):
-        if any(_same(path, other) for other in measured[:number]):
+        if any(same(path, other) for other in measured[:number]):
             raise DhcalError(f"{path}: is given twice; each measurement counts once, to fit or to hold out")
-    robot = [args.robot, *_sidecars([args.robot])]
+    robot = [args.robot, *sidecars([args.robot])]
     priors = [args.priors] if args.priors not in (None, "default", "none") else []
     priors += [args.instrument] if args.instrument else []
     maps = [args.columns] if args.columns else []
     inputs = [*robot, *measured, *priors, *maps]
     _urdf_ending(args.output)
-    _check_outputs([args.json], inputs)
+    check_outputs([args.json], inputs)
     kept = [*measured, *priors, *maps] if args.in_place else inputs
-    _check_outputs([args.output, sidecar_path(args.output), args.json], kept)
+    check_outputs([args.output, sidecar_path(args.output), args.json], kept)
 
     chain = read_robot(args.robot, args.tip)
     sets = args.parameters or chain.parameters
-    data = _read_data(chain, args, held_file, known_frames=not {"base", "tool"} & set(_names(sets)))
+    data = _read_data(chain, args, held_file, known_frames=not {"base", "tool"} & set(names(sets)))
     with terminal.progress("fitting") as progress:
         fit = calibration.calibrate(
             chain,
@@ -149,8 +113,8 @@ def _calibrate(args: Namespace) -> int:
             sets,
             method=args.method,
             priors=read_priors(args.priors),
-            fix=_names(args.fix),
-            free=_names(args.free),
+            fix=names(args.fix),
+            free=names(args.free),
             holdout=data.holdout,
             known=read_instrument(args.instrument) if args.instrument else None,
             loss=args.loss,
@@ -159,7 +123,7 @@ def _calibrate(args: Namespace) -> int:
         )
     contents = _written(fit, args)
     files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
-    if args.json and args.json != _STDOUT:
+    if args.json and args.json != STDOUT:
         files["json"] = args.json
     gross = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))
     impossible = {path: [finding.row for finding in found] for path, found in data.findings.items()}
@@ -174,8 +138,8 @@ def _calibrate(args: Namespace) -> int:
     if "json" in files:
         contents[args.json] = report.json_text(document)
     save(contents)
-    if args.json == _STDOUT:
-        _emit(args.json, document)
+    if args.json == STDOUT:
+        emit(args.json, document)
     for path, found in data.findings.items():
         terminal.findings(path, found)
         terminal.gross(path, gross.get(path, []), args.loss)
@@ -206,21 +170,21 @@ def _written(fit: Result, args: Namespace) -> dict[PathLike, str | bytes]:
 def _validate(args: Namespace) -> int:
     sidecar = args.sidecar or existing_sidecar(args.robot)
     inputs = [args.robot, *args.data, *filter(None, (sidecar, args.columns))]
-    _check_outputs([args.json], inputs)
+    check_outputs([args.json], inputs)
     chain = read_robot(args.robot, args.tip, sidecar)
     readings = [read_readings(path, chain, args.columns) for path in args.data]
     data = [item.data for item in readings]
     surveyed = read_instrument(sidecar) if sidecar else {}
-    names = {unknown.name for item in data for unknown in item.unknowns}
-    known = {name: value for name, value in surveyed.items() if name in names}
+    there = {unknown.name for item in data for unknown in item.unknowns}
+    known = {name: value for name, value in surveyed.items() if name in there}
     if args.fit_frames:
         fit = calibration.calibrate(chain, data, "base,tool", known=known)
         document = report.document(fit, {}, report.fingerprints(inputs))
     else:
         document = report.plain_document(chain, data, report.fingerprints(inputs), known)
     document["before"] = accuracy(chain, data, known)
-    document["files"] = {"json": args.json} if args.json and args.json != _STDOUT else {}
-    _emit(args.json, document)
+    document["files"] = {"json": args.json} if args.json and args.json != STDOUT else {}
+    emit(args.json, document)
     for item in readings:
         terminal.doubts(item.source, doubts(chain, item))
     terminal.validation(args.robot, document, args.fit_frames)
@@ -228,7 +192,7 @@ def _validate(args: Namespace) -> int:
 
 
 def _convert(args: Namespace) -> int:
-    _check_outputs([args.output], [args.input])
+    check_outputs([args.output], [args.input])
     low = args.output.lower()
     if low.endswith(".origins.csv"):
         text, notes = exports.origins_text(read_robot(args.input, args.tip)), ()
@@ -256,7 +220,7 @@ def _to_dh(args: Namespace) -> tuple[str, Sequence[str]]:
         if args.convention in (None, table.convention):
             return dh_text(table, args.output), ()
     found = extract(chain, args.convention or "standard")
-    left = [f"base and tool in {path} do not go to the table" for path in _sidecars([args.input])]
+    left = [f"base and tool in {path} do not go to the table" for path in sidecars([args.input])]
     return dh_text(found.table, args.output), [*found.notes, *left]
 
 
@@ -264,7 +228,7 @@ def _to_urdf(args: Namespace) -> tuple[str, Sequence[str]]:
     _urdf_ending(args.output, "or a DH table as .dh.toml or .dh.csv")
     if args.tip is not None or args.convention is not None:
         raise DhcalError(f"{args.input}: a table has one tip and one URDF; leave out --tip and --convention")
-    beside = [f"{path} lies beside it and is read with it" for path in _sidecars([args.output])]
+    beside = [f"{path} lies beside it and is read with it" for path in sidecars([args.output])]
     return dh_to_urdf(read_table(args.input), robot_name(args.input)), beside
 
 
@@ -274,17 +238,17 @@ def _urdf_ending(path: str, other: str = "") -> None:
 
 
 def _check(args: Namespace) -> int:
-    _check_outputs([args.json], [args.robot])
+    check_outputs([args.json], [args.robot])
     rows = crosscheck(read_robot(args.robot, args.tip))
     agree = all(row.holds for row in rows)
-    _emit(args.json, {"agree": agree, "routes": [asdict(row) | {"holds": row.holds} for row in rows]})
+    emit(args.json, {"agree": agree, "routes": [asdict(row) | {"holds": row.holds} for row in rows]})
     terminal.agreement(args.robot, rows)
     return 0 if agree else 1
 
 
 def _simulate(args: Namespace) -> int:
     robots = [args.robot, *([args.truth] if args.truth else [])]
-    _check_outputs([args.output], [*robots, *_sidecars(robots)])
+    check_outputs([args.output], [*robots, *sidecars(robots)])
     noise = Noise(*parse_noise(args.noise))
     if args.kind not in KINDS:
         raise DhcalError(f"--kind {args.kind}: choose from {', '.join(KINDS)}")
@@ -319,7 +283,7 @@ def _configurations(chain: Chain, count: int, rng: np.random.Generator) -> Array
 def _view(args: Namespace) -> int:
     given = [args.nominal, *([args.calibrated] if args.calibrated else [])]
     page = args.html or os.path.join(tempfile.mkdtemp(prefix="dhcal-"), f"{robot_name(args.nominal)}.html")
-    _check_outputs([page], [*given, *_sidecars(given), *args.data])
+    check_outputs([page], [*given, *sidecars(given), *args.data])
     nominal, *calibrated = (read_robot(path, None if is_table(path) else args.tip) for path in given)
     data = [read_measurements(path, nominal) for path in args.data]
     title = " and ".join(robot_name(path) for path in given)
@@ -334,9 +298,9 @@ def _view(args: Namespace) -> int:
 
 
 def _demo(args: Namespace) -> int:
-    _check_outputs([args.json], [])
+    check_outputs([args.json], [])
     document = demo.run(args.out)
-    _emit(args.json, document)
+    emit(args.json, document)
     if args.open:
         terminal.open_page(document["files"]["scene"])
     return 0

@@ -36,6 +36,7 @@ LAYERS = (
     {"report"},
     {"terminal"},
     {"viewer"},
+    {"outputs"},
     {"demo"},
     {"commands"},
     {"cli"},

@@ -201,7 +201,7 @@ def test_the_command_line_says_so(tmp_path, monkeypatch, capsys, command):
     (tmp_path / "data.csv").write_text("\n".join(lines))
     more = ["-o", "out.urdf"] if command == "calibrate" else []
     assert cli.main([command, "arm.dh.toml", "data.csv", *more]) == 0
-    assert "check:" not in capsys.readouterr().err
+    assert ": check: " not in capsys.readouterr().err
     (tmp_path / "data.csv").write_text("\n".join([*lines, lines[1]]))
     assert cli.main([command, "arm.dh.toml", "data.csv", *more]) == 0
     found = [line for line in capsys.readouterr().err.splitlines() if "check:" in line]
