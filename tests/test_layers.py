@@ -13,7 +13,7 @@ HOUSE = Path(dhcal_pin.__file__).parent
 LAYERS = (
     {"errors"},
     {"se3"},
-    {"urdf_tags", "dh"},
+    {"urdf_tags", "dh", "scratch"},
     {"urdf", "extraction"},
     {"urdf_origins", "dh_urdf"},
     {"chain"},
