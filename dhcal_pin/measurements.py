@@ -18,7 +18,6 @@ import numpy as np
 
 from .chain import Chain, Sweep
 from .errors import DhcalError
-from .scratch import scratch
 from .se3 import Array
 
 # Without a sigma a millimetre weighs as much as a milliradian.
@@ -103,8 +102,10 @@ class Measurement(Protocol):
         """Whitened residuals (k, m); `groups` names its rows."""
         ...
 
-    def whiten(self, sweep: Sweep, velocities: Array, u: Array, out: Array | None = None) -> Array:
-        """Derivatives (p, k, m) of the whitened model from tool velocities (p, 6, c·m)."""
+    def whiten(
+        self, sweep: Sweep, velocities: Array, u: Array, residual: Array, out: Array | None = None
+    ) -> Array:
+        """Derivatives (p, k, m) of the whitened model from tool velocities (p, 6, c·m) where residual is."""
         ...
 
     def own(self, sweep: Sweep, u: Array) -> Array:
@@ -279,21 +280,14 @@ class PointReading:
         """(k, m)."""
         return (self._reading - self.model(self._points(sweep), u)[0]) * self._weights
 
-    def whiten(self, sweep: Sweep, velocities: Array, u: Array, out: Array | None = None) -> Array:
+    def whiten(
+        self, sweep: Sweep, velocities: Array, u: Array, residual: Array, out: Array | None = None
+    ) -> Array:
         """(p, k, m)."""
         derivative = self.model(self._points(sweep), u)[1] * self._weights[:, None]
-        k, m = self._weights.shape
-        out = np.empty((len(velocities), k, m)) if out is None else out
-        product = scratch("product", *out.shape)
-        # A sum over ends and x, y, z, written out: einsum would not use the memory's order.
-        for i, block in enumerate(derivative):
-            for axis in range(3):
-                part = velocities[:, None, axis, i * m : (i + 1) * m]
-                if i == axis == 0:
-                    np.multiply(part, block[:, axis], out=out)
-                else:
-                    out += np.multiply(part, block[:, axis], out=product)
-        return out
+        ends, _, _, m = derivative.shape
+        moved = velocities[:, :3].reshape(-1, 3, ends, m)
+        return np.einsum("pacm,ckam->pkm", moved, derivative, out=out)
 
     def own(self, sweep: Sweep, u: Array) -> Array:
         """(s, k, m)."""
@@ -303,7 +297,8 @@ class PointReading:
         self, sweep: Sweep, velocities: Array, u: Array, out: Array | None = None
     ) -> tuple[Array, Array]:
         """The same rows: there is no rotation in them."""
-        return self.residual(sweep, u), self.whiten(sweep, velocities, u, out)
+        residual = self.residual(sweep, u)
+        return residual, self.whiten(sweep, velocities, u, residual, out)
 
     def errors(self, sweep: Sweep, u: Array) -> dict[str, Array]:
         """{group: (m, k)} in m."""

@@ -293,7 +293,8 @@ class ErrorModel:
         share = np.stack([x, 2 * np.sin(0.5 * angle) ** 2, angle - np.sin(angle)], 1)
         motion = (share[:, None] @ powers).reshape(-1, 4, 4) + np.eye(4)
         stations, group, place = self._slots
-        out = np.tile(np.eye(4), (len(stations), int(place.max(initial=0)) + 1, 1, 1))
+        out = np.empty((len(stations), int(place.max(initial=0)) + 1, 4, 4))
+        out[:] = np.eye(4)
         out[group, place] = motion
         return out
 
@@ -303,7 +304,8 @@ class ErrorModel:
         return self._moved(functools.reduce(np.matmul, np.swapaxes(factors, 0, 1)))
 
     def _moved(self, motions: Array) -> Chain:
-        every = np.tile(np.eye(4), (self.chain.tool_station + 1, 1, 1))
+        every = np.empty((self.chain.tool_station + 1, 4, 4))
+        every[:] = np.eye(4)
         every[self._slots[0]] = motions
         return self.chain.moved(every)
 

@@ -23,7 +23,6 @@ from .measurements import (
     lengths,
     need,
 )
-from .scratch import scratch
 from .se3 import Array
 
 _AXES = ("x", "y", "z")
@@ -201,15 +200,11 @@ class Pose(PoseReading):
 
     def _turn(self, sweep: Sweep) -> Array:
         """R_measured·R_modelᵀ (3, 3, m)."""
-        measured = self._measured
-        turn, product = measured[:, None, 0] * sweep.tool[0], np.empty((3, 3, len(self.rows)))
-        for i in (1, 2):
-            turn += np.multiply(measured[:, None, i], sweep.tool[i], out=product)
-        return turn
+        return np.einsum("ikm,kjm->ijm", self._measured[:, :3], sweep.tool[:3])
 
     def _rotvec(self, sweep: Sweep) -> Array:
         """The turn's rotation vector (3, m)."""
-        return se3.log3(np.moveaxis(self._turn(sweep), -1, 0)).T
+        return se3.log3(self._turn(sweep).transpose(2, 0, 1)).T
 
     def _position(self, sweep: Sweep) -> Array:
         return self._measured[:, 3] - sweep.tool[3]
@@ -218,18 +213,16 @@ class Pose(PoseReading):
         """(6, m): x, y, z, then the rotation vector, over sigma."""
         return np.concatenate([self._position(sweep), self._rotvec(sweep)]) * self._weights
 
-    def whiten(self, sweep: Sweep, velocities: Array, u: Array, out: Array | None = None) -> Array:
+    def whiten(
+        self, sweep: Sweep, velocities: Array, u: Array, residual: Array, out: Array | None = None
+    ) -> Array:
         """(p, 6, m); log3(E·exp(-ω)) = φ - Jr⁻¹(φ)·ω."""
         out = np.empty_like(velocities) if out is None else out
         weights = self._weights
         np.multiply(velocities[:, :3], weights[:3], out=out[:, :3])
-        mix = np.moveaxis(se3.right_jacobian_inverse(self._rotvec(sweep).T), 0, -1) * weights[3:, None]
-        product = scratch("product", len(velocities), len(self.rows))
-        for i in range(3):
-            row = out[:, 3 + i]
-            np.multiply(velocities[:, 3], mix[i, 0], out=row)
-            row += np.multiply(velocities[:, 4], mix[i, 1], out=product)
-            row += np.multiply(velocities[:, 5], mix[i, 2], out=product)
+        mix = se3.right_jacobian_inverse((residual[3:] / weights[3:]).T)
+        mix = mix.transpose(1, 2, 0) * weights[3:, None]
+        np.einsum("pkm,ikm->pim", velocities[:, 3:], mix, out=out[:, 3:])
         return out
 
     def small_angle(

@@ -63,7 +63,9 @@ class Position(PointReading):
         m = points.shape[-1]
         return points[0], np.tile(np.eye(3)[None, :, :, None], (1, 1, 1, m)), np.empty((0, 3, m))
 
-    def whiten(self, sweep: Sweep, velocities: Array, u: Array, out: Array | None = None) -> Array:
+    def whiten(
+        self, sweep: Sweep, velocities: Array, u: Array, residual: Array, out: Array | None = None
+    ) -> Array:
         """(p, 3, m)."""
         return np.multiply(velocities[:, :3], self._weights, out=out)
 
@@ -185,7 +187,9 @@ class Targets(PointReading):
         """(3, m)."""
         return (self._reading - sweep.tool[3] - self._offsets(sweep, u)) * self._weights
 
-    def whiten(self, sweep: Sweep, velocities: Array, u: Array, out: Array | None = None) -> Array:
+    def whiten(
+        self, sweep: Sweep, velocities: Array, u: Array, residual: Array, out: Array | None = None
+    ) -> Array:
         """(p, 3, m): the target's velocity v + ω × offset."""
         offset = self._offsets(sweep, u)
         out = np.empty((len(velocities), *offset.shape)) if out is None else out

@@ -21,7 +21,7 @@ from .scratch import long_rows, scratch
 from .se3 import Array
 
 # Samples a chunk, and columns that LAPACK reduces at once.
-CHUNK, PANEL = 2048, 8
+CHUNK, PANEL = 1024, 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,8 +142,8 @@ class Tangent:
             if small_angle:
                 block[p] = data.small_angle(sweep, velocities, u, block[:errors])[0]
             else:
-                data.whiten(sweep, velocities, u, block[:errors])
                 block[p] = data.residual(sweep, u)
+                data.whiten(sweep, velocities, u, block[p], block[:errors])
             block[errors:p] = 0.0
             for unknown, rows in zip(data.unknowns, data.own(sweep, u), strict=True):
                 if unknown.name in self.places:

@@ -84,14 +84,14 @@ class RelativePose(PoseReading):
         first, second = self._ends(sweep)
         measured = self._measured
         # R_bᵀ·R_a·R_measured: the rows are those of the model's rotation from a to b.
-        between = np.sum(second[:3, None] * first[None, :3], 2)
-        turn = np.sum(between[:, :, None] * measured[None, :, :3], 1)
-        return measured[:, 3] - _seen(first, second[3] - first[3]), turn
+        between = np.einsum("ikm,jkm->ijm", second[:3], first[:3])
+        turn = np.einsum("ijm,jkm->ikm", between, measured[:, :3])
+        return measured[:, 3] - np.einsum("ikm,km->im", first[:3], second[3] - first[3]), turn
 
     def residual(self, sweep: Sweep, u: Array) -> Array:
         """(6, m)."""
         shift, turn = self._gap(sweep)
-        return np.concatenate([shift, se3.log3(np.moveaxis(turn, -1, 0)).T]) * self._weights
+        return np.concatenate([shift, se3.log3(turn.transpose(2, 0, 1)).T]) * self._weights
 
     def _rates(self, sweep: Sweep, velocities: Array, out: Array | None) -> Array:
         """Rates (p, 6, m) of the translation in a and, as body rates, of the model's rotation in frame b."""
@@ -104,20 +104,16 @@ class RelativePose(PoseReading):
             rate[:, x] -= np.multiply(velocities[:, 3 + y, :m], arm[z], out=product)
             rate[:, x] += np.multiply(velocities[:, 3 + z, :m], arm[y], out=product)
         for frame, part in ((first, slice(0, 3)), (second, slice(3, 6))):
-            for i, row in enumerate(out[:, part].transpose(1, 0, 2)):
-                np.multiply(rate[:, part][:, 0], frame[i, 0], out=row)
-                for axis in (1, 2):
-                    row += np.multiply(rate[:, part][:, axis], frame[i, axis], out=product)
+            np.einsum("pkm,ikm->pim", rate[:, part], frame[:3], out=out[:, part])
         return out
 
-    def whiten(self, sweep: Sweep, velocities: Array, u: Array, out: Array | None = None) -> Array:
+    def whiten(
+        self, sweep: Sweep, velocities: Array, u: Array, residual: Array, out: Array | None = None
+    ) -> Array:
         """(p, 6, m); log3(exp(-ω)·E) = φ - Jl⁻¹(φ)·ω, Jl⁻¹ being the transpose of Jr⁻¹."""
         out = self._rates(sweep, velocities, out)
-        turn = se3.log3(np.moveaxis(self._gap(sweep)[1], -1, 0))
-        right = np.moveaxis(se3.right_jacobian_inverse(turn), 0, -1)
-        rate = out[:, 3:].copy()
-        for i in range(3):
-            out[:, 3 + i] = sum(right[j, i] * rate[:, j] for j in range(3))
+        right = se3.right_jacobian_inverse((residual[3:] / self._weights[3:]).T)
+        out[:, 3:] = np.einsum("pkm,mki->pim", out[:, 3:], right)
         out *= self._weights
         return out
 
@@ -135,7 +131,7 @@ class RelativePose(PoseReading):
     def errors(self, sweep: Sweep, u: Array) -> dict[str, Array]:
         """{"position": (m, 3) in m, "orientation": (m, 3) in rad}."""
         shift, turn = self._gap(sweep)
-        return {"position": shift.T, "orientation": se3.log3(np.moveaxis(turn, -1, 0))}
+        return {"position": shift.T, "orientation": se3.log3(turn.transpose(2, 0, 1))}
 
     @classmethod
     def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> RelativePose:
@@ -152,8 +148,3 @@ class RelativePose(PoseReading):
         return cls.of(
             q, q[other], relative, noise.position if known else None, noise.rotation if known else None
         )
-
-
-def _seen(frame: Array, vector: Array) -> Array:
-    """A vector (3, m) in a frame given by its columns (≥3, 3, m)."""
-    return np.sum(frame[:3] * vector, 1)

@@ -80,21 +80,21 @@ def exp3(rotvec: ArrayLike) -> Array:
 def log3(rotation: ArrayLike) -> Array:
     """Rotation vectors (..., 3) in radians, of norm up to π, of rotations (..., 3, 3), precise everywhere.
 
-    Arrays with the samples last in memory, seen through `np.moveaxis`, are the quickest, and the result
-    is such an array too.
+    Arrays with the samples last in memory, seen through a transpose, are the quickest, and the result is
+    such an array too.
     """
     r = np.asarray(rotation, float)
     out = np.empty((3, *r.shape[:-2]))
     for i, (j, k) in enumerate(((2, 1), (0, 2), (1, 0))):
         np.subtract(r[..., j, k], r[..., k, j], out=out[i, ...])
     # Twice the angle's sine and cosine; the sine alone is blind near π, the cosine near 0.
-    sine = np.sqrt(np.maximum(np.sum(out * out, 0), 1e-300))
+    sine = np.sqrt(np.maximum(np.einsum("i...,i...->...", out, out), 1e-300))
     cosine = r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2] - 1
     out *= np.arctan2(sine, cosine) / sine
     back = cosine < -1.8
     if np.any(back):
         out[:, back] = _log3_near_half_turn(r[back]).T
-    return np.moveaxis(out, 0, -1)
+    return out.transpose(*range(1, out.ndim), 0)
 
 
 def _log3_near_half_turn(r: Array) -> Array:
@@ -119,8 +119,9 @@ def right_jacobian_inverse(rotvec: ArrayLike) -> Array:
 
     The result has the samples last in memory.
     """
-    v = np.moveaxis(np.asarray(rotvec, float), -1, 0)
-    t2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    rotvec = np.asarray(rotvec, float)
+    v = rotvec.transpose(-1, *range(rotvec.ndim - 1))
+    t2 = np.einsum("i...,i...->...", v, v)
     factor = np.array(1 / 12 + t2 * (1 / 720 + t2 / 30240))
     large = t2 >= 1e-3
     if np.any(large):
@@ -129,12 +130,12 @@ def right_jacobian_inverse(rotvec: ArrayLike) -> Array:
         factor[large] = 1 / square - 0.5 / (angle * np.tan(0.5 * angle))
     # I + ½[φ]× + f·[φ]×², with [φ]×² = φφᵀ - |φ|²·I.
     out = (factor * v) * v[:, None]
-    half = 0.5 * v
+    half, diagonal = 0.5 * v, 1 - factor * t2
     for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
-        out[i, i] += 1 - factor * t2
+        out[i, i] += diagonal
         out[k, j] += half[i]
         out[j, k] -= half[i]
-    return np.moveaxis(out, (0, 1), (-2, -1))
+    return out.transpose(*range(2, out.ndim), 0, 1)
 
 
 def exp6(twist: ArrayLike) -> Array:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import lapack
 
 from . import observability
 from .errors import DhcalError
@@ -21,23 +22,31 @@ Progress = Callable[[int, float], None]
 # A step is the last one when it changes the rows by less than this share of what they are, or by no more
 # than the rounding of the model, as a share of the Jacobian's size.
 RELATIVE_STEP, ROUNDING = 1e-8, 1e-15
+# A triangle with such a reciprocal condition has no singular value near the cut, however large it is.
+SURELY_REGULAR = 1e3 * observability.RANK_CUT
 # An error of so many metres or radians is no error any more.
 RUNAWAY = 1e6
 
 
 def with_priors(triangle: Triangle, weights: Array, x: Array, damping: Array) -> Triangle:
     """The triangle with prior rows -x/σ and damping rows below it."""
-    p = len(x)
-    stacked = np.zeros((p + 1, 3 * p))
+    p, held, damped = len(x), np.flatnonzero(weights), np.flatnonzero(damping)
+    if not (held.size or damped.size):
+        return triangle
+    stacked = np.zeros((p + 1, p + held.size + damped.size))
     stacked[:p, :p], stacked[p, :p] = triangle.r.T, triangle.z
-    stacked[:p, p : 2 * p], stacked[p, p : 2 * p] = np.diag(weights), -weights * x
-    stacked[:p, 2 * p :] = np.diag(damping)
+    priors = np.arange(p, p + held.size)
+    stacked[held, priors], stacked[p, priors] = weights[held], -(weights * x)[held]
+    stacked[damped, p + held.size + np.arange(damped.size)] = damping[damped]
     full = qr(stacked)
     return Triangle(full[:p, :p], full[:p, p], triangle.rest + float(full[p, p] ** 2))
 
 
 def pseudo_inverse(r: Array, z: Array) -> Array:
     """Shortest least-squares solution of R·δ = z, singular values cut as in `observability`."""
+    # Far from the cut there is one solution, and the triangle gives it a hundred times as fast.
+    if len(z) and lapack.dtrcon(r)[0] > SURELY_REGULAR:
+        return lapack.dtrtrs(r, z)[0]
     return np.linalg.lstsq(r, z, rcond=observability.RANK_CUT)[0]
 
 
