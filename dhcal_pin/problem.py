@@ -21,7 +21,7 @@ from .scratch import long_rows, scratch
 from .se3 import Array
 
 # Samples a chunk, and columns that LAPACK reduces at once.
-CHUNK, PANEL = 1024, 8
+CHUNK, PANEL = 2000, 8
 
 
 @dataclass(frozen=True, eq=False)
