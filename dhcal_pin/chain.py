@@ -321,16 +321,17 @@ class Chain:
         """
         m = sweep.tool.shape[-1]
         out = np.empty((len(bodies), 6, m)) if out is None else out
-        starts = np.searchsorted(bodies, np.arange(len(sweep.bodies) + 1)).tolist()
+        used, starts = np.unique(bodies, return_index=True)
+        groups = list(itertools.pairwise([*starts.tolist(), len(bodies)]))
+        frames = sweep.bodies if len(used) == len(sweep.bodies) else sweep.bodies[used]
         for at in range(0, m, BLOCK):
             some = np.s_[..., at : at + BLOCK]
-            axes, moved = sweep.bodies[:, :3][some], _moved_point(sweep.bodies[some], sweep.tool[3][some])
+            axes, moved = frames[:, :3][some], _moved_point(frames[some], sweep.tool[3][some])
             # A twist mixes what its body's axes do, one small product for all samples and components.
-            for j, (first, last) in enumerate(itertools.pairwise(starts)):
-                if first < last:
-                    rows = out[first:last][some].transpose(1, 0, 2)
-                    np.matmul(twists[first:last], moved[j].transpose(1, 0, 2), out=rows[:3])
-                    np.matmul(twists[first:last, 3:], axes[j].transpose(1, 0, 2), out=rows[3:])
+            for (first, last), turn, move in zip(groups, axes, moved, strict=True):
+                rows = out[first:last][some].transpose(1, 0, 2)
+                np.matmul(twists[first:last], move.transpose(1, 0, 2), out=rows[:3])
+                np.matmul(twists[first:last, 3:], turn.transpose(1, 0, 2), out=rows[3:])
         return out
 
     def displaced(self, motions: Mapping[int, Array]) -> Chain:

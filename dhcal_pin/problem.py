@@ -75,6 +75,12 @@ class Problem:
             for start in range(0, len(item.rows), CHUNK)
         )
 
+    def held(self, weights: Array) -> Problem:
+        """The same data with other priors."""
+        out = replace(self, weights=weights)
+        vars(out)["chunks"] = self.chunks
+        return out
+
     def cost(self, x: Array) -> float:
         """Sum of squared whitened residuals and priors at x (p,)."""
         chain = self.errors.at(x[: len(self.errors.parameters)])
@@ -177,6 +183,11 @@ class Triangle:
     r: Array
     z: Array
     rest: float
+
+    @property
+    def cost(self) -> float:
+        """Sum of the squared rows, at no step."""
+        return self.rest + float(self.z @ self.z)
 
 
 def qr(rows: Array) -> Array:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import lapack
@@ -118,29 +118,40 @@ def _leap(problem: Problem, x: Array, cost: float) -> tuple[Array, float]:
 
 
 def levenberg_marquardt(
-    problem: Problem, x: Array, max_iterations: int, progress: Progress | None
+    problem: Problem,
+    x: Array,
+    max_iterations: int,
+    progress: Progress | None,
+    triangle: Triangle | None = None,
 ) -> Solution:
     """Levenberg-Marquardt; a retry costs forward kinematics only, the triangle stays.
 
     Along a narrow valley that bends, damped steps downhill are tiny and Gauss-Newton's, far uphill at
-    first, arrive: now and then it may try.
+    first, arrive: now and then it may try. `triangle` is the data's at x where that is known already.
     """
-    path, damping, growth = [x], 1e-4, 2.0
+    path, damping, growth = [x], 1e-8, 2.0
     converged, done = False, 0
-    cost = problem.cost(x)
-    scale = np.zeros_like(x)
-    triangle = reduce(problem, x, small_angle=False)
-    while done < max_iterations and not converged:
-        free = with_priors(triangle, problem.weights, x, np.zeros_like(x))
+    none, scale = np.zeros_like(x), np.zeros_like(x)
+    triangle = triangle if triangle is not None else reduce(problem, x, small_angle=False)
+    cost = triangle.cost + float(np.sum((problem.weights * x) ** 2))
+    while done < max_iterations and not converged and damping <= 1e16:
+        before, reached = x, None
+        free = with_priors(triangle, problem.weights, x, none)
         scale = np.maximum(scale, np.linalg.norm(free.r, axis=0))
         floor = np.where(scale > 0, scale, 1.0)
         rounding = ROUNDING * float(np.linalg.norm(free.r))
         done += 1
         while True:
-            damped = with_priors(triangle, problem.weights, x, np.sqrt(damping) * floor)
+            damped = with_priors(free, none, x, np.sqrt(damping) * floor)
             step = pseudo_inverse(damped.r, damped.z)
             settled = _settled(free.r, step, cost)
-            trial = problem.cost(x + step)
+            ahead = None
+            if not settled and growth == 2.0:
+                # A first try mostly holds, and its triangle, which the next step needs, tells its cost too.
+                ahead = reduce(problem, x + step, small_angle=False)
+                trial = ahead.cost + float(np.sum((problem.weights * (x + step)) ** 2))
+            else:
+                trial = problem.cost(x + step)
             expected = float(free.z @ free.z - np.sum((free.r @ step - free.z) ** 2))
             gain = (cost - trial) / expected if expected > 0 else 0.0
             # Where all that is left is rounding, costs tell nothing and the step is to be trusted.
@@ -149,7 +160,7 @@ def levenberg_marquardt(
                 easier = 1e-2 if trusted or gain > 0.9 else max(1e-3, 1 - (2 * gain - 1) ** 3)
                 damping *= easier
                 damping, growth = max(damping, 1e-16), 2.0
-                x, cost, converged = x + step, trial, settled and damping < 1e-3
+                x, cost, converged, reached = x + step, trial, settled and damping < 1e-3, ahead
                 break
             if settled or damping > 1e16:
                 # Nothing left to gain beyond rounding.
@@ -157,13 +168,15 @@ def levenberg_marquardt(
                 break
             damping, growth = damping * growth, growth * 2
         if done in LEAPS and not converged:
-            x, cost = _leap(problem, x, cost)
+            x, cost, reached = *_leap(problem, x, cost), None
         path.append(x)
         if progress:
             progress(done, cost)
-        if damping > 1e16:
-            break
-        triangle = reduce(problem, x, small_angle=False)
+        if converged:
+            # Too small a step to bend the model.
+            triangle = replace(triangle, z=triangle.z - triangle.r @ (x - before))
+        elif x is not before:
+            triangle = reached or reduce(problem, x, small_angle=False)
     return Solution(x, triangle, done, converged, np.array(path))
 
 

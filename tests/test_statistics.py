@@ -14,7 +14,8 @@ from dhcal_pin.dh import DHTable
 from dhcal_pin.measurements import Noise
 from dhcal_pin.parameters import select
 from dhcal_pin.poses import Pose
-from dhcal_pin.problem import Problem, posterior_root, reduce
+from dhcal_pin.problem import Problem, reduce
+from dhcal_pin.solver import posterior_root
 
 POSITION, ROTATION = 1e-4, np.deg2rad(0.01)
 
