@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
@@ -215,6 +216,9 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; 0 done, 1 a check that failed, 2 wrong input, 130 interrupted."""
     args = parser().parse_args(argv)
+    # Small and narrow matrices: further threads of a BLAS, which asks when NumPy loads, would only wait.
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
     try:
         from . import commands
 

@@ -68,7 +68,7 @@ def cases(m: int) -> list[tuple[str, Chain, str, Pose]]:
 
 
 def against_scipy(m: int, repeats: int) -> list[Row]:
-    """scipy's least_squares from the same start, by differences through Pinocchio and by our Jacobian."""
+    """Scipy's least_squares from the same start, by differences through Pinocchio and by our Jacobian."""
     out = []
     for name, chain, sets, data in cases(m):
         fit = calibrate(chain, data, sets)
