@@ -36,7 +36,7 @@ LAYERS = (
     {"report"},
     {"terminal"},
     {"viewer"},
-    {"outputs"},
+    {"outputs", "jobs"},
     {"demo"},
     {"commands"},
     {"cli"},
@@ -74,7 +74,7 @@ def test_special_packages_stay_in_one_place(module):
         "meshcat": {"viewer"},
         "matplotlib": {"report"},
         "rich": {"terminal"},
-        "argparse": {"cli", "commands"},
+        "argparse": {"cli", "commands", "jobs"},
     }
     for package, allowed in homes.items():
         if package in imports(module)[1]:
