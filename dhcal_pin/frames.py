@@ -19,9 +19,10 @@ _TRIED = 4
 
 
 def nearest_rotation(matrix: Array) -> Array:
-    """The rotation (3, 3) nearest to a matrix (3, 3), such as a sum of rotations."""
+    """The rotations (..., 3, 3) nearest to matrices (..., 3, 3), such as sums of rotations."""
     u, _, vt = np.linalg.svd(matrix)
-    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    u[..., -1] *= np.linalg.det(u @ vt)[..., None]
+    return u @ vt
 
 
 def align(source: Array, target: Array) -> tuple[Array, float]:
