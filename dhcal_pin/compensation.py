@@ -34,11 +34,13 @@ from .inverse import (
 from .se3 import Array
 
 OK, SINGULAR, LIMITS, OUT = "ok", "near singular", "joint limits", "out of reach"
-# A motion of the tool, of a thousandth of the arm's size or of a radian, that takes a radian of the joints.
-_SINGULAR = 1e-3
-# Configurations known beforehand, how many of the nearest are started from with how many steps, round after
-# round for targets that are not reached, and how many of the best are taken along.
-_KNOWN, _ROUNDS, _FOLLOWED = 8192, ((8, 60), (64, 60), (1, 300)), 4
+# A motion of the tool, of a thousandth of the arm's size or of a radian that takes a fifth of a radian of a joint.
+_SINGULAR = 5e-3
+# Configurations known beforehand, and how many of the best are taken along from round to round.
+_KNOWN, _FOLLOWED = 8192, 4
+# Round after round for targets that are not reached: from how many of the known ones with how many steps, if
+# the tool came within this share of the arm's size.
+_ROUNDS = ((8, 60, np.inf), (64, 60, np.inf), (512, 300, 0.3))
 # Targets at a time, so that memory does not grow with them.
 _CHUNK = 512
 _SKEW = 1e-6
@@ -185,9 +187,12 @@ class _Search:
         m, n = near.shape
         q, status, miss = np.full((m, n), np.nan), np.full(m, OUT, dtype=object), np.full((m, 2), np.nan)
         scale = np.where(sliding(self.chain), size(self.chain), 1.0)
-        left, best = np.arange(m), near[:, None]
-        for count, steps in _ROUNDS:
-            starts = np.concatenate([best, self.starts(targets[left], count)], 1)
+        best, missed = np.repeat(near[:, None], _FOLLOWED, 1), np.zeros(m)
+        for count, steps, share in _ROUNDS:
+            left = np.flatnonzero((status == OUT) & (missed <= share * size(self.chain)))
+            if not left.size:
+                continue
+            starts = np.concatenate([best[left], self.starts(targets[left], count)], 1)
             tried, _ = self.solved(self.chain, targets[left], starts, steps)
             # Whole turns less; an arm's errors need not repeat with them.
             tried, _ = within(self.chain, tried, near[left, None])
@@ -195,16 +200,15 @@ class _Search:
             away = np.linalg.norm((tried - near[left, None]) / scale, axis=2)
             # Those that are there first, the nearest before others; then those that miss least.
             order = np.lexsort([np.where(wide <= REACHED, away, wide), wide > REACHED])[:, :_FOLLOWED]
-            best = np.take_along_axis(tried, order[..., None], 1)
-            chosen = best[:, 0]
+            best[left] = np.take_along_axis(tried, order[..., None], 1)
+            missed[left] = wide.min(1)
+            chosen = best[left, 0]
             miss[left] = _miss(self.chain, chosen, targets[left])
             inside = np.all((chosen >= self.chain.lower) & (chosen <= self.chain.upper), 1)
             good = np.all(miss[left] <= REACHED, 1) & inside
             q[left[good]], status[left[good]] = chosen[good], OK
-            left, best = left[~good], best[~good]
-            if not left.size:
-                return q, status, miss
-        _, wide = self.solved(unlimited(self.chain), targets[left], best, steps)
+        left = np.flatnonzero(status == OUT)
+        _, wide = self.solved(unlimited(self.chain), targets[left], best[left], _ROUNDS[-1][1])
         status[left[np.any(wide <= REACHED, 1)]] = LIMITS
         return q, status, miss
 
@@ -234,8 +238,9 @@ def _miss(chain: Chain, q: Array, targets: Array) -> Array:
 
 def _delicate(nominal: Chain, calibrated: Chain, targets: Array, q: Array) -> Array:
     """Which solutions (m,) stand at a singularity, or so near that the correction leads across it."""
-    rows = slice(6 if targets.ndim == 3 else 3)
-    out = np.minimum(_least(nominal, q, rows), _least(calibrated, q, rows)) < _SINGULAR
+    # A controller is told a pose in any case.
+    asked = slice(6 if targets.ndim == 3 else 3)
+    out = np.minimum(_least(nominal, q, slice(6)), _least(calibrated, q, asked)) < _SINGULAR
     if nominal.size > 6:
         return out  # A redundant arm's controller is free in any case.
     # A controller that comes from the uncorrected target must end in the same joint values.

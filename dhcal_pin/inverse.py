@@ -21,6 +21,8 @@ _DAMPING, _LEAST_DAMPING = 0.1, 1e-9
 # No joint moves further at once, rad or m.
 _STRIDE = 1.0
 _CLOSED = 1e-14
+# A gap that has not shrunk to this share within so many steps stays as it is.
+_PATIENCE, _WORTH = 10, 0.99
 REACHED = 1e-9  # m, and rad
 
 
@@ -76,14 +78,19 @@ def solve(
     samples = np.arange(len(start)) if samples is None else samples
     q = np.clip(chain.checked(start), chain.lower, chain.upper)
     left = np.arange(len(q))
-    for _ in range(steps):
+    before = np.full(len(q), np.inf)
+    for count in range(steps):
         poses, twists = joint_velocities(chain, q[left])
         wide, by_twist = gap(poses, samples[left])
-        open_ = np.abs(wide).max(1, initial=0.0) > _CLOSED
-        if not open_.any():
+        width = np.linalg.norm(wide, axis=1)
+        go = width > _CLOSED
+        if count % _PATIENCE == 0:
+            go &= width < _WORTH * before[left]
+            before[left] = width
+        if not go.any():
             break
-        left, wide = left[open_], wide[open_]
-        rows = by_twist[open_] @ twists[open_, : by_twist.shape[-1]]
+        left, wide = left[go], wide[go]
+        rows = by_twist[go] @ twists[go, : by_twist.shape[-1]]
         at = q[left]
         step = _damped(rows, wide)
         held = ((at <= chain.lower) & (step < 0)) | ((at >= chain.upper) & (step > 0))
@@ -125,7 +132,7 @@ def to_poses(targets: Array, length: float) -> Gap:
 
 
 def within(chain: Chain, q: Array, near: Array | float = 0.0) -> tuple[Array, Array]:
-    """The same configurations (..., n) with whole turns less, and which of them (...) keep the joints' limits.
+    """The same configurations (..., n) less whole turns, and which of them (...) keep the joints' limits.
 
     Args:
         chain: the arm.
