@@ -209,6 +209,18 @@ def parser() -> argparse.ArgumentParser:
     simulate.add_argument("--kind", metavar="KIND", default="pose", help="what is measured (pose)")
     simulate.add_argument("--tip", **_TIP)
     simulate.add_argument("--seed", metavar="N", type=_seed, default=0, help="of joint values and noise (0)")
+
+    compensate = _add(
+        commands,
+        "compensate",
+        "joint values, and corrected targets for a nominal controller, that land where asked",
+        "dhcal compensate ur10.urdf ur10_calibrated.urdf targets.csv --tip tool0 -o corrected.csv",
+    )
+    compensate.add_argument("nominal", metavar="NOMINAL.urdf", help="what the controller knows")
+    compensate.add_argument("calibrated", metavar="CALIBRATED.urdf", help="the same robot, calibrated")
+    compensate.add_argument("targets", metavar="targets.csv", help="positions or poses of the tool")
+    compensate.add_argument("-o", "--output", metavar="corrected.csv", required=True, help="a row a target")
+    compensate.add_argument("--tip", **_TIP)
     return out
 
 

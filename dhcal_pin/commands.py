@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from . import calibration, demo, exports, report, terminal, ur_kinematics, viewer
+from . import calibration, compensate_command, demo, exports, report, terminal, ur_kinematics, viewer
 from .chain import Chain
 from .check import crosscheck
 from .dh_files import dh_text, is_dh
@@ -347,4 +347,5 @@ COMMANDS: dict[str, Callable[[Namespace], int]] = {
     "view": _view,
     "check": _check,
     "simulate": _simulate,
+    "compensate": compensate_command.run,
 }

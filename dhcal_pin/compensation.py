@@ -34,7 +34,7 @@ from .inverse import (
 from .se3 import Array
 
 OK, SINGULAR, LIMITS, OUT = "ok", "near singular", "joint limits", "out of reach"
-# A motion of the tool, of a thousandth of the arm's size or of a radian that takes a fifth of a radian of a joint.
+# A motion of the tool, by a thousandth of the arm's size or of a radian, that takes the joints 0.2 rad.
 _SINGULAR = 5e-3
 # Configurations known beforehand, and how many of the best are taken along from round to round.
 _KNOWN, _FOLLOWED = 8192, 4
