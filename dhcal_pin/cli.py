@@ -94,9 +94,15 @@ def parser() -> argparse.ArgumentParser:
         "identify a robot's errors from measurements and write the corrected URDF",
         "dhcal calibrate ur10.urdf laser.csv --tip tool0 --holdout 0.3 -o ur10_calibrated.urdf",
     )
-    calibrate.add_argument("robot", **_ROBOT)
-    calibrate.add_argument("data", **_DATA)
-    calibrate.add_argument("-o", "--output", metavar="OUT.urdf", required=True, help="the corrected URDF")
+    calibrate.add_argument("robot", metavar="ROBOT", help=f"{_ROBOT['help']}; or a manifest, NAME.fleet.toml")
+    calibrate.add_argument("data", metavar="DATA", nargs="*", help=f"{_DATA['help']}; none with a manifest")
+    calibrate.add_argument(
+        "-o",
+        "--output",
+        metavar="OUT.urdf",
+        required=True,
+        help="the corrected URDF; a manifest's summary.csv",
+    )
     calibrate.add_argument("--tip", **_TIP)
     calibrate.add_argument("--columns", **_COLUMNS)
     calibrate.add_argument(
@@ -137,6 +143,9 @@ def parser() -> argparse.ArgumentParser:
         "--tool-frame", metavar="NAME", help="put the tool into the URDF, as a link fixed to the tip"
     )
     calibrate.add_argument("--json", **_JSON)
+    calibrate.add_argument(
+        "--jobs", metavar="N", type=_count, help="processes for a manifest (default: one a processor)"
+    )
 
     validate = _add(
         commands,

@@ -14,13 +14,24 @@ from typing import Any
 
 import numpy as np
 
-from . import calibration, compensate_command, demo, exports, report, terminal, ur_kinematics, viewer
+from . import (
+    calibration,
+    compensate_command,
+    demo,
+    exports,
+    fleet_command,
+    report,
+    terminal,
+    ur_kinematics,
+    viewer,
+)
 from .chain import Chain
 from .check import crosscheck
 from .dh_files import dh_text, is_dh
 from .dh_urdf import dh_to_urdf
 from .errors import DhcalError
 from .files import PathLike, parse_noise, save
+from .fleet import ENDING, is_fleet
 from .jobs import Job
 from .kinds import KINDS
 from .measurement_files import measurement_text, read_measurements, read_readings
@@ -168,7 +179,18 @@ def run_job(args: Job, progress: Progress | None = None) -> Outcome:
     return Outcome(fit, document, files, data.findings, gross, data.doubts)
 
 
+def _calibrate_one(job: Job) -> dict[str, Any]:
+    """A robot of a fleet, in a process of its own."""
+    return run_job(job).document
+
+
 def _calibrate(args: Namespace) -> int:
+    if is_fleet(args.robot):
+        return fleet_command.run(args, _calibrate_one)
+    if not args.data:
+        raise DhcalError(f"{args.robot}: no measurements; name at least one CSV file behind it")
+    if args.jobs is not None:
+        raise DhcalError(f"--jobs: goes with a manifest (NAME{ENDING}) in place of ROBOT; leave it out")
     with terminal.progress("fitting") as progress:
         outcome = run_job(Job.of(args), progress)
     if args.json == STDOUT:

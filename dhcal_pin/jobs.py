@@ -44,6 +44,8 @@ class Job:
     @classmethod
     def of(cls, args: Namespace) -> Job:
         """The job that a command line asks for."""
-        values: dict[str, Any] = {field.name: getattr(args, field.name) for field in fields(cls)}
-        values["data"] = tuple(args.data)
+        values: dict[str, Any] = {}
+        for option in fields(cls):
+            value = getattr(args, option.name)
+            values[option.name] = tuple(value) if isinstance(value, list) else value
         return cls(**values)

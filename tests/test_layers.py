@@ -37,7 +37,8 @@ LAYERS = (
     {"terminal"},
     {"viewer"},
     {"outputs", "jobs"},
-    {"demo", "compensate_command"},
+    {"fleet"},
+    {"demo", "compensate_command", "fleet_command"},
     {"commands"},
     {"cli"},
 )
@@ -74,7 +75,7 @@ def test_special_packages_stay_in_one_place(module):
         "meshcat": {"viewer"},
         "matplotlib": {"report"},
         "rich": {"terminal"},
-        "argparse": {"cli", "commands", "jobs", "compensate_command"},
+        "argparse": {"cli", "commands", "jobs", "compensate_command", "fleet_command"},
     }
     for package, allowed in homes.items():
         if package in imports(module)[1]:
