@@ -56,8 +56,8 @@ class Compensation:
             with its own base and tool, has the tool at `q`.
         status: (m,) "ok", "near singular" (reached, but little of the tool takes much of the joints),
             "joint limits" (reached only beyond them) or "out of reach".
-        miss: (m, 2) how far the calibrated tool stays from the targets, m and rad; as near as it was seen
-            to get where they are not reached. The second is 0 for targets without a rotation.
+        miss: (m, 2) how far the calibrated tool stays from the targets, m and rad; the nearest that was
+            found where they are not reached. The second is 0 for targets without a rotation.
     """
 
     q: Array

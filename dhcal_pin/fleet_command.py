@@ -53,7 +53,11 @@ def run(args: Namespace, calibrate: Run) -> int:
         line = f"{count:{len(str(total))}} of {total}  {entries[number].name:{width}}  {_line(outcome)}"
         terminal.lines(line, style=style)
 
-    found = run_fleet(entries, args.robot, calibrate, args.jobs or os.cpu_count() or 1, done)
+    try:
+        found = run_fleet(entries, args.robot, calibrate, args.jobs or os.cpu_count() or 1, done)
+    except KeyboardInterrupt:
+        terminal.lines(f"interrupted: {count} of {total} robots are done; no summary written")
+        return 130
     contents: dict[PathLike, str | bytes] = {args.output: summary_text(entries, found)}
     document = _document(entries, found)
     if args.json and args.json != STDOUT:

@@ -16,8 +16,10 @@ from .se3 import Array
 # by the tool's twist [v, ω] in axes of the measuring frame, or (r, k, 3) where v alone matters.
 Gap = Callable[[Array, Array], tuple[Array, Array]]
 
-# Damping is this share of the squared gap, and never less than what a singularity needs (m²).
+# Damping is this share of the squared gap at first, and never less than what a singularity needs (m²).
 _DAMPING, _LEAST_DAMPING = 0.1, 1e-9
+# It eases where a step closed the gap by something, and brakes where it did not and is taken back.
+_EASE, _BRAKE = 0.5, 8.0
 # No joint moves further at once, rad or m.
 _STRIDE = 1.0
 _CLOSED = 1e-14
@@ -65,8 +67,9 @@ def solve(
 ) -> tuple[Array, Array]:
     """Joint values (m, n) within limits that close gaps, and how wide they stay (m,), m; damped steps.
 
-    The damping shrinks with the gap (Sugihara, T-RO 2011), so that the end is Newton's. A joint that would
-    leave its limits is held there while the others take its part.
+    The damping shrinks with the gap (Sugihara, T-RO 2011), so that the end is Newton's; a step that widens
+    the gap is taken back. A joint that would leave its limits is held there while the others take its part.
+    Where no start closes a gap, the end is where it is narrowest nearby.
 
     Args:
         chain: base and tool included.
@@ -77,34 +80,46 @@ def solve(
     """
     samples = np.arange(len(start)) if samples is None else samples
     q = np.clip(chain.checked(start), chain.lower, chain.upper)
+    wide, rows = _gaps(chain, gap, q, samples)
+    width = np.linalg.norm(wide, axis=1)
+    damping, marked = np.full(len(q), _DAMPING), np.full(len(q), np.inf)
     left = np.arange(len(q))
-    before = np.full(len(q), np.inf)
     for count in range(steps):
-        poses, twists = joint_velocities(chain, q[left])
-        wide, by_twist = gap(poses, samples[left])
-        width = np.linalg.norm(wide, axis=1)
-        go = width > _CLOSED
+        go = width[left] > _CLOSED
         if count % _PATIENCE == 0:
-            go &= width < _WORTH * before[left]
-            before[left] = width
-        if not go.any():
+            go &= width[left] < _WORTH * marked[left]
+            marked[left] = width[left]
+        left = left[go]
+        if not left.size:
             break
-        left, wide = left[go], wide[go]
-        rows = by_twist[go] @ twists[go, : by_twist.shape[-1]]
-        at = q[left]
-        step = _damped(rows, wide)
+        at, slope = q[left], rows[left]
+        amount = _LEAST_DAMPING + damping[left] * width[left] ** 2
+        step = _damped(slope, wide[left], amount)
         held = ((at <= chain.lower) & (step < 0)) | ((at >= chain.upper) & (step > 0))
         if held.any():
-            step = _damped(np.where(held[:, None], 0.0, rows), wide)
+            step = _damped(np.where(held[:, None], 0.0, slope), wide[left], amount)
         step /= np.maximum(1.0, np.abs(step).max(1, keepdims=True) / _STRIDE)
-        q[left] = np.clip(at + step, chain.lower, chain.upper)
-    return q, np.linalg.norm(gap(chain.poses(q), samples)[0], axis=1)
+        at = np.clip(at + step, chain.lower, chain.upper)
+        new_wide, new_rows = _gaps(chain, gap, at, samples[left])
+        new_width = np.linalg.norm(new_wide, axis=1)
+        closer = new_width < width[left]
+        damping[left] *= np.where(closer, _EASE, _BRAKE)
+        taken = left[closer]
+        q[taken], width[taken] = at[closer], new_width[closer]
+        wide[taken], rows[taken] = new_wide[closer], new_rows[closer]
+    return q, width
 
 
-def _damped(rows: Array, wide: Array) -> Array:
+def _gaps(chain: Chain, gap: Gap, q: Array, samples: Array) -> tuple[Array, Array]:
+    """Gaps (r, k) at q (r, n), and their derivatives (r, k, n) by the joints."""
+    poses, twists = joint_velocities(chain, q)
+    wide, by_twist = gap(poses, samples)
+    return wide, by_twist @ twists[:, : by_twist.shape[-1]]
+
+
+def _damped(rows: Array, wide: Array, damping: Array) -> Array:
     """Steps (r, n) that close gaps (r, k) to first order, their derivatives by the joints being (r, k, n)."""
     across = np.swapaxes(rows, 1, 2)
-    damping = _LEAST_DAMPING + _DAMPING * np.sum(wide**2, 1)
     damped = rows @ across + damping[:, None, None] * np.eye(wide.shape[1])
     return -(across @ np.linalg.solve(damped, wide[..., None]))[..., 0]
 
