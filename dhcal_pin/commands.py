@@ -188,7 +188,7 @@ def _calibrate(args: Namespace) -> int:
     if is_fleet(args.robot):
         return fleet_command.run(args, _calibrate_one)
     if not args.data:
-        raise DhcalError(f"DATA: none; name at least one measurement file behind {args.robot}")
+        raise DhcalError(f"DATA is required: name at least one measurement file behind {args.robot}")
     if args.jobs is not None:
         raise DhcalError(f"--jobs: goes with a manifest (NAME{ENDING}) in place of ROBOT; leave it out")
     with terminal.progress("fitting") as progress:

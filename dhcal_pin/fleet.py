@@ -29,7 +29,7 @@ from .calibration import Method
 from .errors import DhcalError
 from .files import PathLike, read_toml
 from .jobs import Job
-from .outputs import STDOUT, same
+from .outputs import STDOUT
 from .robot_files import robot_name, sidecar_path
 
 ENDING = ".fleet.toml"
@@ -123,26 +123,37 @@ def _option(key: str, value: Any, where: str) -> Any:
 def _check_apart(entries: Sequence[Entry], path: PathLike) -> None:
     """Complains about a file that one job writes and another one writes or reads."""
     folder = os.path.dirname(os.path.abspath(path))
-    reads = [[os.path.join(folder, p) for p in (e.job.robot, *e.job.data)] for e in entries]
-    writes = [
-        [os.path.join(folder, p) for p in (e.job.output, sidecar_path(e.job.output), e.job.json) if p]
-        for e in entries
-    ]
-    for i, mine in enumerate(writes):
-        for j in range(len(entries)):
-            others = reads[j] + (writes[j] if j < i else [])
-            if i != j and any(same(a, b) for a in mine for b in others):
-                raise DhcalError(
-                    f"{path}: job {i + 1} writes a file that job {j + 1} also writes or reads; "
-                    "give every robot an output of its own"
-                )
+    jobs = [entry.job for entry in entries]
+    written = [(i, p) for i, job in enumerate(jobs, 1) for p in _written(job)]
+    read = [(i, p) for i, job in enumerate(jobs, 1) for p in (job.robot, *job.data)]
+    writer: dict[str, int] = {}
+
+    def check(number: int, place: str, owner: int) -> None:
+        if owner != number:
+            raise DhcalError(
+                f"{path}: job {number} writes or reads {place}, which job {owner} writes; "
+                "give every robot an output of its own"
+            )
+
+    for number, place in written:
+        check(number, place, writer.setdefault(_whole(folder, place), number))
+    for number, place in read:
+        check(number, place, writer.get(_whole(folder, place), number))
 
 
-def outputs(entries: Sequence[Entry], path: PathLike) -> list[str]:
-    """Paths of all files that a fleet reads or writes, seen from here."""
+def _whole(folder: str, place: str) -> str:
+    return os.path.realpath(os.path.join(folder, place))
+
+
+def _written(job: Job) -> list[str]:
+    return [place for place in (job.output, sidecar_path(job.output), job.json) if place]
+
+
+def places(entries: Sequence[Entry], path: PathLike) -> list[str]:
+    """Paths of the files that a fleet reads or writes, seen from here."""
     folder = os.path.dirname(os.fspath(path))
-    every = [p for e in entries for p in (e.job.robot, *e.job.data, e.job.output, e.job.json) if p]
-    return [os.path.join(folder, p) for p in every]
+    every = [place for e in entries for place in (e.job.robot, *e.job.data, *_written(e.job))]
+    return [os.path.join(folder, place) for place in every]
 
 
 def run_fleet(

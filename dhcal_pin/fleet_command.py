@@ -13,7 +13,7 @@ from typing import Any
 from . import report, terminal
 from .errors import DhcalError
 from .files import PathLike, save
-from .fleet import FAILED, Entry, Outcome, Run, outputs, read_fleet, run_fleet
+from .fleet import FAILED, Entry, Outcome, Run, places, read_fleet, run_fleet
 from .jobs import Job
 from .outputs import STDOUT, check_outputs, emit
 
@@ -42,7 +42,7 @@ def run(args: Namespace, calibrate: Run) -> int:
     if not args.output.lower().endswith(".csv"):
         raise DhcalError(f"{args.output}: the summary of a fleet is a table; name a .csv file")
     entries = read_fleet(args.robot)
-    check_outputs([args.output, args.json], [args.robot, *outputs(entries, args.robot)])
+    check_outputs([args.output, args.json], [args.robot, *places(entries, args.robot)])
     width = max(len(entry.name) for entry in entries)
     total, count = len(entries), 0
 
