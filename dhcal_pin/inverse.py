@@ -23,6 +23,8 @@ _EASE, _BRAKE = 0.5, 8.0
 # No joint moves further at once, rad or m.
 _STRIDE = 1.0
 _CLOSED = 1e-14
+# A wrist alone has no size to speak of, m.
+_SMALLEST = 0.05
 # A gap that has not shrunk to this share within so many steps stays as it is.
 _PATIENCE, _WORTH = 10, 0.99
 REACHED = 1e-9  # m, and rad
@@ -44,7 +46,8 @@ def joint_velocities(chain: Chain, q: Array) -> tuple[Array, Array]:
 def size(chain: Chain) -> float:
     """A length typical of the arm, m: a radian about a joint moves the tool by about that much."""
     links = np.concatenate([chain.origins[1:-1], (chain.origins[-1] @ chain.tool)[None]])
-    return float(np.linalg.norm(links[:, :3, 3], axis=1).sum()) / 3 or 1.0
+    strokes = np.minimum(chain.upper - chain.lower, 1.0)[sliding(chain)]
+    return max(float(np.linalg.norm(links[:, :3, 3], axis=1).sum() + strokes.sum()) / 3, _SMALLEST)
 
 
 def unlimited(chain: Chain) -> Chain:
