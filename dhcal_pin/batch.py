@@ -1,0 +1,300 @@
+"""Many small calibrations at once: Monte Carlo, bootstrap, cross-validation folds, a fleet of one make.
+
+The members share what is unknown and how it is measured; nominal arm, joint values and readings are each
+one's own. The loops of `solver` run on all of them in step, with stacked QR and stacked triangles, and a
+member that has ended takes no further part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import repeat
+
+import numpy as np
+
+from . import observability
+from .arms import Arms
+from .errors import DhcalError
+from .measurements import Measurement, joined
+from .parameters import ErrorModel
+from .se3 import Array
+from .solver import COST_ROUNDING, RUNAWAY
+from .triangles import Triangles, triangles
+
+# Members whose arrays together stay in a core's cache.
+BLOCK = 250
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """b problems in p unknown errors of the robot.
+
+    Attributes:
+        arms: the nominal arms, b.
+        data: measurements of any kinds without unknowns of their own, each with b·m samples, member after
+            member.
+        weights: (p,) one over the prior's sigma; zero where there is none.
+        known: values of instruments' unknowns by name, the same for all members.
+        spare: (d, b) how many samples of each measurement and member are there to fill up, without weight.
+    """
+
+    arms: Arms
+    data: tuple[Measurement, ...]
+    weights: Array
+    known: Mapping[str, float] = field(default_factory=dict)
+    spare: Array = field(default_factory=lambda: np.array(0))
+
+    def __post_init__(self) -> None:
+        for item in self.data:
+            if missing := [u.name for u in item.unknowns if u.name not in self.known]:
+                raise DhcalError(
+                    f"{item.kind}: {missing[0]} is unknown; a batch needs surveyed instruments, "
+                    "so give it as known or calibrate one by one"
+                )
+            if len(item.rows) % max(len(self), 1):
+                raise DhcalError(
+                    f"{item.kind}: {len(item.rows)} samples do not share out among {len(self.arms)} members"
+                )
+
+    @classmethod
+    def of(
+        cls,
+        models: Sequence[ErrorModel],
+        data: Sequence[Sequence[Measurement]],
+        weights: Array,
+        known: Mapping[str, float] | None = None,
+    ) -> Batch:
+        """The problems of b error models with b lists of measurements, the same kinds in each.
+
+        Members may have different numbers of samples: shorter ones are filled up with rows of no weight.
+        """
+        counts = np.array([[len(item.rows) for item in items] for items in data]).T
+        filled = tuple(
+            joined([_filled(item, int(most)) for item in items])
+            for items, most in zip(zip(*data, strict=True), counts.max(1), strict=True)
+        )
+        return cls(Arms.of(models), filled, weights, known or {}, counts.max(1)[:, None] - counts)
+
+    def __len__(self) -> int:
+        return len(self.arms)
+
+    def take(self, members: Array) -> Batch:
+        """The members of an index (j,)."""
+        return replace(
+            self,
+            arms=self.arms.take(members),
+            data=tuple(self._rows(item, members) for item in self.data),
+            spare=self._spare()[:, members],
+        )
+
+    def _rows(self, item: Measurement, members: Array) -> Measurement:
+        m = len(item.rows) // max(len(self), 1)
+        return item.take((members[:, None] * m + np.arange(m)).reshape(-1))
+
+    def _values(self, item: Measurement) -> Array:
+        return np.array([self.known[unknown.name] for unknown in item.unknowns])
+
+    def _joints(self, item: Measurement) -> Array:
+        """Joint values (c, b, m, n)."""
+        q = item.configurations()
+        m = len(item.rows) // max(len(self), 1)
+        return q.reshape(-1, len(self), m, q.shape[-1])
+
+    def rows(self) -> Array:
+        """How many rows have a say in each member, (b,)."""
+        one = self.take(np.array([0]))
+        total = np.zeros(len(self), int)
+        for item, spare in zip(one.data, self._spare(), strict=True):
+            residual = item.residual(one.arms.sweep(one._joints(item)), self._values(item))
+            total += len(residual) * (len(item.rows) - spare)
+        return total
+
+    def _spare(self) -> Array:
+        return np.broadcast_to(self.spare, (len(self.data), len(self)))
+
+    def cost(self, x: Array) -> Array:
+        """Sums (b,) of squared whitened residuals and priors at x (b, p)."""
+        arms = self.arms.at(x)
+        total = np.sum((self.weights * x) ** 2, -1)
+        for item in self.data:
+            residual = item.residual(arms.sweep(self._joints(item)), self._values(item))
+            total += np.sum(residual.reshape(len(residual), len(self), -1) ** 2, (0, 2))
+        return total
+
+    def reduce(self, x: Array, weights: Array, small_angle: bool) -> Triangles:
+        """The triangles at x (b, p) of the data and of priors of these weights (p,)."""
+        arms, bodies, twists = self.arms.derivative(x)
+        b, p = x.shape
+        blocks = []
+        for item in self.data:
+            q, u = self._joints(item), self._values(item)
+            sweep = arms.sweep(q)
+            velocities = arms.tool_velocities(sweep, q.shape[:3], bodies, twists)
+            if small_angle:
+                residual, rows = item.small_angle(sweep, velocities, u)
+            else:
+                residual, rows = item.residual(sweep, u), item.whiten(sweep, velocities, u)
+            k = len(residual)
+            block = np.empty((b, p + 1, k, q.shape[2]))
+            block[:, :p] = rows.reshape(p, k, b, -1).transpose(2, 0, 1, 3)
+            block[:, p] = residual.reshape(k, b, -1).swapaxes(0, 1)
+            blocks.append(block.reshape(b, p + 1, -1))
+        if (held := np.flatnonzero(weights)).size:
+            block = np.zeros((b, p + 1, len(held)))
+            block[:, held, np.arange(len(held))] = weights[held]
+            block[:, p] = -(weights * x)[:, held]
+            blocks.append(block)
+        return triangles(np.concatenate(blocks, 2) if len(blocks) > 1 else blocks[0])
+
+
+def _filled(item: Measurement, count: int) -> Measurement:
+    """The measurement with `count` rows, those too many without weight."""
+    spare = count - len(item.rows)
+    if not spare:
+        return item
+    weights = np.concatenate([np.ones(len(item.rows)), np.zeros(spare)])
+    long = item.take(np.concatenate([np.arange(len(item.rows)), np.zeros(spare, int)]))
+    with np.errstate(divide="ignore"):
+        return long.weighted(weights)
+
+
+@dataclass(frozen=True, eq=False)
+class Solutions:
+    """Where b loops ended.
+
+    Attributes:
+        batch: the problems.
+        x: (b, p) errors in m and rad.
+        iterations: (b,) steps taken.
+        converged: (b,) whether the last step was too small to matter.
+    """
+
+    batch: Batch
+    x: Array
+    iterations: Array
+    converged: Array
+
+    @cached_property
+    def triangles(self) -> Triangles:
+        """Those of the data alone, at x."""
+        return self.batch.reduce(self.x, np.zeros(self.x.shape[1]), small_angle=False)
+
+    @property
+    def cost(self) -> Array:
+        """Sums (b,) of squared whitened residuals, without priors."""
+        return self.triangles.rest + np.sum(self.triangles.z**2, -1)
+
+    @cached_property
+    def rank(self) -> Array:
+        """Numbers (b,) of directions that the data see."""
+        s = np.linalg.svd(self.triangles.r, compute_uv=False)
+        return np.sum(s > observability.RANK_CUT * s[:, :1], -1)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariances (b, p, p) of x as of `result.Result`: infinite where nothing tells, NaN without noise."""
+        p = self.x.shape[1]
+        stacked = np.concatenate([self.triangles.r, np.tile(np.diag(self.batch.weights), (len(self.x), 1, 1))], 1)
+        _, s, vt = np.linalg.svd(np.linalg.qr(stacked, mode="r"))
+        kept = s > observability.RANK_CUT * s[:, :1]
+        half = np.where(kept, 1 / np.where(kept, s, 1.0), 0.0)[..., None] * vt
+        freedom = self.batch.rows() - self.rank
+        with np.errstate(divide="ignore", invalid="ignore"):
+            noise = np.where(freedom > 0, self.cost / freedom, np.nan)
+        out = noise[:, None, None] * (half.swapaxes(1, 2) @ half)
+        lost = 1 - np.sum(np.where(kept[..., None], vt, 0.0) ** 2, 1) > 1e-6
+        out[lost[:, :, None] & lost[:, None, :] & np.eye(p, dtype=bool)] = np.inf
+        return out
+
+
+def _gauss_newton(batch: Batch, max_iterations: int) -> tuple[Array, Array, Array]:
+    """`solver.gauss_newton` in step; a member that runs away stops there, not converged."""
+    b, part, live = len(batch), batch, np.arange(len(batch))
+    x, iterations, converged = np.zeros((b, len(batch.weights))), np.zeros(b, int), np.zeros(b, bool)
+    for done in range(1, max_iterations + 1):
+        full = part.reduce(x[live], batch.weights, small_angle=True)
+        step = full.step()
+        settled = full.settled(step, full.rest + np.sum(full.z**2, -1))
+        x[live] += step
+        iterations[live], converged[live] = done, settled
+        over = settled | ~(np.abs(x[live]).max(1) < RUNAWAY)
+        live, part = live[~over], part.take(np.flatnonzero(~over))
+        if not live.size:
+            break
+    return x, iterations, converged
+
+
+def _levenberg_marquardt(batch: Batch, max_iterations: int) -> tuple[Array, Array, Array]:
+    """`solver.levenberg_marquardt` in step: who has moved gets a new triangle, all others try again."""
+    b, p, part, live = len(batch), len(batch.weights), batch, np.arange(len(batch))
+    x, iterations, converged = np.zeros((b, p)), np.zeros(b, int), np.zeros(b, bool)
+    cost, scale, fresh = batch.cost(x), np.zeros((b, p)), np.ones(b, bool)
+    damping, growth = np.full(b, 1e-4), np.full(b, 2.0)
+    every = Triangles(np.zeros((b, p, p)), np.zeros((b, p)), np.zeros(b))
+    while live.size and max_iterations:
+        if fresh[live].any():
+            new = np.flatnonzero(fresh[live])
+            found = part.take(new).reduce(x[live[new]], batch.weights, small_angle=False)
+            every.put(live[new], found)
+            scale[live[new]] = np.maximum(scale[live[new]], np.linalg.norm(found.r, axis=1))
+            iterations[live[new]] += 1
+            fresh[live[new]] = False
+        free, before = every.take(live), cost[live]
+        floor = np.where(scale[live] > 0, scale[live], 1.0)
+        least = np.sqrt(damping[live])[:, None] * floor
+        step = free.damped(least).step(least.min(1))
+        settled = free.settled(step, before)
+        trial = part.cost(x[live] + step)
+        expected = np.sum(free.z**2, -1) - np.sum((free.moved(step) - free.z) ** 2, -1)
+        gain = np.where(expected > 0, (before - trial) / np.where(expected > 0, expected, 1.0), 0.0)
+        rounding, blur = 10 * free.rounding(), COST_ROUNDING * before
+        trusted = (expected <= rounding**2 + blur) & (trial <= (np.sqrt(before) + rounding) ** 2 + blur)
+        accepted = trusted | ((trial <= before) & (gain > 1e-3))
+        stuck = ~accepted & (settled | (damping[live] > 1e16))
+        easier = np.where(trusted | (gain > 0.9), 1e-2, np.maximum(1e-3, 1 - (2 * gain - 1) ** 3))
+        went, retry = live[accepted], live[~accepted]
+        x[went] += step[accepted]
+        cost[went], growth[went], fresh[went] = trial[accepted], 2.0, True
+        damping[went] = np.maximum(damping[went] * easier[accepted], 1e-16)
+        converged[went] = settled[accepted] & (damping[went] < 1e-3)
+        converged[live[stuck]] = settled[stuck]
+        damping[retry], growth[retry] = damping[retry] * growth[retry], growth[retry] * 2
+        over = stuck | converged[live] | (fresh[live] & (iterations[live] >= max_iterations))
+        live, part = live[~over], part.take(np.flatnonzero(~over))
+    return x, iterations, converged
+
+
+_METHODS: dict[str, Callable[[Batch, int], tuple[Array, Array, Array]]] = {
+    "lm": _levenberg_marquardt,
+    "gn": _gauss_newton,
+}
+
+
+def _solved(batch: Batch, method: str, max_iterations: int) -> tuple[Array, Array, Array]:
+    return _METHODS[method](batch, max_iterations)
+
+
+def solve(
+    batch: Batch, method: str = "lm", max_iterations: int = 100, executor: Executor | None = None
+) -> Solutions:
+    """Solves all members from their nominal arms; the answers are those of `solver`, one by one.
+
+    Args:
+        batch: b problems.
+        method: "lm" or "gn".
+        max_iterations: most steps of a member.
+        executor: where blocks of members are solved; here without one.
+
+    Raises:
+        DhcalError: unknown method.
+    """
+    if method not in _METHODS:
+        raise DhcalError(f"method {method!r}: choose from {', '.join(_METHODS)}")
+    members = np.arange(len(batch))
+    blocks = [batch.take(members[start : start + BLOCK]) for start in range(0, len(batch), BLOCK)]
+    run = executor.map if executor else map
+    found = zip(*run(_solved, blocks, repeat(method), repeat(max_iterations)), strict=True)
+    return Solutions(batch, *(np.concatenate(part) for part in found))
