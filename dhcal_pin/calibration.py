@@ -15,9 +15,10 @@ from .errors import DhcalError
 from .frames import starts
 from .measurements import Measurement
 from .parameters import ErrorModel, select
+from .problem import Problem, shared_unknowns
 from .result import Result
 from .se3 import Array
-from .solver import METHODS, Problem, Progress, Solution, levenberg_marquardt, shared_unknowns
+from .solver import METHODS, Progress, Solution, levenberg_marquardt
 
 Method = Literal["lm", "gn"]
 Priors = Literal["default", "none"] | Mapping[str, float]

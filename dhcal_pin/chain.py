@@ -41,6 +41,20 @@ def link_station(j: int) -> int:
 
 
 @dataclass(frozen=True, eq=False)
+class Motion:
+    """What m configurations say of a chain's joints; errors do not change it, so one serves a whole search.
+
+    Attributes:
+        values: (k, m) of the moving joints, rad or m.
+        cos, sin: (k, m) of the values.
+    """
+
+    values: Array
+    cos: Array
+    sin: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Sweep:
     """Frames of a chain at m samples, components first so that the samples are contiguous.
 
@@ -222,26 +236,31 @@ class Chain:
         out[:-1] = out[:-1] @ self.axis_frames[1:]
         return out
 
-    def sweep(self, q: Array) -> Sweep:
-        """All frames at joint values q (m, n), vectorised over the samples."""
-        q = self.checked(q)
-        values = self.mixing @ q.T + self.shift[:, None]
-        cos, sin = np.cos(values), np.sin(values)
-        m = len(q)
+    def motion(self, q: Array) -> Motion:
+        """The moving joints' values, and their cosines and sines, at joint values q (m, n)."""
+        values = self.mixing @ self.checked(q).T + self.shift[:, None]
+        return Motion(values, np.cos(values), np.sin(values))
+
+    def sweep(self, q: Array | Motion) -> Sweep:
+        """All frames at joint values q (m, n), or at a motion of this chain, vectorised over the samples."""
+        motion = q if isinstance(q, Motion) else self.motion(q)
+        m = motion.values.shape[1]
         bodies = np.empty((len(self.moving) + 1, 4, 3, m))
         bodies[0] = self.base[:3].T[:, :, None]
-        before = np.empty((4, 3, m))
+        turned = np.empty((2, 3, m))
         for j, link in enumerate(self.links[:-1]):
             # The columns of F·L are the columns of F mixed by L: one small product for all samples.
-            np.matmul(link.T, bodies[j].reshape(4, -1), out=before.reshape(4, -1))
-            after = bodies[j + 1]
+            before, after = bodies[j].reshape(4, -1), bodies[j + 1]
+            np.matmul(link.T[:2], before, out=turned.reshape(2, -1))
+            np.matmul(link.T[2:], before, out=after[2:].reshape(2, -1))
             if self.prismatic[j]:
-                after[:] = before
-                after[3] += before[2] * values[j]
+                after[:2] = turned
+                after[3] += after[2] * motion.values[j]
             else:
-                after[0] = before[0] * cos[j] + before[1] * sin[j]
-                after[1] = before[1] * cos[j] - before[0] * sin[j]
-                after[2:] = before[2:]
+                np.multiply(turned, motion.cos[j], out=after[:2])
+                turned *= motion.sin[j]
+                after[0] += turned[1]
+                after[1] -= turned[0]
         tool = (self.links[-1] @ self.tool).T @ bodies[-1].reshape(4, -1)
         return Sweep(bodies, tool.reshape(4, 3, m))
 

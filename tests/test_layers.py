@@ -21,6 +21,7 @@ LAYERS = (
     {"poses", "positions"},
     {"lengths", "contacts", "relative"},
     {"frames", "observability", "robust", "kinds"},
+    {"problem"},
     {"solver"},
     {"result"},
     {"calibration"},
@@ -82,7 +83,7 @@ def test_special_packages_stay_in_one_place(module):
 
 
 def test_the_solver_names_no_kind_and_no_set():
-    for module in ("solver", "result", "calibration", "observability"):
+    for module in ("problem", "solver", "result", "calibration", "observability"):
         text = (HOUSE / f"{module}.py").read_text()
         names = {node.id for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Name)}
         assert not names & {"Position", "Pose", "KINDS", "SETS", "minimal", "placement"}
