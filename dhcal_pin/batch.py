@@ -21,7 +21,7 @@ from .errors import DhcalError
 from .measurements import Measurement, joined
 from .parameters import ErrorModel
 from .se3 import Array
-from .solver import COST_ROUNDING, LEAP_STEPS, LEAPS, RUNAWAY
+from .solver import LEAP_STEPS, LEAPS, RUNAWAY
 from .triangles import Triangles, triangles
 
 # Members whose arrays together stay in a core's cache.
@@ -193,11 +193,18 @@ class Solutions:
         s = np.linalg.svd(self.triangles.r, compute_uv=False)
         return np.sum(s > observability.RANK_CUT * s[:, :1], -1)
 
+    @property
+    def std(self) -> Array:
+        """Standard deviations (b, p) of x, m and rad."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+
     @cached_property
     def covariance(self) -> Array:
         """Covariances (b, p, p) of x as of `result.Result`: infinite where nothing tells, NaN without noise."""
         p = self.x.shape[1]
-        stacked = np.concatenate([self.triangles.r, np.tile(np.diag(self.batch.weights), (len(self.x), 1, 1))], 1)
+        stacked = np.concatenate(
+            [self.triangles.r, np.tile(np.diag(self.batch.weights), (len(self.x), 1, 1))], 1
+        )
         _, s, vt = np.linalg.svd(np.linalg.qr(stacked, mode="r"))
         kept = s > observability.RANK_CUT * s[:, :1]
         half = np.where(kept, 1 / np.where(kept, s, 1.0), 0.0)[..., None] * vt
@@ -265,8 +272,9 @@ def _levenberg_marquardt(batch: Batch, max_iterations: int) -> tuple[Array, Arra
         trial = part.cost(x[live] + step)
         expected = np.sum(free.z**2, -1) - np.sum((free.moved(step) - free.z) ** 2, -1)
         gain = np.where(expected > 0, (before - trial) / np.where(expected > 0, expected, 1.0), 0.0)
-        rounding, blur = 10 * free.rounding(), COST_ROUNDING * before
-        trusted = (expected <= rounding**2 + blur) & (trial <= (np.sqrt(before) + rounding) ** 2 + blur)
+        rounding, root = free.rounding(), np.sqrt(before)
+        blur = (10 * rounding) ** 2 + 2 * rounding * root
+        trusted = (expected <= blur) & (trial <= (root + 10 * rounding) ** 2)
         accepted = trusted | ((trial <= before) & (gain > 1e-3))
         stuck = ~accepted & (settled | (damping[live] > 1e16))
         easier = np.where(trusted | (gain > 0.9), 1e-2, np.maximum(1e-3, 1 - (2 * gain - 1) ** 3))

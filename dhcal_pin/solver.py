@@ -21,8 +21,6 @@ Progress = Callable[[int, float], None]
 # A step is the last one when it changes the rows by less than this share of what they are, or by no more
 # than the rounding of the model, as a share of the Jacobian's size.
 RELATIVE_STEP, ROUNDING = 1e-8, 1e-15
-# Differences of costs below this share of the cost are rounding.
-COST_ROUNDING = 1e-14
 # After so many damped steps Gauss-Newton tries to get farther in a few.
 LEAPS, LEAP_STEPS = (8, 16, 32, 64), 6
 # An error of so many metres or radians is no error any more.
@@ -125,9 +123,8 @@ def levenberg_marquardt(
             expected = float(free.z @ free.z - np.sum((free.r @ step - free.z) ** 2))
             gain = (cost - trial) / expected if expected > 0 else 0.0
             # Where all that is left is rounding, costs tell nothing and the step is to be trusted.
-            blur = COST_ROUNDING * cost
-            trusted = expected <= (10 * rounding) ** 2 + blur
-            trusted = trusted and trial <= (math.sqrt(cost) + 10 * rounding) ** 2 + blur
+            blur = (10 * rounding) ** 2 + 2 * rounding * math.sqrt(cost)
+            trusted = expected <= blur and trial <= (math.sqrt(cost) + 10 * rounding) ** 2
             if trusted or (trial <= cost and gain > 1e-3):
                 easier = 1e-2 if trusted or gain > 0.9 else max(1e-3, 1 - (2 * gain - 1) ** 3)
                 damping *= easier
