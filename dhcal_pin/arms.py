@@ -96,7 +96,7 @@ class Arms:
         return powers.reshape(*powers.shape[:3], 16), np.linalg.norm(twists[..., 3:], axis=-1)
 
     def _factors(self, x: Array) -> Array:
-        """Each parameter's motion exp(x·A) (p, b, 4, 4) at x (b, p); as A⁴ = -rate²·A², A³ is the last term."""
+        """Each parameter's motion exp(x·A) (p, b, 4, 4) at x (b, p); A³ ends it, as A⁴ = -rate²·A²."""
         powers, rate = self._powers
         x = x.T
         _, two, three = se3.series(x * rate)

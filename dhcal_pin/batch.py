@@ -8,16 +8,15 @@ member that has ended takes no further part.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import repeat
 
 import numpy as np
 
 from . import observability
 from .arms import Arms
 from .errors import DhcalError
+from .executors import HERE, Workers
 from .measurements import Measurement, joined
 from .parameters import ErrorModel
 from .se3 import Array
@@ -200,7 +199,7 @@ class Solutions:
 
     @cached_property
     def covariance(self) -> Array:
-        """Covariances (b, p, p) of x as of `result.Result`: infinite where nothing tells, NaN without noise."""
+        """Covariances (b, p, p) of x as of `result.Result`: infinite where nothing tells, else NaN."""
         p = self.x.shape[1]
         stacked = np.concatenate(
             [self.triangles.r, np.tile(np.diag(self.batch.weights), (len(self.x), 1, 1))], 1
@@ -217,10 +216,10 @@ class Solutions:
         return out
 
 
-def _gauss_newton(batch: Batch, max_iterations: int) -> tuple[Array, Array, Array]:
+def _gauss_newton(batch: Batch, x: Array, max_iterations: int) -> tuple[Array, Array, Array]:
     """`solver.gauss_newton` in step; a member that runs away stops there, not converged."""
     b, part, live = len(batch), batch, np.arange(len(batch))
-    x, iterations, converged = np.zeros((b, len(batch.weights))), np.zeros(b, int), np.zeros(b, bool)
+    x, iterations, converged = x.copy(), np.zeros(b, int), np.zeros(b, bool)
     for done in range(1, max_iterations + 1):
         full = part.reduce(x[live], batch.weights, small_angle=True)
         step = full.step()
@@ -249,10 +248,10 @@ def _leap(batch: Batch, x: Array, cost: Array) -> tuple[Array, Array]:
     return np.where(lower[:, None], far, x), np.where(lower, ends, cost)
 
 
-def _levenberg_marquardt(batch: Batch, max_iterations: int) -> tuple[Array, Array, Array]:
+def _levenberg_marquardt(batch: Batch, x: Array, max_iterations: int) -> tuple[Array, Array, Array]:
     """`solver.levenberg_marquardt` in step: who has moved gets a new triangle, all others try again."""
     b, p, part, live = len(batch), len(batch.weights), batch, np.arange(len(batch))
-    x, iterations, converged = np.zeros((b, p)), np.zeros(b, int), np.zeros(b, bool)
+    x, iterations, converged = x.copy(), np.zeros(b, int), np.zeros(b, bool)
     cost, scale, fresh = batch.cost(x), np.zeros((b, p)), np.ones(b, bool)
     damping, growth = np.full(b, 1e-4), np.full(b, 2.0)
     every = Triangles(np.zeros((b, p, p)), np.zeros((b, p)), np.zeros(b))
@@ -294,34 +293,41 @@ def _levenberg_marquardt(batch: Batch, max_iterations: int) -> tuple[Array, Arra
     return x, iterations, converged
 
 
-_METHODS: dict[str, Callable[[Batch, int], tuple[Array, Array, Array]]] = {
+_METHODS: dict[str, Callable[[Batch, Array, int], tuple[Array, Array, Array]]] = {
     "lm": _levenberg_marquardt,
     "gn": _gauss_newton,
 }
 
 
-def _solved(batch: Batch, method: str, max_iterations: int) -> tuple[Array, Array, Array]:
-    return _METHODS[method](batch, max_iterations)
+def _solved(task: tuple[Batch, str, Array, int]) -> tuple[Array, Array, Array]:
+    batch, method, start, max_iterations = task
+    return _METHODS[method](batch, start, max_iterations)
 
 
 def solve(
-    batch: Batch, method: str = "lm", max_iterations: int = 100, executor: Executor | None = None
+    batch: Batch,
+    method: str = "lm",
+    max_iterations: int = 100,
+    *,
+    start: Array | None = None,
+    where: Workers = HERE,
 ) -> Solutions:
-    """Solves all members from their nominal arms; the answers are those of `solver`, one by one.
+    """Solves all members; the answers are those of `solver`, one by one.
 
     Args:
         batch: b problems.
         method: "lm" or "gn".
         max_iterations: most steps of a member.
-        executor: where blocks of members are solved; here without one.
+        start: x (b, p) to start from; the nominal arms without it.
+        where: what blocks of members are shared out to.
 
     Raises:
         DhcalError: unknown method.
     """
     if method not in _METHODS:
         raise DhcalError(f"method {method!r}: choose from {', '.join(_METHODS)}")
-    members = np.arange(len(batch))
-    blocks = [batch.take(members[start : start + BLOCK]) for start in range(0, len(batch), BLOCK)]
-    run = executor.map if executor else map
-    found = zip(*run(_solved, blocks, repeat(method), repeat(max_iterations)), strict=True)
+    x = np.zeros((len(batch), len(batch.weights))) if start is None else start
+    blocks = [np.arange(first, min(first + BLOCK, len(batch))) for first in range(0, len(batch), BLOCK)]
+    tasks = ((batch.take(block), method, x[block], max_iterations) for block in blocks)
+    found = zip(*where.map(_solved, tasks), strict=True)
     return Solutions(batch, *(np.concatenate(part) for part in found))

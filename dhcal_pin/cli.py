@@ -209,7 +209,26 @@ def parser() -> argparse.ArgumentParser:
     simulate.add_argument("--kind", metavar="KIND", default="pose", help="what is measured (pose)")
     simulate.add_argument("--tip", **_TIP)
     simulate.add_argument("--seed", metavar="N", type=_seed, default=0, help="of joint values and noise (0)")
+
+    study = _add(
+        commands,
+        "study",
+        "how accuracy depends on poses, noise, errors, instrument and parameters, by simulation",
+        "dhcal study ur10_poses --jobs 2 -o results.csv",
+    )
+    study.add_argument(
+        "study", metavar="STUDY.toml", help="the grid, or one that ships: figure3, figure4, ur10_poses"
+    )
+    study.add_argument("-o", "--output", metavar="results.csv", required=True, help="a line a setting")
+    _add_where(study)
     return out
+
+
+def _add_where(command: argparse.ArgumentParser) -> None:
+    """Where the work is done."""
+    where = command.add_mutually_exclusive_group()
+    where.add_argument("--jobs", metavar="N", type=_count, default=1, help="processes on this machine (1)")
+    where.add_argument("--scheduler", metavar="ADDRESS", help="a Dask cluster, as tcp://host:8786")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -81,7 +81,7 @@ def triangles(columns: Array) -> Triangles:
     b, p, k = columns.shape[0], columns.shape[1] - 1, columns.shape[2]
     if k <= p:
         columns = np.concatenate([columns, np.zeros((b, p + 1, p + 1 - k))], 2)
-    full = np.linalg.qr(columns.swapaxes(1, 2), mode="r")
+    full: Array = np.asarray(np.linalg.qr(columns.swapaxes(1, 2), mode="r"))
     return Triangles(full[:, :p, :p], full[:, :p, p], full[:, p, p] ** 2)
 
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
-
 import numpy as np
 import pytest
 from conftest import paper, random_joints, random_table
@@ -14,6 +11,7 @@ from dhcal_pin.batch import Batch, joined, solve
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.chain import Chain
 from dhcal_pin.errors import DhcalError
+from dhcal_pin.executors import workers
 from dhcal_pin.kinds import KINDS
 from dhcal_pin.lengths import Wires
 from dhcal_pin.measurements import Noise
@@ -69,7 +67,7 @@ def test_kernel_is_that_of_one_chain(sets, seed):
 def test_answers_are_those_of_the_solver(seed):
     """20 problems of a random arm, parameter set, mixture of kinds, priors and method; 200 in all.
 
-    In metres and radians where the data see it, and within a millionth of a sigma of data and priors all over.
+    In metres and radians where the data see it, and within a millionth of a sigma all over.
     """
     rng = np.random.default_rng(seed)
     table = random_table(rng, size=int(rng.integers(2, 8)))
@@ -203,5 +201,5 @@ def test_processes_give_the_same_digits(sim_6dof, sim_6dof_actual):
     errors = select(sim_6dof, "dh")
     data = Pose.simulate(sim_6dof_actual, rng.uniform(-3, 3, (3000, 6)), NOISE, rng)
     batch = Batch(Arms.of([errors] * 300), (data,), np.zeros(24))
-    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
-        np.testing.assert_array_equal(solve(batch, executor=pool).x, solve(batch).x)
+    with workers(jobs=2) as two:
+        np.testing.assert_array_equal(solve(batch, where=two).x, solve(batch).x)

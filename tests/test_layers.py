@@ -12,6 +12,7 @@ import dhcal_pin
 HOUSE = Path(dhcal_pin.__file__).parent
 LAYERS = (
     {"errors"},
+    {"executors"},
     {"se3"},
     {"urdf_tags", "dh"},
     {"urdf", "extraction"},
@@ -33,13 +34,14 @@ LAYERS = (
     {"foreign_files"},
     {"dh_files", "measurement_files", "ur_kinematics"},
     {"robot_files", "screening"},
+    {"study"},
     {"plausibility"},
     {"exports"},
     {"report"},
     {"terminal"},
     {"viewer"},
     {"outputs"},
-    {"demo"},
+    {"demo", "study_command"},
     {"commands"},
     {"cli"},
 )
