@@ -12,13 +12,13 @@ import numpy as np
 from . import observability, robust
 from .chain import BASE, Chain
 from .errors import DhcalError
-from .frames import starts
+from .frames import few, misfit, starts
 from .measurements import Measurement
 from .parameters import ErrorModel, select
 from .problem import Problem, shared_unknowns
 from .result import Result
 from .se3 import Array
-from .solver import METHODS, Progress, Solution, levenberg_marquardt
+from .solver import METHODS, Progress, Solution, levenberg_marquardt, posterior_root
 
 Method = Literal["lm", "gn"]
 Priors = Literal["default", "none"] | Mapping[str, float]
@@ -26,6 +26,8 @@ Priors = Literal["default", "none"] | Mapping[str, float]
 # Sigmas are not estimated below a nanometre and a nanoradian.
 LEAST_SCALE = 1e-6
 MOST_ROUNDS = 30
+# Starts for the frames are tried until one leaves so small a share of the positions' spread.
+GOOD_FIT = 0.01
 
 
 def _prior_weights(errors: ErrorModel, priors: Priors) -> Array:
@@ -69,16 +71,24 @@ def _place(
     if frames is None:
         return errors.chain
     stations = {p.station for p in frames.parameters}
-    best: tuple[float, Chain] | None = None
-    for start in starts(errors.chain, data, BASE in stations, errors.chain.tool_station in stations):
+
+    def fitted(start: Chain, items: tuple[Measurement, ...]) -> tuple[float, Chain]:
         placed = replace(frames, chain=start)
-        problem = _problem(placed, tuple(item.started(start) for item in data), 1 / placed.priors, known)
+        problem = _problem(placed, tuple(item.started(start) for item in items), 1 / placed.priors, known)
         solution = levenberg_marquardt(problem, np.zeros(len(problem.weights)), max_iterations, None)
-        cost = problem.cost(solution.x)
-        if best is None or cost < best[0]:
-            best = cost, placed.at(solution.x[: len(placed.parameters)])
-    assert best is not None
-    return best[1]
+        chain = placed.at(solution.x[: len(placed.parameters)])
+        return solution.triangle.cost + float(np.sum((problem.weights * solution.x) ** 2)), chain
+
+    begun = starts(errors.chain, data, BASE in stations, errors.chain.tool_station in stations)
+    if len(begun) == 1:
+        return fitted(begun[0], data)[1]
+    some = tuple(few(item) for item in data)
+    best: tuple[float, Chain] = np.inf, begun[0]
+    for start in begun:
+        best = min(best, fitted(start, some), key=lambda found: found[0])
+        if misfit(best[1], some) < GOOD_FIT:
+            break
+    return fitted(best[1], data)[1]
 
 
 def _problem(
@@ -108,6 +118,8 @@ def _scatter(
 
     One where the instrument states its sigmas, or where there are not more rows than directions seen.
     """
+    if all(item.stated for item in data):
+        return np.ones(sum(len(item.groups) for item in data))
     chain = problem.errors.at(solution.x[: len(problem.errors.parameters)])
     residuals = [
         item.residual(chain.sweep(item.configurations()), problem.values(item, solution.x)) for item in data
@@ -125,7 +137,28 @@ def _scatter(
     )
 
 
+def _widened(problem: Problem, solution: Solution, expected: Array) -> Array:
+    """The weights (p+s,) of priors as wide as the errors that were found, never narrower than expected.
+
+    Lengths and angles of the links each have one scale, the one of greatest evidence (MacKay 1992):
+    the mean square of their errors over as many as the data and not the prior determine.
+    """
+    errors = problem.errors
+    outside = (BASE, errors.chain.tool_station)
+    root = posterior_root(solution.triangle, problem.weights)[0]
+    told = 1 - np.sum((root * problem.weights[:, None]) ** 2, 1)
+    weights = problem.weights.copy()
+    for unit in {p.unit for p in errors.parameters}:
+        family = [i for i, p in enumerate(errors.parameters) if p.unit == unit and p.station not in outside]
+        if (count := told[family].sum()) > 1e-3:
+            square = np.sum((solution.x[family] * expected[family]) ** 2) / count
+            weights[family] = expected[family] / np.sqrt(max(1.0, square))
+    return weights
+
+
 def _scaled(data: tuple[Measurement, ...], scales: Array) -> tuple[Measurement, ...]:
+    if np.all(scales == 1):
+        return data
     left = iter(scales.tolist())
     return tuple(item.scaled({name: next(left) for name in item.groups}) for item in data)
 
@@ -163,8 +196,9 @@ def calibrate(
         max_iterations: most steps of a loop.
         progress: called with the iteration and the cost.
 
-    Sigmas that no instrument states are estimated with the fit, a group of rows at a time, so that
-    data and priors weigh right against each other.
+    Sigmas that no instrument states are estimated with the fit, a group of rows at a time, and default
+    priors widen to the errors that are found where these are larger, so that data and priors weigh
+    right against each other.
 
     Raises:
         DhcalError: no data, unknown names, or a plain Gauss-Newton loop that runs away.
@@ -192,6 +226,7 @@ def calibrate(
     if method == "lm":
         # Sigmas and weights that the fit itself tells: a few rounds settle them.
         scales = np.ones(sum(len(item.groups) for item in data))
+        expected = problem.weights
         for _ in range(MOST_ROUNDS):
             before, found = weights, _scatter(problem, solution, data, weights)
             scaled = _scaled(data, found)
@@ -199,11 +234,17 @@ def calibrate(
             values = [problem.values(item, solution.x) for item in data]
             weighed, weights = robust.reweighted(fitted, scaled, values, loss)
             moved = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(weights, before, strict=True))
-            if np.abs(np.log(found / scales)).max() < 0.01 and moved < 0.01:
+            priors_now = _widened(problem, solution, expected) if priors == "default" else expected
+            changes = np.log(found / scales), (priors_now - problem.weights) / np.fmax(expected, 1e-300)
+            if max(moved, *(np.abs(change).max(initial=0.0) for change in changes)) < 0.01:
                 break
             scales = found
-            problem = replace(problem, data=weighed)
-            again = levenberg_marquardt(problem, solution.x, max_iterations, progress)
+            known_now = None
+            if all(new is old for new, old in zip(weighed, problem.data, strict=True)):
+                problem, known_now = problem.held(priors_now), solution.triangle
+            else:
+                problem = replace(problem, data=weighed, weights=priors_now)
+            again = levenberg_marquardt(problem, solution.x, max_iterations, progress, known_now)
             solution = replace(again, iterations=solution.iterations + again.iterations)
     return Result(
         errors=errors,

@@ -14,6 +14,8 @@ from .se3 import Array
 
 # Tool offsets tried where the target's place on the tip is unknown, in metres.
 _REACH = 0.25
+# Samples of each measurement that a start needs.
+_PROBES = 100
 # The most promising of them are followed to the end.
 _TRIED = 4
 
@@ -33,6 +35,11 @@ def align(source: Array, target: Array) -> tuple[Array, float]:
     return motion, float(np.sqrt(np.mean(np.sum(rest**2, -1))))
 
 
+def few(item: Measurement) -> Measurement:
+    """So many of a measurement's samples as a start needs, drawn so that no order in them matters."""
+    return item.take(np.sort(np.random.default_rng(0).permutation(len(item.rows))[:_PROBES]))
+
+
 def starts(chain: Chain, data: Sequence[Measurement], base: bool, tool: bool) -> list[Chain]:
     """Chains with base and tool placed from the measured positions, the most promising first.
 
@@ -40,6 +47,7 @@ def starts(chain: Chain, data: Sequence[Measurement], base: bool, tool: bool) ->
     offset is tried at places around the tip. Fewer than three positions leave the chain as it is.
     """
     readings = [item for item in data if len(item.positions())]
+    readings = [few(item) for item in readings]
     tips = [replace(chain, base=np.eye(4), tool=np.eye(4)).poses(item.q) for item in readings]
     if sum(len(pose) for pose in tips) < 3 or not (base or tool):
         return [chain]
@@ -69,3 +77,11 @@ def starts(chain: Chain, data: Sequence[Measurement], base: bool, tool: bool) ->
             turn = nearest_rotation(np.concatenate(turns).sum(0))
         out.append(replace(chain, base=motion, tool=se3.transform(turn, offset)))
     return out
+
+
+def misfit(chain: Chain, data: Sequence[Measurement]) -> float:
+    """RMS distance of the measured positions from the chain's, over that from their own middle."""
+    readings = [item for item in data if len(item.positions())]
+    seen = np.concatenate([item.positions() for item in readings])
+    modelled = np.concatenate([chain.poses(item.q)[:, :3, 3] for item in readings])
+    return float(np.linalg.norm(seen - modelled) / np.linalg.norm(seen - seen.mean(0)))

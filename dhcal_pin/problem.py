@@ -14,12 +14,14 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import lapack
 
-from .chain import Chain, Motion
+from .chain import Chain, Motion, Sweep
 from .measurements import Measurement, Unknown
 from .parameters import ErrorModel
+from .scratch import long_rows, scratch
 from .se3 import Array
 
-CHUNK = 4096
+# Samples a chunk, and columns that LAPACK reduces at once.
+CHUNK, PANEL = 2000, 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,13 +75,20 @@ class Problem:
             for start in range(0, len(item.rows), CHUNK)
         )
 
+    def held(self, weights: Array) -> Problem:
+        """The same data with other priors."""
+        out = replace(self, weights=weights)
+        vars(out)["chunks"] = self.chunks
+        return out
+
     def cost(self, x: Array) -> float:
         """Sum of squared whitened residuals and priors at x (p,)."""
         chain = self.errors.at(x[: len(self.errors.parameters)])
+        every = self.instruments(x)
         total = float(np.sum((self.weights * x) ** 2))
         for chunk in self.chunks:
-            residual = chunk.data.residual(chain.sweep(chunk.motion), self.values(chunk.data, x))
-            total += float(np.sum(residual**2))
+            residual = chunk.data.residual(chunk.sweep(chain), chunk.unknowns(every))
+            total += float(np.vdot(residual, residual))
         return total
 
 
@@ -99,6 +108,15 @@ class Chunk:
     def motion(self) -> Motion:
         """Of the samples' configurations."""
         return self.nominal.motion(self.data.configurations())
+
+    def sweep(self, chain: Chain) -> Sweep:
+        """A chain's frames at the samples, in memory that the next chunk's overwrite."""
+        k, m = self.motion.values.shape
+        return chain.sweep(self.motion, scratch("sweep", k + 2, 4, 3, m))
+
+    def unknowns(self, instruments: Mapping[str, float]) -> Array:
+        """The values u of the measurement's unknowns among all the instruments'."""
+        return np.array([instruments[unknown.name] for unknown in self.data.unknowns])
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,20 +140,21 @@ class Tangent:
         """Triangle (p+1, p+1) of a chunk's whitened rows [J | r]; exact or by the paper's rows."""
         data, errors = chunk.data, len(self.bodies)
         p = errors + len(self.places)
-        sweep = self.chain.sweep(chunk.motion)
-        u = np.array([self.instruments[unknown.name] for unknown in data.unknowns])
-        velocities = self.chain.tool_velocities(sweep, self.bodies, self.twists)
-        if small_angle:
-            residual, rows = data.small_angle(sweep, velocities, u)
-        else:
-            residual, rows = data.residual(sweep, u), data.whiten(sweep, velocities, u)
-        block = np.zeros((p + 1, residual.size))
-        block[:errors] = rows.reshape(errors, residual.size)
-        for unknown, row in zip(data.unknowns, data.own(sweep, u), strict=True):
-            if unknown.name in self.places:
-                block[self.places[unknown.name]] = row.reshape(-1)
-        block[p] = residual.reshape(-1)
-        return qr(block)
+        sweep, u = chunk.sweep(self.chain), chunk.unknowns(self.instruments)
+        with long_rows():
+            velocities = scratch("velocities", errors, 6, sweep.tool.shape[-1])
+            self.chain.tool_velocities(sweep, self.bodies, self.twists, velocities)
+            block = scratch("block", p + 1, data.size, len(data.rows))
+            if small_angle:
+                block[p] = data.small_angle(sweep, velocities, u, block[:errors])[0]
+            else:
+                block[p] = data.residual(sweep, u)
+                data.whiten(sweep, velocities, u, block[p], block[:errors])
+            block[errors:p] = 0.0
+            for unknown, rows in zip(data.unknowns, data.own(sweep, u), strict=True):
+                if unknown.name in self.places:
+                    block[self.places[unknown.name]] = rows
+        return qr(block.reshape(p + 1, -1))
 
 
 def shared_unknowns(data: Sequence[Measurement]) -> tuple[Unknown, ...]:
@@ -165,14 +184,20 @@ class Triangle:
     z: Array
     rest: float
 
+    @property
+    def cost(self) -> float:
+        """Sum of the squared rows, at no step."""
+        return self.rest + float(self.z @ self.z)
+
 
 def qr(rows: Array) -> Array:
-    """Upper triangle (c, c) of rows (c, k), a C-order array that LAPACK sees as (k, c)."""
+    """Upper triangle (c, c) of rows (c, k), a C-order array that LAPACK sees as (k, c) and overwrites."""
     columns, count = rows.shape
     out = np.zeros((columns, columns))
     if count == 0:
         return out
-    packed = lapack.dgeqrf(rows.T, overwrite_a=1)[0]
+    # Narrow panels: the block is tall and thin.
+    packed = lapack.dgeqrt(min(PANEL, columns, count), rows.T, overwrite_a=1)[0]
     top = min(columns, count)
     out[:top] = np.triu(packed[:top])
     return out

@@ -16,7 +16,7 @@ from .measurements import Measurement, Unknown
 from .parameters import ErrorModel, Parameter
 from .problem import Problem, reduce, shared_unknowns
 from .se3 import Array
-from .solver import Solution, levenberg_marquardt, pseudo_inverse, with_priors
+from .solver import Solution, levenberg_marquardt, posterior_root, pseudo_inverse, with_priors
 
 # A parameter, or a metre and a radian of the tool, with more than this share of itself unseen is unknown.
 UNKNOWN = 1e-6
@@ -162,15 +162,6 @@ class Result:
         return observability.unobservable(self.solution.triangle.r, self.parameters)
 
     @cached_property
-    def _root(self) -> tuple[Array, Array]:
-        """A root (p, r) of the covariance at sigmas as used, and a basis (p, p-r) of what nothing tells."""
-        zero = np.zeros_like(self.x)
-        full = with_priors(self.solution.triangle, self.problem.weights, zero, zero).r
-        _, s, vt = np.linalg.svd(full)
-        keep = s > observability.RANK_CUT * s[0]
-        return vt[keep].T / s[keep], vt[~keep].T
-
-    @cached_property
     def freedom(self) -> float:
         """Rows left over; unknowns count as far as data and not priors tell them (MacKay's number)."""
         count = 0.0
@@ -189,12 +180,7 @@ class Result:
 
     @cached_property
     def _root(self) -> tuple[Array, Array]:
-        """A root (p, r) of the covariance at sigmas as used, and a basis (p, p-r) of what nothing tells."""
-        zero = np.zeros_like(self.x)
-        full = with_priors(self.solution.triangle, self.problem.weights, zero, zero).r
-        _, s, vt = np.linalg.svd(full)
-        keep = s > observability.RANK_CUT * s[0]
-        return vt[keep].T / s[keep], vt[~keep].T
+        return posterior_root(self.solution.triangle, self.problem.weights)
 
     @cached_property
     def _spread(self) -> tuple[Array, Array]:

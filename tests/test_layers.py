@@ -14,7 +14,7 @@ LAYERS = (
     {"errors"},
     {"executors"},
     {"se3"},
-    {"urdf_tags", "dh"},
+    {"urdf_tags", "dh", "scratch"},
     {"urdf", "extraction"},
     {"urdf_origins", "dh_urdf"},
     {"chain"},
