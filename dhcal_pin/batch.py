@@ -25,6 +25,8 @@ from .triangles import Triangles, triangles
 
 # Members whose arrays together stay in a core's cache.
 BLOCK = 250
+# The weight of a sample that is there to fill up: lost in rounding, and still a number.
+_NOTHING = 1e-40
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +137,8 @@ class Batch:
             if small_angle:
                 residual, rows = item.small_angle(sweep, velocities, u)
             else:
-                residual, rows = item.residual(sweep, u), item.whiten(sweep, velocities, u)
+                residual = item.residual(sweep, u)
+                rows = item.whiten(sweep, velocities, u, residual)
             k = len(residual)
             block = np.empty((b, p + 1, k, q.shape[2]))
             block[:, :p] = rows.reshape(p, k, b, -1).transpose(2, 0, 1, 3)
@@ -154,10 +157,8 @@ def _filled(item: Measurement, count: int) -> Measurement:
     spare = count - len(item.rows)
     if not spare:
         return item
-    weights = np.concatenate([np.ones(len(item.rows)), np.zeros(spare)])
-    long = item.take(np.concatenate([np.arange(len(item.rows)), np.zeros(spare, int)]))
-    with np.errstate(divide="ignore"):
-        return long.weighted(weights)
+    weights = np.concatenate([np.ones(len(item.rows)), np.full(spare, _NOTHING)])
+    return item.take(np.concatenate([np.arange(len(item.rows)), np.zeros(spare, int)])).weighted(weights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +185,7 @@ class Solutions:
     @property
     def cost(self) -> Array:
         """Sums (b,) of squared whitened residuals, without priors."""
-        return self.triangles.rest + np.sum(self.triangles.z**2, -1)
+        return self.triangles.cost
 
     @cached_property
     def rank(self) -> Array:
@@ -223,7 +224,7 @@ def _gauss_newton(batch: Batch, x: Array, max_iterations: int) -> tuple[Array, A
     for done in range(1, max_iterations + 1):
         full = part.reduce(x[live], batch.weights, small_angle=True)
         step = full.step()
-        settled = full.settled(step, full.rest + np.sum(full.z**2, -1))
+        settled = full.settled(step, full.cost)
         x[live] += step
         iterations[live], converged[live] = done, settled
         over = settled | ~(np.abs(x[live]).max(1) < RUNAWAY)
@@ -252,23 +253,29 @@ def _levenberg_marquardt(batch: Batch, x: Array, max_iterations: int) -> tuple[A
     """`solver.levenberg_marquardt` in step: who has moved gets a new triangle, all others try again."""
     b, p, part, live = len(batch), len(batch.weights), batch, np.arange(len(batch))
     x, iterations, converged = x.copy(), np.zeros(b, int), np.zeros(b, bool)
-    cost, scale, fresh = batch.cost(x), np.zeros((b, p)), np.ones(b, bool)
-    damping, growth = np.full(b, 1e-4), np.full(b, 2.0)
-    every = Triangles(np.zeros((b, p, p)), np.zeros((b, p)), np.zeros(b))
-    while live.size and max_iterations:
-        if fresh[live].any():
-            new = np.flatnonzero(fresh[live])
-            found = part.take(new).reduce(x[live[new]], batch.weights, small_angle=False)
-            every.put(live[new], found)
-            scale[live[new]] = np.maximum(scale[live[new]], np.linalg.norm(found.r, axis=1))
-            iterations[live[new]] += 1
-            fresh[live[new]] = False
+    every, scale = batch.reduce(x, batch.weights, small_angle=False), np.zeros((b, p))
+    cost, damping, growth = every.cost, np.full(b, 1e-8), np.full(b, 2.0)
+    fresh = np.ones(b, bool)
+    if not max_iterations:
+        return x, iterations, converged
+    while live.size:
         free, before = every.take(live), cost[live]
+        new = live[fresh[live]]
+        iterations[new] += 1
+        scale[new] = np.maximum(scale[new], np.linalg.norm(every.r[new], axis=1))
         floor = np.where(scale[live] > 0, scale[live], 1.0)
         least = np.sqrt(damping[live])[:, None] * floor
         step = free.damped(least).step(least.min(1))
         settled = free.settled(step, before)
-        trial = part.cost(x[live] + step)
+        there, trial = x[live] + step, np.empty(len(live))
+        # A first try mostly holds, and its triangle, which the next step needs, tells its cost too.
+        first = ~settled & fresh[live]
+        tried, others = np.flatnonzero(first), np.flatnonzero(~first)
+        if tried.size:
+            ahead = part.take(tried).reduce(there[tried], batch.weights, small_angle=False)
+            trial[tried] = ahead.cost
+        if others.size:
+            trial[others] = part.take(others).cost(there[others])
         expected = np.sum(free.z**2, -1) - np.sum((free.moved(step) - free.z) ** 2, -1)
         gain = np.where(expected > 0, (before - trial) / np.where(expected > 0, expected, 1.0), 0.0)
         rounding, root = free.rounding(), np.sqrt(before)
@@ -278,8 +285,9 @@ def _levenberg_marquardt(batch: Batch, x: Array, max_iterations: int) -> tuple[A
         stuck = ~accepted & (settled | (damping[live] > 1e16))
         easier = np.where(trusted | (gain > 0.9), 1e-2, np.maximum(1e-3, 1 - (2 * gain - 1) ** 3))
         went, retry = live[accepted], live[~accepted]
-        x[went] += step[accepted]
-        cost[went], growth[went], fresh[went] = trial[accepted], 2.0, True
+        x[went] = there[accepted]
+        cost[went], growth[went] = trial[accepted], 2.0
+        fresh[live] = accepted
         damping[went] = np.maximum(damping[went] * easier[accepted], 1e-16)
         converged[went] = settled[accepted] & (damping[went] < 1e-3)
         converged[live[stuck]] = settled[stuck]
@@ -288,7 +296,16 @@ def _levenberg_marquardt(batch: Batch, x: Array, max_iterations: int) -> tuple[A
         if leaping.size:
             who = live[leaping]
             x[who], cost[who] = _leap(part.take(leaping), x[who], cost[who])
-        over = stuck | converged[live] | (fresh[live] & (iterations[live] >= max_iterations))
+        over = stuck | converged[live] | (accepted & (iterations[live] >= max_iterations))
+        if tried.size:
+            kept = np.flatnonzero(accepted[tried])
+            every.put(live[tried[kept]], ahead.take(kept))
+        # Whose step held without a triangle, or who leapt, needs one.
+        lacking = np.flatnonzero((accepted & ~first) | np.isin(np.arange(len(live)), leaping))
+        lacking = lacking[~over[lacking]]
+        if lacking.size:
+            found = part.take(lacking).reduce(x[live[lacking]], batch.weights, small_angle=False)
+            every.put(live[lacking], found)
         live, part = live[~over], part.take(np.flatnonzero(~over))
     return x, iterations, converged
 

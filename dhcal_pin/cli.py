@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
@@ -233,6 +234,8 @@ def _add_where(command: argparse.ArgumentParser) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; 0 done, 1 a check that failed, 2 wrong input, 130 interrupted."""
+    # Small matrices: threads inside LAPACK would only wait for each other. NumPy reads this when it loads.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     args = parser().parse_args(argv)
     try:
         from . import commands

@@ -74,6 +74,6 @@ def _cluster(address: str) -> Any:
             "--scheduler needs Dask: pip install 'dhcal-pin[cluster]', here and on the workers"
         ) from None
     try:
-        return Client(address, timeout=10)
+        return Client(address, timeout=3)
     except (OSError, ValueError) as error:
         raise DhcalError(f"--scheduler {address}: no Dask scheduler there: {error}") from error

@@ -19,6 +19,11 @@ class Triangles:
     z: Array
     rest: Array
 
+    @property
+    def cost(self) -> Array:
+        """Sums (b,) of the squared rows that they hold."""
+        return self.rest + np.sum(self.z**2, -1)
+
     def take(self, members: Array) -> Triangles:
         """Those of an index (j,)."""
         return Triangles(self.r[members], self.z[members], self.rest[members])
