@@ -237,6 +237,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Small matrices: threads inside LAPACK would only wait for each other. NumPy reads this when it loads.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     args = parser().parse_args(argv)
+    # Small and narrow matrices: further threads of a BLAS, which asks when NumPy loads, would only wait.
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
     try:
         from . import commands
 

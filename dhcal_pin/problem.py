@@ -88,7 +88,7 @@ class Problem:
         total = float(np.sum((self.weights * x) ** 2))
         for chunk in self.chunks:
             residual = chunk.data.residual(chunk.sweep(chain), chunk.unknowns(every))
-            total += float(np.vdot(residual, residual))
+            total += float(np.sum(residual * residual))
         return total
 
 
