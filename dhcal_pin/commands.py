@@ -21,6 +21,7 @@ from . import (
     exports,
     fleet_command,
     report,
+    study_command,
     terminal,
     ur_kinematics,
     viewer,
@@ -52,8 +53,8 @@ from .robot_files import (
     urdf_files,
 )
 from .screening import Finding, screen
-from .se3 import Array
 from .solver import Progress
+from .study import configurations
 
 # --- calibrate -------------------------------------------------------------------------------------
 
@@ -316,23 +317,11 @@ def _simulate(args: Namespace) -> int:
                 f"they must be those of {args.robot}: {', '.join(chain.joint_names)}"
             )
     rng = np.random.default_rng(args.seed)
-    data = KINDS[args.kind].simulate(truth, _configurations(chain, args.samples, rng), noise, rng)
+    data = KINDS[args.kind].simulate(truth, configurations(chain, args.samples, rng), noise, rng)
     comments = [f"simulated {args.kind} of {args.truth or args.robot}, noise {args.noise}, seed {args.seed}"]
     save({args.output: measurement_text(data, chain, comments)})
     terminal.lines(f"wrote {args.output}")
     return 0
-
-
-def _configurations(chain: Chain, count: int, rng: np.random.Generator) -> Array:
-    """Uniform joint values (count, n) within the limits, and within a turn or half a metre each way."""
-    low, high = chain.lower, chain.upper
-    slides = [chain.urdf.joint(name).type == "prismatic" for name in chain.joint_names]
-    span = np.where(slides, 0.5, np.pi)
-    low, high = (
-        np.where(high > -span, np.maximum(low, -span), np.maximum(low, high - 2 * span)),
-        np.where(low < span, np.minimum(high, span), np.minimum(high, low + 2 * span)),
-    )
-    return rng.uniform(low, high, (count, chain.size))
 
 
 def _view(args: Namespace) -> int:
@@ -370,4 +359,5 @@ COMMANDS: dict[str, Callable[[Namespace], int]] = {
     "check": _check,
     "simulate": _simulate,
     "compensate": compensate_command.run,
+    "study": study_command.study,
 }

@@ -12,6 +12,7 @@ import dhcal_pin
 HOUSE = Path(dhcal_pin.__file__).parent
 LAYERS = (
     {"errors"},
+    {"executors"},
     {"se3"},
     {"urdf_tags", "dh", "scratch"},
     {"urdf", "extraction"},
@@ -23,7 +24,8 @@ LAYERS = (
     {"frames", "observability", "robust", "kinds"},
     {"problem"},
     {"solver"},
-    {"result"},
+    {"arms", "triangles"},
+    {"batch", "result"},
     {"calibration", "compensation"},
     {"check"},
     {"files"},
@@ -32,6 +34,7 @@ LAYERS = (
     {"foreign_files"},
     {"dh_files", "measurement_files", "ur_kinematics"},
     {"robot_files", "screening"},
+    {"study"},
     {"plausibility"},
     {"exports"},
     {"report"},
@@ -39,7 +42,7 @@ LAYERS = (
     {"viewer"},
     {"outputs", "jobs"},
     {"fleet"},
-    {"demo", "compensate_command", "fleet_command"},
+    {"demo", "compensate_command", "fleet_command", "study_command"},
     {"commands"},
     {"cli"},
 )
@@ -76,7 +79,7 @@ def test_special_packages_stay_in_one_place(module):
         "meshcat": {"viewer"},
         "matplotlib": {"report"},
         "rich": {"terminal"},
-        "argparse": {"cli", "commands", "jobs", "compensate_command", "fleet_command"},
+        "argparse": {"cli", "commands", "jobs", "compensate_command", "fleet_command", "study_command"},
     }
     for package, allowed in homes.items():
         if package in imports(module)[1]:
