@@ -63,6 +63,8 @@ class Measurement(Protocol):
     needs: ClassVar[tuple[frozenset[str], ...]]
     # Configurations a row: 0, 1, or 2, the second under to:JOINT.
     ends: ClassVar[int]
+    # Whether the tool must be on something for a sample; if not, any configuration can be measured.
+    touches: ClassVar[bool]
 
     @property
     def q(self) -> Array:
@@ -220,6 +222,7 @@ class PointReading:
     columns: ClassVar[Mapping[str, str]]
     needs: ClassVar[tuple[frozenset[str], ...]]
     ends: ClassVar[int] = 1
+    touches: ClassVar[bool] = False
     # Fields with an entry a sample.
     per_row: ClassVar[tuple[str, ...]] = ("q", "reading", "sigma", "rows")
 

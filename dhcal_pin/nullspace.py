@@ -1,0 +1,195 @@
+"""Why directions stay unseen: what would show them, and short combinations that span them.
+
+The unseen directions of a data set are peeled in four layers by asking what the same model would see
+otherwise, with Jacobians that are really computed: at other joint values, and with the tool's whole pose
+read. What nothing shows lies in the arm; what poses would show lies in the instrument; what other joint
+values would show lies in the poses, and some of that in joints that never moved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from . import observability
+from .chain import Chain
+from .measurements import Measurement
+from .poses import Pose
+from .positions import Position
+from .se3 import Array
+from .solver import Problem, reduce
+
+Cause = Literal["arm", "instrument", "poses", "still"]
+
+# Joint values drawn to see what other poses would show: this many rows an unknown.
+_ROWS = 6
+# A direction that other readings show stands out from their rounding by far more than this.
+_CUT = 1e-8
+# Entries of a combination, the largest being 1, below which a parameter takes no part in it.
+_NONE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Unseen directions that share a cause and a part of the arm.
+
+    Attributes:
+        cause: who would have to change for them to be seen.
+        vectors: (p, r) changes of the unknowns that the data do not see, the largest entry of each 1.
+    """
+
+    cause: Cause
+    vectors: Array
+
+    @property
+    def members(self) -> list[int]:
+        """The unknowns that take part."""
+        return np.flatnonzero(np.abs(self.vectors).max(1) > _NONE).tolist()
+
+
+def _kernel(rows: Array) -> Array:
+    """Orthonormal basis of the combinations of columns that vanish in rows of an orthonormal basis."""
+    _, s, vt = np.linalg.svd(rows)
+    return vt[int(np.sum(s > _NONE)) :].T
+
+
+def _within(space: Array, triangle: Array) -> Array:
+    """Basis of the part of a space (p, d) that a triangle does not see either."""
+    size = np.linalg.norm(triangle, 2) if triangle.size else 0.0
+    if not space.shape[1] or size == 0:
+        return space
+    _, s, vt = np.linalg.svd(triangle @ space)
+    return space @ vt[int(np.sum(s > _CUT * size)) :].T
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """What was measured, and what could be measured instead.
+
+    Attributes:
+        problem: the unknowns and the data.
+        x: (p,) where the Jacobian is taken.
+    """
+
+    problem: Problem
+    x: Array
+
+    @property
+    def chain(self) -> Chain:
+        """The chain at x."""
+        return self.problem.errors.at(self.x[: len(self.problem.errors.parameters)])
+
+    def _draw(self, rng: np.random.Generator, m: int) -> Array:
+        chain = self.chain
+        low, high = np.maximum(chain.lower, -np.pi), np.minimum(chain.upper, np.pi)
+        return rng.uniform(low, high, (m, chain.size))
+
+    def _moved(self, item: Any, joints: Sequence[int], rng: np.random.Generator) -> Any:
+        """The same readings with some joints anywhere; who touches something must stay on it."""
+        if item.touches:
+            return item
+        ends = {}
+        for name in ("q", "q_to"):
+            if hasattr(item, name):
+                ends[name] = getattr(item, name).copy()
+                ends[name][:, joints] = self._draw(rng, len(ends[name]))[:, joints]
+        return replace(item, **ends)
+
+    def triangle(self, joints: Sequence[int], *extra: type[Pose] | type[Position]) -> Array:
+        """What the same instruments would see with some joints drawn anew, and with more readings."""
+        rng = np.random.default_rng(0)
+        data = self.problem.data
+        p = len(self.x)
+        rounds = 1 + _ROWS * p // max(1, sum(len(item.rows) for item in data))
+        every: list[Measurement] = [
+            self._moved(item, joints, rng) for _ in range(rounds if len(joints) else 1) for item in data
+        ]
+        q = self._draw(rng, _ROWS * p)
+        pose = self.chain.poses(q)
+        for kind in extra:
+            every.append(Pose.of(q, pose, 1e-3, 1e-3) if kind is Pose else Position.of(q, pose[:, :3, 3], 1e-3))
+        return reduce(replace(self.problem, data=tuple(every)), self.x, small_angle=False).r
+
+    def still(self) -> list[int]:
+        """Independent joints, from 0, that have one value in all the data."""
+        q = np.concatenate([item.configurations() for item in self.problem.data])
+        return np.flatnonzero(np.ptp(q, axis=0) < 1e-9).tolist()
+
+    def layers(self, triangle: Array) -> list[tuple[Cause, Array]]:
+        """Bases (p, ·) of what stays unseen, each within the next: by the arm, and by all that was done."""
+        joints = list(range(self.chain.size))
+        data = observability.unseen(triangle)
+        still = self.still()
+        poses = _within(data, self.triangle(still)) if still else data
+        instrument = _within(poses, self.triangle(joints))
+        arm = _within(instrument, self.triangle(joints, Pose))
+        return [("arm", arm), ("instrument", instrument), ("poses", poses), ("still", data)]
+
+
+def _echelon(space: Array, order: Array) -> Iterator[Array]:
+    """Combinations that span a space (p, d), each the only one with an entry at its pivot."""
+    rows = space.T.copy()
+    done = 0
+    for column in order:
+        if done == len(rows):
+            break
+        pivot = done + int(np.argmax(np.abs(rows[done:, column])))
+        if abs(rows[pivot, column]) < _NONE:
+            continue
+        rows[[done, pivot]] = rows[[pivot, done]]
+        rows[done] /= rows[done, column]
+        others = np.arange(len(rows)) != done
+        rows[others] -= np.outer(rows[others, column], rows[done])
+        done += 1
+    for row in rows:
+        row = row / row[np.argmax(np.abs(row))]
+        yield np.where(np.abs(row) < _NONE, 0.0, row)
+
+
+def _beyond(known: Array, vector: Array) -> Array:
+    """What of a unit vector (p,) lies outside an orthonormal basis (p, d)."""
+    return vector - known @ (known.T @ vector)
+
+
+def groups(layers: Sequence[tuple[Cause, Array]], bodies: Array, robot: int) -> list[Group]:
+    """Every unseen direction once: short combinations, each within as few neighbouring bodies as it can be.
+
+    Args:
+        layers: of `Experiment.layers`.
+        bodies: (robot,) the body that each of the robot's unknowns moves, ascending.
+        robot: how many of the unknowns are the robot's.
+    """
+    p = layers[-1][1].shape[0]
+    last = int(bodies.max(initial=0))
+    spans = [(i, i + length) for length in range(last + 1) for i in range(last + 1 - length)]
+    parts = []
+    for with_instrument in (False, True):
+        for first, end in spans:
+            inside = np.full(p, with_instrument)
+            inside[:robot] = (bodies >= first) & (bodies <= end)
+            parts.append(inside)
+    known = np.empty((p, 0))
+    out = []
+    for cause, space in layers:
+        for inside in parts:
+            if known.shape[1] == space.shape[1]:
+                break
+            local = space @ _kernel(space[~inside]) if (~inside).any() else space
+            if not local.shape[1]:
+                continue
+            members = np.flatnonzero(inside)
+            found = [row for order in (members, members[::-1]) for row in _echelon(local, order)]
+            found.sort(key=lambda row: (np.count_nonzero(row), int(np.argmax(row != 0))))
+            new = []
+            for row in found:
+                rest = _beyond(known, row / np.linalg.norm(row))
+                if np.linalg.norm(rest) > 1e-4:
+                    new.append(row)
+                    rest = _beyond(known, rest / np.linalg.norm(rest))
+                    known = np.concatenate([known, rest[:, None] / np.linalg.norm(rest)], 1)
+            if new:
+                out.append(Group(cause, np.array(new).T))
+    return out
