@@ -1,23 +1,23 @@
 """What the data cannot tell apart, in words: which parameters, why, and what would tell them.
 
 A reason is printed only after it was checked on the arm at hand: a combination is carried along the
-chain, and where it passes a joint it must be a motion that this joint's own motion leaves as it is: along
-or about a revolute joint's axis, along anything or about the axis of a prismatic one. Where a check fails
-the plain fact remains.
+chain, and where it passes a joint it must be a motion that this joint's own motion leaves as it is (see
+`passage`). Where a check fails the plain fact remains. What would help is computed, too.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
-from . import se3
-from .chain import BASE, Chain, joint_station, link_station
-from .measurements import Unknown
-from .nullspace import Experiment, Group, groups
+from . import observability
+from .chain import BASE, Chain
+from .nullspace import Cause, Experiment, Group, groups
 from .parameters import Parameter
+from .passage import PARALLEL, Passage, Path, own_axes, passage, tilt
 from .poses import Pose
 from .positions import Position
 from .se3 import Array
@@ -25,12 +25,12 @@ from .solver import Problem, Triangle
 
 # Carried combinations, the largest entry 1, agree with a reason to this.
 _EXACT = 1e-5
-# Axes within this of each other, rad and m, are parallel, or the same line.
-_PARALLEL = 1e-6
-# Axes within this are called nearly parallel.
+# Axes within this of parallel are nearly so.
 _NEARLY = np.deg2rad(5.0)
 # More names than these make no sentence.
 _MANY = 12
+# Entries of a weakly seen direction of length 1, each in its expected spread, that count.
+_PART = 0.3
 
 
 def listed(names: Sequence[str]) -> str:
@@ -54,86 +54,12 @@ def _axes(numbers: Sequence[int], chain: Chain) -> str:
 
 def _sum(names: Sequence[str], weights: Array) -> str:
     """A weighted sum, as `d2 + d3 - 0.5 a4`."""
-    weights = weights / weights[0]
     text = names[0]
-    for name, weight in zip(names[1:], weights[1:], strict=True):
+    for name, weight in zip(names[1:], weights[1:] / weights[0], strict=True):
         size = abs(weight)
         factor = "" if abs(size - 1) < 1e-4 else f"{size:.3g} "
         text += f" {'+' if weight > 0 else '-'} {factor}{name}"
     return text
-
-
-def tilt(chain: Chain, first: int, second: int) -> tuple[float, float]:
-    """Angle in rad between the lines of two axes, and distance in m of the second's origin from the first.
-
-    Of the axes numbered from 1, with the joints between them at zero.
-    """
-    between = np.eye(4)
-    for j in range(first, second):
-        between = between @ chain.links[j]
-    sine = np.linalg.norm(between[:2, 2])
-    return float(np.arctan2(sine, abs(between[2, 2]))), float(np.linalg.norm(between[:2, 3]))
-
-
-@dataclass(frozen=True, eq=False)
-class Passage:
-    """How an unseen combination passes along the chain.
-
-    Attributes:
-        bodies: between which bodies it acts, 0 the base link.
-        shifts, turns: the joints, from 1, along and about whose axes it passes unnoticed.
-        slides: the prismatic joints that it passes in another direction than along their axis.
-        tool: (r, 6) what is left at the measured point; zero if the whole tool stays.
-    """
-
-    bodies: tuple[int, int]
-    shifts: list[int]
-    turns: list[int]
-    slides: list[int]
-    tool: Array
-
-
-def passage(chain: Chain, bodies: Array, twists: Array, vectors: Array) -> Passage | None:
-    """How combinations (p, r) of twists in bodies' frames pass along the chain; None if a joint notices.
-
-    Args:
-        chain: at the values of the unknowns.
-        bodies, twists: (p,), (p, 6) of the robot's unknowns.
-        vectors: (p, r).
-    """
-    shifts, turns, slides = set[int](), set[int](), set[int]()
-    carried = np.zeros((6, vectors.shape[1]))
-    for body, link in enumerate(chain.links):
-        mine = bodies == body
-        carried = carried + twists[mine].T @ vectors[mine]
-        last = body == len(chain.moving)
-        carried = se3.adjoint(se3.inverse(link @ chain.tool if last else link)) @ carried
-        size = np.abs(carried).max(1) > _EXACT
-        if last or not size.any():
-            continue
-        joint = body + 1
-        slide = chain.prismatic[body]
-        if size[[3, 4]].any() or (size[[0, 1]].any() and not slide):
-            return None
-        shifts |= {joint} if size[2] else set()
-        turns |= {joint} if size[5] else set()
-        slides |= {joint} if size[:2].any() else set()
-    acting = np.unique(bodies[np.abs(vectors).max(1) > _EXACT])
-    return Passage(
-        (int(acting[0]), int(acting[-1])), sorted(shifts), sorted(turns), sorted(slides), carried.T
-    )
-
-
-def _own_axes(chain: Chain, parameters: Sequence[Parameter]) -> set[int]:
-    """Joints along or about whose axes parameters act themselves."""
-    out = set()
-    for p in parameters:
-        twist = np.array(p.twist)
-        for j, axis in enumerate(chain.axes, start=1):
-            at = p.station in (joint_station(j), link_station(j))
-            if at and np.allclose(np.cross(twist.reshape(2, 3), axis), 0, atol=1e-9):
-                out.add(j)
-    return out
 
 
 def _place(chain: Chain, station: int) -> str:
@@ -141,32 +67,32 @@ def _place(chain: Chain, station: int) -> str:
         return "the base"
     if station >= chain.tip_station:
         return "the tool" if station == chain.tool_station else "the tip"
-    return _numbered("joint", "joints", [station // 2], chain)
+    number = _numbered("joint", "joints", [station // 2], chain)
+    return f"the origin of {number}" if station % 2 == 0 else f"the link behind {number}"
 
 
 def _why(chain: Chain, way: Passage, parameters: Sequence[Parameter]) -> str:
     """The geometric reason why a combination of parameters leaves the whole tool where it is."""
     if not (way.shifts or way.turns or way.slides):
-        places = list(dict.fromkeys(_place(chain, p.station) for p in parameters))
-        if len(places) == 1:
-            return f"they act at one place, {places[0]}"
-        return f"no joint moves between {listed(places)}"
-    axes = sorted(_own_axes(chain, parameters) | set(way.shifts))
-    if not way.turns and not way.slides and len(axes) > 1:
-        if all(tilt(chain, axes[0], j)[0] < _PARALLEL for j in axes[1:]):
+        stations = [p.station for p in parameters]
+        first, last = _place(chain, min(stations)), _place(chain, max(stations))
+        return f"no joint moves between {first} and {last}" if first != last else f"they all act at {first}"
+    axes = sorted(own_axes(chain, parameters) | set(way.shifts))
+    if not way.turns and not way.slides and len(axes) == axes[-1] - axes[0] + 1 > 1:
+        if all(tilt(chain, axes[0], j)[0] < PARALLEL for j in axes[1:]):
             return f"{_axes(axes, chain)} are parallel"
-    if len(way.turns) > 1 and all(max(tilt(chain, way.turns[0], j)) < _PARALLEL for j in way.turns[1:]):
+    if len(way.turns) > 1 and all(max(tilt(chain, way.turns[0], j)) < PARALLEL for j in way.turns[1:]):
         return f"{_axes(way.turns, chain)} lie on one line"
     motions = []
-    if way.turns:
-        motions.append(f"a turn about {_axes(way.turns, chain)}")
-    if way.shifts:
-        motions.append(f"a shift along {_axes(way.shifts, chain)}")
+    if way.turns and way.turns == way.shifts:
+        motions.append(f"a turn about and a shift along {_axes(way.turns, chain)}")
+    else:
+        motions += [f"a turn about {_axes(way.turns, chain)}"] if way.turns else []
+        motions += [f"a shift along {_axes(way.shifts, chain)}"] if way.shifts else []
     if way.slides:
-        motions.append(f"a shift of {_numbered('joint', 'joints', way.slides, chain)}, which only slides")
-    passes = "passes" if len(motions) == 1 else "pass"
-    joints = sorted({*way.turns, *way.shifts, *way.slides})
-    return f"{' and '.join(motions)} {passes} {'that joint' if len(joints) == 1 else 'those joints'} unnoticed"
+        motions.append(f"a shift across {_axes(way.slides, chain)}, which only slides,")
+    joints = "that joint" if len({*way.turns, *way.shifts, *way.slides}) == 1 else "those joints"
+    return f"{joints} cannot tell {' and '.join(motions)}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,98 +101,115 @@ class Explainer:
 
     Attributes:
         experiment: the problem, and where its Jacobian is taken.
-        hidden: (p, d) basis of all that the data do not see.
+        layers: of `Experiment.layers`.
         names: (p,).
-        robot: (r,) the robot's parameters, first among the names.
-        chain: at the values of the unknowns.
-        bodies, twists: what the robot's parameters move.
+        path: the robot's plain parameters, first among the names.
     """
 
     experiment: Experiment
-    hidden: Array
+    layers: dict[Cause, Array]
     names: list[str]
-    robot: tuple[Parameter, ...]
-    chain: Chain
-    bodies: Array
-    twists: Array
+    path: Path
 
     def sentence(self, group: Group) -> str:
         """What a group's parameters have to do with each other, why, what is seen, what would help."""
-        members = group.members
-        names = [self.names[i] for i in members]
-        reason, advice = {
-            "arm": self._arm, "instrument": self._instrument, "still": self._still, "poses": self._poses
-        }[group.cause](group)  # fmt: skip
-        who = f"{listed(names)}: {reason}" if reason else listed(names)
-        return f"{who}{': ' if not reason else '; '}{self._seen(group, names)}{advice}"
+        say = {"arm": self._arm, "instrument": self._instrument, "still": self._still, "poses": self._poses}
+        reason, advice = say[group.cause](group)
+        names = [self.names[i] for i in group.members]
+        seen = self._seen(group, names)
+        if reason and all(name in seen for name in names):
+            return f"{reason}: {seen}; {advice}"
+        return f"{listed(names)}: {reason + '; ' if reason else ''}{seen}; {advice}"
 
     def _seen(self, group: Group, names: list[str]) -> str:
-        """How much of the members is seen, counted against all that is not."""
-        members = group.members
-        _, s, vt = np.linalg.svd(self.hidden[members].T)
+        """How much of the members can be seen, counted against all that cannot be for the same cause."""
+        members, r = group.members, group.vectors.shape[1]
+        _, s, vt = np.linalg.svd(self.layers[group.cause][members].T)
         lost = int(np.sum(s > 1e-6))
-        if len(members) == lost:
-            return "no reading depends on it" if lost == 1 else "nothing is seen of any of them"
-        if len(members) == lost + 1:
-            weights = np.where(np.abs(vt[-1]) < 1e-6 * np.abs(vt[-1]).max(), 0.0, vt[-1])
-            taking = np.flatnonzero(weights)
-            return f"only {_sum([names[i] for i in taking], weights[taking])} is seen"
-        return f"only {len(members) - lost} combinations of the {len(members)} are seen"
+        now = int(np.linalg.matrix_rank(self.layers["still"][members], 1e-6))
+        verb = "is" if now == lost else "can be"
+        if r == len(members):
+            return "the readings do not depend on it" if r == 1 else "the readings depend on none of them"
+        if lost != r:
+            return "what one changes the others undo" if r == 1 else f"{r} combinations of them stay unseen"
+        if len(members) > r + 1:
+            return (
+                f"only {len(members) - r} combinations of the {len(members)} {verb.replace('is', 'are')} seen"
+            )
+        weights = vt[-1]
+        if len({self._unit(i) for i in members}) > 1 or np.abs(weights).min() < 1e-6:
+            return f"only one combination of the {len(members)} {verb} seen"
+        return f"only {_sum(names, weights)} {verb} seen"
+
+    def _unit(self, i: int) -> str:
+        problem = self.experiment.problem
+        return (*problem.errors.parameters, *problem.unknowns)[i].unit
 
     def _robot_part(self, group: Group) -> tuple[list[Parameter], Passage | None]:
-        members = [i for i in group.members if i < len(self.robot)]
-        inside = len(members) == len(group.members)
-        part = group.vectors[: len(self.robot)]
-        way = passage(self.chain, self.bodies, self.twists, part) if inside else None
-        return [self.robot[i] for i in members], way
+        """The plain parameters of a group, and how it passes along the chain if these are all of it."""
+        count = len(self.path.parameters)
+        members = [i for i in group.members if i < count]
+        way = passage(self.path, group.vectors[:count]) if len(members) == len(group.members) else None
+        return [self.path.parameters[i] for i in members], way
 
     def _arm(self, group: Group) -> tuple[str, str]:
         members, way = self._robot_part(group)
-        advice = ", and no measurement of this arm can tell more"
+        advice = "no measurement of this arm tells more"
         if way is None or np.abs(way.tool).max() > _EXACT:
             return "", advice
-        return _why(self.chain, way, members), advice
+        return _why(self.path.chain, way, members), advice
 
     def _instrument(self, group: Group) -> tuple[str, str]:
         members, way = self._robot_part(group)
-        joints = list(range(self.chain.size))
-        position = any(len(item.positions()) for item in self.experiment.problem.data)
-        advice = ""
-        for kind, text in (
-            (Position, "the tool's position in a fixed frame"),
-            (Pose, "its orientation too" if position else "the tool's pose in a fixed frame"),
-        ):
-            seen = self.experiment.triangle(joints, kind) @ group.vectors
-            if np.linalg.matrix_rank(seen, 1e-8 * np.linalg.norm(seen)) == group.vectors.shape[1]:
-                advice = f"; measuring {text} would tell"
-                break
-        outside = [i for i in group.members if i >= len(self.robot)]
-        base = all(p.station == BASE for p in members)
-        if base and outside:
-            return "the instrument and the robot can move as one", advice
-        if base:
-            return "the readings stay the same when the whole robot moves so", advice
+        chain = self.path.chain
+        outside = len(group.members) > len(members)
+        if all(p.station == BASE for p in members):
+            if outside:
+                return "the robot and the instrument can move as one", self._reading(group)
+            return "the readings stay the same when the whole robot moves so", self._reading(group)
         if way is not None and np.abs(way.tool[:, :3]).max() < _EXACT:
-            return "the tool only turns about the measured point, and that is not read", advice
-        return "the readings stay the same", advice
+            return "the tool only turns about the measured point, and that is not read", self._reading(group)
+        last = len(chain.moving)
+        point = (chain.links[-1] @ chain.tool)[:2, 3]
+        behind = all(self.path.bodies[i] >= last - 1 for i in group.members if i < len(self.path.bodies))
+        if not outside and behind and not chain.prismatic[-1] and np.linalg.norm(point) < PARALLEL:
+            reason = f"the measured point lies on {_axes([last], chain)} and does not move with it"
+            aside = self.experiment.aside().triangle(range(chain.size))
+            other = "a point beside that axis or " if self._tells(aside, group) else ""
+            return reason, other + self._reading(group)
+        return "the readings stay the same", self._reading(group)
+
+    def _tells(self, triangle: Array, group: Group) -> bool:
+        """Whether a triangle sees all of a group's directions."""
+        s = np.linalg.svd(triangle @ group.vectors, compute_uv=False)
+        return bool(s.min() > 1e-8 * np.linalg.norm(triangle))
+
+    def _reading(self, group: Group) -> str:
+        """The least reading besides those at hand that would tell a group's directions."""
+        position = any(len(item.positions()) for item in self.experiment.problem.data)
+        joints = range(self.path.chain.size)
+        if self._tells(self.experiment.triangle(joints, Position), group):
+            return "the tool's position in a fixed frame would tell"
+        if self._tells(self.experiment.triangle(joints, Pose), group):
+            return f"the tool's {'orientation' if position else 'pose in a fixed frame'} would tell"
+        return "other poses or readings may tell"
 
     def _still(self, group: Group) -> tuple[str, str]:
-        joints = self.experiment.still()
-        words = f"{'joint' if len(joints) == 1 else 'joints'} {listed([self.chain.joint_names[j] for j in joints])}"
-        return f"{words} never moved", f"; moving {'it' if len(joints) == 1 else 'them'} would tell more"
+        names = [self.path.chain.joint_names[j] for j in self.experiment.still()]
+        return f"{listed(names)} never moved", f"moving {'it' if len(names) == 1 else 'them'} would tell more"
 
     def _poses(self, group: Group) -> tuple[str, str]:
-        problem = self.experiment.problem
-        rows = sum(item.residual(self.chain.sweep(item.configurations()), problem.values(item, self.experiment.x)).size
-                   for item in problem.data)  # fmt: skip
+        problem, r = self.experiment.problem, group.vectors.shape[1]
         samples = sum(len(item.rows) for item in problem.data)
-        short = group.vectors.shape[1]
-        p = len(self.names)
-        reason = f"{rows} readings for {p} unknowns"
-        if p - self.hidden.shape[1] == rows:
-            more = -(-short * samples // rows)
-            return reason, f"; at least {more} more {'pose is' if more == 1 else 'poses are'} needed"
-        return "the poses are too much alike", "; poses over the joints' whole range would tell"
+        rows = self.experiment.rows()
+        if len(self.names) - self.layers["still"].shape[1] == rows:
+            more = -(-r * samples // rows)
+            return f"{rows} readings for {len(self.names)} unknowns", (
+                f"at least {more} more {'pose is' if more == 1 else 'poses are'} needed"
+            )
+        free = [j for j in range(self.path.chain.size) if self._tells(self.experiment.triangle([j]), group)]
+        where = listed([self.path.chain.joint_names[j] for j in free]) if free else "the joints"
+        return "the poses are too much alike", f"poses all over the range of {where} would tell"
 
 
 def unobservable(problem: Problem, x: Array, triangle: Triangle) -> list[str]:
@@ -280,15 +223,14 @@ def unobservable(problem: Problem, x: Array, triangle: Triangle) -> list[str]:
     Returns:
         Sentences; none where all is seen.
     """
+    if observability.rank(triangle.r) == len(x):
+        return []
     experiment = Experiment(problem, x)
     layers = experiment.layers(triangle.r)
-    if not layers[-1][1].shape[1]:
-        return []
-    robot = problem.errors.parameters
-    chain, bodies, twists = problem.errors.derivative(x[: len(robot)])
-    names = [p.name for p in (*robot, *problem.unknowns)]
-    explainer = Explainer(experiment, layers[-1][1], names, robot, chain, bodies, twists)
-    return [explainer.sentence(group) for group in _joined(groups(layers, bodies, len(robot)))]
+    path = Path.of(problem.errors, x[: len(problem.errors.parameters)])
+    names = [p.name for p in (*problem.errors.parameters, *problem.unknowns)]
+    explainer = Explainer(experiment, dict(layers), names, path)
+    return [explainer.sentence(group) for group in _joined(groups(layers, path.bodies))]
 
 
 def _joined(found: list[Group]) -> list[Group]:
@@ -304,3 +246,61 @@ def _joined(found: list[Group]) -> list[Group]:
         else:
             out.append(group)
     return out
+
+
+def weakly_seen(problem: Problem, x: Array, triangle: Triangle, expected: Array, noise: float) -> list[str]:
+    """What counts in the rank but is hardly better known than before the measurement, and why.
+
+    Args:
+        problem: the unknowns and the data.
+        x: (p,) where the triangle was taken.
+        triangle: of the data alone.
+        expected: (p,) standard deviations before any measurement, m and rad.
+        noise: standard deviation of the whitened residuals; NaN where nothing tells it.
+
+    Returns:
+        A sentence for each set of parameters that share such directions.
+    """
+    if np.isnan(noise):
+        return [
+            "no reading is left over to tell the noise, so nothing tells how far to believe what was found: "
+            "state the instrument's sigmas or measure more poses"
+        ]
+    directions, left = observability.weakly_seen(triangle.r, expected, noise)
+    if not len(left):
+        return []
+    names = [p.name for p in (*problem.errors.parameters, *problem.unknowns)]
+    path = Path.of(problem.errors, x[: len(problem.errors.parameters)])
+    experiment = Experiment(problem, x)
+    elsewhere = experiment.triangle(range(path.chain.size)) / np.sqrt(experiment.rounds)
+    scaled = directions / expected[:, None]
+    taking = np.abs(scaled) > _PART
+    out = []
+    for members in observability.clusters(taking @ taking.T):
+        mine = taking[list(members)].any(0)
+        count, share = int(mine.sum()), 100 * left[mine].min()
+        what = (
+            "" if len(members) == 1 else "a combination is " if count == 1 else f"{count} combinations are "
+        )
+        best = "" if count == 1 else " or more"
+        text = f"{listed([names[i] for i in members])}: {what}hardly better known than before the measurement"
+        text += f", {share:.0f} %{best} of the expected spread is left"
+        if near := _nearly(path, [path.parameters[i] for i in members if i < len(path.parameters)]):
+            text += f"; {near}"
+        told = np.linalg.norm(elsewhere @ directions[:, mine], axis=0) / noise
+        if np.all(1 / np.hypot(1.0, told) < observability.KNOWN_SHARE):
+            text += "; as many poses all over the joints' range would tell more"
+        out.append(text)
+    return out
+
+
+def _nearly(path: Path, parameters: Sequence[Parameter]) -> str:
+    """That neighbouring axes, along which parameters act, are parallel but for a small angle."""
+    axes = sorted(own_axes(path.chain, parameters))
+    pairs = [(i, j, tilt(path.chain, i, j)[0]) for i, j in pairwise(axes) if j == i + 1]
+    near = [(i, j, angle) for i, j, angle in pairs if angle < _NEARLY]
+    if not near:
+        return ""
+    together = sorted({k for i, j, _ in near for k in (i, j)})
+    worst = np.rad2deg(max(angle for *_, angle in near))
+    return f"{_axes(together, path.chain)} are parallel to their neighbours within {worst:.2g}°"

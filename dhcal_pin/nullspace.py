@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from . import observability
+from . import observability, se3
 from .chain import Chain
 from .measurements import Measurement
 from .poses import Pose
@@ -82,6 +82,27 @@ class Experiment:
         """The chain at x."""
         return self.problem.errors.at(self.x[: len(self.problem.errors.parameters)])
 
+    @property
+    def rounds(self) -> int:
+        """How many times the data's samples are drawn anew, so that there are enough of them."""
+        return 1 + _ROWS * len(self.x) // sum(len(item.rows) for item in self.problem.data)
+
+    def rows(self) -> int:
+        """How many numbers were read."""
+        problem, chain = self.problem, self.chain
+        return sum(
+            item.residual(chain.sweep(item.configurations()), problem.values(item, self.x)).size
+            for item in problem.data
+        )
+
+    def aside(self) -> Experiment:
+        """The same with the measured point some way off."""
+        errors = self.problem.errors
+        off = {errors.chain.tool_station: se3.translation([0.11, 0.07, 0.05])}
+        return Experiment(
+            replace(self.problem, errors=replace(errors, chain=errors.chain.displaced(off))), self.x
+        )
+
     def _draw(self, rng: np.random.Generator, m: int) -> Array:
         chain = self.chain
         low, high = np.maximum(chain.lower, -np.pi), np.minimum(chain.upper, np.pi)
@@ -103,19 +124,20 @@ class Experiment:
         rng = np.random.default_rng(0)
         data = self.problem.data
         p = len(self.x)
-        rounds = 1 + _ROWS * p // max(1, sum(len(item.rows) for item in data))
         every: list[Measurement] = [
-            self._moved(item, joints, rng) for _ in range(rounds if len(joints) else 1) for item in data
+            self._moved(item, joints, rng) for _ in range(self.rounds) for item in data
         ]
         q = self._draw(rng, _ROWS * p)
         pose = self.chain.poses(q)
         for kind in extra:
-            every.append(Pose.of(q, pose, 1e-3, 1e-3) if kind is Pose else Position.of(q, pose[:, :3, 3], 1e-3))
+            every.append(
+                Pose.of(q, pose, 1e-3, 1e-3) if kind is Pose else Position.of(q, pose[:, :3, 3], 1e-3)
+            )
         return reduce(replace(self.problem, data=tuple(every)), self.x, small_angle=False).r
 
     def still(self) -> list[int]:
         """Independent joints, from 0, that have one value in all the data."""
-        q = np.concatenate([item.configurations() for item in self.problem.data])
+        q = np.concatenate([item.configurations() for item in self.problem.data if item.ends])
         return np.flatnonzero(np.ptp(q, axis=0) < 1e-9).tolist()
 
     def layers(self, triangle: Array) -> list[tuple[Cause, Array]]:
@@ -154,22 +176,27 @@ def _beyond(known: Array, vector: Array) -> Array:
     return vector - known @ (known.T @ vector)
 
 
-def groups(layers: Sequence[tuple[Cause, Array]], bodies: Array, robot: int) -> list[Group]:
+def _length(row: Array) -> tuple[int, int, int]:
+    """Short combinations of neighbours come first."""
+    taking = np.flatnonzero(row)
+    return len(taking), int(taking[-1] - taking[0]), int(taking[0])
+
+
+def groups(layers: Sequence[tuple[Cause, Array]], bodies: Array) -> list[Group]:
     """Every unseen direction once: short combinations, each within as few neighbouring bodies as it can be.
 
     Args:
         layers: of `Experiment.layers`.
-        bodies: (robot,) the body that each of the robot's unknowns moves, ascending.
-        robot: how many of the unknowns are the robot's.
+        bodies: (r,) the body that each of the robot's plain errors moves; they are the first of the unknowns.
     """
     p = layers[-1][1].shape[0]
     last = int(bodies.max(initial=0))
     spans = [(i, i + length) for length in range(last + 1) for i in range(last + 1 - length)]
     parts = []
-    for with_instrument in (False, True):
+    for with_others in (False, True):
         for first, end in spans:
-            inside = np.full(p, with_instrument)
-            inside[:robot] = (bodies >= first) & (bodies <= end)
+            inside = np.full(p, with_others)
+            inside[: len(bodies)] = (bodies >= first) & (bodies <= end)
             parts.append(inside)
     known = np.empty((p, 0))
     out = []
@@ -182,7 +209,7 @@ def groups(layers: Sequence[tuple[Cause, Array]], bodies: Array, robot: int) -> 
                 continue
             members = np.flatnonzero(inside)
             found = [row for order in (members, members[::-1]) for row in _echelon(local, order)]
-            found.sort(key=lambda row: (np.count_nonzero(row), int(np.argmax(row != 0))))
+            found.sort(key=_length)
             new = []
             for row in found:
                 rest = _beyond(known, row / np.linalg.norm(row))

@@ -111,12 +111,9 @@ def weakly_seen(triangle: Array, expected: Array, noise: float) -> tuple[Array, 
     return expected[:, None] * vt[weak].T, left[weak]
 
 
-def unseen_groups(triangle: Array) -> list[tuple[tuple[int, ...], int]]:
-    """Groups of parameters that cannot be told apart, each with its number of unseen directions."""
-    basis = row_space(triangle)
-    hidden = np.eye(triangle.shape[1]) - basis.T @ basis
-    linked = np.abs(hidden) > 1e-6
-    groups: list[tuple[tuple[int, ...], int]] = []
+def clusters(linked: Array) -> list[tuple[int, ...]]:
+    """Those of p that link to themselves in a symmetric (p, p) table, put together where it links them."""
+    out: list[tuple[int, ...]] = []
     todo = set(np.flatnonzero(np.diag(linked)).tolist())
     while todo:
         group, edge = set[int](), {min(todo)}
@@ -124,6 +121,15 @@ def unseen_groups(triangle: Array) -> list[tuple[tuple[int, ...], int]]:
             group |= edge
             edge = {int(j) for i in edge for j in np.flatnonzero(linked[i])} - group
         todo -= group
-        members = tuple(sorted(group))
-        groups.append((members, round(float(np.trace(hidden[np.ix_(members, members)])))))
-    return groups
+        out.append(tuple(sorted(group)))
+    return out
+
+
+def unseen_groups(triangle: Array) -> list[tuple[tuple[int, ...], int]]:
+    """Groups of parameters that cannot be told apart, each with its number of unseen directions."""
+    basis = row_space(triangle)
+    hidden = np.eye(triangle.shape[1]) - basis.T @ basis
+    return [
+        (members, round(float(np.trace(hidden[np.ix_(members, members)]))))
+        for members in clusters(np.abs(hidden) > 1e-6)
+    ]
