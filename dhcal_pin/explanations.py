@@ -29,8 +29,8 @@ _EXACT = 1e-5
 _NEARLY = np.deg2rad(5.0)
 # More names than these make no sentence.
 _MANY = 12
-# Entries of a weakly seen direction of length 1, each in its expected spread, that count.
-_PART = 0.3
+# Entries that count of the projector on what is weakly seen, each parameter in its expected spread.
+_PART = 0.1
 
 
 def listed(names: Sequence[str]) -> str:
@@ -77,12 +77,13 @@ def _why(chain: Chain, way: Passage, parameters: Sequence[Parameter]) -> str:
         stations = [p.station for p in parameters]
         first, last = _place(chain, min(stations)), _place(chain, max(stations))
         return f"no joint moves between {first} and {last}" if first != last else f"they all act at {first}"
-    axes = sorted(own_axes(chain, parameters) | set(way.shifts))
-    if not way.turns and not way.slides and len(axes) == axes[-1] - axes[0] + 1 > 1:
-        if all(tilt(chain, axes[0], j)[0] < PARALLEL for j in axes[1:]):
+    axes = sorted(own_axes(chain, parameters) | {*way.shifts, *way.turns})
+    if not way.slides and len(axes) == axes[-1] - axes[0] + 1 > 1:
+        tilts = [tilt(chain, i, j) for i, j in pairwise(axes)]
+        if all(max(one) < PARALLEL for one in tilts):
+            return f"{_axes(axes, chain)} lie on one line"
+        if not way.turns and all(angle < PARALLEL for angle, _ in tilts):
             return f"{_axes(axes, chain)} are parallel"
-    if len(way.turns) > 1 and all(max(tilt(chain, way.turns[0], j)) < PARALLEL for j in way.turns[1:]):
-        return f"{_axes(way.turns, chain)} lie on one line"
     motions = []
     if way.turns and way.turns == way.shifts:
         motions.append(f"a turn about and a shift along {_axes(way.turns, chain)}")
@@ -90,9 +91,10 @@ def _why(chain: Chain, way: Passage, parameters: Sequence[Parameter]) -> str:
         motions += [f"a turn about {_axes(way.turns, chain)}"] if way.turns else []
         motions += [f"a shift along {_axes(way.shifts, chain)}"] if way.shifts else []
     if way.slides:
-        motions.append(f"a shift across {_axes(way.slides, chain)}, which only slides,")
+        motions.append(f"a shift across {_axes(way.slides, chain)} of a joint that only slides")
     joints = "that joint" if len({*way.turns, *way.shifts, *way.slides}) == 1 else "those joints"
-    return f"{joints} cannot tell {' and '.join(motions)}"
+    look = "looks" if len(motions) == 1 and not (way.turns and way.shifts) else "look"
+    return f"{' and '.join(motions)} {look} the same before and behind {joints}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +121,10 @@ class Explainer:
         seen = self._seen(group, names)
         if reason and all(name in seen for name in names):
             return f"{reason}: {seen}; {advice}"
-        return f"{listed(names)}: {reason + '; ' if reason else ''}{seen}; {advice}"
+        # Of too many names those that move most.
+        order = np.argsort(-np.abs(group.vectors[group.members]).max(1), kind="stable")
+        main = sorted(order[: _MANY - 1]) + sorted(order[_MANY - 1 :])
+        return f"{listed([names[i] for i in main])}: {reason + '; ' if reason else ''}{seen}; {advice}"
 
     def _seen(self, group: Group, names: list[str]) -> str:
         """How much of the members can be seen, counted against all that cannot be for the same cause."""
@@ -177,7 +182,26 @@ class Explainer:
             aside = self.experiment.aside().triangle(range(chain.size))
             other = "a point beside that axis or " if self._tells(aside, group) else ""
             return reason, other + self._reading(group)
+        if self._grows(group):
+            return "the readings do not tell how large the robot is", self._reading(group)
         return "the readings stay the same", self._reading(group)
+
+    def _grows(self, group: Group) -> bool:
+        """Whether a group makes the whole robot larger about some point, and does no more than that."""
+        if group.vectors.shape[1] != 1 or len(group.members) < 2:
+            return False
+        path, count = self.path, len(self.path.parameters)
+        if max(i for i in group.members if i < len(self.experiment.problem.errors.parameters)) >= count:
+            return False
+        sweep = path.chain.sweep(self.experiment.draw(np.random.default_rng(0), 30))
+        velocities = path.chain.tool_velocities(sweep, path.bodies, path.twists)[:, :3]
+        moved = np.tensordot(group.vectors[:count, 0], velocities, 1)
+        point = sweep.tool[3]
+        motions = [*(np.eye(3)[i][:, None] * np.ones_like(point) for i in range(3))]
+        motions += [np.cross(np.eye(3)[i], point.T).T for i in range(3)]
+        rows = np.array([point, *motions]).reshape(7, -1).T
+        found, *_ = np.linalg.lstsq(rows, moved.ravel(), rcond=None)
+        return bool(np.abs(rows @ found - moved.ravel()).max() < _EXACT and abs(found[0]) > _EXACT)
 
     def _tells(self, triangle: Array, group: Group) -> bool:
         """Whether a triangle sees all of a group's directions."""
@@ -230,7 +254,7 @@ def unobservable(problem: Problem, x: Array, triangle: Triangle) -> list[str]:
     path = Path.of(problem.errors, x[: len(problem.errors.parameters)])
     names = [p.name for p in (*problem.errors.parameters, *problem.unknowns)]
     explainer = Explainer(experiment, dict(layers), names, path)
-    return [explainer.sentence(group) for group in _joined(groups(layers, path.bodies))]
+    return [explainer.sentence(group) for group in _joined(groups(layers, path.stations))]
 
 
 def _joined(found: list[Group]) -> list[Group]:
@@ -274,20 +298,22 @@ def weakly_seen(problem: Problem, x: Array, triangle: Triangle, expected: Array,
     experiment = Experiment(problem, x)
     elsewhere = experiment.triangle(range(path.chain.size)) / np.sqrt(experiment.rounds)
     scaled = directions / expected[:, None]
-    taking = np.abs(scaled) > _PART
+    variance = (scaled * left**2) @ scaled.T
     out = []
-    for members in observability.clusters(taking @ taking.T):
-        mine = taking[list(members)].any(0)
-        count, share = int(mine.sum()), 100 * left[mine].min()
+    for members in observability.clusters(np.abs(scaled @ scaled.T) > _PART):
+        mine = np.ix_(members, members)
+        count = max(1, round(float(np.trace((scaled @ scaled.T)[mine]))))
+        share, main = (part[..., -count:] for part in np.linalg.eigh(variance[mine]))
         what = (
             "" if len(members) == 1 else "a combination is " if count == 1 else f"{count} combinations are "
         )
-        best = "" if count == 1 else " or more"
-        text = f"{listed([names[i] for i in members])}: {what}hardly better known than before the measurement"
-        text += f", {share:.0f} %{best} of the expected spread is left"
+        text = (
+            f"{listed([names[i] for i in members])}: {what}hardly better known than before the measurement, "
+        )
+        text += f"{100 * np.sqrt(share[0]):.0f} %{' or more' * (count > 1)} of the expected spread is left"
         if near := _nearly(path, [path.parameters[i] for i in members if i < len(path.parameters)]):
             text += f"; {near}"
-        told = np.linalg.norm(elsewhere @ directions[:, mine], axis=0) / noise
+        told = np.linalg.norm(elsewhere[:, members] @ (expected[list(members), None] * main), axis=0) / noise
         if np.all(1 / np.hypot(1.0, told) < observability.KNOWN_SHARE):
             text += "; as many poses all over the joints' range would tell more"
         out.append(text)
@@ -295,12 +321,14 @@ def weakly_seen(problem: Problem, x: Array, triangle: Triangle, expected: Array,
 
 
 def _nearly(path: Path, parameters: Sequence[Parameter]) -> str:
-    """That neighbouring axes, along which parameters act, are parallel but for a small angle."""
-    axes = sorted(own_axes(path.chain, parameters))
-    pairs = [(i, j, tilt(path.chain, i, j)[0]) for i, j in pairwise(axes) if j == i + 1]
-    near = [(i, j, angle) for i, j, angle in pairs if angle < _NEARLY]
-    if not near:
-        return ""
-    together = sorted({k for i, j, _ in near for k in (i, j)})
-    worst = np.rad2deg(max(angle for *_, angle in near))
-    return f"{_axes(together, path.chain)} are parallel to their neighbours within {worst:.2g}°"
+    """Which neighbouring axes, along which parameters act, are parallel but for a small angle."""
+    axes = own_axes(path.chain, parameters)
+    near = {j: tilt(path.chain, j, j + 1)[0] for j in axes if j + 1 in axes}
+    linked = np.zeros((len(path.chain.moving) + 2,) * 2)
+    for j in (j for j, angle in near.items() if angle < _NEARLY):
+        linked[j : j + 2, j : j + 2] = 1
+    said = []
+    for run in observability.clusters(linked):
+        worst = np.rad2deg(max(near[j] for j in run[:-1]))
+        said.append(f"{_axes(run, path.chain)} are parallel to within {worst:.2g}°")
+    return " and ".join(said)

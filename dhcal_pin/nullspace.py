@@ -103,7 +103,8 @@ class Experiment:
             replace(self.problem, errors=replace(errors, chain=errors.chain.displaced(off))), self.x
         )
 
-    def _draw(self, rng: np.random.Generator, m: int) -> Array:
+    def draw(self, rng: np.random.Generator, m: int) -> Array:
+        """Joint values (m, n) anywhere within the limits and within half a turn or π metres each way."""
         chain = self.chain
         low, high = np.maximum(chain.lower, -np.pi), np.minimum(chain.upper, np.pi)
         return rng.uniform(low, high, (m, chain.size))
@@ -116,7 +117,7 @@ class Experiment:
         for name in ("q", "q_to"):
             if hasattr(item, name):
                 ends[name] = getattr(item, name).copy()
-                ends[name][:, joints] = self._draw(rng, len(ends[name]))[:, joints]
+                ends[name][:, joints] = self.draw(rng, len(ends[name]))[:, joints]
         return replace(item, **ends)
 
     def triangle(self, joints: Sequence[int], *extra: type[Pose] | type[Position]) -> Array:
@@ -127,7 +128,7 @@ class Experiment:
         every: list[Measurement] = [
             self._moved(item, joints, rng) for _ in range(self.rounds) for item in data
         ]
-        q = self._draw(rng, _ROWS * p)
+        q = self.draw(rng, _ROWS * p)
         pose = self.chain.poses(q)
         for kind in extra:
             every.append(
@@ -182,21 +183,21 @@ def _length(row: Array) -> tuple[int, int, int]:
     return len(taking), int(taking[-1] - taking[0]), int(taking[0])
 
 
-def groups(layers: Sequence[tuple[Cause, Array]], bodies: Array) -> list[Group]:
-    """Every unseen direction once: short combinations, each within as few neighbouring bodies as it can be.
+def groups(layers: Sequence[tuple[Cause, Array]], stations: Array) -> list[Group]:
+    """Every unseen direction once: short combinations, each on as short a piece of the arm as it can be.
 
     Args:
         layers: of `Experiment.layers`.
-        bodies: (r,) the body that each of the robot's plain errors moves; they are the first of the unknowns.
+        stations: (r,) where each of the robot's plain errors acts; they are the first of the unknowns.
     """
     p = layers[-1][1].shape[0]
-    last = int(bodies.max(initial=0))
-    spans = [(i, i + length) for length in range(last + 1) for i in range(last + 1 - length)]
+    at = np.unique(stations)
+    spans = sorted(((i, j) for i in at for j in at if i <= j), key=lambda span: (span[1] - span[0], span[0]))
     parts = []
     for with_others in (False, True):
         for first, end in spans:
             inside = np.full(p, with_others)
-            inside[: len(bodies)] = (bodies >= first) & (bodies <= end)
+            inside[: len(stations)] = (stations >= first) & (stations <= end)
             parts.append(inside)
     known = np.empty((p, 0))
     out = []

@@ -33,6 +33,11 @@ class Path:
     bodies: Array
     twists: Array
 
+    @property
+    def stations(self) -> Array:
+        """Where they act (r,)."""
+        return np.array([p.station for p in self.parameters], int)
+
     @classmethod
     def of(cls, errors: ErrorModel, x: Array) -> Path:
         """The plain errors of a model at x (p,); they come first in it."""
