@@ -173,7 +173,7 @@ def _echelon(space: Array, order: Array) -> Iterator[Array]:
 
 
 def _beyond(known: Array, vector: Array) -> Array:
-    """What of a unit vector (p,) lies outside an orthonormal basis (p, d)."""
+    """What of a unit vector (p,), or of several (p, k), lies outside an orthonormal basis (p, d)."""
     return vector - known @ (known.T @ vector)
 
 
@@ -194,7 +194,7 @@ def groups(layers: Sequence[tuple[Cause, Array]], stations: Array) -> list[Group
     at = np.unique(stations)
     spans = sorted(((i, j) for i in at for j in at if i <= j), key=lambda span: (span[1] - span[0], span[0]))
     parts = []
-    for with_others in (False, True):
+    for with_others in (False, True)[: 1 + (len(stations) < p)]:
         for first, end in spans:
             inside = np.full(p, with_others)
             inside[: len(stations)] = (stations >= first) & (stations <= end)
@@ -206,7 +206,7 @@ def groups(layers: Sequence[tuple[Cause, Array]], stations: Array) -> list[Group
             if known.shape[1] == space.shape[1]:
                 break
             local = space @ _kernel(space[~inside]) if (~inside).any() else space
-            if not local.shape[1]:
+            if np.abs(_beyond(known, local)).max(initial=0) < 1e-4:
                 continue
             members = np.flatnonzero(inside)
             found = [row for order in (members, members[::-1]) for row in _echelon(local, order)]
