@@ -138,8 +138,8 @@ class Experiment:
 
     def still(self) -> list[int]:
         """Independent joints, from 0, that have one value in all the data."""
-        q = np.concatenate([item.configurations() for item in self.problem.data if item.ends])
-        return np.flatnonzero(np.ptp(q, axis=0) < 1e-9).tolist()
+        moved = [item.configurations() for item in self.problem.data if item.ends]
+        return np.flatnonzero(np.ptp(np.concatenate(moved), axis=0) < 1e-9).tolist() if moved else []
 
     def layers(self, triangle: Array) -> list[tuple[Cause, Array]]:
         """Bases (p, ·) of what stays unseen, each within the next: by the arm, and by all that was done."""

@@ -133,10 +133,15 @@ def test_few_poses_say_how_many_are_missing(poses, more):
 
 # --- every direction once, and nothing claimed that is not so --------------------------------------
 
+ARMS = (*PAPER, *TABLES, *URDFS)
 CASES = [
-    (arm, sets)
-    for arm in (*PAPER, *TABLES, *URDFS)
-    for sets in ("dh", "minimal,base,tool", "placement,base,tool", "modified-dh,tool", "offset")
+    *((arm, sets) for arm in ARMS for sets in ("dh", "minimal,base,tool")),
+    *((arm, "placement,base,tool") for arm in ("scara", "ur10", "panda")),
+    *(
+        pytest.param(arm, sets, marks=pytest.mark.slow)
+        for arm in ARMS
+        for sets in ("placement,base,tool", "modified-dh,tool", "hayati,tool", "offset")
+    ),
 ]
 
 
