@@ -159,7 +159,8 @@ class Explainer:
 
     def _arm(self, group: Group) -> tuple[str, str]:
         members, way = self._robot_part(group)
-        advice = "no measurement of this arm tells more"
+        arm = all(i < len(self.experiment.problem.errors.parameters) for i in group.members)
+        advice = "no measurement of this arm tells more" if arm else "no reading of the tool tells more"
         if way is None or np.abs(way.tool).max() > _EXACT:
             return "", advice
         return _why(self.path.chain, way, members), advice
