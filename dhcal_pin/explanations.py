@@ -17,14 +17,12 @@ from . import observability
 from .chain import BASE, Chain
 from .nullspace import Cause, Experiment, Group, groups
 from .parameters import Parameter
-from .passage import PARALLEL, Passage, Path, own_axes, passage, tilt
+from .passage import NONE, PARALLEL, Passage, Path, own_axes, passage, tilt
 from .poses import Pose
 from .positions import Position
 from .se3 import Array
 from .solver import Problem, Triangle
 
-# Carried combinations, the largest entry 1, agree with a reason to this.
-_EXACT = 1e-5
 # Axes within this of parallel are nearly so.
 _NEARLY = np.deg2rad(5.0)
 # More names than these make no sentence.
@@ -71,6 +69,12 @@ def _place(chain: Chain, station: int) -> str:
     return f"the origin of {number}" if station % 2 == 0 else f"the link behind {number}"
 
 
+def _parallel(axes: Sequence[int], angle: float, chain: Chain) -> str:
+    """That axes are parallel, exactly or to within an angle in rad."""
+    within = "" if angle < PARALLEL else f" to within {np.rad2deg(angle):.2g}°"
+    return f"{_axes(axes, chain)} are parallel{within}"
+
+
 def _why(chain: Chain, way: Passage, parameters: Sequence[Parameter]) -> str:
     """The geometric reason why a combination of parameters leaves the whole tool where it is."""
     if not (way.shifts or way.turns or way.slides):
@@ -82,8 +86,9 @@ def _why(chain: Chain, way: Passage, parameters: Sequence[Parameter]) -> str:
         tilts = [tilt(chain, i, j) for i, j in pairwise(axes)]
         if all(max(one) < PARALLEL for one in tilts):
             return f"{_axes(axes, chain)} lie on one line"
-        if not way.turns and all(angle < PARALLEL for angle, _ in tilts):
-            return f"{_axes(axes, chain)} are parallel"
+        worst = max(angle for angle, _ in tilts)
+        if not way.turns and worst < NONE:
+            return _parallel(axes, worst, chain)
     motions = []
     if way.turns and way.turns == way.shifts:
         motions.append(f"a turn about and a shift along {_axes(way.turns, chain)}")
@@ -130,8 +135,8 @@ class Explainer:
         """How much of the members can be seen, counted against all that cannot be for the same cause."""
         members, r = group.members, group.vectors.shape[1]
         _, s, vt = np.linalg.svd(self.layers[group.cause][members].T)
-        lost = int(np.sum(s > 1e-6))
-        now = int(np.linalg.matrix_rank(self.layers["still"][members], 1e-6))
+        lost = int(np.sum(s > NONE))
+        now = int(np.linalg.matrix_rank(self.layers["still"][members], NONE))
         verb = "is" if now == lost else "can be"
         if r == len(members):
             return "the readings do not depend on it" if r == 1 else "the readings depend on none of them"
@@ -161,7 +166,7 @@ class Explainer:
         members, way = self._robot_part(group)
         arm = all(i < len(self.experiment.problem.errors.parameters) for i in group.members)
         advice = "no measurement of this arm tells more" if arm else "no reading of the tool tells more"
-        if way is None or np.abs(way.tool).max() > _EXACT:
+        if way is None or np.abs(way.tool).max() > NONE:
             return "", advice
         return _why(self.path.chain, way, members), advice
 
@@ -173,7 +178,7 @@ class Explainer:
             if outside:
                 return "the robot and the instrument can move as one", self._reading(group)
             return "the readings stay the same when the whole robot moves so", self._reading(group)
-        if way is not None and np.abs(way.tool[:, :3]).max() < _EXACT:
+        if way is not None and np.abs(way.tool[:, :3]).max() < NONE:
             return "the tool only turns about the measured point, and that is not read", self._reading(group)
         last = len(chain.moving)
         point = (chain.links[-1] @ chain.tool)[:2, 3]
@@ -202,7 +207,7 @@ class Explainer:
         motions += [np.cross(np.eye(3)[i], point.T).T for i in range(3)]
         rows = np.array([point, *motions]).reshape(7, -1).T
         found, *_ = np.linalg.lstsq(rows, moved.ravel(), rcond=None)
-        return bool(np.abs(rows @ found - moved.ravel()).max() < _EXACT and abs(found[0]) > _EXACT)
+        return bool(np.abs(rows @ found - moved.ravel()).max() < NONE and abs(found[0]) > NONE)
 
     def _tells(self, triangle: Array, group: Group) -> bool:
         """Whether a triangle sees all of a group's directions."""
@@ -330,6 +335,5 @@ def _nearly(path: Path, parameters: Sequence[Parameter]) -> str:
         linked[j : j + 2, j : j + 2] = 1
     said = []
     for run in observability.clusters(linked):
-        worst = np.rad2deg(max(near[j] for j in run[:-1]))
-        said.append(f"{_axes(run, path.chain)} are parallel to within {worst:.2g}°")
+        said.append(_parallel(run, max(near[j] for j in run[:-1]), path.chain))
     return " and ".join(said)

@@ -17,6 +17,7 @@ import numpy as np
 from . import observability, se3
 from .chain import Chain
 from .measurements import Measurement
+from .passage import NONE
 from .poses import Pose
 from .positions import Position
 from .se3 import Array
@@ -28,8 +29,6 @@ Cause = Literal["arm", "instrument", "poses", "still"]
 _ROWS = 6
 # A direction that other readings show stands out from their rounding by far more than this.
 _CUT = 1e-8
-# Entries of a combination, the largest being 1, below which a parameter takes no part in it.
-_NONE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,13 +46,13 @@ class Group:
     @property
     def members(self) -> list[int]:
         """The unknowns that take part."""
-        return np.flatnonzero(np.abs(self.vectors).max(1) > _NONE).tolist()
+        return np.flatnonzero(np.abs(self.vectors).max(1) > NONE).tolist()
 
 
 def _kernel(rows: Array) -> Array:
     """Orthonormal basis of the combinations of columns that vanish in rows of an orthonormal basis."""
     _, s, vt = np.linalg.svd(rows)
-    return vt[int(np.sum(s > _NONE)) :].T
+    return vt[int(np.sum(s > NONE)) :].T
 
 
 def _within(space: Array, triangle: Array) -> Array:
@@ -160,7 +159,7 @@ def _echelon(space: Array, order: Array) -> Iterator[Array]:
         if done == len(rows):
             break
         pivot = done + int(np.argmax(np.abs(rows[done:, column])))
-        if abs(rows[pivot, column]) < _NONE:
+        if abs(rows[pivot, column]) < NONE:
             continue
         rows[[done, pivot]] = rows[[pivot, done]]
         rows[done] /= rows[done, column]
@@ -168,8 +167,7 @@ def _echelon(space: Array, order: Array) -> Iterator[Array]:
         rows[others] -= np.outer(rows[others, column], rows[done])
         done += 1
     for row in rows:
-        row = row / row[np.argmax(np.abs(row))]
-        yield np.where(np.abs(row) < _NONE, 0.0, row)
+        yield row / row[np.argmax(np.abs(row))]
 
 
 def _beyond(known: Array, vector: Array) -> Array:
@@ -179,7 +177,7 @@ def _beyond(known: Array, vector: Array) -> Array:
 
 def _length(row: Array) -> tuple[int, int, int]:
     """Short combinations of neighbours come first."""
-    taking = np.flatnonzero(row)
+    taking = np.flatnonzero(np.abs(row) > NONE)
     return len(taking), int(taking[-1] - taking[0]), int(taking[0])
 
 
@@ -206,7 +204,7 @@ def groups(layers: Sequence[tuple[Cause, Array]], stations: Array) -> list[Group
             if known.shape[1] == space.shape[1]:
                 break
             local = space @ _kernel(space[~inside]) if (~inside).any() else space
-            if np.abs(_beyond(known, local)).max(initial=0) < 1e-4:
+            if np.abs(_beyond(known, local)).max(initial=0) < 10 * NONE:
                 continue
             members = np.flatnonzero(inside)
             found = [row for order in (members, members[::-1]) for row in _echelon(local, order)]
@@ -214,7 +212,7 @@ def groups(layers: Sequence[tuple[Cause, Array]], stations: Array) -> list[Group
             new = []
             for row in found:
                 rest = _beyond(known, row / np.linalg.norm(row))
-                if np.linalg.norm(rest) > 1e-4:
+                if np.linalg.norm(rest) > 10 * NONE:
                     new.append(row)
                     rest = _beyond(known, rest / np.linalg.norm(rest))
                     known = np.concatenate([known, rest[:, None] / np.linalg.norm(rest)], 1)

@@ -14,8 +14,8 @@ from .se3 import Array
 
 # Axes within this of each other, rad and m, are parallel, or the same line.
 PARALLEL = 1e-6
-# Entries of a carried combination, the largest change 1, below which there is no motion.
-_NONE = 1e-5
+# Entries of a combination, the largest 1 in m and rad, below which a parameter has no part worth a word.
+NONE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ def passage(path: Path, vectors: Array) -> Passage | None:
         carried = se3.adjoint(se3.inverse(link @ chain.tool if last else link)) @ carried
         if last:
             break
-        size = np.abs(carried).max(1) > _NONE
+        size = np.abs(carried).max(1) > NONE
         if size[3:5].any() or (size[:2].any() and not chain.prismatic[body]):
             return None
         shifts |= {body + 1} if size[2] else set()

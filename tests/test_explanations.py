@@ -206,10 +206,11 @@ def test_what_a_sentence_claims_is_so(arm, sets):
                 taking = np.flatnonzero(weights)
                 assert np.abs(weights @ hidden).max() < 5e-3 * np.abs(hidden[taking]).max()
                 assert np.linalg.matrix_rank(hidden[taking], 1e-6) == len(taking) - 1
-    # A parameter is named if and only if it takes part in something unseen; long lists leave some out.
+    # Nothing is named that is seen, and nothing left out that takes part; long lists leave some out.
+    part, told = np.abs(hidden).max(1, initial=0), set().union(*(named(of, text) for text in texts))
+    assert told <= {names[i] for i in np.flatnonzero(part > 1e-6)}
     if not any(" more:" in text for text in texts):
-        hit = {names[i] for i in np.flatnonzero(np.abs(hidden).max(1, initial=0) > 1e-6)}
-        assert set().union(*(named(of, text) for text in texts)) == hit
+        assert told >= {names[i] for i in np.flatnonzero(part > 1e-2)}
 
 
 def test_signs_follow_the_axes():
