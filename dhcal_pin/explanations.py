@@ -269,7 +269,7 @@ def _joined(found: list[Group]) -> list[Group]:
     for group in found:
         for i, other in enumerate(out):
             both = Group(group.cause, np.concatenate([other.vectors, group.vectors], 1))
-            chained = all(len(g.members) == g.vectors.shape[1] + 1 for g in (group, other, both))
+            chained = len(both.members) == both.vectors.shape[1] + 1
             if other.cause == group.cause and (chained or group.cause in ("poses", "still")):
                 out[i] = both
                 break
