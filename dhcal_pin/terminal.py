@@ -124,6 +124,8 @@ def summary(fit: Result, files: Mapping[str, str]) -> None:
     )
     for text in fit.unobservable:
         lines(f"not observable: {text}", style="yellow")
+    for text in fit.weakly_seen:
+        lines(f"weakly seen: {text}", style="yellow")
     for name, path in files.items():
         lines(f"wrote {name}: {path}")
 

@@ -56,3 +56,8 @@ def sim_6dof() -> Chain:
 @pytest.fixture(scope="session")
 def sim_6dof_actual() -> Chain:
     return Chain.from_dh(paper("sim_6dof_actual"))
+
+
+@pytest.fixture(scope="session")
+def sim_3dof() -> Chain:
+    return Chain.from_dh(paper("sim_3dof"))
