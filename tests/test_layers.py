@@ -35,6 +35,7 @@ LAYERS = (
     {"exports"},
     {"report"},
     {"terminal"},
+    {"shapes"},
     {"viewer"},
     {"outputs"},
     {"demo"},
