@@ -166,6 +166,16 @@ def _meshcat() -> str:
     return "\n".join(parts).replace("</script", "<\\/script")
 
 
+def alike(nominal: Chain, arm: Chain) -> Chain:
+    """The nominal arm as it is drawn: with the other's base and tool where it has none of its own."""
+    same = np.eye(4)
+    return replace(
+        nominal,
+        base=arm.base if np.array_equal(nominal.base, same) else nominal.base,
+        tool=arm.tool if np.array_equal(nominal.tool, same) else nominal.tool,
+    )
+
+
 def tree(nominal: Chain, arm: Chain) -> dict[str, Any]:
     """The tree of bodies and the two arms' frames.
 
@@ -179,9 +189,7 @@ def tree(nominal: Chain, arm: Chain) -> dict[str, Any]:
             f"the arms differ: one moves {', '.join(nominal.moving)}, the other {', '.join(arm.moving)}; "
             "give both the same tip"
         )
-    same = np.eye(4)
-    base = arm.base if np.array_equal(nominal.base, same) else nominal.base
-    tool = arm.tool if np.array_equal(nominal.tool, same) else nominal.tool
+    base, tool = (drawn := alike(nominal, arm)).base, drawn.tool
     model, k = nominal.model, len(nominal.moving)
     index = [model.getJointId(name) for name in nominal.moving]
     bodies = [_body(-1, se3.inverse(arm.base) @ base, np.eye(4))]
@@ -202,7 +210,7 @@ def tree(nominal: Chain, arm: Chain) -> dict[str, Any]:
     holds = se3.inverse(tool) @ nominal.tool
     arms = [
         {"stands": rows(stands), "holds": rows(holds)},
-        {"stands": rows(arm.base), "holds": rows(same)},
+        {"stands": rows(arm.base), "holds": rows(np.eye(4))},
     ]
     return {"bodies": bodies, "arms": arms}
 

@@ -37,8 +37,10 @@ LAYERS = (
     {"terminal"},
     {"shapes"},
     {"viewer"},
+    {"live_server"},
+    {"live"},
     {"outputs"},
-    {"demo"},
+    {"demo", "view_command"},
     {"commands"},
     {"cli"},
 )
@@ -72,7 +74,7 @@ def test_imports_only_from_the_left(module):
 @pytest.mark.parametrize("module", MODULES)
 def test_special_packages_stay_in_one_place(module):
     homes = {
-        "meshcat": {"viewer"},
+        "meshcat": {"live", "live_server"},
         "matplotlib": {"report"},
         "rich": {"terminal"},
         "argparse": {"cli", "commands"},
