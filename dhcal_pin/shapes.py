@@ -26,6 +26,7 @@ from .se3 import Array
 PathLike = str | os.PathLike[str]
 
 GRID = 8000  # mesh corners sit on a grid of this many steps along the longest side, 0.1 mm on most links
+COARSER = (400, 200, 100, 50, 25)  # grids for meshes that are simplified, one after the other
 NAMED = 3  # lost meshes that a note lists
 TRIAD = [MATERIALS[f"{axis}_axis"] for axis in "xyz"]
 
@@ -180,16 +181,20 @@ class Mesh:
         return cls.on_grid(np.asarray(geometry.vertices(), float), np.array(faces, int).reshape(-1, 3))
 
     @classmethod
-    def on_grid(cls, corners: Array, triangles: Array) -> Mesh:
-        """Corners that fall together are one, triangles that vanish are left out."""
+    def on_grid(cls, corners: Array, triangles: Array, grid: int = GRID) -> Mesh:
+        """Corners that fall together are one; triangles that vanish or come twice are left out."""
         origin, size = corners.min(0), np.ptp(corners, axis=0).max()
-        step = size / GRID or 1.0
-        grid, place = np.unique(
-            np.round((corners - origin) / step).astype("<u2"), axis=0, return_inverse=True
-        )
-        triangles = place.ravel()[triangles]
+        step = size / grid or 1.0
+        x, y, z = np.round((corners - origin) / step).astype(np.int64).T
+        # One whole number a corner is found again faster than three.
+        kept, place = np.unique((x << 32) + (y << 16) + z, return_inverse=True)
+        cells = np.stack([kept >> 32, kept >> 16 & 0xFFFF, kept & 0xFFFF], -1).astype("<u2")
+        triangles = place[triangles]
         a, b, c = triangles.T
-        return cls(np.round(origin, 9), float(step), grid, triangles[(a != b) & (b != c) & (c != a)])
+        triangles = triangles[(a != b) & (b != c) & (c != a)]
+        low, middle, high = np.sort(triangles, axis=1).T
+        once = np.unique((low * len(kept) + middle) * len(kept) + high, return_index=True)[1]
+        return cls(np.round(origin, 9), float(step), cells, triangles[np.sort(once)])
 
     @property
     def places(self) -> Array:
@@ -203,12 +208,18 @@ class Mesh:
 
     def simplified(self, most: int) -> Mesh:
         """With at most so many triangles, by collapsing the edges that change its form least."""
-        if len(self.triangles) <= most:
-            return self
-        corners, triangles = fast_simplification.simplify(
-            self.corners.astype(float), self.triangles, target_count=most
-        )[:2]
-        return Mesh.on_grid(self.origin + self.step * corners, np.asarray(triangles, int))
+        mesh = self
+        for grid in COARSER:
+            if len(mesh.triangles) <= most:
+                break
+            # Slivers between the teeth of a thread keep edges from collapsing: a coarser grid takes them.
+            mesh = Mesh.on_grid(mesh.places, mesh.triangles, grid)
+            if len(mesh.triangles) > most:
+                corners, triangles = fast_simplification.simplify(
+                    mesh.places / mesh.step, mesh.triangles, target_count=most
+                )[:2]
+                mesh = Mesh.on_grid(mesh.step * corners, np.asarray(triangles, int))
+        return mesh
 
     def encoded(self) -> dict[str, Any]:
         """For the page: base64 of little-endian integers, the triangles' of `bytes` bytes each."""
