@@ -81,7 +81,7 @@ def serve(
         _draw(view, LOOK[name], drawn, len(bodies) - 1)
     size = float(np.linalg.norm(arm.origins[:, :3, 3], axis=1).sum())
     page = meshcat.Visualizer(window=window)
-    page["/Cameras/default/rotated/<object>"].set_property("position", [1.2 * size, 0.7 * size, 1.4 * size])
+    page["/Cameras/default/rotated/<object>"].set_property("position", [0.7 * size, 0.4 * size, 0.8 * size])
     page["/Background"].set_property("top_color", [0.97, 0.98, 0.99])
     page["/Background"].set_property("bottom_color", [0.86, 0.9, 0.93])
     scene.show(np.zeros(nominal.size))

@@ -86,7 +86,7 @@ def looks(
         _home(model, chain, model.getFrameId(link, pin.FrameType.BODY), pin.SE3.Identity())[0]
         for link in lost
     }
-    most = _level([len(mesh.triangles) for mesh in meshes], triangles)
+    most = level([len(mesh.triangles) for mesh in meshes], triangles)
     drawn = [mesh.simplified(most) for mesh in meshes]
     return Looks(shapes + _skeleton(bodies, bare), drawn, _lost_note(lost))
 
@@ -233,7 +233,7 @@ class Mesh:
         }
 
 
-def _level(counts: Sequence[int], total: int) -> int:
+def level(counts: Sequence[int], total: int) -> int:
     """The most that each may keep so that all together keep `total`: small ones stay whole."""
     left = total
     for done, count in enumerate(sorted(counts)):
