@@ -187,8 +187,8 @@ def parser() -> argparse.ArgumentParser:
         type=_count,
         nargs="?",
         default=40_000,
-        const=8_000,
-        help="most triangles that the meshes keep, for a smaller page (40000; 8000 without N)",
+        const=15_000,
+        help="most triangles that the meshes keep, for a smaller page (40000; 15000 without N)",
     )
     view.add_argument(
         "--live", action="store_true", help="serve a moving scene on this computer instead, until Ctrl-C"

@@ -84,3 +84,13 @@ def window_of(browser: Any) -> Iterator[Window]:
     page.close()
     assert not out.complaints
     assert all(url.startswith(("file:", "data:", "about:")) for url in out.requests), out.requests
+
+
+# In MeshCat's own page: where a body of an arm stands, in columns, once its tool frame is there.
+LIVE_FIND = """(arm, body) => {
+  const node = viewer.scene_tree.find(["meshcat", arm, String(body)]).object;
+  if (!node || !node.children.length) return null;
+  viewer.scene_tree.object.updateMatrixWorld(true);
+  const world = viewer.scene_tree.find(["meshcat"]).object.matrixWorld.clone().invert();
+  return world.multiply(node.matrixWorld).elements;
+}"""
