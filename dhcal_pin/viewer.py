@@ -18,7 +18,7 @@ import json
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -131,7 +131,7 @@ class Scene:
         height: of the frame in the notebook, pixels.
     """
 
-    html: str
+    html: str = field(repr=False)  # a notebook keeps the repr too
     height: int
 
     def _repr_html_(self) -> str:
