@@ -186,9 +186,9 @@ def parser() -> argparse.ArgumentParser:
         metavar="N",
         type=_count,
         nargs="?",
-        default=40_000,
+        default=60_000,
         const=15_000,
-        help="most triangles that the meshes keep, for a smaller page (40000; 15000 without N)",
+        help="most triangles that the meshes keep, for a smaller page (60000; 15000 without N)",
     )
     view.add_argument(
         "--live", action="store_true", help="serve a moving scene on this computer instead, until Ctrl-C"

@@ -26,7 +26,7 @@ from .se3 import Array
 PathLike = str | os.PathLike[str]
 
 GRID = 8000  # mesh corners sit on a grid of this many steps along the longest side, 0.1 mm on most links
-COARSER = (400, 200, 100, 50, 25)  # grids for meshes that are simplified, one after the other
+COARSER = (400, 200, 100, 50, 25, 12, 6)  # grids for meshes that are simplified, one after the other
 NAMED = 3  # lost meshes that a note lists
 TRIAD = [MATERIALS[f"{axis}_axis"] for axis in "xyz"]
 
@@ -55,7 +55,7 @@ def looks(
         chain: the arm.
         bodies: its tree, for the rods: each with `parent`, `placement` (12) and where it moves `axes`.
         package_dirs: where to look for meshes; the folders above the URDF without it.
-        triangles: most of them that all meshes together keep; those with the most lose first.
+        triangles: most of them that all meshes together keep.
     """
     if package_dirs is None:
         package_dirs = list(Path(chain.urdf.source).absolute().parents)
@@ -86,8 +86,8 @@ def looks(
         _home(model, chain, model.getFrameId(link, pin.FrameType.BODY), pin.SE3.Identity())[0]
         for link in lost
     }
-    most = level([len(mesh.triangles) for mesh in meshes], triangles)
-    drawn = [mesh.simplified(most) for mesh in meshes]
+    kept = shares([len(mesh.triangles) for mesh in meshes], triangles)
+    drawn = [mesh.simplified(most) for mesh, most in zip(meshes, kept, strict=True)]
     return Looks(shapes + _skeleton(bodies, bare), drawn, _lost_note(lost))
 
 
@@ -233,15 +233,20 @@ class Mesh:
         }
 
 
-def level(counts: Sequence[int], total: int) -> int:
-    """The most that each may keep so that all together keep `total`: small ones stay whole."""
-    left = total
-    for done, count in enumerate(sorted(counts)):
-        share = left // (len(counts) - done)
-        if count > share:
-            return share
-        left -= count
-    return total
+def shares(counts: Sequence[int], total: int) -> list[int]:
+    """How many of its triangles each mesh keeps, all together at most `total`.
+
+    A mesh of four times as many as another keeps twice as many, so that both lose detail alike; small
+    ones stay whole.
+    """
+    left, roots = float(total), np.sqrt(counts)
+    rate = np.inf
+    for i in np.argsort(roots):
+        rate = left / roots[roots >= roots[i]].sum()
+        if roots[i] > rate:
+            break
+        left -= counts[i]
+    return np.minimum(counts, rate * roots).astype(int).tolist()
 
 
 # --- rods and drums --------------------------------------------------------------------------------

@@ -37,7 +37,7 @@ PathLike = str | os.PathLike[str]
 
 MOST_POINTS = 2000  # more are thinned out evenly: the page keeps moving smoothly
 MOST_ELLIPSOIDS = 400  # more would hide each other
-TRIANGLES = 40_000  # that the meshes keep: with more the page would hardly turn, and be large
+TRIANGLES = 60_000  # that the meshes keep: with more the page would hardly turn, and be large
 FEW_TRIANGLES = 15_000  # one still sees what each link is
 LEAST_TRIANGLES = 100
 SLIDE = 0.5  # m each way for a sliding joint without limits

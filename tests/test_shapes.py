@@ -11,7 +11,7 @@ from conftest import robot_file
 from scipy.spatial import cKDTree
 
 from dhcal_pin.chain import Chain
-from dhcal_pin.shapes import GRID, Looks, Mesh, level, looks
+from dhcal_pin.shapes import GRID, Looks, Mesh, looks, shares
 from dhcal_pin.urdf import parse_urdf
 from dhcal_pin.viewer import FEW_TRIANGLES, TRIANGLES, scene_html, tree
 
@@ -71,18 +71,20 @@ def spread(mesh: Mesh, count: int) -> np.ndarray:
 def test_a_robot_keeps_as_many_triangles_as_it_may_and_its_form(file):
     whole = looked(Chain.from_urdf(robot_file(file)))
     counts = [len(mesh.triangles) for mesh in whole.meshes]
-    most = level(counts, TRIANGLES)
-    few = [mesh.simplified(most) for mesh in whole.meshes]
+    kept = shares(counts, TRIANGLES)
+    few = [mesh.simplified(most) for mesh, most in zip(whole.meshes, kept, strict=True)]
     assert 0.9 * TRIANGLES < sum(len(mesh.triangles) for mesh in few) <= TRIANGLES
     for mesh, cut in zip(whole.meshes, few, strict=True):
         away = cKDTree(spread(cut, 50_000)).query(spread(mesh, 2000))[0]
         assert np.quantile(away, 0.9) < 0.02 * np.ptp(mesh.places, axis=0).max()
-        assert np.quantile(away, 0.99) < 0.05 * np.ptp(mesh.places, axis=0).max()
+        assert np.quantile(away, 0.99) < 0.03 * np.ptp(mesh.places, axis=0).max()
 
 
 def test_small_meshes_stay_whole():
-    assert level([10, 1000, 20, 1000], 400) == 185
-    assert level([10, 20], 400) == 400
+    assert shares([4, 1600, 9, 400], 613) == [4, 400, 9, 200]
+    assert shares([10, 20], 400) == [10, 20]
+    assert shares([100, 100, 100], 30) == [10, 10, 10]
+    assert shares([], 30) == []
 
 
 def test_two_meshed_arms_stay_small_and_come_out_the_same():
@@ -95,7 +97,7 @@ def test_two_meshed_arms_stay_small_and_come_out_the_same():
         *(len(scene_html(nominal, nominal, q=q, triangles=n).encode()) for n in (TRIANGLES, FEW_TRIANGLES)),
     ]
     assert sizes[0] < 6e6
-    assert sizes[1] < 1.5e6
+    assert sizes[1] < 2e6
     assert sizes[2] < 1.2e6
 
 
