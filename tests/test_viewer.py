@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,6 +19,7 @@ from dhcal_pin.chain import Chain
 from dhcal_pin.cli import main
 from dhcal_pin.errors import DhcalError
 from dhcal_pin.lengths import Distance
+from dhcal_pin.measurement_files import measurement_text
 from dhcal_pin.measurements import Noise
 from dhcal_pin.poses import Pose
 from dhcal_pin.positions import Position, Targets
@@ -289,3 +291,24 @@ def test_view_writes_the_page(tmp_path):
     text = page.read_text()
     assert "experiment and experiment_published" in text
     assert main(["view", arms[0], "--html", str(tmp_path / "no" / "scene.html")]) == 2
+
+
+def test_a_calibrated_robots_sidecar_puts_the_points_where_its_tool_is(tmp_path, sim_6dof):
+    truth = replace(sim_6dof, base=se3.exp6(np.array([3.0, -2.0, 1.0, 0.5, 0.2, 2.5])))
+    truth = replace(truth, tool=se3.translation([0.01, 0.02, 0.15]))
+    data = Position.simulate(truth, poses(truth, 40), Noise(1e-5), np.random.default_rng(0))
+    csv, out, page = (tmp_path / name for name in ("data.csv", "out.urdf", "scene.html"))
+    csv.write_text(measurement_text(data, truth))
+    nominal = str(URDF / "sim_6dof.dh.toml")
+    assert main(["calibrate", nominal, str(csv), "--parameters", "base,tool", "-o", str(out)]) == 0
+    assert main(["view", nominal, str(out), "--data", str(csv), "--html", str(page), "--simplify"]) == 0
+    scene = json.loads(page.read_text().split('type="application/json">')[1].split("</script>")[0])
+    # Drawn in the frame of the base link, to where Pinocchio puts the true tool without its base.
+    there = replace(truth, base=np.eye(4)).poses(data.q)[:, :3, 3]
+    assert np.abs(np.array(scene["points"]) - there).max() < 5e-5
+    assert np.abs(scene["residuals"]).max() < 5e-5
+
+
+def test_view_serves_live_only_alone(tmp_path, capsys):
+    assert main(["view", str(URDF / "sim_6dof.dh.toml"), "--live", "--html", str(tmp_path / "a.html")]) == 2
+    assert "--live writes no page" in capsys.readouterr().err
