@@ -16,11 +16,12 @@ ARGUMENTS = (
     "--no-sandbox --disable-dev-shm-usage --use-gl=angle --use-angle=swiftshader "
     "--enable-unsafe-swiftshader --hide-scrollbars"
 ).split()
+SLIDE = "it.value = it.max; it.dispatchEvent(new Event('input'))"
+CLICK = "it.click()"
 READY = "window.dhcal && window.dhcal.ready === true"
 
 # Draws the scene now and looks at its pixels: how many have each layer's colour, and a fingerprint.
-LOOK = """([name, values]) => {
-  if (name) dhcal[name](...values);
+LOOK = """() => {
   const { viewer } = dhcal, gl = viewer.renderer.getContext();
   viewer.render();
   const { drawingBufferWidth: width, drawingBufferHeight: height } = gl;
@@ -61,7 +62,12 @@ class Window:
 
     def look(self, name: str = "", *values: Any) -> dict[str, int]:
         """What is seen, after a call of the page if there is one: together they draw only once."""
-        return self.page.evaluate(LOOK, [name, list(values)])
+        call = f"([name, values]) => {{ if (name) dhcal[name](...values); return ({LOOK})(); }}"
+        return self.page.evaluate(call, [name, list(values)])
+
+    def touch(self, control: Any, action: str) -> dict[str, int]:
+        """What is seen after a control, `it`, was used."""
+        return control.evaluate(f"it => {{ {action}; return ({LOOK})(); }}")
 
     def tip(self, arm: str) -> np.ndarray:
         """Where the page says an arm's tool is, (4, 4)."""

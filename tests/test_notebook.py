@@ -37,10 +37,10 @@ def test_the_scene_lives_in_a_saved_notebook_and_in_its_html(browser, tmp_path):
     frame = next(frame for frame in page.frames if frame.parent_frame)
     frame.wait_for_function(READY)
     assert frame.evaluate("dhcal.scene.points.length") == 12
-    before = frame.evaluate(LOOK, ["", []])
+    before = frame.evaluate(LOOK)
     assert before["calibrated"] > 200
     assert before["nominal"] > 15
     frame.locator("#joints input").first.press("End")
-    assert frame.evaluate(LOOK, ["", []])["print"] != before["print"]
+    assert frame.evaluate(LOOK)["print"] != before["print"]
     assert np.shape(frame.evaluate("dhcal.tip('nominal')")) == (4, 4)
     page.close()

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from conftest import URDF, paper, robot_file
-from pages import READY, Window, window_of
+from pages import CLICK, READY, SLIDE, Window, window_of
 
 from dhcal_pin import se3
 from dhcal_pin.calibration import calibrate
@@ -25,7 +25,7 @@ from dhcal_pin.poses import Pose
 from dhcal_pin.positions import Position, Targets
 from dhcal_pin.result import Result
 from dhcal_pin.urdf import parse_urdf
-from dhcal_pin.viewer import FEW_TRIANGLES, scene_html, show
+from dhcal_pin.viewer import scene_html, show
 
 FILES = {
     "ur10": ("ur_description/urdf/ur10_robot.urdf", None),
@@ -86,7 +86,7 @@ def opened(
     nominal, truth = arms(request.param)
     data = Position.simulate(truth, poses(nominal, 24), Noise(1e-3), np.random.default_rng(3))
     fit = calibrate(nominal, data)
-    html = scene_html(nominal, fit, triangles=FEW_TRIANGLES)
+    html = scene_html(nominal, fit, triangles=4000)
     with window_of(browser) as window:
         window.open(tmp_path_factory.mktemp("scene") / "scene.html", html)
         yield Opened(window, fit, len(html.encode()))
@@ -125,15 +125,13 @@ def test_every_slider_and_switch_changes_the_picture(opened):
     before = window.look("setMagnification", 1)["print"]
     for slider in (page.locator("#magnification"), *page.locator("#joints input").all()):
         where = window.tip("calibrated")
-        slider.press("End")
-        after = window.look()["print"]
+        after = window.touch(slider, SLIDE)["print"]
         assert after != before
         assert np.abs(window.tip("calibrated") - where).max() > 1e-6
         before = after
     before = window.look("setMagnification", 100)["print"]
     for box in page.locator("#layers input").all():
-        box.evaluate("box => box.click()")
-        after = window.look()["print"]
+        after = window.touch(box, CLICK)["print"]
         assert after != before
         before = after
     where = window.tip("nominal")
