@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pages import ARGUMENTS, CHROMIUM, Window, window_of
+from pages import ARGUMENTS, CHROMIUM, VIEWPORT, Window, window_of
 
 from dhcal_pin.chain import Chain
 from dhcal_pin.dh import DHTable
@@ -74,7 +74,14 @@ def browser() -> Iterator[Any]:
         browser.close()
 
 
-@pytest.fixture
-def window(browser: Any) -> Iterator[Window]:
+@pytest.fixture(scope="session")
+def shared_window(browser: Any) -> Iterator[Window]:
     with window_of(browser) as out:
         yield out
+
+
+@pytest.fixture
+def window(shared_window: Window) -> Iterator[Window]:
+    shared_window.page.set_viewport_size(VIEWPORT)
+    yield shared_window
+    shared_window.check()

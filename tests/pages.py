@@ -16,6 +16,7 @@ ARGUMENTS = (
     "--no-sandbox --disable-dev-shm-usage --use-gl=angle --use-angle=swiftshader "
     "--enable-unsafe-swiftshader --hide-scrollbars"
 ).split()
+VIEWPORT = {"width": 700, "height": 400}
 SLIDE = "it.value = it.max; it.dispatchEvent(new Event('input'))"
 CLICK = "it.click()"
 READY = "window.dhcal && window.dhcal.ready === true"
@@ -60,6 +61,14 @@ class Window:
         self.page.goto(path.as_uri())
         self.page.wait_for_function(READY)
 
+    def check(self) -> None:
+        """That the page was silent and asked no host for anything since the last check."""
+        complaints, requests = self.complaints[:], self.requests[:]
+        self.complaints.clear()
+        self.requests.clear()
+        assert not complaints
+        assert all(url.startswith(("file:", "data:", "about:")) for url in requests), requests
+
     def look(self, name: str = "", *values: Any) -> dict[str, int]:
         """What is seen, after a call of the page if there is one: together they draw only once."""
         call = f"([name, values]) => {{ if (name) dhcal[name](...values); return ({LOOK})(); }}"
@@ -81,15 +90,14 @@ class Window:
 @contextmanager
 def window_of(browser: Any) -> Iterator[Window]:
     """A page that must stay silent and ask no host for anything."""
-    page = browser.new_page(viewport={"width": 700, "height": 400})
+    page = browser.new_page(viewport=VIEWPORT)
     out = Window(page, [], [])
     page.on("console", lambda message: out.complaints.append(message.text))
     page.on("pageerror", lambda error: out.complaints.append(str(error)))
     page.on("request", lambda request: out.requests.append(request.url))
     yield out
     page.close()
-    assert not out.complaints
-    assert all(url.startswith(("file:", "data:", "about:")) for url in out.requests), out.requests
+    out.check()
 
 
 # In MeshCat's own page: where a body of an arm stands, in columns, once its tool frame is there.

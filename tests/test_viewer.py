@@ -84,7 +84,7 @@ def opened(
     request: pytest.FixtureRequest, browser: Any, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Opened]:
     nominal, truth = arms(request.param)
-    data = Position.simulate(truth, poses(nominal, 24), Noise(1e-3), np.random.default_rng(3))
+    data = Position.simulate(truth, poses(nominal, 12), Noise(1e-3), np.random.default_rng(3))
     fit = calibrate(nominal, data)
     html = scene_html(nominal, fit, triangles=4000)
     with window_of(browser) as window:
