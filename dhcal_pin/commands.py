@@ -6,7 +6,6 @@ Wrong input is found before anything is written or shown; JSON goes to stdout, a
 from __future__ import annotations
 
 import os
-import tempfile
 from argparse import Namespace
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -24,7 +23,7 @@ from . import (
     study_command,
     terminal,
     ur_kinematics,
-    viewer,
+    view_command,
 )
 from .chain import Chain
 from .check import crosscheck
@@ -35,7 +34,7 @@ from .files import PathLike, parse_noise, save
 from .fleet import ENDING, is_fleet
 from .jobs import Job
 from .kinds import KINDS
-from .measurement_files import measurement_text, read_measurements, read_readings
+from .measurement_files import measurement_text, read_readings
 from .measurements import Measurement, Noise
 from .outputs import STDOUT, check_outputs, emit, names, same, sidecars
 from .parameters import extract
@@ -324,23 +323,6 @@ def _simulate(args: Namespace) -> int:
     return 0
 
 
-def _view(args: Namespace) -> int:
-    given = [args.nominal, *([args.calibrated] if args.calibrated else [])]
-    page = args.html or os.path.join(tempfile.mkdtemp(prefix="dhcal-"), f"{robot_name(args.nominal)}.html")
-    check_outputs([page], [*given, *sidecars(given), *args.data])
-    nominal, *calibrated = (read_robot(path, None if is_table(path) else args.tip) for path in given)
-    data = [read_measurements(path, nominal) for path in args.data]
-    title = " and ".join(robot_name(path) for path in given)
-    text = viewer.scene_html(
-        nominal, *calibrated, measurements=data, title=title, magnification=args.magnification
-    )
-    save({page: text})
-    terminal.lines(f"wrote {page}")
-    if args.open or not args.html:
-        terminal.open_page(page)
-    return 0
-
-
 def _demo(args: Namespace) -> int:
     check_outputs([args.json], [])
     document = demo.run(args.out)
@@ -355,7 +337,7 @@ COMMANDS: dict[str, Callable[[Namespace], int]] = {
     "calibrate": _calibrate,
     "validate": _validate,
     "convert": _convert,
-    "view": _view,
+    "view": view_command.view,
     "check": _check,
     "simulate": _simulate,
     "compensate": compensate_command.run,
