@@ -1,0 +1,376 @@
+"""Which poses to measure: the choice that tells most about a robot's errors with the instrument at hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from . import observability, se3
+from .calibration import Priors
+from .chain import Chain
+from .clearance import Clearance
+from .design import PROMISING, Criterion, Determinant, Pool, Spread, Worst, basis, exchange, greedy
+from .errors import DhcalError
+from .information import Information
+from .measurements import Measurement, Noise
+from .se3 import Array
+
+# Joints stay this far from their limits.
+MARGIN_ANGLE, MARGIN_LENGTH = np.deg2rad(2.0), 5e-3
+# Predicted errors are averaged over so many configurations where no task is given.
+TASK = 300
+# Random choices that a plan is compared with, at so many numbers of poses.
+DRAWS, SIZES = 25, 8
+# Refinement: rounds, each with so many neighbours a pose, nearer from round to round.
+ROUNDS, NEIGHBOURS, REACH, NEARER = 12, 24, 0.15, 0.75
+# More poses stop paying where ten more lower what a check would show by less than a hundredth.
+MORE, WORTH = 10, 0.01
+# Draws for each candidate before the constraints are called too narrow.
+PATIENCE = 200
+
+
+@dataclass(frozen=True, eq=False)
+class Space:
+    """Where the tool may be; places in the measuring frame, which is the base link's own if nobody said more.
+
+    Attributes:
+        box: (2, 3) least and most x, y, z of the tool point, m; None for anywhere.
+        eye: (3,) the instrument, m, which must see the tool point past the robot; None for anywhere.
+        cone: half angle about the tool's z axis in which the instrument must stand, rad; π for any.
+    """
+
+    box: Array | None = None
+    eye: Array | None = None
+    cone: float = np.pi
+
+    def holds(self, poses: Array) -> Array:
+        """Which tool poses (m, 4, 4) are inside the box and look at the instrument, (m,)."""
+        point = poses[:, :3, 3]
+        good = np.ones(len(poses), bool)
+        if self.box is not None:
+            good &= np.all((point >= self.box[0]) & (point <= self.box[1]), 1)
+        if self.eye is not None:
+            away = self.eye - point
+            towards = np.einsum("mi,mi->m", poses[:, :3, 2], away)
+            good &= towards >= np.cos(self.cone) * np.linalg.norm(away, axis=1)
+        return good
+
+
+def joint_range(chain: Chain, angle: float = 0.0, length: float = 0.0) -> tuple[Array, Array]:
+    """Lowest and highest values (n,) inside the limits, and inside a turn or half a metre each way.
+
+    Args:
+        chain: the robot.
+        angle, length: margins to the limits, rad and m.
+    """
+    slides = np.array([chain.urdf.joint(name).type == "prismatic" for name in chain.joint_names])
+    span, margin = np.where(slides, 0.5, np.pi), np.where(slides, length, angle)
+    # A margin that leaves a joint nothing is cut to a quarter of its way.
+    margin = np.minimum(margin, (chain.upper - chain.lower) / 4)
+    low, high = chain.lower + margin, chain.upper - margin
+    return (
+        np.where(high > -span, np.maximum(low, -span), np.maximum(low, high - 2 * span)),
+        np.where(low < span, np.minimum(high, span), np.minimum(high, low + 2 * span)),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Configurations to measure, and what to expect of them.
+
+    Attributes:
+        q: (n, dof) joint values in the order of a short tour, rad or m.
+        index: (n,) their numbers among given candidates; None where candidates were drawn and refined.
+        criterion: what they were chosen for.
+        information: what is known before, and what any configurations would tell.
+        task: combinations whose variances are the mean squared position error over the task.
+        sizes: (c,) numbers of poses, beyond n as if more were added to the plan.
+        errors: (c,) predicted RMS position error over the task after the best so many of them, m.
+        random_sizes, random_errors: the same for poses at random, the median of several draws.
+        enough: number of poses from which on ten more lower what a check with this instrument would show by
+            less than a hundredth; None if that is beyond the sizes.
+        notes: what was not looked at.
+    """
+
+    q: Array
+    index: Array | None
+    criterion: str
+    information: Information
+    task: Array
+    sizes: Array
+    errors: Array
+    random_sizes: Array
+    random_errors: Array
+    enough: int | None
+    notes: tuple[str, ...]
+
+    @cached_property
+    def log_det(self) -> float:
+        """Log det of the information, the unknowns in units of their priors."""
+        rows = self.information.rows(self.q).transpose(2, 1, 0)
+        return -2 * float(np.sum(np.log(np.abs(np.diag(basis(self.information.start, rows))))))
+
+    @property
+    def error(self) -> float:
+        """Predicted RMS position error over the task after these poses, m."""
+        return self.expected(self.q)
+
+    @property
+    def ratio(self) -> float:
+        """Predicted error over that of as many poses at random."""
+        return self.error / float(self.random_errors[-1])
+
+    def expected(self, q: Array) -> float:
+        """Predicted RMS position error in m over the plan's task, after measuring at any q (m, dof)."""
+        return self.information.error(self.information.rows(q).transpose(2, 1, 0), self.task)
+
+
+def plan(
+    chain: Chain,
+    count: int,
+    *,
+    kind: str = "pose",
+    noise: Noise | None = None,
+    parameters: str | None = None,
+    priors: Priors = "default",
+    fix: Sequence[str] = (),
+    free: Sequence[str] = (),
+    criterion: str = "D",
+    data: Sequence[Measurement] = (),
+    known: Mapping[str, float] | None = None,
+    task: Array | None = None,
+    candidates: int | Array = 5000,
+    space: Space | None = None,
+    margin: Noise | None = None,
+    seed: int = 0,
+) -> Plan:
+    """Chooses configurations to measure.
+
+    Drawn candidates keep the joints' limits, the space asked for, and do not collide; the chosen ones are
+    then moved on between them. Given candidates are chosen from as they are.
+
+    Args:
+        chain: the nominal robot; base and tool as far as they are known.
+        count: how many.
+        kind: of measurement; readings of one configuration each that hang together by nothing.
+        noise: sigmas of instrument and robot together, m and rad; without it, those that the data show.
+        parameters, priors, fix, free, known: what is unknown, as in `calibrate`.
+        criterion: "D" volume of the unknowns' uncertainty, "A" mean variance, "E" worst variance, each in units
+            of the priors; "task" predicted position error over the task.
+        data: readings already taken, to be added to.
+        task: (m, n) joint values where the tool is to be right; anywhere without it.
+        candidates: how many to draw, or joint values (m, n) to choose from.
+        space: where the tool may be.
+        margin: distance to the joints' limits: `rotation` in rad, `position` in m.
+        seed: of all draws.
+
+    Raises:
+        DhcalError: an unknown name, no room for the tool, or too few candidates.
+    """
+    if criterion not in CRITERIA:
+        raise DhcalError(f"criterion {criterion!r}: choose from {', '.join(CRITERIA)}")
+    if count < 1:
+        raise DhcalError(f"{count} poses: plan at least one")
+    rng = np.random.default_rng(seed)
+    space = space or Space()
+    margin = margin or Noise(MARGIN_LENGTH, MARGIN_ANGLE)
+    low, high = joint_range(chain, margin.rotation, margin.position)
+    drawn = isinstance(candidates, int)
+    if isinstance(candidates, int):
+        q = _draw(chain, candidates, space, low, high, rng)
+        clearance = Clearance.of(chain)
+    else:
+        q, clearance = chain.checked(candidates), None
+    task_q = _draw(chain, TASK, Space(), low, high, rng) if task is None else chain.checked(task)
+    information = Information.before(chain, q, kind, noise, parameters, priors, fix, free, data, known)
+
+    def possible(values: Array) -> Callable[[int], bool]:
+        if clearance is None:
+            return lambda _: True
+        return lambda i: _possible(clearance, space, values[i])
+
+    pool = Pool.of(information.rows(q), possible(q))
+    combinations = information.task(task_q)
+    weighed = CRITERIA[criterion](information, pool, combinations)
+    chosen = greedy(pool, information.start, count, weighed, np.zeros(0, int))
+    if len(chosen) < count:
+        raise DhcalError(f"only {len(chosen)} of {len(q)} candidates are possible, {count} are asked for")
+    chosen = exchange(pool, information.start, chosen, weighed)
+    best = q[chosen]
+    if drawn:
+        best = _refined(information, weighed, best, space, low, high, possible, rng)
+    sizes, errors = _curve(information, weighed, combinations, best, pool, None if drawn else chosen)
+    random_sizes, random_errors = _random(information, combinations, pool, sizes[sizes <= count], rng)
+    order = tour(best)
+    return Plan(
+        q=best[order],
+        index=None if drawn else chosen[order],
+        criterion=criterion,
+        information=information,
+        task=combinations,
+        sizes=sizes,
+        errors=errors,
+        random_sizes=random_sizes,
+        random_errors=random_errors,
+        enough=_enough(sizes, errors, information.noise.position),
+        notes=tuple(filter(None, (clearance.note if clearance else "",))),
+    )
+
+
+CRITERIA: dict[str, Callable[[Information, Pool, Array], Criterion]] = {
+    "D": lambda information, pool, task: Determinant(),
+    "A": lambda information, pool, task: Spread(np.eye(len(information.scale))),
+    "E": lambda information, pool, task: Worst(_seen(information, pool)),
+    "task": lambda information, pool, task: Spread(task),
+}
+
+
+def _seen(information: Information, pool: Pool) -> Array:
+    """Orthonormal directions (r, p) that any of the candidates sees, of a sample of them."""
+    rows = pool.at(np.arange(0, pool.rows.shape[2], max(1, pool.rows.shape[2] // TASK)))
+    return observability.row_space(np.linalg.qr(rows.reshape(-1, len(information.scale)), mode="r"))
+
+
+def _draw(
+    chain: Chain, count: int, space: Space, low: Array, high: Array, rng: np.random.Generator
+) -> Array:
+    """Uniform joint values (count, n) whose tool the space holds."""
+    out = np.empty((0, chain.size))
+    for _ in range(PATIENCE):
+        q = rng.uniform(low, high, (count, chain.size))
+        out = np.concatenate([out, q[space.holds(chain.poses(q))]])
+        if len(out) >= count:
+            return out[:count]
+    raise DhcalError(
+        f"the tool is in the space asked for in {len(out)} of {PATIENCE * count} configurations; "
+        "widen the box or the cone, or ask for fewer candidates"
+    )
+
+
+def _possible(clearance: Clearance, space: Space, q: Array) -> bool:
+    """Whether the robot can stand there, and the instrument sees the tool if it must."""
+    if not clearance.free(q):
+        return False
+    if space.eye is None:
+        return True
+    into = se3.inverse(clearance.chain.base)
+    point = clearance.chain.poses(q)[0, :3, 3]
+    eye, point = (into[:3, :3] @ at + into[:3, 3] for at in (space.eye, point))
+    return clearance.sees(q, eye, point)
+
+
+def _refined(
+    information: Information,
+    criterion: Criterion,
+    q: Array,
+    space: Space,
+    low: Array,
+    high: Array,
+    possible: Callable[[Array], Callable[[int], bool]],
+    rng: np.random.Generator,
+) -> Array:
+    """The configurations (n, dof) moved to better ones about them, by smaller and smaller steps."""
+    q = q.copy()
+    rows = np.ascontiguousarray(information.rows(q).transpose(2, 1, 0))
+    value = criterion.value(basis(information.start, rows))
+    for turn in range(ROUNDS):
+        step = REACH * NEARER**turn * (high - low)
+        near = np.clip(q[:, None] + step * rng.standard_normal((len(q), NEIGHBOURS, q.shape[1])), low, high)
+        flat = near.reshape(-1, q.shape[1])
+        pool = Pool.of(information.rows(flat), possible(flat))
+        pool.closed[:] = ~space.holds(information.chain.poses(flat))
+        for slot in range(len(q)):
+            block = np.arange(slot * NEIGHBOURS, (slot + 1) * NEIGHBOURS)
+            rest = basis(information.start, np.delete(rows, slot, 0))
+            here = np.concatenate([pool.rows[:, :, block], rows[slot].T[:, :, None]], 2)
+            *gains, own = criterion.gains(here, rest)
+            found = pool.best(np.where(np.array(gains) > own, gains, -np.inf), block)
+            if found is None:
+                continue
+            trial = rows.copy()
+            trial[slot] = pool.rows[:, :, found].T
+            reached = criterion.value(basis(information.start, trial))
+            if reached < value:
+                rows, value, q[slot] = trial, reached, flat[found]
+    return q
+
+
+def _curve(
+    information: Information,
+    criterion: Criterion,
+    task: Array,
+    q: Array,
+    pool: Pool,
+    taken: Array | None,
+) -> tuple[Array, Array]:
+    """Numbers of poses and predicted errors in m: the plan's own, best first, then with candidates added."""
+    own, count = information.rows(q), len(q)
+    start = information.start
+    best_first = greedy(Pool.of(own, lambda _: True), start, count, criterion, np.zeros(0, int))
+    gains = criterion.gains(pool.rows, basis(start, np.ascontiguousarray(own.transpose(2, 1, 0))))
+    gains[pool.closed] = -np.inf
+    if taken is not None:
+        gains[taken] = -np.inf
+    left = np.argsort(-gains)[: min(PROMISING, int(np.isfinite(gains).sum()))]
+    both = Pool.of(
+        np.concatenate([own, pool.rows[:, :, left]], 2),
+        lambda i: i < count or pool.possible(int(left[i - count])),
+    )
+    order = greedy(both, start, max(count, MORE), criterion, best_first)
+    rows = both.at(order)
+    least = -(-(len(_seen(information, pool)) - information.rank) // own.shape[1])
+    sizes = np.arange(max(1, least), len(order) + 1)
+    return sizes, np.array([information.error(rows[:size], task) for size in sizes])
+
+
+def _random(
+    information: Information, task: Array, pool: Pool, sizes: Array, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Some of the sizes, and the predicted error in m after as many poses at random, the median of draws."""
+    if not sizes.size:
+        return sizes, np.empty(0)
+    order = rng.permutation(pool.rows.shape[2])
+    wanted = max(4 * int(sizes[-1]), 200)
+    open_ones = [i for i in order[: 4 * wanted] if not pool.closed[i] and pool.possible(int(i))][:wanted]
+    rows = pool.at(np.array(open_ones, int))
+    some = np.unique(np.linspace(0, len(sizes) - 1, SIZES).round().astype(int))
+    out = [
+        np.median([
+            information.error(rows[rng.permutation(len(rows))[:size]], task) for _ in range(DRAWS)
+        ])
+        for size in sizes[some]
+    ]  # fmt: skip
+    return sizes[some], np.array(out)
+
+
+def _enough(sizes: Array, errors: Array, sigma: float) -> int | None:
+    """The number of poses from which on MORE lower what a check shows, noise of the check included, by < WORTH."""
+    shown = np.sqrt(errors**2 + 3 * sigma**2)
+    little = np.flatnonzero(shown[MORE:] > (1 - WORTH) * shown[:-MORE])
+    return int(sizes[little[0]]) if little.size else None
+
+
+def tour(q: Array) -> Array:
+    """An order (n,) of configurations (n, dof) with little motion from one to the next: 2-opt of nearest ones."""
+    count = len(q)
+    way = np.zeros((count + 1, count + 1))
+    # The last one is nowhere, as near to all: a closed tour through it is an open one.
+    way[:count, :count] = np.linalg.norm(q[:, None] - q[None], axis=2)
+    order, left = [count], set(range(count))
+    at = int(np.argmin(np.linalg.norm(q - q.mean(0), axis=1)))
+    while left:
+        left.remove(at)
+        order.append(at)
+        at = min(left, key=lambda other: way[order[-1], other], default=0)
+    path = np.array(order)
+    while True:
+        first, after = way[path[:, None], path], np.roll(path, -1)
+        steps = way[path, after]
+        gain = steps[:, None] + steps[None] - first - way[after[:, None], after]
+        i, j = np.unravel_index(np.argmax(np.triu(gain, 1)), gain.shape)
+        if gain[i, j] <= 1e-9 or i >= j:
+            return np.roll(path, -int(np.flatnonzero(path == count)[0]))[1:]
+        path[i + 1 : j + 1] = path[i + 1 : j + 1][::-1].copy()
