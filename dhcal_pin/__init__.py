@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from .parameters import extract as extract
     from .poses import Pose as Pose
     from .positions import Position as Position
+    from .result import Prediction as Prediction
     from .result import Result as Result
     from .result import accuracy as accuracy
     from .robot_files import read_robot as read_robot
@@ -48,6 +49,7 @@ _HOMES = {
     "Pose": "poses",
     "Position": "positions",
     "extract": "parameters",
+    "Prediction": "result",
     "Result": "result",
     "accuracy": "result",
     "read_robot": "robot_files",

@@ -25,6 +25,11 @@ from .solver import (
     with_priors,
 )
 
+# A parameter, or a metre and a radian of the tool, with more than this share of itself unseen is unknown.
+UNKNOWN = 1e-6
+# Residuals that are larger than stated by so many standard deviations of chance contradict the sigmas.
+CONTRADICTION = 3.0
+
 
 def accuracy(
     chain: Chain, data: Sequence[Measurement], known: Mapping[str, float] | None = None
@@ -73,6 +78,30 @@ def _instruments(chain: Chain, data: Sequence[Measurement], known: Mapping[str, 
     if not len(weights):
         return given
     return problem.instruments(levenberg_marquardt(problem, np.zeros(len(weights)), 100, None).x)
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Tool poses of a calibrated arm, and how well they are known.
+
+    Attributes:
+        poses: (m, 4, 4) in the measuring frame.
+        covariance: (m, 6, 6) of the tool point's displacement [v, ω], m and rad, in axes of the
+            measuring frame; infinite on the diagonal where neither data nor a prior tell.
+    """
+
+    poses: Array
+    covariance: Array
+
+    @property
+    def position_std(self) -> Array:
+        """Root of the position's total variance (m,), m: the RMS distance to expect."""
+        return np.sqrt(np.trace(self.covariance[:, :3, :3], axis1=1, axis2=2))
+
+    @property
+    def orientation_std(self) -> Array:
+        """Root of the rotation vector's total variance (m,), rad: the RMS angle to expect."""
+        return np.sqrt(np.trace(self.covariance[:, 3:, 3:], axis1=1, axis2=2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,32 +169,79 @@ class Result:
         return observability.unobservable(self.solution.triangle.r, self.parameters)
 
     @cached_property
-    def noise(self) -> float:
-        """Standard deviation of the whitened residuals, about 1 where the sigmas are right."""
+    def _root(self) -> tuple[Array, Array]:
+        """A root (p, r) of the covariance at sigmas as used, and a basis (p, p-r) of what nothing tells."""
+        zero = np.zeros_like(self.x)
+        full = with_priors(self.solution.triangle, self.problem.weights, zero, zero).r
+        _, s, vt = np.linalg.svd(full)
+        keep = s > observability.RANK_CUT * s[0]
+        return vt[keep].T / s[keep], vt[~keep].T
+
+    @cached_property
+    def freedom(self) -> float:
+        """Rows left over; unknowns count as far as data and not priors tell them (MacKay's number)."""
         count = 0.0
         for item, weights in zip(self.data, self.weights, strict=True):
             sweep = self.chain.sweep(item.configurations())
             count += len(item.residual(sweep, self.problem.values(item, self.x))) * weights.sum()
-        cost = self.solution.triangle.rest + float(np.sum(self.solution.triangle.z**2))
-        freedom = count - self.rank
-        return float(np.sqrt(cost / freedom)) if freedom > 0 else float("nan")
+        left = count - float(np.sum((self.solution.triangle.r @ self._root[0]) ** 2))
+        return left if left > 1e-6 * count else 0.0
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the whitened residuals, about 1 for right sigmas; NaN if no row is left."""
+        triangle = self.solution.triangle
+        cost = triangle.rest + float(np.sum(triangle.z**2))
+        return float(np.sqrt(cost / self.freedom)) if self.freedom else float("nan")
+
+    @cached_property
+    def _root(self) -> tuple[Array, Array]:
+        """A root (p, r) of the covariance at sigmas as used, and a basis (p, p-r) of what nothing tells."""
+        zero = np.zeros_like(self.x)
+        full = with_priors(self.solution.triangle, self.problem.weights, zero, zero).r
+        _, s, vt = np.linalg.svd(full)
+        keep = s > observability.RANK_CUT * s[0]
+        return vt[keep].T / s[keep], vt[~keep].T
+
+    @cached_property
+    def _spread(self) -> tuple[Array, Array]:
+        """As `_root`, scaled by the scatter that was seen where no sigma or too small a one is stated."""
+        root, hidden = self._root
+        if all(item.stated for item in self.data):
+            surprise = 1 + CONTRADICTION * np.sqrt(2 / self.freedom) if self.freedom else np.inf
+            return root * (self.noise if self.noise**2 > surprise else 1.0), hidden
+        return root * self.noise, hidden
 
     @cached_property
     def covariance(self) -> Array:
         """Covariance (p, p) of x; infinite on the diagonal where neither data nor a prior tell.
 
-        NaN where there are not more rows than unknown directions and so no noise to go by.
+        Sigmas that instruments state are believed unless the residuals contradict them. NaN where one is
+        not stated and there are not more rows than unknown directions, and so no noise to go by.
         """
-        weights = self.problem.weights
-        zero = np.zeros_like(self.x)
-        full = with_priors(self.solution.triangle, weights, zero, zero).r
-        _, s, vt = np.linalg.svd(full)
-        keep = s > observability.RANK_CUT * s[0]
-        half = (vt[keep].T / s[keep]) * self.noise
-        out = half @ half.T
-        lost = 1 - np.sum(vt[keep] ** 2, 0) > 1e-6
+        root, hidden = self._spread
+        out = root @ root.T
+        lost = np.sum(hidden**2, 1) > UNKNOWN
         out[lost, lost] = np.inf
         return out
+
+    def predict(self, q: Array) -> Prediction:
+        """The calibrated tool poses at joint values q (m, n), rad or m, and how well they are known.
+
+        The covariance is that of the identified errors carried to the tool to first order; noise of a
+        future measurement is not in it.
+        """
+        root, hidden = self._spread
+        robot = len(self.errors.parameters)
+        chain, bodies, twists = self.errors.derivative(self.x[:robot])
+        sweep = chain.sweep(q)
+        velocities = chain.tool_velocities(sweep, bodies, twists)
+        carried = np.einsum("pim,pr->mir", velocities, root[:robot])
+        covariance = carried @ np.swapaxes(carried, 1, 2)
+        lost = np.einsum("pim,pr->mir", velocities, hidden[:robot])
+        rows, axes = np.nonzero(np.sum(lost**2, -1) > UNKNOWN)
+        covariance[rows, axes, axes] = np.inf
+        return Prediction(sweep.poses(), covariance)
 
     @property
     def std(self) -> Array:

@@ -80,6 +80,39 @@ def test_stated_spread_is_the_scatter_over_repeats(sim_6dof, sim_6dof_actual):
     assert abs(np.mean(scores)) < 0.15
 
 
+def test_predicted_spread_of_the_tool_is_its_scatter_over_repeats(sim_6dof, sim_6dof_actual):
+    """True poses lie where the predicted covariance says, in all six directions together."""
+    scores, squares, expected = [], [], []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        data = Pose.simulate(sim_6dof_actual, rng.uniform(-3, 3, (15, 6)), Noise(1e-4, 2e-4), rng)
+        q = rng.uniform(-3, 3, (20, 6))
+        found = calibrate(sim_6dof, data, "dh", priors="none").predict(q)
+        away = se3.inverse(found.poses) @ sim_6dof_actual.poses(q)
+        turn = found.poses[:, :3, :3]
+        moved = np.concatenate(
+            [
+                np.einsum("mij,mj->mi", turn, away[:, :3, 3]),
+                np.einsum("mij,mj->mi", turn, se3.log3(away[:, :3, :3])),
+            ],
+            1,
+        )
+        scores.append(np.einsum("mi,mij,mj->m", moved, np.linalg.inv(found.covariance), moved))
+        squares.append(np.sum(moved[:, :3] ** 2, 1))
+        expected.append(found.position_std**2)
+    assert np.mean(scores) == pytest.approx(6, rel=0.1)
+    assert np.sqrt(np.mean(squares) / np.mean(expected)) == pytest.approx(1, abs=0.1)
+
+
+def test_predicted_spread_says_where_nothing_is_known(sim_6dof):
+    """Without priors and with the last rotations unseen, the tool's place is known and its rotation not."""
+    rng = np.random.default_rng(0)
+    data = Position.simulate(sim_6dof, rng.uniform(-3, 3, (40, 6)), Noise(1e-4), rng)
+    found = calibrate(sim_6dof, data, "dh", priors="none").predict(rng.uniform(-3, 3, (5, 6)))
+    assert (found.position_std < 1e-3).all()
+    assert np.isinf(found.orientation_std).all()
+
+
 def test_unstated_sigmas_are_found(sim_6dof, sim_6dof_actual):
     """Positions 20 times worse than the placeholder and rotations 20 times better, none stated."""
     rng = np.random.default_rng(0)
