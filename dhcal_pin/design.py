@@ -127,32 +127,47 @@ class Worst:
         return Spread(self.seen.T @ directions * (size / size[0]) ** 6).gains(rows, root)
 
 
+def _free(_: int) -> bool:
+    return True
+
+
 @dataclass(frozen=True, eq=False)
 class Pool:
     """Candidates to choose from.
 
     Attributes:
         rows: (p, k, m) whitened, the unknowns in units of their priors.
+        places: (m, d) where they stand. What no model holds is alike for neighbours, so two of them tell less
+            than their rows say.
+        apart: the distance that two chosen ones keep.
         possible: tells of a candidate whether it can be measured at all; asked only of those that are wanted.
         closed: (m,) candidates known to be impossible; grows as they are asked about.
     """
 
     rows: Array
-    possible: Callable[[int], bool] = lambda _: True
+    places: Array
+    apart: float = 0.0
+    possible: Callable[[int], bool] = _free
     closed: Array = field(default_factory=lambda: np.zeros(0, bool))
 
     @classmethod
-    def of(cls, rows: Array, possible: Callable[[int], bool]) -> Pool:
+    def of(cls, rows: Array, places: Array, apart: float = 0.0, possible: Callable[[int], bool] = _free) -> Pool:
         """Candidates none of which is known to be impossible."""
-        return cls(rows, possible, np.zeros(rows.shape[2], bool))
+        return cls(rows, places, apart, possible, np.zeros(rows.shape[2], bool))
 
     def at(self, chosen: Array) -> Array:
         """The chosen ones' rows (n, k, p)."""
         return np.ascontiguousarray(self.rows[:, :, chosen].transpose(2, 1, 0))
 
-    def best(self, gains: Array, among: Array) -> int | None:
-        """The possible one of the largest gain (w,), `among` (w,) being their numbers; None if none is left."""
-        gains = np.where(self.closed[among], -np.inf, gains)
+    def best(self, gains: Array, among: Array, others: Array) -> int | None:
+        """The possible one of the largest gain (w,), or None.
+
+        Args:
+            gains: (w,), -inf for what is out of the question.
+            among: (w,) their numbers.
+            others: (n, d) places to keep away from.
+        """
+        gains = np.where(self.closed[among] | self._crowded(among, others), -np.inf, gains)
         while gains.size:
             at = int(np.argmax(gains))
             if gains[at] == -np.inf:
@@ -163,22 +178,39 @@ class Pool:
             gains[at] = -np.inf
         return None
 
+    def _crowded(self, among: Array, others: Array) -> Array:
+        """Which of the candidates (w,) stand too near to other places (n, d)."""
+        if not self.apart:
+            return np.zeros(len(among), bool)
+        here = self.places[among]
+        squares = np.sum(here**2, 1)[:, None] + np.sum(others**2, 1) - 2 * here @ others.T
+        return np.any(squares < self.apart**2, 1)
 
-def greedy(pool: Pool, start: Array, count: int, criterion: Criterion, chosen: Array) -> Array:
-    """Numbers of the chosen ones (c,) and of `count` more, each the best to add; fewer if no more are possible."""
+
+def greedy(pool: Pool, start: Array, count: int, criterion: Criterion, chosen: Array, kept: Array) -> Array:
+    """Numbers of the chosen ones (c,) and of `count` more, each the best to add; fewer if no more are possible.
+
+    Args:
+        pool: candidates.
+        start: (p, p) triangle of what is known.
+        count: how many to add.
+        criterion: what for.
+        chosen: (c,) numbers.
+        kept: (n, d) further places to keep away from.
+    """
     every = np.arange(pool.rows.shape[2])
     out = list(map(int, chosen))
     for _ in range(count):
         gains = criterion.gains(pool.rows, basis(start, pool.at(np.array(out, int))))
         gains[out] = -np.inf
-        found = pool.best(gains, every)
+        found = pool.best(gains, every, np.concatenate([kept, pool.places[out]]))
         if found is None:
             break
         out.append(found)
     return np.array(out, int)
 
 
-def exchange(pool: Pool, start: Array, chosen: Array, criterion: Criterion) -> Array:
+def exchange(pool: Pool, start: Array, chosen: Array, criterion: Criterion, kept: Array) -> Array:
     """The chosen ones (n,) after exchanging each for the best in its place, until a pass gains next to nothing."""
     chosen = chosen.copy()
     value = criterion.value(basis(start, pool.at(chosen)))
@@ -192,7 +224,7 @@ def exchange(pool: Pool, start: Array, chosen: Array, criterion: Criterion) -> A
             others = np.delete(chosen, slot)
             gains = criterion.gains(rows, basis(start, pool.at(others)))
             gains[np.isin(near, others)] = -np.inf
-            found = pool.best(gains, near)
+            found = pool.best(gains, near, np.concatenate([kept, pool.places[others]]))
             if found is None or found == chosen[slot]:
                 continue
             trial = chosen.copy()

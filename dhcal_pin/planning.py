@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -26,6 +26,11 @@ TASK = 300
 DRAWS, SIZES = 25, 8
 # Refinement: rounds, each with so many neighbours a pose, nearer from round to round.
 ROUNDS, NEIGHBOURS, REACH, NEARER = 12, 24, 0.15, 0.75
+# Half a metre of a slide is as much of the arm's motion as half a turn.
+SLIDE = 2 * np.pi
+# Poses nearer than this are one to a real robot, whose errors no model holds in full: they repeat there. Where
+# poses at random would stand less than twice as far apart, half of their distance.
+APART = np.deg2rad(20.0)
 # More poses stop paying where ten more lower what a check would show by less than a hundredth.
 MORE, WORTH = 10, 0.01
 # Draws for each candidate before the constraints are called too narrow.
@@ -161,7 +166,8 @@ def plan(
         criterion: "D" volume of the unknowns' uncertainty, "A" mean variance, "E" worst variance, each in units
             of the priors; "task" predicted position error over the task.
         data: readings already taken, to be added to.
-        task: (m, n) joint values where the tool is to be right; anywhere without it.
+        task: (m, n) joint values where the tool is to be right; anywhere without it, or where
+            the given candidates are.
         candidates: how many to draw, or joint values (m, n) to choose from.
         space: where the tool may be.
         margin: distance to the joints' limits: `rotation` in rad, `position` in m.
@@ -184,7 +190,8 @@ def plan(
         clearance = Clearance.of(chain)
     else:
         q, clearance = chain.checked(candidates), None
-    task_q = _draw(chain, TASK, Space(), low, high, rng) if task is None else chain.checked(task)
+    if task is None:
+        task = _draw(chain, TASK, Space(), low, high, rng) if drawn else q
     information = Information.before(chain, q, kind, noise, parameters, priors, fix, free, data, known)
 
     def possible(values: Array) -> Callable[[int], bool]:
@@ -192,17 +199,23 @@ def plan(
             return lambda _: True
         return lambda i: _possible(clearance, space, values[i])
 
-    pool = Pool.of(information.rows(q), possible(q))
-    combinations = information.task(task_q)
+    places = _places(chain, q)
+    kept = np.concatenate([places[:0], *(_places(chain, item.q) for item in data if item.ends == 1)])
+    pool = Pool.of(information.rows(q), places, _apart(places, count, rng), possible(q))
+    combinations = information.task(chain.checked(task))
     weighed = CRITERIA[criterion](information, pool, combinations)
-    chosen = greedy(pool, information.start, count, weighed, np.zeros(0, int))
+    chosen = greedy(pool, information.start, count, weighed, np.zeros(0, int), kept)
+    if len(chosen) < count:
+        # They do not stand so far apart.
+        pool = replace(pool, apart=0.0)
+        chosen = greedy(pool, information.start, count - len(chosen), weighed, chosen, kept)
     if len(chosen) < count:
         raise DhcalError(f"only {len(chosen)} of {len(q)} candidates are possible, {count} are asked for")
-    chosen = exchange(pool, information.start, chosen, weighed)
+    chosen = exchange(pool, information.start, chosen, weighed, kept)
     best = q[chosen]
     if drawn:
-        best = _refined(information, weighed, best, space, low, high, possible, rng)
-    sizes, errors = _curve(information, weighed, combinations, best, pool, None if drawn else chosen)
+        best = _refined(information, weighed, best, pool, kept, space, low, high, possible, rng)
+    sizes, errors = _curve(information, weighed, combinations, best, pool, kept, None if drawn else chosen)
     random_sizes, random_errors = _random(information, combinations, pool, sizes[sizes <= count], rng)
     order = tour(best)
     return Plan(
@@ -250,6 +263,21 @@ def _draw(
     )
 
 
+def _places(chain: Chain, q: Array) -> Array:
+    """Joint values (m, n) in which a step of any joint counts alike."""
+    slides = np.array([chain.urdf.joint(name).type == "prismatic" for name in chain.joint_names])
+    return q * np.where(slides, SLIDE, 1.0)
+
+
+def _apart(places: Array, count: int, rng: np.random.Generator) -> float:
+    """How far apart `count` of the places (m, n) are to stand."""
+    some = places[rng.permutation(len(places))[:count]]
+    if len(some) < 2:
+        return 0.0
+    between = np.linalg.norm(some[:, None] - some[None], axis=2) + np.diag(np.full(len(some), np.inf))
+    return min(APART, float(np.median(between.min(1))) / 2)
+
+
 def _possible(clearance: Clearance, space: Space, q: Array) -> bool:
     """Whether the robot can stand there, and the instrument sees the tool if it must."""
     if not clearance.free(q):
@@ -266,6 +294,8 @@ def _refined(
     information: Information,
     criterion: Criterion,
     q: Array,
+    candidates: Pool,
+    kept: Array,
     space: Space,
     low: Array,
     high: Array,
@@ -280,14 +310,16 @@ def _refined(
         step = REACH * NEARER**turn * (high - low)
         near = np.clip(q[:, None] + step * rng.standard_normal((len(q), NEIGHBOURS, q.shape[1])), low, high)
         flat = near.reshape(-1, q.shape[1])
-        pool = Pool.of(information.rows(flat), possible(flat))
+        places = _places(information.chain, flat)
+        pool = Pool.of(information.rows(flat), places, candidates.apart, possible(flat))
         pool.closed[:] = ~space.holds(information.chain.poses(flat))
         for slot in range(len(q)):
             block = np.arange(slot * NEIGHBOURS, (slot + 1) * NEIGHBOURS)
             rest = basis(information.start, np.delete(rows, slot, 0))
             here = np.concatenate([pool.rows[:, :, block], rows[slot].T[:, :, None]], 2)
             *gains, own = criterion.gains(here, rest)
-            found = pool.best(np.where(np.array(gains) > own, gains, -np.inf), block)
+            others = np.concatenate([kept, _places(information.chain, np.delete(q, slot, 0))])
+            found = pool.best(np.where(np.array(gains) > own, gains, -np.inf), block, others)
             if found is None:
                 continue
             trial = rows.copy()
@@ -304,12 +336,13 @@ def _curve(
     task: Array,
     q: Array,
     pool: Pool,
+    kept: Array,
     taken: Array | None,
 ) -> tuple[Array, Array]:
     """Numbers of poses and predicted errors in m: the plan's own, best first, then with candidates added."""
-    own, count = information.rows(q), len(q)
-    start = information.start
-    best_first = greedy(Pool.of(own, lambda _: True), start, count, criterion, np.zeros(0, int))
+    own, count, start = information.rows(q), len(q), information.start
+    places = _places(information.chain, q)
+    best_first = greedy(Pool.of(own, places), start, count, criterion, np.zeros(0, int), kept)
     gains = criterion.gains(pool.rows, basis(start, np.ascontiguousarray(own.transpose(2, 1, 0))))
     gains[pool.closed] = -np.inf
     if taken is not None:
@@ -317,9 +350,11 @@ def _curve(
     left = np.argsort(-gains)[: min(PROMISING, int(np.isfinite(gains).sum()))]
     both = Pool.of(
         np.concatenate([own, pool.rows[:, :, left]], 2),
+        np.concatenate([places, pool.places[left]]),
+        pool.apart,
         lambda i: i < count or pool.possible(int(left[i - count])),
     )
-    order = greedy(both, start, max(count, MORE), criterion, best_first)
+    order = greedy(both, start, max(count, MORE), criterion, best_first, kept)
     rows = both.at(order)
     least = -(-(len(_seen(information, pool)) - information.rank) // own.shape[1])
     sizes = np.arange(max(1, least), len(order) + 1)
