@@ -28,9 +28,9 @@ DRAWS, SIZES = 25, 8
 ROUNDS, NEIGHBOURS, REACH, NEARER = 12, 24, 0.15, 0.75
 # Half a metre of a slide is as much of the arm's motion as half a turn.
 SLIDE = 2 * np.pi
-# Poses nearer than this are one to a real robot, whose errors no model holds in full: they repeat there. Where
-# poses at random would stand less than twice as far apart, half of their distance.
-APART = np.deg2rad(20.0)
+# Poses nearer than this are as one to a real robot, whose errors no model holds in full: they repeat there.
+# Where poses at random would stand nearer than that, their distance.
+APART = np.deg2rad(30.0)
 # More poses stop paying where ten more lower what a check would show by less than a hundredth.
 MORE, WORTH = 10, 0.01
 # Draws for each candidate before the constraints are called too narrow.
@@ -275,7 +275,7 @@ def _apart(places: Array, count: int, rng: np.random.Generator) -> float:
     if len(some) < 2:
         return 0.0
     between = np.linalg.norm(some[:, None] - some[None], axis=2) + np.diag(np.full(len(some), np.inf))
-    return min(APART, float(np.median(between.min(1))) / 2)
+    return min(APART, float(np.median(between.min(1))))
 
 
 def _possible(clearance: Clearance, space: Space, q: Array) -> bool:
