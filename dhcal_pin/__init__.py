@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .calibration import split as split
     from .chain import Chain as Chain
     from .check import crosscheck as crosscheck
+    from .configurations import Space as Space
     from .dh import DHTable as DHTable
     from .dh_files import read_dh as read_dh
     from .dh_urdf import dh_to_urdf as dh_to_urdf
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from .measurement_files import read_measurements as read_measurements
     from .measurements import Noise as Noise
     from .parameters import extract as extract
+    from .planning import Plan as Plan
+    from .planning import plan as plan
     from .poses import Pose as Pose
     from .positions import Position as Position
     from .result import Prediction as Prediction
@@ -39,6 +42,7 @@ _HOMES = {
     "split": "calibration",
     "Chain": "chain",
     "crosscheck": "check",
+    "Space": "configurations",
     "DHTable": "dh",
     "read_dh": "dh_files",
     "dh_to_urdf": "dh_urdf",
@@ -46,6 +50,8 @@ _HOMES = {
     "error_factors": "factors",
     "read_measurements": "measurement_files",
     "Noise": "measurements",
+    "Plan": "planning",
+    "plan": "planning",
     "Pose": "poses",
     "Position": "positions",
     "extract": "parameters",

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import coal
 import numpy as np
@@ -31,7 +32,7 @@ class Clearance:
     """
 
     chain: Chain
-    geometry: pin.GeometryModel | None
+    geometry: Any
     note: str = ""
 
     @classmethod
@@ -48,11 +49,12 @@ class Clearance:
         if package_dirs is None:
             package_dirs = list(Path(chain.urdf.source).absolute().parents)
         text = chain.urdf.data.decode("utf-8-sig")
+        folders = [os.fspath(path) for path in package_dirs]
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 geometry = pin.buildGeomFromUrdfString(
-                    chain.model, text, pin.GeometryType.COLLISION, package_dirs=[*map(os.fspath, package_dirs)]
+                    chain.model, text, pin.GeometryType.COLLISION, package_dirs=folders
                 )
         except (ValueError, RuntimeError) as error:
             reason = " ".join(str(error).split())

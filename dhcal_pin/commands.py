@@ -13,9 +13,10 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from . import calibration, demo, exports, report, terminal, ur_kinematics, viewer
+from . import calibration, demo, exports, plan_command, report, terminal, ur_kinematics, viewer
 from .chain import Chain
 from .check import crosscheck
+from .configurations import joint_range
 from .dh_files import dh_text, is_dh
 from .dh_urdf import dh_to_urdf
 from .errors import DhcalError
@@ -39,7 +40,6 @@ from .robot_files import (
     urdf_files,
 )
 from .screening import Finding, screen
-from .se3 import Array
 
 # --- calibrate -------------------------------------------------------------------------------------
 
@@ -261,23 +261,12 @@ def _simulate(args: Namespace) -> int:
                 f"they must be those of {args.robot}: {', '.join(chain.joint_names)}"
             )
     rng = np.random.default_rng(args.seed)
-    data = KINDS[args.kind].simulate(truth, _configurations(chain, args.samples, rng), noise, rng)
+    q = rng.uniform(*joint_range(chain), (args.samples, chain.size))
+    data = KINDS[args.kind].simulate(truth, q, noise, rng)
     comments = [f"simulated {args.kind} of {args.truth or args.robot}, noise {args.noise}, seed {args.seed}"]
     save({args.output: measurement_text(data, chain, comments)})
     terminal.lines(f"wrote {args.output}")
     return 0
-
-
-def _configurations(chain: Chain, count: int, rng: np.random.Generator) -> Array:
-    """Uniform joint values (count, n) within the limits, and within a turn or half a metre each way."""
-    low, high = chain.lower, chain.upper
-    slides = [chain.urdf.joint(name).type == "prismatic" for name in chain.joint_names]
-    span = np.where(slides, 0.5, np.pi)
-    low, high = (
-        np.where(high > -span, np.maximum(low, -span), np.maximum(low, high - 2 * span)),
-        np.where(low < span, np.minimum(high, span), np.minimum(high, low + 2 * span)),
-    )
-    return rng.uniform(low, high, (count, chain.size))
 
 
 def _view(args: Namespace) -> int:
@@ -313,5 +302,6 @@ COMMANDS: dict[str, Callable[[Namespace], int]] = {
     "convert": _convert,
     "view": _view,
     "check": _check,
+    "plan": plan_command.run,
     "simulate": _simulate,
 }

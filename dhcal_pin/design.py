@@ -1,8 +1,8 @@
 """Optimal design of experiments: which of many candidates' readings tell most about p unknowns.
 
-A candidate is k whitened rows of a Jacobian by the unknowns, each in units of its prior's sigma; a pool of m of
-them is (p, k, m), components first. What is known beforehand, priors included, is a triangle R, and C = R⁻¹R⁻ᵀ
-the covariance. A criterion weighs C: smaller is better, and a hundredth less is one per cent better.
+A candidate is k whitened rows of a Jacobian by the unknowns, each in units of its prior's sigma; a pool of m
+of them is (p, k, m), components first. What is known beforehand, priors included, is a triangle R, and
+C = R⁻¹R⁻ᵀ the covariance. A criterion weighs C: smaller is better, a hundredth less is one per cent better.
 
 Greedy choice, then exchange (Fedorov 1972; Cook and Nachtsheim 1980), with each candidate's k×k determinant
 in place of a p×p one. C never appears, only its root: squaring would lose half the digits.
@@ -151,7 +151,9 @@ class Pool:
     closed: Array = field(default_factory=lambda: np.zeros(0, bool))
 
     @classmethod
-    def of(cls, rows: Array, places: Array, apart: float = 0.0, possible: Callable[[int], bool] = _free) -> Pool:
+    def of(
+        cls, rows: Array, places: Array, apart: float = 0.0, possible: Callable[[int], bool] = _free
+    ) -> Pool:
         """Candidates none of which is known to be impossible."""
         return cls(rows, places, apart, possible, np.zeros(rows.shape[2], bool))
 
@@ -188,7 +190,7 @@ class Pool:
 
 
 def greedy(pool: Pool, start: Array, count: int, criterion: Criterion, chosen: Array, kept: Array) -> Array:
-    """Numbers of the chosen ones (c,) and of `count` more, each the best to add; fewer if no more are possible.
+    """Numbers of the chosen ones and of `count` more, each the best to add; fewer if no more are possible.
 
     Args:
         pool: candidates.
@@ -211,7 +213,15 @@ def greedy(pool: Pool, start: Array, count: int, criterion: Criterion, chosen: A
 
 
 def exchange(pool: Pool, start: Array, chosen: Array, criterion: Criterion, kept: Array) -> Array:
-    """The chosen ones (n,) after exchanging each for the best in its place, until a pass gains next to nothing."""
+    """The chosen ones (n,) after exchanging each for the best in its place, until that gains next to nothing.
+
+    Args:
+        pool: candidates.
+        start: (p, p) triangle of what is known.
+        chosen: (n,) numbers.
+        criterion: what for.
+        kept: (c, d) further places to keep away from.
+    """
     chosen = chosen.copy()
     value = criterion.value(basis(start, pool.at(chosen)))
     for _ in range(MOST_PASSES):

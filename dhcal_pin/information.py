@@ -1,4 +1,4 @@
-"""What measuring would tell: the information of readings not yet taken, and the errors that remain after them."""
+"""What measuring would tell: the information of readings not yet taken, and the errors that remain."""
 
 from __future__ import annotations
 
@@ -72,12 +72,12 @@ class Information:
         return out * self.scale[:, None, None]
 
     def task(self, q: Array) -> Array:
-        """Combinations (p+s', w) whose variances add up to the mean squared position error at q (m, n), m²."""
+        """Combinations (p+s', w) whose variances add up to the mean squared position error at q, m²."""
         chain, bodies, twists = self._derivative
         velocities = chain.tool_velocities(chain.sweep(q), bodies, twists)[:, :3]
         out = np.zeros((len(self.scale), 3 * len(q)))
         out[: len(velocities)] = velocities.reshape(len(velocities), -1)
-        return np.linalg.qr((out * self.scale[:, None]).T / np.sqrt(len(q)), mode="r").T
+        return np.asarray(np.linalg.qr((out * self.scale[:, None]).T / np.sqrt(len(q)), mode="r")).T
 
     def error(self, rows: Array, task: Array) -> float:
         """Predicted RMS position error in m over a `task`, after readings of rows (n, k, p+s')."""
@@ -104,8 +104,12 @@ class Information:
             q: (m, n) joint values of the kind that will be measured.
             kind: of `KINDS`.
             noise: its sigmas; None for those that the data show.
-            parameters, priors, fix, free, known: as in `calibrate`.
+            parameters: what is unknown, as in `calibrate`.
+            priors: as in `calibrate`.
+            fix: as in `calibrate`.
+            free: as in `calibrate`.
             data: readings already taken.
+            known: values of instruments' unknowns, as in `calibrate`.
 
         Raises:
             DhcalError: the kind's readings hang together, a sigma or a prior is missing.
@@ -147,16 +151,14 @@ class Information:
             own=np.array([values.get(unknown.name, unknown.nominal) for unknown in template.unknowns]),
             places=np.array(places, int),
             scale=sigma,
-            start=np.linalg.qr(start, mode="r"),
+            start=np.asarray(np.linalg.qr(start, mode="r")),
             rank=observability.rank(triangle),
         )
 
 
 def _plannable(kind: str) -> type[Measurement]:
-    """The kind, if each of its readings stands alone: one configuration, and no name that ties rows together."""
-    alone = [
-        name for name, kept in KINDS.items() if kept.ends == 1 and "text" not in kept.columns.values()
-    ]
+    """The kind, if its readings stand alone: one configuration each, and no name that ties rows together."""
+    alone = [name for name, kept in KINDS.items() if kept.ends == 1 and "text" not in kept.columns.values()]
     if kind not in alone:
         raise DhcalError(f"kind {kind!r}: no plan for it; choose from {', '.join(alone)}")
     return KINDS[kind]

@@ -8,10 +8,10 @@ from functools import cached_property
 
 import numpy as np
 
-from . import observability, se3
+from . import observability
 from .calibration import Priors
 from .chain import Chain
-from .clearance import Clearance
+from .configurations import Room, Space, evened, tour
 from .design import PROMISING, Criterion, Determinant, Pool, Spread, Worst, basis, exchange, greedy
 from .errors import DhcalError
 from .information import Information
@@ -26,60 +26,11 @@ TASK = 300
 DRAWS, SIZES = 25, 8
 # Refinement: rounds, each with so many neighbours a pose, nearer from round to round.
 ROUNDS, NEIGHBOURS, REACH, NEARER = 12, 24, 0.15, 0.75
-# Half a metre of a slide is as much of the arm's motion as half a turn.
-SLIDE = 2 * np.pi
 # Poses nearer than this are as one to a real robot, whose errors no model holds in full: they repeat there.
 # Where poses at random would stand nearer than that, their distance.
 APART = np.deg2rad(30.0)
 # More poses stop paying where ten more lower what a check would show by less than a hundredth.
 MORE, WORTH = 10, 0.01
-# Draws for each candidate before the constraints are called too narrow.
-PATIENCE = 200
-
-
-@dataclass(frozen=True, eq=False)
-class Space:
-    """Where the tool may be; places in the measuring frame, which is the base link's own if nobody said more.
-
-    Attributes:
-        box: (2, 3) least and most x, y, z of the tool point, m; None for anywhere.
-        eye: (3,) the instrument, m, which must see the tool point past the robot; None for anywhere.
-        cone: half angle about the tool's z axis in which the instrument must stand, rad; π for any.
-    """
-
-    box: Array | None = None
-    eye: Array | None = None
-    cone: float = np.pi
-
-    def holds(self, poses: Array) -> Array:
-        """Which tool poses (m, 4, 4) are inside the box and look at the instrument, (m,)."""
-        point = poses[:, :3, 3]
-        good = np.ones(len(poses), bool)
-        if self.box is not None:
-            good &= np.all((point >= self.box[0]) & (point <= self.box[1]), 1)
-        if self.eye is not None:
-            away = self.eye - point
-            towards = np.einsum("mi,mi->m", poses[:, :3, 2], away)
-            good &= towards >= np.cos(self.cone) * np.linalg.norm(away, axis=1)
-        return good
-
-
-def joint_range(chain: Chain, angle: float = 0.0, length: float = 0.0) -> tuple[Array, Array]:
-    """Lowest and highest values (n,) inside the limits, and inside a turn or half a metre each way.
-
-    Args:
-        chain: the robot.
-        angle, length: margins to the limits, rad and m.
-    """
-    slides = np.array([chain.urdf.joint(name).type == "prismatic" for name in chain.joint_names])
-    span, margin = np.where(slides, 0.5, np.pi), np.where(slides, length, angle)
-    # A margin that leaves a joint nothing is cut to a quarter of its way.
-    margin = np.minimum(margin, (chain.upper - chain.lower) / 4)
-    low, high = chain.lower + margin, chain.upper - margin
-    return (
-        np.where(high > -span, np.maximum(low, -span), np.maximum(low, high - 2 * span)),
-        np.where(low < span, np.minimum(high, span), np.minimum(high, low + 2 * span)),
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,9 +75,14 @@ class Plan:
         return self.expected(self.q)
 
     @property
+    def random(self) -> float:
+        """Predicted error of as many poses at random, the median of several draws, m."""
+        return float(self.random_errors[-1])
+
+    @property
     def ratio(self) -> float:
         """Predicted error over that of as many poses at random."""
-        return self.error / float(self.random_errors[-1])
+        return self.error / self.random
 
     def expected(self, q: Array) -> float:
         """Predicted RMS position error in m over the plan's task, after measuring at any q (m, dof)."""
@@ -162,10 +118,14 @@ def plan(
         count: how many.
         kind: of measurement; readings of one configuration each that hang together by nothing.
         noise: sigmas of instrument and robot together, m and rad; without it, those that the data show.
-        parameters, priors, fix, free, known: what is unknown, as in `calibrate`.
-        criterion: "D" volume of the unknowns' uncertainty, "A" mean variance, "E" worst variance, each in units
-            of the priors; "task" predicted position error over the task.
+        parameters: what is unknown, as in `calibrate`.
+        priors: as in `calibrate`.
+        fix: as in `calibrate`.
+        free: as in `calibrate`.
+        criterion: "D" volume of the unknowns' uncertainty, "A" mean variance, "E" worst variance, each in
+            units of the priors; "task" predicted position error over the task.
         data: readings already taken, to be added to.
+        known: values of instruments' unknowns, as in `calibrate`.
         task: (m, n) joint values where the tool is to be right; anywhere without it, or where
             the given candidates are.
         candidates: how many to draw, or joint values (m, n) to choose from.
@@ -181,28 +141,21 @@ def plan(
     if count < 1:
         raise DhcalError(f"{count} poses: plan at least one")
     rng = np.random.default_rng(seed)
-    space = space or Space()
     margin = margin or Noise(MARGIN_LENGTH, MARGIN_ANGLE)
-    low, high = joint_range(chain, margin.rotation, margin.position)
-    drawn = isinstance(candidates, int)
+    room = None
     if isinstance(candidates, int):
-        q = _draw(chain, candidates, space, low, high, rng)
-        clearance = Clearance.of(chain)
+        room = Room.of(chain, space or Space(), margin.rotation, margin.position)
+        q = room.draw(candidates, rng)
+        where = replace(room, space=Space()).draw(TASK, rng) if task is None else chain.checked(task)
     else:
-        q, clearance = chain.checked(candidates), None
-    if task is None:
-        task = _draw(chain, TASK, Space(), low, high, rng) if drawn else q
+        q = chain.checked(candidates)
+        where = q if task is None else chain.checked(task)
     information = Information.before(chain, q, kind, noise, parameters, priors, fix, free, data, known)
-
-    def possible(values: Array) -> Callable[[int], bool]:
-        if clearance is None:
-            return lambda _: True
-        return lambda i: _possible(clearance, space, values[i])
-
-    places = _places(chain, q)
-    kept = np.concatenate([places[:0], *(_places(chain, item.q) for item in data if item.ends == 1)])
-    pool = Pool.of(information.rows(q), places, _apart(places, count, rng), possible(q))
-    combinations = information.task(chain.checked(task))
+    combinations = information.task(where)
+    stands = evened(chain, q)
+    kept = np.concatenate([stands[:0], *(evened(chain, item.q) for item in data if item.ends == 1)])
+    possible = _anything if room is None else lambda i: room.allows(q[i])
+    pool = Pool.of(information.rows(q), stands, _apart(stands, count, rng), possible)
     weighed = CRITERIA[criterion](information, pool, combinations)
     chosen = greedy(pool, information.start, count, weighed, np.zeros(0, int), kept)
     if len(chosen) < count:
@@ -213,14 +166,14 @@ def plan(
         raise DhcalError(f"only {len(chosen)} of {len(q)} candidates are possible, {count} are asked for")
     chosen = exchange(pool, information.start, chosen, weighed, kept)
     best = q[chosen]
-    if drawn:
-        best = _refined(information, weighed, best, pool, kept, space, low, high, possible, rng)
-    sizes, errors = _curve(information, weighed, combinations, best, pool, kept, None if drawn else chosen)
+    if room is not None:
+        best = _refined(information, weighed, best, room, pool.apart, kept, rng)
+    sizes, errors = _curve(information, weighed, combinations, best, pool, kept, chosen)
     random_sizes, random_errors = _random(information, combinations, pool, sizes[sizes <= count], rng)
-    order = tour(best)
+    order = tour(evened(chain, best))
     return Plan(
         q=best[order],
-        index=None if drawn else chosen[order],
+        index=None if room else chosen[order],
         criterion=criterion,
         information=information,
         task=combinations,
@@ -229,7 +182,7 @@ def plan(
         random_sizes=random_sizes,
         random_errors=random_errors,
         enough=_enough(sizes, errors, information.noise.position),
-        notes=tuple(filter(None, (clearance.note if clearance else "",))),
+        notes=(room.clearance.note,) if room and room.clearance.note else (),
     )
 
 
@@ -244,29 +197,12 @@ CRITERIA: dict[str, Callable[[Information, Pool, Array], Criterion]] = {
 def _seen(information: Information, pool: Pool) -> Array:
     """Orthonormal directions (r, p) that any of the candidates sees, of a sample of them."""
     rows = pool.at(np.arange(0, pool.rows.shape[2], max(1, pool.rows.shape[2] // TASK)))
-    return observability.row_space(np.linalg.qr(rows.reshape(-1, len(information.scale)), mode="r"))
+    triangle = np.linalg.qr(rows.reshape(-1, len(information.scale)), mode="r")
+    return observability.row_space(np.asarray(triangle))
 
 
-def _draw(
-    chain: Chain, count: int, space: Space, low: Array, high: Array, rng: np.random.Generator
-) -> Array:
-    """Uniform joint values (count, n) whose tool the space holds."""
-    out = np.empty((0, chain.size))
-    for _ in range(PATIENCE):
-        q = rng.uniform(low, high, (count, chain.size))
-        out = np.concatenate([out, q[space.holds(chain.poses(q))]])
-        if len(out) >= count:
-            return out[:count]
-    raise DhcalError(
-        f"the tool is in the space asked for in {len(out)} of {PATIENCE * count} configurations; "
-        "widen the box or the cone, or ask for fewer candidates"
-    )
-
-
-def _places(chain: Chain, q: Array) -> Array:
-    """Joint values (m, n) in which a step of any joint counts alike."""
-    slides = np.array([chain.urdf.joint(name).type == "prismatic" for name in chain.joint_names])
-    return q * np.where(slides, SLIDE, 1.0)
+def _anything(_: int) -> bool:
+    return True
 
 
 def _apart(places: Array, count: int, rng: np.random.Generator) -> float:
@@ -278,28 +214,13 @@ def _apart(places: Array, count: int, rng: np.random.Generator) -> float:
     return min(APART, float(np.median(between.min(1))))
 
 
-def _possible(clearance: Clearance, space: Space, q: Array) -> bool:
-    """Whether the robot can stand there, and the instrument sees the tool if it must."""
-    if not clearance.free(q):
-        return False
-    if space.eye is None:
-        return True
-    into = se3.inverse(clearance.chain.base)
-    point = clearance.chain.poses(q)[0, :3, 3]
-    eye, point = (into[:3, :3] @ at + into[:3, 3] for at in (space.eye, point))
-    return clearance.sees(q, eye, point)
-
-
 def _refined(
     information: Information,
     criterion: Criterion,
     q: Array,
-    candidates: Pool,
+    room: Room,
+    apart: float,
     kept: Array,
-    space: Space,
-    low: Array,
-    high: Array,
-    possible: Callable[[Array], Callable[[int], bool]],
     rng: np.random.Generator,
 ) -> Array:
     """The configurations (n, dof) moved to better ones about them, by smaller and smaller steps."""
@@ -307,26 +228,25 @@ def _refined(
     rows = np.ascontiguousarray(information.rows(q).transpose(2, 1, 0))
     value = criterion.value(basis(information.start, rows))
     for turn in range(ROUNDS):
-        step = REACH * NEARER**turn * (high - low)
-        near = np.clip(q[:, None] + step * rng.standard_normal((len(q), NEIGHBOURS, q.shape[1])), low, high)
-        flat = near.reshape(-1, q.shape[1])
-        places = _places(information.chain, flat)
-        pool = Pool.of(information.rows(flat), places, candidates.apart, possible(flat))
-        pool.closed[:] = ~space.holds(information.chain.poses(flat))
+        near = room.near(q, REACH * NEARER**turn, NEIGHBOURS, rng)
+        possible = lambda i, near=near: room.allows(near[i])  # noqa: E731
+        pool = Pool.of(information.rows(near), evened(room.chain, near), apart, possible)
+        pool.closed[:] = ~room.space.holds(room.chain.poses(near))
         for slot in range(len(q)):
             block = np.arange(slot * NEIGHBOURS, (slot + 1) * NEIGHBOURS)
             rest = basis(information.start, np.delete(rows, slot, 0))
             here = np.concatenate([pool.rows[:, :, block], rows[slot].T[:, :, None]], 2)
-            *gains, own = criterion.gains(here, rest)
-            others = np.concatenate([kept, _places(information.chain, np.delete(q, slot, 0))])
-            found = pool.best(np.where(np.array(gains) > own, gains, -np.inf), block, others)
+            gains = criterion.gains(here, rest)
+            better = np.where(gains[:-1] > gains[-1], gains[:-1], -np.inf)
+            others = np.concatenate([kept, evened(room.chain, np.delete(q, slot, 0))])
+            found = pool.best(better, block, others)
             if found is None:
                 continue
             trial = rows.copy()
             trial[slot] = pool.rows[:, :, found].T
             reached = criterion.value(basis(information.start, trial))
             if reached < value:
-                rows, value, q[slot] = trial, reached, flat[found]
+                rows, value, q[slot] = trial, reached, near[found]
     return q
 
 
@@ -337,20 +257,19 @@ def _curve(
     q: Array,
     pool: Pool,
     kept: Array,
-    taken: Array | None,
+    taken: Array,
 ) -> tuple[Array, Array]:
     """Numbers of poses and predicted errors in m: the plan's own, best first, then with candidates added."""
     own, count, start = information.rows(q), len(q), information.start
-    places = _places(information.chain, q)
-    best_first = greedy(Pool.of(own, places), start, count, criterion, np.zeros(0, int), kept)
+    stands = evened(information.chain, q)
+    best_first = greedy(Pool.of(own, stands), start, count, criterion, np.zeros(0, int), kept)
     gains = criterion.gains(pool.rows, basis(start, np.ascontiguousarray(own.transpose(2, 1, 0))))
     gains[pool.closed] = -np.inf
-    if taken is not None:
-        gains[taken] = -np.inf
+    gains[taken] = -np.inf
     left = np.argsort(-gains)[: min(PROMISING, int(np.isfinite(gains).sum()))]
     both = Pool.of(
         np.concatenate([own, pool.rows[:, :, left]], 2),
-        np.concatenate([places, pool.places[left]]),
+        np.concatenate([stands, pool.places[left]]),
         pool.apart,
         lambda i: i < count or pool.possible(int(left[i - count])),
     )
@@ -382,30 +301,7 @@ def _random(
 
 
 def _enough(sizes: Array, errors: Array, sigma: float) -> int | None:
-    """The number of poses from which on MORE lower what a check shows, noise of the check included, by < WORTH."""
+    """The number of poses from which on MORE lower what a check shows, its own noise included, by < WORTH."""
     shown = np.sqrt(errors**2 + 3 * sigma**2)
     little = np.flatnonzero(shown[MORE:] > (1 - WORTH) * shown[:-MORE])
     return int(sizes[little[0]]) if little.size else None
-
-
-def tour(q: Array) -> Array:
-    """An order (n,) of configurations (n, dof) with little motion from one to the next: 2-opt of nearest ones."""
-    count = len(q)
-    way = np.zeros((count + 1, count + 1))
-    # The last one is nowhere, as near to all: a closed tour through it is an open one.
-    way[:count, :count] = np.linalg.norm(q[:, None] - q[None], axis=2)
-    order, left = [count], set(range(count))
-    at = int(np.argmin(np.linalg.norm(q - q.mean(0), axis=1)))
-    while left:
-        left.remove(at)
-        order.append(at)
-        at = min(left, key=lambda other: way[order[-1], other], default=0)
-    path = np.array(order)
-    while True:
-        first, after = way[path[:, None], path], np.roll(path, -1)
-        steps = way[path, after]
-        gain = steps[:, None] + steps[None] - first - way[after[:, None], after]
-        i, j = np.unravel_index(np.argmax(np.triu(gain, 1)), gain.shape)
-        if gain[i, j] <= 1e-9 or i >= j:
-            return np.roll(path, -int(np.flatnonzero(path == count)[0]))[1:]
-        path[i + 1 : j + 1] = path[i + 1 : j + 1][::-1].copy()
