@@ -37,7 +37,7 @@ class Information:
         places: (s,) where those stand among all unknowns; -1 for one that is known.
         scale: (p+s',) sigmas of the priors, m and rad.
         start: (p+s', p+s') triangle of priors and data so far.
-        rank: number of directions that data so far see.
+        taken: (p+s', p+s') or (0, p+s') triangle of the data alone.
     """
 
     errors: ErrorModel
@@ -48,7 +48,7 @@ class Information:
     places: Array
     scale: Array
     start: Array
-    rank: int
+    taken: Array
 
     @cached_property
     def _derivative(self) -> tuple[Chain, Array, Array]:
@@ -78,6 +78,11 @@ class Information:
         out = np.zeros((len(self.scale), 3 * len(q)))
         out[: len(velocities)] = velocities.reshape(len(velocities), -1)
         return np.asarray(np.linalg.qr((out * self.scale[:, None]).T / np.sqrt(len(q)), mode="r")).T
+
+    def seen(self, rows: Array) -> Array:
+        """Orthonormal directions (r, p+s') that data so far and further rows (n, k, p+s') see."""
+        every = np.concatenate([self.taken, rows.reshape(-1, len(self.scale))])
+        return observability.row_space(np.asarray(np.linalg.qr(every, mode="r")))
 
     def error(self, rows: Array, task: Array) -> float:
         """Predicted RMS position error in m over a `task`, after readings of rows (n, k, p+s')."""
@@ -140,9 +145,9 @@ class Information:
                 there[unknown.name] = len(sigma)
                 sigma = np.append(sigma, unknown.prior)
             places.append(there.get(unknown.name, -1))
-        start = np.zeros((len(triangle) + len(sigma), len(sigma)))
-        start[: len(triangle), : triangle.shape[1]] = triangle * sigma[: triangle.shape[1]]
-        start[len(triangle) :] = np.eye(len(sigma))
+        taken = np.zeros((len(triangle), len(sigma)))
+        taken[:, : triangle.shape[1]] = triangle * sigma[: triangle.shape[1]]
+        start = np.concatenate([taken, np.eye(len(sigma))])
         return cls(
             errors=errors,
             x=x,
@@ -152,7 +157,7 @@ class Information:
             places=np.array(places, int),
             scale=sigma,
             start=np.asarray(np.linalg.qr(start, mode="r")),
-            rank=observability.rank(triangle),
+            taken=taken,
         )
 
 

@@ -25,10 +25,12 @@ TASK = 300
 # Random choices that a plan is compared with, at so many numbers of poses.
 DRAWS, SIZES = 25, 8
 # Refinement: rounds, each with so many neighbours a pose, nearer from round to round.
-ROUNDS, NEIGHBOURS, REACH, NEARER = 12, 24, 0.15, 0.75
+ROUNDS, NEIGHBOURS, REACH, NEARER = 8, 24, 0.15, 0.65
 # Poses nearer than this are as one to a real robot, whose errors no model holds in full: they repeat there.
 # Where poses at random would stand nearer than that, their distance.
-APART = np.deg2rad(30.0)
+APART = np.deg2rad(20.0)
+# A share of the task that is unseen and no rounding.
+UNSEEN = 1e-6
 # More poses stop paying where ten more lower what a check would show by less than a hundredth.
 MORE, WORTH = 10, 0.01
 
@@ -142,21 +144,27 @@ def plan(
         raise DhcalError(f"{count} poses: plan at least one")
     rng = np.random.default_rng(seed)
     margin = margin or Noise(MARGIN_LENGTH, MARGIN_ANGLE)
-    room = None
+    room, notes = None, []
     if isinstance(candidates, int):
         room = Room.of(chain, space or Space(), margin.rotation, margin.position)
         q = room.draw(candidates, rng)
+        notes += [room.clearance.note] if room.clearance.note else []
         where = replace(room, space=Space()).draw(TASK, rng) if task is None else chain.checked(task)
     else:
         q = chain.checked(candidates)
         where = q if task is None else chain.checked(task)
     information = Information.before(chain, q, kind, noise, parameters, priors, fix, free, data, known)
-    combinations = information.task(where)
     stands = evened(chain, q)
     kept = np.concatenate([stands[:0], *(evened(chain, item.q) for item in data if item.ends == 1)])
     possible = _anything if room is None else lambda i: room.allows(q[i])
     pool = Pool.of(information.rows(q), stands, _apart(stands, count, rng), possible)
-    weighed = CRITERIA[criterion](information, pool, combinations)
+    seen = information.seen(pool.at(np.arange(0, len(q), max(1, len(q) // TASK))))
+    every = information.task(where)
+    # What the instrument cannot see, as where the base is beside wires of unknown anchors, no choice mends.
+    combinations = seen.T @ (seen @ every)
+    if np.linalg.norm(every - combinations) > UNSEEN * np.linalg.norm(combinations):
+        notes.append(f"where the base stands is not counted, as {kind} readings cannot tell")
+    weighed = CRITERIA[criterion](seen, combinations)
     chosen = greedy(pool, information.start, count, weighed, np.zeros(0, int), kept)
     if len(chosen) < count:
         # They do not stand so far apart.
@@ -168,7 +176,7 @@ def plan(
     best = q[chosen]
     if room is not None:
         best = _refined(information, weighed, best, room, pool.apart, kept, rng)
-    sizes, errors = _curve(information, weighed, combinations, best, pool, kept, chosen)
+    sizes, errors = _curve(information, weighed, combinations, best, pool, kept, chosen, seen)
     random_sizes, random_errors = _random(information, combinations, pool, sizes[sizes <= count], rng)
     order = tour(evened(chain, best))
     return Plan(
@@ -182,23 +190,16 @@ def plan(
         random_sizes=random_sizes,
         random_errors=random_errors,
         enough=_enough(sizes, errors, information.noise.position),
-        notes=(room.clearance.note,) if room and room.clearance.note else (),
+        notes=tuple(notes),
     )
 
 
-CRITERIA: dict[str, Callable[[Information, Pool, Array], Criterion]] = {
-    "D": lambda information, pool, task: Determinant(),
-    "A": lambda information, pool, task: Spread(np.eye(len(information.scale))),
-    "E": lambda information, pool, task: Worst(_seen(information, pool)),
-    "task": lambda information, pool, task: Spread(task),
+CRITERIA: dict[str, Callable[[Array, Array], Criterion]] = {
+    "D": lambda seen, task: Determinant(),
+    "A": lambda seen, task: Spread(seen.T),
+    "E": lambda seen, task: Worst(seen),
+    "task": lambda seen, task: Spread(task),
 }
-
-
-def _seen(information: Information, pool: Pool) -> Array:
-    """Orthonormal directions (r, p) that any of the candidates sees, of a sample of them."""
-    rows = pool.at(np.arange(0, pool.rows.shape[2], max(1, pool.rows.shape[2] // TASK)))
-    triangle = np.linalg.qr(rows.reshape(-1, len(information.scale)), mode="r")
-    return observability.row_space(np.asarray(triangle))
 
 
 def _anything(_: int) -> bool:
@@ -258,6 +259,7 @@ def _curve(
     pool: Pool,
     kept: Array,
     taken: Array,
+    seen: Array,
 ) -> tuple[Array, Array]:
     """Numbers of poses and predicted errors in m: the plan's own, best first, then with candidates added."""
     own, count, start = information.rows(q), len(q), information.start
@@ -275,7 +277,7 @@ def _curve(
     )
     order = greedy(both, start, max(count, MORE), criterion, best_first, kept)
     rows = both.at(order)
-    least = -(-(len(_seen(information, pool)) - information.rank) // own.shape[1])
+    least = -(-(len(seen) - observability.rank(information.taken)) // own.shape[1])
     sizes = np.arange(max(1, least), len(order) + 1)
     return sizes, np.array([information.error(rows[:size], task) for size in sizes])
 
