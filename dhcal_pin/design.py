@@ -23,7 +23,7 @@ from .se3 import Array
 ENOUGH = 1e-3
 MOST_PASSES = 20
 # Exchange looks at so many candidates, those which would add most to the design as it is.
-PROMISING = 1000
+PROMISING = 600
 
 
 def basis(start: Array, rows: Array) -> Array:
@@ -212,7 +212,9 @@ def greedy(pool: Pool, start: Array, count: int, criterion: Criterion, chosen: A
     return np.array(out, int)
 
 
-def exchange(pool: Pool, start: Array, chosen: Array, criterion: Criterion, kept: Array) -> Array:
+def exchange(
+    pool: Pool, start: Array, chosen: Array, criterion: Criterion, kept: Array, passes: int = MOST_PASSES
+) -> Array:
     """The chosen ones (n,) after exchanging each for the best in its place, until that gains next to nothing.
 
     Args:
@@ -221,10 +223,11 @@ def exchange(pool: Pool, start: Array, chosen: Array, criterion: Criterion, kept
         chosen: (n,) numbers.
         criterion: what for.
         kept: (c, d) further places to keep away from.
+        passes: the most of them.
     """
     chosen = chosen.copy()
     value = criterion.value(basis(start, pool.at(chosen)))
-    for _ in range(MOST_PASSES):
+    for _ in range(passes):
         before = value
         gains = criterion.gains(pool.rows, basis(start, pool.at(chosen)))
         gains[chosen] = np.inf

@@ -23,7 +23,7 @@ MARGIN_ANGLE, MARGIN_LENGTH = np.deg2rad(2.0), 5e-3
 # Predicted errors are averaged over so many configurations where no task is given.
 TASK = 300
 # Random choices that a plan is compared with, at so many numbers of poses.
-DRAWS, SIZES = 25, 8
+DRAWS, SIZES = 25, 6
 # Refinement: rounds, each with so many neighbours a pose, nearer from round to round.
 ROUNDS, NEIGHBOURS, REACH, NEARER = 8, 24, 0.15, 0.65
 # Poses nearer than this are as one to a real robot, whose errors no model holds in full: they repeat there.
@@ -46,7 +46,7 @@ class Plan:
         information: what is known before, and what any configurations would tell.
         task: combinations whose variances are the mean squared position error over the task.
         sizes: (c,) numbers of poses, beyond n as if more were added to the plan.
-        errors: (c,) predicted RMS position error over the task after the best so many of them, m.
+        errors: (c,) predicted RMS position error over the task after a plan of so many, m.
         random_sizes, random_errors: the same for poses at random, the median of several draws.
         enough: number of poses from which on ten more lower what a check with this instrument would show by
             less than a hundredth; None if that is beyond the sizes.
@@ -164,20 +164,18 @@ def plan(
     combinations = seen.T @ (seen @ every)
     if np.linalg.norm(every - combinations) > UNSEEN * np.linalg.norm(combinations):
         notes.append(f"where the base stands is not counted, as {kind} readings cannot tell")
-    weighed = CRITERIA[criterion](seen, combinations)
-    chosen = greedy(pool, information.start, count, weighed, np.zeros(0, int), kept)
-    if len(chosen) < count:
+    aim = _Aim(information, CRITERIA[criterion](seen, combinations), combinations, len(seen), kept, room)
+    first = greedy(pool, information.start, count, aim.criterion, np.zeros(0, int), kept)
+    if len(first) < count:
         # They do not stand so far apart.
         pool = replace(pool, apart=0.0)
-        chosen = greedy(pool, information.start, count - len(chosen), weighed, chosen, kept)
-    if len(chosen) < count:
-        raise DhcalError(f"only {len(chosen)} of {len(q)} candidates are possible, {count} are asked for")
-    chosen = exchange(pool, information.start, chosen, weighed, kept)
-    best = q[chosen]
-    if room is not None:
-        best = _refined(information, weighed, best, room, pool.apart, kept, rng)
-    sizes, errors = _curve(information, weighed, combinations, best, pool, kept, chosen, seen)
-    random_sizes, random_errors = _random(information, combinations, pool, sizes[sizes <= count], rng)
+        first = greedy(pool, information.start, count - len(first), aim.criterion, first, kept)
+    if len(first) < count:
+        raise DhcalError(f"only {len(first)} of {len(q)} candidates are possible, {count} are asked for")
+    chosen = exchange(pool, information.start, first, aim.criterion, kept)
+    best = q[chosen] if room is None else _refined(aim, q[chosen], room, pool.apart, rng)
+    sizes, errors = _curve(aim, pool, q, first, chosen, best, rng)
+    random_sizes, random_errors = _random(aim, pool, sizes[sizes <= count], rng)
     order = tour(evened(chain, best))
     return Plan(
         q=best[order],
@@ -215,16 +213,21 @@ def _apart(places: Array, count: int, rng: np.random.Generator) -> float:
     return min(APART, float(np.median(between.min(1))))
 
 
-def _refined(
-    information: Information,
-    criterion: Criterion,
-    q: Array,
-    room: Room,
-    apart: float,
-    kept: Array,
-    rng: np.random.Generator,
-) -> Array:
+@dataclass(frozen=True, eq=False)
+class _Aim:
+    """What is known before and what is to be known; how much can be seen at all; places to keep away from."""
+
+    information: Information
+    criterion: Criterion
+    task: Array
+    seen: int
+    kept: Array
+    room: Room | None
+
+
+def _refined(aim: _Aim, q: Array, room: Room, apart: float, rng: np.random.Generator) -> Array:
     """The configurations (n, dof) moved to better ones about them, by smaller and smaller steps."""
+    information, criterion = aim.information, aim.criterion
     q = q.copy()
     rows = np.ascontiguousarray(information.rows(q).transpose(2, 1, 0))
     value = criterion.value(basis(information.start, rows))
@@ -239,7 +242,7 @@ def _refined(
             here = np.concatenate([pool.rows[:, :, block], rows[slot].T[:, :, None]], 2)
             gains = criterion.gains(here, rest)
             better = np.where(gains[:-1] > gains[-1], gains[:-1], -np.inf)
-            others = np.concatenate([kept, evened(room.chain, np.delete(q, slot, 0))])
+            others = np.concatenate([aim.kept, evened(room.chain, np.delete(q, slot, 0))])
             found = pool.best(better, block, others)
             if found is None:
                 continue
@@ -252,39 +255,54 @@ def _refined(
 
 
 def _curve(
-    information: Information,
-    criterion: Criterion,
-    task: Array,
-    q: Array,
-    pool: Pool,
-    kept: Array,
-    taken: Array,
-    seen: Array,
+    aim: _Aim, pool: Pool, q: Array, first: Array, chosen: Array, best: Array, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Numbers of poses and predicted errors in m: the plan's own, best first, then with candidates added."""
-    own, count, start = information.rows(q), len(q), information.start
-    stands = evened(information.chain, q)
-    best_first = greedy(Pool.of(own, stands), start, count, criterion, np.zeros(0, int), kept)
-    gains = criterion.gains(pool.rows, basis(start, np.ascontiguousarray(own.transpose(2, 1, 0))))
+    """Numbers of poses and predicted errors in m: of smaller plans, of the plan, then with candidates added.
+
+    Args:
+        aim: what for.
+        pool: all candidates.
+        q: (m, dof) their joint values.
+        first: (n,) the greedy choice in its order, from which smaller plans start.
+        chosen: (n,) the exchanged choice.
+        best: (n, dof) the refined one.
+        rng: for refinement.
+    """
+    information, start = aim.information, aim.information.start
+    own, count = information.rows(best), len(best)
+    known = observability.rank(information.taken)
+    least = min(count, max(1, -(-(aim.seen - known) // own.shape[1])))
+    sizes = np.unique(np.rint([least, 1.4 * least, 2 * least, np.sqrt(2 * least * count)]).astype(int))
+    sizes = sizes[sizes < count]
+    smaller = []
+    for size in sizes:
+        some = exchange(pool, start, first[:size], aim.criterion, aim.kept, passes=1)
+        if aim.room is not None and size <= 2 * least:
+            # Near the fewest that tell all, refinement counts for much.
+            better = _refined(aim, q[some], aim.room, pool.apart, rng)
+            smaller.append(information.rows(better).transpose(2, 1, 0))
+        else:
+            smaller.append(pool.at(some))
+    gains = aim.criterion.gains(pool.rows, basis(start, np.ascontiguousarray(own.transpose(2, 1, 0))))
     gains[pool.closed] = -np.inf
-    gains[taken] = -np.inf
+    gains[chosen] = -np.inf
     left = np.argsort(-gains)[: min(PROMISING, int(np.isfinite(gains).sum()))]
     both = Pool.of(
         np.concatenate([own, pool.rows[:, :, left]], 2),
-        np.concatenate([stands, pool.places[left]]),
+        np.concatenate([evened(information.chain, best), pool.places[left]]),
         pool.apart,
         lambda i: i < count or pool.possible(int(left[i - count])),
     )
-    order = greedy(both, start, max(count, MORE), criterion, best_first, kept)
-    rows = both.at(order)
-    least = -(-(len(seen) - observability.rank(information.taken)) // own.shape[1])
-    sizes = np.arange(max(1, least), len(order) + 1)
-    return sizes, np.array([information.error(rows[:size], task) for size in sizes])
+    order = greedy(both, start, max(count, MORE), aim.criterion, np.arange(count), aim.kept)
+    larger = np.arange(count, len(order) + 1)
+    rows = [*smaller, *(both.at(order[:size]) for size in larger)]
+    errors = [information.error(one, aim.task) for one in rows]
+    every = np.arange(least, len(order) + 1)
+    between = np.interp(np.log(every), np.log([*sizes, *larger]), np.log(errors))
+    return every, np.exp(between)
 
 
-def _random(
-    information: Information, task: Array, pool: Pool, sizes: Array, rng: np.random.Generator
-) -> tuple[Array, Array]:
+def _random(aim: _Aim, pool: Pool, sizes: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """Some of the sizes, and the predicted error in m after as many poses at random, the median of draws."""
     if not sizes.size:
         return sizes, np.empty(0)
@@ -295,7 +313,7 @@ def _random(
     some = np.unique(np.linspace(0, len(sizes) - 1, SIZES).round().astype(int))
     out = [
         np.median([
-            information.error(rows[rng.permutation(len(rows))[:size]], task) for _ in range(DRAWS)
+            aim.information.error(rows[rng.permutation(len(rows))[:size]], aim.task) for _ in range(DRAWS)
         ])
         for size in sizes[some]
     ]  # fmt: skip
