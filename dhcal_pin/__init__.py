@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from .robot_files import write_urdf as write_urdf
     from .viewer import scene_html as scene_html
     from .viewer import show as show
+    from .workspace import workspace_map as workspace_map
 
 _HOMES = {
     "calibrate": "calibration",
@@ -62,6 +63,7 @@ _HOMES = {
     "write_urdf": "robot_files",
     "scene_html": "viewer",
     "show": "viewer",
+    "workspace_map": "workspace",
 }
 __all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
 

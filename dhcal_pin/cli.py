@@ -136,6 +136,9 @@ def parser() -> argparse.ArgumentParser:
     calibrate.add_argument(
         "--tool-frame", metavar="NAME", help="put the tool into the URDF, as a link fixed to the tip"
     )
+    calibrate.add_argument(
+        "--map", metavar="MAP.csv", help="predicted position uncertainty by cells of the workspace"
+    )
     calibrate.add_argument("--json", **_JSON)
 
     validate = _add(

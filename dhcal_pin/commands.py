@@ -16,6 +16,7 @@ import numpy as np
 from . import calibration, demo, exports, plan_command, report, terminal, ur_kinematics, viewer
 from .chain import Chain
 from .check import crosscheck
+from .configuration_files import map_text
 from .configurations import joint_range
 from .dh_files import dh_text, is_dh
 from .dh_urdf import dh_to_urdf
@@ -40,6 +41,7 @@ from .robot_files import (
     urdf_files,
 )
 from .screening import Finding, screen
+from .workspace import workspace_map
 
 # --- calibrate -------------------------------------------------------------------------------------
 
@@ -101,7 +103,7 @@ def _calibrate(args: Namespace) -> int:
     _urdf_ending(args.output)
     check_outputs([args.json], inputs)
     kept = [*measured, *priors, *maps] if args.in_place else inputs
-    check_outputs([args.output, sidecar_path(args.output), args.json], kept)
+    check_outputs([args.output, sidecar_path(args.output), args.map, args.json], kept)
 
     chain = read_robot(args.robot, args.tip)
     sets = args.parameters or chain.parameters
@@ -123,6 +125,11 @@ def _calibrate(args: Namespace) -> int:
         )
     contents = _written(fit, args)
     files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
+    if args.map:
+        text = map_text(
+            workspace_map(fit), [f"predicted position uncertainty of {args.output}, measuring frame"]
+        )
+        contents[args.map], files["map"] = text, args.map
     if args.json and args.json != STDOUT:
         files["json"] = args.json
     gross = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))

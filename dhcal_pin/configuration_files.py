@@ -7,14 +7,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from .chain import Chain
+from .configurations import joint_range
 from .errors import DhcalError
 from .files import LENGTHS, PathLike, read_sheet
 from .inverse import solve, to_positions, within
 from .measurement_files import csv_text, joint_columns, joint_values, reading_sheet
 from .reading_columns import check_columns, check_joint_names
 from .se3 import Array
+from .workspace import WorkspaceMap
 
-# Targets are where they should be for knowing how well the tool would be known there.
+# Near enough for knowing how well the tool would be known there; and from so many starts.
 _NEAR = 1e-6
 _STARTS = 20
 
@@ -48,20 +50,25 @@ def read_task(path: PathLike, chain: Chain) -> Array:
             f"{sheet.source}:{sheet.header}: no column {missing[0]!r}; give joints, or x[mm],y[mm],z[mm]"
         )
     targets = np.stack([sheet.si(sheet.columns[name], LENGTHS) for name in "xyz"], -1)
-    out, left = np.empty((len(targets), chain.size)), np.arange(len(targets))
-    rng = np.random.default_rng(0)
-    low, high = np.maximum(chain.lower, -np.pi), np.minimum(chain.upper, np.pi)
-    for _ in range(_STARTS):
-        q, gap = solve(chain, to_positions(targets[left]), rng.uniform(low, high, (len(left), chain.size)))
-        q, allowed = within(chain, q)
-        good = allowed & (gap <= _NEAR)
-        out[left[good]] = q[good]
-        left = left[~good]
-        if not left.size:
-            return out
+    low, high = joint_range(chain)
+    start = np.random.default_rng(0).uniform(low, high, (len(targets) * _STARTS, chain.size))
+    q, gap = solve(chain, to_positions(np.repeat(targets, _STARTS, axis=0)), start)
+    q, allowed = within(chain, q)
+    good = (allowed & (gap <= _NEAR)).reshape(len(targets), _STARTS)
+    left = np.flatnonzero(~good.any(1))
+    if not left.size:
+        return q.reshape(len(targets), _STARTS, -1)[np.arange(len(targets)), good.argmax(1)]
     raise DhcalError(
         f"{sheet.source}:{sheet.lines[left[0]]}: the tool does not reach this position; correct or remove it"
     )
+
+
+def map_text(found: WorkspaceMap, comments: Sequence[str]) -> str:
+    """The CSV text of a map: a row a cell, millimetres."""
+    names = ("x[mm]", "y[mm]", "z[mm]")
+    columns = {name: (1e3 * found.centre[:, i]).round(6).tolist() for i, name in enumerate(names)}
+    columns |= {"position_std[mm]": (1e3 * found.std).tolist(), "worst[mm]": (1e3 * found.worst).tolist()}
+    return csv_text(columns | {"configurations": found.count.tolist()}, comments)
 
 
 def configurations_text(q: Array, chain: Chain, comments: Sequence[str]) -> str:

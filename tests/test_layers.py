@@ -25,7 +25,7 @@ LAYERS = (
     {"solver"},
     {"result"},
     {"calibration"},
-    {"check", "information"},
+    {"check", "information", "workspace"},
     {"planning"},
     {"files"},
     {"reading_columns"},
