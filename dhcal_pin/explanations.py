@@ -20,8 +20,8 @@ from .parameters import Parameter
 from .passage import NONE, PARALLEL, Passage, Path, own_axes, passage, tilt
 from .poses import Pose
 from .positions import Position
+from .problem import Problem, Triangle
 from .se3 import Array
-from .solver import Problem, Triangle
 
 # Axes within this of parallel are nearly so.
 _NEARLY = np.deg2rad(5.0)
