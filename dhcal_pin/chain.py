@@ -25,6 +25,7 @@ from .dh import DHTable
 from .dh_urdf import dh_to_urdf
 from .errors import DhcalError
 from .se3 import Array
+from .transmission import Loads, Transmission
 from .urdf import Urdf, parse_urdf, read_urdf
 
 BASE = 0
@@ -48,10 +49,12 @@ class Sweep:
         bodies: (k+1, 4, 3, m) columns x, y, z, p of each body's frame in the measuring frame. A body's
             frame has its joint's axis along z.
         tool: (4, 3, m) columns of the tool's frame.
+        terms: (t, n, m) of the independent joints' transmission, where the chain has one.
     """
 
     bodies: Array
     tool: Array
+    terms: Array | None = None
 
     def poses(self) -> Array:
         """Tool poses (m, 4, 4) in the measuring frame."""
@@ -89,6 +92,7 @@ class Chain:
         base: (4, 4) base link in the measuring frame.
         tool: (4, 4) measured point in the tip frame.
         parameters: the sets that are identified when nobody says otherwise.
+        transmission: how the independent joints miss their values; None where they do as they are told.
     """
 
     urdf: Urdf
@@ -105,6 +109,7 @@ class Chain:
     base: Array = field(default_factory=lambda: np.eye(4))
     tool: Array = field(default_factory=lambda: np.eye(4))
     parameters: str = "minimal,base,tool"
+    transmission: Transmission | None = None
 
     @classmethod
     def from_urdf(cls, source: str | os.PathLike[str] | Urdf, tip: str | None = None) -> Chain:
@@ -159,6 +164,11 @@ class Chain:
         return len(self.joint_names)
 
     @property
+    def sliding(self) -> Array:
+        """Which independent joints (n,) move a prismatic one."""
+        return np.any(self.mixing[self.prismatic] != 0, 0)
+
+    @property
     def tip_station(self) -> int:
         """Station of the tip, before the tool."""
         return 2 * len(self.moving) + 2
@@ -182,18 +192,14 @@ class Chain:
         """Pinocchio's index of the tip's frame; links and joints may share names."""
         return self.model.getFrameId(self.tip, pin.FrameType.BODY)
 
+    @cached_property
+    def loads(self) -> Loads:
+        """The masses of the whole robot with this chain's joint placements."""
+        return Loads(self.model, self.moving, self.mixing, self.shift)
+
     def configurations(self, q: Array) -> Array:
         """Pinocchio's configurations (m, nq) at q (m, n); joints off the path stay at neutral."""
-        q = self.checked(q)
-        model = self.model
-        out = np.tile(pin.neutral(model), (len(q), 1))
-        for name, value in zip(self.moving, (q @ self.mixing.T + self.shift).T, strict=True):
-            joint = model.joints[model.getJointId(name)]
-            if joint.nq == 2:
-                out[:, joint.idx_q], out[:, joint.idx_q + 1] = np.cos(value), np.sin(value)
-            else:
-                out[:, joint.idx_q] = value
-        return out
+        return self.loads.configurations(self.effective(self.checked(q).T)[0])
 
     def checked(self, q: Array) -> Array:
         """Joint values as a finite (m, n) array, or DhcalError."""
@@ -205,6 +211,19 @@ class Chain:
         if not np.isfinite(q).all():
             raise DhcalError("q: every joint value must be finite")
         return q
+
+    def effective(self, q: Array) -> tuple[Array, Array | None]:
+        """Where commanded values q (n, m) take the independent joints (n, m), and the terms (t, n, m)."""
+        if self.transmission is None:
+            return q, None
+        terms = self.transmission.terms(q)
+        return q + self.transmission.errors(terms), terms
+
+    def loaded(self) -> Chain:
+        """The chain whose joints yield to its own masses as placed now, not to those it was started with."""
+        if self.transmission is None:
+            return self
+        return replace(self, transmission=replace(self.transmission, loads=self.loads))
 
     @cached_property
     def axis_frames(self) -> Array:
@@ -225,7 +244,8 @@ class Chain:
     def sweep(self, q: Array) -> Sweep:
         """All frames at joint values q (m, n), vectorised over the samples."""
         q = self.checked(q)
-        values = self.mixing @ q.T + self.shift[:, None]
+        joints, terms = self.effective(q.T)
+        values = self.mixing @ joints + self.shift[:, None]
         cos, sin = np.cos(values), np.sin(values)
         m = len(q)
         bodies = np.empty((len(self.moving) + 1, 4, 3, m))
@@ -243,7 +263,7 @@ class Chain:
                 after[1] = before[1] * cos[j] - before[0] * sin[j]
                 after[2:] = before[2:]
         tool = (self.links[-1] @ self.tool).T @ bodies[-1].reshape(4, -1)
-        return Sweep(bodies, tool.reshape(4, 3, m))
+        return Sweep(bodies, tool.reshape(4, 3, m), terms)
 
     def poses(self, q: Array) -> Array:
         """Tool poses (m, 4, 4) in the measuring frame at joint values q (m, n) in rad or m."""
@@ -269,8 +289,9 @@ class Chain:
 
         Args:
             sweep: frames at m samples.
-            bodies: (p,) body numbers, ascending.
-            twists: (p, 6) twists in those bodies' frames.
+            bodies: (p,) body numbers, ascending; k+1+e is entry e of the
+                transmission's flat coefficients.
+            twists: (p, 6) twists in those bodies' frames; an entry needs none.
             out: (p, 6, m) written in place when given.
         """
         m = sweep.tool.shape[-1]
@@ -291,7 +312,22 @@ class Chain:
             block[:, 1] += spin[:, 2] * lever[0] - spin[:, 0] * lever[2]
             block[:, 2] += spin[:, 0] * lever[1] - spin[:, 1] * lever[0]
             block[:, 3:] = spin
+        if starts[-1] < len(bodies):
+            assert self.transmission is not None
+            assert sweep.terms is not None
+            term, joint, source = np.unravel_index(
+                bodies[starts[-1] :] - len(sweep.bodies), self.transmission.coefficients.shape
+            )
+            out[starts[-1] :] = self.joint_velocities(sweep)[joint] * sweep.terms[term, source][:, None]
         return out
+
+    def joint_velocities(self, sweep: Sweep) -> Array:
+        """The tool point's velocity (n, 6, m) per unit of each independent joint's effective value."""
+        k = len(self.moving)
+        twists = np.zeros((k, 6))
+        twists[np.arange(k), np.where(self.prismatic, 2, 5)] = 1.0
+        moving = self.tool_velocities(sweep, np.arange(1, k + 1), twists)
+        return np.tensordot(self.mixing, moving, (0, 0))
 
     def displaced(self, motions: Mapping[int, Array]) -> Chain:
         """The chain with each station's frame moved by a right factor (4, 4), M ← M·motion."""

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .chain import Chain, link_station
+from .chain import Chain
 from .errors import DhcalError
 from .se3 import Array
 
@@ -19,12 +19,8 @@ REACHED = 1e-9  # m
 
 def joint_velocities(chain: Chain, q: Array) -> tuple[Array, Array]:
     """Tool points (m, 3) and their Jacobians (m, 3, n) by the independent joints at q (m, n)."""
-    stations = np.array([link_station(j + 1) for j in range(len(chain.moving))])
-    axes = np.concatenate([np.zeros_like(chain.axes), chain.axes], 1)
-    axes[chain.prismatic] = np.roll(axes[chain.prismatic], 3, axis=1)
     sweep = chain.sweep(q)
-    velocities = chain.tool_velocities(sweep, *chain.station_twists(stations, axes))
-    return sweep.tool[3].T, velocities[:, :3].transpose(2, 1, 0) @ chain.mixing
+    return sweep.tool[3].T, chain.joint_velocities(sweep)[:, :3].transpose(2, 1, 0)
 
 
 def solve(chain: Chain, gap: Gap, start: Array, steps: int = 200) -> tuple[Array, Array]:

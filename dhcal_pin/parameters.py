@@ -1,16 +1,17 @@
-"""Error parameters as data: each is a twist at a station of a chain.
+"""Error parameters as data: each is a twist at a station of a chain, some scaled by what the joint does.
 
 A set is a function from a chain to its parameters. Changes at one station act in the order of the
 list, M ← M·exp(x₁ξ₁)·exp(x₂ξ₂)…, so a parameter's value is always its whole error from the nominal
 chain, DH's changes are exact (its rotations and translations about one axis commute), and the
-derivative at any value is a twist again.
+derivative at any value is a twist again. A scaled one, such as a gain or a compliance, is an entry of the
+chain's transmission: its twist is the joint's own, times a term of the joint's value and load.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -20,10 +21,13 @@ from .dh import Convention
 from .errors import DhcalError
 from .extraction import Extraction, extract_dh
 from .se3 import Array
+from .transmission import COUPLING_PRIOR, FAMILIES, TERMS, Transmission
 
 # Standard deviations that manufacturing and assembly lead one to expect, and frames anywhere in a room.
 LENGTH, ANGLE, OFFSET = 1e-3, 5e-3, np.deg2rad(2.0)
 WIDE_LENGTH, WIDE_ANGLE = 10.0, 10.0
+# A term of the transmission that nowhere exceeds this is none, rad or N·m.
+LEAST_TERM = 1e-9
 
 _AXES = np.eye(6)
 
@@ -34,11 +38,12 @@ class Parameter:
 
     Attributes:
         name: what users call it, as `d2` or `elbow_joint.rx`.
-        unit: "m" or "rad".
+        unit: "m" or "rad"; of a scaled one "1", "rad", "rad/Nm", "rad/rad", "rad/m".
         nominal: the value that a drawing would show; zero for a pure error.
         station: where it acts (see `chain`).
         twist: (6,) [v, ω] in the station's frame.
         prior: standard deviation expected before any measurement, in its unit.
+        entry: of a scaled one, where its coefficient stands in the transmission's flat coefficients.
     """
 
     name: str
@@ -47,6 +52,7 @@ class Parameter:
     station: int
     twist: tuple[float, ...]
     prior: float
+    entry: int | None = None
 
 
 def extract(chain: Chain, convention: Convention = "standard", hayati: bool = False) -> Extraction:
@@ -191,6 +197,43 @@ def tool(chain: Chain) -> list[Parameter]:
     return _six("tool", chain.tool_station, WIDE_LENGTH, WIDE_ANGLE)
 
 
+def _scaled(chain: Chain, place: tuple[int, int, int], name: str, unit: str, prior: float) -> Parameter:
+    """A coefficient of the transmission, at the first joint on the path that the independent one moves."""
+    first = int(np.flatnonzero(chain.mixing[:, place[1]])[0])
+    axis, zero = tuple(map(float, chain.axes[first])), (0.0, 0.0, 0.0)
+    twist = axis + zero if chain.prismatic[first] else zero + axis
+    held = 0.0 if chain.transmission is None else float(chain.transmission.coefficients[place])
+    entry = int(np.ravel_multi_index(place, (len(TERMS), chain.size, chain.size)))
+    return Parameter(name, unit, held, link_station(first + 1), twist, prior, entry)
+
+
+def family(chain: Chain, name: str) -> list[Parameter]:
+    """All terms of a family of `transmission.TERMS` at each joint that has them.
+
+    A term that is zero wherever the arm stands, such as the load of a vertical axis, is left out.
+    """
+    q = np.random.default_rng(0).uniform(-1, 1, (chain.size, 64))
+    felt = np.abs(Transmission.ideal(chain.loads).terms(q)).max(-1) > LEAST_TERM
+    return [
+        _scaled(chain, (t, i, i), f"{joint}.{term.name}", term.unit, term.prior)
+        for i, joint in enumerate(chain.joint_names)
+        for t, term in enumerate(TERMS)
+        if term.family == name and felt[t, i] and (term.sliding or not chain.sliding[i])
+    ]
+
+
+def coupling(chain: Chain) -> list[Parameter]:
+    """How far each revolute joint turns per unit of every other joint's value."""
+    return [
+        _scaled(
+            chain, (0, i, j), f"{joint}.{source}", "rad/m" if chain.sliding[j] else "rad/rad", COUPLING_PRIOR
+        )
+        for i, joint in enumerate(chain.joint_names)
+        for j, source in enumerate(chain.joint_names)
+        if i != j and not chain.sliding[i]
+    ]
+
+
 SETS: dict[str, Callable[[Chain], list[Parameter]]] = {
     "dh": dh,
     "modified-dh": modified_dh,
@@ -200,7 +243,10 @@ SETS: dict[str, Callable[[Chain], list[Parameter]]] = {
     "base": base,
     "tool": tool,
     "offset": offset,
+    **{name: partial(family, name=name) for name in FAMILIES},
+    "coupling": coupling,
 }
+EXTENSIONS = (*FAMILIES, "coupling")
 
 
 def select(
@@ -221,7 +267,13 @@ def select(
     unknown = [name for name in names if name not in SETS]
     if unknown:
         raise DhcalError(f"unknown parameter set {unknown[0]!r}; choose from {', '.join(SETS)}")
-    pool = {p.name: p for name in names for p in SETS[name](chain)}
+    found = {name: SETS[name](chain) for name in names}
+    if empty := [name for name, parameters in found.items() if not parameters]:
+        raise DhcalError(
+            f"{chain.urdf.source}: no joint of {empty[0]!r}: it takes a joint that turns, "
+            "for coupling another joint, and for compliance a URDF whose links have masses"
+        )
+    pool = {p.name: p for parameters in found.values() for p in parameters}
     fixed = {p.name for name in fix if name in SETS for p in SETS[name](chain)}
     for name in fix:
         if name not in pool and name not in SETS:
@@ -237,7 +289,7 @@ def select(
     chosen = [p for p in pool.values() if p.name not in fixed]
     if not chosen:
         raise DhcalError("no parameter is left to identify; fix fewer of them")
-    ordered = sorted(chosen, key=lambda p: p.station)
+    ordered = sorted(chosen, key=lambda p: (-1 if p.entry is None else p.entry, p.station))
     return ErrorModel(chain, tuple(ordered), tuple(p for p in pool.values() if p.name in fixed))
 
 
@@ -256,12 +308,21 @@ class ErrorModel:
     fixed: tuple[Parameter, ...] = ()
 
     @cached_property
+    def _geometry(self) -> int:
+        """How many parameters, the first ones, are plain twists."""
+        return sum(parameter.entry is None for parameter in self.parameters)
+
+    @cached_property
+    def _entries(self) -> Array:
+        return np.array([p.entry for p in self.parameters if p.entry is not None], int)
+
+    @cached_property
     def _twists(self) -> Array:
-        return np.array([parameter.twist for parameter in self.parameters]).reshape(-1, 6)
+        return np.array([parameter.twist for parameter in self.parameters]).reshape(-1, 6)[: self._geometry]
 
     @cached_property
     def _stations(self) -> Array:
-        return np.array([parameter.station for parameter in self.parameters], int)
+        return np.array([parameter.station for parameter in self.parameters], int)[: self._geometry]
 
     @property
     def priors(self) -> Array:
@@ -269,21 +330,27 @@ class ErrorModel:
         return np.array([parameter.prior for parameter in self.parameters])
 
     def at(self, x: Array) -> Chain:
-        """The chain with errors x (p,) in m and rad."""
-        factors = se3.exp6(self._twists * np.asarray(x, float)[:, None])
+        """The chain with errors x (p,) in SI; its joints yield to the nominal arm's masses."""
+        x = np.asarray(x, float)
+        factors = se3.exp6(self._twists * x[: self._geometry, None])
         motions: dict[int, Array] = {}
         for station, factor in zip(self._stations, factors, strict=True):
             motions[int(station)] = motions.get(int(station), np.eye(4)) @ factor
-        return self.chain.displaced(motions)
+        chain = self.chain.displaced(motions)
+        if not self._entries.size:
+            return chain
+        held = self.chain.transmission or Transmission.ideal(self.chain.loads)
+        return replace(chain, transmission=held.changed(self._entries, x[self._geometry :]))
 
     def derivative(self, x: Array) -> tuple[Chain, Array, Array]:
         """The chain at x, and for each parameter the body (p,) and twist (p, 6) it moves there.
 
         A factor behind the k-th at its station turns the k-th twist; a link's motion is taken up by the
-        next origin from the left, so there the factors before it do.
+        next origin from the left, so there the factors before it do. Entries of the transmission come
+        last, numbered behind the bodies (see `Chain.tool_velocities`).
         """
         x = np.asarray(x, float)
-        factors = se3.exp6(self._twists * x[:, None])
+        factors = se3.exp6(self._twists * x[: self._geometry, None])
         twists = self._twists.copy()
         for station in np.unique(self._stations):
             members = np.flatnonzero(self._stations == station)
@@ -293,7 +360,11 @@ class ErrorModel:
                 twists[k] = se3.adjoint(carry if left else se3.inverse(carry)) @ self._twists[k]
                 carry = carry @ factors[k] if left else factors[k] @ carry
         chain = self.at(x)
-        return (chain, *chain.station_twists(self._stations, twists))
+        bodies, twists = chain.station_twists(self._stations, twists)
+        if not self._entries.size:
+            return chain, bodies, twists
+        behind = len(chain.moving) + 1 + self._entries
+        return chain, np.concatenate([bodies, behind]), np.pad(twists, ((0, len(behind)), (0, 0)))
 
     def frames(self) -> ErrorModel | None:
         """Base and tool alone, if any of them is unknown."""

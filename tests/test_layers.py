@@ -16,6 +16,7 @@ LAYERS = (
     {"urdf_tags", "dh"},
     {"urdf", "extraction"},
     {"urdf_origins", "dh_urdf"},
+    {"transmission"},
     {"chain"},
     {"parameters", "factors", "measurements", "inverse", "trilateration"},
     {"poses", "positions"},
