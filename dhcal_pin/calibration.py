@@ -187,6 +187,12 @@ def calibrate(
     data = tuple(item.started(reference) for item in data)
     problem = _problem(errors, data, _prior_weights(errors, priors), known)
     solution = METHODS[method](problem, np.zeros(len(problem.weights)), max_iterations, progress)
+    if errors.at(solution.x[: len(errors.parameters)]).transmission is not None:
+        # Gravity's torques follow the arm as found: once more with those.
+        errors = errors.loaded(solution.x[: len(errors.parameters)])
+        problem = replace(problem, errors=errors)
+        again = METHODS[method](problem, solution.x, max_iterations, progress)
+        solution = replace(again, iterations=solution.iterations + again.iterations)
     weights = [np.ones(len(item.rows)) for item in data]
     if method == "lm":
         # Sigmas and weights that the fit itself tells: a few rounds settle them.
@@ -207,7 +213,7 @@ def calibrate(
     return Result(
         errors=errors,
         x=solution.x,
-        chain=errors.at(solution.x[: len(errors.parameters)]),
+        chain=errors.at(solution.x[: len(errors.parameters)]).loaded(),
         reference=reference,
         data=data,
         holdout=tuple(holdout),

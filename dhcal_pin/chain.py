@@ -219,11 +219,15 @@ class Chain:
         terms = self.transmission.terms(q)
         return q + self.transmission.errors(terms), terms
 
+    def driven(self, coefficients: Array) -> Chain:
+        """The chain whose transmission has these coefficients (t, n, n), under its own masses."""
+        return replace(self, transmission=Transmission(coefficients, self.loads))
+
     def loaded(self) -> Chain:
         """The chain whose joints yield to its own masses as placed now, not to those it was started with."""
         if self.transmission is None:
             return self
-        return replace(self, transmission=replace(self.transmission, loads=self.loads))
+        return self.driven(self.transmission.coefficients)
 
     @cached_property
     def axis_frames(self) -> Array:

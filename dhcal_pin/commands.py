@@ -157,6 +157,10 @@ def _written(fit: Result, args: Namespace) -> dict[PathLike, str | bytes]:
     contents = urdf_files(bare, args.output, fit.portable)
     data = contents[args.output]
     assert isinstance(data, bytes)
+    if args.world_joint and chain.transmission is not None and chain.transmission.yields:
+        raise DhcalError(
+            "--world-joint: gravity's torques on the joints count on the robot's own root, z up; leave it out"
+        )
     if args.world_joint:
         data = exports.with_world(data, chain.base)
     if args.tool_frame:
@@ -220,7 +224,7 @@ def _to_dh(args: Namespace) -> tuple[str, Sequence[str]]:
         if args.convention in (None, table.convention):
             return dh_text(table, args.output), ()
     found = extract(chain, args.convention or "standard")
-    left = [f"base and tool in {path} do not go to the table" for path in sidecars([args.input])]
+    left = [f"base, tool and joints in {path} do not go to the table" for path in sidecars([args.input])]
     return dh_text(found.table, args.output), [*found.notes, *left]
 
 

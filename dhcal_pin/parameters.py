@@ -21,7 +21,7 @@ from .dh import Convention
 from .errors import DhcalError
 from .extraction import Extraction, extract_dh
 from .se3 import Array
-from .transmission import COUPLING_PRIOR, FAMILIES, TERMS, Transmission
+from .transmission import COUPLED, COUPLING_PRIOR, FAMILIES, TERMS, Transmission
 
 # Standard deviations that manufacturing and assembly lead one to expect, and frames anywhere in a room.
 LENGTH, ANGLE, OFFSET = 1e-3, 5e-3, np.deg2rad(2.0)
@@ -226,7 +226,11 @@ def coupling(chain: Chain) -> list[Parameter]:
     """How far each revolute joint turns per unit of every other joint's value."""
     return [
         _scaled(
-            chain, (0, i, j), f"{joint}.{source}", "rad/m" if chain.sliding[j] else "rad/rad", COUPLING_PRIOR
+            chain,
+            (COUPLED, i, j),
+            f"{joint}.{source}",
+            "rad/m" if chain.sliding[j] else "rad/rad",
+            COUPLING_PRIOR,
         )
         for i, joint in enumerate(chain.joint_names)
         for j, source in enumerate(chain.joint_names)
@@ -339,8 +343,17 @@ class ErrorModel:
         chain = self.chain.displaced(motions)
         if not self._entries.size:
             return chain
-        held = self.chain.transmission or Transmission.ideal(self.chain.loads)
-        return replace(chain, transmission=held.changed(self._entries, x[self._geometry :]))
+        held = self._transmission.changed(self._entries, x[self._geometry :])
+        return replace(chain, transmission=held)
+
+    @cached_property
+    def _transmission(self) -> Transmission:
+        return self.chain.transmission or Transmission.ideal(self.chain.loads)
+
+    def loaded(self, x: Array) -> ErrorModel:
+        """The same unknowns, with joints that yield to the masses as they are placed at x."""
+        held = replace(self._transmission, loads=self.at(x).loads)
+        return replace(self, chain=replace(self.chain, transmission=held))
 
     def derivative(self, x: Array) -> tuple[Chain, Array, Array]:
         """The chain at x, and for each parameter the body (p,) and twist (p, 6) it moves there.

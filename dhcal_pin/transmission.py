@@ -5,7 +5,7 @@ The effective value of independent joint i at commanded values q is
     q_i + Σ_t Σ_j W[t, i, j] · term_t(q_j, τ_j)
 
 with the terms of `TERMS` and the generalised forces τ that hold the arm against gravity. W (t, n, n) is
-diagonal but for the first term, whose entries off the diagonal couple one joint to another's value.
+diagonal but for the term of the value itself, whose entries off the diagonal couple a joint to others.
 """
 
 from __future__ import annotations
@@ -52,6 +52,8 @@ TERMS = (
     Term("cos2", "cos2_rad", "harmonics", "rad", 1e-3, lambda q, load: np.cos(2 * q)),
     Term("compliance", "compliance_rad_per_nm", "compliance", "rad/Nm", 1e-4, lambda q, load: load),
 )
+# The term whose coefficients off the diagonal couple joints.
+COUPLED = 0
 FAMILIES = tuple(dict.fromkeys(term.family for term in TERMS))
 COUPLING_PRIOR = 2e-3
 
@@ -119,6 +121,11 @@ class Transmission:
         """Joints that do as they are told."""
         n = loads.mixing.shape[1]
         return cls(np.zeros((len(TERMS), n, n)), loads)
+
+    @property
+    def yields(self) -> bool:
+        """Whether a load moves a joint."""
+        return any(self.coefficients[t].any() for t, term in enumerate(TERMS) if term.family == "compliance")
 
     def terms(self, q: Array) -> Array:
         """All terms (t, n, m) at commanded values q (n, m)."""

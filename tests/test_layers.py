@@ -30,7 +30,7 @@ LAYERS = (
     {"reading_columns"},
     {"column_maps"},
     {"foreign_files"},
-    {"dh_files", "measurement_files", "ur_kinematics"},
+    {"dh_files", "measurement_files", "transmission_files", "ur_kinematics"},
     {"robot_files", "screening"},
     {"plausibility"},
     {"exports"},
