@@ -293,8 +293,7 @@ def select(
     chosen = [p for p in pool.values() if p.name not in fixed]
     if not chosen:
         raise DhcalError("no parameter is left to identify; fix fewer of them")
-    ordered = sorted(chosen, key=lambda p: (-1 if p.entry is None else p.entry, p.station))
-    return ErrorModel(chain, tuple(ordered), tuple(p for p in pool.values() if p.name in fixed))
+    return ErrorModel(chain, (), tuple(p for p in pool.values() if p.name in fixed)).joined(chosen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -378,6 +377,12 @@ class ErrorModel:
             return chain, bodies, twists
         behind = len(chain.moving) + 1 + self._entries
         return chain, np.concatenate([bodies, behind]), np.pad(twists, ((0, len(behind)), (0, 0)))
+
+    def joined(self, parameters: Iterable[Parameter]) -> ErrorModel:
+        """With more unknowns, each where it belongs: by station, entries of the transmission last."""
+        both = (*self.parameters, *parameters)
+        ordered = sorted(both, key=lambda p: (-1 if p.entry is None else p.entry, p.station))
+        return replace(self, parameters=tuple(ordered))
 
     def frames(self) -> ErrorModel | None:
         """Base and tool alone, if any of them is unknown."""

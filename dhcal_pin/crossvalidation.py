@@ -1,0 +1,199 @@
+"""Errors on what was left out: at random, by groups, or by whole regions of joint space.
+
+A random split leaves neighbours of every sample in the fit, so a term that runs away where nobody measured
+looks good. Leaving out the ends of the samples' principal directions in joint space shows it.
+
+The model is nearly linear around a fit, so every fold is solved exactly from two triangles: that of its
+fitted rows and that of its left-out rows. Nothing is iterated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import lstsq
+
+from .errors import DhcalError
+from .measurements import Measurement
+from .result import Result
+from .se3 import Array
+from .solver import Problem, Triangle, reduce
+
+# The share of the samples at either end of a principal direction that a fold leaves out.
+SHARE = 0.25
+# Directions with less than this share of the widest one's spread are none.
+_FLAT = 1e-6
+
+# For each measurement of a fit which of its samples (m,) a fold leaves out.
+Fold = tuple[Array, ...]
+
+
+def random_folds(data: Sequence[Measurement], count: int, seed: int = 0) -> tuple[Fold, ...]:
+    """Each sample left out in one of `count` folds at random: k-fold.
+
+    Raises:
+        DhcalError: fewer than two folds, or more than samples.
+    """
+    samples = sum(len(item.rows) for item in data)
+    if not 2 <= count <= samples:
+        raise DhcalError(f"{count} folds: choose from 2 to {samples}, the number of samples")
+    labels = np.random.default_rng(seed).permutation(samples) % count
+    return group_folds(data, labels)
+
+
+def group_folds(data: Sequence[Measurement], labels: Array) -> tuple[Fold, ...]:
+    """A fold a group: leave one group out.
+
+    Args:
+        data: measurements, m samples in all.
+        labels: (m,) the group of each sample.
+
+    Raises:
+        DhcalError: not one label a sample, or one group only.
+    """
+    labels = np.asarray(labels)
+    if labels.shape != (samples := sum(len(item.rows) for item in data),):
+        raise DhcalError(f"labels have shape {labels.shape}; {samples} samples need ({samples},)")
+    if len(groups := np.unique(labels)) < 2:
+        raise DhcalError("one group: leaving it out leaves nothing to fit")
+    return tuple(_parted(data, labels == group) for group in groups)
+
+
+def region_folds(data: Sequence[Measurement], share: float = SHARE) -> tuple[Fold, ...]:
+    """Two folds a principal direction of the joint values: its lowest and its highest share of samples.
+
+    Joint values are scaled to equal spread first. Readings without joint values are always fitted.
+
+    Raises:
+        DhcalError: all samples have the same joint values.
+    """
+    moved = [np.full(len(item.rows), item.ends > 0) for item in data]
+    moving = np.concatenate(moved)
+    q = np.concatenate([item.q for item in data])[moving]
+    spread = q.std(0)
+    scaled = (q - q.mean(0))[:, spread > 0] / spread[spread > 0]
+    _, size, directions = np.linalg.svd(scaled, full_matrices=False)
+    found = []
+    for along in (scaled @ directions[size > _FLAT * size.max(initial=0.0)].T).T:
+        low, high = np.quantile(along, [share, 1 - share])
+        for left in (along <= low, along >= high):
+            if not left.all():
+                mask = np.zeros(len(moving), bool)
+                mask[moving] = left
+                found.append(_parted(data, mask))
+    if not found:
+        raise DhcalError("cross-validation by regions needs samples at different joint values")
+    return tuple(found)
+
+
+def _parted(data: Sequence[Measurement], mask: Array) -> Fold:
+    return tuple(np.split(mask, np.cumsum([len(item.rows) for item in data])[:-1]))
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """A fold's triangles around one x: of what it fits and of what it leaves out, and the latter's rows."""
+
+    fitted: Triangle
+    left: Triangle
+    rows: int
+
+    def error(self, weights: Array, x: Array, columns: Array) -> float:
+        """RMS of the left-out whitened rows after a fit of some columns (p,) with priors of weights about 0.
+
+        What only left-out rows depend on, such as a point that was touched there alone, is fitted to them.
+        """
+        step, _ = solved(self.fitted, weights, x, columns)
+        own = self.left.r[:, columns]
+        rest = self.left.z - own @ step
+        alone = ~self.fitted.r[:, columns].any(0) & own.any(0)
+        if alone.any():
+            basis = np.linalg.qr(own[:, alone])[0]
+            rest = rest - basis @ (basis.T @ rest)
+        return float(np.sqrt((rest @ rest + self.left.rest) / self.rows))
+
+
+def solved(triangle: Triangle, weights: Array, x: Array, columns: Array) -> tuple[Array, float]:
+    """The step (c,) of the columns that count (p,) with priors of weights (p,) about 0, and its cost."""
+    held = weights[columns]
+    a = np.concatenate([triangle.r[:, columns], np.diag(held)])
+    b = np.concatenate([triangle.z, -held * x[columns]])
+    found = lstsq(a, b, lapack_driver="gelsy", check_finite=False)
+    assert found is not None
+    return found[0], triangle.rest + float(np.sum((a @ found[0] - b) ** 2))
+
+
+def rows(problem: Problem, x: Array) -> int:
+    """Number of whitened rows."""
+    chain = problem.errors.at(x[: len(problem.errors.parameters)])
+    return sum(
+        item.residual(chain.sweep(item.configurations()), problem.values(item, x)).size
+        for item in problem.data
+        if len(item.rows)
+    )
+
+
+def parts(
+    problem: Problem, x: Array, folds: Sequence[Fold], progress: Callable[[int, float], None] | None = None
+) -> tuple[Parts, ...]:
+    """Each fold's triangles around x (p,)."""
+    found = []
+    for fold in folds:
+        kept, left = (
+            replace(
+                problem, data=tuple(item.take(side) for item, side in zip(problem.data, sides, strict=True))
+            )
+            for sides in ([~mask for mask in fold], fold)
+        )
+        inside = reduce(kept, x, small_angle=False)
+        found.append(Parts(inside, reduce(left, x, small_angle=False), rows(left, x)))
+        if progress:
+            progress(len(found), inside.rest)
+    return tuple(found)
+
+
+@dataclass(frozen=True, eq=False)
+class CrossValidation:
+    """Errors on what was left out, in standard deviations of the measurements as the fit used them.
+
+    Attributes:
+        errors: (k,) RMS of each fold's left-out rows.
+    """
+
+    errors: Array
+
+    @property
+    def error(self) -> float:
+        """Mean of the folds' errors."""
+        return float(self.errors.mean())
+
+    @property
+    def standard_error(self) -> float:
+        """Of that mean; infinite for one fold."""
+        return standard_error(self.errors)
+
+
+def standard_error(values: Array) -> float:
+    """Standard error of the mean of values (k,); infinite for one."""
+    return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else np.inf
+
+
+def cross_validate(fit: Result, folds: Sequence[Fold] | None = None) -> CrossValidation:
+    """How well a result's model predicts what it is not fitted to.
+
+    Args:
+        fit: a calibration; its sigmas, weights and priors are kept.
+        folds: of `random_folds`, `group_folds` or `region_folds`; the last without it.
+
+    Raises:
+        DhcalError: folds that were not made for the fitted data.
+    """
+    folds = folds if folds is not None else region_folds(fit.problem.data)
+    sizes = [len(item.rows) for item in fit.problem.data]
+    if any([len(mask) for mask in fold] != sizes for fold in folds):
+        raise DhcalError(f"folds were made for other data; {len(sizes)} measurements have {sizes} samples")
+    every = np.ones(len(fit.x), bool)
+    found = [part.error(fit.problem.weights, fit.x, every) for part in parts(fit.problem, fit.x, folds)]
+    return CrossValidation(np.array(found))
