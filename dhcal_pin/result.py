@@ -19,6 +19,7 @@ from .solver import (
     Problem,
     Solution,
     levenberg_marquardt,
+    posterior_root,
     pseudo_inverse,
     reduce,
     shared_unknowns,
@@ -169,15 +170,6 @@ class Result:
         return observability.unobservable(self.solution.triangle.r, self.parameters)
 
     @cached_property
-    def _root(self) -> tuple[Array, Array]:
-        """A root (p, r) of the covariance at sigmas as used, and a basis (p, p-r) of what nothing tells."""
-        zero = np.zeros_like(self.x)
-        full = with_priors(self.solution.triangle, self.problem.weights, zero, zero).r
-        _, s, vt = np.linalg.svd(full)
-        keep = s > observability.RANK_CUT * s[0]
-        return vt[keep].T / s[keep], vt[~keep].T
-
-    @cached_property
     def freedom(self) -> float:
         """Rows left over; unknowns count as far as data and not priors tell them (MacKay's number)."""
         count = 0.0
@@ -196,12 +188,7 @@ class Result:
 
     @cached_property
     def _root(self) -> tuple[Array, Array]:
-        """A root (p, r) of the covariance at sigmas as used, and a basis (p, p-r) of what nothing tells."""
-        zero = np.zeros_like(self.x)
-        full = with_priors(self.solution.triangle, self.problem.weights, zero, zero).r
-        _, s, vt = np.linalg.svd(full)
-        keep = s > observability.RANK_CUT * s[0]
-        return vt[keep].T / s[keep], vt[~keep].T
+        return posterior_root(self.solution.triangle, self.problem.weights)
 
     @cached_property
     def _spread(self) -> tuple[Array, Array]:

@@ -27,6 +27,8 @@ CHUNK = 4096
 # A step is the last one when it changes the rows by less than this share of what they are, or by no more
 # than the rounding of the model, as a share of the Jacobian's size.
 RELATIVE_STEP, ROUNDING = 1e-8, 1e-15
+# After so many damped steps Gauss-Newton tries to get farther in a few.
+LEAPS, LEAP_STEPS = (8, 16, 32, 64), 6
 # An error of so many metres or radians is no error any more.
 RUNAWAY = 1e6
 
@@ -168,6 +170,18 @@ def pseudo_inverse(r: Array, z: Array) -> Array:
     return np.linalg.lstsq(r, z, rcond=observability.RANK_CUT)[0]
 
 
+def posterior_root(triangle: Triangle, weights: Array) -> tuple[Array, Array]:
+    """A root (p, r) of the covariance with priors of these weights (p,), and a basis (p, p-r) of the rest.
+
+    The rest are directions that neither data nor a prior tell.
+    """
+    zero = np.zeros_like(weights)
+    full = with_priors(triangle, weights, zero, zero).r
+    _, s, vt = np.linalg.svd(full)
+    keep = s > observability.RANK_CUT * s[0]
+    return vt[keep].T / s[keep], vt[~keep].T
+
+
 def _settled(r: Array, step: Array, cost: float) -> bool:
     """Whether a step changes the whitened rows by nothing that matters."""
     change = float(np.linalg.norm(r @ step))
@@ -207,10 +221,28 @@ def gauss_newton(problem: Problem, x: Array, max_iterations: int, progress: Prog
     return Solution(x, reduce(problem, x, small_angle=False), done, converged, np.array(path))
 
 
+def _leap(problem: Problem, x: Array, cost: float) -> tuple[Array, float]:
+    """A few plain Gauss-Newton steps, uphill ones too; where they end if that is lower, else x."""
+    far, ends = x, math.inf
+    for _ in range(LEAP_STEPS):
+        triangle = with_priors(
+            reduce(problem, far, small_angle=False), problem.weights, far, np.zeros_like(x)
+        )
+        far = far + pseudo_inverse(triangle.r, triangle.z)
+        if not np.abs(far).max() < RUNAWAY:
+            break
+        ends = problem.cost(far)
+    return (far, ends) if ends < cost else (x, cost)
+
+
 def levenberg_marquardt(
     problem: Problem, x: Array, max_iterations: int, progress: Progress | None
 ) -> Solution:
-    """Levenberg-Marquardt; a retry costs forward kinematics only, the triangle stays."""
+    """Levenberg-Marquardt; a retry costs forward kinematics only, the triangle stays.
+
+    Along a narrow valley that bends, damped steps downhill are tiny and Gauss-Newton's, far uphill at
+    first, arrive: now and then it may try.
+    """
     path, damping, growth = [x], 1e-4, 2.0
     converged, done = False, 0
     cost = problem.cost(x)
@@ -242,6 +274,8 @@ def levenberg_marquardt(
                 converged = settled
                 break
             damping, growth = damping * growth, growth * 2
+        if done in LEAPS and not converged:
+            x, cost = _leap(problem, x, cost)
         path.append(x)
         if progress:
             progress(done, cost)
