@@ -27,12 +27,15 @@ LEAST_SCALE = 1e-6
 MOST_ROUNDS = 30
 
 
-def _prior_weights(errors: ErrorModel, priors: Priors) -> Array:
+def _prior_weights(errors: ErrorModel, priors: Priors) -> tuple[Array, Array]:
+    """One over the priors' sigmas (p,), and which of them (p,) are the default ones."""
+    count = len(errors.parameters)
     if isinstance(priors, str):
         if priors not in ("default", "none"):
             raise DhcalError(f"priors {priors!r}: choose default, none, or sigmas by name")
-        return 1 / errors.priors if priors == "default" else np.zeros(len(errors.parameters))
-    sigma = errors.priors.copy()
+        default = np.full(count, priors == "default")
+        return default / errors.priors, default
+    sigma, default = errors.priors.copy(), np.ones(count, bool)
     names = [p.name for p in errors.parameters]
     for pattern, value in priors.items():
         hit = [i for i, name in enumerate(names) if fnmatch.fnmatchcase(name, pattern)]
@@ -40,8 +43,8 @@ def _prior_weights(errors: ErrorModel, priors: Priors) -> Array:
             raise DhcalError(f"prior for {pattern!r}: no such parameter; there are {', '.join(names)}")
         if not value > 0:
             raise DhcalError(f"prior for {pattern!r}: {value} must be positive, in m or rad")
-        sigma[hit] = value
-    return 1 / sigma
+        sigma[hit], default[hit] = value, False
+    return 1 / sigma, default
 
 
 def split(
@@ -124,19 +127,22 @@ def _scatter(
     )
 
 
-def _widened(problem: Problem, solution: Solution, expected: Array) -> Array:
+def _widened(problem: Problem, solution: Solution, expected: Array, default: Array) -> Array:
     """The weights (p+s,) of priors as wide as the errors that were found, never narrower than expected.
 
     Lengths and angles of the links each have one scale, the one of greatest evidence (MacKay 1992):
-    the mean square of their errors over as many as the data and not the prior determine.
+    the mean square of their errors over as many as the data and not the prior determine. So have
+    coefficients of the transmission of each unit. Priors that are not default (p,) stay.
     """
     errors = problem.errors
     outside = (BASE, errors.chain.tool_station)
     root = posterior_root(solution.triangle, problem.weights)[0]
     told = 1 - np.sum((root * problem.weights[:, None]) ** 2, 1)
     weights = problem.weights.copy()
-    for unit in {p.unit for p in errors.parameters}:
-        family = [i for i, p in enumerate(errors.parameters) if p.unit == unit and p.station not in outside]
+    kinds = [(p.unit, p.entry is None) for p in errors.parameters]
+    inside = [i for i, p in enumerate(errors.parameters) if default[i] and p.station not in outside]
+    for kind in set(kinds):
+        family = [i for i in inside if kinds[i] == kind]
         if (count := told[family].sum()) > 1e-3:
             square = np.sum((solution.x[family] * expected[family]) ** 2) / count
             weights[family] = expected[family] / np.sqrt(max(1.0, square))
@@ -170,8 +176,8 @@ def calibrate(
         data: one measurement or several of any kinds.
         parameters: sets of `parameters.SETS`; the chain's own default without it.
         method: "lm", or "gn" for the paper's loop, which weighs metres and radians alike.
-        priors: "default", "none", or sigmas in m and rad by parameter name or pattern over the default
-            ones. Without it "default" for lm and "none" for gn.
+        priors: "default", "none", or sigmas by parameter name or pattern over the default ones, each in
+            its parameter's unit. Without it "default" for lm and "none" for gn.
         fix: parameters or sets held at nominal.
         free: single parameters of any set added.
         holdout: measurements to judge by, not fitted.
@@ -205,7 +211,8 @@ def calibrate(
     reference = _place(errors, data, known, max_iterations)
     errors = replace(errors, chain=reference)
     data = tuple(item.started(reference) for item in data)
-    problem = _problem(errors, data, _prior_weights(errors, priors), known)
+    sigmas, default = _prior_weights(errors, priors)
+    problem = _problem(errors, data, sigmas, known)
     solution = METHODS[method](problem, np.zeros(len(problem.weights)), max_iterations, progress)
     if errors.at(solution.x[: len(errors.parameters)]).transmission is not None:
         # Gravity's torques follow the arm as found: once more with those.
@@ -225,7 +232,7 @@ def calibrate(
             values = [problem.values(item, solution.x) for item in data]
             weighed, weights = robust.reweighted(fitted, scaled, values, loss)
             moved = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(weights, before, strict=True))
-            priors_now = _widened(problem, solution, expected) if priors == "default" else expected
+            priors_now = _widened(problem, solution, expected, default)
             changes = np.log(found / scales), (priors_now - problem.weights) / np.fmax(expected, 1e-300)
             if max(moved, *(np.abs(change).max(initial=0.0) for change in changes)) < 0.01:
                 break

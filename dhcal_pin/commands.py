@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from . import calibration, demo, exports, report, terminal, ur_kinematics, viewer
+from . import calibration, demo, exports, extension, report, terminal, ur_kinematics, viewer
 from .chain import Chain
 from .check import crosscheck
 from .dh_files import dh_text, is_dh
@@ -24,7 +24,7 @@ from .kinds import KINDS
 from .measurement_files import measurement_text, read_measurements, read_readings
 from .measurements import Measurement, Noise
 from .outputs import STDOUT, check_outputs, emit, names, same, sidecars
-from .parameters import extract
+from .parameters import EXTENSIONS, extract
 from .plausibility import doubts
 from .result import Result, accuracy
 from .robot_files import (
@@ -107,10 +107,11 @@ def _calibrate(args: Namespace) -> int:
     sets = args.parameters or chain.parameters
     data = _read_data(chain, args, held_file, known_frames=not {"base", "tool"} & set(names(sets)))
     with terminal.progress("fitting") as progress:
-        fit = calibration.calibrate(
+        fit, trials = extension.extend(
             chain,
             list(data.fit.values()),
             sets,
+            _families(args.extend),
             method=args.method,
             priors=read_priors(args.priors),
             fix=names(args.fix),
@@ -134,7 +135,7 @@ def _calibrate(args: Namespace) -> int:
     }
     document = report.document(
         fit, files, report.fingerprints(inputs), [row for found in rows.values() for row in found]
-    ) | {"outliers_by_file": rows}
+    ) | {"outliers_by_file": rows, "extension": [asdict(trial) for trial in trials]}
     if "json" in files:
         contents[args.json] = report.json_text(document)
     save(contents)
@@ -145,8 +146,14 @@ def _calibrate(args: Namespace) -> int:
         terminal.gross(path, gross.get(path, []), args.loss)
     for path, texts in data.doubts.items():
         terminal.doubts(path, texts)
+    terminal.trials(trials)
     terminal.summary(fit, files)
     return 0
+
+
+def _families(extend: str) -> tuple[str, ...]:
+    """The families that --extend may add."""
+    return {"none": (), "auto": EXTENSIONS}.get(extend, tuple(names(extend)))
 
 
 def _written(fit: Result, args: Namespace) -> dict[PathLike, str | bytes]:

@@ -193,7 +193,7 @@ def extend(
         DhcalError: as `calibrate`, or an unknown family, no priors, or another method than lm.
     """
     priors = options.get("priors") or "default"
-    if options.get("method", "lm") != "lm" or priors == "none":
+    if families and (options.get("method", "lm") != "lm" or priors == "none"):
         raise DhcalError(
             "an extension is chosen by method lm with priors: leave out --method gn, --priors none"
         )
