@@ -16,10 +16,15 @@ if TYPE_CHECKING:
     from .calibration import split as split
     from .chain import Chain as Chain
     from .check import crosscheck as crosscheck
+    from .crossvalidation import cross_validate as cross_validate
+    from .crossvalidation import group_folds as group_folds
+    from .crossvalidation import random_folds as random_folds
+    from .crossvalidation import region_folds as region_folds
     from .dh import DHTable as DHTable
     from .dh_files import read_dh as read_dh
     from .dh_urdf import dh_to_urdf as dh_to_urdf
     from .errors import DhcalError as DhcalError
+    from .extension import extend as extend
     from .factors import error_factors as error_factors
     from .measurement_files import read_measurements as read_measurements
     from .measurements import Noise as Noise
@@ -39,10 +44,15 @@ _HOMES = {
     "split": "calibration",
     "Chain": "chain",
     "crosscheck": "check",
+    "cross_validate": "crossvalidation",
+    "group_folds": "crossvalidation",
+    "random_folds": "crossvalidation",
+    "region_folds": "crossvalidation",
     "DHTable": "dh",
     "read_dh": "dh_files",
     "dh_to_urdf": "dh_urdf",
     "DhcalError": "errors",
+    "extend": "extension",
     "error_factors": "factors",
     "read_measurements": "measurement_files",
     "Noise": "measurements",

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import lstsq
 
 from .errors import DhcalError
 from .measurements import Measurement
-from .result import Result
+from .result import Result, accuracy
 from .se3 import Array
 from .solver import Problem, Triangle, reduce
 
@@ -100,15 +101,20 @@ class Parts:
     left: Triangle
     rows: int
 
+    @property
+    def unseen(self) -> Array:
+        """Columns (p,) that the fitted rows do not depend on, such as a point that was touched elsewhere."""
+        return np.logical_not(self.fitted.r.any(0))
+
     def error(self, weights: Array, x: Array, columns: Array) -> float:
         """RMS of the left-out whitened rows after a fit of some columns (p,) with priors of weights about 0.
 
-        What only left-out rows depend on, such as a point that was touched there alone, is fitted to them.
+        What only the left-out rows depend on is fitted to them.
         """
         step, _ = solved(self.fitted, weights, x, columns)
         own = self.left.r[:, columns]
         rest = self.left.z - own @ step
-        alone = ~self.fitted.r[:, columns].any(0) & own.any(0)
+        alone = self.unseen[columns] & own.any(0)
         if alone.any():
             basis = np.linalg.qr(own[:, alone])[0]
             rest = rest - basis @ (basis.T @ rest)
@@ -156,23 +162,27 @@ def parts(
 
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
-    """Errors on what was left out, in standard deviations of the measurements as the fit used them.
+    """Errors on what was left out.
 
     Attributes:
-        errors: (k,) RMS of each fold's left-out rows.
+        folds: of each fold what `accuracy` says of its left-out samples, m and rad.
+        errors: (k,) RMS of each fold's left-out rows in standard deviations as the fit used them.
     """
 
+    folds: tuple[dict[str, Any], ...]
     errors: Array
 
     @property
-    def error(self) -> float:
-        """Mean of the folds' errors."""
-        return float(self.errors.mean())
-
-    @property
-    def standard_error(self) -> float:
-        """Of that mean; infinite for one fold."""
-        return standard_error(self.errors)
+    def accuracy(self) -> dict[str, Any]:
+        """All folds together: RMS of the RMS, and the largest of all."""
+        out = {}
+        for key in dict.fromkeys(key for fold in self.folds for key in fold):
+            values = [fold[key] for fold in self.folds if key in fold]
+            if key == "unit":
+                out[key] = values[0]
+            else:
+                out[key] = float(max(values) if "max" in key else np.sqrt(np.mean(np.square(values))))
+        return out
 
 
 def standard_error(values: Array) -> float:
@@ -190,10 +200,19 @@ def cross_validate(fit: Result, folds: Sequence[Fold] | None = None) -> CrossVal
     Raises:
         DhcalError: folds that were not made for the fitted data.
     """
-    folds = folds if folds is not None else region_folds(fit.problem.data)
-    sizes = [len(item.rows) for item in fit.problem.data]
+    problem, weights, x = fit.problem, fit.problem.weights, fit.x
+    folds = folds if folds is not None else region_folds(problem.data)
+    sizes = [len(item.rows) for item in problem.data]
     if any([len(mask) for mask in fold] != sizes for fold in folds):
         raise DhcalError(f"folds were made for other data; {len(sizes)} measurements have {sizes} samples")
-    every = np.ones(len(fit.x), bool)
-    found = [part.error(fit.problem.weights, fit.x, every) for part in parts(fit.problem, fit.x, folds)]
-    return CrossValidation(np.array(found))
+    every = np.ones(len(x), bool)
+    robot = len(problem.errors.parameters)
+    errors, judged = [], []
+    for fold, part in zip(folds, parts(problem, x, folds), strict=True):
+        errors.append(part.error(weights, x, every))
+        moved = x + solved(part.fitted, weights, x, every)[0]
+        unseen = {u.name for u, alone in zip(problem.unknowns, part.unseen[robot:], strict=True) if alone}
+        known = {name: value for name, value in problem.instruments(moved).items() if name not in unseen}
+        left = [item.take(mask) for item, mask in zip(fit.data, fold, strict=True) if mask.any()]
+        judged.append(accuracy(problem.errors.at(moved[:robot]), left, known))
+    return CrossValidation(tuple(judged), np.array(errors))

@@ -2,7 +2,8 @@
 
 A family is added where two things hold: the error on left-out regions of joint space falls by more than its
 standard error, and an F-test on all data says that chance would hardly do it. Cross-validation also chooses
-how wide the family's priors are, as a term that runs away under wide ones may serve under narrow ones.
+how wide the family's priors are, as a term that runs away under wide ones may serve under narrow ones: as
+narrow as does no harm.
 """
 
 from __future__ import annotations
@@ -93,10 +94,15 @@ class _Stage:
         return solved(self.whole, weights, self.x, columns)[1]
 
     def trial(self, name: str, kept: dict[str, float]) -> Trial:
-        """A family at the width that lowers the cross-validated error most."""
+        """A family at the narrowest width that is no more than a standard error worse than the best one."""
         before = self.errors(kept)
         tried = [(self.errors(kept | {name: width}), width) for width in WIDTHS]
-        after, width = min(tried, key=lambda one: one[0].mean())
+        best = min((errors for errors, _ in tried), key=np.mean)
+        after, width = next(
+            (errors, width)
+            for errors, width in reversed(tried)
+            if np.mean(errors - best) <= standard_error(errors - best)
+        )
         _, columns = self.narrowed(kept)
         more = int(np.sum(self.family == name))
         left = self.rows - int(np.sum(columns)) - more

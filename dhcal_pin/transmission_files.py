@@ -10,6 +10,7 @@ import numpy as np
 
 from .chain import Chain
 from .errors import DhcalError
+from .se3 import Array
 from .transmission import COUPLED, TERMS, Transmission
 
 _MOST = 1e6
@@ -44,29 +45,37 @@ def with_transmission(chain: Chain, tables: object, source: str) -> Chain:
         DhcalError: an unknown joint or key, or a value that is not a finite number.
     """
     held = Transmission.ideal(chain.loads).coefficients
-    elsewhere = {joint.name for joint in chain.urdf.joints} - set(chain.moving)
     for name, table in _table(tables, f"{source}: [joint]").items():
         if name in chain.joint_names:
             i = chain.joint_names.index(name)
             _read_joint(chain, i, _table(table, f"{source}: [joint.{name}]"), held, source)
-        elif name not in elsewhere:
+        elif name not in _elsewhere(chain):
             raise DhcalError(
                 f"{source}: [joint.{name}]: no joint of this robot; there are {', '.join(chain.joint_names)}"
             )
     return chain.driven(held)
 
 
-def _read_joint(chain: Chain, i: int, table: Mapping[str, Any], held: np.ndarray, source: str) -> None:
+def _elsewhere(chain: Chain) -> set[str]:
+    """The robot's joints off the path."""
+    return {joint.name for joint in chain.urdf.joints} - set(chain.moving)
+
+
+def _read_joint(chain: Chain, i: int, table: Mapping[str, Any], held: Array, source: str) -> None:
     """Enters one joint's table into coefficients (t, n, n)."""
     here = f"{source}: [joint.{chain.joint_names[i]}]"
     keys = {term.key: t for t, term in enumerate(TERMS) if term.sliding or not chain.sliding[i]}
+    others = {name: j for j, name in enumerate(chain.joint_names) if j != i}
     for key, value in table.items():
         if key == "coupling" and not chain.sliding[i]:
-            for other, share in _table(value, f"{here} coupling").items():
-                if other not in chain.joint_names or other == chain.joint_names[i]:
-                    others = ", ".join(n for n in chain.joint_names if n != chain.joint_names[i])
-                    raise DhcalError(f"{here} coupling: {other!r} is no other joint; there are {others}")
-                held[COUPLED, i, chain.joint_names.index(other)] = _number(share, f"{here} coupling {other}")
+            for name, share in _table(value, f"{here} coupling").items():
+                number = _number(share, f"{here} coupling {name}")
+                if name in others:
+                    held[COUPLED, i, others[name]] = number
+                elif name not in _elsewhere(chain):
+                    raise DhcalError(
+                        f"{here} coupling: {name!r} is no other joint; there are {', '.join(others)}"
+                    )
         elif key not in keys:
             kind = "a sliding joint" if chain.sliding[i] else "a joint"
             allowed = [*keys, *([] if chain.sliding[i] else ["coupling"])]
