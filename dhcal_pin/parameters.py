@@ -26,8 +26,8 @@ from .transmission import COUPLED, COUPLING_PRIOR, FAMILIES, TERMS, Transmission
 # Standard deviations that manufacturing and assembly lead one to expect, and frames anywhere in a room.
 LENGTH, ANGLE, OFFSET = 1e-3, 5e-3, np.deg2rad(2.0)
 WIDE_LENGTH, WIDE_ANGLE = 10.0, 10.0
-# A term of the transmission that nowhere exceeds this is none, rad or N·m.
-LEAST_TERM = 1e-9
+# A term of the transmission that nowhere exceeds this is none, rad or N·m: token masses load no joint.
+LEAST_TERM = 0.1
 
 _AXES = np.eye(6)
 
@@ -210,9 +210,9 @@ def _scaled(chain: Chain, place: tuple[int, int, int], name: str, unit: str, pri
 def family(chain: Chain, name: str) -> list[Parameter]:
     """All terms of a family of `transmission.TERMS` at each joint that has them.
 
-    A term that is zero wherever the arm stands, such as the load of a vertical axis, is left out.
+    A term that is next to nothing wherever the arm stands, such as a vertical axis' load, is left out.
     """
-    q = np.random.default_rng(0).uniform(-1, 1, (chain.size, 64))
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (chain.size, 64))
     felt = np.abs(Transmission.ideal(chain.loads).terms(q)).max(-1) > LEAST_TERM
     return [
         _scaled(chain, (t, i, i), f"{joint}.{term.name}", term.unit, term.prior)

@@ -52,7 +52,7 @@ def random_joints(rng: np.random.Generator, table: DHTable, m: int) -> np.ndarra
 
 
 def with_masses(chain: Chain, rng: np.random.Generator) -> Chain:
-    """The same arm with some tenths of a kilogram on every link, off its axes."""
+    """The same arm with some kilograms on every link, off its axes."""
     root = ElementTree.fromstring(chain.urdf.data)
     for link in root.iter("link"):
         for old in link.findall("inertial"):
@@ -60,7 +60,7 @@ def with_masses(chain: Chain, rng: np.random.Generator) -> Chain:
         xyz = " ".join(map(repr, rng.uniform(-0.2, 0.2, 3).tolist()))
         link.append(
             ElementTree.fromstring(
-                f'<inertial><origin xyz="{xyz}"/><mass value="{rng.uniform(0.1, 0.3)}"/>'
+                f'<inertial><origin xyz="{xyz}"/><mass value="{rng.uniform(1, 3)}"/>'
                 '<inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/></inertial>'
             )
         )

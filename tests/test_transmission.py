@@ -52,7 +52,7 @@ def test_effective_value_is_the_formula():
             found[i] += x[f"{name}.sin2"] * np.sin(2 * v) + x[f"{name}.cos2"] * np.cos(2 * v)
             found[i] += x.get(f"{name}.compliance", 0.0) * torque[i]
             found[i] += sum(x[f"{name}.{o}"] * row[j] for j, o in enumerate(plain.joint_names) if j != i)
-    assert sum(name.endswith(".compliance") for name in x) >= 3
+    assert sum(name.endswith(".compliance") for name in x) >= 2
     assert np.abs(wanted - q).max() > 1e-3
     np.testing.assert_allclose(arm.poses(q), plain.poses(wanted), atol=1e-13)
     placed = [pin.SE3(pose) for pose in plain.poses(wanted)]
@@ -197,7 +197,7 @@ def test_commands_read_what_calibrate_wrote(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.parametrize("family", EXTENSIONS)
 def test_a_family_is_found_again(family):
-    """All coefficients within 3 σ but for the few that chance puts beyond, and their spread as claimed."""
+    """All coefficients within 3 σ but for the one that chance may put beyond, and their spread as claimed."""
     off, arm = [], ur10()
     for seed in range(2):
         rng = np.random.default_rng(seed)
@@ -208,8 +208,8 @@ def test_a_family_is_found_again(family):
         for p, value, std in zip(fit.parameters, fit.x, fit.std, strict=True):
             if getattr(p, "entry", None) is not None:
                 off.append((value - x[p.name]) / std)
-    beyond = np.abs(off) > 3
-    assert beyond.mean() <= 0.02
+    assert np.sum(np.abs(off) > 3) <= 1
+    assert np.abs(off).max() < 4.5
     assert 0.6 < np.sqrt(np.mean(np.square(off))) < 1.4
 
 
