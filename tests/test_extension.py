@@ -38,7 +38,7 @@ def fitted(kind=Position, m: int = 40):
     arm = Chain.from_dh(paper("sim_6dof"))
     rng = np.random.default_rng(0)
     data = kind.simulate(
-        Chain.from_dh(paper("sim_6dof_actual")), rng.uniform(-1, 1, (m, 6)), Noise(1e-3, 1e-3), rng
+        Chain.from_dh(paper("sim_6dof_actual")), rng.uniform(-1, 1, (m, 6)), Noise(1e-4, 1e-4), rng
     )
     return calibrate(arm, data, "dh")
 
