@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from .calibration import split as split
     from .chain import Chain as Chain
     from .check import crosscheck as crosscheck
+    from .compensation import Compensation as Compensation
+    from .compensation import compensate as compensate
     from .crossvalidation import cross_validate as cross_validate
     from .crossvalidation import group_folds as group_folds
     from .crossvalidation import random_folds as random_folds
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from .extension import extend as extend
     from .factors import error_factors as error_factors
     from .measurement_files import read_measurements as read_measurements
+    from .measurement_files import read_targets as read_targets
     from .measurements import Noise as Noise
     from .parameters import extract as extract
     from .poses import Pose as Pose
@@ -48,6 +51,8 @@ _HOMES = {
     "group_folds": "crossvalidation",
     "random_folds": "crossvalidation",
     "region_folds": "crossvalidation",
+    "Compensation": "compensation",
+    "compensate": "compensation",
     "DHTable": "dh",
     "read_dh": "dh_files",
     "dh_to_urdf": "dh_urdf",
@@ -55,6 +60,7 @@ _HOMES = {
     "extend": "extension",
     "error_factors": "factors",
     "read_measurements": "measurement_files",
+    "read_targets": "measurement_files",
     "Noise": "measurements",
     "Pose": "poses",
     "Position": "positions",

@@ -18,9 +18,9 @@ from scipy.linalg import lstsq
 
 from .errors import DhcalError
 from .measurements import Measurement
+from .problem import Problem, Triangle, reduce
 from .result import Result, accuracy
 from .se3 import Array
-from .solver import Problem, Triangle, reduce
 
 # The share of the samples at either end of a principal direction that a fold leaves out.
 SHARE = 0.25

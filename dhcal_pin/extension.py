@@ -21,9 +21,10 @@ from .crossvalidation import Parts, parts, region_folds, rows, solved, standard_
 from .errors import DhcalError
 from .measurements import Measurement
 from .parameters import EXTENSIONS, SETS, Parameter
+from .problem import Triangle, reduce
 from .result import Result
 from .se3 import Array
-from .solver import Progress, Triangle, reduce
+from .solver import Progress
 
 # Widths of a family's priors that are tried, as shares of the default ones.
 WIDTHS = (1.0, 0.3, 0.1, 0.03)

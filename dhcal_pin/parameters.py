@@ -9,9 +9,10 @@ chain's transmission: its twist is the joint's own, times a term of the joint's 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 
@@ -30,6 +31,7 @@ WIDE_LENGTH, WIDE_ANGLE = 10.0, 10.0
 LEAST_TERM = 0.1
 
 _AXES = np.eye(6)
+_IDENTITY = np.eye(4)
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,8 @@ def extract(chain: Chain, convention: Convention = "standard", hayati: bool = Fa
     )
 
 
-def _dh_rows(chain: Chain, convention: Convention, hayati: bool) -> list[Parameter]:
+@functools.lru_cache(maxsize=16)
+def _dh_rows(chain: Chain, convention: Convention, hayati: bool) -> tuple[Parameter, ...]:
     found = extract(chain, convention, hayati)
     table = found.table
     out = []
@@ -94,7 +97,7 @@ def _dh_rows(chain: Chain, convention: Convention, hayati: bool) -> list[Paramet
                 Parameter(f"beta{label}", "rad", float(table.beta[i]), lateral, tuple(sideways[:, 4]), ANGLE)
             )
         out += rows if convention == "standard" else rows[2:] + rows[:2]
-    return out
+    return tuple(out)
 
 
 def _parallel(chain: Chain, i: int, convention: Convention) -> bool:
@@ -105,12 +108,12 @@ def _parallel(chain: Chain, i: int, convention: Convention) -> bool:
 
 def dh(chain: Chain) -> list[Parameter]:
     """Standard DH, 4 a joint: θ, d, a, α of every row; the columns of the paper's R."""
-    return _dh_rows(chain, "standard", hayati=False)
+    return list(_dh_rows(chain, "standard", hayati=False))
 
 
 def modified_dh(chain: Chain) -> list[Parameter]:
     """Modified DH, 4 a joint: a, α of the link before each joint, then d, θ."""
-    return _dh_rows(chain, "modified", hayati=False)
+    return list(_dh_rows(chain, "modified", hayati=False))
 
 
 def hayati(chain: Chain) -> list[Parameter]:
@@ -247,7 +250,7 @@ SETS: dict[str, Callable[[Chain], list[Parameter]]] = {
     "base": base,
     "tool": tool,
     "offset": offset,
-    **{name: partial(family, name=name) for name in FAMILIES},
+    **{name: functools.partial(family, name=name) for name in FAMILIES},
     "coupling": coupling,
 }
 EXTENSIONS = (*FAMILIES, "coupling")
@@ -332,18 +335,63 @@ class ErrorModel:
         """Prior standard deviations (p,), each in its parameter's unit."""
         return np.array([parameter.prior for parameter in self.parameters])
 
+    @cached_property
+    def _slots(self) -> tuple[Array, Array, Array]:
+        """Stations with unknowns (g,), and each parameter's place among them (p,) and at its station (p,)."""
+        stations, group = np.unique(self._stations, return_inverse=True)
+        return stations, group, np.arange(len(group)) - np.searchsorted(group, group)
+
+    @cached_property
+    def _most(self) -> int:
+        """The most parameters at a station, at least one."""
+        return int(self._slots[2].max(initial=0)) + 1
+
+    @cached_property
+    def _left(self) -> Array:
+        """Which stations with unknowns are links', (g, 1, 1, 1)."""
+        stations = self._slots[0]
+        left = (stations % 2 == 1) & (stations != self.chain.tool_station)
+        return left[:, None, None, None]
+
+    @cached_property
+    def _powers(self) -> tuple[Array, Array]:
+        """Sizes of the rotations (p,), and the twists as matrices Ξ, Ξ²/|ω|², Ξ³/|ω|³ (p, 3, 16)."""
+        twist = np.zeros((len(self._twists), 4, 4))
+        twist[:, :3, :3], twist[:, :3, 3] = se3.skew(self._twists[:, 3:]), self._twists[:, :3]
+        size = np.linalg.norm(self._twists[:, 3:], axis=1)
+        unit = twist / np.where(size > 0, size, 1.0)[:, None, None]
+        powers = np.stack([twist, unit @ unit, unit @ unit @ unit], 1)
+        return size, powers.reshape(-1, 3, 16)
+
+    def _factors(self, x: Array) -> Array:
+        """The parameters' motions exp(xξ), in the order of their stations (g, most a station, 4, 4)."""
+        size, powers = self._powers
+        angle = size * x
+        # exp(xξ) = I + xΞ + (1 - cos)(Ξ/|ω|)² + (angle - sin)(Ξ/|ω|)³, and I + xΞ for a translation.
+        share = np.empty((len(x), 1, 3))
+        share[:, 0, 0], share[:, 0, 1] = x, 2 * np.sin(0.5 * angle) ** 2
+        share[:, 0, 2] = angle - np.sin(angle)
+        motion = (share @ powers).reshape(-1, 4, 4) + _IDENTITY
+        stations, group, place = self._slots
+        out = np.empty((len(stations), self._most, 4, 4))
+        out[:] = _IDENTITY
+        out[group, place] = motion
+        return out
+
     def at(self, x: Array) -> Chain:
         """The chain with errors x (p,) in SI; its joints yield to the nominal arm's masses."""
-        x = np.asarray(x, float)
-        factors = se3.exp6(self._twists * x[: self._geometry, None])
-        motions: dict[int, Array] = {}
-        for station, factor in zip(self._stations, factors, strict=True):
-            motions[int(station)] = motions.get(int(station), np.eye(4)) @ factor
-        chain = self.chain.displaced(motions)
+        factors = self._factors(np.asarray(x, float)[: self._geometry])
+        return self._moved(functools.reduce(np.matmul, np.swapaxes(factors, 0, 1)), x)
+
+    def _moved(self, motions: Array, x: Array) -> Chain:
+        every = np.empty((self.chain.tool_station + 1, 4, 4))
+        every[:] = _IDENTITY
+        every[self._slots[0]] = motions
+        chain = self.chain.moved(every)
         if not self._entries.size:
             return chain
         held = self._transmission.changed(self._entries, x[self._geometry :])
-        return replace(chain, transmission=held)
+        return chain.driven(held)
 
     @cached_property
     def _transmission(self) -> Transmission:
@@ -352,7 +400,7 @@ class ErrorModel:
     def loaded(self, x: Array) -> ErrorModel:
         """The same unknowns, with joints that yield to the masses as they are placed at x."""
         held = replace(self._transmission, loads=self.at(x).loads)
-        return replace(self, chain=replace(self.chain, transmission=held))
+        return replace(self, chain=self.chain.driven(held))
 
     def derivative(self, x: Array) -> tuple[Chain, Array, Array]:
         """The chain at x, and for each parameter the body (p,) and twist (p, 6) it moves there.
@@ -362,21 +410,21 @@ class ErrorModel:
         last, numbered behind the bodies (see `Chain.tool_velocities`).
         """
         x = np.asarray(x, float)
-        factors = se3.exp6(self._twists * x[: self._geometry, None])
-        twists = self._twists.copy()
-        for station in np.unique(self._stations):
-            members = np.flatnonzero(self._stations == station)
-            left = station % 2 == 1 and station != self.chain.tool_station
-            carry = np.eye(4)
-            for k in members if left else members[::-1]:
-                twists[k] = se3.adjoint(carry if left else se3.inverse(carry)) @ self._twists[k]
-                carry = carry @ factors[k] if left else factors[k] @ carry
-        chain = self.at(x)
-        bodies, twists = chain.station_twists(self._stations, twists)
+        factors = self._factors(x[: self._geometry])
+        _, group, place = self._slots
+        most = self._most
+        before, behind = np.empty_like(factors), np.empty_like(factors)
+        before[:, 0] = behind[:, -1] = _IDENTITY
+        for i in range(1, most):
+            np.matmul(before[:, i - 1], factors[:, i - 1], out=before[:, i])
+            np.matmul(factors[:, most - i], behind[:, most - i], out=behind[:, most - i - 1])
+        chain = self._moved(factors[:, 0] @ behind[:, 0], x)
+        carry = np.where(self._left, before, se3.inverse(behind))
+        bodies, twists = chain.station_twists(self._stations, self._twists, carry[group, place])
         if not self._entries.size:
             return chain, bodies, twists
-        behind = len(chain.moving) + 1 + self._entries
-        return chain, np.concatenate([bodies, behind]), np.pad(twists, ((0, len(behind)), (0, 0)))
+        entries = len(chain.moving) + 1 + self._entries
+        return chain, np.concatenate([bodies, entries]), np.pad(twists, ((0, len(entries)), (0, 0)))
 
     def joined(self, parameters: Iterable[Parameter]) -> ErrorModel:
         """With more unknowns, each where it belongs: by station, entries of the transmission last."""

@@ -187,8 +187,8 @@ def urdf_files(
     joints = transmission_lines(chain)
     if chain.transmission is not None:
         # From here on the written masses load the joints.
-        again = again.driven(chain.transmission.coefficients)
-        chain = replace(chain, transmission=again.transmission)
+        written = replace(chain.transmission, loads=again.loads)
+        chain, again = chain.driven(written), again.driven(written)
     rng = np.random.default_rng(0)
     q = rng.uniform(-np.pi, np.pi, (50, chain.size))
     wanted = chain.poses(q)

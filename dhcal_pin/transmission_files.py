@@ -53,7 +53,7 @@ def with_transmission(chain: Chain, tables: object, source: str) -> Chain:
             raise DhcalError(
                 f"{source}: [joint.{name}]: no joint of this robot; there are {', '.join(chain.joint_names)}"
             )
-    return chain.driven(held)
+    return chain.driven(Transmission(held, chain.loads))
 
 
 def _elsewhere(chain: Chain) -> set[str]:

@@ -44,7 +44,7 @@ def fitted(kind=Position, m: int = 40):
 
 
 def test_folds_equal_fits_without_what_they_leave_out():
-    fit = fitted()
+    fit = fitted(Pose)
     folds = random_folds(fit.data, 4, seed=1)
     found = cross_validate(fit, folds)
     for fold, judged, error in zip(folds, found.folds, found.errors, strict=True):
