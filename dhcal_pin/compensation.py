@@ -24,7 +24,6 @@ from .inverse import (
     Gap,
     joint_velocities,
     size,
-    sliding,
     solve,
     to_poses,
     to_positions,
@@ -163,7 +162,7 @@ class _Search:
     @classmethod
     def of(cls, chain: Chain, turned: bool) -> _Search:
         """Always the same configurations."""
-        span = np.where(sliding(chain), size(chain), np.pi)
+        span = np.where(chain.sliding, size(chain), np.pi)
         middle = _middle(chain)
         low, high = np.maximum(chain.lower, middle - span), np.minimum(chain.upper, middle + span)
         q = np.random.default_rng(0).uniform(low, high, (_KNOWN, chain.size))
@@ -186,7 +185,7 @@ class _Search:
         """Joint values (m, n), status (m,) and miss (m, 2) of targets, nearest to `near` (m, n)."""
         m, n = near.shape
         q, status, miss = np.full((m, n), np.nan), np.full(m, OUT, dtype=object), np.full((m, 2), np.nan)
-        scale = np.where(sliding(self.chain), size(self.chain), 1.0)
+        scale = np.where(self.chain.sliding, size(self.chain), 1.0)
         best, missed = np.repeat(near[:, None], _FOLLOWED, 1), np.zeros(m)
         for count, steps, share in _ROUNDS:
             left = np.flatnonzero((status == OUT) & (missed <= share * size(self.chain)))
@@ -254,5 +253,5 @@ def _least(chain: Chain, q: Array, rows: slice) -> Array:
     """The smallest motion (m,) of the tool, lengths in sizes of the arm, that a unit of the joints makes."""
     twists = joint_velocities(chain, q)[1]
     twists[:, :3] /= size(chain)
-    twists[:, :, sliding(chain)] *= size(chain)
+    twists[:, :, chain.sliding] *= size(chain)
     return np.linalg.svd(twists[:, rows], compute_uv=False)[:, -1]

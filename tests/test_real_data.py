@@ -14,6 +14,10 @@ import pytest
 from conftest import robot_file
 
 from dhcal_pin import cli
+from dhcal_pin.calibration import calibrate
+from dhcal_pin.chain import Chain
+from dhcal_pin.crossvalidation import cross_validate, random_folds, region_folds
+from dhcal_pin.measurement_files import read_readings
 
 MAPS = Path(__file__).resolve().parent / "maps"
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -21,6 +25,7 @@ SERIES = {
     "B": DATA / "ipa_ur10/Series_B/measurements_joint_configurations.csv",
     "D": DATA / "ipa_ur10/Series_D/measurements_iso_cubes.csv",
 }
+FOLDS = (lambda data: random_folds(data, 5), region_folds)
 PANDA = DATA / "mukca_panda/panda_with_ball.urdf"
 PANDA_2 = "back_left back_right front_center front_left front_right mid-high mid_left mid_right".split()
 PANDA_1 = "back-high front right".split()
@@ -75,6 +80,37 @@ def test_links_from_one_series_hold_for_another(dhcal, tmp_path, series, other, 
     columns = ("--columns", MAPS / "ipa_ur10.toml", "--tip", "tool0")
     moved = dhcal("validate", output, SERIES[other], *columns, "--fit-frames")
     assert moved["after"]["position_rms_m"] <= most
+
+
+@pytest.mark.parametrize(
+    ("series", "other", "held", "moved"), [("B", "D", 0.425e-3, 0.52e-3), ("D", "B", 0.36e-3, 0.49e-3)]
+)
+def test_extensions_hold_for_what_was_left_out_and_for_another_series(
+    dhcal, tmp_path, series, other, held, moved
+):
+    fit, _ = ur10(dhcal, series, "minimal,base,tool", tmp_path, "--holdout", "0.5", "--extend", "auto")
+    assert fit["holdout_after"]["position_rms_m"] <= held
+    assert "compliance" in [trial["family"] for trial in fit["extension"] if trial["kept"]]
+    _, output = ur10(dhcal, series, "minimal,base,tool", tmp_path, "--extend", "auto")
+    columns = ("--columns", MAPS / "ipa_ur10.toml", "--tip", "tool0")
+    judged = dhcal("validate", output, SERIES[other], *columns, "--fit-frames")
+    assert judged["after"]["position_rms_m"] <= moved
+
+
+def test_a_random_split_hides_what_a_split_by_regions_shows():
+    """Harmonics that nothing holds: better among neighbours, worse where nobody measured."""
+    chain = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    data = read_readings(SERIES["B"], chain, MAPS / "ipa_ur10.toml").data.take(np.s_[::4])
+    free = {"*.sin*": 1e3, "*.cos*": 1e3}
+    fits = [
+        calibrate(chain, data, "minimal,base,tool"),
+        calibrate(chain, data, "minimal,base,tool,harmonics", priors=free),
+    ]
+    plain, wild = ([cross_validate(fit, folds(fit.data)) for folds in FOLDS] for fit in fits)
+    key = "position_rms_m"
+    random, regions = (b.accuracy[key] / a.accuracy[key] for a, b in zip(plain, wild, strict=True))
+    assert random < 0.95
+    assert regions > 1.2
 
 
 def known_distances(path, places):
