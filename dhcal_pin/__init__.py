@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from .errors import DhcalError as DhcalError
     from .extension import extend as extend
     from .factors import error_factors as error_factors
+    from .live import Live as Live
+    from .live import serve as serve
     from .measurement_files import read_measurements as read_measurements
     from .measurement_files import read_targets as read_targets
     from .measurements import Noise as Noise
@@ -59,6 +61,8 @@ _HOMES = {
     "DhcalError": "errors",
     "extend": "extension",
     "error_factors": "factors",
+    "Live": "live",
+    "serve": "live",
     "read_measurements": "measurement_files",
     "read_targets": "measurement_files",
     "Noise": "measurements",

@@ -143,16 +143,16 @@ def _scatter(
 def _widened(problem: Problem, solution: Solution, expected: Array, default: Array) -> Array:
     """The weights (p+s,) of priors as wide as the errors that were found, never narrower than expected.
 
-    Lengths and angles of the links each have one scale, the one of greatest evidence (MacKay 1992):
-    the mean square of their errors over as many as the data and not the prior determine. So have
-    coefficients of the transmission of each unit. Priors that are not default (p,) stay.
+    Errors of the links of one unit and one expected size have one scale, the one of greatest evidence
+    (MacKay 1992): the mean square of the errors over as many as the data and not the prior determine.
+    Priors that are not default (p,) stay.
     """
     errors = problem.errors
     outside = (BASE, errors.chain.tool_station)
     root = posterior_root(solution.triangle, problem.weights)[0]
     told = 1 - np.sum((root * problem.weights[:, None]) ** 2, 1)
     weights = problem.weights.copy()
-    kinds = [(p.unit, p.entry is None) for p in errors.parameters]
+    kinds = [(p.unit, expected[i]) for i, p in enumerate(errors.parameters)]
     inside = [i for i, p in enumerate(errors.parameters) if default[i] and p.station not in outside]
     for kind in set(kinds):
         family = [i for i in inside if kinds[i] == kind]

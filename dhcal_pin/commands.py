@@ -6,7 +6,6 @@ Wrong input is found before anything is written or shown; JSON goes to stdout, a
 from __future__ import annotations
 
 import os
-import tempfile
 from argparse import Namespace
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -22,9 +21,10 @@ from . import (
     extension,
     fleet_command,
     report,
+    study_command,
     terminal,
     ur_kinematics,
-    viewer,
+    view_command,
 )
 from .chain import Chain
 from .check import crosscheck
@@ -35,7 +35,7 @@ from .files import PathLike, parse_noise, save
 from .fleet import ENDING, is_fleet
 from .jobs import Job
 from .kinds import KINDS
-from .measurement_files import measurement_text, read_measurements, read_readings
+from .measurement_files import measurement_text, read_readings
 from .measurements import Measurement, Noise
 from .outputs import STDOUT, check_outputs, emit, names, same, sidecars
 from .parameters import EXTENSIONS, extract
@@ -53,8 +53,8 @@ from .robot_files import (
     urdf_files,
 )
 from .screening import Finding, screen
-from .se3 import Array
 from .solver import Progress
+from .study import configurations
 
 # --- calibrate -------------------------------------------------------------------------------------
 
@@ -330,39 +330,10 @@ def _simulate(args: Namespace) -> int:
                 f"they must be those of {args.robot}: {', '.join(chain.joint_names)}"
             )
     rng = np.random.default_rng(args.seed)
-    data = KINDS[args.kind].simulate(truth, _configurations(chain, args.samples, rng), noise, rng)
+    data = KINDS[args.kind].simulate(truth, configurations(chain, args.samples, rng), noise, rng)
     comments = [f"simulated {args.kind} of {args.truth or args.robot}, noise {args.noise}, seed {args.seed}"]
     save({args.output: measurement_text(data, chain, comments)})
     terminal.lines(f"wrote {args.output}")
-    return 0
-
-
-def _configurations(chain: Chain, count: int, rng: np.random.Generator) -> Array:
-    """Uniform joint values (count, n) within the limits, and within a turn or half a metre each way."""
-    low, high = chain.lower, chain.upper
-    slides = [chain.urdf.joint(name).type == "prismatic" for name in chain.joint_names]
-    span = np.where(slides, 0.5, np.pi)
-    low, high = (
-        np.where(high > -span, np.maximum(low, -span), np.maximum(low, high - 2 * span)),
-        np.where(low < span, np.minimum(high, span), np.minimum(high, low + 2 * span)),
-    )
-    return rng.uniform(low, high, (count, chain.size))
-
-
-def _view(args: Namespace) -> int:
-    given = [args.nominal, *([args.calibrated] if args.calibrated else [])]
-    page = args.html or os.path.join(tempfile.mkdtemp(prefix="dhcal-"), f"{robot_name(args.nominal)}.html")
-    check_outputs([page], [*given, *sidecars(given), *args.data])
-    nominal, *calibrated = (read_robot(path, None if is_table(path) else args.tip) for path in given)
-    data = [read_measurements(path, nominal) for path in args.data]
-    title = " and ".join(robot_name(path) for path in given)
-    text = viewer.scene_html(
-        nominal, *calibrated, measurements=data, title=title, magnification=args.magnification
-    )
-    save({page: text})
-    terminal.lines(f"wrote {page}")
-    if args.open or not args.html:
-        terminal.open_page(page)
     return 0
 
 
@@ -380,8 +351,9 @@ COMMANDS: dict[str, Callable[[Namespace], int]] = {
     "calibrate": _calibrate,
     "validate": _validate,
     "convert": _convert,
-    "view": _view,
+    "view": view_command.view,
     "check": _check,
     "simulate": _simulate,
     "compensate": compensate_command.run,
+    "study": study_command.study,
 }
