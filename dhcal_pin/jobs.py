@@ -18,7 +18,8 @@ class Job:
         data: paths of measurement files.
         output: path of the corrected URDF.
         tip, columns, parameters, extend, fix, free, holdout, method, loss, priors, instrument,
-            max_iterations, seed, in_place, world_joint, tool_frame, json: as `dhcal calibrate --help` says.
+            max_iterations, seed, in_place, world_joint, tool_frame, json, map: as in
+            `dhcal calibrate --help`.
     """
 
     robot: str
@@ -41,6 +42,7 @@ class Job:
     world_joint: bool = False
     tool_frame: str | None = None
     json: str | None = None
+    map: str | None = None
 
     @classmethod
     def of(cls, args: Namespace) -> Job:
