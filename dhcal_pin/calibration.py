@@ -32,28 +32,33 @@ NARROWEST = 0.1
 GOOD_FIT = 0.01
 
 
-def prior_weights(errors: ErrorModel, priors: Priors) -> tuple[Array, Array]:
-    """One over each prior's sigma (p,), zero where there is none, and which of them (p,) are default ones.
+def prior_weights(errors: ErrorModel, priors: Priors) -> Array:
+    """One over each prior's sigma (p,), zero where there is none.
 
     Raises:
         DhcalError: an unknown choice or name, or a sigma that is not positive.
     """
-    count = len(errors.parameters)
     if isinstance(priors, str):
         if priors not in ("default", "none"):
             raise DhcalError(f"priors {priors!r}: choose default, none, or sigmas by name")
-        default = np.full(count, priors == "default")
-        return default / errors.priors, default
-    sigma, default = errors.priors.copy(), np.ones(count, bool)
+        return 1 / errors.priors if priors == "default" else np.zeros(len(errors.parameters))
+    sigma = errors.priors.copy()
     names = [p.name for p in errors.parameters]
     for pattern, value in priors.items():
         hit = [i for i, name in enumerate(names) if fnmatch.fnmatchcase(name, pattern)]
         if not hit:
             raise DhcalError(f"prior for {pattern!r}: no such parameter; there are {', '.join(names)}")
         if not value > 0:
-            raise DhcalError(f"prior for {pattern!r}: {value} must be positive, in m or rad")
-        sigma[hit], default[hit] = value, False
-    return 1 / sigma, default
+            raise DhcalError(f"prior for {pattern!r}: {value} must be positive, in its parameter's unit")
+        sigma[hit] = value
+    return 1 / sigma
+
+
+def _default(errors: ErrorModel, priors: Priors) -> Array:
+    """Which parameters (p,) have default priors."""
+    if isinstance(priors, str):
+        return np.full(len(errors.parameters), priors == "default")
+    return np.array([not any(fnmatch.fnmatchcase(p.name, key) for key in priors) for p in errors.parameters])
 
 
 def split(
@@ -232,8 +237,8 @@ def calibrate(
     reference = _place(errors, data, known, max_iterations)
     errors = replace(errors, chain=reference)
     data = tuple(item.started(reference) for item in data)
-    sigmas, default = prior_weights(errors, priors)
-    problem = _problem(errors, data, sigmas, known)
+    problem = _problem(errors, data, prior_weights(errors, priors), known)
+    default = _default(errors, priors)
     solution = METHODS[method](problem, np.zeros(len(problem.weights)), max_iterations, progress)
     if errors.at(solution.x[: len(errors.parameters)]).transmission is not None:
         # Gravity's torques follow the arm as found: once more with those.

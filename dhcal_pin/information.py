@@ -124,7 +124,7 @@ class Information:
         if priors == "none":
             raise DhcalError("a plan needs priors; choose default, or sigmas by name")
         errors = select(chain, parameters if parameters is not None else chain.parameters, fix, free)
-        sigma = 1 / prior_weights(errors, priors)[0]
+        sigma = 1 / prior_weights(errors, priors)
         x, there, triangle = np.zeros(len(sigma)), {}, np.zeros((0, len(sigma)))
         values = dict(known or {})
         if data:

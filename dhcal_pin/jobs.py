@@ -18,8 +18,8 @@ class Job:
         data: paths of measurement files.
         output: path of the corrected URDF.
         tip, columns, parameters, extend, fix, free, holdout, method, loss, priors, instrument,
-            max_iterations, seed, in_place, world_joint, tool_frame, json, map: as
-            `dhcal calibrate --help` says.
+            max_iterations, seed, in_place, world_joint, tool_frame, json, map: as in
+            `dhcal calibrate --help`.
     """
 
     robot: str

@@ -11,6 +11,7 @@ import pinocchio as pin
 import pytest
 from conftest import paper, random_table, robot_file, with_masses
 
+from dhcal_pin.arms import Arms
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.chain import Chain
 from dhcal_pin.cli import main
@@ -105,6 +106,14 @@ def test_sets_that_a_robot_cannot_have(sim_6dof):
     with pytest.raises(DhcalError, match=r"'harmonics'.*turns"):
         select(Chain.from_dh(slides), "harmonics")
     assert [p.name for p in select(Chain.from_dh(slides), "gain").parameters] == ["j1.gain", "j2.gain"]
+
+
+def test_many_arms_at_once_have_ideal_joints():
+    arm = ur10()
+    driven, _ = drawn(arm, "gain", np.random.default_rng(0))
+    for errors in (select(arm, "base,gain"), select(driven, "base")):
+        with pytest.raises(DhcalError, match="calibrate it by itself"):
+            Arms.of([errors])
 
 
 # --- the sidecar -----------------------------------------------------------------------------------
