@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from .calibration import split as split
     from .chain import Chain as Chain
     from .check import crosscheck as crosscheck
+    from .compensation import Compensation as Compensation
+    from .compensation import compensate as compensate
     from .configurations import Space as Space
     from .dh import DHTable as DHTable
     from .dh_files import read_dh as read_dh
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
     from .errors import DhcalError as DhcalError
     from .factors import error_factors as error_factors
     from .measurement_files import read_measurements as read_measurements
+    from .measurement_files import read_targets as read_targets
     from .measurements import Noise as Noise
     from .parameters import extract as extract
     from .planning import Plan as Plan
@@ -43,6 +46,8 @@ _HOMES = {
     "split": "calibration",
     "Chain": "chain",
     "crosscheck": "check",
+    "Compensation": "compensation",
+    "compensate": "compensation",
     "Space": "configurations",
     "DHTable": "dh",
     "read_dh": "dh_files",
@@ -50,6 +55,7 @@ _HOMES = {
     "DhcalError": "errors",
     "error_factors": "factors",
     "read_measurements": "measurement_files",
+    "read_targets": "measurement_files",
     "Noise": "measurements",
     "Plan": "planning",
     "plan": "planning",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
@@ -94,9 +95,15 @@ def parser() -> argparse.ArgumentParser:
         "identify a robot's errors from measurements and write the corrected URDF",
         "dhcal calibrate ur10.urdf laser.csv --tip tool0 --holdout 0.3 -o ur10_calibrated.urdf",
     )
-    calibrate.add_argument("robot", **_ROBOT)
-    calibrate.add_argument("data", **_DATA)
-    calibrate.add_argument("-o", "--output", metavar="OUT.urdf", required=True, help="the corrected URDF")
+    calibrate.add_argument("robot", metavar="ROBOT", help=f"{_ROBOT['help']}; or a manifest, NAME.fleet.toml")
+    calibrate.add_argument("data", metavar="DATA", nargs="*", help=f"{_DATA['help']}; none with a manifest")
+    calibrate.add_argument(
+        "-o",
+        "--output",
+        metavar="OUT.urdf",
+        required=True,
+        help="the corrected URDF; a manifest's summary.csv",
+    )
     calibrate.add_argument("--tip", **_TIP)
     calibrate.add_argument("--columns", **_COLUMNS)
     calibrate.add_argument(
@@ -140,6 +147,9 @@ def parser() -> argparse.ArgumentParser:
         "--map", metavar="MAP.csv", help="predicted position uncertainty by cells of the workspace"
     )
     calibrate.add_argument("--json", **_JSON)
+    calibrate.add_argument(
+        "--jobs", metavar="N", type=_count, help="processes for a manifest (default: one a processor)"
+    )
 
     validate = _add(
         commands,
@@ -261,12 +271,27 @@ def parser() -> argparse.ArgumentParser:
     simulate.add_argument("--kind", metavar="KIND", default="pose", help="what is measured (pose)")
     simulate.add_argument("--tip", **_TIP)
     simulate.add_argument("--seed", metavar="N", type=_seed, default=0, help="of joint values and noise (0)")
+
+    compensate = _add(
+        commands,
+        "compensate",
+        "joint values, and corrected targets for a nominal controller, that land where asked",
+        "dhcal compensate ur10.urdf ur10_calibrated.urdf targets.csv --tip tool0 -o corrected.csv",
+    )
+    compensate.add_argument("nominal", metavar="NOMINAL.urdf", help="what the controller knows")
+    compensate.add_argument("calibrated", metavar="CALIBRATED.urdf", help="the same robot, calibrated")
+    compensate.add_argument("targets", metavar="targets.csv", help="positions or poses of the tool")
+    compensate.add_argument("-o", "--output", metavar="corrected.csv", required=True, help="a row a target")
+    compensate.add_argument("--tip", **_TIP)
     return out
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; 0 done, 1 a check that failed, 2 wrong input, 130 interrupted."""
     args = parser().parse_args(argv)
+    # Small and narrow matrices: further threads of a BLAS, which asks when NumPy loads, would only wait.
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
     try:
         from . import commands
 

@@ -10,10 +10,22 @@ import tempfile
 from argparse import Namespace
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from . import calibration, demo, exports, plan_command, report, terminal, ur_kinematics, viewer
+from . import (
+    calibration,
+    compensate_command,
+    demo,
+    exports,
+    fleet_command,
+    plan_command,
+    report,
+    terminal,
+    ur_kinematics,
+    viewer,
+)
 from .chain import Chain
 from .check import crosscheck
 from .configuration_files import map_text
@@ -22,6 +34,8 @@ from .dh_files import dh_text, is_dh
 from .dh_urdf import dh_to_urdf
 from .errors import DhcalError
 from .files import PathLike, parse_noise, save
+from .fleet import ENDING, is_fleet
+from .jobs import Job
 from .kinds import KINDS
 from .measurement_files import measurement_text, read_measurements, read_readings
 from .measurements import Measurement, Noise
@@ -41,6 +55,7 @@ from .robot_files import (
     urdf_files,
 )
 from .screening import Finding, screen
+from .solver import Progress
 from .workspace import workspace_map
 
 # --- calibrate -------------------------------------------------------------------------------------
@@ -60,7 +75,7 @@ def _without(data: Measurement, findings: Sequence[Finding]) -> Measurement:
     return data.take(~np.isin(data.rows, [finding.row for finding in findings]))
 
 
-def _read_data(chain: Chain, args: Namespace, held_file: str | None, known_frames: bool) -> _Data:
+def _read_data(chain: Chain, args: Job, held_file: str | None, known_frames: bool) -> _Data:
     """All measurements, split as the files' `set` columns and --holdout ask."""
     fit: list[Measurement] = []
     holdout: list[Measurement] = []
@@ -89,7 +104,32 @@ def _read_data(chain: Chain, args: Namespace, held_file: str | None, known_frame
     return _Data(fitted, [item for item in holdout if len(item.rows)], findings, doubtful)
 
 
-def _calibrate(args: Namespace) -> int:
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """A calibration whose files are written.
+
+    Attributes:
+        fit: what was found.
+        document: the same as JSON.
+        files: paths of what was written, by what it is.
+        findings, gross, doubts: by file, the impossible rows, the numbers of gross ones, and what is hard
+            to believe.
+    """
+
+    fit: Result
+    document: dict[str, Any]
+    files: dict[str, str]
+    findings: dict[str, list[Finding]]
+    gross: dict[str, list[int]]
+    doubts: dict[str, list[str]]
+
+
+def run_job(args: Job, progress: Progress | None = None) -> Outcome:
+    """Calibrates one robot and writes its files, in this process or another; shows nothing.
+
+    Raises:
+        DhcalError: the input is wrong or a file cannot be written; then none is.
+    """
     held_file = args.holdout if args.holdout is not None and os.path.exists(args.holdout) else None
     measured = [*args.data, *([held_file] if held_file else [])]
     for number, path in enumerate(measured):
@@ -108,21 +148,20 @@ def _calibrate(args: Namespace) -> int:
     chain = read_robot(args.robot, args.tip)
     sets = args.parameters or chain.parameters
     data = _read_data(chain, args, held_file, known_frames=not {"base", "tool"} & set(names(sets)))
-    with terminal.progress("fitting") as progress:
-        fit = calibration.calibrate(
-            chain,
-            list(data.fit.values()),
-            sets,
-            method=args.method,
-            priors=read_priors(args.priors),
-            fix=names(args.fix),
-            free=names(args.free),
-            holdout=data.holdout,
-            known=read_instrument(args.instrument) if args.instrument else None,
-            loss=args.loss,
-            max_iterations=args.max_iterations,
-            progress=progress,
-        )
+    fit = calibration.calibrate(
+        chain,
+        list(data.fit.values()),
+        sets,
+        method=args.method,
+        priors=read_priors(args.priors),
+        fix=names(args.fix),
+        free=names(args.free),
+        holdout=data.holdout,
+        known=read_instrument(args.instrument) if args.instrument else None,
+        loss=args.loss,
+        max_iterations=args.max_iterations,
+        progress=progress,
+    )
     contents = _written(fit, args)
     files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
     if args.map:
@@ -142,21 +181,38 @@ def _calibrate(args: Namespace) -> int:
     document = report.document(
         fit, files, report.fingerprints(inputs), [row for found in rows.values() for row in found]
     ) | {"outliers_by_file": rows}
-    if "json" in files:
+    if args.json and args.json != STDOUT:
         contents[args.json] = report.json_text(document)
     save(contents)
+    return Outcome(fit, document, files, data.findings, gross, data.doubts)
+
+
+def _calibrate_one(job: Job) -> dict[str, Any]:
+    """A robot of a fleet, in a process of its own."""
+    return run_job(job).document
+
+
+def _calibrate(args: Namespace) -> int:
+    if is_fleet(args.robot):
+        return fleet_command.run(args, _calibrate_one)
+    if not args.data:
+        raise DhcalError(f"DATA is required: name at least one measurement file behind {args.robot}")
+    if args.jobs is not None:
+        raise DhcalError(f"--jobs: goes with a manifest (NAME{ENDING}) in place of ROBOT; leave it out")
+    with terminal.progress("fitting") as progress:
+        outcome = run_job(Job.of(args), progress)
     if args.json == STDOUT:
-        emit(args.json, document)
-    for path, found in data.findings.items():
+        emit(args.json, outcome.document)
+    for path, found in outcome.findings.items():
         terminal.findings(path, found)
-        terminal.gross(path, gross.get(path, []), args.loss)
-    for path, texts in data.doubts.items():
+        terminal.gross(path, outcome.gross.get(path, []), args.loss)
+    for path, texts in outcome.doubts.items():
         terminal.doubts(path, texts)
-    terminal.summary(fit, files)
+    terminal.summary(outcome.fit, outcome.files)
     return 0
 
 
-def _written(fit: Result, args: Namespace) -> dict[PathLike, str | bytes]:
+def _written(fit: Result, args: Job) -> dict[PathLike, str | bytes]:
     """The calibrated URDF and its sidecar, base and tool moved into the URDF where that was asked for."""
     chain = fit.chain
     # A base that the URDF holds must not stand in the sidecar too.
@@ -311,4 +367,5 @@ COMMANDS: dict[str, Callable[[Namespace], int]] = {
     "check": _check,
     "plan": plan_command.run,
     "simulate": _simulate,
+    "compensate": compensate_command.run,
 }

@@ -64,7 +64,8 @@ class Information:
         chain, bodies, twists = self._derivative
         data = self.kind.simulate(chain, q, self.noise, np.random.default_rng(0))
         sweep = chain.sweep(q)
-        whitened = data.whiten(sweep, chain.tool_velocities(sweep, bodies, twists), self.own)
+        velocities = chain.tool_velocities(sweep, bodies, twists)
+        whitened = data.whiten(sweep, velocities, self.own, data.residual(sweep, self.own))
         out = np.zeros((len(self.scale), *whitened.shape[1:]))
         out[: len(whitened)] = whitened
         free = self.places >= 0

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
@@ -75,6 +76,11 @@ class Measurement(Protocol):
         ...
 
     @property
+    def size(self) -> int:
+        """Number k of residuals a sample."""
+        ...
+
+    @property
     def stated(self) -> bool:
         """Whether the sigmas are the instrument's own, not a placeholder to be estimated."""
         ...
@@ -96,15 +102,19 @@ class Measurement(Protocol):
         """Whitened residuals (k, m); `groups` names its rows."""
         ...
 
-    def whiten(self, sweep: Sweep, velocities: Array, u: Array) -> Array:
-        """Derivatives (p, k, m) of the whitened model from tool velocities (p, 6, c·m)."""
+    def whiten(
+        self, sweep: Sweep, velocities: Array, u: Array, residual: Array, out: Array | None = None
+    ) -> Array:
+        """Derivatives (p, k, m) of the whitened model from tool velocities (p, 6, c·m) where residual is."""
         ...
 
     def own(self, sweep: Sweep, u: Array) -> Array:
         """Derivatives (s, k, m) of the whitened model by the unknowns."""
         ...
 
-    def small_angle(self, sweep: Sweep, velocities: Array, u: Array) -> tuple[Array, Array]:
+    def small_angle(
+        self, sweep: Sweep, velocities: Array, u: Array, out: Array | None = None
+    ) -> tuple[Array, Array]:
         """The paper's rows: residual (k, m) by (35) and (36), derivative (p, k, m) by its R."""
         ...
 
@@ -243,6 +253,21 @@ class PointReading:
         """As they are, (m, n)."""
         return self.q
 
+    @property
+    def size(self) -> int:
+        """As many as the reading has columns."""
+        return self.reading.shape[1]
+
+    @cached_property
+    def _weights(self) -> Array:
+        """One over sigma, (k, m)."""
+        return 1 / np.ascontiguousarray(self.sigma.T)
+
+    @cached_property
+    def _reading(self) -> Array:
+        """(k, m), the samples last in memory."""
+        return np.ascontiguousarray(self.reading.T)
+
     def _points(self, sweep: Sweep) -> Array:
         m = len(self.rows)
         return sweep.tool[3].reshape(3, -1, m).transpose(1, 0, 2) if m else np.empty((1, 3, 0))
@@ -253,27 +278,27 @@ class PointReading:
 
     def residual(self, sweep: Sweep, u: Array) -> Array:
         """(k, m)."""
-        return (self.reading.T - self.model(self._points(sweep), u)[0]) / self.sigma.T
+        return (self._reading - self.model(self._points(sweep), u)[0]) * self._weights
 
-    def whiten(self, sweep: Sweep, velocities: Array, u: Array) -> Array:
+    def whiten(
+        self, sweep: Sweep, velocities: Array, u: Array, residual: Array, out: Array | None = None
+    ) -> Array:
         """(p, k, m)."""
-        derivative = self.model(self._points(sweep), u)[1]
-        m = len(self.rows)
-        out = np.zeros((len(velocities), *derivative.shape[1:2], m))
-        for i, block in enumerate(derivative):
-            part = velocities[:, :3, i * m : (i + 1) * m]
-            # A sum over x, y, z, written out: einsum would not use the memory's order.
-            for axis in range(3):
-                out += part[:, None, axis] * block[:, axis]
-        return out / self.sigma.T
+        derivative = self.model(self._points(sweep), u)[1] * self._weights[:, None]
+        ends, _, _, m = derivative.shape
+        moved = velocities[:, :3].reshape(-1, 3, ends, m)
+        return np.einsum("pacm,ckam->pkm", moved, derivative, out=out)
 
     def own(self, sweep: Sweep, u: Array) -> Array:
         """(s, k, m)."""
-        return self.model(self._points(sweep), u)[2] / self.sigma.T
+        return self.model(self._points(sweep), u)[2] * self._weights
 
-    def small_angle(self, sweep: Sweep, velocities: Array, u: Array) -> tuple[Array, Array]:
+    def small_angle(
+        self, sweep: Sweep, velocities: Array, u: Array, out: Array | None = None
+    ) -> tuple[Array, Array]:
         """The same rows: there is no rotation in them."""
-        return self.residual(sweep, u), self.whiten(sweep, velocities, u)
+        residual = self.residual(sweep, u)
+        return residual, self.whiten(sweep, velocities, u, residual, out)
 
     def errors(self, sweep: Sweep, u: Array) -> dict[str, Array]:
         """{group: (m, k)} in m."""

@@ -14,17 +14,9 @@ from . import observability, robust
 from .chain import Chain
 from .measurements import Measurement, Unknown
 from .parameters import ErrorModel, Parameter
+from .problem import Problem, reduce, shared_unknowns
 from .se3 import Array
-from .solver import (
-    Problem,
-    Solution,
-    levenberg_marquardt,
-    posterior_root,
-    pseudo_inverse,
-    reduce,
-    shared_unknowns,
-    with_priors,
-)
+from .solver import Solution, levenberg_marquardt, posterior_root, pseudo_inverse, with_priors
 
 # A parameter, or a metre and a radian of the tool, with more than this share of itself unseen is unknown.
 UNKNOWN = 1e-6

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import webbrowser
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -57,6 +57,17 @@ def progress(title: str) -> Iterator[Progress | None]:
         return
     with console.status(title) as status:
         yield lambda iteration, cost: status.update(f"{title}: iteration {iteration}, cost {cost:.6g}")
+
+
+@contextmanager
+def counting(title: str, total: int) -> Iterator[Callable[[int], None] | None]:
+    """A status line that counts up to a total; nothing where stderr is not a terminal."""
+    console = _console()
+    if not console.is_terminal:
+        yield None
+        return
+    with console.status(f"{title}: 0 of {total}") as status:
+        yield lambda done: status.update(f"{title}: {done} of {total}")
 
 
 def findings(path: str, found: Sequence[Finding]) -> None:
