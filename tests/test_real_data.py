@@ -122,13 +122,16 @@ def test_a_panda_that_touched_sockets_at_three_places(dhcal, tmp_path, left, mos
     assert fitted <= most
 
 
-def test_planned_poses_of_a_series_are_worth_more_than_random_ones():
-    """Forty poses chosen out of half a series by their joint values alone, judged on the other half."""
+def planned_and_random(seeds: int, choices: int) -> tuple[float, float]:
+    """Held-out error on half a series, of forty planned and of forty random poses over that of the other half.
+
+    The plan sees joint values alone. Means over several halves: one choice of forty scatters by 0.025.
+    """
     chain = read_robot(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
     data = read_measurements(SERIES["B"], chain, MAPS / "ipa_ur10.toml")
     sets, noise = "minimal,base,tool", Noise(1e-4, np.deg2rad(0.01))
     planned, random = [], []
-    for seed in range(4):
+    for seed in range(seeds):
         rng = np.random.default_rng(seed)
         order = rng.permutation(len(data.rows))
         half = len(order) // 2
@@ -138,10 +141,19 @@ def test_planned_poses_of_a_series_are_worth_more_than_random_ones():
             return calibrate(chain, part, sets).validate(second)["position_rms_m"]
 
         every = held_out(first)
-        found = plan(chain, 40, noise=noise, parameters=sets, criterion="task", candidates=first.q)
+        found = plan(chain, 40, noise=noise, parameters=sets, candidates=first.q)
         planned.append(held_out(first.take(found.index)) / every)
-        choices = [rng.choice(half, 40, replace=False) for _ in range(10)]
-        random.append(np.median([held_out(first.take(choice)) for choice in choices]) / every)
-    # One choice of forty scatters by 0.025 about its mean, which is what is judged.
-    assert np.mean(planned) <= 1.10
-    assert np.mean(planned) <= np.mean(random)
+        drawn = [held_out(first.take(rng.choice(half, 40, replace=False))) for _ in range(choices)]
+        random.append(np.median(drawn) / every)
+    return float(np.mean(planned)), float(np.mean(random))
+
+
+def test_planned_poses_of_a_series_do_for_all_of_it():
+    assert planned_and_random(2, 1)[0] <= 1.10
+
+
+@pytest.mark.slow
+def test_planned_poses_of_a_series_are_worth_more_than_random_ones():
+    planned, random = planned_and_random(12, 100)
+    assert planned <= 1.10
+    assert planned <= random
