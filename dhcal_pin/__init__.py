@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from .dh_urdf import dh_to_urdf as dh_to_urdf
     from .errors import DhcalError as DhcalError
     from .factors import error_factors as error_factors
+    from .live import Live as Live
+    from .live import serve as serve
     from .measurement_files import read_measurements as read_measurements
     from .measurement_files import read_targets as read_targets
     from .measurements import Noise as Noise
@@ -54,6 +56,8 @@ _HOMES = {
     "dh_to_urdf": "dh_urdf",
     "DhcalError": "errors",
     "error_factors": "factors",
+    "Live": "live",
+    "serve": "live",
     "read_measurements": "measurement_files",
     "read_targets": "measurement_files",
     "Noise": "measurements",

@@ -194,6 +194,18 @@ def parser() -> argparse.ArgumentParser:
     view.add_argument(
         "--magnification", metavar="S", type=float, default=1.0, help="errors at first, 1 to 500 (1)"
     )
+    view.add_argument(
+        "--simplify",
+        metavar="N",
+        type=_count,
+        nargs="?",
+        default=60_000,
+        const=15_000,
+        help="most triangles that the meshes keep, for a smaller page (60000; 15000 without N)",
+    )
+    view.add_argument(
+        "--live", action="store_true", help="serve a moving scene on this computer instead, until Ctrl-C"
+    )
     view.add_argument("--tip", **_TIP)
 
     check = _add(
@@ -283,11 +295,31 @@ def parser() -> argparse.ArgumentParser:
     compensate.add_argument("targets", metavar="targets.csv", help="positions or poses of the tool")
     compensate.add_argument("-o", "--output", metavar="corrected.csv", required=True, help="a row a target")
     compensate.add_argument("--tip", **_TIP)
+    study = _add(
+        commands,
+        "study",
+        "how accuracy depends on poses, noise, errors, instrument and parameters, by simulation",
+        "dhcal study ur10_poses --jobs 2 -o results.csv",
+    )
+    study.add_argument(
+        "study", metavar="STUDY.toml", help="the grid, or one that ships: figure3, figure4, ur10_poses"
+    )
+    study.add_argument("-o", "--output", metavar="results.csv", required=True, help="a line a setting")
+    _add_where(study)
     return out
+
+
+def _add_where(command: argparse.ArgumentParser) -> None:
+    """Where the work is done."""
+    where = command.add_mutually_exclusive_group()
+    where.add_argument("--jobs", metavar="N", type=_count, default=1, help="processes on this machine (1)")
+    where.add_argument("--scheduler", metavar="ADDRESS", help="a Dask cluster, as tcp://host:8786")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; 0 done, 1 a check that failed, 2 wrong input, 130 interrupted."""
+    # Small matrices: threads inside LAPACK would only wait for each other. NumPy reads this when it loads.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     args = parser().parse_args(argv)
     # Small and narrow matrices: further threads of a BLAS, which asks when NumPy loads, would only wait.
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):

@@ -6,7 +6,6 @@ Wrong input is found before anything is written or shown; JSON goes to stdout, a
 from __future__ import annotations
 
 import os
-import tempfile
 from argparse import Namespace
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -22,14 +21,14 @@ from . import (
     fleet_command,
     plan_command,
     report,
+    study_command,
     terminal,
     ur_kinematics,
-    viewer,
+    view_command,
 )
 from .chain import Chain
 from .check import crosscheck
 from .configuration_files import map_text
-from .configurations import joint_range
 from .dh_files import dh_text, is_dh
 from .dh_urdf import dh_to_urdf
 from .errors import DhcalError
@@ -37,7 +36,7 @@ from .files import PathLike, parse_noise, save
 from .fleet import ENDING, is_fleet
 from .jobs import Job
 from .kinds import KINDS
-from .measurement_files import measurement_text, read_measurements, read_readings
+from .measurement_files import measurement_text, read_readings
 from .measurements import Measurement, Noise
 from .outputs import STDOUT, check_outputs, emit, names, same, sidecars
 from .parameters import extract
@@ -56,6 +55,7 @@ from .robot_files import (
 )
 from .screening import Finding, screen
 from .solver import Progress
+from .study import configurations
 from .workspace import workspace_map
 
 # --- calibrate -------------------------------------------------------------------------------------
@@ -165,10 +165,7 @@ def run_job(args: Job, progress: Progress | None = None) -> Outcome:
     contents = _written(fit, args)
     files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
     if args.map:
-        text = map_text(
-            workspace_map(fit), [f"predicted position uncertainty of {args.output}, measuring frame"]
-        )
-        contents[args.map], files["map"] = text, args.map
+        contents[args.map], files["map"] = map_text(workspace_map(fit)), args.map
     if args.json and args.json != STDOUT:
         files["json"] = args.json
     gross = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))
@@ -324,28 +321,10 @@ def _simulate(args: Namespace) -> int:
                 f"they must be those of {args.robot}: {', '.join(chain.joint_names)}"
             )
     rng = np.random.default_rng(args.seed)
-    q = rng.uniform(*joint_range(chain), (args.samples, chain.size))
-    data = KINDS[args.kind].simulate(truth, q, noise, rng)
+    data = KINDS[args.kind].simulate(truth, configurations(chain, args.samples, rng), noise, rng)
     comments = [f"simulated {args.kind} of {args.truth or args.robot}, noise {args.noise}, seed {args.seed}"]
     save({args.output: measurement_text(data, chain, comments)})
     terminal.lines(f"wrote {args.output}")
-    return 0
-
-
-def _view(args: Namespace) -> int:
-    given = [args.nominal, *([args.calibrated] if args.calibrated else [])]
-    page = args.html or os.path.join(tempfile.mkdtemp(prefix="dhcal-"), f"{robot_name(args.nominal)}.html")
-    check_outputs([page], [*given, *sidecars(given), *args.data])
-    nominal, *calibrated = (read_robot(path, None if is_table(path) else args.tip) for path in given)
-    data = [read_measurements(path, nominal) for path in args.data]
-    title = " and ".join(robot_name(path) for path in given)
-    text = viewer.scene_html(
-        nominal, *calibrated, measurements=data, title=title, magnification=args.magnification
-    )
-    save({page: text})
-    terminal.lines(f"wrote {page}")
-    if args.open or not args.html:
-        terminal.open_page(page)
     return 0
 
 
@@ -363,9 +342,10 @@ COMMANDS: dict[str, Callable[[Namespace], int]] = {
     "calibrate": _calibrate,
     "validate": _validate,
     "convert": _convert,
-    "view": _view,
+    "view": view_command.view,
     "check": _check,
     "plan": plan_command.run,
     "simulate": _simulate,
     "compensate": compensate_command.run,
+    "study": study_command.study,
 }

@@ -35,7 +35,7 @@ def run(args: Namespace) -> int:
             "name one with --tip"
         )
     wanted = read_targets(args.targets, calibrated)
-    with terminal.counting("compensating", len(wanted.targets)) as progress:
+    with terminal.counted("compensating", len(wanted.targets)) as progress:
         found = compensate(nominal, calibrated, wanted.targets, wanted.near, progress)
     save({args.output: corrected_text(found, calibrated, wanted)})
     _show(found, calibrated, wanted)

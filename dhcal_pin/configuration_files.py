@@ -49,12 +49,13 @@ def read_task(path: PathLike, chain: Chain) -> Array:
     return found.q
 
 
-def map_text(found: WorkspaceMap, comments: Sequence[str]) -> str:
+def map_text(found: WorkspaceMap) -> str:
     """The CSV text of a map: a row a cell, millimetres."""
     names = ("x[mm]", "y[mm]", "z[mm]")
     columns = {name: (1e3 * found.centre[:, i]).round(6).tolist() for i, name in enumerate(names)}
     columns |= {"position_std[mm]": (1e3 * found.std).tolist(), "worst[mm]": (1e3 * found.worst).tolist()}
-    return csv_text(columns | {"configurations": found.count.tolist()}, comments)
+    columns["configurations"] = found.count.tolist()
+    return csv_text(columns, ["predicted position uncertainty by cells of the workspace, measuring frame"])
 
 
 def configurations_text(q: Array, chain: Chain, comments: Sequence[str]) -> str:

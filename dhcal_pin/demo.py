@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from .measurement_files import Readings, read_readings
 from .measurements import Measurement, Noise
 from .parameters import ErrorModel, select
 from .result import Result, accuracy
-from .robot_files import urdf_files
+from .robot_files import paper_file, urdf_files
 from .screening import Finding, screen
 from .se3 import Array
 from .solver import Problem, gauss_newton, reduce
@@ -29,15 +28,6 @@ from .viewer import scene_html
 
 SEEDS, TESTS = 50, 100
 _STEPS = (0, 1, 2, 3, 5, 10)
-
-
-def paper_file(name: str) -> Path:
-    """A file of the paper's tables, from the installed package or the source tree."""
-    here = Path(__file__).resolve().parent
-    for folder in (here / "paper", here.parent / "urdf"):
-        if (folder / name).exists():
-            return folder / name
-    raise DhcalError(f"{name}: the paper's tables are not installed; reinstall dhcal-pin")
 
 
 def paper_arm(name: str) -> Chain:
@@ -333,9 +323,7 @@ def run(out: PathLike) -> dict[str, Any]:
         },
         [finding.row for finding in found.findings],
     ) | {"experiment_m": found.figures}
-    contents[files["scene"]] = scene_html(
-        found.chain, found.fit.chain, measurements=[found.data], title="The paper's robot, before and after"
-    )
+    contents[files["scene"]] = scene_html(found.chain, found.fit, title="The paper's robot, before and after")
     contents[files["json"]] = report.json_text(document)
     contents[files["summary"]] = "\n\n".join(
         [

@@ -130,15 +130,19 @@ def check_names(names: Sequence[str], source: str) -> None:
             )
 
 
-def parse_noise(text: str, option: str = "--noise") -> tuple[float, float]:
-    """A length and an angle in m and rad from a text such as `0.1mm` or `0.1mm,0.01deg`, 0 for one not there.
+def parse_noise(text: str, what: str = "--noise") -> tuple[float, float]:
+    """Standard deviations in m and rad from a text such as `0.1mm` or `0.1mm,0.01deg`.
+
+    Args:
+        text: one length, one angle, or both.
+        what: what an error calls it.
 
     Raises:
         DhcalError: not a number with a unit, a negative one, or one quantity twice.
     """
     out: dict[str, float] = {}
     for part in text.split(","):
-        where = f"{option} {part.strip()!r}"
+        where = f"{what} {part.strip()!r}"
         match = re.fullmatch(r"\s*([0-9.eE+-]+)\s*([a-z\u00b5\u03bc]+)\s*", part)
         kind = "length" if match and match[2] in LENGTHS else "angle"
         units = LENGTHS if kind == "length" else ANGLES

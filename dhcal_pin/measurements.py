@@ -10,9 +10,9 @@ a Fortran matrix. A step solves derivative·Δx = residual.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar, Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -64,6 +64,10 @@ class Measurement(Protocol):
     needs: ClassVar[tuple[frozenset[str], ...]]
     # Configurations a row: 0, 1, or 2, the second under to:JOINT.
     ends: ClassVar[int]
+    # Fields with an entry a sample.
+    per_row: ClassVar[tuple[str, ...]]
+    # Whether the tool must be on something for a sample; if not, any configuration can be measured.
+    touches: ClassVar[bool]
 
     @property
     def q(self) -> Array:
@@ -157,6 +161,30 @@ class Measurement(Protocol):
         ...
 
 
+_Kind = TypeVar("_Kind", bound=Measurement)
+
+
+def joined(items: Sequence[_Kind]) -> _Kind:
+    """The samples of several measurements as one measurement's, in this order.
+
+    Raises:
+        DhcalError: they are of different kinds, or differ in more than their samples.
+    """
+    first = items[0]
+    common = [f.name for f in fields(first) if f.name not in first.per_row]  # pyright: ignore[reportArgumentType]
+    for item in items[1:]:
+        if type(item) is not type(first) or not all(
+            _alike(getattr(item, name), getattr(first, name)) for name in common
+        ):
+            raise DhcalError(f"{item.kind}: differs from the first {first.kind} in more than its samples")
+    samples = {name: np.concatenate([getattr(item, name) for item in items]) for name in first.per_row}
+    return replace(first, **samples)  # pyright: ignore[reportArgumentType]
+
+
+def _alike(a: Any, b: Any) -> bool:
+    return np.array_equal(a, b, equal_nan=True) if isinstance(a, np.ndarray) else a == b
+
+
 def need(*names: str) -> frozenset[str]:
     """Columns that go together."""
     return frozenset(names)
@@ -230,6 +258,7 @@ class PointReading:
     columns: ClassVar[Mapping[str, str]]
     needs: ClassVar[tuple[frozenset[str], ...]]
     ends: ClassVar[int] = 1
+    touches: ClassVar[bool] = False
     # Fields with an entry a sample.
     per_row: ClassVar[tuple[str, ...]] = ("q", "reading", "sigma", "rows")
 

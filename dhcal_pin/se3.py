@@ -59,7 +59,7 @@ def adjoint(pose: ArrayLike) -> Array:
     return out
 
 
-def _series(angle: Array) -> tuple[Array, Array, Array]:
+def series(angle: Array) -> tuple[Array, Array, Array]:
     """sin(t)/t, (1-cos t)/t², (t-sin t)/t³ of angles (...,) in radians, exact to rounding at any t."""
     half = np.sinc(angle / (2 * np.pi))
     small = np.abs(angle) < 0.1
@@ -76,7 +76,7 @@ def _series(angle: Array) -> tuple[Array, Array, Array]:
 def exp3(rotvec: ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians."""
     rotvec = np.asarray(rotvec, float)
-    first, second, _ = _series(np.linalg.norm(rotvec, axis=-1))
+    first, second, _ = series(np.linalg.norm(rotvec, axis=-1))
     k = skew(rotvec)
     return np.eye(3) + first[..., None, None] * k + second[..., None, None] * (k @ k)
 
@@ -146,7 +146,7 @@ def exp6(twist: ArrayLike) -> Array:
     """Rigid motions (..., 4, 4) of twists [v, ω] (..., 6)."""
     twist = np.asarray(twist, float)
     v, w = twist[..., :3], twist[..., 3:]
-    _, second, third = _series(np.linalg.norm(w, axis=-1))
+    _, second, third = series(np.linalg.norm(w, axis=-1))
     k = skew(w)
     left = np.eye(3) + second[..., None, None] * k + third[..., None, None] * (k @ k)
     return transform(exp3(w), (left @ v[..., None])[..., 0])

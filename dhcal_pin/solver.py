@@ -119,10 +119,10 @@ def _leap(problem: Problem, x: Array, cost: float) -> tuple[Array, float]:
         triangle = with_priors(
             reduce(problem, far, small_angle=False), problem.weights, far, np.zeros_like(x)
         )
-        far = far + pseudo_inverse(triangle.r, triangle.z)
-        if not np.abs(far).max() < RUNAWAY:
+        there = far + pseudo_inverse(triangle.r, triangle.z)
+        if not np.abs(there).max() < RUNAWAY:
             break
-        ends = problem.cost(far)
+        far, ends = there, problem.cost(there)
     return (far, ends) if ends < cost else (x, cost)
 
 
@@ -165,7 +165,8 @@ def levenberg_marquardt(
             expected = float(free.z @ free.z - np.sum((free.r @ step - free.z) ** 2))
             gain = (cost - trial) / expected if expected > 0 else 0.0
             # Where all that is left is rounding, costs tell nothing and the step is to be trusted.
-            trusted = expected <= (10 * rounding) ** 2 and trial <= (math.sqrt(cost) + 10 * rounding) ** 2
+            blur = (10 * rounding) ** 2 + 2 * rounding * math.sqrt(cost)
+            trusted = expected <= blur and trial <= (math.sqrt(cost) + 10 * rounding) ** 2
             if trusted or (trial <= cost and gain > 1e-3):
                 easier = 1e-2 if trusted or gain > 0.9 else max(1e-3, 1 - (2 * gain - 1) ** 3)
                 damping *= easier

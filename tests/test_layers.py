@@ -12,6 +12,7 @@ import dhcal_pin
 HOUSE = Path(dhcal_pin.__file__).parent
 LAYERS = (
     {"errors"},
+    {"executors"},
     {"se3"},
     {"urdf_tags", "dh", "scratch"},
     {"urdf", "extraction"},
@@ -24,7 +25,10 @@ LAYERS = (
     {"frames", "observability", "robust", "kinds"},
     {"problem"},
     {"solver"},
-    {"result"},
+    {"arms", "triangles", "passage"},
+    {"nullspace"},
+    {"explanations"},
+    {"batch", "result"},
     {"calibration", "compensation"},
     {"check", "information", "workspace"},
     {"planning"},
@@ -34,14 +38,18 @@ LAYERS = (
     {"foreign_files"},
     {"dh_files", "measurement_files", "ur_kinematics"},
     {"robot_files", "screening", "configuration_files"},
+    {"study"},
     {"plausibility"},
     {"exports"},
     {"report"},
     {"terminal"},
+    {"shapes"},
     {"viewer"},
+    {"live_server"},
+    {"live"},
     {"outputs", "jobs"},
     {"fleet"},
-    {"demo", "compensate_command", "fleet_command", "plan_command"},
+    {"demo", "compensate_command", "fleet_command", "plan_command", "study_command", "view_command"},
     {"commands"},
     {"cli"},
 )
@@ -75,10 +83,19 @@ def test_imports_only_from_the_left(module):
 @pytest.mark.parametrize("module", MODULES)
 def test_special_packages_stay_in_one_place(module):
     homes = {
-        "meshcat": {"viewer"},
+        "meshcat": {"live", "live_server"},
         "matplotlib": {"report"},
         "rich": {"terminal"},
-        "argparse": {"cli", "commands", "jobs", "compensate_command", "fleet_command", "plan_command"},
+        "argparse": {
+            "cli",
+            "commands",
+            "jobs",
+            "compensate_command",
+            "fleet_command",
+            "plan_command",
+            "study_command",
+            "view_command",
+        },
     }
     for package, allowed in homes.items():
         if package in imports(module)[1]:

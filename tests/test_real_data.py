@@ -123,7 +123,7 @@ def test_a_panda_that_touched_sockets_at_three_places(dhcal, tmp_path, left, mos
 
 
 def planned_and_random(seeds: int, choices: int) -> tuple[float, float]:
-    """Held-out error on half a series, of forty planned and of forty random poses over that of the other half.
+    """Held-out errors of forty planned and forty random poses over that of half a series.
 
     The plan sees joint values alone. Means over several halves: one choice of forty scatters by 0.025.
     """
