@@ -29,6 +29,7 @@ from . import (
 from .chain import Chain
 from .check import crosscheck
 from .configuration_files import map_text
+from .configurations import joint_range
 from .dh_files import dh_text, is_dh
 from .dh_urdf import dh_to_urdf
 from .errors import DhcalError
@@ -55,7 +56,6 @@ from .robot_files import (
 )
 from .screening import Finding, screen
 from .solver import Progress
-from .study import configurations
 from .workspace import workspace_map
 
 # --- calibrate -------------------------------------------------------------------------------------
@@ -321,7 +321,8 @@ def _simulate(args: Namespace) -> int:
                 f"they must be those of {args.robot}: {', '.join(chain.joint_names)}"
             )
     rng = np.random.default_rng(args.seed)
-    data = KINDS[args.kind].simulate(truth, configurations(chain, args.samples, rng), noise, rng)
+    q = rng.uniform(*joint_range(chain), (args.samples, chain.size))
+    data = KINDS[args.kind].simulate(truth, q, noise, rng)
     comments = [f"simulated {args.kind} of {args.truth or args.robot}, noise {args.noise}, seed {args.seed}"]
     save({args.output: measurement_text(data, chain, comments)})
     terminal.lines(f"wrote {args.output}")

@@ -49,7 +49,7 @@ LAYERS = (
     {"live"},
     {"outputs", "jobs"},
     {"fleet"},
-    {"demo", "compensate_command", "fleet_command", "plan_command", "study_command", "view_command"},
+    {"demo", "compensate_command", "fleet_command", "study_command", "view_command", "plan_command"},
     {"commands"},
     {"cli"},
 )
@@ -92,9 +92,9 @@ def test_special_packages_stay_in_one_place(module):
             "jobs",
             "compensate_command",
             "fleet_command",
-            "plan_command",
             "study_command",
             "view_command",
+            "plan_command",
         },
     }
     for package, allowed in homes.items():
