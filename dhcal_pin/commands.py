@@ -169,10 +169,7 @@ def run_job(args: Job, progress: Progress | None = None) -> Outcome:
     contents = _written(fit, args)
     files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
     if args.map:
-        text = map_text(
-            workspace_map(fit), [f"predicted position uncertainty of {args.output}, measuring frame"]
-        )
-        contents[args.map], files["map"] = text, args.map
+        contents[args.map], files["map"] = map_text(workspace_map(fit)), args.map
     if args.json and args.json != STDOUT:
         files["json"] = args.json
     gross = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))
