@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from .check import crosscheck as crosscheck
     from .compensation import Compensation as Compensation
     from .compensation import compensate as compensate
+    from .configurations import Space as Space
     from .dh import DHTable as DHTable
     from .dh_files import read_dh as read_dh
     from .dh_urdf import dh_to_urdf as dh_to_urdf
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     from .measurement_files import read_targets as read_targets
     from .measurements import Noise as Noise
     from .parameters import extract as extract
+    from .planning import Plan as Plan
+    from .planning import plan as plan
     from .poses import Pose as Pose
     from .positions import Position as Position
     from .result import Prediction as Prediction
@@ -38,6 +41,7 @@ if TYPE_CHECKING:
     from .robot_files import write_urdf as write_urdf
     from .viewer import scene_html as scene_html
     from .viewer import show as show
+    from .workspace import workspace_map as workspace_map
 
 _HOMES = {
     "calibrate": "calibration",
@@ -46,6 +50,7 @@ _HOMES = {
     "crosscheck": "check",
     "Compensation": "compensation",
     "compensate": "compensation",
+    "Space": "configurations",
     "DHTable": "dh",
     "read_dh": "dh_files",
     "dh_to_urdf": "dh_urdf",
@@ -56,6 +61,8 @@ _HOMES = {
     "read_measurements": "measurement_files",
     "read_targets": "measurement_files",
     "Noise": "measurements",
+    "Plan": "planning",
+    "plan": "planning",
     "Pose": "poses",
     "Position": "positions",
     "extract": "parameters",
@@ -66,6 +73,7 @@ _HOMES = {
     "write_urdf": "robot_files",
     "scene_html": "viewer",
     "show": "viewer",
+    "workspace_map": "workspace",
 }
 __all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
 

@@ -22,6 +22,7 @@ from . import se3
 from .arms import Arms
 from .batch import Batch, joined, solve
 from .chain import Chain
+from .configurations import joint_range
 from .errors import DhcalError
 from .executors import HERE, Workers
 from .files import PathLike, parse_noise, read_toml
@@ -86,13 +87,7 @@ def configurations(chain: Chain, count: int, rng: np.random.Generator, share: fl
         rng: where they are drawn from.
         share: the part of each joint's range that they are in, from its lower end.
     """
-    low, high = chain.lower, chain.upper
-    slides = [chain.urdf.joint(name).type == "prismatic" for name in chain.joint_names]
-    span = np.where(slides, 0.5, np.pi)
-    low, high = (
-        np.where(high > -span, np.maximum(low, -span), np.maximum(low, high - 2 * span)),
-        np.where(low < span, np.minimum(high, span), np.minimum(high, low + 2 * span)),
-    )
+    low, high = joint_range(chain)
     return rng.uniform(low, low + share * (high - low), (count, chain.size))
 
 
