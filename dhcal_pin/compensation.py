@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
 
 from . import se3
 from .chain import Chain
@@ -31,6 +31,9 @@ from .inverse import (
     within,
 )
 from .se3 import Array
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 OK, SINGULAR, LIMITS, OUT = "ok", "near singular", "joint limits", "out of reach"
 # A motion of the tool, by a thousandth of the arm's size or of a radian, that takes the joints 0.2 rad.
@@ -166,6 +169,9 @@ class _Search:
         middle = _middle(chain)
         low, high = np.maximum(chain.lower, middle - span), np.minimum(chain.upper, middle + span)
         q = np.random.default_rng(0).uniform(low, high, (_KNOWN, chain.size))
+        # A heavy import that no other command needs.
+        from scipy.spatial import cKDTree
+
         return cls(chain, q, cKDTree(_places(chain.poses(q), turned, size(chain))), turned)
 
     def starts(self, targets: Array, count: int) -> Array:
