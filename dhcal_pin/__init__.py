@@ -20,15 +20,17 @@ if TYPE_CHECKING:
     from .dh_files import read_dh as read_dh
     from .dh_urdf import dh_to_urdf as dh_to_urdf
     from .errors import DhcalError as DhcalError
+    from .evaluation import accuracy as accuracy
     from .factors import error_factors as error_factors
     from .measurement_files import read_measurements as read_measurements
     from .measurements import Noise as Noise
     from .parameters import extract as extract
     from .poses import Pose as Pose
     from .positions import Position as Position
+    from .report import Provenance as Provenance
+    from .report_page import write_report as write_report
     from .result import Prediction as Prediction
     from .result import Result as Result
-    from .result import accuracy as accuracy
     from .robot_files import read_robot as read_robot
     from .robot_files import write_urdf as write_urdf
     from .viewer import scene_html as scene_html
@@ -43,15 +45,17 @@ _HOMES = {
     "read_dh": "dh_files",
     "dh_to_urdf": "dh_urdf",
     "DhcalError": "errors",
+    "accuracy": "evaluation",
     "error_factors": "factors",
     "read_measurements": "measurement_files",
     "Noise": "measurements",
     "Pose": "poses",
     "Position": "positions",
+    "Provenance": "report",
+    "write_report": "report_page",
     "extract": "parameters",
     "Prediction": "result",
     "Result": "result",
-    "accuracy": "result",
     "read_robot": "robot_files",
     "write_urdf": "robot_files",
     "scene_html": "viewer",

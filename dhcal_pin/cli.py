@@ -136,6 +136,9 @@ def parser() -> argparse.ArgumentParser:
     calibrate.add_argument(
         "--tool-frame", metavar="NAME", help="put the tool into the URDF, as a link fixed to the tip"
     )
+    calibrate.add_argument(
+        "--report", metavar="R.html", action="append", default=[], help="the report, as .html or .md; may repeat"
+    )
     calibrate.add_argument("--json", **_JSON)
 
     validate = _add(
@@ -214,7 +217,9 @@ def parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; 0 done, 1 a check that failed, 2 wrong input, 130 interrupted."""
-    args = parser().parse_args(argv)
+    given = sys.argv[1:] if argv is None else argv
+    args = parser().parse_args(given)
+    args.given = given
     try:
         from . import commands
 

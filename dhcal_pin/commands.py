@@ -13,20 +13,22 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from . import calibration, demo, exports, report, terminal, ur_kinematics, viewer
+from . import calibration, demo, exports, report, report_page, terminal, ur_kinematics, viewer
 from .chain import Chain
 from .check import crosscheck
 from .dh_files import dh_text, is_dh
 from .dh_urdf import dh_to_urdf
+from .diagnosis import configurations
 from .errors import DhcalError
+from .evaluation import accuracy
 from .files import PathLike, parse_noise, save
 from .kinds import KINDS
 from .measurement_files import measurement_text, read_measurements, read_readings
 from .measurements import Measurement, Noise
-from .outputs import STDOUT, check_outputs, emit, names, same, sidecars
+from .outputs import STDOUT, check_outputs, command_line, emit, names, same, sidecars
 from .parameters import extract
 from .plausibility import doubts
-from .result import Result, accuracy
+from .result import Result
 from .robot_files import (
     existing_sidecar,
     is_table,
@@ -46,10 +48,10 @@ from .se3 import Array
 
 @dataclass(frozen=True)
 class _Data:
-    """What is fitted and held out, and by file the impossible rows left out of both, and doubts."""
+    """What is fitted and held out by file, and the impossible rows left out of both, and doubts."""
 
     fit: dict[str, Measurement]
-    holdout: list[Measurement]
+    holdout: list[tuple[str, Measurement]]
     findings: dict[str, list[Finding]]
     doubts: dict[str, list[str]]
 
@@ -61,7 +63,7 @@ def _without(data: Measurement, findings: Sequence[Finding]) -> Measurement:
 def _read_data(chain: Chain, args: Namespace, held_file: str | None, known_frames: bool) -> _Data:
     """All measurements, split as the files' `set` columns and --holdout ask."""
     fit: list[Measurement] = []
-    holdout: list[Measurement] = []
+    holdout: list[tuple[str, Measurement]] = []
     findings: dict[str, list[Finding]] = {}
     doubtful: dict[str, list[str]] = {}
     for path in [*args.data, *([held_file] if held_file else [])]:
@@ -70,21 +72,22 @@ def _read_data(chain: Chain, args: Namespace, held_file: str | None, known_frame
         # A row can only be called impossible where base and tool are known.
         findings[path] = screen(chain, readings) if known_frames else []
         if path == held_file:
-            holdout.append(_without(readings.data, findings[path]))
+            holdout.append((path, _without(readings.data, findings[path])))
         else:
             fit.append(_without(readings.fit, findings[path]))
-            holdout.append(_without(readings.holdout, findings[path]))
+            holdout.append((path, _without(readings.holdout, findings[path])))
     if args.holdout is not None and not held_file:
         try:
             fraction = float(args.holdout)
         except ValueError:
             raise DhcalError(f"--holdout {args.holdout}: neither a file nor a share such as 0.3") from None
+        drawn = [path for path, item in zip(args.data, fit, strict=True) if round(fraction * len(item.rows))]
         kept, parted = calibration.split(fit, fraction, args.seed)
-        fit, holdout = list(kept), holdout + list(parted)
+        fit, holdout = list(kept), [*holdout, *zip(drawn, parted, strict=True)]
     fitted = {path: item for path, item in zip(args.data, fit, strict=True) if len(item.rows)}
     if not fitted:
         raise DhcalError(f"{', '.join(args.data)}: every row is held out; leave some to fit")
-    return _Data(fitted, [item for item in holdout if len(item.rows)], findings, doubtful)
+    return _Data(fitted, [(path, item) for path, item in holdout if len(item.rows)], findings, doubtful)
 
 
 def _calibrate(args: Namespace) -> int:
@@ -99,9 +102,11 @@ def _calibrate(args: Namespace) -> int:
     maps = [args.columns] if args.columns else []
     inputs = [*robot, *measured, *priors, *maps]
     _urdf_ending(args.output)
-    check_outputs([args.json], inputs)
+    check_outputs([args.json, *args.report], inputs)
     kept = [*measured, *priors, *maps] if args.in_place else inputs
-    check_outputs([args.output, sidecar_path(args.output), args.json], kept)
+    check_outputs([args.output, sidecar_path(args.output), args.json, *args.report], kept)
+    for path in args.report:
+        report_page.check_ending(path)
 
     chain = read_robot(args.robot, args.tip)
     sets = args.parameters or chain.parameters
@@ -115,7 +120,7 @@ def _calibrate(args: Namespace) -> int:
             priors=read_priors(args.priors),
             fix=names(args.fix),
             free=names(args.free),
-            holdout=data.holdout,
+            holdout=[item for _, item in data.holdout],
             known=read_instrument(args.instrument) if args.instrument else None,
             loss=args.loss,
             max_iterations=args.max_iterations,
@@ -132,9 +137,11 @@ def _calibrate(args: Namespace) -> int:
         for path in impossible
         if impossible[path] + gross.get(path, [])
     }
-    document = report.document(
-        fit, files, report.fingerprints(inputs), [row for found in rows.values() for row in found]
-    ) | {"outliers_by_file": rows}
+    files |= {f"report{number or ''}": path for number, path in enumerate(args.report)}
+    source = _provenance(args, data, inputs)
+    contents |= report_page.report_files(fit, args.report, source)
+    document = report.document(fit, files, source.inputs, [row for found in rows.values() for row in found])
+    document |= {"outliers_by_file": rows, "command": source.command, "settings": source.settings}
     if "json" in files:
         contents[args.json] = report.json_text(document)
     save(contents)
@@ -147,6 +154,33 @@ def _calibrate(args: Namespace) -> int:
         terminal.doubts(path, texts)
     terminal.summary(fit, files)
     return 0
+
+
+def _provenance(args: Namespace, data: _Data, inputs: Sequence[str]) -> report.Provenance:
+    """What the report says of the files, the command and its choices."""
+    short = report.short_names(inputs)
+    outputs = [args.output, args.json, *args.report]
+    settings = {
+        "parameters": args.parameters or "the robot's own default",
+        "loss": args.loss,
+        "seed": str(args.seed),
+    }
+    if args.holdout is not None:
+        settings["hold-out"] = short.get(args.holdout, f"{args.holdout} of each file, at random by the seed")
+    left_out = {
+        short[path]: {finding.row: finding.reason for finding in found}
+        for path, found in data.findings.items()
+    }
+    doubtful = {short[path]: texts for path, texts in data.doubts.items()}
+    return report.Provenance(
+        command=command_line(args.given, [path for path in outputs if path], short),
+        inputs=report.fingerprints(inputs),
+        names=list(data.fit),
+        holdout_names=[path for path, _ in data.holdout],
+        settings=settings,
+        left_out=left_out,
+        doubts=doubtful,
+    )
 
 
 def _written(fit: Result, args: Namespace) -> dict[PathLike, str | bytes]:
@@ -261,23 +295,11 @@ def _simulate(args: Namespace) -> int:
                 f"they must be those of {args.robot}: {', '.join(chain.joint_names)}"
             )
     rng = np.random.default_rng(args.seed)
-    data = KINDS[args.kind].simulate(truth, _configurations(chain, args.samples, rng), noise, rng)
+    data = KINDS[args.kind].simulate(truth, configurations(chain, args.samples, rng), noise, rng)
     comments = [f"simulated {args.kind} of {args.truth or args.robot}, noise {args.noise}, seed {args.seed}"]
     save({args.output: measurement_text(data, chain, comments)})
     terminal.lines(f"wrote {args.output}")
     return 0
-
-
-def _configurations(chain: Chain, count: int, rng: np.random.Generator) -> Array:
-    """Uniform joint values (count, n) within the limits, and within a turn or half a metre each way."""
-    low, high = chain.lower, chain.upper
-    slides = [chain.urdf.joint(name).type == "prismatic" for name in chain.joint_names]
-    span = np.where(slides, 0.5, np.pi)
-    low, high = (
-        np.where(high > -span, np.maximum(low, -span), np.maximum(low, high - 2 * span)),
-        np.where(low < span, np.minimum(high, span), np.minimum(high, low + 2 * span)),
-    )
-    return rng.uniform(low, high, (count, chain.size))
 
 
 def _view(args: Namespace) -> int:

@@ -10,17 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from . import observability, report, terminal
+from . import observability, report, report_page, tables, terminal
 from .calibration import calibrate
 from .chain import Chain
 from .dh_files import read_dh
 from .errors import DhcalError
+from .evaluation import accuracy
 from .files import PathLike, save
 from .kinds import KINDS
 from .measurement_files import Readings, read_readings
 from .measurements import Measurement, Noise
 from .parameters import ErrorModel, select
-from .result import Result, accuracy
+from .result import Result
 from .robot_files import urdf_files
 from .screening import Finding, screen
 from .se3 import Array
@@ -300,15 +301,17 @@ def run(out: PathLike) -> dict[str, Any]:
     terminal.findings("Table 5", found.findings)
     header = ["position RMS in mm", "fitted", "left one out"]
     title = f"The experiment, {len(found.data.q)} of {len(found.readings.data.q)} rows"
-    terminal.table(title, header, found.rows)
-    parameters = report.table(found.fit)
-    terminal.table("Parameters, least squares", *parameters)
+    verdict = tables.Table(header, found.rows)
+    terminal.table(title, verdict)
+    parameters = tables.estimate_table(found.fit.estimates)
+    terminal.table("Parameters, least squares", parameters)
     terminal.lines("", *_verdict(found))
     rows = simulation_rows()
     simulation_title = (
         f"The simulations: worst of {TESTS} test poses in mm by iteration, median of {SEEDS} seeds"
     )
-    terminal.table(simulation_title, SIMULATION_HEADER, rows)
+    simulations = tables.Table(SIMULATION_HEADER, rows)
+    terminal.table(simulation_title, simulations)
     terminal.lines(
         "Two joint sets fit without a rest and still leave the parameters wrong; ten find them. More sets "
         "converge faster where they are drawn anew at each iteration.",
@@ -322,17 +325,21 @@ def run(out: PathLike) -> dict[str, Any]:
         "json": os.path.join(folder, "result.json"),
         "summary": os.path.join(folder, "summary.md"),
         "scene": os.path.join(folder, "scene.html"),
+        "report": os.path.join(folder, "report.html"),
     }
     inputs = [paper_file("experiment.dh.toml"), paper_file("experiment_table5.csv")]
-    document = report.document(
-        found.fit,
-        files,
-        {
-            path.name: digest
-            for path, digest in zip(inputs, report.fingerprints(inputs).values(), strict=True)
-        },
-        [finding.row for finding in found.findings],
-    ) | {"experiment_m": found.figures}
+    digests = zip(inputs, report.fingerprints(inputs).values(), strict=True)
+    source = report.Provenance(
+        command="dhcal demo",
+        inputs={path.name: digest for path, digest in digests},
+        names=[inputs[1].name],
+        settings={"parameters": "dh"},
+        left_out={inputs[1].name: {f.row: f.reason for f in found.findings}},
+        remarks=_verdict(found),
+    )
+    rejected = [finding.row for finding in found.findings]
+    document = report.document(found.fit, files, source.inputs, rejected) | {"experiment_m": found.figures}
+    contents |= report_page.report_files(found.fit, [files["report"]], source)
     contents[files["scene"]] = scene_html(
         found.chain, found.fit.chain, measurements=[found.data], title="The paper's robot, before and after"
     )
@@ -342,12 +349,12 @@ def run(out: PathLike) -> dict[str, Any]:
             "# The paper's robot, calibrated",
             *(f"Row {f.row} of Table 5 is left out: {f.reason}." for f in found.findings),
             f"## {title}",
-            report.markdown_table(header, found.rows),
+            tables.markdown_table(verdict),
             *_verdict(found),
             "## Parameters, least squares",
-            report.markdown_table(*parameters),
+            tables.markdown_table(parameters),
             f"## {simulation_title}",
-            report.markdown_table(SIMULATION_HEADER, rows),
+            tables.markdown_table(simulations),
             "",
         ]
     )

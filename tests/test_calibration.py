@@ -14,7 +14,7 @@ from dhcal_pin.measurements import Noise
 from dhcal_pin.parameters import select
 from dhcal_pin.poses import Pose
 from dhcal_pin.positions import Position
-from dhcal_pin.result import accuracy
+from dhcal_pin.evaluation import accuracy
 from dhcal_pin.solver import CHUNK, Problem, reduce
 
 NONE = np.empty(0)
