@@ -137,8 +137,8 @@ def _calibrate(args: Namespace) -> int:
         for path in impossible
         if impossible[path] + gross.get(path, [])
     }
-    files |= {f"report{number or ''}": path for number, path in enumerate(args.report)}
-    source = _provenance(args, data, inputs)
+    files |= {"report" if number == 1 else f"report_{number}": path for number, path in enumerate(args.report, 1)}
+    source = _provenance(args, sets, data, inputs)
     contents |= report_page.report_files(fit, args.report, source)
     document = report.document(fit, files, source.inputs, [row for found in rows.values() for row in found])
     document |= {"outliers_by_file": rows, "command": source.command, "settings": source.settings}
@@ -156,12 +156,12 @@ def _calibrate(args: Namespace) -> int:
     return 0
 
 
-def _provenance(args: Namespace, data: _Data, inputs: Sequence[str]) -> report.Provenance:
+def _provenance(args: Namespace, sets: str, data: _Data, inputs: Sequence[str]) -> report.Provenance:
     """What the report says of the files, the command and its choices."""
     short = report.short_names(inputs)
     outputs = [args.output, args.json, *args.report]
     settings = {
-        "parameters": args.parameters or "the robot's own default",
+        "parameters": sets,
         "loss": args.loss,
         "seed": str(args.seed),
     }

@@ -18,7 +18,7 @@ from .se3 import Array
 # A joint without limits turns half a turn each way, or slides half a metre.
 TURN, SLIDE = np.pi, 0.5
 # Configurations that the workspace is judged by, and bins that a joint's range is parted into.
-SAMPLES, BINS = 6000, 12
+SAMPLES, BINS = 16000, 12
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from .se3 import Array
 
-WIDTH, HEIGHT = 320.0, 200.0
+WIDTH, WIDE, HEIGHT = 320.0, 420.0, 200.0
 LEFT, RIGHT, TOP, BOTTOM = 46.0, 10.0, 26.0, 36.0
 # Levels of a map, from good to bad.
 LEVELS = 6
@@ -52,15 +52,19 @@ class Axis:
             step = max(1, -(-(last - first) // 4))
             return [(10.0**e, _power(e)) for e in range(first, last + 1, step)]
         step = nice_step((self.high - self.low) / 5)
-        places = max(0, -math.floor(math.log10(step) + 1e-9))
         numbers = range(math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9) + 1)
-        return [(n * step, _minus(f"{n * step:.{places}f}")) for n in numbers]
+        return [(n * step, _minus(f"{n * step:.{places(step)}f}")) for n in numbers]
 
 
 def nice_step(least: float) -> float:
     """The smallest of 1, 2, 5 times a power of ten that is not below `least`."""
     power = 10.0 ** math.floor(math.log10(least))
     return next(k * power for k in (1, 2, 5, 10) if k * power >= least * (1 - 1e-9))
+
+
+def places(step: float) -> int:
+    """Digits behind the point that multiples of a round step need."""
+    return max(0, -math.floor(math.log10(step) + 1e-9))
 
 
 def _minus(text: str) -> str:
@@ -101,11 +105,17 @@ class Frame:
 
     x: Axis
     y: Axis
+    width: float
     height: float
+
+    @property
+    def right(self) -> float:
+        """The right end of the plotting area, pixels."""
+        return self.width - RIGHT
 
     def across(self, values: ArrayLike) -> Array:
         """Pixels from the left."""
-        return LEFT + np.clip(self.x.share(values), -0.02, 1.02) * (WIDTH - LEFT - RIGHT)
+        return LEFT + np.clip(self.x.share(values), -0.02, 1.02) * (self.right - LEFT)
 
     def down(self, values: ArrayLike) -> Array:
         """Pixels from the top."""
@@ -163,7 +173,7 @@ def across_at(value: float, look: str) -> Mark:
     """A horizontal line through the whole panel."""
     return lambda frame: (
         f'<path class="line {look}" d="M{_number(LEFT)} {_number(float(frame.down(value)))}'
-        f'H{_number(WIDTH - RIGHT)}"/>'
+        f'H{_number(frame.right)}"/>'
     )
 
 
@@ -196,24 +206,31 @@ def cells(x: ArrayLike, y: ArrayLike, size: float, level: ArrayLike) -> Mark:
 
 
 def panel(
-    key: str, title: str, description: str, x: Axis, y: Axis, marks: Sequence[Mark], height: float = HEIGHT
+    key: str,
+    title: str,
+    description: str,
+    x: Axis,
+    y: Axis,
+    marks: Sequence[Mark],
+    width: float = WIDTH,
+    height: float = HEIGHT,
 ) -> str:
     """One figure: title, axes and marks; `key` makes its ids unique on the page."""
-    frame = Frame(x, y, height)
+    frame = Frame(x, y, width, height)
     floor = height - BOTTOM
     lines, labels = [], []
     for value, label in y.ticks():
         at = float(frame.down(value))
-        lines.append(f"M{_number(LEFT)} {_number(at)}H{_number(WIDTH - RIGHT)}")
+        lines.append(f"M{_number(LEFT)} {_number(at)}H{_number(frame.right)}")
         labels.append(f'<text class="tick end" x="{_number(LEFT - 5)}" y="{_number(at + 3.5)}">{label}</text>')
     for value, label in x.ticks():
         at = float(frame.across(value))
         lines.append(f"M{_number(at)} {_number(TOP)}V{_number(floor)}")
         labels.append(f'<text class="tick middle" x="{_number(at)}" y="{_number(floor + 13)}">{label}</text>')
-    middle = _number(0.5 * (LEFT + WIDTH - RIGHT))
+    middle = _number(0.5 * (LEFT + frame.right))
     return "\n".join(
         [
-            f'<svg role="img" aria-labelledby="{key}-t {key}-d" viewBox="0 0 {WIDTH:.0f} {height:.0f}">',
+            f'<svg role="img" aria-labelledby="{key}-t {key}-d" viewBox="0 0 {width:.0f} {height:.0f}">',
             f'<title id="{key}-t">{html.escape(title)}</title>',
             f'<desc id="{key}-d">{html.escape(description)}</desc>',
             f'<path class="grid" d="{"".join(lines)}"/>',

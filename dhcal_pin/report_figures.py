@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,11 +16,11 @@ from .se3 import Array
 from .tables import SMALL, WORDS
 
 HISTOGRAM = 28
-# Cells a side of a map; fewer samples than this in one tell nothing.
-GRID, LEAST = 36, 1
+# Cells a side of a map.
+GRID = 32
 MOST_DOTS = 1500
 # Height of a panel on which a metre is as long upwards as across.
-SQUARE = figures.WIDTH - figures.LEFT - figures.RIGHT + figures.TOP + figures.BOTTOM
+SQUARE = figures.WIDE - figures.LEFT - figures.RIGHT + figures.TOP + figures.BOTTOM
 
 
 def _unit(group: str) -> tuple[float, str]:
@@ -93,7 +94,7 @@ def by_sample(study: Study) -> list[str]:
                     marks += [figures.dots(rows[bad], factor * size[bad], "gross")] if bad.any() else []
         text = f"{WORDS[group]} after calibration of {len(every)} samples in order; the largest is {most.max():.3g} {unit}."
         title = f"{WORDS[group][0].upper()}{WORDS[group][1:]} by sample"
-        out.append(panel(f"s-{group}", title, text, x, y, marks))
+        out.append(panel(f"s-{group}", title, text, x, y, marks, figures.WIDE))
     return out
 
 
@@ -153,42 +154,79 @@ def asked(study: Study) -> list[str]:
     return out
 
 
-def levels(w: Workspace) -> list[float]:
-    """Edges in m between the levels of a map: round steps over most of what is predicted."""
-    good = w.std[np.isfinite(w.std)]
-    low, high = (float(np.quantile(good, at)) for at in (0.02, 0.95))
-    step = figures.nice_step(max(high - low, 1e-3 * high, 1e-12) / (figures.LEVELS - 1))
-    first = np.floor(low / step)
-    return (step * (first + np.arange(figures.LEVELS + 1))).tolist()
+@dataclass(frozen=True, eq=False)
+class Map:
+    """Predicted position std over two coordinates, its RMS along the line of sight.
+
+    Attributes:
+        key: the two coordinates' names.
+        corners: (c, 2) lower corners of the cells with a configuration, m.
+        size: a cell's side, m.
+        std: (c,) m; infinite where at most configurations it cannot be predicted.
+    """
+
+    key: str
+    corners: Array
+    size: float
+    std: Array
 
 
-def maps(study: Study) -> list[str]:
-    """Predicted position std seen from above and from the side, the median along the line of sight."""
-    w = study.workspace
-    if not np.isfinite(w.std).any():
-        return []
-    edges = levels(w)
+def maps(w: Workspace) -> list[Map]:
+    """The workspace from above and from the side; empty where nothing is predicted."""
     out = []
-    for key, first, second, title in (("xy", 0, 1, "Seen from above"), ("xz", 0, 2, "Seen from the side")):
-        low = np.array([w.points[:, first].min(), w.points[:, second].min()])
-        size = max(float(np.ptp(w.points[:, first])), float(np.ptp(w.points[:, second]))) / GRID or 1.0
-        place = np.floor((w.points[:, [first, second]] - low) / size).astype(int)
-        number = place[:, 0] * (GRID + 1) + place[:, 1]
-        kept = [c for c in np.unique(number) if np.sum(number == c) >= LEAST]
-        values = np.array([np.median(w.std[number == c]) for c in kept])
-        corners = low + size * np.stack([np.array(kept) // (GRID + 1), np.array(kept) % (GRID + 1)], 1)
-        x, y = _square(w.points[:, [first, second]], f"x{'xyz'[second]}")
-        thin = np.unique(np.linspace(0, len(w.measured) - 1, min(len(w.measured), 400)).astype(int))
-        marks = [figures.cells(corners[:, 0], corners[:, 1], size, figures.level_of(values, edges))]
-        marks += [figures.dots(w.measured[thin, first], w.measured[thin, second], "measured")] if len(thin) else []
-        good = w.std[np.isfinite(w.std)]
+    for key, pick in (("xy", [0, 1]), ("xz", [0, 2])) if np.isfinite(w.std).any() else ():
+        points = w.points[:, pick]
+        low = points.min(0)
+        size = float(np.ptp(points, axis=0).max()) / GRID or 1.0
+        place = np.floor((points - low) / size).astype(int)
+        known = np.isfinite(w.std)
+        sums = np.zeros((3, GRID + 3, GRID + 3))
+        for layer, weight in zip(sums, (np.where(known, w.std, 0.0) ** 2, known, np.ones(len(known))), strict=True):
+            np.add.at(layer, (place[:, 0] + 1, place[:, 1] + 1), weight)
+        cells = np.argwhere(sums[2] > 0)
+        # Each cell with its eight neighbours, so that few configurations make no speckles.
+        pooled = np.array([sums[:, i - 1 : i + 2, j - 1 : j + 2].sum((1, 2)) for i, j in cells])
+        square = pooled[:, 0] / np.maximum(pooled[:, 1], 1)
+        std = np.where(pooled[:, 1] > 0.5 * pooled[:, 2], np.sqrt(square), np.inf)
+        out.append(Map(key, low + size * (cells - 1), size, std))
+    return out
+
+
+def levels(found: Sequence[Map]) -> list[float]:
+    """Edges in m between the levels of maps: round steps over most of what they show."""
+    every = np.concatenate([m.std[np.isfinite(m.std)] for m in found])
+    low, high = (float(np.quantile(every, at)) for at in (0.02, 0.98)) if every.size else (0.0, 1.0)
+    step = figures.nice_step(max(high - low, 1e-3 * high, 1e-12) / figures.LEVELS)
+    return (step * (np.floor(low / step) + np.arange(figures.LEVELS + 1))).tolist()
+
+
+def map_panels(study: Study) -> tuple[list[str], list[tuple[str, str]]]:
+    """Maps of the predicted position std with the fitted samples, and their legend in mm."""
+    w = study.workspace
+    found = maps(w)
+    if not found:
+        return [], []
+    edges, out = levels(found), []
+    good = w.std[np.isfinite(w.std)]
+    thin = np.unique(np.linspace(0, len(w.measured) - 1, min(len(w.measured), 500)).astype(int))
+    for m, title in zip(found, ("Seen from above", "Seen from the side"), strict=True):
+        pick = ["xyz".index(name) for name in m.key]
+        x, y = _square(w.points[:, pick], m.key)
+        marks = [figures.cells(m.corners[:, 0], m.corners[:, 1], m.size, figures.level_of(m.std, edges))]
+        marks += [figures.dots(*w.measured[thin][:, pick].T, "measured")] if len(thin) else []
         text = (
-            f"Map of the predicted standard deviation of the tool's position over x and {'xyz'[second]}: half of the "
-            f"configurations below {1e3 * float(np.median(good)):.3g} mm, 95 % below "
+            f"Map of the predicted standard deviation of the tool's position over {m.key[0]} and {m.key[1]}: half of "
+            f"the configurations below {1e3 * float(np.median(good)):.3g} mm, 95 % below "
             f"{1e3 * float(np.quantile(good, 0.95)):.3g} mm."
         )
-        out.append(panel(f"m-{key}", title, text, x, y, marks, SQUARE))
-    return out
+        out.append(panel(f"m-{m.key}", title, text, x, y, marks, figures.WIDE, SQUARE))
+    places = figures.places(1e3 * (edges[1] - edges[0]))
+    words = [f"{1e3 * edge:.{places}f}" for edge in edges]
+    legend = [(f"level{i}", f"{a}–{b} mm") for i, (a, b) in enumerate(zip(words, words[1:], strict=False))]
+    legend[0], legend[-1] = ("level0", f"below {words[1]} mm"), (legend[-1][0], f"above {words[-2]} mm")
+    if not all(np.isfinite(m.std).all() for m in found):
+        legend.append(("unknown", "cannot be predicted"))
+    return out, [*legend, ("dots measured", "fitted samples")]
 
 
 def _square(points: Array, names: str) -> tuple[Axis, Axis]:
@@ -200,45 +238,49 @@ def _square(points: Array, names: str) -> tuple[Axis, Axis]:
     return x, y
 
 
+def magnification(study: Study) -> float:
+    """How many times larger errors are drawn so that they show: round, from 1 to 500."""
+    points = [
+        np.array([body[3, :, 0] for body in chain.sweep(_pose(study)).bodies])
+        for chain in (study.fit.reference, study.fit.chain)
+    ]
+    off = float(np.linalg.norm(points[1] - points[0], axis=1).max())
+    wanted = 0.05 * float(np.ptp(points[0], axis=0).max()) / max(off, 1e-12)
+    return min(max(figures.nice_step(max(wanted, 1e-3) / 2), 1.0), 500.0)
+
+
+def _pose(study: Study) -> Array:
+    """Joint values (1, n) of the fitted sample that is nearest the middle of all."""
+    used = [item.configurations() for item in study.fit.data if item.ends > 0]
+    if not used:
+        return np.zeros((1, study.fit.chain.size))
+    points = study.workspace.measured
+    nearest = int(np.argmin(np.linalg.norm(points - points.mean(0), axis=1)))
+    return np.concatenate(used)[nearest : nearest + 1]
+
+
 def arm(study: Study) -> list[str]:
-    """The arm's skeleton at its first sample before and after, errors drawn larger, from the side and from above."""
-    fit = study.fit
+    """The arm's skeleton at one sample before and after, errors drawn larger, from the side and from above."""
+    fit, larger = study.fit, magnification(study)
     into = se3.inverse(fit.chain.base)
-    used = [item.q[:1] for item in fit.data if item.ends > 0]
-    q = used[0] if used else np.zeros((1, fit.chain.size))
     shapes = []
     for chain in (fit.reference, fit.chain):
-        sweep = chain.sweep(q)
+        sweep = chain.sweep(_pose(study))
         points = np.array([*(body[3, :, 0] for body in sweep.bodies), sweep.tool[3, :, 0]])
         shapes.append(points @ into[:3, :3].T + into[:3, 3])
-    nominal, calibrated = shapes
-    reach = float(np.ptp(nominal, axis=0).max())
-    off = float(np.linalg.norm(calibrated - nominal, axis=1).max())
-    larger = figures.nice_step(max(0.05 * reach / off, 1.0) / 2) if off > 1e-9 * reach else 1.0
-    drawn = nominal + larger * (calibrated - nominal)
+    nominal = shapes[0]
+    drawn = nominal + larger * (shapes[1] - nominal)
     cloud = study.workspace.measured[:MOST_DOTS]
     out = []
-    for key, second, title in (("xz", 2, "From the side"), ("xy", 1, "From above")):
-        x, y = _square(np.concatenate([nominal, drawn, cloud])[:, [0, second]], f"x{'xyz'[second]}")
-        marks = [figures.dots(cloud[:, 0], cloud[:, second], "faint")] if len(cloud) else []
+    for key, pick, title in (("xz", [0, 2], "From the side"), ("xy", [0, 1], "From above")):
+        x, y = _square(np.concatenate([nominal, drawn, cloud])[:, pick], key)
+        marks = [figures.dots(*cloud[:, pick].T, "faint")] if len(cloud) else []
         for points, look in ((nominal, "before"), (drawn, "after")):
-            marks += [draw(points[:, 0], points[:, second], look) for draw in (figures.line, figures.dots)]
-        name = f"{title}, errors {larger:g} × larger than true"
-        text = f"The arm's joints before and after calibration over x and {'xyz'[second]}; errors drawn {larger:g} times."
-        out.append(panel(f"arm-{key}", name, text, x, y, marks, SQUARE))
+            marks += [draw(*points[:, pick].T, look) for draw in (figures.line, figures.dots)]
+        name = f"{title}, errors drawn {larger:g} times larger"
+        text = f"The arm's joints before and after calibration over {key[0]} and {key[1]}."
+        out.append(panel(f"arm-{key}", name, text, x, y, marks, figures.WIDE, SQUARE))
     return out
-
-
-def map_legend(study: Study) -> list[tuple[str, str]]:
-    """Class and words of each level of the maps, in mm."""
-    edges = [1e3 * edge for edge in levels(study.workspace)]
-    places = max(0, -int(np.floor(np.log10(edges[1] - edges[0]) + 1e-9)))
-    out = [(f"level{i}", f"{a:.{places}f}–{b:.{places}f} mm") for i, (a, b) in enumerate(zip(edges, edges[1:], strict=False))]
-    out[0] = ("level0", f"below {edges[1]:.{places}f} mm")
-    out[-1] = (out[-1][0], f"above {edges[-2]:.{places}f} mm")
-    if not np.isfinite(study.workspace.std).all():
-        out.append(("unknown", "cannot be predicted"))
-    return [*out, ("measured", "fitted samples")]
 
 
 def spectrum(study: Study) -> list[str]:
@@ -250,7 +292,7 @@ def spectrum(study: Study) -> list[str]:
     number = np.arange(1, len(s) + 1)
     seen = np.arange(len(s)) < study.fit.rank
     low = 10.0 ** np.floor(np.log10(min(float(share.min()), 0.1)))
-    y = Axis(low, 2.0, "singular value, share of the largest", log=True)
+    y = Axis(low, 2.0, "share of the largest", log=True)
     x = Axis(0.0, len(s) + 1.0, "direction")
     marks: list[Mark] = [figures.dots(number[seen], share[seen], "after large")]
     if not seen.all():

@@ -89,7 +89,7 @@ def _head(found: Study) -> str:
     notes += report_sections.warnings(found)
     out = [
         "<header>",
-        f'<p class="eyebrow">Calibration of {html.escape(found.robot)}</p>',
+        f'<p class="eyebrow">Calibration of {html.escape(found.robot)}{_files(found)}</p>',
         f"<h1>{html.escape(title)}</h1>",
         _figures(big, "figure"),
         _figures(_details(best, head.group), "figure small"),
@@ -98,6 +98,13 @@ def _head(found: Study) -> str:
     if notes:
         out.append(f'<ul class="warn">{"".join(f"<li>{html.escape(text)}</li>" for text in notes)}</ul>')
     return "\n".join([*out, "</header>"])
+
+
+def _files(found: Study) -> str:
+    names = sorted({*found.source.names, *found.source.holdout_names})
+    if not names:
+        return ""
+    return f" from {html.escape(names[0].rsplit('/', 1)[-1] if len(names) == 1 else f'{len(names)} files')}"
 
 
 def _figures(rows: Sequence[tuple[str, str, str]], look: str) -> str:
@@ -149,9 +156,8 @@ def _table(found: Study, section: Section, table: Table) -> str:
 
 def _legend(entries: Sequence[tuple[str, str]]) -> str:
     def swatch(look: str) -> str:
-        if look.startswith(("level", "unknown")):
-            return f'<path class="{look}" d="M0 1H22V11H0Z"/>'
-        return f'<path class="{look}" d="{"M11 6h0" if look.startswith("dots") else "M1 11V3H21V11"}"/>'
+        shapes = {"dots": "M4 6h0M11 6h0M18 6h0", "line": "M0 6H22", "steps": "M1 11V2H21V11Z"}
+        return f'<path class="{look}" d="{shapes.get(look.split()[0], "M0 1H22V11H0Z")}"/>'
 
     cells = (f'<li><svg aria-hidden="true" viewBox="0 0 22 12">{swatch(look)}</svg>{html.escape(text)}</li>'
              for look, text in entries)  # fmt: skip
@@ -165,6 +171,11 @@ def _panels(drawn: Sequence[str], legend: Sequence[tuple[str, str]] = (), title:
     return "\n".join([head, _legend(legend) if legend else "", f'<div class="{look}">', *drawn, "</div>"])
 
 
+def _histograms(found: Study) -> str:
+    drawn = report_figures.histograms(found)
+    return _panels(drawn, BEFORE_AFTER, look="panels two" if len(drawn) in (2, 4) else "panels")
+
+
 def _left_figures(found: Study) -> str:
     dots = [("dots faint", "fitted"), ("dots after", "held out")] if found.fit.holdout else [("dots faint", "fitted")]
     dots += [("dots gross", "gross error")] if found.outliers else []
@@ -174,22 +185,25 @@ def _left_figures(found: Study) -> str:
         [
             _panels(report_figures.asked(found), lines, "Error that each part of a joint's range asks of that joint alone"),
             _panels(report_figures.by_joint(found), one, "Size of the errors over each joint's value, after"),
-            _panels(report_figures.by_sample(found), dots, "Size of the errors in the order of the files, after"),
+            _panels(report_figures.by_sample(found), dots, "Size of the errors in the order of the files, after", "panels wide"),
         ]
     )
 
 
 def _map_figures(found: Study) -> str:
-    drawn = report_figures.maps(found)
-    legend = [(f"dots {look}" if look == "measured" else look, text)
-              for look, text in report_figures.map_legend(found)] if drawn else []  # fmt: skip
+    drawn, legend = report_figures.map_panels(found)
     return _panels(drawn, legend, look="panels wide")
 
 
 def _scene(found: Study) -> str:
     fit = found.fit
     scene = viewer.scene_html(
-        fit.reference, fit.chain, measurements=fit.data, known=fit.instruments, title=found.robot
+        fit.reference,
+        fit.chain,
+        measurements=fit.data,
+        known=fit.instruments,
+        title=found.robot,
+        magnification=report_figures.magnification(found),
     )
     frame = (
         '<iframe class="screen" sandbox="allow-scripts" loading="lazy" title="The arm before and after, in three '
@@ -202,7 +216,7 @@ def _scene(found: Study) -> str:
 
 BEFORE_AFTER_ARM = [("line before", "nominal"), ("line after", "calibrated"), ("dots faint", "fitted samples")]
 FIGURES = {
-    "accuracy": lambda found: _panels(report_figures.histograms(found), BEFORE_AFTER),
+    "accuracy": _histograms,
     "left": _left_figures,
     "workspace": _map_figures,
     "scene": _scene,

@@ -123,7 +123,7 @@ def _left(found: Study) -> Section:
             most = [np.nanmax(np.abs(t.before)), t.after[worst]]
             cells = [shown(float(v), unit, float(t.after_std[worst]), small=True) for v in most]
             rows.append([t.name, *cells, shown(float(t.after_std[worst]), unit, float(t.after_std[worst]), True),
-                         shown(float(t.centres[worst]), unit)])  # fmt: skip
+                         f"{1e3 * t.centres[worst]:.0f} mm" if t.slides else f"{np.degrees(t.centres[worst]):.0f}°"])  # fmt: skip
     text = (
         f"In each part of a joint's range, the error of that joint alone that would explain the samples {which} best. "
         "Scatter about zero is noise; a wave means that the joint errs in a way that the model lacks: eccentric "
@@ -169,11 +169,14 @@ def _parameters(found: Study) -> Section:
     for title, rows in every:
         if rows:
             table = tables.estimate_table(rows)
-            keep = [i for i in range(len(table.header)) if title != titles["frame"] or i not in (1, 3)]
-            extra = [[shown(e.prior, e.unit, e.prior, small=True) if not e.fixed else "", f"{e.observability:.2f}"]
-                     for e in rows]  # fmt: skip
-            cells = [[row[i] for i in keep] + more for row, more in zip(table.rows, extra, strict=True)]
-            header = [*(table.header[i] for i in keep), "prior std", "observability"]
+            # A frame's nominal place says nothing, and only joints have a prior that matters.
+            drop = (1, 3, 5) if title == titles["frame"] else (5,) if title == titles["instrument"] else ()
+            header = [*table.header, "prior std", "observability"]
+            full = [
+                [*row, shown(e.prior, e.unit, e.prior, True) if not e.fixed else "", f"{e.observability:.2f}"]
+                for row, e in zip(table.rows, rows, strict=True)
+            ]
+            header, *cells = [[text for i, text in enumerate(row) if i not in drop] for row in [header, *full]]
             out.append(Table(header, cells, caption=title))
     text = (
         "Observability is how far the data alone see a parameter, from 0 (not at all) to 1 (fully). A parameter with "
@@ -231,7 +234,7 @@ def _done(found: Study) -> Section:
     facts.append(["method", {"lm": "Levenberg-Marquardt", "gn": "Gauss-Newton, the paper's loop"}[fit.method]])
     facts.append(["state", f"{'converged' if fit.converged else 'not converged'} after {fit.iterations} iterations"])
     priors = bool(np.any(fit.problem.weights))
-    facts.append(["priors", "normal, with the standard deviations in the tables above" if priors else "none"])
+    facts.append(["priors", "normal about nominal, standard deviations in the tables above; frames and instruments anywhere in a hall" if priors else "none"])
     facts += [[name, text] for name, text in source.settings.items()]
     rows = []
     held_out = dict.fromkeys(found.names, 0)

@@ -13,7 +13,7 @@ from .evaluation import ENDINGS, Comparison
 UNITS = {"m": (1e3, " mm"), "rad": (180 / math.pi, "°")}
 SMALL = {"m": (1e3, " mm"), "rad": (1e3, " mrad")}
 # Digits behind the point where no uncertainty says how many are known; and never more than MOST.
-PLAIN, MOST = 4, 6
+PLAIN, MOST = 3, 6
 # Groups of accuracy in words.
 WORDS = {"position": "position error", "orientation": "orientation error", "residual": "residual"}
 # Measures of accuracy in words.
@@ -21,10 +21,12 @@ MEASURES = {"mean": "mean", "rms": "RMS", "p95": "95 % within", "max": "largest"
 
 
 def digits(std: float) -> int:
-    """Digits behind the point that show two digits of an uncertainty."""
+    """Digits behind the point for an uncertainty: two of its own up to 35, else one (Particle Data Group)."""
     if not (math.isfinite(std) and std > 0):
         return PLAIN
-    return min(max(1 - math.floor(math.log10(std)), 0), MOST)
+    power = math.floor(math.log10(std))
+    leading = std / 10.0**power
+    return min(max((1 if leading < 3.55 or leading >= 9.5 else 0) - power - (leading >= 9.5), 0), MOST)
 
 
 def fixed(value: float, places: int) -> str:
@@ -108,7 +110,7 @@ def estimate_table(estimates: Sequence[Estimate]) -> Table:
     rows = [
         [
             e.name,
-            shown(e.nominal, e.unit),
+            shown(e.nominal, e.unit, e.std),
             shown(e.value, e.unit, e.std),
             shown(e.change, e.unit, e.std, small=True),
             e.certainty,
@@ -133,7 +135,7 @@ def accuracy_table(comparisons: Sequence[Comparison]) -> Table:
                 cells = [fixed(factor * figure, places) for figure in figures]
                 rows.append([f"{c.samples} {c.title}", f"{WORDS[group]},{unit}", state, *cells])
     axes = [f"{axis}, RMS" for axis in "xyz"]
-    return Table(["samples", "error", "", *MEASURES.values(), *axes], rows, texts=3)
+    return Table(["samples", "error", "calibration", *MEASURES.values(), *axes], rows, texts=3)
 
 
 @dataclass(frozen=True)
