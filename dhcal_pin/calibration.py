@@ -17,7 +17,7 @@ from .measurements import Measurement
 from .parameters import ErrorModel, select
 from .result import Result
 from .se3 import Array
-from .solver import METHODS, Problem, Progress, Solution, levenberg_marquardt, shared_unknowns
+from .solver import METHODS, Problem, Progress, Solution, levenberg_marquardt, posterior_root, shared_unknowns
 
 Method = Literal["lm", "gn"]
 Priors = Literal["default", "none"] | Mapping[str, float]
@@ -124,6 +124,25 @@ def _scatter(
     )
 
 
+def _widened(problem: Problem, solution: Solution, expected: Array) -> Array:
+    """The weights (p+s,) of priors as wide as the errors that were found, never narrower than expected.
+
+    Lengths and angles of the links each have one scale, the one of greatest evidence (MacKay 1992):
+    the mean square of their errors over as many as the data and not the prior determine.
+    """
+    errors = problem.errors
+    outside = (BASE, errors.chain.tool_station)
+    root = posterior_root(solution.triangle, problem.weights)[0]
+    told = 1 - np.sum((root * problem.weights[:, None]) ** 2, 1)
+    weights = problem.weights.copy()
+    for unit in {p.unit for p in errors.parameters}:
+        family = [i for i, p in enumerate(errors.parameters) if p.unit == unit and p.station not in outside]
+        if (count := told[family].sum()) > 1e-3:
+            square = np.sum((solution.x[family] * expected[family]) ** 2) / count
+            weights[family] = expected[family] / np.sqrt(max(1.0, square))
+    return weights
+
+
 def _scaled(data: tuple[Measurement, ...], scales: Array) -> tuple[Measurement, ...]:
     left = iter(scales.tolist())
     return tuple(item.scaled({name: next(left) for name in item.groups}) for item in data)
@@ -162,8 +181,9 @@ def calibrate(
         max_iterations: most steps of a loop.
         progress: called with the iteration and the cost.
 
-    Sigmas that no instrument states are estimated with the fit, a group of rows at a time, so that
-    data and priors weigh right against each other.
+    Sigmas that no instrument states are estimated with the fit, a group of rows at a time, and default
+    priors widen to the errors that are found where these are larger, so that data and priors weigh
+    right against each other.
 
     Raises:
         DhcalError: no data, unknown names, or a plain Gauss-Newton loop that runs away.
@@ -191,6 +211,7 @@ def calibrate(
     if method == "lm":
         # Sigmas and weights that the fit itself tells: a few rounds settle them.
         scales = np.ones(sum(len(item.groups) for item in data))
+        expected = problem.weights
         for _ in range(MOST_ROUNDS):
             before, found = weights, _scatter(problem, solution, data, weights)
             scaled = _scaled(data, found)
@@ -198,10 +219,12 @@ def calibrate(
             values = [problem.values(item, solution.x) for item in data]
             weighed, weights = robust.reweighted(fitted, scaled, values, loss)
             moved = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(weights, before, strict=True))
-            if np.abs(np.log(found / scales)).max() < 0.01 and moved < 0.01:
+            priors_now = _widened(problem, solution, expected) if priors == "default" else expected
+            changes = np.log(found / scales), (priors_now - problem.weights) / np.fmax(expected, 1e-300)
+            if max(moved, *(np.abs(change).max(initial=0.0) for change in changes)) < 0.01:
                 break
             scales = found
-            problem = replace(problem, data=weighed)
+            problem = replace(problem, data=weighed, weights=priors_now)
             again = levenberg_marquardt(problem, solution.x, max_iterations, progress)
             solution = replace(again, iterations=solution.iterations + again.iterations)
     return Result(

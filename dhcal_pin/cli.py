@@ -137,7 +137,11 @@ def parser() -> argparse.ArgumentParser:
         "--tool-frame", metavar="NAME", help="put the tool into the URDF, as a link fixed to the tip"
     )
     calibrate.add_argument(
-        "--report", metavar="R.html", action="append", default=[], help="the report, as .html or .md; may repeat"
+        "--report",
+        metavar="R.html",
+        action="append",
+        default=[],
+        help="the report, as .html or .md; may repeat",
     )
     calibrate.add_argument("--json", **_JSON)
 

@@ -41,7 +41,6 @@ from .robot_files import (
     urdf_files,
 )
 from .screening import Finding, screen
-from .se3 import Array
 
 # --- calibrate -------------------------------------------------------------------------------------
 
@@ -137,7 +136,9 @@ def _calibrate(args: Namespace) -> int:
         for path in impossible
         if impossible[path] + gross.get(path, [])
     }
-    files |= {"report" if number == 1 else f"report_{number}": path for number, path in enumerate(args.report, 1)}
+    files |= {
+        "report" if number == 1 else f"report_{number}": path for number, path in enumerate(args.report, 1)
+    }
     source = _provenance(args, sets, data, inputs)
     contents |= report_page.report_files(fit, args.report, source)
     document = report.document(fit, files, source.inputs, [row for found in rows.values() for row in found])

@@ -15,7 +15,7 @@ from .calibration import calibrate
 from .chain import Chain
 from .dh_files import read_dh
 from .errors import DhcalError
-from .evaluation import accuracy
+from .evaluation import Comparison, accuracy, deviations, summary
 from .files import PathLike, save
 from .kinds import KINDS
 from .measurement_files import Readings, read_readings
@@ -62,14 +62,11 @@ def identifiable(chain: Chain, data: Sequence[Measurement]) -> list[str]:
     return sorted(held)
 
 
-def leave_one_out(fit: Callable[[Measurement], Result], data: Measurement) -> float:
-    """RMS position error in m of each sample under the fit to all the others."""
+def leave_one_out(fit: Callable[[Measurement], Result], data: Measurement) -> dict[str, Any]:
+    """Accuracy, as from `accuracy`, on each sample under the fit to all the others."""
     rows = np.arange(len(data.q))
-    squares = []
-    for row in rows:
-        left = data.take(rows == row)
-        squares.append(accuracy(fit(data.take(rows != row)).chain, [left])["position_rms_m"] ** 2)
-    return float(np.sqrt(np.mean(squares)))
+    found = [deviations(fit(data.take(rows != row)).chain, [data.take(rows == row)])[0] for row in rows]
+    return summary(found)
 
 
 def _rms(difference: Array) -> float:
@@ -87,6 +84,7 @@ class Experiment:
         data: the rows that remain.
         held: parameters that these poses cannot see.
         fit: least squares on the rest.
+        judged: its accuracy on each sample left out of the fit to the others.
         rows: the comparison for people, numbers in mm.
         figures: the same numbers in m.
     """
@@ -97,6 +95,7 @@ class Experiment:
     data: Measurement
     held: list[str]
     fit: Result
+    judged: Comparison
     rows: list[list[str]]
     figures: dict[str, float]
 
@@ -120,14 +119,15 @@ def experiment() -> Experiment:
         return calibrate(chain, part, "dh", priors="none", fix=held)
 
     fit = least_squares(data)
+    left_out = leave_one_out(least_squares, data)
     step = one_step(data)
     measured = readings.data.positions()
     figures = {
         "before": accuracy(chain, [data])["position_rms_m"],
         "one_step": accuracy(step.chain, [data])["position_rms_m"],
-        "one_step_left_out": leave_one_out(one_step, data),
+        "one_step_left_out": leave_one_out(one_step, data)["position_rms_m"],
         "least_squares": accuracy(fit.chain, [data])["position_rms_m"],
-        "least_squares_left_out": leave_one_out(least_squares, data),
+        "least_squares_left_out": left_out["position_rms_m"],
         "published_parameters": accuracy(paper_arm("experiment_published"), [data])["position_rms_m"],
         "paper_before": _rms((measured - commanded)[good]),
         "paper_after": _rms((after - commanded)[good]),
@@ -143,7 +143,8 @@ def experiment() -> Experiment:
         ["the paper's own distance from the object, before", mm["paper_before"], ""],
         ["the paper's own distance from the object, after", mm["paper_after"], ""],
     ]
-    return Experiment(chain, readings, findings, data, held, fit, rows, figures)
+    judged = Comparison("left out", len(data.q), accuracy(chain, [data]), left_out)
+    return Experiment(chain, readings, findings, data, held, fit, judged, rows, figures)
 
 
 # --- the simulations -------------------------------------------------------------------------------
@@ -336,6 +337,7 @@ def run(out: PathLike) -> dict[str, Any]:
         settings={"parameters": "dh"},
         left_out={inputs[1].name: {f.row: f.reason for f in found.findings}},
         remarks=_verdict(found),
+        judged=found.judged,
     )
     rejected = [finding.row for finding in found.findings]
     document = report.document(found.fit, files, source.inputs, rejected) | {"experiment_m": found.figures}

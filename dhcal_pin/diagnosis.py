@@ -1,4 +1,4 @@
-"""What a calibration leaves unexplained, by sample and by joint, and where in the workspace it can be trusted."""
+"""What a calibration leaves unexplained, by sample and by joint, and where it can be trusted."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def outliers(fit: Result) -> list[Outlier]:
 
 
 def sigmas(fit: Result) -> list[dict[str, float]]:
-    """Standard deviation an axis, m or rad, by group of rows that each fitted item went in with: the median."""
+    """Median standard deviation an axis, m or rad, by group of rows that each fitted item went in with."""
     out = []
     for item, weights in zip(fit.problem.data, fit.weights, strict=True):
         sweep, u = fit.chain.sweep(item.configurations()), fit.problem.values(item, fit.x)
@@ -94,8 +94,9 @@ class JointTrace:
 def joint_traces(fit: Result) -> list[JointTrace]:
     """Each moving joint's trace over the samples held out, or over the fitted where none are.
 
-    Least squares over the joint's own offset in each part of its range, whatever was measured: a wave over the
-    range is an error that the joint has and the model lacks. Empty where no reading belongs to one configuration.
+    Least squares over the joint's own offset in each part of its range, whatever was measured: a wave
+    over the range is an error that the joint has and the model lacks. Empty where no reading belongs to
+    one configuration.
     """
     data = [item for item in fit.holdout or fit.data if item.ends == 1]
     if not data:
@@ -151,7 +152,7 @@ class Workspace:
     """Predicted accuracy over the workspace.
 
     Attributes:
-        points: (s, 3) tool points in the robot's base frame, m, of configurations all over the joints' ranges.
+        points: (s, 3) tool points in the base frame, m, of configurations all over the joints' ranges.
         std: (s,) predicted standard deviation of the position there, m; infinite where nothing tells.
         measured: (m, 3) tool points of the fitted samples in the base frame, m.
         measured_std: (m,) predicted there.

@@ -80,7 +80,11 @@ def accuracy(
         data: measurements of any kinds.
         known: values of instruments' unknowns; others are fitted to the data first.
     """  # noqa: D205
-    found = deviations(chain, data, known)
+    return summary(deviations(chain, data, known))
+
+
+def summary(found: Sequence[Mapping[str, Array]]) -> dict[str, Any]:
+    """What `accuracy` says, of deviations."""
     out: dict[str, Any] = {}
     for group, size in sizes(found).items():
         end = ENDINGS[group]
@@ -106,7 +110,7 @@ class Comparison:
     """Accuracy before and after a calibration on the same samples.
 
     Attributes:
-        title: "held out" or "fitted".
+        title: "held out", "left out" (each sample of a fit without it) or "fitted".
         samples: how many.
         before, after: as from `accuracy`.
     """

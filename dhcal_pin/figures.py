@@ -119,7 +119,9 @@ class Frame:
 
     def down(self, values: ArrayLike) -> Array:
         """Pixels from the top."""
-        return self.height - BOTTOM - np.clip(self.y.share(values), -0.02, 1.02) * (self.height - TOP - BOTTOM)
+        return (
+            self.height - BOTTOM - np.clip(self.y.share(values), -0.02, 1.02) * (self.height - TOP - BOTTOM)
+        )
 
 
 Mark = Callable[[Frame], str]
@@ -138,7 +140,9 @@ def _pairs(frame: Frame, x: ArrayLike, y: ArrayLike) -> list[str]:
 
 def dots(x: ArrayLike, y: ArrayLike, look: str) -> Mark:
     """Round dots, one path for all of them."""
-    return lambda frame: f'<path class="dots {look}" d="{"".join(f"M{at}h0" for at in _pairs(frame, x, y))}"/>'
+    return lambda frame: (
+        f'<path class="dots {look}" d="{"".join(f"M{at}h0" for at in _pairs(frame, x, y))}"/>'
+    )
 
 
 def line(x: ArrayLike, y: ArrayLike, look: str) -> Mark:
@@ -222,7 +226,9 @@ def panel(
     for value, label in y.ticks():
         at = float(frame.down(value))
         lines.append(f"M{_number(LEFT)} {_number(at)}H{_number(frame.right)}")
-        labels.append(f'<text class="tick end" x="{_number(LEFT - 5)}" y="{_number(at + 3.5)}">{label}</text>')
+        labels.append(
+            f'<text class="tick end" x="{_number(LEFT - 5)}" y="{_number(at + 3.5)}">{label}</text>'
+        )
     for value, label in x.ticks():
         at = float(frame.across(value))
         lines.append(f"M{_number(at)} {_number(TOP)}V{_number(floor)}")

@@ -49,7 +49,10 @@ def command_line(given: Sequence[str], outputs: Sequence[str], names: Mapping[st
     for word in given:
         if word in outputs and words and words[-1].startswith("-"):
             words.pop()
-        elif not (word.startswith("-") and any(word in (f"-o{path}", f"{word.split('=')[0]}={path}") for path in outputs)):
+        elif not (
+            word.startswith("-")
+            and any(word in (f"-o{path}", f"{word.split('=')[0]}={path}") for path in outputs)
+        ):
             words.append(names.get(word, word))
     return shlex.join(["dhcal", *words])
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from . import observability
 from .chain import Chain
-from .evaluation import accuracy
+from .evaluation import Comparison, accuracy
 from .files import PathLike
 from .measurements import Measurement
 from .result import Result
@@ -33,6 +33,7 @@ class Provenance:
         left_out: reasons by file and row of what was not used at all.
         doubts: what is hard to believe, by file.
         remarks: sentences that belong beside the headline.
+        judged: accuracy on samples that were each left out of a fit, where none were held out.
     """
 
     command: str = ""
@@ -43,6 +44,7 @@ class Provenance:
     left_out: Mapping[str, Mapping[int, str]] = field(default_factory=dict)
     doubts: Mapping[str, Sequence[str]] = field(default_factory=dict)
     remarks: Sequence[str] = ()
+    judged: Comparison | None = None
 
 
 def fingerprints(paths: Sequence[PathLike]) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""The report as one HTML page that holds everything: figures, tables, and the scene; it asks no host for anything."""
+"""The report as one HTML page that holds figures, tables and the scene, and asks no host for anything."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from . import figures, report_figures, report_sections, tables, viewer
+from . import report_figures, report_maps, report_sections, tables, viewer
 from .errors import DhcalError
 from .evaluation import ENDINGS, Comparison
 from .files import PathLike, save
 from .report import Provenance
 from .report_sections import Section, Study
 from .result import Result
-from .tables import MEASURES, SMALL, WORDS, Table, shown
+from .tables import MEASURES, WORDS, Table, shown
 
 PAGE = Path(__file__).with_name("report.html")
 BEFORE_AFTER = [("steps before", "before"), ("steps after", "after")]
@@ -67,15 +67,12 @@ def page(found: Study) -> str:
 
 
 def _head(found: Study) -> str:
-    comparisons = found.fit.comparisons
+    comparisons = found.comparisons
     best, head = comparisons[0], tables.headline(comparisons)
     what = f"{WORDS[head.group][0].upper()}{WORDS[head.group][1:]}"
     many = "sample" if best.samples == 1 else "samples"
-    if best.title == "held out":
-        was = "was" if best.samples == 1 else "were"
-        title, note = f"{what} on {best.samples} {many} that {was} not fitted", ""
-        if best.samples < 10:
-            note = f"So few samples say little: hold out more than {best.samples}."
+    if best.title != "fitted":
+        title, note = f"{what} {tables.on_samples(best)}", tables.few(best)
     else:
         title = "Nothing was held out"
         note = (
@@ -120,7 +117,11 @@ def _details(best: Comparison, chosen: str) -> list[tuple[str, str, str]]:
         unit = end.strip("_") or "m"
         for key, word in MEASURES.items():
             name = f"{group}_{key}{end}"
-            if name in best.after and ((group == chosen) == (key in ("p95", "max"))) and (group == chosen or key == "rms"):
+            if (
+                name in best.after
+                and ((group == chosen) == (key in ("p95", "max")))
+                and (group == chosen or key == "rms")
+            ):
                 std = best.after[f"{group}_rms_std{end}"]
                 value = shown(best.after[name], unit, std, small=True)
                 if group != chosen:
@@ -142,7 +143,9 @@ def _section(found: Study, section: Section) -> str:
     if not any(inside):
         return ""
     head = f'<h2 id="{section.key}-h">{html.escape(section.title)}</h2>'
-    return "\n".join([f'<section aria-labelledby="{section.key}-h">', head, *filter(None, inside), "</section>"])
+    return "\n".join(
+        [f'<section aria-labelledby="{section.key}-h">', head, *filter(None, inside), "</section>"]
+    )
 
 
 def _table(found: Study, section: Section, table: Table) -> str:
@@ -151,7 +154,8 @@ def _table(found: Study, section: Section, table: Table) -> str:
         bars = report_figures.estimate_bars(found, [row[0] for row in table.rows])
     name = html.escape(table.caption or f"{section.title}: {table.header[0]}")
     # A region that scrolls must be reachable by the keyboard.
-    return f'<div class="scroll" tabindex="0" role="region" aria-label="{name}">{tables.html_table(table, bars)}</div>'
+    region = f'<div class="scroll" tabindex="0" role="region" aria-label="{name}">'
+    return f"{region}{tables.html_table(table, bars)}</div>"
 
 
 def _legend(entries: Sequence[tuple[str, str]]) -> str:
@@ -164,7 +168,9 @@ def _legend(entries: Sequence[tuple[str, str]]) -> str:
     return f'<ul class="legend">{"".join(cells)}</ul>'
 
 
-def _panels(drawn: Sequence[str], legend: Sequence[tuple[str, str]] = (), title: str = "", look: str = "panels") -> str:
+def _panels(
+    drawn: Sequence[str], legend: Sequence[tuple[str, str]] = (), title: str = "", look: str = "panels"
+) -> str:
     if not drawn:
         return ""
     head = f"<h3>{html.escape(title)}</h3>" if title else ""
@@ -177,21 +183,31 @@ def _histograms(found: Study) -> str:
 
 
 def _left_figures(found: Study) -> str:
-    dots = [("dots faint", "fitted"), ("dots after", "held out")] if found.fit.holdout else [("dots faint", "fitted")]
+    looks = report_figures.sample_looks(found)
+    dots = [(f"dots {look}", name) for look, name in zip(looks, ("fitted", "held out"), strict=False)]
     dots += [("dots gross", "gross error")] if found.outliers else []
     lines = [("line before", "before"), ("line after", "after")]
     one = [("dots faint", "a sample"), ("line after", "median")]
     return "\n".join(
         [
-            _panels(report_figures.asked(found), lines, "Error that each part of a joint's range asks of that joint alone"),
+            _panels(
+                report_figures.asked(found),
+                lines,
+                "Error that each part of a joint's range asks of that joint alone",
+            ),
             _panels(report_figures.by_joint(found), one, "Size of the errors over each joint's value, after"),
-            _panels(report_figures.by_sample(found), dots, "Size of the errors in the order of the files, after", "panels wide"),
+            _panels(
+                report_figures.by_sample(found),
+                dots,
+                "Size of the errors in the order of the files, after",
+                "panels wide",
+            ),
         ]
     )
 
 
 def _map_figures(found: Study) -> str:
-    drawn, legend = report_figures.map_panels(found)
+    drawn, legend = report_maps.map_panels(found)
     return _panels(drawn, legend, look="panels wide")
 
 
@@ -203,18 +219,22 @@ def _scene(found: Study) -> str:
         measurements=fit.data,
         known=fit.instruments,
         title=found.robot,
-        magnification=report_figures.magnification(found),
+        magnification=report_maps.magnification(found),
     )
     frame = (
-        '<iframe class="screen" sandbox="allow-scripts" loading="lazy" title="The arm before and after, in three '
-        f'dimensions" srcdoc="{html.escape(scene)}"></iframe>'
+        '<iframe class="screen" sandbox="allow-scripts" loading="lazy" '
+        f'title="The arm before and after, in three dimensions" srcdoc="{html.escape(scene)}"></iframe>'
     )
-    note = '<p class="screen">Drag to turn; the sliders move the joints and draw the errors larger than they are.</p>'
-    still = report_figures.arm(found)
+    note = '<p class="screen">Drag to turn; sliders move the joints and draw errors larger than they are.</p>'
+    still = report_maps.arm(found)
     return f'{note}\n{frame}\n<div class="paper">{_panels(still, BEFORE_AFTER_ARM, look="panels wide")}</div>'
 
 
-BEFORE_AFTER_ARM = [("line before", "nominal"), ("line after", "calibrated"), ("dots faint", "fitted samples")]
+BEFORE_AFTER_ARM = [
+    ("line before", "nominal"),
+    ("line after", "calibrated"),
+    ("dots faint", "fitted samples"),
+]
 FIGURES = {
     "accuracy": _histograms,
     "left": _left_figures,

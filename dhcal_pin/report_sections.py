@@ -10,6 +10,7 @@ import numpy as np
 from . import robust, tables
 from .chain import BASE
 from .diagnosis import JointTrace, Outlier, Workspace, joint_traces, outliers, sigmas, workspace
+from .evaluation import Comparison
 from .report import Provenance, short_names, versions
 from .result import Result
 from .tables import Table, fixed, shown
@@ -37,6 +38,12 @@ class Study:
     def holdout_names(self) -> list[str]:
         """What each item held out is called."""
         return _names(self.source.holdout_names, [item.kind for item in self.fit.holdout])
+
+    @property
+    def comparisons(self) -> tuple[Comparison, ...]:
+        """Accuracy before and after, the most honest first."""
+        judged = self.source.judged
+        return (judged, *self.fit.comparisons) if judged and not self.fit.holdout else self.fit.comparisons
 
     @property
     def robot(self) -> str:
@@ -86,12 +93,15 @@ def warnings(found: Study) -> list[str]:
     fit, out = found.fit, []
     if not fit.converged:
         out.append("The loop did not converge: the figures are of its last step.")
-    worse = [c for c in fit.comparisons if tables.headline([c]).drop < 0]
-    out += [f"On the {c.samples} samples {c.title} the calibrated arm is worse than the nominal one." for c in worse]
+    worse = [c for c in found.comparisons if tables.headline([c]).drop < 0]
+    out += [
+        f"{tables.on_samples(c).capitalize()} the calibrated arm is worse than the nominal one."
+        for c in worse
+    ]
     if not np.isfinite(fit.noise):
         out.append(
-            f"{fit.samples} samples stand against {fit.rank} directions that they see: no reading is left over "
-            "to tell how uncertain the parameters are."
+            f"{fit.samples} samples stand against {fit.rank} directions that they see: no reading is left "
+            "over to tell how uncertain the parameters are."
         )
     if found.outliers:
         many = f"{len(found.outliers)} gross errors are" if len(found.outliers) > 1 else "One gross error is"
@@ -106,7 +116,7 @@ def _accuracy(found: Study) -> Section:
         "accuracy",
         "Accuracy",
         [f"Before is the nominal arm{same}: what differs between before and after is the robot alone."],
-        tables=[tables.accuracy_table(found.fit.comparisons)],
+        tables=[tables.accuracy_table(found.comparisons)],
     )
 
 
@@ -120,17 +130,19 @@ def _left(found: Study) -> Section:
         unit = "m" if t.slides else "rad"
         if len(t.centres):
             worst = int(np.nanargmax(np.abs(t.after)))
-            most = [np.nanmax(np.abs(t.before)), t.after[worst]]
-            cells = [shown(float(v), unit, float(t.after_std[worst]), small=True) for v in most]
-            rows.append([t.name, *cells, shown(float(t.after_std[worst]), unit, float(t.after_std[worst]), True),
-                         f"{1e3 * t.centres[worst]:.0f} mm" if t.slides else f"{np.degrees(t.centres[worst]):.0f}°"])  # fmt: skip
+            std, at = float(t.after_std[worst]), float(t.centres[worst])
+            figures = (float(np.nanmax(np.abs(t.before))), float(t.after[worst]), std)
+            place = f"{1e3 * at:.0f} mm" if t.slides else f"{np.degrees(at):.0f}°"
+            rows.append([t.name, *(shown(figure, unit, std, small=True) for figure in figures), place])
     text = (
-        f"In each part of a joint's range, the error of that joint alone that would explain the samples {which} best. "
-        "Scatter about zero is noise; a wave means that the joint errs in a way that the model lacks: eccentric "
-        "gears, elasticity, backlash."
+        "In each part of a joint's range, the error of that joint alone that would explain the samples "
+        f"{which} best. Scatter about zero is noise; a wave means that the joint errs in a way that the model "
+        "lacks: eccentric gears, elasticity, backlash."
     )
     table = Table(["joint", "largest before", "largest after", "std", "at"], rows)
-    return Section(key, title, [text], tables=[table] if rows else [])
+    if not rows:
+        return Section(key, title, ["There are too few samples to see how each joint errs over its range."])
+    return Section(key, title, [text], tables=[table])
 
 
 def _workspace(found: Study) -> Section:
@@ -143,28 +155,37 @@ def _workspace(found: Study) -> Section:
     ):
         if len(std):
             good = std[np.isfinite(std)]
-            cells = [fixed(1e3 * float(np.quantile(good, at)), 3) if good.size else "–" for at in (0.05, 0.5, 0.95, 1)]
+            cells = [
+                fixed(1e3 * float(np.quantile(good, at)), 3) if good.size else "–"
+                for at in (0.05, 0.5, 0.95, 1)
+            ]
             rows.append([title, *cells, f"{100 * (1 - good.size / len(std)):.0f} %"])
     sentences = [
-        "The standard deviation of the tool's position that follows from the parameters' own uncertainty, "
-        "for configurations drawn over the joints' limits (a joint turns at most half a turn each way). It grows "
-        "away from what was measured. What the model lacks comes on top of it: see the error on samples that were "
-        "not fitted."
+        "The standard deviation of the tool's position that follows from the parameters' own uncertainty, for "
+        "configurations drawn over the joints' limits (a joint turns at most half a turn each way). It grows "
+        "away from what was measured. What the model lacks comes on top of it: see the error on samples that "
+        "were not fitted."
     ]
     if not known.any():
-        sentences = ["No accuracy can be predicted anywhere: the data leave the tool's place undetermined, and there "
-                     "is no prior that holds it, or no reading to tell the noise by."]  # fmt: skip
+        sentences = [
+            "No accuracy can be predicted anywhere: the data leave the tool's place undetermined and no prior "
+            "holds it, or no reading is left over to tell the noise by."
+        ]
     elif not known.all():
         sentences.append("Where the data leave the tool's place undetermined it cannot be predicted at all.")
     header = ["predicted position std, mm", "best 5 % below", "half below", "95 % below", "worst", "unknown"]
-    return Section("workspace", "Where the calibrated arm can be trusted", sentences, tables=[Table(header, rows)])
+    return Section(
+        "workspace", "Where the calibrated arm can be trusted", sentences, tables=[Table(header, rows)]
+    )
 
 
 def _parameters(found: Study) -> Section:
-    titles = {"robot": "Robot", "frame": "Where the robot stands and where the target sits", "instrument": "Instruments"}
-    every = [
-        (title, [e for e in found.fit.estimates if e.place == place]) for place, title in titles.items()
-    ]
+    titles = {
+        "robot": "Robot",
+        "frame": "Where the robot stands and where the target sits",
+        "instrument": "Instruments",
+    }
+    every = [(title, [e for e in found.fit.estimates if e.place == place]) for place, title in titles.items()]
     out = []
     for title, rows in every:
         if rows:
@@ -173,14 +194,20 @@ def _parameters(found: Study) -> Section:
             drop = (1, 3, 5) if title == titles["frame"] else (5,) if title == titles["instrument"] else ()
             header = [*table.header, "prior std", "observability"]
             full = [
-                [*row, shown(e.prior, e.unit, e.prior, True) if not e.fixed else "", f"{e.observability:.2f}"]
+                [
+                    *row,
+                    shown(e.prior, e.unit, e.prior, True) if not e.fixed else "",
+                    "" if e.fixed else f"{e.observability:.2f}",
+                ]
                 for row, e in zip(table.rows, rows, strict=True)
             ]
-            header, *cells = [[text for i, text in enumerate(row) if i not in drop] for row in [header, *full]]
+            header, *cells = [
+                [text for i, text in enumerate(row) if i not in drop] for row in [header, *full]
+            ]
             out.append(Table(header, cells, caption=title))
     text = (
-        "Observability is how far the data alone see a parameter, from 0 (not at all) to 1 (fully). A parameter with "
-        "less than 1 shares what it does with others; the prior then decides how the sum is parted."
+        "Observability is how far the data alone see a parameter, from 0 (not at all) to 1 (fully). A parameter "
+        "with less than 1 shares what it does with others; the prior then decides how the sum is parted."
     )
     return Section("parameters", "Parameters", [text], tables=out)
 
@@ -188,26 +215,28 @@ def _parameters(found: Study) -> Section:
 def _seen(found: Study) -> Section:
     fit = found.fit
     text = (
-        f"The data see {fit.rank} of {len(fit.parameters)} directions of the parameters; the largest singular value "
-        f"seen is {fit.condition:.3g} times the smallest."
+        f"The data see {fit.rank} of {len(fit.parameters)} directions of the parameters; the largest singular "
+        f"value seen is {fit.condition:.3g} times the smallest."
     )
-    also = "Nothing is hidden: every parameter can be told from the others." if not fit.unobservable else (
-        "These cannot be told apart, so their single values mean little, although what they do together is known:"
-    )  # fmt: skip
+    also = "Nothing is hidden: every parameter can be told from the others."
+    if fit.unobservable:
+        also = "These cannot be told apart: their single values mean little, what they do together is known."
     return Section("seen", "What could not be told apart", [text, also], fit.unobservable)
 
 
 def _rows(found: Study) -> Section:
     names, rows = found.names, []
     for o in found.outliers[:MOST_OUTLIERS]:
-        size = ", ".join(shown(v, "rad" if g == "orientation" else "m", v / 10, True) for g, v in o.sizes.items())
+        size = ", ".join(
+            shown(v, "rad" if g == "orientation" else "m", v / 10, True) for g, v in o.sizes.items()
+        )
         rows.append([names[o.item], str(o.row), size, f"{o.score:.0f}"])
     sentences = [f"No fitted sample scores beyond {robust.OUTLYING:g} against the scatter of the others."]
     if rows:
         more = len(found.outliers) - len(rows)
         sentences = [
-            f"Fitted samples that score beyond {robust.OUTLYING:g} against the scatter of the others; a good sample does "
-            "that once in three million." + (f" {more} more are not listed." if more else "")
+            f"Fitted samples that score beyond {robust.OUTLYING:g} against the scatter of the others; a good "
+            "sample does that once in three million." + (f" {more} more are not listed." if more else "")
         ]
     items = [
         f"{name}, row {row}, is left out: {reason}"
@@ -228,13 +257,20 @@ def _done(found: Study) -> Section:
     free = {e.name for e in fit.estimates if not e.fixed}
     for what, station in (("base", BASE), ("tool", fit.chain.tool_station)):
         count = sum(p.station == station and p.name in free for p in fit.errors.parameters)
-        facts.append([what, f"{count} of 6 components found from the data" if count else "as given, not changed"])
+        facts.append(
+            [what, f"{count} of 6 components found from the data" if count else "as given, not changed"]
+        )
     held = [e.name for e in fit.estimates if e.fixed]
     facts += [["held", ", ".join(held)]] if held else []
-    facts.append(["method", {"lm": "Levenberg-Marquardt", "gn": "Gauss-Newton, the paper's loop"}[fit.method]])
-    facts.append(["state", f"{'converged' if fit.converged else 'not converged'} after {fit.iterations} iterations"])
+    facts.append(
+        ["method", {"lm": "Levenberg-Marquardt", "gn": "Gauss-Newton, the paper's loop"}[fit.method]]
+    )
+    facts.append(
+        ["state", f"{'converged' if fit.converged else 'not converged'} after {fit.iterations} iterations"]
+    )
     priors = bool(np.any(fit.problem.weights))
-    facts.append(["priors", "normal about nominal, standard deviations in the tables above; frames and instruments anywhere in a hall" if priors else "none"])
+    near = "normal about nominal, standard deviations in the tables above; frames and instruments wide"
+    facts.append(["priors", near if priors else "none"])
     facts += [[name, text] for name, text in source.settings.items()]
     rows = []
     held_out = dict.fromkeys(found.names, 0)
@@ -243,7 +279,8 @@ def _done(found: Study) -> Section:
     for name, item, sigma in zip(found.names, fit.data, sigmas(fit), strict=True):
         how = "stated" if item.stated else ("estimated" if fit.method == "lm" else "assumed")
         each = ", ".join(
-            f"{group} {shown(v, 'rad' if group == 'orientation' else 'm', v, small=True)}" for group, v in sigma.items()
+            f"{group} {shown(v, 'rad' if group == 'orientation' else 'm', v, small=True)}"
+            for group, v in sigma.items()
         )
         rows.append([name, item.kind, f"{each}, {how}", str(len(item.rows)), str(held_out.pop(name, 0))])
     rows += [[name, "", "", "0", str(count)] for name, count in held_out.items()]
@@ -260,7 +297,7 @@ def _done(found: Study) -> Section:
 
 def markdown(found: Study) -> str:
     """The report without its figures."""
-    head = tables.headline(found.fit.comparisons)
+    head = tables.headline(found.comparisons)
     parts = [f"# Calibration of {found.robot}", f"**{head.text}**", *found.source.remarks, *warnings(found)]
     for section in sections(found):
         blocks = [*section.sentences]

@@ -16,7 +16,7 @@ from .evaluation import Comparison, accuracy
 from .measurements import Measurement, Unknown
 from .parameters import ErrorModel, Parameter
 from .se3 import Array
-from .solver import Problem, Solution, pseudo_inverse, reduce, with_priors
+from .solver import Problem, Solution, posterior_root, pseudo_inverse, reduce, with_priors
 from .tables import Estimate
 
 # A parameter, or a metre and a radian of the tool, with more than this share of itself unseen is unknown.
@@ -114,15 +114,6 @@ class Result:
         return observability.unobservable(self.solution.triangle.r, self.parameters)
 
     @cached_property
-    def _root(self) -> tuple[Array, Array]:
-        """A root (p, r) of the covariance at sigmas as used, and a basis (p, p-r) of what nothing tells."""
-        zero = np.zeros_like(self.x)
-        full = with_priors(self.solution.triangle, self.problem.weights, zero, zero).r
-        _, s, vt = np.linalg.svd(full)
-        keep = s > observability.RANK_CUT * s[0]
-        return vt[keep].T / s[keep], vt[~keep].T
-
-    @cached_property
     def freedom(self) -> float:
         """Rows left over; unknowns count as far as data and not priors tell them (MacKay's number)."""
         count = 0.0
@@ -141,12 +132,7 @@ class Result:
 
     @cached_property
     def _root(self) -> tuple[Array, Array]:
-        """A root (p, r) of the covariance at sigmas as used, and a basis (p, p-r) of what nothing tells."""
-        zero = np.zeros_like(self.x)
-        full = with_priors(self.solution.triangle, self.problem.weights, zero, zero).r
-        _, s, vt = np.linalg.svd(full)
-        keep = s > observability.RANK_CUT * s[0]
-        return vt[keep].T / s[keep], vt[~keep].T
+        return posterior_root(self.solution.triangle, self.problem.weights)
 
     @cached_property
     def _spread(self) -> tuple[Array, Array]:
@@ -267,7 +253,8 @@ class Result:
             if isinstance(p, Parameter) and place == "frame":
                 value = float(sixes[p.station] @ np.array(p.twist))
                 nominal = value if held else nominal
-            out.append(Estimate(p.name, p.unit, nominal, value, float(std), float(prior), float(seen), held, place))
+            figures = (nominal, value, float(std), float(prior), float(seen))
+            out.append(Estimate(p.name, p.unit, *figures, held, place))
         return tuple(out)
 
     def _repr_html_(self) -> str:

@@ -170,6 +170,18 @@ def pseudo_inverse(r: Array, z: Array) -> Array:
     return np.linalg.lstsq(r, z, rcond=observability.RANK_CUT)[0]
 
 
+def posterior_root(triangle: Triangle, weights: Array) -> tuple[Array, Array]:
+    """A root (p, r) of the covariance with priors of these weights (p,), and a basis (p, p-r) of the rest.
+
+    The rest are directions that neither data nor a prior tell.
+    """
+    zero = np.zeros_like(weights)
+    full = with_priors(triangle, weights, zero, zero).r
+    _, s, vt = np.linalg.svd(full)
+    keep = s > observability.RANK_CUT * s[0]
+    return vt[keep].T / s[keep], vt[~keep].T
+
+
 def _settled(r: Array, step: Array, cost: float) -> bool:
     """Whether a step changes the whitened rows by nothing that matters."""
     change = float(np.linalg.norm(r @ step))

@@ -14,6 +14,8 @@ UNITS = {"m": (1e3, " mm"), "rad": (180 / math.pi, "°")}
 SMALL = {"m": (1e3, " mm"), "rad": (1e3, " mrad")}
 # Digits behind the point where no uncertainty says how many are known; and never more than MOST.
 PLAIN, MOST = 3, 6
+# Fewer samples than this do not tell an accuracy; a longer text than this may be broken into lines.
+FEW, LONG = 10, 48
 # Groups of accuracy in words.
 WORDS = {"position": "position error", "orientation": "orientation error", "residual": "residual"}
 # Measures of accuracy in words.
@@ -164,17 +166,26 @@ def headline(comparisons: Sequence[Comparison]) -> Headline:
     unit = end.strip("_") or "m"
     key, spread = f"{group}_rms{end}", f"{group}_rms_std{end}"
     before, after = (shown(side[key], unit, side[spread], True) for side in (best.before, best.after))
-    many = "sample" if best.samples == 1 else "samples"
-    what = f"RMS {WORDS[group]} {before} before, {after} after"
-    if best.title == "held out":
-        was = "was" if best.samples == 1 else "were"
-        text = f"On {best.samples} {many} that {was} not fitted: {what}."
-        if best.samples < 10:
-            text += f" So few say little: hold out more than {best.samples}."
-    else:
-        text = f"Nothing was held out; on the {best.samples} fitted {many} themselves: {what}."
+    what = f"RMS {WORDS[group]} {on_samples(best)}: {before} before, {after} after."
+    text = f"{what} {few(best)}".strip() if best.title != "fitted" else f"Nothing was held out. {what}"
     drop = 100 * (1 - best.after[key] / best.before[key]) if best.before[key] else 0.0
     return Headline(text, before, after, drop, group)
+
+
+def on_samples(c: Comparison) -> str:
+    """Which samples a comparison is about, in words."""
+    many, was = ("sample", "was") if c.samples == 1 else ("samples", "were")
+    ends = {
+        "held out": f"{many} that {was} not fitted",
+        "left out": f"{many}, each left out of the fit that it judges",
+        "fitted": f"fitted {many}",
+    }
+    return f"on {c.samples} {ends[c.title]}"
+
+
+def few(c: Comparison) -> str:
+    """A warning where a comparison has too few samples to be sure of."""
+    return "So few samples say little." if c.samples < FEW else ""
 
 
 def html_table(table: Table, drawings: Mapping[str, Sequence[str]] | None = None) -> str:
@@ -182,9 +193,10 @@ def html_table(table: Table, drawings: Mapping[str, Sequence[str]] | None = None
     drawn = drawings or {}
 
     def cell(tag: str, i: int, text: str) -> str:
-        look = ' class="number"' if i >= table.texts else ""
+        look = ' class="number"' if i >= table.texts else ' class="long"' if len(text) > LONG else ""
         scope = ' scope="row"' if tag == "th" else ""
-        return f"<{tag}{scope}{look}>{html.escape(text).replace('-', '−') if look else html.escape(text)}</{tag}>"
+        content = html.escape(text).replace("-", "−") if i >= table.texts else html.escape(text)
+        return f"<{tag}{scope}{look}>{content}</{tag}>"
 
     head = "".join(
         f'<th scope="col"{" class=number" if i >= table.texts else ""}>{html.escape(name)}</th>'

@@ -10,11 +10,11 @@ from dhcal_pin import observability, se3
 from dhcal_pin.calibration import calibrate, split
 from dhcal_pin.chain import Chain
 from dhcal_pin.errors import DhcalError
+from dhcal_pin.evaluation import accuracy
 from dhcal_pin.measurements import Noise
 from dhcal_pin.parameters import select
 from dhcal_pin.poses import Pose
 from dhcal_pin.positions import Position
-from dhcal_pin.evaluation import accuracy
 from dhcal_pin.solver import CHUNK, Problem, reduce
 
 NONE = np.empty(0)

@@ -39,6 +39,7 @@ LAYERS = (
     {"report"},
     {"report_sections"},
     {"report_figures"},
+    {"report_maps"},
     {"terminal"},
     {"viewer"},
     {"report_page"},
