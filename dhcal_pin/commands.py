@@ -80,8 +80,8 @@ def _read_data(chain: Chain, args: Namespace, held_file: str | None, known_frame
             fraction = float(args.holdout)
         except ValueError:
             raise DhcalError(f"--holdout {args.holdout}: neither a file nor a share such as 0.3") from None
-        drawn = [path for path, item in zip(args.data, fit, strict=True) if round(fraction * len(item.rows))]
         kept, parted = calibration.split(fit, fraction, args.seed)
+        drawn = [path for path, a, b in zip(args.data, fit, kept, strict=True) if len(b.rows) < len(a.rows)]
         fit, holdout = list(kept), [*holdout, *zip(drawn, parted, strict=True)]
     fitted = {path: item for path, item in zip(args.data, fit, strict=True) if len(item.rows)}
     if not fitted:
@@ -212,17 +212,19 @@ def _validate(args: Namespace) -> int:
     surveyed = read_instrument(sidecar) if sidecar else {}
     there = {unknown.name for item in data for unknown in item.unknowns}
     known = {name: value for name, value in surveyed.items() if name in there}
+    found = {"as given": accuracy(chain, data, known)}
     if args.fit_frames:
         fit = calibration.calibrate(chain, data, "base,tool", known=known)
+        found["base and tool fitted"] = fit.comparisons[0].after
         document = report.document(fit, {}, report.fingerprints(inputs))
     else:
         document = report.plain_document(chain, data, report.fingerprints(inputs), known)
-    document["before"] = accuracy(chain, data, known)
+    document["before"] = report.essentials(found["as given"])
     document["files"] = {"json": args.json} if args.json and args.json != STDOUT else {}
     emit(args.json, document)
     for item in readings:
         terminal.doubts(item.source, doubts(chain, item))
-    terminal.validation(args.robot, document, args.fit_frames)
+    terminal.validation(f"{args.robot}: accuracy on {document['samples']} samples", found)
     return 0
 
 

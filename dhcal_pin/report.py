@@ -75,6 +75,20 @@ def short_names(paths: Sequence[PathLike]) -> dict[str, str]:
     return {path: tail(path) for path in parts}
 
 
+# What the document says of accuracy and of a parameter; all that is known is under `comparisons`, `priors`.
+_ACCURACY = "position_rms_m position_max_m orientation_rms_rad residual_rms residual_max unit".split()
+_PARAMETER = "name unit nominal value std observability fixed".split()
+
+
+def _only(found: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
+    return {key: found[key] for key in keys if key in found}
+
+
+def essentials(found: Mapping[str, Any]) -> dict[str, Any]:
+    """RMS and largest errors of what `accuracy` found."""
+    return _only(found, _ACCURACY)
+
+
 def document(
     fit: Result, files: Mapping[str, str], inputs: Mapping[str, str], outliers: Sequence[int] = ()
 ) -> dict[str, Any]:
@@ -91,11 +105,13 @@ def document(
         "parameters_total": len(fit.parameters),
         "condition": fit.condition,
         "singular_values": observability.singular_values(fit.solution.triangle.r).tolist(),
-        "before": found["fitted"].before,
-        "after": found["fitted"].after,
-        "holdout_before": held.before if held else {},
-        "holdout_after": held.after if held else {},
-        "parameters": [asdict(estimate) for estimate in fit.estimates],
+        "before": essentials(found["fitted"].before),
+        "after": essentials(found["fitted"].after),
+        "holdout_before": essentials(held.before) if held else {},
+        "holdout_after": essentials(held.after) if held else {},
+        "comparisons": [asdict(comparison) for comparison in fit.comparisons],
+        "parameters": [_only(asdict(estimate), _PARAMETER) for estimate in fit.estimates],
+        "priors": {estimate.name: estimate.prior for estimate in fit.estimates if not estimate.fixed},
         "unobservable": fit.unobservable,
         "outliers": list(outliers),
         "files": dict(files),
@@ -108,7 +124,7 @@ def plain_document(
     chain: Chain, data: Sequence[Measurement], inputs: Mapping[str, str], known: Mapping[str, float]
 ) -> dict[str, Any]:
     """The same document of a model that nothing was fitted to but instruments' unknown values."""
-    found = accuracy(chain, data, known)
+    found = essentials(accuracy(chain, data, known))
     return {
         "converged": True,
         "iterations": 0,
@@ -118,7 +134,6 @@ def plain_document(
         "rank": 0,
         "parameters_total": 0,
         "condition": 0.0,
-        "singular_values": [],
         "before": found,
         "after": found,
         "holdout_before": {},

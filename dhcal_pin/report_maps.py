@@ -84,11 +84,7 @@ def map_panels(study: Study) -> tuple[list[str], list[tuple[str, str]]]:
         pick = ["xyz".index(name) for name in m.key]
         x, y = _square(w.points[:, pick], m.key)
         marks = [figures.cells(m.corners[:, 0], m.corners[:, 1], m.size, figures.level_of(m.std, edges))]
-        marks += (
-            [figures.dots(w.measured[thin, pick[0]], w.measured[thin, pick[1]], "measured")]
-            if len(thin)
-            else []
-        )
+        marks.append(figures.dots(w.measured[thin, pick[0]], w.measured[thin, pick[1]], "measured"))
         text = (
             f"Map of the predicted standard deviation of the tool's position over {m.key[0]} and {m.key[1]}: "
             f"half of the configurations below {1e3 * float(np.median(good)):.3g} mm, 95 % below "
@@ -149,19 +145,11 @@ def arm(study: Study) -> list[str]:
     out = []
     for key, pick, title in (("xz", [0, 2], "From the side"), ("xy", [0, 1], "From above")):
         x, y = _square(np.concatenate([nominal, drawn, cloud])[:, pick], key)
-        marks = (
-            [
-                figures.dots(
-                    cloud[:, pick[0]], cloud[:, pick[1]], "faint large" if len(cloud) < FEW else "faint"
-                )
-            ]
-            if len(cloud)
-            else []
-        )
+        size = " large" if len(cloud) < FEW else ""
+        marks = [figures.dots(cloud[:, pick[0]], cloud[:, pick[1]], f"faint{size}")]
         for points, look in ((nominal, "before"), (drawn, "after")):
-            marks += [
-                draw(points[:, pick[0]], points[:, pick[1]], look) for draw in (figures.line, figures.dots)
-            ]
+            across, up = points[:, pick].T
+            marks += [draw(across, up, look) for draw in (figures.line, figures.dots)]
         name = f"{title}, " + (f"errors drawn {larger:g} times larger" if larger > 1 else "true to scale")
         text = f"The arm's joints before and after calibration over {key[0]} and {key[1]}."
         out.append(panel(f"arm-{key}", name, text, x, y, marks, figures.WIDE, SQUARE))

@@ -136,8 +136,8 @@ def _left(found: Study) -> Section:
             rows.append([t.name, *(shown(figure, unit, std, small=True) for figure in figures), place])
     text = (
         "In each part of a joint's range, the error of that joint alone that would explain the samples "
-        f"{which} best. Scatter about zero is noise; a wave means that the joint errs in a way that the model "
-        "lacks: eccentric gears, elasticity, backlash."
+        f"{which} best. Scatter about zero is noise; a wave means that the joint errs in a way that the "
+        "model lacks: eccentric gears, elasticity, backlash."
     )
     table = Table(["joint", "largest before", "largest after", "std", "at"], rows)
     if not rows:
@@ -161,15 +161,15 @@ def _workspace(found: Study) -> Section:
             ]
             rows.append([title, *cells, f"{100 * (1 - good.size / len(std)):.0f} %"])
     sentences = [
-        "The standard deviation of the tool's position that follows from the parameters' own uncertainty, for "
-        "configurations drawn over the joints' limits (a joint turns at most half a turn each way). It grows "
-        "away from what was measured. What the model lacks comes on top of it: see the error on samples that "
-        "were not fitted."
+        "The standard deviation of the tool's position that follows from the parameters' own uncertainty, "
+        "for configurations drawn over the joints' limits (a joint turns at most half a turn each way). "
+        "It grows away from what was measured. What the model lacks comes on top of it: see "
+        "the error on samples that were not fitted."
     ]
     if not known.any():
         sentences = [
-            "No accuracy can be predicted anywhere: the data leave the tool's place undetermined and no prior "
-            "holds it, or no reading is left over to tell the noise by."
+            "No accuracy can be predicted anywhere: the data leave the tool's place undetermined and no "
+            "prior holds it, or no reading is left over to tell the noise by."
         ]
     elif not known.all():
         sentences.append("Where the data leave the tool's place undetermined it cannot be predicted at all.")
@@ -206,8 +206,8 @@ def _parameters(found: Study) -> Section:
             ]
             out.append(Table(header, cells, caption=title))
     text = (
-        "Observability is how far the data alone see a parameter, from 0 (not at all) to 1 (fully). A parameter "
-        "with less than 1 shares what it does with others; the prior then decides how the sum is parted."
+        "Observability is how far the data alone see a parameter, from 0 (not at all) to 1 (fully). A "
+        "parameter with less than 1 shares what it does with others; the prior decides how the sum is parted."
     )
     return Section("parameters", "Parameters", [text], tables=out)
 
@@ -215,8 +215,8 @@ def _parameters(found: Study) -> Section:
 def _seen(found: Study) -> Section:
     fit = found.fit
     text = (
-        f"The data see {fit.rank} of {len(fit.parameters)} directions of the parameters; the largest singular "
-        f"value seen is {fit.condition:.3g} times the smallest."
+        f"The data see {fit.rank} of {len(fit.parameters)} directions of the parameters; the largest "
+        f"singular value seen is {fit.condition:.3g} times the smallest."
     )
     also = "Nothing is hidden: every parameter can be told from the others."
     if fit.unobservable:

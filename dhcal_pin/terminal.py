@@ -125,17 +125,16 @@ def open_page(path: str) -> None:
         lines(f"no browser here; open {url}")
 
 
-def validation(robot: str, document: Mapping[str, Any], fitted: bool) -> None:
-    """Accuracy of a model on data, before and after base and tool were fitted if they were."""
-    header = ["error", "base and tool as given", "fitted"] if fitted else ["error", "value"]
-    before, after = document["before"], document["after"]
+def validation(title: str, found: Mapping[str, Mapping[str, Any]]) -> None:
+    """Accuracies of a model on data, by what was done before."""
     rows = []
     for group, end in ENDINGS.items():
         for key, word in MEASURES.items():
-            name, unit = f"{group}_{key}{end}", end.strip("_") or "m"
-            if name in after:
-                spread = f"{group}_rms_std{end}"
-                sides = [before, after] if fitted else [after]
-                cells = [shown(side[name], unit, side[spread], small=True) for side in sides]
-                rows.append([f"{WORDS[group]}, {word}", *cells])
-    table(f"{robot}: accuracy on {document['samples']} samples", Table(header, rows))
+            name, spread = f"{group}_{key}{end}", f"{group}_rms_std{end}"
+            cells = [
+                shown(one[name], end.strip("_") or "m", one[spread], small=True)
+                for one in found.values()
+                if name in one
+            ]
+            rows += [[f"{WORDS[group]}, {word}", *cells]] if cells else []
+    table(title, Table(["error", *found], rows))

@@ -396,7 +396,7 @@ def test_too_much_is_one_line(refused, monkeypatch):
     def endless(*_):
         raise MemoryError
 
-    monkeypatch.setattr(commands, "_configurations", endless)
+    monkeypatch.setattr(commands, "configurations", endless)
     refused(["not enough memory", "fewer"], "simulate", "arm.urdf", "-m", "1000000000000", "-o", "s.csv")
 
 
@@ -786,7 +786,8 @@ def test_demo(run, place, monkeypatch):
     monkeypatch.setattr(demo, "simulation_rows", lambda: whole(seeds=2))
     assert strict(done(run("demo", "--out", "shown", "--json", "-")))["outliers"] == [7, 8]
     assert sorted(os.listdir("shown")) == [
-        *("experiment.urdf", "experiment_calibrated.urdf", "result.json", "scene.html", "summary.md")
+        *("experiment.urdf", "experiment_calibrated.urdf", "report.html"),
+        *("result.json", "scene.html", "summary.md"),
     ]
     found = strict(Path("shown/result.json").read_text())
     assert found.keys() >= KEYS

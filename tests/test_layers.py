@@ -44,6 +44,7 @@ LAYERS = (
     {"viewer"},
     {"report_page"},
     {"outputs"},
+    {"experiment"},
     {"demo"},
     {"commands"},
     {"cli"},
