@@ -8,8 +8,9 @@ from __future__ import annotations
 import os
 import tempfile
 from argparse import Namespace
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -212,14 +213,15 @@ def _validate(args: Namespace) -> int:
     surveyed = read_instrument(sidecar) if sidecar else {}
     there = {unknown.name for item in data for unknown in item.unknowns}
     known = {name: value for name, value in surveyed.items() if name in there}
-    found = {"as given": accuracy(chain, data, known)}
+    given = accuracy(chain, data, known)
+    found: dict[str, Mapping[str, Any]] = {"base and tool as given": given}
     if args.fit_frames:
         fit = calibration.calibrate(chain, data, "base,tool", known=known)
-        found["base and tool fitted"] = fit.comparisons[0].after
+        found["fitted"] = fit.comparisons[0].after
         document = report.document(fit, {}, report.fingerprints(inputs))
     else:
         document = report.plain_document(chain, data, report.fingerprints(inputs), known)
-    document["before"] = report.essentials(found["as given"])
+    document["before"] = report.essentials(given)
     document["files"] = {"json": args.json} if args.json and args.json != STDOUT else {}
     emit(args.json, document)
     for item in readings:
