@@ -19,6 +19,8 @@ from .se3 import Array
 TURN, SLIDE = np.pi, 0.5
 # Configurations that the workspace is judged by, and bins that a joint's range is parted into.
 SAMPLES, BINS = 16000, 12
+# A joint that hardly moves the measured point asks for nothing: its error is known worse than this, rad or m.
+LOOSE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,11 +112,14 @@ def joint_traces(fit: Result) -> list[JointTrace]:
     for j, name in enumerate(fit.chain.moving):
         edges = np.linspace(values[:, j].min(), values[:, j].max(), BINS + 1)
         part = np.clip(np.searchsorted(edges, values[:, j], side="right") - 1, 0, BINS - 1)
-        kept = np.array([b for b in range(BINS) if np.sum(part == b) >= 5], int)
-        rows = [_slope(pull[j], weight[j], part, kept) for pull, weight in (before, after)]
-        centres = 0.5 * (edges[:-1] + edges[1:])[kept]
+        full = np.array([b for b in range(BINS) if np.sum(part == b) >= 5], int)
+        rows = np.array(
+            [row for pull, weight in (before, after) for row in _slope(pull[j], weight[j], part, full)]
+        )
+        told = (rows[1::2] < LOOSE).all(0)
+        centres = 0.5 * (edges[:-1] + edges[1:])[full[told]]
         slides = bool(fit.chain.prismatic[j])
-        out.append(JointTrace(name, slides, values[:, j], sizes, centres, *rows[0], *rows[1]))
+        out.append(JointTrace(name, slides, values[:, j], sizes, centres, *rows[:, told]))
     return out
 
 

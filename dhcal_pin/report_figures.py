@@ -138,6 +138,13 @@ def by_joint(study: Study) -> list[str]:
     return out
 
 
+def _reach(t: JointTrace) -> float:
+    """How far from zero a trace goes, two standard errors included, rad or m."""
+    return float(
+        max(np.max(np.abs(v) + 2 * s) for v, s in ((t.before, t.before_std), (t.after, t.after_std)))
+    )
+
+
 def asked(study: Study) -> list[str]:
     """The error of each joint alone that each part of its range asks for, before and after."""
     out = []
@@ -145,11 +152,10 @@ def asked(study: Study) -> list[str]:
         if not len(t.centres):
             continue
         scale, angle, factor, unit = _label(t)
-        alike = [other for other in study.traces if other.slides == t.slides]
-        reach = np.concatenate(
-            [s * factor * (np.abs(v) + 2 * d) for o in alike for s in (1, -1)
-             for v, d in ((o.before, o.before_std), (o.after, o.after_std))]
-        )  # fmt: skip
+        # Joints share a scale, but for one that is asked for much more than the others.
+        alike = [_reach(o) for o in study.traces if o.slides == t.slides and len(o.centres)]
+        shared = max(r for r in alike if r <= 4 * np.median(alike))
+        reach = factor * max(_reach(t), shared)
         x = spanning(scale * t.values, f"{t.name}, {angle}", round_up=False)
         marks = [figures.across_at(0.0, "zero")]
         for value, std, look in ((t.before, t.before_std, "before"), (t.after, t.after_std, "after")):
@@ -164,7 +170,7 @@ def asked(study: Study) -> list[str]:
             f"Error of {t.name} alone that would explain the readings in each part of its range, with two "
             f"standard errors; at most {worst:.3g} {unit} after calibration."
         )
-        y = symmetric(reach, f"joint error asked for, {unit}")
+        y = symmetric([reach], f"joint error asked for, {unit}")
         out.append(panel(f"a-{i}", t.name, text, x, y, marks))
     return out
 

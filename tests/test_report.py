@@ -1,4 +1,4 @@
-"""The report: its numbers against other ways to them, its page in a real browser, and honesty where data are few."""
+"""The report: numbers against other ways to them, the page in a real browser, honesty where data are few."""
 
 from __future__ import annotations
 
@@ -32,18 +32,15 @@ from dhcal_pin.result import Result
 
 CHROMIUM = Path("/usr/bin/chromium")
 AXE = Path(sys.prefix) / "node_modules" / "axe-core" / "axe.min.js"
-WIDTHS = (1200, 390)
 # The text of an A4 page between its margins of 14 mm, CSS pixels.
 PRINTED = round((210 - 2 * 14) / 25.4 * 96)
 
 
-def fitted(
-    kind: str = "pose", noise: Noise = Noise(2e-4, 3e-4), count: int = 40, held: float = 0.3
-) -> Result:
+def fitted(held: float = 0.3) -> Result:
     """The paper's simulated arm, calibrated on its actual one."""
     nominal, actual = Chain.from_dh(paper("sim_6dof")), Chain.from_dh(paper("sim_6dof_actual"))
     rng = np.random.default_rng(0)
-    data = KINDS[kind].simulate(actual, rng.uniform(-1.5, 1.5, (count, 6)), noise, rng)
+    data = Pose.simulate(actual, rng.uniform(-1.5, 1.5, (40, 6)), Noise(2e-4, 3e-4), rng)
     kept, parted = split([data], held, 0)
     return calibrate(nominal, kept, "dh", holdout=parted)
 
@@ -353,8 +350,7 @@ def still_file(page_file) -> Path:
     return path
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize(("scheme", "width"), [("light", 1200), ("dark", 390)])
 def test_the_page_is_accessible_and_fits(browser, still_file, scheme, width):
     if not AXE.exists() and os.environ.get("CI") != "true":
         pytest.skip("no axe-core")
