@@ -69,8 +69,8 @@ def sizes(found: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
 def accuracy(
     chain: Chain, data: Sequence[Measurement], known: Mapping[str, float] | None = None
 ) -> dict[str, Any]:
-    """Errors of a chain on data, in m and rad: by group RMS with its standard error, mean, 95th percentile,
-    largest, and RMS along each axis.
+    """Errors of a chain on data, in m and rad: by group their number, RMS with its standard error, mean,
+    95th percentile, largest, and RMS along each axis.
 
     The keys are `position_rms_m`, `orientation_p95_rad` and so on. What else was measured goes to
     `residual_rms` and so on, with `unit`.
@@ -91,6 +91,7 @@ def summary(found: Sequence[Mapping[str, Array]]) -> dict[str, Any]:
         square = size**2
         rms = float(np.sqrt(np.mean(square)))
         out |= {
+            f"{group}_samples": len(size),
             f"{group}_rms{end}": rms,
             f"{group}_rms_std{end}": float(np.std(square) / np.sqrt(len(size)) / (2 * rms)) if rms else 0.0,
             f"{group}_mean{end}": float(np.mean(size)),

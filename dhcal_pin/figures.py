@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from .se3 import Array
 
 WIDTH, WIDE, HEIGHT = 320.0, 420.0, 200.0
-LEFT, RIGHT, TOP, BOTTOM = 46.0, 10.0, 26.0, 36.0
+LEFT, RIGHT, TOP, BOTTOM = 50.0, 10.0, 26.0, 36.0
 # Levels of a map, from good to bad.
 LEVELS = 6
 
@@ -49,6 +49,10 @@ class Axis:
         """Round places and their labels."""
         if self.log:
             first, last = math.ceil(math.log10(self.low) - 1e-9), math.floor(math.log10(self.high) + 1e-9)
+            if last - first < 3:
+                steps = (k * 10.0**e for e in range(first - 1, last + 1) for k in (1, 2, 5))
+                inside = (v for v in steps if self.low <= v * (1 + 1e-9) and v <= self.high * (1 + 1e-9))
+                return [(value, f"{value:g}") for value in inside]
             step = max(1, -(-(last - first) // 4))
             return [(10.0**e, _power(e)) for e in range(first, last + 1, step)]
         step = nice_step((self.high - self.low) / 5)
@@ -244,7 +248,7 @@ def panel(
             *labels,
             f'<text class="title" x="{_number(LEFT)}" y="14">{html.escape(title)}</text>',
             f'<text class="axis middle" x="{middle}" y="{_number(height - 6)}">{html.escape(x.title)}</text>',
-            f'<text class="axis middle" transform="translate(11 {_number(0.5 * (TOP + floor))}) rotate(-90)">'
+            f'<text class="axis middle" transform="translate(10 {_number(0.5 * (TOP + floor))}) rotate(-90)">'
             f"{html.escape(y.title)}</text>",
             "</svg>",
         ]

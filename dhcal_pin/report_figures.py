@@ -18,11 +18,25 @@ HISTOGRAM = 28
 MOST_DOTS = 1500
 # Fewer dots than this are drawn large.
 FEW = 100
+# What is so many times larger than the rest would flatten it, were they to share a scale.
+CROWDED = 4
 
 
 def _unit(group: str) -> tuple[float, str]:
     factor, name = SMALL[ENDINGS[group].strip("_") or "m"]
     return factor, name.strip()
+
+
+def _bins(before: Array, after: Array, title: str, count: int) -> tuple[Axis, Array]:
+    """Axis and edges of a histogram of sizes; logarithmic where one of both would else be a single bar."""
+    every = np.concatenate([before, after])
+    high = float(every.max())
+    medians = sorted((float(np.median(before)), float(np.median(after))))
+    if medians[1] <= CROWDED * medians[0]:
+        axis = spanning(every, title, zero=True)
+        return axis, np.linspace(axis.low, axis.high, count + 1)
+    low = max(float(np.quantile(every, 0.01)), 1e-6 * high)
+    return Axis(low, high, title, log=True), np.geomspace(low, high, count + 1)
 
 
 def histograms(study: Study) -> list[str]:
@@ -35,13 +49,14 @@ def histograms(study: Study) -> list[str]:
         after = sizes(deviations(fit.chain, data, fit.instruments))
         for group, size in after.items():
             factor, unit = _unit(group)
-            x = spanning(factor * np.concatenate([before[group], size]), f"{WORDS[group]}, {unit}", zero=True)
-            edges = np.linspace(x.low, x.high, min(HISTOGRAM, max(8, len(size) // 3)) + 1)
-            counts = [np.histogram(factor * v, edges)[0] for v in (before[group], size)]
+            bins = min(HISTOGRAM, max(8, len(size) // 3))
+            pair = [factor * before[group], factor * size]
+            x, edges = _bins(pair[0], pair[1], f"{WORDS[group]}, {unit}", bins)
+            counts = [np.histogram(np.clip(v, edges[0], edges[-1]), edges)[0] for v in pair]
             marks = [
                 figures.steps(edges, n, look) for n, look in zip(counts, ("before", "after"), strict=True)
             ]
-            rms = [factor * float(np.sqrt(np.mean(v**2))) for v in (before[group], size)]
+            rms = [float(np.sqrt(np.mean(v**2))) for v in pair]
             text = (
                 f"Histogram of the {WORDS[group]} of {len(size)} samples {title}: RMS {rms[0]:.3g} {unit} "
                 f"before, {rms[1]:.3g} {unit} after."
@@ -138,27 +153,42 @@ def by_joint(study: Study) -> list[str]:
     return out
 
 
-def _reach(t: JointTrace) -> float:
-    """How far from zero a trace goes, two standard errors included, rad or m."""
-    return float(
-        max(np.max(np.abs(v) + 2 * s) for v, s in ((t.before, t.before_std), (t.after, t.after_std)))
-    )
+def _reach(value: Array, std: Array) -> float:
+    """How far from zero values go, two standard errors included."""
+    return float(np.max(np.abs(value) + 2 * std, initial=0.0))
+
+
+def states(study: Study) -> list[str]:
+    """What the panels of `asked` show: "before" only where it leaves room to see what is left after."""
+    pairs = [
+        max((_reach(v, s) for v, s in rows), default=0.0)
+        for rows in (
+            [(t.before, t.before_std) for t in study.traces],
+            [(t.after, t.after_std) for t in study.traces],
+        )
+    ]
+    return ["before", "after"] if pairs[0] <= CROWDED * pairs[1] else ["after"]
 
 
 def asked(study: Study) -> list[str]:
     """The error of each joint alone that each part of its range asks for, before and after."""
-    out = []
+    out, looks = [], states(study)
+
+    def drawn(t: JointTrace) -> list[tuple[Array, Array]]:
+        every = {"before": (t.before, t.before_std), "after": (t.after, t.after_std)}
+        return [every[look] for look in looks]
+
     for i, t in enumerate(study.traces):
         if not len(t.centres):
             continue
         scale, angle, factor, unit = _label(t)
         # Joints share a scale, but for one that is asked for much more than the others.
-        alike = [_reach(o) for o in study.traces if o.slides == t.slides and len(o.centres)]
-        shared = max(r for r in alike if r <= 4 * np.median(alike))
-        reach = factor * max(_reach(t), shared)
+        reach = {o.name: max(_reach(v, s) for v, s in drawn(o)) for o in study.traces if o.slides == t.slides
+                 and len(o.centres)}  # fmt: skip
+        shared = max(r for r in reach.values() if r <= CROWDED * np.median(list(reach.values())))
         x = spanning(scale * t.values, f"{t.name}, {angle}", round_up=False)
         marks = [figures.across_at(0.0, "zero")]
-        for value, std, look in ((t.before, t.before_std, "before"), (t.after, t.after_std, "after")):
+        for (value, std), look in zip(drawn(t), looks, strict=True):
             at, v, s = scale * t.centres, factor * value, factor * std
             marks += [
                 figures.spans(at, v - 2 * s, v + 2 * s, look),
@@ -170,7 +200,7 @@ def asked(study: Study) -> list[str]:
             f"Error of {t.name} alone that would explain the readings in each part of its range, with two "
             f"standard errors; at most {worst:.3g} {unit} after calibration."
         )
-        y = symmetric([reach], f"joint error asked for, {unit}")
+        y = symmetric([factor * max(shared, reach[t.name])], f"joint error asked for, {unit}")
         out.append(panel(f"a-{i}", t.name, text, x, y, marks))
     return out
 

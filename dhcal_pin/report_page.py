@@ -67,8 +67,8 @@ def page(found: Study) -> str:
 
 
 def _head(found: Study) -> str:
-    comparisons = found.comparisons
-    best, head = comparisons[0], tables.headline(comparisons)
+    head = tables.headline(found.comparisons)
+    best = head.of
     what = f"{WORDS[head.group][0].upper()}{WORDS[head.group][1:]}"
     many = "sample" if best.samples == 1 else "samples"
     if best.title != "fitted":
@@ -186,7 +186,7 @@ def _left_figures(found: Study) -> str:
     looks = report_figures.sample_looks(found)
     dots = [(f"dots {look}", name) for look, name in zip(looks, ("fitted", "held out"), strict=False)]
     dots += [("dots gross", "gross error")] if found.outliers else []
-    lines = [("line before", "before"), ("line after", "after")]
+    lines = [(f"line {look}", look) for look in report_figures.states(found)]
     one = [("dots faint", "a sample"), ("line after", "median")]
     return "\n".join(
         [

@@ -140,6 +140,8 @@ def _left(found: Study) -> Section:
         "model lacks: eccentric gears, elasticity, backlash."
     )
     table = Table(["joint", "largest before", "largest after", "std", "at"], rows)
+    if silent := [t.name for t in found.traces if not len(t.centres)]:
+        text += f" Nothing is said of {', '.join(silent)}: too few samples, or it hardly moves the point."
     if not rows:
         return Section(key, title, ["There are too few samples to see how each joint errs over its range."])
     return Section(key, title, [text], tables=[table])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from .evaluation import ENDINGS, Comparison
 
@@ -135,7 +135,9 @@ def accuracy_table(comparisons: Sequence[Comparison]) -> Table:
                 figures = [side[f"{group}_{key}{end}"] for key in MEASURES]
                 figures += side.get(f"{group}_axes_rms{end}", [math.nan] * 3)
                 cells = [fixed(factor * figure, places) for figure in figures]
-                rows.append([f"{c.samples} {c.title}", f"{WORDS[group]},{unit}", state, *cells])
+                rows.append(
+                    [f"{c.after[f'{group}_samples']} {c.title}", f"{WORDS[group]},{unit}", state, *cells]
+                )
     axes = [f"{axis}, RMS" for axis in "xyz"]
     return Table(["samples", "error", "calibration", *MEASURES.values(), *axes], rows, texts=3)
 
@@ -149,6 +151,7 @@ class Headline:
         before, after: the figures with their unit.
         drop: how much smaller in percent; negative where the error grew.
         group: of ENDINGS.
+        of: the accuracy it is of, with as many samples as the group has.
     """
 
     text: str
@@ -156,12 +159,14 @@ class Headline:
     after: str
     drop: float
     group: str
+    of: Comparison
 
 
 def headline(comparisons: Sequence[Comparison]) -> Headline:
     """The error on what was not fitted where there is such, and an honest word where there is not."""
     best = comparisons[0]
     group = next(group for group in ENDINGS if f"{group}_rms{ENDINGS[group]}" in best.after)
+    best = replace(best, samples=best.after[f"{group}_samples"])
     end = ENDINGS[group]
     unit = end.strip("_") or "m"
     key, spread = f"{group}_rms{end}", f"{group}_rms_std{end}"
@@ -169,7 +174,7 @@ def headline(comparisons: Sequence[Comparison]) -> Headline:
     what = f"RMS {WORDS[group]} {on_samples(best)}: {before} before, {after} after."
     text = f"{what} {few(best)}".strip() if best.title != "fitted" else f"Nothing was held out. {what}"
     drop = 100 * (1 - best.after[key] / best.before[key]) if best.before[key] else 0.0
-    return Headline(text, before, after, drop, group)
+    return Headline(text, before, after, drop, group, best)
 
 
 def on_samples(c: Comparison) -> str:
