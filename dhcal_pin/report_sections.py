@@ -111,7 +111,7 @@ def warnings(found: Study) -> list[str]:
 
 def _accuracy(found: Study) -> Section:
     frames = {e.name.split(".")[0] for e in found.fit.estimates if e.place == "frame" and not e.fixed}
-    same = f", its {' and '.join(sorted(frames))} fitted to the same samples" if frames else ""
+    same = f", its {' and '.join(sorted(frames))} where they fit best" if frames else ""
     return Section(
         "accuracy",
         "Accuracy",

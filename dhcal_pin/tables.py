@@ -40,16 +40,16 @@ def shown(value: float, unit: str, std: float = math.nan, small: bool = False) -
     """A value with its unit, rounded to its standard deviation where that is known.
 
     Args:
-        value: m, rad or in another unit, which is then shown as it is.
-        unit: of the value.
+        value: m, rad, or in another unit and then shown as it is, to three digits.
+        unit: of the value; "1" for a pure number.
         std: standard deviation in that unit.
         small: whether it is a change or an uncertainty: then angles are in mrad, not degrees.
     """
     if not math.isfinite(value):
         return "–"
-    factor, name = (SMALL if small else UNITS).get(unit, (1.0, f" {unit}"))
     if unit not in UNITS:
-        return f"{value:.4g}{name}" if not std > 0 else f"{fixed(value, digits(std))}{name}"
+        return f"{value:.3g} {unit}".removesuffix(" 1")
+    factor, name = (SMALL if small else UNITS)[unit]
     return f"{fixed(factor * value, digits(factor * std))}{name}"
 
 

@@ -76,6 +76,11 @@ def test_numbers_have_the_digits_that_are_known(value, std, text):
     assert tables.shown(value, "m", std) == text
 
 
+def test_other_units_are_shown_as_they_are():
+    assert tables.shown(1.2345e-5, "rad/Nm", 1e-7) == "1.23e-05 rad/Nm"
+    assert tables.shown(-0.00125, "1", 1e-5) == "-0.00125"
+
+
 def test_the_standard_error_of_an_rms_is_its_scatter():
     rng = np.random.default_rng(1)
     runs = [summary([{"position": rng.standard_normal((200, 3))}]) for _ in range(400)]
