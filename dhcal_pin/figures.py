@@ -49,9 +49,10 @@ class Axis:
         """Round places and their labels."""
         if self.log:
             first, last = math.ceil(math.log10(self.low) - 1e-9), math.floor(math.log10(self.high) + 1e-9)
-            if last - first < 3:
-                steps = (k * 10.0**e for e in range(first - 1, last + 1) for k in (1, 2, 5))
-                inside = (v for v in steps if self.low <= v * (1 + 1e-9) and v <= self.high * (1 + 1e-9))
+            if self.high / self.low < 1e3:
+                between = (1, 2, 5) if self.high / self.low < 50 else (1,)
+                every = (k * 10.0**e for e in range(first - 1, last + 1) for k in between)
+                inside = (v for v in every if self.low <= v * (1 + 1e-9) and v <= self.high * (1 + 1e-9))
                 return [(value, f"{value:g}") for value in inside]
             step = max(1, -(-(last - first) // 4))
             return [(10.0**e, _power(e)) for e in range(first, last + 1, step)]
@@ -253,6 +254,11 @@ def panel(
             "</svg>",
         ]
     )
+
+
+def thinned(count: int, most: int) -> Array:
+    """At most so many numbers below `count`, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
 
 
 def level_of(values: ArrayLike, edges: Sequence[float]) -> Array:

@@ -115,7 +115,8 @@ def by_sample(study: Study) -> list[str]:
         for look, wanted in zip(sample_looks(study), ("fitted", "held out"), strict=False):
             for title, rows, size, bad in mine:
                 if title == wanted:
-                    marks.append(figures.dots(rows[~bad], factor * size[~bad], look))
+                    thin = np.flatnonzero(~bad)[figures.thinned(int(np.sum(~bad)), 2 * MOST_DOTS)]
+                    marks.append(figures.dots(rows[thin], factor * size[thin], look))
                     marks += [figures.dots(rows[bad], factor * size[bad], "gross")] if bad.any() else []
         text = f"{WORDS[group]} after calibration of {len(every)} samples; at most {most.max():.3g} {unit}."
         title = f"{WORDS[group][0].upper()}{WORDS[group][1:]} by sample"
@@ -141,7 +142,7 @@ def by_joint(study: Study) -> list[str]:
     for i, t in enumerate(traces):
         scale, angle, _, _ = _label(t)
         x = spanning(scale * t.values, f"{t.name}, {angle}", round_up=False)
-        thin = np.unique(np.linspace(0, len(t.values) - 1, min(len(t.values), MOST_DOTS)).astype(int))
+        thin = figures.thinned(len(t.values), MOST_DOTS)
         size = " large" if len(thin) < FEW else ""
         marks = [figures.dots(scale * t.values[thin], factor * t.sizes[thin], f"faint{size}")]
         if len(t.centres) > 1:

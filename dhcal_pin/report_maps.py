@@ -79,7 +79,7 @@ def map_panels(study: Study) -> tuple[list[str], list[tuple[str, str]]]:
         return [], []
     edges, out = levels(found), []
     good = w.std[np.isfinite(w.std)]
-    thin = np.unique(np.linspace(0, len(w.measured) - 1, min(len(w.measured), 500)).astype(int))
+    thin = figures.thinned(len(w.measured), 500)
     for m, title in zip(found, ("Seen from above", "Seen from the side"), strict=True):
         pick = ["xyz".index(name) for name in m.key]
         x, y = _square(w.points[:, pick], m.key)
@@ -141,7 +141,8 @@ def arm(study: Study) -> list[str]:
         shapes.append(points @ into[:3, :3].T + into[:3, 3])
     nominal = shapes[0]
     drawn = nominal + larger * (shapes[1] - nominal)
-    cloud = study.workspace.measured[:MOST_DOTS]
+    cloud = study.workspace.measured
+    cloud = cloud[figures.thinned(len(cloud), MOST_DOTS)]
     out = []
     for key, pick, title in (("xz", [0, 2], "From the side"), ("xy", [0, 1], "From above")):
         x, y = _square(np.concatenate([nominal, drawn, cloud])[:, pick], key)

@@ -223,7 +223,10 @@ def _seen(found: Study) -> Section:
     also = "Nothing is hidden: every parameter can be told from the others."
     if fit.unobservable:
         also = "These cannot be told apart: their single values mean little, what they do together is known."
-    return Section("seen", "What could not be told apart", [text, also], fit.unobservable)
+    sentences = [text, also]
+    if held := [e.name for e in fit.estimates if e.fixed]:
+        sentences.append(f"Held at nominal, and so not judged: {', '.join(held)}.")
+    return Section("seen", "What could not be told apart", sentences, fit.unobservable)
 
 
 def _rows(found: Study) -> Section:
