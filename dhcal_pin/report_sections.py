@@ -136,8 +136,8 @@ def _left(found: Study) -> Section:
             rows.append([t.name, *(shown(figure, unit, std, small=True) for figure in figures), place])
     text = (
         "In each part of a joint's range, the error of that joint alone that would explain the samples "
-        f"{which} best. Scatter about zero is noise; a wave means that the joint errs in a way that the "
-        "model lacks: eccentric gears, elasticity, backlash."
+        f"{which} best. Scatter about zero is noise; a wave points to an error that the model lacks: an "
+        "eccentric gear, elasticity, backlash."
     )
     table = Table(["joint", "largest before", "largest after", "std", "at"], rows)
     if silent := [t.name for t in found.traces if not len(t.centres)]:
