@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from .calibration import split as split
     from .chain import Chain as Chain
     from .check import crosscheck as crosscheck
+    from .compensation import Compensation as Compensation
+    from .compensation import compensate as compensate
     from .dh import DHTable as DHTable
     from .dh_files import read_dh as read_dh
     from .dh_urdf import dh_to_urdf as dh_to_urdf
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
     from .evaluation import accuracy as accuracy
     from .factors import error_factors as error_factors
     from .measurement_files import read_measurements as read_measurements
+    from .measurement_files import read_targets as read_targets
     from .measurements import Noise as Noise
     from .parameters import extract as extract
     from .poses import Pose as Pose
@@ -41,6 +44,8 @@ _HOMES = {
     "split": "calibration",
     "Chain": "chain",
     "crosscheck": "check",
+    "Compensation": "compensation",
+    "compensate": "compensation",
     "DHTable": "dh",
     "read_dh": "dh_files",
     "dh_to_urdf": "dh_urdf",
@@ -48,6 +53,7 @@ _HOMES = {
     "accuracy": "evaluation",
     "error_factors": "factors",
     "read_measurements": "measurement_files",
+    "read_targets": "measurement_files",
     "Noise": "measurements",
     "Pose": "poses",
     "Position": "positions",

@@ -12,12 +12,13 @@ import numpy as np
 from . import observability, robust
 from .chain import BASE, Chain
 from .errors import DhcalError
-from .frames import starts
+from .frames import few, misfit, starts
 from .measurements import Measurement
 from .parameters import ErrorModel, select
+from .problem import Problem, shared_unknowns
 from .result import Result
 from .se3 import Array
-from .solver import METHODS, Problem, Progress, Solution, levenberg_marquardt, posterior_root, shared_unknowns
+from .solver import METHODS, Progress, Solution, levenberg_marquardt, posterior_root
 
 Method = Literal["lm", "gn"]
 Priors = Literal["default", "none"] | Mapping[str, float]
@@ -25,6 +26,8 @@ Priors = Literal["default", "none"] | Mapping[str, float]
 # Sigmas are not estimated below a nanometre and a nanoradian.
 LEAST_SCALE = 1e-6
 MOST_ROUNDS = 30
+# Starts for the frames are tried until one leaves so small a share of the positions' spread.
+GOOD_FIT = 0.01
 
 
 def _prior_weights(errors: ErrorModel, priors: Priors) -> Array:
@@ -68,16 +71,24 @@ def _place(
     if frames is None:
         return errors.chain
     stations = {p.station for p in frames.parameters}
-    best: tuple[float, Chain] | None = None
-    for start in starts(errors.chain, data, BASE in stations, errors.chain.tool_station in stations):
+
+    def fitted(start: Chain, items: tuple[Measurement, ...]) -> tuple[float, Chain]:
         placed = replace(frames, chain=start)
-        problem = _problem(placed, tuple(item.started(start) for item in data), 1 / placed.priors, known)
+        problem = _problem(placed, tuple(item.started(start) for item in items), 1 / placed.priors, known)
         solution = levenberg_marquardt(problem, np.zeros(len(problem.weights)), max_iterations, None)
-        cost = problem.cost(solution.x)
-        if best is None or cost < best[0]:
-            best = cost, placed.at(solution.x[: len(placed.parameters)])
-    assert best is not None
-    return best[1]
+        chain = placed.at(solution.x[: len(placed.parameters)])
+        return solution.triangle.cost + float(np.sum((problem.weights * solution.x) ** 2)), chain
+
+    begun = starts(errors.chain, data, BASE in stations, errors.chain.tool_station in stations)
+    if len(begun) == 1:
+        return fitted(begun[0], data)[1]
+    some = tuple(few(item) for item in data)
+    best: tuple[float, Chain] = np.inf, begun[0]
+    for start in begun:
+        best = min(best, fitted(start, some), key=lambda found: found[0])
+        if misfit(best[1], some) < GOOD_FIT:
+            break
+    return fitted(best[1], data)[1]
 
 
 def _problem(
@@ -107,6 +118,8 @@ def _scatter(
 
     One where the instrument states its sigmas, or where there are not more rows than directions seen.
     """
+    if all(item.stated for item in data):
+        return np.ones(sum(len(item.groups) for item in data))
     chain = problem.errors.at(solution.x[: len(problem.errors.parameters)])
     residuals = [
         item.residual(chain.sweep(item.configurations()), problem.values(item, solution.x)) for item in data
@@ -144,6 +157,8 @@ def _widened(problem: Problem, solution: Solution, expected: Array) -> Array:
 
 
 def _scaled(data: tuple[Measurement, ...], scales: Array) -> tuple[Measurement, ...]:
+    if np.all(scales == 1):
+        return data
     left = iter(scales.tolist())
     return tuple(item.scaled({name: next(left) for name in item.groups}) for item in data)
 
@@ -224,8 +239,12 @@ def calibrate(
             if max(moved, *(np.abs(change).max(initial=0.0) for change in changes)) < 0.01:
                 break
             scales = found
-            problem = replace(problem, data=weighed, weights=priors_now)
-            again = levenberg_marquardt(problem, solution.x, max_iterations, progress)
+            known_now = None
+            if all(new is old for new, old in zip(weighed, problem.data, strict=True)):
+                problem, known_now = problem.held(priors_now), solution.triangle
+            else:
+                problem = replace(problem, data=weighed, weights=priors_now)
+            again = levenberg_marquardt(problem, solution.x, max_iterations, progress, known_now)
             solution = replace(again, iterations=solution.iterations + again.iterations)
     return Result(
         errors=errors,

@@ -12,6 +12,7 @@ base link's pose in the measuring frame, `tool` the measured point's pose in the
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -24,10 +25,13 @@ from . import se3
 from .dh import DHTable
 from .dh_urdf import dh_to_urdf
 from .errors import DhcalError
+from .scratch import LongRows, scratch
 from .se3 import Array
 from .urdf import Urdf, parse_urdf, read_urdf
 
 BASE = 0
+# So many samples of all bodies stay in a processor's cache.
+BLOCK = 2048
 
 
 def joint_station(j: int) -> int:
@@ -38,6 +42,20 @@ def joint_station(j: int) -> int:
 def link_station(j: int) -> int:
     """Station behind the j-th moving joint's motion; 0 is the base link."""
     return 2 * j + 1
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What m configurations say of a chain's joints; errors do not change it, so one serves a whole search.
+
+    Attributes:
+        values: (k, m) of the moving joints, rad or m.
+        cos, sin: (k, m) of the values.
+    """
+
+    values: Array
+    cos: Array
+    sin: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,58 +230,86 @@ class Chain:
         return np.stack([np.eye(4), *(_axis_frame(axis) for axis in self.axes)])
 
     @cached_property
+    def _into(self) -> Array:
+        """(k+1, 4, 4): each body's URDF frame in its body frame."""
+        return se3.inverse(self.axis_frames)
+
+    @cached_property
     def links(self) -> Array:
         """Constant transforms (k+1, 4, 4) between the motions; every joint moves about its own z.
 
         The tool's pose is base · links[0] · Z(q_1) · links[1] · … · Z(q_k) · links[k] · tool.
         """
-        into = se3.inverse(self.axis_frames)
-        out = into @ self.origins
+        out = self._into @ self.origins
         out[:-1] = out[:-1] @ self.axis_frames[1:]
         return out
 
-    def sweep(self, q: Array) -> Sweep:
-        """All frames at joint values q (m, n), vectorised over the samples."""
-        q = self.checked(q)
-        values = self.mixing @ q.T + self.shift[:, None]
-        cos, sin = np.cos(values), np.sin(values)
-        m = len(q)
-        bodies = np.empty((len(self.moving) + 1, 4, 3, m))
-        bodies[0] = self.base[:3].T[:, :, None]
-        before = np.empty((4, 3, m))
-        for j, link in enumerate(self.links[:-1]):
+    def motion(self, q: Array) -> Motion:
+        """The moving joints' values, and their cosines and sines, at joint values q (m, n)."""
+        values = self.mixing @ self.checked(q).T + self.shift[:, None]
+        # One tangent of half the angle costs a fifth of a cosine and a sine.
+        half = np.tan(0.5 * values)
+        square = half * half
+        return Motion(values, (1 - square) / (1 + square), 2 * half / (1 + square))
+
+    @LongRows()
+    def sweep(self, q: Array | Motion, out: Array | None = None) -> Sweep:
+        """All frames at joint values q (m, n), or at a motion of this chain, vectorised over the samples.
+
+        `out` (k+2, 4, 3, m) holds them when given.
+        """
+        motion = q if isinstance(q, Motion) else self.motion(q)
+        k, m = motion.values.shape
+        frames = np.empty((k + 2, 4, 3, m)) if out is None else out
+        frames[0] = self.base[:3].T[:, :, None]
+        turned = scratch("turned", 2, 3, m)
+        mixing = np.swapaxes(self.links, 1, 2)
+        for j, (after, slides) in enumerate(zip(frames[1:-1], self.prismatic, strict=True)):
             # The columns of F·L are the columns of F mixed by L: one small product for all samples.
-            np.matmul(link.T, bodies[j].reshape(4, -1), out=before.reshape(4, -1))
-            after = bodies[j + 1]
-            if self.prismatic[j]:
-                after[:] = before
-                after[3] += before[2] * values[j]
+            before = frames[j].reshape(4, -1)
+            np.matmul(mixing[j, :2], before, out=turned.reshape(2, -1))
+            np.matmul(mixing[j, 2:], before, out=after[2:].reshape(2, -1))
+            if slides:
+                after[:2] = turned
+                after[3] += after[2] * motion.values[j]
             else:
-                after[0] = before[0] * cos[j] + before[1] * sin[j]
-                after[1] = before[1] * cos[j] - before[0] * sin[j]
-                after[2:] = before[2:]
-        tool = (self.links[-1] @ self.tool).T @ bodies[-1].reshape(4, -1)
-        return Sweep(bodies, tool.reshape(4, 3, m))
+                np.multiply(turned, motion.cos[j], out=after[:2])
+                turned *= motion.sin[j]
+                after[0] += turned[1]
+                after[1] -= turned[0]
+        last = (self.links[-1] @ self.tool).T
+        np.matmul(last, frames[-2].reshape(4, -1), out=frames[-1].reshape(4, -1))
+        return Sweep(frames[:-1], frames[-1])
 
     def poses(self, q: Array) -> Array:
         """Tool poses (m, 4, 4) in the measuring frame at joint values q (m, n) in rad or m."""
         return self.sweep(q).poses()
 
-    def station_twists(self, stations: Array, twists: Array) -> tuple[Array, Array]:
-        """Bodies (p,) and the same twists (p, 6) in those bodies' frames, of twists at stations."""
+    @cached_property
+    def _station_frames(self) -> Array:
+        """(2k+4, 4, 4): each station's frame in its body."""
         k = len(self.moving)
         frames = np.empty((2 * k + 4, 4, 4))
-        into = se3.inverse(self.axis_frames)
-        frames[0] = frames[1] = np.eye(4)
-        for j in range(k):
-            frames[2 * j + 2] = into[j] @ self.origins[j]
-            frames[2 * j + 3] = into[j + 1]
-        frames[2 * k + 2] = into[k] @ self.origins[k]
-        frames[2 * k + 3] = frames[2 * k + 2] @ self.tool
-        stations = np.asarray(stations, int)
-        bodies = np.clip((stations - 1) // 2, 0, k)
-        return bodies, np.einsum("pij,pj->pi", se3.adjoint(frames[stations]), np.asarray(twists, float))
+        frames[0] = np.eye(4)
+        frames[1:-1:2] = self._into
+        frames[2::2] = self._into @ self.origins
+        frames[-1] = frames[-2] @ self.tool
+        return frames
 
+    def station_twists(
+        self, stations: Array, twists: Array, carry: Array | None = None
+    ) -> tuple[Array, Array]:
+        """Bodies (p,) and the same twists (p, 6) in those bodies' frames, of twists at stations.
+
+        `carry` (p, 4, 4) are the frames that the twists are seen in where these are not the stations' own.
+        """
+        stations = np.asarray(stations, int)
+        bodies = np.clip((stations - 1) // 2, 0, len(self.moving))
+        frames = self._station_frames[stations]
+        seen = se3.adjoint(frames if carry is None else frames @ carry)
+        return bodies, (seen @ np.asarray(twists, float)[..., None])[..., 0]
+
+    @LongRows()
     def tool_velocities(self, sweep: Sweep, bodies: Array, twists: Array, out: Array | None = None) -> Array:
         """The tool point's velocity (p, 6, m) per unit of each body twist, axes of the measuring frame.
 
@@ -275,39 +321,53 @@ class Chain:
         """
         m = sweep.tool.shape[-1]
         out = np.empty((len(bodies), 6, m)) if out is None else out
-        starts = np.searchsorted(bodies, np.arange(len(sweep.bodies) + 1))
-        lever = np.empty((3, m))
-        for j, body in enumerate(sweep.bodies):
-            rows = slice(starts[j], starts[j + 1])
-            if rows.start == rows.stop:
-                continue
-            axes = body[:3].reshape(3, -1)
-            count = rows.stop - rows.start
-            spin = (twists[rows, 3:] @ axes).reshape(count, 3, m)
-            block = out[rows]
-            block[:, :3] = (twists[rows, :3] @ axes).reshape(count, 3, m)
-            np.subtract(sweep.tool[3], body[3], out=lever)
-            block[:, 0] += spin[:, 1] * lever[2] - spin[:, 2] * lever[1]
-            block[:, 1] += spin[:, 2] * lever[0] - spin[:, 0] * lever[2]
-            block[:, 2] += spin[:, 0] * lever[1] - spin[:, 1] * lever[0]
-            block[:, 3:] = spin
+        counts = np.bincount(bodies, minlength=len(sweep.bodies))
+        used = np.flatnonzero(counts)
+        groups = list(itertools.pairwise([0, *np.cumsum(counts[used]).tolist()]))
+        frames = sweep.bodies if len(used) == len(sweep.bodies) else sweep.bodies[used]
+        for at in range(0, m, BLOCK):
+            some = np.s_[..., at : at + BLOCK]
+            axes, moved = frames[:, :3][some], _moved_point(frames[some], sweep.tool[3][some])
+            # A twist mixes what its body's axes do, one small product for all samples and components.
+            for (first, last), turn, move in zip(groups, axes, moved, strict=True):
+                rows = out[first:last][some].transpose(1, 0, 2)
+                np.matmul(twists[first:last], move.transpose(1, 0, 2), out=rows[:3])
+                np.matmul(twists[first:last, 3:], turn.transpose(1, 0, 2), out=rows[3:])
         return out
 
     def displaced(self, motions: Mapping[int, Array]) -> Chain:
         """The chain with each station's frame moved by a right factor (4, 4), M ← M·motion."""
-        origins, base, tool = self.origins.copy(), self.base, self.tool
+        every = np.tile(np.eye(4), (self.tool_station + 1, 1, 1))
         for station, motion in motions.items():
-            if station == BASE:
-                base = base @ motion
-            elif station == self.tool_station:
-                tool = tool @ motion
-            elif station % 2:
-                j = (station - 1) // 2
-                origins[j] = motion @ origins[j]
-            else:
-                j = station // 2 - 1
-                origins[j] = origins[j] @ motion
-        return replace(self, origins=origins, base=base, tool=tool)
+            every[station] = motion
+        return self.moved(every)
+
+    def moved(self, motions: Array) -> Chain:
+        """The chain with every station's frame moved by a right factor (2k+4, 4, 4), M ← M·motion."""
+        chain = replace(
+            self,
+            origins=motions[1:-1:2] @ self.origins @ motions[2::2],
+            base=self.base @ motions[0],
+            tool=self.tool @ motions[-1],
+        )
+        # The axes stay, and so do the frames made of them.
+        vars(chain).update(axis_frames=self.axis_frames, _into=self._into)
+        return chain
+
+
+def _moved_point(bodies: Array, point: Array) -> Array:
+    """How a point (3, m) moves when it slides along each body's axes and turns about them, (b, 6, 3, m)."""
+    count, _, _, m = bodies.shape
+    axes, out = bodies[:, :3], scratch("moved", count, 6, 3, m)
+    lever, product = scratch("lever", count, 1, 3, m), scratch("product", count, 3, m)
+    np.subtract(point, bodies[:, 3:], out=lever)
+    out[:, :3] = axes
+    # The cross products of all bodies at once, a component at a time.
+    for x, y, z in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        turned = out[:, 3:, x]
+        np.multiply(axes[:, :, y], lever[:, :, z], out=turned)
+        turned -= np.multiply(axes[:, :, z], lever[:, :, y], out=product)
+    return out
 
 
 def _build(urdf: Urdf) -> pin.Model:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
@@ -94,9 +95,15 @@ def parser() -> argparse.ArgumentParser:
         "identify a robot's errors from measurements and write the corrected URDF",
         "dhcal calibrate ur10.urdf laser.csv --tip tool0 --holdout 0.3 -o ur10_calibrated.urdf",
     )
-    calibrate.add_argument("robot", **_ROBOT)
-    calibrate.add_argument("data", **_DATA)
-    calibrate.add_argument("-o", "--output", metavar="OUT.urdf", required=True, help="the corrected URDF")
+    calibrate.add_argument("robot", metavar="ROBOT", help=f"{_ROBOT['help']}; or a manifest, NAME.fleet.toml")
+    calibrate.add_argument("data", metavar="DATA", nargs="*", help=f"{_DATA['help']}; none with a manifest")
+    calibrate.add_argument(
+        "-o",
+        "--output",
+        metavar="OUT.urdf",
+        required=True,
+        help="the corrected URDF; a manifest's summary.csv",
+    )
     calibrate.add_argument("--tip", **_TIP)
     calibrate.add_argument("--columns", **_COLUMNS)
     calibrate.add_argument(
@@ -144,6 +151,9 @@ def parser() -> argparse.ArgumentParser:
         help="the report, as .html or .md; may repeat",
     )
     calibrate.add_argument("--json", **_JSON)
+    calibrate.add_argument(
+        "--jobs", metavar="N", type=_count, help="processes for a manifest (default: one a processor)"
+    )
 
     validate = _add(
         commands,
@@ -216,14 +226,47 @@ def parser() -> argparse.ArgumentParser:
     simulate.add_argument("--kind", metavar="KIND", default="pose", help="what is measured (pose)")
     simulate.add_argument("--tip", **_TIP)
     simulate.add_argument("--seed", metavar="N", type=_seed, default=0, help="of joint values and noise (0)")
+
+    compensate = _add(
+        commands,
+        "compensate",
+        "joint values, and corrected targets for a nominal controller, that land where asked",
+        "dhcal compensate ur10.urdf ur10_calibrated.urdf targets.csv --tip tool0 -o corrected.csv",
+    )
+    compensate.add_argument("nominal", metavar="NOMINAL.urdf", help="what the controller knows")
+    compensate.add_argument("calibrated", metavar="CALIBRATED.urdf", help="the same robot, calibrated")
+    compensate.add_argument("targets", metavar="targets.csv", help="positions or poses of the tool")
+    compensate.add_argument("-o", "--output", metavar="corrected.csv", required=True, help="a row a target")
+    compensate.add_argument("--tip", **_TIP)
+    study = _add(
+        commands,
+        "study",
+        "how accuracy depends on poses, noise, errors, instrument and parameters, by simulation",
+        "dhcal study ur10_poses --jobs 2 -o results.csv",
+    )
+    study.add_argument(
+        "study", metavar="STUDY.toml", help="the grid, or one that ships: figure3, figure4, ur10_poses"
+    )
+    study.add_argument("-o", "--output", metavar="results.csv", required=True, help="a line a setting")
+    _add_where(study)
     return out
+
+
+def _add_where(command: argparse.ArgumentParser) -> None:
+    """Where the work is done."""
+    where = command.add_mutually_exclusive_group()
+    where.add_argument("--jobs", metavar="N", type=_count, default=1, help="processes on this machine (1)")
+    where.add_argument("--scheduler", metavar="ADDRESS", help="a Dask cluster, as tcp://host:8786")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; 0 done, 1 a check that failed, 2 wrong input, 130 interrupted."""
-    given = sys.argv[1:] if argv is None else argv
-    args = parser().parse_args(given)
-    args.given = given
+    # Small matrices: threads inside LAPACK would only wait for each other. NumPy reads this when it loads.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    args = parser().parse_args(argv)
+    # Small and narrow matrices: further threads of a BLAS, which asks when NumPy loads, would only wait.
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
     try:
         from . import commands
 

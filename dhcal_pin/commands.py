@@ -9,195 +9,74 @@ import os
 import tempfile
 from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from . import calibration, demo, exports, report, report_page, terminal, ur_kinematics, viewer
-from .chain import Chain
+from . import (
+    calibration,
+    compensate_command,
+    demo,
+    exports,
+    fleet_command,
+    report,
+    study_command,
+    terminal,
+    ur_kinematics,
+    viewer,
+)
+from .calibrate_command import run_job
 from .check import crosscheck
 from .dh_files import dh_text, is_dh
 from .dh_urdf import dh_to_urdf
-from .diagnosis import configurations
 from .errors import DhcalError
 from .evaluation import accuracy
-from .files import PathLike, parse_noise, save
+from .files import parse_noise, save
+from .fleet import ENDING, is_fleet
+from .jobs import Job
 from .kinds import KINDS
 from .measurement_files import measurement_text, read_measurements, read_readings
-from .measurements import Measurement, Noise
-from .outputs import STDOUT, check_outputs, command_line, emit, names, same, sidecars
+from .measurements import Noise
+from .outputs import STDOUT, check_outputs, check_urdf_ending, emit, sidecars
 from .parameters import extract
 from .plausibility import doubts
-from .result import Result
 from .robot_files import (
     existing_sidecar,
     is_table,
     read_instrument,
-    read_priors,
     read_robot,
     read_table,
     robot_name,
-    sidecar_path,
-    urdf_files,
 )
-from .screening import Finding, screen
+from .study import configurations
 
 # --- calibrate -------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Data:
-    """What is fitted and held out by file, and the impossible rows left out of both, and doubts."""
-
-    fit: dict[str, Measurement]
-    holdout: list[tuple[str, Measurement]]
-    findings: dict[str, list[Finding]]
-    doubts: dict[str, list[str]]
-
-
-def _without(data: Measurement, findings: Sequence[Finding]) -> Measurement:
-    return data.take(~np.isin(data.rows, [finding.row for finding in findings]))
-
-
-def _read_data(chain: Chain, args: Namespace, held_file: str | None, known_frames: bool) -> _Data:
-    """All measurements, split as the files' `set` columns and --holdout ask."""
-    fit: list[Measurement] = []
-    holdout: list[tuple[str, Measurement]] = []
-    findings: dict[str, list[Finding]] = {}
-    doubtful: dict[str, list[str]] = {}
-    for path in [*args.data, *([held_file] if held_file else [])]:
-        readings = read_readings(path, chain, args.columns)
-        doubtful[path] = doubts(chain, readings)
-        # A row can only be called impossible where base and tool are known.
-        findings[path] = screen(chain, readings) if known_frames else []
-        if path == held_file:
-            holdout.append((path, _without(readings.data, findings[path])))
-        else:
-            fit.append(_without(readings.fit, findings[path]))
-            holdout.append((path, _without(readings.holdout, findings[path])))
-    if args.holdout is not None and not held_file:
-        try:
-            fraction = float(args.holdout)
-        except ValueError:
-            raise DhcalError(f"--holdout {args.holdout}: neither a file nor a share such as 0.3") from None
-        kept, parted = calibration.split(fit, fraction, args.seed)
-        drawn = [path for path, a, b in zip(args.data, fit, kept, strict=True) if len(b.rows) < len(a.rows)]
-        fit, holdout = list(kept), [*holdout, *zip(drawn, parted, strict=True)]
-    fitted = {path: item for path, item in zip(args.data, fit, strict=True) if len(item.rows)}
-    if not fitted:
-        raise DhcalError(f"{', '.join(args.data)}: every row is held out; leave some to fit")
-    return _Data(fitted, [(path, item) for path, item in holdout if len(item.rows)], findings, doubtful)
+def _calibrate_one(job: Job) -> dict[str, Any]:
+    """A robot of a fleet, in a process of its own."""
+    return run_job(job).document
 
 
 def _calibrate(args: Namespace) -> int:
-    held_file = args.holdout if args.holdout is not None and os.path.exists(args.holdout) else None
-    measured = [*args.data, *([held_file] if held_file else [])]
-    for number, path in enumerate(measured):
-        if any(same(path, other) for other in measured[:number]):
-            raise DhcalError(f"{path}: is given twice; each measurement counts once, to fit or to hold out")
-    robot = [args.robot, *sidecars([args.robot])]
-    priors = [args.priors] if args.priors not in (None, "default", "none") else []
-    priors += [args.instrument] if args.instrument else []
-    maps = [args.columns] if args.columns else []
-    inputs = [*robot, *measured, *priors, *maps]
-    _urdf_ending(args.output)
-    check_outputs([args.json, *args.report], inputs)
-    kept = [*measured, *priors, *maps] if args.in_place else inputs
-    check_outputs([args.output, sidecar_path(args.output), args.json, *args.report], kept)
-    for path in args.report:
-        report_page.check_ending(path)
-
-    chain = read_robot(args.robot, args.tip)
-    sets = args.parameters or chain.parameters
-    data = _read_data(chain, args, held_file, known_frames=not {"base", "tool"} & set(names(sets)))
+    if is_fleet(args.robot):
+        return fleet_command.run(args, _calibrate_one)
+    if not args.data:
+        raise DhcalError(f"DATA is required: name at least one measurement file behind {args.robot}")
+    if args.jobs is not None:
+        raise DhcalError(f"--jobs: goes with a manifest (NAME{ENDING}) in place of ROBOT; leave it out")
     with terminal.progress("fitting") as progress:
-        fit = calibration.calibrate(
-            chain,
-            list(data.fit.values()),
-            sets,
-            method=args.method,
-            priors=read_priors(args.priors),
-            fix=names(args.fix),
-            free=names(args.free),
-            holdout=[item for _, item in data.holdout],
-            known=read_instrument(args.instrument) if args.instrument else None,
-            loss=args.loss,
-            max_iterations=args.max_iterations,
-            progress=progress,
-        )
-    contents = _written(fit, args)
-    files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
-    if args.json and args.json != STDOUT:
-        files["json"] = args.json
-    gross = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))
-    impossible = {path: [finding.row for finding in found] for path, found in data.findings.items()}
-    rows = {
-        path: sorted(impossible[path] + gross.get(path, []))
-        for path in impossible
-        if impossible[path] + gross.get(path, [])
-    }
-    files |= {
-        "report" if number == 1 else f"report_{number}": path for number, path in enumerate(args.report, 1)
-    }
-    source = _provenance(args, sets, data, inputs)
-    contents |= report_page.report_files(fit, args.report, source)
-    document = report.document(fit, files, source.inputs, [row for found in rows.values() for row in found])
-    document |= {"outliers_by_file": rows, "command": source.command, "settings": source.settings}
-    if "json" in files:
-        contents[args.json] = report.json_text(document)
-    save(contents)
+        outcome = run_job(Job.of(args), progress)
     if args.json == STDOUT:
-        emit(args.json, document)
-    for path, found in data.findings.items():
+        emit(args.json, outcome.document)
+    for path, found in outcome.findings.items():
         terminal.findings(path, found)
-        terminal.gross(path, gross.get(path, []), args.loss)
-    for path, texts in data.doubts.items():
+        terminal.gross(path, outcome.gross.get(path, []), args.loss)
+    for path, texts in outcome.doubts.items():
         terminal.doubts(path, texts)
-    terminal.summary(fit, files)
+    terminal.summary(outcome.fit, outcome.files)
     return 0
-
-
-def _provenance(args: Namespace, sets: str, data: _Data, inputs: Sequence[str]) -> report.Provenance:
-    """What the report says of the files, the command and its choices."""
-    short = report.short_names(inputs)
-    outputs = [args.output, args.json, *args.report]
-    settings = {
-        "parameters": sets,
-        "loss": args.loss,
-        "seed": str(args.seed),
-    }
-    if args.holdout is not None:
-        settings["hold-out"] = short.get(args.holdout, f"{args.holdout} of each file, at random by the seed")
-    left_out = {
-        short[path]: {finding.row: finding.reason for finding in found}
-        for path, found in data.findings.items()
-    }
-    doubtful = {short[path]: texts for path, texts in data.doubts.items()}
-    return report.Provenance(
-        command=command_line(args.given, [path for path in outputs if path], short),
-        inputs=report.fingerprints(inputs),
-        names=list(data.fit),
-        holdout_names=[path for path, _ in data.holdout],
-        settings=settings,
-        left_out=left_out,
-        doubts=doubtful,
-    )
-
-
-def _written(fit: Result, args: Namespace) -> dict[PathLike, str | bytes]:
-    """The calibrated URDF and its sidecar, base and tool moved into the URDF where that was asked for."""
-    chain = fit.chain
-    # A base that the URDF holds must not stand in the sidecar too.
-    bare = replace(chain, base=np.eye(4)) if args.world_joint else chain
-    contents = urdf_files(bare, args.output, fit.portable)
-    data = contents[args.output]
-    assert isinstance(data, bytes)
-    if args.world_joint:
-        data = exports.with_world(data, chain.base)
-    if args.tool_frame:
-        data = exports.with_tool_frame(data, chain.tip, args.tool_frame, chain.tool)
-    return contents | {args.output: data}
 
 
 # --- the other commands ----------------------------------------------------------------------------
@@ -264,16 +143,11 @@ def _to_dh(args: Namespace) -> tuple[str, Sequence[str]]:
 
 
 def _to_urdf(args: Namespace) -> tuple[str, Sequence[str]]:
-    _urdf_ending(args.output, "or a DH table as .dh.toml or .dh.csv")
+    check_urdf_ending(args.output, "or a DH table as .dh.toml or .dh.csv")
     if args.tip is not None or args.convention is not None:
         raise DhcalError(f"{args.input}: a table has one tip and one URDF; leave out --tip and --convention")
     beside = [f"{path} lies beside it and is read with it" for path in sidecars([args.output])]
     return dh_to_urdf(read_table(args.input), robot_name(args.input)), beside
-
-
-def _urdf_ending(path: str, other: str = "") -> None:
-    if not path.lower().endswith(".urdf"):
-        raise DhcalError(f"{path}: unknown ending; write a URDF as .urdf {other}".rstrip())
 
 
 def _check(args: Namespace) -> int:
@@ -341,4 +215,6 @@ COMMANDS: dict[str, Callable[[Namespace], int]] = {
     "view": _view,
     "check": _check,
     "simulate": _simulate,
+    "compensate": compensate_command.run,
+    "study": study_command.study,
 }

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from .chain import Chain
 from .errors import DhcalError
-from .inverse import Gap, land, to_positions
+from .inverse import land, to_positions
 from .measurements import (
     LENGTH_SIGMA,
     PLACE_PRIOR,
@@ -105,7 +105,7 @@ class Touch(PointReading):
         at = chain.poses(q)[:4, :3, 3]
         label = np.arange(len(q)) % len(at)
         targets = at[label] + noise.position * rng.standard_normal((len(q), 3))
-        q = land(chain, lambda which: to_positions(targets[which]), q, rng)
+        q = land(chain, to_positions(targets), q, rng)
         return cls.of(q, [f"p{i + 1}" for i in label], noise.position or None)
 
 
@@ -251,11 +251,9 @@ class Plane(PointReading):
         normal = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
         height = noise.position * rng.standard_normal(len(q))
 
-        def gap(which: Array) -> Gap:
-            return lambda points: (
-                ((points - middle) @ normal - height[which])[:, None],
-                np.broadcast_to(normal, (len(points), 1, 3)),
-            )
+        def gap(poses: Array, which: Array) -> tuple[Array, Array]:
+            wide = (poses[:, :3, 3] - middle) @ normal - height[which]
+            return wide[:, None], np.broadcast_to(normal, (len(poses), 1, 3))
 
         return cls.of(land(chain, gap, q, rng), noise.position or None)
 
@@ -318,12 +316,9 @@ class Sphere(PointReading):
         radius = 0.15
         length = radius + noise.position * rng.standard_normal(len(q))
 
-        def gap(which: Array) -> Gap:
-            def wide(points: Array) -> tuple[Array, Array]:
-                reach = points - centre
-                size = np.linalg.norm(reach, axis=1)
-                return (size - length[which])[:, None], (reach / np.maximum(size, 1e-12)[:, None])[:, None]
-
-            return wide
+        def gap(poses: Array, which: Array) -> tuple[Array, Array]:
+            reach = poses[:, :3, 3] - centre
+            size = np.linalg.norm(reach, axis=1)
+            return (size - length[which])[:, None], (reach / np.maximum(size, 1e-12)[:, None])[:, None]
 
         return cls.of(land(chain, gap, q, rng), radius, noise.position or None)

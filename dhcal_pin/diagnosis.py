@@ -14,9 +14,8 @@ from .measurements import Measurement
 from .parameters import ErrorModel, offset
 from .result import Result
 from .se3 import Array
+from .study import configurations
 
-# A joint without limits turns half a turn each way, or slides half a metre.
-TURN, SLIDE = np.pi, 0.5
 # Configurations that the workspace is judged by, and bins that a joint's range is parted into.
 SAMPLES, BINS = 16000, 12
 # A joint that hardly moves the measured point asks for nothing: its error is known worse than this, rad or m.
@@ -133,8 +132,9 @@ def _asked(chain: Chain, data: Sequence[Measurement], fit: Result) -> tuple[Arra
     for item in data:
         u = np.array([values[unknown.name] for unknown in item.unknowns])
         sweep = chain.sweep(item.configurations())
-        rows = item.whiten(sweep, chain.tool_velocities(sweep, bodies, twists), u)
-        pulls.append(np.sum(rows * item.residual(sweep, u), 1))
+        residual = item.residual(sweep, u)
+        rows = item.whiten(sweep, chain.tool_velocities(sweep, bodies, twists), u, residual)
+        pulls.append(np.sum(rows * residual, 1))
         weights.append(np.sum(rows**2, 1))
     return np.concatenate(pulls, 1), np.concatenate(weights, 1)
 
@@ -167,18 +167,6 @@ class Workspace:
     std: Array
     measured: Array
     measured_std: Array
-
-
-def configurations(chain: Chain, count: int, rng: np.random.Generator) -> Array:
-    """Uniform joint values (count, n) within the limits, and within a turn or half a metre each way."""
-    low, high = chain.lower, chain.upper
-    slides = [chain.urdf.joint(name).type == "prismatic" for name in chain.joint_names]
-    span = np.where(slides, SLIDE, TURN)
-    low, high = (
-        np.where(high > -span, np.maximum(low, -span), np.maximum(low, high - 2 * span)),
-        np.where(low < span, np.minimum(high, span), np.minimum(high, low + 2 * span)),
-    )
-    return rng.uniform(low, high, (count, chain.size))
 
 
 def workspace(fit: Result) -> Workspace:

@@ -11,8 +11,9 @@ import numpy as np
 from .chain import Chain
 from .measurements import Measurement
 from .parameters import ErrorModel
+from .problem import Problem, shared_unknowns
 from .se3 import Array
-from .solver import Problem, levenberg_marquardt, shared_unknowns
+from .solver import levenberg_marquardt
 
 # What a kind calls its errors, where not position or orientation, counts as residual; and its key's ending.
 ENDINGS = {"position": "_m", "orientation": "_rad", "residual": ""}

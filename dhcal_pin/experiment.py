@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,24 +12,15 @@ from . import observability
 from .calibration import calibrate
 from .chain import Chain
 from .dh_files import read_dh
-from .errors import DhcalError
 from .evaluation import Comparison, accuracy, deviations, summary
 from .measurement_files import Readings, read_readings
 from .measurements import Measurement
 from .parameters import select
+from .problem import Problem, reduce
 from .result import Result
+from .robot_files import paper_file
 from .screening import Finding, screen
 from .se3 import Array
-from .solver import Problem, reduce
-
-
-def paper_file(name: str) -> Path:
-    """A file of the paper's tables, from the installed package or the source tree."""
-    here = Path(__file__).resolve().parent
-    for folder in (here / "paper", here.parent / "urdf"):
-        if (folder / name).exists():
-            return folder / name
-    raise DhcalError(f"{name}: the paper's tables are not installed; reinstall dhcal-pin")
 
 
 def paper_arm(name: str) -> Chain:

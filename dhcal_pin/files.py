@@ -10,8 +10,9 @@ import tempfile
 import tomllib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -108,8 +109,9 @@ def read_text(path: PathLike, encoding: str = "utf-8") -> str:
 
 def read_toml(path: PathLike) -> dict:
     """A TOML file, or DhcalError."""
+    text = read_text(path)
     try:
-        return tomllib.loads(read_text(path))
+        return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # more than TOMLDecodeError: endless numbers and brackets
         raise DhcalError(f"{path}: not TOML: {error}; correct that line") from error
 
@@ -128,15 +130,19 @@ def check_names(names: Sequence[str], source: str) -> None:
             )
 
 
-def parse_noise(text: str) -> tuple[float, float]:
+def parse_noise(text: str, what: str = "--noise") -> tuple[float, float]:
     """Standard deviations in m and rad from a text such as `0.1mm` or `0.1mm,0.01deg`.
+
+    Args:
+        text: one length, one angle, or both.
+        what: what an error calls it.
 
     Raises:
         DhcalError: not a number with a unit, a negative one, or one quantity twice.
     """
     out: dict[str, float] = {}
     for part in text.split(","):
-        where = f"--noise {part.strip()!r}"
+        where = f"{what} {part.strip()!r}"
         match = re.fullmatch(r"\s*([0-9.eE+-]+)\s*([a-z\u00b5\u03bc]+)\s*", part)
         kind = "length" if match and match[2] in LENGTHS else "angle"
         units = LENGTHS if kind == "length" else ANGLES
@@ -174,14 +180,18 @@ class Column:
 
 @dataclass(frozen=True)
 class Sheet:
-    """A CSV file: comments, columns, and cells with the line each row stands on."""
+    """A CSV file: comments, columns, and cells with the line each row stands on.
+
+    `parsed` has the numbers (m,) of columns, by index, that a quick parser understood as a whole.
+    """
 
     source: str
     comments: tuple[str, ...]
     columns: dict[str, Column]
-    cells: list[list[str]]
+    cells: Sequence[list[str]]
     lines: list[int]
     header: int
+    parsed: Mapping[int, Array] = field(default_factory=dict)
 
     def si(self, column: Column, units: Mapping[str, float]) -> Array:
         """A column's numbers (m,) in metres or radians, or DhcalError naming line and column."""
@@ -198,7 +208,9 @@ class Sheet:
     def numbers(self, column: Column) -> Array:
         """A column's finite numbers (m,), or DhcalError naming line and column."""
         with suppress(ValueError):
-            out = np.array([row[column.index] for row in self.cells], dtype=float)
+            out = self.parsed.get(column.index)
+            if out is None:
+                out = np.array([row[column.index] for row in self.cells], dtype=float)
             if np.isfinite(out).all():
                 return out
         for row, line in zip(self.cells, self.lines, strict=True):
@@ -235,20 +247,52 @@ def read_sheet(path: PathLike) -> Sheet:
         raise DhcalError(
             f"{source}: is empty; the first line must be a header such as joint_1[deg],…,x[mm],y[mm],z[mm]"
         )
-    # Line by line, so that a stray quote stays in its own row.
-    rows = [_cells(line, f"{source}:{number}") for number, line in kept]
-    first = kept[0][0]
-    columns = _columns(rows[0], f"{source}:{first}")
+    first, head = kept[0]
+    columns = _columns(_cells(head, f"{source}:{first}"), f"{source}:{first}")
     lines = [number for number, _ in kept[1:]]
-    for row, line in zip(rows[1:], lines, strict=True):
-        if len(row) != len(columns):
+    cells = _Rows(source, kept[1:])
+    for i, (line, text) in enumerate(kept[1:]):
+        count = len(cells[i]) if '"' in text else text.count(",") + 1
+        if count != len(columns):
             raise DhcalError(
-                f"{source}:{line}: {len(row)} values under a header of {len(columns)} columns; "
+                f"{source}:{line}: {count} values under a header of {len(columns)} columns; "
                 "give every row one value a column (decimal point, comma between)"
             )
     if not lines:
         raise DhcalError(f"{source}: no rows under the header in line {first}; add at least one row")
-    return Sheet(source, tuple(comments), columns, rows[1:], lines, first)
+    return Sheet(source, tuple(comments), columns, cells, lines, first, cells.numbers())
+
+
+class _Rows(Sequence[list[str]]):
+    """Rows of comma-separated text, split when they are asked for: numbers mostly need no cells."""
+
+    def __init__(self, source: str, kept: Sequence[tuple[int, str]]):
+        self.source, self.kept = source, kept
+
+    def __len__(self) -> int:
+        return len(self.kept)
+
+    def __getitem__(self, index: Any) -> Any:
+        number, line = self.kept[index]
+        # Line by line, so that a stray quote stays in its own row.
+        return _cells(line, f"{self.source}:{number}")
+
+    def numbers(self) -> dict[int, Array]:
+        """All columns of numbers (m,) by index; none if a cell of them is something else, or quoted."""
+        if any('"' in line for _, line in self.kept):
+            return {}
+        numeric = []
+        for i, cell in enumerate(self[0]):
+            with suppress(ValueError):
+                float(cell)
+                numeric.append(i)
+        try:
+            table = np.loadtxt(
+                (line for _, line in self.kept), delimiter=",", comments=None, usecols=numeric, ndmin=2
+            )
+        except ValueError:
+            return {}
+        return dict(zip(numeric, np.ascontiguousarray(table.T), strict=True))
 
 
 def _cells(line: str, where: str) -> list[str]:

@@ -10,8 +10,9 @@ a Fortran matrix. A step solves derivative·Δx = residual.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Protocol, Self
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any, ClassVar, Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -63,6 +64,8 @@ class Measurement(Protocol):
     needs: ClassVar[tuple[frozenset[str], ...]]
     # Configurations a row: 0, 1, or 2, the second under to:JOINT.
     ends: ClassVar[int]
+    # Fields with an entry a sample.
+    per_row: ClassVar[tuple[str, ...]]
 
     @property
     def q(self) -> Array:
@@ -72,6 +75,11 @@ class Measurement(Protocol):
     @property
     def rows(self) -> Array:
         """Row numbers (m,), the first reading of a file being 1."""
+        ...
+
+    @property
+    def size(self) -> int:
+        """Number k of residuals a sample."""
         ...
 
     @property
@@ -96,15 +104,19 @@ class Measurement(Protocol):
         """Whitened residuals (k, m); `groups` names its rows."""
         ...
 
-    def whiten(self, sweep: Sweep, velocities: Array, u: Array) -> Array:
-        """Derivatives (p, k, m) of the whitened model from tool velocities (p, 6, c·m)."""
+    def whiten(
+        self, sweep: Sweep, velocities: Array, u: Array, residual: Array, out: Array | None = None
+    ) -> Array:
+        """Derivatives (p, k, m) of the whitened model from tool velocities (p, 6, c·m) where residual is."""
         ...
 
     def own(self, sweep: Sweep, u: Array) -> Array:
         """Derivatives (s, k, m) of the whitened model by the unknowns."""
         ...
 
-    def small_angle(self, sweep: Sweep, velocities: Array, u: Array) -> tuple[Array, Array]:
+    def small_angle(
+        self, sweep: Sweep, velocities: Array, u: Array, out: Array | None = None
+    ) -> tuple[Array, Array]:
         """The paper's rows: residual (k, m) by (35) and (36), derivative (p, k, m) by its R."""
         ...
 
@@ -145,6 +157,30 @@ class Measurement(Protocol):
     def to_columns(self) -> dict[str, Any]:
         """The columns (m,) that a file of these readings has, in SI or as text."""
         ...
+
+
+_Kind = TypeVar("_Kind", bound=Measurement)
+
+
+def joined(items: Sequence[_Kind]) -> _Kind:
+    """The samples of several measurements as one measurement's, in this order.
+
+    Raises:
+        DhcalError: they are of different kinds, or differ in more than their samples.
+    """
+    first = items[0]
+    common = [f.name for f in fields(first) if f.name not in first.per_row]  # pyright: ignore[reportArgumentType]
+    for item in items[1:]:
+        if type(item) is not type(first) or not all(
+            _alike(getattr(item, name), getattr(first, name)) for name in common
+        ):
+            raise DhcalError(f"{item.kind}: differs from the first {first.kind} in more than its samples")
+    samples = {name: np.concatenate([getattr(item, name) for item in items]) for name in first.per_row}
+    return replace(first, **samples)  # pyright: ignore[reportArgumentType]
+
+
+def _alike(a: Any, b: Any) -> bool:
+    return np.array_equal(a, b, equal_nan=True) if isinstance(a, np.ndarray) else a == b
 
 
 def need(*names: str) -> frozenset[str]:
@@ -243,6 +279,21 @@ class PointReading:
         """As they are, (m, n)."""
         return self.q
 
+    @property
+    def size(self) -> int:
+        """As many as the reading has columns."""
+        return self.reading.shape[1]
+
+    @cached_property
+    def _weights(self) -> Array:
+        """One over sigma, (k, m)."""
+        return 1 / np.ascontiguousarray(self.sigma.T)
+
+    @cached_property
+    def _reading(self) -> Array:
+        """(k, m), the samples last in memory."""
+        return np.ascontiguousarray(self.reading.T)
+
     def _points(self, sweep: Sweep) -> Array:
         m = len(self.rows)
         return sweep.tool[3].reshape(3, -1, m).transpose(1, 0, 2) if m else np.empty((1, 3, 0))
@@ -253,27 +304,27 @@ class PointReading:
 
     def residual(self, sweep: Sweep, u: Array) -> Array:
         """(k, m)."""
-        return (self.reading.T - self.model(self._points(sweep), u)[0]) / self.sigma.T
+        return (self._reading - self.model(self._points(sweep), u)[0]) * self._weights
 
-    def whiten(self, sweep: Sweep, velocities: Array, u: Array) -> Array:
+    def whiten(
+        self, sweep: Sweep, velocities: Array, u: Array, residual: Array, out: Array | None = None
+    ) -> Array:
         """(p, k, m)."""
-        derivative = self.model(self._points(sweep), u)[1]
-        m = len(self.rows)
-        out = np.zeros((len(velocities), *derivative.shape[1:2], m))
-        for i, block in enumerate(derivative):
-            part = velocities[:, :3, i * m : (i + 1) * m]
-            # A sum over x, y, z, written out: einsum would not use the memory's order.
-            for axis in range(3):
-                out += part[:, None, axis] * block[:, axis]
-        return out / self.sigma.T
+        derivative = self.model(self._points(sweep), u)[1] * self._weights[:, None]
+        ends, _, _, m = derivative.shape
+        moved = velocities[:, :3].reshape(-1, 3, ends, m)
+        return np.einsum("pacm,ckam->pkm", moved, derivative, out=out)
 
     def own(self, sweep: Sweep, u: Array) -> Array:
         """(s, k, m)."""
-        return self.model(self._points(sweep), u)[2] / self.sigma.T
+        return self.model(self._points(sweep), u)[2] * self._weights
 
-    def small_angle(self, sweep: Sweep, velocities: Array, u: Array) -> tuple[Array, Array]:
+    def small_angle(
+        self, sweep: Sweep, velocities: Array, u: Array, out: Array | None = None
+    ) -> tuple[Array, Array]:
         """The same rows: there is no rotation in them."""
-        return self.residual(sweep, u), self.whiten(sweep, velocities, u)
+        residual = self.residual(sweep, u)
+        return residual, self.whiten(sweep, velocities, u, residual, out)
 
     def errors(self, sweep: Sweep, u: Array) -> dict[str, Array]:
         """{group: (m, k)} in m."""

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from . import report
 from .errors import DhcalError
@@ -38,23 +37,10 @@ def check_outputs(outputs: Sequence[str | None], inputs: Sequence[str]) -> None:
         check_place(path)
 
 
-def command_line(given: Sequence[str], outputs: Sequence[str], names: Mapping[str, str]) -> str:
-    """A command as given, without where it wrote and with files by their names: the same for the same work.
-
-    >>> command_line(["calibrate", "in/arm.urdf", "-o", "out.urdf", "--json=-"], ["out.urdf", "-"],
-    ...              {"in/arm.urdf": "arm.urdf"})
-    'dhcal calibrate arm.urdf'
-    """
-    words: list[str] = []
-    for word in given:
-        if word in outputs and words and words[-1].startswith("-"):
-            words.pop()
-        elif not (
-            word.startswith("-")
-            and any(word in (f"-o{path}", f"{word.split('=')[0]}={path}") for path in outputs)
-        ):
-            words.append(names.get(word, word))
-    return shlex.join(["dhcal", *words])
+def check_urdf_ending(path: str, other: str = "") -> None:
+    """Complains about a path of a URDF to write that does not end like one; `other` is what else could be."""
+    if not path.lower().endswith(".urdf"):
+        raise DhcalError(f"{path}: unknown ending; write a URDF as .urdf {other}".rstrip())
 
 
 def emit(target: str | None, content: object) -> None:

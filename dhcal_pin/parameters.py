@@ -8,6 +8,7 @@ derivative at any value is a twist again.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -26,6 +27,7 @@ LENGTH, ANGLE, OFFSET = 1e-3, 5e-3, np.deg2rad(2.0)
 WIDE_LENGTH, WIDE_ANGLE = 10.0, 10.0
 
 _AXES = np.eye(6)
+_IDENTITY = np.eye(4)
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,8 @@ def extract(chain: Chain, convention: Convention = "standard", hayati: bool = Fa
     )
 
 
-def _dh_rows(chain: Chain, convention: Convention, hayati: bool) -> list[Parameter]:
+@functools.lru_cache(maxsize=16)
+def _dh_rows(chain: Chain, convention: Convention, hayati: bool) -> tuple[Parameter, ...]:
     found = extract(chain, convention, hayati)
     table = found.table
     out = []
@@ -88,7 +91,7 @@ def _dh_rows(chain: Chain, convention: Convention, hayati: bool) -> list[Paramet
                 Parameter(f"beta{label}", "rad", float(table.beta[i]), lateral, tuple(sideways[:, 4]), ANGLE)
             )
         out += rows if convention == "standard" else rows[2:] + rows[:2]
-    return out
+    return tuple(out)
 
 
 def _parallel(chain: Chain, i: int, convention: Convention) -> bool:
@@ -99,12 +102,12 @@ def _parallel(chain: Chain, i: int, convention: Convention) -> bool:
 
 def dh(chain: Chain) -> list[Parameter]:
     """Standard DH, 4 a joint: θ, d, a, α of every row; the columns of the paper's R."""
-    return _dh_rows(chain, "standard", hayati=False)
+    return list(_dh_rows(chain, "standard", hayati=False))
 
 
 def modified_dh(chain: Chain) -> list[Parameter]:
     """Modified DH, 4 a joint: a, α of the link before each joint, then d, θ."""
-    return _dh_rows(chain, "modified", hayati=False)
+    return list(_dh_rows(chain, "modified", hayati=False))
 
 
 def hayati(chain: Chain) -> list[Parameter]:
@@ -268,13 +271,59 @@ class ErrorModel:
         """Prior standard deviations (p,), each in its parameter's unit."""
         return np.array([parameter.prior for parameter in self.parameters])
 
+    @cached_property
+    def _slots(self) -> tuple[Array, Array, Array]:
+        """Stations with unknowns (g,), and each parameter's place among them (p,) and at its station (p,)."""
+        stations, group = np.unique(self._stations, return_inverse=True)
+        return stations, group, np.arange(len(group)) - np.searchsorted(group, group)
+
+    @cached_property
+    def _most(self) -> int:
+        """The most parameters at a station, at least one."""
+        return int(self._slots[2].max(initial=0)) + 1
+
+    @cached_property
+    def _left(self) -> Array:
+        """Which stations with unknowns are links', (g, 1, 1, 1)."""
+        stations = self._slots[0]
+        left = (stations % 2 == 1) & (stations != self.chain.tool_station)
+        return left[:, None, None, None]
+
+    @cached_property
+    def _powers(self) -> tuple[Array, Array]:
+        """Sizes of the rotations (p,), and the twists as matrices Ξ, Ξ²/|ω|², Ξ³/|ω|³ (p, 3, 16)."""
+        twist = np.zeros((len(self._twists), 4, 4))
+        twist[:, :3, :3], twist[:, :3, 3] = se3.skew(self._twists[:, 3:]), self._twists[:, :3]
+        size = np.linalg.norm(self._twists[:, 3:], axis=1)
+        unit = twist / np.where(size > 0, size, 1.0)[:, None, None]
+        powers = np.stack([twist, unit @ unit, unit @ unit @ unit], 1)
+        return size, powers.reshape(-1, 3, 16)
+
+    def _factors(self, x: Array) -> Array:
+        """The parameters' motions exp(xξ), in the order of their stations (g, most a station, 4, 4)."""
+        size, powers = self._powers
+        angle = size * x
+        # exp(xξ) = I + xΞ + (1 - cos)(Ξ/|ω|)² + (angle - sin)(Ξ/|ω|)³, and I + xΞ for a translation.
+        share = np.empty((len(x), 1, 3))
+        share[:, 0, 0], share[:, 0, 1] = x, 2 * np.sin(0.5 * angle) ** 2
+        share[:, 0, 2] = angle - np.sin(angle)
+        motion = (share @ powers).reshape(-1, 4, 4) + _IDENTITY
+        stations, group, place = self._slots
+        out = np.empty((len(stations), self._most, 4, 4))
+        out[:] = _IDENTITY
+        out[group, place] = motion
+        return out
+
     def at(self, x: Array) -> Chain:
         """The chain with errors x (p,) in m and rad."""
-        factors = se3.exp6(self._twists * np.asarray(x, float)[:, None])
-        motions: dict[int, Array] = {}
-        for station, factor in zip(self._stations, factors, strict=True):
-            motions[int(station)] = motions.get(int(station), np.eye(4)) @ factor
-        return self.chain.displaced(motions)
+        factors = self._factors(np.asarray(x, float))
+        return self._moved(functools.reduce(np.matmul, np.swapaxes(factors, 0, 1)))
+
+    def _moved(self, motions: Array) -> Chain:
+        every = np.empty((self.chain.tool_station + 1, 4, 4))
+        every[:] = _IDENTITY
+        every[self._slots[0]] = motions
+        return self.chain.moved(every)
 
     def derivative(self, x: Array) -> tuple[Chain, Array, Array]:
         """The chain at x, and for each parameter the body (p,) and twist (p, 6) it moves there.
@@ -282,18 +331,17 @@ class ErrorModel:
         A factor behind the k-th at its station turns the k-th twist; a link's motion is taken up by the
         next origin from the left, so there the factors before it do.
         """
-        x = np.asarray(x, float)
-        factors = se3.exp6(self._twists * x[:, None])
-        twists = self._twists.copy()
-        for station in np.unique(self._stations):
-            members = np.flatnonzero(self._stations == station)
-            left = station % 2 == 1 and station != self.chain.tool_station
-            carry = np.eye(4)
-            for k in members if left else members[::-1]:
-                twists[k] = se3.adjoint(carry if left else se3.inverse(carry)) @ self._twists[k]
-                carry = carry @ factors[k] if left else factors[k] @ carry
-        chain = self.at(x)
-        return (chain, *chain.station_twists(self._stations, twists))
+        factors = self._factors(np.asarray(x, float))
+        _, group, place = self._slots
+        most = self._most
+        before, behind = np.empty_like(factors), np.empty_like(factors)
+        before[:, 0] = behind[:, -1] = _IDENTITY
+        for i in range(1, most):
+            np.matmul(before[:, i - 1], factors[:, i - 1], out=before[:, i])
+            np.matmul(factors[:, most - i], behind[:, most - i], out=behind[:, most - i - 1])
+        chain = self._moved(factors[:, 0] @ behind[:, 0])
+        carry = np.where(self._left, before, se3.inverse(behind))
+        return chain, *chain.station_twists(self._stations, self._twists, carry[group, place])
 
     def frames(self) -> ErrorModel | None:
         """Base and tool alone, if any of them is unknown."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -55,6 +56,21 @@ class PoseReading:
     reads: ClassVar[tuple[tuple[str, ...], tuple[str, ...]]]
     # Fields with an entry a sample.
     per_row: ClassVar[tuple[str, ...]] = ("q", "poses", "sigma", "rotation_sigma", "rows")
+
+    @cached_property
+    def _weights(self) -> Array:
+        """One over both sigmas, (6, m)."""
+        return 1 / np.concatenate([self.sigma.T, self.rotation_sigma.T])
+
+    @cached_property
+    def _measured(self) -> Array:
+        """Rows and columns of the poses (3, 4, m), the samples last in memory."""
+        return np.ascontiguousarray(self.poses[:, :3].transpose(1, 2, 0))
+
+    @property
+    def size(self) -> int:
+        """Three of the position, three of the rotation."""
+        return 6
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
@@ -183,42 +199,47 @@ class Pose(PoseReading):
         return self.poses[:, :3, :3]
 
     def _turn(self, sweep: Sweep) -> Array:
-        """R_measured·R_modelᵀ (m, 3, 3)."""
-        return np.einsum("mik,kjm->mij", self.poses[:, :3, :3], sweep.tool[:3])
+        """R_measured·R_modelᵀ (3, 3, m)."""
+        return np.einsum("ikm,kjm->ijm", self._measured[:, :3], sweep.tool[:3])
+
+    def _rotvec(self, sweep: Sweep) -> Array:
+        """The turn's rotation vector (3, m)."""
+        return se3.log3(self._turn(sweep).transpose(2, 0, 1)).T
 
     def _position(self, sweep: Sweep) -> Array:
-        return (self.poses[:, :3, 3].T - sweep.tool[3]) / self.sigma.T
+        return self._measured[:, 3] - sweep.tool[3]
 
     def residual(self, sweep: Sweep, u: Array) -> Array:
         """(6, m): x, y, z, then the rotation vector, over sigma."""
-        return np.concatenate([self._position(sweep), se3.log3(self._turn(sweep)).T / self.rotation_sigma.T])
+        return np.concatenate([self._position(sweep), self._rotvec(sweep)]) * self._weights
 
-    def whiten(self, sweep: Sweep, velocities: Array, u: Array) -> Array:
+    def whiten(
+        self, sweep: Sweep, velocities: Array, u: Array, residual: Array, out: Array | None = None
+    ) -> Array:
         """(p, 6, m); log3(E·exp(-ω)) = φ - Jr⁻¹(φ)·ω."""
-        out = np.empty_like(velocities)
-        np.divide(velocities[:, :3], self.sigma.T, out=out[:, :3])
-        mix = se3.right_jacobian_inverse(se3.log3(self._turn(sweep))) / self.rotation_sigma[:, :, None]
-        mix = np.ascontiguousarray(mix.transpose(1, 2, 0))
-        for i in range(3):
-            row = mix[i, 0] * velocities[:, 3]
-            row += mix[i, 1] * velocities[:, 4]
-            row += mix[i, 2] * velocities[:, 5]
-            out[:, 3 + i] = row
+        out = np.empty_like(velocities) if out is None else out
+        weights = self._weights
+        np.multiply(velocities[:, :3], weights[:3], out=out[:, :3])
+        mix = se3.right_jacobian_inverse((residual[3:] / weights[3:]).T)
+        mix = mix.transpose(1, 2, 0) * weights[3:, None]
+        np.einsum("pkm,ikm->pim", velocities[:, 3:], mix, out=out[:, 3:])
         return out
 
-    def small_angle(self, sweep: Sweep, velocities: Array, u: Array) -> tuple[Array, Array]:
+    def small_angle(
+        self, sweep: Sweep, velocities: Array, u: Array, out: Array | None = None
+    ) -> tuple[Array, Array]:
         """Half the vee of E - Eᵀ, E = R_measured·R_modelᵀ, is (36) seen in the measuring frame."""
         turn = self._turn(sweep)
-        difference = 0.5 * (turn - np.swapaxes(turn, 1, 2))
-        sine = np.stack([difference[:, 2, 1], difference[:, 0, 2], difference[:, 1, 0]])
-        residual = np.concatenate([self._position(sweep), sine / self.rotation_sigma.T])
-        return residual, velocities / np.concatenate([self.sigma.T, self.rotation_sigma.T])
+        difference = 0.5 * (turn - np.swapaxes(turn, 0, 1))
+        sine = np.stack([difference[2, 1], difference[0, 2], difference[1, 0]])
+        residual = np.concatenate([self._position(sweep), sine]) * self._weights
+        return residual, np.multiply(velocities, self._weights, out=out)
 
     def errors(self, sweep: Sweep, u: Array) -> dict[str, Array]:
         """{"position": (m, 3) in m, "orientation": (m, 3) rotation vectors in rad}."""
         return {
             "position": self.poses[:, :3, 3] - sweep.tool[3].T,
-            "orientation": se3.log3(self._turn(sweep)),
+            "orientation": self._rotvec(sweep).T,
         }
 
     @classmethod

@@ -22,6 +22,7 @@ from .measurements import (
     lengths,
     need,
 )
+from .scratch import scratch
 from .se3 import Array
 
 _AXES = ("x", "y", "z")
@@ -62,9 +63,11 @@ class Position(PointReading):
         m = points.shape[-1]
         return points[0], np.tile(np.eye(3)[None, :, :, None], (1, 1, 1, m)), np.empty((0, 3, m))
 
-    def whiten(self, sweep: Sweep, velocities: Array, u: Array) -> Array:
+    def whiten(
+        self, sweep: Sweep, velocities: Array, u: Array, residual: Array, out: Array | None = None
+    ) -> Array:
         """(p, 3, m)."""
-        return velocities[:, :3] / self.sigma.T
+        return np.multiply(velocities[:, :3], self._weights, out=out)
 
     def positions(self) -> Array:
         """As measured, (m, 3)."""
@@ -178,23 +181,31 @@ class Targets(PointReading):
     def _offsets(self, sweep: Sweep, u: Array) -> Array:
         """Each sample's target relative to the tool point, (3, m) in axes of the measuring frame."""
         local = np.concatenate([np.zeros((1, 3)), u.reshape(-1, 3)])[self.label]
-        return np.einsum("crm,mc->rm", sweep.tool[:3], local)
+        return np.sum(sweep.tool[:3] * local.T[:, None], 0)
 
     def residual(self, sweep: Sweep, u: Array) -> Array:
         """(3, m)."""
-        return (self.reading.T - sweep.tool[3] - self._offsets(sweep, u)) / self.sigma.T
+        return (self._reading - sweep.tool[3] - self._offsets(sweep, u)) * self._weights
 
-    def whiten(self, sweep: Sweep, velocities: Array, u: Array) -> Array:
+    def whiten(
+        self, sweep: Sweep, velocities: Array, u: Array, residual: Array, out: Array | None = None
+    ) -> Array:
         """(p, 3, m): the target's velocity v + ω × offset."""
         offset = self._offsets(sweep, u)
-        turned = np.cross(velocities[:, 3:], offset[None], axis=1)
-        return (velocities[:, :3] + turned) / self.sigma.T
+        out = np.empty((len(velocities), *offset.shape)) if out is None else out
+        product = scratch("product", len(velocities), offset.shape[1])
+        for x, y, z in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            np.multiply(velocities[:, 3 + y], offset[z], out=out[:, x])
+            out[:, x] -= np.multiply(velocities[:, 3 + z], offset[y], out=product)
+        out += velocities[:, :3]
+        out *= self._weights
+        return out
 
     def own(self, sweep: Sweep, u: Array) -> Array:
         """(s, 3, m): the tool's axes where the sample is of that target."""
         mine = self.label[None] == np.arange(1, len(self.names))[:, None]
         out = mine[:, None, None, :] * sweep.tool[:3]
-        return out.reshape(-1, 3, out.shape[-1]) / self.sigma.T
+        return out.reshape(-1, 3, out.shape[-1]) * self._weights
 
     def positions(self) -> Array:
         """As measured, (m, 3): good enough to find the instrument by, as reflectors sit close together."""

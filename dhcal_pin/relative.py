@@ -13,6 +13,7 @@ from . import se3
 from .chain import Chain, Sweep
 from .measurements import ANGLE_SIGMA, LENGTH_SIGMA, Noise, checked, checked_sigma, gathered, need
 from .poses import PoseReading, pose_columns, poses_of
+from .scratch import scratch
 from .se3 import Array
 
 _SHIFT, _TURN = ("dx", "dy", "dz"), ("drx", "dry", "drz")
@@ -74,53 +75,63 @@ class RelativePose(PoseReading):
         return np.concatenate([self.q, self.q_to])
 
     def _ends(self, sweep: Sweep) -> tuple[Array, Array]:
-        poses = sweep.poses()
-        return poses[: len(self.rows)], poses[len(self.rows) :]
+        """The tool's columns x, y, z, p at a and at b, (4, 3, m) each."""
+        m = len(self.rows)
+        return sweep.tool[..., :m], sweep.tool[..., m:]
 
     def _gap(self, sweep: Sweep) -> tuple[Array, Array]:
-        """Translation error (m, 3) in frame a, and E = R_modelᵀ·R_measured (m, 3, 3) in frame b."""
+        """Translation error (3, m) in frame a, and E = R_modelᵀ·R_measured (3, 3, m) in frame b."""
         first, second = self._ends(sweep)
-        model = se3.inverse(first) @ second
-        return (self.poses - model)[:, :3, 3], np.swapaxes(model[:, :3, :3], 1, 2) @ self.poses[:, :3, :3]
+        measured = self._measured
+        # R_bᵀ·R_a·R_measured: the rows are those of the model's rotation from a to b.
+        between = np.einsum("ikm,jkm->ijm", second[:3], first[:3])
+        turn = np.einsum("ijm,jkm->ikm", between, measured[:, :3])
+        return measured[:, 3] - np.einsum("ikm,km->im", first[:3], second[3] - first[3]), turn
 
     def residual(self, sweep: Sweep, u: Array) -> Array:
         """(6, m)."""
         shift, turn = self._gap(sweep)
-        return np.concatenate([shift.T / self.sigma.T, se3.log3(turn).T / self.rotation_sigma.T])
+        return np.concatenate([shift, se3.log3(turn.transpose(2, 0, 1)).T]) * self._weights
 
-    def _rates(self, sweep: Sweep, velocities: Array) -> tuple[Array, Array]:
-        """d(translation in a) (p, m, 3) and body rates of the model's rotation in frame b (p, m, 3)."""
+    def _rates(self, sweep: Sweep, velocities: Array, out: Array | None) -> Array:
+        """Rates (p, 6, m) of the translation in a and, as body rates, of the model's rotation in frame b."""
         first, second = self._ends(sweep)
         m = len(self.rows)
-        va, wa, vb, wb = (
-            velocities[:, rows, part].transpose(0, 2, 1)
-            for part in (slice(0, m), slice(m, 2 * m))
-            for rows in (slice(0, 3), slice(3, 6))
-        )
-        arm = second[:, :3, 3] - first[:, :3, 3]
-        shift = np.einsum("mji,pmj->pmi", first[:, :3, :3], vb - va - np.cross(wa, arm[None]))
-        return shift, np.einsum("mji,pmj->pmi", second[:, :3, :3], wb - wa)
+        out = np.empty((len(velocities), 6, m)) if out is None else out
+        rate = velocities[..., m:] - velocities[..., :m]
+        arm, product = second[3] - first[3], scratch("product", len(velocities), m)
+        for x, y, z in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            rate[:, x] -= np.multiply(velocities[:, 3 + y, :m], arm[z], out=product)
+            rate[:, x] += np.multiply(velocities[:, 3 + z, :m], arm[y], out=product)
+        for frame, part in ((first, slice(0, 3)), (second, slice(3, 6))):
+            np.einsum("pkm,ikm->pim", rate[:, part], frame[:3], out=out[:, part])
+        return out
 
-    def whiten(self, sweep: Sweep, velocities: Array, u: Array) -> Array:
-        """(p, 6, m); log3(exp(-ω)·E) = φ - Jl⁻¹(φ)·ω."""
-        shift, rate = self._rates(sweep, velocities)
-        left = np.swapaxes(se3.right_jacobian_inverse(se3.log3(self._gap(sweep)[1])), 1, 2)
-        turned = np.einsum("mij,pmj->pmi", left, rate)
-        return np.concatenate([shift / self.sigma, turned / self.rotation_sigma], -1).transpose(0, 2, 1)
+    def whiten(
+        self, sweep: Sweep, velocities: Array, u: Array, residual: Array, out: Array | None = None
+    ) -> Array:
+        """(p, 6, m); log3(exp(-ω)·E) = φ - Jl⁻¹(φ)·ω, Jl⁻¹ being the transpose of Jr⁻¹."""
+        out = self._rates(sweep, velocities, out)
+        right = se3.right_jacobian_inverse((residual[3:] / self._weights[3:]).T)
+        out[:, 3:] = np.einsum("pkm,mki->pim", out[:, 3:], right)
+        out *= self._weights
+        return out
 
-    def small_angle(self, sweep: Sweep, velocities: Array, u: Array) -> tuple[Array, Array]:
+    def small_angle(
+        self, sweep: Sweep, velocities: Array, u: Array, out: Array | None = None
+    ) -> tuple[Array, Array]:
         """The rotation as half the vee of E - Eᵀ, and its derivative as the rate itself."""
         gap, turn = self._gap(sweep)
-        half = 0.5 * (turn - np.swapaxes(turn, 1, 2))
-        sine = np.stack([half[:, 2, 1], half[:, 0, 2], half[:, 1, 0]])
-        shift, rate = self._rates(sweep, velocities)
-        rows = np.concatenate([shift / self.sigma, rate / self.rotation_sigma], -1).transpose(0, 2, 1)
-        return np.concatenate([gap.T / self.sigma.T, sine / self.rotation_sigma.T]), rows
+        half = 0.5 * (turn - np.swapaxes(turn, 0, 1))
+        sine = np.stack([half[2, 1], half[0, 2], half[1, 0]])
+        rows = self._rates(sweep, velocities, out)
+        rows *= self._weights
+        return np.concatenate([gap, sine]) * self._weights, rows
 
     def errors(self, sweep: Sweep, u: Array) -> dict[str, Array]:
         """{"position": (m, 3) in m, "orientation": (m, 3) in rad}."""
         shift, turn = self._gap(sweep)
-        return {"position": shift, "orientation": se3.log3(turn)}
+        return {"position": shift.T, "orientation": se3.log3(turn.transpose(2, 0, 1))}
 
     @classmethod
     def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> RelativePose:

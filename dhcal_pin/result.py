@@ -15,8 +15,9 @@ from .chain import BASE, Chain
 from .evaluation import Comparison, accuracy
 from .measurements import Measurement, Unknown
 from .parameters import ErrorModel, Parameter
+from .problem import Problem, reduce
 from .se3 import Array
-from .solver import Problem, Solution, posterior_root, pseudo_inverse, reduce, with_priors
+from .solver import Solution, posterior_root, pseudo_inverse, with_priors
 from .tables import Estimate
 
 # A parameter, or a metre and a radian of the tool, with more than this share of itself unseen is unknown.

@@ -57,6 +57,15 @@ def read_table(path: PathLike) -> DHTable:
     return read_dh(path) if is_dh(path) else read_ur_kinematics(path)
 
 
+def paper_file(name: str) -> Path:
+    """A file that ships with the package, such as the paper's tables, installed or in the source tree."""
+    here = Path(__file__).resolve().parent
+    for folder in (here / "paper", here.parent / "urdf"):
+        if (folder / name).exists():
+            return folder / name
+    raise DhcalError(f"{name}: no such file, nor one that ships with dhcal-pin; check its name")
+
+
 def read_robot(path: PathLike, tip: str | None = None, sidecar: PathLike | None = None) -> Chain:
     """A chain from a URDF or a DH file, with base and tool of its sidecar where there is one.
 

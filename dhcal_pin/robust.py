@@ -63,6 +63,8 @@ def reweighted(
     chain: Chain, data: Sequence[Measurement], values: Sequence[Array], loss: str
 ) -> tuple[tuple[Measurement, ...], list[Array]]:
     """The data with every sample's sigmas widened as the loss wants, and the weights (m,) an item."""
+    if loss == "linear":
+        return tuple(data), [np.ones(len(item.rows)) for item in data]
     weights = [
         np.maximum(LOSSES[loss](scores(chain, item, u)), _LEAST) for item, u in zip(data, values, strict=True)
     ]

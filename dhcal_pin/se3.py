@@ -41,8 +41,12 @@ def translation(xyz: ArrayLike) -> Array:
 def inverse(pose: ArrayLike) -> Array:
     """Inverse of rigid motions (..., 4, 4), by transposing the rotation."""
     pose = np.asarray(pose, float)
+    out = np.zeros(pose.shape)
     rotation = np.swapaxes(pose[..., :3, :3], -1, -2)
-    return transform(rotation, -(rotation @ pose[..., :3, 3:])[..., 0])
+    out[..., :3, :3] = rotation
+    out[..., :3, 3:] = -(rotation @ pose[..., :3, 3:])
+    out[..., 3, 3] = 1.0
+    return out
 
 
 def adjoint(pose: ArrayLike) -> Array:
@@ -55,7 +59,7 @@ def adjoint(pose: ArrayLike) -> Array:
     return out
 
 
-def _series(angle: Array) -> tuple[Array, Array, Array]:
+def series(angle: Array) -> tuple[Array, Array, Array]:
     """sin(t)/t, (1-cos t)/t², (t-sin t)/t³ of angles (...,) in radians, exact to rounding at any t."""
     half = np.sinc(angle / (2 * np.pi))
     small = np.abs(angle) < 0.1
@@ -72,59 +76,77 @@ def _series(angle: Array) -> tuple[Array, Array, Array]:
 def exp3(rotvec: ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians."""
     rotvec = np.asarray(rotvec, float)
-    first, second, _ = _series(np.linalg.norm(rotvec, axis=-1))
+    first, second, _ = series(np.linalg.norm(rotvec, axis=-1))
     k = skew(rotvec)
     return np.eye(3) + first[..., None, None] * k + second[..., None, None] * (k @ k)
 
 
 def log3(rotation: ArrayLike) -> Array:
-    """Rotation vectors (..., 3) in radians, of norm up to π, of rotations (..., 3, 3).
+    """Rotation vectors (..., 3) in radians, of norm up to π, of rotations (..., 3, 3), precise everywhere.
 
-    Goes through the unit quaternion with the largest component positive, which keeps full precision
-    near zero and near π.
+    Arrays with the samples last in memory, seen through a transpose, are the quickest, and the result is
+    such an array too.
     """
     r = np.asarray(rotation, float)
-    trace = r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2]
-    candidates = np.stack([trace, r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]], -1)
-    pick = np.argmax(candidates, -1)[..., None, None]
-    d = r - np.swapaxes(r, -1, -2)
-    vee = np.stack([d[..., 2, 1], d[..., 0, 2], d[..., 1, 0]], -1)
-    s = r + np.swapaxes(r, -1, -2)
-    # Rows of 4·q·qᵀ, [w, x, y, z]: any of them is proportional to q; the longest is the safest.
-    rows = np.empty((*r.shape[:-2], 4, 4))
-    rows[..., 0, 0] = 1 + trace
-    rows[..., 0, 1:] = rows[..., 1:, 0] = vee
-    rows[..., 1:, 1:] = s
+    out = np.empty((3, *r.shape[:-2]))
+    for i, (j, k) in enumerate(((2, 1), (0, 2), (1, 0))):
+        np.subtract(r[..., j, k], r[..., k, j], out=out[i, ...])
+    # Twice the angle's sine and cosine; the sine alone is blind near π, the cosine near 0.
+    sine = np.sqrt(np.maximum(np.einsum("i...,i...->...", out, out), 1e-300))
+    cosine = r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2] - 1
+    out *= np.arctan2(sine, cosine) / sine
+    back = cosine < -1.8
+    if np.any(back):
+        out[:, back] = _log3_near_half_turn(r[back]).T
+    return out.transpose(*range(1, out.ndim), 0)
+
+
+def _log3_near_half_turn(r: Array) -> Array:
+    """Rotation vectors (m, 3) of rotations (m, 3, 3) by an obtuse angle, through the unit quaternion.
+
+    Rows of 4·q·qᵀ, [w, x, y, z], are all proportional to q; that of the largest component is the safest.
+    """
+    m, trace = len(r), np.trace(r, axis1=1, axis2=2)
+    rows = np.empty((m, 3, 4))
+    rows[:, :, 0] = np.stack([r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]], -1)
+    rows[:, :, 1:] = r + np.swapaxes(r, 1, 2)
     for i in range(3):
-        rows[..., i + 1, i + 1] = 1 - trace + 2 * r[..., i, i]
-    q = np.take_along_axis(rows, pick, -2)[..., 0, :]
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    q = np.where(q[..., :1] < 0, -q, q)
-    sine = np.linalg.norm(q[..., 1:], axis=-1)
-    angle = 2 * np.arctan2(sine, q[..., 0])
-    scale = np.where(sine > 1e-12, angle / np.where(sine > 1e-12, sine, 1.0), 2.0)
-    return q[..., 1:] * scale[..., None]
+        rows[:, i, i + 1] = 1 - trace + 2 * r[:, i, i]
+    q = rows[np.arange(m), np.argmax(np.stack([r[:, i, i] for i in range(3)], -1), 1)]
+    q *= np.where(q[:, :1] < 0, -1.0, 1.0)
+    sine = np.linalg.norm(q[:, 1:], axis=1)
+    return q[:, 1:] * (2 * np.arctan2(sine, q[:, 0]) / sine)[:, None]
 
 
 def right_jacobian_inverse(rotvec: ArrayLike) -> Array:
-    """Jr⁻¹ (..., 3, 3): log3(R·exp3(δ)) = φ + Jr⁻¹(φ)·δ to first order, φ = rotvec (..., 3)."""
+    """Jr⁻¹ (..., 3, 3): log3(R·exp3(δ)) = φ + Jr⁻¹(φ)·δ to first order, φ = rotvec (..., 3).
+
+    The result has the samples last in memory.
+    """
     rotvec = np.asarray(rotvec, float)
-    t2 = np.sum(rotvec**2, -1)
-    small = t2 < 1e-3
-    safe = np.where(small, 1.0, t2)
-    angle = np.sqrt(safe)
-    factor = np.where(
-        small, 1 / 12 + t2 / 720 + t2**2 / 30240, 1 / safe - 0.5 / (angle * np.tan(0.5 * angle))
-    )
-    k = skew(rotvec)
-    return np.eye(3) + 0.5 * k + factor[..., None, None] * (k @ k)
+    v = rotvec.transpose(-1, *range(rotvec.ndim - 1))
+    t2 = np.einsum("i...,i...->...", v, v)
+    factor = np.array(1 / 12 + t2 * (1 / 720 + t2 / 30240))
+    large = t2 >= 1e-3
+    if np.any(large):
+        square = t2[large]
+        angle = np.sqrt(square)
+        factor[large] = 1 / square - 0.5 / (angle * np.tan(0.5 * angle))
+    # I + ½[φ]× + f·[φ]×², with [φ]×² = φφᵀ - |φ|²·I.
+    out = (factor * v) * v[:, None]
+    half, diagonal = 0.5 * v, 1 - factor * t2
+    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
+        out[i, i] += diagonal
+        out[k, j] += half[i]
+        out[j, k] -= half[i]
+    return out.transpose(*range(2, out.ndim), 0, 1)
 
 
 def exp6(twist: ArrayLike) -> Array:
     """Rigid motions (..., 4, 4) of twists [v, ω] (..., 6)."""
     twist = np.asarray(twist, float)
     v, w = twist[..., :3], twist[..., 3:]
-    _, second, third = _series(np.linalg.norm(w, axis=-1))
+    _, second, third = series(np.linalg.norm(w, axis=-1))
     k = skew(w)
     left = np.eye(3) + second[..., None, None] * k + third[..., None, None] * (k @ k)
     return transform(exp3(w), (left @ v[..., None])[..., 0])

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import webbrowser
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.progress import Progress as Bar
 from rich.table import Table as Grid
 from rich.text import Text
 
@@ -58,6 +59,15 @@ def progress(title: str) -> Iterator[Progress | None]:
         return
     with console.status(title) as status:
         yield lambda iteration, cost: status.update(f"{title}: iteration {iteration}, cost {cost:.6g}")
+
+
+@contextmanager
+def counted(title: str, total: int, done: int = 0) -> Iterator[Callable[[int], None]]:
+    """A bar for so many pieces of work, told how many are done; nothing where it is no terminal."""
+    console = _console()
+    with Bar(console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task(title, total=total, completed=done)
+        yield lambda count: bar.update(task, completed=count)
 
 
 def findings(path: str, found: Sequence[Finding]) -> None:

@@ -15,7 +15,7 @@ from dhcal_pin.measurements import Noise
 from dhcal_pin.parameters import select
 from dhcal_pin.poses import Pose
 from dhcal_pin.positions import Position
-from dhcal_pin.solver import CHUNK, Problem, reduce
+from dhcal_pin.problem import CHUNK, Problem, reduce
 
 NONE = np.empty(0)
 
@@ -180,7 +180,8 @@ def test_chunks_do_not_change_the_answer(sim_6dof_actual):
     found = reduce(Problem(errors, (data,), zero), zero, False)
     chain, bodies, twists = errors.derivative(zero)
     sweep = chain.sweep(q)
-    rows = data.whiten(sweep, chain.tool_velocities(sweep, bodies, twists), NONE).reshape(24, -1)
+    velocities = chain.tool_velocities(sweep, bodies, twists)
+    rows = data.whiten(sweep, velocities, NONE, data.residual(sweep, NONE)).reshape(24, -1)
     r = np.linalg.qr(rows.T, mode="r")
     np.testing.assert_allclose(np.abs(found.r), np.abs(r), atol=1e-9 * np.abs(r).max())
     assert found.rest + found.z @ found.z == pytest.approx(np.sum(data.residual(sweep, NONE) ** 2), rel=1e-12)

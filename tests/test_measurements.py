@@ -45,8 +45,9 @@ def derivatives_hold(kind, sim_6dof_actual, seeds):
         x = x + 0.2 * rng.normal(size=len(x))
         chain, bodies, twists = errors.derivative(x)
         sweep = chain.sweep(data.configurations())
-        rows = data.whiten(sweep, chain.tool_velocities(sweep, bodies, twists), u)
-        assert rows.shape == (len(x), *data.residual(sweep, u).shape)
+        residual = data.residual(sweep, u)
+        rows = data.whiten(sweep, chain.tool_velocities(sweep, bodies, twists), u, residual)
+        assert rows.shape == (len(x), *residual.shape)
         bound = 1e-6 * max(1.0, np.abs(rows).max())
         for k in range(len(x)):
             step = h * np.eye(len(x))[k]

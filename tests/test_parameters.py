@@ -15,7 +15,7 @@ from dhcal_pin.measurements import Noise
 from dhcal_pin.parameters import SETS, select
 from dhcal_pin.poses import Pose
 from dhcal_pin.positions import Position
-from dhcal_pin.solver import Problem, reduce
+from dhcal_pin.problem import Problem, reduce
 
 
 def rank(chain: Chain, sets: str, kind=Pose, m: int = 60) -> int:

@@ -19,8 +19,8 @@ from dhcal_pin.errors import DhcalError
 from dhcal_pin.measurements import Noise
 from dhcal_pin.parameters import SETS, extract, select
 from dhcal_pin.poses import Pose
+from dhcal_pin.problem import Problem, reduce
 from dhcal_pin.robot_files import read_robot, write_urdf
-from dhcal_pin.solver import Problem, reduce
 from dhcal_pin.urdf import read_urdf
 
 ARMS = {

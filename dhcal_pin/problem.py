@@ -1,0 +1,229 @@
+"""Least squares problems as chunks of whitened rows [J | r], reduced to one small triangle.
+
+A chunk's rows become their triangle by QR wherever the chunk is, and triangles merge in any order, so
+memory does not grow with the samples. Nothing here knows a kind of measurement or a set by name.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+
+import numpy as np
+from scipy.linalg import lapack
+
+from .chain import Chain, Motion, Sweep
+from .measurements import Measurement, Unknown
+from .parameters import ErrorModel
+from .scratch import LongRows, scratch
+from .se3 import Array
+
+# Samples a chunk, and columns that LAPACK reduces at once.
+CHUNK, PANEL = 2000, 8
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is unknown and what was measured.
+
+    The unknowns x are the p errors of the robot, then the s unknowns of the instruments as differences
+    from where they start; instruments share what they name alike.
+
+    Attributes:
+        errors: the nominal chain and its p errors.
+        data: measurements, any mixture of kinds.
+        weights: (p+s,) one over the prior's sigma; zero where there is none.
+        known: values of instruments' unknowns, by name, that are no unknowns here.
+    """
+
+    errors: ErrorModel
+    data: tuple[Measurement, ...]
+    weights: Array
+    known: Mapping[str, float] = field(default_factory=dict)
+
+    @cached_property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        """The instruments' s unknowns, each once."""
+        return tuple(u for u in shared_unknowns(self.data) if u.name not in self.known)
+
+    def instruments(self, x: Array) -> dict[str, float]:
+        """The values of all the instruments' unknowns at x, by name."""
+        found = x[len(self.errors.parameters) :]
+        return {u.name: u.nominal + float(v) for u, v in zip(self.unknowns, found, strict=True)} | dict(
+            self.known
+        )
+
+    def values(self, item: Measurement, x: Array) -> Array:
+        """The values u of a measurement's unknowns at x."""
+        every = self.instruments(x)
+        return np.array([every[unknown.name] for unknown in item.unknowns])
+
+    def tangent(self, x: Array) -> Tangent:
+        """The model at x (p+s,), ready for any chunk of data."""
+        robot = len(self.errors.parameters)
+        places = {unknown.name: robot + i for i, unknown in enumerate(self.unknowns)}
+        return Tangent(*self.errors.derivative(x[:robot]), self.instruments(x), places)
+
+    @cached_property
+    def chunks(self) -> tuple[Chunk, ...]:
+        """The data in pieces of at most CHUNK samples."""
+        return tuple(
+            Chunk(item.take(np.s_[start : start + CHUNK]), self.errors.chain)
+            for item in self.data
+            for start in range(0, len(item.rows), CHUNK)
+        )
+
+    def held(self, weights: Array) -> Problem:
+        """The same data with other priors."""
+        out = replace(self, weights=weights)
+        vars(out)["chunks"] = self.chunks
+        return out
+
+    def cost(self, x: Array) -> float:
+        """Sum of squared whitened residuals and priors at x (p,)."""
+        chain = self.errors.at(x[: len(self.errors.parameters)])
+        every = self.instruments(x)
+        total = float(np.sum((self.weights * x) ** 2))
+        for chunk in self.chunks:
+            residual = chunk.data.residual(chunk.sweep(chain), chunk.unknowns(every))
+            total += float(np.sum(residual * residual))
+        return total
+
+
+@dataclass(frozen=True, eq=False)
+class Chunk:
+    """Some samples of one measurement, and their joints' motion, which every x shares.
+
+    Attributes:
+        data: the samples.
+        nominal: the chain that they belong to; errors of it do not matter here.
+    """
+
+    data: Measurement
+    nominal: Chain
+
+    @cached_property
+    def motion(self) -> Motion:
+        """Of the samples' configurations."""
+        return self.nominal.motion(self.data.configurations())
+
+    def sweep(self, chain: Chain) -> Sweep:
+        """A chain's frames at the samples, in memory that the next chunk's overwrite."""
+        k, m = self.motion.values.shape
+        return chain.sweep(self.motion, scratch("sweep", k + 2, 4, 3, m))
+
+    def unknowns(self, instruments: Mapping[str, float]) -> Array:
+        """The values u of the measurement's unknowns among all the instruments'."""
+        return np.array([instruments[unknown.name] for unknown in self.data.unknowns])
+
+
+@dataclass(frozen=True, eq=False)
+class Tangent:
+    """A problem's model at one x. It holds no data, so it goes to wherever a chunk of them is.
+
+    Attributes:
+        chain: with its errors at x.
+        bodies, twists: (e,), (e, 6): what each of the e errors moves, as `Chain.tool_velocities` takes it.
+        instruments: values of all the instruments' unknowns by name.
+        places: where those of them that are unknown here stand in x.
+    """
+
+    chain: Chain
+    bodies: Array
+    twists: Array
+    instruments: Mapping[str, float]
+    places: Mapping[str, int]
+
+    def triangle(self, chunk: Chunk, small_angle: bool) -> Array:
+        """Triangle (p+1, p+1) of a chunk's whitened rows [J | r]; exact or by the paper's rows."""
+        data, errors = chunk.data, len(self.bodies)
+        p = errors + len(self.places)
+        sweep, u = chunk.sweep(self.chain), chunk.unknowns(self.instruments)
+        with LongRows():
+            velocities = scratch("velocities", errors, 6, sweep.tool.shape[-1])
+            self.chain.tool_velocities(sweep, self.bodies, self.twists, velocities)
+            block = scratch("block", p + 1, data.size, len(data.rows))
+            if small_angle:
+                block[p] = data.small_angle(sweep, velocities, u, block[:errors])[0]
+            else:
+                block[p] = data.residual(sweep, u)
+                data.whiten(sweep, velocities, u, block[p], block[:errors])
+            block[errors:p] = 0.0
+            for unknown, rows in zip(data.unknowns, data.own(sweep, u), strict=True):
+                if unknown.name in self.places:
+                    block[self.places[unknown.name]] = rows
+        return qr(block.reshape(p + 1, -1))
+
+
+def shared_unknowns(data: Sequence[Measurement]) -> tuple[Unknown, ...]:
+    """The unknowns of several measurements, each once; a start that is NaN gives way to one that is not."""
+    found: dict[str, Unknown] = {}
+    for item in data:
+        for unknown in item.unknowns:
+            if unknown.name not in found or math.isnan(found[unknown.name].nominal):
+                found[unknown.name] = unknown
+    return tuple(
+        replace(unknown, nominal=0.0) if math.isnan(unknown.nominal) else unknown
+        for unknown in found.values()
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Triangle:
+    """QR of the whitened [J | r] at one x: ‖J·δ - r‖² = ‖R·δ - z‖² + rest.
+
+    Attributes:
+        r: (p, p) upper triangular, of the data alone.
+        z: (p,) right-hand side.
+        rest: the part of the cost that no step removes.
+    """
+
+    r: Array
+    z: Array
+    rest: float
+
+    @property
+    def cost(self) -> float:
+        """Sum of the squared rows, at no step."""
+        return self.rest + float(self.z @ self.z)
+
+
+def qr(rows: Array) -> Array:
+    """Upper triangle (c, c) of rows (c, k), a C-order array that LAPACK sees as (k, c) and overwrites."""
+    columns, count = rows.shape
+    out = np.zeros((columns, columns))
+    if count == 0:
+        return out
+    # Narrow panels: the block is tall and thin.
+    packed = lapack.dgeqrt(min(PANEL, columns, count), rows.T, overwrite_a=1)[0]
+    top = min(columns, count)
+    np.copyto(out[:top], packed[:top], where=_upper(columns)[:top])
+    return out
+
+
+@lru_cache(maxsize=64)
+def _upper(size: int) -> Array:
+    return np.triu(np.ones((size, size), bool))
+
+
+def merge(first: Array, second: Array) -> Array:
+    """The triangle (c, c) of the rows of two triangles (c, c), which may come from anywhere."""
+    return qr(np.concatenate([first, second]).T.copy())
+
+
+def reduce(problem: Problem, x: Array, small_angle: bool) -> Triangle:
+    """The data's triangle at x (p,), without the priors; exact or by the paper's rows."""
+    tangent = problem.tangent(x)
+    return finished((tangent.triangle(chunk, small_angle) for chunk in problem.chunks), len(x))
+
+
+def finished(triangles: Iterable[Array], p: int) -> Triangle:
+    """All chunks' triangles (p+1, p+1) in one; memory holds one of them and the one that comes next."""
+    merged = None
+    for triangle in triangles:
+        merged = triangle if merged is None else merge(merged, triangle)
+    if merged is None:
+        merged = np.zeros((p + 1, p + 1))
+    return Triangle(merged[:p, :p], merged[:p, p], float(merged[p, p] ** 2))

@@ -1,0 +1,100 @@
+"""`dhcal study`: a grid of simulated calibrations, shared out, resumed after a kill, as CSV and plot."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+from argparse import Namespace
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import fields
+from typing import Any, TextIO
+
+import numpy as np
+
+from . import terminal
+from .errors import DhcalError
+from .executors import workers
+from .files import read_text, save
+from .outputs import check_outputs
+from .robot_files import paper_file
+from .study import Setting, Study, read_study, run, table
+from .tables import Table
+
+
+def study(args: Namespace) -> int:
+    """Runs a study, or what is left of it."""
+    path = args.study if os.path.exists(args.study) else paper_file(f"{args.study}.study.toml")
+    journal = f"{args.output}.part"
+    check_outputs([args.output, journal], [os.fspath(path)])
+    wanted = read_study(path)
+    blocks = _resumed(journal, wanted)
+    total = len(wanted.tasks())
+    if blocks:
+        terminal.lines(f"{journal}: goes on after {len(blocks)} of {total} blocks")
+    with (
+        workers(args.jobs, args.scheduler) as where,
+        terminal.counted(wanted.title or "study", total, len(blocks)) as progress,
+        _opened(journal, wanted, blocks) as file,
+    ):
+        for block in run(wanted, len(blocks), where):
+            # One line a block and each at once, so that a kill costs no more than the blocks under way.
+            file.write(json.dumps(block) + "\n")
+            file.flush()
+            blocks.append(block)
+            progress(len(blocks))
+    header, rows = table(wanted, blocks)
+    save({args.output: _csv_text(header, rows)})
+    os.unlink(journal)
+    _shown(wanted, header, rows)
+    terminal.lines(f"wrote {args.output}")
+    return 0
+
+
+def _resumed(journal: str, wanted: Study) -> list[list[list[float]]]:
+    """The blocks that a run before this one finished."""
+    if not os.path.exists(journal):
+        return []
+    head, *lines = read_text(journal).split("\n")
+    if head != wanted.digest:
+        raise DhcalError(
+            f"{journal}: belongs to another study, or to other robots; finish that one, or remove the file"
+        )
+    blocks = []
+    # The last line is empty, or was cut by the kill.
+    with suppress(ValueError):
+        for line in lines[:-1]:
+            blocks.append(json.loads(line))
+    return blocks
+
+
+def _opened(journal: str, wanted: Study, blocks: Sequence[list[list[float]]]) -> TextIO:
+    """The journal with its whole lines, to be written on."""
+    save({journal: "".join(f"{line}\n" for line in (wanted.digest, *map(json.dumps, blocks)))})
+    return open(journal, "a", encoding="utf-8")
+
+
+def _csv_text(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(header)
+    # Numbers to the last digit; what a setting cannot tell stays empty.
+    writer.writerows([repr(cell) if isinstance(cell, float) else cell for cell in row] for row in rows)
+    return out.getvalue()
+
+
+def _shown(wanted: Study, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """The settings that differ, and the figures, in mm and degrees."""
+    count = len(fields(Setting))
+    varied = [i for i in range(count) if len({row[i] for row in rows}) > 1]
+    names = [name.replace("[m]", " mm").replace("[rad]", " °").replace("_", " ") for name in header]
+    scale = [1e3 if "[m]" in name else np.rad2deg(1.0) if "[rad]" in name else 1.0 for name in header]
+    told = [i for i in range(count + 1, len(header)) if any(row[i] is not None for row in rows)]
+    lines = [
+        [str(row[i]) for i in varied] + ["" if row[i] is None else f"{row[i] * scale[i]:.3g}" for i in told]
+        for row in rows
+    ]
+    title = f"{wanted.title or 'study'}: medians of {wanted.seeds} calibrations a line"
+    terminal.table(title, Table([names[i] for i in (*varied, *told)], lines, texts=len(varied)))

@@ -1,0 +1,94 @@
+"""Stacked triangles: what `solver` and `observability` do with one, for many problems at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .observability import RANK_CUT
+from .se3 import Array
+from .solver import RELATIVE_STEP, ROUNDING
+
+
+@dataclass(frozen=True, eq=False)
+class Triangles:
+    """`solver.Triangle` of b members: r (b, p, p), z (b, p), rest (b,)."""
+
+    r: Array
+    z: Array
+    rest: Array
+
+    @property
+    def cost(self) -> Array:
+        """Sums (b,) of the squared rows that they hold."""
+        return self.rest + np.sum(self.z**2, -1)
+
+    def take(self, members: Array) -> Triangles:
+        """Those of an index (j,)."""
+        return Triangles(self.r[members], self.z[members], self.rest[members])
+
+    def put(self, members: Array, other: Triangles) -> None:
+        """Writes other ones in their places."""
+        self.r[members], self.z[members], self.rest[members] = other.r, other.z, other.rest
+
+    def damped(self, damping: Array) -> Triangles:
+        """With rows of damping (b, p) below."""
+        b, p = self.z.shape
+        block = np.zeros((b, p + 1, 2 * p))
+        block[:, :p, :p], block[:, p, :p] = self.r.swapaxes(1, 2), self.z
+        block[:, np.arange(p), np.arange(p, 2 * p)] = damping
+        return triangles(block)
+
+    def step(self, least: Array | float = 0.0) -> Array:
+        """Shortest least-squares solutions (b, p), singular values cut as in `observability`.
+
+        Args:
+            least: what no singular value is below, (b,), as far as that is known.
+        """
+        p = self.z.shape[1]
+        size, out = _size(self.r), np.empty_like(self.z)
+        # A triangle's singular values go at least as low as its diagonal.
+        plain = np.flatnonzero(np.abs(np.diagonal(self.r, axis1=1, axis2=2)).min(1) > RANK_CUT * size)
+        # Some directions beside z show how near to singular it is; decompositions are for those that are.
+        probes = np.random.default_rng(0).standard_normal((p, 4))
+        probes /= np.linalg.norm(probes, axis=0)
+        sides = np.concatenate([self.z[plain, :, None], np.tile(probes, (len(plain), 1, 1))], 2)
+        found = np.linalg.solve(self.r[plain], sides)
+        condition = size[plain] * np.linalg.norm(found[..., 1:], axis=1).max(1)
+        good = (condition < 1e-3 / RANK_CUT) | (least > RANK_CUT * size)[plain]
+        out[plain[good]] = found[good, :, 0]
+        rest = np.setdiff1d(np.arange(len(out)), plain[good])
+        if rest.size:
+            u, s, vt = np.linalg.svd(self.r[rest])
+            kept = s > RANK_CUT * s[:, :1]
+            share = np.where(kept, 1 / np.where(kept, s, 1.0), 0.0)
+            along = share[..., None] * (u.swapaxes(1, 2) @ self.z[rest, :, None])
+            out[rest] = (vt.swapaxes(1, 2) @ along)[..., 0]
+        return out
+
+    def moved(self, step: Array) -> Array:
+        """R·step (b, p)."""
+        return (self.r @ step[..., None])[..., 0]
+
+    def settled(self, step: Array, cost: Array) -> Array:
+        """Whether a step (b, p) changes the whitened rows by nothing that matters, (b,)."""
+        change = np.linalg.norm(self.moved(step), axis=1)
+        return change <= RELATIVE_STEP * np.sqrt(cost) + self.rounding()
+
+    def rounding(self) -> Array:
+        """What the model's own rounding makes of the rows, (b,)."""
+        return ROUNDING * _size(self.r)
+
+
+def triangles(columns: Array) -> Triangles:
+    """QR of whitened rows [J | r], column by column: (b, p+1, k)."""
+    b, p, k = columns.shape[0], columns.shape[1] - 1, columns.shape[2]
+    if k <= p:
+        columns = np.concatenate([columns, np.zeros((b, p + 1, p + 1 - k))], 2)
+    full: Array = np.asarray(np.linalg.qr(columns.swapaxes(1, 2), mode="r"))
+    return Triangles(full[:, :p, :p], full[:, :p, p], full[:, p, p] ** 2)
+
+
+def _size(matrices: Array) -> Array:
+    return np.sqrt(np.einsum("bij,bij->b", matrices, matrices))

@@ -1,0 +1,95 @@
+"""A whole calibration against what people do otherwise, on the same data and the same cost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import pinocchio as pin
+from bench_common import Row, clocked, measured, robots
+from scipy.optimize import least_squares
+
+from dhcal_pin.calibration import calibrate
+from dhcal_pin.chain import Chain
+from dhcal_pin.parameters import ErrorModel
+from dhcal_pin.poses import Pose
+from dhcal_pin.problem import Problem
+
+NONE = np.empty(0)
+
+
+def by_pinocchio(errors: ErrorModel, data: Pose, weights: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """The whitened residuals and priors, Pinocchio called a sample at a time as peers do."""
+    model, frame = errors.chain.model.copy(), errors.chain.frame_id
+    scratch = model.createData()
+    rows = errors.chain.configurations(data.q)
+    seen = [pin.SE3(pose) for pose in data.poses]
+    joints = [model.getJointId(name) for name in errors.chain.moving]
+    sigmas = np.concatenate([data.sigma, data.rotation_sigma], 1)
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        chain = errors.at(x)
+        for joint, origin in zip(joints, chain.origins[:-1], strict=True):
+            model.jointPlacements[joint] = pin.SE3(origin)
+        model.frames[frame].placement = pin.SE3(chain.origins[-1])
+        base, tool = pin.SE3(chain.base), pin.SE3(chain.tool)
+        out = np.empty((len(rows), 6))
+        for i, row in enumerate(rows):
+            pin.forwardKinematics(model, scratch, row)
+            pose = base * pin.updateFramePlacement(model, scratch, frame) * tool
+            out[i, :3] = seen[i].translation - pose.translation
+            out[i, 3:] = pin.log3(seen[i].rotation @ pose.rotation.T)
+        return np.concatenate([(out / sigmas).ravel(), weights * x])
+
+    return residual
+
+
+def analytic(problem: Problem) -> tuple[Callable[..., np.ndarray], Callable[..., np.ndarray]]:
+    """The same residuals and their Jacobian by our kernel, all samples at once."""
+    errors, (data,) = problem.errors, problem.data
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        rows = data.residual(errors.at(x).sweep(data.q), NONE)
+        return np.concatenate([rows.ravel(), problem.weights * x])
+
+    def jacobian(x: np.ndarray) -> np.ndarray:
+        chain, bodies, twists = errors.derivative(x)
+        sweep = chain.sweep(data.q)
+        velocities = chain.tool_velocities(sweep, bodies, twists)
+        rows = data.whiten(sweep, velocities, NONE, data.residual(sweep, NONE)).reshape(len(x), -1)
+        return np.concatenate([-rows.T, np.diag(problem.weights)])
+
+    return residual, jacobian
+
+
+def cases(m: int) -> list[tuple[str, Chain, str, Pose]]:
+    """The arms with data of their own, the second in a frame that nobody gave."""
+    return [(name, chain, sets, measured(chain, sets, m)[2]) for name, (chain, sets) in robots().items()]
+
+
+def against_scipy(m: int, repeats: int) -> list[Row]:
+    """Scipy's least_squares from the same start, by differences through Pinocchio and by our Jacobian."""
+    out = []
+    for name, chain, sets, data in cases(m):
+        fit = calibrate(chain, data, sets)
+        # The rivals are given the placed frames for nothing, and the priors that the fit ended with.
+        problem = fit.problem
+        slow = by_pinocchio(problem.errors, data, problem.weights)
+        residual, jacobian = analytic(problem)
+        start = np.zeros(len(fit.x))
+        found: dict[str, np.ndarray] = {}
+
+        def scipy(way: str, *functions: Callable, start=start, found=found) -> None:
+            found[way] = least_squares(functions[0], start, *functions[1:], x_scale="jac").x
+
+        mine = partial(calibrate, chain, data, sets)
+        for way, functions, times, wanted in (
+            ("differences through Pinocchio", (slow,), repeats, "≥ 80"),
+            ("our Jacobian", (residual, jacobian), 5 * repeats, "≥ 4"),
+        ):
+            ours, theirs = clocked([mine, partial(scipy, way, *functions)], times)
+            out.append(Row(f"scipy with {way}, {name}, m={m}", ours, theirs, theirs / ours, wanted))
+        reached = [float(np.sum(residual(x) ** 2)) for x in (fit.x, *found.values())]
+        assert reached[0] <= min(reached[1:]) * (1 + 1e-6), reached
+    return out

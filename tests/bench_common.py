@@ -1,0 +1,106 @@
+"""Robots, readings and clocks that the benchmarks share."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from conftest import paper, robot_file
+
+from dhcal_pin import se3
+from dhcal_pin.chain import Chain
+from dhcal_pin.dh import DHTable
+from dhcal_pin.measurements import Noise
+from dhcal_pin.parameters import ErrorModel, select
+from dhcal_pin.poses import Pose
+from dhcal_pin.problem import Problem
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of the table: what is compared, both times in seconds, and the ratio that is wanted."""
+
+    what: str
+    ours: float
+    theirs: float
+    ratio: float
+    wanted: str
+
+
+def clocked(ways: Sequence[Callable[[], object]], repeats: int, turn: float = 5e-3) -> list[float]:
+    """Median CPU seconds of each way, taken in turns so that the machine's moods hit all alike.
+
+    A turn lasts at least so many seconds: a loop finds its own data in the caches, not a rival's.
+    """
+    counts = []
+    for way in ways:
+        way()
+        start = time.process_time()
+        way()
+        counts.append(max(1, round(turn / max(time.process_time() - start, 1e-7))))
+    spent: list[list[float]] = [[] for _ in ways]
+    for _ in range(repeats):
+        for way, count, times in zip(ways, counts, spent, strict=True):
+            start = time.process_time()
+            for _ in range(count):
+                way()
+            times.append((time.process_time() - start) / count)
+    return [float(np.median(times)) for times in spent]
+
+
+def robots() -> dict[str, tuple[Chain, str]]:
+    """The paper's arm with DH errors, and a UR10 with the minimal set and both frames unknown."""
+    return {
+        "paper's 6-DOF, dh": (Chain.from_dh(paper("sim_6dof")), "dh"),
+        "UR10, minimal,base,tool": (
+            Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0"),
+            "minimal,base,tool",
+        ),
+    }
+
+
+def panda() -> Chain:
+    """Franka's arm, to its hand."""
+    return Chain.from_urdf(robot_file("panda_description/urdf/panda.urdf"), "panda_link8")
+
+
+def serial(joints: int) -> Chain:
+    """An arm of so many revolute joints, no two axes parallel."""
+    rng = np.random.default_rng(joints)
+    zero = np.zeros(joints)
+    table = DHTable(
+        "standard",
+        tuple(f"j{i + 1}" for i in range(joints)),
+        zero.astype(bool),
+        zero,
+        rng.uniform(0.1, 0.3, joints),
+        rng.uniform(0.1, 0.3, joints),
+        rng.choice([-1, 1], joints) * rng.uniform(0.5, 1.5, joints),
+        zero,
+        zero - np.pi,
+        zero + np.pi,
+    )
+    return Chain.from_dh(table)
+
+
+def measured(chain: Chain, sets: str, m: int, seed: int = 0) -> tuple[ErrorModel, np.ndarray, Pose]:
+    """An arm with errors of a millimetre and a milliradian in a frame of its own: model, truth, poses."""
+    rng = np.random.default_rng(seed)
+    errors = select(chain, sets)
+    truth = 1e-3 * rng.standard_normal(len(errors.parameters))
+    real = errors.at(truth)
+    if "base" in sets:
+        real = real.displaced({0: se3.exp6(np.array([0.4, -0.2, 0.1, 0.2, -0.3, 1.0]))})
+    q = rng.uniform(-2.5, 2.5, (m, chain.size))
+    return errors, truth, Pose.simulate(real, q, Noise(1e-4, 1e-4), rng)
+
+
+def problem(chain: Chain, sets: str, m: int) -> tuple[Problem, np.ndarray]:
+    """The calibration as the solver sees it, and the truth, near which an iteration is clocked."""
+    rng = np.random.default_rng(0)
+    errors = select(chain, sets)
+    truth = 1e-3 * rng.standard_normal(len(errors.parameters))
+    data = Pose.simulate(errors.at(truth), rng.uniform(-2.5, 2.5, (m, chain.size)), Noise(1e-4, 1e-4), rng)
+    return Problem(errors, (data,), 1 / errors.priors), truth
