@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from .errors import DhcalError as DhcalError
     from .evaluation import accuracy as accuracy
     from .factors import error_factors as error_factors
+    from .live import Live as Live
+    from .live import serve as serve
     from .measurement_files import read_measurements as read_measurements
     from .measurement_files import read_targets as read_targets
     from .measurements import Noise as Noise
@@ -52,6 +54,8 @@ _HOMES = {
     "DhcalError": "errors",
     "accuracy": "evaluation",
     "error_factors": "factors",
+    "Live": "live",
+    "serve": "live",
     "read_measurements": "measurement_files",
     "read_targets": "measurement_files",
     "Noise": "measurements",

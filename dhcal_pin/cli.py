@@ -198,6 +198,18 @@ def parser() -> argparse.ArgumentParser:
     view.add_argument(
         "--magnification", metavar="S", type=float, default=1.0, help="errors at first, 1 to 500 (1)"
     )
+    view.add_argument(
+        "--simplify",
+        metavar="N",
+        type=_count,
+        nargs="?",
+        default=60_000,
+        const=15_000,
+        help="most triangles that the meshes keep, for a smaller page (60000; 15000 without N)",
+    )
+    view.add_argument(
+        "--live", action="store_true", help="serve a moving scene on this computer instead, until Ctrl-C"
+    )
     view.add_argument("--tip", **_TIP)
 
     check = _add(

@@ -5,8 +5,6 @@ Wrong input is found before anything is written or shown; JSON goes to stdout, a
 
 from __future__ import annotations
 
-import os
-import tempfile
 from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
@@ -24,7 +22,7 @@ from . import (
     study_command,
     terminal,
     ur_kinematics,
-    viewer,
+    view_command,
 )
 from .calibrate_command import run_job
 from .check import crosscheck
@@ -36,7 +34,7 @@ from .files import parse_noise, save
 from .fleet import ENDING, is_fleet
 from .jobs import Job
 from .kinds import KINDS
-from .measurement_files import measurement_text, read_measurements, read_readings
+from .measurement_files import measurement_text, read_readings
 from .measurements import Noise
 from .outputs import STDOUT, check_outputs, check_urdf_ending, emit, sidecars
 from .parameters import extract
@@ -181,23 +179,6 @@ def _simulate(args: Namespace) -> int:
     return 0
 
 
-def _view(args: Namespace) -> int:
-    given = [args.nominal, *([args.calibrated] if args.calibrated else [])]
-    page = args.html or os.path.join(tempfile.mkdtemp(prefix="dhcal-"), f"{robot_name(args.nominal)}.html")
-    check_outputs([page], [*given, *sidecars(given), *args.data])
-    nominal, *calibrated = (read_robot(path, None if is_table(path) else args.tip) for path in given)
-    data = [read_measurements(path, nominal) for path in args.data]
-    title = " and ".join(robot_name(path) for path in given)
-    text = viewer.scene_html(
-        nominal, *calibrated, measurements=data, title=title, magnification=args.magnification
-    )
-    save({page: text})
-    terminal.lines(f"wrote {page}")
-    if args.open or not args.html:
-        terminal.open_page(page)
-    return 0
-
-
 def _demo(args: Namespace) -> int:
     check_outputs([args.json], [])
     document = demo.run(args.out)
@@ -212,7 +193,7 @@ COMMANDS: dict[str, Callable[[Namespace], int]] = {
     "calibrate": _calibrate,
     "validate": _validate,
     "convert": _convert,
-    "view": _view,
+    "view": view_command.view,
     "check": _check,
     "simulate": _simulate,
     "compensate": compensate_command.run,

@@ -56,6 +56,7 @@ class Touch(PointReading):
     names: tuple[str, ...] = ()
 
     kind: ClassVar[str] = "point"
+    touches: ClassVar[bool] = True
     groups: ClassVar[Mapping[str, slice]] = {"position": slice(0, 3)}
     columns: ClassVar[Mapping[str, str]] = {"point": "text", **dict.fromkeys(_SIGMAS, "length")}
     needs: ClassVar[tuple[frozenset[str], ...]] = (need("point"),)
@@ -196,6 +197,7 @@ class Plane(PointReading):
     axes: Array = field(default_factory=lambda: np.eye(3))
 
     kind: ClassVar[str] = "plane"
+    touches: ClassVar[bool] = True
     groups: ClassVar[Mapping[str, slice]] = {"height": slice(0, 1)}
     columns: ClassVar[Mapping[str, str]] = {"plane": "text", "sigma_plane": "length"}
     needs: ClassVar[tuple[frozenset[str], ...]] = (need("plane"),)
@@ -271,6 +273,7 @@ class Sphere(PointReading):
     name: str = "1"
 
     kind: ClassVar[str] = "sphere"
+    touches: ClassVar[bool] = True
     groups: ClassVar[Mapping[str, slice]] = {"radius": slice(0, 1)}
     columns: ClassVar[Mapping[str, str]] = {"sphere": "text", **lengths("radius")}
     needs: ClassVar[tuple[frozenset[str], ...]] = (need("sphere", "radius"),)

@@ -220,9 +220,7 @@ def run(out: PathLike) -> dict[str, Any]:
     rejected = [finding.row for finding in found.findings]
     document = report.document(found.fit, files, source.inputs, rejected) | {"experiment_m": found.figures}
     contents |= report_page.report_files(found.fit, [files["report"]], source)
-    contents[files["scene"]] = scene_html(
-        found.chain, found.fit.chain, measurements=[found.data], title="The paper's robot, before and after"
-    )
+    contents[files["scene"]] = scene_html(found.chain, found.fit, title="The paper's robot, before and after")
     contents[files["json"]] = report.json_text(document)
     contents[files["summary"]] = "\n\n".join(
         [

@@ -77,7 +77,7 @@ def short_names(paths: Sequence[PathLike]) -> dict[str, str]:
 
 # What the document says of accuracy and of a parameter; all that is known is under `comparisons`, `priors`.
 _ACCURACY = "position_rms_m position_max_m orientation_rms_rad residual_rms residual_max unit".split()
-_PARAMETER = "name unit nominal value std observability fixed".split()
+_PARAMETER = "name unit nominal value std observability remaining fixed".split()
 
 
 def _only(found: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
@@ -113,6 +113,8 @@ def document(
         "parameters": [_only(asdict(estimate), _PARAMETER) for estimate in fit.estimates],
         "priors": {estimate.name: estimate.prior for estimate in fit.estimates if not estimate.fixed},
         "unobservable": fit.unobservable,
+        "weakly_seen": fit.weakly_seen,
+        "observability_indices": fit.observability_indices,
         "outliers": list(outliers),
         "files": dict(files),
         "versions": versions(),
@@ -140,6 +142,8 @@ def plain_document(
         "holdout_after": {},
         "parameters": [],
         "unobservable": [],
+        "weakly_seen": [],
+        "observability_indices": {},
         "outliers": [],
         "files": {},
         "versions": versions(),

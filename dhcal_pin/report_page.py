@@ -215,9 +215,7 @@ def _scene(found: Study) -> str:
     fit = found.fit
     scene = viewer.scene_html(
         fit.reference,
-        fit.chain,
-        measurements=fit.data,
-        known=fit.instruments,
+        fit,
         title=found.robot,
         magnification=report_maps.magnification(found),
     )

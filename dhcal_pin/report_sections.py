@@ -226,7 +226,8 @@ def _seen(found: Study) -> Section:
     sentences = [text, also]
     if held := [e.name for e in fit.estimates if e.fixed]:
         sentences.append(f"Held at nominal, and so not judged: {', '.join(held)}.")
-    return Section("seen", "What could not be told apart", sentences, fit.unobservable)
+    items = [*fit.unobservable, *(f"weakly seen: {text}" for text in fit.weakly_seen)]
+    return Section("seen", "What could not be told apart", sentences, items)
 
 
 def _rows(found: Study) -> Section:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from . import observability, robust, se3, tables
+from . import explanations, observability, robust, se3, tables
 from .chain import BASE, Chain
 from .evaluation import Comparison, accuracy
 from .measurements import Measurement, Unknown
@@ -110,9 +110,38 @@ class Result:
         return observability.condition(self.solution.triangle.r)
 
     @property
+    def observability_indices(self) -> dict[str, float]:
+        """O1 to O5 of the samples, over the directions seen; see `observability.indices`."""
+        return observability.indices(self.solution.triangle.r, self.samples)
+
+    @cached_property
     def unobservable(self) -> list[str]:
-        """What the data cannot tell apart, one sentence a group."""
-        return observability.unobservable(self.solution.triangle.r, self.parameters)
+        """What the data cannot tell apart, why, and what would tell it; one sentence a group."""
+        return explanations.unobservable(self.problem, self.x, self.solution.triangle)
+
+    @cached_property
+    def weakly_seen(self) -> list[str]:
+        """What counts in the rank but is hardly better known than before the measurement."""
+        return explanations.weakly_seen(
+            self.problem, self.x, self.solution.triangle, self.expected, self._scale
+        )
+
+    @property
+    def expected(self) -> Array:
+        """Standard deviations (p,) expected before the measurement: the priors used, or usual ones."""
+        usual = np.array([parameter.prior for parameter in self.parameters])
+        weights = self.problem.weights
+        return np.where(weights > 0, 1 / np.where(weights > 0, weights, 1.0), usual)
+
+    @property
+    def remaining(self) -> Array:
+        """How much of each parameter's expected spread is left, (p,): 0 well known, 1 or more unknown."""
+        return self.std / self.expected
+
+    @property
+    def correlation(self) -> Array:
+        """Correlations (p, p) of x; NaN with what is unknown."""
+        return observability.correlation(self.covariance)
 
     @cached_property
     def freedom(self) -> float:
@@ -132,6 +161,14 @@ class Result:
         return float(np.sqrt(cost / self.freedom)) if self.freedom else float("nan")
 
     @cached_property
+    def _scale(self) -> float:
+        """The scatter of a whitened row that is believed; NaN where nothing tells it."""
+        if all(item.stated for item in self.data):
+            surprise = 1 + CONTRADICTION * np.sqrt(2 / self.freedom) if self.freedom else np.inf
+            return self.noise if self.noise**2 > surprise else 1.0
+        return self.noise
+
+    @cached_property
     def _root(self) -> tuple[Array, Array]:
         return posterior_root(self.solution.triangle, self.problem.weights)
 
@@ -139,10 +176,7 @@ class Result:
     def _spread(self) -> tuple[Array, Array]:
         """As `_root`, scaled by the scatter that was seen where no sigma or too small a one is stated."""
         root, hidden = self._root
-        if all(item.stated for item in self.data):
-            surprise = 1 + CONTRADICTION * np.sqrt(2 / self.freedom) if self.freedom else np.inf
-            return root * (self.noise if self.noise**2 > surprise else 1.0), hidden
-        return root * self.noise, hidden
+        return root * self._scale, hidden
 
     @cached_property
     def covariance(self) -> Array:
@@ -239,23 +273,18 @@ class Result:
         sixes = {at: np.append(pose[:3, 3], se3.log3(pose[:3, :3])) for at, pose in frames.items()}
         with np.errstate(divide="ignore"):
             priors = 1 / self.problem.weights
-        rows = [
-            (p, x, std, prior, seen, False)
-            for p, x, std, prior, seen in zip(
-                self.parameters, self.x, self.std, priors, self.seen, strict=True
-            )
-        ]
-        rows += [(p, 0.0, 0.0, 0.0, 0.0, True) for p in self.errors.fixed]
+        figures = np.stack([self.std, priors, self.seen, self.remaining], 1).tolist()
+        rows = [(p, x, row, False) for p, x, row in zip(self.parameters, self.x, figures, strict=True)]
+        rows += [(p, 0.0, [0.0] * 4, True) for p in self.errors.fixed]
         out = []
-        for p, x, std, prior, seen, held in rows:
+        for p, x, (std, prior, seen, left), held in rows:
             nominal, value, place = p.nominal, p.nominal + float(x), "instrument"
             if isinstance(p, Parameter):
                 place = "frame" if p.station in frames else "robot"
             if isinstance(p, Parameter) and place == "frame":
                 value = float(sixes[p.station] @ np.array(p.twist))
                 nominal = value if held else nominal
-            figures = (nominal, value, float(std), float(prior), float(seen))
-            out.append(Estimate(p.name, p.unit, *figures, held, place))
+            out.append(Estimate(p.name, p.unit, nominal, value, std, prior, seen, left, held, place))
         return tuple(out)
 
     def _repr_html_(self) -> str:

@@ -80,6 +80,7 @@ class Estimate:
         std: standard deviation, infinite where nothing tells.
         prior: standard deviation expected before any measurement, infinite without a prior.
         observability: how far the data see it, 0 to 1.
+        remaining: the share that std is of what was expected before the measurement.
         fixed: whether it was held.
         place: "robot", "frame" (base and tool) or "instrument".
     """
@@ -91,6 +92,7 @@ class Estimate:
     std: float
     prior: float
     observability: float
+    remaining: float
     fixed: bool
     place: str
 

@@ -123,6 +123,8 @@ def summary(fit: Result, files: Mapping[str, str]) -> None:
     )
     for text in fit.unobservable:
         lines(f"not observable: {text}", style="yellow")
+    for text in fit.weakly_seen:
+        lines(f"weakly seen: {text}", style="yellow")
     for name, path in files.items():
         lines(f"wrote {name}: {path}")
     lines("", headline(fit.comparisons).text, style="bold")
@@ -130,7 +132,11 @@ def summary(fit: Result, files: Mapping[str, str]) -> None:
 
 def open_page(path: str) -> None:
     """Shows a page in the browser, or says where it lies."""
-    url = Path(path).resolve().as_uri()
+    open_url(Path(path).resolve().as_uri())
+
+
+def open_url(url: str) -> None:
+    """Shows an address in the browser, or says it."""
     if not webbrowser.open(url):
         lines(f"no browser here; open {url}")
 
