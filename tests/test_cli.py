@@ -229,7 +229,7 @@ ARGUMENTS = {
         ["'tool'", "'tool0'"],
     ),
     "tip of a table": ([*CALIBRATE, "--tip", "tool0"], ["arm.dh.toml", "leave out --tip"]),
-    "unknown set": ([*CALIBRATE, "--parameters", "dh,gain"], ["'gain'", "dh, modified-dh"]),
+    "unknown set": ([*CALIBRATE, "--parameters", "dh,gains"], ["'gains'", "dh, modified-dh"]),
     "unknown to fix": ([*CALIBRATE, "--fix", "d9"], ["cannot fix 'd9'", "d1"]),
     "unknown to free": ([*CALIBRATE, "--free", "d9"], ["cannot free 'd9'", "d1"]),
     "all fixed": ([*CALIBRATE, "--fix", "dh"], ["fix fewer"]),
