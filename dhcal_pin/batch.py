@@ -200,20 +200,15 @@ class Solutions:
 
     @cached_property
     def covariance(self) -> Array:
-        """Covariances (b, p, p) of x as of `result.Result`: infinite where nothing tells, else NaN."""
-        p = self.x.shape[1]
-        stacked = np.concatenate(
-            [self.triangles.r, np.tile(np.diag(self.batch.weights), (len(self.x), 1, 1))], 1
-        )
-        _, s, vt = np.linalg.svd(np.linalg.qr(stacked, mode="r"))
+        """Covariances (b, p, p) of x, sigmas believed; infinite on the diagonal where nothing tells."""
+        b, p = self.x.shape
+        priors = np.tile(np.diag(self.batch.weights), (b, 1, 1))
+        _, s, vt = np.linalg.svd(np.linalg.qr(np.concatenate([self.triangles.r, priors], 1), mode="r"))
         kept = s > observability.RANK_CUT * s[:, :1]
         half = np.where(kept, 1 / np.where(kept, s, 1.0), 0.0)[..., None] * vt
-        freedom = self.batch.rows() - self.rank
-        with np.errstate(divide="ignore", invalid="ignore"):
-            noise = np.where(freedom > 0, self.cost / freedom, np.nan)
-        out = noise[:, None, None] * (half.swapaxes(1, 2) @ half)
+        out = half.swapaxes(1, 2) @ half
         lost = 1 - np.sum(np.where(kept[..., None], vt, 0.0) ** 2, 1) > 1e-6
-        out[lost[:, :, None] & lost[:, None, :] & np.eye(p, dtype=bool)] = np.inf
+        out[lost[:, :, None] & np.eye(p, dtype=bool)] = np.inf
         return out
 
 

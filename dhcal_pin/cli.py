@@ -138,6 +138,7 @@ def parser() -> argparse.ArgumentParser:
         "--tool-frame", metavar="NAME", help="put the tool into the URDF, as a link fixed to the tip"
     )
     calibrate.add_argument("--json", **_JSON)
+    _add_where(calibrate)
 
     validate = _add(
         commands,

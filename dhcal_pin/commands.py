@@ -19,6 +19,7 @@ from .check import crosscheck
 from .dh_files import dh_text, is_dh
 from .dh_urdf import dh_to_urdf
 from .errors import DhcalError
+from .executors import workers
 from .files import PathLike, parse_noise, save
 from .kinds import KINDS
 from .measurement_files import measurement_text, read_measurements, read_readings
@@ -106,7 +107,7 @@ def _calibrate(args: Namespace) -> int:
     chain = read_robot(args.robot, args.tip)
     sets = args.parameters or chain.parameters
     data = _read_data(chain, args, held_file, known_frames=not {"base", "tool"} & set(names(sets)))
-    with terminal.progress("fitting") as progress:
+    with workers(args.jobs, args.scheduler) as where, terminal.progress("fitting") as progress:
         fit = calibration.calibrate(
             chain,
             list(data.fit.values()),
@@ -120,6 +121,7 @@ def _calibrate(args: Namespace) -> int:
             loss=args.loss,
             max_iterations=args.max_iterations,
             progress=progress,
+            where=where,
         )
     contents = _written(fit, args)
     files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))

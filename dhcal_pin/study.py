@@ -154,7 +154,7 @@ class Study:
 
 
 def read_study(path: PathLike) -> Study:
-    """A study's TOML file: `title`, `seeds`, and a table `[settings]` of `Setting`'s entries or lists of them.
+    """A study's TOML file: `title`, `seeds`, and `[settings]` with `Setting`'s entries or lists of them.
 
     Raises:
         DhcalError: an unknown key, a value that does not fit, a robot that cannot be read.

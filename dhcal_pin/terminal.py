@@ -62,7 +62,7 @@ def progress(title: str) -> Iterator[Progress | None]:
 
 @contextmanager
 def counted(title: str, total: int, done: int = 0) -> Iterator[Callable[[], None]]:
-    """A bar for so many pieces of work, with a function to call after each; nothing where it is no terminal."""
+    """A bar for so many pieces of work, and what to call after each; nothing where it is no terminal."""
     console = _console()
     with Bar(console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(title, total=total, completed=done)

@@ -35,7 +35,7 @@ LAYERS = (
     {"dh_files", "measurement_files", "ur_kinematics"},
     {"robot_files", "screening"},
     {"study"},
-    {"plausibility"},
+    {"plausibility", "stream"},
     {"exports"},
     {"report"},
     {"terminal"},
