@@ -12,6 +12,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .batch import Batch as Batch
+    from .batch import solve as solve
     from .calibration import calibrate as calibrate
     from .calibration import split as split
     from .chain import Chain as Chain
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from .measurement_files import read_measurements as read_measurements
     from .measurements import Noise as Noise
     from .parameters import extract as extract
+    from .parameters import select as select
     from .poses import Pose as Pose
     from .positions import Position as Position
     from .result import Prediction as Prediction
@@ -31,10 +34,14 @@ if TYPE_CHECKING:
     from .result import accuracy as accuracy
     from .robot_files import read_robot as read_robot
     from .robot_files import write_urdf as write_urdf
+    from .stream import calibrate_stream as calibrate_stream
+    from .stream import file_parts as file_parts
     from .viewer import scene_html as scene_html
     from .viewer import show as show
 
 _HOMES = {
+    "Batch": "batch",
+    "solve": "batch",
     "calibrate": "calibration",
     "split": "calibration",
     "Chain": "chain",
@@ -49,11 +56,14 @@ _HOMES = {
     "Pose": "poses",
     "Position": "positions",
     "extract": "parameters",
+    "select": "parameters",
     "Prediction": "result",
     "Result": "result",
     "accuracy": "result",
     "read_robot": "robot_files",
     "write_urdf": "robot_files",
+    "calibrate_stream": "stream",
+    "file_parts": "stream",
     "scene_html": "viewer",
     "show": "viewer",
 }

@@ -12,7 +12,8 @@ from typing import Any, TypeVar
 
 from .errors import DhcalError
 
-_Task, _Done = TypeVar("_Task"), TypeVar("_Done")
+_Task = TypeVar("_Task")
+_Done = TypeVar("_Done")
 
 
 @dataclass(frozen=True)

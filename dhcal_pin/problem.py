@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from typing import TypeVar
 
 import numpy as np
 from scipy.linalg import lapack
@@ -23,6 +24,7 @@ from .se3 import Array
 
 # Samples a chunk, and columns that LAPACK reduces at once.
 CHUNK, PANEL = 2000, 8
+_Found = TypeVar("_Found")
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from . import observability
-from .calibration import Priors, calibrate
+from .calibration import Method, Priors, calibrate
 from .chain import Chain
 from .errors import DhcalError
 from .executors import HERE, Workers
@@ -155,7 +155,7 @@ def calibrate_stream(
     parts: Callable[[], Iterable[Part]],
     parameters: str | Iterable[str] | None = None,
     *,
-    method: str = "lm",
+    method: Method = "lm",
     priors: Priors | None = None,
     fix: Sequence[str] = (),
     free: Sequence[str] = (),
@@ -173,8 +173,15 @@ def calibrate_stream(
         chain: the nominal robot.
         parts: gives the parts anew at each call, as `lambda: file_parts("laser.csv", chain)`; some thousand
             samples a part are best.
-        parameters, method, priors, fix, free, known, max_iterations, progress: as of `calibrate`.
+        parameters: sets of `parameters.SETS`; the chain's own default without it.
+        method: "lm", or "gn" for the paper's loop.
+        priors: "default", "none", or sigmas by name.
+        fix: parameters or sets held at nominal.
+        free: single parameters of any set added.
+        known: values in m and rad of the instrument's unknowns by name.
+        max_iterations: most steps of a loop.
         where: what parts are shared out to.
+        progress: called with the iteration and the cost.
 
     Raises:
         DhcalError: no part, an instrument with unknowns of its own, or what `calibrate` complains about.

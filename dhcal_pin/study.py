@@ -173,9 +173,10 @@ def read_study(path: PathLike) -> Study:
     for name in {name for setting in settings for name in (setting.robot, setting.truth) if name}:
         chains[name] = read_robot(_beside(name, path))
     cases = [Case(setting, chains[setting.robot], chains.get(setting.truth)) for setting in settings]
-    for case in {
-        (case.setting.robot, case.setting.truth, case.setting.kind): case for case in cases
-    }.values():
+    different = {
+        (s.robot, s.truth, s.kind, s.parameters, s.wrong): case for case in cases if (s := case.setting)
+    }
+    for case in different.values():
         _tried(case, where)
     digest = hashlib.sha256(repr((seeds, settings)).encode())
     for name in sorted(chains):
@@ -227,6 +228,7 @@ def _tried(case: Case, where: str) -> None:
     """Complains about what would only fail in the middle of the work."""
     setting, nominal = case.setting, case.nominal
     errors = select(nominal, setting.parameters)
+    select(nominal, setting.wrong)
     if case.truth is not None:
         Arms.of([errors, select(case.truth, setting.parameters)])
     q = configurations(nominal, 8, np.random.default_rng(0))
@@ -278,15 +280,13 @@ def calibrations(task: tuple[Case, int, int]) -> list[list[float]]:
         return Batch(Arms.of([errors] * count), (joined(items),), weights)
 
     batch = measured()
-    found = solve(
-        batch, setting.method, min(setting.iterations, 1) if setting.redrawn else setting.iterations
-    )
-    for _ in range(1, setting.iterations if setting.redrawn else 1):
+    most = min(setting.iterations, 1) if setting.redrawn else setting.iterations
+    found = solve(batch, setting.method, most)
+    for _ in range(most, setting.iterations if setting.redrawn else most):
         batch = measured()
         found = solve(batch, setting.method, 1, start=found.x)
-    tests = np.array(
-        [configurations(nominal, TESTS, np.random.default_rng(_TEST_SEED + seed)) for seed in seeds]
-    )
+    checks = [np.random.default_rng(_TEST_SEED + seed) for seed in seeds]
+    tests = np.array([configurations(nominal, TESTS, rng) for rng in checks])
     goal, start, end = (
         arms.sweep(tests[None]).tool.reshape(4, 3, count, TESTS)
         for arms in (truths, batch.arms, batch.arms.at(found.x))
