@@ -18,12 +18,17 @@ if TYPE_CHECKING:
     from .calibration import split as split
     from .chain import Chain as Chain
     from .check import crosscheck as crosscheck
+    from .compensation import Compensation as Compensation
+    from .compensation import compensate as compensate
     from .dh import DHTable as DHTable
     from .dh_files import read_dh as read_dh
     from .dh_urdf import dh_to_urdf as dh_to_urdf
     from .errors import DhcalError as DhcalError
     from .factors import error_factors as error_factors
+    from .live import Live as Live
+    from .live import serve as serve
     from .measurement_files import read_measurements as read_measurements
+    from .measurement_files import read_targets as read_targets
     from .measurements import Noise as Noise
     from .parameters import extract as extract
     from .parameters import select as select
@@ -46,12 +51,17 @@ _HOMES = {
     "split": "calibration",
     "Chain": "chain",
     "crosscheck": "check",
+    "Compensation": "compensation",
+    "compensate": "compensation",
     "DHTable": "dh",
     "read_dh": "dh_files",
     "dh_to_urdf": "dh_urdf",
     "DhcalError": "errors",
     "error_factors": "factors",
+    "Live": "live",
+    "serve": "live",
     "read_measurements": "measurement_files",
+    "read_targets": "measurement_files",
     "Noise": "measurements",
     "Pose": "poses",
     "Position": "positions",

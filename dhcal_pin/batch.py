@@ -219,7 +219,7 @@ def _gauss_newton(batch: Batch, x: Array, max_iterations: int) -> tuple[Array, A
     for done in range(1, max_iterations + 1):
         full = part.reduce(x[live], batch.weights, small_angle=True)
         step = full.step()
-        settled = full.settled(step, full.cost)
+        settled = full.settled(np.linalg.norm(full.moved(step), axis=1), full.cost)
         x[live] += step
         iterations[live], converged[live] = done, settled
         over = settled | ~(np.abs(x[live]).max(1) < RUNAWAY)
@@ -250,7 +250,7 @@ def _levenberg_marquardt(batch: Batch, x: Array, max_iterations: int) -> tuple[A
     x, iterations, converged = x.copy(), np.zeros(b, int), np.zeros(b, bool)
     every, scale = batch.reduce(x, batch.weights, small_angle=False), np.zeros((b, p))
     cost, damping, growth = every.cost, np.full(b, 1e-8), np.full(b, 2.0)
-    fresh = np.ones(b, bool)
+    fresh, last = np.ones(b, bool), np.zeros(b)
     if not max_iterations:
         return x, iterations, converged
     while live.size:
@@ -261,7 +261,9 @@ def _levenberg_marquardt(batch: Batch, x: Array, max_iterations: int) -> tuple[A
         floor = np.where(scale[live] > 0, scale[live], 1.0)
         least = np.sqrt(damping[live])[:, None] * floor
         step = free.damped(least).step(least.min(1))
-        settled = free.settled(step, before)
+        moved = free.moved(step)
+        change = np.linalg.norm(moved, axis=1)
+        settled = free.settled(change, before, last[live])
         there, trial = x[live] + step, np.empty(len(live))
         # A first try mostly holds, and its triangle, which the next step needs, tells its cost too.
         first = ~settled & fresh[live]
@@ -271,7 +273,7 @@ def _levenberg_marquardt(batch: Batch, x: Array, max_iterations: int) -> tuple[A
             trial[tried] = ahead.cost
         if others.size:
             trial[others] = part.take(others).cost(there[others])
-        expected = np.sum(free.z**2, -1) - np.sum((free.moved(step) - free.z) ** 2, -1)
+        expected = np.sum(free.z**2, -1) - np.sum((moved - free.z) ** 2, -1)
         gain = np.where(expected > 0, (before - trial) / np.where(expected > 0, expected, 1.0), 0.0)
         rounding, root = free.rounding(), np.sqrt(before)
         blur = (10 * rounding) ** 2 + 2 * rounding * root
@@ -280,7 +282,7 @@ def _levenberg_marquardt(batch: Batch, x: Array, max_iterations: int) -> tuple[A
         stuck = ~accepted & (settled | (damping[live] > 1e16))
         easier = np.where(trusted | (gain > 0.9), 1e-2, np.maximum(1e-3, 1 - (2 * gain - 1) ** 3))
         went, retry = live[accepted], live[~accepted]
-        x[went] = there[accepted]
+        x[went], last[went] = there[accepted], change[accepted]
         cost[went], growth[went] = trial[accepted], 2.0
         fresh[live] = accepted
         damping[went] = np.maximum(damping[went] * easier[accepted], 1e-16)

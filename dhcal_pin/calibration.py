@@ -141,16 +141,17 @@ def _scatter(
 def _widened(problem: Problem, solution: Solution, expected: Array) -> Array:
     """The weights (p+s,) of priors as wide as the errors that were found, never narrower than expected.
 
-    Lengths and angles of the links each have one scale, the one of greatest evidence (MacKay 1992):
-    the mean square of their errors over as many as the data and not the prior determine.
+    Errors of the links of one unit and one expected size have one scale, the one of greatest evidence
+    (MacKay 1992): the mean square of the errors over as many as the data and not the prior determine.
     """
     errors = problem.errors
     outside = (BASE, errors.chain.tool_station)
     root = posterior_root(solution.triangle, problem.weights)[0]
     told = 1 - np.sum((root * problem.weights[:, None]) ** 2, 1)
     weights = problem.weights.copy()
-    for unit in {p.unit for p in errors.parameters}:
-        family = [i for i, p in enumerate(errors.parameters) if p.unit == unit and p.station not in outside]
+    kinds = [(p.unit, expected[i]) for i, p in enumerate(errors.parameters)]
+    for kind in set(kinds):
+        family = [i for i, p in enumerate(errors.parameters) if kinds[i] == kind and p.station not in outside]
         if (count := told[family].sum()) > 1e-3:
             square = np.sum((solution.x[family] * expected[family]) ** 2) / count
             weights[family] = expected[family] / np.sqrt(max(1.0, square))

@@ -25,7 +25,7 @@ from . import se3
 from .dh import DHTable
 from .dh_urdf import dh_to_urdf
 from .errors import DhcalError
-from .scratch import long_rows, scratch
+from .scratch import LongRows, scratch
 from .se3 import Array
 from .urdf import Urdf, parse_urdf, read_urdf
 
@@ -252,7 +252,7 @@ class Chain:
         square = half * half
         return Motion(values, (1 - square) / (1 + square), 2 * half / (1 + square))
 
-    @long_rows()
+    @LongRows()
     def sweep(self, q: Array | Motion, out: Array | None = None) -> Sweep:
         """All frames at joint values q (m, n), or at a motion of this chain, vectorised over the samples.
 
@@ -309,7 +309,7 @@ class Chain:
         seen = se3.adjoint(frames if carry is None else frames @ carry)
         return bodies, (seen @ np.asarray(twists, float)[..., None])[..., 0]
 
-    @long_rows()
+    @LongRows()
     def tool_velocities(self, sweep: Sweep, bodies: Array, twists: Array, out: Array | None = None) -> Array:
         """The tool point's velocity (p, 6, m) per unit of each body twist, axes of the measuring frame.
 
@@ -321,8 +321,9 @@ class Chain:
         """
         m = sweep.tool.shape[-1]
         out = np.empty((len(bodies), 6, m)) if out is None else out
-        used, starts = np.unique(bodies, return_index=True)
-        groups = list(itertools.pairwise([*starts.tolist(), len(bodies)]))
+        counts = np.bincount(bodies, minlength=len(sweep.bodies))
+        used = np.flatnonzero(counts)
+        groups = list(itertools.pairwise([0, *np.cumsum(counts[used]).tolist()]))
         frames = sweep.bodies if len(used) == len(sweep.bodies) else sweep.bodies[used]
         for at in range(0, m, BLOCK):
             some = np.s_[..., at : at + BLOCK]

@@ -51,6 +51,7 @@ _DATA: dict[str, Any] = {"metavar": "DATA", "nargs": "+", "help": "measurement C
 _TIP: dict[str, Any] = {"metavar": "F", "help": "tip link of a URDF (default: the deepest leaf)"}
 _COLUMNS: dict[str, Any] = {"metavar": "MAP.toml", "help": "how to read files of another maker"}
 _JSON: dict[str, Any] = {"metavar": "FILE", "help": "the result as JSON; - for stdout"}
+_SCHEDULER: dict[str, Any] = {"metavar": "ADDRESS", "help": "a Dask cluster, as tcp://host:8786"}
 
 
 def _count(text: str) -> int:
@@ -95,9 +96,15 @@ def parser() -> argparse.ArgumentParser:
         "identify a robot's errors from measurements and write the corrected URDF",
         "dhcal calibrate ur10.urdf laser.csv --tip tool0 --holdout 0.3 -o ur10_calibrated.urdf",
     )
-    calibrate.add_argument("robot", **_ROBOT)
-    calibrate.add_argument("data", **_DATA)
-    calibrate.add_argument("-o", "--output", metavar="OUT.urdf", required=True, help="the corrected URDF")
+    calibrate.add_argument("robot", metavar="ROBOT", help=f"{_ROBOT['help']}; or a manifest, NAME.fleet.toml")
+    calibrate.add_argument("data", metavar="DATA", nargs="*", help=f"{_DATA['help']}; none with a manifest")
+    calibrate.add_argument(
+        "-o",
+        "--output",
+        metavar="OUT.urdf",
+        required=True,
+        help="the corrected URDF; a manifest's summary.csv",
+    )
     calibrate.add_argument("--tip", **_TIP)
     calibrate.add_argument("--columns", **_COLUMNS)
     calibrate.add_argument(
@@ -138,7 +145,11 @@ def parser() -> argparse.ArgumentParser:
         "--tool-frame", metavar="NAME", help="put the tool into the URDF, as a link fixed to the tip"
     )
     calibrate.add_argument("--json", **_JSON)
-    _add_where(calibrate)
+    where = calibrate.add_mutually_exclusive_group()
+    where.add_argument(
+        "--jobs", metavar="N", type=_count, help="processes (default: one, or one a processor for a manifest)"
+    )
+    where.add_argument("--scheduler", **_SCHEDULER)
 
     validate = _add(
         commands,
@@ -183,6 +194,18 @@ def parser() -> argparse.ArgumentParser:
     view.add_argument(
         "--magnification", metavar="S", type=float, default=1.0, help="errors at first, 1 to 500 (1)"
     )
+    view.add_argument(
+        "--simplify",
+        metavar="N",
+        type=_count,
+        nargs="?",
+        default=60_000,
+        const=15_000,
+        help="most triangles that the meshes keep, for a smaller page (60000; 15000 without N)",
+    )
+    view.add_argument(
+        "--live", action="store_true", help="serve a moving scene on this computer instead, until Ctrl-C"
+    )
     view.add_argument("--tip", **_TIP)
 
     check = _add(
@@ -212,6 +235,17 @@ def parser() -> argparse.ArgumentParser:
     simulate.add_argument("--tip", **_TIP)
     simulate.add_argument("--seed", metavar="N", type=_seed, default=0, help="of joint values and noise (0)")
 
+    compensate = _add(
+        commands,
+        "compensate",
+        "joint values, and corrected targets for a nominal controller, that land where asked",
+        "dhcal compensate ur10.urdf ur10_calibrated.urdf targets.csv --tip tool0 -o corrected.csv",
+    )
+    compensate.add_argument("nominal", metavar="NOMINAL.urdf", help="what the controller knows")
+    compensate.add_argument("calibrated", metavar="CALIBRATED.urdf", help="the same robot, calibrated")
+    compensate.add_argument("targets", metavar="targets.csv", help="positions or poses of the tool")
+    compensate.add_argument("-o", "--output", metavar="corrected.csv", required=True, help="a row a target")
+    compensate.add_argument("--tip", **_TIP)
     study = _add(
         commands,
         "study",
@@ -222,15 +256,10 @@ def parser() -> argparse.ArgumentParser:
         "study", metavar="STUDY.toml", help="the grid, or one that ships: figure3, figure4, ur10_poses"
     )
     study.add_argument("-o", "--output", metavar="results.csv", required=True, help="a line a setting")
-    _add_where(study)
-    return out
-
-
-def _add_where(command: argparse.ArgumentParser) -> None:
-    """Where the work is done."""
-    where = command.add_mutually_exclusive_group()
+    where = study.add_mutually_exclusive_group()
     where.add_argument("--jobs", metavar="N", type=_count, default=1, help="processes on this machine (1)")
-    where.add_argument("--scheduler", metavar="ADDRESS", help="a Dask cluster, as tcp://host:8786")
+    where.add_argument("--scheduler", **_SCHEDULER)
+    return out
 
 
 def main(argv: Sequence[str] | None = None) -> int:

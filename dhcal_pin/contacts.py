@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from .chain import Chain
 from .errors import DhcalError
-from .inverse import Gap, land, to_positions
+from .inverse import land, to_positions
 from .measurements import (
     LENGTH_SIGMA,
     PLACE_PRIOR,
@@ -56,6 +56,7 @@ class Touch(PointReading):
     names: tuple[str, ...] = ()
 
     kind: ClassVar[str] = "point"
+    touches: ClassVar[bool] = True
     groups: ClassVar[Mapping[str, slice]] = {"position": slice(0, 3)}
     columns: ClassVar[Mapping[str, str]] = {"point": "text", **dict.fromkeys(_SIGMAS, "length")}
     needs: ClassVar[tuple[frozenset[str], ...]] = (need("point"),)
@@ -105,7 +106,7 @@ class Touch(PointReading):
         at = chain.poses(q)[:4, :3, 3]
         label = np.arange(len(q)) % len(at)
         targets = at[label] + noise.position * rng.standard_normal((len(q), 3))
-        q = land(chain, lambda which: to_positions(targets[which]), q, rng)
+        q = land(chain, to_positions(targets), q, rng)
         return cls.of(q, [f"p{i + 1}" for i in label], noise.position or None)
 
 
@@ -196,6 +197,7 @@ class Plane(PointReading):
     axes: Array = field(default_factory=lambda: np.eye(3))
 
     kind: ClassVar[str] = "plane"
+    touches: ClassVar[bool] = True
     groups: ClassVar[Mapping[str, slice]] = {"height": slice(0, 1)}
     columns: ClassVar[Mapping[str, str]] = {"plane": "text", "sigma_plane": "length"}
     needs: ClassVar[tuple[frozenset[str], ...]] = (need("plane"),)
@@ -251,11 +253,9 @@ class Plane(PointReading):
         normal = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
         height = noise.position * rng.standard_normal(len(q))
 
-        def gap(which: Array) -> Gap:
-            return lambda points: (
-                ((points - middle) @ normal - height[which])[:, None],
-                np.broadcast_to(normal, (len(points), 1, 3)),
-            )
+        def gap(poses: Array, which: Array) -> tuple[Array, Array]:
+            wide = (poses[:, :3, 3] - middle) @ normal - height[which]
+            return wide[:, None], np.broadcast_to(normal, (len(poses), 1, 3))
 
         return cls.of(land(chain, gap, q, rng), noise.position or None)
 
@@ -273,6 +273,7 @@ class Sphere(PointReading):
     name: str = "1"
 
     kind: ClassVar[str] = "sphere"
+    touches: ClassVar[bool] = True
     groups: ClassVar[Mapping[str, slice]] = {"radius": slice(0, 1)}
     columns: ClassVar[Mapping[str, str]] = {"sphere": "text", **lengths("radius")}
     needs: ClassVar[tuple[frozenset[str], ...]] = (need("sphere", "radius"),)
@@ -318,12 +319,9 @@ class Sphere(PointReading):
         radius = 0.15
         length = radius + noise.position * rng.standard_normal(len(q))
 
-        def gap(which: Array) -> Gap:
-            def wide(points: Array) -> tuple[Array, Array]:
-                reach = points - centre
-                size = np.linalg.norm(reach, axis=1)
-                return (size - length[which])[:, None], (reach / np.maximum(size, 1e-12)[:, None])[:, None]
-
-            return wide
+        def gap(poses: Array, which: Array) -> tuple[Array, Array]:
+            reach = poses[:, :3, 3] - centre
+            size = np.linalg.norm(reach, axis=1)
+            return (size - length[which])[:, None], (reach / np.maximum(size, 1e-12)[:, None])[:, None]
 
         return cls.of(land(chain, gap, q, rng), radius, noise.position or None)

@@ -323,9 +323,7 @@ def run(out: PathLike) -> dict[str, Any]:
         },
         [finding.row for finding in found.findings],
     ) | {"experiment_m": found.figures}
-    contents[files["scene"]] = scene_html(
-        found.chain, found.fit.chain, measurements=[found.data], title="The paper's robot, before and after"
-    )
+    contents[files["scene"]] = scene_html(found.chain, found.fit, title="The paper's robot, before and after")
     contents[files["json"]] = report.json_text(document)
     contents[files["summary"]] = "\n\n".join(
         [

@@ -109,8 +109,9 @@ def read_text(path: PathLike, encoding: str = "utf-8") -> str:
 
 def read_toml(path: PathLike) -> dict:
     """A TOML file, or DhcalError."""
+    text = read_text(path)
     try:
-        return tomllib.loads(read_text(path))
+        return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # more than TOMLDecodeError: endless numbers and brackets
         raise DhcalError(f"{path}: not TOML: {error}; correct that line") from error
 

@@ -21,18 +21,19 @@ _TRIED = 4
 
 
 def nearest_rotation(matrix: Array) -> Array:
-    """The rotation (3, 3) nearest to a matrix (3, 3), such as a sum of rotations."""
+    """The rotations (..., 3, 3) nearest to matrices (..., 3, 3), such as sums of rotations."""
     u, _, vt = np.linalg.svd(matrix)
-    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    u[..., 2] *= np.linalg.det(u @ vt)[..., None]
+    return u @ vt
 
 
-def align(source: Array, target: Array) -> tuple[Array, float]:
-    """The rigid motion (4, 4) that carries points (m, 3) best onto others, and its RMS distance in m."""
-    centre, goal = source.mean(0), target.mean(0)
-    rotation = nearest_rotation((target - goal).T @ (source - centre))
-    motion = se3.transform(rotation, goal - rotation @ centre)
-    rest = source @ rotation.T + motion[:3, 3] - target
-    return motion, float(np.sqrt(np.mean(np.sum(rest**2, -1))))
+def align(source: Array, target: Array) -> tuple[Array, Array]:
+    """Rigid motions (..., 4, 4) that carry points (..., m, 3) best onto others (m, 3); RMS distances, m."""
+    centre, goal = source.mean(-2), target.mean(0)
+    rotation = nearest_rotation(np.swapaxes(target - goal, 0, 1) @ (source - centre[..., None, :]))
+    motion = se3.transform(rotation, goal - (rotation @ centre[..., None])[..., 0])
+    rest = source @ np.swapaxes(rotation, -1, -2) + motion[..., None, :3, 3] - target
+    return motion, np.sqrt(np.mean(np.sum(rest**2, -1), -1))
 
 
 def few(item: Measurement) -> Measurement:
@@ -62,9 +63,9 @@ def starts(chain: Chain, data: Sequence[Measurement], base: bool, tool: bool) ->
         steps = [0.0, -_REACH, _REACH]
         grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
         offsets = grid if tool else chain.tool[None, :3, 3]
-        fits = [align(tip[:, :3, 3] + tip[:, :3, :3] @ offset, seen) for offset in offsets]
-        order = np.argsort([rest for _, rest in fits], kind="stable")[:_TRIED]
-        best = [(fits[k][0], offsets[k]) for k in order]
+        points = tip[:, :3, 3] + (tip[:, :3, :3] @ offsets.T).transpose(2, 0, 1)
+        motions, rests = align(points, seen)
+        best = [(motions[k], offsets[k]) for k in np.argsort(rests, kind="stable")[:_TRIED]]
     out = []
     for motion, offset in best:
         turn = chain.tool[:3, :3]

@@ -17,6 +17,8 @@ from .errors import DhcalError
 from .files import LENGTHS, Column, PathLike, Sheet, read_sheet
 from .foreign_files import mapped_sheet
 from .measurements import Measurement
+from .poses import Pose
+from .positions import Position
 from .reading_columns import (
     AFTER,
     COMMANDED,
@@ -209,6 +211,48 @@ def read_measurements(path: PathLike, chain: Chain, columns: PathLike | None = N
         DhcalError: what is wrong, with file, line and column, and what would be right.
     """
     return read_readings(path, chain, columns).data
+
+
+@dataclass(frozen=True, eq=False)
+class Targets:
+    """Where a tool is wanted.
+
+    Attributes:
+        source: the file's name.
+        targets: (m, 3) positions in m, or (m, 4, 4) poses where the file has rotations.
+        near: (m, n) joint values of the file, near which solutions are wanted; None without them.
+        units: the unit that each column was written in.
+    """
+
+    source: str
+    targets: Array
+    near: Array | None
+    units: Mapping[str, str]
+
+
+def read_targets(path: PathLike, chain: Chain) -> Targets:
+    """Target positions or poses for a chain's tool: columns as in measurements, the joints' not needed.
+
+    Raises:
+        DhcalError: what is wrong, with file, line and column, and what would be right.
+    """
+    check_joint_names(chain)
+    sheet = read_sheet(path)
+    check_columns(sheet, chain)
+    kind = kind_of(sheet)
+    if kind not in (Pose, Position):
+        raise DhcalError(
+            f"{sheet.source}:{sheet.header}: these are readings of kind {kind.kind}; targets have "
+            "x[mm],y[mm],z[mm], with or without qw,qx,qy,qz or rx[rad],ry[rad],rz[rad]"
+        )
+    near = _joints(sheet, chain) if set(chain.joint_names) & set(sheet.columns) else None
+    nowhere = np.zeros((len(sheet.cells), chain.size))
+    try:
+        data = kind.from_columns([nowhere], _values(sheet, kind))
+    except DhcalError as error:
+        raise DhcalError(f"{sheet.source}: {error}") from None
+    targets = data.poses if isinstance(data, Pose) else data.positions()
+    return Targets(sheet.source, targets, near, {name: column.unit for name, column in sheet.columns.items()})
 
 
 def measurement_text(data: Measurement, chain: Chain, comments: Sequence[str] = ()) -> str:

@@ -66,6 +66,8 @@ class Measurement(Protocol):
     ends: ClassVar[int]
     # Fields with an entry a sample.
     per_row: ClassVar[tuple[str, ...]]
+    # Whether the tool must be on something for a sample; if not, any configuration can be measured.
+    touches: ClassVar[bool]
 
     @property
     def q(self) -> Array:
@@ -256,6 +258,7 @@ class PointReading:
     columns: ClassVar[Mapping[str, str]]
     needs: ClassVar[tuple[frozenset[str], ...]]
     ends: ClassVar[int] = 1
+    touches: ClassVar[bool] = False
     # Fields with an entry a sample.
     per_row: ClassVar[tuple[str, ...]] = ("q", "reading", "sigma", "rows")
 

@@ -1,4 +1,6 @@
-"""What the data see: rank, unseen directions and their words, all from the triangle of a QR.
+"""What the data see, in numbers: rank, unseen and weakly seen directions, observability indices.
+
+All of it comes from the triangle of a QR; the words are in `explanations`.
 
 The triangle is R of the QR of the whitened Jacobian, metres and radians in its columns. Nothing here
 forms JᵀJ: at condition 1e7 that is wrong in the third digit.
@@ -6,17 +8,15 @@ forms JᵀJ: at condition 1e7 that is wrong in the third digit.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from .measurements import Unknown
-from .parameters import Parameter
 from .se3 import Array
 
 # Singular values below this share of the largest are rounding. The paper's arms keep what they see
 # above 1e-4; a cut of 1e-3 or more would already block its loop.
 RANK_CUT = 1e-9
+# A direction is known by the data if they leave less than this share of what was expected before them.
+KNOWN_SHARE = 0.5
 
 
 def singular_values(triangle: Array) -> Array:
@@ -47,12 +47,73 @@ def seen_share(triangle: Array) -> Array:
     return np.clip(np.sum(row_space(triangle) ** 2, 0), 0.0, 1.0)
 
 
-def unseen_groups(triangle: Array) -> list[tuple[tuple[int, ...], int]]:
-    """Groups of parameters that cannot be told apart, each with its number of unseen directions."""
-    basis = row_space(triangle)
-    hidden = np.eye(triangle.shape[1]) - basis.T @ basis
-    linked = np.abs(hidden) > 1e-6
-    groups: list[tuple[tuple[int, ...], int]] = []
+def unseen(triangle: Array) -> Array:
+    """Orthonormal basis (p, d) of the directions in parameter space that the data do not see."""
+    return np.linalg.svd(triangle)[2][rank(triangle) :].T
+
+
+def indices(triangle: Array, samples: int) -> dict[str, float]:
+    """Observability indices O1 to O5 over the directions seen; the larger, the better; 0 if there is none.
+
+    With σ₁ ≥ … ≥ σ_L the singular values of the whitened Jacobian (metres and radians) and m samples:
+
+    * O1 = (σ₁…σ_L)^(1/L)/√m: Borm and Menq, Int. J. Robotics Research 10 (1991);
+    * O2 = σ_L/σ₁, the inverse condition: Driels and Pathre, J. Robotic Systems 7 (1990);
+    * O3 = σ_L: Nahvi, Hollerbach and Hayward, ICRA 1994;
+    * O4 = σ_L²/σ₁, noise amplification: Nahvi and Hollerbach, ICRA 1996;
+    * O5 = 1/(1/σ₁ + … + 1/σ_L): Sun and Hollerbach, ICRA 2008.
+
+    Args:
+        triangle: (p, p).
+        samples: m.
+    """
+    s = singular_values(triangle)[: rank(triangle)]
+    if not s.size:
+        return dict.fromkeys(("O1", "O2", "O3", "O4", "O5"), 0.0)
+    found = (
+        np.exp(np.mean(np.log(s))) / np.sqrt(samples),
+        s[-1] / s[0],
+        s[-1],
+        s[-1] ** 2 / s[0],
+        1 / np.sum(1 / s),
+    )
+    return {f"O{i + 1}": float(value) for i, value in enumerate(found)}
+
+
+def correlation(covariance: Array) -> Array:
+    """Correlations (p, p) of a covariance; NaN off the diagonal where a variance is not finite."""
+    std = np.sqrt(np.diag(covariance))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        out = np.clip(covariance / np.outer(std, std), -1.0, 1.0)
+    np.fill_diagonal(out, 1.0)
+    return out
+
+
+def weakly_seen(triangle: Array, expected: Array, noise: float) -> tuple[Array, Array]:
+    """Directions that count in the rank but of which the data tell next to nothing.
+
+    Each column of the triangle is scaled by what was expected of its parameter, so that metres and radians
+    compare. Of a direction with singular value s there, data of that noise leave 1/√(1 + (s/noise)²) of
+    what was expected before; `KNOWN_SHARE` of it or more is not knowledge. Directions not seen at all
+    are left out.
+
+    Args:
+        triangle: (p, p).
+        expected: (p,) standard deviations before any measurement, m and rad.
+        noise: standard deviation of the whitened residuals.
+
+    Returns:
+        The directions (p, w), each one expected standard deviation long, and the shares (w,) left.
+    """
+    _, s, vt = np.linalg.svd(triangle * expected)
+    left = 1 / np.hypot(1.0, s / noise)
+    weak = np.flatnonzero(left[: rank(triangle)] >= KNOWN_SHARE)
+    return expected[:, None] * vt[weak].T, left[weak]
+
+
+def clusters(linked: Array) -> list[tuple[int, ...]]:
+    """Those of p that link to themselves in a symmetric (p, p) table, put together where it links them."""
+    out: list[tuple[int, ...]] = []
     todo = set(np.flatnonzero(np.diag(linked)).tolist())
     while todo:
         group, edge = set[int](), {min(todo)}
@@ -60,24 +121,15 @@ def unseen_groups(triangle: Array) -> list[tuple[tuple[int, ...], int]]:
             group |= edge
             edge = {int(j) for i in edge for j in np.flatnonzero(linked[i])} - group
         todo -= group
-        members = tuple(sorted(group))
-        groups.append((members, round(float(np.trace(hidden[np.ix_(members, members)])))))
-    return groups
-
-
-def unobservable(triangle: Array, parameters: Sequence[Parameter | Unknown]) -> list[str]:
-    """One sentence a group of parameters that the data cannot tell apart; empty when all is seen."""
-    out = []
-    for members, unseen in unseen_groups(triangle):
-        names = [parameters[i].name for i in members]
-        if len(names) == 1:
-            out.append(f"{names[0]}: the measurements do not depend on it")
-            continue
-        listed = f"{', '.join(names[:-1])} and {names[-1]}"
-        if unseen == len(names):
-            out.append(f"{listed}: the measurements depend on none of them")
-        else:
-            seen = len(names) - unseen
-            only = "only one combination" if seen == 1 else f"only {seen} combinations"
-            out.append(f"{listed} move the measured point alike: {only} of the {len(names)} can be seen")
+        out.append(tuple(sorted(group)))
     return out
+
+
+def unseen_groups(triangle: Array) -> list[tuple[tuple[int, ...], int]]:
+    """Groups of parameters that cannot be told apart, each with its number of unseen directions."""
+    basis = row_space(triangle)
+    hidden = np.eye(triangle.shape[1]) - basis.T @ basis
+    return [
+        (members, round(float(np.trace(hidden[np.ix_(members, members)]))))
+        for members in clusters(np.abs(hidden) > 1e-6)
+    ]

@@ -27,6 +27,7 @@ LENGTH, ANGLE, OFFSET = 1e-3, 5e-3, np.deg2rad(2.0)
 WIDE_LENGTH, WIDE_ANGLE = 10.0, 10.0
 
 _AXES = np.eye(6)
+_IDENTITY = np.eye(4)
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,8 @@ def extract(chain: Chain, convention: Convention = "standard", hayati: bool = Fa
     )
 
 
-def _dh_rows(chain: Chain, convention: Convention, hayati: bool) -> list[Parameter]:
+@functools.lru_cache(maxsize=16)
+def _dh_rows(chain: Chain, convention: Convention, hayati: bool) -> tuple[Parameter, ...]:
     found = extract(chain, convention, hayati)
     table = found.table
     out = []
@@ -89,7 +91,7 @@ def _dh_rows(chain: Chain, convention: Convention, hayati: bool) -> list[Paramet
                 Parameter(f"beta{label}", "rad", float(table.beta[i]), lateral, tuple(sideways[:, 4]), ANGLE)
             )
         out += rows if convention == "standard" else rows[2:] + rows[:2]
-    return out
+    return tuple(out)
 
 
 def _parallel(chain: Chain, i: int, convention: Convention) -> bool:
@@ -100,12 +102,12 @@ def _parallel(chain: Chain, i: int, convention: Convention) -> bool:
 
 def dh(chain: Chain) -> list[Parameter]:
     """Standard DH, 4 a joint: θ, d, a, α of every row; the columns of the paper's R."""
-    return _dh_rows(chain, "standard", hayati=False)
+    return list(_dh_rows(chain, "standard", hayati=False))
 
 
 def modified_dh(chain: Chain) -> list[Parameter]:
     """Modified DH, 4 a joint: a, α of the link before each joint, then d, θ."""
-    return _dh_rows(chain, "modified", hayati=False)
+    return list(_dh_rows(chain, "modified", hayati=False))
 
 
 def hayati(chain: Chain) -> list[Parameter]:
@@ -276,6 +278,18 @@ class ErrorModel:
         return stations, group, np.arange(len(group)) - np.searchsorted(group, group)
 
     @cached_property
+    def _most(self) -> int:
+        """The most parameters at a station, at least one."""
+        return int(self._slots[2].max(initial=0)) + 1
+
+    @cached_property
+    def _left(self) -> Array:
+        """Which stations with unknowns are links', (g, 1, 1, 1)."""
+        stations = self._slots[0]
+        left = (stations % 2 == 1) & (stations != self.chain.tool_station)
+        return left[:, None, None, None]
+
+    @cached_property
     def _powers(self) -> tuple[Array, Array]:
         """Sizes of the rotations (p,), and the twists as matrices Ξ, Ξ²/|ω|², Ξ³/|ω|³ (p, 3, 16)."""
         twist = np.zeros((len(self._twists), 4, 4))
@@ -290,11 +304,13 @@ class ErrorModel:
         size, powers = self._powers
         angle = size * x
         # exp(xξ) = I + xΞ + (1 - cos)(Ξ/|ω|)² + (angle - sin)(Ξ/|ω|)³, and I + xΞ for a translation.
-        share = np.stack([x, 2 * np.sin(0.5 * angle) ** 2, angle - np.sin(angle)], 1)
-        motion = (share[:, None] @ powers).reshape(-1, 4, 4) + np.eye(4)
+        share = np.empty((len(x), 1, 3))
+        share[:, 0, 0], share[:, 0, 1] = x, 2 * np.sin(0.5 * angle) ** 2
+        share[:, 0, 2] = angle - np.sin(angle)
+        motion = (share @ powers).reshape(-1, 4, 4) + _IDENTITY
         stations, group, place = self._slots
-        out = np.empty((len(stations), int(place.max(initial=0)) + 1, 4, 4))
-        out[:] = np.eye(4)
+        out = np.empty((len(stations), self._most, 4, 4))
+        out[:] = _IDENTITY
         out[group, place] = motion
         return out
 
@@ -305,7 +321,7 @@ class ErrorModel:
 
     def _moved(self, motions: Array) -> Chain:
         every = np.empty((self.chain.tool_station + 1, 4, 4))
-        every[:] = np.eye(4)
+        every[:] = _IDENTITY
         every[self._slots[0]] = motions
         return self.chain.moved(every)
 
@@ -316,16 +332,15 @@ class ErrorModel:
         next origin from the left, so there the factors before it do.
         """
         factors = self._factors(np.asarray(x, float))
-        stations, group, place = self._slots
-        most = factors.shape[1]
+        _, group, place = self._slots
+        most = self._most
         before, behind = np.empty_like(factors), np.empty_like(factors)
-        before[:, 0] = behind[:, -1] = np.eye(4)
+        before[:, 0] = behind[:, -1] = _IDENTITY
         for i in range(1, most):
             np.matmul(before[:, i - 1], factors[:, i - 1], out=before[:, i])
             np.matmul(factors[:, most - i], behind[:, most - i], out=behind[:, most - i - 1])
         chain = self._moved(factors[:, 0] @ behind[:, 0])
-        left = (stations % 2 == 1) & (stations != chain.tool_station)
-        carry = np.where(left[:, None, None, None], before, se3.inverse(behind))
+        carry = np.where(self._left, before, se3.inverse(behind))
         return chain, *chain.station_twists(self._stations, self._twists, carry[group, place])
 
     def frames(self) -> ErrorModel | None:

@@ -54,6 +54,7 @@ class PoseReading:
     groups: ClassVar[Mapping[str, slice]] = {"position": slice(0, 3), "orientation": slice(3, 6)}
     # Names of the position's and of the rotation vector's columns.
     reads: ClassVar[tuple[tuple[str, ...], tuple[str, ...]]]
+    touches: ClassVar[bool] = False
     # Fields with an entry a sample.
     per_row: ClassVar[tuple[str, ...]] = ("q", "poses", "sigma", "rotation_sigma", "rows")
 

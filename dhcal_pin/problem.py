@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from typing import TypeVar
 
 import numpy as np
@@ -19,7 +19,7 @@ from .chain import Chain, Motion, Sweep
 from .executors import HERE, Workers
 from .measurements import Measurement, Unknown
 from .parameters import ErrorModel
-from .scratch import long_rows, scratch
+from .scratch import LongRows, scratch
 from .se3 import Array
 
 # Samples a chunk, and columns that LAPACK reduces at once.
@@ -146,7 +146,7 @@ class Tangent:
         data, errors = chunk.data, len(self.bodies)
         p = errors + len(self.places)
         sweep, u = chunk.sweep(self.chain), chunk.unknowns(self.instruments)
-        with long_rows():
+        with LongRows():
             velocities = scratch("velocities", errors, 6, sweep.tool.shape[-1])
             self.chain.tool_velocities(sweep, self.bodies, self.twists, velocities)
             block = scratch("block", p + 1, data.size, len(data.rows))
@@ -213,8 +213,13 @@ def qr(rows: Array) -> Array:
     # Narrow panels: the block is tall and thin.
     packed = lapack.dgeqrt(min(PANEL, columns, count), rows.T, overwrite_a=1)[0]
     top = min(columns, count)
-    out[:top] = np.triu(packed[:top])
+    np.copyto(out[:top], packed[:top], where=_upper(columns)[:top])
     return out
+
+
+@lru_cache(maxsize=64)
+def _upper(size: int) -> Array:
+    return np.triu(np.ones((size, size), bool))
 
 
 def merge(first: Array, second: Array) -> Array:

@@ -50,7 +50,10 @@ def _value(fit: Result, parameter: Parameter | Unknown, error: float) -> float:
 
 
 def parameter_rows(fit: Result) -> list[dict[str, Any]]:
-    """Each parameter with nominal, value, std (infinite where unknown), observability and fixed."""
+    """Each parameter with nominal, value, std (infinite where unknown), observability and fixed.
+
+    `remaining` is the share that std is of what was expected before the measurement.
+    """
     rows = [
         {
             "name": p.name,
@@ -59,9 +62,12 @@ def parameter_rows(fit: Result) -> list[dict[str, Any]]:
             "value": _value(fit, p, float(x)),
             "std": float(std),
             "observability": float(seen),
+            "remaining": float(remaining),
             "fixed": False,
         }
-        for p, x, std, seen in zip(fit.parameters, fit.x, fit.std, fit.seen, strict=True)
+        for p, x, std, seen, remaining in zip(
+            fit.parameters, fit.x, fit.std, fit.seen, fit.remaining, strict=True
+        )
     ]
     for p in fit.errors.fixed:
         held = _value(fit, p, 0.0)
@@ -73,6 +79,7 @@ def parameter_rows(fit: Result) -> list[dict[str, Any]]:
                 "value": held,
                 "std": 0.0,
                 "observability": 0.0,
+                "remaining": 0.0,
                 "fixed": True,
             }
         )
@@ -98,6 +105,8 @@ def document(
         "holdout_after": accuracy(fit.chain, fit.holdout, fit.instruments),
         "parameters": parameter_rows(fit),
         "unobservable": fit.unobservable,
+        "weakly_seen": fit.weakly_seen,
+        "observability_indices": fit.observability_indices,
         "outliers": list(outliers),
         "files": dict(files),
         "versions": versions(),
@@ -125,6 +134,8 @@ def plain_document(
         "holdout_after": {},
         "parameters": [],
         "unobservable": [],
+        "weakly_seen": [],
+        "observability_indices": {},
         "outliers": [],
         "files": {},
         "versions": versions(),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from . import observability, robust
+from . import explanations, observability, robust
 from .chain import Chain
 from .measurements import Measurement, Unknown
 from .parameters import ErrorModel, Parameter
@@ -157,9 +157,38 @@ class Result:
         return observability.condition(self.solution.triangle.r)
 
     @property
+    def observability_indices(self) -> dict[str, float]:
+        """O1 to O5 of the samples, over the directions seen; see `observability.indices`."""
+        return observability.indices(self.solution.triangle.r, self.samples)
+
+    @cached_property
     def unobservable(self) -> list[str]:
-        """What the data cannot tell apart, one sentence a group."""
-        return observability.unobservable(self.solution.triangle.r, self.parameters)
+        """What the data cannot tell apart, why, and what would tell it; one sentence a group."""
+        return explanations.unobservable(self.problem, self.x, self.solution.triangle)
+
+    @cached_property
+    def weakly_seen(self) -> list[str]:
+        """What counts in the rank but is hardly better known than before the measurement."""
+        return explanations.weakly_seen(
+            self.problem, self.x, self.solution.triangle, self.expected, self._scale
+        )
+
+    @property
+    def expected(self) -> Array:
+        """Standard deviations (p,) expected before the measurement: the priors used, or usual ones."""
+        usual = np.array([parameter.prior for parameter in self.parameters])
+        weights = self.problem.weights
+        return np.where(weights > 0, 1 / np.where(weights > 0, weights, 1.0), usual)
+
+    @property
+    def remaining(self) -> Array:
+        """How much of each parameter's expected spread is left, (p,): 0 well known, 1 or more unknown."""
+        return self.std / self.expected
+
+    @property
+    def correlation(self) -> Array:
+        """Correlations (p, p) of x; NaN with what is unknown."""
+        return observability.correlation(self.covariance)
 
     @cached_property
     def freedom(self) -> float:
@@ -179,6 +208,14 @@ class Result:
         return float(np.sqrt(cost / self.freedom)) if self.freedom else float("nan")
 
     @cached_property
+    def _scale(self) -> float:
+        """The scatter of a whitened row that is believed; NaN where nothing tells it."""
+        if all(item.stated for item in self.data):
+            surprise = 1 + CONTRADICTION * np.sqrt(2 / self.freedom) if self.freedom else np.inf
+            return self.noise if self.noise**2 > surprise else 1.0
+        return self.noise
+
+    @cached_property
     def _root(self) -> tuple[Array, Array]:
         return posterior_root(self.solution.triangle, self.problem.weights)
 
@@ -186,10 +223,7 @@ class Result:
     def _spread(self) -> tuple[Array, Array]:
         """As `_root`, scaled by the scatter that was seen where no sigma or too small a one is stated."""
         root, hidden = self._root
-        if all(item.stated for item in self.data):
-            surprise = 1 + CONTRADICTION * np.sqrt(2 / self.freedom) if self.freedom else np.inf
-            return root * (self.noise if self.noise**2 > surprise else 1.0), hidden
-        return root * self.noise, hidden
+        return root * self._scale, hidden
 
     @cached_property
     def covariance(self) -> Array:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ContextDecorator
 
 import numpy as np
 
@@ -28,11 +27,16 @@ def scratch(name: str, *shape: int) -> Array:
     return held[:size].reshape(shape)
 
 
-@contextmanager
-def long_rows() -> Iterator[None]:
+class LongRows(ContextDecorator):
     """Keeps NumPy from gathering rows of samples into its buffer first, which doubles an operation's time."""
-    before = np.setbufsize(64)
-    try:
-        yield
-    finally:
-        np.setbufsize(before)
+
+    def __enter__(self) -> None:
+        """Rows longer than the buffer are used where they are."""
+        self.before = np.setbufsize(64)
+
+    def __exit__(self, *_: object) -> None:
+        """As it was."""
+        np.setbufsize(self.before)
+
+    def _recreate_cm(self) -> LongRows:
+        return LongRows()

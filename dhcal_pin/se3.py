@@ -41,8 +41,12 @@ def translation(xyz: ArrayLike) -> Array:
 def inverse(pose: ArrayLike) -> Array:
     """Inverse of rigid motions (..., 4, 4), by transposing the rotation."""
     pose = np.asarray(pose, float)
+    out = np.zeros(pose.shape)
     rotation = np.swapaxes(pose[..., :3, :3], -1, -2)
-    return transform(rotation, -(rotation @ pose[..., :3, 3:])[..., 0])
+    out[..., :3, :3] = rotation
+    out[..., :3, 3:] = -(rotation @ pose[..., :3, 3:])
+    out[..., 3, 3] = 1.0
+    return out
 
 
 def adjoint(pose: ArrayLike) -> Array:

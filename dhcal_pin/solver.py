@@ -64,10 +64,19 @@ def posterior_root(triangle: Triangle, weights: Array) -> tuple[Array, Array]:
     return vt[keep].T / s[keep], vt[~keep].T
 
 
-def _settled(r: Array, step: Array, cost: float) -> bool:
-    """Whether a step changes the whitened rows by nothing that matters."""
-    change = float(np.linalg.norm(r @ step))
-    return change <= RELATIVE_STEP * math.sqrt(cost) + ROUNDING * float(np.linalg.norm(r))
+def _change(r: Array, step: Array) -> float:
+    """How far a step moves the whitened rows."""
+    return float(np.linalg.norm(r @ step))
+
+
+def _settled(r: Array, change: float, cost: float, last: float = 0.0) -> bool:
+    """Whether the rows will not move by anything that matters after a step that moves them by `change`.
+
+    Steps shrink quadratically near the end, so the next one shrinks at least as much as this one did
+    from the `last`, which is zero where nothing is known of it.
+    """
+    ahead = change * (min(1.0, change / last) if last else 1.0)
+    return ahead <= RELATIVE_STEP * math.sqrt(cost) or change <= ROUNDING * float(np.linalg.norm(r))
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +101,7 @@ def gauss_newton(problem: Problem, x: Array, max_iterations: int, progress: Prog
         full = with_priors(triangle, problem.weights, x, np.zeros_like(x))
         step = pseudo_inverse(full.r, full.z)
         cost = full.rest + float(full.z @ full.z)
-        converged = _settled(full.r, step, cost)
+        converged = _settled(full.r, _change(full.r, step), cost)
         x = x + step
         path.append(x)
         done += 1
@@ -130,7 +139,7 @@ def levenberg_marquardt(
     first, arrive: now and then it may try. `triangle` is the data's at x where that is known already.
     """
     path, damping, growth = [x], 1e-8, 2.0
-    converged, done = False, 0
+    converged, done, last = False, 0, 0.0
     none, scale = np.zeros_like(x), np.zeros_like(x)
     triangle = triangle if triangle is not None else reduce(problem, x, small_angle=False)
     cost = triangle.cost + float(np.sum((problem.weights * x) ** 2))
@@ -144,7 +153,8 @@ def levenberg_marquardt(
         while True:
             damped = with_priors(free, none, x, np.sqrt(damping) * floor)
             step = pseudo_inverse(damped.r, damped.z)
-            settled = _settled(free.r, step, cost)
+            change = _change(free.r, step)
+            settled = _settled(free.r, change, cost, last)
             ahead = None
             if not settled and growth == 2.0:
                 # A first try mostly holds, and its triangle, which the next step needs, tells its cost too.
@@ -170,6 +180,8 @@ def levenberg_marquardt(
             damping, growth = damping * growth, growth * 2
         if done in LEAPS and not converged:
             x, cost, reached = *_leap(problem, x, cost), None
+        # Only whole steps show how fast they shrink.
+        last = change if x is not before and growth == 2.0 else 0.0
         path.append(x)
         if progress:
             progress(done, cost)

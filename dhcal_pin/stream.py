@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from . import observability
+from . import explanations, observability
 from .calibration import Method, Priors, calibrate
 from .chain import Chain
 from .errors import DhcalError
@@ -18,7 +18,6 @@ from .executors import HERE, Workers
 from .files import PathLike, sheet_of
 from .measurement_files import readings_of
 from .measurements import Measurement
-from .parameters import ErrorModel
 from .problem import CHUNK, Chunk, Problem
 from .result import Result
 from .se3 import Array
@@ -110,20 +109,18 @@ class Streamed:
     """What a stream told of a chain's errors.
 
     Attributes:
-        errors: the nominal chain, base and tool as the first part places them, and its p unknowns.
+        problem: with the nominal chain, base and tool as the first part places them, and its p unknowns.
         x: (p,) identified errors, m and rad.
         chain: the calibrated chain.
         solution: the loop's end.
-        weights: (p,) one over the priors' sigmas.
         samples: how many there were.
         before, after: RMS errors of all samples by group: "position" in m, "orientation" in rad.
     """
 
-    errors: ErrorModel
+    problem: Stream
     x: Array
     chain: Chain
     solution: Solution
-    weights: Array
     samples: int
     before: Mapping[str, float]
     after: Mapping[str, float]
@@ -141,12 +138,12 @@ class Streamed:
     @property
     def unobservable(self) -> list[str]:
         """What the data cannot tell apart, one sentence a group."""
-        return observability.unobservable(self.solution.triangle.r, self.errors.parameters)
+        return explanations.unobservable(self.problem, self.x, self.solution.triangle)
 
     @cached_property
     def std(self) -> Array:
         """Standard deviations (p,) of x, m and rad; infinite where neither data nor a prior tell."""
-        root, hidden = posterior_root(self.solution.triangle, self.weights)
+        root, hidden = posterior_root(self.solution.triangle, self.problem.weights)
         return np.where(np.sum(hidden**2, 1) > 1e-6, np.inf, np.linalg.norm(root, axis=1))
 
 
@@ -218,7 +215,7 @@ def calibrate_stream(
     before, after = (
         {name: float(np.sqrt(value / samples)) for name, value in total.items()} for total in (before, after)
     )
-    return Streamed(fit.errors, solution.x, end, solution, problem.weights, samples, before, after)
+    return Streamed(problem, solution.x, end, solution, samples, before, after)
 
 
 def _scales(fit: Result, head: Measurement) -> dict[str, float] | None:

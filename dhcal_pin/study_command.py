@@ -35,7 +35,7 @@ def study(args: Namespace) -> int:
         terminal.lines(f"{journal}: goes on after {len(blocks)} of {total} blocks")
     with (
         workers(args.jobs, args.scheduler) as where,
-        terminal.counted(wanted.title or "study", total, len(blocks)) as step,
+        terminal.counted(wanted.title or "study", total, len(blocks)) as progress,
         _opened(journal, wanted, blocks) as file,
     ):
         for block in run(wanted, len(blocks), where):
@@ -43,7 +43,7 @@ def study(args: Namespace) -> int:
             file.write(json.dumps(block) + "\n")
             file.flush()
             blocks.append(block)
-            step()
+            progress(len(blocks))
     header, rows = table(wanted, blocks)
     save({args.output: _csv_text(header, rows)})
     os.unlink(journal)

@@ -61,12 +61,12 @@ def progress(title: str) -> Iterator[Progress | None]:
 
 
 @contextmanager
-def counted(title: str, total: int, done: int = 0) -> Iterator[Callable[[], None]]:
-    """A bar for so many pieces of work, and what to call after each; nothing where it is no terminal."""
+def counted(title: str, total: int, done: int = 0) -> Iterator[Callable[[int], None]]:
+    """A bar for so many pieces of work, told how many are done; nothing where it is no terminal."""
     console = _console()
     with Bar(console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(title, total=total, completed=done)
-        yield lambda: bar.advance(task)
+        yield lambda count: bar.update(task, completed=count)
 
 
 def findings(path: str, found: Sequence[Finding]) -> None:
@@ -124,13 +124,19 @@ def summary(fit: Result, files: Mapping[str, str]) -> None:
     )
     for text in fit.unobservable:
         lines(f"not observable: {text}", style="yellow")
+    for text in fit.weakly_seen:
+        lines(f"weakly seen: {text}", style="yellow")
     for name, path in files.items():
         lines(f"wrote {name}: {path}")
 
 
 def open_page(path: str) -> None:
     """Shows a page in the browser, or says where it lies."""
-    url = Path(path).resolve().as_uri()
+    open_url(Path(path).resolve().as_uri())
+
+
+def open_url(url: str) -> None:
+    """Shows an address in the browser, or says it."""
     if not webbrowser.open(url):
         lines(f"no browser here; open {url}")
 

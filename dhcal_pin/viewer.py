@@ -13,53 +13,56 @@ be drawn: these say where the instrument stands and what it looks at, not how th
 
 from __future__ import annotations
 
-import base64
 import html
 import json
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 
 from . import se3
 from .chain import Chain
-from .dh_urdf import MATERIALS
 from .errors import DhcalError
 from .measurements import Measurement
 from .result import Result
 from .se3 import Array
+from .shapes import looks, rows
 
 PathLike = str | os.PathLike[str]
 
 MOST_POINTS = 2000  # more are thinned out evenly: the page keeps moving smoothly
-GRID = 8000  # mesh corners sit on a grid of this many steps along the longest side, 0.1 mm on most links
+MOST_ELLIPSOIDS = 400  # more would hide each other
+TRIANGLES = 60_000  # that the meshes keep: with more the page would hardly turn, and be large
+FEW_TRIANGLES = 15_000  # one still sees what each link is
+LEAST_TRIANGLES = 100
 SLIDE = 0.5  # m each way for a sliding joint without limits
-TRIAD = [MATERIALS[f"{axis}_axis"] for axis in "xyz"]
 PAGE = Path(__file__).with_name("viewer.html")
 
 
 def scene_html(
     nominal: Chain,
-    calibrated: Chain | None = None,
+    calibrated: Chain | Result | None = None,
     *,
     q: Array | None = None,
-    measurements: Sequence[Measurement] = (),
+    measurements: Sequence[Measurement] | None = None,
     known: Mapping[str, float] | None = None,
     title: str = "Robot calibration",
     package_dirs: Sequence[PathLike] | None = None,
     magnification: float = 1.0,
+    triangles: int = TRIANGLES,
 ) -> str:
     """One offline HTML page of an arm, or of an arm before and after its calibration.
 
     Args:
         nominal: the arm as it was thought to be; a ghost beside the calibrated one, solid if alone.
-        calibrated: the same arm with other origins, base and tool.
+        calibrated: the same arm with other origins, base and tool; or the result that found it: then the
+            nominal arm stands where it was fitted to the same data, those data are shown, and ellipsoids
+            of one standard deviation say how well the calibrated tool's place is known.
         q: (m, n) poses to play, rad or m; those of the measurements without it.
         measurements: those that are positions are drawn, with arrows from where the arm puts them.
         known: values of the instruments' unknowns, as in `Result.instruments`; without it where their
@@ -67,6 +70,7 @@ def scene_html(
         title: the page's heading.
         package_dirs: where to look for the URDF's meshes; the folders above the URDF without it.
         magnification: how many times larger than true the errors are drawn at first, 1 to 500.
+        triangles: most of them that the meshes keep all together; `FEW_TRIANGLES` for a small page.
 
     Returns:
         The page; the same bytes for the same input.
@@ -76,28 +80,42 @@ def scene_html(
     """
     if not 1 <= magnification <= 500:
         raise DhcalError(f"magnification {magnification:g}: must be between 1 and 500")
+    if triangles < LEAST_TRIANGLES:
+        raise DhcalError(f"{triangles} triangles draw no robot: allow {LEAST_TRIANGLES} at least")
+    fit = calibrated if isinstance(calibrated, Result) else None
+    if isinstance(calibrated, Result):
+        measurements = calibrated.data if measurements is None else measurements
+        known = calibrated.instruments if known is None else known
+        nominal = replace(nominal, base=calibrated.reference.base, tool=calibrated.reference.tool)
+        calibrated = calibrated.chain
+    measurements = measurements or ()
     arm = nominal if calibrated is None else calibrated
-    bodies = _bodies(nominal, arm)
-    shapes, meshes, note = _shapes(nominal, package_dirs)
-    played = [q] if q is not None else [item.q for item in measurements]
+    arms = tree(nominal, arm)
+    drawn = looks(nominal, arms["bodies"], package_dirs, triangles)
+    played = [q] if q is not None else [item.configurations() for item in measurements]
     poses = np.concatenate([np.empty((0, nominal.size)), *map(nominal.checked, played)])
     samples, points, residuals = _points(arm, measurements, known or {})
-    thinned = _thin(len(samples))
+    thinned = _thin(len(samples), MOST_POINTS)
+    notes = [drawn.note]
     if len(thinned) < len(samples):
-        note = f"{note} {len(thinned)} of {len(samples)} measured points are drawn.".strip()
+        notes.append(f"{len(thinned)} of {len(samples)} measured points are drawn.")
+    ellipsoids = _ellipsoids(fit, poses) if fit else []
+    if fit and len(poses) and not ellipsoids:
+        notes.append("No ellipsoids: the data do not tell how well the tool's place is known.")
     scene = {
         "title": title,
-        "note": note,
+        "note": " ".join(filter(None, notes)),
         "compared": calibrated is not None,
         "magnification": magnification,
         "joints": _joints(nominal, np.concatenate([poses, samples])),
-        "poses": poses[_thin(len(poses))].tolist(),
+        "poses": poses[_thin(len(poses), MOST_POINTS)].tolist(),
         "samples": samples[thinned].tolist(),
         "points": np.round((points[thinned] - arm.base[:3, 3]) @ arm.base[:3, :3], 9).tolist(),
         "residuals": np.round(residuals[thinned] @ arm.base[:3, :3], 9).tolist(),
-        "shapes": shapes,
-        "meshes": meshes,
-        **bodies,
+        "ellipsoids": ellipsoids,
+        "shapes": drawn.shapes,
+        "meshes": [mesh.encoded() for mesh in drawn.meshes],
+        **arms,
     }
     data = json.dumps(scene, separators=(",", ":"), ensure_ascii=False).replace("<", "\\u003c")
     parts = {"@TITLE@": html.escape(title), "/*@MESHCAT@*/": _meshcat(), "@SCENE@": data}
@@ -113,7 +131,7 @@ class Scene:
         height: of the frame in the notebook, pixels.
     """
 
-    html: str
+    html: str = field(repr=False)  # a notebook keeps the repr too
     height: int
 
     def _repr_html_(self) -> str:
@@ -129,15 +147,10 @@ def show(
 
     Args:
         nominal: the arm as it was thought to be.
-        calibrated: the arm, or the result that found it: then the nominal arm stands where it was
-            fitted to the same data, and those data are shown.
+        calibrated: the calibrated arm, or the result that found it.
         height: of the frame in the notebook, pixels.
         options: as for `scene_html`.
     """
-    if isinstance(calibrated, Result):
-        fit, calibrated = calibrated, calibrated.chain
-        nominal = replace(nominal, base=fit.reference.base, tool=fit.reference.tool)
-        options = {"measurements": fit.data, "known": fit.instruments, **options}
     return Scene(scene_html(nominal, calibrated, **options), height)
 
 
@@ -153,12 +166,17 @@ def _meshcat() -> str:
     return "\n".join(parts).replace("</script", "<\\/script")
 
 
-def _rows(pose: Array) -> list[float]:
-    """The upper three rows of a pose (4, 4), in full."""
-    return (np.asarray(pose, float)[:3] + 0.0).ravel().tolist()
+def alike(nominal: Chain, arm: Chain) -> Chain:
+    """The nominal arm as it is drawn: with the other's base and tool where it has none of its own."""
+    same = np.eye(4)
+    return replace(
+        nominal,
+        base=arm.base if np.array_equal(nominal.base, same) else nominal.base,
+        tool=arm.tool if np.array_equal(nominal.tool, same) else nominal.tool,
+    )
 
 
-def _bodies(nominal: Chain, arm: Chain) -> dict[str, Any]:
+def tree(nominal: Chain, arm: Chain) -> dict[str, Any]:
     """The tree of bodies and the two arms' frames.
 
     Body 0 is the base link, body i the model's joint i, and the last two are tip and tool; each has
@@ -171,9 +189,7 @@ def _bodies(nominal: Chain, arm: Chain) -> dict[str, Any]:
             f"the arms differ: one moves {', '.join(nominal.moving)}, the other {', '.join(arm.moving)}; "
             "give both the same tip"
         )
-    same = np.eye(4)
-    base = arm.base if np.array_equal(nominal.base, same) else nominal.base
-    tool = arm.tool if np.array_equal(nominal.tool, same) else nominal.tool
+    base, tool = (drawn := alike(nominal, arm)).base, drawn.tool
     model, k = nominal.model, len(nominal.moving)
     index = [model.getJointId(name) for name in nominal.moving]
     bodies = [_body(-1, se3.inverse(arm.base) @ base, np.eye(4))]
@@ -193,8 +209,8 @@ def _bodies(nominal: Chain, arm: Chain) -> dict[str, Any]:
     stands = nominal.base @ se3.inverse(base) @ arm.base
     holds = se3.inverse(tool) @ nominal.tool
     arms = [
-        {"stands": _rows(stands), "holds": _rows(holds)},
-        {"stands": _rows(arm.base), "holds": _rows(same)},
+        {"stands": rows(stands), "holds": rows(holds)},
+        {"stands": rows(arm.base), "holds": rows(np.eye(4))},
     ]
     return {"bodies": bodies, "arms": arms}
 
@@ -202,7 +218,7 @@ def _bodies(nominal: Chain, arm: Chain) -> dict[str, Any]:
 def _body(parent: int, placement: Array, calibrated: Array) -> dict[str, Any]:
     same = np.array_equal(placement, calibrated)
     twist = np.zeros(6) if same else se3.log6(se3.inverse(placement) @ calibrated)
-    return {"parent": int(parent), "placement": _rows(placement), "twist": twist.tolist()}
+    return {"parent": int(parent), "placement": rows(placement), "twist": twist.tolist()}
 
 
 def _joints(chain: Chain, poses: Array) -> list[dict[str, Any]]:
@@ -239,108 +255,27 @@ def _points(
     return np.concatenate(q), np.concatenate(points), np.concatenate(residuals)
 
 
-def _thin(count: int) -> Array:
-    """At most MOST_POINTS indices, evenly spread over `count`."""
-    return np.unique(np.linspace(0, count - 1, min(count, MOST_POINTS)).round().astype(int))
+def _thin(count: int, most: int) -> Array:
+    """At most so many indices, evenly spread over `count`."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
-def _shapes(
-    chain: Chain, package_dirs: Sequence[PathLike] | None
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]], str]:
-    """What each body looks like, the meshes it refers to by number, and a note on what is missing."""
-    if package_dirs is None:
-        package_dirs = list(Path(chain.urdf.source).absolute().parents)
-    text = chain.urdf.data.decode("utf-8-sig")
-    model = pin.buildModelFromXML(text)
-    try:
-        found = pin.buildGeomFromUrdfString(
-            model, text, pin.GeometryType.VISUAL, package_dirs=[os.fspath(path) for path in package_dirs]
-        ).geometryObjects
-    except (ValueError, RuntimeError) as error:
-        reason = str(error).strip().splitlines()[0]
-        return _skeleton(chain), [], f"Drawn as a skeleton, because a mesh is missing: {reason}"
-    if not len(found):
-        return _skeleton(chain), [], "Drawn as a skeleton: the URDF has no visual geometry."
-    numbers: dict[str, int] = {}
-    shapes = []
-    for item in found:
-        if any(np.allclose(item.meshColor, axis, atol=1e-6) for axis in TRIAD):
-            continue  # the URDF of a DH table draws its own tool frame; the page's is a layer
-        shape = _shape(item.geometry)
-        if "mesh" in shape:
-            # Equal parts, such as the same motor five times, are sent once.
-            shape["mesh"] = numbers.setdefault(json.dumps(shape["mesh"]), len(numbers))
-        body, placement = _home(model, chain.frame_id, item)
-        shapes.append({"body": body, "placement": np.round(_rows(placement), 9).tolist(), **shape})
-    return shapes, [json.loads(mesh) for mesh in numbers], ""
+def _ellipsoids(fit: Result, poses: Array) -> list[dict[str, Any]]:
+    """How well the calibrated tool's place is known at some of the poses (m, n).
 
-
-def _home(model: pin.Model, tip: int, item: pin.GeometryObject) -> tuple[int, Array]:
-    """The body a shape belongs to and its pose (4, 4) there: what is fixed to the tip moves with it."""
-    frame = item.parentFrame
-    while frame != tip and model.frames[frame].type != pin.FrameType.JOINT and frame > 0:
-        frame = model.frames[frame].parentFrame
-    if frame != tip:
-        return int(item.parentJoint), item.placement.homogeneous
-    return model.njoints, (model.frames[tip].placement.inverse() * item.placement).homogeneous
-
-
-def _shape(geometry: Any) -> dict[str, Any]:
-    """A primitive with its sizes in metres, or a mesh."""
-    kind = type(geometry).__name__
-    if kind == "Box":
-        return {"box": (2 * geometry.halfSide).tolist()}
-    if kind == "Sphere":
-        return {"sphere": geometry.radius}
-    if kind in ("Cylinder", "Capsule"):
-        return {"cylinder": [geometry.radius, 2 * geometry.halfLength]}
-    return {"mesh": _mesh(geometry)}
-
-
-def _mesh(geometry: Any) -> dict[str, Any]:
-    """A triangle mesh on a grid: corners that fall together are one, triangles that vanish are left out.
-
-    `corners` (v, 3) and `triangles` (t, 3) are base64 of little-endian integers, the latter of `bytes`
-    bytes each; a corner is at `origin` + `step` · its integers, m.
+    Each has its joint values `q` (n,) and `axes` (9), rows of the matrix whose columns are the half
+    axes of one standard deviation, m, in axes of the calibrated base link. Poses at which a direction
+    is not known at all have none.
     """
-    corners = np.asarray(geometry.vertices(), float)
-    triangles = np.array([(t[0], t[1], t[2]) for t in map(geometry.tri_indices, range(geometry.num_tris))])
-    origin, size = corners.min(0), np.ptp(corners, axis=0).max()
-    step = size / GRID or 1.0
-    grid, place = np.unique(np.round((corners - origin) / step).astype("<u2"), axis=0, return_inverse=True)
-    triangles = place.ravel()[triangles]
-    a, b, c = triangles.T
-    triangles = triangles[(a != b) & (b != c) & (c != a)]
-    width = 2 if len(grid) <= 1 << 16 else 4
-    return {
-        "origin": np.round(origin, 9).tolist(),
-        "step": float(step),
-        "bytes": width,
-        "corners": base64.b64encode(grid.tobytes()).decode(),
-        "triangles": base64.b64encode(triangles.astype(f"<u{width}").tobytes()).decode(),
-    }
-
-
-def _skeleton(chain: Chain) -> list[dict[str, Any]]:
-    """Rods from joint to joint and a drum on each moving joint, where there is nothing else to draw."""
-    tree = _bodies(chain, chain)["bodies"]
-    ends = [np.reshape(body["placement"], (3, 4))[:, 3] for body in tree]
-    radius = 0.02 * (sum(float(np.linalg.norm(end)) for end in ends[1:]) or 1.0)
-    shapes = [_rod(0, np.zeros(3), np.array([0.0, 0.0, -0.6 * radius]), 4 * radius)]
-    for i, (body, end) in enumerate(zip(tree, ends, strict=True)):
-        if i and np.linalg.norm(end) > 1e-6:
-            shapes.append(_rod(body["parent"], np.zeros(3), end, radius))
-        if "axes" in body:
-            half = 1.8 * radius * np.array(body["axes"][0])
-            shapes.append(_rod(i, -half, half, 1.6 * radius))
-    return shapes
-
-
-def _rod(body: int, start: Array, end: Array, radius: float) -> dict[str, Any]:
-    """A cylinder between two points (3,) of a body, m."""
-    z = (end - start) / np.linalg.norm(end - start)
-    x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
-    x /= np.linalg.norm(x)
-    pose = se3.transform(np.stack([x, np.cross(z, x), z], -1), 0.5 * (start + end))
-    size = [radius, float(np.linalg.norm(end - start))]
-    return {"body": body, "placement": np.round(_rows(pose), 9).tolist(), "cylinder": size}
+    poses = poses[_thin(len(poses), MOST_ELLIPSOIDS)]
+    covariance = fit.predict(poses).covariance[:, :3, :3]
+    told = np.isfinite(covariance).all((1, 2))
+    squares, axes = np.linalg.eigh(covariance[told])
+    # A flat ellipsoid would have no outside to be lit.
+    half = np.sqrt(np.maximum(squares, 1e-6 * squares[:, -1:] + 1e-18))
+    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
+    axes = fit.chain.base[:3, :3].T @ axes * half[:, None]
+    return [
+        {"q": q, "axes": np.round(matrix, 12).ravel().tolist()}
+        for q, matrix in zip(poses[told].tolist(), axes, strict=True)
+    ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -79,18 +80,16 @@ def against_scipy(m: int, repeats: int) -> list[Row]:
         start = np.zeros(len(fit.x))
         found: dict[str, np.ndarray] = {}
 
-        def differences(start=start, slow=slow, found=found) -> None:
-            found["differences"] = least_squares(slow, start, x_scale="jac").x
+        def scipy(way: str, *functions: Callable, start=start, found=found) -> None:
+            found[way] = least_squares(functions[0], start, *functions[1:], x_scale="jac").x
 
-        def given(start=start, residual=residual, jacobian=jacobian, found=found) -> None:
-            found["given"] = least_squares(residual, start, jacobian, x_scale="jac").x
-
-        ours, theirs = clocked([lambda c=chain, d=data, s=sets: calibrate(c, d, s), differences], repeats)
-        out.append(
-            Row(f"scipy, differences through Pinocchio, {name}, m={m}", ours, theirs, theirs / ours, "≥ 80")
-        )
-        ours, theirs = clocked([lambda c=chain, d=data, s=sets: calibrate(c, d, s), given], 5 * repeats)
-        out.append(Row(f"scipy with our Jacobian, {name}, m={m}", ours, theirs, theirs / ours, "≥ 4"))
+        mine = partial(calibrate, chain, data, sets)
+        for way, functions, times, wanted in (
+            ("differences through Pinocchio", (slow,), repeats, "≥ 80"),
+            ("our Jacobian", (residual, jacobian), 5 * repeats, "≥ 4"),
+        ):
+            ours, theirs = clocked([mine, partial(scipy, way, *functions)], times)
+            out.append(Row(f"scipy with {way}, {name}, m={m}", ours, theirs, theirs / ours, wanted))
         reached = [float(np.sum(residual(x) ** 2)) for x in (fit.x, *found.values())]
         assert reached[0] <= min(reached[1:]) * (1 + 1e-6), reached
     return out

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from pages import ARGUMENTS, CHROMIUM, VIEWPORT, Window, window_of
 
 from dhcal_pin.chain import Chain
 from dhcal_pin.dh import DHTable
@@ -56,3 +60,33 @@ def sim_6dof() -> Chain:
 @pytest.fixture(scope="session")
 def sim_6dof_actual() -> Chain:
     return Chain.from_dh(paper("sim_6dof_actual"))
+
+
+@pytest.fixture(scope="session")
+def sim_3dof() -> Chain:
+    return Chain.from_dh(paper("sim_3dof"))
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    if not os.path.exists(CHROMIUM) and os.environ.get("CI") != "true":
+        pytest.skip("no Chromium")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="session")
+def shared_window(browser: Any) -> Iterator[Window]:
+    with window_of(browser) as out:
+        yield out
+
+
+@pytest.fixture
+def window(shared_window: Window) -> Iterator[Window]:
+    shared_window.page.set_viewport_size(VIEWPORT)
+    yield shared_window
+    shared_window.check()

@@ -396,7 +396,7 @@ def test_too_much_is_one_line(refused, monkeypatch):
     def endless(*_):
         raise MemoryError
 
-    monkeypatch.setattr(commands, "_configurations", endless)
+    monkeypatch.setattr(commands, "configurations", endless)
     refused(["not enough memory", "fewer"], "simulate", "arm.urdf", "-m", "1000000000000", "-o", "s.csv")
 
 
@@ -417,7 +417,16 @@ def test_the_json_of_a_calibration(run, place):
     for key in ("before", "after", "holdout_before", "holdout_after"):
         assert found[key].keys() == {"position_rms_m", "position_max_m"}
     for row in found["parameters"]:
-        assert row.keys() == {"name", "unit", "nominal", "value", "std", "observability", "fixed"}
+        assert row.keys() == {
+            "name",
+            "unit",
+            "nominal",
+            "value",
+            "std",
+            "observability",
+            "remaining",
+            "fixed",
+        }
         assert 0 <= row["observability"] <= 1
     nominal = {row["name"]: (row["nominal"], row["unit"]) for row in found["parameters"]}
     assert nominal == {

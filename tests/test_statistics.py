@@ -124,3 +124,48 @@ def test_intervals_and_predictions_hold_over_1000_robots(name):
     assert 0.93 < tally.inside / tally.count < 0.97
     assert np.sqrt(tally.squares / tally.bound) == pytest.approx(1, abs=0.05)
     assert np.sqrt(tally.squares / tally.claimed) == pytest.approx(1, abs=0.10)
+
+
+def worse_than_nominal(sets: str, poses, seeds) -> float:
+    """Share of arms whose tool is farther off after the fit than before, at poses anywhere."""
+    nominal, worse = arm("paper"), 0
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        errors = select(nominal, sets)
+        size = np.array([np.deg2rad(2.0) if p.unit == "rad" else 1e-2 for p in errors.parameters])
+        size = size if seed % 2 else size / 10
+        truth = errors.at(size * rng.uniform(-1, 1, len(size)))
+        data = Pose.simulate(truth, poses(nominal, rng), Noise(POSITION, ROTATION), rng)
+        q = drawn(nominal, 100, rng)
+        wanted = truth.poses(q)[:, :3, 3]
+        before, after = (
+            np.mean(np.sum((chain.poses(q)[:, :3, 3] - wanted) ** 2, 1))
+            for chain in (nominal, calibrate(nominal, data, sets).chain)
+        )
+        worse += after > before
+    return worse / len(seeds)
+
+
+def two_poses(chain: Chain, rng: np.random.Generator):
+    return drawn(chain, 2, rng)
+
+
+def one_corner(chain: Chain, rng: np.random.Generator):
+    return drawn(chain, 1, rng) + rng.uniform(-0.2, 0.2, (30, chain.size))
+
+
+POOR = pytest.mark.parametrize("poses", [two_poses, one_corner])
+SETS = pytest.mark.parametrize("sets", ["dh", "minimal"])
+
+
+@POOR
+@SETS
+def test_poor_data_do_no_harm(sets, poses):
+    assert worse_than_nominal(sets, poses, range(10)) == 0
+
+
+@pytest.mark.slow
+@POOR
+@SETS
+def test_poor_data_do_no_harm_in_200(sets, poses):
+    assert worse_than_nominal(sets, poses, range(200)) <= 0.01

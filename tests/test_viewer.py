@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import os
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from conftest import URDF, paper, robot_file
+from pages import CLICK, READY, SLIDE, Window, window_of
 
 from dhcal_pin import se3
 from dhcal_pin.calibration import calibrate
@@ -19,55 +19,28 @@ from dhcal_pin.chain import Chain
 from dhcal_pin.cli import main
 from dhcal_pin.errors import DhcalError
 from dhcal_pin.lengths import Distance
+from dhcal_pin.measurement_files import measurement_text
 from dhcal_pin.measurements import Noise
 from dhcal_pin.poses import Pose
 from dhcal_pin.positions import Position, Targets
+from dhcal_pin.result import Result
 from dhcal_pin.urdf import parse_urdf
 from dhcal_pin.viewer import scene_html, show
 
-CHROMIUM = "/usr/bin/chromium"
-# Software rendering, which works without a graphics card and in a container.
-ARGUMENTS = (
-    "--no-sandbox --disable-dev-shm-usage --use-gl=angle --use-angle=swiftshader "
-    "--enable-unsafe-swiftshader --hide-scrollbars"
-).split()
 FILES = {
     "ur10": ("ur_description/urdf/ur10_robot.urdf", None),
     "panda": ("panda_description/urdf/panda.urdf", "panda_hand_tcp"),
     "z1": ("z1_description/urdf/z1.urdf", None),
     "so101": ("so_arm_description/urdf/so101.urdf", None),
 }
-ROBOTS = ("paper", *FILES)
-
-# Draws the scene now and looks at its pixels: how many have each layer's colour, and a fingerprint.
-LOOK = """([name, values]) => {
-  if (name) dhcal[name](...values);
-  const { viewer } = dhcal, canvas = viewer.renderer.domElement;
-  viewer.render();
-  const { width, height } = canvas, copy = document.createElement("canvas");
-  Object.assign(copy, { width, height });
-  const context = copy.getContext("2d");
-  context.drawImage(canvas, 0, 0);
-  const data = context.getImageData(0, 0, width, height).data;
-  const seen = { nominal: 0, calibrated: 0, frames: 0, points: 0, arrows: 0, black: 0, print: 0 };
-  for (let i = 0; i < data.length; i += 4) {
-    const [r, g, b] = data.subarray(i, i + 3);
-    if (b - r > 40 && g > r && r > 40) seen.nominal++;
-    if (r - b > 70 && g - b > 35 && g > 0.55 * r) seen.calibrated++;
-    if (g - r > 60 && g - b > 15) seen.frames++;
-    if (r < 40 && g < 55 && b > 45 && b < 90) seen.points++;
-    if (r - g > 45 && b - g > 25) seen.arrows++;
-    if (r + g + b < 30) seen.black++;
-    seen.print = (Math.imul(seen.print, 31) + r + 7 * g + 49 * b) | 0;
-  }
-  return seen;
-}"""
+PAPER = {"paper": "sim_6dof", "paper_3dof": "sim_3dof"}
+ROBOTS = (*PAPER, *FILES)
 
 
 def arms(name: str) -> tuple[Chain, Chain]:
     """A nominal arm and one whose joints are off by some tenths of a millimetre and of a degree."""
-    if name == "paper":
-        return Chain.from_dh(paper("sim_6dof")), Chain.from_dh(paper("sim_6dof_actual"))
+    if name in PAPER:
+        return perturbed(Chain.from_dh(paper(PAPER[name])))
     file, tip = FILES[name]
     return perturbed(Chain.from_urdf(robot_file(file), tip))
 
@@ -85,58 +58,6 @@ def poses(chain: Chain, m: int) -> np.ndarray:
     return np.random.default_rng(2).uniform(lower, upper, (m, chain.size))
 
 
-@dataclass(frozen=True)
-class Window:
-    """One page of the browser and everything it complained about or asked for."""
-
-    page: Any
-    complaints: list[str]
-    requests: list[str]
-
-    def open(self, path: Path, html: str) -> None:
-        """Loads a page from disk and waits until it says that it is ready."""
-        path.write_text(html, encoding="utf-8")
-        self.page.goto(path.as_uri())
-        self.page.wait_for_function("window.dhcal && window.dhcal.ready === true")
-
-    def look(self, name: str = "", *values: Any) -> dict[str, int]:
-        """What is seen, after a call of the page if there is one: together they draw only once."""
-        return self.page.evaluate(LOOK, [name, list(values)])
-
-    def tip(self, arm: str) -> np.ndarray:
-        """Where the page says an arm's tool is, (4, 4)."""
-        return np.array(self.page.evaluate("arm => dhcal.tip(arm)", arm))
-
-    def call(self, name: str, *values: Any) -> None:
-        """A function of the page."""
-        self.page.evaluate("([name, values]) => dhcal[name](...values)", [name, list(values)])
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    if not os.path.exists(CHROMIUM) and os.environ.get("CI") != "true":
-        pytest.skip("no Chromium")
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
-        yield browser
-        browser.close()
-
-
-@pytest.fixture
-def window(browser: Any) -> Iterator[Window]:
-    page = browser.new_page(viewport={"width": 800, "height": 460})
-    out = Window(page, [], [])
-    page.on("console", lambda message: out.complaints.append(message.text))
-    page.on("pageerror", lambda error: out.complaints.append(str(error)))
-    page.on("request", lambda request: out.requests.append(request.url))
-    yield out
-    page.close()
-    assert not out.complaints
-    assert all(url.startswith(("file:", "data:", "about:")) for url in out.requests), out.requests
-
-
 def check_tips(window: Window, nominal: Chain, calibrated: Chain) -> None:
     for q in poses(nominal, 5):
         window.call("setJoints", q.tolist())
@@ -149,52 +70,74 @@ def check_tips(window: Window, nominal: Chain, calibrated: Chain) -> None:
             assert np.abs(window.tip(arm) - there).max() <= 1e-9
 
 
-@pytest.mark.parametrize("name", ROBOTS)
-def test_every_layer_is_seen_and_the_tips_are_pinocchios(name, window, tmp_path):
-    nominal, calibrated = arms(name)
-    data = Position.simulate(calibrated, poses(nominal, 12), Noise(5e-4), np.random.default_rng(3))
-    start = 2.0 if name == "paper" else 60.0
-    html = scene_html(nominal, calibrated, measurements=[data], magnification=start)
-    assert len(html.encode()) < (1.2e6 if name == "paper" else 6e6)
-    window.open(tmp_path / "scene.html", html)
+@dataclass(frozen=True)
+class Opened:
+    """A robot's page, opened once for all that is asked of it."""
+
+    window: Window
+    fit: Result
+    size: int
+
+
+@pytest.fixture(scope="module", params=ROBOTS)
+def opened(
+    request: pytest.FixtureRequest, browser: Any, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Opened]:
+    nominal, truth = arms(request.param)
+    data = Position.simulate(truth, poses(nominal, 12), Noise(1e-3), np.random.default_rng(3))
+    fit = calibrate(nominal, data)
+    html = scene_html(nominal, fit, triangles=4000)
+    with window_of(browser) as window:
+        window.open(tmp_path_factory.mktemp("scene") / "scene.html", html)
+        yield Opened(window, fit, len(html.encode()))
+
+
+def test_every_layer_is_seen(opened):
+    window = opened.window
+    assert opened.size < 1.2e6
     assert window.page.evaluate("dhcal.renderCalls()") > 10
-    if name == "paper":
-        # Its arms are centimetres apart: residuals are drawn longer than these errors can be.
-        window.page.evaluate("placePoints(magnification = 60); magnification = 2")
-    seen = window.look("setLayer", "frames", True)
-    assert seen["black"] == 0
-    for layer in ("frames", "arrows", "points", "nominal", "calibrated"):
+    assert window.look("setMagnification", 100)["black"] == 0
+    # Ellipsoids are as green as y axes, and may hide the tool frames.
+    window.call("setLayer", "frames", False)
+    check_layers(window, "ellipsoids")
+    window.call("setLayer", "frames", True)
+    check_layers(window, "frames", "arrows", "points", "nominal", "calibrated")
+
+
+def check_layers(window: Window, *layers: str) -> None:
+    """Each is seen, and not once it is switched off."""
+    seen = window.look()
+    for layer in layers:
         assert seen[layer] > 15, layer
         seen = window.look("setLayer", layer, False)
         assert seen[layer] == 0, layer
-    window.call("setMagnification", 1)
-    check_tips(window, nominal, calibrated)
 
 
-@pytest.mark.parametrize("name", ["paper", "ur10"])
-def test_every_slider_and_switch_changes_the_picture(name, window, tmp_path):
-    nominal, calibrated = arms(name)
-    data = Position.simulate(calibrated, poses(nominal, 12), Noise(5e-4), np.random.default_rng(3))
-    window.open(tmp_path / "scene.html", scene_html(nominal, calibrated, measurements=[data]))
-    page, before = window.page, window.look()["print"]
+def test_the_tips_are_pinocchios(opened):
+    opened.window.call("setMagnification", 1)
+    check_tips(opened.window, opened.fit.reference, opened.fit.chain)
+
+
+def test_every_slider_and_switch_changes_the_picture(opened):
+    window, page = opened.window, opened.window.page
+    for box in page.locator("#layers input").all():
+        box.evaluate("box => box.checked || box.click()")
+    before = window.look("setMagnification", 1)["print"]
     for slider in (page.locator("#magnification"), *page.locator("#joints input").all()):
         where = window.tip("calibrated")
-        slider.press("End")
-        after = window.look()["print"]
+        after = window.touch(slider, SLIDE)["print"]
         assert after != before
         assert np.abs(window.tip("calibrated") - where).max() > 1e-6
         before = after
-    before = window.look("setMagnification", 20)["print"]
+    before = window.look("setMagnification", 100)["print"]
     for box in page.locator("#layers input").all():
-        box.uncheck()
-        after = window.look()["print"]
+        after = window.touch(box, CLICK)["print"]
         assert after != before
         before = after
     where = window.tip("nominal")
     page.get_by_role("button", name="Play").click()
-    page.wait_for_timeout(400)
+    page.wait_for_function("where => Math.abs(dhcal.tip('nominal')[0][3] - where) > 1e-3", arg=where[0, 3])
     page.get_by_role("button", name="Pause").click()
-    assert np.abs(window.tip("nominal") - where).max() > 1e-3
     still = window.tip("nominal")
     page.wait_for_timeout(100)
     assert np.array_equal(window.tip("nominal"), still)
@@ -268,7 +211,7 @@ def test_a_result_shows_its_own_data_in_a_notebook(window, tmp_path, sim_6dof, s
     cell = show(sim_6dof, fit, title='A <b>"&</b> arm')._repr_html_()
     window.page.set_content(f"<!DOCTYPE html>{cell}")
     frame = window.page.frames[1]
-    frame.wait_for_function("window.dhcal && window.dhcal.ready === true")
+    frame.wait_for_function(READY)
     assert frame.locator("h1").inner_text() == 'A <b>"&</b> arm'
     assert frame.evaluate("dhcal.scene.points.length") == 20
     frame.evaluate("q => dhcal.setJoints(q)", data.q[0].tolist())
@@ -288,29 +231,43 @@ def test_reflectors_beside_the_tool_and_lengths_are_no_residuals(window, tmp_pat
     known = {unknown.name: place for unknown, place in zip(data[0].unknowns, places, strict=True)}
     html = scene_html(sim_6dof, measurements=data, known=known)
     window.open(tmp_path / "scene.html", html)
-    assert window.page.evaluate("dhcal.scene.poses.length") == 18
+    assert window.page.evaluate("dhcal.scene.poses.length") == 27
     assert window.page.evaluate("dhcal.scene.points.length") == 9
     assert window.page.evaluate("largest") < 1e-8
     assert window.look()["points"] > 15
 
 
-def test_two_meshed_arms_stay_small_and_come_out_the_same():
-    nominal, calibrated = perturbed(Chain.from_urdf(robot_file("ur_description/urdf/ur5_robot.urdf")))
-    first, second = (scene_html(nominal, calibrated, q=poses(nominal, 20)) for _ in range(2))
-    assert first == second
-    assert len(first.encode()) < 6e6
-    assert '"mesh":0' in first
+def test_ellipsoids_are_what_the_result_predicts(window, tmp_path):
+    nominal, truth = perturbed(Chain.from_dh(paper("sim_6dof")))
+    truth = replace(truth, base=se3.exp6(np.array([2.0, -1.0, 0.3, 0.4, 0.8, -1.2])))
+    q = poses(nominal, 15)
+    fit = calibrate(
+        nominal, Position.simulate(truth, q, Noise(1e-3), np.random.default_rng(5)), "minimal,base"
+    )
+    window.open(tmp_path / "scene.html", scene_html(nominal, fit))
+    seen = window.page.evaluate("dhcal.scene.ellipsoids")
+    assert np.array_equal([each["q"] for each in seen], q)
+    half = fit.chain.base[:3, :3] @ np.array([each["axes"] for each in seen]).reshape(-1, 3, 3)
+    expected = fit.predict(q).covariance[:, :3, :3]
+    assert np.abs(half @ np.swapaxes(half, 1, 2) / expected - 1).max() < 1e-3
+    assert (np.linalg.det(half) > 0).all()
+    # They stand around the calibrated tool, as large as the slider says, and the legend has their size.
+    window.call("setMagnification", 40)
+    columns = window.page.evaluate("[...ellipsoids.children[0].instanceMatrix.array.slice(7 * 16, 8 * 16)]")
+    drawn = np.reshape(columns, (4, 4)).T
+    window.call("setJoints", q[7].tolist())
+    there = se3.inverse(fit.chain.base) @ window.tip("calibrated")
+    assert np.abs(drawn[:3, 3] - there[:3, 3]).max() < 1e-6
+    assert np.abs(fit.chain.base[:3, :3] @ drawn[:3, :3] - 40 * half[7]).max() < 1e-6
+    largest = 1e3 * np.sqrt(np.linalg.eigvalsh(expected).max())
+    assert f"up to {largest:.3f} mm" in window.page.locator("#layers").inner_text()
 
 
-def test_missing_meshes_become_a_skeleton(tmp_path):
-    source = robot_file("ur_description/urdf/ur5_robot.urdf")
-    lost = tmp_path / "arm.urdf"
-    lost.write_bytes(source.read_bytes())
-    page = scene_html(Chain.from_urdf(lost))
-    assert "a mesh is missing" in page
-    assert '"cylinder"' in page
-    found = scene_html(Chain.from_urdf(lost), package_dirs=list(source.parents))
-    assert '"mesh":0' in found
+def test_a_tool_of_which_nothing_tells_the_place_has_no_ellipsoid(sim_6dof):
+    data = Position.simulate(sim_6dof, poses(sim_6dof, 3), Noise(), np.random.default_rng(0))
+    page = scene_html(sim_6dof, calibrate(sim_6dof, data, "dh", priors="none"))
+    assert '"ellipsoids":[]' in page
+    assert "No ellipsoids" in page
 
 
 def test_what_does_not_fit_together_is_said(sim_6dof):
@@ -320,6 +277,8 @@ def test_what_does_not_fit_together_is_said(sim_6dof):
         scene_html(sim_6dof, q=np.zeros((2, 3)))
     with pytest.raises(DhcalError, match="magnification"):
         scene_html(sim_6dof, magnification=0.5)
+    with pytest.raises(DhcalError, match="3 triangles"):
+        scene_html(sim_6dof, triangles=3)
 
 
 def test_view_writes_the_page(tmp_path):
@@ -330,3 +289,24 @@ def test_view_writes_the_page(tmp_path):
     text = page.read_text()
     assert "experiment and experiment_published" in text
     assert main(["view", arms[0], "--html", str(tmp_path / "no" / "scene.html")]) == 2
+
+
+def test_a_calibrated_robots_sidecar_puts_the_points_where_its_tool_is(tmp_path, sim_6dof):
+    truth = replace(sim_6dof, base=se3.exp6(np.array([3.0, -2.0, 1.0, 0.5, 0.2, 2.5])))
+    truth = replace(truth, tool=se3.translation([0.01, 0.02, 0.15]))
+    data = Position.simulate(truth, poses(truth, 40), Noise(1e-5), np.random.default_rng(0))
+    csv, out, page = (tmp_path / name for name in ("data.csv", "out.urdf", "scene.html"))
+    csv.write_text(measurement_text(data, truth))
+    nominal = str(URDF / "sim_6dof.dh.toml")
+    assert main(["calibrate", nominal, str(csv), "--parameters", "base,tool", "-o", str(out)]) == 0
+    assert main(["view", nominal, str(out), "--data", str(csv), "--html", str(page), "--simplify"]) == 0
+    scene = json.loads(page.read_text().split('type="application/json">')[1].split("</script>")[0])
+    # Drawn in the frame of the base link, to where Pinocchio puts the true tool without its base.
+    there = replace(truth, base=np.eye(4)).poses(data.q)[:, :3, 3]
+    assert np.abs(np.array(scene["points"]) - there).max() < 5e-5
+    assert np.abs(scene["residuals"]).max() < 5e-5
+
+
+def test_view_serves_live_only_alone(tmp_path, capsys):
+    assert main(["view", str(URDF / "sim_6dof.dh.toml"), "--live", "--html", str(tmp_path / "a.html")]) == 2
+    assert "--live writes no page" in capsys.readouterr().err

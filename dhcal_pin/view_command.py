@@ -1,0 +1,61 @@
+"""`dhcal view`: the offline page of an arm, or a live scene of it until it is interrupted."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from argparse import Namespace
+
+import numpy as np
+
+from . import terminal, viewer
+from .chain import Chain
+from .errors import DhcalError
+from .files import save
+from .measurement_files import read_measurements
+from .measurements import Measurement
+from .outputs import check_outputs, sidecars
+from .robot_files import existing_sidecar, is_table, read_instrument, read_robot, robot_name
+
+
+def view(args: Namespace) -> int:
+    """Writes the page, opens it where asked for or where no file is named."""
+    if args.live and (args.html or args.open):
+        raise DhcalError("--live writes no page; leave out --html and --open")
+    given = [args.nominal, *([args.calibrated] if args.calibrated else [])]
+    beside = sidecars(given)
+    page = args.html or os.path.join(tempfile.mkdtemp(prefix="dhcal-"), f"{robot_name(args.nominal)}.html")
+    check_outputs([page], [*given, *beside, *args.data])
+    arms = [read_robot(path, None if is_table(path) else args.tip) for path in given]
+    data = [read_measurements(path, arms[0]) for path in args.data]
+    if args.live:
+        return _live(arms, data, args)
+    sidecar = existing_sidecar(given[-1])
+    text = viewer.scene_html(
+        *arms,
+        measurements=data,
+        known=read_instrument(sidecar) if sidecar else None,
+        title=" and ".join(robot_name(path) for path in given),
+        magnification=args.magnification,
+        triangles=args.simplify,
+    )
+    save({page: text})
+    terminal.lines(f"wrote {page}")
+    if args.open or not args.html:
+        terminal.open_page(page)
+    return 0
+
+
+def _live(arms: list[Chain], data: list[Measurement], args: Namespace) -> int:
+    """Plays the measured poses over and over."""
+    from . import live  # MeshCat's Python side takes half a second to import
+
+    poses = np.concatenate([np.zeros((not data, arms[0].size)), *(item.configurations() for item in data)])
+    with live.serve(*arms, magnification=args.magnification, triangles=args.simplify) as scene:
+        terminal.lines(f"live at {scene.url}; end with Ctrl-C")
+        terminal.open_url(scene.url)
+        try:
+            while True:
+                scene.play(poses)
+        except KeyboardInterrupt:
+            return 0

@@ -1,0 +1,110 @@
+"""Pages in a real browser: what is seen on them, what they complain about, what they ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+CHROMIUM = "/usr/bin/chromium"
+# Software rendering, which works without a graphics card and in a container.
+ARGUMENTS = (
+    "--no-sandbox --disable-dev-shm-usage --use-gl=angle --use-angle=swiftshader "
+    "--enable-unsafe-swiftshader --hide-scrollbars"
+).split()
+VIEWPORT = {"width": 700, "height": 400}
+SLIDE = "it.value = it.max; it.dispatchEvent(new Event('input'))"
+CLICK = "it.click()"
+READY = "window.dhcal && window.dhcal.ready === true"
+
+# Draws the scene now and looks at its pixels: how many have each layer's colour, and a fingerprint.
+LOOK = """() => {
+  const { viewer } = dhcal, gl = viewer.renderer.getContext();
+  viewer.render();
+  const { drawingBufferWidth: width, drawingBufferHeight: height } = gl;
+  const data = new Uint8Array(4 * width * height);
+  gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, data);
+  const names = ["nominal", "calibrated", "frames", "points", "ellipsoids", "arrows", "black", "print"];
+  const seen = Object.fromEntries(names.map(name => [name, 0]));
+  const is = (i, ...color) => color.every((value, k) => Math.abs(data[i + k] - value) < 4);
+  for (let i = 0; i < data.length; i += 4) {
+    const r = data[i], g = data[i + 1], b = data[i + 2];
+    if (b - r > 40 && g > r && r > 40 && !is(i, 86, 180, 233)) seen.nominal++;
+    if (r - b > 70 && g - b > 35 && g > 0.55 * r) seen.calibrated++;
+    const green = g - r > 45 && g - b > 8;   // both ellipsoids and y axes
+    if (is(i, 213, 94, 0) || is(i, 86, 180, 233) || green) seen.frames++;
+    if (green) seen.ellipsoids++;
+    if (r < 40 && g < 55 && b > 45 && b < 90) seen.points++;
+    if (r - g > 45 && b - g > 25) seen.arrows++;
+    if (r + g + b < 30) seen.black++;
+    seen.print = (Math.imul(seen.print, 31) + r + 7 * g + 49 * b) | 0;
+  }
+  return seen;
+}"""
+
+
+@dataclass(frozen=True)
+class Window:
+    """One page of the browser and everything it complained about or asked for."""
+
+    page: Any
+    complaints: list[str]
+    requests: list[str]
+
+    def open(self, path: Path, html: str) -> None:
+        """Loads a page from disk and waits until it says that it is ready."""
+        path.write_text(html, encoding="utf-8")
+        self.page.goto(path.as_uri())
+        self.page.wait_for_function(READY)
+
+    def check(self) -> None:
+        """That the page was silent and asked no host for anything since the last check."""
+        complaints, requests = self.complaints[:], self.requests[:]
+        self.complaints.clear()
+        self.requests.clear()
+        assert not complaints
+        assert all(url.startswith(("file:", "data:", "about:")) for url in requests), requests
+
+    def look(self, name: str = "", *values: Any) -> dict[str, int]:
+        """What is seen, after a call of the page if there is one: together they draw only once."""
+        call = f"([name, values]) => {{ if (name) dhcal[name](...values); return ({LOOK})(); }}"
+        return self.page.evaluate(call, [name, list(values)])
+
+    def touch(self, control: Any, action: str) -> dict[str, int]:
+        """What is seen after a control, `it`, was used."""
+        return control.evaluate(f"it => {{ {action}; return ({LOOK})(); }}")
+
+    def tip(self, arm: str) -> np.ndarray:
+        """Where the page says an arm's tool is, (4, 4)."""
+        return np.array(self.page.evaluate("arm => dhcal.tip(arm)", arm))
+
+    def call(self, name: str, *values: Any) -> None:
+        """A function of the page."""
+        self.page.evaluate("([name, values]) => dhcal[name](...values)", [name, list(values)])
+
+
+@contextmanager
+def window_of(browser: Any) -> Iterator[Window]:
+    """A page that must stay silent and ask no host for anything."""
+    page = browser.new_page(viewport=VIEWPORT)
+    out = Window(page, [], [])
+    page.on("console", lambda message: out.complaints.append(message.text))
+    page.on("pageerror", lambda error: out.complaints.append(str(error)))
+    page.on("request", lambda request: out.requests.append(request.url))
+    yield out
+    page.close()
+    out.check()
+
+
+# In MeshCat's own page: where a body of an arm stands, in columns, once its tool frame is there.
+LIVE_FIND = """(arm, body) => {
+  const node = viewer.scene_tree.find(["meshcat", arm, String(body)]).object;
+  if (!node || !node.children.length) return null;
+  viewer.scene_tree.object.updateMatrixWorld(true);
+  const world = viewer.scene_tree.find(["meshcat"]).object.matrixWorld.clone().invert();
+  return world.multiply(node.matrixWorld).elements;
+}"""

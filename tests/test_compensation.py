@@ -1,0 +1,373 @@
+"""Compensation: the true robot, driven with what is returned, lands where it was asked to."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from conftest import paper, robot_file
+from scipy.spatial.transform import Rotation
+
+from dhcal_pin import cli, se3
+from dhcal_pin.calibration import calibrate
+from dhcal_pin.chain import Chain
+from dhcal_pin.compensation import compensate
+from dhcal_pin.dh import DHTable
+from dhcal_pin.errors import DhcalError
+from dhcal_pin.measurement_files import read_targets
+from dhcal_pin.measurements import Noise
+from dhcal_pin.poses import Pose
+from dhcal_pin.robot_files import write_urdf
+
+URDF = Path(__file__).resolve().parent.parent / "urdf"
+ERROR = np.array([5e-3] * 3 + [np.deg2rad(1.0)] * 3)
+
+
+def cartesian() -> Chain:
+    """Three slides and a wrist."""
+    zero, turn = np.zeros(6), np.pi / 2
+    return Chain.from_dh(
+        DHTable(
+            "standard",
+            tuple(f"j{i + 1}" for i in range(6)),
+            np.array([True, True, True, False, False, False]),
+            np.array([0, -turn, 0, 0, 0, 0]),
+            zero,
+            zero,
+            np.array([-turn, -turn, 0, turn, -turn, 0]),
+            zero,
+            np.array([-0.4, -0.4, -0.4, -3.0, -2.0, -3.0]),
+            np.array([0.4, 0.4, 0.4, 3.0, 2.0, 3.0]),
+        )
+    )
+
+
+ROBOTS = {
+    "ur5": lambda: Chain.from_urdf(robot_file("ur_description/urdf/ur5_robot.urdf"), "tool0"),
+    "ur10": lambda: Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "ee_link"),
+    "panda": lambda: Chain.from_urdf(robot_file("panda_description/urdf/panda.urdf"), "panda_hand"),
+    "sim_6dof": lambda: Chain.from_dh(paper("sim_6dof")),
+    "z1": lambda: Chain.from_urdf(robot_file("z1_description/urdf/z1.urdf"), "link06"),
+    "cartesian": cartesian,
+}
+
+
+def wrong(chain: Chain, rng: np.random.Generator) -> Chain:
+    """The chain with every joint and the tip misplaced by up to 1° and 5 mm an axis."""
+    stations = range(2, 2 * len(chain.moving) + 3, 2)
+    return chain.displaced({station: se3.exp6(ERROR * rng.uniform(-1, 1, 6)) for station in stations})
+
+
+def draw(chain: Chain, m: int, rng: np.random.Generator):
+    return rng.uniform(np.maximum(chain.lower, -np.pi), np.minimum(chain.upper, np.pi), (m, chain.size))
+
+
+def pinocchio_pose(chain: Chain, q) -> pin.SE3:
+    data = chain.model.createData()
+    pin.framesForwardKinematics(chain.model, data, chain.configurations(q)[0])
+    return pin.SE3(chain.base) * data.oMf[chain.frame_id] * pin.SE3(chain.tool)
+
+
+def controller(chain: Chain, pose, start):
+    """Newton's method by Pinocchio's Jacobian: joint values (n,) of a nominal controller; tool at the tip."""
+    model, data = chain.model, chain.model.createData()
+    moving = [model.joints[model.getJointId(name)].idx_v for name in chain.joint_names]
+    goal, q = pin.SE3(pose), np.array(start)
+    for _ in range(50):
+        full = chain.configurations(q)[0]
+        pin.framesForwardKinematics(model, data, full)
+        jacobian = pin.computeFrameJacobian(model, data, full, chain.frame_id, pin.LOCAL)[:, moving]
+        gap = pin.log6((pin.SE3(chain.base) * data.oMf[chain.frame_id]).actInv(goal)).vector
+        if np.abs(gap).max() < 1e-13:
+            break
+        q = q + np.linalg.lstsq(jacobian, gap, rcond=None)[0]
+    return q
+
+
+def landing(name: str, m: int, seed: int):
+    """A true robot, targets of which every tenth is beyond its reach, and their compensation."""
+    rng = np.random.default_rng(seed)
+    nominal = ROBOTS[name]()
+    true = wrong(nominal, rng)
+    targets = true.poses(draw(nominal, m, rng))
+    beyond = np.zeros(m, bool)
+    beyond[::10] = True
+    targets[beyond, :3, 3] *= 20 / np.linalg.norm(targets[beyond, :3, 3], axis=1)[:, None]
+    return rng, nominal, true, targets, beyond
+
+
+def check_landing(name: str, m: int, seed: int):
+    rng, nominal, true, targets, beyond = landing(name, m, seed)
+    found = compensate(nominal, true, targets)
+    assert [status == "out of reach" for status in found.status] == beyond.tolist()
+    assert found.reached.tolist() == (~beyond).tolist()
+    assert np.isnan(found.q[beyond]).all()
+    assert np.isnan(found.poses[beyond]).all()
+    for i in np.flatnonzero(~beyond):
+        q, goal = found.q[i], pin.SE3(targets[i])
+        assert np.all((q >= nominal.lower) & (q <= nominal.upper))
+        there = pinocchio_pose(true, q)
+        assert np.linalg.norm(there.translation - goal.translation) <= 1e-9
+        assert np.linalg.norm(pin.log3(there.rotation.T @ goal.rotation)) <= 1e-9
+        assert np.abs(pinocchio_pose(nominal, q).homogeneous - found.poses[i]).max() <= 1e-12
+        # A redundant arm's controller comes from where it is sent; others from somewhere near.
+        near = q if nominal.size > 6 else q + rng.uniform(-5e-3, 5e-3, nominal.size)
+        if found.status[i] == "ok":
+            driven = pinocchio_pose(true, controller(nominal, found.poses[i], near))
+            assert np.linalg.norm(driven.translation - goal.translation) <= 1e-9
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_the_true_robot_lands_where_asked(name):
+    check_landing(name, 60, 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2, 5))
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_thousand_targets_land(name, seed):
+    check_landing(name, 1100, seed)
+
+
+@pytest.mark.parametrize("name", ["ur5", "panda", "sim_6dof"])
+def test_positions_alone_land(name):
+    _, nominal, true, targets, beyond = landing(name, 100, 7)
+    found = compensate(nominal, true, targets[:, :3, 3])
+    assert found.reached.tolist() == (~beyond).tolist()
+    for i in np.flatnonzero(~beyond):
+        there = pinocchio_pose(true, found.q[i]).translation
+        assert np.linalg.norm(there - targets[i, :3, 3]) <= 1e-9
+
+
+def noisy(m: int, seeds: range) -> tuple[list[float], list[float]]:
+    """Squared misses of the true robot and squared predicted standard deviations, both in m²."""
+    nominal = Chain.from_dh(paper("sim_6dof"))
+    misses, expected = [], []
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        true = Chain.from_dh(paper("sim_6dof_actual"))
+        data = Pose.simulate(true, draw(nominal, 40, rng), Noise(1e-4, 1e-4), rng)
+        fit = calibrate(nominal, data, "dh")
+        targets = true.poses(draw(nominal, m, rng))
+        found = compensate(nominal, fit.chain, targets)
+        there = true.poses(found.q[found.reached])[:, :3, 3]
+        misses += np.sum((there - targets[found.reached, :3, 3]) ** 2, 1).tolist()
+        expected += (fit.predict(found.q[found.reached]).position_std ** 2).tolist()
+    return misses, expected
+
+
+def test_with_a_calibrated_model_it_lands_within_the_predicted_spread():
+    misses, expected = noisy(20, range(8))
+    assert 0.6 <= np.sqrt(np.mean(misses) / np.mean(expected)) <= 1.5
+    assert np.mean(np.array(misses) <= 9 * np.array(expected)) >= 0.97
+
+
+@pytest.mark.slow
+def test_the_predicted_spread_is_right_over_many_seeds():
+    misses, expected = noisy(20, range(60))
+    assert 0.9 <= np.sqrt(np.mean(misses) / np.mean(expected)) <= 1.1
+
+
+def test_the_paper_s_eight_objects():
+    """Rows 1-6 of Table 5 give the joint values that the paper sent; row 8 is beyond the arm."""
+    nominal = Chain.from_dh(paper("experiment"))
+    wanted = read_targets(URDF / "experiment_targets.csv", nominal)
+    printed = np.loadtxt(URDF / "experiment_table5.csv", delimiter=",", skiprows=4)[:, :3]
+    for calibrated in (nominal, Chain.from_dh(paper("experiment_published"))):
+        found = compensate(nominal, calibrated, wanted.targets, np.deg2rad([15, 15, -60]))
+        assert found.status == (*["ok"] * 7, "out of reach")
+        assert np.abs(calibrated.poses(found.q[:7])[:, :3, 3] - wanted.targets[:7]).max() <= 1e-9
+    ideal = compensate(nominal, nominal, wanted.targets, np.deg2rad([15, 15, -60]))
+    assert np.abs(np.rad2deg(ideal.q[:5]) - printed[:5]).max() <= 0.03
+    assert np.abs(np.rad2deg(ideal.q[6]) - (29.95, 29.70, -29.39)).max() <= 0.01
+    # 1305.8 mm from the shoulder of an arm of 745 mm.
+    assert ideal.miss[7, 0] == pytest.approx(1.3058 - 0.745, abs=1e-4)
+
+
+def test_at_a_singularity_it_says_so():
+    """UR5's wrist with axes 4 and 6 parallel."""
+    arm = ROBOTS["ur5"]()
+    q = draw(arm, 20, np.random.default_rng(0))
+    q[:10, 4] = 0.0
+    q[10:, 4] = 1.0
+    q[10:, 2] = 1.0
+    found = compensate(arm, arm, arm.poses(q), q)
+    assert found.reached.all()
+    assert set(found.status[:10]) == {"near singular"}
+    assert found.status[10:].count("ok") >= 9
+
+
+def test_beyond_limits_is_not_beyond_reach():
+    table = replace(paper("experiment"), lower=np.deg2rad([-90, -90, -150]), upper=np.deg2rad([90, 90, -5]))
+    arm = Chain.from_dh(table)
+    behind = replace(arm, lower=arm.lower - 10, upper=arm.upper + 10).poses(np.array([[np.pi, 0.3, -1.0]]))
+    found = compensate(arm, arm, np.concatenate([behind[:, :3, 3], 3 * behind[:, :3, 3]]))
+    assert found.status == ("joint limits", "out of reach")
+    assert np.isnan(found.q).all()
+
+
+def test_of_several_solutions_the_nearest_to_what_is_asked():
+    rng = np.random.default_rng(3)
+    arm = ROBOTS["ur10"]()
+    true = wrong(arm, rng)
+    q = draw(arm, 50, rng)
+    round_ = q - 2 * np.pi * np.sign(q)
+    q[25:] = np.where((round_ > arm.lower) & (round_ < arm.upper), round_, q)[25:]
+    assert np.abs(q[25:]).max() > 4.0
+    found = compensate(arm, true, true.poses(q), q + rng.uniform(-0.01, 0.01, q.shape))
+    clear = np.array(found.status) == "ok"
+    assert clear.sum() >= 40
+    assert np.abs(found.q - q)[clear].max() <= 1e-6
+
+
+def test_targets_are_where_the_calibrated_arm_was_measured():
+    rng = np.random.default_rng(5)
+    nominal = ROBOTS["z1"]()
+    base, tool = se3.exp6(rng.normal(size=(2, 6)) * 0.3)
+    true = replace(wrong(nominal, rng), base=base, tool=tool)
+    targets = true.poses(draw(nominal, 30, rng))
+    found = compensate(nominal, true, targets)
+    assert found.reached.all()
+    assert np.abs(true.poses(found.q) - targets).max() <= 1e-9
+    assert np.abs(nominal.poses(found.q) - found.poses).max() <= 1e-12
+
+
+@pytest.mark.parametrize(
+    "targets", [np.zeros((3, 2)), np.full((1, 3), np.nan), np.zeros((0, 3)), 2 * np.eye(4)[None]]
+)
+def test_wrong_targets(targets):
+    arm = Chain.from_dh(paper("experiment"))
+    with pytest.raises(DhcalError, match="targets"):
+        compensate(arm, arm, targets)
+
+
+# --- the command -----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A nominal UR5 and a true one with a base and a tool in its sidecar."""
+    monkeypatch.chdir(tmp_path)
+    nominal = ROBOTS["ur5"]()
+    rng = np.random.default_rng(0)
+    base, tool = se3.exp6(rng.normal(size=(2, 6)) * 0.2)
+    Path("ur5.urdf").write_bytes(nominal.urdf.data)
+    write_urdf(replace(wrong(nominal, rng), base=base, tool=tool), "true.urdf")
+    return Chain.from_urdf("ur5.urdf", "tool0"), replace(
+        Chain.from_urdf("true.urdf", "tool0"), base=base, tool=tool
+    )
+
+
+COMMAND = ("compensate", "ur5.urdf", "true.urdf", "targets.csv", "--tip", "tool0", "-o", "out.csv")
+
+
+def rows():
+    with open("out.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.parametrize("rotation", ["", "qw,qx,qy,qz", "rx[deg],ry[deg],rz[deg]"])
+def test_the_command_writes_what_lands(place, capsys, rotation):
+    nominal, true = place
+    joints = draw(nominal, 20, np.random.default_rng(1))
+    poses = true.poses(joints)
+    poses[3, 0, 3] += 9.0
+    turns = Rotation.from_matrix(poses[:, :3, :3])
+    extra = {"": np.empty((20, 0)), "q": turns.as_quat()[:, [3, 0, 1, 2]], "r": np.rad2deg(turns.as_rotvec())}
+    table = np.hstack([1e3 * poses[:, :3, 3], extra[rotation[:1]]]).tolist()
+    header = "x[mm],y[mm],z[mm]" + ("," + rotation if rotation else "")
+    Path("targets.csv").write_text("\n".join([header, *(",".join(map(repr, row)) for row in table)]))
+    assert cli.main(COMMAND) == 0
+    said = capsys.readouterr().err
+    assert "1 of 20 out of reach: row 4" in said
+    found = rows()
+    assert len(found) == 20
+    assert found[3]["status"] == "out of reach"
+    assert not any(found[3][f"{name}[rad]"] for name in nominal.joint_names)
+    good = [i for i, row in enumerate(found) if row["status"] in ("ok", "near singular")]
+    assert len(good) == 19
+    q = np.array([[float(found[i][f"{name}[rad]"]) for name in nominal.joint_names] for i in good])
+    assert np.abs(true.poses(q)[:, :3, 3] - poses[good, :3, 3]).max() <= 1e-9
+    if rotation:
+        assert np.abs(true.poses(q) - poses[good]).max() <= 1e-9
+    place_ = np.array([[float(found[i][f"{axis}[mm]"]) for axis in "xyz"] for i in good]) / 1e3
+    names = rotation.split(",") if rotation else ["qw", "qx", "qy", "qz"]
+    turned = np.array([[float(found[i][name]) for name in names] for i in good])
+    matrix = (
+        Rotation.from_rotvec(np.deg2rad(turned))
+        if rotation[:1] == "r"
+        else Rotation.from_quat(turned[:, [1, 2, 3, 0]])
+    ).as_matrix()
+    assert np.abs(nominal.poses(q)[:, :3, 3] - place_).max() <= 1e-12
+    assert np.abs(nominal.poses(q)[:, :3, :3] - matrix).max() <= 1e-12
+
+
+def test_joint_columns_choose_the_branch(place):
+    nominal, true = place
+    q = draw(nominal, 30, np.random.default_rng(2))
+    poses = true.poses(q)
+    header = (
+        ",".join(f"{name}[deg]" for name in nominal.joint_names) + ",x[m],y[m],z[m],rx[rad],ry[rad],rz[rad]"
+    )
+    table = np.hstack([np.rad2deg(q), poses[:, :3, 3], se3.log3(poses[:, :3, :3])]).tolist()
+    Path("targets.csv").write_text("\n".join([header, *(",".join(map(repr, row)) for row in table)]))
+    assert cli.main(COMMAND) == 0
+    found = rows()
+    assert {"x[m]", "rz[rad]", "miss_position[m]", "miss_rotation[deg]"} <= set(found[0])
+    got = np.array([[float(row[f"{name}[rad]"]) for name in nominal.joint_names] for row in found])
+    clear = [row["status"] == "ok" for row in found]
+    assert sum(clear) >= 24
+    assert np.abs(got - q)[clear].max() <= 1e-6
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", ["targets.csv", "empty"]),
+        ("x[mm],y[mm],z[mm]\n", ["targets.csv", "no rows"]),
+        ("x,y[mm],z[mm]\n1,2,3\n", ["targets.csv:1", "'x'", "no unit"]),
+        ("x[mm],y[mm]\n1,2\n", ["targets.csv:1", "axes", "x[mm],y[mm],z[mm]"]),
+        ("x[mm],y[mm],z[mm]\n1,2,oops\n", ["targets.csv:2", "'z'", "oops"]),
+        ("x[mm],y[mm],z[mm],qw,qx,qy,qz\n1,2,3,1,1,0,0\n", ["targets.csv:2", "quaternion"]),
+        ("x[mm],y[mm],z[mm],qw\n1,2,3,1\n", ["targets.csv:1", "qw"]),
+        ("x[mm],y[mm],z[mm],elbow[deg]\n1,2,3,1\n", ["targets.csv:1", "elbow"]),
+        ("x[mm],y[mm],z[mm],elbow_joint[deg]\n1,2,3,1\n", ["targets.csv:1", "shoulder_pan_joint"]),
+        ("x[mm],y[mm],z[mm],target\n1,2,3,a\n", ["targets.csv:1", "targets"]),
+    ],
+)
+def test_wrong_target_files(place, capsys, text, words):
+    Path("targets.csv").write_text(text)
+    assert cli.main(COMMAND) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    for word in words:
+        assert word in said
+    assert not Path("out.csv").exists()
+
+
+def test_robots_that_do_not_go_together(place, capsys):
+    Path("targets.csv").write_text("x[mm],y[mm],z[mm]\n1,2,3\n")
+    Path("other.urdf").write_bytes((URDF / "experiment.urdf").read_bytes())
+    for second, tips, words in (
+        ("other.urdf", [], ["other.urdf", "joint_1"]),
+        ("true.urdf", ["--tip", "nowhere"], ["nowhere"]),
+    ):
+        assert cli.main(["compensate", "ur5.urdf", second, "targets.csv", "-o", "out.csv", *tips]) == 2
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        for word in words:
+            assert word in said
+    # A frame behind the tip makes another default tip.
+    text = Path("true.urdf").read_text()
+    more = (
+        '<link name="probe"/><joint name="p" type="fixed"><parent link="tool0"/><child link="probe"/></joint>'
+    )
+    Path("true.urdf").write_text(text.replace("</robot>", f"{more}</robot>"))
+    assert cli.main(["compensate", "ur5.urdf", "true.urdf", "targets.csv", "-o", "out.csv"]) == 2
+    assert "--tip" in capsys.readouterr().err
+    assert cli.main([*COMMAND[:-1], "targets.csv"]) == 2
+    assert "is an input" in capsys.readouterr().err
