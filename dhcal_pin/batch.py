@@ -19,6 +19,7 @@ from .errors import DhcalError
 from .executors import HERE, Workers
 from .measurements import Measurement, joined
 from .parameters import ErrorModel
+from .scratch import scratch
 from .se3 import Array
 from .solver import LEAP_STEPS, LEAPS, RUNAWAY
 from .triangles import Triangles, triangles
@@ -138,9 +139,10 @@ class Batch:
                 residual, rows = item.small_angle(sweep, velocities, u)
             else:
                 residual = item.residual(sweep, u)
-                rows = item.whiten(sweep, velocities, u, residual)
+                rows = scratch("batch rows", p, *residual.shape)
+                item.whiten(sweep, velocities, u, residual, rows)
             k = len(residual)
-            block = np.empty((b, p + 1, k, q.shape[2]))
+            block = scratch(f"batch block {len(blocks)}", b, p + 1, k, q.shape[2])
             block[:, :p] = rows.reshape(p, k, b, -1).transpose(2, 0, 1, 3)
             block[:, p] = residual.reshape(k, b, -1).swapaxes(0, 1)
             blocks.append(block.reshape(b, p + 1, -1))
