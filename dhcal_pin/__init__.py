@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from .measurement_files import read_targets as read_targets
     from .measurements import Noise as Noise
     from .parameters import extract as extract
-    from .parameters import select as select
     from .poses import Pose as Pose
     from .positions import Position as Position
     from .result import Prediction as Prediction
@@ -66,7 +65,6 @@ _HOMES = {
     "Pose": "poses",
     "Position": "positions",
     "extract": "parameters",
-    "select": "parameters",
     "Prediction": "result",
     "Result": "result",
     "accuracy": "result",

@@ -266,7 +266,7 @@ def _levenberg_marquardt(batch: Batch, x: Array, max_iterations: int) -> tuple[A
         moved = free.moved(step)
         change = np.linalg.norm(moved, axis=1)
         settled = free.settled(change, before, last[live])
-        there, trial = x[live] + step, np.empty(len(live))
+        there, trial, ahead = x[live] + step, np.empty(len(live)), None
         # A first try mostly holds, and its triangle, which the next step needs, tells its cost too.
         first = ~settled & fresh[live]
         tried, others = np.flatnonzero(first), np.flatnonzero(~first)
@@ -296,7 +296,7 @@ def _levenberg_marquardt(batch: Batch, x: Array, max_iterations: int) -> tuple[A
             who = live[leaping]
             x[who], cost[who] = _leap(part.take(leaping), x[who], cost[who])
         over = stuck | converged[live] | (accepted & (iterations[live] >= max_iterations))
-        if tried.size:
+        if ahead is not None:
             kept = np.flatnonzero(accepted[tried])
             every.put(live[tried[kept]], ahead.take(kept))
         # Whose step held without a triangle, or who leapt, needs one.
