@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from .check import crosscheck as crosscheck
     from .compensation import Compensation as Compensation
     from .compensation import compensate as compensate
+    from .configurations import Space as Space
     from .dh import DHTable as DHTable
     from .dh_files import read_dh as read_dh
     from .dh_urdf import dh_to_urdf as dh_to_urdf
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from .measurement_files import read_targets as read_targets
     from .measurements import Noise as Noise
     from .parameters import extract as extract
+    from .planning import Plan as Plan
+    from .planning import plan as plan
     from .poses import Pose as Pose
     from .positions import Position as Position
     from .result import Prediction as Prediction
@@ -42,6 +45,7 @@ if TYPE_CHECKING:
     from .stream import file_parts as file_parts
     from .viewer import scene_html as scene_html
     from .viewer import show as show
+    from .workspace import workspace_map as workspace_map
 
 _HOMES = {
     "Batch": "batch",
@@ -52,6 +56,7 @@ _HOMES = {
     "crosscheck": "check",
     "Compensation": "compensation",
     "compensate": "compensation",
+    "Space": "configurations",
     "DHTable": "dh",
     "read_dh": "dh_files",
     "dh_to_urdf": "dh_urdf",
@@ -62,6 +67,8 @@ _HOMES = {
     "read_measurements": "measurement_files",
     "read_targets": "measurement_files",
     "Noise": "measurements",
+    "Plan": "planning",
+    "plan": "planning",
     "Pose": "poses",
     "Position": "positions",
     "extract": "parameters",
@@ -74,6 +81,7 @@ _HOMES = {
     "file_parts": "stream",
     "scene_html": "viewer",
     "show": "viewer",
+    "workspace_map": "workspace",
 }
 __all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
 

@@ -31,7 +31,12 @@ MOST_ROUNDS = 30
 GOOD_FIT = 0.01
 
 
-def _prior_weights(errors: ErrorModel, priors: Priors) -> Array:
+def prior_weights(errors: ErrorModel, priors: Priors) -> Array:
+    """One over each prior's sigma (p,), zero where there is none.
+
+    Raises:
+        DhcalError: an unknown choice or name, or a sigma that is not positive.
+    """
     if isinstance(priors, str):
         if priors not in ("default", "none"):
             raise DhcalError(f"priors {priors!r}: choose default, none, or sigmas by name")
@@ -224,7 +229,7 @@ def calibrate(
     reference = _place(errors, data, known, max_iterations)
     errors = replace(errors, chain=reference)
     data = tuple(item.started(reference) for item in data)
-    problem = replace(_problem(errors, data, _prior_weights(errors, priors), known), where=where)
+    problem = replace(_problem(errors, data, prior_weights(errors, priors), known), where=where)
     solution = METHODS[method](problem, np.zeros(len(problem.weights)), max_iterations, progress)
     weights = [np.ones(len(item.rows)) for item in data]
     if method == "lm":

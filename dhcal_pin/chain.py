@@ -304,7 +304,7 @@ class Chain:
         `carry` (p, 4, 4) are the frames that the twists are seen in where these are not the stations' own.
         """
         stations = np.asarray(stations, int)
-        bodies = np.clip((stations - 1) // 2, 0, len(self.moving))
+        bodies = np.minimum(np.maximum((stations - 1) // 2, 0), len(self.moving))
         frames = self._station_frames[stations]
         seen = se3.adjoint(frames if carry is None else frames @ carry)
         return bodies, (seen @ np.asarray(twists, float)[..., None])[..., 0]

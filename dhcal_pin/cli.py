@@ -144,6 +144,9 @@ def parser() -> argparse.ArgumentParser:
     calibrate.add_argument(
         "--tool-frame", metavar="NAME", help="put the tool into the URDF, as a link fixed to the tip"
     )
+    calibrate.add_argument(
+        "--map", metavar="MAP.csv", help="predicted position uncertainty by cells of the workspace"
+    )
     calibrate.add_argument("--json", **_JSON)
     where = calibrate.add_mutually_exclusive_group()
     where.add_argument(
@@ -217,6 +220,55 @@ def parser() -> argparse.ArgumentParser:
     check.add_argument("robot", **_ROBOT)
     check.add_argument("--tip", **_TIP)
     check.add_argument("--json", **_JSON)
+
+    plan = _add(
+        commands,
+        "plan",
+        "which poses to measure, and what accuracy to expect of them",
+        "dhcal plan ur10.urdf -n 40 --tip tool0 --sigma 0.1mm,0.01deg -o poses.csv",
+    )
+    plan.add_argument("robot", **_ROBOT)
+    plan.add_argument("-n", "--count", type=_count, required=True, metavar="N", help="how many poses")
+    plan.add_argument("-o", "--output", metavar="poses.csv", required=True, help="joint values, short tour")
+    plan.add_argument("--tip", **_TIP)
+    plan.add_argument("--kind", metavar="KIND", default="pose", help="what is measured (pose)")
+    plan.add_argument(
+        "--sigma",
+        metavar="LENGTH[,ANGLE]",
+        help="of instrument and repeatability, an axis (what --data show, else 0.1mm,0.01deg)",
+    )
+    plan.add_argument(
+        "--criterion",
+        metavar="C",
+        default="D",
+        help="D volume of the errors' uncertainty, A mean, E worst, task position error (D)",
+    )
+    plan.add_argument(
+        "--task", metavar="FILE", help="where the tool must be right: joint values, or x[mm],y[mm],z[mm]"
+    )
+    plan.add_argument("--parameters", metavar="SET[,SET]", help="what is unknown, as in calibrate")
+    plan.add_argument("--fix", metavar="NAME[,NAME]", default="", help="hold parameters or sets at nominal")
+    plan.add_argument("--free", metavar="NAME[,NAME]", default="", help="add single parameters")
+    plan.add_argument("--priors", metavar="default|FILE", help="sigmas of the errors, as in calibrate")
+    plan.add_argument("--instrument", metavar="FILE", help="surveyed values, as in calibrate")
+    plan.add_argument("--data", metavar="DATA", nargs="+", help="measurements already taken, to add to")
+    plan.add_argument("--columns", **_COLUMNS)
+    plan.add_argument(
+        "--candidates", type=_count, default=5000, metavar="N", help="how many to choose from (5000)"
+    )
+    plan.add_argument(
+        "--from", dest="candidates_from", metavar="FILE", help="choose among a file's joint values instead"
+    )
+    plan.add_argument("--box", metavar="X,Y,Z:X,Y,ZUNIT", help="where the tool may be, measuring frame")
+    plan.add_argument("--visible-from", metavar="X,Y,ZUNIT", help="the instrument; nothing may hide the tool")
+    plan.add_argument(
+        "--cone", metavar="ANGLE", help="the instrument is within this of the tool's z axis, as 30deg"
+    )
+    plan.add_argument(
+        "--margin", default="5mm,2deg", metavar="LENGTH,ANGLE", help="to the joints' limits (5mm,2deg)"
+    )
+    plan.add_argument("--seed", metavar="N", type=_seed, default=0, help="of the candidates (0)")
+    plan.add_argument("--json", **_JSON)
 
     simulate = _add(
         commands,

@@ -19,6 +19,7 @@ from . import (
     demo,
     exports,
     fleet_command,
+    plan_command,
     report,
     study_command,
     terminal,
@@ -27,6 +28,8 @@ from . import (
 )
 from .chain import Chain
 from .check import crosscheck
+from .configuration_files import map_text
+from .configurations import joint_range
 from .dh_files import dh_text, is_dh
 from .dh_urdf import dh_to_urdf
 from .errors import DhcalError
@@ -54,7 +57,7 @@ from .robot_files import (
 )
 from .screening import Finding, screen
 from .solver import Progress
-from .study import configurations
+from .workspace import workspace_map
 
 # --- calibrate -------------------------------------------------------------------------------------
 
@@ -141,7 +144,7 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     _urdf_ending(args.output)
     check_outputs([args.json], inputs)
     kept = [*measured, *priors, *maps] if args.in_place else inputs
-    check_outputs([args.output, sidecar_path(args.output), args.json], kept)
+    check_outputs([args.output, sidecar_path(args.output), args.map, args.json], kept)
 
     chain = read_robot(args.robot, args.tip)
     sets = args.parameters or chain.parameters
@@ -163,6 +166,11 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     )
     contents = _written(fit, args)
     files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
+    if args.map:
+        text = map_text(
+            workspace_map(fit), [f"predicted position uncertainty of {args.output}, measuring frame"]
+        )
+        contents[args.map], files["map"] = text, args.map
     if args.json and args.json != STDOUT:
         files["json"] = args.json
     gross = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))
@@ -318,7 +326,8 @@ def _simulate(args: Namespace) -> int:
                 f"they must be those of {args.robot}: {', '.join(chain.joint_names)}"
             )
     rng = np.random.default_rng(args.seed)
-    data = KINDS[args.kind].simulate(truth, configurations(chain, args.samples, rng), noise, rng)
+    q = rng.uniform(*joint_range(chain), (args.samples, chain.size))
+    data = KINDS[args.kind].simulate(truth, q, noise, rng)
     comments = [f"simulated {args.kind} of {args.truth or args.robot}, noise {args.noise}, seed {args.seed}"]
     save({args.output: measurement_text(data, chain, comments)})
     terminal.lines(f"wrote {args.output}")
@@ -341,6 +350,7 @@ COMMANDS: dict[str, Callable[[Namespace], int]] = {
     "convert": _convert,
     "view": view_command.view,
     "check": _check,
+    "plan": plan_command.run,
     "simulate": _simulate,
     "compensate": compensate_command.run,
     "study": study_command.study,

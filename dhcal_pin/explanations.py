@@ -20,8 +20,8 @@ from .parameters import Parameter
 from .passage import NONE, PARALLEL, Passage, Path, own_axes, passage, tilt
 from .poses import Pose
 from .positions import Position
+from .problem import Problem, Triangle
 from .se3 import Array
-from .solver import Problem, Triangle
 
 # Axes within this of parallel are nearly so.
 _NEARLY = np.deg2rad(5.0)
@@ -164,8 +164,11 @@ class Explainer:
 
     def _arm(self, group: Group) -> tuple[str, str]:
         members, way = self._robot_part(group)
-        arm = all(i < len(self.experiment.problem.errors.parameters) for i in group.members)
-        advice = "no measurement of this arm tells more" if arm else "no reading of the tool tells more"
+        robot = len(self.experiment.problem.errors.parameters)
+        if all(i < robot for i in group.members):
+            advice = "no measurement of this arm tells more"
+        else:
+            advice = "more readings that depend on them may tell"
         if way is None or np.abs(way.tool).max() > NONE:
             return "", advice
         return _why(self.path.chain, way, members), advice
@@ -174,7 +177,7 @@ class Explainer:
         members, way = self._robot_part(group)
         chain = self.path.chain
         outside = len(group.members) > len(members)
-        if all(p.station == BASE for p in members):
+        if members and all(p.station == BASE for p in members):
             if outside:
                 return "the robot and the instrument can move as one", self._reading(group)
             return "the readings stay the same when the whole robot moves so", self._reading(group)
@@ -197,7 +200,8 @@ class Explainer:
         if group.vectors.shape[1] != 1 or len(group.members) < 2:
             return False
         path, count = self.path, len(self.path.parameters)
-        if max(i for i in group.members if i < len(self.experiment.problem.errors.parameters)) >= count:
+        robot = [i for i in group.members if i < len(self.experiment.problem.errors.parameters)]
+        if not robot or robot[-1] >= count:
             return False
         sweep = path.chain.sweep(self.experiment.draw(np.random.default_rng(0), 30))
         velocities = path.chain.tool_velocities(sweep, path.bodies, path.twists)[:, :3]

@@ -18,7 +18,7 @@ class Job:
         data: paths of measurement files.
         output: path of the corrected URDF.
         tip, columns, parameters, fix, free, holdout, method, loss, priors, instrument, max_iterations,
-            seed, in_place, world_joint, tool_frame, json: as `dhcal calibrate --help` says.
+            seed, in_place, world_joint, tool_frame, json, map: as `dhcal calibrate --help` says.
     """
 
     robot: str
@@ -40,6 +40,7 @@ class Job:
     world_joint: bool = False
     tool_frame: str | None = None
     json: str | None = None
+    map: str | None = None
 
     @classmethod
     def of(cls, args: Namespace) -> Job:

@@ -80,7 +80,7 @@ def _group(sheet: Sheet, names: Sequence[str], units: Mapping[str, float] | None
     return np.stack([sheet.si(sheet.columns[name], units) for name in names], -1)
 
 
-def _joints(sheet: Sheet, chain: Chain, before: str = "") -> Array:
+def joint_values(sheet: Sheet, chain: Chain, before: str = "") -> Array:
     """Joint values (m, n) under the joints' names, each with `before` in front."""
     missing = [name for name in chain.joint_names if before + name not in sheet.columns]
     if missing:
@@ -131,7 +131,7 @@ def _whole_sigmas(sheet: Sheet, kind: type[Measurement], values: Mapping[str, An
         )
 
 
-def _sheet(path: PathLike, chain: Chain, columns: PathLike | None) -> Sheet:
+def reading_sheet(path: PathLike, chain: Chain, columns: PathLike | None) -> Sheet:
     """A measurement file as it is, or another maker's by its map."""
     if columns is None:
         return read_sheet(path)
@@ -151,7 +151,7 @@ def read_readings(path: PathLike, chain: Chain, columns: PathLike | None = None)
         DhcalError: what is wrong, with file, line and column, and what would be right.
     """
     check_joint_names(chain)
-    return readings_of(_sheet(path, chain, columns), chain)
+    return readings_of(reading_sheet(path, chain, columns), chain)
 
 
 def readings_of(sheet: Sheet, chain: Chain) -> Readings:
@@ -160,7 +160,7 @@ def readings_of(sheet: Sheet, chain: Chain) -> Readings:
     kind = kind_of(sheet)
     values = _values(sheet, kind)
     _whole_sigmas(sheet, kind, values)
-    q = [_joints(sheet, chain, before) for before in ("", TO)[: kind.ends]]
+    q = [joint_values(sheet, chain, before) for before in ("", TO)[: kind.ends]]
     try:
         data = kind.from_columns(q or [np.zeros((len(sheet.cells), chain.size))], values)
     except DhcalError as error:
@@ -245,7 +245,7 @@ def read_targets(path: PathLike, chain: Chain) -> Targets:
             f"{sheet.source}:{sheet.header}: these are readings of kind {kind.kind}; targets have "
             "x[mm],y[mm],z[mm], with or without qw,qx,qy,qz or rx[rad],ry[rad],rz[rad]"
         )
-    near = _joints(sheet, chain) if set(chain.joint_names) & set(sheet.columns) else None
+    near = joint_values(sheet, chain) if set(chain.joint_names) & set(sheet.columns) else None
     nowhere = np.zeros((len(sheet.cells), chain.size))
     try:
         data = kind.from_columns([nowhere], _values(sheet, kind))
@@ -266,13 +266,23 @@ def measurement_text(data: Measurement, chain: Chain, comments: Sequence[str] = 
     for before, q in zip(
         ("", TO)[: data.ends], np.split(data.configurations(), max(data.ends, 1)), strict=False
     ):
-        for j, name in enumerate(chain.joint_names):
-            columns[f"{before}{name}[{'m' if units_of(chain, name) is LENGTHS else 'rad'}]"] = q[
-                :, j
-            ].tolist()
+        columns |= joint_columns(q, chain, before)
     for name, values in data.to_columns().items():
         unit = {"length": "[m]", "angle": "[rad]", "text": ""}[data.columns[name]]
         columns[name + unit] = list(values) if unit == "" else values.tolist()
+    return csv_text(columns, comments)
+
+
+def joint_columns(q: Array, chain: Chain, before: str = "") -> dict[str, list[float]]:
+    """Columns (m,) of joint values (m, n), each name with `before` in front, in metres and radians."""
+    return {
+        f"{before}{name}[{'m' if units_of(chain, name) is LENGTHS else 'rad'}]": q[:, j].tolist()
+        for j, name in enumerate(chain.joint_names)
+    }
+
+
+def csv_text(columns: Mapping[str, Sequence[Any]], comments: Sequence[str]) -> str:
+    """Comments and columns of equal length as CSV."""
     out = io.StringIO()
     out.writelines(f"# {comment}\n" for comment in comments)
     writer = csv.writer(out, lineterminator="\n")

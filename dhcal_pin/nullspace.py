@@ -20,8 +20,8 @@ from .measurements import Measurement
 from .passage import NONE
 from .poses import Pose
 from .positions import Position
+from .problem import Problem, reduce
 from .se3 import Array
-from .solver import Problem, reduce
 
 Cause = Literal["arm", "instrument", "poses", "still"]
 
@@ -88,11 +88,7 @@ class Experiment:
 
     def rows(self) -> int:
         """How many numbers were read."""
-        problem, chain = self.problem, self.chain
-        return sum(
-            item.residual(chain.sweep(item.configurations()), problem.values(item, self.x)).size
-            for item in problem.data
-        )
+        return sum(item.size * len(item.rows) for item in self.problem.data)
 
     def aside(self) -> Experiment:
         """The same with the measured point some way off."""

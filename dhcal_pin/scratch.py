@@ -20,10 +20,9 @@ def scratch(name: str, *shape: int) -> Array:
     unless its caller knows.
     """
     size = math.prod(shape)
-    held: Array | None = getattr(_store, name, None)
+    held: Array | None = _store.__dict__.get(name)
     if held is None or held.size < size:
-        held = np.empty(size)
-        setattr(_store, name, held)
+        held = _store.__dict__[name] = np.empty(size)
     return held[:size].reshape(shape)
 
 
@@ -32,11 +31,16 @@ class LongRows(ContextDecorator):
 
     def __enter__(self) -> None:
         """Rows longer than the buffer are used where they are."""
-        self.before = np.setbufsize(64)
+        self.outermost = not getattr(_store, "long_rows", False)
+        if self.outermost:
+            self.before = np.setbufsize(64)
+            _store.long_rows = True
 
     def __exit__(self, *_: object) -> None:
         """As it was."""
-        np.setbufsize(self.before)
+        if self.outermost:
+            np.setbufsize(self.before)
+            _store.long_rows = False
 
     def _recreate_cm(self) -> LongRows:
         return LongRows()

@@ -44,10 +44,15 @@ def with_priors(triangle: Triangle, weights: Array, x: Array, damping: Array) ->
     return Triangle(full[:p, :p], full[:p, p], triangle.rest + float(full[p, p] ** 2))
 
 
+def _regular(r: Array) -> bool:
+    """Whether no singular value of a triangle (p, p) can be near the cut."""
+    return bool(r.size) and lapack.dtrcon(r)[0] > SURELY_REGULAR
+
+
 def pseudo_inverse(r: Array, z: Array) -> Array:
     """Shortest least-squares solution of R·δ = z, singular values cut as in `observability`."""
     # Far from the cut there is one solution, and the triangle gives it a hundred times as fast.
-    if len(z) and lapack.dtrcon(r)[0] > SURELY_REGULAR:
+    if _regular(r):
         return lapack.dtrtrs(r, z)[0]
     return np.linalg.lstsq(r, z, rcond=observability.RANK_CUT)[0]
 
@@ -59,6 +64,8 @@ def posterior_root(triangle: Triangle, weights: Array) -> tuple[Array, Array]:
     """
     zero = np.zeros_like(weights)
     full = with_priors(triangle, weights, zero, zero).r
+    if _regular(full):
+        return lapack.dtrtri(full)[0], np.empty((len(zero), 0))
     _, s, vt = np.linalg.svd(full)
     keep = s > observability.RANK_CUT * s[0]
     return vt[keep].T / s[keep], vt[~keep].T

@@ -22,6 +22,7 @@ from . import se3
 from .arms import Arms
 from .batch import Batch, joined, solve
 from .chain import Chain
+from .configurations import joint_range
 from .errors import DhcalError
 from .executors import HERE, Workers
 from .files import PathLike, parse_noise, read_toml
@@ -77,29 +78,16 @@ class Setting:
     iterations: int = 100
 
 
-def configurations(chain: Chain, count: int, rng: np.random.Generator, share: float = 1.0) -> Array:
-    """Uniform joint values (count, n) within the limits, and within a turn or half a metre each way.
-
-    Args:
-        chain: the robot.
-        count: how many.
-        rng: where they are drawn from.
-        share: the part of each joint's range that they are in, from its lower end.
-    """
-    low, high = chain.lower, chain.upper
-    slides = [chain.urdf.joint(name).type == "prismatic" for name in chain.joint_names]
-    span = np.where(slides, 0.5, np.pi)
-    low, high = (
-        np.where(high > -span, np.maximum(low, -span), np.maximum(low, high - 2 * span)),
-        np.where(low < span, np.minimum(high, span), np.minimum(high, low + 2 * span)),
-    )
+def _drawn(chain: Chain, count: int, rng: np.random.Generator, share: float = 1.0) -> Array:
+    """Uniform joint values (count, n) in the lower `share` of each joint's range."""
+    low, high = joint_range(chain)
     return rng.uniform(low, low + share * (high - low), (count, chain.size))
 
 
 # How poses are chosen: all over the joints' ranges, or in their lowest quarter alone.
 CHOICES: dict[str, Callable[[Chain, int, np.random.Generator], Array]] = {
-    "random": configurations,
-    "corner": partial(configurations, share=0.25),
+    "random": _drawn,
+    "corner": partial(_drawn, share=0.25),
 }
 # What is kept of each calibration, and its unit.
 MEASURES = {
@@ -231,7 +219,7 @@ def _tried(case: Case, where: str) -> None:
     select(nominal, setting.wrong)
     if case.truth is not None:
         Arms.of([errors, select(case.truth, setting.parameters)])
-    q = configurations(nominal, 8, np.random.default_rng(0))
+    q = _drawn(nominal, 8, np.random.default_rng(0))
     data = KINDS[setting.kind].simulate(nominal, q, Noise(), np.random.default_rng(0))
     try:
         Batch(Arms.of([errors]), (data,), np.zeros(len(errors.parameters)))
@@ -286,7 +274,7 @@ def calibrations(task: tuple[Case, int, int]) -> list[list[float]]:
         batch = measured()
         found = solve(batch, setting.method, 1, start=found.x)
     checks = [np.random.default_rng(_TEST_SEED + seed) for seed in seeds]
-    tests = np.array([configurations(nominal, TESTS, rng) for rng in checks])
+    tests = np.array([_drawn(nominal, TESTS, rng) for rng in checks])
     goal, start, end = (
         arms.sweep(tests[None]).tool.reshape(4, 3, count, TESTS)
         for arms in (truths, batch.arms, batch.arms.at(found.x))

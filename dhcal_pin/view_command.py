@@ -50,7 +50,7 @@ def _live(arms: list[Chain], data: list[Measurement], args: Namespace) -> int:
     """Plays the measured poses over and over."""
     from . import live  # MeshCat's Python side takes half a second to import
 
-    poses = np.concatenate([np.zeros((not data, arms[0].size)), *(item.configurations() for item in data)])
+    poses = np.concatenate([item.configurations() for item in data] or [np.zeros((1, arms[0].size))])
     with live.serve(*arms, magnification=args.magnification, triangles=args.simplify) as scene:
         terminal.lines(f"live at {scene.url}; end with Ctrl-C")
         terminal.open_url(scene.url)

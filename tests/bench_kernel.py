@@ -10,7 +10,8 @@ from scipy.linalg import lapack
 from dhcal_pin import se3
 from dhcal_pin.chain import Chain, link_station
 from dhcal_pin.parameters import ErrorModel, select
-from dhcal_pin.problem import reduce
+from dhcal_pin.problem import CHUNK, reduce
+from dhcal_pin.scratch import scratch
 from dhcal_pin.solver import pseudo_inverse, with_priors
 
 
@@ -62,7 +63,12 @@ def jacobian(chain: Chain, sets: str, m: int, repeats: int) -> tuple[float, floa
     out = np.empty((len(bodies), 6, m))
 
     def ours() -> None:
-        chain.tool_velocities(chain.sweep(q), bodies, twists, out)
+        # In pieces that stay in the caches, as the solver takes them.
+        for at in range(0, m, CHUNK):
+            motion = chain.motion(q[at : at + CHUNK])
+            k, some = motion.values.shape
+            sweep = chain.sweep(motion, scratch("sweep", k + 2, 4, 3, some))
+            chain.tool_velocities(sweep, bodies, twists, out[..., at : at + CHUNK])
 
     model, frame = chain.model, chain.frame_id
     data = model.createData()

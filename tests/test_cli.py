@@ -396,7 +396,7 @@ def test_too_much_is_one_line(refused, monkeypatch):
     def endless(*_):
         raise MemoryError
 
-    monkeypatch.setattr(commands, "configurations", endless)
+    monkeypatch.setattr(commands, "joint_range", endless)
     refused(["not enough memory", "fewer"], "simulate", "arm.urdf", "-m", "1000000000000", "-o", "s.csv")
 
 

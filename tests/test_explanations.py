@@ -20,7 +20,7 @@ from dhcal_pin.parameters import select
 from dhcal_pin.passage import Path
 from dhcal_pin.poses import Pose
 from dhcal_pin.positions import Position
-from dhcal_pin.solver import Problem, reduce
+from dhcal_pin.problem import Problem, reduce
 
 
 def table(theta, d, a, alpha, prismatic=()):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import webbrowser
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -11,10 +12,12 @@ import numpy as np
 import pinocchio as pin
 import psutil
 import pytest
+from conftest import URDF
 from pages import LIVE_FIND
 
 from dhcal_pin import se3
 from dhcal_pin.chain import Chain
+from dhcal_pin.cli import main
 from dhcal_pin.errors import DhcalError
 from dhcal_pin.live import PATIENCE, Live, serve
 
@@ -81,3 +84,21 @@ def test_the_server_ends_with_the_scene(sim_6dof):
         mine = processes(scene)
     assert not psutil.wait_procs(mine, timeout=10)[1]
     assert not os.path.exists(scene._window.folder.name)
+
+
+@pytest.mark.parametrize("data", [[], ["--data", str(URDF / "experiment_table5.csv")]])
+def test_view_plays_the_measured_poses_until_it_is_interrupted(data, monkeypatch, capsys):
+    opened, played = [], []
+
+    def play(scene: Live, q: np.ndarray) -> None:
+        scene.show(q[0])
+        played.append(q)
+        if len(played) == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(webbrowser, "open", lambda url: opened.append(url) or True)
+    monkeypatch.setattr(Live, "play", play)
+    assert main(["view", str(URDF / "experiment.dh.toml"), "--live", *data]) == 0
+    assert opened[0].startswith("http://127.0.0.1:")
+    assert opened[0] in capsys.readouterr().err
+    assert [q.shape for q in played] == [(8 if data else 1, 3)] * 2

@@ -1,0 +1,179 @@
+"""What measuring would tell: the information of readings not yet taken, and the errors that remain."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from . import observability
+from .calibration import Priors, calibrate, prior_weights
+from .chain import Chain
+from .design import basis
+from .errors import DhcalError
+from .kinds import KINDS
+from .measurements import Measurement, Noise
+from .parameters import ErrorModel, select
+from .se3 import Array
+
+# The unknowns of an instrument are placed as if it were to read so many configurations.
+_PLACED = 200
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """What would be known after measuring at any configurations, to first order about the model at hand.
+
+    The unknowns are the p errors of the robot, then those of instruments, each in units of its prior's sigma.
+
+    Attributes:
+        errors: the robot's unknowns.
+        x: (p,) their values so far.
+        kind: of measurement.
+        noise: its sigmas.
+        own: (s,) values of the kind's unknowns.
+        places: (s,) where those stand among all unknowns; -1 for one that is known.
+        scale: (p+s',) sigmas of the priors, m and rad.
+        start: (p+s', p+s') triangle of priors and data so far.
+        taken: (p+s', p+s') or (0, p+s') triangle of the data alone.
+    """
+
+    errors: ErrorModel
+    x: Array
+    kind: type[Measurement]
+    noise: Noise
+    own: Array
+    places: Array
+    scale: Array
+    start: Array
+    taken: Array
+
+    @cached_property
+    def _derivative(self) -> tuple[Chain, Array, Array]:
+        return self.errors.derivative(self.x)
+
+    @property
+    def chain(self) -> Chain:
+        """The robot as far as it is known."""
+        return self._derivative[0]
+
+    def rows(self, q: Array) -> Array:
+        """Whitened rows (p+s', k, m) of readings at joint values q (m, n)."""
+        chain, bodies, twists = self._derivative
+        data = self.kind.simulate(chain, q, self.noise, np.random.default_rng(0))
+        sweep = chain.sweep(q)
+        velocities = chain.tool_velocities(sweep, bodies, twists)
+        whitened = data.whiten(sweep, velocities, self.own, data.residual(sweep, self.own))
+        out = np.zeros((len(self.scale), *whitened.shape[1:]))
+        out[: len(whitened)] = whitened
+        free = self.places >= 0
+        out[self.places[free]] = data.own(sweep, self.own)[free]
+        return out * self.scale[:, None, None]
+
+    def task(self, q: Array) -> Array:
+        """Combinations (p+s', w) whose variances add up to the mean squared position error at q, m²."""
+        chain, bodies, twists = self._derivative
+        velocities = chain.tool_velocities(chain.sweep(q), bodies, twists)[:, :3]
+        out = np.zeros((len(self.scale), 3 * len(q)))
+        out[: len(velocities)] = velocities.reshape(len(velocities), -1)
+        return np.asarray(np.linalg.qr((out * self.scale[:, None]).T / np.sqrt(len(q)), mode="r")).T
+
+    def seen(self, rows: Array) -> Array:
+        """Orthonormal directions (r, p+s') that data so far and further rows (n, k, p+s') see."""
+        every = np.concatenate([self.taken, rows.reshape(-1, len(self.scale))])
+        return observability.row_space(np.asarray(np.linalg.qr(every, mode="r")))
+
+    def error(self, rows: Array, task: Array) -> float:
+        """Predicted RMS position error in m over a `task`, after readings of rows (n, k, p+s')."""
+        return float(np.sqrt(np.sum((task.T @ basis(self.start, rows)) ** 2)))
+
+    @classmethod
+    def before(
+        cls,
+        chain: Chain,
+        q: Array,
+        kind: str,
+        noise: Noise | None,
+        parameters: str | None = None,
+        priors: Priors = "default",
+        fix: Sequence[str] = (),
+        free: Sequence[str] = (),
+        data: Sequence[Measurement] = (),
+        known: Mapping[str, float] | None = None,
+    ) -> Information:
+        """What is known before measuring: the priors, and what data already taken tell.
+
+        Args:
+            chain: the nominal robot.
+            q: (m, n) joint values of the kind that will be measured.
+            kind: of `KINDS`.
+            noise: its sigmas; None for those that the data show.
+            parameters: what is unknown, as in `calibrate`.
+            priors: as in `calibrate`.
+            fix: as in `calibrate`.
+            free: as in `calibrate`.
+            data: readings already taken.
+            known: values of instruments' unknowns, as in `calibrate`.
+
+        Raises:
+            DhcalError: the kind's readings hang together, a sigma or a prior is missing.
+        """
+        maker = _plannable(kind)
+        if priors == "none":
+            raise DhcalError("a plan needs priors; choose default, or sigmas by name")
+        errors = select(chain, parameters if parameters is not None else chain.parameters, fix, free)
+        sigma = 1 / prior_weights(errors, priors)
+        x, there, triangle = np.zeros(len(sigma)), {}, np.zeros((0, len(sigma)))
+        values = dict(known or {})
+        if data:
+            fit = calibrate(chain, data, parameters, priors=priors, fix=fix, free=free, known=known)
+            errors, x, triangle = fit.errors, fit.x[: len(sigma)], fit.solution.triangle.r
+            there = {unknown.name: len(sigma) + i for i, unknown in enumerate(fit.problem.unknowns)}
+            sigma, values = 1 / fit.problem.weights, values | fit.instruments
+            noise = noise or _seen(fit.problem.data, kind)
+        if noise is None:
+            raise DhcalError(f"no sigma is known of a {kind}; give one, as 0.1mm,0.01deg")
+        model = errors.at(x)
+        template = maker.simulate(model, q[:_PLACED], noise, np.random.default_rng(0)).started(model)
+        if not template.stated:
+            needs = "0.1mm,0.01deg" if "orientation" in maker.groups else "0.1mm"
+            raise DhcalError(f"a {kind} needs sigmas above zero, as {needs}")
+        places = []
+        for unknown in template.unknowns:
+            if unknown.name not in values:
+                there[unknown.name] = len(sigma)
+                sigma = np.append(sigma, unknown.prior)
+            places.append(there.get(unknown.name, -1))
+        taken = np.zeros((len(triangle), len(sigma)))
+        taken[:, : triangle.shape[1]] = triangle * sigma[: triangle.shape[1]]
+        start = np.concatenate([taken, np.eye(len(sigma))])
+        return cls(
+            errors=errors,
+            x=x,
+            kind=maker,
+            noise=noise,
+            own=np.array([values.get(unknown.name, unknown.nominal) for unknown in template.unknowns]),
+            places=np.array(places, int),
+            scale=sigma,
+            start=np.asarray(np.linalg.qr(start, mode="r")),
+            taken=taken,
+        )
+
+
+def _plannable(kind: str) -> type[Measurement]:
+    """The kind, if its readings stand alone: one configuration each, and no name that ties rows together."""
+    alone = [name for name, kept in KINDS.items() if kept.ends == 1 and "text" not in kept.columns.values()]
+    if kind not in alone:
+        raise DhcalError(f"kind {kind!r}: no plan for it; choose from {', '.join(alone)}")
+    return KINDS[kind]
+
+
+def _seen(data: Sequence[Measurement], kind: str) -> Noise | None:
+    """The sigmas of data of that kind, as stated or as the fit found them."""
+    for item in data:
+        if item.kind == kind:
+            sigmas = [getattr(item, name, np.zeros(1)) for name in ("sigma", "rotation_sigma")]
+            return Noise(*(float(np.sqrt(np.mean(sigma**2))) for sigma in sigmas))
+    return None

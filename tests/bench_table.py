@@ -1,0 +1,175 @@
+# ruff: noqa: E402
+"""All benchmarks in one table of ratios, measured side by side on one core: `python tests/bench_table.py`.
+
+Rivals from PyPI get environments of their own in a folder under the system's temporary one, built once.
+CPU time, medians of turns; `--quick` takes fewer turns and smaller cases.
+"""
+
+from __future__ import annotations
+
+import os
+
+# Before NumPy is loaded: one thread for everybody.
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[_name] = "1"
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import time
+import venv
+from pathlib import Path
+
+import bench_calibration
+import bench_kernel
+import numpy as np
+import pinocchio as pin
+from bench_common import Row, clocked, measured, robots
+from conftest import robot_file
+
+from dhcal_pin.calibration import calibrate
+from dhcal_pin.measurement_files import measurement_text
+
+HERE = Path(__file__).resolve().parent
+CACHE = Path(tempfile.gettempdir()) / "dhcal-bench"
+UR10 = "ur_description/urdf/ur10_robot.urdf"
+
+
+def environment(package: str) -> Path | None:
+    """The Python of an environment with a package from PyPI, or None if it does not install."""
+    folder = CACHE / package
+    python = folder / "bin" / "python"
+    if not (folder / "ready").exists():
+        venv.create(folder, with_pip=True, clear=True)
+        if subprocess.run([python, "-m", "pip", "install", "-q", package], check=False).returncode:
+            return None
+        (folder / "ready").touch()
+    return python
+
+
+def spoken(command: list, folder: Path, **environ: str) -> object:
+    """The JSON in the last line that a command prints."""
+    done = subprocess.run(
+        command, cwd=folder, env=os.environ | environ, capture_output=True, text=True, check=True
+    )
+    return json.loads(done.stdout.strip().splitlines()[-1])
+
+
+def against_ceres(m: int, repeats: int) -> list[Row]:
+    """Ceres through pyceres, one vectorised block."""
+    if (python := environment("pyceres")) is None:
+        return []
+    theirs = subprocess.run(
+        [python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"],
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.strip()
+    # Our own packages first: pyceres needs nothing but NumPy.
+    path = os.pathsep.join([str(HERE.parent), str(HERE), sysconfig.get_path("purelib"), theirs])
+    found = spoken([sys.executable, HERE / "bench_ceres.py", str(m), str(repeats)], HERE, PYTHONPATH=path)
+    assert isinstance(found, list)
+    return [
+        Row(f"calibration: Ceres with our Jacobian, {name}, m={m}", ours, other, other / ours, "≥ 8")
+        for name, ours, other in found
+    ]
+
+
+def against_figaroh(m: int, repeats: int) -> list[Row]:
+    """Figaroh on a UR10 in a frame that nobody gave, and both errors on 200 poses held out."""
+    if (python := environment("figaroh")) is None:
+        return []
+    chain, sets = robots()["UR10, minimal,base,tool"]
+    _, _, data = measured(chain, sets, m + 200)
+    fit, held = data.take(np.s_[:m]), data.take(np.s_[m:])
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        shutil.copy(robot_file(UR10), folder / "robot.urdf")
+        for file, part in (("fit.csv", fit), ("holdout.csv", held)):
+            rpy = np.array([pin.rpy.matrixToRpy(pose[:3, :3]) for pose in part.poses])
+            head = ",".join(["x1", "y1", "z1", "phix1", "phiy1", "phiz1", *chain.joint_names])
+            rows = np.hstack([part.poses[:, :3, 3], rpy, part.q])
+            np.savetxt(folder / file, rows, "%.17g", ",", header=head, comments="")
+        command = [python, HERE / "bench_figaroh.py", chain.urdf.root, chain.tip, str(m)]
+        found = spoken(command, folder, PYTHONPATH="")
+    assert isinstance(found, dict)
+    (ours,) = clocked([lambda: calibrate(chain, fit, sets)], repeats)
+    mine = 1e3 * calibrate(chain, fit, sets).validate(held)["position_rms_m"]
+    other = 1e3 * found["holdout"]
+    what = f"calibration: figaroh, UR10, m={m} (held out {mine:.3f} mm, figaroh {other:.3f} mm)"
+    return [Row(what, ours, found["seconds"], found["seconds"] / ours, "≥ 100")]
+
+
+def start_up(repeats: int) -> list[Row]:
+    """`dhcal calibrate` on 1,000 rows against importing what it stands on."""
+    chain, sets = robots()["UR10, minimal,base,tool"]
+    _, _, data = measured(chain, sets, 1000)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        shutil.copy(robot_file(UR10), folder / "arm.urdf")
+        (folder / "data.csv").write_text(measurement_text(data, chain))
+        whole = "-m dhcal_pin.cli calibrate arm.urdf data.csv --tip tool0 -o out.urdf".split()
+        imports = ["-c", "import pinocchio, numpy, scipy.linalg"]
+        times: dict[str, list[float]] = {"ours": [], "theirs": []}
+        for _ in range(repeats):
+            for key, arguments in (("ours", whole), ("theirs", imports)):
+                before = os.times()
+                subprocess.run(
+                    [sys.executable, *arguments],
+                    cwd=folder,
+                    env=os.environ | {"PYTHONPATH": str(HERE.parent)},
+                    stderr=subprocess.DEVNULL,
+                    check=True,
+                )
+                after = os.times()
+                times[key].append(
+                    after.children_user
+                    - before.children_user
+                    + after.children_system
+                    - before.children_system
+                )
+    ours, theirs = (float(np.median(times[key])) for key in ("ours", "theirs"))
+    what = "`dhcal calibrate` on 1,000 rows as a multiple of its imports"
+    return [Row(what, ours, theirs, ours / theirs, "≤ 2.5")]
+
+
+def line(row: Row) -> str:
+    """A row of the table in Markdown."""
+    times = (f"{1e3 * seconds:.3g} ms" for seconds in (row.ours, row.theirs))
+    return f"| {row.what} | {' | '.join(times)} | {row.ratio:.3g} | {row.wanted} |"
+
+
+def main() -> None:
+    """Prints the table as it grows, then the growth of an iteration with samples and joints."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="fewer turns, smaller cases")
+    quick = parser.parse_args().quick
+    turns, began = (5 if quick else 15), time.time()
+    print("| What | dhcal_pin | other | ratio | wanted |\n| --- | --- | --- | --- | --- |")
+    for part, arguments in (
+        (bench_kernel.iterations, ((100, 1000, 10000), turns)),
+        (bench_kernel.jacobians, (turns,)),
+        (bench_calibration.against_scipy, (1000, 1 if quick else 3)),
+        (against_ceres, (1000, turns)),
+        (against_figaroh, (100 if quick else 1000, turns)),
+        (start_up, (3 if quick else 7,)),
+    ):
+        for row in part(*arguments):
+            print(line(row), flush=True)
+    sizes = (100, 1000, 10000, 100000) if quick else (100, 1000, 10000, 100000, 1000000)
+    print(f"\n| µs a sample, Jacobian to triangle | {' | '.join(f'm={m:.0e}' for m in sizes)} |")
+    print("| --- |" + " --- |" * len(sizes))
+    for name, micros in bench_kernel.growth(sizes, turns):
+        print(f"| {name} | {' | '.join(f'{value:.2f}' for value in micros)} |", flush=True)
+    joints = (3, 6, 10, 14)
+    print(f"\n| Joints, m=1000 | {' | '.join(map(str, joints))} |\n| --- |" + " --- |" * len(joints))
+    print(f"| µs a sample | {' | '.join(f'{v:.2f}' for v in bench_kernel.by_joints(joints, turns))} |")
+    print(f"\n{time.time() - began:.0f} s", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

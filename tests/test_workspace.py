@@ -1,0 +1,56 @@
+"""Maps of the predicted uncertainty against the errors of many simulated robots."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dhcal_pin.calibration import calibrate
+from dhcal_pin.configurations import Room, Space
+from dhcal_pin.measurements import Noise
+from dhcal_pin.parameters import select
+from dhcal_pin.poses import Pose
+from dhcal_pin.workspace import workspace_map
+
+NOISE = Noise(1e-4, np.deg2rad(0.01))
+
+
+def test_cells_hold_the_errors_that_calibrated_robots_have(sim_6dof):
+    """Poses of one corner calibrate well there and badly elsewhere, and the map says how badly."""
+    errors = select(sim_6dof, "minimal,base,tool")
+    prior = np.where(errors.priors < 1, errors.priors, 1e-3)
+    rng = np.random.default_rng(0)
+    q = Room.of(sim_6dof, Space(), 0.0, 0.0).draw(1500, rng)
+    squares, expected = [], []
+    for _ in range(6):
+        truth = errors.at(prior * rng.standard_normal(len(prior)))
+        taken = rng.uniform(0.0, 1.2, (20, 6))
+        fit = calibrate(sim_6dof, Pose.simulate(truth, taken, NOISE, rng), "minimal,base,tool")
+        found = workspace_map(fit, cell=0.5, samples=1500)
+        points = fit.chain.poses(q)[:, :3, 3]
+        gap = np.sum((points - truth.poses(q)[:, :3, 3]) ** 2, 1)
+        cells = {tuple(cell): i for i, cell in enumerate(np.floor(found.centre / 0.5).astype(int))}
+        at = np.array([cells.get(tuple(cell), -1) for cell in np.floor(points / 0.5).astype(int)])
+        squares.append(gap[at >= 0])
+        expected.append(found.std[at[at >= 0]] ** 2)
+    squares, expected = np.concatenate(squares), np.concatenate(expected)
+    for low, high in ((0, 25), (25, 50), (50, 75), (75, 100)):
+        part = (expected >= np.percentile(expected, low)) & (expected <= np.percentile(expected, high))
+        # Six robots with some thirty directions each.
+        assert np.sqrt(squares[part].mean()) == pytest.approx(np.sqrt(expected[part].mean()), rel=0.25)
+    assert np.percentile(expected, 90) > 1.3 * np.percentile(expected, 10)
+
+
+def test_every_configuration_has_its_cell(sim_6dof):
+    rng = np.random.default_rng(1)
+    fit = calibrate(sim_6dof, Pose.simulate(sim_6dof, rng.uniform(-2, 2, (20, 6)), NOISE, rng))
+    found = workspace_map(fit, cell=0.25, samples=3000, seed=5)
+    assert found.count.sum() == 3000
+    q = Room.of(fit.chain, Space(), 0.0, 0.0).draw(3000, np.random.default_rng(5))
+    prediction = fit.predict(q)
+    assert found.worst.max() == pytest.approx(prediction.position_std.max(), rel=1e-12)
+    inside = np.abs(prediction.poses[:, None, :3, 3] - found.centre).max(-1) <= 0.125
+    assert np.array_equal(inside.sum(0), found.count)
+    cell = int(np.argmax(found.count))
+    wanted = np.sqrt(np.mean(prediction.position_std[inside[:, cell]] ** 2))
+    assert found.std[cell] == pytest.approx(wanted, rel=1e-12)
