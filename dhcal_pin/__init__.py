@@ -12,6 +12,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .batch import Batch as Batch
+    from .batch import solve as solve
     from .calibration import calibrate as calibrate
     from .calibration import split as split
     from .chain import Chain as Chain
@@ -46,11 +48,15 @@ if TYPE_CHECKING:
     from .result import Result as Result
     from .robot_files import read_robot as read_robot
     from .robot_files import write_urdf as write_urdf
+    from .stream import calibrate_stream as calibrate_stream
+    from .stream import file_parts as file_parts
     from .viewer import scene_html as scene_html
     from .viewer import show as show
     from .workspace import workspace_map as workspace_map
 
 _HOMES = {
+    "Batch": "batch",
+    "solve": "batch",
     "calibrate": "calibration",
     "split": "calibration",
     "Chain": "chain",
@@ -85,6 +91,8 @@ _HOMES = {
     "Result": "result",
     "read_robot": "robot_files",
     "write_urdf": "robot_files",
+    "calibrate_stream": "stream",
+    "file_parts": "stream",
     "scene_html": "viewer",
     "show": "viewer",
     "workspace_map": "workspace",

@@ -17,6 +17,7 @@ from . import se3
 from .chain import BASE, Chain, Sweep
 from .errors import DhcalError
 from .parameters import ErrorModel
+from .scratch import scratch
 from .se3 import Array
 
 
@@ -179,8 +180,10 @@ class Arms:
             shape: c, b and m.
             bodies: (p,) ascending.
             twists: (p, b, 6) in those bodies' frames; velocities are in axes of the measuring frame.
+
+        The velocities lie in memory that the next ones overwrite.
         """
-        out = np.empty((len(bodies), 6, *shape))
+        out = scratch("arms' velocities", len(bodies), 6, *shape)
         starts = np.searchsorted(bodies, np.arange(len(sweep.bodies) + 1))
         for j, body in enumerate(sweep.bodies):
             rows = slice(starts[j], starts[j + 1])

@@ -19,6 +19,7 @@ from .errors import DhcalError
 from .executors import HERE, Workers
 from .measurements import Measurement, joined
 from .parameters import ErrorModel
+from .scratch import scratch
 from .se3 import Array
 from .solver import LEAP_STEPS, LEAPS, RUNAWAY
 from .triangles import Triangles, triangles
@@ -138,9 +139,10 @@ class Batch:
                 residual, rows = item.small_angle(sweep, velocities, u)
             else:
                 residual = item.residual(sweep, u)
-                rows = item.whiten(sweep, velocities, u, residual)
+                rows = scratch("batch rows", p, *residual.shape)
+                item.whiten(sweep, velocities, u, residual, rows)
             k = len(residual)
-            block = np.empty((b, p + 1, k, q.shape[2]))
+            block = scratch(f"batch block {len(blocks)}", b, p + 1, k, q.shape[2])
             block[:, :p] = rows.reshape(p, k, b, -1).transpose(2, 0, 1, 3)
             block[:, p] = residual.reshape(k, b, -1).swapaxes(0, 1)
             blocks.append(block.reshape(b, p + 1, -1))
@@ -200,20 +202,15 @@ class Solutions:
 
     @cached_property
     def covariance(self) -> Array:
-        """Covariances (b, p, p) of x as of `result.Result`: infinite where nothing tells, else NaN."""
-        p = self.x.shape[1]
-        stacked = np.concatenate(
-            [self.triangles.r, np.tile(np.diag(self.batch.weights), (len(self.x), 1, 1))], 1
-        )
-        _, s, vt = np.linalg.svd(np.linalg.qr(stacked, mode="r"))
+        """Covariances (b, p, p) of x, sigmas believed; infinite on the diagonal where nothing tells."""
+        b, p = self.x.shape
+        priors = np.tile(np.diag(self.batch.weights), (b, 1, 1))
+        _, s, vt = np.linalg.svd(np.linalg.qr(np.concatenate([self.triangles.r, priors], 1), mode="r"))
         kept = s > observability.RANK_CUT * s[:, :1]
         half = np.where(kept, 1 / np.where(kept, s, 1.0), 0.0)[..., None] * vt
-        freedom = self.batch.rows() - self.rank
-        with np.errstate(divide="ignore", invalid="ignore"):
-            noise = np.where(freedom > 0, self.cost / freedom, np.nan)
-        out = noise[:, None, None] * (half.swapaxes(1, 2) @ half)
+        out = half.swapaxes(1, 2) @ half
         lost = 1 - np.sum(np.where(kept[..., None], vt, 0.0) ** 2, 1) > 1e-6
-        out[lost[:, :, None] & lost[:, None, :] & np.eye(p, dtype=bool)] = np.inf
+        out[lost[:, :, None] & np.eye(p, dtype=bool)] = np.inf
         return out
 
 
@@ -224,7 +221,7 @@ def _gauss_newton(batch: Batch, x: Array, max_iterations: int) -> tuple[Array, A
     for done in range(1, max_iterations + 1):
         full = part.reduce(x[live], batch.weights, small_angle=True)
         step = full.step()
-        settled = full.settled(step, full.cost)
+        settled = full.settled(np.linalg.norm(full.moved(step), axis=1), full.cost)
         x[live] += step
         iterations[live], converged[live] = done, settled
         over = settled | ~(np.abs(x[live]).max(1) < RUNAWAY)
@@ -255,7 +252,7 @@ def _levenberg_marquardt(batch: Batch, x: Array, max_iterations: int) -> tuple[A
     x, iterations, converged = x.copy(), np.zeros(b, int), np.zeros(b, bool)
     every, scale = batch.reduce(x, batch.weights, small_angle=False), np.zeros((b, p))
     cost, damping, growth = every.cost, np.full(b, 1e-8), np.full(b, 2.0)
-    fresh = np.ones(b, bool)
+    fresh, last = np.ones(b, bool), np.zeros(b)
     if not max_iterations:
         return x, iterations, converged
     while live.size:
@@ -266,8 +263,10 @@ def _levenberg_marquardt(batch: Batch, x: Array, max_iterations: int) -> tuple[A
         floor = np.where(scale[live] > 0, scale[live], 1.0)
         least = np.sqrt(damping[live])[:, None] * floor
         step = free.damped(least).step(least.min(1))
-        settled = free.settled(step, before)
-        there, trial = x[live] + step, np.empty(len(live))
+        moved = free.moved(step)
+        change = np.linalg.norm(moved, axis=1)
+        settled = free.settled(change, before, last[live])
+        there, trial, ahead = x[live] + step, np.empty(len(live)), None
         # A first try mostly holds, and its triangle, which the next step needs, tells its cost too.
         first = ~settled & fresh[live]
         tried, others = np.flatnonzero(first), np.flatnonzero(~first)
@@ -276,7 +275,7 @@ def _levenberg_marquardt(batch: Batch, x: Array, max_iterations: int) -> tuple[A
             trial[tried] = ahead.cost
         if others.size:
             trial[others] = part.take(others).cost(there[others])
-        expected = np.sum(free.z**2, -1) - np.sum((free.moved(step) - free.z) ** 2, -1)
+        expected = np.sum(free.z**2, -1) - np.sum((moved - free.z) ** 2, -1)
         gain = np.where(expected > 0, (before - trial) / np.where(expected > 0, expected, 1.0), 0.0)
         rounding, root = free.rounding(), np.sqrt(before)
         blur = (10 * rounding) ** 2 + 2 * rounding * root
@@ -285,7 +284,7 @@ def _levenberg_marquardt(batch: Batch, x: Array, max_iterations: int) -> tuple[A
         stuck = ~accepted & (settled | (damping[live] > 1e16))
         easier = np.where(trusted | (gain > 0.9), 1e-2, np.maximum(1e-3, 1 - (2 * gain - 1) ** 3))
         went, retry = live[accepted], live[~accepted]
-        x[went] = there[accepted]
+        x[went], last[went] = there[accepted], change[accepted]
         cost[went], growth[went] = trial[accepted], 2.0
         fresh[live] = accepted
         damping[went] = np.maximum(damping[went] * easier[accepted], 1e-16)
@@ -297,7 +296,7 @@ def _levenberg_marquardt(batch: Batch, x: Array, max_iterations: int) -> tuple[A
             who = live[leaping]
             x[who], cost[who] = _leap(part.take(leaping), x[who], cost[who])
         over = stuck | converged[live] | (accepted & (iterations[live] >= max_iterations))
-        if tried.size:
+        if ahead is not None:
             kept = np.flatnonzero(accepted[tried])
             every.put(live[tried[kept]], ahead.take(kept))
         # Whose step held without a triangle, or who leapt, needs one.

@@ -13,6 +13,7 @@ from . import calibration, exports, extension, report, report_page
 from .chain import Chain
 from .configuration_files import map_text
 from .errors import DhcalError
+from .executors import HERE, Workers
 from .files import PathLike, save
 from .jobs import Job
 from .measurement_files import read_readings
@@ -99,7 +100,7 @@ class Outcome:
     trials: tuple[extension.Trial, ...]
 
 
-def run_job(args: Job, progress: Progress | None = None) -> Outcome:
+def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) -> Outcome:
     """Calibrates one robot and writes its files, in this process or another; shows nothing.
 
     Raises:
@@ -139,6 +140,7 @@ def run_job(args: Job, progress: Progress | None = None) -> Outcome:
         loss=args.loss,
         max_iterations=args.max_iterations,
         progress=progress,
+        where=where,
     )
     contents = _written(fit, args)
     files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))

@@ -12,6 +12,7 @@ import numpy as np
 from . import observability, robust
 from .chain import BASE, Chain
 from .errors import DhcalError
+from .executors import HERE, Workers
 from .frames import few, misfit, starts
 from .measurements import Measurement
 from .parameters import ErrorModel, select
@@ -194,6 +195,7 @@ def calibrate(
     loss: str = "linear",
     max_iterations: int = 100,
     progress: Progress | None = None,
+    where: Workers = HERE,
 ) -> Result:
     """Identify a chain's errors from measurements.
 
@@ -212,6 +214,7 @@ def calibrate(
         loss: "linear", or "huber", "cauchy", "tukey", which gross errors bend little or not at all.
         max_iterations: most steps of a loop.
         progress: called with the iteration and the cost.
+        where: what chunks of many samples are shared out to.
 
     Sigmas that no instrument states are estimated with the fit, a group of rows at a time, and default
     priors take the size of the errors that are found, so that data and priors weigh right against each
@@ -237,7 +240,7 @@ def calibrate(
     reference = _place(errors, data, known, max_iterations)
     errors = replace(errors, chain=reference)
     data = tuple(item.started(reference) for item in data)
-    problem = _problem(errors, data, prior_weights(errors, priors), known)
+    problem = replace(_problem(errors, data, prior_weights(errors, priors), known), where=where)
     default = _default(errors, priors)
     solution = METHODS[method](problem, np.zeros(len(problem.weights)), max_iterations, progress)
     if errors.at(solution.x[: len(errors.parameters)]).transmission is not None:

@@ -15,8 +15,9 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -177,6 +178,10 @@ class Chain:
         text = dh_to_urdf(table, name)
         chain = cls.from_urdf(parse_urdf(text.encode(), f"{name}.urdf"), "tool0")
         return replace(chain, parameters="dh")
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what can be worked out anew: a model is heavy to send to another process."""
+        return {part.name: getattr(self, part.name) for part in fields(self)}
 
     @property
     def size(self) -> int:

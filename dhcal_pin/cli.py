@@ -51,6 +51,7 @@ _DATA: dict[str, Any] = {"metavar": "DATA", "nargs": "+", "help": "measurement C
 _TIP: dict[str, Any] = {"metavar": "F", "help": "tip link of a URDF (default: the deepest leaf)"}
 _COLUMNS: dict[str, Any] = {"metavar": "MAP.toml", "help": "how to read files of another maker"}
 _JSON: dict[str, Any] = {"metavar": "FILE", "help": "the result as JSON; - for stdout"}
+_SCHEDULER: dict[str, Any] = {"metavar": "ADDRESS", "help": "a Dask cluster, as tcp://host:8786"}
 
 
 def _count(text: str) -> int:
@@ -161,9 +162,11 @@ def parser() -> argparse.ArgumentParser:
         help="the report, as .html or .md; may repeat",
     )
     calibrate.add_argument("--json", **_JSON)
-    calibrate.add_argument(
-        "--jobs", metavar="N", type=_count, help="processes for a manifest (default: one a processor)"
+    where = calibrate.add_mutually_exclusive_group()
+    where.add_argument(
+        "--jobs", metavar="N", type=_count, help="processes (default: one, or one a processor for a manifest)"
     )
+    where.add_argument("--scheduler", **_SCHEDULER)
 
     validate = _add(
         commands,
@@ -321,15 +324,10 @@ def parser() -> argparse.ArgumentParser:
         "study", metavar="STUDY.toml", help="the grid, or one that ships: figure3, figure4, ur10_poses"
     )
     study.add_argument("-o", "--output", metavar="results.csv", required=True, help="a line a setting")
-    _add_where(study)
-    return out
-
-
-def _add_where(command: argparse.ArgumentParser) -> None:
-    """Where the work is done."""
-    where = command.add_mutually_exclusive_group()
+    where = study.add_mutually_exclusive_group()
     where.add_argument("--jobs", metavar="N", type=_count, default=1, help="processes on this machine (1)")
-    where.add_argument("--scheduler", metavar="ADDRESS", help="a Dask cluster, as tcp://host:8786")
+    where.add_argument("--scheduler", **_SCHEDULER)
+    return out
 
 
 def main(argv: Sequence[str] | None = None) -> int:

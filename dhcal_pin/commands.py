@@ -32,8 +32,9 @@ from .dh_files import dh_text, is_dh
 from .dh_urdf import dh_to_urdf
 from .errors import DhcalError
 from .evaluation import accuracy
+from .executors import workers
 from .files import parse_noise, save
-from .fleet import ENDING, is_fleet
+from .fleet import is_fleet
 from .jobs import Job
 from .kinds import KINDS
 from .measurement_files import measurement_text, read_readings
@@ -60,13 +61,13 @@ def _calibrate_one(job: Job) -> dict[str, Any]:
 
 def _calibrate(args: Namespace) -> int:
     if is_fleet(args.robot):
+        if args.scheduler:
+            raise DhcalError("--scheduler: goes with one robot; a manifest takes --jobs")
         return fleet_command.run(args, _calibrate_one)
     if not args.data:
         raise DhcalError(f"DATA is required: name at least one measurement file behind {args.robot}")
-    if args.jobs is not None:
-        raise DhcalError(f"--jobs: goes with a manifest (NAME{ENDING}) in place of ROBOT; leave it out")
-    with terminal.progress("fitting") as progress:
-        outcome = run_job(Job.of(args), progress)
+    with workers(args.jobs or 1, args.scheduler) as where, terminal.progress("fitting") as progress:
+        outcome = run_job(Job.of(args), progress, where)
     if args.json == STDOUT:
         emit(args.json, outcome.document)
     for path, found in outcome.findings.items():

@@ -9,12 +9,12 @@ import numpy as np
 
 from . import robust, se3
 from .chain import Chain
+from .configurations import joint_range
 from .evaluation import deviations, group_of, instrument_values
 from .measurements import Measurement
 from .parameters import ErrorModel, offset
 from .result import Result
 from .se3 import Array
-from .study import configurations
 
 # Configurations that the workspace is judged by, and bins that a joint's range is parted into.
 SAMPLES, BINS = 16000, 12
@@ -171,7 +171,7 @@ class Workspace:
 
 def workspace(fit: Result) -> Workspace:
     """Predicted accuracy at configurations drawn over the joints' ranges, and at the fitted samples."""
-    every = configurations(fit.chain, SAMPLES, np.random.default_rng(0))
+    every = np.random.default_rng(0).uniform(*joint_range(fit.chain), (SAMPLES, fit.chain.size))
     used = [item.configurations() for item in fit.data if item.ends > 0]
     there = np.concatenate(used) if used else np.empty((0, fit.chain.size))
     into = se3.inverse(fit.chain.base)

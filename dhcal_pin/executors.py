@@ -31,7 +31,8 @@ class Workers:
     def map(self, function: Callable[[_Task], _Done], tasks: Iterable[_Task]) -> Iterator[_Done]:
         """Results in the order of the tasks, of which never more than `ahead` are in memory."""
         if self.executor is None:
-            yield from map(function, tasks)
+            for task in tasks:
+                yield function(task)
             return
         waiting = deque()
         try:

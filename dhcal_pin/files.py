@@ -8,7 +8,7 @@ import re
 import shutil
 import tempfile
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -237,8 +237,13 @@ def read_sheet(path: PathLike) -> Sheet:
     Raises:
         DhcalError: it is empty, its header is none, or a row is too short or too long.
     """
-    source, comments, kept = os.fspath(path), [], []
-    for number, line in enumerate(read_text(path).splitlines(), 1):
+    return sheet_of(os.fspath(path), enumerate(read_text(path).splitlines(), 1))
+
+
+def sheet_of(source: str, numbered: Iterable[tuple[int, str]]) -> Sheet:
+    """The sheet of numbered lines, which need not be all of a file; as `read_sheet`."""
+    comments, kept = [], []
+    for number, line in numbered:
         if line.lstrip().startswith("#"):
             comments.append(line.lstrip()[1:].strip())
         elif line.strip(" \t,;"):

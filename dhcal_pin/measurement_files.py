@@ -151,7 +151,11 @@ def read_readings(path: PathLike, chain: Chain, columns: PathLike | None = None)
         DhcalError: what is wrong, with file, line and column, and what would be right.
     """
     check_joint_names(chain)
-    sheet = reading_sheet(path, chain, columns)
+    return readings_of(reading_sheet(path, chain, columns), chain)
+
+
+def readings_of(sheet: Sheet, chain: Chain) -> Readings:
+    """The readings of a sheet, which may be a part of a file; as `read_readings`."""
     check_columns(sheet, chain)
     kind = kind_of(sheet)
     values = _values(sheet, kind)

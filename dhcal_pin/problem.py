@@ -7,14 +7,16 @@ memory does not grow with the samples. Nothing here knows a kind of measurement 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
+from typing import TypeVar
 
 import numpy as np
 from scipy.linalg import lapack
 
 from .chain import Chain, Motion, Sweep
+from .executors import HERE, Workers
 from .measurements import Measurement, Unknown
 from .parameters import ErrorModel
 from .scratch import LongRows, scratch
@@ -22,6 +24,7 @@ from .se3 import Array
 
 # Samples a chunk, and columns that LAPACK reduces at once.
 CHUNK, PANEL = 2000, 8
+_Found = TypeVar("_Found")
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,12 +39,14 @@ class Problem:
         data: measurements, any mixture of kinds.
         weights: (p+s,) one over the prior's sigma; zero where there is none.
         known: values of instruments' unknowns, by name, that are no unknowns here.
+        where: what the chunks are shared out to; their order, and so every digit, stays.
     """
 
     errors: ErrorModel
     data: tuple[Measurement, ...]
     weights: Array
     known: Mapping[str, float] = field(default_factory=dict)
+    where: Workers = HERE
 
     @cached_property
     def unknowns(self) -> tuple[Unknown, ...]:
@@ -84,12 +89,12 @@ class Problem:
     def cost(self, x: Array) -> float:
         """Sum of squared whitened residuals and priors at x (p,)."""
         chain = self.errors.at(x[: len(self.errors.parameters)])
-        every = self.instruments(x)
-        total = float(np.sum((self.weights * x) ** 2))
-        for chunk in self.chunks:
-            residual = chunk.data.residual(chunk.sweep(chain), chunk.unknowns(every))
-            total += float(np.sum(residual * residual))
-        return total
+        costs = self.each(partial(_cost, chain, self.instruments(x)))
+        return sum(costs, float(np.sum((self.weights * x) ** 2)))
+
+    def each(self, function: Callable[[Chunk], _Found]) -> Iterator[_Found]:
+        """What a function finds in each chunk, in order."""
+        return self.where.map(function, self.chunks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,6 +162,15 @@ class Tangent:
         return qr(block.reshape(p + 1, -1))
 
 
+def _cost(chain: Chain, instruments: Mapping[str, float], chunk: Chunk) -> float:
+    residual = chunk.data.residual(chunk.sweep(chain), chunk.unknowns(instruments))
+    return float(np.vdot(residual, residual))
+
+
+def _triangle(tangent: Tangent, small_angle: bool, chunk: Chunk) -> Array:
+    return tangent.triangle(chunk, small_angle)
+
+
 def shared_unknowns(data: Sequence[Measurement]) -> tuple[Unknown, ...]:
     """The unknowns of several measurements, each once; a start that is NaN gives way to one that is not."""
     found: dict[str, Unknown] = {}
@@ -215,8 +229,7 @@ def merge(first: Array, second: Array) -> Array:
 
 def reduce(problem: Problem, x: Array, small_angle: bool) -> Triangle:
     """The data's triangle at x (p,), without the priors; exact or by the paper's rows."""
-    tangent = problem.tangent(x)
-    return finished((tangent.triangle(chunk, small_angle) for chunk in problem.chunks), len(x))
+    return finished(problem.each(partial(_triangle, problem.tangent(x), small_angle)), len(x))
 
 
 def finished(triangles: Iterable[Array], p: int) -> Triangle:

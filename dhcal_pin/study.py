@@ -78,23 +78,16 @@ class Setting:
     iterations: int = 100
 
 
-def configurations(chain: Chain, count: int, rng: np.random.Generator, share: float = 1.0) -> Array:
-    """Uniform joint values (count, n) within the limits, and within a turn or half a metre each way.
-
-    Args:
-        chain: the robot.
-        count: how many.
-        rng: where they are drawn from.
-        share: the part of each joint's range that they are in, from its lower end.
-    """
+def _drawn(chain: Chain, count: int, rng: np.random.Generator, share: float = 1.0) -> Array:
+    """Uniform joint values (count, n) in the lower `share` of each joint's range."""
     low, high = joint_range(chain)
     return rng.uniform(low, low + share * (high - low), (count, chain.size))
 
 
 # How poses are chosen: all over the joints' ranges, or in their lowest quarter alone.
 CHOICES: dict[str, Callable[[Chain, int, np.random.Generator], Array]] = {
-    "random": configurations,
-    "corner": partial(configurations, share=0.25),
+    "random": _drawn,
+    "corner": partial(_drawn, share=0.25),
 }
 # What is kept of each calibration, and its unit.
 MEASURES = {
@@ -149,7 +142,7 @@ class Study:
 
 
 def read_study(path: PathLike) -> Study:
-    """A study's TOML file: `title`, `seeds`, and `[settings]`, entries of `Setting` or lists.
+    """A study's TOML file: `title`, `seeds`, and `[settings]` with `Setting`'s entries or lists of them.
 
     Raises:
         DhcalError: an unknown key, a value that does not fit, a robot that cannot be read.
@@ -168,9 +161,10 @@ def read_study(path: PathLike) -> Study:
     for name in {name for setting in settings for name in (setting.robot, setting.truth) if name}:
         chains[name] = read_robot(_beside(name, path))
     cases = [Case(setting, chains[setting.robot], chains.get(setting.truth)) for setting in settings]
-    for case in {
-        (case.setting.robot, case.setting.truth, case.setting.kind): case for case in cases
-    }.values():
+    different = {
+        (s.robot, s.truth, s.kind, s.parameters, s.wrong): case for case in cases if (s := case.setting)
+    }
+    for case in different.values():
         _tried(case, where)
     digest = hashlib.sha256(repr((seeds, settings)).encode())
     for name in sorted(chains):
@@ -222,9 +216,10 @@ def _tried(case: Case, where: str) -> None:
     """Complains about what would only fail in the middle of the work."""
     setting, nominal = case.setting, case.nominal
     errors = select(nominal, setting.parameters)
+    select(nominal, setting.wrong)
     if case.truth is not None:
         Arms.of([errors, select(case.truth, setting.parameters)])
-    q = configurations(nominal, 8, np.random.default_rng(0))
+    q = _drawn(nominal, 8, np.random.default_rng(0))
     data = KINDS[setting.kind].simulate(nominal, q, Noise(), np.random.default_rng(0))
     try:
         Batch(Arms.of([errors]), (data,), np.zeros(len(errors.parameters)))
@@ -273,15 +268,13 @@ def calibrations(task: tuple[Case, int, int]) -> list[list[float]]:
         return Batch(Arms.of([errors] * count), (joined(items),), weights)
 
     batch = measured()
-    found = solve(
-        batch, setting.method, min(setting.iterations, 1) if setting.redrawn else setting.iterations
-    )
-    for _ in range(1, setting.iterations if setting.redrawn else 1):
+    most = min(setting.iterations, 1) if setting.redrawn else setting.iterations
+    found = solve(batch, setting.method, most)
+    for _ in range(most, setting.iterations if setting.redrawn else most):
         batch = measured()
         found = solve(batch, setting.method, 1, start=found.x)
-    tests = np.array(
-        [configurations(nominal, TESTS, np.random.default_rng(_TEST_SEED + seed)) for seed in seeds]
-    )
+    checks = [np.random.default_rng(_TEST_SEED + seed) for seed in seeds]
+    tests = np.array([_drawn(nominal, TESTS, rng) for rng in checks])
     goal, start, end = (
         arms.sweep(tests[None]).tool.reshape(4, 3, count, TESTS)
         for arms in (truths, batch.arms, batch.arms.at(found.x))

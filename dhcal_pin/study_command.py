@@ -1,4 +1,4 @@
-"""`dhcal study`: a grid of simulated calibrations, shared out, resumed after a kill, as CSV and plot."""
+"""`dhcal study`: a grid of simulated calibrations, shared out, resumed after a kill, as CSV."""
 
 from __future__ import annotations
 

@@ -71,10 +71,16 @@ class Triangles:
         """R·step (b, p)."""
         return (self.r @ step[..., None])[..., 0]
 
-    def settled(self, step: Array, cost: Array) -> Array:
-        """Whether a step (b, p) changes the whitened rows by nothing that matters, (b,)."""
-        change = np.linalg.norm(self.moved(step), axis=1)
-        return change <= RELATIVE_STEP * np.sqrt(cost) + self.rounding()
+    def settled(self, change: Array, cost: Array, last: Array | float = 0.0) -> Array:
+        """Whether the rows will not move by anything that matters, (b,), as `solver` has it.
+
+        Args:
+            change: (b,) how far a step moves them.
+            cost: (b,) before it.
+            last: (b,) how far the last step moved them; zero where nothing is known of it.
+        """
+        shrinks = np.where(last > 0, np.minimum(1.0, change / np.where(last > 0, last, 1.0)), 1.0)
+        return (change * shrinks <= RELATIVE_STEP * np.sqrt(cost)) | (change <= self.rounding())
 
     def rounding(self) -> Array:
         """What the model's own rounding makes of the rows, (b,)."""

@@ -120,8 +120,7 @@ def test_rank_and_covariance_are_the_result_s(sim_6dof, sim_6dof_actual):
     for i, items in enumerate(data):
         fit = calibrate(sim_6dof, items, "dh", priors="none")
         assert found.rank[i] == fit.rank == 23
-        np.testing.assert_allclose(np.diag(found.covariance[i]) ** 0.5, found.std[i])
-        np.testing.assert_array_equal(np.isinf(found.std[i]), np.isinf(fit.std))
+        np.testing.assert_allclose(found.std[i], fit.std, rtol=1e-5)
 
 
 def test_stated_spread_is_the_scatter_over_repeats(sim_6dof, sim_6dof_actual):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import warnings
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,6 +13,10 @@ from test_study import MANY, table_of
 
 from dhcal_pin.errors import DhcalError
 from dhcal_pin.executors import workers
+from dhcal_pin.measurement_files import measurement_text
+from dhcal_pin.measurements import Noise
+from dhcal_pin.positions import Position
+from dhcal_pin.stream import calibrate_stream, file_parts
 from dhcal_pin.study import read_study, run
 
 distributed = pytest.importorskip("distributed")
@@ -40,6 +45,7 @@ def test_ten_thousand_calibrations_on_a_cluster(cluster, tmp_path):
     assert there == table_of(tmp_path, "here", text=text)
 
 
+@pytest.mark.slow
 def test_a_worker_lost_in_the_middle_changes_nothing(cluster, tmp_path):
     (tmp_path / "s.study.toml").write_text(MANY.replace("seeds = 120", "seeds = 400"))
     study = read_study(tmp_path / "s.study.toml")
@@ -54,6 +60,33 @@ def test_a_worker_lost_in_the_middle_changes_nothing(cluster, tmp_path):
         survivors = client.run(os.getpid)
     np.testing.assert_array_equal(found, here)
     assert next(iter(victim.values())) not in survivors.values()
+
+
+def test_a_stream_gives_the_same_digits_with_a_worker_lost(cluster, tmp_path, sim_6dof, sim_6dof_actual):
+    """Parts of a file that both workers see; one worker dies after the first few triangles."""
+    rng = np.random.default_rng(0)
+    data = Position.simulate(sim_6dof_actual, rng.uniform(-3, 3, (1200, 6)), Noise(1e-4), rng)
+    path = tmp_path / "laser.csv"
+    path.write_text(measurement_text(data, sim_6dof))
+    parts = partial(file_parts, path, sim_6dof, 100)
+    here = calibrate_stream(sim_6dof, parts, "dh")
+    with workers(scheduler=cluster.scheduler_address) as where, distributed.Client(cluster) as client:
+        client.wait_for_workers(2)
+        np.testing.assert_array_equal(calibrate_stream(sim_6dof, parts, "dh", where=where).x, here.x)
+        victims = client.run(os.getpid)
+        killed = []
+
+        def progress(iteration: int, cost: float) -> None:
+            if not killed:
+                killed.append(next(iter(victims.values())))
+                os.kill(killed[0], signal.SIGKILL)
+
+        there = calibrate_stream(sim_6dof, parts, "dh", where=where, progress=progress)
+        survivors = client.run(os.getpid)
+    np.testing.assert_array_equal(there.x, here.x)
+    np.testing.assert_array_equal(there.solution.triangle.r, here.solution.triangle.r)
+    assert killed
+    assert killed[0] not in survivors.values()
 
 
 def test_no_scheduler_is_said():

@@ -41,7 +41,7 @@ LAYERS = (
     {"dh_files", "measurement_files", "transmission_files", "ur_kinematics"},
     {"robot_files", "screening", "configuration_files"},
     {"study"},
-    {"plausibility"},
+    {"plausibility", "stream"},
     {"exports", "diagnosis"},
     {"report"},
     {"report_sections"},

@@ -141,7 +141,7 @@ def killed_and_resumed(folder, text: str, lines: int, *options: str) -> str:
 
 
 def test_a_killed_run_continues_to_the_same_table(tmp_path):
-    text = MANY.replace("120", "400")
+    text = MANY.replace("120", "300")
     assert killed_and_resumed(tmp_path, text, 2) == table_of(tmp_path, "whole", text=text)
 
 
