@@ -32,6 +32,7 @@ from .measurements import Measurement
 from .result import Result
 from .se3 import Array
 from .shapes import looks, rows
+from .transmission import TERMS, Loads
 
 PathLike = str | os.PathLike[str]
 
@@ -182,7 +183,8 @@ def tree(nominal: Chain, arm: Chain) -> dict[str, Any]:
     Body 0 is the base link, body i the model's joint i, and the last two are tip and tool; each has
     `parent`, `placement` in it, `twist` (6) to the calibrated placement, and where it moves `axes` of
     both arms, `slides`, `mixing` (n,) and `shift`. The measuring frame sees a drawn tool D of an arm at
-    `stands`·D·`holds`, which are its entries in `arms`.
+    `stands`·D·`holds`, which are its entries in `arms`; there `terms` say how its joints miss their
+    values, and where they yield to weights `loads` are the bodies that these pull at.
     """
     if (arm.joint_names, arm.moving) != (nominal.joint_names, nominal.moving):
         raise DhcalError(
@@ -200,17 +202,15 @@ def tree(nominal: Chain, arm: Chain) -> dict[str, Any]:
     for j, i in enumerate(index):
         bodies[i] = _body(int(model.parents[i]), nominal.origins[j], arm.origins[j]) | {
             "axes": [nominal.axes[j].tolist(), arm.axes[j].tolist()],
-            "slides": bool(nominal.prismatic[j]),
-            "mixing": nominal.mixing[j].tolist(),
-            "shift": float(nominal.shift[j]),
+            **_drive(nominal, j),
         }
     bodies.append(_body(index[-1], nominal.origins[k], arm.origins[k]))
     bodies.append(_body(len(bodies) - 1, tool, arm.tool))
     stands = nominal.base @ se3.inverse(base) @ arm.base
     holds = se3.inverse(tool) @ nominal.tool
     arms = [
-        {"stands": rows(stands), "holds": rows(holds)},
-        {"stands": rows(arm.base), "holds": rows(np.eye(4))},
+        {"stands": rows(stands), "holds": rows(holds)} | _misses(nominal),
+        {"stands": rows(arm.base), "holds": rows(np.eye(4))} | _misses(arm),
     ]
     return {"bodies": bodies, "arms": arms}
 
@@ -219,6 +219,47 @@ def _body(parent: int, placement: Array, calibrated: Array) -> dict[str, Any]:
     same = np.array_equal(placement, calibrated)
     twist = np.zeros(6) if same else se3.log6(se3.inverse(placement) @ calibrated)
     return {"parent": int(parent), "placement": rows(placement), "twist": twist.tolist()}
+
+
+def _misses(chain: Chain) -> dict[str, Any]:
+    """An arm's transmission, term by term: which joint by what of which joint, and its coefficient."""
+    if chain.transmission is None:
+        return {"terms": []}
+    held = chain.transmission.coefficients
+    terms = [
+        {"name": TERMS[t].name, "joint": int(i), "of": int(j), "value": float(held[t, i, j])}
+        for t, i, j in np.argwhere(held)
+    ]
+    return {"terms": terms} | (
+        {"loads": _weights(chain, chain.transmission.loads)} if chain.transmission.yields else {}
+    )
+
+
+def _weights(chain: Chain, loads: Loads) -> list[dict[str, Any]]:
+    """The tree of what loads a chain's joints: each body's weight, N, its centre, and what moves it."""
+    model = loads.model
+    moved = {model.getJointId(name): j for j, name in enumerate(chain.moving)}
+    out = []
+    for i, inertia in enumerate(model.inertias):
+        body = {
+            "parent": int(model.parents[i]),
+            "placement": rows(model.jointPlacements[i].homogeneous),
+            "weight": -float(inertia.mass * model.gravity.linear[2]),
+            "centre": inertia.lever.tolist(),
+        }
+        out.append(
+            body | ({"axis": chain.axes[moved[i]].tolist()} | _drive(chain, moved[i]) if i in moved else {})
+        )
+    return out
+
+
+def _drive(chain: Chain, j: int) -> dict[str, Any]:
+    """What moves the moving joint j by how much."""
+    return {
+        "slides": bool(chain.prismatic[j]),
+        "mixing": chain.mixing[j].tolist(),
+        "shift": float(chain.shift[j]),
+    }
 
 
 def _joints(chain: Chain, poses: Array) -> list[dict[str, Any]]:
