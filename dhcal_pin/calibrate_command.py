@@ -11,7 +11,6 @@ import numpy as np
 
 from . import calibration, exports, extension, report, report_page
 from .chain import Chain
-from .configuration_files import map_text
 from .errors import DhcalError
 from .executors import HERE, Workers
 from .files import PathLike, save
@@ -31,7 +30,7 @@ from .robot_files import (
 )
 from .screening import Finding, screen
 from .solver import Progress
-from .workspace import workspace_map
+from .workspace_files import check_map_ending, map_content
 
 
 @dataclass(frozen=True)
@@ -122,6 +121,8 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     check_outputs([args.output, sidecar_path(args.output), args.map, args.json, *args.report], kept)
     for path in args.report:
         report_page.check_ending(path)
+    if args.map:
+        check_map_ending(args.map)
 
     chain = read_robot(args.robot, args.tip)
     sets = args.parameters or chain.parameters
@@ -145,7 +146,7 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     contents = _written(fit, args)
     files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
     if args.map:
-        contents[args.map], files["map"] = map_text(workspace_map(fit)), args.map
+        contents[args.map], files["map"] = map_content(args.map, fit, ()), args.map
     if args.json and args.json != STDOUT:
         files["json"] = args.json
     gross = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))
@@ -209,7 +210,7 @@ def _written(fit: Result, args: Job) -> dict[PathLike, str | bytes]:
     chain = fit.chain
     # A base that the URDF holds must not stand in the sidecar too.
     bare = replace(chain, base=np.eye(4)) if args.world_joint else chain
-    contents = urdf_files(bare, args.output, fit.portable)
+    contents = urdf_files(bare, args.output, fit.portable, fit.uncertainty)
     data = contents[args.output]
     assert isinstance(data, bytes)
     if args.world_joint and chain.transmission is not None and chain.transmission.yields:

@@ -152,7 +152,7 @@ def parser() -> argparse.ArgumentParser:
         "--tool-frame", metavar="NAME", help="put the tool into the URDF, as a link fixed to the tip"
     )
     calibrate.add_argument(
-        "--map", metavar="MAP.csv", help="predicted position uncertainty by cells of the workspace"
+        "--map", metavar="MAP", help="predicted position uncertainty over the workspace, as .csv or .html"
     )
     calibrate.add_argument(
         "--report",
@@ -182,6 +182,11 @@ def parser() -> argparse.ArgumentParser:
         "--sidecar", metavar="S.toml", help="base, tool and joints (default: the one beside ROBOT)"
     )
     validate.add_argument("--fit-frames", action="store_true", help="fit base and tool first")
+    validate.add_argument(
+        "--map",
+        metavar="MAP",
+        help="predicted uncertainty over the workspace beside the errors measured, as .csv or .html",
+    )
     validate.add_argument("--json", **_JSON)
 
     convert = _add(

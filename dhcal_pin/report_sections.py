@@ -60,7 +60,7 @@ def _names(given: Sequence[str], kinds: Sequence[str]) -> list[str]:
 
 def study(fit: Result, source: Provenance) -> Study:
     """Everything that the report of a result needs."""
-    return Study(fit, source, outliers(fit), joint_traces(fit), workspace(fit))
+    return Study(fit, source, outliers(fit), joint_traces(fit), workspace(fit, fit.data))
 
 
 @dataclass(frozen=True)

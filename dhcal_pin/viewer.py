@@ -33,6 +33,7 @@ from .result import Result
 from .se3 import Array
 from .shapes import looks, rows
 from .transmission import TERMS, Loads
+from .uncertainty import Predictor
 
 PathLike = str | os.PathLike[str]
 
@@ -52,6 +53,7 @@ def scene_html(
     q: Array | None = None,
     measurements: Sequence[Measurement] | None = None,
     known: Mapping[str, float] | None = None,
+    predictor: Predictor | None = None,
     title: str = "Robot calibration",
     package_dirs: Sequence[PathLike] | None = None,
     magnification: float = 1.0,
@@ -68,6 +70,7 @@ def scene_html(
         measurements: those that are positions are drawn, with arrows from where the arm puts them.
         known: values of the instruments' unknowns, as in `Result.instruments`; without it where their
             search starts.
+        predictor: how well the calibrated tool's place is known; the result itself without it.
         title: the page's heading.
         package_dirs: where to look for the URDF's meshes; the folders above the URDF without it.
         magnification: how many times larger than true the errors are drawn at first, 1 to 500.
@@ -83,8 +86,8 @@ def scene_html(
         raise DhcalError(f"magnification {magnification:g}: must be between 1 and 500")
     if triangles < LEAST_TRIANGLES:
         raise DhcalError(f"{triangles} triangles draw no robot: allow {LEAST_TRIANGLES} at least")
-    fit = calibrated if isinstance(calibrated, Result) else None
     if isinstance(calibrated, Result):
+        predictor = predictor or calibrated
         measurements = calibrated.data if measurements is None else measurements
         known = calibrated.instruments if known is None else known
         nominal = replace(nominal, base=calibrated.reference.base, tool=calibrated.reference.tool)
@@ -100,8 +103,8 @@ def scene_html(
     notes = [drawn.note]
     if len(thinned) < len(samples):
         notes.append(f"{len(thinned)} of {len(samples)} measured points are drawn.")
-    ellipsoids = _ellipsoids(fit, poses) if fit else []
-    if fit and len(poses) and not ellipsoids:
+    ellipsoids = _ellipsoids(predictor, poses) if predictor else []
+    if predictor and len(poses) and not ellipsoids:
         notes.append("No ellipsoids: the data do not tell how well the tool's place is known.")
     scene = {
         "title": title,
@@ -301,7 +304,7 @@ def _thin(count: int, most: int) -> Array:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
-def _ellipsoids(fit: Result, poses: Array) -> list[dict[str, Any]]:
+def _ellipsoids(model: Predictor, poses: Array) -> list[dict[str, Any]]:
     """How well the calibrated tool's place is known at some of the poses (m, n).
 
     Each has its joint values `q` (n,) and `axes` (9), rows of the matrix whose columns are the half
@@ -309,13 +312,13 @@ def _ellipsoids(fit: Result, poses: Array) -> list[dict[str, Any]]:
     is not known at all have none.
     """
     poses = poses[_thin(len(poses), MOST_ELLIPSOIDS)]
-    covariance = fit.predict(poses).covariance[:, :3, :3]
+    covariance = model.predict(poses).covariance[:, :3, :3]
     told = np.isfinite(covariance).all((1, 2))
     squares, axes = np.linalg.eigh(covariance[told])
     # A flat ellipsoid would have no outside to be lit.
     half = np.sqrt(np.maximum(squares, 1e-6 * squares[:, -1:] + 1e-18))
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
-    axes = fit.chain.base[:3, :3].T @ axes * half[:, None]
+    axes = model.chain.base[:3, :3].T @ axes * half[:, None]
     return [
         {"q": q, "axes": np.round(matrix, 12).ravel().tolist()}
         for q, matrix in zip(poses[told].tolist(), axes, strict=True)

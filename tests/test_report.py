@@ -123,7 +123,7 @@ def test_the_workspace_is_in_the_base_frame(quick):
     truth = replace(actual, base=se3.exp6(np.array([3.0, -2.0, 1.0, 0.3, 0.2, 2.0])))
     rng = np.random.default_rng(0)
     data = Pose.simulate(truth, rng.uniform(-1.5, 1.5, (40, 6)), Noise(1e-4, 1e-4), rng)
-    found = diagnosis.workspace(calibrate(nominal, data, "dh,base"))
+    found = diagnosis.workspace(calibrate(nominal, data, "dh,base"), [data])
     model, state = actual.model, actual.model.createData()
     for q, point in zip(data.q, found.measured, strict=True):
         pin.framesForwardKinematics(model, state, actual.configurations(q)[0])
