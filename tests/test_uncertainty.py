@@ -101,7 +101,7 @@ def test_what_nothing_tells_stays_unknown(sim_6dof, tmp_path):
 
 @pytest.fixture
 def calibrated(tmp_path, monkeypatch) -> Result:
-    """A working folder with data of a robot that stands elsewhere, and what calibrating with half of it gave."""
+    """A working folder with a calibrated robot and further measurements of it."""
     monkeypatch.chdir(tmp_path)
     fit = fitted(Chain.from_dh(read_dh(URDF / "sim_6dof.dh.toml")), "minimal,base,tool", count=30)
     other = Pose.simulate(fit.chain, np.random.default_rng(5).uniform(-1, 1, (50, 6)), Noise(1e-4, 1e-4),
