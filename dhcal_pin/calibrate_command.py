@@ -159,7 +159,7 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     files |= {
         "report" if number == 1 else f"report_{number}": path for number, path in enumerate(args.report, 1)
     }
-    source = _provenance(args, sets, data, inputs)
+    source = _provenance(args, sets, data, inputs, trials)
     contents |= report_page.report_files(fit, args.report, source)
     document = report.document(fit, files, source.inputs, [row for found in rows.values() for row in found])
     document |= {
@@ -174,7 +174,9 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     return Outcome(fit, document, files, data.findings, gross, data.doubts, trials)
 
 
-def _provenance(args: Job, sets: str, data: _Data, inputs: Sequence[str]) -> report.Provenance:
+def _provenance(
+    args: Job, sets: str, data: _Data, inputs: Sequence[str], trials: Sequence[extension.Trial]
+) -> report.Provenance:
     """What the report says of the files, the command and its choices."""
     short = report.short_names(inputs)
     settings = {
@@ -197,6 +199,7 @@ def _provenance(args: Job, sets: str, data: _Data, inputs: Sequence[str]) -> rep
         settings=settings,
         left_out=left_out,
         doubts=doubtful,
+        trials=trials,
     )
 
 
