@@ -146,7 +146,7 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     contents = _written(fit, args)
     files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
     if args.map:
-        contents[args.map], files["map"] = map_content(args.map, fit, ()), args.map
+        contents[args.map], files["map"] = map_content(args.map, fit, fit.holdout, fit.instruments), args.map
     if args.json and args.json != STDOUT:
         files["json"] = args.json
     gross = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))

@@ -152,7 +152,9 @@ def parser() -> argparse.ArgumentParser:
         "--tool-frame", metavar="NAME", help="put the tool into the URDF, as a link fixed to the tip"
     )
     calibrate.add_argument(
-        "--map", metavar="MAP", help="predicted position uncertainty over the workspace, as .csv or .html"
+        "--map",
+        metavar="MAP",
+        help="predicted position uncertainty over the workspace, and held-out errors, as .csv or .html",
     )
     calibrate.add_argument(
         "--report",

@@ -31,6 +31,8 @@ from .tables import Table, fixed
 WIDTHS = (1.0, 0.3, 0.1, 0.03)
 # A family that chance alone would make look so good more often than this is not added.
 CHANCE = 0.01
+# Smaller chances differ by nothing that one could believe.
+LEAST = 1e-6
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ def trial_table(found: Sequence[Trial]) -> Table:
             fixed(one.cv_before, 3),
             fixed(one.cv_after, 3),
             fixed(one.standard_error, 3),
-            f"{one.chance:.1g}",
+            f"{one.chance:.1g}" if one.chance > LEAST else f"< {LEAST:g}",
             f"{one.prior_width:g} of default",
         ]
         for one in found

@@ -96,7 +96,7 @@ def map_panels(w: Workspace) -> tuple[list[str], list[tuple[str, str]]]:
     legend[0], legend[-1] = ("level0", f"below {words[1]} mm"), (legend[-1][0], f"above {words[-2]} mm")
     if not all(np.isfinite(m.std).all() for m in found):
         legend.append(("unknown", "cannot be predicted"))
-    return out, [*legend, ("dots measured", "measured samples")]
+    return out, [*legend, *([("dots measured", "measured samples")] if len(thin) else [])]
 
 
 def _square(points: Array, names: str) -> tuple[Axis, Axis]:

@@ -76,8 +76,9 @@ def test_numbers_have_the_digits_that_are_known(value, std, text):
     assert tables.shown(value, "m", std) == text
 
 
-def test_other_units_are_shown_as_they_are():
-    assert tables.shown(1.2345e-5, "rad/Nm", 1e-7) == "1.23e-05 rad/Nm"
+def test_rates_and_pure_numbers():
+    assert tables.shown(1.2346e-5, "rad/Nm", 1e-7) == "12.35 µrad/Nm"
+    assert tables.shown(-2.5e-3, "rad/rad", 4e-4, small=True) == "-2.5 mrad/rad"
     assert tables.shown(-0.00125, "1", 1e-5) == "-0.00125"
 
 
