@@ -87,7 +87,7 @@ def parser() -> argparse.ArgumentParser:
         commands, "demo", "the paper's arm and its measured table, end to end", "dhcal demo --out demo"
     )
     demo.add_argument("--out", default="demo", metavar="DIR", help="folder for the results (default: demo)")
-    demo.add_argument("--open", action="store_true", help="open the scene in the browser")
+    demo.add_argument("--open", action="store_true", help="open the report, scene included, in the browser")
     demo.add_argument("--json", metavar="FILE", help="the result as JSON to one more place; - for stdout")
 
     calibrate = _add(

@@ -212,7 +212,7 @@ def _demo(args: Namespace) -> int:
     document = demo.run(args.out)
     emit(args.json, document)
     if args.open:
-        terminal.open_page(document["files"]["scene"])
+        terminal.open_page(document["files"]["report"])
     return 0
 
 
