@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -30,7 +29,6 @@ from dhcal_pin.positions import Position
 from dhcal_pin.report_sections import markdown, study
 from dhcal_pin.result import Result
 
-CHROMIUM = Path("/usr/bin/chromium")
 AXE = Path(sys.prefix) / "node_modules" / "axe-core" / "axe.min.js"
 # The text of an A4 page between its margins of 14 mm, CSS pixels.
 PRINTED = round((210 - 2 * 14) / 25.4 * 96)
@@ -304,20 +302,6 @@ def test_gross_errors_are_listed_with_file_row_and_size(quick):
 
 
 # --- the page in a browser -------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    if not CHROMIUM.exists() and os.environ.get("CI") != "true":
-        pytest.skip("no Chromium")
-    from playwright.sync_api import sync_playwright
-
-    arguments = "--no-sandbox --disable-dev-shm-usage --use-gl=angle --use-angle=swiftshader"
-    arguments += " --enable-unsafe-swiftshader"
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=str(CHROMIUM), args=arguments.split())
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")

@@ -120,6 +120,8 @@ def test_the_tips_are_pinocchios(opened):
     check_tips(opened.window, opened.fit.reference, opened.fit.chain)
 
 
+# One drawn by us, one with seven joints, one of many meshes.
+@pytest.mark.parametrize("opened", ["paper", "panda", "so101"], indirect=True)
 def test_every_slider_and_switch_changes_the_picture(opened):
     window, page = opened.window, opened.window.page
     for box in page.locator("#layers input").all():
@@ -229,14 +231,13 @@ def driven(chain: Chain, seed: int) -> Chain:
 def test_joints_that_miss_their_values_stand_where_pinocchio_has_them(window, tmp_path, robot):
     pair = perturbed(Chain.from_urdf(parse_urdf(WEIGHTS, "odd.urdf"), "e")) if robot == "odd" else arms(robot)
     nominal, calibrated = (driven(chain, seed) for seed, chain in enumerate(pair))
-    window.open(tmp_path / "scene.html", scene_html(nominal, calibrated, triangles=400))
+    window.open(tmp_path / "scene.html", scene_html(nominal, calibrated, package_dirs=[tmp_path]))
     check_tips(window, nominal, calibrated)
     missed = np.abs(pair[1].poses(poses(nominal, 5)) - calibrated.poses(poses(nominal, 5))).max()
     assert missed > 1e-3
     # Enlarged, the calibrated joints leave the nominal ones in proportion.
-    window.open(
-        tmp_path / "scene.html", scene_html(pair[0], calibrated.driven(nominal.transmission), triangles=400)
-    )
+    other = calibrated.driven(nominal.transmission)
+    window.open(tmp_path / "scene.html", scene_html(pair[0], other, package_dirs=[tmp_path]))
     window.call("setMagnification", 10)
     q = poses(nominal, 1)
     window.call("setJoints", q[0].tolist())
