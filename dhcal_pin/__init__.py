@@ -21,10 +21,15 @@ if TYPE_CHECKING:
     from .compensation import Compensation as Compensation
     from .compensation import compensate as compensate
     from .configurations import Space as Space
+    from .crossvalidation import cross_validate as cross_validate
+    from .crossvalidation import group_folds as group_folds
+    from .crossvalidation import random_folds as random_folds
+    from .crossvalidation import region_folds as region_folds
     from .dh import DHTable as DHTable
     from .dh_files import read_dh as read_dh
     from .dh_urdf import dh_to_urdf as dh_to_urdf
     from .errors import DhcalError as DhcalError
+    from .extension import extend as extend
     from .factors import error_factors as error_factors
     from .live import Live as Live
     from .live import serve as serve
@@ -54,6 +59,10 @@ _HOMES = {
     "split": "calibration",
     "Chain": "chain",
     "crosscheck": "check",
+    "cross_validate": "crossvalidation",
+    "group_folds": "crossvalidation",
+    "random_folds": "crossvalidation",
+    "region_folds": "crossvalidation",
     "Compensation": "compensation",
     "compensate": "compensation",
     "Space": "configurations",
@@ -61,6 +70,7 @@ _HOMES = {
     "read_dh": "dh_files",
     "dh_to_urdf": "dh_urdf",
     "DhcalError": "errors",
+    "extend": "extension",
     "error_factors": "factors",
     "Live": "live",
     "serve": "live",

@@ -48,10 +48,18 @@ class Arms:
         """The arms of several error models.
 
         Raises:
-            DhcalError: they differ in joints or in parameters.
+            DhcalError: they differ in joints or in parameters, or have gains or other errors of the joints'
+                transmission.
         """
         first = models[0]
+        if first.chain.transmission is not None or any(p.entry is not None for p in first.parameters):
+            raise DhcalError("arms with gains, harmonics, compliance or couplings calibrate one by one")
         for number, model in enumerate(models, 1):
+            if model.chain.transmission is not None or any(p.entry is not None for p in model.parameters):
+                raise DhcalError(
+                    f"arm {number} has errors of its joints' transmission (gain, harmonics, compliance, "
+                    "coupling); calibrate it by itself"
+                )
             if model is not first and _structure(model) != _structure(first):
                 raise DhcalError(
                     f"arm {number} has other joints or other parameters than arm 1; calibrate it by itself"

@@ -27,6 +27,8 @@ Priors = Literal["default", "none"] | Mapping[str, float]
 # Sigmas are not estimated below a nanometre and a nanoradian.
 LEAST_SCALE = 1e-6
 MOST_ROUNDS = 30
+# Default priors narrow, where errors are smaller than expected, to so much of what they were.
+NARROWEST = 0.1
 # Starts for the frames are tried until one leaves so small a share of the positions' spread.
 GOOD_FIT = 0.01
 
@@ -48,9 +50,16 @@ def prior_weights(errors: ErrorModel, priors: Priors) -> Array:
         if not hit:
             raise DhcalError(f"prior for {pattern!r}: no such parameter; there are {', '.join(names)}")
         if not value > 0:
-            raise DhcalError(f"prior for {pattern!r}: {value} must be positive, in m or rad")
+            raise DhcalError(f"prior for {pattern!r}: {value} must be positive, in its parameter's unit")
         sigma[hit] = value
     return 1 / sigma
+
+
+def _default(errors: ErrorModel, priors: Priors) -> Array:
+    """Which parameters (p,) have default priors."""
+    if isinstance(priors, str):
+        return np.full(len(errors.parameters), priors == "default")
+    return np.array([not any(fnmatch.fnmatchcase(p.name, key) for key in priors) for p in errors.parameters])
 
 
 def split(
@@ -143,11 +152,12 @@ def _scatter(
     )
 
 
-def _widened(problem: Problem, solution: Solution, expected: Array) -> Array:
-    """The weights (p+s,) of priors as wide as the errors that were found, never narrower than expected.
+def _rescaled(problem: Problem, solution: Solution, expected: Array, default: Array) -> Array:
+    """The weights (p+s,) of priors as wide as the errors that were found.
 
-    Errors of the links of one unit and one expected size have one scale, the one of greatest evidence
+    Default priors of one unit and one expected size have one scale, the one of greatest evidence
     (MacKay 1992): the mean square of the errors over as many as the data and not the prior determine.
+    Priors that are not default (p,) stay.
     """
     errors = problem.errors
     outside = (BASE, errors.chain.tool_station)
@@ -155,11 +165,12 @@ def _widened(problem: Problem, solution: Solution, expected: Array) -> Array:
     told = 1 - np.sum((root * problem.weights[:, None]) ** 2, 1)
     weights = problem.weights.copy()
     kinds = [(p.unit, expected[i]) for i, p in enumerate(errors.parameters)]
+    inside = [i for i, p in enumerate(errors.parameters) if default[i] and p.station not in outside]
     for kind in set(kinds):
-        family = [i for i, p in enumerate(errors.parameters) if kinds[i] == kind and p.station not in outside]
+        family = [i for i in inside if kinds[i] == kind]
         if (count := told[family].sum()) > 1e-3:
             square = np.sum((solution.x[family] * expected[family]) ** 2) / count
-            weights[family] = expected[family] / np.sqrt(max(1.0, square))
+            weights[family] = expected[family] / np.sqrt(max(NARROWEST**2, square))
     return weights
 
 
@@ -193,8 +204,8 @@ def calibrate(
         data: one measurement or several of any kinds.
         parameters: sets of `parameters.SETS`; the chain's own default without it.
         method: "lm", or "gn" for the paper's loop, which weighs metres and radians alike.
-        priors: "default", "none", or sigmas in m and rad by parameter name or pattern over the default
-            ones. Without it "default" for lm and "none" for gn.
+        priors: "default", "none", or sigmas by parameter name or pattern over the default ones, each in
+            its parameter's unit. Without it "default" for lm and "none" for gn.
         fix: parameters or sets held at nominal.
         free: single parameters of any set added.
         holdout: measurements to judge by, not fitted.
@@ -206,8 +217,8 @@ def calibrate(
         where: what chunks of many samples are shared out to.
 
     Sigmas that no instrument states are estimated with the fit, a group of rows at a time, and default
-    priors widen to the errors that are found where these are larger, so that data and priors weigh
-    right against each other.
+    priors take the size of the errors that are found, so that data and priors weigh right against each
+    other.
 
     Raises:
         DhcalError: no data, unknown names, or a plain Gauss-Newton loop that runs away.
@@ -230,7 +241,14 @@ def calibrate(
     errors = replace(errors, chain=reference)
     data = tuple(item.started(reference) for item in data)
     problem = replace(_problem(errors, data, prior_weights(errors, priors), known), where=where)
+    default = _default(errors, priors)
     solution = METHODS[method](problem, np.zeros(len(problem.weights)), max_iterations, progress)
+    if errors.at(solution.x[: len(errors.parameters)]).transmission is not None:
+        # Gravity's torques follow the arm as found: once more with those.
+        errors = errors.loaded(solution.x[: len(errors.parameters)])
+        problem = replace(problem, errors=errors)
+        again = METHODS[method](problem, solution.x, max_iterations, progress)
+        solution = replace(again, iterations=solution.iterations + again.iterations)
     weights = [np.ones(len(item.rows)) for item in data]
     if method == "lm":
         # Sigmas and weights that the fit itself tells: a few rounds settle them.
@@ -243,7 +261,7 @@ def calibrate(
             values = [problem.values(item, solution.x) for item in data]
             weighed, weights = robust.reweighted(fitted, scaled, values, loss)
             moved = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(weights, before, strict=True))
-            priors_now = _widened(problem, solution, expected) if priors == "default" else expected
+            priors_now = _rescaled(problem, solution, expected, default)
             changes = np.log(found / scales), (priors_now - problem.weights) / np.fmax(expected, 1e-300)
             if max(moved, *(np.abs(change).max(initial=0.0) for change in changes)) < 0.01:
                 break
@@ -258,7 +276,7 @@ def calibrate(
     return Result(
         errors=errors,
         x=solution.x,
-        chain=errors.at(solution.x[: len(errors.parameters)]),
+        chain=errors.at(solution.x[: len(errors.parameters)]).loaded(),
         reference=reference,
         data=data,
         holdout=tuple(holdout),

@@ -28,6 +28,7 @@ from .dh_urdf import dh_to_urdf
 from .errors import DhcalError
 from .scratch import LongRows, scratch
 from .se3 import Array
+from .transmission import Loads, Transmission
 from .urdf import Urdf, parse_urdf, read_urdf
 
 BASE = 0
@@ -47,13 +48,15 @@ def link_station(j: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """What m configurations say of a chain's joints; errors do not change it, so one serves a whole search.
+    """What m configurations ask of a chain's joints; errors do not change it, so one serves a whole search.
 
     Attributes:
+        joints: (n, m) values of the independent joints, rad or m.
         values: (k, m) of the moving joints, rad or m.
         cos, sin: (k, m) of the values.
     """
 
+    joints: Array
     values: Array
     cos: Array
     sin: Array
@@ -67,10 +70,12 @@ class Sweep:
         bodies: (k+1, 4, 3, m) columns x, y, z, p of each body's frame in the measuring frame. A body's
             frame has its joint's axis along z.
         tool: (4, 3, m) columns of the tool's frame.
+        terms: (t, n, m) of the independent joints' transmission, where the chain has one.
     """
 
     bodies: Array
     tool: Array
+    terms: Array | None = None
 
     def poses(self) -> Array:
         """Tool poses (m, 4, 4) in the measuring frame."""
@@ -108,6 +113,7 @@ class Chain:
         base: (4, 4) base link in the measuring frame.
         tool: (4, 4) measured point in the tip frame.
         parameters: the sets that are identified when nobody says otherwise.
+        transmission: how the independent joints miss their values; None where they do as they are told.
     """
 
     urdf: Urdf
@@ -124,6 +130,7 @@ class Chain:
     base: Array = field(default_factory=lambda: np.eye(4))
     tool: Array = field(default_factory=lambda: np.eye(4))
     parameters: str = "minimal,base,tool"
+    transmission: Transmission | None = None
 
     @classmethod
     def from_urdf(cls, source: str | os.PathLike[str] | Urdf, tip: str | None = None) -> Chain:
@@ -182,6 +189,11 @@ class Chain:
         return len(self.joint_names)
 
     @property
+    def sliding(self) -> Array:
+        """Which independent joints (n,) move a prismatic one."""
+        return np.any(self.mixing[self.prismatic] != 0, 0)
+
+    @property
     def tip_station(self) -> int:
         """Station of the tip, before the tool."""
         return 2 * len(self.moving) + 2
@@ -205,18 +217,14 @@ class Chain:
         """Pinocchio's index of the tip's frame; links and joints may share names."""
         return self.model.getFrameId(self.tip, pin.FrameType.BODY)
 
+    @cached_property
+    def loads(self) -> Loads:
+        """The masses of the whole robot with this chain's joint placements."""
+        return Loads(self.model, self.moving, self.mixing, self.shift)
+
     def configurations(self, q: Array) -> Array:
         """Pinocchio's configurations (m, nq) at q (m, n); joints off the path stay at neutral."""
-        q = self.checked(q)
-        model = self.model
-        out = np.tile(pin.neutral(model), (len(q), 1))
-        for name, value in zip(self.moving, (q @ self.mixing.T + self.shift).T, strict=True):
-            joint = model.joints[model.getJointId(name)]
-            if joint.nq == 2:
-                out[:, joint.idx_q], out[:, joint.idx_q + 1] = np.cos(value), np.sin(value)
-            else:
-                out[:, joint.idx_q] = value
-        return out
+        return self.loads.configurations(self.effective(self.checked(q).T)[0])
 
     def checked(self, q: Array) -> Array:
         """Joint values as a finite (m, n) array, or DhcalError."""
@@ -228,6 +236,23 @@ class Chain:
         if not np.isfinite(q).all():
             raise DhcalError("q: every joint value must be finite")
         return q
+
+    def effective(self, q: Array) -> tuple[Array, Array | None]:
+        """Where commanded values q (n, m) take the independent joints (n, m), and the terms (t, n, m)."""
+        if self.transmission is None:
+            return q, None
+        terms = self.transmission.terms(q)
+        return q + self.transmission.errors(terms), terms
+
+    def driven(self, transmission: Transmission) -> Chain:
+        """The chain with other joints."""
+        return replace(self, transmission=transmission)
+
+    def loaded(self) -> Chain:
+        """The chain whose joints yield to its own masses as placed now, not to those it was started with."""
+        if self.transmission is None:
+            return self
+        return self.driven(replace(self.transmission, loads=self.loads))
 
     @cached_property
     def axis_frames(self) -> Array:
@@ -251,11 +276,15 @@ class Chain:
 
     def motion(self, q: Array) -> Motion:
         """The moving joints' values, and their cosines and sines, at joint values q (m, n)."""
-        values = self.mixing @ self.checked(q).T + self.shift[:, None]
+        return self._motion(np.ascontiguousarray(self.checked(q).T))
+
+    def _motion(self, joints: Array) -> Motion:
+        """The motion of independent joints that stand at (n, m)."""
+        values = self.mixing @ joints + self.shift[:, None]
         # One tangent of half the angle costs a fifth of a cosine and a sine.
         half = np.tan(0.5 * values)
         square = half * half
-        return Motion(values, (1 - square) / (1 + square), 2 * half / (1 + square))
+        return Motion(joints, values, (1 - square) / (1 + square), 2 * half / (1 + square))
 
     @LongRows()
     def sweep(self, q: Array | Motion, out: Array | None = None) -> Sweep:
@@ -263,7 +292,10 @@ class Chain:
 
         `out` (k+2, 4, 3, m) holds them when given.
         """
-        motion = q if isinstance(q, Motion) else self.motion(q)
+        motion, terms = q if isinstance(q, Motion) else self.motion(q), None
+        if self.transmission is not None:
+            joints, terms = self.effective(motion.joints)
+            motion = self._motion(joints)
         k, m = motion.values.shape
         frames = np.empty((k + 2, 4, 3, m)) if out is None else out
         frames[0] = self.base[:3].T[:, :, None]
@@ -284,7 +316,7 @@ class Chain:
                 after[1] -= turned[0]
         last = (self.links[-1] @ self.tool).T
         np.matmul(last, frames[-2].reshape(4, -1), out=frames[-1].reshape(4, -1))
-        return Sweep(frames[:-1], frames[-1])
+        return Sweep(frames[:-1], frames[-1], terms)
 
     def poses(self, q: Array) -> Array:
         """Tool poses (m, 4, 4) in the measuring frame at joint values q (m, n) in rad or m."""
@@ -320,12 +352,17 @@ class Chain:
 
         Args:
             sweep: frames at m samples.
-            bodies: (p,) body numbers, ascending.
-            twists: (p, 6) twists in those bodies' frames.
+            bodies: (p,) body numbers, ascending; k+1+e is entry e of the
+                transmission's flat coefficients.
+            twists: (p, 6) twists in those bodies' frames; an entry needs none.
             out: (p, 6, m) written in place when given.
         """
         m = sweep.tool.shape[-1]
         out = np.empty((len(bodies), 6, m)) if out is None else out
+        behind = int(np.searchsorted(bodies, len(sweep.bodies)))
+        if behind < len(bodies):
+            out[behind:] = self._entry_velocities(sweep, bodies[behind:] - len(sweep.bodies))
+            bodies, twists = bodies[:behind], twists[:behind]
         counts = np.bincount(bodies, minlength=len(sweep.bodies))
         used = np.flatnonzero(counts)
         groups = list(itertools.pairwise([0, *np.cumsum(counts[used]).tolist()]))
@@ -339,6 +376,21 @@ class Chain:
                 np.matmul(twists[first:last], move.transpose(1, 0, 2), out=rows[:3])
                 np.matmul(twists[first:last, 3:], turn.transpose(1, 0, 2), out=rows[3:])
         return out
+
+    def _entry_velocities(self, sweep: Sweep, entries: Array) -> Array:
+        """The same (e, 6, m) per unit of entries (e,) of the flat transmission."""
+        assert self.transmission is not None
+        assert sweep.terms is not None
+        term, joint, source = np.unravel_index(entries, self.transmission.coefficients.shape)
+        return self.joint_velocities(sweep)[joint] * sweep.terms[term, source][:, None]
+
+    def joint_velocities(self, sweep: Sweep) -> Array:
+        """The tool point's velocity (n, 6, m) per unit of each independent joint's effective value."""
+        k = len(self.moving)
+        twists = np.zeros((k, 6))
+        twists[np.arange(k), np.where(self.prismatic, 2, 5)] = 1.0
+        moving = self.tool_velocities(sweep, np.arange(1, k + 1), twists)
+        return np.tensordot(self.mixing, moving, (0, 0))
 
     def displaced(self, motions: Mapping[int, Array]) -> Chain:
         """The chain with each station's frame moved by a right factor (4, 4), M ← M·motion."""

@@ -110,8 +110,15 @@ def parser() -> argparse.ArgumentParser:
     calibrate.add_argument(
         "--parameters",
         metavar="SET[,SET]",
-        help="what is unknown: dh, modified-dh, hayati, minimal, placement, base, tool, offset "
-        "(default: minimal,base,tool for a URDF, dh for a DH file)",
+        help="what is unknown: dh, modified-dh, hayati, minimal, placement, base, tool, offset, gain, "
+        "harmonics, compliance, coupling (default: minimal,base,tool for a URDF, dh for a DH file)",
+    )
+    calibrate.add_argument(
+        "--extend",
+        metavar="auto|none|FAMILY[,FAMILY]",
+        default="none",
+        help="add gain, harmonics, compliance, coupling of the joints where cross-validation by regions of "
+        "joint space gains by it: all that do, none (default), or some of those named",
     )
     calibrate.add_argument(
         "--fix", metavar="NAME[,NAME]", default="", help="hold parameters or sets at nominal"
@@ -164,7 +171,9 @@ def parser() -> argparse.ArgumentParser:
     validate.add_argument("data", **_DATA)
     validate.add_argument("--tip", **_TIP)
     validate.add_argument("--columns", **_COLUMNS)
-    validate.add_argument("--sidecar", metavar="S.toml", help="base and tool (default: the one beside ROBOT)")
+    validate.add_argument(
+        "--sidecar", metavar="S.toml", help="base, tool and joints (default: the one beside ROBOT)"
+    )
     validate.add_argument("--fit-frames", action="store_true", help="fit base and tool first")
     validate.add_argument("--json", **_JSON)
 

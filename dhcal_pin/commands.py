@@ -18,6 +18,7 @@ from . import (
     compensate_command,
     demo,
     exports,
+    extension,
     fleet_command,
     plan_command,
     report,
@@ -41,7 +42,7 @@ from .kinds import KINDS
 from .measurement_files import measurement_text, read_readings
 from .measurements import Measurement, Noise
 from .outputs import STDOUT, check_outputs, emit, names, same, sidecars
-from .parameters import extract
+from .parameters import EXTENSIONS, extract
 from .plausibility import doubts
 from .result import Result, accuracy
 from .robot_files import (
@@ -115,6 +116,7 @@ class Outcome:
         files: paths of what was written, by what it is.
         findings, gross, doubts: by file, the impossible rows, the numbers of gross ones, and what is hard
             to believe.
+        trials: what each family of --extend brought.
     """
 
     fit: Result
@@ -123,6 +125,7 @@ class Outcome:
     findings: dict[str, list[Finding]]
     gross: dict[str, list[int]]
     doubts: dict[str, list[str]]
+    trials: tuple[extension.Trial, ...]
 
 
 def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) -> Outcome:
@@ -149,10 +152,11 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     chain = read_robot(args.robot, args.tip)
     sets = args.parameters or chain.parameters
     data = _read_data(chain, args, held_file, known_frames=not {"base", "tool"} & set(names(sets)))
-    fit = calibration.calibrate(
+    fit, trials = extension.extend(
         chain,
         list(data.fit.values()),
         sets,
+        _families(args.extend),
         method=args.method,
         priors=read_priors(args.priors),
         fix=names(args.fix),
@@ -167,10 +171,7 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     contents = _written(fit, args)
     files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
     if args.map:
-        text = map_text(
-            workspace_map(fit), [f"predicted position uncertainty of {args.output}, measuring frame"]
-        )
-        contents[args.map], files["map"] = text, args.map
+        contents[args.map], files["map"] = map_text(workspace_map(fit)), args.map
     if args.json and args.json != STDOUT:
         files["json"] = args.json
     gross = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))
@@ -182,11 +183,11 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     }
     document = report.document(
         fit, files, report.fingerprints(inputs), [row for found in rows.values() for row in found]
-    ) | {"outliers_by_file": rows}
+    ) | {"outliers_by_file": rows, "extension": [asdict(trial) for trial in trials]}
     if args.json and args.json != STDOUT:
         contents[args.json] = report.json_text(document)
     save(contents)
-    return Outcome(fit, document, files, data.findings, gross, data.doubts)
+    return Outcome(fit, document, files, data.findings, gross, data.doubts, trials)
 
 
 def _calibrate_one(job: Job) -> dict[str, Any]:
@@ -210,8 +211,14 @@ def _calibrate(args: Namespace) -> int:
         terminal.gross(path, outcome.gross.get(path, []), args.loss)
     for path, texts in outcome.doubts.items():
         terminal.doubts(path, texts)
+    terminal.trials(outcome.trials)
     terminal.summary(outcome.fit, outcome.files)
     return 0
+
+
+def _families(extend: str) -> tuple[str, ...]:
+    """The families that --extend may add."""
+    return {"none": (), "auto": EXTENSIONS}.get(extend, tuple(names(extend)))
 
 
 def _written(fit: Result, args: Job) -> dict[PathLike, str | bytes]:
@@ -222,6 +229,10 @@ def _written(fit: Result, args: Job) -> dict[PathLike, str | bytes]:
     contents = urdf_files(bare, args.output, fit.portable)
     data = contents[args.output]
     assert isinstance(data, bytes)
+    if args.world_joint and chain.transmission is not None and chain.transmission.yields:
+        raise DhcalError(
+            "--world-joint: gravity's torques on the joints count on the robot's own root, z up; leave it out"
+        )
     if args.world_joint:
         data = exports.with_world(data, chain.base)
     if args.tool_frame:
@@ -285,7 +296,7 @@ def _to_dh(args: Namespace) -> tuple[str, Sequence[str]]:
         if args.convention in (None, table.convention):
             return dh_text(table, args.output), ()
     found = extract(chain, args.convention or "standard")
-    left = [f"base and tool in {path} do not go to the table" for path in sidecars([args.input])]
+    left = [f"base, tool and joints in {path} do not go to the table" for path in sidecars([args.input])]
     return dh_text(found.table, args.output), [*found.notes, *left]
 
 

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
 
 from . import se3
 from .chain import Chain
@@ -24,7 +24,6 @@ from .inverse import (
     Gap,
     joint_velocities,
     size,
-    sliding,
     solve,
     to_poses,
     to_positions,
@@ -32,6 +31,9 @@ from .inverse import (
     within,
 )
 from .se3 import Array
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 OK, SINGULAR, LIMITS, OUT = "ok", "near singular", "joint limits", "out of reach"
 # A motion of the tool, by a thousandth of the arm's size or of a radian, that takes the joints 0.2 rad.
@@ -163,10 +165,13 @@ class _Search:
     @classmethod
     def of(cls, chain: Chain, turned: bool) -> _Search:
         """Always the same configurations."""
-        span = np.where(sliding(chain), size(chain), np.pi)
+        span = np.where(chain.sliding, size(chain), np.pi)
         middle = _middle(chain)
         low, high = np.maximum(chain.lower, middle - span), np.minimum(chain.upper, middle + span)
         q = np.random.default_rng(0).uniform(low, high, (_KNOWN, chain.size))
+        # A heavy import that no other command needs.
+        from scipy.spatial import cKDTree
+
         return cls(chain, q, cKDTree(_places(chain.poses(q), turned, size(chain))), turned)
 
     def starts(self, targets: Array, count: int) -> Array:
@@ -186,7 +191,7 @@ class _Search:
         """Joint values (m, n), status (m,) and miss (m, 2) of targets, nearest to `near` (m, n)."""
         m, n = near.shape
         q, status, miss = np.full((m, n), np.nan), np.full(m, OUT, dtype=object), np.full((m, 2), np.nan)
-        scale = np.where(sliding(self.chain), size(self.chain), 1.0)
+        scale = np.where(self.chain.sliding, size(self.chain), 1.0)
         best, missed = np.repeat(near[:, None], _FOLLOWED, 1), np.zeros(m)
         for count, steps, share in _ROUNDS:
             left = np.flatnonzero((status == OUT) & (missed <= share * size(self.chain)))
@@ -254,5 +259,5 @@ def _least(chain: Chain, q: Array, rows: slice) -> Array:
     """The smallest motion (m,) of the tool, lengths in sizes of the arm, that a unit of the joints makes."""
     twists = joint_velocities(chain, q)[1]
     twists[:, :3] /= size(chain)
-    twists[:, :, sliding(chain)] *= size(chain)
+    twists[:, :, chain.sliding] *= size(chain)
     return np.linalg.svd(twists[:, rows], compute_uv=False)[:, -1]

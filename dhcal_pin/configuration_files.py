@@ -7,18 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from .chain import Chain
-from .configurations import joint_range
+from .compensation import compensate
 from .errors import DhcalError
-from .files import LENGTHS, PathLike, read_sheet
-from .inverse import solve, to_positions, within
-from .measurement_files import csv_text, joint_columns, joint_values, reading_sheet
+from .files import PathLike, read_sheet
+from .measurement_files import csv_text, joint_columns, joint_values, read_targets, reading_sheet
 from .reading_columns import check_columns, check_joint_names
 from .se3 import Array
 from .workspace import WorkspaceMap
-
-# Near enough for knowing how well the tool would be known there; and from so many starts.
-_NEAR = 1e-6
-_STARTS = 20
 
 
 def read_configurations(path: PathLike, chain: Chain, columns: PathLike | None = None) -> Array:
@@ -34,41 +29,33 @@ def read_configurations(path: PathLike, chain: Chain, columns: PathLike | None =
 
 
 def read_task(path: PathLike, chain: Chain) -> Array:
-    """Joint values (m, n) of a task: as the file has them, or such that the tool is at its x, y, z.
+    """Joint values (m, n) of a task: as the file has them, or such that the tool is on its targets.
 
-    Positions are those of the chain's tool in the measuring frame; a rotation beside them is not looked at.
+    Targets are places or poses of the chain's tool in the measuring frame.
 
     Raises:
-        DhcalError: what is wrong, or a position that is out of reach.
+        DhcalError: what is wrong, or a target that is out of reach.
     """
-    sheet = read_sheet(path)
-    if any(name in sheet.columns for name in chain.joint_names):
+    columns = read_sheet(path).columns
+    if any(name in columns for name in chain.joint_names):
         return read_configurations(path, chain)
-    missing = [name for name in "xyz" if name not in sheet.columns]
-    if missing:
+    targets = read_targets(path, chain)
+    found = compensate(chain, chain, targets.targets)
+    if (lost := np.flatnonzero(~found.reached)).size:
         raise DhcalError(
-            f"{sheet.source}:{sheet.header}: no column {missing[0]!r}; give joints, or x[mm],y[mm],z[mm]"
+            f"{targets.source}: target {lost[0] + 1} is out of reach ({found.status[lost[0]]}); "
+            "correct or remove it"
         )
-    targets = np.stack([sheet.si(sheet.columns[name], LENGTHS) for name in "xyz"], -1)
-    low, high = joint_range(chain)
-    start = np.random.default_rng(0).uniform(low, high, (len(targets) * _STARTS, chain.size))
-    q, gap = solve(chain, to_positions(np.repeat(targets, _STARTS, axis=0)), start)
-    q, allowed = within(chain, q)
-    good = (allowed & (gap <= _NEAR)).reshape(len(targets), _STARTS)
-    left = np.flatnonzero(~good.any(1))
-    if not left.size:
-        return q.reshape(len(targets), _STARTS, -1)[np.arange(len(targets)), good.argmax(1)]
-    raise DhcalError(
-        f"{sheet.source}:{sheet.lines[left[0]]}: the tool does not reach this position; correct or remove it"
-    )
+    return found.q
 
 
-def map_text(found: WorkspaceMap, comments: Sequence[str]) -> str:
+def map_text(found: WorkspaceMap) -> str:
     """The CSV text of a map: a row a cell, millimetres."""
     names = ("x[mm]", "y[mm]", "z[mm]")
     columns = {name: (1e3 * found.centre[:, i]).round(6).tolist() for i, name in enumerate(names)}
     columns |= {"position_std[mm]": (1e3 * found.std).tolist(), "worst[mm]": (1e3 * found.worst).tolist()}
-    return csv_text(columns | {"configurations": found.count.tolist()}, comments)
+    columns["configurations"] = found.count.tolist()
+    return csv_text(columns, ["predicted position uncertainty by cells of the workspace, measuring frame"])
 
 
 def configurations_text(q: Array, chain: Chain, comments: Sequence[str]) -> str:

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from .dh import DHTable
 from .extraction import settled
 from .se3 import Array
+from .urdf_tags import quoted
 
 # Okabe and Ito's palette: told apart by colour-blind eyes and on grey paper.
 MATERIALS = {
@@ -61,7 +61,7 @@ def dh_to_urdf(table: DHTable, name: str) -> str:
     paths = _paths(table)
     tool_joint = next(t for t in _tool_names() if t not in table.names)
     links = ["base_link", *(f"link_{i + 1}" for i in range(table.size)), "tool0"]
-    lines = ['<?xml version="1.0"?>', *_preamble(table), f"<robot name={quoteattr(name)}>", ""]
+    lines = ['<?xml version="1.0"?>', *_preamble(table), f"<robot name={quoted(name)}>", ""]
     for i, joint in enumerate(table.names):
         lines += _joint(
             joint, "prismatic" if table.prismatic[i] else "revolute", origins[i], links[i : i + 2]
@@ -121,7 +121,7 @@ def _joint(name: str, kind: str, origin: Array, links: list[str]) -> list[str]:
     xyz = " ".join(_exact(v) for v in origin[:3, 3])
     rpy = " ".join(_exact(v) for v in _rpy(origin[:3, :3]))
     return [
-        f'  <joint name={quoteattr(name)} type="{kind}">',
+        f'  <joint name={quoted(name)} type="{kind}">',
         f'    <origin xyz="{xyz}" rpy="{rpy}"/>',
         f'    <parent link="{links[0]}"/>',
         f'    <child link="{links[1]}"/>',

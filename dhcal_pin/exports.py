@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from xml.parsers import expat
-from xml.sax.saxutils import quoteattr
 
 from .chain import Chain
 from .errors import DhcalError
@@ -12,6 +11,7 @@ from .se3 import Array
 from .ur_kinematics import ORIGIN_KEYS, six_numbers
 from .urdf import parse_urdf
 from .urdf_origins import with_origins
+from .urdf_tags import quoted
 
 
 def _end_of_robot(data: bytes) -> int:
@@ -27,11 +27,11 @@ def _appended(data: bytes, link: str, joint: str, parent: str, child: str, origi
     """The URDF with one more link and the fixed joint that holds it."""
     xyz, rpy = (" ".join(map(repr, part)) for part in (six_numbers(origin)[:3], six_numbers(origin)[3:]))
     lines = [
-        f"  <link name={quoteattr(link)}/>",
-        f'  <joint name={quoteattr(joint)} type="fixed">',
+        f"  <link name={quoted(link)}/>",
+        f'  <joint name={quoted(joint)} type="fixed">',
         f'    <origin xyz="{xyz}" rpy="{rpy}"/>',
-        f"    <parent link={quoteattr(parent)}/>",
-        f"    <child link={quoteattr(child)}/>",
+        f"    <parent link={quoted(parent)}/>",
+        f"    <child link={quoted(child)}/>",
         "  </joint>",
         "",
     ]

@@ -146,7 +146,7 @@ def _whole(folder: str, place: str) -> str:
 
 
 def _written(job: Job) -> list[str]:
-    return [place for place in (job.output, sidecar_path(job.output), job.json) if place]
+    return [place for place in (job.output, sidecar_path(job.output), job.map, job.json) if place]
 
 
 def places(entries: Sequence[Entry], path: PathLike) -> list[str]:

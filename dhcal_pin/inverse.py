@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from . import se3
-from .chain import Chain, link_station
+from .chain import Chain
 from .errors import DhcalError
 from .se3 import Array
 
@@ -35,34 +35,25 @@ def joint_velocities(chain: Chain, q: Array) -> tuple[Array, Array]:
 
     A twist is [v, ω] of the tool point, in axes of the measuring frame.
     """
-    stations = np.array([link_station(j + 1) for j in range(len(chain.moving))])
-    axes = np.concatenate([np.zeros_like(chain.axes), chain.axes], 1)
-    axes[chain.prismatic] = np.roll(axes[chain.prismatic], 3, axis=1)
     sweep = chain.sweep(q)
-    velocities = chain.tool_velocities(sweep, *chain.station_twists(stations, axes))
-    return sweep.poses(), velocities.transpose(2, 1, 0) @ chain.mixing
+    return sweep.poses(), chain.joint_velocities(sweep).transpose(2, 1, 0)
 
 
 def size(chain: Chain) -> float:
     """A length typical of the arm, m: a radian about a joint moves the tool by about that much."""
     links = np.concatenate([chain.origins[1:-1], (chain.origins[-1] @ chain.tool)[None]])
-    strokes = np.minimum(chain.upper - chain.lower, 1.0)[sliding(chain)]
+    strokes = np.minimum(chain.upper - chain.lower, 1.0)[chain.sliding]
     return max(float(np.linalg.norm(links[:, :3, 3], axis=1).sum() + strokes.sum()) / 3, _SMALLEST)
 
 
 def unlimited(chain: Chain) -> Chain:
     """The same arm with joints that turn without end; those that slide keep their limits."""
-    turning = ~sliding(chain)
+    turning = ~chain.sliding
     return replace(
         chain,
         lower=np.where(turning, -np.inf, chain.lower),
         upper=np.where(turning, np.inf, chain.upper),
     )
-
-
-def sliding(chain: Chain) -> Array:
-    """Which independent joints (n,) slide something."""
-    return np.any(chain.mixing[chain.prismatic] != 0, 0)
 
 
 def solve(
@@ -157,7 +148,7 @@ def within(chain: Chain, q: Array, near: Array | float = 0.0) -> tuple[Array, Ar
         q: (..., n) joint values.
         near: (..., n) what turning joints come within half a turn of, where their limits let them.
     """
-    turning = ~sliding(chain) & np.all(chain.mixing % 1 == 0, 0)
+    turning = ~chain.sliding & np.all(chain.mixing % 1 == 0, 0)
     home = near + (q - near + np.pi) % (2 * np.pi) - np.pi
     home = home + 2 * np.pi * ((home < chain.lower).astype(float) - (home > chain.upper))
     q = np.where(turning, home, q)

@@ -17,8 +17,9 @@ class Job:
         robot: path of a URDF or a DH file.
         data: paths of measurement files.
         output: path of the corrected URDF.
-        tip, columns, parameters, fix, free, holdout, method, loss, priors, instrument, max_iterations,
-            seed, in_place, world_joint, tool_frame, json, map: as `dhcal calibrate --help` says.
+        tip, columns, parameters, extend, fix, free, holdout, method, loss, priors, instrument,
+            max_iterations, seed, in_place, world_joint, tool_frame, json, map: as in
+            `dhcal calibrate --help`.
     """
 
     robot: str
@@ -27,6 +28,7 @@ class Job:
     tip: str | None = None
     columns: str | None = None
     parameters: str | None = None
+    extend: str = "none"
     fix: str = ""
     free: str = ""
     holdout: str | None = None

@@ -1,9 +1,10 @@
-"""Error parameters as data: each is a twist at a station of a chain.
+"""Error parameters as data: each is a twist at a station of a chain, some scaled by what the joint does.
 
 A set is a function from a chain to its parameters. Changes at one station act in the order of the
 list, M ← M·exp(x₁ξ₁)·exp(x₂ξ₂)…, so a parameter's value is always its whole error from the nominal
 chain, DH's changes are exact (its rotations and translations about one axis commute), and the
-derivative at any value is a twist again.
+derivative at any value is a twist again. A scaled one, such as a gain or a compliance, is an entry of the
+chain's transmission: its twist is the joint's own, times a term of the joint's value and load.
 """
 
 from __future__ import annotations
@@ -21,10 +22,13 @@ from .dh import Convention
 from .errors import DhcalError
 from .extraction import Extraction, extract_dh
 from .se3 import Array
+from .transmission import COUPLED, COUPLING_PRIOR, FAMILIES, TERMS, Transmission
 
 # Standard deviations that manufacturing and assembly lead one to expect, and frames anywhere in a room.
 LENGTH, ANGLE, OFFSET = 1e-3, 5e-3, np.deg2rad(2.0)
 WIDE_LENGTH, WIDE_ANGLE = 10.0, 10.0
+# A term of the transmission that nowhere exceeds this is none, rad or N·m: token masses load no joint.
+LEAST_TERM = 0.1
 
 _AXES = np.eye(6)
 _IDENTITY = np.eye(4)
@@ -36,11 +40,12 @@ class Parameter:
 
     Attributes:
         name: what users call it, as `d2` or `elbow_joint.rx`.
-        unit: "m" or "rad".
+        unit: "m" or "rad"; of a scaled one "1", "rad", "rad/Nm", "rad/rad", "rad/m".
         nominal: the value that a drawing would show; zero for a pure error.
         station: where it acts (see `chain`).
         twist: (6,) [v, ω] in the station's frame.
         prior: standard deviation expected before any measurement, in its unit.
+        entry: of a scaled one, where its coefficient stands in the transmission's flat coefficients.
     """
 
     name: str
@@ -49,6 +54,7 @@ class Parameter:
     station: int
     twist: tuple[float, ...]
     prior: float
+    entry: int | None = None
 
 
 def extract(chain: Chain, convention: Convention = "standard", hayati: bool = False) -> Extraction:
@@ -194,6 +200,47 @@ def tool(chain: Chain) -> list[Parameter]:
     return _six("tool", chain.tool_station, WIDE_LENGTH, WIDE_ANGLE)
 
 
+def _scaled(chain: Chain, place: tuple[int, int, int], name: str, unit: str, prior: float) -> Parameter:
+    """A coefficient of the transmission, at the first joint on the path that the independent one moves."""
+    first = int(np.flatnonzero(chain.mixing[:, place[1]])[0])
+    axis, zero = tuple(map(float, chain.axes[first])), (0.0, 0.0, 0.0)
+    twist = axis + zero if chain.prismatic[first] else zero + axis
+    held = 0.0 if chain.transmission is None else float(chain.transmission.coefficients[place])
+    entry = int(np.ravel_multi_index(place, (len(TERMS), chain.size, chain.size)))
+    return Parameter(name, unit, held, link_station(first + 1), twist, prior, entry)
+
+
+def family(chain: Chain, name: str) -> list[Parameter]:
+    """All terms of a family of `transmission.TERMS` at each joint that has them.
+
+    A term that is next to nothing wherever the arm stands, such as a vertical axis' load, is left out.
+    """
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (chain.size, 64))
+    felt = np.abs(Transmission.ideal(chain.loads).terms(q)).max(-1) > LEAST_TERM
+    return [
+        _scaled(chain, (t, i, i), f"{joint}.{term.name}", term.unit, term.prior)
+        for i, joint in enumerate(chain.joint_names)
+        for t, term in enumerate(TERMS)
+        if term.family == name and felt[t, i] and (term.sliding or not chain.sliding[i])
+    ]
+
+
+def coupling(chain: Chain) -> list[Parameter]:
+    """How far each revolute joint turns per unit of every other joint's value."""
+    return [
+        _scaled(
+            chain,
+            (COUPLED, i, j),
+            f"{joint}.{source}",
+            "rad/m" if chain.sliding[j] else "rad/rad",
+            COUPLING_PRIOR,
+        )
+        for i, joint in enumerate(chain.joint_names)
+        for j, source in enumerate(chain.joint_names)
+        if i != j and not chain.sliding[i]
+    ]
+
+
 SETS: dict[str, Callable[[Chain], list[Parameter]]] = {
     "dh": dh,
     "modified-dh": modified_dh,
@@ -203,7 +250,10 @@ SETS: dict[str, Callable[[Chain], list[Parameter]]] = {
     "base": base,
     "tool": tool,
     "offset": offset,
+    **{name: functools.partial(family, name=name) for name in FAMILIES},
+    "coupling": coupling,
 }
+EXTENSIONS = (*FAMILIES, "coupling")
 
 
 def select(
@@ -224,7 +274,13 @@ def select(
     unknown = [name for name in names if name not in SETS]
     if unknown:
         raise DhcalError(f"unknown parameter set {unknown[0]!r}; choose from {', '.join(SETS)}")
-    pool = {p.name: p for name in names for p in SETS[name](chain)}
+    found = {name: SETS[name](chain) for name in names}
+    if empty := [name for name, parameters in found.items() if not parameters]:
+        raise DhcalError(
+            f"{chain.urdf.source}: no joint of {empty[0]!r}: it takes a joint that turns, "
+            "for coupling another joint, and for compliance a URDF whose links have masses"
+        )
+    pool = {p.name: p for parameters in found.values() for p in parameters}
     fixed = {p.name for name in fix if name in SETS for p in SETS[name](chain)}
     for name in fix:
         if name not in pool and name not in SETS:
@@ -240,8 +296,7 @@ def select(
     chosen = [p for p in pool.values() if p.name not in fixed]
     if not chosen:
         raise DhcalError("no parameter is left to identify; fix fewer of them")
-    ordered = sorted(chosen, key=lambda p: p.station)
-    return ErrorModel(chain, tuple(ordered), tuple(p for p in pool.values() if p.name in fixed))
+    return ErrorModel(chain, (), tuple(p for p in pool.values() if p.name in fixed)).joined(chosen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,12 +314,21 @@ class ErrorModel:
     fixed: tuple[Parameter, ...] = ()
 
     @cached_property
+    def _geometry(self) -> int:
+        """How many parameters, the first ones, are plain twists."""
+        return sum(parameter.entry is None for parameter in self.parameters)
+
+    @cached_property
+    def _entries(self) -> Array:
+        return np.array([p.entry for p in self.parameters if p.entry is not None], int)
+
+    @cached_property
     def _twists(self) -> Array:
-        return np.array([parameter.twist for parameter in self.parameters]).reshape(-1, 6)
+        return np.array([parameter.twist for parameter in self.parameters]).reshape(-1, 6)[: self._geometry]
 
     @cached_property
     def _stations(self) -> Array:
-        return np.array([parameter.station for parameter in self.parameters], int)
+        return np.array([parameter.station for parameter in self.parameters], int)[: self._geometry]
 
     @property
     def priors(self) -> Array:
@@ -315,23 +379,38 @@ class ErrorModel:
         return out
 
     def at(self, x: Array) -> Chain:
-        """The chain with errors x (p,) in m and rad."""
-        factors = self._factors(np.asarray(x, float))
-        return self._moved(functools.reduce(np.matmul, np.swapaxes(factors, 0, 1)))
+        """The chain with errors x (p,) in SI; its joints yield to the nominal arm's masses."""
+        factors = self._factors(np.asarray(x, float)[: self._geometry])
+        return self._moved(functools.reduce(np.matmul, np.swapaxes(factors, 0, 1)), x)
 
-    def _moved(self, motions: Array) -> Chain:
+    def _moved(self, motions: Array, x: Array) -> Chain:
         every = np.empty((self.chain.tool_station + 1, 4, 4))
         every[:] = _IDENTITY
         every[self._slots[0]] = motions
-        return self.chain.moved(every)
+        chain = self.chain.moved(every)
+        if not self._entries.size:
+            return chain
+        held = self._transmission.changed(self._entries, x[self._geometry :])
+        return chain.driven(held)
+
+    @cached_property
+    def _transmission(self) -> Transmission:
+        return self.chain.transmission or Transmission.ideal(self.chain.loads)
+
+    def loaded(self, x: Array) -> ErrorModel:
+        """The same unknowns, with joints that yield to the masses as they are placed at x."""
+        held = replace(self._transmission, loads=self.at(x).loads)
+        return replace(self, chain=self.chain.driven(held))
 
     def derivative(self, x: Array) -> tuple[Chain, Array, Array]:
         """The chain at x, and for each parameter the body (p,) and twist (p, 6) it moves there.
 
         A factor behind the k-th at its station turns the k-th twist; a link's motion is taken up by the
-        next origin from the left, so there the factors before it do.
+        next origin from the left, so there the factors before it do. Entries of the transmission come
+        last, numbered behind the bodies (see `Chain.tool_velocities`).
         """
-        factors = self._factors(np.asarray(x, float))
+        x = np.asarray(x, float)
+        factors = self._factors(x[: self._geometry])
         _, group, place = self._slots
         most = self._most
         before, behind = np.empty_like(factors), np.empty_like(factors)
@@ -339,9 +418,19 @@ class ErrorModel:
         for i in range(1, most):
             np.matmul(before[:, i - 1], factors[:, i - 1], out=before[:, i])
             np.matmul(factors[:, most - i], behind[:, most - i], out=behind[:, most - i - 1])
-        chain = self._moved(factors[:, 0] @ behind[:, 0])
+        chain = self._moved(factors[:, 0] @ behind[:, 0], x)
         carry = np.where(self._left, before, se3.inverse(behind))
-        return chain, *chain.station_twists(self._stations, self._twists, carry[group, place])
+        bodies, twists = chain.station_twists(self._stations, self._twists, carry[group, place])
+        if not self._entries.size:
+            return chain, bodies, twists
+        entries = len(chain.moving) + 1 + self._entries
+        return chain, np.concatenate([bodies, entries]), np.pad(twists, ((0, len(entries)), (0, 0)))
+
+    def joined(self, parameters: Iterable[Parameter]) -> ErrorModel:
+        """With more unknowns, each where it belongs: by station, entries of the transmission last."""
+        both = (*self.parameters, *parameters)
+        ordered = sorted(both, key=lambda p: (-1 if p.entry is None else p.entry, p.station))
+        return replace(self, parameters=tuple(ordered))
 
     def frames(self) -> ErrorModel | None:
         """Base and tool alone, if any of them is unknown."""

@@ -23,7 +23,7 @@ MARGIN_ANGLE, MARGIN_LENGTH = np.deg2rad(2.0), 5e-3
 # Predicted errors are averaged over so many configurations where no task is given.
 TASK = 300
 # Random choices that a plan is compared with, at so many numbers of poses.
-DRAWS, SIZES = 25, 6
+DRAWS, SIZES = 60, 6
 # Refinement: rounds, each with so many neighbours a pose, nearer from round to round.
 ROUNDS, NEIGHBOURS, REACH, NEARER = 8, 24, 0.15, 0.65
 # Poses nearer than this are as one to a real robot, whose errors no model holds in full: they repeat there.

@@ -161,10 +161,12 @@ def json_text(content: Any) -> str:
 
 
 def shown(value: float, unit: str) -> str:
-    """A length in mm or an angle in degrees for reading; a dash where it is unknown."""
+    """A length in mm or an angle in degrees for reading, others as they are; a dash where it is unknown."""
     if not math.isfinite(value):
         return "–"
-    return f"{1e3 * value:.3f} mm" if unit == "m" else f"{math.degrees(value):.4f}°"
+    if unit == "rad":
+        return f"{math.degrees(value):.4f}°"
+    return f"{1e3 * value:.3f} mm" if unit == "m" else f"{value:.3g} {unit}".removesuffix(" 1")
 
 
 def table(fit: Result) -> tuple[list[str], list[list[str]]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from .errors import DhcalError
 from .files import PathLike, read_toml, save
 from .result import Result
 from .se3 import Array
+from .transmission_files import transmission_lines, with_transmission
 from .ur_kinematics import read_ur_kinematics
 from .urdf import parse_urdf
 from .urdf_origins import with_origins
@@ -67,7 +68,7 @@ def paper_file(name: str) -> Path:
 
 
 def read_robot(path: PathLike, tip: str | None = None, sidecar: PathLike | None = None) -> Chain:
-    """A chain from a URDF or a DH file, with base and tool of its sidecar where there is one.
+    """A chain from a URDF or a DH file, with what its sidecar holds where there is one.
 
     Args:
         path: `.urdf`, a DH table as `.toml` or `.csv`, or UR's kinematics as `.yaml`.
@@ -90,15 +91,17 @@ def read_robot(path: PathLike, tip: str | None = None, sidecar: PathLike | None 
 def _with_sidecar(chain: Chain, path: PathLike) -> Chain:
     raw = read_toml(path)
     tip = raw.pop("tip", chain.tip)
-    if unknown := set(raw) - {"base", "tool", "instrument"}:
+    if unknown := set(raw) - {"base", "tool", "joint", "instrument"}:
         raise DhcalError(
-            f"{os.fspath(path)}: unknown key {min(unknown)!r}; allowed: tip, [base], [tool], [instrument]"
+            f"{os.fspath(path)}: unknown key {min(unknown)!r}; "
+            "allowed: tip, [base], [tool], [joint.NAME], [instrument]"
         )
     frames = {key: read_frame(raw[key], os.fspath(path), key) for key in ("base", "tool") if key in raw}
     if tip != chain.tip:
         # The tool is a place on another link.
         frames.pop("tool", None)
-    return replace(chain, **frames)
+    placed = replace(chain, **frames)
+    return with_transmission(placed, raw["joint"], os.fspath(path)) if "joint" in raw else placed
 
 
 def read_instrument(path: PathLike) -> dict[str, float]:
@@ -116,16 +119,32 @@ def read_instrument(path: PathLike) -> dict[str, float]:
     return {name: float(value) for name, value in values.items()}
 
 
-def sidecar_text(tip: str, base: Array, tool: Array, instrument: Mapping[str, float]) -> str:
-    """The sidecar's TOML of base and tool (4, 4), the tool being on `tip`, and the instrument's values."""
+def sidecar_text(
+    tip: str, base: Array, tool: Array, instrument: Mapping[str, float], joints: Sequence[str] = ()
+) -> str:
+    """The sidecar's TOML of base and tool (4, 4), the tool being on `tip`, of the instrument and the joints.
+
+    Args:
+        tip: the link that holds the tool.
+        base: (4, 4) base link in the measuring frame.
+        tool: (4, 4) measured point in the tip frame.
+        instrument: its values by name, m and rad.
+        joints: lines of `transmission_lines`.
+    """
     out = [
         "# What the URDF cannot hold. base: the robot's base link in the measuring frame;",
         "# tool: the measured point in the tip frame. Metres; rotation vectors in radians.",
+        *(
+            ["# joint: what a joint adds to its commanded value q, by q and gravity's torque."]
+            if joints
+            else []
+        ),
         f"tip = {json.dumps(tip)}",
     ]
     for name, pose in (("base", base), ("tool", tool)):
         xyz, turn = pose[:3, 3].tolist(), se3.log3(pose[:3, :3]).tolist()
         out += ["", f"[{name}]", f"xyz_m = {xyz}", f"rotvec_rad = {turn}"]
+    out += joints
     if instrument:
         out += [
             "",
@@ -165,8 +184,8 @@ def urdf_files(
 ) -> dict[PathLike, str | bytes]:
     """The calibrated URDF, read back and compared, and its sidecar; by path, not yet written.
 
-    Identity base and tool need no sidecar; one that is there already would be read with the new URDF,
-    and is replaced.
+    Identity base and tool and ideal joints need no sidecar; one that is there already would be read with
+    the new URDF, and is replaced.
 
     Raises:
         DhcalError: the written text would not be the same robot.
@@ -174,6 +193,11 @@ def urdf_files(
     origins, tool = joint_origins(chain)
     data = with_origins(chain.urdf, origins)
     again = replace(Chain.from_urdf(parse_urdf(data, os.fspath(path)), chain.tip), base=chain.base, tool=tool)
+    joints = transmission_lines(chain)
+    if chain.transmission is not None:
+        # From here on the written masses load the joints.
+        written = replace(chain.transmission, loads=again.loads)
+        chain, again = chain.driven(written), again.driven(written)
     rng = np.random.default_rng(0)
     q = rng.uniform(-np.pi, np.pi, (50, chain.size))
     wanted = chain.poses(q)
@@ -183,9 +207,9 @@ def urdf_files(
             f"{os.fspath(path)}: not written: read back, the tool is off by {gap:.2g}; please report it"
         )
     out: dict[PathLike, str | bytes] = {path: data}
-    plain = np.array_equal(chain.base, np.eye(4)) and np.array_equal(tool, np.eye(4)) and not instrument
-    if not plain or existing_sidecar(path):
-        out[sidecar_path(path)] = sidecar_text(chain.tip, chain.base, tool, instrument or {})
+    plain = np.array_equal(chain.base, np.eye(4)) and np.array_equal(tool, np.eye(4))
+    if not plain or joints or instrument or existing_sidecar(path):
+        out[sidecar_path(path)] = sidecar_text(chain.tip, chain.base, tool, instrument or {}, joints)
     return out
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from . import se3
 from .chain import Chain
-from .inverse import sliding, solve, to_positions, unlimited
+from .inverse import solve, to_positions, unlimited
 from .measurement_files import Readings
 from .se3 import Array
 
@@ -60,7 +60,7 @@ def solve_position(chain: Chain, target: Array, near: Array) -> Array | None:
     rng = np.random.default_rng(0)
     start = np.concatenate([near[None], rng.uniform(-1.5, 1.5, (63, chain.size))])
     q, left = solve(unlimited(chain), to_positions(np.broadcast_to(target, (64, 3))), start)
-    q = np.where(sliding(chain), q, (q + np.pi) % (2 * np.pi) - np.pi)
+    q = np.where(chain.sliding, q, (q + np.pi) % (2 * np.pi) - np.pi)
     good = np.flatnonzero(left < 1e-6)
     return q[good[np.argmin(np.abs(q[good] - near).sum(1))]] if good.size else None
 
@@ -91,7 +91,7 @@ def screen(chain: Chain, readings: Readings) -> list[Finding]:
             elif (solved := solve_position(chain, position[i], typical)) is not None:
                 values = ", ".join(
                     f"{1e3 * v:.2f} mm" if slides else f"{np.rad2deg(v):.2f}°"
-                    for v, slides in zip(solved, sliding(chain), strict=True)
+                    for v, slides in zip(solved, chain.sliding, strict=True)
                 )
                 reason += f", which the arm reaches with ({values})"
             found[int(i) + 1] = Finding(int(i) + 1, float(off[i]), reason)

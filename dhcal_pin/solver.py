@@ -79,11 +79,12 @@ def _change(r: Array, step: Array) -> float:
 def _settled(r: Array, change: float, cost: float, last: float = 0.0) -> bool:
     """Whether the rows will not move by anything that matters after a step that moves them by `change`.
 
-    Steps shrink quadratically near the end, so the next one shrinks at least as much as this one did
-    from the `last`, which is zero where nothing is known of it.
+    Near the end steps shrink quadratically: where this one is far smaller than the `last` (zero where
+    nothing is known of it), the next one shrinks at least as much.
     """
-    ahead = change * (min(1.0, change / last) if last else 1.0)
-    return ahead <= RELATIVE_STEP * math.sqrt(cost) or change <= ROUNDING * float(np.linalg.norm(r))
+    enough = RELATIVE_STEP * math.sqrt(cost)
+    shrunk = change < 1e-2 * last and change * change < 0.1 * enough * last
+    return change <= enough or shrunk or change <= ROUNDING * float(np.linalg.norm(r))
 
 
 @dataclass(frozen=True, eq=False)

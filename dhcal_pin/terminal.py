@@ -15,6 +15,7 @@ from rich.text import Text
 
 from . import report
 from .check import Agreement
+from .extension import Trial
 from .result import Result
 from .screening import Finding
 from .solver import Progress
@@ -128,6 +129,29 @@ def summary(fit: Result, files: Mapping[str, str]) -> None:
         lines(f"weakly seen: {text}", style="yellow")
     for name, path in files.items():
         lines(f"wrote {name}: {path}")
+
+
+def trials(found: Sequence[Trial]) -> None:
+    """What each family of joints' transmission errors brought, or would bring."""
+    if not found:
+        return
+    table(
+        "extensions: error on left-out regions of joint space, in standard deviations",
+        ["family", "verdict", "before", "after", "standard error of the change", "by chance", "prior width"],
+        [
+            [
+                one.family,
+                "added" if one.kept else "left out",
+                f"{one.cv_before:.3f}",
+                f"{one.cv_after:.3f}",
+                f"{one.standard_error:.3f}",
+                f"{one.chance:.1g}",
+                f"{one.prior_width:g} of default",
+            ]
+            for one in found
+        ],
+        texts=2,
+    )
 
 
 def open_page(path: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import html
 import math
 import re
 from collections.abc import Iterable
@@ -132,3 +133,8 @@ def scan(data: bytes, source: str) -> tuple[Tag, dict[str, Tag], dict[str, Tag]]
         ) from None
     assert robot is not None, "expat refuses a document without an element"
     return robot, named["link"], named["joint"]
+
+
+def quoted(text: str) -> str:
+    """An attribute's value as XML has it, quotes included; `xml.sax.saxutils` would import an HTTP client."""
+    return f'"{html.escape(text)}"'

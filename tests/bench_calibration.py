@@ -89,7 +89,9 @@ def against_scipy(m: int, repeats: int) -> list[Row]:
             ("our Jacobian", (residual, jacobian), 5 * repeats, "≥ 4"),
         ):
             ours, theirs = clocked([mine, partial(scipy, way, *functions)], times)
-            out.append(Row(f"scipy with {way}, {name}, m={m}", ours, theirs, theirs / ours, wanted))
+            out.append(
+                Row(f"calibration: scipy with {way}, {name}, m={m}", ours, theirs, theirs / ours, wanted)
+            )
         reached = [float(np.sum(residual(x) ** 2)) for x in (fit.x, *found.values())]
         assert reached[0] <= min(reached[1:]) * (1 + 1e-6), reached
     return out

@@ -161,7 +161,7 @@ def main() -> None:
         for row in part(*arguments):
             print(line(row), flush=True)
     sizes = (100, 1000, 10000, 100000) if quick else (100, 1000, 10000, 100000, 1000000)
-    print(f"\n| µs a sample, Jacobian to triangle | {' | '.join(f'm={m:.0e}' for m in sizes)} |")
+    print(f"\n| µs a sample, Jacobian to triangle | {' | '.join(f'm={m:,}' for m in sizes)} |")
     print("| --- |" + " --- |" * len(sizes))
     for name, micros in bench_kernel.growth(sizes, turns):
         print(f"| {name} | {' | '.join(f'{value:.2f}' for value in micros)} |", flush=True)

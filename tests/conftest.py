@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from pages import ARGUMENTS, CHROMIUM, VIEWPORT, Window, window_of
 from dhcal_pin.chain import Chain
 from dhcal_pin.dh import DHTable
 from dhcal_pin.dh_files import read_dh
+from dhcal_pin.urdf import parse_urdf
 
 URDF = Path(__file__).resolve().parent.parent / "urdf"
 
@@ -50,6 +53,23 @@ def random_table(rng: np.random.Generator, convention: str = "standard", size: i
 def random_joints(rng: np.random.Generator, table: DHTable, m: int) -> np.ndarray:
     """Any angle, and half a metre of slide each way."""
     return rng.uniform(-1, 1, (m, table.size)) * np.where(table.prismatic, 0.5, np.pi)
+
+
+def with_masses(chain: Chain, rng: np.random.Generator) -> Chain:
+    """The same arm with some kilograms on every link, off its axes."""
+    root = ElementTree.fromstring(chain.urdf.data)
+    for link in root.iter("link"):
+        for old in link.findall("inertial"):
+            link.remove(old)
+        xyz = " ".join(map(repr, rng.uniform(-0.2, 0.2, 3).tolist()))
+        link.append(
+            ElementTree.fromstring(
+                f'<inertial><origin xyz="{xyz}"/><mass value="{rng.uniform(1, 3)}"/>'
+                '<inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/></inertial>'
+            )
+        )
+    heavy = Chain.from_urdf(parse_urdf(ElementTree.tostring(root), "heavy.urdf"), chain.tip)
+    return replace(heavy, parameters=chain.parameters)
 
 
 @pytest.fixture(scope="session")

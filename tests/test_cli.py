@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dhcal_pin import calibration, check, cli, commands, demo
+from dhcal_pin import check, cli, commands, demo, extension
 from dhcal_pin.chain import Chain
 from dhcal_pin.dh_files import read_dh
 from dhcal_pin.measurement_files import read_readings
@@ -229,7 +229,7 @@ ARGUMENTS = {
         ["'tool'", "'tool0'"],
     ),
     "tip of a table": ([*CALIBRATE, "--tip", "tool0"], ["arm.dh.toml", "leave out --tip"]),
-    "unknown set": ([*CALIBRATE, "--parameters", "dh,gain"], ["'gain'", "dh, modified-dh"]),
+    "unknown set": ([*CALIBRATE, "--parameters", "dh,gains"], ["'gains'", "dh, modified-dh"]),
     "unknown to fix": ([*CALIBRATE, "--fix", "d9"], ["cannot fix 'd9'", "d1"]),
     "unknown to free": ([*CALIBRATE, "--free", "d9"], ["cannot free 'd9'", "d1"]),
     "all fixed": ([*CALIBRATE, "--fix", "dh"], ["fix fewer"]),
@@ -387,7 +387,7 @@ def test_an_interrupt_leaves_nothing(run, place, monkeypatch):
         raise KeyboardInterrupt
 
     before = contents(place)
-    monkeypatch.setattr(calibration, "calibrate", stop)
+    monkeypatch.setattr(extension, "extend", stop)
     assert run(*CALIBRATE, "--json", "-") == (130, "", "dhcal: interrupted; nothing written\n")
     assert contents(place) == before
 

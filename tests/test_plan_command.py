@@ -77,7 +77,7 @@ def test_a_task_by_positions_and_by_joints(tmp_path, capsys):
     targets.write_text("x[mm],y[mm],z[mm]\n9000,0,0\n")
     status, _, err = run(capsys, *base, targets, "-o", tmp_path / "none.csv")
     assert status == 2
-    assert "targets.csv:2" in err
+    assert "targets.csv: target 1 is out of reach" in err
     assert not (tmp_path / "none.csv").exists()
 
 

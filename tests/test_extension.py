@@ -1,0 +1,152 @@
+"""Cross-validation against real refits, and families added only where the data ask for them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import paper, robot_file
+
+from dhcal_pin.calibration import calibrate
+from dhcal_pin.chain import Chain
+from dhcal_pin.cli import main
+from dhcal_pin.contacts import Touch
+from dhcal_pin.crossvalidation import cross_validate, group_folds, random_folds, region_folds
+from dhcal_pin.errors import DhcalError
+from dhcal_pin.extension import extend
+from dhcal_pin.measurement_files import measurement_text
+from dhcal_pin.measurements import Noise
+from dhcal_pin.parameters import select
+from dhcal_pin.poses import Pose
+from dhcal_pin.positions import Position
+from dhcal_pin.result import accuracy
+from dhcal_pin.solver import levenberg_marquardt
+
+
+def simulated(sets: str, seed: int, m: int = 60, noise: float = 1e-4, kind=Pose):
+    """A UR10 with errors of the size of the priors, and what is measured of it."""
+    rng = np.random.default_rng(seed)
+    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    errors = select(arm, sets)
+    truth = errors.at(rng.normal(size=len(errors.parameters)) * np.minimum(errors.priors, 0.1)).loaded()
+    return arm, kind.simulate(truth, rng.uniform(-2.5, 2.5, (m, 6)), Noise(noise, noise), rng)
+
+
+def fitted(kind=Position, m: int = 40):
+    arm = Chain.from_dh(paper("sim_6dof"))
+    rng = np.random.default_rng(0)
+    data = kind.simulate(
+        Chain.from_dh(paper("sim_6dof_actual")), rng.uniform(-1, 1, (m, 6)), Noise(1e-4, 1e-4), rng
+    )
+    return calibrate(arm, data, "dh")
+
+
+def test_folds_equal_fits_without_what_they_leave_out():
+    fit = fitted(Pose)
+    folds = random_folds(fit.data, 4, seed=1)
+    found = cross_validate(fit, folds)
+    for fold, judged, error in zip(folds, found.folds, found.errors, strict=True):
+        kept = replace(
+            fit.problem, data=tuple(d.take(~m) for d, m in zip(fit.problem.data, fold, strict=True))
+        )
+        x = levenberg_marquardt(kept, np.zeros(len(fit.x)), 100, None).x
+        left = [d.take(m) for d, m in zip(fit.problem.data, fold, strict=True)]
+        chain = fit.errors.at(x)
+        assert judged["position_rms_m"] == pytest.approx(accuracy(chain, left)["position_rms_m"], rel=2e-3)
+        rows = left[0].residual(chain.sweep(left[0].q), np.empty(0))
+        assert error == pytest.approx(np.sqrt(np.mean(rows**2)), rel=2e-3)
+    whole = np.sqrt(np.mean([fold["position_rms_m"] ** 2 for fold in found.folds]))
+    assert found.accuracy["position_rms_m"] == pytest.approx(whole)
+    assert whole > 1.1 * fit.validate(fit.data)["position_rms_m"]
+
+
+def test_random_folds_and_groups_leave_each_sample_out_once():
+    data = fitted().data
+    for folds in (random_folds(data, 5), group_folds(data, np.arange(40) // 8)):
+        assert len(folds) == 5
+        np.testing.assert_array_equal(np.sum([fold[0] for fold in folds], 0), np.ones(40))
+    with pytest.raises(DhcalError, match="choose from 2 to 40"):
+        random_folds(data, 41)
+    with pytest.raises(DhcalError, match="40 samples need"):
+        group_folds(data, np.arange(3))
+    with pytest.raises(DhcalError, match="one group"):
+        group_folds(data, np.zeros(40))
+    with pytest.raises(DhcalError, match="made for other data"):
+        cross_validate(fitted(m=30), random_folds(data, 5))
+
+
+def test_regions_are_the_ends_of_joint_space():
+    """One joint moves in steps and another with it: one direction, its lowest and highest quarter."""
+    q = np.zeros((8, 6))
+    q[:, 1] = np.arange(8)
+    q[:, 4] = -2 * np.arange(8)
+    data = replace(fitted(m=8).data[0], q=q)
+    low, high = sorted(fold[0].nonzero()[0].tolist() for fold in region_folds([data]))
+    assert (low, high) == ([0, 1], [6, 7])
+    with pytest.raises(DhcalError, match="different joint values"):
+        region_folds([replace(data, q=np.ones((8, 6)))])
+
+
+def test_a_point_that_only_left_out_samples_touch_is_fitted_to_them():
+    fit = fitted(Touch, 60)
+    groups = [item.kind for item in fit.data]
+    assert groups == ["point"]
+    found = cross_validate(fit)
+    assert found.accuracy["position_rms_m"] < 0.05
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_nothing_is_added_to_an_arm_without(seed):
+    _, trials = extend(*simulated("minimal,base,tool", seed))
+    assert len(trials) == 4
+    assert not [trial.family for trial in trials if trial.kept]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [Pose, Position])
+def test_nothing_is_added_to_two_hundred_arms_without(kind):
+    added = 0
+    for seed in range(200):
+        m = (30, 60, 120)[seed % 3]
+        _, trials = extend(*simulated("minimal,base,tool", 100 + seed, m, kind=kind))
+        added += any(trial.kept for trial in trials)
+    assert added <= 10
+
+
+@pytest.mark.parametrize("family", ["compliance", "harmonics"])
+def test_what_is_there_is_added(family):
+    arm, data = simulated(f"minimal,base,tool,{family}", 3)
+    fit, trials = extend(arm, data)
+    assert next(trial.family for trial in trials if trial.kept) == family
+    one = trials[0]
+    assert one.cv_after < one.cv_before - one.standard_error
+    plain = calibrate(arm, data)
+    _, more = simulated(f"minimal,base,tool,{family}", 3, m=200)
+    assert fit.validate(more)["position_rms_m"] < 0.5 * plain.validate(more)["position_rms_m"]
+
+
+def test_the_command_says_what_each_family_brought(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    arm, data = simulated("minimal,base,tool,compliance", 4)
+    (tmp_path / "data.csv").write_text(measurement_text(data, arm, []))
+    robot = str(robot_file("ur_description/urdf/ur10_robot.urdf"))
+    common = ("calibrate", robot, "data.csv", "--tip", "tool0", "-o", "out.urdf", "--json", "r.json")
+    assert main([*common, "--extend", "gain,compliance"]) == 0
+    said = capsys.readouterr().err
+    rows = json.loads((tmp_path / "r.json").read_text())["extension"]
+    assert [(row["family"], row["kept"]) for row in rows] == [("compliance", True), ("gain", False)]
+    assert {"cv_before", "cv_after", "standard_error"} <= set(rows[0])
+    assert "compliance_rad_per_nm" in (tmp_path / "out.calibration.toml").read_text()
+    assert "gain        left out" in said
+    assert main([*common]) == 0
+    assert json.loads((tmp_path / "r.json").read_text())["extension"] == []
+    for wrong, words in (
+        (("--extend", "gains"), "no extension 'gains': choose from gain, harmonics, compliance, coupling"),
+        (("--extend", "auto", "--method", "gn"), "leave out --method gn"),
+        (("--extend", "auto", "--priors", "none"), "leave out"),
+    ):
+        capsys.readouterr()
+        assert main([*common, *wrong]) == 2
+        assert words in capsys.readouterr().err
