@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .dh_files import read_dh as read_dh
     from .dh_urdf import dh_to_urdf as dh_to_urdf
     from .errors import DhcalError as DhcalError
+    from .evaluation import accuracy as accuracy
     from .extension import extend as extend
     from .factors import error_factors as error_factors
     from .live import Live as Live
@@ -41,9 +42,10 @@ if TYPE_CHECKING:
     from .planning import plan as plan
     from .poses import Pose as Pose
     from .positions import Position as Position
+    from .report import Provenance as Provenance
+    from .report_page import write_report as write_report
     from .result import Prediction as Prediction
     from .result import Result as Result
-    from .result import accuracy as accuracy
     from .robot_files import read_robot as read_robot
     from .robot_files import write_urdf as write_urdf
     from .stream import calibrate_stream as calibrate_stream
@@ -71,6 +73,7 @@ _HOMES = {
     "dh_to_urdf": "dh_urdf",
     "DhcalError": "errors",
     "extend": "extension",
+    "accuracy": "evaluation",
     "error_factors": "factors",
     "Live": "live",
     "serve": "live",
@@ -81,10 +84,11 @@ _HOMES = {
     "plan": "planning",
     "Pose": "poses",
     "Position": "positions",
+    "Provenance": "report",
+    "write_report": "report_page",
     "extract": "parameters",
     "Prediction": "result",
     "Result": "result",
-    "accuracy": "result",
     "read_robot": "robot_files",
     "write_urdf": "robot_files",
     "calibrate_stream": "stream",

@@ -154,6 +154,13 @@ def parser() -> argparse.ArgumentParser:
     calibrate.add_argument(
         "--map", metavar="MAP.csv", help="predicted position uncertainty by cells of the workspace"
     )
+    calibrate.add_argument(
+        "--report",
+        metavar="R.html",
+        action="append",
+        default=[],
+        help="the report, as .html or .md; may repeat",
+    )
     calibrate.add_argument("--json", **_JSON)
     where = calibrate.add_mutually_exclusive_group()
     where.add_argument(

@@ -3,136 +3,26 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from . import observability, report, terminal
-from .calibration import calibrate
+from . import observability, report, report_page, tables, terminal
 from .chain import Chain
-from .dh_files import read_dh
 from .errors import DhcalError
+from .experiment import Experiment, experiment, paper_arm
 from .files import PathLike, save
 from .kinds import KINDS
-from .measurement_files import Readings, read_readings
 from .measurements import Measurement, Noise
 from .parameters import ErrorModel, select
-from .result import Result, accuracy
 from .robot_files import paper_file, urdf_files
-from .screening import Finding, screen
 from .se3 import Array
 from .solver import Problem, gauss_newton, reduce
 from .viewer import scene_html
 
 SEEDS, TESTS = 50, 100
 _STEPS = (0, 1, 2, 3, 5, 10)
-
-
-def paper_arm(name: str) -> Chain:
-    """One of the paper's arms by the name of its DH file, such as `sim_6dof`."""
-    return Chain.from_dh(read_dh(paper_file(f"{name}.dh.toml")), name)
-
-
-# --- the experiment --------------------------------------------------------------------------------
-
-
-def identifiable(chain: Chain, data: Sequence[Measurement]) -> list[str]:
-    """Parameters to hold so that no direction is unseen at the nominal arm: the last of each group."""
-    errors = select(chain, "dh")
-    zero = np.zeros(len(errors.parameters))
-    triangle = reduce(Problem(errors, tuple(data), zero), zero, small_angle=False)
-    held = [
-        errors.parameters[i].name
-        for members, unseen in observability.unseen_groups(triangle.r)
-        for i in members[len(members) - unseen :]
-    ]
-    return sorted(held)
-
-
-def leave_one_out(fit: Callable[[Measurement], Result], data: Measurement) -> float:
-    """RMS position error in m of each sample under the fit to all the others."""
-    rows = np.arange(len(data.q))
-    squares = []
-    for row in rows:
-        left = data.take(rows == row)
-        squares.append(accuracy(fit(data.take(rows != row)).chain, [left])["position_rms_m"] ** 2)
-    return float(np.sqrt(np.mean(squares)))
-
-
-def _rms(difference: Array) -> float:
-    return float(np.sqrt(np.mean(np.sum(difference**2, 1))))
-
-
-@dataclass(frozen=True, eq=False)
-class Experiment:
-    """The paper's measured robot.
-
-    Attributes:
-        chain: as designed (Table 3).
-        readings: Table 5 as printed.
-        findings: its impossible rows.
-        data: the rows that remain.
-        held: parameters that these poses cannot see.
-        fit: least squares on the rest.
-        rows: the comparison for people, numbers in mm.
-        figures: the same numbers in m.
-    """
-
-    chain: Chain
-    readings: Readings
-    findings: list[Finding]
-    data: Measurement
-    held: list[str]
-    fit: Result
-    rows: list[list[str]]
-    figures: dict[str, float]
-
-
-def experiment() -> Experiment:
-    """Screens Table 5, calibrates Table 3 on what is left, and compares with what the paper printed."""
-    chain = paper_arm("experiment")
-    readings = read_readings(paper_file("experiment_table5.csv"), chain)
-    findings = screen(chain, readings)
-    good = ~np.isin(readings.data.rows, [finding.row for finding in findings])
-    data = readings.data.take(good)
-    held = identifiable(chain, [data])
-    commanded, after = readings.commanded, readings.after
-    assert commanded is not None
-    assert after is not None
-
-    def one_step(part: Measurement) -> Result:
-        return calibrate(chain, part, "dh", method="gn", max_iterations=1)
-
-    def least_squares(part: Measurement) -> Result:
-        return calibrate(chain, part, "dh", priors="none", fix=held)
-
-    fit = least_squares(data)
-    step = one_step(data)
-    measured = readings.data.positions()
-    figures = {
-        "before": accuracy(chain, [data])["position_rms_m"],
-        "one_step": accuracy(step.chain, [data])["position_rms_m"],
-        "one_step_left_out": leave_one_out(one_step, data),
-        "least_squares": accuracy(fit.chain, [data])["position_rms_m"],
-        "least_squares_left_out": leave_one_out(least_squares, data),
-        "published_parameters": accuracy(paper_arm("experiment_published"), [data])["position_rms_m"],
-        "paper_before": _rms((measured - commanded)[good]),
-        "paper_after": _rms((after - commanded)[good]),
-        "paper_before_all": _rms(measured - commanded),
-        "paper_after_all": _rms(after - commanded),
-    }
-    mm = {key: f"{1e3 * value:.3f}" for key, value in figures.items()}
-    rows = [
-        ["as designed (Table 3)", mm["before"], ""],
-        ["one pseudo-inverse step, (37) to (39)", mm["one_step"], mm["one_step_left_out"]],
-        [f"least squares, {' and '.join(held)} held", mm["least_squares"], mm["least_squares_left_out"]],
-        ["parameters as published (Table 4)", mm["published_parameters"], ""],
-        ["the paper's own distance from the object, before", mm["paper_before"], ""],
-        ["the paper's own distance from the object, after", mm["paper_after"], ""],
-    ]
-    return Experiment(chain, readings, findings, data, held, fit, rows, figures)
 
 
 # --- the simulations -------------------------------------------------------------------------------
@@ -290,15 +180,17 @@ def run(out: PathLike) -> dict[str, Any]:
     terminal.findings("Table 5", found.findings)
     header = ["position RMS in mm", "fitted", "left one out"]
     title = f"The experiment, {len(found.data.q)} of {len(found.readings.data.q)} rows"
-    terminal.table(title, header, found.rows)
-    parameters = report.table(found.fit)
-    terminal.table("Parameters, least squares", *parameters)
+    verdict = tables.Table(header, found.rows)
+    terminal.table(title, verdict)
+    parameters = tables.estimate_table(found.fit.estimates)
+    terminal.table("Parameters, least squares", parameters)
     terminal.lines("", *_verdict(found))
     rows = simulation_rows()
     simulation_title = (
         f"The simulations: worst of {TESTS} test poses in mm by iteration, median of {SEEDS} seeds"
     )
-    terminal.table(simulation_title, SIMULATION_HEADER, rows)
+    simulations = tables.Table(SIMULATION_HEADER, rows)
+    terminal.table(simulation_title, simulations)
     terminal.lines(
         "Two joint sets fit without a rest and still leave the parameters wrong; ten find them. More sets "
         "converge faster where they are drawn anew at each iteration.",
@@ -312,17 +204,22 @@ def run(out: PathLike) -> dict[str, Any]:
         "json": os.path.join(folder, "result.json"),
         "summary": os.path.join(folder, "summary.md"),
         "scene": os.path.join(folder, "scene.html"),
+        "report": os.path.join(folder, "report.html"),
     }
     inputs = [paper_file("experiment.dh.toml"), paper_file("experiment_table5.csv")]
-    document = report.document(
-        found.fit,
-        files,
-        {
-            path.name: digest
-            for path, digest in zip(inputs, report.fingerprints(inputs).values(), strict=True)
-        },
-        [finding.row for finding in found.findings],
-    ) | {"experiment_m": found.figures}
+    digests = zip(inputs, report.fingerprints(inputs).values(), strict=True)
+    source = report.Provenance(
+        command="dhcal demo",
+        inputs={path.name: digest for path, digest in digests},
+        names=[inputs[1].name],
+        settings={"parameters": "dh"},
+        left_out={inputs[1].name: {f.row: f.reason for f in found.findings}},
+        remarks=_verdict(found),
+        judged=found.judged,
+    )
+    rejected = [finding.row for finding in found.findings]
+    document = report.document(found.fit, files, source.inputs, rejected) | {"experiment_m": found.figures}
+    contents |= report_page.report_files(found.fit, [files["report"]], source)
     contents[files["scene"]] = scene_html(found.chain, found.fit, title="The paper's robot, before and after")
     contents[files["json"]] = report.json_text(document)
     contents[files["summary"]] = "\n\n".join(
@@ -330,12 +227,12 @@ def run(out: PathLike) -> dict[str, Any]:
             "# The paper's robot, calibrated",
             *(f"Row {f.row} of Table 5 is left out: {f.reason}." for f in found.findings),
             f"## {title}",
-            report.markdown_table(header, found.rows),
+            tables.markdown_table(verdict),
             *_verdict(found),
             "## Parameters, least squares",
-            report.markdown_table(*parameters),
+            tables.markdown_table(parameters),
             f"## {simulation_title}",
-            report.markdown_table(SIMULATION_HEADER, rows),
+            tables.markdown_table(simulations),
             "",
         ]
     )

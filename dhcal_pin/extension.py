@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.special import fdtrc
 
-from .calibration import calibrate
+from . import calibration
 from .chain import Chain
 from .crossvalidation import Parts, parts, region_folds, rows, solved, standard_error
 from .errors import DhcalError
@@ -205,7 +205,7 @@ def extend(
             "an extension is chosen by method lm with priors: leave out --method gn, --priors none"
         )
     parameters = parameters or chain.parameters
-    fit = calibrate(chain, data, parameters, **options)
+    fit = calibration.calibrate(chain, data, parameters, **options)
     trials = select_families(fit, families, options.get("progress"))
     widths = {trial.family: trial.prior_width for trial in trials if trial.kept}
     if not widths:
@@ -213,4 +213,4 @@ def extend(
     narrowed = {p.name: p.prior * width for name, width in widths.items() for p in SETS[name](chain)}
     own = {} if isinstance(priors, str) else dict(priors)
     options["priors"] = narrowed | own
-    return calibrate(chain, data, ",".join([parameters, *widths]), **options), trials
+    return calibration.calibrate(chain, data, ",".join([parameters, *widths]), **options), trials

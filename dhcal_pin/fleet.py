@@ -146,7 +146,8 @@ def _whole(folder: str, place: str) -> str:
 
 
 def _written(job: Job) -> list[str]:
-    return [place for place in (job.output, sidecar_path(job.output), job.map, job.json) if place]
+    kept = (job.output, sidecar_path(job.output), job.map, job.json, *job.report)
+    return [place for place in kept if place]
 
 
 def places(entries: Sequence[Entry], path: PathLike) -> list[str]:

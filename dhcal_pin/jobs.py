@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import shlex
 from argparse import Namespace
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
 from .calibration import Method
+
+# Where a job writes, which changes nothing about what it finds.
+_PLACES = ("output", "in_place", "report", "json", "map")
 
 
 @dataclass(frozen=True)
@@ -18,7 +23,7 @@ class Job:
         data: paths of measurement files.
         output: path of the corrected URDF.
         tip, columns, parameters, extend, fix, free, holdout, method, loss, priors, instrument,
-            max_iterations, seed, in_place, world_joint, tool_frame, json, map: as in
+            max_iterations, seed, in_place, world_joint, tool_frame, report, json, map: as in
             `dhcal calibrate --help`.
     """
 
@@ -41,6 +46,7 @@ class Job:
     in_place: bool = False
     world_joint: bool = False
     tool_frame: str | None = None
+    report: tuple[str, ...] = ()
     json: str | None = None
     map: str | None = None
 
@@ -52,3 +58,17 @@ class Job:
             value = getattr(args, option.name)
             values[option.name] = tuple(value) if isinstance(value, list) else value
         return cls(**values)
+
+    def command(self, names: Mapping[str, str]) -> str:
+        """The command line of this job, without where it writes, and files under other names.
+
+        >>> Job("in/arm.urdf", ("in/a.csv",), "out.urdf", seed=3).command({"in/arm.urdf": "arm.urdf"})
+        'dhcal calibrate arm.urdf in/a.csv --seed 3'
+        """
+        words = ["dhcal", "calibrate", *(names.get(path, path) for path in (self.robot, *self.data))]
+        for option in fields(self):
+            value = getattr(self, option.name)
+            if option.name not in (*_PLACES, "robot", "data") and value != option.default:
+                flag = f"--{option.name.replace('_', '-')}"
+                words += [flag] if value is True else [flag, names.get(str(value), str(value))]
+        return shlex.join(words)

@@ -37,6 +37,12 @@ def check_outputs(outputs: Sequence[str | None], inputs: Sequence[str]) -> None:
         check_place(path)
 
 
+def check_urdf_ending(path: str, other: str = "") -> None:
+    """Complains about a path of a URDF to write that does not end like one; `other` is what else could be."""
+    if not path.lower().endswith(".urdf"):
+        raise DhcalError(f"{path}: unknown ending; write a URDF as .urdf {other}".rstrip())
+
+
 def emit(target: str | None, content: object) -> None:
     """JSON to a file, or alone on stdout for `-`."""
     if target == STDOUT:

@@ -19,6 +19,7 @@ from .outputs import STDOUT, check_outputs, emit, names, sidecars
 from .planning import Plan, plan
 from .robot_files import read_instrument, read_priors, read_robot
 from .se3 import Array
+from .tables import Table
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 # A laser tracker and a good arm's repeatability, where neither --sigma nor --data tell.
@@ -145,9 +146,8 @@ def _say(found: Plan, args: Namespace) -> None:
         ]
         for size in shown
     ]
-    terminal.table(
-        "predicted position error, RMS over the task", ["poses", "planned mm", "random mm"], rows, 0
-    )
+    content = Table(["poses", "planned mm", "random mm"], rows, texts=0)
+    terminal.table("predicted position error, RMS over the task", content)
     terminal.lines("")
     terminal.lines(
         f"{len(found.q)} planned poses leave {found.ratio:.2f} of the error that as many at random leave"

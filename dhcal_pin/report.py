@@ -1,32 +1,50 @@
-"""What was done and found: a JSON document and a Markdown page from one result."""
+"""What was done and found: the JSON document, and where a result comes from."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import math
+import os
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from . import se3
-from .chain import BASE, Chain
+from . import observability
+from .chain import Chain
+from .evaluation import Comparison, accuracy
 from .files import PathLike
-from .measurements import Measurement, Unknown
-from .parameters import Parameter
-from .result import Result, accuracy
+from .measurements import Measurement
+from .result import Result
 
-# Keys of an accuracy, as people read them.
-MEASURES = (
-    ("position_rms_m", "position RMS", "m"),
-    ("position_max_m", "position, largest", "m"),
-    ("orientation_rms_rad", "orientation RMS", "rad"),
-    ("residual_rms", "other residuals, RMS", "m"),
-    ("residual_max", "other residuals, largest", "m"),
-)
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a result comes from, as far as it does not know that itself.
+
+    Attributes:
+        command: the command line that made it, without where it wrote.
+        inputs: SHA-256 of each input file, by path.
+        names: the file of each item of the fitted data; empty where they came from Python.
+        holdout_names: the same of the items held out.
+        settings: further choices, in words by name.
+        left_out: reasons by file and row of what was not used at all.
+        doubts: what is hard to believe, by file.
+        remarks: sentences that belong beside the headline.
+        judged: accuracy on samples that were each left out of a fit, where none were held out.
+    """
+
+    command: str = ""
+    inputs: Mapping[str, str] = field(default_factory=dict)
+    names: Sequence[str] = ()
+    holdout_names: Sequence[str] = ()
+    settings: Mapping[str, str] = field(default_factory=dict)
+    left_out: Mapping[str, Mapping[int, str]] = field(default_factory=dict)
+    doubts: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    remarks: Sequence[str] = ()
+    judged: Comparison | None = None
 
 
 def fingerprints(paths: Sequence[PathLike]) -> dict[str, str]:
@@ -39,71 +57,61 @@ def versions() -> dict[str, str]:
     return {name: metadata.version(name) for name in ("dhcal-pin", "pin", "numpy", "scipy")}
 
 
-def _value(fit: Result, parameter: Parameter | Unknown, error: float) -> float:
-    """A parameter's own value; base and tool by component of their place, the others nominal plus error."""
-    frames = {BASE: fit.chain.base, fit.chain.tool_station: fit.chain.tool}
-    if isinstance(parameter, Unknown) or parameter.station not in frames:
-        return parameter.nominal + error
-    frame = frames[parameter.station]
-    six = np.concatenate([frame[:3, 3], se3.log3(frame[:3, :3])])
-    return float(six @ np.array(parameter.twist))
+def short_names(paths: Sequence[PathLike]) -> dict[str, str]:
+    """Each path's last parts, as few as tell them apart.
 
-
-def parameter_rows(fit: Result) -> list[dict[str, Any]]:
-    """Each parameter with nominal, value, std (infinite where unknown), observability and fixed.
-
-    `remaining` is the share that std is of what was expected before the measurement.
+    >>> short_names(["a/front/hole.csv", "a/back/hole.csv", "arm.urdf"])
+    {'a/front/hole.csv': 'front/hole.csv', 'a/back/hole.csv': 'back/hole.csv', 'arm.urdf': 'arm.urdf'}
     """
-    rows = [
-        {
-            "name": p.name,
-            "unit": p.unit,
-            "nominal": p.nominal,
-            "value": _value(fit, p, float(x)),
-            "std": float(std),
-            "observability": float(seen),
-            "remaining": float(remaining),
-            "fixed": False,
-        }
-        for p, x, std, seen, remaining in zip(
-            fit.parameters, fit.x, fit.std, fit.seen, fit.remaining, strict=True
-        )
-    ]
-    for p in fit.errors.fixed:
-        held = _value(fit, p, 0.0)
-        rows.append(
-            {
-                "name": p.name,
-                "unit": p.unit,
-                "nominal": held,
-                "value": held,
-                "std": 0.0,
-                "observability": 0.0,
-                "remaining": 0.0,
-                "fixed": True,
-            }
-        )
-    return rows
+    parts = {os.fspath(path): Path(path).parts for path in paths}
+
+    def tail(path: str) -> str:
+        for count in range(1, len(parts[path])):
+            mine = parts[path][-count:]
+            if all(other[-count:] != mine for name, other in parts.items() if name != path):
+                return "/".join(mine)
+        return path
+
+    return {path: tail(path) for path in parts}
+
+
+# What the document says of accuracy and of a parameter; all that is known is under `comparisons`, `priors`.
+_ACCURACY = "position_rms_m position_max_m orientation_rms_rad residual_rms residual_max unit".split()
+_PARAMETER = "name unit nominal value std observability remaining fixed".split()
+
+
+def _only(found: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
+    return {key: found[key] for key in keys if key in found}
+
+
+def essentials(found: Mapping[str, Any]) -> dict[str, Any]:
+    """RMS and largest errors of what `accuracy` found."""
+    return _only(found, _ACCURACY)
 
 
 def document(
     fit: Result, files: Mapping[str, str], inputs: Mapping[str, str], outliers: Sequence[int] = ()
 ) -> dict[str, Any]:
     """The JSON document of a calibration."""
+    found = {c.title: c for c in fit.comparisons}
+    held = found.get("held out")
     return {
         "converged": fit.converged,
         "iterations": fit.iterations,
         "method": fit.method,
         "samples": fit.samples,
-        "samples_holdout": sum(len(item.q) for item in fit.holdout),
+        "samples_holdout": held.samples if held else 0,
         "rank": fit.rank,
         "parameters_total": len(fit.parameters),
         "condition": fit.condition,
-        "before": accuracy(fit.reference, fit.data),
-        "after": accuracy(fit.chain, fit.data, fit.instruments),
-        "holdout_before": accuracy(fit.reference, fit.holdout),
-        "holdout_after": accuracy(fit.chain, fit.holdout, fit.instruments),
-        "parameters": parameter_rows(fit),
+        "singular_values": observability.singular_values(fit.solution.triangle.r).tolist(),
+        "before": essentials(found["fitted"].before),
+        "after": essentials(found["fitted"].after),
+        "holdout_before": essentials(held.before) if held else {},
+        "holdout_after": essentials(held.after) if held else {},
+        "comparisons": [asdict(comparison) for comparison in fit.comparisons],
+        "parameters": [_only(asdict(estimate), _PARAMETER) for estimate in fit.estimates],
+        "priors": {estimate.name: estimate.prior for estimate in fit.estimates if not estimate.fixed},
         "unobservable": fit.unobservable,
         "weakly_seen": fit.weakly_seen,
         "observability_indices": fit.observability_indices,
@@ -118,7 +126,7 @@ def plain_document(
     chain: Chain, data: Sequence[Measurement], inputs: Mapping[str, str], known: Mapping[str, float]
 ) -> dict[str, Any]:
     """The same document of a model that nothing was fitted to but instruments' unknown values."""
-    found = accuracy(chain, data, known)
+    found = essentials(accuracy(chain, data, known))
     return {
         "converged": True,
         "iterations": 0,
@@ -158,57 +166,3 @@ def json_text(content: Any) -> str:
     text = json.dumps(clean(content), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     # A file's name need not be UTF-8; what is not becomes an escape that JSON knows.
     return text.encode(errors="backslashreplace").decode()
-
-
-def shown(value: float, unit: str) -> str:
-    """A length in mm or an angle in degrees for reading, others as they are; a dash where it is unknown."""
-    if not math.isfinite(value):
-        return "–"
-    if unit == "rad":
-        return f"{math.degrees(value):.4f}°"
-    return f"{1e3 * value:.3f} mm" if unit == "m" else f"{value:.3g} {unit}".removesuffix(" 1")
-
-
-def table(fit: Result) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of the parameter table as people read it."""
-    rows = []
-    for row in parameter_rows(fit):
-        std = (
-            "fixed"
-            if row["fixed"]
-            else ("not seen" if math.isinf(row["std"]) else shown(row["std"], row["unit"]))
-        )
-        rows.append(
-            [
-                row["name"],
-                shown(row["nominal"], row["unit"]),
-                shown(row["value"], row["unit"]),
-                shown(row["value"] - row["nominal"], row["unit"]),
-                std,
-            ]
-        )
-    return ["parameter", "nominal", "calibrated", "change", "std"], rows
-
-
-def accuracy_rows(fit: Result) -> list[list[str]]:
-    """Before and after in millimetres and degrees, fitted and held out."""
-    rows = []
-    for title, data in (("fitted", fit.data), ("held out", fit.holdout)):
-        if not data:
-            continue
-        title = f"{sum(len(item.q) for item in data)} {title}"
-        before, after = accuracy(fit.reference, data), accuracy(fit.chain, data, fit.instruments)
-        for key, label, unit in MEASURES:
-            if key in before:
-                rows.append([title, label, shown(before[key], unit), shown(after[key], unit)])
-    return rows
-
-
-def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table, numbers to the right."""
-    lines = [
-        "| " + " | ".join(header) + " |",
-        "|" + "|".join([" --- "] + [" ---: "] * (len(header) - 1)) + "|",
-    ]
-    lines += ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows]
-    return "\n".join(lines)

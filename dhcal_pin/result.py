@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -10,67 +10,20 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from . import explanations, observability, robust
-from .chain import Chain
+from . import explanations, observability, robust, se3, tables
+from .chain import BASE, Chain
+from .evaluation import Comparison, accuracy
 from .measurements import Measurement, Unknown
 from .parameters import ErrorModel, Parameter
-from .problem import Problem, reduce, shared_unknowns
+from .problem import Problem, reduce
 from .se3 import Array
-from .solver import Solution, levenberg_marquardt, posterior_root, pseudo_inverse, with_priors
+from .solver import Solution, posterior_root, pseudo_inverse, with_priors
+from .tables import Estimate
 
 # A parameter, or a metre and a radian of the tool, with more than this share of itself unseen is unknown.
 UNKNOWN = 1e-6
 # Residuals that are larger than stated by so many standard deviations of chance contradict the sigmas.
 CONTRADICTION = 3.0
-
-
-def accuracy(
-    chain: Chain, data: Sequence[Measurement], known: Mapping[str, float] | None = None
-) -> dict[str, Any]:
-    """Errors of a chain on data: RMS and largest position error in m, RMS orientation error in rad.
-
-    What else was measured goes to `residual_rms` and `residual_max`, with `unit`.
-
-    Args:
-        chain: base and tool included.
-        data: measurements of any kinds.
-        known: values of instruments' unknowns; others (a point that only these data touch) are fitted
-            to the data first.
-    """
-    data = [item.started(chain) for item in data]
-    values = _instruments(chain, data, known or {})
-    groups: dict[str, list[Array]] = {}
-    for item in data:
-        u = np.array([values[unknown.name] for unknown in item.unknowns])
-        for name, error in item.errors(chain.sweep(item.configurations()), u).items():
-            group = name if name in ("position", "orientation") else "residual"
-            groups.setdefault(group, []).append(np.linalg.norm(error, axis=1))
-    out: dict[str, Any] = {}
-    if "position" in groups:
-        size = np.concatenate(groups["position"])
-        out |= {"position_rms_m": float(np.sqrt(np.mean(size**2))), "position_max_m": float(size.max())}
-    if "orientation" in groups:
-        size = np.concatenate(groups["orientation"])
-        out["orientation_rms_rad"] = float(np.sqrt(np.mean(size**2)))
-    if "residual" in groups:
-        size = np.concatenate(groups["residual"])
-        out |= {
-            "residual_rms": float(np.sqrt(np.mean(size**2))),
-            "residual_max": float(size.max()),
-            "unit": "m",
-        }
-    return out
-
-
-def _instruments(chain: Chain, data: Sequence[Measurement], known: Mapping[str, float]) -> dict[str, float]:
-    """Values of the data's unknowns by name, those that are not known fitted to the data alone."""
-    every = shared_unknowns(data)
-    given = {u.name: known[u.name] for u in every if u.name in known and not u.local}
-    weights = np.array([1 / u.prior for u in every if u.name not in given])
-    problem = Problem(ErrorModel(chain, ()), tuple(data), weights, given)
-    if not len(weights):
-        return given
-    return problem.instruments(levenberg_marquardt(problem, np.zeros(len(weights)), 100, None).x)
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,6 +247,52 @@ class Result:
         """Those of the instruments' values that hold for other measurements with it, too."""
         local = {unknown.name for unknown in self.problem.unknowns if unknown.local}
         return {name: value for name, value in self.instruments.items() if name not in local}
+
+    @cached_property
+    def comparisons(self) -> tuple[Comparison, ...]:
+        """Accuracy before and after: on the samples held out first, if there are any, then on the fitted."""
+        return tuple(
+            Comparison(
+                title,
+                sum(len(item.rows) for item in data),
+                accuracy(self.reference, data),
+                accuracy(self.chain, data, self.instruments),
+            )
+            for title, data in (("held out", self.holdout), ("fitted", self.data))
+            if data
+        )
+
+    @cached_property
+    def estimates(self) -> tuple[Estimate, ...]:
+        """What was found of each unknown, then the parameters that were held.
+
+        Base and tool are given by component of their place, the others as nominal plus error.
+        """
+        frames = {BASE: self.chain.base}
+        frames[self.chain.tool_station] = self.chain.tool
+        sixes = {at: np.append(pose[:3, 3], se3.log3(pose[:3, :3])) for at, pose in frames.items()}
+        with np.errstate(divide="ignore"):
+            priors = 1 / self.problem.weights
+        figures = np.stack([self.std, priors, self.seen, self.remaining], 1).tolist()
+        rows = [(p, x, row, False) for p, x, row in zip(self.parameters, self.x, figures, strict=True)]
+        rows += [(p, 0.0, [0.0] * 4, True) for p in self.errors.fixed]
+        out = []
+        for p, x, (std, prior, seen, left), held in rows:
+            nominal, value, place = p.nominal, p.nominal + float(x), "instrument"
+            if isinstance(p, Parameter):
+                place = "frame" if p.station in frames else "robot"
+            if isinstance(p, Parameter) and place == "frame":
+                value = float(sixes[p.station] @ np.array(p.twist))
+                nominal = value if held else nominal
+            out.append(Estimate(p.name, p.unit, nominal, value, std, prior, seen, left, held, place))
+        return tuple(out)
+
+    def _repr_html_(self) -> str:
+        """The headline, before and after, and the parameters, as a notebook shows them."""
+        found = (tables.accuracy_table(self.comparisons), tables.estimate_table(self.estimates))
+        doubt = "" if self.converged else "<p>It did not converge.</p>"
+        said = f"<p><strong>{tables.headline(self.comparisons).text}</strong></p>{doubt}"
+        return "\n".join([said, *map(tables.html_table, found)])
 
     def validate(self, data: Measurement | Sequence[Measurement]) -> dict[str, Any]:
         """Accuracy of the calibrated chain on other data: position in m, orientation in rad."""

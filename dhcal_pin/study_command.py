@@ -21,6 +21,7 @@ from .files import read_text, save
 from .outputs import check_outputs
 from .robot_files import paper_file
 from .study import Setting, Study, read_study, run, table
+from .tables import Table
 
 
 def study(args: Namespace) -> int:
@@ -96,4 +97,4 @@ def _shown(wanted: Study, header: Sequence[str], rows: Sequence[Sequence[Any]]) 
         for row in rows
     ]
     title = f"{wanted.title or 'study'}: medians of {wanted.seeds} calibrations a line"
-    terminal.table(title, [names[i] for i in (*varied, *told)], lines, texts=len(varied))
+    terminal.table(title, Table([names[i] for i in (*varied, *told)], lines, texts=len(varied)))

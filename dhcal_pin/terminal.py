@@ -10,15 +10,16 @@ from typing import Any
 
 from rich.console import Console
 from rich.progress import Progress as Bar
-from rich.table import Table
+from rich.table import Table as Grid
 from rich.text import Text
 
-from . import report
 from .check import Agreement
+from .evaluation import ENDINGS
 from .extension import Trial
 from .result import Result
 from .screening import Finding
 from .solver import Progress
+from .tables import MEASURES, WORDS, Table, accuracy_table, estimate_table, headline, shown
 
 
 def _console() -> Console:
@@ -29,13 +30,13 @@ def _console() -> Console:
     return console
 
 
-def table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], texts: int = 1) -> None:
-    """A table whose first columns are text and the others numbers."""
+def table(title: str, content: Table) -> None:
+    """A table under its title."""
     console = _console()
-    out = Table(header_style="bold", box=None, pad_edge=False)
-    for i, name in enumerate(header):
-        out.add_column(name, justify="left" if i < texts else "right")
-    for row in rows:
+    out = Grid(header_style="bold", box=None, pad_edge=False)
+    for i, name in enumerate(content.header):
+        out.add_column(name, justify="left" if i < content.texts else "right")
+    for row in content.rows:
         out.add_row(*map(Text, row))
     console.print()
     # Not the table's own title, which would be folded to the table's width.
@@ -97,26 +98,24 @@ def notes(texts: Sequence[str]) -> None:
 
 def agreement(robot: str, rows: Sequence[Agreement]) -> None:
     """The routes of `dhcal check` against the paper's factors."""
-    table(
-        f"{robot}: largest difference from the paper's factors (m, rad)",
-        ["route", "columns", "difference", "allowed", "verdict"],
+    cells = [
         [
-            [
-                row.route,
-                str(row.columns) if row.columns else "",
-                f"{row.difference:.1e}",
-                f"{row.allowed:.0e}",
-                "agrees" if row.holds else "DISAGREES",
-            ]
-            for row in rows
-        ],
-    )
+            row.route,
+            str(row.columns) if row.columns else "",
+            f"{row.difference:.1e}",
+            f"{row.allowed:.0e}",
+            "agrees" if row.holds else "DISAGREES",
+        ]
+        for row in rows
+    ]
+    header = ["route", "columns", "difference", "allowed", "verdict"]
+    table(f"{robot}: largest difference from the paper's factors (m, rad)", Table(header, cells))
 
 
 def summary(fit: Result, files: Mapping[str, str]) -> None:
-    """Accuracy, parameters, and what could not be seen."""
-    table("accuracy", ["samples", "error", "before", "after"], report.accuracy_rows(fit), texts=2)
-    table("parameters", *report.table(fit))
+    """Parameters, accuracy, what could not be seen, and the headline last, where the eye is."""
+    table("parameters", estimate_table(fit.estimates))
+    table("accuracy", accuracy_table(fit.comparisons))
     state = "converged" if fit.converged else "NOT converged"
     lines(
         "",
@@ -129,29 +128,36 @@ def summary(fit: Result, files: Mapping[str, str]) -> None:
         lines(f"weakly seen: {text}", style="yellow")
     for name, path in files.items():
         lines(f"wrote {name}: {path}")
+    lines("", headline(fit.comparisons).text, style="bold")
 
 
 def trials(found: Sequence[Trial]) -> None:
     """What each family of joints' transmission errors brought, or would bring."""
     if not found:
         return
-    table(
-        "extensions: error on left-out regions of joint space, in standard deviations",
-        ["family", "verdict", "before", "after", "standard error of the change", "by chance", "prior width"],
+    header = [
+        "family",
+        "verdict",
+        "before",
+        "after",
+        "standard error of the change",
+        "by chance",
+        "prior width",
+    ]
+    rows = [
         [
-            [
-                one.family,
-                "added" if one.kept else "left out",
-                f"{one.cv_before:.3f}",
-                f"{one.cv_after:.3f}",
-                f"{one.standard_error:.3f}",
-                f"{one.chance:.1g}",
-                f"{one.prior_width:g} of default",
-            ]
-            for one in found
-        ],
-        texts=2,
-    )
+            one.family,
+            "added" if one.kept else "left out",
+            f"{one.cv_before:.3f}",
+            f"{one.cv_after:.3f}",
+            f"{one.standard_error:.3f}",
+            f"{one.chance:.1g}",
+            f"{one.prior_width:g} of default",
+        ]
+        for one in found
+    ]
+    title = "extensions: error on left-out regions of joint space, in standard deviations"
+    table(title, Table(header, rows, texts=2))
 
 
 def open_page(path: str) -> None:
@@ -165,13 +171,16 @@ def open_url(url: str) -> None:
         lines(f"no browser here; open {url}")
 
 
-def validation(robot: str, document: Mapping[str, Any], fitted: bool) -> None:
-    """Accuracy of a model on data, before and after base and tool were fitted if they were."""
-    header = ["error", "base and tool as given", "fitted"] if fitted else ["error", "value"]
-    before, after = document["before"], document["after"]
+def validation(title: str, found: Mapping[str, Mapping[str, Any]]) -> None:
+    """Accuracies of a model on data, by what was done before."""
     rows = []
-    for key, label, unit in report.MEASURES:
-        if key in after:
-            values = [before[key], after[key]] if fitted else [after[key]]
-            rows.append([label, *(report.shown(value, unit) for value in values)])
-    table(f"{robot}: accuracy on {document['samples']} samples", header, rows)
+    for group, end in ENDINGS.items():
+        for key, word in MEASURES.items():
+            name, spread = f"{group}_{key}{end}", f"{group}_rms_std{end}"
+            cells = [
+                shown(one[name], end.strip("_") or "m", one[spread], small=True)
+                for one in found.values()
+                if name in one
+            ]
+            rows += [[f"{WORDS[group]}, {word}", *cells]] if cells else []
+    table(title, Table(["error", *found], rows))

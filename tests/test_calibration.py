@@ -10,12 +10,12 @@ from dhcal_pin import observability, se3
 from dhcal_pin.calibration import calibrate, split
 from dhcal_pin.chain import Chain
 from dhcal_pin.errors import DhcalError
+from dhcal_pin.evaluation import accuracy
 from dhcal_pin.measurements import Noise
 from dhcal_pin.parameters import select
 from dhcal_pin.poses import Pose
 from dhcal_pin.positions import Position
 from dhcal_pin.problem import CHUNK, Problem, reduce
-from dhcal_pin.result import accuracy
 
 NONE = np.empty(0)
 

@@ -795,7 +795,8 @@ def test_demo(run, place, monkeypatch):
     monkeypatch.setattr(demo, "simulation_rows", lambda: whole(seeds=2))
     assert strict(done(run("demo", "--out", "shown", "--json", "-")))["outliers"] == [7, 8]
     assert sorted(os.listdir("shown")) == [
-        *("experiment.urdf", "experiment_calibrated.urdf", "result.json", "scene.html", "summary.md")
+        *("experiment.urdf", "experiment_calibrated.urdf", "report.html"),
+        *("result.json", "scene.html", "summary.md"),
     ]
     found = strict(Path("shown/result.json").read_text())
     assert found.keys() >= KEYS

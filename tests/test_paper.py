@@ -7,11 +7,11 @@ import pytest
 
 from dhcal_pin import demo
 from dhcal_pin.calibration import calibrate
+from dhcal_pin.evaluation import accuracy
 from dhcal_pin.measurements import Noise
 from dhcal_pin.parameters import select
 from dhcal_pin.poses import Pose
 from dhcal_pin.positions import Position
-from dhcal_pin.result import accuracy
 
 # Medians over 50 seeds: largest angle error in degrees, largest length error in mm, as printed, and the
 # test poses' error in mm, whose poses are free.

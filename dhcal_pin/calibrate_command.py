@@ -1,0 +1,223 @@
+"""`dhcal calibrate` for one robot: files in, a fit, files out; any process can do it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from . import calibration, exports, extension, report, report_page
+from .chain import Chain
+from .configuration_files import map_text
+from .errors import DhcalError
+from .executors import HERE, Workers
+from .files import PathLike, save
+from .jobs import Job
+from .measurement_files import read_readings
+from .measurements import Measurement
+from .outputs import STDOUT, check_outputs, check_urdf_ending, names, same, sidecars
+from .parameters import EXTENSIONS
+from .plausibility import doubts
+from .result import Result
+from .robot_files import (
+    read_instrument,
+    read_priors,
+    read_robot,
+    sidecar_path,
+    urdf_files,
+)
+from .screening import Finding, screen
+from .solver import Progress
+from .workspace import workspace_map
+
+
+@dataclass(frozen=True)
+class _Data:
+    """What is fitted and held out by file, and the impossible rows left out of both, and doubts."""
+
+    fit: dict[str, Measurement]
+    holdout: list[tuple[str, Measurement]]
+    findings: dict[str, list[Finding]]
+    doubts: dict[str, list[str]]
+
+
+def _without(data: Measurement, findings: Sequence[Finding]) -> Measurement:
+    return data.take(~np.isin(data.rows, [finding.row for finding in findings]))
+
+
+def _read_data(chain: Chain, args: Job, held_file: str | None, known_frames: bool) -> _Data:
+    """All measurements, split as the files' `set` columns and --holdout ask."""
+    fit: list[Measurement] = []
+    holdout: list[tuple[str, Measurement]] = []
+    findings: dict[str, list[Finding]] = {}
+    doubtful: dict[str, list[str]] = {}
+    for path in [*args.data, *([held_file] if held_file else [])]:
+        readings = read_readings(path, chain, args.columns)
+        doubtful[path] = doubts(chain, readings)
+        # A row can only be called impossible where base and tool are known.
+        findings[path] = screen(chain, readings) if known_frames else []
+        if path == held_file:
+            holdout.append((path, _without(readings.data, findings[path])))
+        else:
+            fit.append(_without(readings.fit, findings[path]))
+            holdout.append((path, _without(readings.holdout, findings[path])))
+    if args.holdout is not None and not held_file:
+        try:
+            fraction = float(args.holdout)
+        except ValueError:
+            raise DhcalError(f"--holdout {args.holdout}: neither a file nor a share such as 0.3") from None
+        kept, parted = calibration.split(fit, fraction, args.seed)
+        drawn = [path for path, a, b in zip(args.data, fit, kept, strict=True) if len(b.rows) < len(a.rows)]
+        fit, holdout = list(kept), [*holdout, *zip(drawn, parted, strict=True)]
+    fitted = {path: item for path, item in zip(args.data, fit, strict=True) if len(item.rows)}
+    if not fitted:
+        raise DhcalError(f"{', '.join(args.data)}: every row is held out; leave some to fit")
+    return _Data(fitted, [(path, item) for path, item in holdout if len(item.rows)], findings, doubtful)
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """A calibration whose files are written.
+
+    Attributes:
+        fit: what was found.
+        document: the same as JSON.
+        files: paths of what was written, by what it is.
+        findings, gross, doubts: by file, the impossible rows, the numbers of gross ones, and what is hard
+            to believe.
+        trials: what each family of --extend brought.
+    """
+
+    fit: Result
+    document: dict[str, Any]
+    files: dict[str, str]
+    findings: dict[str, list[Finding]]
+    gross: dict[str, list[int]]
+    doubts: dict[str, list[str]]
+    trials: tuple[extension.Trial, ...]
+
+
+def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) -> Outcome:
+    """Calibrates one robot and writes its files, in this process or another; shows nothing.
+
+    Raises:
+        DhcalError: the input is wrong or a file cannot be written; then none is.
+    """
+    held_file = args.holdout if args.holdout is not None and os.path.exists(args.holdout) else None
+    measured = [*args.data, *([held_file] if held_file else [])]
+    for number, path in enumerate(measured):
+        if any(same(path, other) for other in measured[:number]):
+            raise DhcalError(f"{path}: is given twice; each measurement counts once, to fit or to hold out")
+    robot = [args.robot, *sidecars([args.robot])]
+    priors = [args.priors] if args.priors not in (None, "default", "none") else []
+    priors += [args.instrument] if args.instrument else []
+    maps = [args.columns] if args.columns else []
+    inputs = [*robot, *measured, *priors, *maps]
+    check_urdf_ending(args.output)
+    check_outputs([args.json, *args.report], inputs)
+    kept = [*measured, *priors, *maps] if args.in_place else inputs
+    check_outputs([args.output, sidecar_path(args.output), args.map, args.json, *args.report], kept)
+    for path in args.report:
+        report_page.check_ending(path)
+
+    chain = read_robot(args.robot, args.tip)
+    sets = args.parameters or chain.parameters
+    data = _read_data(chain, args, held_file, known_frames=not {"base", "tool"} & set(names(sets)))
+    fit, trials = extension.extend(
+        chain,
+        list(data.fit.values()),
+        sets,
+        _families(args.extend),
+        method=args.method,
+        priors=read_priors(args.priors),
+        fix=names(args.fix),
+        free=names(args.free),
+        holdout=[item for _, item in data.holdout],
+        known=read_instrument(args.instrument) if args.instrument else None,
+        loss=args.loss,
+        max_iterations=args.max_iterations,
+        progress=progress,
+        where=where,
+    )
+    contents = _written(fit, args)
+    files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
+    if args.map:
+        contents[args.map], files["map"] = map_text(workspace_map(fit)), args.map
+    if args.json and args.json != STDOUT:
+        files["json"] = args.json
+    gross = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))
+    impossible = {path: [finding.row for finding in found] for path, found in data.findings.items()}
+    rows = {
+        path: sorted(impossible[path] + gross.get(path, []))
+        for path in impossible
+        if impossible[path] + gross.get(path, [])
+    }
+    files |= {
+        "report" if number == 1 else f"report_{number}": path for number, path in enumerate(args.report, 1)
+    }
+    source = _provenance(args, sets, data, inputs)
+    contents |= report_page.report_files(fit, args.report, source)
+    document = report.document(fit, files, source.inputs, [row for found in rows.values() for row in found])
+    document |= {
+        "outliers_by_file": rows,
+        "command": source.command,
+        "settings": source.settings,
+        "extension": [asdict(trial) for trial in trials],
+    }
+    if args.json and args.json != STDOUT:
+        contents[args.json] = report.json_text(document)
+    save(contents)
+    return Outcome(fit, document, files, data.findings, gross, data.doubts, trials)
+
+
+def _provenance(args: Job, sets: str, data: _Data, inputs: Sequence[str]) -> report.Provenance:
+    """What the report says of the files, the command and its choices."""
+    short = report.short_names(inputs)
+    settings = {
+        "parameters": sets,
+        "loss": args.loss,
+        "seed": str(args.seed),
+    }
+    if args.holdout is not None:
+        settings["hold-out"] = short.get(args.holdout, f"{args.holdout} of each file, at random by the seed")
+    left_out = {
+        short[path]: {finding.row: finding.reason for finding in found}
+        for path, found in data.findings.items()
+    }
+    doubtful = {short[path]: texts for path, texts in data.doubts.items()}
+    return report.Provenance(
+        command=args.command(short),
+        inputs=report.fingerprints(inputs),
+        names=list(data.fit),
+        holdout_names=[path for path, _ in data.holdout],
+        settings=settings,
+        left_out=left_out,
+        doubts=doubtful,
+    )
+
+
+def _families(extend: str) -> tuple[str, ...]:
+    """The families that --extend may add."""
+    return {"none": (), "auto": EXTENSIONS}.get(extend, tuple(names(extend)))
+
+
+def _written(fit: Result, args: Job) -> dict[PathLike, str | bytes]:
+    """The calibrated URDF and its sidecar, base and tool moved into the URDF where that was asked for."""
+    chain = fit.chain
+    # A base that the URDF holds must not stand in the sidecar too.
+    bare = replace(chain, base=np.eye(4)) if args.world_joint else chain
+    contents = urdf_files(bare, args.output, fit.portable)
+    data = contents[args.output]
+    assert isinstance(data, bytes)
+    if args.world_joint and chain.transmission is not None and chain.transmission.yields:
+        raise DhcalError(
+            "--world-joint: gravity's torques on the joints count on the robot's own root, z up; leave it out"
+        )
+    if args.world_joint:
+        data = exports.with_world(data, chain.base)
+    if args.tool_frame:
+        data = exports.with_tool_frame(data, chain.tip, args.tool_frame, chain.tool)
+    return contents | {args.output: data}
