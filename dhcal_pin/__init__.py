@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from .compensation import compensate as compensate
     from .configurations import Space as Space
     from .crossvalidation import cross_validate as cross_validate
-    from .crossvalidation import group_folds as group_folds
-    from .crossvalidation import random_folds as random_folds
-    from .crossvalidation import region_folds as region_folds
     from .dh import DHTable as DHTable
     from .dh_files import read_dh as read_dh
     from .dh_urdf import dh_to_urdf as dh_to_urdf
@@ -32,6 +29,9 @@ if TYPE_CHECKING:
     from .evaluation import accuracy as accuracy
     from .extension import extend as extend
     from .factors import error_factors as error_factors
+    from .folds import group_folds as group_folds
+    from .folds import random_folds as random_folds
+    from .folds import region_folds as region_folds
     from .live import Live as Live
     from .live import serve as serve
     from .measurement_files import read_measurements as read_measurements
@@ -62,9 +62,9 @@ _HOMES = {
     "Chain": "chain",
     "crosscheck": "check",
     "cross_validate": "crossvalidation",
-    "group_folds": "crossvalidation",
-    "random_folds": "crossvalidation",
-    "region_folds": "crossvalidation",
+    "group_folds": "folds",
+    "random_folds": "folds",
+    "region_folds": "folds",
     "Compensation": "compensation",
     "compensate": "compensation",
     "Space": "configurations",

@@ -97,7 +97,7 @@ def _validate(args: Namespace) -> int:
     found: dict[str, Mapping[str, Any]] = {"base and tool as given": given}
     if args.fit_frames:
         fit = calibration.calibrate(chain, data, "base,tool", known=known)
-        found["fitted"] = fit.comparisons[0].after
+        found["fitted"] = fit.comparisons[-1].after
         document = report.document(fit, {}, report.fingerprints(inputs))
     else:
         document = report.plain_document(chain, data, report.fingerprints(inputs), known)

@@ -17,8 +17,9 @@ from scipy.special import fdtrc
 
 from . import calibration
 from .chain import Chain
-from .crossvalidation import Parts, parts, region_folds, rows, solved, standard_error
+from .crossvalidation import standard_error
 from .errors import DhcalError
+from .folds import Parts, parts, region_folds, rows, solved
 from .measurements import Measurement
 from .parameters import EXTENSIONS, SETS, Parameter
 from .problem import Triangle, reduce

@@ -12,7 +12,8 @@ import pinocchio as pin
 
 from . import explanations, observability, robust, se3, tables
 from .chain import BASE, Chain
-from .evaluation import Comparison, accuracy
+from .evaluation import Comparison, accuracy, summary
+from .folds import left_out, random_folds
 from .measurements import Measurement, Unknown
 from .parameters import ErrorModel, Parameter
 from .problem import Problem, reduce
@@ -24,6 +25,8 @@ from .tables import Estimate
 UNKNOWN = 1e-6
 # Residuals that are larger than stated by so many standard deviations of chance contradict the sigmas.
 CONTRADICTION = 3.0
+# Folds that samples are left out in where none were held out.
+FOLDS = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,8 +253,11 @@ class Result:
 
     @cached_property
     def comparisons(self) -> tuple[Comparison, ...]:
-        """Accuracy before and after: on the samples held out first, if there are any, then on the fitted."""
-        return tuple(
+        """Accuracy before and after: on what was not fitted first, then on the fitted.
+
+        Where nothing was held out, every sample is judged by a fit without it and others, in ten folds.
+        """
+        found = tuple(
             Comparison(
                 title,
                 sum(len(item.rows) for item in data),
@@ -261,6 +267,12 @@ class Result:
             for title, data in (("held out", self.holdout), ("fitted", self.data))
             if data
         )
+        count = sum(len(item.rows) for item in self.data)
+        if self.holdout or count < 2:
+            return found
+        folds = random_folds(self.data, min(FOLDS, count))
+        judged = [item for fold, _ in left_out(self.problem, self.x, self.data, folds) for item in fold]
+        return (Comparison("left out", count, found[-1].before, summary(judged)), *found)
 
     @cached_property
     def estimates(self) -> tuple[Estimate, ...]:

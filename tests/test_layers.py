@@ -29,6 +29,7 @@ LAYERS = (
     {"evaluation", "arms", "triangles", "passage"},
     {"nullspace", "tables"},
     {"explanations"},
+    {"folds"},
     {"batch", "result"},
     {"calibration", "compensation", "crossvalidation"},
     {"extension", "figures"},
