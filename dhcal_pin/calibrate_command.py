@@ -23,6 +23,7 @@ from .parameters import EXTENSIONS
 from .plausibility import doubts
 from .result import Result
 from .robot_files import (
+    read_bounds,
     read_instrument,
     read_priors,
     read_robot,
@@ -113,7 +114,7 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
             raise DhcalError(f"{path}: is given twice; each measurement counts once, to fit or to hold out")
     robot = [args.robot, *sidecars([args.robot])]
     priors = [args.priors] if args.priors not in (None, "default", "none") else []
-    priors += [args.instrument] if args.instrument else []
+    priors += [path for path in (args.bounds, args.instrument) if path]
     maps = [args.columns] if args.columns else []
     inputs = [*robot, *measured, *priors, *maps]
     check_urdf_ending(args.output)
@@ -133,6 +134,7 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
         _families(args.extend),
         method=args.method,
         priors=read_priors(args.priors),
+        bounds=read_bounds(args.bounds),
         fix=names(args.fix),
         free=names(args.free),
         holdout=[item for _, item in data.holdout],

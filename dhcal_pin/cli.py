@@ -137,6 +137,7 @@ def parser() -> argparse.ArgumentParser:
         help="linear, huber, cauchy or tukey: what gross errors count",
     )
     calibrate.add_argument("--priors", metavar="default|none|FILE", help="default for lm, none for gn")
+    calibrate.add_argument("--bounds", metavar="FILE.toml", help="least and largest values by parameter name")
     calibrate.add_argument(
         "--instrument", metavar="FILE", help="TOML whose [instrument] table holds surveyed values, as wire1.x"
     )

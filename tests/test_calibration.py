@@ -231,6 +231,9 @@ def test_split_is_a_partition_by_seed(sim_6dof):
         ({"priors": "weak"}, "choose default, none"),
         ({"priors": {"x9": 1.0}}, "no such parameter"),
         ({"priors": {"d*": -1.0}}, "must be positive"),
+        ({"bounds": {"x9": (-1.0, 1.0)}}, "no such parameter"),
+        ({"bounds": {"d1": (5.0, 6.0)}}, "must hold the nominal"),
+        ({"bounds": {"d1": (-5.0, 6.0)}, "method": "gn"}, "bounds need method lm"),
     ],
 )
 def test_wrong_choices_are_named(sim_6dof, kwargs, message):
@@ -284,3 +287,28 @@ def test_the_step_is_exact_at_condition_1e8():
         wanted = np.array([float(value) for value in wanted])
     step = pseudo_inverse(full.r, full.z)
     assert np.linalg.norm(step - wanted) <= 1e-6 * np.linalg.norm(wanted)
+
+
+def test_bounds_hold_and_the_rest_is_least_squares(sim_6dof, sim_6dof_actual):
+    """Two parameters at their bounds and one inside: scipy's own bounded solver finds no less."""
+    from scipy.optimize import least_squares
+
+    rng = np.random.default_rng(5)
+    data = Pose.simulate(sim_6dof_actual, rng.uniform(-3, 3, (15, 6)), Noise(1e-4, 1e-4), rng)
+    errors = select(sim_6dof, "dh")
+    nominal = {p.name: p.nominal for p in errors.parameters}
+    bounds = {
+        "a2": (nominal["a2"], nominal["a2"] + 1e-3),
+        "theta1": (nominal["theta1"] - 0.1, nominal["theta1"] + 0.01),
+        "d5": (nominal["d5"] - 1.0, nominal["d5"] + 1.0),
+    }
+    fit = calibrate(sim_6dof, data, "dh", priors="none", bounds=bounds)
+    assert fit.converged
+    assert fit.problem.bounds is not None
+    low, high = fit.problem.bounds
+    assert np.all((low - 1e-12 <= fit.x) & (fit.x <= high + 1e-12))
+    residual = lambda x: data.residual(errors.at(x).sweep(data.q), NONE).ravel()  # noqa: E731
+    other = least_squares(residual, np.zeros(24), bounds=(low - 1e-12, high + 1e-12), xtol=1e-14, ftol=1e-14)
+    assert np.sum(residual(fit.x) ** 2) <= 2 * other.cost * (1 + 1e-6)
+    free = calibrate(sim_6dof, data, "dh", priors="none")
+    assert np.any((free.x < low) | (free.x > high))
