@@ -18,9 +18,10 @@ from scipy.special import fdtrc
 from . import calibration
 from .chain import Chain
 from .crossvalidation import Parts, parts, region_folds, rows, solved, standard_error
+from .error_model import Parameter
 from .errors import DhcalError
 from .measurements import Measurement
-from .parameters import EXTENSIONS, SETS, Parameter
+from .parameters import EXTENSIONS, SETS
 from .problem import Triangle, reduce
 from .result import Result
 from .se3 import Array

@@ -15,10 +15,11 @@ from typing import TypeVar
 import numpy as np
 from scipy.linalg import lapack
 
-from .chain import Chain, Motion, Sweep
+from .chain import Chain
+from .error_model import ErrorModel
 from .executors import HERE, Workers
+from .kinematics import Motion, Sweep
 from .measurements import Measurement, Unknown
-from .parameters import ErrorModel
 from .scratch import LongRows, scratch
 from .se3 import Array
 
