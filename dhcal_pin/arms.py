@@ -53,6 +53,8 @@ class Arms:
                 transmission.
         """
         first = models[0]
+        if first.chain.transmission is not None or any(p.entry is not None for p in first.parameters):
+            raise DhcalError("arms with gains, harmonics, compliance or couplings calibrate one by one")
         for number, model in enumerate(models, 1):
             if model.chain.transmission is not None or any(p.entry is not None for p in model.parameters):
                 raise DhcalError(

@@ -28,8 +28,8 @@ Priors = Literal["default", "none"] | Mapping[str, float]
 # Sigmas are not estimated below a nanometre and a nanoradian.
 LEAST_SCALE = 1e-6
 MOST_ROUNDS = 30
-# Default priors narrow, where errors are smaller than expected, to so much of what they were.
-NARROWEST = 0.1
+# Against narrower priors the expected size counts as much as so many errors that were found.
+EXPECTATION = 0.5
 # Starts for the frames are tried until one leaves so small a share of the positions' spread.
 GOOD_FIT = 0.01
 
@@ -158,6 +158,7 @@ def _rescaled(problem: Problem, solution: Solution, expected: Array, default: Ar
 
     Default priors of one unit and one expected size have one scale, the one of greatest evidence
     (MacKay 1992): the mean square of the errors over as many as the data and not the prior determine.
+    None gets narrower than the narrowest expectation of its unit, as offsets of no more than tilts' size.
     Priors that are not default (p,) stay.
     """
     errors = problem.errors
@@ -165,13 +166,14 @@ def _rescaled(problem: Problem, solution: Solution, expected: Array, default: Ar
     root = posterior_root(solution.triangle, problem.weights)[0]
     told = 1 - np.sum((root * problem.weights[:, None]) ** 2, 1)
     weights = problem.weights.copy()
-    kinds = [(p.unit, expected[i]) for i, p in enumerate(errors.parameters)]
     inside = [i for i, p in enumerate(errors.parameters) if default[i] and p.station not in outside]
-    for kind in set(kinds):
-        family = [i for i in inside if kinds[i] == kind]
-        if (count := told[family].sum()) > 1e-3:
-            square = np.sum((solution.x[family] * expected[family]) ** 2) / count
-            weights[family] = expected[family] / np.sqrt(max(NARROWEST**2, square))
+    alike = {i: (errors.parameters[i].unit, errors.parameters[i].entry is None) for i in inside}
+    for kind in {(alike[i], expected[i]) for i in inside}:
+        family = [i for i in inside if (alike[i], expected[i]) == kind]
+        narrowest = max(expected[i] for i in inside if alike[i] == kind[0])
+        found, count = np.sum((solution.x[family] * expected[family]) ** 2), told[family].sum()
+        share = EXPECTATION if found <= count else 0.0
+        weights[family] = min(expected[family[0]] * np.sqrt((count + share) / (found + share)), narrowest)
     return weights
 
 

@@ -33,7 +33,7 @@ LAYERS = (
     {"batch", "result"},
     {"calibration", "compensation", "crossvalidation"},
     {"extension", "figures"},
-    {"check", "information", "workspace"},
+    {"check", "information", "workspace", "study_plot"},
     {"planning"},
     {"files"},
     {"reading_columns"},

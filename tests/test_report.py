@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -303,20 +302,6 @@ def test_gross_errors_are_listed_with_file_row_and_size(quick):
 
 
 # --- the page in a browser -------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    if not CHROMIUM.exists() and os.environ.get("CI") != "true":
-        pytest.skip("no Chromium")
-    from playwright.sync_api import sync_playwright
-
-    arguments = "--no-sandbox --disable-dev-shm-usage --use-gl=angle --use-angle=swiftshader"
-    arguments += " --enable-unsafe-swiftshader"
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=str(CHROMIUM), args=arguments.split())
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")
