@@ -206,7 +206,7 @@ class Chain:
     @cached_property
     def axis_frames(self) -> Array:
         """(k+1, 4, 4): body frame (joint axis along z) in each body's URDF frame; body 0 as it is."""
-        return np.stack([np.eye(4), *(axis_frame(axis) for axis in self.axes)])
+        return np.stack([np.eye(4), *(axis_frame(tuple(axis)) for axis in self.axes.tolist())])
 
     @cached_property
     def _into(self) -> Array:

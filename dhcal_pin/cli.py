@@ -5,9 +5,24 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 
 from .arguments import parser
 from .errors import DhcalError
+
+# Where each command lives: module and function, imported when it is asked for and not before.
+COMMANDS = {
+    "demo": "commands:demo",
+    "calibrate": "calibrate_command:calibrate",
+    "validate": "commands:validate",
+    "convert": "commands:convert",
+    "view": "view_command:view",
+    "check": "commands:check",
+    "plan": "plan_command:run",
+    "simulate": "commands:simulate",
+    "compensate": "compensate_command:run",
+    "study": "study_command:study",
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -17,9 +32,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     try:
-        from . import commands
-
-        return commands.COMMANDS[args.command](args)
+        module, _, function = COMMANDS[args.command].partition(":")
+        return getattr(import_module(f".{module}", __package__), function)(args)
     except DhcalError as error:
         print(f"dhcal: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

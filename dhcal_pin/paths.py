@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import pinocchio as pin
 
@@ -73,8 +75,10 @@ def placements(model: pin.Model, tip: str, moving: list[str]) -> tuple[Array, Ar
     return np.array(origins), np.array(axes)
 
 
-def axis_frame(axis: Array) -> Array:
+@lru_cache(maxsize=256)
+def axis_frame(unit: tuple[float, ...]) -> Array:
     """A rotation (4, 4) that carries z onto a unit axis (3,); a permutation for coordinate axes."""
+    axis = np.array(unit)
     i = int(np.argmax(np.abs(axis)))
     sign = 1.0 if axis[i] > 0 else -1.0
     x = np.eye(3)[(i + 1) % 3] * sign

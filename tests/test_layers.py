@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ast
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 import dhcal_pin
+from dhcal_pin import cli
 
 HOUSE = Path(dhcal_pin.__file__).parent
 LAYERS = (
@@ -57,10 +59,10 @@ LAYERS = (
     {"outputs", "jobs"},
     {"fleet", "experiment"},
     {
-        *("demo", "calibrate_command", "compensate_command", "fleet_command", "study_command"),
+        *("demo", "compensate_command", "fleet_command", "study_command"),
         *("plan_command", "view_command"),
     },
-    {"commands"},
+    {"calibrate_command", "commands"},
     {"arguments"},
     {"cli"},
 )
@@ -78,6 +80,14 @@ def imports(module: str) -> tuple[set[str], set[str]]:
         elif isinstance(node, ast.Import):
             others |= {alias.name.split(".")[0] for alias in node.names}
     return own, others
+
+
+def test_commands_live_to_the_left_of_the_command_line():
+    allowed = set().union(*LAYERS[:-1])
+    for home in cli.COMMANDS.values():
+        module, _, function = home.partition(":")
+        assert module in allowed
+        assert callable(getattr(import_module(f"dhcal_pin.{module}"), function))
 
 
 def test_every_module_has_its_place():
@@ -99,6 +109,7 @@ def test_special_packages_stay_in_one_place(module):
         "rich": {"terminal"},
         "argparse": {
             "arguments",
+            "calibrate_command",
             "commands",
             "jobs",
             "compensate_command",
