@@ -174,7 +174,7 @@ def _narrow(rows: Array) -> Array:
     Half the errors of an arm are lengths, which turn nothing: a quarter of the work for rows of rotations.
     """
     columns = len(rows)
-    used = np.flatnonzero([bool(row[0, 0]) or bool(row.any()) for row in rows])
+    used = [i for i, row in enumerate(rows) if row[0, 0] or np.vdot(row, row)]
     part = scratch("narrow", len(used), *rows.shape[1:])
     np.take(rows, used, 0, out=part, mode="clip")
     out = np.zeros((columns, columns))
