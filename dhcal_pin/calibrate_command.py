@@ -1,24 +1,26 @@
-"""`dhcal calibrate` for one robot: files in, a fit, files out; any process can do it."""
+"""`dhcal calibrate`: files in, a fit, files out; any process can do one robot of many."""
 
 from __future__ import annotations
 
 import os
+from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from . import calibration, exports, extension, report, report_page
+from . import calibration, exports, extension, fleet_command, report, terminal
 from .chain import Chain
 from .configuration_files import map_text
 from .errors import DhcalError
-from .executors import HERE, Workers
+from .executors import HERE, Workers, workers
 from .files import PathLike, save
+from .fleet import is_fleet
 from .jobs import Job
 from .measurement_files import read_readings
 from .measurements import Measurement
-from .outputs import STDOUT, check_outputs, check_urdf_ending, names, same, sidecars
+from .outputs import STDOUT, check_outputs, check_urdf_ending, emit, names, same, sidecars
 from .parameters import EXTENSIONS
 from .plausibility import doubts
 from .result import Result
@@ -121,8 +123,11 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     check_outputs([args.json, *args.report], inputs)
     kept = [*measured, *priors, *maps] if args.in_place else inputs
     check_outputs([args.output, sidecar_path(args.output), args.map, args.json, *args.report], kept)
-    for path in args.report:
-        report_page.check_ending(path)
+    if args.report:
+        from . import report_page  # its figures are a good part of the start-up
+
+        for path in args.report:
+            report_page.check_ending(path)
 
     chain = read_robot(args.robot, args.tip)
     sets = args.parameters or chain.parameters
@@ -161,7 +166,8 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
         "report" if number == 1 else f"report_{number}": path for number, path in enumerate(args.report, 1)
     }
     source = _provenance(args, sets, data, inputs)
-    contents |= report_page.report_files(fit, args.report, source)
+    if args.report:
+        contents |= report_page.report_files(fit, args.report, source)
     document = report.document(fit, files, source.inputs, [row for found in rows.values() for row in found])
     document |= {
         "outliers_by_file": rows,
@@ -223,3 +229,30 @@ def _written(fit: Result, args: Job) -> dict[PathLike, str | bytes]:
     if args.tool_frame:
         data = exports.with_tool_frame(data, chain.tip, args.tool_frame, chain.tool)
     return contents | {args.output: data}
+
+
+def _calibrate_one(job: Job) -> dict[str, Any]:
+    """A robot of a fleet, in a process of its own."""
+    return run_job(job).document
+
+
+def calibrate(args: Namespace) -> int:
+    """One robot, or all of a manifest."""
+    if is_fleet(args.robot):
+        if args.scheduler:
+            raise DhcalError("--scheduler: goes with one robot; a manifest takes --jobs")
+        return fleet_command.run(args, _calibrate_one)
+    if not args.data:
+        raise DhcalError(f"DATA is required: name at least one measurement file behind {args.robot}")
+    with workers(args.jobs or 1, args.scheduler) as where, terminal.progress("fitting") as progress:
+        outcome = run_job(Job.of(args), progress, where)
+    if args.json == STDOUT:
+        emit(args.json, outcome.document)
+    for path, found in outcome.findings.items():
+        terminal.findings(path, found)
+        terminal.gross(path, outcome.gross.get(path, []), args.loss)
+    for path, texts in outcome.doubts.items():
+        terminal.doubts(path, texts)
+    terminal.trials(outcome.trials)
+    terminal.summary(outcome.fit, outcome.files)
+    return 0

@@ -11,11 +11,12 @@ import numpy as np
 
 from . import observability, robust
 from .chain import BASE, Chain
+from .error_model import ErrorModel
 from .errors import DhcalError
 from .executors import HERE, Workers
 from .frames import few, misfit, starts
 from .measurements import Measurement
-from .parameters import ErrorModel, select
+from .parameters import select
 from .problem import Problem, shared_unknowns
 from .result import Result
 from .se3 import Array

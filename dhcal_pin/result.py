@@ -12,10 +12,10 @@ import pinocchio as pin
 
 from . import explanations, observability, robust, se3, tables
 from .chain import BASE, Chain
+from .error_model import ErrorModel, Parameter
 from .evaluation import Comparison, accuracy, summary
 from .folds import left_out, random_folds
 from .measurements import Measurement, Unknown
-from .parameters import ErrorModel, Parameter
 from .problem import Problem, reduce
 from .se3 import Array
 from .solver import Solution, posterior_root, pseudo_inverse, with_priors

@@ -839,7 +839,7 @@ def test_every_command_has_an_example_that_parses(run, name):
     example = out.split("example:\n")[1].strip()
     args = cli.parser().parse_args(example.split()[1:])
     assert args.command == name
-    assert name in commands.COMMANDS
+    assert name in cli.COMMANDS
 
 
 def test_help_and_version(run):
