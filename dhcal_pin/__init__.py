@@ -44,12 +44,12 @@ if TYPE_CHECKING:
     from .positions import Position as Position
     from .report import Provenance as Provenance
     from .report_page import write_report as write_report
-    from .result import Prediction as Prediction
     from .result import Result as Result
     from .robot_files import read_robot as read_robot
     from .robot_files import write_urdf as write_urdf
     from .stream import calibrate_stream as calibrate_stream
     from .stream import file_parts as file_parts
+    from .uncertainty import Prediction as Prediction
     from .viewer import scene_html as scene_html
     from .viewer import show as show
     from .workspace import workspace_map as workspace_map
@@ -87,12 +87,12 @@ _HOMES = {
     "Provenance": "report",
     "write_report": "report_page",
     "extract": "parameters",
-    "Prediction": "result",
     "Result": "result",
     "read_robot": "robot_files",
     "write_urdf": "robot_files",
     "calibrate_stream": "stream",
     "file_parts": "stream",
+    "Prediction": "uncertainty",
     "scene_html": "viewer",
     "show": "viewer",
     "workspace_map": "workspace",

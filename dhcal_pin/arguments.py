@@ -83,7 +83,7 @@ def parser() -> argparse.ArgumentParser:
         commands, "demo", "the paper's arm and its measured table, end to end", "dhcal demo --out demo"
     )
     demo.add_argument("--out", default="demo", metavar="DIR", help="folder for the results (default: demo)")
-    demo.add_argument("--open", action="store_true", help="open the scene in the browser")
+    demo.add_argument("--open", action="store_true", help="open the report, scene included, in the browser")
     demo.add_argument("--json", metavar="FILE", help="the result as JSON to one more place; - for stdout")
 
     calibrate = _add(
@@ -149,7 +149,9 @@ def parser() -> argparse.ArgumentParser:
         "--tool-frame", metavar="NAME", help="put the tool into the URDF, as a link fixed to the tip"
     )
     calibrate.add_argument(
-        "--map", metavar="MAP.csv", help="predicted position uncertainty by cells of the workspace"
+        "--map",
+        metavar="MAP",
+        help="predicted position uncertainty over the workspace, and held-out errors, as .csv or .html",
     )
     calibrate.add_argument(
         "--report",
@@ -179,6 +181,11 @@ def parser() -> argparse.ArgumentParser:
         "--sidecar", metavar="S.toml", help="base, tool and joints (default: the one beside ROBOT)"
     )
     validate.add_argument("--fit-frames", action="store_true", help="fit base and tool first")
+    validate.add_argument(
+        "--map",
+        metavar="MAP",
+        help="predicted uncertainty over the workspace beside the errors measured, as .csv or .html",
+    )
     validate.add_argument("--json", **_JSON)
 
     convert = _add(

@@ -181,7 +181,8 @@ def main() -> None:
     many = 1_000_000 if quick else 10_000_000
     few, most = (streamed(samples) for samples in (100_000, many))
     print(
-        f"\nPeak memory of a stream: {few:.0f} MB with 100,000 samples, {most:.0f} MB with {many:,} (≤ 16 more)."
+        f"\nPeak memory of a stream: {few:.0f} MB with 100,000 samples, {most:.0f} MB with {many:,} "
+        "(at most 16 more)."
     )
     print(f"\n{time.time() - began:.0f} s", file=sys.stderr)
 
