@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from .compensation import Compensation as Compensation
     from .compensation import compensate as compensate
     from .configurations import Space as Space
+    from .contacts import PointDistance as PointDistance
+    from .contacts import Touch as Touch
     from .crossvalidation import cross_validate as cross_validate
     from .dh import DHTable as DHTable
     from .dh_files import read_dh as read_dh
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
     from .measurement_files import read_targets as read_targets
     from .measurements import Noise as Noise
     from .parameters import extract as extract
+    from .parameters import select as select
     from .planning import Plan as Plan
     from .planning import plan as plan
     from .poses import Pose as Pose
@@ -61,6 +64,8 @@ _HOMES = {
     "split": "calibration",
     "Chain": "chain",
     "crosscheck": "check",
+    "PointDistance": "contacts",
+    "Touch": "contacts",
     "cross_validate": "crossvalidation",
     "group_folds": "folds",
     "random_folds": "folds",
@@ -87,6 +92,7 @@ _HOMES = {
     "Provenance": "report",
     "write_report": "report_page",
     "extract": "parameters",
+    "select": "parameters",
     "Result": "result",
     "read_robot": "robot_files",
     "write_urdf": "robot_files",

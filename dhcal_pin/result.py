@@ -28,7 +28,7 @@ CONTRADICTION = 3.0
 FOLDS = 10
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Result:
     """An identified arm and how far to believe it.
 
@@ -270,6 +270,9 @@ class Result:
                 nominal = value if held else nominal
             out.append(Estimate(p.name, p.unit, nominal, value, std, prior, seen, left, held, place))
         return tuple(out)
+
+    def __repr__(self) -> str:
+        return f"<Result: {tables.headline(self.comparisons).text}>"
 
     def _repr_html_(self) -> str:
         """The headline, before and after, and the parameters, as a notebook shows them."""
