@@ -1,27 +1,30 @@
-"""`dhcal calibrate` for one robot: files in, a fit, files out; any process can do it."""
+"""`dhcal calibrate`: files in, a fit, files out; any process can do one robot of many."""
 
 from __future__ import annotations
 
 import os
+from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from . import calibration, exports, extension, report, report_page
+from . import calibration, exports, extension, fleet_command, report, terminal
 from .chain import Chain
 from .errors import DhcalError
-from .executors import HERE, Workers
+from .executors import HERE, Workers, workers
 from .files import PathLike, save
+from .fleet import is_fleet
 from .jobs import Job
 from .measurement_files import read_readings
 from .measurements import Measurement
-from .outputs import STDOUT, check_outputs, check_urdf_ending, names, same, sidecars
+from .outputs import STDOUT, check_outputs, check_urdf_ending, emit, names, same, sidecars
 from .parameters import EXTENSIONS
 from .plausibility import doubts
 from .result import Result
 from .robot_files import (
+    read_bounds,
     read_instrument,
     read_priors,
     read_robot,
@@ -30,7 +33,6 @@ from .robot_files import (
 )
 from .screening import Finding, screen
 from .solver import Progress
-from .workspace_files import check_map_ending, map_content
 
 
 @dataclass(frozen=True)
@@ -112,17 +114,22 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
             raise DhcalError(f"{path}: is given twice; each measurement counts once, to fit or to hold out")
     robot = [args.robot, *sidecars([args.robot])]
     priors = [args.priors] if args.priors not in (None, "default", "none") else []
-    priors += [args.instrument] if args.instrument else []
+    priors += [path for path in (args.bounds, args.instrument) if path]
     maps = [args.columns] if args.columns else []
     inputs = [*robot, *measured, *priors, *maps]
     check_urdf_ending(args.output)
     check_outputs([args.json, *args.report], inputs)
     kept = [*measured, *priors, *maps] if args.in_place else inputs
     check_outputs([args.output, sidecar_path(args.output), args.map, args.json, *args.report], kept)
-    for path in args.report:
-        report_page.check_ending(path)
+    if args.report:
+        from . import report_page  # its figures are a good part of the start-up
+
+        for path in args.report:
+            report_page.check_ending(path)
     if args.map:
-        check_map_ending(args.map)
+        from . import workspace_files  # and so are the map's
+
+        workspace_files.check_map_ending(args.map)
 
     chain = read_robot(args.robot, args.tip)
     sets = args.parameters or chain.parameters
@@ -134,6 +141,7 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
         _families(args.extend),
         method=args.method,
         priors=read_priors(args.priors),
+        bounds=read_bounds(args.bounds),
         fix=names(args.fix),
         free=names(args.free),
         holdout=[item for _, item in data.holdout],
@@ -146,7 +154,10 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     contents = _written(fit, args)
     files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
     if args.map:
-        contents[args.map], files["map"] = map_content(args.map, fit, fit.holdout, fit.instruments), args.map
+        from . import workspace_files
+
+        contents[args.map] = workspace_files.map_content(args.map, fit, fit.holdout, fit.instruments)
+        files["map"] = args.map
     if args.json and args.json != STDOUT:
         files["json"] = args.json
     gross = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))
@@ -160,7 +171,10 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
         "report" if number == 1 else f"report_{number}": path for number, path in enumerate(args.report, 1)
     }
     source = _provenance(args, sets, data, inputs, trials)
-    contents |= report_page.report_files(fit, args.report, source)
+    if args.report:
+        from . import report_page
+
+        contents |= report_page.report_files(fit, args.report, source)
     document = report.document(fit, files, source.inputs, [row for found in rows.values() for row in found])
     document |= {
         "outliers_by_file": rows,
@@ -225,3 +239,30 @@ def _written(fit: Result, args: Job) -> dict[PathLike, str | bytes]:
     if args.tool_frame:
         data = exports.with_tool_frame(data, chain.tip, args.tool_frame, chain.tool)
     return contents | {args.output: data}
+
+
+def _calibrate_one(job: Job) -> dict[str, Any]:
+    """A robot of a fleet, in a process of its own."""
+    return run_job(job).document
+
+
+def calibrate(args: Namespace) -> int:
+    """One robot, or all of a manifest."""
+    if is_fleet(args.robot):
+        if args.scheduler:
+            raise DhcalError("--scheduler: goes with one robot; a manifest takes --jobs")
+        return fleet_command.run(args, _calibrate_one)
+    if not args.data:
+        raise DhcalError(f"DATA is required: name at least one measurement file behind {args.robot}")
+    with workers(args.jobs or 1, args.scheduler) as where, terminal.progress("fitting") as progress:
+        outcome = run_job(Job.of(args), progress, where)
+    if args.json == STDOUT:
+        emit(args.json, outcome.document)
+    for path, found in outcome.findings.items():
+        terminal.findings(path, found)
+        terminal.gross(path, outcome.gross.get(path, []), args.loss)
+    for path, texts in outcome.doubts.items():
+        terminal.doubts(path, texts)
+    terminal.trials(outcome.trials)
+    terminal.summary(outcome.fit, outcome.files)
+    return 0

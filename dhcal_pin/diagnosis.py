@@ -10,9 +10,10 @@ import numpy as np
 from . import robust, se3
 from .chain import Chain
 from .configurations import joint_range
+from .error_model import ErrorModel
 from .evaluation import deviations, group_of, instrument_values
 from .measurements import Measurement
-from .parameters import ErrorModel, offset
+from .parameters import offset
 from .result import Result
 from .se3 import Array
 from .uncertainty import Predictor

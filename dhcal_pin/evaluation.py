@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from .chain import Chain
+from .error_model import ErrorModel
 from .measurements import Measurement
-from .parameters import ErrorModel
 from .problem import Problem, shared_unknowns
 from .se3 import Array
 from .solver import levenberg_marquardt

@@ -13,14 +13,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.special import fdtrc
 
 from . import calibration
 from .chain import Chain
-from .crossvalidation import Parts, parts, region_folds, rows, solved, standard_error
+from .crossvalidation import standard_error
+from .error_model import Parameter
 from .errors import DhcalError
+from .folds import Parts, parts, region_folds, rows, solved
 from .measurements import Measurement
-from .parameters import EXTENSIONS, SETS, Parameter
+from .parameters import EXTENSIONS, SETS
 from .problem import Triangle, reduce
 from .result import Result
 from .se3 import Array
@@ -132,6 +133,8 @@ class _Stage:
         without, with_it = self.cost(kept), self.cost(kept | {name: 1.0})
         chance = 1.0
         if left > 0 and with_it > 0:
+            from scipy.special import fdtrc  # a good part of the start-up, and few fits are extended
+
             chance = float(fdtrc(more, left, (without - with_it) / more / (with_it / left)))
         error = standard_error(before - after)
         return Trial(name, float(before.mean()), float(after.mean()), error, chance, width)

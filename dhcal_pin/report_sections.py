@@ -43,8 +43,8 @@ class Study:
     @property
     def comparisons(self) -> tuple[Comparison, ...]:
         """Accuracy before and after, the most honest first."""
-        judged = self.source.judged
-        return (judged, *self.fit.comparisons) if judged and not self.fit.holdout else self.fit.comparisons
+        judged, own = self.source.judged, self.fit.comparisons
+        return (judged, *(c for c in own if c.title == "fitted")) if judged and not self.fit.holdout else own
 
     @property
     def robot(self) -> str:

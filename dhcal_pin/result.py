@@ -12,9 +12,10 @@ import pinocchio as pin
 
 from . import explanations, observability, robust, se3, tables
 from .chain import BASE, Chain
-from .evaluation import Comparison, accuracy
+from .error_model import ErrorModel, Parameter
+from .evaluation import Comparison, accuracy, summary
+from .folds import left_out, random_folds
 from .measurements import Measurement, Unknown
-from .parameters import ErrorModel, Parameter
 from .problem import Problem, reduce
 from .se3 import Array
 from .solver import Solution, posterior_root, pseudo_inverse, with_priors
@@ -23,9 +24,11 @@ from .uncertainty import UNKNOWN, Prediction, Uncertainty
 
 # Residuals that are larger than stated by so many standard deviations of chance contradict the sigmas.
 CONTRADICTION = 3.0
+# Folds that samples are left out in where none were held out.
+FOLDS = 10
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Result:
     """An identified arm and how far to believe it.
 
@@ -222,8 +225,11 @@ class Result:
 
     @cached_property
     def comparisons(self) -> tuple[Comparison, ...]:
-        """Accuracy before and after: on the samples held out first, if there are any, then on the fitted."""
-        return tuple(
+        """Accuracy before and after: on what was not fitted first, then on the fitted.
+
+        Where nothing was held out, every sample is judged by a fit without it and others, in ten folds.
+        """
+        found = tuple(
             Comparison(
                 title,
                 sum(len(item.rows) for item in data),
@@ -233,6 +239,12 @@ class Result:
             for title, data in (("held out", self.holdout), ("fitted", self.data))
             if data
         )
+        count = sum(len(item.rows) for item in self.data)
+        if self.holdout or count < 2:
+            return found
+        folds = random_folds(self.data, min(FOLDS, count))
+        judged = [item for fold, _ in left_out(self.problem, self.x, self.data, folds) for item in fold]
+        return (Comparison("left out", count, found[-1].before, summary(judged)), *found)
 
     @cached_property
     def estimates(self) -> tuple[Estimate, ...]:
@@ -258,6 +270,9 @@ class Result:
                 nominal = value if held else nominal
             out.append(Estimate(p.name, p.unit, nominal, value, std, prior, seen, left, held, place))
         return tuple(out)
+
+    def __repr__(self) -> str:
+        return f"<Result: {tables.headline(self.comparisons).text}>"
 
     def _repr_html_(self) -> str:
         """The headline, before and after, and the parameters, as a notebook shows them."""

@@ -250,6 +250,24 @@ def write_urdf(fit: Result | Chain, path: PathLike) -> None:
     save(urdf_files(chain, path, instrument, known))
 
 
+def read_bounds(path: PathLike | None) -> dict[str, tuple[float, float]]:
+    """A TOML file of least and largest values in m and rad by parameter name or pattern; none without it.
+
+    Raises:
+        DhcalError: a value is not a pair of numbers in order.
+    """
+    raw = read_toml(path) if path else {}
+    for name, value in raw.items():
+        pair = value if isinstance(value, list) and len(value) == 2 else []
+        numbers = [v for v in pair if isinstance(v, int | float) and not isinstance(v, bool)]
+        if len(numbers) != 2 or not numbers[0] < numbers[1]:
+            raise DhcalError(
+                f"{path}: {name} = {value!r} are no bounds; write the least and the largest value "
+                'in m or rad, such as "d2" = [0.12, 0.13]'
+            )
+    return {name: (float(low), float(high)) for name, (low, high) in raw.items()}
+
+
 def read_priors(choice: str | None) -> Priors | None:
     """`default`, `none`, or a TOML file of sigmas in m and rad by parameter name or pattern.
 

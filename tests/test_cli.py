@@ -342,6 +342,20 @@ def test_wrong_priors(refused, text, words):
     refused(words, *CALIBRATE, "--priors", "priors.toml")
 
 
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a1 = 0.1\n", ["bounds.toml", "a1 = 0.1", "such as"]),
+        ("a1 = [0.2, 0.1]\n", ["bounds.toml", "a1 = [0.2, 0.1]", "m or rad"]),
+        ("a9 = [0.1, 0.2]\n", ["'a9'", "no such parameter", "a1"]),
+        ("a1 = [5.0, 6.0]\n", ["'a1'", "must hold the nominal"]),
+    ],
+)
+def test_wrong_bounds(refused, text, words):
+    Path("bounds.toml").write_text(text)
+    refused(words, *CALIBRATE, "--bounds", "bounds.toml")
+
+
 def test_outputs_do_not_overwrite_what_else_is_read(refused):
     Path("held.csv").write_text(csv(5, 1))
     Path("out.calibration.toml").write_text("a1 = 0.1\n")
@@ -820,7 +834,7 @@ def test_demo(run, place, monkeypatch):
 
 # --- the command itself ----------------------------------------------------------------------------
 
-COMMANDS = tuple(commands.COMMANDS)
+COMMANDS = tuple(cli.COMMANDS)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
