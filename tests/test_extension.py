@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -135,9 +136,15 @@ def test_the_command_says_what_each_family_brought(tmp_path, monkeypatch, capsys
     (tmp_path / "data.csv").write_text(measurement_text(data, arm, []))
     robot = str(robot_file("ur_description/urdf/ur10_robot.urdf"))
     common = ("calibrate", robot, "data.csv", "--tip", "tool0", "-o", "out.urdf", "--json", "r.json")
-    assert main([*common, "--extend", "gain,compliance"]) == 0
+    assert main([*common, "--extend", "gain,compliance", "--report", "r.md"]) == 0
     said = capsys.readouterr().err
     rows = json.loads((tmp_path / "r.json").read_text())["extension"]
+    report = (tmp_path / "r.md").read_text()
+    for row in rows:
+        verdict = "added" if row["kept"] else "left out"
+        assert f"| {row['family']} | {verdict} | {row['cv_before']:.3f} | {row['cv_after']:.3f} |" in report
+    assert "µrad/Nm" in report
+    assert not re.search(r"\b(nan|inf|infinity)\b", report, re.IGNORECASE)
     assert [(row["family"], row["kept"]) for row in rows] == [("compliance", True), ("gain", False)]
     assert {"cv_before", "cv_after", "standard_error"} <= set(rows[0])
     assert "compliance_rad_per_nm" in (tmp_path / "out.calibration.toml").read_text()
