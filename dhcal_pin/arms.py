@@ -14,9 +14,10 @@ from functools import cached_property
 import numpy as np
 
 from . import se3
-from .chain import BASE, Chain, Sweep
+from .chain import BASE, Chain
+from .error_model import ErrorModel
 from .errors import DhcalError
-from .parameters import ErrorModel
+from .kinematics import Sweep
 from .scratch import scratch
 from .se3 import Array
 
