@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from argparse import Namespace
 from collections.abc import Sequence
 
@@ -13,7 +11,7 @@ from . import se3, terminal
 from .chain import Chain
 from .compensation import SINGULAR, Compensation, compensate
 from .errors import DhcalError
-from .files import ANGLES, LENGTHS, save
+from .files import ANGLES, LENGTHS, csv_text, save
 from .measurement_files import Targets, read_targets
 from .outputs import check_outputs, sidecars
 from .reading_columns import QUATERNION, ROTVEC, units_of
@@ -69,11 +67,7 @@ def corrected_text(found: Compensation, chain: Chain, wanted: Targets) -> str:
     columns[f"miss_position[{unit}]"] = _numbers(found.miss[:, 0] * LENGTHS[unit])
     if wanted.targets.ndim == 3:
         columns["miss_rotation[deg]"] = _numbers(found.miss[:, 1] * ANGLES["deg"])
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([*columns, "status"])
-    writer.writerows(zip(*columns.values(), found.status, strict=True))
-    return out.getvalue()
+    return csv_text(columns | {"status": found.status})
 
 
 def _numbers(values: Array) -> list[str]:

@@ -9,8 +9,8 @@ import numpy as np
 from .chain import Chain
 from .compensation import compensate
 from .errors import DhcalError
-from .files import PathLike, read_sheet
-from .measurement_files import csv_text, joint_columns, joint_values, read_targets, reading_sheet
+from .files import PathLike, csv_text, read_sheet
+from .measurement_files import joint_columns, joint_values, read_targets, reading_sheet
 from .reading_columns import check_columns, check_joint_names
 from .se3 import Array
 

@@ -186,14 +186,6 @@ def across_at(value: float, look: str) -> Mark:
     )
 
 
-def down_at(value: float, look: str) -> Mark:
-    """A vertical line through the whole panel."""
-    return lambda frame: (
-        f'<path class="line {look}" d="M{_number(float(frame.across(value)))} {_number(TOP)}'
-        f'V{_number(frame.height - BOTTOM)}"/>'
-    )
-
-
 def cells(x: ArrayLike, y: ArrayLike, size: float, level: ArrayLike) -> Mark:
     """Squares of a map with lower corners (x, y) and side `size`, coloured by level; -1 is unknown."""
     x, y, level = np.asarray(x, float), np.asarray(y, float), np.asarray(level, int)

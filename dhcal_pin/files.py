@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import os
 import re
 import shutil
@@ -319,3 +320,13 @@ def _columns(header: Sequence[str], where: str) -> dict[str, Column]:
             raise DhcalError(f"{where}: column {name!r} stands twice; remove one")
         columns[name] = Column(name, unit, index)
     return columns
+
+
+def csv_text(columns: Mapping[str, Iterable[Any]], comments: Iterable[str] = ()) -> str:
+    """Comments and columns of equal length as CSV; numbers to the last digit, None as an empty cell."""
+    out = io.StringIO()
+    out.writelines(f"# {comment}\n" for comment in comments)
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*columns.values(), strict=True))
+    return out.getvalue()

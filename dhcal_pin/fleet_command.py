@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import os
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
@@ -12,7 +10,7 @@ from typing import Any
 
 from . import report, terminal
 from .errors import DhcalError
-from .files import PathLike, save
+from .files import PathLike, csv_text, save
 from .fleet import FAILED, Entry, Outcome, Run, places, read_fleet, run_fleet
 from .jobs import Job
 from .outputs import STDOUT, check_outputs, emit
@@ -56,7 +54,7 @@ def run(args: Namespace, calibrate: Run) -> int:
     try:
         found = run_fleet(entries, args.robot, calibrate, args.jobs or os.cpu_count() or 1, done)
     except KeyboardInterrupt:
-        terminal.lines(f"interrupted: {count} of {total} robots are done; no summary written")
+        terminal.lines(f"dhcal: interrupted; {count} of {total} robots are done; no summary written")
         return 130
     contents: dict[PathLike, str | bytes] = {args.output: summary_text(entries, found)}
     document = _document(entries, found)
@@ -98,11 +96,7 @@ def summary_text(entries: Sequence[Entry], found: Sequence[Outcome]) -> str:
             for key, name, factor in _ERRORS:
                 row[f"{stage}_{name}"] = repr(factor * accuracy[key]) if key in accuracy else ""
         rows.append(row | {"message": outcome.message})
-    out = io.StringIO()
-    writer = csv.DictWriter(out, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return out.getvalue()
+    return csv_text({name: [row[name] for row in rows] for name in rows[0]})
 
 
 def _document(entries: Sequence[Entry], found: Sequence[Outcome]) -> dict[str, Any]:

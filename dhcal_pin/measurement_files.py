@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,7 +12,7 @@ from . import se3
 from .chain import Chain
 from .column_maps import UNITS, read_map
 from .errors import DhcalError
-from .files import LENGTHS, Column, PathLike, Sheet, read_sheet
+from .files import LENGTHS, Column, PathLike, Sheet, csv_text, read_sheet
 from .foreign_files import mapped_sheet
 from .measurements import Measurement
 from .poses import Pose
@@ -247,8 +245,9 @@ def read_targets(path: PathLike, chain: Chain) -> Targets:
         )
     near = joint_values(sheet, chain) if set(chain.joint_names) & set(sheet.columns) else None
     nowhere = np.zeros((len(sheet.cells), chain.size))
+    values = _values(sheet, kind)
     try:
-        data = kind.from_columns([nowhere], _values(sheet, kind))
+        data = kind.from_columns([nowhere], values)
     except DhcalError as error:
         raise DhcalError(f"{sheet.source}: {error}") from None
     targets = data.poses if isinstance(data, Pose) else data.positions()
@@ -279,13 +278,3 @@ def joint_columns(q: Array, chain: Chain, before: str = "") -> dict[str, list[fl
         f"{before}{name}[{'m' if units_of(chain, name) is LENGTHS else 'rad'}]": q[:, j].tolist()
         for j, name in enumerate(chain.joint_names)
     }
-
-
-def csv_text(columns: Mapping[str, Sequence[Any]], comments: Sequence[str]) -> str:
-    """Comments and columns of equal length as CSV."""
-    out = io.StringIO()
-    out.writelines(f"# {comment}\n" for comment in comments)
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(zip(*columns.values(), strict=True))
-    return out.getvalue()

@@ -42,24 +42,25 @@ def run(args: Namespace) -> int:
         candidates = read_configurations(args.candidates_from, chain, args.columns)
     data = [read_readings(path, chain, args.columns).data for path in args.data or []]
     sigma = args.sigma or (None if any(item.kind == args.kind for item in data) else _SIGMA)
-    found = plan(
-        chain,
-        args.count,
-        kind=args.kind,
-        noise=Noise(*parse_noise(sigma, "--sigma")) if sigma else None,
-        parameters=args.parameters,
-        priors=read_priors(args.priors) or "default",
-        fix=names(args.fix),
-        free=names(args.free),
-        criterion=args.criterion,
-        data=data,
-        known=read_instrument(args.instrument) if args.instrument else None,
-        task=read_task(args.task, chain) if args.task else None,
-        candidates=candidates,
-        space=space,
-        margin=Noise(*parse_noise(args.margin, "--margin")),
-        seed=args.seed,
-    )
+    with terminal.progress(f"choosing {args.count} poses"):
+        found = plan(
+            chain,
+            args.count,
+            kind=args.kind,
+            noise=Noise(*parse_noise(sigma, "--sigma")) if sigma else None,
+            parameters=args.parameters,
+            priors=read_priors(args.priors) or "default",
+            fix=names(args.fix),
+            free=names(args.free),
+            criterion=args.criterion,
+            data=data,
+            known=read_instrument(args.instrument) if args.instrument else None,
+            task=read_task(args.task, chain) if args.task else None,
+            candidates=candidates,
+            space=space,
+            margin=Noise(*parse_noise(args.margin, "--margin")),
+            seed=args.seed,
+        )
     noise = found.information.noise
     document = _document(found, args)
     document |= {"inputs": report.fingerprints(inputs), "versions": report.versions()}

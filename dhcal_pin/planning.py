@@ -24,6 +24,8 @@ MARGIN_ANGLE, MARGIN_LENGTH = np.deg2rad(2.0), 5e-3
 TASK = 300
 # Random choices that a plan is compared with, at so many numbers of poses.
 DRAWS, SIZES = 60, 6
+# Candidates drawn at the most: with more of them memory ends before the plan gains.
+MOST_CANDIDATES = 10**6
 # Refinement: rounds, each with so many neighbours a pose, nearer from round to round.
 ROUNDS, NEIGHBOURS, REACH, NEARER = 8, 24, 0.15, 0.65
 # Poses nearer than this are as one to a real robot, whose errors no model holds in full: they repeat there.
@@ -142,6 +144,8 @@ def plan(
         raise DhcalError(f"criterion {criterion!r}: choose from {', '.join(CRITERIA)}")
     if count < 1:
         raise DhcalError(f"{count} poses: plan at least one")
+    if isinstance(candidates, int) and not count <= candidates <= MOST_CANDIDATES:
+        raise DhcalError(f"{candidates} candidates for {count} poses: draw from {count} to {MOST_CANDIDATES}")
     rng = np.random.default_rng(seed)
     margin = margin or Noise(MARGIN_LENGTH, MARGIN_ANGLE)
     room, notes = None, []

@@ -122,12 +122,14 @@ class Study:
         seeds: calibrations a setting, seeded 0, 1, ….
         cases: the settings, in the order of the file's lists, the last one fastest.
         digest: of everything that the result depends on.
+        robots: the files that the settings' robots were read from.
     """
 
     title: str
     seeds: int
     cases: tuple[Case, ...]
     digest: str
+    robots: tuple[str, ...]
 
     def tasks(self) -> list[tuple[Case, int, int]]:
         """Blocks of calibrations: case, first seed, and how many."""
@@ -157,9 +159,9 @@ def read_study(path: PathLike) -> Study:
     if not isinstance(table, dict) or "robot" not in table:
         raise DhcalError(f'{where}: no robot; write [settings] with robot = "arm.urdf" in it')
     settings = [_checked(setting, where) for setting in _grid(table, where)]
-    chains: dict[str, Chain] = {}
-    for name in {name for setting in settings for name in (setting.robot, setting.truth) if name}:
-        chains[name] = read_robot(_beside(name, path))
+    names = {name for setting in settings for name in (setting.robot, setting.truth) if name}
+    files = {name: os.fspath(_beside(name, path)) for name in sorted(names)}
+    chains = {name: read_robot(file) for name, file in files.items()}
     cases = [Case(setting, chains[setting.robot], chains.get(setting.truth)) for setting in settings]
     different = {
         (s.robot, s.truth, s.kind, s.parameters, s.wrong): case for case in cases if (s := case.setting)
@@ -167,9 +169,10 @@ def read_study(path: PathLike) -> Study:
     for case in different.values():
         _tried(case, where)
     digest = hashlib.sha256(repr((seeds, settings)).encode())
-    for name in sorted(chains):
-        digest.update(chains[name].urdf.data + chains[name].origins.tobytes())
-    return Study(str(document.get("title", "")), seeds, tuple(cases), digest.hexdigest())
+    for chain in chains.values():
+        digest.update(chain.urdf.data + chain.origins.tobytes())
+    title, robots = str(document.get("title", "")), tuple(files.values())
+    return Study(title, seeds, tuple(cases), digest.hexdigest(), robots)
 
 
 def _grid(table: Mapping[str, Any], where: str) -> Iterator[Setting]:

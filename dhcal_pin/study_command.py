@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import os
 from argparse import Namespace
@@ -17,8 +15,8 @@ import numpy as np
 from . import terminal
 from .errors import DhcalError
 from .executors import workers
-from .files import read_text, save
-from .outputs import check_outputs
+from .files import csv_text, read_text, save
+from .outputs import check_outputs, sidecars
 from .robot_files import paper_file
 from .study import Setting, Study, read_study, run, table
 from .study_plot import plot
@@ -27,29 +25,37 @@ from .tables import Table
 
 def study(args: Namespace) -> int:
     """Runs a study, or what is left of it."""
-    path = args.study if os.path.exists(args.study) else paper_file(f"{args.study}.study.toml")
+    given = os.path.exists(args.study) or args.study.endswith(".toml")
+    path = args.study if given else paper_file(f"{args.study}.study.toml")
     journal = f"{args.output}.part"
     picture = f"{os.path.splitext(args.output)[0]}.svg"
-    check_outputs([args.output, journal, picture], [os.fspath(path)])
     wanted = read_study(path)
+    inputs = [os.fspath(path), *wanted.robots, *sidecars(wanted.robots)]
+    check_outputs([args.output, journal, picture], inputs)
     blocks = _resumed(journal, wanted)
     total = len(wanted.tasks())
     if blocks:
         terminal.lines(f"{journal}: goes on after {len(blocks)} of {total} blocks")
-    with (
-        workers(args.jobs, args.scheduler) as where,
-        terminal.counted(wanted.title or "study", total, len(blocks)) as progress,
-        _opened(journal, wanted, blocks) as file,
-    ):
-        for block in run(wanted, len(blocks), where):
-            # One line a block and each at once, so that a kill costs no more than the blocks under way.
-            file.write(json.dumps(block) + "\n")
-            file.flush()
-            blocks.append(block)
-            progress(len(blocks))
+    try:
+        with (
+            workers(args.jobs, args.scheduler) as where,
+            terminal.counted(wanted.title or "study", total, len(blocks)) as progress,
+            _opened(journal, wanted, blocks) as file,
+        ):
+            for block in run(wanted, len(blocks), where):
+                # One line a block and each at once, so that a kill costs no more than the blocks under way.
+                file.write(json.dumps(block) + "\n")
+                file.flush()
+                blocks.append(block)
+                progress(len(blocks))
+    except KeyboardInterrupt:
+        kept = f"{journal} keeps {len(blocks)} of {total} blocks, and the same command goes on from there"
+        terminal.lines(f"dhcal: interrupted; {kept}")
+        return 130
     header, rows = table(wanted, blocks)
     drawn = plot(wanted.title or "study", len(fields(Setting)), header, rows)
-    contents = {args.output: _csv_text(header, rows)} | ({picture: drawn} if drawn else {})
+    columns = dict(zip(header, zip(*rows, strict=True), strict=True))
+    contents = {args.output: csv_text(columns)} | ({picture: drawn} if drawn else {})
     save(contents)
     os.unlink(journal)
     _shown(wanted, header, rows)
@@ -78,15 +84,6 @@ def _opened(journal: str, wanted: Study, blocks: Sequence[list[list[float]]]) ->
     """The journal with its whole lines, to be written on."""
     save({journal: "".join(f"{line}\n" for line in (wanted.digest, *map(json.dumps, blocks)))})
     return open(journal, "a", encoding="utf-8")
-
-
-def _csv_text(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(header)
-    # Numbers to the last digit; what a setting cannot tell stays empty.
-    writer.writerows([repr(cell) if isinstance(cell, float) else cell for cell in row] for row in rows)
-    return out.getvalue()
 
 
 def _shown(wanted: Study, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:

@@ -346,6 +346,7 @@ def test_wrong_target_files(place, capsys, text, words):
     assert said.count("\n") == 1
     for word in words:
         assert word in said
+    assert said.count("targets.csv") == 1
     assert not Path("out.csv").exists()
 
 

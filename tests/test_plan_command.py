@@ -108,6 +108,8 @@ def test_the_tool_in_a_box_before_an_instrument(tmp_path, capsys):
         (("--visible-from", "1,2mm"), "unit at the end"),
         (("--cone", "30deg"), "needs --visible-from"),
         (("--visible-from", "3,0,1m", "--cone", "400deg"), "half angle"),
+        (("--candidates", "4"), "4 candidates for 5 poses: draw from 5 to 1000000"),
+        (("--candidates", "50000000"), "draw from 5 to 1000000"),
         (("--margin", "2"), "--margin"),
         (("--priors", "none"), "needs priors"),
         (("--from", "nowhere.csv"), "nowhere.csv"),

@@ -158,7 +158,8 @@ def test_planned_poses_leave_less_error_than_random_ones():
 @pytest.mark.parametrize("kind", ["pose", "position"])
 @pytest.mark.parametrize("name", ["ur10", "panda", "sim_6dof"])
 def test_planned_poses_leave_less_error_than_random_ones_over_many_robots(name, kind):
-    reached, predicted = ratios(name, kind, 100)
+    # A hundred robots' median scatters by 3 %, four hundred's by half of that.
+    reached, predicted = ratios(name, kind, 400)
     assert reached <= 0.9
     assert predicted == pytest.approx(reached, rel=0.05)
 

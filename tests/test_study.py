@@ -187,6 +187,18 @@ def test_wrong_studies_are_named(tmp_path, change, message):
         read_study(path)
 
 
+def test_a_studys_robot_is_no_output(tmp_path, capsys):
+    path, robot = tmp_path / "s.study.toml", tmp_path / "sim_6dof.dh.toml"
+    path.write_text(MANY)
+    robot.write_bytes((URDF / robot.name).read_bytes())
+    before = robot.read_bytes()
+    assert cli.main(["study", str(path), "-o", str(robot)]) == 2
+    assert "is an input" in capsys.readouterr().err
+    assert robot.read_bytes() == before
+    assert cli.main(["study", str(tmp_path / "none.toml"), "-o", str(tmp_path / "r.csv")]) == 2
+    assert "none.toml: cannot read it" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("path", sorted(URDF.glob("*.study.toml")), ids=lambda path: path.name)
 def test_shipped_studies_can_be_read(path):
     assert read_study(path).title
