@@ -24,9 +24,6 @@ if TYPE_CHECKING:
     from .contacts import PointDistance as PointDistance
     from .contacts import Touch as Touch
     from .crossvalidation import cross_validate as cross_validate
-    from .crossvalidation import group_folds as group_folds
-    from .crossvalidation import random_folds as random_folds
-    from .crossvalidation import region_folds as region_folds
     from .dh import DHTable as DHTable
     from .dh_files import read_dh as read_dh
     from .dh_urdf import dh_to_urdf as dh_to_urdf
@@ -34,6 +31,9 @@ if TYPE_CHECKING:
     from .evaluation import accuracy as accuracy
     from .extension import extend as extend
     from .factors import error_factors as error_factors
+    from .folds import group_folds as group_folds
+    from .folds import random_folds as random_folds
+    from .folds import region_folds as region_folds
     from .live import Live as Live
     from .live import serve as serve
     from .measurement_files import read_measurements as read_measurements
@@ -47,12 +47,12 @@ if TYPE_CHECKING:
     from .positions import Position as Position
     from .report import Provenance as Provenance
     from .report_page import write_report as write_report
-    from .result import Prediction as Prediction
     from .result import Result as Result
     from .robot_files import read_robot as read_robot
     from .robot_files import write_urdf as write_urdf
     from .stream import calibrate_stream as calibrate_stream
     from .stream import file_parts as file_parts
+    from .uncertainty import Prediction as Prediction
     from .viewer import scene_html as scene_html
     from .viewer import show as show
     from .workspace import workspace_map as workspace_map
@@ -67,9 +67,9 @@ _HOMES = {
     "PointDistance": "contacts",
     "Touch": "contacts",
     "cross_validate": "crossvalidation",
-    "group_folds": "crossvalidation",
-    "random_folds": "crossvalidation",
-    "region_folds": "crossvalidation",
+    "group_folds": "folds",
+    "random_folds": "folds",
+    "region_folds": "folds",
     "Compensation": "compensation",
     "compensate": "compensation",
     "Space": "configurations",
@@ -93,12 +93,12 @@ _HOMES = {
     "write_report": "report_page",
     "extract": "parameters",
     "select": "parameters",
-    "Prediction": "result",
     "Result": "result",
     "read_robot": "robot_files",
     "write_urdf": "robot_files",
     "calibrate_stream": "stream",
     "file_parts": "stream",
+    "Prediction": "uncertainty",
     "scene_html": "viewer",
     "show": "viewer",
     "workspace_map": "workspace",

@@ -14,9 +14,10 @@ from functools import cached_property
 import numpy as np
 
 from . import se3
-from .chain import BASE, Chain, Sweep
+from .chain import BASE, Chain
+from .error_model import ErrorModel
 from .errors import DhcalError
-from .parameters import ErrorModel
+from .kinematics import Sweep
 from .scratch import scratch
 from .se3 import Array
 
@@ -52,6 +53,8 @@ class Arms:
                 transmission.
         """
         first = models[0]
+        if first.chain.transmission is not None or any(p.entry is not None for p in first.parameters):
+            raise DhcalError("arms with gains, harmonics, compliance or couplings calibrate one by one")
         for number, model in enumerate(models, 1):
             if model.chain.transmission is not None or any(p.entry is not None for p in model.parameters):
                 raise DhcalError(

@@ -15,10 +15,10 @@ import numpy as np
 
 from . import observability
 from .arms import Arms
+from .error_model import ErrorModel
 from .errors import DhcalError
 from .executors import HERE, Workers
 from .measurements import Measurement, joined
-from .parameters import ErrorModel
 from .scratch import scratch
 from .se3 import Array
 from .solver import LEAP_STEPS, LEAPS, RUNAWAY

@@ -1,28 +1,30 @@
-"""`dhcal calibrate` for one robot: files in, a fit, files out; any process can do it."""
+"""`dhcal calibrate`: files in, a fit, files out; any process can do one robot of many."""
 
 from __future__ import annotations
 
 import os
+from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from . import calibration, exports, extension, report, report_page
+from . import calibration, exports, extension, fleet_command, report, terminal
 from .chain import Chain
-from .configuration_files import map_text
 from .errors import DhcalError
-from .executors import HERE, Workers
+from .executors import HERE, Workers, workers
 from .files import PathLike, save
+from .fleet import is_fleet
 from .jobs import Job
 from .measurement_files import read_readings
 from .measurements import Measurement
-from .outputs import STDOUT, check_outputs, check_urdf_ending, names, same, sidecars
+from .outputs import STDOUT, check_outputs, check_urdf_ending, emit, names, same, sidecars
 from .parameters import EXTENSIONS
 from .plausibility import doubts
 from .result import Result
 from .robot_files import (
+    read_bounds,
     read_instrument,
     read_priors,
     read_robot,
@@ -31,7 +33,6 @@ from .robot_files import (
 )
 from .screening import Finding, screen
 from .solver import Progress
-from .workspace import workspace_map
 
 
 @dataclass(frozen=True)
@@ -113,15 +114,22 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
             raise DhcalError(f"{path}: is given twice; each measurement counts once, to fit or to hold out")
     robot = [args.robot, *sidecars([args.robot])]
     priors = [args.priors] if args.priors not in (None, "default", "none") else []
-    priors += [args.instrument] if args.instrument else []
+    priors += [path for path in (args.bounds, args.instrument) if path]
     maps = [args.columns] if args.columns else []
     inputs = [*robot, *measured, *priors, *maps]
     check_urdf_ending(args.output)
     check_outputs([args.json, *args.report], inputs)
     kept = [*measured, *priors, *maps] if args.in_place else inputs
     check_outputs([args.output, sidecar_path(args.output), args.map, args.json, *args.report], kept)
-    for path in args.report:
-        report_page.check_ending(path)
+    if args.report:
+        from . import report_page  # its figures are a good part of the start-up
+
+        for path in args.report:
+            report_page.check_ending(path)
+    if args.map:
+        from . import workspace_files  # and so are the map's
+
+        workspace_files.check_map_ending(args.map)
 
     chain = read_robot(args.robot, args.tip)
     sets = args.parameters or chain.parameters
@@ -133,6 +141,7 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
         _families(args.extend),
         method=args.method,
         priors=read_priors(args.priors),
+        bounds=read_bounds(args.bounds),
         fix=names(args.fix),
         free=names(args.free),
         holdout=[item for _, item in data.holdout],
@@ -145,7 +154,10 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     contents = _written(fit, args)
     files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
     if args.map:
-        contents[args.map], files["map"] = map_text(workspace_map(fit)), args.map
+        from . import workspace_files
+
+        contents[args.map] = workspace_files.map_content(args.map, fit, fit.holdout, fit.instruments)
+        files["map"] = args.map
     if args.json and args.json != STDOUT:
         files["json"] = args.json
     gross = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))
@@ -158,8 +170,11 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     files |= {
         "report" if number == 1 else f"report_{number}": path for number, path in enumerate(args.report, 1)
     }
-    source = _provenance(args, sets, data, inputs)
-    contents |= report_page.report_files(fit, args.report, source)
+    source = _provenance(args, sets, data, inputs, trials)
+    if args.report:
+        from . import report_page
+
+        contents |= report_page.report_files(fit, args.report, source)
     document = report.document(fit, files, source.inputs, [row for found in rows.values() for row in found])
     document |= {
         "outliers_by_file": rows,
@@ -173,7 +188,9 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     return Outcome(fit, document, files, data.findings, gross, data.doubts, trials)
 
 
-def _provenance(args: Job, sets: str, data: _Data, inputs: Sequence[str]) -> report.Provenance:
+def _provenance(
+    args: Job, sets: str, data: _Data, inputs: Sequence[str], trials: Sequence[extension.Trial]
+) -> report.Provenance:
     """What the report says of the files, the command and its choices."""
     short = report.short_names(inputs)
     settings = {
@@ -196,6 +213,7 @@ def _provenance(args: Job, sets: str, data: _Data, inputs: Sequence[str]) -> rep
         settings=settings,
         left_out=left_out,
         doubts=doubtful,
+        trials=trials,
     )
 
 
@@ -209,7 +227,7 @@ def _written(fit: Result, args: Job) -> dict[PathLike, str | bytes]:
     chain = fit.chain
     # A base that the URDF holds must not stand in the sidecar too.
     bare = replace(chain, base=np.eye(4)) if args.world_joint else chain
-    contents = urdf_files(bare, args.output, fit.portable)
+    contents = urdf_files(bare, args.output, fit.portable, fit.uncertainty)
     data = contents[args.output]
     assert isinstance(data, bytes)
     if args.world_joint and chain.transmission is not None and chain.transmission.yields:
@@ -221,3 +239,30 @@ def _written(fit: Result, args: Job) -> dict[PathLike, str | bytes]:
     if args.tool_frame:
         data = exports.with_tool_frame(data, chain.tip, args.tool_frame, chain.tool)
     return contents | {args.output: data}
+
+
+def _calibrate_one(job: Job) -> dict[str, Any]:
+    """A robot of a fleet, in a process of its own."""
+    return run_job(job).document
+
+
+def calibrate(args: Namespace) -> int:
+    """One robot, or all of a manifest."""
+    if is_fleet(args.robot):
+        if args.scheduler:
+            raise DhcalError("--scheduler: goes with one robot; a manifest takes --jobs")
+        return fleet_command.run(args, _calibrate_one)
+    if not args.data:
+        raise DhcalError(f"DATA is required: name at least one measurement file behind {args.robot}")
+    with workers(args.jobs or 1, args.scheduler) as where, terminal.progress("fitting") as progress:
+        outcome = run_job(Job.of(args), progress, where)
+    if args.json == STDOUT:
+        emit(args.json, outcome.document)
+    for path, found in outcome.findings.items():
+        terminal.findings(path, found)
+        terminal.gross(path, outcome.gross.get(path, []), args.loss)
+    for path, texts in outcome.doubts.items():
+        terminal.doubts(path, texts)
+    terminal.trials(outcome.trials)
+    terminal.summary(outcome.fit, outcome.files)
+    return 0

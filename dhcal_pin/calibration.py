@@ -11,11 +11,12 @@ import numpy as np
 
 from . import observability, robust
 from .chain import BASE, Chain
+from .error_model import ErrorModel
 from .errors import DhcalError
 from .executors import HERE, Workers
 from .frames import few, misfit, starts
 from .measurements import Measurement
-from .parameters import ErrorModel, select
+from .parameters import select
 from .problem import Problem, shared_unknowns
 from .result import Result
 from .se3 import Array
@@ -27,8 +28,8 @@ Priors = Literal["default", "none"] | Mapping[str, float]
 # Sigmas are not estimated below a nanometre and a nanoradian.
 LEAST_SCALE = 1e-6
 MOST_ROUNDS = 30
-# Default priors narrow, where errors are smaller than expected, to so much of what they were.
-NARROWEST = 0.1
+# Against narrower priors the expected size counts as much as so many errors that were found.
+EXPECTATION = 0.5
 # Starts for the frames are tried until one leaves so small a share of the positions' spread.
 GOOD_FIT = 0.01
 
@@ -53,6 +54,26 @@ def prior_weights(errors: ErrorModel, priors: Priors) -> Array:
             raise DhcalError(f"prior for {pattern!r}: {value} must be positive, in its parameter's unit")
         sigma[hit] = value
     return 1 / sigma
+
+
+def _bounds(problem: Problem, bounds: Mapping[str, tuple[float, float]]) -> Array:
+    """Least and largest x (2, p+s) of values that are bounded by name."""
+    outside = (BASE, problem.errors.chain.tool_station)
+    inside = [p for p in problem.errors.parameters if p.station not in outside]
+    out = np.tile([[-np.inf], [np.inf]], len(problem.weights))
+    for pattern, (low, high) in bounds.items():
+        hit = [p for p in inside if fnmatch.fnmatchcase(p.name, pattern)]
+        if not hit:
+            raise DhcalError(
+                f"bounds for {pattern!r}: no such parameter; there are {', '.join(p.name for p in inside)}"
+            )
+        for p in hit:
+            if not low <= p.nominal <= high:
+                raise DhcalError(
+                    f"bounds for {pattern!r}: {low} to {high} must hold the nominal {p.nominal:g} of {p.name}"
+                )
+            out[:, problem.errors.parameters.index(p)] = low - p.nominal, high - p.nominal
+    return out
 
 
 def _default(errors: ErrorModel, priors: Priors) -> Array:
@@ -157,6 +178,7 @@ def _rescaled(problem: Problem, solution: Solution, expected: Array, default: Ar
 
     Default priors of one unit and one expected size have one scale, the one of greatest evidence
     (MacKay 1992): the mean square of the errors over as many as the data and not the prior determine.
+    None gets narrower than the narrowest expectation of its unit, as offsets of no more than tilts' size.
     Priors that are not default (p,) stay.
     """
     errors = problem.errors
@@ -164,13 +186,14 @@ def _rescaled(problem: Problem, solution: Solution, expected: Array, default: Ar
     root = posterior_root(solution.triangle, problem.weights)[0]
     told = 1 - np.sum((root * problem.weights[:, None]) ** 2, 1)
     weights = problem.weights.copy()
-    kinds = [(p.unit, expected[i]) for i, p in enumerate(errors.parameters)]
     inside = [i for i, p in enumerate(errors.parameters) if default[i] and p.station not in outside]
-    for kind in set(kinds):
-        family = [i for i in inside if kinds[i] == kind]
-        if (count := told[family].sum()) > 1e-3:
-            square = np.sum((solution.x[family] * expected[family]) ** 2) / count
-            weights[family] = expected[family] / np.sqrt(max(NARROWEST**2, square))
+    alike = {i: (errors.parameters[i].unit, errors.parameters[i].entry is None) for i in inside}
+    for kind in {(alike[i], expected[i]) for i in inside}:
+        family = [i for i in inside if (alike[i], expected[i]) == kind]
+        narrowest = max(expected[i] for i in inside if alike[i] == kind[0])
+        found, count = np.sum((solution.x[family] * expected[family]) ** 2), told[family].sum()
+        share = EXPECTATION if found <= count else 0.0
+        weights[family] = min(expected[family[0]] * np.sqrt((count + share) / (found + share)), narrowest)
     return weights
 
 
@@ -193,6 +216,7 @@ def calibrate(
     holdout: Sequence[Measurement] = (),
     known: Mapping[str, float] | None = None,
     loss: str = "linear",
+    bounds: Mapping[str, tuple[float, float]] | None = None,
     max_iterations: int = 100,
     progress: Progress | None = None,
     where: Workers = HERE,
@@ -212,6 +236,8 @@ def calibrate(
         known: values in m and rad of instruments' unknowns by name, such as a surveyed anchor
             `wire1.x`; they are held.
         loss: "linear", or "huber", "cauchy", "tukey", which gross errors bend little or not at all.
+        bounds: least and largest values in m and rad by the names or patterns of the robot's parameters;
+            base and tool stay free.
         max_iterations: most steps of a loop.
         progress: called with the iteration and the cost.
         where: what chunks of many samples are shared out to.
@@ -232,6 +258,8 @@ def calibrate(
         raise DhcalError(f"loss {loss!r}: choose from {', '.join(robust.LOSSES)}")
     if loss != "linear" and method != "lm":
         raise DhcalError(f"loss {loss!r} needs method lm; the paper's loop weighs all rows alike")
+    if bounds and method != "lm":
+        raise DhcalError("bounds need method lm; the paper's loop knows none")
     for item in (*data, *holdout):
         chain.checked(item.configurations())
     priors = priors if priors is not None else ("none" if method == "gn" else "default")
@@ -241,6 +269,8 @@ def calibrate(
     errors = replace(errors, chain=reference)
     data = tuple(item.started(reference) for item in data)
     problem = replace(_problem(errors, data, prior_weights(errors, priors), known), where=where)
+    if bounds:
+        problem = replace(problem, bounds=_bounds(problem, bounds))
     default = _default(errors, priors)
     solution = METHODS[method](problem, np.zeros(len(problem.weights)), max_iterations, progress)
     if errors.at(solution.x[: len(errors.parameters)]).transmission is not None:

@@ -12,7 +12,6 @@ base link's pose in the measuring frame, `tool` the measured point's pose in the
 
 from __future__ import annotations
 
-import itertools
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -22,18 +21,17 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from . import se3
+from . import kinematics, se3
 from .dh import DHTable
 from .dh_urdf import dh_to_urdf
 from .errors import DhcalError
-from .scratch import LongRows, scratch
+from .kinematics import Motion, Sweep
+from .paths import axis_frame, build_model, default_tip, independent_joints, placements
 from .se3 import Array
 from .transmission import Loads, Transmission
 from .urdf import Urdf, parse_urdf, read_urdf
 
 BASE = 0
-# So many samples of all bodies stay in a processor's cache.
-BLOCK = 2048
 
 
 def joint_station(j: int) -> int:
@@ -44,55 +42,6 @@ def joint_station(j: int) -> int:
 def link_station(j: int) -> int:
     """Station behind the j-th moving joint's motion; 0 is the base link."""
     return 2 * j + 1
-
-
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """What m configurations ask of a chain's joints; errors do not change it, so one serves a whole search.
-
-    Attributes:
-        joints: (n, m) values of the independent joints, rad or m.
-        values: (k, m) of the moving joints, rad or m.
-        cos, sin: (k, m) of the values.
-    """
-
-    joints: Array
-    values: Array
-    cos: Array
-    sin: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Sweep:
-    """Frames of a chain at m samples, components first so that the samples are contiguous.
-
-    Attributes:
-        bodies: (k+1, 4, 3, m) columns x, y, z, p of each body's frame in the measuring frame. A body's
-            frame has its joint's axis along z.
-        tool: (4, 3, m) columns of the tool's frame.
-        terms: (t, n, m) of the independent joints' transmission, where the chain has one.
-    """
-
-    bodies: Array
-    tool: Array
-    terms: Array | None = None
-
-    def poses(self) -> Array:
-        """Tool poses (m, 4, 4) in the measuring frame."""
-        out = np.zeros((self.tool.shape[-1], 4, 4))
-        out[:, :3, :] = self.tool.transpose(2, 1, 0)
-        out[:, 3, 3] = 1.0
-        return out
-
-
-def _axis_frame(axis: Array) -> Array:
-    """A rotation (4, 4) that carries z onto a unit axis (3,); a permutation for coordinate axes."""
-    i = int(np.argmax(np.abs(axis)))
-    sign = 1.0 if axis[i] > 0 else -1.0
-    x = np.eye(3)[(i + 1) % 3] * sign
-    x = x - (x @ axis) * axis
-    x /= np.linalg.norm(x)
-    return se3.transform(np.stack([x, np.cross(axis, x), axis], -1), np.zeros(3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +93,7 @@ class Chain:
             DhcalError: the file is not a sound URDF, the tip is unknown or ambiguous, nothing moves.
         """
         urdf = source if isinstance(source, Urdf) else read_urdf(source)
-        tip = tip if tip is not None else _default_tip(urdf)
+        tip = tip if tip is not None else default_tip(urdf)
         joints = [joint for joint in urdf.path(tip) if joint.type != "fixed"]
         for joint in joints:
             if joint.type in ("floating", "planar"):
@@ -154,10 +103,10 @@ class Chain:
                 )
         if not joints:
             raise DhcalError(f"{urdf.source}: no moving joint between {urdf.root!r} and {tip!r}")
-        names, rows, shift = _independent(urdf, [joint.name for joint in joints])
+        names, rows, shift = independent_joints(urdf, [joint.name for joint in joints])
         sources = [urdf.joint(name) for name in names]
-        model = _build(urdf)
-        origins, axes = _path(model, tip, [joint.name for joint in joints])
+        model = build_model(urdf)
+        origins, axes = placements(model, tip, [joint.name for joint in joints])
         return cls(
             urdf=urdf,
             tip=tip,
@@ -206,7 +155,7 @@ class Chain:
     @cached_property
     def model(self) -> pin.Model:
         """Pinocchio's model of the whole robot with this chain's joint placements and tip frame."""
-        model = _build(self.urdf)
+        model = build_model(self.urdf)
         for name, origin in zip(self.moving, self.origins[:-1], strict=True):
             model.jointPlacements[model.getJointId(name)] = pin.SE3(origin)
         model.frames[model.getFrameId(self.tip, pin.FrameType.BODY)].placement = pin.SE3(self.origins[-1])
@@ -257,7 +206,7 @@ class Chain:
     @cached_property
     def axis_frames(self) -> Array:
         """(k+1, 4, 4): body frame (joint axis along z) in each body's URDF frame; body 0 as it is."""
-        return np.stack([np.eye(4), *(_axis_frame(axis) for axis in self.axes)])
+        return np.stack([np.eye(4), *(axis_frame(tuple(axis)) for axis in self.axes.tolist())])
 
     @cached_property
     def _into(self) -> Array:
@@ -280,13 +229,8 @@ class Chain:
 
     def _motion(self, joints: Array) -> Motion:
         """The motion of independent joints that stand at (n, m)."""
-        values = self.mixing @ joints + self.shift[:, None]
-        # One tangent of half the angle costs a fifth of a cosine and a sine.
-        half = np.tan(0.5 * values)
-        square = half * half
-        return Motion(joints, values, (1 - square) / (1 + square), 2 * half / (1 + square))
+        return kinematics.motion(joints, self.mixing @ joints + self.shift[:, None])
 
-    @LongRows()
     def sweep(self, q: Array | Motion, out: Array | None = None) -> Sweep:
         """All frames at joint values q (m, n), or at a motion of this chain, vectorised over the samples.
 
@@ -299,23 +243,8 @@ class Chain:
         k, m = motion.values.shape
         frames = np.empty((k + 2, 4, 3, m)) if out is None else out
         frames[0] = self.base[:3].T[:, :, None]
-        turned = scratch("turned", 2, 3, m)
-        mixing = np.swapaxes(self.links, 1, 2)
-        for j, (after, slides) in enumerate(zip(frames[1:-1], self.prismatic, strict=True)):
-            # The columns of F·L are the columns of F mixed by L: one small product for all samples.
-            before = frames[j].reshape(4, -1)
-            np.matmul(mixing[j, :2], before, out=turned.reshape(2, -1))
-            np.matmul(mixing[j, 2:], before, out=after[2:].reshape(2, -1))
-            if slides:
-                after[:2] = turned
-                after[3] += after[2] * motion.values[j]
-            else:
-                np.multiply(turned, motion.cos[j], out=after[:2])
-                turned *= motion.sin[j]
-                after[0] += turned[1]
-                after[1] -= turned[0]
-        last = (self.links[-1] @ self.tool).T
-        np.matmul(last, frames[-2].reshape(4, -1), out=frames[-1].reshape(4, -1))
+        links = np.concatenate([self.links[:-1], (self.links[-1] @ self.tool)[None]])
+        kinematics.carry_frames(links, self.prismatic, motion, frames)
         return Sweep(frames[:-1], frames[-1], terms)
 
     def poses(self, q: Array) -> Array:
@@ -346,7 +275,6 @@ class Chain:
         seen = se3.adjoint(frames if carry is None else frames @ carry)
         return bodies, (seen @ np.asarray(twists, float)[..., None])[..., 0]
 
-    @LongRows()
     def tool_velocities(self, sweep: Sweep, bodies: Array, twists: Array, out: Array | None = None) -> Array:
         """The tool point's velocity (p, 6, m) per unit of each body twist, axes of the measuring frame.
 
@@ -363,18 +291,7 @@ class Chain:
         if behind < len(bodies):
             out[behind:] = self._entry_velocities(sweep, bodies[behind:] - len(sweep.bodies))
             bodies, twists = bodies[:behind], twists[:behind]
-        counts = np.bincount(bodies, minlength=len(sweep.bodies))
-        used = np.flatnonzero(counts)
-        groups = list(itertools.pairwise([0, *np.cumsum(counts[used]).tolist()]))
-        frames = sweep.bodies if len(used) == len(sweep.bodies) else sweep.bodies[used]
-        for at in range(0, m, BLOCK):
-            some = np.s_[..., at : at + BLOCK]
-            axes, moved = frames[:, :3][some], _moved_point(frames[some], sweep.tool[3][some])
-            # A twist mixes what its body's axes do, one small product for all samples and components.
-            for (first, last), turn, move in zip(groups, axes, moved, strict=True):
-                rows = out[first:last][some].transpose(1, 0, 2)
-                np.matmul(twists[first:last], move.transpose(1, 0, 2), out=rows[:3])
-                np.matmul(twists[first:last, 3:], turn.transpose(1, 0, 2), out=rows[3:])
+        kinematics.point_velocities(sweep.bodies, sweep.tool[3], bodies, twists, out[:behind])
         return out
 
     def _entry_velocities(self, sweep: Sweep, entries: Array) -> Array:
@@ -410,79 +327,3 @@ class Chain:
         # The axes stay, and so do the frames made of them.
         vars(chain).update(axis_frames=self.axis_frames, _into=self._into)
         return chain
-
-
-def _moved_point(bodies: Array, point: Array) -> Array:
-    """How a point (3, m) moves when it slides along each body's axes and turns about them, (b, 6, 3, m)."""
-    count, _, _, m = bodies.shape
-    axes, out = bodies[:, :3], scratch("moved", count, 6, 3, m)
-    lever, product = scratch("lever", count, 1, 3, m), scratch("product", count, 3, m)
-    np.subtract(point, bodies[:, 3:], out=lever)
-    out[:, :3] = axes
-    # The cross products of all bodies at once, a component at a time.
-    for x, y, z in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        turned = out[:, 3:, x]
-        np.multiply(axes[:, :, y], lever[:, :, z], out=turned)
-        turned -= np.multiply(axes[:, :, z], lever[:, :, y], out=product)
-    return out
-
-
-def _build(urdf: Urdf) -> pin.Model:
-    try:
-        # Pinocchio splits numbers at spaces only; XML allows any white space.
-        return pin.buildModelFromXML(urdf.data.decode("utf-8-sig").translate(dict.fromkeys(b"\t\r\n", " ")))
-    except (ValueError, RuntimeError) as error:
-        raise DhcalError(f"{urdf.source}: Pinocchio does not accept this URDF: {error}") from error
-
-
-def _default_tip(urdf: Urdf) -> str:
-    """The leaf behind the most moving joints, then behind the most links; `tool0` breaks a tie."""
-    depth = {leaf: urdf.path(leaf) for leaf in urdf.leaves()}
-    rank = {leaf: (sum(j.type != "fixed" for j in path), len(path)) for leaf, path in depth.items()}
-    best = max(rank.values())
-    deepest = [leaf for leaf, value in rank.items() if value[0] == best[0]]
-    if "tool0" in deepest:
-        return "tool0"
-    farthest = [leaf for leaf in deepest if rank[leaf] == best]
-    if len(farthest) > 1:
-        shared = set.intersection(*({joint.child for joint in depth[leaf]} for leaf in farthest))
-        common = [joint.child for joint in depth[farthest[0]] if joint.child in shared]
-        also = f" (or {common[-1]}, the last link they share)" if common else ""
-        raise DhcalError(
-            f"{urdf.source}: several tips are equally deep; "
-            f"choose one with --tip: {', '.join(sorted(deepest))}{also}"
-        )
-    return farthest[0]
-
-
-def _independent(urdf: Urdf, moving: list[str]) -> tuple[list[str], Array, Array]:
-    """Independent joints behind the moving ones, with the (k, n) mixing and (k,) shift of mimics."""
-    names: list[str] = []
-    entries = []
-    for name in moving:
-        factor, shift = 1.0, 0.0
-        while (mimic := urdf.joint(name).mimic) is not None:
-            name, shift, factor = mimic[0], shift + factor * mimic[2], factor * mimic[1]
-        if name not in names:
-            names.append(name)
-        entries.append((names.index(name), factor, shift))
-    mixing = np.zeros((len(moving), len(names)))
-    for row, (column, factor, _) in enumerate(entries):
-        mixing[row, column] = factor
-    return names, mixing, np.array([shift for _, _, shift in entries])
-
-
-def _path(model: pin.Model, tip: str, moving: list[str]) -> tuple[Array, Array]:
-    """Origins (k+1, 4, 4) and axes (k, 3) of the path as Pinocchio sees it."""
-    origins, axes = [], []
-    for name in moving:
-        index = model.getJointId(name)
-        origins.append(model.jointPlacements[index].homogeneous)
-        joint = model.joints[index]
-        data = joint.createData()
-        joint.calc(data, pin.neutral(model))
-        subspace = np.asarray(data.S).reshape(6)
-        axes.append(subspace[:3] if np.any(subspace[:3]) else subspace[3:])
-    frame = model.frames[model.getFrameId(tip, pin.FrameType.BODY)]
-    origins.append(frame.placement.homogeneous)
-    return np.array(origins), np.array(axes)

@@ -10,8 +10,9 @@ import pinocchio as pin
 from . import se3
 from .chain import Chain, link_station
 from .dh import DHTable
+from .error_model import ErrorModel
 from .factors import error_factors
-from .parameters import ErrorModel, extract, select
+from .parameters import extract, select
 from .se3 import Array
 
 ALGEBRAIC, NUMERICAL = 1e-12, 1e-7

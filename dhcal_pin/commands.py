@@ -1,4 +1,4 @@
-"""What each command of `dhcal` does, once the command line is read.
+"""What the small commands of `dhcal` do, once the command line is read.
 
 Wrong input is found before anything is written or shown; JSON goes to stdout, all else to stderr.
 """
@@ -6,7 +6,7 @@ Wrong input is found before anything is written or shown; JSON goes to stdout, a
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -14,28 +14,20 @@ import numpy as np
 
 from . import (
     calibration,
-    compensate_command,
-    demo,
     exports,
-    fleet_command,
-    plan_command,
     report,
-    study_command,
     terminal,
     ur_kinematics,
-    view_command,
 )
-from .calibrate_command import run_job
+from .chain import Chain
 from .check import crosscheck
 from .configurations import joint_range
+from .demo import run as run_demo
 from .dh_files import dh_text, is_dh
 from .dh_urdf import dh_to_urdf
 from .errors import DhcalError
 from .evaluation import accuracy
-from .executors import workers
 from .files import parse_noise, save
-from .fleet import is_fleet
-from .jobs import Job
 from .kinds import KINDS
 from .measurement_files import measurement_text, read_readings
 from .measurements import Noise
@@ -50,44 +42,18 @@ from .robot_files import (
     read_table,
     robot_name,
 )
-
-# --- calibrate -------------------------------------------------------------------------------------
-
-
-def _calibrate_one(job: Job) -> dict[str, Any]:
-    """A robot of a fleet, in a process of its own."""
-    return run_job(job).document
+from .uncertainty import Predictor
+from .uncertainty_files import read_uncertainty
+from .workspace_files import check_map_ending, map_content
 
 
-def _calibrate(args: Namespace) -> int:
-    if is_fleet(args.robot):
-        if args.scheduler:
-            raise DhcalError("--scheduler: goes with one robot; a manifest takes --jobs")
-        return fleet_command.run(args, _calibrate_one)
-    if not args.data:
-        raise DhcalError(f"DATA is required: name at least one measurement file behind {args.robot}")
-    with workers(args.jobs or 1, args.scheduler) as where, terminal.progress("fitting") as progress:
-        outcome = run_job(Job.of(args), progress, where)
-    if args.json == STDOUT:
-        emit(args.json, outcome.document)
-    for path, found in outcome.findings.items():
-        terminal.findings(path, found)
-        terminal.gross(path, outcome.gross.get(path, []), args.loss)
-    for path, texts in outcome.doubts.items():
-        terminal.doubts(path, texts)
-    terminal.trials(outcome.trials)
-    terminal.summary(outcome.fit, outcome.files)
-    return 0
-
-
-# --- the other commands ----------------------------------------------------------------------------
-
-
-def _validate(args: Namespace) -> int:
+def validate(args: Namespace) -> int:
+    """The accuracy of a model on measurements."""
     sidecar = args.sidecar or existing_sidecar(args.robot)
     inputs = [args.robot, *args.data, *filter(None, (sidecar, args.columns))]
-    check_outputs([args.json], inputs)
+    check_outputs([args.json, args.map], inputs)
     chain = read_robot(args.robot, args.tip, sidecar)
+    model = _trusted(chain, sidecar, args) if args.map else None
     readings = [read_readings(path, chain, args.columns) for path in args.data]
     data = [item.data for item in readings]
     surveyed = read_instrument(sidecar) if sidecar else {}
@@ -97,20 +63,40 @@ def _validate(args: Namespace) -> int:
     found: dict[str, Mapping[str, Any]] = {"base and tool as given": given}
     if args.fit_frames:
         fit = calibration.calibrate(chain, data, "base,tool", known=known)
-        found["fitted"] = fit.comparisons[0].after
+        found["fitted"] = fit.comparisons[-1].after
         document = report.document(fit, {}, report.fingerprints(inputs))
     else:
         document = report.plain_document(chain, data, report.fingerprints(inputs), known)
     document["before"] = report.essentials(given)
     document["files"] = {"json": args.json} if args.json and args.json != STDOUT else {}
+    if model:
+        document["files"]["map"] = args.map
+        save({args.map: map_content(args.map, model, data, known)})
     emit(args.json, document)
     for item in readings:
         terminal.doubts(item.source, doubts(chain, item))
     terminal.validation(f"{args.robot}: accuracy on {document['samples']} samples", found)
+    if model:
+        terminal.lines(f"wrote map: {args.map}")
     return 0
 
 
-def _convert(args: Namespace) -> int:
+def _trusted(chain: Chain, sidecar: str | None, args: Namespace) -> Predictor:
+    """How well the arm is known, as its calibration has left it beside the robot."""
+    check_map_ending(args.map)
+    if args.fit_frames:
+        raise DhcalError("--map is of base and tool as calibrated; leave out --fit-frames")
+    known = read_uncertainty(sidecar, chain) if sidecar else None
+    if known is None:
+        raise DhcalError(
+            f"{sidecar or args.robot}: holds no [uncertainty] of a calibration to draw --map from; "
+            "`dhcal calibrate` writes one beside the new robot where samples are left over to tell it"
+        )
+    return known
+
+
+def convert(args: Namespace) -> int:
+    """A table to a URDF, or a robot to a table, a list of origins, or UR's YAML."""
     check_outputs([args.output], [args.input])
     low = args.output.lower()
     if low.endswith(".origins.csv"):
@@ -151,7 +137,8 @@ def _to_urdf(args: Namespace) -> tuple[str, Sequence[str]]:
     return dh_to_urdf(read_table(args.input), robot_name(args.input)), beside
 
 
-def _check(args: Namespace) -> int:
+def check(args: Namespace) -> int:
+    """All routes to the Jacobian side by side; 1 where they disagree."""
     check_outputs([args.json], [args.robot])
     rows = crosscheck(read_robot(args.robot, args.tip))
     agree = all(row.holds for row in rows)
@@ -160,7 +147,8 @@ def _check(args: Namespace) -> int:
     return 0 if agree else 1
 
 
-def _simulate(args: Namespace) -> int:
+def simulate(args: Namespace) -> int:
+    """Measurements of a robot that is known to be wrong."""
     robots = [args.robot, *([args.truth] if args.truth else [])]
     check_outputs([args.output], [*robots, *sidecars(robots)])
     noise = Noise(*parse_noise(args.noise))
@@ -183,24 +171,11 @@ def _simulate(args: Namespace) -> int:
     return 0
 
 
-def _demo(args: Namespace) -> int:
+def demo(args: Namespace) -> int:
+    """The paper's arm, end to end."""
     check_outputs([args.json], [])
-    document = demo.run(args.out)
+    document = run_demo(args.out)
     emit(args.json, document)
     if args.open:
-        terminal.open_page(document["files"]["scene"])
+        terminal.open_page(document["files"]["report"])
     return 0
-
-
-COMMANDS: dict[str, Callable[[Namespace], int]] = {
-    "demo": _demo,
-    "calibrate": _calibrate,
-    "validate": _validate,
-    "convert": _convert,
-    "view": view_command.view,
-    "check": _check,
-    "plan": plan_command.run,
-    "simulate": _simulate,
-    "compensate": compensate_command.run,
-    "study": study_command.study,
-}

@@ -16,7 +16,6 @@ from .measurements import (
     LENGTH_SIGMA,
     PLACE_PRIOR,
     Noise,
-    PointReading,
     Unknown,
     checked,
     checked_sigma,
@@ -25,6 +24,7 @@ from .measurements import (
     need,
     places,
 )
+from .point_readings import PointReading
 from .positions import labelled
 from .se3 import Array
 from .trilateration import anchors_of

@@ -10,12 +10,13 @@ import numpy as np
 
 from . import observability, report, report_page, tables, terminal
 from .chain import Chain
+from .error_model import ErrorModel
 from .errors import DhcalError
 from .experiment import Experiment, experiment, paper_arm
 from .files import PathLike, save
 from .kinds import KINDS
 from .measurements import Measurement, Noise
-from .parameters import ErrorModel, select
+from .parameters import select
 from .robot_files import paper_file, urdf_files
 from .se3 import Array
 from .solver import Problem, gauss_newton, reduce

@@ -15,8 +15,8 @@ import numpy as np
 
 from . import observability
 from .chain import BASE, Chain
+from .error_model import Parameter
 from .nullspace import Cause, Experiment, Group, groups
-from .parameters import Parameter
 from .passage import NONE, PARALLEL, Passage, Path, own_axes, passage, tilt
 from .poses import Pose
 from .positions import Position

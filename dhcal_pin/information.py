@@ -12,10 +12,11 @@ from . import observability
 from .calibration import Priors, calibrate, prior_weights
 from .chain import Chain
 from .design import basis
+from .error_model import ErrorModel
 from .errors import DhcalError
 from .kinds import KINDS
 from .measurements import Measurement, Noise
-from .parameters import ErrorModel, select
+from .parameters import select
 from .se3 import Array
 
 # The unknowns of an instrument are placed as if it were to read so many configurations.

@@ -15,7 +15,6 @@ from .measurements import (
     LENGTH_SIGMA,
     ZERO_PRIOR,
     Noise,
-    PointReading,
     Unknown,
     checked,
     checked_sigma,
@@ -24,6 +23,7 @@ from .measurements import (
     need,
     places,
 )
+from .point_readings import PointReading
 from .se3 import Array
 from .trilateration import anchors_of
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from . import se3
 from .chain import Chain, joint_station, link_station
-from .parameters import ErrorModel, Parameter
+from .error_model import ErrorModel, Parameter
 from .se3 import Array
 
 # Axes within this of each other, rad and m, are parallel, or the same line.

@@ -10,8 +10,9 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from . import se3
-from .chain import Chain, Sweep
+from .chain import Chain
 from .errors import DhcalError
+from .kinematics import Sweep
 from .measurements import (
     ANGLE_SIGMA,
     LENGTH_SIGMA,

@@ -8,13 +8,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from .chain import Chain, Sweep
+from .chain import Chain
 from .errors import DhcalError
+from .kinematics import Sweep
 from .measurements import (
     LENGTH_SIGMA,
     ZERO_PRIOR,
     Noise,
-    PointReading,
     Unknown,
     checked,
     checked_sigma,
@@ -22,6 +22,7 @@ from .measurements import (
     lengths,
     need,
 )
+from .point_readings import PointReading
 from .scratch import scratch
 from .se3 import Array
 

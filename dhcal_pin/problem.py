@@ -6,6 +6,7 @@ memory does not grow with the samples. Nothing here knows a kind of measurement 
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,15 +16,18 @@ from typing import TypeVar
 import numpy as np
 from scipy.linalg import lapack
 
-from .chain import Chain, Motion, Sweep
+from .chain import Chain
+from .error_model import ErrorModel
 from .executors import HERE, Workers
+from .kinematics import Motion, Sweep
 from .measurements import Measurement, Unknown
-from .parameters import ErrorModel
 from .scratch import LongRows, scratch
 from .se3 import Array
 
 # Samples a chunk, and columns that LAPACK reduces at once.
 CHUNK, PANEL = 2000, 8
+# From so many rows on, groups of them are reduced apart: below, the calls cost more than the arithmetic.
+TALL = 2000
 _Found = TypeVar("_Found")
 
 
@@ -40,6 +44,7 @@ class Problem:
         weights: (p+s,) one over the prior's sigma; zero where there is none.
         known: values of instruments' unknowns, by name, that are no unknowns here.
         where: what the chunks are shared out to; their order, and so every digit, stays.
+        bounds: (2, p+s) least and largest x; None where nothing is bounded.
     """
 
     errors: ErrorModel
@@ -47,6 +52,7 @@ class Problem:
     weights: Array
     known: Mapping[str, float] = field(default_factory=dict)
     where: Workers = HERE
+    bounds: Array | None = None
 
     @cached_property
     def unknowns(self) -> tuple[Unknown, ...]:
@@ -159,7 +165,23 @@ class Tangent:
             for unknown, rows in zip(data.unknowns, data.own(sweep, u), strict=True):
                 if unknown.name in self.places:
                     block[self.places[unknown.name]] = rows
-        return qr(block.reshape(p + 1, -1))
+        if block[0].size < TALL:
+            return qr(block.reshape(p + 1, -1))
+        return functools.reduce(merge, (_narrow(block[:, rows]) for rows in data.groups.values()))
+
+
+def _narrow(rows: Array) -> Array:
+    """Triangle (c, c) of a group's rows (c, g, m), without the columns that are zero in all of them.
+
+    Half the errors of an arm are lengths, which turn nothing: a quarter of the work for rows of rotations.
+    """
+    columns = len(rows)
+    used = [i for i, row in enumerate(rows) if row[0, 0] or np.vdot(row, row)]
+    part = scratch("narrow", len(used), *rows.shape[1:])
+    np.take(rows, used, 0, out=part, mode="clip")
+    out = np.zeros((columns, columns))
+    out[: len(used), used] = qr(part.reshape(len(used), -1))
+    return out
 
 
 def _cost(chain: Chain, instruments: Mapping[str, float], chunk: Chunk) -> float:

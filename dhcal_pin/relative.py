@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import se3
-from .chain import Chain, Sweep
+from .chain import Chain
+from .kinematics import Sweep
 from .measurements import ANGLE_SIGMA, LENGTH_SIGMA, Noise, checked, checked_sigma, gathered, need
 from .poses import PoseReading, pose_columns, poses_of
 from .scratch import scratch

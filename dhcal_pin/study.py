@@ -78,7 +78,7 @@ class Setting:
     iterations: int = 100
 
 
-def _drawn(chain: Chain, count: int, rng: np.random.Generator, share: float = 1.0) -> Array:
+def configurations(chain: Chain, count: int, rng: np.random.Generator, share: float = 1.0) -> Array:
     """Uniform joint values (count, n) in the lower `share` of each joint's range."""
     low, high = joint_range(chain)
     return rng.uniform(low, low + share * (high - low), (count, chain.size))
@@ -86,8 +86,8 @@ def _drawn(chain: Chain, count: int, rng: np.random.Generator, share: float = 1.
 
 # How poses are chosen: all over the joints' ranges, or in their lowest quarter alone.
 CHOICES: dict[str, Callable[[Chain, int, np.random.Generator], Array]] = {
-    "random": _drawn,
-    "corner": partial(_drawn, share=0.25),
+    "random": configurations,
+    "corner": partial(configurations, share=0.25),
 }
 # What is kept of each calibration, and its unit.
 MEASURES = {
@@ -219,7 +219,7 @@ def _tried(case: Case, where: str) -> None:
     select(nominal, setting.wrong)
     if case.truth is not None:
         Arms.of([errors, select(case.truth, setting.parameters)])
-    q = _drawn(nominal, 8, np.random.default_rng(0))
+    q = configurations(nominal, 8, np.random.default_rng(0))
     data = KINDS[setting.kind].simulate(nominal, q, Noise(), np.random.default_rng(0))
     try:
         Batch(Arms.of([errors]), (data,), np.zeros(len(errors.parameters)))
@@ -274,7 +274,7 @@ def calibrations(task: tuple[Case, int, int]) -> list[list[float]]:
         batch = measured()
         found = solve(batch, setting.method, 1, start=found.x)
     checks = [np.random.default_rng(_TEST_SEED + seed) for seed in seeds]
-    tests = np.array([_drawn(nominal, TESTS, rng) for rng in checks])
+    tests = np.array([configurations(nominal, TESTS, rng) for rng in checks])
     goal, start, end = (
         arms.sweep(tests[None]).tool.reshape(4, 3, count, TESTS)
         for arms in (truths, batch.arms, batch.arms.at(found.x))

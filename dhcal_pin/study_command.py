@@ -1,4 +1,4 @@
-"""`dhcal study`: a grid of simulated calibrations, shared out, resumed after a kill, as CSV."""
+"""`dhcal study`: a grid of simulated calibrations, shared out, resumed after a kill, as CSV and plot."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from .files import read_text, save
 from .outputs import check_outputs
 from .robot_files import paper_file
 from .study import Setting, Study, read_study, run, table
+from .study_plot import plot
 from .tables import Table
 
 
@@ -28,7 +29,8 @@ def study(args: Namespace) -> int:
     """Runs a study, or what is left of it."""
     path = args.study if os.path.exists(args.study) else paper_file(f"{args.study}.study.toml")
     journal = f"{args.output}.part"
-    check_outputs([args.output, journal], [os.fspath(path)])
+    picture = f"{os.path.splitext(args.output)[0]}.svg"
+    check_outputs([args.output, journal, picture], [os.fspath(path)])
     wanted = read_study(path)
     blocks = _resumed(journal, wanted)
     total = len(wanted.tasks())
@@ -46,10 +48,12 @@ def study(args: Namespace) -> int:
             blocks.append(block)
             progress(len(blocks))
     header, rows = table(wanted, blocks)
-    save({args.output: _csv_text(header, rows)})
+    drawn = plot(wanted.title or "study", len(fields(Setting)), header, rows)
+    contents = {args.output: _csv_text(header, rows)} | ({picture: drawn} if drawn else {})
+    save(contents)
     os.unlink(journal)
     _shown(wanted, header, rows)
-    terminal.lines(f"wrote {args.output}")
+    terminal.lines(*(f"wrote {path}" for path in contents))
     return 0
 
 

@@ -79,8 +79,9 @@ class Triangles:
             cost: (b,) before it.
             last: (b,) how far the last step moved them; zero where nothing is known of it.
         """
-        shrinks = np.where(last > 0, np.minimum(1.0, change / np.where(last > 0, last, 1.0)), 1.0)
-        return (change * shrinks <= RELATIVE_STEP * np.sqrt(cost)) | (change <= self.rounding())
+        enough = RELATIVE_STEP * np.sqrt(cost)
+        shrunk = (change < 1e-2 * last) & (change**2 < 0.1 * enough * last)
+        return (change <= enough) | shrunk | (change <= self.rounding())
 
     def rounding(self) -> Array:
         """What the model's own rounding makes of the rows, (b,)."""

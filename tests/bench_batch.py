@@ -1,21 +1,16 @@
 """Stacked calibrations against single ones and against finite differences through Pinocchio.
 
-One table of ratios, medians of interleaved repeats on one thread: `python tests/bench_batch.py`. The paper's
-6-DOF study, ten poses, noise of 0.1 mm and 0.1 mrad; CPU time, but for two processes against one.
+The paper's 6-DOF study, ten poses, noise of 0.1 mm and 0.1 mrad.
 """
 
 from __future__ import annotations
 
-import os
-
-os.environ["OMP_NUM_THREADS"] = "1"
-
 import statistics
 import time
-from collections.abc import Callable
 
 import numpy as np
 import pinocchio as pin
+from bench_common import Row, clocked
 from conftest import paper
 from scipy.optimize import least_squares
 
@@ -71,47 +66,36 @@ def differences(data: Pose) -> np.ndarray:
     return least_squares(residual, np.zeros(len(twists))).x
 
 
-def main() -> None:
-    """Prints the table."""
+def rows(repeats: int) -> list[Row]:
+    """Stacked calibrations against single ones and differences, and two processes against one."""
     data = [measured(seed) for seed in range(MANY)]
     batch = Batch(Arms.of([ERRORS] * MANY), (joined(data),), np.zeros(len(ERRORS.parameters)))
 
-    def stacked(method: str, where: Workers = HERE) -> Solutions:
-        return solve(batch, method, where=where)
+    def stacked(where: Workers = HERE) -> Solutions:
+        return solve(batch, "lm", where=where)
 
-    def singles(method: str) -> None:
+    def singles() -> None:
         for item in data[:FEW]:
-            calibrate(NOMINAL, item, "dh", method=method, priors="none")  # pyright: ignore[reportArgumentType]
+            calibrate(NOMINAL, item, "dh", priors="none")
 
-    runs: dict[str, tuple[int, Callable[[], object]]] = {
-        "stacked, lm": (MANY, lambda: stacked("lm")),
-        "stacked, gn": (MANY, lambda: stacked("gn")),
-        "single calls, lm": (FEW, lambda: singles("lm")),
-        "single calls, gn": (FEW, lambda: singles("gn")),
-        "finite differences": (SLOW, lambda: [differences(item) for item in data[:SLOW]]),
-    }
-    taken: dict[str, list[float]] = {name: [] for name in runs}
-    for _ in range(5):
-        for name, (count, run) in runs.items():
-            start = time.process_time()
-            run()
-            taken[name].append((time.process_time() - start) / count)
-    medians = {name: statistics.median(times) for name, times in taken.items()}
-    print(f"{'':22}{'µs each':>10}{'/ stacked lm':>14}{'/ stacked gn':>14}")
-    for name, value in medians.items():
-        ratios = (value / medians[f"stacked, {method}"] for method in ("lm", "gn"))
-        print(f"{name:22}{1e6 * value:10.0f}" + "".join(f"{ratio:14.1f}" for ratio in ratios))
+    def slow() -> None:
+        for item in data[:SLOW]:
+            differences(item)
+
+    ours, single, other = clocked([stacked, singles, slow], repeats)
+    ours, single, other = ours / MANY, single / FEW, other / SLOW
     with workers(jobs=2) as two:
-        stacked("lm", two)
-        shared: list[float] = []
-        alone: list[float] = []
-        for _ in range(5):
-            for where, times in ((two, shared), (HERE, alone)):
+        stacked(two)
+        spent: tuple[list[float], list[float]] = ([], [])
+        for _ in range(repeats):
+            for where, times in zip((two, HERE), spent, strict=True):
                 start = time.perf_counter()
-                stacked("lm", where)
+                stacked(where)
                 times.append(time.perf_counter() - start)
-    print(f"two processes: {statistics.median(alone) / statistics.median(shared):.2f} × one")
-
-
-if __name__ == "__main__":
-    main()
+    shared, alone = map(statistics.median, spent)
+    study = "1,000 calibrations of ten poses, stacked"
+    return [
+        Row(f"{study}: single calls, each", ours, single, single / ours, "≥ 8"),
+        Row(f"{study}: differences through Pinocchio, each", ours, other, other / ours, "≥ 100"),
+        Row(f"{study}: two processes against one, wall clock", shared, alone, alone / shared, "≥ 1.5"),
+    ]

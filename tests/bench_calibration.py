@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.chain import Chain
-from dhcal_pin.parameters import ErrorModel
+from dhcal_pin.error_model import ErrorModel
 from dhcal_pin.poses import Pose
 from dhcal_pin.problem import Problem
 

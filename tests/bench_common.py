@@ -12,8 +12,9 @@ from conftest import paper, robot_file
 from dhcal_pin import se3
 from dhcal_pin.chain import Chain
 from dhcal_pin.dh import DHTable
+from dhcal_pin.error_model import ErrorModel
 from dhcal_pin.measurements import Noise
-from dhcal_pin.parameters import ErrorModel, select
+from dhcal_pin.parameters import select
 from dhcal_pin.poses import Pose
 from dhcal_pin.problem import Problem
 

@@ -9,7 +9,8 @@ from scipy.linalg import lapack
 
 from dhcal_pin import se3
 from dhcal_pin.chain import Chain, link_station
-from dhcal_pin.parameters import ErrorModel, select
+from dhcal_pin.error_model import ErrorModel
+from dhcal_pin.parameters import select
 from dhcal_pin.problem import CHUNK, reduce
 from dhcal_pin.scratch import scratch
 from dhcal_pin.solver import pseudo_inverse, with_priors

@@ -24,6 +24,7 @@ import time
 import venv
 from pathlib import Path
 
+import bench_batch
 import bench_calibration
 import bench_kernel
 import numpy as np
@@ -137,6 +138,14 @@ def start_up(repeats: int) -> list[Row]:
     return [Row(what, ours, theirs, ours / theirs, "≤ 2.5")]
 
 
+def streamed(samples: int) -> float:
+    """Peak memory in MB of a process that calibrates with so many samples, never all in memory."""
+    parts = -(-samples // 4096)
+    found = spoken([sys.executable, HERE / "bench_stream.py", str(parts)], HERE, PYTHONPATH=str(HERE.parent))
+    assert isinstance(found, float)
+    return found
+
+
 def line(row: Row) -> str:
     """A row of the table in Markdown."""
     times = (f"{1e3 * seconds:.3g} ms" for seconds in (row.ours, row.theirs))
@@ -156,6 +165,7 @@ def main() -> None:
         (bench_calibration.against_scipy, (1000, 1 if quick else 3)),
         (against_ceres, (1000, turns)),
         (against_figaroh, (100 if quick else 1000, turns)),
+        (bench_batch.rows, (3 if quick else 5,)),
         (start_up, (3 if quick else 7,)),
     ):
         for row in part(*arguments):
@@ -168,6 +178,9 @@ def main() -> None:
     joints = (3, 6, 10, 14)
     print(f"\n| Joints, m=1000 | {' | '.join(map(str, joints))} |\n| --- |" + " --- |" * len(joints))
     print(f"| µs a sample | {' | '.join(f'{v:.2f}' for v in bench_kernel.by_joints(joints, turns))} |")
+    many = 1_000_000 if quick else 10_000_000
+    few, most = (streamed(samples) for samples in (100_000, many))
+    print(f"\nPeak memory of a stream: {few:.0f} MB with 100,000 samples, {most:.0f} MB with {many:,}")
     print(f"\n{time.time() - began:.0f} s", file=sys.stderr)
 
 

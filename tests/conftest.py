@@ -19,6 +19,9 @@ from dhcal_pin.dh import DHTable
 from dhcal_pin.dh_files import read_dh
 from dhcal_pin.urdf import parse_urdf
 
+# Benchmarks need rivals in environments of their own.
+collect_ignore_glob = ["bench_*.py"]
+
 URDF = Path(__file__).resolve().parent.parent / "urdf"
 
 

@@ -191,6 +191,8 @@ def test_what_does_not_go_together_is_said(sim_6dof):
         Batch(Arms.of([errors] * 2), (pose,), np.zeros(24))
     with pytest.raises(DhcalError, match="arm 2 has other joints or other parameters"):
         Arms.of([errors, select(sim_6dof, "minimal")])
+    with pytest.raises(DhcalError, match="calibrate one by one"):
+        Arms.of([select(sim_6dof, "dh,gain")])
     with pytest.raises(DhcalError, match="choose from lm, gn"):
         solve(Batch(Arms.of([errors]), (pose,), np.zeros(24)), "newton")
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ast
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 import dhcal_pin
+from dhcal_pin import cli
 
 HOUSE = Path(dhcal_pin.__file__).parent
 LAYERS = (
@@ -18,27 +20,29 @@ LAYERS = (
     {"urdf", "extraction"},
     {"urdf_origins", "dh_urdf"},
     {"transmission"},
+    {"paths", "kinematics"},
     {"chain"},
-    {"parameters", "factors", "measurements", "inverse", "trilateration", "clearance", "design"},
-    {"configurations"},
+    {"error_model", "factors", "measurements", "inverse", "trilateration", "clearance", "design"},
+    {"parameters", "configurations", "point_readings"},
     {"poses", "positions"},
     {"lengths", "contacts", "relative"},
     {"frames", "observability", "robust", "kinds"},
-    {"problem"},
+    {"problem", "uncertainty"},
     {"solver"},
     {"evaluation", "arms", "triangles", "passage"},
     {"nullspace", "tables"},
     {"explanations"},
+    {"folds"},
     {"batch", "result"},
     {"calibration", "compensation", "crossvalidation"},
     {"extension", "figures"},
-    {"check", "information", "workspace"},
+    {"check", "information", "workspace", "study_plot"},
     {"planning"},
     {"files"},
     {"reading_columns"},
     {"column_maps"},
     {"foreign_files"},
-    {"dh_files", "measurement_files", "transmission_files", "ur_kinematics"},
+    {"dh_files", "measurement_files", "transmission_files", "uncertainty_files", "ur_kinematics"},
     {"robot_files", "screening", "configuration_files"},
     {"study"},
     {"plausibility", "stream"},
@@ -51,15 +55,16 @@ LAYERS = (
     {"shapes"},
     {"viewer"},
     {"report_page"},
-    {"live_server"},
+    {"live_server", "workspace_files"},
     {"live"},
     {"outputs", "jobs"},
     {"fleet", "experiment"},
     {
-        *("demo", "calibrate_command", "compensate_command", "fleet_command", "study_command"),
+        *("demo", "compensate_command", "fleet_command", "study_command"),
         *("plan_command", "view_command"),
     },
-    {"commands"},
+    {"calibrate_command", "commands"},
+    {"arguments"},
     {"cli"},
 )
 MODULES = sorted(path.stem for path in HOUSE.glob("*.py") if path.stem != "__init__")
@@ -76,6 +81,14 @@ def imports(module: str) -> tuple[set[str], set[str]]:
         elif isinstance(node, ast.Import):
             others |= {alias.name.split(".")[0] for alias in node.names}
     return own, others
+
+
+def test_commands_live_to_the_left_of_the_command_line():
+    allowed = set().union(*LAYERS[:-1])
+    for home in cli.COMMANDS.values():
+        module, _, function = home.partition(":")
+        assert module in allowed
+        assert callable(getattr(import_module(f"dhcal_pin.{module}"), function))
 
 
 def test_every_module_has_its_place():
@@ -96,7 +109,8 @@ def test_special_packages_stay_in_one_place(module):
         "matplotlib": set(),
         "rich": {"terminal"},
         "argparse": {
-            "cli",
+            "arguments",
+            "calibrate_command",
             "commands",
             "jobs",
             "compensate_command",

@@ -14,13 +14,13 @@ from dhcal_pin.calibration import calibrate
 from dhcal_pin.cli import main
 from dhcal_pin.contacts import Plane, PointDistance, Touch
 from dhcal_pin.errors import DhcalError
+from dhcal_pin.evaluation import instrument_values
 from dhcal_pin.kinds import KINDS
 from dhcal_pin.measurement_files import measurement_text, read_measurements
 from dhcal_pin.measurements import Noise
 from dhcal_pin.parameters import select
 from dhcal_pin.poses import Pose
 from dhcal_pin.positions import Position
-from dhcal_pin.result import _instruments
 
 KIND = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 
@@ -81,7 +81,7 @@ def truth_of(kind, chain, m, noise=None, seed=0):
     rng = np.random.default_rng(seed)
     q = rng.uniform(-2.5, 2.5, (m, chain.size))
     data = kind.simulate(chain, q, noise or Noise(), rng).started(chain)
-    names = _instruments(chain, [data], {})
+    names = instrument_values(chain, [data], {})
     return data, np.array([names[unknown.name] for unknown in data.unknowns])
 
 

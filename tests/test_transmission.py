@@ -112,7 +112,7 @@ def test_many_arms_at_once_have_ideal_joints():
     arm = ur10()
     driven, _ = drawn(arm, "gain", np.random.default_rng(0))
     for errors in (select(arm, "base,gain"), select(driven, "base")):
-        with pytest.raises(DhcalError, match="calibrate it by itself"):
+        with pytest.raises(DhcalError, match="calibrate one by one"):
             Arms.of([errors])
 
 

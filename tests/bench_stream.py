@@ -1,0 +1,37 @@
+"""Peak memory, in MB, of a calibration that streams so many parts: `python tests/bench_stream.py PARTS`."""
+
+from __future__ import annotations
+
+import resource
+import sys
+from functools import partial
+
+import numpy as np
+from conftest import paper
+
+from dhcal_pin.chain import Chain
+from dhcal_pin.measurements import Noise
+from dhcal_pin.positions import Position
+from dhcal_pin.stream import calibrate_stream
+
+PART = 4096
+NOMINAL, ACTUAL = (Chain.from_dh(paper(name)) for name in ("sim_6dof", "sim_6dof_actual"))
+
+
+def part(seed: int) -> Position:
+    """Positions of the paper's arm, made when they are asked for."""
+    rng = np.random.default_rng(seed)
+    return Position.simulate(ACTUAL, rng.uniform(-3, 3, (PART, 6)), Noise(1e-4), rng)
+
+
+def main() -> None:
+    """Prints the peak."""
+    parts = int(sys.argv[1])
+    found = calibrate_stream(NOMINAL, lambda: (partial(part, i) for i in range(parts)), "dh")
+    assert found.converged
+    assert found.samples == PART * parts
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+
+
+if __name__ == "__main__":
+    main()
