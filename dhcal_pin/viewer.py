@@ -96,7 +96,7 @@ def scene_html(
     arm = nominal if calibrated is None else calibrated
     arms = tree(nominal, arm)
     drawn = looks(nominal, arms["bodies"], package_dirs, triangles)
-    played = [q] if q is not None else [item.configurations() for item in measurements]
+    played = [q] if q is not None else [item.configurations() for item in measurements if item.ends]
     poses = np.concatenate([np.empty((0, nominal.size)), *map(nominal.checked, played)])
     samples, points, residuals = _points(arm, measurements, known or {})
     thinned = _thin(len(samples), MOST_POINTS)
