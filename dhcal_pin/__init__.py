@@ -21,10 +21,9 @@ if TYPE_CHECKING:
     from .compensation import Compensation as Compensation
     from .compensation import compensate as compensate
     from .configurations import Space as Space
+    from .contacts import PointDistance as PointDistance
+    from .contacts import Touch as Touch
     from .crossvalidation import cross_validate as cross_validate
-    from .crossvalidation import group_folds as group_folds
-    from .crossvalidation import random_folds as random_folds
-    from .crossvalidation import region_folds as region_folds
     from .dh import DHTable as DHTable
     from .dh_files import read_dh as read_dh
     from .dh_urdf import dh_to_urdf as dh_to_urdf
@@ -32,24 +31,28 @@ if TYPE_CHECKING:
     from .evaluation import accuracy as accuracy
     from .extension import extend as extend
     from .factors import error_factors as error_factors
+    from .folds import group_folds as group_folds
+    from .folds import random_folds as random_folds
+    from .folds import region_folds as region_folds
     from .live import Live as Live
     from .live import serve as serve
     from .measurement_files import read_measurements as read_measurements
     from .measurement_files import read_targets as read_targets
     from .measurements import Noise as Noise
     from .parameters import extract as extract
+    from .parameters import select as select
     from .planning import Plan as Plan
     from .planning import plan as plan
     from .poses import Pose as Pose
     from .positions import Position as Position
     from .report import Provenance as Provenance
     from .report_page import write_report as write_report
-    from .result import Prediction as Prediction
     from .result import Result as Result
     from .robot_files import read_robot as read_robot
     from .robot_files import write_urdf as write_urdf
     from .stream import calibrate_stream as calibrate_stream
     from .stream import file_parts as file_parts
+    from .uncertainty import Prediction as Prediction
     from .viewer import scene_html as scene_html
     from .viewer import show as show
     from .workspace import workspace_map as workspace_map
@@ -61,10 +64,12 @@ _HOMES = {
     "split": "calibration",
     "Chain": "chain",
     "crosscheck": "check",
+    "PointDistance": "contacts",
+    "Touch": "contacts",
     "cross_validate": "crossvalidation",
-    "group_folds": "crossvalidation",
-    "random_folds": "crossvalidation",
-    "region_folds": "crossvalidation",
+    "group_folds": "folds",
+    "random_folds": "folds",
+    "region_folds": "folds",
     "Compensation": "compensation",
     "compensate": "compensation",
     "Space": "configurations",
@@ -87,12 +92,13 @@ _HOMES = {
     "Provenance": "report",
     "write_report": "report_page",
     "extract": "parameters",
-    "Prediction": "result",
+    "select": "parameters",
     "Result": "result",
     "read_robot": "robot_files",
     "write_urdf": "robot_files",
     "calibrate_stream": "stream",
     "file_parts": "stream",
+    "Prediction": "uncertainty",
     "scene_html": "viewer",
     "show": "viewer",
     "workspace_map": "workspace",

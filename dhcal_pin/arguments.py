@@ -83,7 +83,7 @@ def parser() -> argparse.ArgumentParser:
         commands, "demo", "the paper's arm and its measured table, end to end", "dhcal demo --out demo"
     )
     demo.add_argument("--out", default="demo", metavar="DIR", help="folder for the results (default: demo)")
-    demo.add_argument("--open", action="store_true", help="open the scene in the browser")
+    demo.add_argument("--open", action="store_true", help="open the report, scene included, in the browser")
     demo.add_argument("--json", metavar="FILE", help="the result as JSON to one more place; - for stdout")
 
     calibrate = _add(
@@ -133,6 +133,7 @@ def parser() -> argparse.ArgumentParser:
         help="linear, huber, cauchy or tukey: what gross errors count",
     )
     calibrate.add_argument("--priors", metavar="default|none|FILE", help="default for lm, none for gn")
+    calibrate.add_argument("--bounds", metavar="FILE.toml", help="least and largest values by parameter name")
     calibrate.add_argument(
         "--instrument", metavar="FILE", help="TOML whose [instrument] table holds surveyed values, as wire1.x"
     )
@@ -148,7 +149,9 @@ def parser() -> argparse.ArgumentParser:
         "--tool-frame", metavar="NAME", help="put the tool into the URDF, as a link fixed to the tip"
     )
     calibrate.add_argument(
-        "--map", metavar="MAP.csv", help="predicted position uncertainty by cells of the workspace"
+        "--map",
+        metavar="MAP",
+        help="predicted position uncertainty over the workspace, and held-out errors, as .csv or .html",
     )
     calibrate.add_argument(
         "--report",
@@ -178,6 +181,11 @@ def parser() -> argparse.ArgumentParser:
         "--sidecar", metavar="S.toml", help="base, tool and joints (default: the one beside ROBOT)"
     )
     validate.add_argument("--fit-frames", action="store_true", help="fit base and tool first")
+    validate.add_argument(
+        "--map",
+        metavar="MAP",
+        help="predicted uncertainty over the workspace beside the errors measured, as .csv or .html",
+    )
     validate.add_argument("--json", **_JSON)
 
     convert = _add(

@@ -12,7 +12,6 @@ import numpy as np
 
 from . import calibration, exports, extension, fleet_command, report, terminal
 from .chain import Chain
-from .configuration_files import map_text
 from .errors import DhcalError
 from .executors import HERE, Workers, workers
 from .files import PathLike, save
@@ -25,6 +24,7 @@ from .parameters import EXTENSIONS
 from .plausibility import doubts
 from .result import Result
 from .robot_files import (
+    read_bounds,
     read_instrument,
     read_priors,
     read_robot,
@@ -33,7 +33,6 @@ from .robot_files import (
 )
 from .screening import Finding, screen
 from .solver import Progress
-from .workspace import workspace_map
 
 
 @dataclass(frozen=True)
@@ -115,7 +114,7 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
             raise DhcalError(f"{path}: is given twice; each measurement counts once, to fit or to hold out")
     robot = [args.robot, *sidecars([args.robot])]
     priors = [args.priors] if args.priors not in (None, "default", "none") else []
-    priors += [args.instrument] if args.instrument else []
+    priors += [path for path in (args.bounds, args.instrument) if path]
     maps = [args.columns] if args.columns else []
     inputs = [*robot, *measured, *priors, *maps]
     check_urdf_ending(args.output)
@@ -127,6 +126,10 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
 
         for path in args.report:
             report_page.check_ending(path)
+    if args.map:
+        from . import workspace_files  # and so are the map's
+
+        workspace_files.check_map_ending(args.map)
 
     chain = read_robot(args.robot, args.tip)
     sets = args.parameters or chain.parameters
@@ -138,6 +141,7 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
         _families(args.extend),
         method=args.method,
         priors=read_priors(args.priors),
+        bounds=read_bounds(args.bounds),
         fix=names(args.fix),
         free=names(args.free),
         holdout=[item for _, item in data.holdout],
@@ -150,7 +154,10 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     contents = _written(fit, args)
     files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
     if args.map:
-        contents[args.map], files["map"] = map_text(workspace_map(fit)), args.map
+        from . import workspace_files
+
+        contents[args.map] = workspace_files.map_content(args.map, fit, fit.holdout, fit.instruments)
+        files["map"] = args.map
     if args.json and args.json != STDOUT:
         files["json"] = args.json
     gross = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))
@@ -163,8 +170,10 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     files |= {
         "report" if number == 1 else f"report_{number}": path for number, path in enumerate(args.report, 1)
     }
-    source = _provenance(args, sets, data, inputs)
+    source = _provenance(args, sets, data, inputs, trials)
     if args.report:
+        from . import report_page
+
         contents |= report_page.report_files(fit, args.report, source)
     document = report.document(fit, files, source.inputs, [row for found in rows.values() for row in found])
     document |= {
@@ -179,7 +188,9 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     return Outcome(fit, document, files, data.findings, gross, data.doubts, trials)
 
 
-def _provenance(args: Job, sets: str, data: _Data, inputs: Sequence[str]) -> report.Provenance:
+def _provenance(
+    args: Job, sets: str, data: _Data, inputs: Sequence[str], trials: Sequence[extension.Trial]
+) -> report.Provenance:
     """What the report says of the files, the command and its choices."""
     short = report.short_names(inputs)
     settings = {
@@ -202,6 +213,7 @@ def _provenance(args: Job, sets: str, data: _Data, inputs: Sequence[str]) -> rep
         settings=settings,
         left_out=left_out,
         doubts=doubtful,
+        trials=trials,
     )
 
 
@@ -215,7 +227,7 @@ def _written(fit: Result, args: Job) -> dict[PathLike, str | bytes]:
     chain = fit.chain
     # A base that the URDF holds must not stand in the sidecar too.
     bare = replace(chain, base=np.eye(4)) if args.world_joint else chain
-    contents = urdf_files(bare, args.output, fit.portable)
+    contents = urdf_files(bare, args.output, fit.portable, fit.uncertainty)
     data = contents[args.output]
     assert isinstance(data, bytes)
     if args.world_joint and chain.transmission is not None and chain.transmission.yields:

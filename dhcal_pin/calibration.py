@@ -56,6 +56,26 @@ def prior_weights(errors: ErrorModel, priors: Priors) -> Array:
     return 1 / sigma
 
 
+def _bounds(problem: Problem, bounds: Mapping[str, tuple[float, float]]) -> Array:
+    """Least and largest x (2, p+s) of values that are bounded by name."""
+    outside = (BASE, problem.errors.chain.tool_station)
+    inside = [p for p in problem.errors.parameters if p.station not in outside]
+    out = np.tile([[-np.inf], [np.inf]], len(problem.weights))
+    for pattern, (low, high) in bounds.items():
+        hit = [p for p in inside if fnmatch.fnmatchcase(p.name, pattern)]
+        if not hit:
+            raise DhcalError(
+                f"bounds for {pattern!r}: no such parameter; there are {', '.join(p.name for p in inside)}"
+            )
+        for p in hit:
+            if not low <= p.nominal <= high:
+                raise DhcalError(
+                    f"bounds for {pattern!r}: {low} to {high} must hold the nominal {p.nominal:g} of {p.name}"
+                )
+            out[:, problem.errors.parameters.index(p)] = low - p.nominal, high - p.nominal
+    return out
+
+
 def _default(errors: ErrorModel, priors: Priors) -> Array:
     """Which parameters (p,) have default priors."""
     if isinstance(priors, str):
@@ -196,6 +216,7 @@ def calibrate(
     holdout: Sequence[Measurement] = (),
     known: Mapping[str, float] | None = None,
     loss: str = "linear",
+    bounds: Mapping[str, tuple[float, float]] | None = None,
     max_iterations: int = 100,
     progress: Progress | None = None,
     where: Workers = HERE,
@@ -215,6 +236,8 @@ def calibrate(
         known: values in m and rad of instruments' unknowns by name, such as a surveyed anchor
             `wire1.x`; they are held.
         loss: "linear", or "huber", "cauchy", "tukey", which gross errors bend little or not at all.
+        bounds: least and largest values in m and rad by the names or patterns of the robot's parameters;
+            base and tool stay free.
         max_iterations: most steps of a loop.
         progress: called with the iteration and the cost.
         where: what chunks of many samples are shared out to.
@@ -235,6 +258,8 @@ def calibrate(
         raise DhcalError(f"loss {loss!r}: choose from {', '.join(robust.LOSSES)}")
     if loss != "linear" and method != "lm":
         raise DhcalError(f"loss {loss!r} needs method lm; the paper's loop weighs all rows alike")
+    if bounds and method != "lm":
+        raise DhcalError("bounds need method lm; the paper's loop knows none")
     for item in (*data, *holdout):
         chain.checked(item.configurations())
     priors = priors if priors is not None else ("none" if method == "gn" else "default")
@@ -244,6 +269,8 @@ def calibrate(
     errors = replace(errors, chain=reference)
     data = tuple(item.started(reference) for item in data)
     problem = replace(_problem(errors, data, prior_weights(errors, priors), known), where=where)
+    if bounds:
+        problem = replace(problem, bounds=_bounds(problem, bounds))
     default = _default(errors, priors)
     solution = METHODS[method](problem, np.zeros(len(problem.weights)), max_iterations, progress)
     if errors.at(solution.x[: len(errors.parameters)]).transmission is not None:

@@ -19,6 +19,7 @@ from . import (
     terminal,
     ur_kinematics,
 )
+from .chain import Chain
 from .check import crosscheck
 from .configurations import joint_range
 from .demo import run as run_demo
@@ -41,14 +42,18 @@ from .robot_files import (
     read_table,
     robot_name,
 )
+from .uncertainty import Predictor
+from .uncertainty_files import read_uncertainty
+from .workspace_files import check_map_ending, map_content
 
 
 def validate(args: Namespace) -> int:
     """The accuracy of a model on measurements."""
     sidecar = args.sidecar or existing_sidecar(args.robot)
     inputs = [args.robot, *args.data, *filter(None, (sidecar, args.columns))]
-    check_outputs([args.json], inputs)
+    check_outputs([args.json, args.map], inputs)
     chain = read_robot(args.robot, args.tip, sidecar)
+    model = _trusted(chain, sidecar, args) if args.map else None
     readings = [read_readings(path, chain, args.columns) for path in args.data]
     data = [item.data for item in readings]
     surveyed = read_instrument(sidecar) if sidecar else {}
@@ -58,17 +63,36 @@ def validate(args: Namespace) -> int:
     found: dict[str, Mapping[str, Any]] = {"base and tool as given": given}
     if args.fit_frames:
         fit = calibration.calibrate(chain, data, "base,tool", known=known)
-        found["fitted"] = fit.comparisons[0].after
+        found["fitted"] = fit.comparisons[-1].after
         document = report.document(fit, {}, report.fingerprints(inputs))
     else:
         document = report.plain_document(chain, data, report.fingerprints(inputs), known)
     document["before"] = report.essentials(given)
     document["files"] = {"json": args.json} if args.json and args.json != STDOUT else {}
+    if model:
+        document["files"]["map"] = args.map
+        save({args.map: map_content(args.map, model, data, known)})
     emit(args.json, document)
     for item in readings:
         terminal.doubts(item.source, doubts(chain, item))
     terminal.validation(f"{args.robot}: accuracy on {document['samples']} samples", found)
+    if model:
+        terminal.lines(f"wrote map: {args.map}")
     return 0
+
+
+def _trusted(chain: Chain, sidecar: str | None, args: Namespace) -> Predictor:
+    """How well the arm is known, as its calibration has left it beside the robot."""
+    check_map_ending(args.map)
+    if args.fit_frames:
+        raise DhcalError("--map is of base and tool as calibrated; leave out --fit-frames")
+    known = read_uncertainty(sidecar, chain) if sidecar else None
+    if known is None:
+        raise DhcalError(
+            f"{sidecar or args.robot}: holds no [uncertainty] of a calibration to draw --map from; "
+            "`dhcal calibrate` writes one beside the new robot where samples are left over to tell it"
+        )
+    return known
 
 
 def convert(args: Namespace) -> int:
@@ -153,5 +177,5 @@ def demo(args: Namespace) -> int:
     document = run_demo(args.out)
     emit(args.json, document)
     if args.open:
-        terminal.open_page(document["files"]["scene"])
+        terminal.open_page(document["files"]["report"])
     return 0

@@ -13,7 +13,6 @@ from .files import PathLike, read_sheet
 from .measurement_files import csv_text, joint_columns, joint_values, read_targets, reading_sheet
 from .reading_columns import check_columns, check_joint_names
 from .se3 import Array
-from .workspace import WorkspaceMap
 
 
 def read_configurations(path: PathLike, chain: Chain, columns: PathLike | None = None) -> Array:
@@ -47,15 +46,6 @@ def read_task(path: PathLike, chain: Chain) -> Array:
             "correct or remove it"
         )
     return found.q
-
-
-def map_text(found: WorkspaceMap) -> str:
-    """The CSV text of a map: a row a cell, millimetres."""
-    names = ("x[mm]", "y[mm]", "z[mm]")
-    columns = {name: (1e3 * found.centre[:, i]).round(6).tolist() for i, name in enumerate(names)}
-    columns |= {"position_std[mm]": (1e3 * found.std).tolist(), "worst[mm]": (1e3 * found.worst).tolist()}
-    columns["configurations"] = found.count.tolist()
-    return csv_text(columns, ["predicted position uncertainty by cells of the workspace, measuring frame"])
 
 
 def configurations_text(q: Array, chain: Chain, comments: Sequence[str]) -> str:

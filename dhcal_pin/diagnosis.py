@@ -16,6 +16,7 @@ from .measurements import Measurement
 from .parameters import offset
 from .result import Result
 from .se3 import Array
+from .uncertainty import Predictor
 
 # Configurations that the workspace is judged by, and bins that a joint's range is parted into.
 SAMPLES, BINS = 16000, 12
@@ -160,7 +161,7 @@ class Workspace:
     Attributes:
         points: (s, 3) tool points in the base frame, m, of configurations all over the joints' ranges.
         std: (s,) predicted standard deviation of the position there, m; infinite where nothing tells.
-        measured: (m, 3) tool points of the fitted samples in the base frame, m.
+        measured: (m, 3) tool points of measured samples in the base frame, m.
         measured_std: (m,) predicted there.
     """
 
@@ -170,17 +171,17 @@ class Workspace:
     measured_std: Array
 
 
-def workspace(fit: Result) -> Workspace:
-    """Predicted accuracy at configurations drawn over the joints' ranges, and at the fitted samples."""
-    every = np.random.default_rng(0).uniform(*joint_range(fit.chain), (SAMPLES, fit.chain.size))
-    used = [item.configurations() for item in fit.data if item.ends > 0]
-    there = np.concatenate(used) if used else np.empty((0, fit.chain.size))
-    into = se3.inverse(fit.chain.base)
+def workspace(model: Predictor, data: Sequence[Measurement]) -> Workspace:
+    """Predicted accuracy at configurations drawn over the joints' ranges, and at measured samples."""
+    every = np.random.default_rng(0).uniform(*joint_range(model.chain), (SAMPLES, model.chain.size))
+    used = [item.configurations() for item in data if item.ends > 0]
+    there = np.concatenate(used) if used else np.empty((0, model.chain.size))
+    into = se3.inverse(model.chain.base)
 
     def judged(q: Array) -> tuple[Array, Array]:
         if not len(q):
             return np.empty((0, 3)), np.empty(0)
-        found = [fit.predict(part) for part in np.array_split(q, -(-len(q) // 2000))]
+        found = [model.predict(part) for part in np.array_split(q, -(-len(q) // 2000))]
         points = np.concatenate([p.poses[:, :3, 3] for p in found])
         return points @ into[:3, :3].T + into[:3, 3], np.concatenate([p.position_std for p in found])
 

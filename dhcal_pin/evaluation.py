@@ -58,6 +58,18 @@ def deviations(
     ]
 
 
+def position_errors(
+    chain: Chain, data: Sequence[Measurement], known: Mapping[str, float] | None = None
+) -> tuple[Array, Array]:
+    """Joint values (m, n) of all measured positions, and how far the chain is from each (m,), m."""
+    q, sizes = [np.empty((0, chain.size))], [np.empty(0)]
+    placed = [item for item in data if len(item.positions())]
+    for item, errors in zip(placed, deviations(chain, placed, known), strict=True):
+        q.append(item.configurations())
+        sizes.append(np.linalg.norm(errors["position"], axis=1))
+    return np.concatenate(q), np.concatenate(sizes)
+
+
 def sizes(found: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
     """Sizes (m,) of deviations by group, those of all items in a row."""
     out: dict[str, list[Array]] = {}

@@ -16,20 +16,24 @@ import numpy as np
 
 from . import calibration
 from .chain import Chain
-from .crossvalidation import Parts, parts, region_folds, rows, solved, standard_error
+from .crossvalidation import standard_error
 from .error_model import Parameter
 from .errors import DhcalError
+from .folds import Parts, parts, region_folds, rows, solved
 from .measurements import Measurement
 from .parameters import EXTENSIONS, SETS
 from .problem import Triangle, reduce
 from .result import Result
 from .se3 import Array
 from .solver import Progress
+from .tables import Table, fixed
 
 # Widths of a family's priors that are tried, as shares of the default ones.
 WIDTHS = (1.0, 0.3, 0.1, 0.03)
 # A family that chance alone would make look so good more often than this is not added.
 CHANCE = 0.01
+# Smaller chances differ by nothing that one could believe.
+LEAST = 1e-6
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,25 @@ class Trial:
     def helps(self) -> bool:
         """Whether the data ask for it."""
         return self.cv_before - self.cv_after > self.standard_error and self.chance < CHANCE
+
+
+def trial_table(found: Sequence[Trial]) -> Table:
+    """What each family brought, or would bring on top of those added before it."""
+    header = ["family", "verdict", "before", "after"]
+    header += ["standard error of the change", "by chance", "prior width"]
+    rows = [
+        [
+            one.family,
+            "added" if one.kept else "left out",
+            fixed(one.cv_before, 3),
+            fixed(one.cv_after, 3),
+            fixed(one.standard_error, 3),
+            f"{one.chance:.1g}" if one.chance > LEAST else f"< {LEAST:g}",
+            f"{one.prior_width:g} of default",
+        ]
+        for one in found
+    ]
+    return Table(header, rows, texts=2)
 
 
 @dataclass(frozen=True, eq=False)

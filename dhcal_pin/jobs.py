@@ -22,7 +22,7 @@ class Job:
         robot: path of a URDF or a DH file.
         data: paths of measurement files.
         output: path of the corrected URDF.
-        tip, columns, parameters, extend, fix, free, holdout, method, loss, priors, instrument,
+        tip, columns, parameters, extend, fix, free, holdout, method, loss, priors, bounds, instrument,
             max_iterations, seed, in_place, world_joint, tool_frame, report, json, map: as in
             `dhcal calibrate --help`.
     """
@@ -40,6 +40,7 @@ class Job:
     method: Method = "lm"
     loss: str = "linear"
     priors: str | None = None
+    bounds: str | None = None
     instrument: str | None = None
     max_iterations: int = 100
     seed: int = 0

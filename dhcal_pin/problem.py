@@ -44,6 +44,7 @@ class Problem:
         weights: (p+s,) one over the prior's sigma; zero where there is none.
         known: values of instruments' unknowns, by name, that are no unknowns here.
         where: what the chunks are shared out to; their order, and so every digit, stays.
+        bounds: (2, p+s) least and largest x; None where nothing is bounded.
     """
 
     errors: ErrorModel
@@ -51,6 +52,7 @@ class Problem:
     weights: Array
     known: Mapping[str, float] = field(default_factory=dict)
     where: Workers = HERE
+    bounds: Array | None = None
 
     @cached_property
     def unknowns(self) -> tuple[Unknown, ...]:

@@ -15,6 +15,7 @@ from typing import Any
 from . import observability
 from .chain import Chain
 from .evaluation import Comparison, accuracy
+from .extension import Trial
 from .files import PathLike
 from .measurements import Measurement
 from .result import Result
@@ -33,6 +34,7 @@ class Provenance:
         left_out: reasons by file and row of what was not used at all.
         doubts: what is hard to believe, by file.
         remarks: sentences that belong beside the headline.
+        trials: what each family of joints' transmission errors brought, where they were tried.
         judged: accuracy on samples that were each left out of a fit, where none were held out.
     """
 
@@ -44,6 +46,7 @@ class Provenance:
     left_out: Mapping[str, Mapping[int, str]] = field(default_factory=dict)
     doubts: Mapping[str, Sequence[str]] = field(default_factory=dict)
     remarks: Sequence[str] = ()
+    trials: Sequence[Trial] = ()
     judged: Comparison | None = None
 
 

@@ -71,9 +71,8 @@ def levels(found: Sequence[Map]) -> list[float]:
     return (digit * np.round((low + step * np.arange(figures.LEVELS + 1)) / digit)).tolist()
 
 
-def map_panels(study: Study) -> tuple[list[str], list[tuple[str, str]]]:
-    """Maps of the predicted position std with the fitted samples, and their legend in mm."""
-    w = study.workspace
+def map_panels(w: Workspace) -> tuple[list[str], list[tuple[str, str]]]:
+    """Maps of the predicted position std with measured samples, and their legend in mm."""
     found = maps(w)
     if not found:
         return [], []
@@ -97,7 +96,7 @@ def map_panels(study: Study) -> tuple[list[str], list[tuple[str, str]]]:
     legend[0], legend[-1] = ("level0", f"below {words[1]} mm"), (legend[-1][0], f"above {words[-2]} mm")
     if not all(np.isfinite(m.std).all() for m in found):
         legend.append(("unknown", "cannot be predicted"))
-    return out, [*legend, ("dots measured", "fitted samples")]
+    return out, [*legend, *([("dots measured", "measured samples")] if len(thin) else [])]
 
 
 def _square(points: Array, names: str) -> tuple[Axis, Axis]:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from . import report_figures, report_maps, report_sections, tables, viewer
+from .diagnosis import Workspace
 from .errors import DhcalError
 from .evaluation import ENDINGS, Comparison
 from .files import PathLike, save
@@ -62,7 +63,19 @@ def write_report(fit: Result, path: PathLike, source: Provenance | None = None) 
 def page(found: Study) -> str:
     """The HTML page; the same text for the same input."""
     body = [_head(found), *(_section(found, section) for section in report_sections.sections(found))]
-    parts = {"@TITLE@": html.escape(f"Calibration of {found.robot}"), "@CONTENT@": "\n".join(body)}
+    return _filled(f"Calibration of {found.robot}", body)
+
+
+def map_page(title: str, found: Workspace, sentences: Sequence[str]) -> str:
+    """The HTML page of a map of the predicted accuracy; the same text for the same input."""
+    drawn, legend = report_maps.map_panels(found)
+    body = [f"<header><h1>{html.escape(title)}</h1></header>", "<section>"]
+    body += [f"<p>{html.escape(text)}</p>" for text in sentences]
+    return _filled(title, [*body, _panels(drawn, legend, look="panels two"), "</section>"])
+
+
+def _filled(title: str, body: Sequence[str]) -> str:
+    parts = {"@TITLE@": html.escape(title), "@CONTENT@": "\n".join(body)}
     return re.sub("|".join(parts), lambda mark: parts[mark[0]], PAGE.read_text("utf-8"))
 
 
@@ -207,7 +220,7 @@ def _left_figures(found: Study) -> str:
 
 
 def _map_figures(found: Study) -> str:
-    drawn, legend = report_maps.map_panels(found)
+    drawn, legend = report_maps.map_panels(found.workspace)
     return _panels(drawn, legend, look="panels wide")
 
 

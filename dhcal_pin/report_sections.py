@@ -11,6 +11,7 @@ from . import robust, tables
 from .chain import BASE
 from .diagnosis import JointTrace, Outlier, Workspace, joint_traces, outliers, sigmas, workspace
 from .evaluation import Comparison
+from .extension import trial_table
 from .report import Provenance, short_names, versions
 from .result import Result
 from .tables import Table, fixed, shown
@@ -42,8 +43,8 @@ class Study:
     @property
     def comparisons(self) -> tuple[Comparison, ...]:
         """Accuracy before and after, the most honest first."""
-        judged = self.source.judged
-        return (judged, *self.fit.comparisons) if judged and not self.fit.holdout else self.fit.comparisons
+        judged, own = self.source.judged, self.fit.comparisons
+        return (judged, *(c for c in own if c.title == "fitted")) if judged and not self.fit.holdout else own
 
     @property
     def robot(self) -> str:
@@ -60,7 +61,7 @@ def _names(given: Sequence[str], kinds: Sequence[str]) -> list[str]:
 
 def study(fit: Result, source: Provenance) -> Study:
     """Everything that the report of a result needs."""
-    return Study(fit, source, outliers(fit), joint_traces(fit), workspace(fit))
+    return Study(fit, source, outliers(fit), joint_traces(fit), workspace(fit, fit.data))
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,7 @@ def sections(found: Study) -> list[Section]:
     return [
         _accuracy(found),
         _left(found),
+        _extension(found),
         _workspace(found),
         Section("scene", "The arm"),
         _parameters(found),
@@ -145,6 +147,20 @@ def _left(found: Study) -> Section:
     if not rows:
         return Section(key, title, ["There are too few samples to see how each joint errs over its range."])
     return Section(key, title, [text], tables=[table])
+
+
+def _extension(found: Study) -> Section:
+    title, trials = "Errors of the joints' drives", found.source.trials
+    if not trials:
+        return Section("extension", title)
+    kept = [trial.family for trial in trials if trial.kept]
+    said = f"Added to the geometry: {', '.join(kept)}." if kept else "None was added to the geometry."
+    text = (
+        "Errors are those on regions of joint space that were left out of the fit, in standard deviations "
+        "of a reading, without the family and with it, each on top of those added before. A family is added "
+        "where the error falls by more than its standard error and where chance would hardly bring as much."
+    )
+    return Section("extension", title, [said, text], tables=[trial_table(trials)])
 
 
 def _workspace(found: Study) -> Section:

@@ -13,44 +13,22 @@ import pinocchio as pin
 from . import explanations, observability, robust, se3, tables
 from .chain import BASE, Chain
 from .error_model import ErrorModel, Parameter
-from .evaluation import Comparison, accuracy
+from .evaluation import Comparison, accuracy, summary
+from .folds import left_out, random_folds
 from .measurements import Measurement, Unknown
 from .problem import Problem, reduce
 from .se3 import Array
 from .solver import Solution, posterior_root, pseudo_inverse, with_priors
 from .tables import Estimate
+from .uncertainty import UNKNOWN, Prediction, Uncertainty
 
-# A parameter, or a metre and a radian of the tool, with more than this share of itself unseen is unknown.
-UNKNOWN = 1e-6
 # Residuals that are larger than stated by so many standard deviations of chance contradict the sigmas.
 CONTRADICTION = 3.0
+# Folds that samples are left out in where none were held out.
+FOLDS = 10
 
 
-@dataclass(frozen=True, eq=False)
-class Prediction:
-    """Tool poses of a calibrated arm, and how well they are known.
-
-    Attributes:
-        poses: (m, 4, 4) in the measuring frame.
-        covariance: (m, 6, 6) of the tool point's displacement [v, ω], m and rad, in axes of the
-            measuring frame; infinite on the diagonal where neither data nor a prior tell.
-    """
-
-    poses: Array
-    covariance: Array
-
-    @property
-    def position_std(self) -> Array:
-        """Root of the position's total variance (m,), m: the RMS distance to expect."""
-        return np.sqrt(np.trace(self.covariance[:, :3, :3], axis1=1, axis2=2))
-
-    @property
-    def orientation_std(self) -> Array:
-        """Root of the rotation vector's total variance (m,), rad: the RMS angle to expect."""
-        return np.sqrt(np.trace(self.covariance[:, 3:, 3:], axis1=1, axis2=2))
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Result:
     """An identified arm and how far to believe it.
 
@@ -191,23 +169,20 @@ class Result:
         out[lost, lost] = np.inf
         return out
 
+    @cached_property
+    def uncertainty(self) -> Uncertainty:
+        """The robot's part of the covariance, as the calibrated arm alone needs it."""
+        root, hidden = self._spread
+        robot = len(self.errors.parameters)
+        return Uncertainty.of(self.errors, self.x[:robot], self.chain, root[:robot], hidden[:robot])
+
     def predict(self, q: Array) -> Prediction:
         """The calibrated tool poses at joint values q (m, n), rad or m, and how well they are known.
 
         The covariance is that of the identified errors carried to the tool to first order; noise of a
         future measurement is not in it.
         """
-        root, hidden = self._spread
-        robot = len(self.errors.parameters)
-        chain, bodies, twists = self.errors.derivative(self.x[:robot])
-        sweep = chain.sweep(q)
-        velocities = chain.tool_velocities(sweep, bodies, twists)
-        carried = np.einsum("pim,pr->mir", velocities, root[:robot])
-        covariance = carried @ np.swapaxes(carried, 1, 2)
-        lost = np.einsum("pim,pr->mir", velocities, hidden[:robot])
-        rows, axes = np.nonzero(np.sum(lost**2, -1) > UNKNOWN)
-        covariance[rows, axes, axes] = np.inf
-        return Prediction(sweep.poses(), covariance)
+        return self.uncertainty.predict(q)
 
     @property
     def std(self) -> Array:
@@ -250,8 +225,11 @@ class Result:
 
     @cached_property
     def comparisons(self) -> tuple[Comparison, ...]:
-        """Accuracy before and after: on the samples held out first, if there are any, then on the fitted."""
-        return tuple(
+        """Accuracy before and after: on what was not fitted first, then on the fitted.
+
+        Where nothing was held out, every sample is judged by a fit without it and others, in ten folds.
+        """
+        found = tuple(
             Comparison(
                 title,
                 sum(len(item.rows) for item in data),
@@ -261,6 +239,12 @@ class Result:
             for title, data in (("held out", self.holdout), ("fitted", self.data))
             if data
         )
+        count = sum(len(item.rows) for item in self.data)
+        if self.holdout or count < 2:
+            return found
+        folds = random_folds(self.data, min(FOLDS, count))
+        judged = [item for fold, _ in left_out(self.problem, self.x, self.data, folds) for item in fold]
+        return (Comparison("left out", count, found[-1].before, summary(judged)), *found)
 
     @cached_property
     def estimates(self) -> tuple[Estimate, ...]:
@@ -286,6 +270,9 @@ class Result:
                 nominal = value if held else nominal
             out.append(Estimate(p.name, p.unit, nominal, value, std, prior, seen, left, held, place))
         return tuple(out)
+
+    def __repr__(self) -> str:
+        return f"<Result: {tables.headline(self.comparisons).text}>"
 
     def _repr_html_(self) -> str:
         """The headline, before and after, and the parameters, as a notebook shows them."""

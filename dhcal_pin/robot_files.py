@@ -20,6 +20,8 @@ from .files import PathLike, read_toml, save
 from .result import Result
 from .se3 import Array
 from .transmission_files import transmission_lines, with_transmission
+from .uncertainty import Uncertainty
+from .uncertainty_files import uncertainty_lines
 from .ur_kinematics import read_ur_kinematics
 from .urdf import parse_urdf
 from .urdf_origins import with_origins
@@ -91,10 +93,10 @@ def read_robot(path: PathLike, tip: str | None = None, sidecar: PathLike | None 
 def _with_sidecar(chain: Chain, path: PathLike) -> Chain:
     raw = read_toml(path)
     tip = raw.pop("tip", chain.tip)
-    if unknown := set(raw) - {"base", "tool", "joint", "instrument"}:
+    if unknown := set(raw) - {"base", "tool", "joint", "instrument", "uncertainty"}:
         raise DhcalError(
             f"{os.fspath(path)}: unknown key {min(unknown)!r}; "
-            "allowed: tip, [base], [tool], [joint.NAME], [instrument]"
+            "allowed: tip, [base], [tool], [joint.NAME], [instrument], [uncertainty]"
         )
     frames = {key: read_frame(raw[key], os.fspath(path), key) for key in ("base", "tool") if key in raw}
     if tip != chain.tip:
@@ -120,9 +122,14 @@ def read_instrument(path: PathLike) -> dict[str, float]:
 
 
 def sidecar_text(
-    tip: str, base: Array, tool: Array, instrument: Mapping[str, float], joints: Sequence[str] = ()
+    tip: str,
+    base: Array,
+    tool: Array,
+    instrument: Mapping[str, float],
+    joints: Sequence[str] = (),
+    uncertainty: Sequence[str] = (),
 ) -> str:
-    """The sidecar's TOML of base and tool (4, 4), the tool being on `tip`, of the instrument and the joints.
+    """The sidecar's TOML of base and tool (4, 4), the tool being on `tip`, of instrument, joints and doubt.
 
     Args:
         tip: the link that holds the tool.
@@ -130,6 +137,7 @@ def sidecar_text(
         tool: (4, 4) measured point in the tip frame.
         instrument: its values by name, m and rad.
         joints: lines of `transmission_lines`.
+        uncertainty: lines of `uncertainty_lines`.
     """
     out = [
         "# What the URDF cannot hold. base: the robot's base link in the measuring frame;",
@@ -151,7 +159,7 @@ def sidecar_text(
             "[instrument]",
             *(f"{json.dumps(name)} = {value!r}" for name, value in instrument.items()),
         ]
-    return "\n".join(out) + "\n"
+    return "\n".join([*out, *uncertainty]) + "\n"
 
 
 def joint_origins(chain: Chain) -> tuple[dict[str, Array], Array]:
@@ -180,12 +188,21 @@ def joint_origins(chain: Chain) -> tuple[dict[str, Array], Array]:
 
 
 def urdf_files(
-    chain: Chain, path: PathLike, instrument: Mapping[str, float] | None = None
+    chain: Chain,
+    path: PathLike,
+    instrument: Mapping[str, float] | None = None,
+    known: Uncertainty | None = None,
 ) -> dict[PathLike, str | bytes]:
     """The calibrated URDF, read back and compared, and its sidecar; by path, not yet written.
 
     Identity base and tool and ideal joints need no sidecar; one that is there already would be read with
     the new URDF, and is replaced.
+
+    Args:
+        chain: the calibrated arm.
+        path: of the URDF.
+        instrument: its values by name, m and rad.
+        known: how well the arm is known.
 
     Raises:
         DhcalError: the written text would not be the same robot.
@@ -208,8 +225,9 @@ def urdf_files(
         )
     out: dict[PathLike, str | bytes] = {path: data}
     plain = np.array_equal(chain.base, np.eye(4)) and np.array_equal(tool, np.eye(4))
-    if not plain or joints or instrument or existing_sidecar(path):
-        out[sidecar_path(path)] = sidecar_text(chain.tip, chain.base, tool, instrument or {}, joints)
+    doubt = uncertainty_lines(known) if known else []
+    if not plain or joints or instrument or doubt or existing_sidecar(path):
+        out[sidecar_path(path)] = sidecar_text(chain.tip, chain.base, tool, instrument or {}, joints, doubt)
     return out
 
 
@@ -228,7 +246,26 @@ def write_urdf(fit: Result | Chain, path: PathLike) -> None:
         and os.path.samefile(path, chain.urdf.source)
     ):
         raise DhcalError(f"{os.fspath(path)}: is the nominal robot itself; write to another file")
-    save(urdf_files(chain, path, fit.portable if isinstance(fit, Result) else None))
+    instrument, known = (fit.portable, fit.uncertainty) if isinstance(fit, Result) else (None, None)
+    save(urdf_files(chain, path, instrument, known))
+
+
+def read_bounds(path: PathLike | None) -> dict[str, tuple[float, float]]:
+    """A TOML file of least and largest values in m and rad by parameter name or pattern; none without it.
+
+    Raises:
+        DhcalError: a value is not a pair of numbers in order.
+    """
+    raw = read_toml(path) if path else {}
+    for name, value in raw.items():
+        pair = value if isinstance(value, list) and len(value) == 2 else []
+        numbers = [v for v in pair if isinstance(v, int | float) and not isinstance(v, bool)]
+        if len(numbers) != 2 or not numbers[0] < numbers[1]:
+            raise DhcalError(
+                f"{path}: {name} = {value!r} are no bounds; write the least and the largest value "
+                'in m or rad, such as "d2" = [0.12, 0.13]'
+            )
+    return {name: (float(low), float(high)) for name, (low, high) in raw.items()}
 
 
 def read_priors(choice: str | None) -> Priors | None:

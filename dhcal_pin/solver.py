@@ -57,6 +57,21 @@ def pseudo_inverse(r: Array, z: Array) -> Array:
     return np.linalg.lstsq(r, z, rcond=observability.RANK_CUT)[0]
 
 
+def _step(problem: Problem, triangle: Triangle, x: Array) -> Array:
+    """The least-squares step from x (p,) that stays within the problem's bounds."""
+    if problem.bounds is None:
+        return pseudo_inverse(triangle.r, triangle.z)
+    # Loaded where it is needed: it takes longer than most calibrations.
+    from scipy.optimize import lsq_linear
+
+    scale = np.linalg.norm(triangle.r, axis=0)
+    scale[scale == 0] = 1.0
+    low, high = (problem.bounds - x) * scale
+    # Bounds of no width are not allowed there; a step may touch one.
+    found = lsq_linear(triangle.r / scale, triangle.z, (low - 1e-15 * scale, high + 1e-15 * scale), "bvls")
+    return np.clip(found.x, low, high) / scale
+
+
 def posterior_root(triangle: Triangle, weights: Array) -> tuple[Array, Array]:
     """A root (p, r) of the covariance with priors of these weights (p,), and a basis (p, p-r) of the rest.
 
@@ -127,7 +142,7 @@ def _leap(problem: Problem, x: Array, cost: float) -> tuple[Array, float]:
         triangle = with_priors(
             reduce(problem, far, small_angle=False), problem.weights, far, np.zeros_like(x)
         )
-        there = far + pseudo_inverse(triangle.r, triangle.z)
+        there = far + _step(problem, triangle, far)
         if not np.abs(there).max() < RUNAWAY:
             break
         far, ends = there, problem.cost(there)
@@ -160,7 +175,7 @@ def levenberg_marquardt(
         done += 1
         while True:
             damped = with_priors(free, none, x, np.sqrt(damping) * floor)
-            step = pseudo_inverse(damped.r, damped.z)
+            step = _step(problem, damped, x)
             change = _change(free.r, step)
             settled = _settled(free.r, change, cost, last)
             ahead = None

@@ -203,7 +203,7 @@ def calibrate_stream(
         known=known,
         max_iterations=max_iterations,
     )
-    problem = Stream(fit.errors, (head,), fit.problem.weights, known, where, parts, _scales(fit, head))
+    problem = Stream(fit.errors, (head,), fit.problem.weights, known, where, None, parts, _scales(fit, head))
     solution = METHODS[method](problem, fit.x, max_iterations, progress)
     end = fit.errors.at(solution.x)
     samples, before, after = 0, {}, {}

@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 from .evaluation import ENDINGS, Comparison
 
 # Factor and name of a unit for reading: of a value, and of a change or an uncertainty.
-UNITS = {"m": (1e3, " mm"), "rad": (180 / math.pi, "°")}
-SMALL = {"m": (1e3, " mm"), "rad": (1e3, " mrad")}
+RATES = {"rad/Nm": (1e6, " µrad/Nm"), "rad/rad": (1e3, " mrad/rad"), "rad/m": (1e3, " mrad/m")}
+UNITS = {"m": (1e3, " mm"), "rad": (180 / math.pi, "°"), **RATES}
+SMALL = {"m": (1e3, " mm"), "rad": (1e3, " mrad"), **RATES}
 # Digits behind the point where no uncertainty says how many are known; and never more than MOST.
 PLAIN, MOST = 3, 6
 # Fewer samples than this do not tell an accuracy; a longer text than this may be broken into lines.

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from .check import Agreement
 from .evaluation import ENDINGS
-from .extension import Trial
+from .extension import Trial, trial_table
 from .result import Result
 from .screening import Finding
 from .solver import Progress
@@ -135,29 +135,8 @@ def trials(found: Sequence[Trial]) -> None:
     """What each family of joints' transmission errors brought, or would bring."""
     if not found:
         return
-    header = [
-        "family",
-        "verdict",
-        "before",
-        "after",
-        "standard error of the change",
-        "by chance",
-        "prior width",
-    ]
-    rows = [
-        [
-            one.family,
-            "added" if one.kept else "left out",
-            f"{one.cv_before:.3f}",
-            f"{one.cv_after:.3f}",
-            f"{one.standard_error:.3f}",
-            f"{one.chance:.1g}",
-            f"{one.prior_width:g} of default",
-        ]
-        for one in found
-    ]
     title = "extensions: error on left-out regions of joint space, in standard deviations"
-    table(title, Table(header, rows, texts=2))
+    table(title, trial_table(found))
 
 
 def open_page(path: str) -> None:

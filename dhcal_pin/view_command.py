@@ -16,6 +16,7 @@ from .measurement_files import read_measurements
 from .measurements import Measurement
 from .outputs import check_outputs, sidecars
 from .robot_files import existing_sidecar, is_table, read_instrument, read_robot, robot_name
+from .uncertainty_files import read_uncertainty
 
 
 def view(args: Namespace) -> int:
@@ -35,6 +36,7 @@ def view(args: Namespace) -> int:
         *arms,
         measurements=data,
         known=read_instrument(sidecar) if sidecar else None,
+        predictor=read_uncertainty(sidecar, arms[-1]) if sidecar and len(arms) > 1 else None,
         title=" and ".join(robot_name(path) for path in given),
         magnification=args.magnification,
         triangles=args.simplify,

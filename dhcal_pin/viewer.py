@@ -32,6 +32,8 @@ from .measurements import Measurement
 from .result import Result
 from .se3 import Array
 from .shapes import looks, rows
+from .transmission import TERMS, Loads
+from .uncertainty import Predictor
 
 PathLike = str | os.PathLike[str]
 
@@ -51,6 +53,7 @@ def scene_html(
     q: Array | None = None,
     measurements: Sequence[Measurement] | None = None,
     known: Mapping[str, float] | None = None,
+    predictor: Predictor | None = None,
     title: str = "Robot calibration",
     package_dirs: Sequence[PathLike] | None = None,
     magnification: float = 1.0,
@@ -67,6 +70,7 @@ def scene_html(
         measurements: those that are positions are drawn, with arrows from where the arm puts them.
         known: values of the instruments' unknowns, as in `Result.instruments`; without it where their
             search starts.
+        predictor: how well the calibrated tool's place is known; the result itself without it.
         title: the page's heading.
         package_dirs: where to look for the URDF's meshes; the folders above the URDF without it.
         magnification: how many times larger than true the errors are drawn at first, 1 to 500.
@@ -82,8 +86,8 @@ def scene_html(
         raise DhcalError(f"magnification {magnification:g}: must be between 1 and 500")
     if triangles < LEAST_TRIANGLES:
         raise DhcalError(f"{triangles} triangles draw no robot: allow {LEAST_TRIANGLES} at least")
-    fit = calibrated if isinstance(calibrated, Result) else None
     if isinstance(calibrated, Result):
+        predictor = predictor or calibrated
         measurements = calibrated.data if measurements is None else measurements
         known = calibrated.instruments if known is None else known
         nominal = replace(nominal, base=calibrated.reference.base, tool=calibrated.reference.tool)
@@ -99,8 +103,8 @@ def scene_html(
     notes = [drawn.note]
     if len(thinned) < len(samples):
         notes.append(f"{len(thinned)} of {len(samples)} measured points are drawn.")
-    ellipsoids = _ellipsoids(fit, poses) if fit else []
-    if fit and len(poses) and not ellipsoids:
+    ellipsoids = _ellipsoids(predictor, poses) if predictor else []
+    if predictor and len(poses) and not ellipsoids:
         notes.append("No ellipsoids: the data do not tell how well the tool's place is known.")
     scene = {
         "title": title,
@@ -182,7 +186,8 @@ def tree(nominal: Chain, arm: Chain) -> dict[str, Any]:
     Body 0 is the base link, body i the model's joint i, and the last two are tip and tool; each has
     `parent`, `placement` in it, `twist` (6) to the calibrated placement, and where it moves `axes` of
     both arms, `slides`, `mixing` (n,) and `shift`. The measuring frame sees a drawn tool D of an arm at
-    `stands`·D·`holds`, which are its entries in `arms`.
+    `stands`·D·`holds`, which are its entries in `arms`; there `terms` say how its joints miss their
+    values, and where they yield to weights `loads` are the bodies that these pull at.
     """
     if (arm.joint_names, arm.moving) != (nominal.joint_names, nominal.moving):
         raise DhcalError(
@@ -200,17 +205,15 @@ def tree(nominal: Chain, arm: Chain) -> dict[str, Any]:
     for j, i in enumerate(index):
         bodies[i] = _body(int(model.parents[i]), nominal.origins[j], arm.origins[j]) | {
             "axes": [nominal.axes[j].tolist(), arm.axes[j].tolist()],
-            "slides": bool(nominal.prismatic[j]),
-            "mixing": nominal.mixing[j].tolist(),
-            "shift": float(nominal.shift[j]),
+            **_drive(nominal, j),
         }
     bodies.append(_body(index[-1], nominal.origins[k], arm.origins[k]))
     bodies.append(_body(len(bodies) - 1, tool, arm.tool))
     stands = nominal.base @ se3.inverse(base) @ arm.base
     holds = se3.inverse(tool) @ nominal.tool
     arms = [
-        {"stands": rows(stands), "holds": rows(holds)},
-        {"stands": rows(arm.base), "holds": rows(np.eye(4))},
+        {"stands": rows(stands), "holds": rows(holds)} | _misses(nominal),
+        {"stands": rows(arm.base), "holds": rows(np.eye(4))} | _misses(arm),
     ]
     return {"bodies": bodies, "arms": arms}
 
@@ -219,6 +222,47 @@ def _body(parent: int, placement: Array, calibrated: Array) -> dict[str, Any]:
     same = np.array_equal(placement, calibrated)
     twist = np.zeros(6) if same else se3.log6(se3.inverse(placement) @ calibrated)
     return {"parent": int(parent), "placement": rows(placement), "twist": twist.tolist()}
+
+
+def _misses(chain: Chain) -> dict[str, Any]:
+    """An arm's transmission, term by term: which joint by what of which joint, and its coefficient."""
+    if chain.transmission is None:
+        return {"terms": []}
+    held = chain.transmission.coefficients
+    terms = [
+        {"name": TERMS[t].name, "joint": int(i), "of": int(j), "value": float(held[t, i, j])}
+        for t, i, j in np.argwhere(held)
+    ]
+    return {"terms": terms} | (
+        {"loads": _weights(chain, chain.transmission.loads)} if chain.transmission.yields else {}
+    )
+
+
+def _weights(chain: Chain, loads: Loads) -> list[dict[str, Any]]:
+    """The tree of what loads a chain's joints: each body's weight, N, its centre, and what moves it."""
+    model = loads.model
+    moved = {model.getJointId(name): j for j, name in enumerate(chain.moving)}
+    out = []
+    for i, inertia in enumerate(model.inertias):
+        body = {
+            "parent": int(model.parents[i]),
+            "placement": rows(model.jointPlacements[i].homogeneous),
+            "weight": -float(inertia.mass * model.gravity.linear[2]),
+            "centre": inertia.lever.tolist(),
+        }
+        out.append(
+            body | ({"axis": chain.axes[moved[i]].tolist()} | _drive(chain, moved[i]) if i in moved else {})
+        )
+    return out
+
+
+def _drive(chain: Chain, j: int) -> dict[str, Any]:
+    """What moves the moving joint j by how much."""
+    return {
+        "slides": bool(chain.prismatic[j]),
+        "mixing": chain.mixing[j].tolist(),
+        "shift": float(chain.shift[j]),
+    }
 
 
 def _joints(chain: Chain, poses: Array) -> list[dict[str, Any]]:
@@ -260,7 +304,7 @@ def _thin(count: int, most: int) -> Array:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
-def _ellipsoids(fit: Result, poses: Array) -> list[dict[str, Any]]:
+def _ellipsoids(model: Predictor, poses: Array) -> list[dict[str, Any]]:
     """How well the calibrated tool's place is known at some of the poses (m, n).
 
     Each has its joint values `q` (n,) and `axes` (9), rows of the matrix whose columns are the half
@@ -268,13 +312,13 @@ def _ellipsoids(fit: Result, poses: Array) -> list[dict[str, Any]]:
     is not known at all have none.
     """
     poses = poses[_thin(len(poses), MOST_ELLIPSOIDS)]
-    covariance = fit.predict(poses).covariance[:, :3, :3]
+    covariance = model.predict(poses).covariance[:, :3, :3]
     told = np.isfinite(covariance).all((1, 2))
     squares, axes = np.linalg.eigh(covariance[told])
     # A flat ellipsoid would have no outside to be lit.
     half = np.sqrt(np.maximum(squares, 1e-6 * squares[:, -1:] + 1e-18))
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
-    axes = fit.chain.base[:3, :3].T @ axes * half[:, None]
+    axes = model.chain.base[:3, :3].T @ axes * half[:, None]
     return [
         {"q": q, "axes": np.round(matrix, 12).ravel().tolist()}
         for q, matrix in zip(poses[told].tolist(), axes, strict=True)

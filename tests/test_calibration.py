@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mpmath
 import numpy as np
 import pytest
 from conftest import paper, random_table
@@ -11,11 +12,13 @@ from dhcal_pin.calibration import calibrate, split
 from dhcal_pin.chain import Chain
 from dhcal_pin.errors import DhcalError
 from dhcal_pin.evaluation import accuracy
+from dhcal_pin.folds import random_folds
 from dhcal_pin.measurements import Noise
 from dhcal_pin.parameters import select
 from dhcal_pin.poses import Pose
 from dhcal_pin.positions import Position
 from dhcal_pin.problem import CHUNK, Problem, reduce
+from dhcal_pin.solver import pseudo_inverse, with_priors
 
 NONE = np.empty(0)
 
@@ -228,6 +231,9 @@ def test_split_is_a_partition_by_seed(sim_6dof):
         ({"priors": "weak"}, "choose default, none"),
         ({"priors": {"x9": 1.0}}, "no such parameter"),
         ({"priors": {"d*": -1.0}}, "must be positive"),
+        ({"bounds": {"x9": (-1.0, 1.0)}}, "no such parameter"),
+        ({"bounds": {"d1": (5.0, 6.0)}}, "must hold the nominal"),
+        ({"bounds": {"d1": (-5.0, 6.0)}, "method": "gn"}, "bounds need method lm"),
     ],
 )
 def test_wrong_choices_are_named(sim_6dof, kwargs, message):
@@ -239,3 +245,70 @@ def test_wrong_choices_are_named(sim_6dof, kwargs, message):
 def test_no_data_is_said(sim_6dof):
     with pytest.raises(DhcalError, match="no measurements"):
         calibrate(sim_6dof, [])
+
+
+def test_a_fit_without_hold_out_is_judged_by_samples_left_out(sim_6dof, sim_6dof_actual):
+    """Ten folds, each refitted from the start by the whole loop, give the same errors."""
+    rng = np.random.default_rng(1)
+    data = Pose.simulate(sim_6dof_actual, rng.uniform(-3, 3, (30, 6)), Noise(1e-3, 1e-3), rng)
+    fit = calibrate(sim_6dof, data, "dh", priors="none")
+    squares = [
+        accuracy(calibrate(sim_6dof, data.take(~mask), "dh", priors="none").chain, [data.take(mask)])
+        for (mask,) in random_folds([data], 10)
+    ]
+    wanted = np.sqrt(np.mean([found["position_rms_m"] ** 2 for found in squares]))
+    judged = fit.comparisons[0]
+    assert judged.title == "left out"
+    assert judged.after["position_rms_m"] == pytest.approx(wanted, rel=0.02)
+    assert judged.after["position_rms_m"] > 1.05 * fit.comparisons[1].after["position_rms_m"]
+
+
+def test_the_step_is_exact_at_condition_1e8():
+    """Nearly parallel axes: the same rows solved with fifty digits give the same step."""
+    nominal = Chain.from_dh(paper("sim_6dof"))
+    errors = select(nominal, "dh")
+    tilts = [i for i, p in enumerate(errors.parameters) if p.name in ("alpha2", "alpha3", "alpha5")]
+    x = np.zeros(24)
+    x[tilts] = 1e-4, -2e-4, 1e-4
+    rng = np.random.default_rng(2)
+    q = rng.uniform(-3, 3, (12, 6))
+    data = Pose.simulate(errors.at(x + 1e-4 * rng.normal(size=24)), q, Noise(1e-4, 1e-4), rng)
+    problem = Problem(errors, (data,), np.zeros(24))
+    full = with_priors(reduce(problem, x, False), problem.weights, x, np.zeros(24))
+    assert observability.rank(full.r) == 24
+    assert 3e7 < observability.condition(full.r) < 3e8
+    chain, bodies, twists = errors.derivative(x)
+    sweep = chain.sweep(q)
+    residual = data.residual(sweep, NONE)
+    rows = data.whiten(sweep, chain.tool_velocities(sweep, bodies, twists), NONE, residual).reshape(24, -1).T
+    with mpmath.workdps(50):
+        # Fifty digits can afford the normal equations.
+        wanted = mpmath.lu_solve(mpmath.matrix(rows.tolist()), mpmath.matrix(residual.ravel().tolist()))
+        wanted = np.array([float(value) for value in wanted])
+    step = pseudo_inverse(full.r, full.z)
+    assert np.linalg.norm(step - wanted) <= 1e-6 * np.linalg.norm(wanted)
+
+
+def test_bounds_hold_and_the_rest_is_least_squares(sim_6dof, sim_6dof_actual):
+    """Two parameters at their bounds and one inside: scipy's own bounded solver finds no less."""
+    from scipy.optimize import least_squares
+
+    rng = np.random.default_rng(5)
+    data = Pose.simulate(sim_6dof_actual, rng.uniform(-3, 3, (15, 6)), Noise(1e-4, 1e-4), rng)
+    errors = select(sim_6dof, "dh")
+    nominal = {p.name: p.nominal for p in errors.parameters}
+    bounds = {
+        "a2": (nominal["a2"], nominal["a2"] + 1e-3),
+        "theta1": (nominal["theta1"] - 0.1, nominal["theta1"] + 0.01),
+        "d5": (nominal["d5"] - 1.0, nominal["d5"] + 1.0),
+    }
+    fit = calibrate(sim_6dof, data, "dh", priors="none", bounds=bounds)
+    assert fit.converged
+    assert fit.problem.bounds is not None
+    low, high = fit.problem.bounds
+    assert np.all((low - 1e-12 <= fit.x) & (fit.x <= high + 1e-12))
+    residual = lambda x: data.residual(errors.at(x).sweep(data.q), NONE).ravel()  # noqa: E731
+    other = least_squares(residual, np.zeros(24), bounds=(low - 1e-12, high + 1e-12), xtol=1e-14, ftol=1e-14)
+    assert np.sum(residual(fit.x) ** 2) <= 2 * other.cost * (1 + 1e-6)
+    free = calibrate(sim_6dof, data, "dh", priors="none")
+    assert np.any((free.x < low) | (free.x > high))

@@ -13,9 +13,10 @@ from dhcal_pin.calibration import calibrate
 from dhcal_pin.chain import Chain
 from dhcal_pin.cli import main
 from dhcal_pin.contacts import Touch
-from dhcal_pin.crossvalidation import cross_validate, group_folds, random_folds, region_folds
+from dhcal_pin.crossvalidation import cross_validate
 from dhcal_pin.errors import DhcalError
 from dhcal_pin.extension import extend
+from dhcal_pin.folds import group_folds, random_folds, region_folds
 from dhcal_pin.measurement_files import measurement_text
 from dhcal_pin.measurements import Noise
 from dhcal_pin.parameters import select
@@ -57,7 +58,8 @@ def test_folds_equal_fits_without_what_they_leave_out():
         assert judged["position_rms_m"] == pytest.approx(accuracy(chain, left)["position_rms_m"], rel=2e-3)
         rows = left[0].residual(chain.sweep(left[0].q), np.empty(0))
         assert error == pytest.approx(np.sqrt(np.mean(rows**2)), rel=2e-3)
-    whole = np.sqrt(np.mean([fold["position_rms_m"] ** 2 for fold in found.folds]))
+    counts = [fold["position_samples"] for fold in found.folds]
+    whole = np.sqrt(np.average([fold["position_rms_m"] ** 2 for fold in found.folds], weights=counts))
     assert found.accuracy["position_rms_m"] == pytest.approx(whole)
     assert whole > 1.1 * fit.validate(fit.data)["position_rms_m"]
 

@@ -16,7 +16,8 @@ from conftest import robot_file
 from dhcal_pin import cli
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.chain import Chain
-from dhcal_pin.crossvalidation import cross_validate, random_folds, region_folds
+from dhcal_pin.crossvalidation import cross_validate
+from dhcal_pin.folds import random_folds, region_folds
 from dhcal_pin.measurement_files import read_measurements, read_readings
 from dhcal_pin.measurements import Noise
 from dhcal_pin.planning import plan

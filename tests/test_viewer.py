@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -24,6 +25,7 @@ from dhcal_pin.measurements import Noise
 from dhcal_pin.poses import Pose
 from dhcal_pin.positions import Position, Targets
 from dhcal_pin.result import Result
+from dhcal_pin.transmission import COUPLED, COUPLING_PRIOR, TERMS, Transmission
 from dhcal_pin.urdf import parse_urdf
 from dhcal_pin.viewer import scene_html, show
 
@@ -202,6 +204,46 @@ def test_any_joint_in_any_place_without_anything_to_draw(window, tmp_path):
     window.call("setMagnification", 500)
     window.call("setLayer", "calibrated", False)
     assert window.look()["nominal"] > 200
+
+
+WEIGHTS = re.sub(
+    rb'<link name="(.)"/>',
+    rb'<link name="\1"><inertial><origin xyz="0.05 -0.02 0.1"/><mass value="4"/>'
+    rb'<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>',
+    MIMIC,
+)
+
+
+def driven(chain: Chain, seed: int) -> Chain:
+    """With every term that its joints can have, some also off the diagonal."""
+    rng, n = np.random.default_rng(seed), chain.size
+    held = np.zeros((len(TERMS), n, n))
+    held[:, range(n), range(n)] = [
+        [term.prior * (term.sliding or not s) for s in chain.sliding] for term in TERMS
+    ]
+    held[COUPLED] += COUPLING_PRIOR * ~np.eye(n, dtype=bool)
+    return chain.driven(Transmission(held * rng.uniform(1, 3, held.shape), chain.loads))
+
+
+@pytest.mark.parametrize("robot", ["ur10", "odd"])
+def test_joints_that_miss_their_values_stand_where_pinocchio_has_them(window, tmp_path, robot):
+    pair = perturbed(Chain.from_urdf(parse_urdf(WEIGHTS, "odd.urdf"), "e")) if robot == "odd" else arms(robot)
+    nominal, calibrated = (driven(chain, seed) for seed, chain in enumerate(pair))
+    window.open(tmp_path / "scene.html", scene_html(nominal, calibrated, triangles=400))
+    check_tips(window, nominal, calibrated)
+    missed = np.abs(pair[1].poses(poses(nominal, 5)) - calibrated.poses(poses(nominal, 5))).max()
+    assert missed > 1e-3
+    # Enlarged, the calibrated joints leave the nominal ones in proportion.
+    window.open(
+        tmp_path / "scene.html", scene_html(pair[0], calibrated.driven(nominal.transmission), triangles=400)
+    )
+    window.call("setMagnification", 10)
+    q = poses(nominal, 1)
+    window.call("setJoints", q[0].tolist())
+    grown = replace(nominal.transmission, coefficients=10 * nominal.transmission.coefficients)
+    errors = se3.log6(se3.inverse(pair[0].origins) @ pair[1].origins)
+    there = replace(pair[0], origins=pair[0].origins @ se3.exp6(10 * errors)).driven(grown)
+    assert np.abs(window.tip("calibrated") - there.poses(q)[0]).max() <= 1e-9
 
 
 def test_a_result_shows_its_own_data_in_a_notebook(window, tmp_path, sim_6dof, sim_6dof_actual):

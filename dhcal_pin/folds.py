@@ -1,0 +1,183 @@
+"""Samples left out of a fit, and what the fit to the others says of them.
+
+The model is nearly linear around a fit, so every fold is solved exactly from two triangles: that of its
+fitted rows and that of its left-out rows. Nothing is iterated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import lstsq
+
+from .errors import DhcalError
+from .evaluation import deviations
+from .measurements import Measurement
+from .problem import Problem, Triangle, reduce
+from .se3 import Array
+
+# The share of the samples at either end of a principal direction that a fold leaves out.
+SHARE = 0.25
+# Directions with less than this share of the widest one's spread are none.
+_FLAT = 1e-6
+
+# For each measurement of a fit which of its samples (m,) a fold leaves out.
+Fold = tuple[Array, ...]
+
+
+def random_folds(data: Sequence[Measurement], count: int, seed: int = 0) -> tuple[Fold, ...]:
+    """Each sample left out in one of `count` folds at random: k-fold.
+
+    Raises:
+        DhcalError: fewer than two folds, or more than samples.
+    """
+    samples = sum(len(item.rows) for item in data)
+    if not 2 <= count <= samples:
+        raise DhcalError(f"{count} folds: choose from 2 to {samples}, the number of samples")
+    labels = np.random.default_rng(seed).permutation(samples) % count
+    return group_folds(data, labels)
+
+
+def group_folds(data: Sequence[Measurement], labels: Array) -> tuple[Fold, ...]:
+    """A fold a group: leave one group out.
+
+    Args:
+        data: measurements, m samples in all.
+        labels: (m,) the group of each sample.
+
+    Raises:
+        DhcalError: not one label a sample, or one group only.
+    """
+    labels = np.asarray(labels)
+    if labels.shape != (samples := sum(len(item.rows) for item in data),):
+        raise DhcalError(f"labels have shape {labels.shape}; {samples} samples need ({samples},)")
+    if len(groups := np.unique(labels)) < 2:
+        raise DhcalError("one group: leaving it out leaves nothing to fit")
+    return tuple(_parted(data, labels == group) for group in groups)
+
+
+def region_folds(data: Sequence[Measurement], share: float = SHARE) -> tuple[Fold, ...]:
+    """Two folds a principal direction of the joint values: its lowest and its highest share of samples.
+
+    Joint values are scaled to equal spread first. Readings without joint values are always fitted.
+
+    Raises:
+        DhcalError: all samples have the same joint values.
+    """
+    moved = [np.full(len(item.rows), item.ends > 0) for item in data]
+    moving = np.concatenate(moved)
+    q = np.concatenate([item.q for item in data])[moving]
+    spread = q.std(0)
+    scaled = (q - q.mean(0))[:, spread > 0] / spread[spread > 0]
+    _, size, directions = np.linalg.svd(scaled, full_matrices=False)
+    found = []
+    for along in (scaled @ directions[size > _FLAT * size.max(initial=0.0)].T).T:
+        low, high = np.quantile(along, [share, 1 - share])
+        for left in (along <= low, along >= high):
+            if not left.all():
+                mask = np.zeros(len(moving), bool)
+                mask[moving] = left
+                found.append(_parted(data, mask))
+    if not found:
+        raise DhcalError("cross-validation by regions needs samples at different joint values")
+    return tuple(found)
+
+
+def _parted(data: Sequence[Measurement], mask: Array) -> Fold:
+    return tuple(np.split(mask, np.cumsum([len(item.rows) for item in data])[:-1]))
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """A fold's triangles around one x: of what it fits and of what it leaves out, and the latter's rows."""
+
+    fitted: Triangle
+    left: Triangle
+    rows: int
+
+    @property
+    def unseen(self) -> Array:
+        """Columns (p,) that the fitted rows do not depend on, such as a point that was touched elsewhere."""
+        return np.logical_not(self.fitted.r.any(0))
+
+    def error(self, weights: Array, x: Array, columns: Array) -> float:
+        """RMS of the left-out whitened rows after a fit of some columns (p,) with priors of weights about 0.
+
+        What only the left-out rows depend on is fitted to them.
+        """
+        step, _ = solved(self.fitted, weights, x, columns)
+        own = self.left.r[:, columns]
+        rest = self.left.z - own @ step
+        alone = self.unseen[columns] & own.any(0)
+        if alone.any():
+            basis = np.linalg.qr(own[:, alone])[0]
+            rest = rest - basis @ (basis.T @ rest)
+        return float(np.sqrt((rest @ rest + self.left.rest) / self.rows))
+
+
+def solved(triangle: Triangle, weights: Array, x: Array, columns: Array) -> tuple[Array, float]:
+    """The step (c,) of the columns that count (p,) with priors of weights (p,) about 0, and its cost."""
+    held = weights[columns]
+    a = np.concatenate([triangle.r[:, columns], np.diag(held)])
+    b = np.concatenate([triangle.z, -held * x[columns]])
+    found = lstsq(a, b, lapack_driver="gelsy", check_finite=False)
+    assert found is not None
+    return found[0], triangle.rest + float(np.sum((a @ found[0] - b) ** 2))
+
+
+def rows(problem: Problem, x: Array) -> int:
+    """Number of whitened rows."""
+    chain = problem.errors.at(x[: len(problem.errors.parameters)])
+    return sum(
+        item.residual(chain.sweep(item.configurations()), problem.values(item, x)).size
+        for item in problem.data
+        if len(item.rows)
+    )
+
+
+def parts(
+    problem: Problem, x: Array, folds: Sequence[Fold], progress: Callable[[int, float], None] | None = None
+) -> tuple[Parts, ...]:
+    """Each fold's triangles around x (p,)."""
+    found = []
+    for fold in folds:
+        kept, left = (
+            replace(
+                problem, data=tuple(item.take(side) for item, side in zip(problem.data, sides, strict=True))
+            )
+            for sides in ([~mask for mask in fold], fold)
+        )
+        inside = reduce(kept, x, small_angle=False)
+        found.append(Parts(inside, reduce(left, x, small_angle=False), rows(left, x)))
+        if progress:
+            progress(len(found), inside.rest)
+    return tuple(found)
+
+
+def left_out(
+    problem: Problem, x: Array, data: Sequence[Measurement], folds: Sequence[Fold]
+) -> Iterator[tuple[list[dict[str, Array]], float]]:
+    """For each fold the deviations of its left-out samples, and their RMS in standard deviations.
+
+    Args:
+        problem: as it was fitted.
+        x: (p,) where it ended.
+        data: the fitted measurements, whose samples are judged.
+        folds: made for them.
+
+    Raises:
+        DhcalError: folds that were made for other data.
+    """
+    sizes = [len(item.rows) for item in data]
+    if any([len(mask) for mask in fold] != sizes for fold in folds):
+        raise DhcalError(f"folds were made for other data; {len(sizes)} measurements have {sizes} samples")
+    every, robot = np.ones(len(x), bool), len(problem.errors.parameters)
+    for fold, part in zip(folds, parts(problem, x, folds), strict=True):
+        moved = x + solved(part.fitted, problem.weights, x, every)[0]
+        unseen = {u.name for u, alone in zip(problem.unknowns, part.unseen[robot:], strict=True) if alone}
+        known = {name: value for name, value in problem.instruments(moved).items() if name not in unseen}
+        left = [item.take(mask) for item, mask in zip(data, fold, strict=True) if mask.any()]
+        found = deviations(problem.errors.at(moved[:robot]), left, known)
+        yield found, part.error(problem.weights, x, every)
