@@ -244,7 +244,7 @@ def calibrate(
 
     Sigmas that no instrument states are estimated with the fit, a group of rows at a time, and default
     priors take the size of the errors that are found, so that data and priors weigh right against each
-    other.
+    other. Where no reading holds a length, priors alone tell the arm's size and stay as they are.
 
     Raises:
         DhcalError: no data, unknown names, or a plain Gauss-Newton loop that runs away.
@@ -271,7 +271,8 @@ def calibrate(
     problem = replace(_problem(errors, data, prior_weights(errors, priors), known), where=where)
     if bounds:
         problem = replace(problem, bounds=_bounds(problem, bounds))
-    default = _default(errors, priors)
+    # Without a length in the data the smallest arm would fit best: there priors keep their size.
+    default = _default(errors, priors) & any(item.metric for item in data)
     solution = METHODS[method](problem, np.zeros(len(problem.weights)), max_iterations, progress)
     if errors.at(solution.x[: len(errors.parameters)]).transmission is not None:
         # Gravity's torques follow the arm as found: once more with those.

@@ -57,6 +57,7 @@ class Touch(PointReading):
 
     kind: ClassVar[str] = "point"
     touches: ClassVar[bool] = True
+    metric: ClassVar[bool] = False
     groups: ClassVar[Mapping[str, slice]] = {"position": slice(0, 3)}
     columns: ClassVar[Mapping[str, str]] = {"point": "text", **dict.fromkeys(_SIGMAS, "length")}
     needs: ClassVar[tuple[frozenset[str], ...]] = (need("point"),)
@@ -198,6 +199,7 @@ class Plane(PointReading):
 
     kind: ClassVar[str] = "plane"
     touches: ClassVar[bool] = True
+    metric: ClassVar[bool] = False
     groups: ClassVar[Mapping[str, slice]] = {"height": slice(0, 1)}
     columns: ClassVar[Mapping[str, str]] = {"plane": "text", "sigma_plane": "length"}
     needs: ClassVar[tuple[frozenset[str], ...]] = (need("plane"),)

@@ -29,6 +29,11 @@ _NEARLY = np.deg2rad(5.0)
 _MANY = 12
 # Entries that count of the projector on what is weakly seen, each parameter in its expected spread.
 _PART = 0.1
+# What data without a length leave open, whether they happen to show it or not.
+SIZE = "the readings do not tell how large the robot is"
+SCALE = (
+    f"all lengths together: {SIZE}; priors alone keep it; a known distance of two touched points would tell"
+)
 
 
 def listed(names: Sequence[str]) -> str:
@@ -192,7 +197,7 @@ class Explainer:
             other = "a point beside that axis or " if self._tells(aside, group) else ""
             return reason, other + self._reading(group)
         if self._grows(group):
-            return "the readings do not tell how large the robot is", self._reading(group)
+            return SIZE, self._reading(group)
         return "the readings stay the same", self._reading(group)
 
     def _grows(self, group: Group) -> bool:
@@ -257,14 +262,16 @@ def unobservable(problem: Problem, x: Array, triangle: Triangle) -> list[str]:
     Returns:
         Sentences; none where all is seen.
     """
+    scale = [] if any(item.metric for item in problem.data) else [SCALE]
     if observability.rank(triangle.r) == len(x):
-        return []
+        return scale
     experiment = Experiment(problem, x)
     layers = experiment.layers(triangle.r)
     path = Path.of(problem.errors, x[: len(problem.errors.parameters)])
     names = [p.name for p in (*problem.errors.parameters, *problem.unknowns)]
     explainer = Explainer(experiment, dict(layers), names, path)
-    return [explainer.sentence(group) for group in _joined(groups(layers, path.stations))]
+    found = [explainer.sentence(group) for group in _joined(groups(layers, path.stations))]
+    return found if any(SIZE in text for text in found) else scale + found
 
 
 def _joined(found: list[Group]) -> list[Group]:

@@ -68,6 +68,8 @@ class Measurement(Protocol):
     per_row: ClassVar[tuple[str, ...]]
     # Whether the tool must be on something for a sample; if not, any configuration can be measured.
     touches: ClassVar[bool]
+    # Whether a reading holds a length; if not, an arm of any size fits as well.
+    metric: ClassVar[bool]
 
     @property
     def q(self) -> Array:

@@ -43,6 +43,7 @@ class PointReading:
     needs: ClassVar[tuple[frozenset[str], ...]]
     ends: ClassVar[int] = 1
     touches: ClassVar[bool] = False
+    metric: ClassVar[bool] = True
     # Fields with an entry a sample.
     per_row: ClassVar[tuple[str, ...]] = ("q", "reading", "sigma", "rows")
 

@@ -56,6 +56,7 @@ class PoseReading:
     # Names of the position's and of the rotation vector's columns.
     reads: ClassVar[tuple[tuple[str, ...], tuple[str, ...]]]
     touches: ClassVar[bool] = False
+    metric: ClassVar[bool] = True
     # Fields with an entry a sample.
     per_row: ClassVar[tuple[str, ...]] = ("q", "poses", "sigma", "rotation_sigma", "rows")
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mpmath
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from conftest import paper, random_table
 from dhcal_pin import observability, se3
 from dhcal_pin.calibration import calibrate, split
 from dhcal_pin.chain import Chain
+from dhcal_pin.contacts import Touch
 from dhcal_pin.errors import DhcalError
 from dhcal_pin.evaluation import accuracy
 from dhcal_pin.folds import random_folds
@@ -312,3 +315,22 @@ def test_bounds_hold_and_the_rest_is_least_squares(sim_6dof, sim_6dof_actual):
     assert np.sum(residual(fit.x) ** 2) <= 2 * other.cost * (1 + 1e-6)
     free = calibrate(sim_6dof, data, "dh", priors="none")
     assert np.any((free.x < low) | (free.x > high))
+
+
+def test_touches_without_a_length_do_not_shrink_the_arm_away(sim_6dof, sim_6dof_actual):
+    """The smallest arm touches every point best; priors keep its size, and that is said."""
+    rng = np.random.default_rng(0)
+    errors = select(sim_6dof, "minimal")
+    truth = errors.at(errors.priors * rng.normal(size=len(errors.parameters)))
+    data = Touch.simulate(truth, rng.uniform(-2.5, 2.5, (300, 6)), Noise(2e-4), rng)
+    fit = calibrate(
+        sim_6dof, replace(data, stated=False), "minimal,tool", fix=("tool.rx", "tool.ry", "tool.rz")
+    )
+    assert "no reading holds a length" in fit.unobservable[0]
+    q = rng.uniform(-2.5, 2.5, (50, 6))
+    sizes = [
+        np.linalg.norm(np.diff(chain.poses(q)[:, :3, 3], axis=0), axis=1).sum()
+        for chain in (fit.chain, truth)
+    ]
+    assert sizes[0] / sizes[1] == pytest.approx(1, abs=0.03)
+    assert fit.problem.data[0].sigma.mean() == pytest.approx(2e-4, rel=0.2)
