@@ -31,9 +31,7 @@ _MANY = 12
 _PART = 0.1
 # What data without a length leave open, whether they happen to show it or not.
 SIZE = "the readings do not tell how large the robot is"
-SCALE = (
-    f"all lengths together: {SIZE}; priors alone keep it; a known distance of two touched points would tell"
-)
+SCALE = f"all lengths together: {SIZE}; priors alone do; a known distance of touched points would tell"
 
 
 def listed(names: Sequence[str]) -> str:
