@@ -173,11 +173,12 @@ def left_out(
     sizes = [len(item.rows) for item in data]
     if any([len(mask) for mask in fold] != sizes for fold in folds):
         raise DhcalError(f"folds were made for other data; {len(sizes)} measurements have {sizes} samples")
-    every, robot = np.ones(len(x), bool), len(problem.errors.parameters)
+    columns, robot = problem.free(x), len(problem.errors.parameters)
     for fold, part in zip(folds, parts(problem, x, folds), strict=True):
-        moved = x + solved(part.fitted, problem.weights, x, every)[0]
+        moved = x.copy()
+        moved[columns] += solved(part.fitted, problem.weights, x, columns)[0]
         unseen = {u.name for u, alone in zip(problem.unknowns, part.unseen[robot:], strict=True) if alone}
         known = {name: value for name, value in problem.instruments(moved).items() if name not in unseen}
         left = [item.take(mask) for item, mask in zip(data, fold, strict=True) if mask.any()]
         found = deviations(problem.errors.at(moved[:robot]), left, known)
-        yield found, part.error(problem.weights, x, every)
+        yield found, part.error(problem.weights, x, columns)

@@ -92,6 +92,12 @@ class Problem:
         vars(out)["chunks"] = self.chunks
         return out
 
+    def free(self, x: Array) -> Array:
+        """Which unknowns (p+s,) are not pressed against a bound at x."""
+        if self.bounds is None:
+            return np.ones(len(x), bool)
+        return ~np.any(np.abs(self.bounds - x) <= 1e-12, 0)
+
     def cost(self, x: Array) -> float:
         """Sum of squared whitened residuals and priors at x (p,)."""
         chain = self.errors.at(x[: len(self.errors.parameters)])

@@ -18,7 +18,7 @@ from .folds import left_out, random_folds
 from .measurements import Measurement, Unknown
 from .problem import Problem, reduce
 from .se3 import Array
-from .solver import Solution, posterior_root, pseudo_inverse, with_priors
+from .solver import Solution, bounded_step, posterior_root, with_priors
 from .tables import Estimate
 from .uncertainty import UNKNOWN, Prediction, Uncertainty
 
@@ -294,5 +294,5 @@ class Result:
             self.x,
             np.zeros_like(self.x),
         )
-        step = pseudo_inverse(full.r, full.z)
+        step = bounded_step(self.problem, full, self.x)
         return float(np.linalg.norm(full.r @ step)) <= eps * np.sqrt(max(1, self.samples))

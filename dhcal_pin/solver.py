@@ -57,7 +57,7 @@ def pseudo_inverse(r: Array, z: Array) -> Array:
     return np.linalg.lstsq(r, z, rcond=observability.RANK_CUT)[0]
 
 
-def _step(problem: Problem, triangle: Triangle, x: Array) -> Array:
+def bounded_step(problem: Problem, triangle: Triangle, x: Array) -> Array:
     """The least-squares step from x (p,) that stays within the problem's bounds."""
     if problem.bounds is None:
         return pseudo_inverse(triangle.r, triangle.z)
@@ -142,7 +142,7 @@ def _leap(problem: Problem, x: Array, cost: float) -> tuple[Array, float]:
         triangle = with_priors(
             reduce(problem, far, small_angle=False), problem.weights, far, np.zeros_like(x)
         )
-        there = far + _step(problem, triangle, far)
+        there = far + bounded_step(problem, triangle, far)
         if not np.abs(there).max() < RUNAWAY:
             break
         far, ends = there, problem.cost(there)
@@ -175,7 +175,7 @@ def levenberg_marquardt(
         done += 1
         while True:
             damped = with_priors(free, none, x, np.sqrt(damping) * floor)
-            step = _step(problem, damped, x)
+            step = bounded_step(problem, damped, x)
             change = _change(free.r, step)
             settled = _settled(free.r, change, cost, last)
             ahead = None

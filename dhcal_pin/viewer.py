@@ -40,7 +40,6 @@ PathLike = str | os.PathLike[str]
 MOST_POINTS = 2000  # more are thinned out evenly: the page keeps moving smoothly
 MOST_ELLIPSOIDS = 400  # more would hide each other
 TRIANGLES = 60_000  # that the meshes keep: with more the page would hardly turn, and be large
-FEW_TRIANGLES = 15_000  # one still sees what each link is
 LEAST_TRIANGLES = 100
 SLIDE = 0.5  # m each way for a sliding joint without limits
 PAGE = Path(__file__).with_name("viewer.html")
@@ -74,7 +73,7 @@ def scene_html(
         title: the page's heading.
         package_dirs: where to look for the URDF's meshes; the folders above the URDF without it.
         magnification: how many times larger than true the errors are drawn at first, 1 to 500.
-        triangles: most of them that the meshes keep all together; `FEW_TRIANGLES` for a small page.
+        triangles: most of them that the meshes keep all together; 15,000 still show what each link is.
 
     Returns:
         The page; the same bytes for the same input.

@@ -307,7 +307,10 @@ def test_bounds_hold_and_the_rest_is_least_squares(sim_6dof, sim_6dof_actual):
     }
     fit = calibrate(sim_6dof, data, "dh", priors="none", bounds=bounds)
     assert fit.converged
+    assert fit.is_converged(1e-4)
     assert fit.problem.bounds is not None
+    # Samples that are left out are judged by arms within the same bounds.
+    assert fit.comparisons[0].after["position_rms_m"] > 1e-3
     low, high = fit.problem.bounds
     assert np.all((low - 1e-12 <= fit.x) & (fit.x <= high + 1e-12))
     residual = lambda x: data.residual(errors.at(x).sweep(data.q), NONE).ravel()  # noqa: E731
