@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from dhcal_pin.chain import Chain
 from dhcal_pin.shapes import GRID, Looks, Mesh, looks, shares
 from dhcal_pin.urdf import parse_urdf
-from dhcal_pin.viewer import FEW_TRIANGLES, TRIANGLES, scene_html, tree
+from dhcal_pin.viewer import TRIANGLES, scene_html, tree
 
 UR5 = "ur_description/urdf/ur5_robot.urdf"
 EVERYTHING = 10**9
@@ -94,7 +94,7 @@ def test_two_meshed_arms_stay_small_and_come_out_the_same():
     assert first == second
     sizes = [
         len(first.encode()),
-        *(len(scene_html(nominal, nominal, q=q, triangles=n).encode()) for n in (TRIANGLES, FEW_TRIANGLES)),
+        *(len(scene_html(nominal, nominal, q=q, triangles=n).encode()) for n in (TRIANGLES, 15_000)),
     ]
     assert sizes[0] < 6e6
     assert sizes[1] < 2e6
