@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from .evaluation import summary
-from .folds import Fold, left_out, region_folds
+from .folds import Fold, left_out, region_folds, touched
 from .result import Result
 from .se3 import Array
 
@@ -34,8 +34,12 @@ class CrossValidation:
 
 
 def standard_error(values: Array) -> float:
-    """Standard error of the mean of values (k,); infinite for one."""
-    return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else np.inf
+    """Standard error of the mean of values (k,), as wide as Student's t makes few; infinite for one."""
+    if len(values) < 2:
+        return np.inf
+    from scipy.special import ndtr, stdtrit  # a good part of the start-up, and few fits need it
+
+    return float(stdtrit(len(values) - 1, ndtr(1.0)) * values.std(ddof=1) / np.sqrt(len(values)))
 
 
 def cross_validate(fit: Result, folds: Sequence[Fold] | None = None) -> CrossValidation:
@@ -48,7 +52,8 @@ def cross_validate(fit: Result, folds: Sequence[Fold] | None = None) -> CrossVal
     Raises:
         DhcalError: folds that were not made for the fitted data.
     """
-    folds = folds if folds is not None else region_folds(fit.data)
+    if folds is None:
+        folds = region_folds(fit.data, places=touched(fit.problem, fit.x))
     judged = list(left_out(fit.problem, fit.x, fit.data, folds))
     every = [item for found, _ in judged for item in found]
     return CrossValidation(

@@ -19,7 +19,7 @@ from .chain import Chain
 from .crossvalidation import standard_error
 from .error_model import Parameter
 from .errors import DhcalError
-from .folds import Parts, parts, region_folds, rows, solved
+from .folds import Parts, parts, region_folds, rows, solved, touched
 from .measurements import Measurement
 from .parameters import EXTENSIONS, SETS
 from .problem import Triangle, reduce
@@ -158,7 +158,7 @@ def _stage(fit: Result, families: dict[str, list[Parameter]], progress: Progress
     home = {p.name: name for name, parameters in families.items() for p in parameters if p.name not in names}
     problem = replace(fit.problem, errors=errors, weights=weights)
     return _Stage(
-        parts(problem, x, region_folds(problem.data), progress),
+        parts(problem, x, region_folds(problem.data, places=touched(problem, x)), progress),
         reduce(problem, x, small_angle=False),
         rows(problem, x),
         x,

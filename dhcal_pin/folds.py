@@ -15,7 +15,7 @@ from scipy.linalg import lstsq
 from .errors import DhcalError
 from .evaluation import deviations
 from .measurements import Measurement
-from .problem import Problem, Triangle, reduce
+from .problem import Problem, Triangle, reduce, shared_unknowns
 from .se3 import Array
 
 # The share of the samples at either end of a principal direction that a fold leaves out.
@@ -58,31 +58,68 @@ def group_folds(data: Sequence[Measurement], labels: Array) -> tuple[Fold, ...]:
     return tuple(_parted(data, labels == group) for group in groups)
 
 
-def region_folds(data: Sequence[Measurement], share: float = SHARE) -> tuple[Fold, ...]:
+def region_folds(
+    data: Sequence[Measurement], share: float = SHARE, places: Array | None = None
+) -> tuple[Fold, ...]:
     """Two folds a principal direction of the joint values: its lowest and its highest share of samples.
 
-    Joint values are scaled to equal spread first. Readings without joint values are always fitted.
+    Joint values are scaled to equal spread first. Places are left out as a whole, so that nothing fitted
+    says where a left-out point is or how far it is from another; with one place each sample is its own.
+
+    Args:
+        data: measurements, m samples in all.
+        share: of the samples or places at either end that a fold leaves out.
+        places: (m,) labels of samples that belong together, as from `touched`; each by itself without it.
+            Readings without joint values go with their place, or are always fitted.
 
     Raises:
         DhcalError: all samples have the same joint values.
     """
-    moved = [np.full(len(item.rows), item.ends > 0) for item in data]
-    moving = np.concatenate(moved)
-    q = np.concatenate([item.q for item in data])[moving]
-    spread = q.std(0)
-    scaled = (q - q.mean(0))[:, spread > 0] / spread[spread > 0]
+    moving = np.concatenate([np.full(len(item.rows), item.ends > 0) for item in data])
+    q = np.concatenate([item.q for item in data])
+    label = np.unique(np.arange(len(q)) if places is None else places, return_inverse=True)[1]
+    count = np.bincount(label[moving], minlength=label.max(initial=-1) + 1)
+    if np.count_nonzero(count) == 1:
+        return region_folds(data, share)
+    middle = np.stack([np.bincount(label[moving], column, len(count)) for column in q[moving].T], 1)
+    middle = middle[count > 0] / count[count > 0, None]
+    spread = middle.std(0)
+    scaled = (middle - middle.mean(0))[:, spread > 0] / spread[spread > 0]
     _, size, directions = np.linalg.svd(scaled, full_matrices=False)
-    found = []
+    found: dict[bytes, Fold] = {}
     for along in (scaled @ directions[size > _FLAT * size.max(initial=0.0)].T).T:
         low, high = np.quantile(along, [share, 1 - share])
         for left in (along <= low, along >= high):
             if not left.all():
-                mask = np.zeros(len(moving), bool)
-                mask[moving] = left
-                found.append(_parted(data, mask))
+                gone = np.zeros(len(count), bool)
+                gone[count > 0] = left
+                found.setdefault(gone.tobytes(), _parted(data, gone[label]))
     if not found:
         raise DhcalError("cross-validation by regions needs samples at different joint values")
-    return tuple(found)
+    return tuple(found.values())
+
+
+def touched(problem: Problem, x: Array) -> Array:
+    """Labels (m,) of the samples' places: alike where they touch the same thing, or what is known from there.
+
+    Points that a known distance joins are one place; a sample of free space is one by itself.
+    """
+    from scipy.sparse import coo_array  # a part of the start-up, and few fits need it
+    from scipy.sparse.csgraph import connected_components
+
+    chain = problem.errors.at(x[: len(problem.errors.parameters)])
+    place = {unknown.name: i for i, unknown in enumerate(shared_unknowns(problem.data))}
+    first, samples, things = len(place), [], []
+    for item in problem.data:
+        if (item.touches or not item.ends) and len(item.rows):
+            sweep = chain.sweep(item.configurations())
+            own, sample = np.nonzero(item.own(sweep, problem.values(item, x)).any(1))
+            samples.append(first + sample)
+            things.append(np.array([place[unknown.name] for unknown in item.unknowns], int)[own])
+        first += len(item.rows)
+    rows, columns = (np.concatenate([*found, np.empty(0, int)]) for found in (samples, things))
+    links = coo_array((np.ones(len(rows)), (rows, columns)), shape=(first, first))
+    return connected_components(links, directed=False)[1][len(place) :]
 
 
 def _parted(data: Sequence[Measurement], mask: Array) -> Fold:

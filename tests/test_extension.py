@@ -13,11 +13,11 @@ from conftest import paper, robot_file
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.chain import Chain
 from dhcal_pin.cli import main
-from dhcal_pin.contacts import Touch
-from dhcal_pin.crossvalidation import cross_validate
+from dhcal_pin.contacts import PointDistance, Touch
+from dhcal_pin.crossvalidation import cross_validate, standard_error
 from dhcal_pin.errors import DhcalError
 from dhcal_pin.extension import extend
-from dhcal_pin.folds import group_folds, random_folds, region_folds
+from dhcal_pin.folds import group_folds, random_folds, region_folds, touched
 from dhcal_pin.measurement_files import measurement_text
 from dhcal_pin.measurements import Noise
 from dhcal_pin.parameters import select
@@ -90,6 +90,37 @@ def test_regions_are_the_ends_of_joint_space():
     assert (low, high) == ([0, 1], [6, 7])
     with pytest.raises(DhcalError, match="different joint values"):
         region_folds([replace(data, q=np.ones((8, 6)))])
+
+
+def test_what_was_touched_is_left_out_as_a_whole():
+    """Points a, b are joined by a distance, as c, d are; e stands alone and i is never touched."""
+    names = np.array(list("abcde"))
+    label = np.repeat(np.arange(5), 4)
+    arm = Chain.from_dh(paper("sim_6dof"))
+    q = 0.4 * label[:, None] + np.random.default_rng(0).uniform(-0.1, 0.1, (20, 6))
+    touches = Touch.of(q, names[label].tolist())
+    known = PointDistance.of(6, [("c", "d"), ("a", "b"), ("a", "i")], [0.1, 0.1, 0.1])
+    problem = calibrate(arm, [touches, known], "dh", max_iterations=1).problem
+    places = touched(problem, np.zeros(len(problem.weights)))
+    folds = region_folds(problem.data, places=places)
+    for of_touches, of_distances in folds:
+        by_name = {name: set(of_touches[label == i].tolist()) for i, name in enumerate("abcde")}
+        assert all(len(found) == 1 for found in by_name.values())
+        assert by_name["a"] == by_name["b"] == set(of_distances[1:].tolist())
+        assert by_name["c"] == by_name["d"] == set(of_distances[:1].tolist())
+    left = {tuple(fold[0].tolist()) for fold in folds}
+    assert len(left) == len(folds) >= 2
+    # One place is no region of its own: there samples are left out one by one.
+    one = Touch.of(q, ["a"] * 20)
+    alone = [fold[0] for fold in region_folds([one], places=np.zeros(20, int))]
+    np.testing.assert_array_equal(alone, [fold[0] for fold in region_folds([one])])
+
+
+def test_few_folds_must_agree_more():
+    """Student's t that a normal deviate passes one sigma as often: 1.84 for two folds, 1.32 for three."""
+    assert standard_error(np.array([0.0, 1.0])) == pytest.approx(0.5 * 1.837, rel=1e-3)
+    assert standard_error(np.array([0.0, 1.0, 2.0])) == pytest.approx(1.321 / np.sqrt(3), rel=1e-3)
+    assert standard_error(np.array([1.0])) == np.inf
 
 
 def test_a_point_that_only_left_out_samples_touch_is_fitted_to_them():

@@ -32,6 +32,7 @@ SERIES = {
 FOLDS = (lambda data: random_folds(data, 5), region_folds)
 PANDA = DATA / "mukca_panda/panda_with_ball.urdf"
 PANDA_2 = "back_left back_right front_center front_left front_right mid-high mid_left mid_right".split()
+EXTEND = ("--extend", "auto")
 PANDA_1 = "back-high front right".split()
 
 
@@ -123,8 +124,8 @@ def known_distances(path, places):
     return path
 
 
-def judged(dhcal, folder, arm, places, left):
-    """Nominal and calibrated: consistency of a left-out place's points and error of their distance, mm."""
+def judged(dhcal, folder, arm, places, left, *more):
+    """Calibrated and nominal: consistency of a left-out place's points and error of their distance, mm."""
     holes = {
         place: [DATA / "mukca_panda" / arm / place / f"hole_{i}.csv" for i in (0, 1)] for place in places
     }
@@ -134,27 +135,34 @@ def judged(dhcal, folder, arm, places, left):
     output = folder / "panda.urdf"
     known = known_distances(folder / "known.csv", kept)
     sets = ("--parameters", "placement,tool", "-o", output)
-    assert dhcal("calibrate", PANDA, *touched, known, *common, *sets)["converged"]
+    assert dhcal("calibrate", PANDA, *touched, known, *common, *sets, *more)["converged"]
     judge = (*holes[left], known_distances(folder / "left.csv", [left]), *common)
-    found = [dhcal("validate", robot, *judge)["after"] for robot in (PANDA, output)]
+    found = [dhcal("validate", robot, *judge)["after"] for robot in (output, PANDA)]
     return [[1e3 * one[key] for key in ("position_rms_m", "residual_rms")] for one in found]
 
 
 def test_a_panda_that_touched_sockets_at_eight_places(dhcal, tmp_path):
-    nominal, fitted = np.array(
+    fitted, nominal = np.array(
         [judged(dhcal, tmp_path, "panda_2_clean", PANDA_2, left) for left in PANDA_2]
     ).swapaxes(0, 1)
     assert 7 < np.sqrt(np.mean(nominal[:, 0] ** 2)) < 11
     consistency, distance = fitted.mean(0)
     assert consistency <= 0.34
     assert distance <= 0.2
+    auto = [judged(dhcal, tmp_path, "panda_2_clean", PANDA_2, left, *EXTEND)[0] for left in PANDA_2[::2]]
+    extended = np.mean(auto, 0)
+    assert extended[0] < fitted[::2, 0].mean()
+    assert extended[1] <= fitted[::2, 1].mean()
 
 
 @pytest.mark.parametrize(("left", "most"), [("back-high", 1.05), ("front", 0.74), ("right", 0.86)])
 def test_a_panda_that_touched_sockets_at_three_places(dhcal, tmp_path, left, most):
-    (nominal, _), (fitted, _) = judged(dhcal, tmp_path, "panda_1", PANDA_1, left)
+    """Two places alone tell nothing of a third: an extension is not added on their word."""
+    (fitted, distance), (nominal, _) = judged(dhcal, tmp_path, "panda_1", PANDA_1, left)
     assert nominal > 7
     assert fitted <= most
+    extended = judged(dhcal, tmp_path, "panda_1", PANDA_1, left, *EXTEND)[0]
+    assert np.all(np.array(extended) <= [fitted + 1e-9, distance + 1e-9])
 
 
 def planned_and_random(seeds: int, choices: int) -> tuple[float, float]:
