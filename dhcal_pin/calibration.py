@@ -244,7 +244,7 @@ def calibrate(
 
     Sigmas that no instrument states are estimated with the fit, a group of rows at a time, and default
     priors take the size of the errors that are found, so that data and priors weigh right against each
-    other. Where no reading holds a length, priors alone tell the arm's size and stay as they are.
+    other. Readings without a length leave the arm's size to others, and to the priors.
 
     Raises:
         DhcalError: no data, unknown names, or a plain Gauss-Newton loop that runs away.
@@ -271,8 +271,7 @@ def calibrate(
     problem = replace(_problem(errors, data, prior_weights(errors, priors), known), where=where)
     if bounds:
         problem = replace(problem, bounds=_bounds(problem, bounds))
-    # Without a length in the data the smallest arm would fit best: there priors keep their size.
-    default = _default(errors, priors) & any(item.metric for item in data)
+    default = _default(errors, priors)
     solution = METHODS[method](problem, np.zeros(len(problem.weights)), max_iterations, progress)
     if errors.at(solution.x[: len(errors.parameters)]).transmission is not None:
         # Gravity's torques follow the arm as found: once more with those.
@@ -301,7 +300,7 @@ def calibrate(
             if all(new is old for new, old in zip(weighed, problem.data, strict=True)):
                 problem, known_now = problem.held(priors_now), solution.triangle
             else:
-                problem = replace(problem, data=weighed, weights=priors_now)
+                problem = problem.of(weighed).held(priors_now)
             again = levenberg_marquardt(problem, solution.x, max_iterations, progress, known_now)
             solution = replace(again, iterations=solution.iterations + again.iterations)
     return Result(

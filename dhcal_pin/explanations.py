@@ -29,7 +29,7 @@ _NEARLY = np.deg2rad(5.0)
 _MANY = 12
 # Entries that count of the projector on what is weakly seen, each parameter in its expected spread.
 _PART = 0.1
-# What data without a length leave open, whether they happen to show it or not.
+# What data without a length leave open.
 SIZE = "the readings do not tell how large the robot is"
 SCALE = f"all lengths together: {SIZE}; priors alone do; a known distance of touched points would tell"
 
@@ -260,16 +260,26 @@ def unobservable(problem: Problem, x: Array, triangle: Triangle) -> list[str]:
     Returns:
         Sentences; none where all is seen.
     """
-    scale = [] if any(item.metric for item in problem.data) else [SCALE]
     if observability.rank(triangle.r) == len(x):
-        return scale
+        return []
     experiment = Experiment(problem, x)
     layers = experiment.layers(triangle.r)
     path = Path.of(problem.errors, x[: len(problem.errors.parameters)])
     names = [p.name for p in (*problem.errors.parameters, *problem.unknowns)]
     explainer = Explainer(experiment, dict(layers), names, path)
     found = [explainer.sentence(group) for group in _joined(groups(layers, path.stations))]
-    return found if any(SIZE in text for text in found) else scale + found
+    if _size_is_open(problem, x, triangle) and not any(SIZE in text for text in found):
+        found = [SCALE, *found]
+    return found
+
+
+def _size_is_open(problem: Problem, x: Array, triangle: Triangle) -> bool:
+    """Whether an unseen direction makes the arm larger."""
+    if problem.ruler is None:
+        return False
+    robot = len(problem.errors.parameters)
+    growth = problem.ruler.rates(*problem.errors.derivative(x[:robot]))[:, 0]
+    return bool(np.abs(growth @ observability.unseen(triangle.r)[:robot]).max() > NONE)
 
 
 def _joined(found: list[Group]) -> list[Group]:

@@ -1,9 +1,9 @@
 """Which families of joints' transmission errors the data ask for: forward selection by cross-validation.
 
 A family is added where two things hold: the error on left-out regions of joint space falls by more than its
-standard error, and an F-test on all data says that chance would hardly do it. Cross-validation also chooses
-how wide the family's priors are, as a term that runs away under wide ones may serve under narrow ones: as
-narrow as does no harm.
+standard error and by a share that is worth it, and an F-test on all data says that chance would hardly do
+it. Cross-validation also chooses how wide the family's priors are, as a term that runs away under wide ones
+may serve under narrow ones: as narrow as does no harm.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ from .tables import Table, fixed
 
 # Widths of a family's priors that are tried, as shares of the default ones.
 WIDTHS = (1.0, 0.3, 0.1, 0.03)
+# A family that lowers the error by a smaller share is not worth its unknowns.
+WORTH = 0.01
 # A family that chance alone would make look so good more often than this is not added.
 CHANCE = 0.01
 # Smaller chances differ by nothing that one could believe.
@@ -60,7 +62,8 @@ class Trial:
     @property
     def helps(self) -> bool:
         """Whether the data ask for it."""
-        return self.cv_before - self.cv_after > self.standard_error and self.chance < CHANCE
+        gained = self.cv_before - self.cv_after
+        return gained > max(self.standard_error, WORTH * self.cv_before) and self.chance < CHANCE
 
 
 def trial_table(found: Sequence[Trial]) -> Table:

@@ -7,7 +7,7 @@ fitted rows and that of its left-out rows. Nothing is iterated.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import lstsq
@@ -181,9 +181,7 @@ def parts(
     found = []
     for fold in folds:
         kept, left = (
-            replace(
-                problem, data=tuple(item.take(side) for item, side in zip(problem.data, sides, strict=True))
-            )
+            problem.of([item.take(side) for item, side in zip(problem.data, sides, strict=True)])
             for sides in ([~mask for mask in fold], fold)
         )
         inside = reduce(kept, x, small_angle=False)

@@ -21,6 +21,7 @@ from .error_model import ErrorModel
 from .executors import HERE, Workers
 from .kinematics import Motion, Sweep
 from .measurements import Measurement, Unknown
+from .scale import Ruler, count_in_arm
 from .scratch import LongRows, scratch
 from .se3 import Array
 
@@ -75,7 +76,25 @@ class Problem:
         """The model at x (p+s,), ready for any chunk of data."""
         robot = len(self.errors.parameters)
         places = {unknown.name: robot + i for i, unknown in enumerate(self.unknowns)}
-        return Tangent(*self.errors.derivative(x[:robot]), self.instruments(x), places)
+        model = self.errors.derivative(x[:robot])
+        size, rates = 1.0, np.zeros((robot, 4))
+        if self.ruler:
+            size, rates = self.ruler.size(model[0]), self.ruler.rates(*model)
+        return Tangent(*model, self.instruments(x), places, size, rates)
+
+    @cached_property
+    def ruler(self) -> Ruler | None:
+        """What tells the arm's size, which readings without a length are counted in, if there are any."""
+        plain = [item for item in self.data if not item.metric and len(item.rows)]
+        if not plain or any(unknown.name in self.known for item in plain for unknown in item.unknowns):
+            return None
+        return Ruler.of(self.errors.chain, np.concatenate([item.q for item in plain]))
+
+    def of(self, data: Sequence[Measurement]) -> Problem:
+        """The same problem with some or other samples of the same measurements."""
+        out = replace(self, data=tuple(data))
+        vars(out)["ruler"] = self.ruler
+        return out
 
     @cached_property
     def chunks(self) -> tuple[Chunk, ...]:
@@ -89,7 +108,7 @@ class Problem:
     def held(self, weights: Array) -> Problem:
         """The same data with other priors."""
         out = replace(self, weights=weights)
-        vars(out)["chunks"] = self.chunks
+        vars(out).update(chunks=self.chunks, ruler=self.ruler)
         return out
 
     def free(self, x: Array) -> Array:
@@ -101,7 +120,8 @@ class Problem:
     def cost(self, x: Array) -> float:
         """Sum of squared whitened residuals and priors at x (p,)."""
         chain = self.errors.at(x[: len(self.errors.parameters)])
-        costs = self.each(partial(_cost, chain, self.instruments(x)))
+        size = self.ruler.size(chain) if self.ruler else 1.0
+        costs = self.each(partial(_cost, chain, self.instruments(x), size))
         return sum(costs, float(np.sum((self.weights * x) ** 2)))
 
     def each(self, function: Callable[[Chunk], _Found]) -> Iterator[_Found]:
@@ -145,6 +165,7 @@ class Tangent:
         bodies, twists: (e,), (e, 6): what each of the e errors moves, as `Chain.tool_velocities` takes it.
         instruments: values of all the instruments' unknowns by name.
         places: where those of them that are unknown here stand in x.
+        size, rates: of the arm, and how fast it grows and turns with each error (e, 4); see `scale`.
     """
 
     chain: Chain
@@ -152,6 +173,8 @@ class Tangent:
     twists: Array
     instruments: Mapping[str, float]
     places: Mapping[str, int]
+    size: float
+    rates: Array
 
     def triangle(self, chunk: Chunk, small_angle: bool) -> Array:
         """Triangle (p+1, p+1) of a chunk's whitened rows [J | r]; exact or by the paper's rows."""
@@ -171,6 +194,8 @@ class Tangent:
             for unknown, rows in zip(data.unknowns, data.own(sweep, u), strict=True):
                 if unknown.name in self.places:
                     block[self.places[unknown.name]] = rows
+            if not data.metric:
+                count_in_arm(block, self.size, self.rates, data.groups.get("position"))
         if block[0].size < TALL:
             return qr(block.reshape(p + 1, -1))
         return functools.reduce(merge, (_narrow(block[:, rows]) for rows in data.groups.values()))
@@ -190,9 +215,10 @@ def _narrow(rows: Array) -> Array:
     return out
 
 
-def _cost(chain: Chain, instruments: Mapping[str, float], chunk: Chunk) -> float:
+def _cost(chain: Chain, instruments: Mapping[str, float], size: float, chunk: Chunk) -> float:
     residual = chunk.data.residual(chunk.sweep(chain), chunk.unknowns(instruments))
-    return float(np.vdot(residual, residual))
+    square = float(np.vdot(residual, residual))
+    return square if chunk.data.metric else square / size**2
 
 
 def _triangle(tangent: Tangent, small_angle: bool, chunk: Chunk) -> Array:

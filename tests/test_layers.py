@@ -22,7 +22,7 @@ LAYERS = (
     {"transmission"},
     {"paths", "kinematics"},
     {"chain"},
-    {"error_model", "factors", "measurements", "inverse", "trilateration", "clearance", "design"},
+    {"error_model", "factors", "measurements", "scale", "inverse", "trilateration", "clearance", "design"},
     {"parameters", "configurations", "point_readings"},
     {"poses", "positions"},
     {"lengths", "contacts", "relative"},
