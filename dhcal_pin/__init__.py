@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from .robot_files import write_urdf as write_urdf
     from .stream import calibrate_stream as calibrate_stream
     from .stream import file_parts as file_parts
+    from .transmission import Payload as Payload
     from .uncertainty import Prediction as Prediction
     from .viewer import scene_html as scene_html
     from .viewer import show as show
@@ -98,6 +99,7 @@ _HOMES = {
     "write_urdf": "robot_files",
     "calibrate_stream": "stream",
     "file_parts": "stream",
+    "Payload": "transmission",
     "Prediction": "uncertainty",
     "scene_html": "viewer",
     "show": "viewer",

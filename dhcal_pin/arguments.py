@@ -137,6 +137,9 @@ def parser() -> argparse.ArgumentParser:
     calibrate.add_argument(
         "--instrument", metavar="FILE", help="TOML whose [instrument] table holds surveyed values, as wire1.x"
     )
+    calibrate.add_argument(
+        "--payload", metavar="KG[@X,Y,Z]", help="what the tip carries, for compliance: 5kg or 5kg@0,0,80mm"
+    )
     calibrate.add_argument("--max-iterations", metavar="N", type=_count, default=100, help="most steps (100)")
     calibrate.add_argument(
         "--seed", metavar="N", type=_seed, default=0, help="for the choice of the hold-out"

@@ -21,6 +21,7 @@ from .measurement_files import read_readings
 from .measurements import Measurement
 from .outputs import STDOUT, check_outputs, check_urdf_ending, emit, names, same, sidecars
 from .parameters import EXTENSIONS
+from .payload_files import parse_payload
 from .plausibility import doubts
 from .result import Result
 from .robot_files import (
@@ -132,6 +133,8 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
         workspace_files.check_map_ending(args.map)
 
     chain = read_robot(args.robot, args.tip)
+    if args.payload:
+        chain = chain.carrying(parse_payload(args.payload))
     sets = args.parameters or chain.parameters
     data = _read_data(chain, args, held_file, known_frames=not {"base", "tool"} & set(names(sets)))
     fit, trials = extension.extend(
@@ -198,6 +201,8 @@ def _provenance(
         "loss": args.loss,
         "seed": str(args.seed),
     }
+    if args.payload:
+        settings["payload"] = args.payload
     if args.holdout is not None:
         settings["hold-out"] = short.get(args.holdout, f"{args.holdout} of each file, at random by the seed")
     left_out = {

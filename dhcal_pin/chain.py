@@ -28,7 +28,7 @@ from .errors import DhcalError
 from .kinematics import Motion, Sweep
 from .paths import axis_frame, build_model, default_tip, independent_joints, placements
 from .se3 import Array
-from .transmission import Loads, Transmission
+from .transmission import Loads, Payload, Transmission
 from .urdf import Urdf, parse_urdf, read_urdf
 
 BASE = 0
@@ -63,6 +63,7 @@ class Chain:
         tool: (4, 4) measured point in the tip frame.
         parameters: the sets that are identified when nobody says otherwise.
         transmission: how the independent joints miss their values; None where they do as they are told.
+        payload: what the tip carries, for joints that yield to loads.
     """
 
     urdf: Urdf
@@ -80,6 +81,7 @@ class Chain:
     tool: Array = field(default_factory=lambda: np.eye(4))
     parameters: str = "minimal,base,tool"
     transmission: Transmission | None = None
+    payload: Payload | None = None
 
     @classmethod
     def from_urdf(cls, source: str | os.PathLike[str] | Urdf, tip: str | None = None) -> Chain:
@@ -158,7 +160,11 @@ class Chain:
         model = build_model(self.urdf)
         for name, origin in zip(self.moving, self.origins[:-1], strict=True):
             model.jointPlacements[model.getJointId(name)] = pin.SE3(origin)
-        model.frames[model.getFrameId(self.tip, pin.FrameType.BODY)].placement = pin.SE3(self.origins[-1])
+        tip = model.frames[model.getFrameId(self.tip, pin.FrameType.BODY)]
+        tip.placement = pin.SE3(self.origins[-1])
+        if self.payload:
+            carried = pin.Inertia(self.payload.mass, np.array(self.payload.centre), np.zeros((3, 3)))
+            model.appendBodyToJoint(tip.parentJoint, carried, tip.placement)
         return model
 
     @cached_property
@@ -196,6 +202,10 @@ class Chain:
     def driven(self, transmission: Transmission) -> Chain:
         """The chain with other joints."""
         return replace(self, transmission=transmission)
+
+    def carrying(self, payload: Payload | None) -> Chain:
+        """The chain with something in its hand, to whose weight its joints yield too."""
+        return replace(self, payload=payload).loaded()
 
     def loaded(self) -> Chain:
         """The chain whose joints yield to its own masses as placed now, not to those it was started with."""

@@ -23,7 +23,7 @@ class Job:
         data: paths of measurement files.
         output: path of the corrected URDF.
         tip, columns, parameters, extend, fix, free, holdout, method, loss, priors, bounds, instrument,
-            max_iterations, seed, in_place, world_joint, tool_frame, report, json, map: as in
+            payload, max_iterations, seed, in_place, world_joint, tool_frame, report, json, map: as in
             `dhcal calibrate --help`.
     """
 
@@ -42,6 +42,7 @@ class Job:
     priors: str | None = None
     bounds: str | None = None
     instrument: str | None = None
+    payload: str | None = None
     max_iterations: int = 100
     seed: int = 0
     in_place: bool = False

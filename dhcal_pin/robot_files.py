@@ -17,6 +17,7 @@ from .dh import DHTable
 from .dh_files import is_dh, read_dh, read_frame
 from .errors import DhcalError
 from .files import PathLike, read_toml, save
+from .payload_files import payload_lines, read_payload
 from .result import Result
 from .se3 import Array
 from .transmission_files import transmission_lines, with_transmission
@@ -93,16 +94,20 @@ def read_robot(path: PathLike, tip: str | None = None, sidecar: PathLike | None 
 def _with_sidecar(chain: Chain, path: PathLike) -> Chain:
     raw = read_toml(path)
     tip = raw.pop("tip", chain.tip)
-    if unknown := set(raw) - {"base", "tool", "joint", "instrument", "uncertainty"}:
+    if unknown := set(raw) - {"base", "tool", "payload", "joint", "instrument", "uncertainty"}:
         raise DhcalError(
             f"{os.fspath(path)}: unknown key {min(unknown)!r}; "
-            "allowed: tip, [base], [tool], [joint.NAME], [instrument], [uncertainty]"
+            "allowed: tip, [base], [tool], [payload], [joint.NAME], [instrument], [uncertainty]"
         )
     frames = {key: read_frame(raw[key], os.fspath(path), key) for key in ("base", "tool") if key in raw}
     if tip != chain.tip:
         # The tool is a place on another link.
         frames.pop("tool", None)
     placed = replace(chain, **frames)
+    if "payload" in raw:
+        if tip != chain.tip:
+            raise DhcalError(f"{os.fspath(path)}: [payload] is carried by {tip!r}; name that with --tip")
+        placed = placed.carrying(read_payload(raw["payload"], os.fspath(path)))
     return with_transmission(placed, raw["joint"], os.fspath(path)) if "joint" in raw else placed
 
 
@@ -128,8 +133,9 @@ def sidecar_text(
     instrument: Mapping[str, float],
     joints: Sequence[str] = (),
     uncertainty: Sequence[str] = (),
+    payload: Sequence[str] = (),
 ) -> str:
-    """The sidecar's TOML of base and tool (4, 4), the tool being on `tip`, of instrument, joints and doubt.
+    """The sidecar's TOML of base and tool (4, 4), the tool being on `tip`, and of what else is known.
 
     Args:
         tip: the link that holds the tool.
@@ -138,6 +144,7 @@ def sidecar_text(
         instrument: its values by name, m and rad.
         joints: lines of `transmission_lines`.
         uncertainty: lines of `uncertainty_lines`.
+        payload: lines of `payload_lines`.
     """
     out = [
         "# What the URDF cannot hold. base: the robot's base link in the measuring frame;",
@@ -152,7 +159,7 @@ def sidecar_text(
     for name, pose in (("base", base), ("tool", tool)):
         xyz, turn = pose[:3, 3].tolist(), se3.log3(pose[:3, :3]).tolist()
         out += ["", f"[{name}]", f"xyz_m = {xyz}", f"rotvec_rad = {turn}"]
-    out += joints
+    out += [*payload, *joints]
     if instrument:
         out += [
             "",
@@ -209,8 +216,9 @@ def urdf_files(
     """
     origins, tool = joint_origins(chain)
     data = with_origins(chain.urdf, origins)
-    again = replace(Chain.from_urdf(parse_urdf(data, os.fspath(path)), chain.tip), base=chain.base, tool=tool)
-    joints = transmission_lines(chain)
+    read = Chain.from_urdf(parse_urdf(data, os.fspath(path)), chain.tip)
+    again = replace(read, base=chain.base, tool=tool, payload=chain.payload)
+    joints, carried = transmission_lines(chain), payload_lines(chain.payload)
     if chain.transmission is not None:
         # From here on the written masses load the joints.
         written = replace(chain.transmission, loads=again.loads)
@@ -226,8 +234,11 @@ def urdf_files(
     out: dict[PathLike, str | bytes] = {path: data}
     plain = np.array_equal(chain.base, np.eye(4)) and np.array_equal(tool, np.eye(4))
     doubt = uncertainty_lines(known) if known else []
-    if not plain or joints or instrument or doubt or existing_sidecar(path):
-        out[sidecar_path(path)] = sidecar_text(chain.tip, chain.base, tool, instrument or {}, joints, doubt)
+    if not plain or joints or carried or instrument or doubt or existing_sidecar(path):
+        known_values = instrument or {}
+        out[sidecar_path(path)] = sidecar_text(
+            chain.tip, chain.base, tool, known_values, joints, doubt, carried
+        )
     return out
 
 

@@ -62,6 +62,19 @@ COUPLING_PRIOR = 2e-3
 TORQUES_KEPT = 256
 
 
+@dataclass(frozen=True)
+class Payload:
+    """What a tip carries besides the masses of the URDF.
+
+    Attributes:
+        mass: kg.
+        centre: of gravity in the tip frame, m.
+    """
+
+    mass: float
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
 @dataclass(frozen=True, eq=False)
 class Loads:
     """The masses that load a path's joints.

@@ -21,6 +21,7 @@ from dhcal_pin.measurements import Noise
 from dhcal_pin.parameters import EXTENSIONS, select
 from dhcal_pin.poses import Pose
 from dhcal_pin.robot_files import read_robot, write_urdf
+from dhcal_pin.transmission import Payload
 from dhcal_pin.urdf import parse_urdf
 
 
@@ -230,3 +231,80 @@ def test_the_nominal_of_a_calibrated_robot_is_what_it_had(tmp_path):
     fit = calibrate(had, data, "gain")
     assert [p.nominal for p in fit.errors.parameters] == list(x.values())
     assert np.abs(fit.x).max() < 1e-5
+
+
+CARRIED = Payload(4.0, (0.02, -0.01, 0.15))
+
+
+def carried_in_the_file() -> bytes:
+    """The UR10 with the payload as a link of its own behind the tip."""
+    text = robot_file("ur_description/urdf/ur10_robot.urdf").read_text()
+    x, y, z = CARRIED.centre
+    more = f"""<link name="held"><inertial><origin xyz="{x} {y} {z}"/><mass value="{CARRIED.mass}"/>
+      <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial></link>
+      <joint name="hold" type="fixed"><parent link="tool0"/><child link="held"/></joint></robot>"""
+    return text.replace("</robot>", more).encode()
+
+
+def test_a_payload_weighs_as_much_as_a_link_of_the_file():
+    q = np.random.default_rng(0).uniform(-2, 2, (6, 20))
+    wanted = Chain.from_urdf(parse_urdf(carried_in_the_file(), "held.urdf"), "tool0").loads.torques(q)
+    bare, carrying = ur10(), ur10().carrying(CARRIED)
+    np.testing.assert_allclose(carrying.loads.torques(q), wanted, atol=1e-10)
+    assert np.abs(bare.loads.torques(q) - wanted).max() > 20
+    np.testing.assert_array_equal(carrying.poses(q.T), bare.poses(q.T))
+
+
+def test_what_a_carrying_arm_gives_is_found_and_kept(tmp_path, monkeypatch, capsys):
+    """Told of the payload, calibrate finds the compliance that the truth has, and the sidecar says so."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "arm.urdf").write_bytes(robot_file("ur_description/urdf/ur10_robot.urdf").read_bytes())
+    rng = np.random.default_rng(2)
+    truth, x = drawn(ur10().carrying(CARRIED), "minimal,compliance", rng)
+    for name, m in (("fit", 60), ("other", 30)):
+        data = Pose.simulate(truth, rng.uniform(-2, 2, (m, 6)), Noise(1e-5, 1e-5), rng)
+        (tmp_path / f"{name}.csv").write_text(measurement_text(data, truth, []))
+    common = ["calibrate", "arm.urdf", "fit.csv", "--tip", "tool0", "--parameters", "minimal,compliance"]
+    carried = ["--payload", "4kg@20,-10,150mm"]
+    assert main([*common, *carried, "-o", "out.urdf", "--json", "r.json"]) == 0
+    found = {p["name"]: p for p in json.loads((tmp_path / "r.json").read_text())["parameters"]}
+    for name, value in x.items():
+        if name.endswith(".compliance"):
+            assert abs(found[name]["value"] - value) < 4 * found[name]["std"]
+    sidecar = tomllib.loads((tmp_path / "out.calibration.toml").read_text())
+    assert sidecar["payload"] == {"mass_kg": 4.0, "centre_m": list(CARRIED.centre)}
+    assert main([*common, "-o", "without.urdf"]) == 0
+
+    def judged(robot: str) -> float:
+        assert main(["validate", robot, "other.csv", "--tip", "tool0", "--json", "v.json"]) == 0
+        return json.loads((tmp_path / "v.json").read_text())["after"]["position_rms_m"]
+
+    assert judged("out.urdf") < 5e-5 < 2 * judged("without.urdf")
+    again = read_robot("out.urdf", "tool0")
+    assert again.payload == CARRIED
+    q = rng.uniform(-2, 2, (5, 6))
+    write_urdf(again, "again.urdf")
+    np.testing.assert_allclose(read_robot("again.urdf", "tool0").poses(q), again.poses(q), atol=1e-12)
+    capsys.readouterr()
+    assert main([*common, "--payload", "4lb", "-o", "no.urdf"]) == 2
+    assert "as 5kg or 5kg@0,0,80mm" in capsys.readouterr().err
+    assert main([*common, "--payload", "0kg", "-o", "no.urdf"]) == 2
+    assert "write a positive one" in capsys.readouterr().err
+    assert not (tmp_path / "no.urdf").exists()
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ("mass_kg = -1", "a mass of -1 kg"),
+        ("centre_m = [0.0, 0.0, 0.1]", "needs mass_kg"),
+        ("mass_kg = 2\ncentre_m = [0, 1]", "needs mass_kg"),
+        ("mass_kg = 2\ncentre_m = [0, 0, 150]", "its centre is 150 m off the tip"),
+        ("mass_kg = 2\nmass = 2", "needs mass_kg"),
+    ],
+)
+def test_a_wrong_payload_is_refused(tmp_path, table, words):
+    (tmp_path / "arm.urdf").write_bytes(robot_file("ur_description/urdf/ur10_robot.urdf").read_bytes())
+    (tmp_path / "arm.calibration.toml").write_text(f"[payload]\n{table}\n")
+    with pytest.raises(DhcalError, match=words):
+        read_robot(tmp_path / "arm.urdf", "tool0")
