@@ -62,12 +62,15 @@ def scores(chain: Chain, item: Measurement, u: Array) -> Array:
 def reweighted(
     chain: Chain, data: Sequence[Measurement], values: Sequence[Array], loss: str
 ) -> tuple[tuple[Measurement, ...], list[Array]]:
-    """The data with every sample's sigmas widened as the loss wants, and the weights (m,) an item."""
+    """The data with every sample's sigmas widened as the loss wants, and the weights (m,) an item.
+
+    What is named as a gross error counts for nothing whatever the loss: of Huber's a constant pull remains,
+    and a tenth of them would cost a quarter of the accuracy.
+    """
     if loss == "linear":
         return tuple(data), [np.ones(len(item.rows)) for item in data]
-    weights = [
-        np.maximum(LOSSES[loss](scores(chain, item, u)), _LEAST) for item, u in zip(data, values, strict=True)
-    ]
+    found = [scores(chain, item, u) for item, u in zip(data, values, strict=True)]
+    weights = [np.maximum(np.where(score > OUTLYING, 0.0, LOSSES[loss](score)), _LEAST) for score in found]
     return tuple(item.weighted(w) for item, w in zip(data, weights, strict=True)), weights
 
 
