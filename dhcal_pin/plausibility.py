@@ -15,6 +15,7 @@ from .chain import Chain
 from .files import ANGLES, LENGTHS
 from .frames import align
 from .measurement_files import Readings
+from .mistakes import misturned, mixed_up, spread
 from .reading_columns import ROTVEC, TO
 from .screening import reach
 from .se3 import Array
@@ -37,9 +38,11 @@ def doubts(chain: Chain, readings: Readings) -> list[str]:
     """What is hard to believe in a file, a sentence each; an empty list for most files."""
     joints = _joint_units(chain, readings)
     out = [*joints.values(), *_small_joints(chain, readings)]
-    # With joint values in doubt, how they turn the tool says nothing about the readings.
-    turns = [] if out else _turns(chain, readings)
-    out += [*_sizes(chain, readings), *turns, *_outside(chain, readings, joints)]
+    sizes = _sizes(chain, readings)
+    # With joint values in doubt, how they move and turn the tool says nothing about the readings.
+    moves = [] if out or sizes else mixed_up(chain, readings.data)
+    turns = [] if out or moves else _turns(chain, readings)
+    out += [*sizes, *moves, *turns, *_outside(chain, readings, joints)]
     return [*out, *_repeated(readings)]
 
 
@@ -51,11 +54,6 @@ def _ends(readings: Readings) -> list[Array]:
 
 def _sample(count: int) -> Array:
     return np.unique(np.linspace(0, count - 1, min(count, _SAMPLE)).astype(int))
-
-
-def _spread(points: Array) -> float:
-    """The usual distance of points (m, 3) from their middle, whatever a few of them are."""
-    return float(np.median(np.linalg.norm(points - np.median(points, 0), axis=1)))
 
 
 def _written(value: float, unit: str) -> str:
@@ -101,7 +99,7 @@ def _small_joints(chain: Chain, readings: Readings) -> list[str]:
     if not 1.0 < most <= 2 * np.pi:
         return []
     seen, index = readings.data.positions(), _sample(len(ends[0]))
-    if len(seen) and _spread(seen[index]) < 5 * _spread(chain.poses(ends[0][index])[:, :3, 3]):
+    if len(seen) and spread(seen[index]) < 5 * spread(chain.poses(ends[0][index])[:, :3, 3]):
         return []
     return [
         f"no joint goes further than {most:.3g} deg, so the arm hardly moves; "
@@ -141,24 +139,19 @@ def _position_sizes(chain: Chain, readings: Readings, radius: float) -> list[str
         return []
     index = _sample(len(seen))
     seen, unit = seen[index], readings.units.get("x", "")
-    moved, spread = chain.poses(readings.data.q[index])[:, :3, 3], _spread(seen)
-    if spread > 3 * (radius + _TOOL):
+    moved, extent = chain.poses(readings.data.q[index])[:, :3, 3], spread(seen)
+    if extent > 3 * (radius + _TOOL):
         return [
-            f"the positions lie {_written(spread, unit)} around their middle, and the arm reaches "
+            f"the positions lie {_written(extent, unit)} around their middle, and the arm reaches "
             f"{radius:.2g} m; if they are mm, write x[mm],y[mm],z[mm]"
         ]
-    wanted = _spread(moved)
-    if 0 < spread < wanted / 50 and align(seen * (wanted / spread), moved)[1] < 0.5 * wanted:
+    wanted = spread(moved)
+    if 0 < extent < wanted / 50 and align(seen * (wanted / extent), moved)[1] < 0.5 * wanted:
         return [
-            f"the positions lie {_written(spread, unit)} around their middle where the arm moves its tip by "
+            f"the positions lie {_written(extent, unit)} around their middle where the arm moves its tip by "
             f"{_written(wanted, unit)}; if they are metres, write x[m],y[m],z[m]"
         ]
     return []
-
-
-def _angles(rotations: Array) -> Array:
-    """Angles (m-1,) in rad from each rotation (m, 3, 3) to the next; they hold in any frames."""
-    return np.linalg.norm(se3.log3(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:]), axis=1)
 
 
 def _turns(chain: Chain, readings: Readings) -> list[str]:
@@ -175,12 +168,12 @@ def _turns(chain: Chain, readings: Readings) -> list[str]:
         return []
     index = _sample(len(turned))
     modelled = chain.poses(readings.data.q[index])[:, :3, :3]
-    off = float(np.median(np.abs(_angles(turned[index]) - _angles(modelled))))
+    off = misturned(modelled, turned[index])
     if off <= _MOST_MISTURN:
         return []
     return [
-        f"the measured rotations turn from row to row by other angles than the joints say, usually by "
-        f"{np.rad2deg(off):.0f} deg; check unit, order of a quaternion, axes and frame of Euler angles"
+        f"the measured rotations are usually {np.rad2deg(off):.0f} deg off this arm's wherever instrument and "
+        "target are; check unit, order of a quaternion, axes and frame of Euler angles, rows of a matrix, the tip"
     ]
 
 

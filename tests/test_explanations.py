@@ -307,7 +307,7 @@ def test_poses_too_much_alike_name_the_joint_to_move():
 
 @pytest.mark.parametrize("arm", [*TABLES, "ur10", "tiago", "sim_6dof_actual"])
 def test_a_fit_to_poses_all_over_the_range_asks_for_no_more(arm):
-    """Four a revolute joint, two a sliding one and six are all there is to see, wherever tracker and target are."""
+    """Four a revolute joint, two a sliding one and six are all there is to see, wherever the tracker is."""
     chain = load(arm)
     for seed in range(3):
         rng = np.random.default_rng(seed)

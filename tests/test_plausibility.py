@@ -8,7 +8,7 @@ from conftest import URDF, paper, robot_file
 from scipy.spatial.transform import Rotation
 
 from dhcal_pin import cli, se3
-from dhcal_pin.chain import Chain
+from dhcal_pin.chain import Chain, joint_station
 from dhcal_pin.inverse import within
 from dhcal_pin.kinds import KINDS
 from dhcal_pin.measurement_files import measurement_text, read_readings
@@ -160,6 +160,79 @@ def test_joints_beyond_their_limits(told, ur10):
     q[11, 2] = np.pi + 1e-5
     (text,) = told(ur10, sheet(ur10, q))
     assert "joint elbow_joint is beyond its limits, -3.142 rad to 3.142 rad, in rows 4, 8;" in text
+
+
+def swapped(i, j):
+    order = np.arange(6)
+    order[[i, j]] = j, i
+    return lambda q: q[:, order]
+
+
+def off(j, degrees):
+    return lambda q: q + np.deg2rad(degrees) * (np.arange(6) == j)
+
+
+def flipped(j):
+    return lambda q: q * np.where(np.arange(6) == j, -1, 1)
+
+
+MISTAKES = [
+    *((flipped(j), f"joint {name}_joint moving the other way") for j, name in enumerate(
+        ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"))),
+    (off(1, 90), "with -90 deg added to joint shoulder_lift_joint; check its zero"),
+    (off(4, -90), "with 90 deg added to joint wrist_2_joint; check its zero"),
+    (swapped(0, 2), "shoulder_pan_joint and elbow_joint in each other's place; check the joints' order"),
+    (swapped(3, 4), "joints wrist_1_joint and wrist_2_joint in each other's place"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["pose", "position"])
+@pytest.mark.parametrize(("mistake", "words"), MISTAKES)
+def test_joints_that_were_mixed_up_are_named(told, ur10, kind, mistake, words):
+    """Joint values within half their range, so that no limit tells; an arm that is millimetres off."""
+    real = real_ur10()
+    q = 0.4 * joints(ur10, 60)
+    lines = sheet(real, q, kind=kind).splitlines()
+    written = sheet(real, mistake(q), kind=kind).splitlines()
+    # The joints' columns of one, the readings of the other.
+    rows = [",".join((*w.split(",")[:6], *t.split(",")[6:])) for w, t in zip(written, lines, strict=True)]
+    (text,) = told(ur10, "\n".join(rows))
+    assert words in text
+
+
+def real_ur10():
+    """A UR10 off by two millimetres and four milliradians at every joint."""
+    rng = np.random.default_rng(3)
+    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    scale = np.repeat([2e-3, 4e-3], 3)
+    return arm.displaced({joint_station(j): se3.exp6(scale * rng.uniform(-1, 1, 6)) for j in range(1, 7)})
+
+
+@pytest.mark.parametrize("swap", [("x", "y"), ("y", "z")])
+def test_a_mirrored_frame_is_named(told, ur10, swap):
+    text = sheet(real_ur10(), joints(ur10, 60))
+    head, body = text.split("\n", 1)
+    a, b = (f"{axis}[mm]" for axis in swap)
+    head = head.replace(a, "?").replace(b, a).replace("?", b)
+    (said,) = told(ur10, f"{head}\n{body}")
+    assert "with the frame mirrored; check the order and the signs of x, y and z" in said
+
+
+def test_another_robot_is_told_but_nothing_guessed(told, ur10):
+    other = Chain.from_urdf(robot_file("ur_description/urdf/ur3_robot.urdf"), "tool0")
+    (said,) = told(ur10, sheet(other, joints(ur10, 60), kind="position"))
+    assert said.endswith("check robot and tip, units, and the joints' order, signs and zeros")
+
+
+def test_gross_errors_are_no_mistaken_column(told, ur10):
+    rng = np.random.default_rng(5)
+    real, q = real_ur10(), joints(ur10, 80)
+    rows = sheet(real, q, kind="position").splitlines()
+    for i in rng.permutation(80)[:8] + 1:
+        cells = rows[i].split(",")
+        cells[6:] = [repr(float(cell) + 1e3 * rng.normal()) for cell in cells[6:]]
+        rows[i] = ",".join(cells)
+    assert told(ur10, "\n".join(rows)) == []
 
 
 def test_rows_given_twice(told, ur10):
