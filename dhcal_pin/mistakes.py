@@ -72,8 +72,8 @@ def misturned(modelled: Array, seen: Array) -> float:
     """
     product = np.einsum("mij,mkl->ikjl", seen, modelled).reshape(9, 9)
     usual = np.inf
-    for base in np.linalg.svd(product)[0].T[:_FOLLOWED]:
-        base = nearest_rotation(base.reshape(3, 3))
+    for found in np.linalg.svd(product)[0].T[:_FOLLOWED].reshape(-1, 3, 3):
+        base, tool = nearest_rotation(found * np.sign(np.linalg.det(found))), np.eye(3)
         for _ in range(_ROUNDS):
             tool = nearest_rotation(np.sum(np.swapaxes(base @ modelled, 1, 2) @ seen, 0))
             base = nearest_rotation(np.sum(seen @ np.swapaxes(modelled @ tool, 1, 2), 0))

@@ -10,7 +10,6 @@ from collections.abc import Container
 
 import numpy as np
 
-from . import se3
 from .chain import Chain
 from .files import ANGLES, LENGTHS
 from .frames import align
@@ -172,8 +171,9 @@ def _turns(chain: Chain, readings: Readings) -> list[str]:
     if off <= _MOST_MISTURN:
         return []
     return [
-        f"the measured rotations are usually {np.rad2deg(off):.0f} deg off this arm's wherever instrument and "
-        "target are; check unit, order of a quaternion, axes and frame of Euler angles, rows of a matrix, the tip"
+        f"the measured rotations are usually {np.rad2deg(off):.0f} deg off this arm's wherever instrument "
+        "and target are; check unit, order of a quaternion, axes and frame of Euler angles, "
+        "rows of a matrix, and the tip"
     ]
 
 

@@ -83,7 +83,7 @@ def test_a_wrong_unit_is_told_once(told, ur10, kind, units, word):
 
 
 @pytest.mark.parametrize(
-    ("said", "true", "word"), [("rad", "deg", "more than a turn"), ("deg", "rad", "turn")]
+    ("said", "true", "word"), [("rad", "deg", "more than a turn"), ("deg", "rad", "deg off")]
 )
 def test_rotation_vectors_in_the_wrong_unit(told, ur10, said, true, word):
     (text,) = told(ur10, sheet(ur10, joints(ur10), angle=said, wrong={"angle": true}))
@@ -104,6 +104,29 @@ def test_euler_angles_are_no_rotation_vector(told, ur10):
     ]
     (found,) = told(ur10, "\n".join([lines[0], *rows]))
     assert "axes and frame of Euler angles" in found
+
+
+def test_matrices_by_columns_are_told(told, ur10):
+    """The inverse rotation turns from row to row by the same angles."""
+    q = joints(ur10)
+    base, tool = frames()
+    turned = se3.log3((base @ ur10.poses(q) @ tool)[:, :3, :3])
+    lines = sheet(ur10, q).splitlines()
+    rows = [
+        ",".join([*line.split(",")[:9], *map(repr, row)])
+        for line, row in zip(lines[1:], (-turned).tolist(), strict=True)
+    ]
+    (found,) = told(ur10, "\n".join([lines[0], *rows]))
+    assert "rows of a matrix" in found
+
+
+@pytest.mark.parametrize("moving", [[0], [5], [0, 5], [0, 1, 2, 5]])
+def test_few_moving_joints_are_believed(told, ur10, moving):
+    """Motions that leave base or target open turn as the joints do in some frames."""
+    for seed in range(3):
+        q = np.full((30, 6), 0.4)
+        q[:, moving] = joints(ur10, 30, seed)[:, moving]
+        assert told(real_ur10(), sheet(real_ur10(), q)) == []
 
 
 def test_small_motions_are_believed(told, ur10):
