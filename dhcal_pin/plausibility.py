@@ -6,14 +6,16 @@ the robot's nominal geometry, and hold wherever instrument and target are.
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Container, Mapping
 
 import numpy as np
 
 from .chain import Chain
+from .evaluation import deviations
 from .files import ANGLES, LENGTHS
 from .frames import align
 from .measurement_files import Readings
+from .measurements import Measurement
 from .mistakes import misturned, mixed_up, spread
 from .reading_columns import ROTVEC, TO
 from .screening import reach
@@ -29,6 +31,8 @@ _TOOL, _HALL = 1.0, 50.0
 _LEAST_LENGTH, _MOST_SIGMA = 2e-3, {"length": 0.05, "angle": 0.2}
 # Half of the rotations differ by more than this from what the joints say, rad: another convention.
 _MOST_MISTURN = 0.35
+# A calibrated arm usually is nearer to its readings than this share of its reach, or angle in rad.
+_MISFIT, _MISFIT_ANGLE = 0.02, 0.1
 # Rows that the tests of geometry look at, at most.
 _SAMPLE = 2000
 
@@ -43,6 +47,37 @@ def doubts(chain: Chain, readings: Readings) -> list[str]:
     turns = [] if out or moves else _turns(chain, readings)
     out += [*sizes, *moves, *turns, *_outside(chain, readings, joints)]
     return [*out, *_repeated(readings)]
+
+
+def misfits(
+    chain: Chain, data: Mapping[str, Measurement], known: Mapping[str, float]
+) -> dict[str, list[str]]:
+    """Readings that stay far from the arm that was fitted to them and others, sentences by file.
+
+    Args:
+        chain: calibrated.
+        data: the fitted readings by file.
+        known: values of the instruments' unknowns by name, as found.
+    """
+    _, radius = reach(chain)
+    bounds = {"orientation": _MISFIT_ANGLE}
+    out: dict[str, list[str]] = {path: [] for path in data}
+    for (path, item), found in zip(data.items(), deviations(chain, list(data.values()), known), strict=True):
+        names = {unknown.name for unknown in item.unknowns if not unknown.local}
+        shared = [other for other in data if other != path and names & {u.name for u in data[other].unknowns}]
+        for what, errors in found.items():
+            usual = float(np.median(np.linalg.norm(errors, axis=1)))
+            if usual <= bounds.get(what, _MISFIT * radius):
+                continue
+            text = f"after the fit, {what} is usually {_size(usual, what)} off; check robot, tip and columns"
+            if shared:
+                text += f", and whether its {min(names).split('.')[0]} is that of {' and '.join(shared)}"
+            out[path].append(text)
+    return out
+
+
+def _size(value: float, what: str) -> str:
+    return f"{np.rad2deg(value):.3g} deg" if what == "orientation" else f"{1e3 * value:.3g} mm"
 
 
 def _ends(readings: Readings) -> list[Array]:

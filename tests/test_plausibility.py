@@ -11,6 +11,7 @@ from dhcal_pin import cli, se3
 from dhcal_pin.chain import Chain, joint_station
 from dhcal_pin.inverse import within
 from dhcal_pin.kinds import KINDS
+from dhcal_pin.lengths import Wires
 from dhcal_pin.measurement_files import measurement_text, read_readings
 from dhcal_pin.measurements import Noise
 from dhcal_pin.plausibility import doubts
@@ -303,3 +304,22 @@ def test_the_command_line_says_so(tmp_path, monkeypatch, capsys, command):
     found = [line for line in capsys.readouterr().err.splitlines() if "check:" in line]
     assert len(found) == 1
     assert found[0].startswith("data.csv: check: row 13: the same as others")
+
+
+def test_two_wires_of_one_name_are_told(tmp_path, monkeypatch, capsys):
+    """Files that call two anchors alike cannot both be met."""
+    monkeypatch.chdir(tmp_path)
+    arm = Chain.from_dh(paper("sim_6dof"))
+    (tmp_path / "arm.dh.toml").write_bytes((URDF / "sim_6dof.dh.toml").read_bytes())
+    for file, anchor in (("one.csv", [2.0, 1, 0]), ("two.csv", [-1.0, 2, 0.5])):
+        q = joints(arm, 60, len(file) + int(anchor[0]))
+        length = np.linalg.norm(arm.poses(q)[:, :3, 3] - anchor, axis=1)
+        (tmp_path / file).write_text(measurement_text(Wires.of(q, length[:, None]), arm))
+    assert cli.main(["calibrate", "arm.dh.toml", "one.csv", "-o", "out.urdf"]) == 0
+    assert ": check: " not in capsys.readouterr().err
+    assert cli.main(["calibrate", "arm.dh.toml", "one.csv", "two.csv", "-o", "out.urdf"]) == 0
+    found = [line for line in capsys.readouterr().err.splitlines() if "check:" in line]
+    assert found
+    assert all(
+        "after the fit, length is usually" in line and "whether its wire1 is" in line for line in found
+    )
