@@ -14,7 +14,7 @@ import numpy as np
 
 from . import se3
 from .chain import Chain
-from .frames import few, nearest_rotation, starts
+from .frames import nearest_rotation, starts
 from .measurements import Measurement
 from .positions import Position, Targets
 from .se3 import Array
@@ -26,8 +26,8 @@ _NOMINAL, _NEAR, _FOREIGN = 0.05, 0.01, 0.2
 _BETTER, _ALIKE = 4.0, 1.5
 # Fewer positions fit too many guesses.
 _ENOUGH = 10
-# Positions that a guess is tried on.
-_PROBES = 40
+# Positions that the arm is tried on, and that a guess is.
+_SAMPLE, _PROBES = 100, 40
 _ROUNDS, _FOLLOWED = 12, 3
 # Positions so many times as far from their middle as is usual are gross errors.
 _GROSS = 5.0
@@ -98,7 +98,14 @@ class Guess:
     seen: Array
 
 
-def _guesses(chain: Chain, q: Array, seen: Array) -> Iterator[Guess]:
+def _guesses(chain: Chain, data: Measurement, index: Array) -> Iterator[Guess]:
+    """What may be otherwise with the rows of an index."""
+    every = data.positions()
+    q, seen = data.q[index], every[index]
+    for step, side in ((-1, "before"), (1, "after")):
+        there = (index + step >= 0) & (index + step < len(every))
+        words = f"the readings of the row {side}"
+        yield Guess(words, "how rows were put together", q[there], every[index[there] + step])
     yield Guess("the frame mirrored", "the order and the signs of x, y and z", q, seen * [1, 1, -1])
     for j, name in enumerate(chain.joint_names):
         one = np.arange(chain.size) == j
@@ -120,15 +127,17 @@ def mixed_up(chain: Chain, data: Measurement) -> list[str]:
         data = data.take(data.label == np.bincount(data.label).argmax())
     if len(data.positions()) < _ENOUGH:
         return []
-    near = np.linalg.norm(data.positions() - np.median(data.positions(), 0), axis=1)
+    every = data.positions()
+    near = np.linalg.norm(every - np.median(every, 0), axis=1)
     # Gross errors would draw the frames away.
-    data = few(data.take(near <= _GROSS * np.median(near)))
-    q, seen = data.q, data.positions()
+    rows = np.flatnonzero(near <= _GROSS * np.median(near))
+    index = np.sort(np.random.default_rng(0).permutation(rows)[:_SAMPLE])
+    q, seen = data.q[index], every[index]
     size, left = spread(seen), unexplained(chain, q, seen)
     if left <= max(_NOMINAL * size, _NEAR):
         return []
     off = f"the positions are usually {1e3 * left:.3g} mm off this arm wherever instrument and target are"
-    guesses = _guesses(chain, q[:_PROBES], seen[:_PROBES])
+    guesses = _guesses(chain, data, np.sort(np.random.default_rng(1).permutation(index)[:_PROBES]))
     found = [(unexplained(chain, guess.q, guess.seen), guess) for guess in guesses]
     best = min(rest for rest, _ in found)
     if best * _BETTER < left:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from conftest import URDF, paper, robot_file
@@ -240,6 +242,14 @@ def test_a_mirrored_frame_is_named(told, ur10, swap):
     head = head.replace(a, "?").replace(b, a).replace("?", b)
     (said,) = told(ur10, f"{head}\n{body}")
     assert "with the frame mirrored; check the order and the signs of x, y and z" in said
+
+
+def test_readings_of_another_row_are_named(told, ur10):
+    lines = sheet(real_ur10(), joints(ur10, 150)).splitlines()
+    pairs = pairwise(lines[1:])
+    rows = [",".join((*q.split(",")[:6], *reading.split(",")[6:])) for q, reading in pairs]
+    (said,) = told(ur10, "\n".join([lines[0], *rows]))
+    assert "with the readings of the row before; check how rows were put together" in said
 
 
 def test_another_robot_is_told_but_nothing_guessed(told, ur10):
