@@ -184,6 +184,7 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     document = report.document(fit, files, source.inputs, [row for found in rows.values() for row in found])
     document |= {
         "outliers_by_file": rows,
+        "doubts": {path: texts for path, texts in data.doubts.items() if texts},
         "command": source.command,
         "settings": source.settings,
         "extension": [asdict(trial) for trial in trials],
