@@ -22,7 +22,7 @@ from .measurements import Measurement
 from .outputs import STDOUT, check_outputs, check_urdf_ending, emit, names, same, sidecars
 from .parameters import EXTENSIONS
 from .payload_files import parse_payload
-from .plausibility import doubts
+from .plausibility import doubts, misfits
 from .result import Result
 from .robot_files import (
     read_bounds,
@@ -154,6 +154,9 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
         progress=progress,
         where=where,
     )
+    for path, texts in misfits(fit.chain, data.fit, fit.instruments).items():
+        # What a file's columns tell already is not told again.
+        data.doubts[path] += texts if not data.doubts[path] else []
     contents = _written(fit, args)
     files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
     if args.map:
@@ -181,6 +184,7 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     document = report.document(fit, files, source.inputs, [row for found in rows.values() for row in found])
     document |= {
         "outliers_by_file": rows,
+        "doubts": {path: texts for path, texts in data.doubts.items() if texts},
         "command": source.command,
         "settings": source.settings,
         "extension": [asdict(trial) for trial in trials],

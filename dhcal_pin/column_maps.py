@@ -256,6 +256,8 @@ def _rotation(raw: Any, where: str) -> Rotation:
         value, fits = raw.get(key), key in needs
         if key in raw and not fits:
             raise DhcalError(f"{where} {key}: does not go with {convention}; leave it out")
+        if fits and key not in raw:
+            raise DhcalError(f"{where}: no {key}; {convention} needs {_WORDS[key][1]}")
         if fits and not (isinstance(value, str) and re.fullmatch(_WORDS[key][0], value)):
             raise DhcalError(f"{where} {key} = {value!r}; {convention} needs {_WORDS[key][1]}")
     columns = _several(raw.get("columns"), count, f"{where} columns")

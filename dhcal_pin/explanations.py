@@ -20,7 +20,7 @@ from .nullspace import Cause, Experiment, Group, groups
 from .passage import NONE, PARALLEL, Passage, Path, own_axes, passage, tilt
 from .poses import Pose
 from .positions import Position
-from .problem import Problem, Triangle
+from .problem import Problem, Triangle, reduce
 from .se3 import Array
 
 # Axes within this of parallel are nearly so.
@@ -254,8 +254,8 @@ def unobservable(problem: Problem, x: Array, triangle: Triangle) -> list[str]:
 
     Args:
         problem: the unknowns and the data.
-        x: (p,) where the triangle was taken.
-        triangle: of the data alone.
+        x: (p,) the unknowns' values.
+        triangle: of the data alone, at x or where the last step came from.
 
     Returns:
         Sentences; none where all is seen.
@@ -263,7 +263,8 @@ def unobservable(problem: Problem, x: Array, triangle: Triangle) -> list[str]:
     if observability.rank(triangle.r) == len(x):
         return []
     experiment = Experiment(problem, x)
-    layers = experiment.layers(triangle.r)
+    # The last step, small as it is, turns unseen directions by more than other readings may: taken anew.
+    layers = experiment.layers(reduce(problem, x, small_angle=False).r)
     path = Path.of(problem.errors, x[: len(problem.errors.parameters)])
     names = [p.name for p in (*problem.errors.parameters, *problem.unknowns)]
     explainer = Explainer(experiment, dict(layers), names, path)

@@ -50,7 +50,7 @@ class Outcome:
 
     Attributes:
         status: "ok", "not converged" (its files are written all the same) or "failed".
-        message: why it failed.
+        message: why it failed, or what of its data is hard to believe.
         document: as the JSON of `dhcal calibrate`; empty where it failed.
     """
 
@@ -211,7 +211,10 @@ def _work(run: Run, job: Job) -> Outcome:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         document = run(job)
-        return Outcome(OK if document["converged"] else OPEN, "", document)
+        doubts = [
+            f"{path}: check: {text}" for path, texts in document.get("doubts", {}).items() for text in texts
+        ]
+        return Outcome(OK if document["converged"] else OPEN, "; ".join(doubts), document)
     except DhcalError as error:
         return Outcome(FAILED, " ".join(str(error).split()))
     except KeyboardInterrupt:

@@ -50,6 +50,8 @@ def run(args: Namespace, calibrate: Run) -> int:
         style = "" if outcome.status == "ok" else "red" if outcome.status == FAILED else "yellow"
         line = f"{count:{len(str(total))}} of {total}  {entries[number].name:{width}}  {_line(outcome)}"
         terminal.lines(line, style=style)
+        if outcome.status != FAILED and outcome.message:
+            terminal.lines(f"        {outcome.message}", style="yellow")
 
     try:
         found = run_fleet(entries, args.robot, calibrate, args.jobs or os.cpu_count() or 1, done)

@@ -27,7 +27,11 @@ _AXES = np.eye(6)
 def extract(chain: Chain, convention: Convention = "standard", hayati: bool = False) -> Extraction:
     """The chain's DH table, base and tool apart, by common normals."""
     if not (np.array_equal(chain.mixing, np.eye(chain.size)) and not chain.shift.any()):
-        raise DhcalError("DH parameters need a path without mimic joints; use --parameters minimal")
+        follows = next(name for name in chain.moving if name not in chain.joint_names)
+        raise DhcalError(
+            f"{chain.urdf.source}: joint {follows!r} mimics another, which a DH table cannot hold; "
+            "calibrate with --parameters minimal,base,tool"
+        )
     return extract_dh(
         chain.links, chain.joint_names, chain.prismatic, chain.lower, chain.upper, convention, hayati
     )

@@ -6,15 +6,17 @@ the robot's nominal geometry, and hold wherever instrument and target are.
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Container, Mapping
 
 import numpy as np
 
-from . import se3
 from .chain import Chain
+from .evaluation import deviations
 from .files import ANGLES, LENGTHS
 from .frames import align
 from .measurement_files import Readings
+from .measurements import Measurement
+from .mistakes import misturned, mixed_up, spread
 from .reading_columns import ROTVEC, TO
 from .screening import reach
 from .se3 import Array
@@ -29,6 +31,8 @@ _TOOL, _HALL = 1.0, 50.0
 _LEAST_LENGTH, _MOST_SIGMA = 2e-3, {"length": 0.05, "angle": 0.2}
 # Half of the rotations differ by more than this from what the joints say, rad: another convention.
 _MOST_MISTURN = 0.35
+# A calibrated arm usually is nearer to its readings than this share of its reach, or angle in rad.
+_MISFIT, _MISFIT_ANGLE = 0.02, 0.1
 # Rows that the tests of geometry look at, at most.
 _SAMPLE = 2000
 
@@ -37,10 +41,43 @@ def doubts(chain: Chain, readings: Readings) -> list[str]:
     """What is hard to believe in a file, a sentence each; an empty list for most files."""
     joints = _joint_units(chain, readings)
     out = [*joints.values(), *_small_joints(chain, readings)]
-    # With joint values in doubt, how they turn the tool says nothing about the readings.
-    turns = [] if out else _turns(chain, readings)
-    out += [*_sizes(chain, readings), *turns, *_outside(chain, readings, joints)]
+    sizes = _sizes(chain, readings)
+    # With joint values in doubt, how they move and turn the tool says nothing about the readings.
+    moves = [] if out or sizes else mixed_up(chain, readings.data)
+    turns = [] if out or moves else _turns(chain, readings)
+    out += [*sizes, *moves, *turns, *_outside(chain, readings, joints)]
     return [*out, *_repeated(readings)]
+
+
+def misfits(
+    chain: Chain, data: Mapping[str, Measurement], known: Mapping[str, float]
+) -> dict[str, list[str]]:
+    """Readings that stay far from the arm that was fitted to them and others, sentences by file.
+
+    Args:
+        chain: calibrated.
+        data: the fitted readings by file.
+        known: values of the instruments' unknowns by name, as found.
+    """
+    _, radius = reach(chain)
+    bounds = {"orientation": _MISFIT_ANGLE}
+    out: dict[str, list[str]] = {path: [] for path in data}
+    for (path, item), found in zip(data.items(), deviations(chain, list(data.values()), known), strict=True):
+        names = {unknown.name for unknown in item.unknowns if not unknown.local}
+        shared = [other for other in data if other != path and names & {u.name for u in data[other].unknowns}]
+        for what, errors in found.items():
+            usual = float(np.median(np.linalg.norm(errors, axis=1)))
+            if usual <= bounds.get(what, _MISFIT * radius):
+                continue
+            text = f"after the fit, {what} is usually {_size(usual, what)} off; check robot, tip and columns"
+            if shared:
+                text += f", and whether its {min(names).split('.')[0]} is that of {' and '.join(shared)}"
+            out[path].append(text)
+    return out
+
+
+def _size(value: float, what: str) -> str:
+    return f"{np.rad2deg(value):.3g} deg" if what == "orientation" else f"{1e3 * value:.3g} mm"
 
 
 def _ends(readings: Readings) -> list[Array]:
@@ -51,11 +88,6 @@ def _ends(readings: Readings) -> list[Array]:
 
 def _sample(count: int) -> Array:
     return np.unique(np.linspace(0, count - 1, min(count, _SAMPLE)).astype(int))
-
-
-def _spread(points: Array) -> float:
-    """The usual distance of points (m, 3) from their middle, whatever a few of them are."""
-    return float(np.median(np.linalg.norm(points - np.median(points, 0), axis=1)))
 
 
 def _written(value: float, unit: str) -> str:
@@ -101,7 +133,7 @@ def _small_joints(chain: Chain, readings: Readings) -> list[str]:
     if not 1.0 < most <= 2 * np.pi:
         return []
     seen, index = readings.data.positions(), _sample(len(ends[0]))
-    if len(seen) and _spread(seen[index]) < 5 * _spread(chain.poses(ends[0][index])[:, :3, 3]):
+    if len(seen) and spread(seen[index]) < 5 * spread(chain.poses(ends[0][index])[:, :3, 3]):
         return []
     return [
         f"no joint goes further than {most:.3g} deg, so the arm hardly moves; "
@@ -141,24 +173,19 @@ def _position_sizes(chain: Chain, readings: Readings, radius: float) -> list[str
         return []
     index = _sample(len(seen))
     seen, unit = seen[index], readings.units.get("x", "")
-    moved, spread = chain.poses(readings.data.q[index])[:, :3, 3], _spread(seen)
-    if spread > 3 * (radius + _TOOL):
+    moved, extent = chain.poses(readings.data.q[index])[:, :3, 3], spread(seen)
+    if extent > 3 * (radius + _TOOL):
         return [
-            f"the positions lie {_written(spread, unit)} around their middle, and the arm reaches "
+            f"the positions lie {_written(extent, unit)} around their middle, and the arm reaches "
             f"{radius:.2g} m; if they are mm, write x[mm],y[mm],z[mm]"
         ]
-    wanted = _spread(moved)
-    if 0 < spread < wanted / 50 and align(seen * (wanted / spread), moved)[1] < 0.5 * wanted:
+    wanted = spread(moved)
+    if 0 < extent < wanted / 50 and align(seen * (wanted / extent), moved)[1] < 0.5 * wanted:
         return [
-            f"the positions lie {_written(spread, unit)} around their middle where the arm moves its tip by "
+            f"the positions lie {_written(extent, unit)} around their middle where the arm moves its tip by "
             f"{_written(wanted, unit)}; if they are metres, write x[m],y[m],z[m]"
         ]
     return []
-
-
-def _angles(rotations: Array) -> Array:
-    """Angles (m-1,) in rad from each rotation (m, 3, 3) to the next; they hold in any frames."""
-    return np.linalg.norm(se3.log3(np.swapaxes(rotations[:-1], 1, 2) @ rotations[1:]), axis=1)
 
 
 def _turns(chain: Chain, readings: Readings) -> list[str]:
@@ -175,12 +202,13 @@ def _turns(chain: Chain, readings: Readings) -> list[str]:
         return []
     index = _sample(len(turned))
     modelled = chain.poses(readings.data.q[index])[:, :3, :3]
-    off = float(np.median(np.abs(_angles(turned[index]) - _angles(modelled))))
+    off = misturned(modelled, turned[index])
     if off <= _MOST_MISTURN:
         return []
     return [
-        f"the measured rotations turn from row to row by other angles than the joints say, usually by "
-        f"{np.rad2deg(off):.0f} deg; check unit, order of a quaternion, axes and frame of Euler angles"
+        f"the measured rotations are usually {np.rad2deg(off):.0f} deg off this arm's wherever instrument "
+        "and target are; check unit, order of a quaternion, axes and frame of Euler angles, "
+        "rows of a matrix, and the tip"
     ]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -24,6 +24,8 @@ from .uncertainty import UNKNOWN, Prediction, Uncertainty
 
 # Residuals that are larger than stated by so many standard deviations of chance contradict the sigmas.
 CONTRADICTION = 3.0
+# Exact rows are taken to scatter by this share of their sigmas.
+LEAST = 1e-9
 # Folds that samples are left out in where none were held out.
 FOLDS = 10
 
@@ -152,9 +154,13 @@ class Result:
 
     @cached_property
     def _spread(self) -> tuple[Array, Array]:
-        """As `_root`, scaled by the scatter that was seen where no sigma or too small a one is stated."""
+        """As `_root`, with rows that scatter as was seen where no sigma or too small a one is stated."""
         root, hidden = self._root
-        return root * self._scale, hidden
+        scale, triangle = self._scale, self.solution.triangle
+        if np.isnan(scale) or scale == 1:
+            return root * scale, hidden
+        # The priors are no data: they stay.
+        return posterior_root(replace(triangle, r=triangle.r / max(scale, LEAST)), self.problem.weights)
 
     @cached_property
     def covariance(self) -> Array:

@@ -81,9 +81,18 @@ def posterior_root(triangle: Triangle, weights: Array) -> tuple[Array, Array]:
     full = with_priors(triangle, weights, zero, zero).r
     if _regular(full):
         return lapack.dtrtri(full)[0], np.empty((len(zero), 0))
-    _, s, vt = np.linalg.svd(full)
-    keep = s > observability.RANK_CUT * s[0]
-    return vt[keep].T / s[keep], vt[~keep].T
+    # However exact the data are, what they do not see is the priors' to tell: by what is seen and what not.
+    _, s, vt = np.linalg.svd(triangle.r)
+    count = int(np.sum(s > observability.RANK_CUT * s[0]))
+    seen, unseen = vt[:count].T, vt[count:].T
+    left, t, yt = np.linalg.svd(weights[:, None] * unseen)
+    told = t > observability.RANK_CUT * weights.max(initial=0.0)
+    left, across = left[:, : len(t)][:, told], unseen @ (yt[told].T / t[told])
+    priors = weights[:, None] * seen
+    rows = np.concatenate([np.diag(s[:count]), priors - left @ (left.T @ priors)])
+    along = lapack.dtrtri(np.linalg.qr(rows)[1])[0]
+    root = np.concatenate([(seen - across @ (left.T @ priors)) @ along, across], 1)
+    return root, unseen @ np.delete(yt, np.flatnonzero(told), 0).T
 
 
 def _change(r: Array, step: Array) -> float:

@@ -7,8 +7,8 @@ from there to the calibrated place, and the joint that moves it; `viewer.html` d
 magnified by stretching these twists, so that at 1 × the page shows the calibrated arm itself.
 
 Everything is drawn in the frame of the calibrated arm's base link; the tips that the page states are
-in the measuring frame. A nominal arm without base or tool of its own borrows the calibrated one's to
-be drawn: these say where the instrument stands and what it looks at, not how the robot was made.
+in the measuring frame. A nominal arm without base or tool of its own borrows the calibrated one's:
+these say where the instrument stands and what it looks at, not how the robot was made.
 """
 
 from __future__ import annotations
@@ -170,7 +170,7 @@ def _meshcat() -> str:
 
 
 def alike(nominal: Chain, arm: Chain) -> Chain:
-    """The nominal arm as it is drawn: with the other's base and tool where it has none of its own."""
+    """The nominal arm as drawn and compared: with the other's base and tool where it has none of its own."""
     same = np.eye(4)
     return replace(
         nominal,
@@ -184,19 +184,19 @@ def tree(nominal: Chain, arm: Chain) -> dict[str, Any]:
 
     Body 0 is the base link, body i the model's joint i, and the last two are tip and tool; each has
     `parent`, `placement` in it, `twist` (6) to the calibrated placement, and where it moves `axes` of
-    both arms, `slides`, `mixing` (n,) and `shift`. The measuring frame sees a drawn tool D of an arm at
-    `stands`·D·`holds`, which are its entries in `arms`; there `terms` say how its joints miss their
-    values, and where they yield to weights `loads` are the bodies that these pull at.
+    both arms, `slides`, `mixing` (n,) and `shift`. The measuring frame sees a drawn tool D at `stands`·D.
+    Of each of `arms`, `terms` say how its joints miss their values, and where they yield to weights
+    `loads` are the bodies that these pull at.
     """
     if (arm.joint_names, arm.moving) != (nominal.joint_names, nominal.moving):
         raise DhcalError(
             f"the arms differ: one moves {', '.join(nominal.moving)}, the other {', '.join(arm.moving)}; "
             "give both the same tip"
         )
-    base, tool = (drawn := alike(nominal, arm)).base, drawn.tool
+    drawn = alike(nominal, arm)
     model, k = nominal.model, len(nominal.moving)
     index = [model.getJointId(name) for name in nominal.moving]
-    bodies = [_body(-1, se3.inverse(arm.base) @ base, np.eye(4))]
+    bodies = [_body(-1, se3.inverse(arm.base) @ drawn.base, np.eye(4))]
     bodies += [
         _body(parent, placement.homogeneous, placement.homogeneous)
         for parent, placement in zip(list(model.parents)[1:], list(model.jointPlacements)[1:], strict=True)
@@ -207,14 +207,8 @@ def tree(nominal: Chain, arm: Chain) -> dict[str, Any]:
             **_drive(nominal, j),
         }
     bodies.append(_body(index[-1], nominal.origins[k], arm.origins[k]))
-    bodies.append(_body(len(bodies) - 1, tool, arm.tool))
-    stands = nominal.base @ se3.inverse(base) @ arm.base
-    holds = se3.inverse(tool) @ nominal.tool
-    arms = [
-        {"stands": rows(stands), "holds": rows(holds)} | _misses(nominal),
-        {"stands": rows(arm.base), "holds": rows(np.eye(4))} | _misses(arm),
-    ]
-    return {"bodies": bodies, "arms": arms}
+    bodies.append(_body(len(bodies) - 1, drawn.tool, arm.tool))
+    return {"bodies": bodies, "stands": rows(arm.base), "arms": [_misses(nominal), _misses(arm)]}
 
 
 def _body(parent: int, placement: Array, calibrated: Array) -> dict[str, Any]:

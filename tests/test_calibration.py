@@ -8,6 +8,7 @@ import mpmath
 import numpy as np
 import pytest
 from conftest import paper, random_table
+from scipy.linalg import null_space
 
 from dhcal_pin import observability, se3
 from dhcal_pin.calibration import calibrate, split
@@ -117,6 +118,40 @@ def test_predicted_spread_says_where_nothing_is_known(sim_6dof):
     found = calibrate(sim_6dof, data, "dh", priors="none").predict(rng.uniform(-3, 3, (5, 6)))
     assert (found.position_std < 1e-3).all()
     assert np.isinf(found.orientation_std).all()
+
+
+def told_by_priors(fit):
+    """Standard deviations that priors leave where exact data see nothing, with scipy's null space."""
+    blind = null_space(fit.solution.triangle.r, rcond=1e-9)
+    precision = blind.T @ (fit.problem.weights[:, None] ** 2 * blind)
+    return np.sqrt(np.diag(blind @ np.linalg.solve(precision, blind.T)))
+
+
+def test_exact_data_leave_what_they_do_not_see_as_unknown_as_it_was(sim_6dof, sim_6dof_actual):
+    """No noise makes nothing seen that is not: a tilt before the first joint is the base's as well."""
+    rng = np.random.default_rng(0)
+    data = Pose.simulate(placed(sim_6dof_actual, rng), rng.uniform(-3, 3, (40, 6)), Noise(), rng)
+    fit = calibrate(sim_6dof, data, "minimal,base,tool")
+    assert fit.rank == 30
+    expected = told_by_priors(fit)
+    assert fit.std == pytest.approx(expected, rel=1e-6, abs=1e-8)
+    names = [p.name for p in fit.parameters]
+    assert fit.remaining[names.index("joint_1.rx")] > 0.7
+    assert not np.isinf(fit.std).any()
+
+
+def test_sigmas_that_are_too_small_widen_what_the_data_tell_alone(sim_6dof, sim_6dof_actual):
+    """Readings ten times worse than stated leave the spread that right sigmas do: priors stay as wide."""
+    found = []
+    for share in (1.0, 0.1):
+        rng = np.random.default_rng(1)
+        q = rng.uniform(-3, 3, (200, 6))
+        read = Pose.simulate(placed(sim_6dof_actual, rng), q, Noise(1e-4, 1e-4), rng)
+        data = Pose.of(q, read.poses, 1e-4 * share, 1e-4 * share)
+        found.append(calibrate(sim_6dof, data, "minimal,base,tool", priors={"*": 1e-2}))
+    right, wrong = found
+    assert wrong.noise == pytest.approx(10, rel=0.1)
+    assert wrong.std == pytest.approx(right.std, rel=0.1)
 
 
 def test_unstated_sigmas_are_found(sim_6dof, sim_6dof_actual):

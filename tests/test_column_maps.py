@@ -237,7 +237,10 @@ ROTATION = '[rotation]\nconvention = "euler"\naxes = "XYZ"\nframe = "intrinsic"\
         (MAP + ROTATION + "columns = [1, 2]", ["columns: 2 entries for 3 columns"]),
         (MAP + ROTATION.replace("XYZ", "XXZ") + "columns = [1, 2, 3]", ["axes = 'XXZ'", "ZYZ"]),
         (MAP + ROTATION.replace("intrinsic", "moving") + "columns = [1, 2, 3]", ["frame = 'moving'"]),
-        (MAP + ROTATION.replace('frame = "intrinsic"\n', "") + "columns = [1, 2, 3]", ["frame = None"]),
+        (
+            MAP + ROTATION.replace('frame = "intrinsic"\n', "") + "columns = [1, 2, 3]",
+            ["no frame", "extrinsic"],
+        ),
         (MAP + ROTATION.replace("euler", "rpy") + "columns = [1, 2, 3]", ["convention = 'rpy'", "euler"]),
         (MAP + ROTATION + 'order = "wxyz"\ncolumns = [1, 2, 3]', ["order", "does not go with euler"]),
     ],

@@ -10,7 +10,8 @@ import pinocchio as pin
 import pytest
 from conftest import paper, robot_file
 
-from dhcal_pin import explanations, observability
+from dhcal_pin import explanations, observability, se3
+from dhcal_pin.calibration import calibrate
 from dhcal_pin.chain import Chain
 from dhcal_pin.dh import DHTable
 from dhcal_pin.kinds import KINDS
@@ -302,6 +303,19 @@ def test_poses_too_much_alike_name_the_joint_to_move():
     q[:, 4] = anywhere(chain, 40, seed=1)[:, 4]
     assert bool(texts) == (before < rank(problem(chain, "dh", Position, q=q)))
     assert all("joint_5" in text for text in texts)
+
+
+@pytest.mark.parametrize("arm", [*TABLES, "ur10", "tiago", "sim_6dof_actual"])
+def test_a_fit_to_poses_all_over_the_range_asks_for_no_more(arm):
+    """Four a revolute joint, two a sliding one and six are all there is to see, wherever the tracker is."""
+    chain = load(arm)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        placed = replace(chain, base=se3.exp6(rng.normal(0, 1, 6)), tool=se3.exp6(rng.normal(0, 0.5, 6)))
+        data = Pose.simulate(placed, anywhere(chain, 60, seed), Noise(1e-4, 1e-4), rng)
+        fit = calibrate(chain, data, "minimal,base,tool")
+        assert fit.rank == 6 + sum(2 if slides else 4 for slides in chain.prismatic)
+        assert [text for text in fit.unobservable if NOTHING not in text] == []
 
 
 def test_an_arm_that_is_all_seen_says_nothing():

@@ -144,6 +144,26 @@ def dies(job):
     return {"converged": job.robot != "slow", "folder": os.getcwd()}
 
 
+def test_what_is_hard_to_believe_of_a_robot_is_told(place, capsys):
+    """A joint's sign that is wrong in one robot's file."""
+    lines = (place / "data.csv").read_text().splitlines()
+    rows = [line.split(",") for line in lines[1:]]
+    wrong = [",".join([*row[:2], repr(-float(row[2])), *row[3:]]) for row in rows]
+    (place / "wrong.csv").write_text("\n".join([lines[0], *wrong]))
+    fleet(place, job("arm.dh.toml", "a.urdf") + job("arm.dh.toml", "b.urdf", data="wrong.csv"))
+    assert cli.main([*RUN, "--jobs", "1", "--json", "summary.json"]) == 0
+    said = capsys.readouterr().err.splitlines()
+    (line,) = [line for line in said if "check:" in line]
+    assert "wrong.csv: check: " in line
+    assert "joint joint_3 moving the other way" in line
+    first, second = csv.DictReader(Path("summary.csv").read_text().splitlines())
+    assert first["message"] == ""
+    assert "joint_3" in second["message"]
+    jobs = json.loads(Path("summary.json").read_text())["jobs"]
+    assert jobs[0]["result"]["doubts"] == {}
+    assert list(jobs[1]["result"]["doubts"]) == ["wrong.csv"]
+
+
 def test_a_process_that_dies_takes_no_other_with_it(place):
     names = ["a", "killer", "b", "defect", "slow", "wrong"]
     fleet(place, "".join(job(name, f"{name}.out") for name in names))

@@ -27,7 +27,7 @@ LAYERS = (
     {"poses", "positions"},
     {"lengths", "contacts", "relative"},
     {"frames", "observability", "robust", "kinds"},
-    {"problem", "uncertainty"},
+    {"problem", "uncertainty", "mistakes"},
     {"solver"},
     {"evaluation", "arms", "triangles", "passage"},
     {"nullspace", "tables"},

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from conftest import URDF, paper, robot_file
 from scipy.spatial.transform import Rotation
 
 from dhcal_pin import cli, se3
-from dhcal_pin.chain import Chain
+from dhcal_pin.chain import Chain, joint_station
 from dhcal_pin.inverse import within
 from dhcal_pin.kinds import KINDS
+from dhcal_pin.lengths import Wires
 from dhcal_pin.measurement_files import measurement_text, read_readings
 from dhcal_pin.measurements import Noise
 from dhcal_pin.plausibility import doubts
@@ -83,7 +86,7 @@ def test_a_wrong_unit_is_told_once(told, ur10, kind, units, word):
 
 
 @pytest.mark.parametrize(
-    ("said", "true", "word"), [("rad", "deg", "more than a turn"), ("deg", "rad", "turn")]
+    ("said", "true", "word"), [("rad", "deg", "more than a turn"), ("deg", "rad", "deg off")]
 )
 def test_rotation_vectors_in_the_wrong_unit(told, ur10, said, true, word):
     (text,) = told(ur10, sheet(ur10, joints(ur10), angle=said, wrong={"angle": true}))
@@ -104,6 +107,29 @@ def test_euler_angles_are_no_rotation_vector(told, ur10):
     ]
     (found,) = told(ur10, "\n".join([lines[0], *rows]))
     assert "axes and frame of Euler angles" in found
+
+
+def test_matrices_by_columns_are_told(told, ur10):
+    """The inverse rotation turns from row to row by the same angles."""
+    q = joints(ur10)
+    base, tool = frames()
+    turned = se3.log3((base @ ur10.poses(q) @ tool)[:, :3, :3])
+    lines = sheet(ur10, q).splitlines()
+    rows = [
+        ",".join([*line.split(",")[:9], *map(repr, row)])
+        for line, row in zip(lines[1:], (-turned).tolist(), strict=True)
+    ]
+    (found,) = told(ur10, "\n".join([lines[0], *rows]))
+    assert "rows of a matrix" in found
+
+
+@pytest.mark.parametrize("moving", [[0], [5], [0, 5], [0, 1, 2, 5]])
+def test_few_moving_joints_are_believed(told, ur10, moving):
+    """Motions that leave base or target open turn as the joints do in some frames."""
+    for seed in range(3):
+        q = np.full((30, 6), 0.4)
+        q[:, moving] = joints(ur10, 30, seed)[:, moving]
+        assert told(real_ur10(), sheet(real_ur10(), q)) == []
 
 
 def test_small_motions_are_believed(told, ur10):
@@ -162,6 +188,87 @@ def test_joints_beyond_their_limits(told, ur10):
     assert "joint elbow_joint is beyond its limits, -3.142 rad to 3.142 rad, in rows 4, 8;" in text
 
 
+def swapped(i, j):
+    order = np.arange(6)
+    order[[i, j]] = j, i
+    return lambda q: q[:, order]
+
+
+def off(j, degrees):
+    return lambda q: q + np.deg2rad(degrees) * (np.arange(6) == j)
+
+
+def flipped(j):
+    return lambda q: q * np.where(np.arange(6) == j, -1, 1)
+
+
+MISTAKES = [
+    *((flipped(j), f"joint {name}_joint moving the other way") for j, name in enumerate(
+        ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"))),
+    (off(1, 90), "with -90 deg added to joint shoulder_lift_joint; check its zero"),
+    (off(4, -90), "with 90 deg added to joint wrist_2_joint; check its zero"),
+    (swapped(0, 2), "shoulder_pan_joint and elbow_joint in each other's place; check the joints' order"),
+    (swapped(3, 4), "joints wrist_1_joint and wrist_2_joint in each other's place"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["pose", "position"])
+@pytest.mark.parametrize(("mistake", "words"), MISTAKES)
+def test_joints_that_were_mixed_up_are_named(told, ur10, kind, mistake, words):
+    """Joint values within half their range, so that no limit tells; an arm that is millimetres off."""
+    real = real_ur10()
+    q = 0.4 * joints(ur10, 60)
+    lines = sheet(real, q, kind=kind).splitlines()
+    written = sheet(real, mistake(q), kind=kind).splitlines()
+    # The joints' columns of one, the readings of the other.
+    rows = [",".join((*w.split(",")[:6], *t.split(",")[6:])) for w, t in zip(written, lines, strict=True)]
+    (text,) = told(ur10, "\n".join(rows))
+    assert words in text
+
+
+def real_ur10():
+    """A UR10 off by two millimetres and four milliradians at every joint."""
+    rng = np.random.default_rng(3)
+    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    scale = np.repeat([2e-3, 4e-3], 3)
+    return arm.displaced({joint_station(j): se3.exp6(scale * rng.uniform(-1, 1, 6)) for j in range(1, 7)})
+
+
+@pytest.mark.parametrize("swap", [("x", "y"), ("y", "z")])
+def test_a_mirrored_frame_is_named(told, ur10, swap):
+    text = sheet(real_ur10(), joints(ur10, 60))
+    head, body = text.split("\n", 1)
+    a, b = (f"{axis}[mm]" for axis in swap)
+    head = head.replace(a, "?").replace(b, a).replace("?", b)
+    (said,) = told(ur10, f"{head}\n{body}")
+    assert "with the frame mirrored; check the order and the signs of x, y and z" in said
+
+
+def test_readings_of_another_row_are_named(told, ur10):
+    lines = sheet(real_ur10(), joints(ur10, 150)).splitlines()
+    pairs = pairwise(lines[1:])
+    rows = [",".join((*q.split(",")[:6], *reading.split(",")[6:])) for q, reading in pairs]
+    (said,) = told(ur10, "\n".join([lines[0], *rows]))
+    assert "with the readings of the row before; check how rows were put together" in said
+
+
+def test_another_robot_is_told_but_nothing_guessed(told, ur10):
+    other = Chain.from_urdf(robot_file("ur_description/urdf/ur3_robot.urdf"), "tool0")
+    (said,) = told(ur10, sheet(other, joints(ur10, 60), kind="position"))
+    assert said.endswith("check robot and tip, units, and the joints' order, signs and zeros")
+
+
+def test_gross_errors_are_no_mistaken_column(told, ur10):
+    rng = np.random.default_rng(5)
+    real, q = real_ur10(), joints(ur10, 80)
+    rows = sheet(real, q, kind="position").splitlines()
+    for i in rng.permutation(80)[:8] + 1:
+        cells = rows[i].split(",")
+        cells[6:] = [repr(float(cell) + 1e3 * rng.normal()) for cell in cells[6:]]
+        rows[i] = ",".join(cells)
+    assert told(ur10, "\n".join(rows)) == []
+
+
 def test_rows_given_twice(told, ur10):
     lines = sheet(ur10, joints(ur10)).splitlines()
     (text,) = told(ur10, "\n".join([*lines, lines[3], lines[3], lines[9]]))
@@ -207,3 +314,22 @@ def test_the_command_line_says_so(tmp_path, monkeypatch, capsys, command):
     found = [line for line in capsys.readouterr().err.splitlines() if "check:" in line]
     assert len(found) == 1
     assert found[0].startswith("data.csv: check: row 13: the same as others")
+
+
+def test_two_wires_of_one_name_are_told(tmp_path, monkeypatch, capsys):
+    """Files that call two anchors alike cannot both be met."""
+    monkeypatch.chdir(tmp_path)
+    arm = Chain.from_dh(paper("sim_6dof"))
+    (tmp_path / "arm.dh.toml").write_bytes((URDF / "sim_6dof.dh.toml").read_bytes())
+    for file, anchor in (("one.csv", [2.0, 1, 0]), ("two.csv", [-1.0, 2, 0.5])):
+        q = joints(arm, 60, len(file) + int(anchor[0]))
+        length = np.linalg.norm(arm.poses(q)[:, :3, 3] - anchor, axis=1)
+        (tmp_path / file).write_text(measurement_text(Wires.of(q, length[:, None]), arm))
+    assert cli.main(["calibrate", "arm.dh.toml", "one.csv", "-o", "out.urdf"]) == 0
+    assert ": check: " not in capsys.readouterr().err
+    assert cli.main(["calibrate", "arm.dh.toml", "one.csv", "two.csv", "-o", "out.urdf"]) == 0
+    found = [line for line in capsys.readouterr().err.splitlines() if "check:" in line]
+    assert found
+    assert all(
+        "after the fit, length is usually" in line and "whether its wire1 is" in line for line in found
+    )

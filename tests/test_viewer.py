@@ -200,7 +200,7 @@ def test_any_joint_in_any_place_without_anything_to_draw(window, tmp_path):
     html = scene_html(nominal, calibrated)
     window.open(tmp_path / "scene.html", html)
     assert "no visual geometry" in window.page.locator("#note").inner_text()
-    check_tips(window, nominal, calibrated)
+    check_tips(window, replace(nominal, base=calibrated.base, tool=calibrated.tool), calibrated)
     assert window.look()["calibrated"] > 200
     # Both stand on the same base and hold the same tool, however far away that is.
     window.call("setMagnification", 500)
@@ -278,6 +278,20 @@ def test_reflectors_beside_the_tool_and_lengths_are_no_residuals(window, tmp_pat
     assert window.page.evaluate("dhcal.scene.points.length") == 9
     assert window.page.evaluate("largest") < 1e-8
     assert window.look()["points"] > 15
+
+
+def test_where_the_instrument_stands_is_no_difference_of_the_arms(window, tmp_path):
+    """A nominal file knows no base and no tool: `apart` is what the robots alone make of it."""
+    nominal, truth = perturbed(Chain.from_dh(paper("sim_6dof")))
+    base, tool = (se3.exp6(np.array(x)) for x in ([2.0, -1, 0.3, 0.4, 0.8, -1.2], [0.1, 0, 0.2, 0.3, 0, 1]))
+    calibrated = replace(truth, base=base, tool=tool)
+    window.open(tmp_path / "scene.html", scene_html(nominal, calibrated))
+    check_tips(window, replace(nominal, base=base, tool=tool), calibrated)
+    apart = float(window.page.locator("#tips td").last.inner_text().split(" mm")[0])
+    q = poses(nominal, 5)[-1:]
+    wanted = 1e3 * np.linalg.norm((nominal.poses(q) @ tool - truth.poses(q) @ tool)[0, :3, 3])
+    assert apart == pytest.approx(wanted, abs=1e-3)
+    assert apart < 10
 
 
 def test_ellipsoids_are_what_the_result_predicts(window, tmp_path):
