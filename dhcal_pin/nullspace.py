@@ -28,7 +28,7 @@ Cause = Literal["arm", "instrument", "poses", "still"]
 # Joint values drawn to see what other poses would show: this many rows an unknown.
 _ROWS = 6
 # A direction that other readings show stands out from their rounding by far more than this.
-_CUT = 1e-7
+_CUT = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
