@@ -270,18 +270,9 @@ def unobservable(problem: Problem, x: Array, triangle: Triangle) -> list[str]:
     names = [p.name for p in (*problem.errors.parameters, *problem.unknowns)]
     explainer = Explainer(experiment, dict(layers), names, path)
     found = [explainer.sentence(group) for group in _joined(groups(layers, path.stations))]
-    if _size_is_open(problem, x, here) and not any(SIZE in text for text in found):
+    if experiment.size_is_open(here) and not any(SIZE in text for text in found):
         found = [SCALE, *found]
     return found
-
-
-def _size_is_open(problem: Problem, x: Array, triangle: Array) -> bool:
-    """Whether an unseen direction makes the arm larger."""
-    if problem.ruler is None:
-        return False
-    robot = len(problem.errors.parameters)
-    growth = problem.ruler.rates(*problem.errors.derivative(x[:robot]))[:, 0]
-    return bool(np.abs(growth @ observability.unseen(triangle)[:robot]).max(initial=0.0) > NONE)
 
 
 def _joined(found: list[Group]) -> list[Group]:

@@ -136,6 +136,14 @@ class Experiment:
         moved = [item.configurations() for item in self.problem.data if item.ends]
         return np.flatnonzero(np.ptp(np.concatenate(moved), axis=0) < 1e-9).tolist() if moved else []
 
+    def size_is_open(self, triangle: Array) -> bool:
+        """Whether a direction that a triangle does not see makes the arm larger."""
+        if self.problem.ruler is None:
+            return False
+        robot = len(self.problem.errors.parameters)
+        growth = self.problem.ruler.rates(*self.problem.errors.derivative(self.x[:robot]))[:, 0]
+        return bool(np.abs(growth @ observability.unseen(triangle)[:robot]).max(initial=0.0) > NONE)
+
     def layers(self, triangle: Array) -> list[tuple[Cause, Array]]:
         """Bases (p, ·) of what stays unseen, each within the next: by the arm, and by all that was done."""
         joints = list(range(self.chain.size))
