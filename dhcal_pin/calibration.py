@@ -152,7 +152,9 @@ def _scatter(
 ) -> Array:
     """How many of its sigmas each group of rows scatters in the fit, all items' groups in a row (g,).
 
-    One where the instrument states its sigmas, or where there are not more rows than directions seen.
+    One where the instrument states its sigmas, or where there are not more rows than directions seen. A
+    group of no more rows than that could be met exactly, whatever it reads, and tells no scatter of its
+    own: it takes the one of all rows of its unit, and where the others are stated that of a placeholder.
     """
     if all(item.stated for item in data):
         return np.ones(sum(len(item.groups) for item in data))
@@ -160,17 +162,25 @@ def _scatter(
     residuals = [
         item.residual(chain.sweep(item.configurations()), problem.values(item, solution.x)) for item in data
     ]
-    counted = sum(len(r) * w.sum() for r, w in zip(residuals, weights, strict=True))
-    share = 1 - observability.rank(solution.triangle.r) / counted
-    return np.array(
-        [
-            1.0
-            if item.stated or share <= 0
-            else max(float(np.sqrt(np.average(np.mean(r[rows] ** 2, 0), weights=w) / share)), LEAST_SCALE)
-            for item, r, w in zip(data, residuals, weights, strict=True)
-            for rows in item.groups.values()
-        ]
-    )
+    counts = [w.sum() for w in weights]
+    seen = observability.rank(solution.triangle.r)
+    share = 1 - seen / sum(len(r) * count for r, count in zip(residuals, counts, strict=True))
+    # Of each group: whether it is of angles, whether it is stated, its rows, and the sum of their squares.
+    groups = [
+        (name == "orientation", item.stated, len(r[rows]) * count, np.sum(r[rows] ** 2 * w))
+        for item, r, w, count in zip(data, residuals, weights, counts, strict=True)
+        for name, rows in item.groups.items()
+    ]
+    out = np.ones(len(groups))
+    for i, (angle, stated, rows, squares) in enumerate(groups if share > 0 else ()):
+        alike = [group for group in groups if group[0] == angle]
+        pooled = [group for group in alike if not group[1]]
+        if rows <= seen and len(alike) > 1:
+            rows, squares = (sum(group[k] for group in pooled) for k in (2, 3))
+            stated = stated or len(pooled) == 1
+        if not stated:
+            out[i] = max(float(np.sqrt(squares / (rows * share))), LEAST_SCALE)
+    return out
 
 
 def _rescaled(problem: Problem, solution: Solution, expected: Array, default: Array) -> Array:

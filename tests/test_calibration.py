@@ -154,6 +154,21 @@ def test_sigmas_that_are_too_small_widen_what_the_data_tell_alone(sim_6dof, sim_
     assert wrong.std == pytest.approx(right.std, rel=0.1)
 
 
+@pytest.mark.parametrize(("stated", "expected"), [(False, 1e-4), (True, 1e-3)])
+def test_a_single_distance_tells_no_scatter_of_its_own(sim_6dof, sim_6dof_actual, stated, expected):
+    """It can be met exactly, and is no better for that: it counts as the touches, unless theirs is stated."""
+    rng = np.random.default_rng(4)
+    touches = Touch.simulate(sim_6dof_actual, rng.uniform(-2.5, 2.5, (200, 6)), Noise(1e-4), rng)
+    tip = touches.started(sim_6dof_actual)
+    places = np.reshape([unknown.nominal for unknown in tip.unknowns], (-1, 3))
+    far = np.linalg.norm(places[1] - places[0]) + 1e-3
+    known = PointDistance.of(6, [touches.names[:2]], [far])
+    names = [touches.names[i] for i in touches.label]
+    data = Touch.of(touches.q, names, 1e-4 if stated else None)
+    fit = calibrate(sim_6dof, [data, known], "minimal,tool")
+    assert fit.problem.data[1].sigma.item() == pytest.approx(expected, rel=0.2)
+
+
 def test_unstated_sigmas_are_found(sim_6dof, sim_6dof_actual):
     """Positions 20 times worse than the placeholder and rotations 20 times better, none stated."""
     rng = np.random.default_rng(0)
