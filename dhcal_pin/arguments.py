@@ -263,8 +263,8 @@ def parser() -> argparse.ArgumentParser:
     plan.add_argument(
         "--criterion",
         metavar="C",
-        default="D",
-        help="D volume of the errors' uncertainty, A mean, E worst, task position error (D)",
+        help="D volume of the errors' uncertainty, A mean, E worst, task position error, robust this and "
+        "what the model leaves out (D; robust with --from)",
     )
     plan.add_argument(
         "--task", metavar="FILE", help="where the tool must be right: joint values, or x[mm],y[mm],z[mm]"
@@ -272,7 +272,11 @@ def parser() -> argparse.ArgumentParser:
     plan.add_argument("--parameters", metavar="SET[,SET]", help="what is unknown, as in calibrate")
     plan.add_argument("--fix", metavar="NAME[,NAME]", default="", help="hold parameters or sets at nominal")
     plan.add_argument("--free", metavar="NAME[,NAME]", default="", help="add single parameters")
-    plan.add_argument("--priors", metavar="default|FILE", help="sigmas of the errors, as in calibrate")
+    plan.add_argument(
+        "--priors",
+        metavar="default|FILE",
+        help="sigmas of the errors, as in calibrate (what a calibrated robot's sidecar knows, else default)",
+    )
     plan.add_argument("--instrument", metavar="FILE", help="surveyed values, as in calibrate")
     plan.add_argument("--data", metavar="DATA", nargs="+", help="measurements already taken, to add to")
     plan.add_argument("--columns", **_COLUMNS)

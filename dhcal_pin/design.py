@@ -12,11 +12,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from scipy.linalg import lapack
 
+from .criteria import Criterion
 from .se3 import Array
 
 # A pass of exchanges that gains less than this is the last one: a thousandth of efficiency.
@@ -31,100 +31,6 @@ def basis(start: Array, rows: Array) -> Array:
     p = start.shape[1]
     triangle = np.linalg.qr(np.concatenate([start, rows.reshape(-1, p)]), mode="r")
     return lapack.dtrtri(triangle)[0]
-
-
-class Criterion(Protocol):
-    """What a design is chosen for."""
-
-    def value(self, root: Array) -> float:
-        """Log of what is to be small, of a root (p, p) of the covariance."""
-        ...
-
-    def gains(self, rows: Array, root: Array) -> Array:
-        """How much each candidate (m,) of a pool (p, k, m) would help, by a measure that ranks them."""
-        ...
-
-
-def _turned(rows: Array, by: Array) -> Array:
-    """Rows (p, k, m) in coordinates by (p, w): (w, k, m)."""
-    p, k, m = rows.shape
-    return (by.T @ rows.reshape(p, k * m)).reshape(-1, k, m)
-
-
-def _factor(rows: Array) -> Array:
-    """Cholesky factors (k, k, m), lower, of I + rowsᵀ·rows for rows (p, k, m), all candidates at once."""
-    k, m = rows.shape[1:]
-    out = np.empty((k, k, m))
-    for i in range(k):
-        for j in range(i + 1):
-            np.einsum("pm,pm->m", rows[:, i], rows[:, j], out=out[i, j])
-        out[i, i] += 1.0
-    for j in range(k):
-        for i in range(j):
-            out[j:, j] -= out[j:, i] * out[j, i]
-        np.sqrt(out[j, j], out=out[j, j])
-        out[j + 1 :, j] /= out[j, j]
-    return out
-
-
-@dataclass(frozen=True)
-class Determinant:
-    """D: the volume of the unknowns' uncertainty, as the geometric mean of p standard deviations, squared."""
-
-    def value(self, root: Array) -> float:
-        """Log of det(C)^(1/p)."""
-        return 2 * float(np.mean(np.log(np.abs(np.diag(root)))))
-
-    def gains(self, rows: Array, root: Array) -> Array:
-        """By how much log det of the information grows: det(I + A·C·Aᵀ)."""
-        factor = _factor(_turned(rows, root))
-        return 2 * np.log(np.einsum("iim->im", factor)).sum(0)
-
-
-@dataclass(frozen=True, eq=False)
-class Spread:
-    """A and task: the sum of the variances of some combinations of the unknowns.
-
-    Attributes:
-        combinations: (p, w).
-    """
-
-    combinations: Array
-
-    def value(self, root: Array) -> float:
-        """Log of the sum."""
-        return float(np.log(np.sum((self.combinations.T @ root) ** 2)))
-
-    def gains(self, rows: Array, root: Array) -> Array:
-        """By how much the sum falls: tr((I + A·C·Aᵀ)⁻¹·A·C·W·C·Aᵀ)."""
-        turned = _turned(rows, root)
-        factor = _factor(turned)
-        left = _turned(turned, root.T @ self.combinations)
-        for j in range(rows.shape[1]):
-            for i in range(j):
-                left[:, j] -= factor[j, i] * left[:, i]
-            left[:, j] /= factor[j, j]
-        return np.einsum("wkm,wkm->m", left, left)
-
-
-@dataclass(frozen=True, eq=False)
-class Worst:
-    """E: the variance of the worst known among the combinations that can be known at all.
-
-    Attributes:
-        seen: (r, p) orthonormal directions that the candidates see.
-    """
-
-    seen: Array
-
-    def value(self, root: Array) -> float:
-        """Log of the largest variance."""
-        return 2 * float(np.log(np.linalg.norm(self.seen @ root, 2)))
-
-    def gains(self, rows: Array, root: Array) -> Array:
-        """By how much a sum of variances falls in which the worst ones count nearly alone."""
-        directions, size, _ = np.linalg.svd(self.seen @ root, full_matrices=False)
-        return Spread(self.seen.T @ directions * (size / size[0]) ** 6).gains(rows, root)
 
 
 def _free(_: int) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,11 +16,17 @@ from .error_model import ErrorModel
 from .errors import DhcalError
 from .kinds import KINDS
 from .measurements import Measurement, Noise
-from .parameters import select
+from .parameters import SETS, select
+from .problem import reduce
 from .se3 import Array
+from .uncertainty import Uncertainty
 
 # The unknowns of an instrument are placed as if it were to read so many configurations.
 _PLACED = 200
+# What no model holds of a joint, from pose to pose: a gear of an arcminute, and as little on a slide.
+JOINTS = Noise(5e-5, np.deg2rad(1 / 60))
+# A share of the largest standard deviation that is none, but rounding.
+HELD = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +45,7 @@ class Information:
         scale: (p+s',) sigmas of the priors, m and rad.
         start: (p+s', p+s') triangle of priors and data so far.
         taken: (p+s', p+s') or (0, p+s') triangle of the data alone.
+        fitted: (p+s',) which unknowns a fit will find; it takes the others for zero.
     """
 
     errors: ErrorModel
@@ -50,6 +57,7 @@ class Information:
     scale: Array
     start: Array
     taken: Array
+    fitted: Array
 
     @cached_property
     def _derivative(self) -> tuple[Chain, Array, Array]:
@@ -81,6 +89,22 @@ class Information:
         out[: len(velocities)] = velocities.reshape(len(velocities), -1)
         return np.asarray(np.linalg.qr((out * self.scale[:, None]).T / np.sqrt(len(q)), mode="r")).T
 
+    def narrowed(self) -> Information:
+        """The same without what a fit will leave out."""
+        kept, robot = self.fitted, len(self.x)
+        found = [p for p, fitted in zip(self.errors.parameters, kept[:robot], strict=True) if fitted]
+        places = np.where(self.places < 0, -1, np.cumsum(kept)[self.places] - 1)
+        return replace(
+            self,
+            errors=replace(self.errors, parameters=tuple(found)),
+            x=self.x[kept[:robot]],
+            places=places,
+            scale=self.scale[kept],
+            start=np.asarray(np.linalg.qr(self.start[:, kept], mode="r")),
+            taken=self.taken[:, kept],
+            fitted=kept[kept],
+        )
+
     def seen(self, rows: Array) -> Array:
         """Orthonormal directions (r, p+s') that data so far and further rows (n, k, p+s') see."""
         every = np.concatenate([self.taken, rows.reshape(-1, len(self.scale))])
@@ -103,8 +127,10 @@ class Information:
         free: Sequence[str] = (),
         data: Sequence[Measurement] = (),
         known: Mapping[str, float] | None = None,
+        left_out: Sequence[str] = (),
+        learnt: Uncertainty | None = None,
     ) -> Information:
-        """What is known before measuring: the priors, and what data already taken tell.
+        """What is known before measuring: the priors, and what data already taken or a calibration tell.
 
         Args:
             chain: the nominal robot.
@@ -117,6 +143,9 @@ class Information:
             free: as in `calibrate`.
             data: readings already taken.
             known: values of instruments' unknowns, as in `calibrate`.
+            left_out: sets whose parameters the robot has and a fit will take for zero, as far as it does not
+                find them.
+            learnt: of the calibration that made the chain; it takes the priors' place for what it found.
 
         Raises:
             DhcalError: the kind's readings hang together, a sigma or a prior is missing.
@@ -125,17 +154,21 @@ class Information:
         if priors == "none":
             raise DhcalError("a plan needs priors; choose default, or sigmas by name")
         errors = select(chain, parameters if parameters is not None else chain.parameters, fix, free)
-        sigma = 1 / prior_weights(errors, priors)
-        x, there, triangle = np.zeros(len(sigma)), {}, np.zeros((0, len(sigma)))
-        values = dict(known or {})
+        sigma, x = 1 / prior_weights(errors, priors), np.zeros(len(errors.parameters))
+        fit, values = None, dict(known or {})
         if data:
             fit = calibrate(chain, data, parameters, priors=priors, fix=fix, free=free, known=known)
-            errors, x, triangle = fit.errors, fit.x[: len(sigma)], fit.solution.triangle.r
-            there = {unknown.name: len(sigma) + i for i, unknown in enumerate(fit.problem.unknowns)}
+            errors, x = fit.errors, fit.x[: len(x)]
             sigma, values = 1 / fit.problem.weights, values | fit.instruments
             noise = noise or _seen(fit.problem.data, kind)
         if noise is None:
             raise DhcalError(f"no sigma is known of a {kind}; give one, as 0.1mm,0.01deg")
+        errors, x, sigma, fitted = _with(errors, x, sigma, left_out)
+        there, triangle = {}, np.zeros((0, len(sigma)))
+        if fit is not None:
+            there = {unknown.name: len(x) + i for i, unknown in enumerate(fit.problem.unknowns)}
+            every = np.concatenate([x, fit.x[len(fit.x) - len(there) :]])
+            triangle = reduce(replace(fit.problem, errors=errors), every, small_angle=False).r
         model = errors.at(x)
         template = maker.simulate(model, q[:_PLACED], noise, np.random.default_rng(0)).started(model)
         if not template.stated:
@@ -145,11 +178,15 @@ class Information:
         for unknown in template.unknowns:
             if unknown.name not in values:
                 there[unknown.name] = len(sigma)
-                sigma = np.append(sigma, unknown.prior)
+                sigma, fitted = np.append(sigma, unknown.prior), np.append(fitted, True)
             places.append(there.get(unknown.name, -1))
         taken = np.zeros((len(triangle), len(sigma)))
         taken[:, : triangle.shape[1]] = triangle * sigma[: triangle.shape[1]]
         start = np.concatenate([taken, np.eye(len(sigma))])
+        if learnt is not None:
+            start[len(taken) :, : len(x)] = 0.0
+            told = _rows(*learnt.of_unknowns(errors, sigma[: len(x)]))
+            start[len(taken) : len(taken) + len(x), : len(x)] = told
         return cls(
             errors=errors,
             x=x,
@@ -160,7 +197,56 @@ class Information:
             scale=sigma,
             start=np.asarray(np.linalg.qr(start, mode="r")),
             taken=taken,
+            fitted=fitted,
         )
+
+
+def _rows(root: Array, hidden: Array) -> Array:
+    """Rows (p, p) whose information is that of a covariance's root (p, r), in units of the priors.
+
+    Unknowns and directions that a calibration did not look for have no covariance: they keep their prior.
+
+    Args:
+        root: (p, r).
+        hidden: (p, h) directions that nothing told, whose variance is without bounds.
+    """
+    ways, size, _ = np.linalg.svd(np.pad(root, ((0, 0), (0, max(0, len(root) - root.shape[1])))))
+    known = size > HELD * size[0]
+    rows = ways.T[known] / size[known, None]
+    lost = np.linalg.svd(rows @ hidden, full_matrices=False)
+    away = lost[0][:, lost[1] > HELD * np.linalg.norm(rows)]
+    return np.concatenate([rows - away @ (away.T @ rows), ways.T[~known]])
+
+
+def _with(
+    errors: ErrorModel, x: Array, sigma: Array, sets: Sequence[str]
+) -> tuple[ErrorModel, Array, Array, Array]:
+    """With further sets' parameters among the errors: values and sigmas of all unknowns, and which are old.
+
+    Args:
+        errors: p unknowns.
+        x: (p,) their values.
+        sigma: (p+s,) theirs and instruments'.
+        sets: names.
+    """
+    own = {parameter.name: i for i, parameter in enumerate(errors.parameters)}
+    more = [p for name in sets for p in SETS[name](errors.chain) if p.name not in own]
+    wide = errors.joined(more)
+    at = np.array([own.get(parameter.name, -1) for parameter in wide.parameters])
+    priors = np.where(at < 0, wide.priors, sigma[at])
+    fitted = np.concatenate([at >= 0, np.full(len(sigma) - len(x), True)])
+    return wide, np.where(at < 0, 0.0, x[at]), np.concatenate([priors, sigma[len(x) :]]), fitted
+
+
+def unsteady(chain: Chain, q: Array, noise: Noise) -> Noise:
+    """Sigmas of readings at joint values q (m, n) by arms whose joints scatter by `JOINTS`, too."""
+    errors = select(chain, "offset")
+    model, bodies, twists = errors.derivative(np.zeros(len(errors.parameters)))
+    turns = np.array([parameter.unit == "rad" for parameter in errors.parameters])
+    sizes = np.where(turns, JOINTS.rotation, JOINTS.position)
+    moved = model.tool_velocities(model.sweep(q), bodies, twists) * sizes[:, None, None]
+    place, turn = np.sqrt(np.sum(moved**2, 0).reshape(2, 3, -1).mean((1, 2)))
+    return Noise(float(np.hypot(noise.position, place)), float(np.hypot(noise.rotation, turn)))
 
 
 def _plannable(kind: str) -> type[Measurement]:

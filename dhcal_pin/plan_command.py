@@ -17,9 +17,10 @@ from .measurement_files import read_readings
 from .measurements import Noise
 from .outputs import STDOUT, check_outputs, emit, names, sidecars
 from .planning import Plan, plan
-from .robot_files import read_instrument, read_priors, read_robot
+from .robot_files import existing_sidecar, read_instrument, read_priors, read_robot
 from .se3 import Array
 from .tables import Table
+from .uncertainty_files import read_uncertainty
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 # A laser tracker and a good arm's repeatability, where neither --sigma nor --data tell.
@@ -41,6 +42,9 @@ def run(args: Namespace) -> int:
     if args.candidates_from:
         candidates = read_configurations(args.candidates_from, chain, args.columns)
     data = [read_readings(path, chain, args.columns).data for path in args.data or []]
+    # Readings given tell themselves what they tell, and priors asked for stand alone.
+    sidecar = None if args.data or args.priors else existing_sidecar(args.robot)
+    learnt = read_uncertainty(sidecar, chain) if sidecar else None
     sigma = args.sigma or (None if any(item.kind == args.kind for item in data) else _SIGMA)
     with terminal.progress(f"choosing {args.count} poses"):
         found = plan(
@@ -55,6 +59,7 @@ def run(args: Namespace) -> int:
             criterion=args.criterion,
             data=data,
             known=read_instrument(args.instrument) if args.instrument else None,
+            learnt=learnt,
             task=read_task(args.task, chain) if args.task else None,
             candidates=candidates,
             space=space,
@@ -65,7 +70,7 @@ def run(args: Namespace) -> int:
     document = _document(found, args)
     document |= {"inputs": report.fingerprints(inputs), "versions": report.versions()}
     comments = [
-        f"{args.count} poses to measure ({args.kind}, criterion {args.criterion}), as a short tour",
+        f"{args.count} poses to measure ({args.kind}, criterion {found.criterion}), as a short tour",
         f"predicted position error {1e3 * found.error:.4g} mm RMS with sigma "
         f"{1e3 * noise.position:.4g} mm, {np.degrees(noise.rotation):.4g} deg",
     ]

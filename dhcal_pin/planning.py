@@ -12,22 +12,24 @@ from . import observability
 from .calibration import Priors
 from .chain import Chain
 from .configurations import Room, Space, evened, tour
-from .design import PROMISING, Criterion, Determinant, Pool, Spread, Worst, basis, exchange, greedy
+from .criteria import Compromise, Criterion, Determinant, Spread, Worst
+from .design import PROMISING, Pool, basis, exchange, greedy
 from .errors import DhcalError
-from .information import Information
+from .information import Information, unsteady
 from .measurements import Measurement, Noise
+from .refinement import Aim, refined
 from .se3 import Array
+from .transmission import FAMILIES
+from .uncertainty import Uncertainty
 
 # Joints stay this far from their limits.
 MARGIN_ANGLE, MARGIN_LENGTH = np.deg2rad(2.0), 5e-3
 # Predicted errors are averaged over so many configurations where no task is given.
 TASK = 300
-# Random choices that a plan is compared with, at so many numbers of poses.
-DRAWS, SIZES = 60, 6
+# Random choices that a plan is compared with, at so many numbers of poses, out of so many poses at least.
+DRAWS, SIZES, DRAWN = 200, 6, 600
 # Candidates drawn at the most: with more of them memory ends before the plan gains.
 MOST_CANDIDATES = 10**6
-# Refinement: rounds, each with so many neighbours a pose, nearer from round to round.
-ROUNDS, NEIGHBOURS, REACH, NEARER = 8, 24, 0.15, 0.65
 # Poses nearer than this are as one to a real robot, whose errors no model holds in full: they repeat there.
 # Where poses at random would stand nearer than that, their distance.
 APART = np.deg2rad(20.0)
@@ -103,9 +105,10 @@ def plan(
     priors: Priors = "default",
     fix: Sequence[str] = (),
     free: Sequence[str] = (),
-    criterion: str = "D",
+    criterion: str | None = None,
     data: Sequence[Measurement] = (),
     known: Mapping[str, float] | None = None,
+    learnt: Uncertainty | None = None,
     task: Array | None = None,
     candidates: int | Array = 5000,
     space: Space | None = None,
@@ -127,9 +130,13 @@ def plan(
         fix: as in `calibrate`.
         free: as in `calibrate`.
         criterion: "D" volume of the unknowns' uncertainty, "A" mean variance, "E" worst variance, each in
-            units of the priors; "task" predicted position error over the task.
+            units of the priors; "task" predicted position error over the task; "robust" this and, as much,
+            the error over the task by what the model leaves out of gains, harmonics and compliance, of an arm
+            whose joints scatter by an arcminute beside the noise given. Without it "robust" for given
+            candidates, which tell where the robot works, and "D" for drawn ones.
         data: readings already taken, to be added to.
         known: values of instruments' unknowns, as in `calibrate`.
+        learnt: what the calibration that made the chain left uncertain; it takes the priors' place.
         task: (m, n) joint values where the tool is to be right; anywhere without it, or where
             the given candidates are.
         candidates: how many to draw, or joint values (m, n) to choose from.
@@ -140,6 +147,7 @@ def plan(
     Raises:
         DhcalError: an unknown name, no room for the tool, or too few candidates.
     """
+    criterion = criterion or ("D" if isinstance(candidates, int) else "robust")
     if criterion not in CRITERIA:
         raise DhcalError(f"criterion {criterion!r}: choose from {', '.join(CRITERIA)}")
     if count < 1:
@@ -157,27 +165,34 @@ def plan(
     else:
         q = chain.checked(candidates)
         where = q if task is None else chain.checked(task)
-    information = Information.before(chain, q, kind, noise, parameters, priors, fix, free, data, known)
+    left_out = ()
+    if criterion == "robust":
+        left_out, noise = FAMILIES, noise and unsteady(chain, q, noise)
+    wide = Information.before(
+        chain, q, kind, noise, parameters, priors, fix, free, data, known, left_out, learnt
+    )
+    information = wide.narrowed()
     stands = evened(chain, q)
     kept = np.concatenate([stands[:0], *(evened(chain, item.q) for item in data if item.ends == 1)])
     possible = _anything if room is None else lambda i: room.allows(q[i])
-    pool = Pool.of(information.rows(q), stands, _apart(stands, count, rng), possible)
-    seen = information.seen(pool.at(np.arange(0, len(q), max(1, len(q) // TASK))))
+    pool = Pool.of(wide.rows(q), stands, _apart(stands, count, rng), possible)
+    seen = information.seen(pool.at(np.arange(0, len(q), max(1, len(q) // TASK)))[..., wide.fitted])
     every = information.task(where)
     # What the instrument cannot see, as where the base is beside wires of unknown anchors, no choice mends.
     combinations = seen.T @ (seen @ every)
     if np.linalg.norm(every - combinations) > UNSEEN * np.linalg.norm(combinations):
         notes.append(f"where the base stands is not counted, as {kind} readings cannot tell")
-    aim = _Aim(information, CRITERIA[criterion](seen, combinations), combinations, len(seen), kept, room)
-    first = greedy(pool, information.start, count, aim.criterion, np.zeros(0, int), kept)
+    goal = CRITERIA[criterion](seen, combinations, wide, where)
+    aim = Aim(information, wide, goal, combinations, len(seen), kept, room)
+    first = greedy(pool, wide.start, count, aim.criterion, np.zeros(0, int), kept)
     if len(first) < count:
         # They do not stand so far apart.
         pool = replace(pool, apart=0.0)
-        first = greedy(pool, information.start, count - len(first), aim.criterion, first, kept)
+        first = greedy(pool, wide.start, count - len(first), aim.criterion, first, kept)
     if len(first) < count:
         raise DhcalError(f"only {len(first)} of {len(q)} candidates are possible, {count} are asked for")
-    chosen = exchange(pool, information.start, first, aim.criterion, kept)
-    best = q[chosen] if room is None else _refined(aim, q[chosen], room, pool.apart, rng)
+    chosen = exchange(pool, wide.start, first, aim.criterion, kept)
+    best = q[chosen] if room is None else refined(aim, q[chosen], room, pool.apart, rng)
     sizes, errors = _curve(aim, pool, q, first, chosen, best, rng)
     random_sizes, random_errors = _random(aim, pool, sizes[sizes <= count], rng)
     order = tour(evened(chain, best))
@@ -196,11 +211,24 @@ def plan(
     )
 
 
-CRITERIA: dict[str, Callable[[Array, Array], Criterion]] = {
-    "D": lambda seen, task: Determinant(),
-    "A": lambda seen, task: Spread(seen.T),
-    "E": lambda seen, task: Worst(seen),
-    "task": lambda seen, task: Spread(task),
+def _robust(seen: Array, task: Array, wide: Information, where: Array) -> Criterion:
+    """The compromise over a task at joint values (m, n), if anything is left out at all."""
+    kept = wide.fitted
+    if kept.all():
+        return Spread(task)
+    every = wide.task(where)
+    # Of the displacements over the task, those that a fit can make: what it should put there, and its share.
+    ways, size, _ = np.linalg.svd((seen.T @ (seen @ every[kept])).T, full_matrices=False)
+    ways = ways[:, size > UNSEEN * size[0]]
+    return Compromise(kept, seen.T @ (seen @ every[kept]) @ ways, ways.T @ every[~kept].T)
+
+
+CRITERIA: dict[str, Callable[[Array, Array, Information, Array], Criterion]] = {
+    "D": lambda seen, task, wide, where: Determinant(),
+    "A": lambda seen, task, wide, where: Spread(seen.T),
+    "E": lambda seen, task, wide, where: Worst(seen),
+    "task": lambda seen, task, wide, where: Spread(task),
+    "robust": _robust,
 }
 
 
@@ -217,49 +245,8 @@ def _apart(places: Array, count: int, rng: np.random.Generator) -> float:
     return min(APART, float(np.median(between.min(1))))
 
 
-@dataclass(frozen=True, eq=False)
-class _Aim:
-    """What is known before and what is to be known; how much can be seen at all; places to keep away from."""
-
-    information: Information
-    criterion: Criterion
-    task: Array
-    seen: int
-    kept: Array
-    room: Room | None
-
-
-def _refined(aim: _Aim, q: Array, room: Room, apart: float, rng: np.random.Generator) -> Array:
-    """The configurations (n, dof) moved to better ones about them, by smaller and smaller steps."""
-    information, criterion = aim.information, aim.criterion
-    q = q.copy()
-    rows = np.ascontiguousarray(information.rows(q).transpose(2, 1, 0))
-    value = criterion.value(basis(information.start, rows))
-    for turn in range(ROUNDS):
-        near = room.near(q, REACH * NEARER**turn, NEIGHBOURS, rng)
-        possible = lambda i, near=near: room.allows(near[i])  # noqa: E731
-        pool = Pool.of(information.rows(near), evened(room.chain, near), apart, possible)
-        pool.closed[:] = ~room.space.holds(room.chain.poses(near))
-        for slot in range(len(q)):
-            block = np.arange(slot * NEIGHBOURS, (slot + 1) * NEIGHBOURS)
-            rest = basis(information.start, np.delete(rows, slot, 0))
-            here = np.concatenate([pool.rows[:, :, block], rows[slot].T[:, :, None]], 2)
-            gains = criterion.gains(here, rest)
-            better = np.where(gains[:-1] > gains[-1], gains[:-1], -np.inf)
-            others = np.concatenate([aim.kept, evened(room.chain, np.delete(q, slot, 0))])
-            found = pool.best(better, block, others)
-            if found is None:
-                continue
-            trial = rows.copy()
-            trial[slot] = pool.rows[:, :, found].T
-            reached = criterion.value(basis(information.start, trial))
-            if reached < value:
-                rows, value, q[slot] = trial, reached, near[found]
-    return q
-
-
 def _curve(
-    aim: _Aim, pool: Pool, q: Array, first: Array, chosen: Array, best: Array, rng: np.random.Generator
+    aim: Aim, pool: Pool, q: Array, first: Array, chosen: Array, best: Array, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Numbers of poses and predicted errors in m: of smaller plans, of the plan, then with candidates added.
 
@@ -272,9 +259,9 @@ def _curve(
         best: (n, dof) the refined one.
         rng: for refinement.
     """
-    information, start = aim.information, aim.information.start
-    own, count = information.rows(best), len(best)
-    known = observability.rank(information.taken)
+    wide, start = aim.wide, aim.wide.start
+    own, count = wide.rows(best), len(best)
+    known = observability.rank(aim.information.taken)
     least = min(count, max(1, -(-(aim.seen - known) // own.shape[1])))
     sizes = np.unique(np.rint([least, 1.4 * least, 2 * least, np.sqrt(2 * least * count)]).astype(int))
     sizes = sizes[sizes < count]
@@ -283,8 +270,8 @@ def _curve(
         some = exchange(pool, start, first[:size], aim.criterion, aim.kept, passes=1)
         if aim.room is not None and size <= 2 * least:
             # Near the fewest that tell all, refinement counts for much.
-            better = _refined(aim, q[some], aim.room, pool.apart, rng)
-            smaller.append(information.rows(better).transpose(2, 1, 0))
+            better = refined(aim, q[some], aim.room, pool.apart, rng)
+            smaller.append(wide.rows(better).transpose(2, 1, 0))
         else:
             smaller.append(pool.at(some))
     gains = aim.criterion.gains(pool.rows, basis(start, np.ascontiguousarray(own.transpose(2, 1, 0))))
@@ -293,27 +280,27 @@ def _curve(
     left = np.argsort(-gains)[: min(PROMISING, int(np.isfinite(gains).sum()))]
     both = Pool.of(
         np.concatenate([own, pool.rows[:, :, left]], 2),
-        np.concatenate([evened(information.chain, best), pool.places[left]]),
+        np.concatenate([evened(wide.chain, best), pool.places[left]]),
         pool.apart,
         lambda i: i < count or pool.possible(int(left[i - count])),
     )
     order = greedy(both, start, max(count, MORE), aim.criterion, np.arange(count), aim.kept)
     larger = np.arange(count, len(order) + 1)
     rows = [*smaller, *(both.at(order[:size]) for size in larger)]
-    errors = [information.error(one, aim.task) for one in rows]
+    errors = [aim.information.error(one[..., wide.fitted], aim.task) for one in rows]
     every = np.arange(least, len(order) + 1)
     between = np.interp(np.log(every), np.log([*sizes, *larger]), np.log(errors))
     return every, np.exp(between)
 
 
-def _random(aim: _Aim, pool: Pool, sizes: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+def _random(aim: Aim, pool: Pool, sizes: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """Some of the sizes, and the predicted error in m after as many poses at random, the median of draws."""
     if not sizes.size:
         return sizes, np.empty(0)
     order = rng.permutation(pool.rows.shape[2])
-    wanted = max(4 * int(sizes[-1]), 200)
+    wanted = max(4 * int(sizes[-1]), DRAWN)
     open_ones = [i for i in order[: 4 * wanted] if not pool.closed[i] and pool.possible(int(i))][:wanted]
-    rows = pool.at(np.array(open_ones, int))
+    rows = pool.at(np.array(open_ones, int))[..., aim.wide.fitted]
     some = np.unique(np.linspace(0, len(sizes) - 1, SIZES).round().astype(int))
     out = [
         np.median([

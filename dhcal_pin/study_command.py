@@ -18,7 +18,8 @@ from .executors import workers
 from .files import csv_text, read_text, save
 from .outputs import check_outputs, sidecars
 from .robot_files import paper_file
-from .study import Setting, Study, read_study, run, table
+from .study import run, table
+from .study_grid import Setting, Study, read_study
 from .study_plot import plot
 from .tables import Table
 

@@ -14,11 +14,15 @@ import numpy as np
 
 from . import se3
 from .chain import Chain, link_station
+from .kinematics import Sweep
+from .observability import RANK_CUT
 from .parameters import ErrorModel
 from .se3 import Array
 
 # A parameter, or a metre and a radian of the tool, with more than this share of itself unseen is unknown.
 UNKNOWN = 1e-6
+# Configurations at which the motions of two sets of errors are compared.
+TOLD = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,23 +103,45 @@ class Uncertainty:
         rows = np.concatenate([motions.reshape(6 * count, -1), np.eye(len(bodies))[plain:]])
         return cls(chain, entries, rows @ root, rows @ hidden)
 
+    def of_unknowns(self, errors: ErrorModel, scale: Array) -> tuple[Array, Array]:
+        """Root (p, r) of the covariance of this arm's p further errors, and what of them is hidden (p, h).
+
+        They are told by what they do to the tool; what several of them do alike is shared out by their scale,
+        and what none of them does goes to those that come nearest.
+
+        Args:
+            errors: unknowns of the calibrated arm.
+            scale: (p,) units to count them in, such as their priors' sigmas.
+        """
+        q = np.random.default_rng(0).uniform(-np.pi, np.pi, (TOLD, self.chain.size))
+        chain, bodies, twists = errors.derivative(np.zeros(len(scale)))
+        moved = chain.tool_velocities(chain.sweep(q), bodies, twists) * scale[:, None, None]
+        inverse = np.linalg.pinv(moved.reshape(len(scale), -1).T, rcond=RANK_CUT)
+        carried = self._velocities(self.chain.sweep(q)).reshape(len(self.root), -1)
+        told = inverse @ carried.T
+        return told @ self.root, told @ self.hidden
+
+    def _velocities(self, sweep: Sweep) -> Array:
+        """Of the tool (6(k+1)+e, 6, m) by each of the motions and entries, as `Chain.tool_velocities`."""
+        chain, count = self.chain, len(self.chain.moving) + 1
+        carry = np.tile(np.eye(4), (count, 1, 1))
+        carry[0] = se3.inverse(chain.base)
+        stations = np.repeat([link_station(j) for j in range(count)], 6)
+        bodies, twists = chain.station_twists(stations, np.tile(np.eye(6), (count, 1)), carry.repeat(6, 0))
+        return chain.tool_velocities(
+            sweep,
+            np.concatenate([bodies, count + self.entries]),
+            np.pad(twists, ((0, len(self.entries)), (0, 0))),
+        )
+
     def predict(self, q: Array) -> Prediction:
         """The calibrated tool poses at joint values q (m, n), rad or m, and how well they are known.
 
         The covariance is that of the identified errors carried to the tool to first order; noise of a
         future measurement is not in it.
         """
-        chain, count = self.chain, len(self.chain.moving) + 1
-        carry = np.tile(np.eye(4), (count, 1, 1))
-        carry[0] = se3.inverse(chain.base)
-        stations = np.repeat([link_station(j) for j in range(count)], 6)
-        bodies, twists = chain.station_twists(stations, np.tile(np.eye(6), (count, 1)), carry.repeat(6, 0))
-        sweep = chain.sweep(q)
-        velocities = chain.tool_velocities(
-            sweep,
-            np.concatenate([bodies, count + self.entries]),
-            np.pad(twists, ((0, len(self.entries)), (0, 0))),
-        )
+        sweep = self.chain.sweep(q)
+        velocities = self._velocities(sweep)
         carried, lost = (np.einsum("pim,pr->mir", velocities, part) for part in (self.root, self.hidden))
         covariance = carried @ np.swapaxes(carried, 1, 2)
         rows, axes = np.nonzero(np.sum(lost**2, -1) > UNKNOWN)

@@ -17,7 +17,8 @@ from dhcal_pin.measurement_files import measurement_text
 from dhcal_pin.measurements import Noise
 from dhcal_pin.positions import Position
 from dhcal_pin.stream import calibrate_stream, file_parts
-from dhcal_pin.study import read_study, run
+from dhcal_pin.study import run
+from dhcal_pin.study_grid import read_study
 
 distributed = pytest.importorskip("distributed")
 

@@ -7,7 +7,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from dhcal_pin.design import Determinant, Pool, Spread, Worst, basis, exchange, greedy
+from dhcal_pin.criteria import Compromise, Determinant, Spread, Worst
+from dhcal_pin.design import Pool, basis, exchange, greedy
 
 NONE = np.empty((0, 1))
 
@@ -53,6 +54,27 @@ def test_gains_are_what_another_candidate_brings():
     spread = [np.trace(WEIGHTS.T @ (before - one) @ WEIGHTS) for one in after]
     assert Determinant().gains(pool.rows, root) == pytest.approx(determinant, rel=1e-10)
     assert Spread(WEIGHTS).gains(pool.rows, root) == pytest.approx(spread, rel=1e-10)
+
+
+def test_a_compromise_weighs_noise_and_what_is_left_out():
+    """Mean squared errors of a fit that takes two of seven unknowns for zero, formed outright."""
+    pool, rng = draw(7, 2, 30), np.random.default_rng(1)
+    fitted = np.array([True, True, False, True, True, False, True])
+    wanted = rng.standard_normal((3, 2))
+    criterion = Compromise(fitted, WEIGHTS, wanted)
+
+    def expected(chosen) -> float:
+        every = information(pool, chosen)
+        covariance = np.linalg.inv(every[np.ix_(fitted, fitted)])
+        bias = covariance @ every[np.ix_(fitted, ~fitted)]
+        variance = np.trace(WEIGHTS.T @ covariance @ WEIGHTS)
+        return 0.5 * float(np.log(variance * np.sum((WEIGHTS.T @ bias - wanted) ** 2)))
+
+    chosen = [0, 3, 4]
+    root = basis(np.eye(7), pool.at(np.array(chosen)))
+    assert criterion.value(root) == pytest.approx(expected(chosen), rel=1e-12)
+    after = [expected([*chosen, i]) for i in range(30)]
+    assert criterion.gains(pool.rows, root) == pytest.approx(-np.array(after), rel=1e-10)
 
 
 @pytest.mark.parametrize("name", CRITERIA)

@@ -64,6 +64,26 @@ def test_ten_more_among_measured_ones(tmp_path, capsys):
     assert found["predicted_position_rms_m"] < 1e-4
 
 
+def test_ten_more_for_a_calibrated_robot(tmp_path, capsys):
+    """Its sidecar tells what is known, unless readings or priors are given; --from chooses robustly."""
+    data, robot, out = tmp_path / "data.csv", tmp_path / "arm.urdf", tmp_path / "more.csv"
+    run(capsys, "simulate", ROBOT, "--truth", TRUTH, "-m", 40, "--noise", "0.1mm,0.01deg", "-o", data)
+    run(capsys, "calibrate", ROBOT, data, "-o", robot, "--parameters", "minimal,base,tool")
+    options = ("-n", 10, "--candidates", 300, "--parameters", "minimal,base,tool", "-o", out, "--json", "-")
+    known, beside, fresh = (
+        json.loads(run(capsys, "plan", *more, *options)[1])
+        for more in ((robot,), (ROBOT, "--data", data), (robot, "--priors", "default"))
+    )
+    assert [found["criterion"] for found in (known, beside, fresh)] == ["D"] * 3
+    key = "predicted_position_rms_m"
+    assert known[key] == pytest.approx(beside[key], rel=0.1)
+    assert known[key] < 0.7 * fresh[key]
+    chosen = json.loads(run(capsys, "plan", ROBOT, "-n", 10, "--from", data, "-o", out, "--json", "-")[1])
+    assert chosen["criterion"] == "robust"
+    # A gear's arcminute counts beside the noise.
+    assert chosen["sigma_orientation_rad"] > 2e-4
+
+
 def test_a_task_by_positions_and_by_joints(tmp_path, capsys):
     targets = tmp_path / "targets.csv"
     chain = read_robot(ROBOT)

@@ -12,14 +12,18 @@ from conftest import paper, robot_file
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.chain import Chain
 from dhcal_pin.configurations import Room, Space, tour
-from dhcal_pin.design import Determinant, Pool, basis, exchange, greedy
+from dhcal_pin.criteria import Determinant
+from dhcal_pin.design import Pool, basis, exchange, greedy
 from dhcal_pin.errors import DhcalError
+from dhcal_pin.information import Information
 from dhcal_pin.kinds import KINDS
 from dhcal_pin.measurements import Noise
 from dhcal_pin.parameters import select
 from dhcal_pin.planning import plan
 from dhcal_pin.problem import Problem, reduce
+from dhcal_pin.robot_files import read_robot, write_urdf
 from dhcal_pin.solver import with_priors
+from dhcal_pin.uncertainty_files import read_uncertainty
 from dhcal_pin.urdf import parse_urdf
 
 NOISE = Noise(1e-4, np.deg2rad(0.01))
@@ -164,6 +168,48 @@ def test_planned_poses_leave_less_error_than_random_ones_over_many_robots(name, 
     assert predicted == pytest.approx(reached, rel=0.05)
 
 
+def misfits(name: str, kind: str, seeds: int) -> np.ndarray:
+    """Errors anywhere (seeds, 3) of 20 poses out of 400, robust, "D" and at random, over that of all 400.
+
+    The arms have gains, harmonics and compliance of a tenth of their priors, which no fit looks for.
+    """
+    chain = arm(name)
+    space = Room.of(chain, Space(), 0.0, 0.0)
+    pool, held = space.draw(400, np.random.default_rng(77)), space.draw(150, np.random.default_rng(5))
+    sizes = {p.name: 0.3 if p.station == 0 else min(p.prior, 2e-3) for p in select(chain, SETS).parameters}
+    errors = select(chain, f"{SETS},gain,harmonics,compliance")
+    size = np.array([sizes.get(p.name, 0.1 * p.prior) for p in errors.parameters])
+    options = {"kind": kind, "noise": NOISE, "parameters": SETS, "candidates": pool}
+    robust, plain = (plan(chain, 20, criterion=name, **options) for name in (None, "D"))
+    assert robust.criterion == "robust"
+    out = []
+    for seed in range(seeds):
+        rng = np.random.default_rng(seed)
+        truth = errors.at(size * rng.standard_normal(len(size)))
+        missed = []
+        for q in (robust.q, plain.q, pool[rng.choice(400, 20, replace=False)], pool):
+            fit = calibrate(chain, KINDS[kind].simulate(truth, q, NOISE, rng), SETS)
+            gap = fit.chain.poses(held)[:, :3, 3] - truth.poses(held)[:, :3, 3]
+            missed.append(np.sqrt(np.mean(np.sum(gap**2, 1))))
+        out.append(np.array(missed[:3]) / missed[3])
+    return np.array(out)
+
+
+def test_a_robust_plan_minds_what_the_model_leaves_out():
+    robust, plain, random = np.median(misfits("panda", "pose", 8), 0)
+    assert robust < min(plain, random)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "kind"), [("panda", "pose"), ("ur10", "pose"), ("ur10", "position")])
+def test_robust_plans_mind_what_the_model_leaves_out_on_many_robots(name, kind):
+    errors = misfits(name, kind, 60)
+    robust, plain, random = np.median(errors, 0)
+    assert robust <= 1.15
+    assert robust < plain < random
+    assert np.mean(errors[:, 0] < errors[:, 2]) >= 0.9
+
+
 def curve(sizes, seeds: int) -> list[tuple[float, float]]:
     """RMS errors of plans of several sizes as the largest plan predicts them, and simulated."""
     chain = arm("ur10")
@@ -205,6 +251,37 @@ def test_readings_already_taken_count():
     assert found.error < 0.5 * before
     alone = plan(chain, 10, noise=NOISE, parameters=SETS, criterion="task", task=task, candidates=1500)
     assert found.error < alone.error
+
+
+def test_a_calibration_says_itself_what_is_left_to_learn(tmp_path):
+    """What a calibrated robot's file keeps counts as the readings themselves do, whatever sets come next."""
+    chain = arm("ur10")
+    rng = np.random.default_rng(2)
+    errors = select(chain, SETS)
+    truth = errors.at(np.where(errors.priors < 1, errors.priors, 0.3) * rng.standard_normal(36))
+    old = KINDS["pose"].simulate(truth, rng.uniform(0.2, 0.8, (25, 6)), NOISE, rng)
+    write_urdf(calibrate(chain, old, SETS), tmp_path / "arm.urdf")
+    sidecar, there = tmp_path / "arm.calibration.toml", read_robot(tmp_path / "arm.urdf", "tool0")
+    learnt = read_uncertainty(sidecar, there)
+    task = Room.of(chain, Space(), 0.0, 0.0).draw(200, rng)
+    options = {"noise": NOISE, "criterion": "task", "task": task, "candidates": 800}
+    beside = plan(chain, 10, parameters=SETS, data=[old], **options)
+    found = plan(there, 10, parameters=SETS, learnt=learnt, **options)
+    assert found.error == pytest.approx(beside.error, rel=0.03)
+    none = Information.before(there, task, "pose", NOISE, SETS, learnt=learnt)
+    before = np.sqrt(np.mean(calibrate(chain, old, SETS).predict(task).position_std ** 2))
+    empty = np.zeros((0, 6, len(none.scale)))
+    assert none.error(empty, none.task(task)) == pytest.approx(before, rel=1e-6)
+    assert found.error < 0.5 * before
+    # Six a joint say the same with more unknowns; what was not looked for keeps its prior.
+    wide = Information.before(there, task, "pose", NOISE, "placement,base,tool", learnt=learnt)
+    empty = np.zeros((0, 6, len(wide.scale)))
+    assert wide.error(empty, wide.task(task)) == pytest.approx(before, rel=1e-6)
+    gain = Information.before(there, task, "pose", NOISE, f"{SETS},gain", learnt=learnt)
+    empty = np.zeros((0, 6, len(gain.scale)))
+    prior = Information.before(there, task, "pose", NOISE, "gain")
+    alone = prior.error(np.zeros((0, 6, 6)), prior.task(task))
+    assert gain.error(empty, gain.task(task)) == pytest.approx(np.hypot(before, alone), rel=0.01)
 
 
 def test_the_tool_stays_in_the_box_and_in_sight():

@@ -178,15 +178,15 @@ def test_a_panda_that_touched_sockets_at_three_places(dhcal, tmp_path, left, mos
     assert np.all(np.array(extended) <= [fitted + 1e-9, distance + 1e-9])
 
 
-def planned_and_random(seeds: int, choices: int) -> tuple[float, float]:
-    """Held-out errors of forty planned and forty random poses over that of half a series.
+def planned_and_random(seeds: int, choices: int) -> np.ndarray:
+    """Held-out errors (seeds, 2) of forty planned and forty random poses over that of half a series.
 
-    The plan sees joint values alone. Means over several halves: one choice of forty scatters by 0.025.
+    The plan sees joint values alone. Several halves: one choice of forty scatters by 0.025.
     """
     chain = read_robot(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
     data = read_measurements(SERIES["B"], chain, MAPS / "ipa_ur10.toml")
     sets, noise = "minimal,base,tool", Noise(1e-4, np.deg2rad(0.01))
-    planned, random = [], []
+    out = []
     for seed in range(seeds):
         rng = np.random.default_rng(seed)
         order = rng.permutation(len(data.rows))
@@ -198,18 +198,19 @@ def planned_and_random(seeds: int, choices: int) -> tuple[float, float]:
 
         every = held_out(first)
         found = plan(chain, 40, noise=noise, parameters=sets, candidates=first.q)
-        planned.append(held_out(first.take(found.index)) / every)
         drawn = [held_out(first.take(rng.choice(half, 40, replace=False))) for _ in range(choices)]
-        random.append(np.median(drawn) / every)
-    return float(np.mean(planned)), float(np.mean(random))
+        out.append([held_out(first.take(found.index)) / every, np.median(drawn) / every])
+    return np.array(out)
 
 
 def test_planned_poses_of_a_series_do_for_all_of_it():
-    assert planned_and_random(2, 1)[0] <= 1.10
+    assert planned_and_random(2, 1)[:, 0].max() <= 1.10
 
 
 @pytest.mark.slow
 def test_planned_poses_of_a_series_are_worth_more_than_random_ones():
-    planned, random = planned_and_random(12, 100)
-    assert planned <= 1.10
-    assert planned <= random
+    planned, random = planned_and_random(12, 100).T
+    assert (planned <= 1.10).all()
+    assert planned.mean() <= 1.06
+    # Which of two sets of forty is better on one half is a matter of luck, too.
+    assert np.mean(planned <= random) >= 0.8

@@ -16,7 +16,11 @@ from conftest import URDF
 
 from dhcal_pin import cli
 from dhcal_pin.errors import DhcalError
-from dhcal_pin.study import read_study, run, table
+from dhcal_pin.measurements import Noise
+from dhcal_pin.planning import plan
+from dhcal_pin.robot_files import read_robot
+from dhcal_pin.study import run, table
+from dhcal_pin.study_grid import read_study
 
 SIX = """
 seeds = 50
@@ -116,6 +120,30 @@ def test_two_processes_give_the_same_table(tmp_path):
     assert table_of(tmp_path, "one") == table_of(tmp_path, "two", "--jobs", "2")
 
 
+PLANNED = """
+seeds = 150
+[settings]
+robot = "sim_6dof.dh.toml"
+kind = "position"
+choice = ["random", "planned"]
+poses = 16
+"""
+
+
+def test_planned_poses_are_worth_what_the_plan_says(tmp_path):
+    """The same arms with poses at random and with those of `plan`, however the work is shared out."""
+    one = table_of(tmp_path, "one", text=PLANNED)
+    assert one == table_of(tmp_path, "two", "--jobs", "2", text=PLANNED)
+    assert one == killed_and_resumed(tmp_path, PLANNED, 3)
+    random, planned = (float(row["position_rms[m]"]) for row in csv.DictReader(one.splitlines()))
+    arm = read_robot(URDF / "sim_6dof.dh.toml")
+    options = {"kind": "position", "noise": Noise(1e-4, np.deg2rad(0.01)), "parameters": "minimal,base,tool"}
+    expected = plan(arm, 16, **options)
+    assert random == pytest.approx(expected.random, rel=0.1)
+    assert planned == pytest.approx(expected.error, rel=0.1)
+    assert planned < 0.85 * random
+
+
 def test_a_cut_journal_is_taken_up(tmp_path, capsys):
     """As a kill leaves it: whole lines and a piece of one."""
     whole = table_of(tmp_path, "whole")
@@ -173,6 +201,9 @@ def test_journal_of_another_study_is_left_alone(tmp_path, capsys):
         (("seeds = 120", "seeds = -1"), "seeds = -1: must be a whole number"),
         (("seeds = 120", "sedes = 120"), "'sedes' is not known"),
         (('"pose", "position"', '"gps"'), "kind = 'gps': choose from pose, position"),
+        (("poses = 12", "choice = 'best'"), "choice = 'best': choose from random, corner, planned"),
+        (("poses = 12", "choice = 'planned'\nredrawn = true"), "planned poses are not drawn anew"),
+        (("poses = 12", "choice = 'planned'\nnoise = '0mm'"), "a pose needs sigmas above zero"),
         (('"pose", "position"', '"wires"'), r"kind = 'wires': wires: wire1.x is unknown"),
         (("0.5mm,0.1deg", "0.5"), "errors '0.5': write a number with a unit"),
         (("sim_6dof.dh.toml", "none.urdf"), "none.urdf: no such file"),
