@@ -244,18 +244,18 @@ class Chain:
     def sweep(self, q: Array | Motion, out: Array | None = None) -> Sweep:
         """All frames at joint values q (m, n), or at a motion of this chain, vectorised over the samples.
 
-        `out` (k+2, 4, 3, m) holds them when given.
+        `out` (k+2, 7, 3, m) holds them when given.
         """
         motion, terms = q if isinstance(q, Motion) else self.motion(q), None
         if self.transmission is not None:
             joints, terms = self.effective(motion.joints)
             motion = self._motion(joints)
         k, m = motion.values.shape
-        frames = np.empty((k + 2, 4, 3, m)) if out is None else out
-        frames[0] = self.base[:3].T[:, :, None]
+        frames = np.empty((k + 2, 7, 3, m)) if out is None else out
+        frames[0, :4] = self.base[:3].T[:, :, None]
         links = np.concatenate([self.links[:-1], (self.links[-1] @ self.tool)[None]])
         kinematics.carry_frames(links, self.prismatic, motion, frames)
-        return Sweep(frames[:-1], frames[-1], terms)
+        return Sweep(frames[:-1], frames[-1, :4], terms)
 
     def poses(self, q: Array) -> Array:
         """Tool poses (m, 4, 4) in the measuring frame at joint values q (m, n) in rad or m."""
@@ -297,11 +297,11 @@ class Chain:
         """
         m = sweep.tool.shape[-1]
         out = np.empty((len(bodies), 6, m)) if out is None else out
-        behind = int(np.searchsorted(bodies, len(sweep.bodies)))
+        behind = int(np.searchsorted(bodies, len(sweep.frames)))
         if behind < len(bodies):
-            out[behind:] = self._entry_velocities(sweep, bodies[behind:] - len(sweep.bodies))
+            out[behind:] = self._entry_velocities(sweep, bodies[behind:] - len(sweep.frames))
             bodies, twists = bodies[:behind], twists[:behind]
-        kinematics.point_velocities(sweep.bodies, sweep.tool[3], bodies, twists, out[:behind])
+        kinematics.point_velocities(sweep.frames, sweep.tool[3], bodies, twists, out[:behind])
         return out
 
     def _entry_velocities(self, sweep: Sweep, entries: Array) -> Array:

@@ -149,7 +149,7 @@ class Chunk:
     def sweep(self, chain: Chain) -> Sweep:
         """A chain's frames at the samples, in memory that the next chunk's overwrite."""
         k, m = self.motion.values.shape
-        return chain.sweep(self.motion, scratch("sweep", k + 2, 4, 3, m))
+        return chain.sweep(self.motion, scratch("sweep", k + 2, 7, 3, m))
 
     def unknowns(self, instruments: Mapping[str, float]) -> Array:
         """The values u of the measurement's unknowns among all the instruments'."""

@@ -68,7 +68,7 @@ def jacobian(chain: Chain, sets: str, m: int, repeats: int) -> tuple[float, floa
         for at in range(0, m, CHUNK):
             motion = chain.motion(q[at : at + CHUNK])
             k, some = motion.values.shape
-            sweep = chain.sweep(motion, scratch("sweep", k + 2, 4, 3, some))
+            sweep = chain.sweep(motion, scratch("sweep", k + 2, 7, 3, some))
             chain.tool_velocities(sweep, bodies, twists, out[..., at : at + CHUNK])
 
     model, frame = chain.model, chain.frame_id
