@@ -5,6 +5,7 @@ from __future__ import annotations
 import fnmatch
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -20,7 +21,7 @@ from .parameters import select
 from .problem import Problem, shared_unknowns
 from .result import Result
 from .se3 import Array
-from .solver import METHODS, Progress, Solution, levenberg_marquardt, posterior_root
+from .solver import METHODS, Progress, Solution, last_step, levenberg_marquardt, posterior_root
 
 Method = Literal["lm", "gn"]
 Priors = Literal["default", "none"] | Mapping[str, float]
@@ -111,9 +112,10 @@ def _place(
     def fitted(start: Chain, items: tuple[Measurement, ...]) -> tuple[float, Chain]:
         placed = replace(frames, chain=start)
         problem = _problem(placed, tuple(item.started(start) for item in items), 1 / placed.priors, known)
-        solution = levenberg_marquardt(problem, np.zeros(len(problem.weights)), max_iterations, None)
-        chain = placed.at(solution.x[: len(placed.parameters)])
-        return solution.triangle.cost + float(np.sum((problem.weights * solution.x) ** 2)), chain
+        nominal = np.zeros(len(problem.weights))
+        solution = levenberg_marquardt(problem, nominal, max_iterations, None, nearly=True)
+        cost = solution.triangle.cost + float(np.sum((problem.weights * solution.x) ** 2))
+        return cost, placed.at(last_step(problem, solution)[: len(placed.parameters)])
 
     begun = starts(errors.chain, data, BASE in stations, errors.chain.tool_station in stations)
     if len(begun) == 1:
@@ -272,19 +274,21 @@ def calibrate(
     if bounds:
         problem = replace(problem, bounds=_bounds(problem, bounds))
     default = _default(errors, priors)
-    solution = METHODS[method](problem, np.zeros(len(problem.weights)), max_iterations, progress)
+    # Until sigmas and priors are settled, too, where the loop nearly ends is enough.
+    loop = partial(levenberg_marquardt, nearly=True) if method == "lm" else METHODS[method]
+    solution, earlier = loop(problem, np.zeros(len(problem.weights)), max_iterations, progress), 0
     if errors.at(solution.x[: len(errors.parameters)]).transmission is not None:
         # Gravity's torques follow the arm as found: once more with those.
         errors = errors.loaded(solution.x[: len(errors.parameters)])
         problem = replace(problem, errors=errors)
-        again = METHODS[method](problem, solution.x, max_iterations, progress)
-        solution = replace(again, iterations=solution.iterations + again.iterations)
+        earlier = solution.iterations
+        solution = loop(problem, solution.x, max_iterations, progress)
     weights = [np.ones(len(item.rows)) for item in data]
     if method == "lm":
         # Sigmas and weights that the fit itself tells: a few rounds settle them.
         scales = np.ones(sum(len(item.groups) for item in data))
-        expected = problem.weights
-        for _ in range(MOST_ROUNDS):
+        expected, ended = problem.weights, False
+        for left in reversed(range(MOST_ROUNDS)):
             before, found = weights, _scatter(problem, solution, data, weights)
             scaled = _scaled(data, found)
             fitted = errors.at(solution.x[: len(errors.parameters)])
@@ -293,16 +297,17 @@ def calibrate(
             moved = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(weights, before, strict=True))
             priors_now = _rescaled(problem, solution, expected, default)
             changes = np.log(found / scales), (priors_now - problem.weights) / np.fmax(expected, 1e-300)
-            if max(moved, *(np.abs(change).max(initial=0.0) for change in changes)) < 0.01:
+            settled = max(moved, *(np.abs(change).max(initial=0.0) for change in changes)) < 0.01
+            if settled and ended:
                 break
-            scales = found
-            known_now = None
-            if all(new is old for new, old in zip(weighed, problem.data, strict=True)):
-                problem, known_now = problem.held(priors_now), solution.triangle
+            ended = settled or left < 2
+            if settled or all(new is old for new, old in zip(weighed, problem.data, strict=True)):
+                problem, going_on = problem.held(priors_now), solution
             else:
                 problem = problem.of(weighed).held(priors_now)
-            again = levenberg_marquardt(problem, solution.x, max_iterations, progress, known_now)
-            solution = replace(again, iterations=solution.iterations + again.iterations)
+                scales, going_on, earlier = found, None, earlier + solution.iterations
+            loop = partial(levenberg_marquardt, before=going_on, nearly=not ended)
+            solution = loop(problem, solution.x, max_iterations, progress)
     return Result(
         errors=errors,
         x=solution.x,
@@ -311,7 +316,7 @@ def calibrate(
         data=data,
         holdout=tuple(holdout),
         problem=problem,
-        solution=solution,
+        solution=replace(solution, iterations=earlier + solution.iterations),
         method=method,
         weights=tuple(weights),
     )
