@@ -15,13 +15,13 @@ from .chain import BASE, Chain
 from .error_model import ErrorModel
 from .errors import DhcalError
 from .executors import HERE, Workers
-from .frames import few, misfit, starts
 from .measurements import Measurement
 from .parameters import select
+from .placing import placed, problem_of
 from .problem import Problem, shared_unknowns
 from .result import Result
 from .se3 import Array
-from .solver import METHODS, Progress, Solution, last_step, levenberg_marquardt, posterior_root
+from .solver import METHODS, Progress, Solution, levenberg_marquardt, posterior_root
 
 Method = Literal["lm", "gn"]
 Priors = Literal["default", "none"] | Mapping[str, float]
@@ -31,8 +31,6 @@ LEAST_SCALE = 1e-6
 MOST_ROUNDS = 30
 # Against narrower priors the expected size counts as much as so many errors that were found.
 EXPECTATION = 0.5
-# Starts for the frames are tried until one leaves so small a share of the positions' spread.
-GOOD_FIT = 0.01
 
 
 def prior_weights(errors: ErrorModel, priors: Priors) -> Array:
@@ -98,43 +96,6 @@ def split(
         held.append(item.take(np.sort(order[:count])))
         fit.append(item.take(np.sort(order[count:])))
     return tuple(fit), tuple(item for item in held if len(item.rows))
-
-
-def _place(
-    errors: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float], max_iterations: int
-) -> Chain:
-    """The nominal chain with its unknown base and tool as they fit the data best."""
-    frames = errors.frames()
-    if frames is None:
-        return errors.chain
-    stations = {p.station for p in frames.parameters}
-
-    def fitted(start: Chain, items: tuple[Measurement, ...]) -> tuple[float, Chain]:
-        placed = replace(frames, chain=start)
-        problem = _problem(placed, tuple(item.started(start) for item in items), 1 / placed.priors, known)
-        nominal = np.zeros(len(problem.weights))
-        solution = levenberg_marquardt(problem, nominal, max_iterations, None, nearly=True)
-        cost = solution.triangle.cost + float(np.sum((problem.weights * solution.x) ** 2))
-        return cost, placed.at(last_step(problem, solution)[: len(placed.parameters)])
-
-    begun = starts(errors.chain, data, BASE in stations, errors.chain.tool_station in stations)
-    if len(begun) == 1:
-        return fitted(begun[0], data)[1]
-    some = tuple(few(item) for item in data)
-    best: tuple[float, Chain] = np.inf, begun[0]
-    for start in begun:
-        best = min(best, fitted(start, some), key=lambda found: found[0])
-        if misfit(best[1], some) < GOOD_FIT:
-            break
-    return fitted(best[1], data)[1]
-
-
-def _problem(
-    errors: ErrorModel, data: tuple[Measurement, ...], weights: Array, known: Mapping[str, float]
-) -> Problem:
-    """The problem whose instruments have their own wide priors where the robot has any."""
-    wide = np.array([1 / unknown.prior for unknown in shared_unknowns(data) if unknown.name not in known])
-    return Problem(errors, data, np.concatenate([weights, wide * np.any(weights)]), known)
 
 
 def _known(data: tuple[Measurement, ...], known: Mapping[str, float]) -> Mapping[str, float]:
@@ -267,10 +228,9 @@ def calibrate(
     priors = priors if priors is not None else ("none" if method == "gn" else "default")
     errors = select(chain, parameters if parameters is not None else chain.parameters, fix, free)
     known = _known(data, known or {})
-    reference = _place(errors, data, known, max_iterations)
-    errors = replace(errors, chain=reference)
-    data = tuple(item.started(reference) for item in data)
-    problem = replace(_problem(errors, data, prior_weights(errors, priors), known), where=where)
+    errors = placed(errors, data, known, max_iterations)
+    data = tuple(item.started(errors.chain) for item in data)
+    problem = replace(problem_of(errors, data, prior_weights(errors, priors), known), where=where)
     if bounds:
         problem = replace(problem, bounds=_bounds(problem, bounds))
     default = _default(errors, priors)
@@ -312,7 +272,6 @@ def calibrate(
         errors=errors,
         x=solution.x,
         chain=errors.at(solution.x[: len(errors.parameters)]).loaded(),
-        reference=reference,
         data=data,
         holdout=tuple(holdout),
         problem=problem,
