@@ -13,6 +13,8 @@ from .se3 import Array
 
 # So many samples of all bodies stay in a processor's cache.
 BLOCK = 2048
+# Of columns x, y, z, p, the same and y, -x.
+_TURNING = np.vstack([np.eye(4), [[0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0]]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,17 +81,15 @@ def carry_frames(links: Array, prismatic: Array, motion: Motion, frames: Array) 
     """
     # The columns of F·L are the columns of F mixed by L: one small product for all samples. A turn by q
     # makes of x and y their cos q-fold, and to that adds the sin q-fold of y and -x.
-    mixing = np.swapaxes(links, 1, 2)
-    mixing = np.concatenate([mixing, mixing[:, 1:2], -mixing[:, :1]], 1)
-    columns = frames.reshape(*frames.shape[:2], -1)
-    for j, slides in enumerate(prismatic.tolist()):
-        after = frames[j + 1]
+    mixing, columns = _TURNING @ np.swapaxes(links, 1, 2), frames.reshape(*frames.shape[:2], -1)
+    steps = zip(mixing, columns[:, :4], columns[1:, :6], frames[1:], prismatic.tolist(), strict=False)
+    for j, (mix, before, mixed, after, slides) in enumerate(steps):
         if slides:
-            np.matmul(mixing[j, :4], columns[j, :4], out=columns[j + 1, :4])
+            np.matmul(mix[:4], before, out=mixed[:4])
             np.multiply(after[2], motion.values[j], out=after[4])
             after[3] += after[4]
         else:
-            np.matmul(mixing[j], columns[j, :4], out=columns[j + 1, :6])
+            np.matmul(mix, before, out=mixed)
             turned, across = after[:2], after[4:6]
             turned *= motion.cos[j]
             across *= motion.sin[j]
