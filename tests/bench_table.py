@@ -111,7 +111,7 @@ def against_figaroh(m: int, repeats: int) -> list[Row]:
 
 
 def against_pybotics(m: int, repeats: int) -> list[Row]:
-    """Pybotics on positions of an arm with all its modified DH parameters unknown, and both held-out errors."""
+    """Pybotics on positions of an arm whose modified DH parameters are unknown; both errors held out."""
     if (python := environment("pybotics")) is None:
         return []
     rng = np.random.default_rng(0)
