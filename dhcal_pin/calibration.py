@@ -136,27 +136,38 @@ def _scatter(
     )
 
 
-def _rescaled(problem: Problem, solution: Solution, expected: Array, default: Array) -> Array:
+def _families(errors: ErrorModel, expected: Array, default: Array) -> list[tuple[list[int], float, float]]:
+    """Default priors (p,) of one unit and one expected weight: which, that weight, the unit's largest."""
+    outside = (BASE, errors.chain.tool_station)
+    inside = [i for i, p in enumerate(errors.parameters) if default[i] and p.station not in outside]
+    units = {i: (errors.parameters[i].unit, errors.parameters[i].entry is None) for i in inside}
+    narrowest: dict[tuple[str, bool], float] = {}
+    families: dict[tuple[tuple[str, bool], float], list[int]] = {}
+    for i, weight in zip(inside, expected[inside].tolist(), strict=True):
+        narrowest[units[i]] = max(weight, narrowest.get(units[i], 0.0))
+        families.setdefault((units[i], weight), []).append(i)
+    return [(family, weight, narrowest[unit]) for (unit, weight), family in families.items()]
+
+
+def _rescaled(
+    problem: Problem, solution: Solution, families: Sequence[tuple[list[int], float, float]]
+) -> Array:
     """The weights (p+s,) of priors as wide as the errors that were found.
 
     Default priors of one unit and one expected size have one scale, the one of greatest evidence
     (MacKay 1992): the mean square of the errors over as many as the data and not the prior determine.
     None gets narrower than the narrowest expectation of its unit, as offsets of no more than tilts' size.
-    Priors that are not default (p,) stay.
+    Priors that are not default stay.
     """
-    errors = problem.errors
-    outside = (BASE, errors.chain.tool_station)
+    weights = problem.weights.copy()
+    if not families:
+        return weights
     root = posterior_root(solution.triangle, problem.weights)[0]
     told = 1 - np.sum((root * problem.weights[:, None]) ** 2, 1)
-    weights = problem.weights.copy()
-    inside = [i for i, p in enumerate(errors.parameters) if default[i] and p.station not in outside]
-    alike = {i: (errors.parameters[i].unit, errors.parameters[i].entry is None) for i in inside}
-    for kind in {(alike[i], expected[i]) for i in inside}:
-        family = [i for i in inside if (alike[i], expected[i]) == kind]
-        narrowest = max(expected[i] for i in inside if alike[i] == kind[0])
-        found, count = np.sum((solution.x[family] * expected[family]) ** 2), told[family].sum()
+    for family, expected, narrowest in families:
+        found, count = np.sum((solution.x[family] * expected) ** 2), told[family].sum()
         share = EXPECTATION if found <= count else 0.0
-        weights[family] = min(expected[family[0]] * np.sqrt((count + share) / (found + share)), narrowest)
+        weights[family] = min(expected * np.sqrt((count + share) / (found + share)), narrowest)
     return weights
 
 
@@ -248,14 +259,16 @@ def calibrate(
         # Sigmas and weights that the fit itself tells: a few rounds settle them.
         scales = np.ones(sum(len(item.groups) for item in data))
         expected, ended = problem.weights, False
+        families = _families(errors, expected, default)
         for left in reversed(range(MOST_ROUNDS)):
             before, found = weights, _scatter(problem, solution, data, weights)
-            scaled = _scaled(data, found)
-            fitted = errors.at(solution.x[: len(errors.parameters)])
-            values = [problem.values(item, solution.x) for item in data]
-            weighed, weights = robust.reweighted(fitted, scaled, values, loss)
+            weighed = _scaled(data, found)
+            if loss != "linear":
+                fitted = errors.at(solution.x[: len(errors.parameters)])
+                values = [problem.values(item, solution.x) for item in data]
+                weighed, weights = robust.reweighted(fitted, weighed, values, loss)
             moved = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(weights, before, strict=True))
-            priors_now = _rescaled(problem, solution, expected, default)
+            priors_now = _rescaled(problem, solution, families)
             changes = np.log(found / scales), (priors_now - problem.weights) / np.fmax(expected, 1e-300)
             settled = max(moved, *(np.abs(change).max(initial=0.0) for change in changes)) < 0.01
             if settled and ended:

@@ -34,7 +34,7 @@ RUNAWAY = 1e6
 
 def with_priors(triangle: Triangle, weights: Array, x: Array, damping: Array) -> Triangle:
     """The triangle with prior rows -x/σ and damping rows below it."""
-    p, held, damped = len(x), np.flatnonzero(weights), np.flatnonzero(damping)
+    p, (held,), (damped,) = len(x), weights.nonzero(), damping.nonzero()
     if not (held.size or damped.size):
         return triangle
     stacked = np.zeros((p + 1, p + held.size + damped.size))
