@@ -44,20 +44,20 @@ def placed(
 ) -> ErrorModel:
     """The same unknowns on the nominal chain with its unknown base and tool about where the data have them.
 
-    Where the data tell several starts, samples enough for a start choose among them and carry it on.
+    Where positions tell starts, samples enough for one choose among them and carry it on.
     """
     frames = errors.frames()
     if frames is None:
         return errors
     stations = {p.station for p in frames.parameters}
-    begun = starts(errors.chain, data, BASE in stations, errors.chain.tool_station in stations)
-    some = tuple(few(item) for item in data) if len(begun) > 1 else data
-    best: tuple[float, Chain] = np.inf, begun[0]
-    for start in begun:
+    some = tuple(few(item) for item in data)
+    best: tuple[float, Chain] | None = None
+    for start in starts(errors.chain, data, BASE in stations, errors.chain.tool_station in stations):
         found = _fitted(replace(frames, chain=start), some, known, max_iterations)
-        best = min(best, found, key=lambda each: each[0])
-        if len(begun) > 1 and misfit(best[1], some) < GOOD_FIT:
+        best = found if best is None else min(best, found, key=lambda each: each[0])
+        if misfit(best[1], some) < GOOD_FIT:
             break
+    best = best or _fitted(frames, data, known, max_iterations)
     return replace(errors, chain=best[1])
 
 
