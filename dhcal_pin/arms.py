@@ -160,8 +160,8 @@ class Arms:
         values = np.moveaxis(q @ chain.mixing.T + chain.shift, -1, 0).copy()
         cos, sin = np.cos(values), np.sin(values)
         shape = values.shape[1:]
-        bodies = np.empty((len(chain.moving) + 1, 4, 3, *shape))
-        bodies[0] = self.base[:, :3].transpose(2, 1, 0)[:, :, None, :, None]
+        bodies = np.empty((len(chain.moving) + 1, 7, 3, *shape))
+        bodies[0, :4] = self.base[:, :3].transpose(2, 1, 0)[:, :, None, :, None]
         for j in range(len(chain.moving)):
             after = _mixed(bodies[j], self.links[:, j], bodies[j + 1])
             if chain.prismatic[j]:
@@ -171,7 +171,7 @@ class Arms:
                 after[0] = x * cos[j] + y * sin[j]
                 after[1] = y * cos[j] - x * sin[j]
         tool = _mixed(bodies[-1], self.links[:, -1] @ self.tool, np.empty((4, 3, *shape)))
-        return Sweep(bodies.reshape(len(bodies), 4, 3, -1), tool.reshape(4, 3, -1))
+        return Sweep(bodies.reshape(len(bodies), 7, 3, -1), tool.reshape(4, 3, -1))
 
     def tool_velocities(
         self, sweep: Sweep, shape: tuple[int, int, int], bodies: Array, twists: Array

@@ -266,19 +266,19 @@ def _levenberg_marquardt(batch: Batch, x: Array, max_iterations: int) -> tuple[A
         moved = free.moved(step)
         change = np.linalg.norm(moved, axis=1)
         settled = free.settled(change, before, last[live])
-        there, trial, ahead = x[live] + step, np.empty(len(live)), None
+        expected = np.sum(free.z**2, -1) - np.sum((moved - free.z) ** 2, -1)
+        rounding, root = free.rounding(), np.sqrt(before)
+        blur = (10 * rounding) ** 2 + 2 * rounding * root
+        there, trial, ahead = x[live] + step, before - expected, None
         # A first try mostly holds, and its triangle, which the next step needs, tells its cost too.
         first = ~settled & fresh[live]
-        tried, others = np.flatnonzero(first), np.flatnonzero(~first)
+        tried, others = np.flatnonzero(first), np.flatnonzero(~first & ~(settled & (expected <= blur)))
         if tried.size:
             ahead = part.take(tried).reduce(there[tried], batch.weights, small_angle=False)
             trial[tried] = ahead.cost
         if others.size:
             trial[others] = part.take(others).cost(there[others])
-        expected = np.sum(free.z**2, -1) - np.sum((moved - free.z) ** 2, -1)
         gain = np.where(expected > 0, (before - trial) / np.where(expected > 0, expected, 1.0), 0.0)
-        rounding, root = free.rounding(), np.sqrt(before)
-        blur = (10 * rounding) ** 2 + 2 * rounding * root
         trusted = (expected <= blur) & (trial <= (root + 10 * rounding) ** 2)
         accepted = trusted | ((trial <= before) & (gain > 1e-3))
         stuck = ~accepted & (settled | (damping[live] > 1e16))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fnmatch
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -14,9 +15,9 @@ from .chain import BASE, Chain
 from .error_model import ErrorModel
 from .errors import DhcalError
 from .executors import HERE, Workers
-from .frames import few, misfit, starts
 from .measurements import Measurement
 from .parameters import select
+from .placing import placed, problem_of
 from .problem import Problem, shared_unknowns
 from .result import Result
 from .se3 import Array
@@ -30,8 +31,6 @@ LEAST_SCALE = 1e-6
 MOST_ROUNDS = 30
 # Against narrower priors the expected size counts as much as so many errors that were found.
 EXPECTATION = 0.5
-# Starts for the frames are tried until one leaves so small a share of the positions' spread.
-GOOD_FIT = 0.01
 
 
 def prior_weights(errors: ErrorModel, priors: Priors) -> Array:
@@ -99,42 +98,6 @@ def split(
     return tuple(fit), tuple(item for item in held if len(item.rows))
 
 
-def _place(
-    errors: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float], max_iterations: int
-) -> Chain:
-    """The nominal chain with its unknown base and tool as they fit the data best."""
-    frames = errors.frames()
-    if frames is None:
-        return errors.chain
-    stations = {p.station for p in frames.parameters}
-
-    def fitted(start: Chain, items: tuple[Measurement, ...]) -> tuple[float, Chain]:
-        placed = replace(frames, chain=start)
-        problem = _problem(placed, tuple(item.started(start) for item in items), 1 / placed.priors, known)
-        solution = levenberg_marquardt(problem, np.zeros(len(problem.weights)), max_iterations, None)
-        chain = placed.at(solution.x[: len(placed.parameters)])
-        return solution.triangle.cost + float(np.sum((problem.weights * solution.x) ** 2)), chain
-
-    begun = starts(errors.chain, data, BASE in stations, errors.chain.tool_station in stations)
-    if len(begun) == 1:
-        return fitted(begun[0], data)[1]
-    some = tuple(few(item) for item in data)
-    best: tuple[float, Chain] = np.inf, begun[0]
-    for start in begun:
-        best = min(best, fitted(start, some), key=lambda found: found[0])
-        if misfit(best[1], some) < GOOD_FIT:
-            break
-    return fitted(best[1], data)[1]
-
-
-def _problem(
-    errors: ErrorModel, data: tuple[Measurement, ...], weights: Array, known: Mapping[str, float]
-) -> Problem:
-    """The problem whose instruments have their own wide priors where the robot has any."""
-    wide = np.array([1 / unknown.prior for unknown in shared_unknowns(data) if unknown.name not in known])
-    return Problem(errors, data, np.concatenate([weights, wide * np.any(weights)]), known)
-
-
 def _known(data: tuple[Measurement, ...], known: Mapping[str, float]) -> Mapping[str, float]:
     """The known values, after checking that each belongs to an unknown of the data."""
     names = [unknown.name for unknown in shared_unknowns(data) if not unknown.local]
@@ -183,27 +146,38 @@ def _scatter(
     return out
 
 
-def _rescaled(problem: Problem, solution: Solution, expected: Array, default: Array) -> Array:
+def _families(errors: ErrorModel, expected: Array, default: Array) -> list[tuple[list[int], float, float]]:
+    """Default priors (p,) of one unit and one expected weight: which, that weight, the unit's largest."""
+    outside = (BASE, errors.chain.tool_station)
+    inside = [i for i, p in enumerate(errors.parameters) if default[i] and p.station not in outside]
+    units = {i: (errors.parameters[i].unit, errors.parameters[i].entry is None) for i in inside}
+    narrowest: dict[tuple[str, bool], float] = {}
+    families: dict[tuple[tuple[str, bool], float], list[int]] = {}
+    for i, weight in zip(inside, expected[inside].tolist(), strict=True):
+        narrowest[units[i]] = max(weight, narrowest.get(units[i], 0.0))
+        families.setdefault((units[i], weight), []).append(i)
+    return [(family, weight, narrowest[unit]) for (unit, weight), family in families.items()]
+
+
+def _rescaled(
+    problem: Problem, solution: Solution, families: Sequence[tuple[list[int], float, float]]
+) -> Array:
     """The weights (p+s,) of priors as wide as the errors that were found.
 
     Default priors of one unit and one expected size have one scale, the one of greatest evidence
     (MacKay 1992): the mean square of the errors over as many as the data and not the prior determine.
     None gets narrower than the narrowest expectation of its unit, as offsets of no more than tilts' size.
-    Priors that are not default (p,) stay.
+    Priors that are not default stay.
     """
-    errors = problem.errors
-    outside = (BASE, errors.chain.tool_station)
+    weights = problem.weights.copy()
+    if not families:
+        return weights
     root = posterior_root(solution.triangle, problem.weights)[0]
     told = 1 - np.sum((root * problem.weights[:, None]) ** 2, 1)
-    weights = problem.weights.copy()
-    inside = [i for i, p in enumerate(errors.parameters) if default[i] and p.station not in outside]
-    alike = {i: (errors.parameters[i].unit, errors.parameters[i].entry is None) for i in inside}
-    for kind in {(alike[i], expected[i]) for i in inside}:
-        family = [i for i in inside if (alike[i], expected[i]) == kind]
-        narrowest = max(expected[i] for i in inside if alike[i] == kind[0])
-        found, count = np.sum((solution.x[family] * expected[family]) ** 2), told[family].sum()
+    for family, expected, narrowest in families:
+        found, count = np.sum((solution.x[family] * expected) ** 2), told[family].sum()
         share = EXPECTATION if found <= count else 0.0
-        weights[family] = min(expected[family[0]] * np.sqrt((count + share) / (found + share)), narrowest)
+        weights[family] = min(expected * np.sqrt((count + share) / (found + share)), narrowest)
     return weights
 
 
@@ -275,53 +249,56 @@ def calibrate(
     priors = priors if priors is not None else ("none" if method == "gn" else "default")
     errors = select(chain, parameters if parameters is not None else chain.parameters, fix, free)
     known = _known(data, known or {})
-    reference = _place(errors, data, known, max_iterations)
-    errors = replace(errors, chain=reference)
-    data = tuple(item.started(reference) for item in data)
-    problem = replace(_problem(errors, data, prior_weights(errors, priors), known), where=where)
+    errors = placed(errors, data, known, max_iterations)
+    data = tuple(item.started(errors.chain) for item in data)
+    problem = replace(problem_of(errors, data, prior_weights(errors, priors), known), where=where)
     if bounds:
         problem = replace(problem, bounds=_bounds(problem, bounds))
     default = _default(errors, priors)
-    solution = METHODS[method](problem, np.zeros(len(problem.weights)), max_iterations, progress)
+    # Until sigmas and priors are settled, too, where the loop nearly ends is enough.
+    loop = partial(levenberg_marquardt, nearly=True) if method == "lm" else METHODS[method]
+    solution, earlier = loop(problem, np.zeros(len(problem.weights)), max_iterations, progress), 0
     if errors.at(solution.x[: len(errors.parameters)]).transmission is not None:
         # Gravity's torques follow the arm as found: once more with those.
         errors = errors.loaded(solution.x[: len(errors.parameters)])
         problem = replace(problem, errors=errors)
-        again = METHODS[method](problem, solution.x, max_iterations, progress)
-        solution = replace(again, iterations=solution.iterations + again.iterations)
+        earlier = solution.iterations
+        solution = loop(problem, solution.x, max_iterations, progress)
     weights = [np.ones(len(item.rows)) for item in data]
     if method == "lm":
         # Sigmas and weights that the fit itself tells: a few rounds settle them.
         scales = np.ones(sum(len(item.groups) for item in data))
-        expected = problem.weights
-        for _ in range(MOST_ROUNDS):
+        expected, ended = problem.weights, False
+        families = _families(errors, expected, default)
+        for left in reversed(range(MOST_ROUNDS)):
             before, found = weights, _scatter(problem, solution, data, weights)
-            scaled = _scaled(data, found)
-            fitted = errors.at(solution.x[: len(errors.parameters)])
-            values = [problem.values(item, solution.x) for item in data]
-            weighed, weights = robust.reweighted(fitted, scaled, values, loss)
+            weighed = _scaled(data, found)
+            if loss != "linear":
+                fitted = errors.at(solution.x[: len(errors.parameters)])
+                values = [problem.values(item, solution.x) for item in data]
+                weighed, weights = robust.reweighted(fitted, weighed, values, loss)
             moved = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(weights, before, strict=True))
-            priors_now = _rescaled(problem, solution, expected, default)
+            priors_now = _rescaled(problem, solution, families)
             changes = np.log(found / scales), (priors_now - problem.weights) / np.fmax(expected, 1e-300)
-            if max(moved, *(np.abs(change).max(initial=0.0) for change in changes)) < 0.01:
+            settled = max(moved, *(np.abs(change).max(initial=0.0) for change in changes)) < 0.01
+            if settled and ended:
                 break
-            scales = found
-            known_now = None
-            if all(new is old for new, old in zip(weighed, problem.data, strict=True)):
-                problem, known_now = problem.held(priors_now), solution.triangle
+            ended = settled or left < 2
+            if settled or all(new is old for new, old in zip(weighed, problem.data, strict=True)):
+                problem, going_on = problem.held(priors_now), solution
             else:
                 problem = problem.of(weighed).held(priors_now)
-            again = levenberg_marquardt(problem, solution.x, max_iterations, progress, known_now)
-            solution = replace(again, iterations=solution.iterations + again.iterations)
+                scales, going_on, earlier = found, None, earlier + solution.iterations
+            loop = partial(levenberg_marquardt, before=going_on, nearly=not ended)
+            solution = loop(problem, solution.x, max_iterations, progress)
     return Result(
         errors=errors,
         x=solution.x,
         chain=errors.at(solution.x[: len(errors.parameters)]).loaded(),
-        reference=reference,
         data=data,
         holdout=tuple(holdout),
         problem=problem,
-        solution=solution,
+        solution=replace(solution, iterations=earlier + solution.iterations),
         method=method,
         weights=tuple(weights),
     )

@@ -32,6 +32,7 @@ from .transmission import Loads, Payload, Transmission
 from .urdf import Urdf, parse_urdf, read_urdf
 
 BASE = 0
+_IDENTITY = np.eye(4)
 
 
 def joint_station(j: int) -> int:
@@ -224,12 +225,17 @@ class Chain:
         return se3.inverse(self.axis_frames)
 
     @cached_property
+    def _reached(self) -> Array:
+        """(k+1, 4, 4): each joint's URDF frame, and the tip, in the body frame before it."""
+        return self._into @ self.origins
+
+    @cached_property
     def links(self) -> Array:
         """Constant transforms (k+1, 4, 4) between the motions; every joint moves about its own z.
 
         The tool's pose is base · links[0] · Z(q_1) · links[1] · … · Z(q_k) · links[k] · tool.
         """
-        out = self._into @ self.origins
+        out = self._reached.copy()
         out[:-1] = out[:-1] @ self.axis_frames[1:]
         return out
 
@@ -244,18 +250,19 @@ class Chain:
     def sweep(self, q: Array | Motion, out: Array | None = None) -> Sweep:
         """All frames at joint values q (m, n), or at a motion of this chain, vectorised over the samples.
 
-        `out` (k+2, 4, 3, m) holds them when given.
+        `out` (k+2, 7, 3, m) holds them when given.
         """
         motion, terms = q if isinstance(q, Motion) else self.motion(q), None
         if self.transmission is not None:
             joints, terms = self.effective(motion.joints)
             motion = self._motion(joints)
         k, m = motion.values.shape
-        frames = np.empty((k + 2, 4, 3, m)) if out is None else out
-        frames[0] = self.base[:3].T[:, :, None]
-        links = np.concatenate([self.links[:-1], (self.links[-1] @ self.tool)[None]])
+        frames = np.empty((k + 2, 7, 3, m)) if out is None else out
+        frames[0, :4] = self.base[:3].T[:, :, None]
+        links = self.links.copy()
+        links[-1] = links[-1] @ self.tool
         kinematics.carry_frames(links, self.prismatic, motion, frames)
-        return Sweep(frames[:-1], frames[-1], terms)
+        return Sweep(frames[:-1], frames[-1, :4], terms)
 
     def poses(self, q: Array) -> Array:
         """Tool poses (m, 4, 4) in the measuring frame at joint values q (m, n) in rad or m."""
@@ -266,9 +273,9 @@ class Chain:
         """(2k+4, 4, 4): each station's frame in its body."""
         k = len(self.moving)
         frames = np.empty((2 * k + 4, 4, 4))
-        frames[0] = np.eye(4)
+        frames[0] = _IDENTITY
         frames[1:-1:2] = self._into
-        frames[2::2] = self._into @ self.origins
+        frames[2::2] = self._reached
         frames[-1] = frames[-2] @ self.tool
         return frames
 
@@ -297,11 +304,11 @@ class Chain:
         """
         m = sweep.tool.shape[-1]
         out = np.empty((len(bodies), 6, m)) if out is None else out
-        behind = int(np.searchsorted(bodies, len(sweep.bodies)))
+        behind = int(np.searchsorted(bodies, len(sweep.frames)))
         if behind < len(bodies):
-            out[behind:] = self._entry_velocities(sweep, bodies[behind:] - len(sweep.bodies))
+            out[behind:] = self._entry_velocities(sweep, bodies[behind:] - len(sweep.frames))
             bodies, twists = bodies[:behind], twists[:behind]
-        kinematics.point_velocities(sweep.bodies, sweep.tool[3], bodies, twists, out[:behind])
+        kinematics.point_velocities(sweep.frames, sweep.tool[3], bodies, twists, out[:behind])
         return out
 
     def _entry_velocities(self, sweep: Sweep, entries: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -41,17 +41,17 @@ def few(item: Measurement) -> Measurement:
     return item.take(np.sort(np.random.default_rng(0).permutation(len(item.rows))[:_PROBES]))
 
 
-def starts(chain: Chain, data: Sequence[Measurement], base: bool, tool: bool) -> list[Chain]:
+def starts(chain: Chain, data: Sequence[Measurement], base: bool, tool: bool) -> Iterator[Chain]:
     """Chains with base and tool placed from the measured positions, the most promising first.
 
     Positions alone carry the base; rotations, where there are any, then give the tool's. The target's
-    offset is tried at places around the tip. Fewer than three positions leave the chain as it is.
+    offset is tried at places around the tip. Fewer than three positions tell no start.
     """
     readings = [item for item in data if len(item.positions())]
     readings = [few(item) for item in readings]
     tips = [replace(chain, base=np.eye(4), tool=np.eye(4)).poses(item.q) for item in readings]
     if sum(len(pose) for pose in tips) < 3 or not (base or tool):
-        return [chain]
+        return
     tip = np.concatenate(tips)
     seen = np.concatenate([item.positions() for item in readings])
     if not base:
@@ -66,7 +66,6 @@ def starts(chain: Chain, data: Sequence[Measurement], base: bool, tool: bool) ->
         points = tip[:, :3, 3] + (tip[:, :3, :3] @ offsets.T).transpose(2, 0, 1)
         motions, rests = align(points, seen)
         best = [(motions[k], offsets[k]) for k in np.argsort(rests, kind="stable")[:_TRIED]]
-    out = []
     for motion, offset in best:
         turn = chain.tool[:3, :3]
         turns = [
@@ -76,8 +75,7 @@ def starts(chain: Chain, data: Sequence[Measurement], base: bool, tool: bool) ->
         ]
         if tool and turns:
             turn = nearest_rotation(np.concatenate(turns).sum(0))
-        out.append(replace(chain, base=motion, tool=se3.transform(turn, offset)))
-    return out
+        yield replace(chain, base=motion, tool=se3.transform(turn, offset))
 
 
 def misfit(chain: Chain, data: Sequence[Measurement]) -> float:

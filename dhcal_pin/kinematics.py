@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from .se3 import Array
 
 # So many samples of all bodies stay in a processor's cache.
 BLOCK = 2048
+# Of columns x, y, z, p, the same and y, -x.
+_TURNING = np.vstack([np.eye(4), [[0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0]]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,15 +38,20 @@ class Sweep:
     """Frames of a chain at m samples, components first so that the samples are contiguous.
 
     Attributes:
-        bodies: (k+1, 4, 3, m) columns x, y, z, p of each body's frame in the measuring frame. A body's
-            frame has its joint's axis along z.
+        frames: (k+1, 7, 3, m) columns x, y, z, p of each body's frame in the measuring frame, and room for
+            how a point moves that turns about x, y and z. A body's frame has its joint's axis along z.
         tool: (4, 3, m) columns of the tool's frame.
         terms: (t, n, m) of the independent joints' transmission, where the chain has one.
     """
 
-    bodies: Array
+    frames: Array
     tool: Array
     terms: Array | None = None
+
+    @property
+    def bodies(self) -> Array:
+        """Columns x, y, z, p (k+1, 4, 3, m) of each body's frame."""
+        return self.frames[:, :4]
 
     def poses(self) -> Array:
         """Tool poses (m, 4, 4) in the measuring frame."""
@@ -63,68 +71,80 @@ def motion(joints: Array, values: Array) -> Motion:
 
 @LongRows()
 def carry_frames(links: Array, prismatic: Array, motion: Motion, frames: Array) -> None:
-    """Fills frames (k+2, 4, 3, m), whose first is the base's, with every body's and the tool's.
+    """Fills the columns x, y, z, p of frames (k+2, 7, 3, m), whose first is the base's, to the tool's.
 
     Args:
         links: (k+1, 4, 4) constant transforms between the motions; the last one leads to the tool.
         prismatic: (k,) True where a joint slides along its z; the others turn about it.
         motion: of the joints.
-        frames: columns x, y, z, p of each frame.
+        frames: columns x, y, z, p of each frame, and three that are overwritten.
     """
-    turned = scratch("turned", 2, *frames.shape[2:])
-    mixing = np.swapaxes(links, 1, 2)
-    for j, (after, slides) in enumerate(zip(frames[1:-1], prismatic, strict=True)):
-        # The columns of F·L are the columns of F mixed by L: one small product for all samples.
-        before = frames[j].reshape(4, -1)
-        np.matmul(mixing[j, :2], before, out=turned.reshape(2, -1))
-        np.matmul(mixing[j, 2:], before, out=after[2:].reshape(2, -1))
+    # The columns of F·L are the columns of F mixed by L: one small product for all samples. A turn by q
+    # makes of x and y their cos q-fold, and to that adds the sin q-fold of y and -x.
+    mixing, columns = _TURNING @ np.swapaxes(links, 1, 2), frames.reshape(*frames.shape[:2], -1)
+    steps = zip(mixing, columns[:, :4], columns[1:, :6], frames[1:], prismatic.tolist(), strict=False)
+    for j, (mix, before, mixed, after, slides) in enumerate(steps):
         if slides:
-            after[:2] = turned
-            after[3] += after[2] * motion.values[j]
+            np.matmul(mix[:4], before, out=mixed[:4])
+            np.multiply(after[2], motion.values[j], out=after[4])
+            after[3] += after[4]
         else:
-            np.multiply(turned, motion.cos[j], out=after[:2])
-            turned *= motion.sin[j]
-            after[0] += turned[1]
-            after[1] -= turned[0]
-    np.matmul(mixing[-1], frames[-2].reshape(4, -1), out=frames[-1].reshape(4, -1))
+            np.matmul(mix, before, out=mixed)
+            turned, across = after[:2], after[4:6]
+            turned *= motion.cos[j]
+            across *= motion.sin[j]
+            turned += across
+    np.matmul(mixing[-1, :4], columns[-2, :4], out=columns[-1, :4])
 
 
 @LongRows()
-def point_velocities(bodies: Array, point: Array, at: Array, twists: Array, out: Array) -> Array:
+def point_velocities(frames: Array, point: Array, at: Array, twists: Array, out: Array) -> Array:
     """A point's velocity (p, 6, m) per unit of each twist of a body, axes of the measuring frame.
 
     Args:
-        bodies: (b, 4, 3, m) columns x, y, z, p of each body's frame.
+        frames: (b, 7, 3, m) columns x, y, z, p of each body's frame, and three that are overwritten.
         point: (3, m).
         at: (p,) body numbers, ascending.
         twists: (p, 6) twists in those bodies' frames.
         out: (p, 6, m), written in place.
     """
-    counts = np.bincount(at, minlength=len(bodies))
-    used = np.flatnonzero(counts)
-    groups = list(itertools.pairwise([0, *np.cumsum(counts[used]).tolist()]))
-    frames = bodies if len(used) == len(bodies) else bodies[used]
+    # A twist mixes what its body's axes do, one small product for all samples and components.
+    move = np.zeros((len(at), 7))
+    move[:, :3], move[:, 4:] = twists[:, :3], twists[:, 3:]
+    runs = _runs(tuple(np.bincount(at).tolist()))
     for start in range(0, point.shape[-1], BLOCK):
         some = np.s_[..., start : start + BLOCK]
-        axes, moved = frames[:, :3][some], _moved_point(frames[some], point[some])
-        # A twist mixes what its body's axes do, one small product for all samples and components.
-        for (first, last), turn, move in zip(groups, axes, moved, strict=True):
-            rows = out[first:last][some].transpose(1, 0, 2)
-            np.matmul(twists[first:last], move.transpose(1, 0, 2), out=rows[:3])
-            np.matmul(twists[first:last, 3:], turn.transpose(1, 0, 2), out=rows[3:])
+        for bodies, rows, count in runs:
+            part = frames[bodies][some]
+            _turn_about_axes(part, point[some])
+            n, _, _, m = part.shape
+            part = part.swapaxes(1, 2)
+            velocity = out[rows][some].reshape(n, count, 6, m).swapaxes(1, 2)
+            np.matmul(move[rows].reshape(n, 1, count, 7), part, out=velocity[:, :3])
+            np.matmul(move[rows, 4:].reshape(n, 1, count, 3), part[:, :, :3], out=velocity[:, 3:])
     return out
 
 
-def _moved_point(bodies: Array, point: Array) -> Array:
-    """How a point (3, m) moves when it slides along each body's axes and turns about them, (b, 6, 3, m)."""
-    count, _, _, m = bodies.shape
-    axes, out = bodies[:, :3], scratch("moved", count, 6, 3, m)
+@lru_cache(maxsize=64)
+def _runs(counts: tuple[int, ...]) -> list[tuple[slice, slice, int]]:
+    """Neighbouring bodies with as many twists each: which bodies, which twists, how many a body."""
+    out, body, row = [], 0, 0
+    for count, alike in itertools.groupby(counts):
+        bodies = len(list(alike))
+        if count:
+            out.append((slice(body, body + bodies), slice(row, row + bodies * count), count))
+        body, row = body + bodies, row + bodies * count
+    return out
+
+
+def _turn_about_axes(frames: Array, point: Array) -> None:
+    """Fills the last columns of frames (b, 7, 3, m): how a point (3, m) moves that turns about x, y, z."""
+    count, _, _, m = frames.shape
+    axes, turns = frames[:, :3], frames[:, 4:]
     lever, product = scratch("lever", count, 1, 3, m), scratch("product", count, 3, m)
-    np.subtract(point, bodies[:, 3:], out=lever)
-    out[:, :3] = axes
+    np.subtract(point, frames[:, 3:4], out=lever)
     # The cross products of all bodies at once, a component at a time.
     for x, y, z in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        turned = out[:, 3:, x]
+        turned = turns[:, :, x]
         np.multiply(axes[:, :, y], lever[:, :, z], out=turned)
         turned -= np.multiply(axes[:, :, z], lever[:, :, y], out=product)
-    return out

@@ -6,7 +6,6 @@ memory does not grow with the samples. Nothing here knows a kind of measurement 
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,9 +24,12 @@ from .scale import Ruler, count_in_arm
 from .scratch import LongRows, scratch
 from .se3 import Array
 
-# Samples a chunk, and columns that LAPACK reduces at once.
+# Samples a chunk, and columns that are reduced at once where that pays.
 CHUNK, PANEL = 2000, 8
-# From so many rows on, groups of them are reduced apart: below, the calls cost more than the arithmetic.
+# OpenBLAS has kernels for narrow products where there is AVX-512: there panels take half the time of LAPACK's
+# plain reduction, elsewhere twice.
+PANELS = not {"AVX512F", "X86_V4"}.isdisjoint(np.show_config(mode="dicts")["SIMD Extensions"]["found"])
+# From so many rows on, each reading's are reduced apart: below, the calls cost more than the arithmetic.
 TALL = 2000
 _Found = TypeVar("_Found")
 
@@ -149,7 +151,7 @@ class Chunk:
     def sweep(self, chain: Chain) -> Sweep:
         """A chain's frames at the samples, in memory that the next chunk's overwrite."""
         k, m = self.motion.values.shape
-        return chain.sweep(self.motion, scratch("sweep", k + 2, 4, 3, m))
+        return chain.sweep(self.motion, scratch("sweep", k + 2, 7, 3, m))
 
     def unknowns(self, instruments: Mapping[str, float]) -> Array:
         """The values u of the measurement's unknowns among all the instruments'."""
@@ -184,7 +186,9 @@ class Tangent:
         with LongRows():
             velocities = scratch("velocities", errors, 6, sweep.tool.shape[-1])
             self.chain.tool_velocities(sweep, self.bodies, self.twists, velocities)
-            block = scratch("block", p + 1, data.size, len(data.rows))
+            k, m = data.size, len(data.rows)
+            tall = k * m >= TALL
+            block = scratch("block", k, p + 1, m).swapaxes(0, 1) if tall else scratch("block", p + 1, k, m)
             if small_angle:
                 block[p] = data.small_angle(sweep, velocities, u, block[:errors])[0]
             else:
@@ -196,22 +200,23 @@ class Tangent:
                     block[self.places[unknown.name]] = rows
             if not data.metric:
                 count_in_arm(block, self.size, self.rates, data.groups.get("position"))
-        if block[0].size < TALL:
+        if not tall:
             return qr(block.reshape(p + 1, -1))
-        return functools.reduce(merge, (_narrow(block[:, rows]) for rows in data.groups.values()))
+        return merged([_narrow(rows) for rows in block.swapaxes(0, 1)])
 
 
 def _narrow(rows: Array) -> Array:
-    """Triangle (c, c) of a group's rows (c, g, m), without the columns that are zero in all of them.
+    """Triangle (u, c) of rows (c, m), which are overwritten, by the u columns that are not zero in all.
 
     Half the errors of an arm are lengths, which turn nothing: a quarter of the work for rows of rotations.
     """
     columns = len(rows)
-    used = [i for i, row in enumerate(rows) if row[0, 0] or np.vdot(row, row)]
-    part = scratch("narrow", len(used), *rows.shape[1:])
-    np.take(rows, used, 0, out=part, mode="clip")
-    out = np.zeros((columns, columns))
-    out[: len(used), used] = qr(part.reshape(len(used), -1))
+    used, rest = np.flatnonzero(rows[:, 0]), np.flatnonzero(rows[:, 0] == 0)
+    if not rest.size or rows[rest].any():
+        return qr(rows)
+    out = np.zeros((len(used), columns))
+    part = scratch("narrow", len(used), rows.shape[1])
+    out[:, used] = qr(np.take(rows, used, 0, out=part, mode="clip"))
     return out
 
 
@@ -262,10 +267,12 @@ def qr(rows: Array) -> Array:
     """Upper triangle (c, c) of rows (c, k), a C-order array that LAPACK sees as (k, c) and overwrites."""
     columns, count = rows.shape
     out = np.zeros((columns, columns))
-    if count == 0:
+    if not rows.size:
         return out
-    # Narrow panels: the block is tall and thin.
-    packed = lapack.dgeqrt(min(PANEL, columns, count), rows.T, overwrite_a=1)[0]
+    if PANELS:
+        packed = lapack.dgeqrt(min(PANEL, columns, count), rows.T, overwrite_a=1)[0]
+    else:
+        packed = lapack.dgeqrf(rows.T, overwrite_a=1)[0]
     top = min(columns, count)
     np.copyto(out[:top], packed[:top], where=_upper(columns)[:top])
     return out
@@ -276,9 +283,9 @@ def _upper(size: int) -> Array:
     return np.triu(np.ones((size, size), bool))
 
 
-def merge(first: Array, second: Array) -> Array:
-    """The triangle (c, c) of the rows of two triangles (c, c), which may come from anywhere."""
-    return qr(np.concatenate([first, second]).T.copy())
+def merged(triangles: Sequence[Array]) -> Array:
+    """The triangle (c, c) of the rows of several (u, c), which may come from anywhere."""
+    return qr(np.concatenate(triangles).T.copy())
 
 
 def reduce(problem: Problem, x: Array, small_angle: bool) -> Triangle:
@@ -288,9 +295,9 @@ def reduce(problem: Problem, x: Array, small_angle: bool) -> Triangle:
 
 def finished(triangles: Iterable[Array], p: int) -> Triangle:
     """All chunks' triangles (p+1, p+1) in one; memory holds one of them and the one that comes next."""
-    merged = None
+    whole = None
     for triangle in triangles:
-        merged = triangle if merged is None else merge(merged, triangle)
-    if merged is None:
-        merged = np.zeros((p + 1, p + 1))
-    return Triangle(merged[:p, :p], merged[:p, p], float(merged[p, p] ** 2))
+        whole = triangle if whole is None else merged((whole, triangle))
+    if whole is None:
+        whole = np.zeros((p + 1, p + 1))
+    return Triangle(whole[:p, :p], whole[:p, p], float(whole[p, p] ** 2))

@@ -16,6 +16,7 @@ from .error_model import ErrorModel, Parameter
 from .evaluation import Comparison, accuracy, summary
 from .folds import left_out, random_folds
 from .measurements import Measurement, Unknown
+from .placing import refitted
 from .problem import Problem, reduce
 from .se3 import Array
 from .solver import Solution, bounded_step, posterior_root, with_priors
@@ -35,12 +36,10 @@ class Result:
     """An identified arm and how far to believe it.
 
     Attributes:
-        errors: the nominal chain and its unknowns.
+        errors: the nominal chain, its base and tool about where they are, and its unknowns.
         x: (p+s,) identified errors of the robot, then the instruments' unknowns from where they
             started; m and rad.
         chain: the calibrated chain.
-        reference: the nominal chain, with base and tool as fitted to the same data where they were
-            unknown, so that before and after differ by the robot alone.
         data, holdout: what was fitted, and what was kept back.
         problem: with the sigmas that were used in the end.
         solution: the loop's end.
@@ -51,7 +50,6 @@ class Result:
     errors: ErrorModel
     x: Array
     chain: Chain
-    reference: Chain
     data: tuple[Measurement, ...]
     holdout: tuple[Measurement, ...]
     problem: Problem
@@ -63,6 +61,14 @@ class Result:
     def model(self) -> pin.Model:
         """Pinocchio's model with the calibrated joint placements."""
         return self.chain.model
+
+    @cached_property
+    def reference(self) -> Chain:
+        """The nominal chain, with base and tool as fitted to the same data where they were unknown.
+
+        So before and after differ by the robot alone.
+        """
+        return refitted(self.errors, self.data, self.problem.known)
 
     @property
     def converged(self) -> bool:

@@ -96,7 +96,7 @@ def log3(rotation: ArrayLike) -> Array:
     cosine = r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2] - 1
     out *= np.arctan2(sine, cosine) / sine
     back = cosine < -1.8
-    if np.any(back):
+    if back.any():
         out[:, back] = _log3_near_half_turn(r[back]).T
     return out.transpose(*range(1, out.ndim), 0)
 
@@ -126,9 +126,9 @@ def right_jacobian_inverse(rotvec: ArrayLike) -> Array:
     rotvec = np.asarray(rotvec, float)
     v = rotvec.transpose(-1, *range(rotvec.ndim - 1))
     t2 = np.einsum("i...,i...->...", v, v)
-    factor = np.array(1 / 12 + t2 * (1 / 720 + t2 / 30240))
+    factor = np.asarray(1 / 12 + t2 * (1 / 720 + t2 / 30240))
     large = t2 >= 1e-3
-    if np.any(large):
+    if large.any():
         square = t2[large]
         angle = np.sqrt(square)
         factor[large] = 1 / square - 0.5 / (angle * np.tan(0.5 * angle))

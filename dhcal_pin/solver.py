@@ -24,6 +24,8 @@ Progress = Callable[[int, float], None]
 RELATIVE_STEP, ROUNDING = 1e-8, 1e-15
 # A triangle with such a reciprocal condition has no singular value near the cut, however large it is.
 SURELY_REGULAR = 1e3 * observability.RANK_CUT
+# With so small a step ahead sigmas and priors can be told as well as at the end of the loop.
+NEARLY = 0.1
 # After so many damped steps Gauss-Newton tries to get farther in a few.
 LEAPS, LEAP_STEPS = (8, 16, 32, 64), 6
 # An error of so many metres or radians is no error any more.
@@ -32,7 +34,7 @@ RUNAWAY = 1e6
 
 def with_priors(triangle: Triangle, weights: Array, x: Array, damping: Array) -> Triangle:
     """The triangle with prior rows -x/σ and damping rows below it."""
-    p, held, damped = len(x), np.flatnonzero(weights), np.flatnonzero(damping)
+    p, (held,), (damped,) = len(x), weights.nonzero(), damping.nonzero()
     if not (held.size or damped.size):
         return triangle
     stacked = np.zeros((p + 1, p + held.size + damped.size))
@@ -100,26 +102,38 @@ def _change(r: Array, step: Array) -> float:
     return float(np.linalg.norm(r @ step))
 
 
-def _settled(r: Array, change: float, cost: float, last: float = 0.0) -> bool:
+def _settled(
+    r: Array, change: float, cost: float, last: float = 0.0, relative: float = RELATIVE_STEP
+) -> bool:
     """Whether the rows will not move by anything that matters after a step that moves them by `change`.
 
     Near the end steps shrink quadratically: where this one is far smaller than the `last` (zero where
     nothing is known of it), the next one shrinks at least as much.
     """
-    enough = RELATIVE_STEP * math.sqrt(cost)
+    enough = relative * math.sqrt(cost)
     shrunk = change < 1e-2 * last and change * change < 0.1 * enough * last
     return change <= enough or shrunk or change <= ROUNDING * float(np.linalg.norm(r))
 
 
 @dataclass(frozen=True, eq=False)
+class Trust:
+    """How far a loop trusts a triangle by now: damping, scales (p,), how far the last step moved the rows."""
+
+    damping: float = 1e-8
+    scale: Array | float = 0.0
+    last: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
 class Solution:
-    """Where a loop ended: x (p,), the data's triangle there, iterations, and every x on the way."""
+    """Where a loop ended: x (p,), the data's triangle there, iterations, every x on the way, its trust."""
 
     x: Array
     triangle: Triangle
     iterations: int
     converged: bool
     path: Array
+    trust: Trust = Trust()
 
 
 def gauss_newton(problem: Problem, x: Array, max_iterations: int, progress: Progress | None) -> Solution:
@@ -163,41 +177,48 @@ def levenberg_marquardt(
     x: Array,
     max_iterations: int,
     progress: Progress | None,
-    triangle: Triangle | None = None,
+    before: Solution | None = None,
+    nearly: bool = False,
 ) -> Solution:
     """Levenberg-Marquardt; a retry costs forward kinematics only, the triangle stays.
 
     Along a narrow valley that bends, damped steps downhill are tiny and Gauss-Newton's, far uphill at
-    first, arrive: now and then it may try. `triangle` is the data's at x where that is known already.
+    first, arrive: now and then it may try. A loop on the same data that was `before` goes on. Who needs no
+    more than where it `nearly` ends gets that, unconverged.
     """
-    path, damping, growth = [x], 1e-8, 2.0
-    converged, done, last = False, 0, 0.0
-    none, scale = np.zeros_like(x), np.zeros_like(x)
-    triangle = triangle if triangle is not None else reduce(problem, x, small_angle=False)
+    trust = before.trust if before else Trust()
+    damping, scale, last = trust.damping, trust.scale, trust.last
+    path, done = (list(before.path), before.iterations) if before else ([x], 0)
+    growth, converged, none = 2.0, False, np.zeros_like(x)
+    triangle = before.triangle if before else reduce(problem, x, small_angle=False)
     cost = triangle.cost + float(np.sum((problem.weights * x) ** 2))
     while done < max_iterations and not converged and damping <= 1e16:
-        before, reached = x, None
+        start, reached = x, None
         free = with_priors(triangle, problem.weights, x, none)
         scale = np.maximum(scale, np.linalg.norm(free.r, axis=0))
         floor = np.where(scale > 0, scale, 1.0)
         rounding = ROUNDING * float(np.linalg.norm(free.r))
+        # Where all that is left to gain is rounding, costs tell nothing and the step is to be trusted.
+        blur = (10 * rounding) ** 2 + 2 * rounding * math.sqrt(cost)
         done += 1
         while True:
             damped = with_priors(free, none, x, np.sqrt(damping) * floor)
             step = bounded_step(problem, damped, x)
             change = _change(free.r, step)
+            if nearly and damping < 1e-3 and _settled(free.r, change, cost, last, NEARLY):
+                return Solution(x, triangle, done - 1, False, np.array(path), Trust(damping, scale, last))
             settled = _settled(free.r, change, cost, last)
+            expected = float(free.z @ free.z - np.sum((free.r @ step - free.z) ** 2))
             ahead = None
-            if not settled and growth == 2.0:
+            if settled and expected <= blur:
+                trial = cost - expected
+            elif not settled and growth == 2.0:
                 # A first try mostly holds, and its triangle, which the next step needs, tells its cost too.
                 ahead = reduce(problem, x + step, small_angle=False)
                 trial = ahead.cost + float(np.sum((problem.weights * (x + step)) ** 2))
             else:
                 trial = problem.cost(x + step)
-            expected = float(free.z @ free.z - np.sum((free.r @ step - free.z) ** 2))
             gain = (cost - trial) / expected if expected > 0 else 0.0
-            # Where all that is left is rounding, costs tell nothing and the step is to be trusted.
-            blur = (10 * rounding) ** 2 + 2 * rounding * math.sqrt(cost)
             trusted = expected <= blur and trial <= (math.sqrt(cost) + 10 * rounding) ** 2
             if trusted or (trial <= cost and gain > 1e-3):
                 easier = 1e-2 if trusted or gain > 0.9 else max(1e-3, 1 - (2 * gain - 1) ** 3)
@@ -213,16 +234,23 @@ def levenberg_marquardt(
         if done in LEAPS and not converged:
             x, cost, reached = *_leap(problem, x, cost), None
         # Only whole steps show how fast they shrink.
-        last = change if x is not before and growth == 2.0 else 0.0
+        last = change if x is not start and growth == 2.0 else 0.0
         path.append(x)
         if progress:
             progress(done, cost)
         if converged:
             # Too small a step to bend the model.
-            triangle = replace(triangle, z=triangle.z - triangle.r @ (x - before))
-        elif x is not before:
+            triangle = replace(triangle, z=triangle.z - triangle.r @ (x - start))
+        elif x is not start:
             triangle = reached or reduce(problem, x, small_angle=False)
-    return Solution(x, triangle, done, converged, np.array(path))
+    return Solution(x, triangle, done, converged, np.array(path), Trust(damping, scale, last))
+
+
+def last_step(problem: Problem, solution: Solution) -> Array:
+    """Where the least-squares step leads (p,) from where a loop nearly ended."""
+    none = np.zeros_like(solution.x)
+    full = with_priors(solution.triangle, problem.weights, solution.x, none)
+    return solution.x + bounded_step(problem, full, solution.x)
 
 
 METHODS: dict[str, Callable[[Problem, Array, int, Progress | None], Solution]] = {

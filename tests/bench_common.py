@@ -67,11 +67,11 @@ def panda() -> Chain:
     return Chain.from_urdf(robot_file("panda_description/urdf/panda.urdf"), "panda_link8")
 
 
-def serial(joints: int) -> Chain:
+def serial(joints: int) -> DHTable:
     """An arm of so many revolute joints, no two axes parallel."""
     rng = np.random.default_rng(joints)
     zero = np.zeros(joints)
-    table = DHTable(
+    return DHTable(
         "standard",
         tuple(f"j{i + 1}" for i in range(joints)),
         zero.astype(bool),
@@ -83,7 +83,6 @@ def serial(joints: int) -> Chain:
         zero - np.pi,
         zero + np.pi,
     )
-    return Chain.from_dh(table)
 
 
 def measured(chain: Chain, sets: str, m: int, seed: int = 0) -> tuple[ErrorModel, np.ndarray, Pose]:

@@ -68,7 +68,7 @@ def jacobian(chain: Chain, sets: str, m: int, repeats: int) -> tuple[float, floa
         for at in range(0, m, CHUNK):
             motion = chain.motion(q[at : at + CHUNK])
             k, some = motion.values.shape
-            sweep = chain.sweep(motion, scratch("sweep", k + 2, 4, 3, some))
+            sweep = chain.sweep(motion, scratch("sweep", k + 2, 7, 3, some))
             chain.tool_velocities(sweep, bodies, twists, out[..., at : at + CHUNK])
 
     model, frame = chain.model, chain.frame_id
@@ -137,7 +137,7 @@ def growth(sizes: tuple[int, ...], repeats: int) -> list[tuple[str, list[float]]
 
 def by_joints(joints: tuple[int, ...], repeats: int) -> list[float]:
     """Microseconds a sample of an iteration at m=1000 with four errors a joint."""
-    return [1e3 * _one(serial(n), "minimal", 1000, repeats) for n in joints]
+    return [1e3 * _one(Chain.from_dh(serial(n)), "minimal", 1000, repeats) for n in joints]
 
 
 def _one(chain: Chain, sets: str, m: int, repeats: int) -> float:

@@ -22,6 +22,7 @@ import sysconfig
 import tempfile
 import time
 import venv
+from dataclasses import replace
 from pathlib import Path
 
 import bench_batch
@@ -29,11 +30,15 @@ import bench_calibration
 import bench_kernel
 import numpy as np
 import pinocchio as pin
-from bench_common import Row, clocked, measured, robots
+from bench_common import Row, clocked, measured, robots, serial
 from conftest import robot_file
 
 from dhcal_pin.calibration import calibrate
+from dhcal_pin.chain import Chain
 from dhcal_pin.measurement_files import measurement_text
+from dhcal_pin.measurements import Noise
+from dhcal_pin.parameters import select
+from dhcal_pin.positions import Position
 
 HERE = Path(__file__).resolve().parent
 CACHE = Path(tempfile.gettempdir()) / "dhcal-bench"
@@ -105,6 +110,32 @@ def against_figaroh(m: int, repeats: int) -> list[Row]:
     return [Row(what, ours, found["seconds"], found["seconds"] / ours, "≥ 100")]
 
 
+def against_pybotics(m: int, repeats: int) -> list[Row]:
+    """Pybotics on positions of an arm whose modified DH parameters are unknown; both errors held out."""
+    if (python := environment("pybotics")) is None:
+        return []
+    rng = np.random.default_rng(0)
+    table = replace(serial(6), convention="modified")
+    chain = Chain.from_dh(table)
+    errors = select(chain, "modified-dh")
+    real = errors.at(1e-3 * rng.standard_normal(len(errors.parameters)))
+    data = Position.simulate(real, rng.uniform(-2.5, 2.5, (m + 200, 6)), Noise(1e-4), rng)
+    fit, held = data.take(np.s_[:m]), data.take(np.s_[m:])
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        rows = np.stack([table.alpha, table.a, table.theta, table.d], 1)
+        np.savetxt(folder / "arm.csv", rows, "%.17g", ",")
+        for file, part in (("fit.csv", fit), ("holdout.csv", held)):
+            np.savetxt(folder / file, np.hstack([part.q, part.reading]), "%.17g", ",")
+        found = spoken([python, HERE / "bench_pybotics.py"], folder, PYTHONPATH="")
+    assert isinstance(found, dict)
+    (ours,) = clocked([lambda: calibrate(chain, fit, "modified-dh")], repeats)
+    mine = 1e3 * calibrate(chain, fit, "modified-dh").validate(held)["position_rms_m"]
+    other = 1e3 * found["holdout"]
+    what = f"calibration: pybotics, modified DH, m={m} (held out {mine:.3f} mm, pybotics {other:.3f} mm)"
+    return [Row(what, ours, found["seconds"], found["seconds"] / ours, "≥ 100")]
+
+
 def start_up(repeats: int) -> list[Row]:
     """`dhcal calibrate` on 1,000 rows against importing what it stands on."""
     chain, sets = robots()["UR10, minimal,base,tool"]
@@ -165,6 +196,7 @@ def main() -> None:
         (bench_calibration.against_scipy, (1000, 1 if quick else 3)),
         (against_ceres, (1000, turns)),
         (against_figaroh, (100 if quick else 1000, turns)),
+        (against_pybotics, (100, turns)),
         (bench_batch.rows, (3 if quick else 5,)),
         (start_up, (3 if quick else 7,)),
     ):

@@ -1,0 +1,39 @@
+"""A whole calibration by pybotics, in the environment where it is installed.
+
+Run by `bench_table.py` in a folder that holds arm.csv, fit.csv and holdout.csv; prints JSON with CPU seconds
+and the RMS distance in metres on the held-out positions.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+
+import numpy as np
+from pybotics.kinematic_chain import MDHKinematicChain  # pyright: ignore[reportMissingImports]
+from pybotics.optimization import (  # pyright: ignore[reportMissingImports]
+    OptimizationHandler,
+    compute_absolute_errors,
+    optimize_accuracy,
+)
+from pybotics.robot import Robot  # pyright: ignore[reportMissingImports]
+from scipy.optimize import leastsq
+
+
+def main() -> None:
+    """Fits fit.csv, rows of joint values and x, y, z, and judges by holdout.csv."""
+    robot = Robot(MDHKinematicChain(np.loadtxt("arm.csv", delimiter=",")))
+    fit, held = (np.loadtxt(name, delimiter=",") for name in ("fit.csv", "holdout.csv"))
+    joints = len(robot)
+    start = time.process_time()
+    handler = OptimizationHandler(robot, kinematic_chain_mask=True)
+    vector = handler.generate_optimization_vector()
+    found, _ = leastsq(optimize_accuracy, vector, args=(handler, fit[:, :joints], fit[:, joints:]))
+    spent = time.process_time() - start
+    handler.apply_optimization_vector(found)
+    errors = compute_absolute_errors(held[:, :joints], held[:, joints:], handler.robot)
+    print(json.dumps({"seconds": spent, "holdout": float(np.sqrt(np.mean(errors**2)))}))
+
+
+if __name__ == "__main__":
+    main()
