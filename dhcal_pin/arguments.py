@@ -263,8 +263,9 @@ def parser() -> argparse.ArgumentParser:
     plan.add_argument(
         "--criterion",
         metavar="C",
+        default="D",
         help="D volume of the errors' uncertainty, A mean, E worst, task position error, robust this and "
-        "what the model leaves out (D; robust with --from)",
+        "what the model leaves out (D)",
     )
     plan.add_argument(
         "--task", metavar="FILE", help="where the tool must be right: joint values, or x[mm],y[mm],z[mm]"

@@ -105,7 +105,7 @@ def plan(
     priors: Priors = "default",
     fix: Sequence[str] = (),
     free: Sequence[str] = (),
-    criterion: str | None = None,
+    criterion: str = "D",
     data: Sequence[Measurement] = (),
     known: Mapping[str, float] | None = None,
     learnt: Uncertainty | None = None,
@@ -132,8 +132,7 @@ def plan(
         criterion: "D" volume of the unknowns' uncertainty, "A" mean variance, "E" worst variance, each in
             units of the priors; "task" predicted position error over the task; "robust" this and, as much,
             the error over the task by what the model leaves out of gains, harmonics and compliance, of an arm
-            whose joints scatter by an arcminute beside the noise given. Without it "robust" for given
-            candidates, which tell where the robot works, and "D" for drawn ones.
+            whose joints scatter by an arcminute beside the noise given.
         data: readings already taken, to be added to.
         known: values of instruments' unknowns, as in `calibrate`.
         learnt: what the calibration that made the chain left uncertain; it takes the priors' place.
@@ -147,7 +146,6 @@ def plan(
     Raises:
         DhcalError: an unknown name, no room for the tool, or too few candidates.
     """
-    criterion = criterion or ("D" if isinstance(candidates, int) else "robust")
     if criterion not in CRITERIA:
         raise DhcalError(f"criterion {criterion!r}: choose from {', '.join(CRITERIA)}")
     if count < 1:

@@ -65,7 +65,7 @@ def test_ten_more_among_measured_ones(tmp_path, capsys):
 
 
 def test_ten_more_for_a_calibrated_robot(tmp_path, capsys):
-    """Its sidecar tells what is known, unless readings or priors are given; --from chooses robustly."""
+    """Its sidecar tells what is known, unless readings or priors are given."""
     data, robot, out = tmp_path / "data.csv", tmp_path / "arm.urdf", tmp_path / "more.csv"
     run(capsys, "simulate", ROBOT, "--truth", TRUTH, "-m", 40, "--noise", "0.1mm,0.01deg", "-o", data)
     run(capsys, "calibrate", ROBOT, data, "-o", robot, "--parameters", "minimal,base,tool")
@@ -78,7 +78,8 @@ def test_ten_more_for_a_calibrated_robot(tmp_path, capsys):
     key = "predicted_position_rms_m"
     assert known[key] == pytest.approx(beside[key], rel=0.1)
     assert known[key] < 0.7 * fresh[key]
-    chosen = json.loads(run(capsys, "plan", ROBOT, "-n", 10, "--from", data, "-o", out, "--json", "-")[1])
+    robust = ("-n", 10, "--from", data, "--criterion", "robust", "-o", out, "--json", "-")
+    chosen = json.loads(run(capsys, "plan", ROBOT, *robust)[1])
     assert chosen["criterion"] == "robust"
     # A gear's arcminute counts beside the noise.
     assert chosen["sigma_orientation_rad"] > 2e-4

@@ -177,7 +177,7 @@ def test_a_panda_that_touched_sockets_at_three_places(dhcal, tmp_path, left, mos
     assert np.all(np.array(extended) <= [fitted + 1e-9, distance + 1e-9])
 
 
-def planned_and_random(seeds: int, choices: int) -> np.ndarray:
+def planned_and_random(criterion: str, seeds: int, choices: int) -> np.ndarray:
     """Held-out errors (seeds, 2) of forty planned and forty random poses over that of half a series.
 
     The plan sees joint values alone. Several halves: one choice of forty scatters by 0.025.
@@ -196,19 +196,20 @@ def planned_and_random(seeds: int, choices: int) -> np.ndarray:
             return calibrate(chain, part, sets).validate(second)["position_rms_m"]
 
         every = held_out(first)
-        found = plan(chain, 40, noise=noise, parameters=sets, candidates=first.q)
+        found = plan(chain, 40, noise=noise, parameters=sets, criterion=criterion, candidates=first.q)
         drawn = [held_out(first.take(rng.choice(half, 40, replace=False))) for _ in range(choices)]
         out.append([held_out(first.take(found.index)) / every, np.median(drawn) / every])
     return np.array(out)
 
 
-def test_planned_poses_of_a_series_do_for_all_of_it():
-    assert planned_and_random(2, 1)[:, 0].max() <= 1.10
+@pytest.mark.parametrize("criterion", ["D", "robust"])
+def test_planned_poses_of_a_series_do_for_all_of_it(criterion):
+    assert planned_and_random(criterion, 2, 1)[:, 0].max() <= 1.10
 
 
 @pytest.mark.slow
 def test_planned_poses_of_a_series_are_worth_more_than_random_ones():
-    planned, random = planned_and_random(12, 100).T
+    planned, random = planned_and_random("robust", 12, 100).T
     assert (planned <= 1.10).all()
     assert planned.mean() <= 1.06
     # Which of two sets of forty is better on one half is a matter of luck, too.
