@@ -10,7 +10,7 @@ import pytest
 from conftest import paper, random_table
 from scipy.linalg import null_space
 
-from dhcal_pin import observability, se3
+from dhcal_pin import observability, problem, se3
 from dhcal_pin.calibration import calibrate, split
 from dhcal_pin.chain import Chain
 from dhcal_pin.contacts import PointDistance, Touch
@@ -22,7 +22,7 @@ from dhcal_pin.parameters import select
 from dhcal_pin.poses import Pose
 from dhcal_pin.positions import Position
 from dhcal_pin.problem import CHUNK, Problem, reduce
-from dhcal_pin.solver import pseudo_inverse, with_priors
+from dhcal_pin.solver import levenberg_marquardt, pseudo_inverse, with_priors
 
 NONE = np.empty(0)
 
@@ -241,6 +241,43 @@ def test_chunks_do_not_change_the_answer(sim_6dof_actual):
     r = np.linalg.qr(rows.T, mode="r")
     np.testing.assert_allclose(np.abs(found.r), np.abs(r), atol=1e-9 * np.abs(r).max())
     assert found.rest + found.z @ found.z == pytest.approx(np.sum(data.residual(sweep, NONE) ** 2), rel=1e-12)
+
+
+@pytest.mark.parametrize("panels", [True, False])
+@pytest.mark.parametrize("samples", [50, 700])
+def test_each_way_of_reduction_keeps_what_the_rows_tell(panels, samples, sim_6dof, monkeypatch):
+    """Whole or a row of readings at a time, by panels or not, with columns that are zero in some rows."""
+    monkeypatch.setattr(problem, "PANELS", panels)
+    errors, rng = select(sim_6dof, "dh"), np.random.default_rng(0)
+    data = Pose.simulate(sim_6dof, rng.uniform(-3, 3, (samples, 6)), Noise(1e-4, 1e-4), rng)
+    found = reduce(Problem(errors, (data,), np.zeros(24)), np.zeros(24), False)
+    chain, bodies, twists = errors.derivative(np.zeros(24))
+    sweep = chain.sweep(data.q)
+    residual = data.residual(sweep, NONE)
+    rows = data.whiten(sweep, chain.tool_velocities(sweep, bodies, twists), NONE, residual)
+    whole = np.concatenate([rows, residual[None]]).reshape(25, -1)
+    whole /= np.linalg.norm(whole, axis=1)[:, None]
+    packed = np.zeros((25, 25))
+    packed[:24, :24], packed[:24, 24], packed[24, 24] = found.r, found.z, np.sqrt(found.rest)
+    assert np.array_equal(packed, np.triu(packed))
+    packed /= np.linalg.norm(packed, axis=0)
+    np.testing.assert_allclose(packed.T @ packed, whole @ whole.T, atol=1e-13)
+
+
+@pytest.mark.parametrize("sets", ["dh", "minimal,base,tool"])
+def test_a_loop_that_stopped_near_its_end_goes_on_as_if_it_had_not(sets, sim_6dof, sim_6dof_actual):
+    rng = np.random.default_rng(0)
+    data = Position.simulate(sim_6dof_actual, rng.uniform(-3, 3, (20, 6)), Noise(1e-4), rng)
+    errors = select(sim_6dof, sets)
+    case, zero = Problem(errors, (data,), 1 / errors.priors), np.zeros(len(errors.parameters))
+    whole = levenberg_marquardt(case, zero, 100, None)
+    near = levenberg_marquardt(case, zero, 100, None, nearly=True)
+    after = levenberg_marquardt(case, near.x, 100, None, before=near)
+    assert whole.converged
+    assert after.converged
+    assert not near.converged
+    assert near.iterations < whole.iterations
+    np.testing.assert_array_equal(after.path, whole.path)
 
 
 def test_rank_is_not_taken_from_a_square():
