@@ -37,7 +37,7 @@ def default_tip(urdf: Urdf) -> str:
         also = f" (or {common[-1]}, the last link they share)" if common else ""
         raise DhcalError(
             f"{urdf.source}: several tips are equally deep; "
-            f"choose one with --tip: {', '.join(sorted(deepest))}{also}"
+            f"choose the tip, --tip: {', '.join(sorted(deepest))}{also}"
         )
     return farthest[0]
 

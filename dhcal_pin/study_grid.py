@@ -37,6 +37,7 @@ class Setting:
 
     Attributes:
         robot: the nominal robot's file, beside the study or shipped.
+        tip: the tip link of URDFs; the deepest leaf without it.
         truth: the true robot's file; without it the truth is the nominal robot with errors drawn.
         errors: standard deviations of the true robot's parameters, length and angle.
         wrong: the sets that these errors are in.
@@ -52,6 +53,7 @@ class Setting:
     """
 
     robot: str
+    tip: str = ""
     truth: str = ""
     errors: str = "1mm,0.3deg"
     wrong: str = "placement"
@@ -160,12 +162,12 @@ def read_study(path: PathLike) -> Study:
     if not isinstance(table, dict) or "robot" not in table:
         raise DhcalError(f'{where}: no robot; write [settings] with robot = "arm.urdf" in it')
     settings = [_checked(setting, where) for setting in _grid(table, where)]
-    names = {name for setting in settings for name in (setting.robot, setting.truth) if name}
-    files = {name: os.fspath(_beside(name, path)) for name in sorted(names)}
-    chains = {name: read_robot(file) for name, file in files.items()}
-    cases = [Case(setting, chains[setting.robot], chains.get(setting.truth)) for setting in settings]
+    arms = {(name, s.tip) for s in settings for name in (s.robot, s.truth) if name}
+    files = {name: os.fspath(_beside(name, path)) for name in sorted({name for name, _ in arms})}
+    chains = {(name, tip): read_robot(files[name], tip or None) for name, tip in sorted(arms)}
+    cases = [Case(s, chains[s.robot, s.tip], chains.get((s.truth, s.tip))) for s in settings]
     different = {
-        (s.robot, s.truth, s.kind, s.parameters, s.wrong, s.choice, s.noise): case
+        (s.robot, s.tip, s.truth, s.kind, s.parameters, s.wrong, s.choice, s.noise): case
         for case in cases
         if (s := case.setting)
     }

@@ -194,7 +194,7 @@ def test_journal_of_another_study_is_left_alone(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("poses = 12", "pose = 12"), "setting 'pose' is not known; there are robot, truth"),
+        (("poses = 12", "pose = 12"), "setting 'pose' is not known; there are robot, tip, truth"),
         (("poses = 12", "poses = 'many'"), "setting poses = 'many': must be a whole number"),
         (("poses = 12", "poses = []"), "give at least one value"),
         (("poses = 12", "poses = 0"), "must be from 1"),
@@ -217,6 +217,28 @@ def test_wrong_studies_are_named(tmp_path, change, message):
     path.write_text(MANY.replace(*change))
     with pytest.raises(DhcalError, match=message):
         read_study(path)
+
+
+FORK = """<robot name="fork"><link name="base"/><link name="left"/><link name="right"/>
+  <joint name="j" type="revolute"><parent link="base"/><child link="middle"/><axis xyz="0 0 1"/>
+    <limit lower="-2" upper="2" effort="1" velocity="1"/></joint><link name="middle"/>
+  <joint name="k" type="revolute"><parent link="middle"/><child link="fork"/><axis xyz="0 1 0"/>
+    <origin xyz=".3 0 0"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint><link name="fork"/>
+  <joint name="l" type="fixed"><parent link="fork"/><child link="left"/><origin xyz=".2 .1 0"/></joint>
+  <joint name="r" type="fixed"><parent link="fork"/><child link="right"/><origin xyz=".1 -.1 0"/></joint>
+</robot>"""
+
+
+def test_a_study_of_an_arm_with_two_hands(tmp_path):
+    """Its tip is a setting as any other."""
+    (tmp_path / "fork.urdf").write_text(FORK)
+    text = 'seeds = 3\n[settings]\nrobot = "fork.urdf"\nposes = 20\n'
+    with pytest.raises(DhcalError, match=r"choose the tip, --tip: left, right"):
+        results(tmp_path, text)
+    rows = results(tmp_path, text + 'tip = ["left", "right"]\n')
+    assert [row["tip"] for row in rows] == ["left", "right"]
+    alone = results(tmp_path, text + 'tip = "right"\n')
+    assert alone == rows[1:]
 
 
 def test_a_studys_robot_is_no_output(tmp_path, capsys):
