@@ -270,9 +270,8 @@ def unobservable(problem: Problem, x: Array, triangle: Triangle) -> list[str]:
     names = [p.name for p in (*problem.errors.parameters, *problem.unknowns)]
     explainer = Explainer(experiment, dict(layers), names, path)
     found = [explainer.sentence(group) for group in _joined(groups(layers, path.stations))]
-    if experiment.size_is_open(here) and not any(SIZE in text for text in found):
-        found = [SCALE, *found]
-    return found
+    untold = experiment.size_is_open(here) and not any(SIZE in text for text in found)
+    return [SCALE, *found] if untold else found
 
 
 def _joined(found: list[Group]) -> list[Group]:
