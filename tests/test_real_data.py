@@ -208,9 +208,9 @@ def test_planned_poses_of_a_series_do_for_all_of_it(criterion):
 
 
 @pytest.mark.slow
-def test_planned_poses_of_a_series_are_worth_more_than_random_ones():
-    planned, random = planned_and_random("robust", 12, 100).T
-    assert (planned <= 1.10).all()
-    assert planned.mean() <= 1.06
-    # Which of two sets of forty is better on one half is a matter of luck, too.
-    assert np.mean(planned <= random) >= 0.8
+@pytest.mark.parametrize(("criterion", "most"), [("D", 1.10), ("robust", 1.06)])
+def test_planned_poses_of_a_series_are_worth_more_than_random_ones(criterion, most):
+    """On the mean of several halves: which of two sets of forty is better on one is a matter of luck, too."""
+    planned, random = planned_and_random(criterion, 12, 100).T
+    assert planned.mean() <= most
+    assert planned.mean() <= random.mean()
