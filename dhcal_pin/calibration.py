@@ -17,8 +17,9 @@ from .errors import DhcalError
 from .executors import HERE, Workers
 from .measurements import Measurement
 from .parameters import select
-from .placing import placed, problem_of
+from .placing import placed, problem_of, refitted
 from .problem import Problem, shared_unknowns
+from .restraint import kept_share
 from .result import Result
 from .se3 import Array
 from .solver import METHODS, Progress, Solution, levenberg_marquardt, posterior_root
@@ -264,7 +265,7 @@ def calibrate(
         problem = replace(problem, errors=errors)
         earlier = solution.iterations
         solution = loop(problem, solution.x, max_iterations, progress)
-    weights = [np.ones(len(item.rows)) for item in data]
+    weights, kept = [np.ones(len(item.rows)) for item in data], 1.0
     if method == "lm":
         # Sigmas and weights that the fit itself tells: a few rounds settle them.
         scales = np.ones(sum(len(item.groups) for item in data))
@@ -291,14 +292,18 @@ def calibrate(
                 scales, going_on, earlier = found, None, earlier + solution.iterations
             loop = partial(levenberg_marquardt, before=going_on, nearly=not ended)
             solution = loop(problem, solution.x, max_iterations, progress)
+        kept = kept_share(problem, solution, [(members, usual) for members, usual, _ in families])
+    x = kept * solution.x
+    found = errors.at(x[: len(errors.parameters)]).loaded() if kept else refitted(errors, data, known)
     return Result(
         errors=errors,
-        x=solution.x,
-        chain=errors.at(solution.x[: len(errors.parameters)]).loaded(),
+        x=x,
+        chain=found,
         data=data,
         holdout=tuple(holdout),
         problem=problem,
         solution=replace(solution, iterations=earlier + solution.iterations),
         method=method,
         weights=tuple(weights),
+        kept=kept,
     )

@@ -192,7 +192,7 @@ def parts(
 
 
 def left_out(
-    problem: Problem, x: Array, data: Sequence[Measurement], folds: Sequence[Fold]
+    problem: Problem, x: Array, data: Sequence[Measurement], folds: Sequence[Fold], kept: float = 1.0
 ) -> Iterator[tuple[list[dict[str, Array]], float]]:
     """For each fold the deviations of its left-out samples, and their RMS in standard deviations.
 
@@ -201,6 +201,7 @@ def left_out(
         x: (p,) where it ended.
         data: the fitted measurements, whose samples are judged.
         folds: made for them.
+        kept: the share of each fold's x that its samples are judged by.
 
     Raises:
         DhcalError: folds that were made for other data.
@@ -212,6 +213,7 @@ def left_out(
     for fold, part in zip(folds, parts(problem, x, folds), strict=True):
         moved = x.copy()
         moved[columns] += solved(part.fitted, problem.weights, x, columns)[0]
+        moved *= kept
         unseen = {u.name for u, alone in zip(problem.unknowns, part.unseen[robot:], strict=True) if alone}
         known = {name: value for name, value in problem.instruments(moved).items() if name not in unseen}
         left = [item.take(mask) for item, mask in zip(data, fold, strict=True) if mask.any()]

@@ -242,7 +242,11 @@ def _seen(found: Study) -> Section:
     sentences = [text, also]
     if held := [e.name for e in fit.estimates if e.fixed]:
         sentences.append(f"Held at nominal, and so not judged: {', '.join(held)}.")
-    items = [*fit.unobservable, *(f"weakly seen: {text}" for text in fit.weakly_seen)]
+    items = [
+        *(f"held back: {text}" for text in fit.held_back),
+        *fit.unobservable,
+        *(f"weakly seen: {text}" for text in fit.weakly_seen),
+    ]
     return Section("seen", "What could not be told apart", sentences, items)
 
 

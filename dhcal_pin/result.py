@@ -45,6 +45,8 @@ class Result:
         solution: the loop's end.
         method: "lm" or "gn".
         weights: (m,) of each fitted measurement's samples, 1 but for a robust loss.
+        kept: how much of what fits the readings best, `solution.x`, x is: 1, or less where so few readings
+            might leave the arm worse than nominal.
     """
 
     errors: ErrorModel
@@ -56,6 +58,7 @@ class Result:
     solution: Solution
     method: str
     weights: tuple[Array, ...]
+    kept: float = 1.0
 
     @property
     def model(self) -> pin.Model:
@@ -68,6 +71,8 @@ class Result:
 
         So before and after differ by the robot alone.
         """
+        if not self.kept:
+            return self.chain
         return refitted(self.errors, self.data, self.problem.known)
 
     @property
@@ -111,6 +116,17 @@ class Result:
         return explanations.weakly_seen(
             self.problem, self.x, self.solution.triangle, self.expected, self._scale
         )
+
+    @property
+    def held_back(self) -> list[str]:
+        """What of the correction is not kept, and why; a sentence, or none."""
+        if self.kept == 1:
+            return []
+        much = f"only {100 * self.kept:.0f} %" if self.kept else "nothing"
+        return [
+            f"{much} of the correction that fits best is kept: so few readings fit many arms, and more of it "
+            "might leave this one worse than nominal; measure more poses"
+        ]
 
     @property
     def expected(self) -> Array:
@@ -164,9 +180,15 @@ class Result:
         root, hidden = self._root
         scale, triangle = self._scale, self.solution.triangle
         if np.isnan(scale) or scale == 1:
-            return root * scale, hidden
-        # The priors are no data: they stay.
-        return posterior_root(replace(triangle, r=triangle.r / max(scale, LEAST)), self.problem.weights)
+            root = root * scale
+        else:
+            # The priors are no data: they stay.
+            root, hidden = posterior_root(
+                replace(triangle, r=triangle.r / max(scale, LEAST)), self.problem.weights
+            )
+        # What the readings ask for and is not kept is an error of its own.
+        given_up = (self.solution.x - self.x)[:, None]
+        return (np.concatenate([root, given_up], 1) if self.kept < 1 else root), hidden
 
     @cached_property
     def covariance(self) -> Array:
@@ -255,7 +277,11 @@ class Result:
         if self.holdout or count < 2:
             return found
         folds = random_folds(self.data, min(FOLDS, count))
-        judged = [item for fold, _ in left_out(self.problem, self.x, self.data, folds) for item in fold]
+        judged = [
+            item
+            for fold, _ in left_out(self.problem, self.solution.x, self.data, folds, self.kept)
+            for item in fold
+        ]
         return (Comparison("left out", count, found[-1].before, summary(judged)), *found)
 
     @cached_property
@@ -289,7 +315,8 @@ class Result:
     def _repr_html_(self) -> str:
         """The headline, before and after, and the parameters, as a notebook shows them."""
         found = (tables.accuracy_table(self.comparisons), tables.estimate_table(self.estimates))
-        doubt = "" if self.converged else "<p>It did not converge.</p>"
+        doubts = [*([] if self.converged else ["It did not converge."]), *self.held_back]
+        doubt = "".join(f"<p>{text}</p>" for text in doubts)
         said = f"<p><strong>{tables.headline(self.comparisons).text}</strong></p>{doubt}"
         return "\n".join([said, *map(tables.html_table, found)])
 
@@ -301,10 +328,10 @@ class Result:
     def is_converged(self, eps: float = 1e-6) -> bool:
         """Whether a fresh Gauss-Newton step would change no whitened row by more than eps RMS."""
         full = with_priors(
-            reduce(self.problem, self.x, small_angle=False),
+            reduce(self.problem, self.solution.x, small_angle=False),
             self.problem.weights,
-            self.x,
+            self.solution.x,
             np.zeros_like(self.x),
         )
-        step = bounded_step(self.problem, full, self.x)
+        step = bounded_step(self.problem, full, self.solution.x)
         return float(np.linalg.norm(full.r @ step)) <= eps * np.sqrt(max(1, self.samples))

@@ -122,6 +122,8 @@ def summary(fit: Result, files: Mapping[str, str]) -> None:
         f"{state} after {fit.iterations} iterations; {fit.samples} samples; "
         f"rank {fit.rank} of {len(fit.parameters)}; condition {fit.condition:.3g}",
     )
+    for text in fit.held_back:
+        lines(f"held back: {text}", style="yellow")
     for text in fit.unobservable:
         lines(f"not observable: {text}", style="yellow")
     for text in fit.weakly_seen:

@@ -29,6 +29,7 @@ LAYERS = (
     {"frames", "observability", "robust", "kinds"},
     {"problem", "uncertainty", "mistakes"},
     {"solver"},
+    {"restraint"},
     {"evaluation", "arms", "placing", "triangles", "passage"},
     {"nullspace", "tables"},
     {"explanations"},
