@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from .chain import BASE
-from .configurations import joint_range
 from .observability import RANK_CUT, rank
 from .problem import Problem, Triangle
 from .se3 import Array
@@ -86,6 +85,8 @@ def kept_share(
     readings = sum(len(item.rows) * item.size for item in problem.data)
     if readings > rank(solution.triangle.r) or not families or not x[inside].any():
         return 1.0
+    from .configurations import joint_range  # a good part of the start-up, and few fits need it
+
     follow, rows, read = _without(solution.triangle, x, inside, np.setdiff1d(np.arange(len(x)), inside))
     chain, bodies, twists = errors.derivative(x[:robot])
     q = np.random.default_rng(0).uniform(*joint_range(chain), (SAMPLES, chain.size))
