@@ -170,6 +170,21 @@ def test_experiment_figures(experiment):
     assert mm["paper_after_all"] == pytest.approx(20.174, abs=5e-4)
 
 
+@pytest.mark.parametrize(
+    ("options", "fitted", "left_out"),
+    [
+        ({"priors": "none", "fix": ["d3", "alpha3"]}, 4.724, 13.133),
+        ({"method": "gn", "max_iterations": 1}, 5.629, 11.441),
+    ],
+)
+def test_a_result_alone_says_the_same_of_points_left_out(experiment, options, fitted, left_out):
+    """Folds so far from linear that they are fitted again, one step of the paper's loop included."""
+    first, second = calibrate(experiment.chain, experiment.data, "dh", **options).comparisons
+    assert (first.title, second.title) == ("left out", "fitted")
+    assert 1e3 * second.after["position_rms_m"] == pytest.approx(fitted, abs=5e-4)
+    assert 1e3 * first.after["position_rms_m"] == pytest.approx(left_out, abs=2e-3)
+
+
 def test_impossible_rows_are_found_with_their_reasons(experiment):
     assert [finding.row for finding in experiment.findings] == [7, 8]
     seven, eight = experiment.findings
