@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import lstsq
 
+from . import observability
 from .errors import DhcalError
 from .evaluation import deviations
 from .measurements import Measurement
@@ -160,13 +161,21 @@ class Parts:
 
 
 def solved(triangle: Triangle, weights: Array, x: Array, columns: Array) -> tuple[Array, float]:
-    """The step (c,) of the columns that count (p,) with priors of weights (p,) about 0, and its cost."""
+    """The step (c,) of the columns that count (p,) with priors of weights (p,) about 0, and its cost.
+
+    What neither rows nor priors tell goes back to 0, as x may have it from rows that are left out.
+    """
     held = weights[columns]
     a = np.concatenate([triangle.r[:, columns], np.diag(held)])
     b = np.concatenate([triangle.z, -held * x[columns]])
     found = lstsq(a, b, lapack_driver="gelsy", check_finite=False)
     assert found is not None
-    return found[0], triangle.rest + float(np.sum((a @ found[0] - b) ** 2))
+    step = found[0]
+    if not held.all():
+        _, s, vt = np.linalg.svd(a)
+        untold = vt[s <= observability.RANK_CUT * s[0]]
+        step = step - untold.T @ (untold @ (x[columns] + step))
+    return step, triangle.rest + float(np.sum((a @ step - b) ** 2))
 
 
 def rows(problem: Problem, x: Array) -> int:

@@ -265,11 +265,15 @@ class Result:
         return (Comparison("left out", count, found[-1].before, summary(judged)), *found)
 
     def again(self, problem: Problem) -> Array:
-        """Where the same loop ends (p,) on some of the samples: from here on, or stopped as this one was."""
+        """Where a fit of some of the samples ends (p,); the same loop stopped as early if this one was.
+
+        It starts from nominal: x has from all the samples what some of them do not tell.
+        """
+        nominal = np.zeros_like(self.x)
         if not self.converged:
-            with suppress(DhcalError):  # of few samples the paper's loop may run away
-                return METHODS[self.method](problem, np.zeros_like(self.x), self.iterations, None).x
-        return levenberg_marquardt(problem, self.x, AGAIN, None).x
+            with suppress(DhcalError):  # on few samples the paper's loop may run away
+                return METHODS[self.method](problem, nominal, self.iterations, None).x
+        return levenberg_marquardt(problem, nominal, AGAIN, None).x
 
     @cached_property
     def estimates(self) -> tuple[Estimate, ...]:
