@@ -226,6 +226,31 @@ def test_good_rows_are_not_called_impossible(sim_6dof, sim_6dof_actual):
         assert screen(sim_6dof, readings) == []
 
 
+def test_an_arm_right_at_its_reference_is_not_impossible_elsewhere(sim_6dof, sim_6dof_actual):
+    """Thirty readings of the pose that the arm was set up by are exact to 10 µm, the others 40 mm off.
+
+    And nothing is impossible about a controller that once stops 2 mm early.
+    """
+    from dhcal_pin.measurement_files import Readings
+    from dhcal_pin.screening import screen
+
+    rng = np.random.default_rng(0)
+    q = np.concatenate([np.tile(0.3, (30, 6)), rng.uniform(-2, 2, (20, 6))])
+    measured = Position.simulate(sim_6dof_actual, q, Noise(1e-5), rng).positions()
+    measured += (sim_6dof.poses(q[:1]) - sim_6dof_actual.poses(q[:1]))[0, :3, 3]
+    commanded = sim_6dof.poses(q)[:, :3, 3]
+    commanded[40] += [0.002, 0.0, 0.0]
+    data = Position.of(q, measured)
+
+    def found(told):
+        return [f.row for f in screen(sim_6dof, Readings("t", data, data, data, told, None))]
+
+    assert np.linalg.norm(measured - sim_6dof.poses(q)[:, :3, 3], axis=1).max() > 0.02
+    assert found(None) == found(commanded) == []
+    commanded[40] += [0.0, 0.02, 0.0]
+    assert found(commanded) == [41]
+
+
 def test_only_angle_offsets_fit_worse(experiment):
     """Δθ alone: 13.124 mm."""
     fit = calibrate(experiment.chain, experiment.data, "dh", priors="none",
