@@ -580,6 +580,20 @@ def test_a_share_is_held_out_by_seed(run, place):
     assert (none["samples"], none["samples_holdout"], none["holdout_after"]) == (20, 0, {})
 
 
+def test_validate_names_impossible_rows_and_counts_them(run, place):
+    """Table 5 as printed: its rows 7 and 8 make 473 mm of 25.5 mm, and that is not left without a word."""
+    table = str(URDF / "experiment_table5.csv")
+    status, out, err = run("validate", URDF / "experiment.dh.toml", table, "--json", "-")
+    rows = np.loadtxt(table, delimiter=",", comments=("#", "j"))
+    off = np.linalg.norm(tip(rows[:, :3]) - rows[:, 3:6], axis=1) / 1e3
+    found = strict(out)
+    assert (status, found["samples"]) == (0, 8)
+    assert found["after"]["position_rms_m"] == pytest.approx(np.sqrt(np.mean(off**2)), rel=1e-9)
+    assert [text.split(":")[0] for text in found["doubts"][table]] == ["row 7", "row 8"]
+    assert "check: row 7: its joint values lead 1095 mm away" in err
+    assert run("validate", URDF / "experiment.dh.toml", table, "--fit-frames")[2].count("check: row") == 0
+
+
 def test_a_file_is_held_out(run, place):
     Path("held.csv").write_text(csv(7, 1))
     found = strict(done(run(*CALIBRATE, "--holdout", "held.csv", "--json", "-")))
