@@ -137,6 +137,13 @@ DATA = {
     "header only": (HEADER + "\n", ["data.csv: no rows", "line 1"]),
     "not UTF-8": (b"\xff\xfe" + csv(4).encode("utf-16-le"), ["data.csv: byte 0 is not UTF-8", "save"]),
     "unknown column": (column("weather", [1, 2]), ["data.csv:1:", "'weather'", "remove it", "joint_1"]),
+    "mistyped": (edited("joint_2[", "joint_two["), ["data.csv:1:", "did you mean 'joint_2'?"]),
+    "a joint too many": (column("joint_4[deg]", [1, 2]), ["data.csv:1:", "'joint_4'", "remove it"]),
+    "no header": ("\n".join(LINES[1:]) + "\n", ["data.csv:1: numbers where the header must be", "x[mm]"]),
+    "underscore": (
+        column("sigma_x[mm],sigma_y[mm],sigma_z[mm]", ["1,1,1", "1,1,1_0"]),
+        ["data.csv:3:", "'sigma_z'", "'1_0' is not a finite number"],
+    ),
     "near miss": (edited("joint_2[", "joint2["), ["data.csv:1:", "'joint2'", "did you mean 'joint_2'?"]),
     "foreign joint": (edited("joint_2[", "wrist_yaw["), ["data.csv:1:", "'wrist_yaw'", "joint_2"]),
     "no unit": (edited("x[mm]", "x"), ["data.csv:1:", "'x' has no unit", "x[mm]"]),
