@@ -56,12 +56,12 @@ def frame_jacobian(chain: Chain, q: Array) -> Array:
     model, frame = chain.model, chain.frame_id
     data = model.createData()
     columns = [model.joints[model.getJointId(name)].idx_v for name in chain.moving]
-    return np.array(
-        [
-            pin.computeFrameJacobian(model, data, configuration, frame, pin.ReferenceFrame.LOCAL)[:, columns]
-            for configuration in chain.configurations(q)
-        ]
-    )
+    found = [
+        pin.computeFrameJacobian(model, data, configuration, frame, pin.ReferenceFrame.LOCAL)
+        for configuration in chain.configurations(q)
+    ]
+    # Of a single joint Pinocchio gives a vector.
+    return np.array(found).reshape(len(q), 6, model.nv)[:, :, columns]
 
 
 def augmented_jacobian(table: DHTable, q: Array) -> Array:

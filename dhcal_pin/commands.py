@@ -29,7 +29,7 @@ from .errors import DhcalError
 from .evaluation import accuracy
 from .files import parse_noise, save
 from .kinds import KINDS
-from .measurement_files import measurement_text, read_readings
+from .measurement_files import Readings, measurement_text, read_readings
 from .measurements import Noise
 from .outputs import STDOUT, check_outputs, check_urdf_ending, emit, sidecars
 from .parameters import extract
@@ -42,6 +42,7 @@ from .robot_files import (
     read_table,
     robot_name,
 )
+from .screening import screen
 from .uncertainty import Predictor
 from .uncertainty_files import read_uncertainty
 from .workspace_files import check_map_ending, map_content
@@ -68,17 +69,25 @@ def validate(args: Namespace) -> int:
     else:
         document = report.plain_document(chain, data, report.fingerprints(inputs), known)
     document["before"] = report.essentials(given)
+    doubtful = {item.source: _doubts(chain, item, args.fit_frames) for item in readings}
+    document["doubts"] = {path: texts for path, texts in doubtful.items() if texts}
     document["files"] = {"json": args.json} if args.json and args.json != STDOUT else {}
     if model:
         document["files"]["map"] = args.map
         save({args.map: map_content(args.map, model, data, known)})
     emit(args.json, document)
-    for item in readings:
-        terminal.doubts(item.source, doubts(chain, item))
+    for path, texts in doubtful.items():
+        terminal.doubts(path, texts)
     terminal.validation(f"{args.robot}: accuracy on {document['samples']} samples", found)
     if model:
         terminal.lines(f"wrote map: {args.map}")
     return 0
+
+
+def _doubts(chain: Chain, readings: Readings, frames_unknown: bool) -> list[str]:
+    """What is hard to believe in a file, impossible rows too; a model that is judged has to bear them all."""
+    found = [] if frames_unknown else screen(chain, readings)
+    return [*doubts(chain, readings), *(f"row {finding.row}: {finding.reason}" for finding in found)]
 
 
 def _trusted(chain: Chain, sidecar: str | None, args: Namespace) -> Predictor:

@@ -54,7 +54,7 @@ def cross_validate(fit: Result, folds: Sequence[Fold] | None = None) -> CrossVal
     """
     if folds is None:
         folds = region_folds(fit.data, places=touched(fit.problem, fit.x))
-    judged = list(left_out(fit.problem, fit.solution.x, fit.data, folds))
+    judged = list(left_out(fit.problem, fit.solution.x, fit.data, folds, fit.again))
     every = [item for found, _ in judged for item in found]
     return CrossValidation(
         tuple(summary(found) for found, _ in judged), np.array([error for _, error in judged]), summary(every)

@@ -12,7 +12,7 @@ import numpy as np
 from . import se3
 from .dh import CONVENTIONS, DHTable
 from .errors import DhcalError
-from .files import ANGLES, LENGTHS, Column, PathLike, Sheet, check_names, read_sheet, read_toml
+from .files import ANGLES, LENGTHS, Column, PathLike, Sheet, check_names, number, read_sheet, read_toml
 from .se3 import Array
 
 _UNITS = {"theta": ANGLES, "d": LENGTHS, "a": LENGTHS, "alpha": ANGLES, "beta": ANGLES}
@@ -85,9 +85,9 @@ def _read_dh_toml(path: PathLike) -> DHTable:
     if not isinstance(joints, list) or not joints or not all(isinstance(joint, dict) for joint in joints):
         raise DhcalError(f"{source}: no [[joint]]; write one block a joint with theta, d, a, alpha")
     columns: dict[str, list] = {key: [] for key in ("name", "type", *_UNITS, *_LIMITS)}
-    for number, joint in enumerate(joints, 1):
+    for place, joint in enumerate(joints, 1):
         kind = joint.get("type", "revolute")
-        columns["name"].append(joint.get("name", f"joint_{number}"))
+        columns["name"].append(joint.get("name", f"joint_{place}"))
         columns["type"].append(kind)
         where = f"{source}: joint {columns['name'][-1]!r}"
         if unknown := set(joint) - set(columns):
@@ -174,7 +174,7 @@ def _limit(sheet: Sheet, column: Column, row: int, slides: bool, none: float) ->
             f"or {column.name}[deg|mm] where there are both kinds"
         )
     try:
-        value = float(cell)
+        value = number(cell)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):

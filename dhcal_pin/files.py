@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import os
 import re
 import shutil
@@ -211,16 +212,12 @@ class Sheet:
         with suppress(ValueError):
             out = self.parsed.get(column.index)
             if out is None:
-                out = np.array([row[column.index] for row in self.cells], dtype=float)
+                out = np.array([number(row[column.index]) for row in self.cells])
             if np.isfinite(out).all():
                 return out
         for row, line in zip(self.cells, self.lines, strict=True):
             text = row[column.index].strip()
-            try:
-                good = np.isfinite(float(text))
-            except ValueError:
-                good = False
-            if not good:
+            if not _is_number(text):
                 what = f"{text!r} is not a finite number" if text else "is empty"
                 raise DhcalError(
                     f"{self.source}:{line}: column {column.name!r}: {what}; correct or remove the row"
@@ -230,6 +227,13 @@ class Sheet:
     def text(self, column: Column) -> list[str]:
         """A column's cells as text (m,)."""
         return [row[column.index].strip() for row in self.cells]
+
+
+def number(text: str) -> float:
+    """The number that a cell holds, or ValueError; 1_000, which Python would read, is none."""
+    if "_" in text:
+        raise ValueError(text)
+    return float(text)
 
 
 def read_sheet(path: PathLike) -> Sheet:
@@ -319,7 +323,17 @@ def _columns(header: Sequence[str], where: str) -> dict[str, Column]:
         if name in columns:
             raise DhcalError(f"{where}: column {name!r} stands twice; remove one")
         columns[name] = Column(name, unit, index)
+    if all(map(_is_number, columns)):
+        raise DhcalError(
+            f"{where}: numbers where the header must be; write one such as joint_1[deg],…,x[mm],y[mm],z[mm]"
+        )
     return columns
+
+
+def _is_number(text: str) -> bool:
+    with suppress(ValueError):
+        return math.isfinite(number(text))
+    return False
 
 
 def csv_text(columns: Mapping[str, Iterable[Any]], comments: Iterable[str] = ()) -> str:

@@ -1,7 +1,8 @@
 """Samples left out of a fit, and what the fit to the others says of them.
 
-The model is nearly linear around a fit, so every fold is solved exactly from two triangles: that of its
-fitted rows and that of its left-out rows. Nothing is iterated.
+The model is nearly linear around a fit, so a fold is solved from two triangles: that of its fitted rows and
+that of its left-out rows. Where few samples make a fold's fit quite another one, its cost tells, and it is
+fitted again.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import lstsq
 
+from . import observability
 from .errors import DhcalError
 from .evaluation import deviations
 from .measurements import Measurement
@@ -22,9 +24,13 @@ from .se3 import Array
 SHARE = 0.25
 # Directions with less than this share of the widest one's spread are none.
 _FLAT = 1e-6
+# A fold's fit may cost more than its triangle foretells by this share of one fitted sample's cost.
+_BENT = 1e-3
 
 # For each measurement of a fit which of its samples (m,) a fold leaves out.
 Fold = tuple[Array, ...]
+# Where a fit of a problem ends (p,).
+Again = Callable[[Problem], Array]
 
 
 def random_folds(data: Sequence[Measurement], count: int, seed: int = 0) -> tuple[Fold, ...]:
@@ -155,13 +161,21 @@ class Parts:
 
 
 def solved(triangle: Triangle, weights: Array, x: Array, columns: Array) -> tuple[Array, float]:
-    """The step (c,) of the columns that count (p,) with priors of weights (p,) about 0, and its cost."""
+    """The step (c,) of the columns that count (p,) with priors of weights (p,) about 0, and its cost.
+
+    What neither rows nor priors tell goes back to 0, as x may have it from rows that are left out.
+    """
     held = weights[columns]
     a = np.concatenate([triangle.r[:, columns], np.diag(held)])
     b = np.concatenate([triangle.z, -held * x[columns]])
     found = lstsq(a, b, lapack_driver="gelsy", check_finite=False)
     assert found is not None
-    return found[0], triangle.rest + float(np.sum((a @ found[0] - b) ** 2))
+    step = found[0]
+    if not held.all():
+        _, s, vt = np.linalg.svd(a)
+        untold = vt[s <= observability.RANK_CUT * s[0]]
+        step = step - untold.T @ (untold @ (x[columns] + step))
+    return step, triangle.rest + float(np.sum((a @ step - b) ** 2))
 
 
 def rows(problem: Problem, x: Array) -> int:
@@ -180,19 +194,42 @@ def parts(
     """Each fold's triangles around x (p,)."""
     found = []
     for fold in folds:
-        kept, left = (
-            problem.of([item.take(side) for item, side in zip(problem.data, sides, strict=True)])
-            for sides in ([~mask for mask in fold], fold)
-        )
-        inside = reduce(kept, x, small_angle=False)
-        found.append(Parts(inside, reduce(left, x, small_angle=False), rows(left, x)))
+        found.append(_split(problem, x, fold)[1])
         if progress:
-            progress(len(found), inside.rest)
+            progress(len(found), found[-1].fitted.rest)
     return tuple(found)
 
 
+def _split(problem: Problem, x: Array, fold: Fold) -> tuple[Problem, Parts]:
+    """The problem of what a fold fits, and the fold's triangles around x (p,)."""
+    kept, left = (
+        problem.of([item.take(side) for item, side in zip(problem.data, sides, strict=True)])
+        for sides in ([~mask for mask in fold], fold)
+    )
+    inside = reduce(kept, x, small_angle=False)
+    return kept, Parts(inside, reduce(left, x, small_angle=False), rows(left, x))
+
+
+def _ending(kept: Problem, part: Parts, x: Array, columns: Array, again: Again) -> Array:
+    """Where the fit of what a fold keeps ends (p,), from the fit of all at x with its free columns."""
+    moved = x.copy()
+    step, cost = solved(part.fitted, kept.weights, x, columns)
+    moved[columns] += step
+    cost += float(np.sum((kept.weights * x)[~columns] ** 2))
+    samples = sum(len(item.rows) for item in kept.data)
+    # One step is all where the model is as straight as its triangle.
+    if kept.cost(moved) <= cost + _BENT * cost / max(1, samples):
+        return moved
+    return again(kept)
+
+
 def left_out(
-    problem: Problem, x: Array, data: Sequence[Measurement], folds: Sequence[Fold], kept: float = 1.0
+    problem: Problem,
+    x: Array,
+    data: Sequence[Measurement],
+    folds: Sequence[Fold],
+    again: Again,
+    share: float = 1.0,
 ) -> Iterator[tuple[list[dict[str, Array]], float]]:
     """For each fold the deviations of its left-out samples, and their RMS in standard deviations.
 
@@ -201,7 +238,8 @@ def left_out(
         x: (p,) where it ended.
         data: the fitted measurements, whose samples are judged.
         folds: made for them.
-        kept: the share of each fold's x that its samples are judged by.
+        again: the same fit of some of its samples, where one step from x does not reach it.
+        share: of each fold's x that its samples are judged by.
 
     Raises:
         DhcalError: folds that were made for other data.
@@ -210,10 +248,9 @@ def left_out(
     if any([len(mask) for mask in fold] != sizes for fold in folds):
         raise DhcalError(f"folds were made for other data; {len(sizes)} measurements have {sizes} samples")
     columns, robot = problem.free(x), len(problem.errors.parameters)
-    for fold, part in zip(folds, parts(problem, x, folds), strict=True):
-        moved = x.copy()
-        moved[columns] += solved(part.fitted, problem.weights, x, columns)[0]
-        moved *= kept
+    for fold in folds:
+        kept, part = _split(problem, x, fold)
+        moved = share * _ending(kept, part, x, columns, again)
         unseen = {u.name for u, alone in zip(problem.unknowns, part.unseen[robot:], strict=True) if alone}
         known = {name: value for name, value in problem.instruments(moved).items() if name not in unseen}
         left = [item.take(mask) for item, mask in zip(data, fold, strict=True) if mask.any()]

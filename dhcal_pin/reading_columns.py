@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from .chain import Chain
 from .errors import DhcalError
@@ -56,16 +56,24 @@ def check_joint_names(chain: Chain) -> None:
         )
 
 
+def _nearest(name: str, known: Iterable[str]) -> set[str]:
+    """Those known names that a mistyped one is most like, if it is like any."""
+    alike = {other: difflib.SequenceMatcher(None, name[:100], other).ratio() for other in known}
+    return {other for other, ratio in alike.items() if ratio == max(0.7, *alike.values())}
+
+
 def check_columns(sheet: Sheet, chain: Chain) -> None:
     """Complains about a column that is neither a joint nor a reading."""
     names = [joint.name for joint in chain.urdf.joints]
     joints = {*names, *(TO + name for name in names)}
     for name in sheet.columns:
         if name not in _KNOWN | joints:
-            near = difflib.get_close_matches(name[:100], sorted(_KNOWN | joints), 1, 0.7)
+            near = _nearest(name, _KNOWN | joints)
+            # What is there already was not meant.
+            meant = sorted(near - set(sheet.columns))
             hint = (
-                f"did you mean {near[0]!r}?"
-                if near
+                f"did you mean {meant[0]!r}?"
+                if meant
                 else f"remove it; the joints are {', '.join(chain.joint_names)}"
             )
             raise DhcalError(

@@ -12,8 +12,9 @@ from .inverse import solve, to_positions, unlimited
 from .measurement_files import Readings
 from .se3 import Array
 
-# A row is impossible only if it is this many times as far off as the typical row.
-TYPICAL = 20.0
+# A row is impossible only if it is this many times as far off as the typical row, and by more than a share
+# of the tool's distance from the shoulder: so far no controller strays, and no arm is wrong.
+TYPICAL, STRAY, WRONG = 20.0, 0.01, 0.05
 
 
 @dataclass(frozen=True)
@@ -71,15 +72,18 @@ def screen(chain: Chain, readings: Readings) -> list[Finding]:
     centre, radius = reach(chain)
     typical = np.median(readings.data.q, 0)
     modelled = chain.poses(readings.data.q)[:, :3, 3]
-    places = [("measured", readings.data.positions())]
+    size = np.linalg.norm(modelled - centre, axis=1).max(initial=0.0)
+    # Readings repeated at one pose are typical of that pose only.
+    distinct = np.unique(np.round(readings.data.q, 3), axis=0, return_index=True)[1]
+    places = [("measured", readings.data.positions(), WRONG)]
     if readings.commanded is not None:
-        places.insert(0, ("commanded", readings.commanded))
-    for what, position in places:
+        places.insert(0, ("commanded", readings.commanded, STRAY))
+    for what, position, share in places:
         if not len(position):
             continue
         off = np.linalg.norm(position - modelled, axis=1)
         far = np.linalg.norm(position - centre, axis=1)
-        for i in np.flatnonzero(off > TYPICAL * np.median(off)):
+        for i in np.flatnonzero(off > max(TYPICAL * float(np.median(off[distinct])), share * size)):
             if i + 1 in found or off[i] < 1e-6:
                 continue
             reason = f"its joint values lead {1e3 * off[i]:.0f} mm away from the {what} position"

@@ -353,6 +353,22 @@ def test_a_fit_without_hold_out_is_judged_by_samples_left_out(sim_6dof, sim_6dof
     assert judged.after["position_rms_m"] > 1.05 * fit.comparisons[1].after["position_rms_m"]
 
 
+@pytest.mark.parametrize("options", [{"method": "gn"}, {"priors": "none"}])
+def test_samples_that_are_met_exactly_do_not_foretell_the_others(sim_6dof, sim_6dof_actual, options):
+    """Two poses fit without a rest and tell half of the errors: a fit to one misses the other."""
+    rng = np.random.default_rng(0)
+    data = Pose.simulate(sim_6dof_actual, rng.uniform(-3, 3, (2, 6)), Noise(), rng)
+    left_out, fitted = calibrate(sim_6dof, data, "dh", **options).comparisons
+    assert fitted.after["position_rms_m"] < 1e-9
+    alone = [
+        accuracy(calibrate(sim_6dof, data.take([one]), "dh", **options).chain, [data.take([1 - one])])
+        for one in (0, 1)
+    ]
+    wanted = np.sqrt(np.mean([found["position_rms_m"] ** 2 for found in alone]))
+    assert left_out.after["position_rms_m"] == pytest.approx(wanted, rel=0.05)
+    assert wanted > 5e-3
+
+
 def test_the_step_is_exact_at_condition_1e8():
     """Nearly parallel axes: the same rows solved with fifty digits give the same step."""
     nominal = Chain.from_dh(paper("sim_6dof"))

@@ -137,6 +137,13 @@ DATA = {
     "header only": (HEADER + "\n", ["data.csv: no rows", "line 1"]),
     "not UTF-8": (b"\xff\xfe" + csv(4).encode("utf-16-le"), ["data.csv: byte 0 is not UTF-8", "save"]),
     "unknown column": (column("weather", [1, 2]), ["data.csv:1:", "'weather'", "remove it", "joint_1"]),
+    "mistyped": (edited("joint_2[", "joint_two["), ["data.csv:1:", "did you mean 'joint_2'?"]),
+    "a joint too many": (column("joint_4[deg]", [1, 2]), ["data.csv:1:", "'joint_4'", "remove it"]),
+    "no header": ("\n".join(LINES[1:]) + "\n", ["data.csv:1: numbers where the header must be", "x[mm]"]),
+    "underscore": (
+        column("sigma_x[mm],sigma_y[mm],sigma_z[mm]", ["1,1,1", "1,1,1_0"]),
+        ["data.csv:3:", "'sigma_z'", "'1_0' is not a finite number"],
+    ),
     "near miss": (edited("joint_2[", "joint2["), ["data.csv:1:", "'joint2'", "did you mean 'joint_2'?"]),
     "foreign joint": (edited("joint_2[", "wrist_yaw["), ["data.csv:1:", "'wrist_yaw'", "joint_2"]),
     "no unit": (edited("x[mm]", "x"), ["data.csv:1:", "'x' has no unit", "x[mm]"]),
@@ -580,6 +587,20 @@ def test_a_share_is_held_out_by_seed(run, place):
     assert (none["samples"], none["samples_holdout"], none["holdout_after"]) == (20, 0, {})
 
 
+def test_validate_names_impossible_rows_and_counts_them(run, place):
+    """Table 5 as printed: its rows 7 and 8 make 473 mm of 25.5 mm, and that is not left without a word."""
+    table = str(URDF / "experiment_table5.csv")
+    status, out, err = run("validate", URDF / "experiment.dh.toml", table, "--json", "-")
+    rows = np.loadtxt(table, delimiter=",", comments=("#", "j"))
+    off = np.linalg.norm(tip(rows[:, :3]) - rows[:, 3:6], axis=1) / 1e3
+    found = strict(out)
+    assert (status, found["samples"]) == (0, 8)
+    assert found["after"]["position_rms_m"] == pytest.approx(np.sqrt(np.mean(off**2)), rel=1e-9)
+    assert [text.split(":")[0] for text in found["doubts"][table]] == ["row 7", "row 8"]
+    assert "check: row 7: its joint values lead 1095 mm away" in err
+    assert run("validate", URDF / "experiment.dh.toml", table, "--fit-frames")[2].count("check: row") == 0
+
+
 def test_a_file_is_held_out(run, place):
     Path("held.csv").write_text(csv(7, 1))
     found = strict(done(run(*CALIBRATE, "--holdout", "held.csv", "--json", "-")))
@@ -829,6 +850,10 @@ def test_demo(run, place, monkeypatch):
     summary = Path("shown/summary.md").read_text()
     assert "Row 7 of Table 5 is left out" in summary
     assert f"{1e3 * found['after']['position_rms_m']:.3f}" in summary
+    assert "21→24/24" in summary
+    assert "all but alpha3" in summary
+    left_out, other = found["comparisons"][0]["after"], found["experiment_m"]["least_squares_left_out"]
+    assert left_out["position_rms_m"] == pytest.approx(other, rel=1e-3)
     poses_agree("shown/experiment.urdf", URDF / "experiment.dh.toml")
 
 

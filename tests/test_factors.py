@@ -45,6 +45,16 @@ def test_all_routes_agree_on_every_robot_that_ships(file):
         assert row.difference <= (1e-7 if "differences" in row.route else 1e-12), row.route
 
 
+@pytest.mark.parametrize("convention", ["standard", "modified"])
+@pytest.mark.parametrize("slides", [False, True])
+def test_all_routes_agree_on_a_single_joint(convention, slides):
+    """Of which Pinocchio's Jacobian is a vector."""
+    one = {key: np.array([value]) for key, value in zip(KEYS, (0.3, 0.2, -0.1, 0.7), strict=True)}
+    limits = {"beta": np.zeros(1), "lower": np.array([-1.0]), "upper": np.ones(1)}
+    table = DHTable(convention, ("only",), np.array([slides]), **one, **limits)
+    assert all(row.holds for row in crosscheck(Chain.from_dh(table)))
+
+
 def test_link_derivatives_are_products_with_q():
     """Equations (7) to (10): ∂A/∂x = A·Q_x."""
     table, h = paper("sim_6dof_actual"), 1e-6
