@@ -21,7 +21,7 @@ from .executors import HERE, Workers
 from .measurements import Measurement, joined
 from .scratch import scratch
 from .se3 import Array
-from .solver import LEAP_STEPS, LEAPS, RUNAWAY
+from .solver import LEAP, LEAP_STEPS, RUNAWAY
 from .triangles import Triangles, triangles
 
 # Members whose arrays together stay in a core's cache.
@@ -252,10 +252,8 @@ def _levenberg_marquardt(batch: Batch, x: Array, max_iterations: int) -> tuple[A
     x, iterations, converged = x.copy(), np.zeros(b, int), np.zeros(b, bool)
     every, scale = batch.reduce(x, batch.weights, small_angle=False), np.zeros((b, p))
     cost, damping, growth = every.cost, np.full(b, 1e-8), np.full(b, 2.0)
-    fresh, last = np.ones(b, bool), np.zeros(b)
-    if not max_iterations:
-        return x, iterations, converged
-    while live.size:
+    fresh, last, leapt = np.ones(b, bool), np.zeros(b), np.zeros(b, int)
+    while live.size and max_iterations:
         free, before = every.take(live), cost[live]
         new = live[fresh[live]]
         iterations[new] += 1
@@ -284,27 +282,30 @@ def _levenberg_marquardt(batch: Batch, x: Array, max_iterations: int) -> tuple[A
         stuck = ~accepted & (settled | (damping[live] > 1e16))
         easier = np.where(trusted | (gain > 0.9), 1e-2, np.maximum(1e-3, 1 - (2 * gain - 1) ** 3))
         went, retry = live[accepted], live[~accepted]
-        x[went], last[went] = there[accepted], change[accepted]
+        was, x[went], last[went] = last[live], there[accepted], change[accepted]
         cost[went], growth[went] = trial[accepted], 2.0
         fresh[live] = accepted
         damping[went] = np.maximum(damping[went] * easier[accepted], 1e-16)
         converged[went] = settled[accepted] & (damping[went] < 1e-3)
         converged[live[stuck]] = settled[stuck]
         damping[retry], growth[retry] = damping[retry] * growth[retry], growth[retry] * 2
-        leaping = np.flatnonzero((accepted | stuck) & ~converged[live] & np.isin(iterations[live], LEAPS))
-        if leaping.size:
+        # A damped step that is too small to matter is no end where a plain one, not tried yet, is not.
+        creeping = converged[live] & (leapt[live] == 0)
+        creeping[creeping] = ~free.take(creeping).ended(before[creeping], was[creeping])
+        converged[live[creeping]], fresh[live[creeping]] = False, True
+        due = creeping | (iterations[live] >= np.maximum(LEAP, 2 * leapt[live]))
+        leaping = (accepted | stuck) & ~converged[live] & due
+        if leaping.any():
             who = live[leaping]
-            x[who], cost[who] = _leap(part.take(leaping), x[who], cost[who])
-        over = stuck | converged[live] | (accepted & (iterations[live] >= max_iterations))
+            leapt[who] = iterations[who]
+            x[who], cost[who] = _leap(part.take(np.flatnonzero(leaping)), x[who], cost[who])
+        over = (stuck & ~creeping) | converged[live] | (fresh[live] & (iterations[live] >= max_iterations))
         if ahead is not None:
-            kept = np.flatnonzero(accepted[tried])
-            every.put(live[tried[kept]], ahead.take(kept))
+            every.put(live[tried][accepted[tried]], ahead.take(accepted[tried]))
         # Whose step held without a triangle, or who leapt, needs one.
-        lacking = np.flatnonzero((accepted & ~first) | np.isin(np.arange(len(live)), leaping))
-        lacking = lacking[~over[lacking]]
+        lacking = np.flatnonzero(((accepted & ~first) | leaping) & ~over)
         if lacking.size:
-            found = part.take(lacking).reduce(x[live[lacking]], batch.weights, small_angle=False)
-            every.put(live[lacking], found)
+            every.put(live[lacking], part.take(lacking).reduce(x[live[lacking]], batch.weights, False))
         live, part = live[~over], part.take(np.flatnonzero(~over))
     return x, iterations, converged
 

@@ -26,7 +26,7 @@ from .dh import DHTable
 from .dh_urdf import dh_to_urdf
 from .errors import DhcalError
 from .kinematics import Motion, Sweep
-from .paths import axis_frame, build_model, default_tip, independent_joints, placements
+from .paths import axis_frame, build_model, default_tip, independent_joints, moving_joints, placements
 from .se3 import Array
 from .transmission import Loads, Payload, Transmission
 from .urdf import Urdf, parse_urdf, read_urdf
@@ -97,15 +97,7 @@ class Chain:
         """
         urdf = source if isinstance(source, Urdf) else read_urdf(source)
         tip = tip if tip is not None else default_tip(urdf)
-        joints = [joint for joint in urdf.path(tip) if joint.type != "fixed"]
-        for joint in joints:
-            if joint.type in ("floating", "planar"):
-                raise DhcalError(
-                    f"{urdf.source}:{joint.line}: joint {joint.name!r} is {joint.type}; "
-                    f"the path to {tip!r} may only have revolute, continuous, prismatic and fixed joints"
-                )
-        if not joints:
-            raise DhcalError(f"{urdf.source}: no moving joint between {urdf.root!r} and {tip!r}")
+        joints = moving_joints(urdf, tip)
         names, rows, shift = independent_joints(urdf, [joint.name for joint in joints])
         sources = [urdf.joint(name) for name in names]
         model = build_model(urdf)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,13 +25,22 @@ LEAST_TERM = 0.1
 _AXES = np.eye(6)
 
 
+def unlinked(chain: Chain) -> Chain:
+    """The same path whose every moving joint is commanded by itself, none following another."""
+    k = len(chain.moving)
+    free = np.full(k, np.inf)
+    return replace(
+        chain, joint_names=chain.moving, mixing=np.eye(k), shift=np.zeros(k), lower=-free, upper=free
+    )
+
+
 def extract(chain: Chain, convention: Convention = "standard", hayati: bool = False) -> Extraction:
     """The chain's DH table, base and tool apart, by common normals."""
     if not (np.array_equal(chain.mixing, np.eye(chain.size)) and not chain.shift.any()):
         follows = next(name for name in chain.moving if name not in chain.joint_names)
         raise DhcalError(
             f"{chain.urdf.source}: joint {follows!r} mimics another, which a DH table cannot hold; "
-            "calibrate with --parameters minimal,base,tool"
+            "calibrate the URDF itself"
         )
     return extract_dh(
         chain.links, chain.joint_names, chain.prismatic, chain.lower, chain.upper, convention, hayati
@@ -39,7 +49,7 @@ def extract(chain: Chain, convention: Convention = "standard", hayati: bool = Fa
 
 @functools.lru_cache(maxsize=16)
 def _dh_rows(chain: Chain, convention: Convention, hayati: bool) -> tuple[Parameter, ...]:
-    found = extract(chain, convention, hayati)
+    found = extract(unlinked(chain), convention, hayati)
     table = found.table
     out = []
     k = len(chain.moving)

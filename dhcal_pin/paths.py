@@ -10,7 +10,10 @@ import pinocchio as pin
 from . import se3
 from .errors import DhcalError
 from .se3 import Array
-from .urdf import Urdf
+from .urdf import Urdf, UrdfJoint
+from .urdf_tags import instead, show
+
+_MAX_MOVING = 64  # what is unknown grows with the path, and work with its cube; no arm comes near
 
 
 def build_model(urdf: Urdf) -> pin.Model:
@@ -42,20 +45,60 @@ def default_tip(urdf: Urdf) -> str:
     return farthest[0]
 
 
+def moving_joints(urdf: Urdf, tip: str) -> list[UrdfJoint]:
+    """The joints that move between the root and a tip, in that order.
+
+    Raises:
+        DhcalError: there is no such tip, none moves, too many do, or one has more than one freedom.
+    """
+    joints = [joint for joint in urdf.path(tip) if joint.type != "fixed"]
+    for joint in joints:
+        if joint.type in ("floating", "planar"):
+            raise DhcalError(
+                f"{urdf.source}:{joint.line}: joint {joint.name!r} is {joint.type}; "
+                f"the path to {tip!r} may only have revolute, continuous, prismatic and fixed joints: "
+                "make it fixed, as the robot stands while it is measured"
+            )
+    if not joints:
+        raise DhcalError(
+            f"{urdf.source}: no moving joint between {urdf.root!r} and {tip!r}; "
+            "choose a tip behind joints that move, --tip"
+        )
+    if len(joints) > _MAX_MOVING:
+        raise DhcalError(
+            f"{urdf.source}: {len(joints)} moving joints between {urdf.root!r} and {tip!r}; "
+            f"at most {_MAX_MOVING} are accepted: choose a nearer tip, --tip"
+        )
+    return joints
+
+
 def independent_joints(urdf: Urdf, moving: list[str]) -> tuple[list[str], Array, Array]:
-    """Independent joints behind the moving ones, with the (k, n) mixing and (k,) shift of mimics."""
-    names: list[str] = []
+    """Independent joints behind the moving ones, with the (k, n) mixing and (k,) shift of mimics.
+
+    Raises:
+        DhcalError: a joint follows one that is not there or cannot move, or none is left to command.
+    """
+    free = [joint.name for joint in urdf.joints if joint.type in ("revolute", "continuous", "prismatic")]
     entries = []
     for name in moving:
         factor, shift = 1.0, 0.0
         while (mimic := urdf.joint(name).mimic) is not None:
+            if mimic[0] not in free:
+                raise DhcalError(
+                    f"{urdf.source}:{urdf.joint(name).line}: joint {show(name)}: it mimics {show(mimic[0])}, "
+                    f"which is no joint that moves; {instead(mimic[0], free)}"
+                )
             name, shift, factor = mimic[0], shift + factor * mimic[2], factor * mimic[1]
-        if name not in names:
-            names.append(name)
-        entries.append((names.index(name), factor, shift))
+        entries.append((name, factor, shift))
+    names = list(dict.fromkeys(name for name, factor, _ in entries if factor))
+    if not names:
+        raise DhcalError(
+            f"{urdf.source}: all joints of the path mimic with multiplier 0; none is left to move"
+        )
     mixing = np.zeros((len(moving), len(names)))
-    for row, (column, factor, _) in enumerate(entries):
-        mixing[row, column] = factor
+    for row, (name, factor, _) in enumerate(entries):
+        if factor:
+            mixing[row, names.index(name)] = factor
     return names, mixing, np.array([shift for _, _, shift in entries])
 
 

@@ -26,8 +26,8 @@ RELATIVE_STEP, ROUNDING = 1e-8, 1e-15
 SURELY_REGULAR = 1e3 * observability.RANK_CUT
 # With so small a step ahead sigmas and priors can be told as well as at the end of the loop.
 NEARLY = 0.1
-# After so many damped steps Gauss-Newton tries to get farther in a few.
-LEAPS, LEAP_STEPS = (8, 16, 32, 64), 6
+# After so many damped steps Gauss-Newton tries to get farther in a few, and again after twice as many.
+LEAP, LEAP_STEPS = 8, 6
 # An error of so many metres or radians is no error any more.
 RUNAWAY = 1e6
 
@@ -115,6 +115,18 @@ def _settled(
     return change <= enough or shrunk or change <= ROUNDING * float(np.linalg.norm(r))
 
 
+def _at_end(
+    problem: Problem,
+    free: Triangle,
+    x: Array,
+    cost: float,
+    last: float,
+    relative: float = RELATIVE_STEP,
+) -> bool:
+    """Whether a plain step from x would not matter either; a damped one may be tiny in a narrow valley."""
+    return _settled(free.r, _change(free.r, bounded_step(problem, free, x)), cost, last, relative)
+
+
 @dataclass(frozen=True, eq=False)
 class Trust:
     """How far a loop trusts a triangle by now: damping, scales (p,), how far the last step moved the rows."""
@@ -183,13 +195,14 @@ def levenberg_marquardt(
     """Levenberg-Marquardt; a retry costs forward kinematics only, the triangle stays.
 
     Along a narrow valley that bends, damped steps downhill are tiny and Gauss-Newton's, far uphill at
-    first, arrive: now and then it may try. A loop on the same data that was `before` goes on. Who needs no
-    more than where it `nearly` ends gets that, unconverged.
+    first, arrive: now and then it may try, and at once where a damped step is so small that it looks like
+    the end and a plain one is not. A loop on the same data that was `before` goes on. Who needs no more than
+    where it `nearly` ends gets that, unconverged.
     """
     trust = before.trust if before else Trust()
     damping, scale, last = trust.damping, trust.scale, trust.last
     path, done = (list(before.path), before.iterations) if before else ([x], 0)
-    growth, converged, none = 2.0, False, np.zeros_like(x)
+    growth, converged, none, leapt = 2.0, False, np.zeros_like(x), 0
     triangle = before.triangle if before else reduce(problem, x, small_angle=False)
     cost = triangle.cost + float(np.sum((problem.weights * x) ** 2))
     while done < max_iterations and not converged and damping <= 1e16:
@@ -200,13 +213,16 @@ def levenberg_marquardt(
         rounding = ROUNDING * float(np.linalg.norm(free.r))
         # Where all that is left to gain is rounding, costs tell nothing and the step is to be trusted.
         blur = (10 * rounding) ** 2 + 2 * rounding * math.sqrt(cost)
+        creeping = False
         done += 1
         while True:
             damped = with_priors(free, none, x, np.sqrt(damping) * floor)
             step = bounded_step(problem, damped, x)
             change = _change(free.r, step)
             if nearly and damping < 1e-3 and _settled(free.r, change, cost, last, NEARLY):
-                return Solution(x, triangle, done - 1, False, np.array(path), Trust(damping, scale, last))
+                if _at_end(problem, free, x, cost, last, NEARLY):
+                    return Solution(x, triangle, done - 1, False, np.array(path), Trust(damping, scale, last))
+                creeping = leapt == 0
             settled = _settled(free.r, change, cost, last)
             expected = float(free.z @ free.z - np.sum((free.r @ step - free.z) ** 2))
             ahead = None
@@ -231,7 +247,10 @@ def levenberg_marquardt(
                 converged = settled
                 break
             damping, growth = damping * growth, growth * 2
-        if done in LEAPS and not converged:
+        if converged and leapt == 0 and not _at_end(problem, free, start, cost, last):
+            creeping, converged = True, False
+        if not converged and (creeping or done >= max(LEAP, 2 * leapt)):
+            leapt = done
             x, cost, reached = *_leap(problem, x, cost), None
         # Only whole steps show how fast they shrink.
         last = change if x is not start and growth == 2.0 else 0.0

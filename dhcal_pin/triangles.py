@@ -83,6 +83,10 @@ class Triangles:
         shrunk = (change < 1e-2 * last) & (change**2 < 0.1 * enough * last)
         return (change <= enough) | shrunk | (change <= self.rounding())
 
+    def ended(self, cost: Array, last: Array | float = 0.0) -> Array:
+        """Whether not even a plain step moves the rows by anything that matters, (b,)."""
+        return self.settled(np.linalg.norm(self.moved(self.step()), axis=1), cost, last)
+
     def rounding(self) -> Array:
         """What the model's own rounding makes of the rows, (b,)."""
         return ROUNDING * _size(self.r)

@@ -91,6 +91,17 @@ def sim_3dof() -> Chain:
 
 
 @pytest.fixture(scope="session")
+def mimicking() -> Chain:
+    """An arm whose third joint follows its second, backwards, half as fast again, and from elsewhere."""
+    arm = Chain.from_dh(paper("sim_6dof_actual"))
+    follow = b'<mimic joint="joint_2" multiplier="-1.5" offset="0.2"/>'
+    head, tail = arm.urdf.data.split(b'<joint name="joint_3"')
+    body, rest = tail.split(b"</joint>", 1)
+    data = head + b'<joint name="joint_3"' + body + follow + b"</joint>" + rest
+    return Chain.from_urdf(parse_urdf(data, "mimicking.urdf"), "tool0")
+
+
+@pytest.fixture(scope="session")
 def browser() -> Iterator[Any]:
     if not os.path.exists(CHROMIUM) and os.environ.get("CI") != "true":
         pytest.skip("no Chromium")

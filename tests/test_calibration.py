@@ -7,13 +7,14 @@ from dataclasses import replace
 import mpmath
 import numpy as np
 import pytest
-from conftest import paper, random_table
+from conftest import paper, random_joints, random_table
 from scipy.linalg import null_space
 
 from dhcal_pin import observability, problem, se3
 from dhcal_pin.calibration import calibrate, split
 from dhcal_pin.chain import Chain
 from dhcal_pin.contacts import PointDistance, Touch
+from dhcal_pin.dh import DHTable
 from dhcal_pin.errors import DhcalError
 from dhcal_pin.evaluation import accuracy
 from dhcal_pin.folds import random_folds
@@ -460,3 +461,34 @@ def test_lengths_that_are_held_tell_how_large_an_arm_is_that_touches(sim_6dof):
     said = calibrate(sim_6dof, data, "offset,tool").unobservable
     assert said
     assert not [text for text in said if "how large" in text]
+
+
+@pytest.mark.parametrize(
+    ("seed", "prismatic", "theta", "d", "a", "quarters", "tilt", "beta"),
+    [
+        (1, "011", [0.1, -2, -2.6], [0.3, -0.3, 0.3], [0, 0.2, 0.4], [-1, 2, 0], [0, 0, 0.03], [-0.03, 0, 0]),
+        (
+            *(0, "1100", [-2.6, -0.9, -3, -0.6], [0, 0, 0.3, 0.5], [-0.3, 0, 0, 0]),
+            *([-1, 2, -1, 0], [0.03, 0.01, 0, 0], [0, 0, 0.01, 0.001]),
+        ),
+    ],
+)
+def test_a_step_that_damping_makes_small_is_no_end(seed, prismatic, theta, d, a, quarters, tilt, beta):
+    """Nearly parallel axes: of the turns of a narrow valley a damped loop sees nothing, a plain step does."""
+    n = len(theta)
+    table = DHTable(
+        "modified",
+        tuple(f"j{i + 1}" for i in range(n)),
+        np.array([letter == "1" for letter in prismatic]),
+        *map(np.array, (theta, d, a, np.pi / 2 * np.array(quarters) + tilt, beta)),
+        np.full(n, -np.inf),
+        np.full(n, np.inf),
+    )
+    arm, rng = Chain.from_dh(table), np.random.default_rng(seed)
+    errors = select(arm, "dh,base,tool")
+    size = np.array([np.deg2rad(2) if p.unit == "rad" else 0.01 for p in errors.parameters])
+    truth = errors.at(size * rng.uniform(-1, 1, len(size)))
+    q = random_joints(rng, table, 80)
+    fit = calibrate(arm, Pose.of(q[:40], truth.poses(q[:40])), "dh,base,tool", priors="none")
+    assert fit.converged
+    assert np.abs(fit.chain.poses(q[40:]) - truth.poses(q[40:])).max() < 1e-9

@@ -98,9 +98,56 @@ def test_mimic_joint_follows_its_source():
 
 def test_mimic_of_nothing_matters_on_the_path_only():
     text = ROBOT.format(mimic='<mimic joint="nobody"/>')
-    with pytest.raises(DhcalError, match="no joint 'nobody'"):
+    with pytest.raises(
+        DhcalError, match=r"r.urdf:9: joint 'end': it mimics 'nobody', which is no joint that"
+    ):
         Chain.from_urdf(parse_urdf(text.encode(), "r.urdf"), "end")
     assert Chain.from_urdf(parse_urdf(text.encode(), "r.urdf"), "side").joint_names == ("one", "out")
+
+
+def test_a_joint_cannot_mimic_one_that_stands_still():
+    text = ROBOT.format(mimic='<mimic joint="glue"/>')
+    with pytest.raises(DhcalError, match=r"r.urdf:9: joint 'end': it mimics 'glue', which is no joint that"):
+        Chain.from_urdf(parse_urdf(text.encode(), "r.urdf"), "end")
+
+
+def test_a_mimic_that_takes_nothing_of_its_source_stands_still():
+    text = ROBOT.format(mimic='<mimic joint="out" multiplier="0" offset=".5"/>')
+    chain = Chain.from_urdf(parse_urdf(text.encode(), "r.urdf"), "end")
+    assert chain.joint_names == ("one", "two")
+    free = Chain.from_urdf(parse_urdf(ROBOT.format(mimic="").encode(), "r.urdf"), "end")
+    q = np.random.default_rng(0).uniform(-1, 1, (20, 2))
+    held = np.column_stack([q, np.full(20, 0.5)])
+    np.testing.assert_allclose(chain.poses(q), pinocchio_poses(free, held), atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "tip", "message"),
+    [
+        ('"continuous"', '"floating"', "end", "r.urdf:9: joint 'end' is floating.*: make it fixed"),
+        ('"continuous"', '"fixed"', "base", "no moving joint between 'base' and 'base'; choose a tip behind"),
+    ],
+)
+def test_paths_that_cannot_be_calibrated_say_what_would(old, new, tip, message):
+    text = ROBOT.format(mimic="").replace(old, new)
+    with pytest.raises(DhcalError, match=message):
+        Chain.from_urdf(parse_urdf(text.encode(), "r.urdf"), tip)
+
+
+@pytest.mark.parametrize("count", [64, 65])
+def test_nobody_calibrates_a_rope(count):
+    """Commands take minutes on a path of hundreds of joints; it ends where no arm is."""
+    links = "".join(f'<link name="l{i}"/>' for i in range(count + 1))
+    joints = "".join(
+        f'<joint name="j{i}" type="continuous"><parent link="l{i}"/><child link="l{i + 1}"/></joint>'
+        for i in range(count)
+    )
+    urdf = parse_urdf(f'<robot name="rope">{links}{joints}</robot>'.encode(), "rope.urdf")
+    if count == 64:
+        assert Chain.from_urdf(urdf).size == 64
+        return
+    with pytest.raises(DhcalError, match=r"65 moving joints between 'l0' and 'l65'; at most 64.*--tip"):
+        Chain.from_urdf(urdf)
 
 
 def test_tabs_and_newlines_between_numbers():

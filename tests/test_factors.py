@@ -168,3 +168,9 @@ def test_check_refuses_nothing_that_is_a_chain():
         table = random_table(rng, convention, 5)
         for row in crosscheck(Chain.from_dh(table), 20):
             assert row.holds, row
+
+
+def test_check_refuses_no_mimic_joint(mimicking):
+    assert mimicking.size < len(mimicking.moving)
+    for row in crosscheck(mimicking, 20):
+        assert row.holds, row

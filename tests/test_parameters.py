@@ -9,6 +9,7 @@ import pytest
 from conftest import paper, random_table, with_masses
 
 from dhcal_pin import observability, se3
+from dhcal_pin.calibration import calibrate
 from dhcal_pin.chain import Chain
 from dhcal_pin.errors import DhcalError
 from dhcal_pin.measurements import Noise
@@ -85,6 +86,20 @@ def test_minimal_with_base_and_tool_is_complete(seed):
     theory = 4 * (5 - slides) + 2 * slides + 6
     assert rank(chain, "minimal,base,tool") == theory
     assert rank(chain, "minimal,placement,base,tool,offset") == theory
+
+
+@pytest.mark.parametrize(
+    "sets", ["dh,base,tool", "modified-dh,base,tool", "hayati,base,tool", "minimal,base,tool"]
+)
+def test_a_joint_that_mimics_another_has_errors_of_its_own(sets, mimicking):
+    """Six joints that move, five that are commanded: 4R + 6 directions, and the true arm is found."""
+    assert rank(mimicking, sets) == 4 * 6 + 6
+    rng = np.random.default_rng(3)
+    errors = select(mimicking, sets)
+    truth = errors.at(5e-3 * rng.normal(size=len(errors.parameters)))
+    q = rng.uniform(-np.pi, np.pi, (60, mimicking.size))
+    fit = calibrate(mimicking, Pose.of(q[:30], truth.poses(q[:30])), sets, priors="none")
+    assert np.abs(fit.chain.poses(q[30:]) - truth.poses(q[30:])).max() < 1e-9
 
 
 def test_minimal_has_four_a_revolute_and_two_a_sliding_joint():
