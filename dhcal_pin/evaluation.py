@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -127,9 +127,15 @@ class Comparison:
         title: "held out", "left out" (each sample of a fit without it) or "fitted".
         samples: how many.
         before, after: as from `accuracy`.
+        aside: gross errors among the samples of a fit that they take no part in; not in the figures.
+        gross: gross errors that are in the figures.
+        without: `after` without those, where there are any.
     """
 
     title: str
     samples: int
     before: Mapping[str, Any]
     after: Mapping[str, Any]
+    aside: int = 0
+    gross: int = 0
+    without: Mapping[str, Any] = field(default_factory=dict)

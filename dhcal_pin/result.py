@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from . import explanations, observability, robust, se3, tables
+from . import explanations, leverage, observability, robust, se3, tables
 from .chain import BASE, Chain
 from .error_model import ErrorModel, Parameter
-from .evaluation import Comparison, accuracy, summary
+from .evaluation import Comparison, accuracy, deviations, summary
 from .folds import left_out, random_folds
 from .measurements import Measurement, Unknown
 from .placing import refitted
@@ -68,7 +68,17 @@ class Result:
 
         So before and after differ by the robot alone.
         """
-        return refitted(self.errors, self.data, self.problem.known)
+        return refitted(self.errors, tuple(self.counted), self.problem.known)
+
+    @property
+    def counted(self) -> list[Measurement]:
+        """The fitted measurements without samples that count for nothing."""
+        return self._counted(self.data)
+
+    def _counted(self, data: Sequence[Measurement]) -> list[Measurement]:
+        """Those samples of the fitted measurements that count in the fit."""
+        found = [item.take(w > robust.NOTHING) for item, w in zip(data, self.weights, strict=True)]
+        return [item for item in found if len(item.rows)]
 
     @property
     def converged(self) -> bool:
@@ -217,16 +227,16 @@ class Result:
         return self.problem.instruments(self.x)
 
     @cached_property
-    def outliers(self) -> tuple[Array, ...]:
-        """Row numbers of gross errors in each fitted measurement.
+    def scores(self) -> tuple[Array, ...]:
+        """How far each fitted sample (m,) lies from its kind's scatter; see `robust.scores`."""
+        data = [item.weighted(1 / w) for item, w in zip(self.problem.data, self.weights, strict=True)]
+        return tuple(leverage.scores(self.problem, self.solution, data, self.weights))
 
-        None where few samples stand against many unknowns, as then the scatter tells nothing.
-        """
+    @cached_property
+    def outliers(self) -> tuple[Array, ...]:
+        """Row numbers of gross errors in each fitted measurement."""
         return tuple(
-            robust.outliers(self.chain, item, self.problem.values(item, self.x))
-            if len(item.rows) > 2 * len(self.parameters)
-            else np.empty(0, int)
-            for item in self.data
+            item.rows[score > robust.OUTLYING] for item, score in zip(self.data, self.scores, strict=True)
         )
 
     @property
@@ -240,23 +250,35 @@ class Result:
         """Accuracy before and after: on what was not fitted first, then on the fitted.
 
         Where nothing was held out, every sample is judged by a fit without it and others, in ten folds.
+        Gross errors that take no part in the fit are in neither; among what was held out they are.
         """
-        found = tuple(
-            Comparison(
-                title,
-                sum(len(item.rows) for item in data),
-                accuracy(self.reference, data),
-                accuracy(self.chain, data, self.instruments),
-            )
-            for title, data in (("held out", self.holdout), ("fitted", self.data))
-            if data
-        )
-        count = sum(len(item.rows) for item in self.data)
-        if self.holdout or count < 2:
+        kept = self.counted
+        count = sum(len(item.rows) for item in kept)
+        aside = self.samples - count
+        before = accuracy(self.reference, kept)
+        found = (Comparison("fitted", count, before, accuracy(self.chain, kept, self.instruments), aside),)
+        if self.holdout:
+            return (self._held_out(), *found)
+        if count < 2:
             return found
-        folds = random_folds(self.data, min(FOLDS, count))
-        judged = [item for fold, _ in left_out(self.problem, self.x, self.data, folds) for item in fold]
-        return (Comparison("left out", count, found[-1].before, summary(judged)), *found)
+        folds = random_folds(kept, min(FOLDS, count))
+        problem = self.problem.of(self._counted(self.problem.data))
+        judged = [item for fold, _ in left_out(problem, self.x, kept, folds) for item in fold]
+        return (Comparison("left out", count, before, summary(judged), aside), *found)
+
+    def _held_out(self) -> Comparison:
+        """Accuracy on what was held back, as it is, and without gross errors."""
+        errors = deviations(self.chain, self.holdout, self.instruments)
+        after, clean, gross = summary(errors), [], 0
+        for item in errors:
+            # Of several groups the first, the position, tells.
+            first = next(iter(item.values()))
+            good = robust.scored(np.mean(first**2, 1), first.shape[1]) <= robust.OUTLYING
+            gross += int(np.sum(~good))
+            clean.append({name: error[good] for name, error in item.items()})
+        count = sum(len(item.rows) for item in self.holdout)
+        without = summary(clean) if gross else {}
+        return Comparison("held out", count, accuracy(self.reference, self.holdout), after, 0, gross, without)
 
     @cached_property
     def estimates(self) -> tuple[Estimate, ...]:

@@ -7,7 +7,7 @@ for a good sample whatever its number of rows, so that one threshold serves ever
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
@@ -15,8 +15,9 @@ from .chain import Chain
 from .measurements import Measurement
 from .se3 import Array
 
-# Scores beyond this are gross: one good sample in three million.
-OUTLYING = 5.0
+# Scores beyond this are gross: one good sample in three million. Gross errors in a fit hide behind the
+# scatter that they make themselves, so that it is looked into from this one on.
+OUTLYING, SUSPECT = 5.0, 3.5
 
 
 def _linear(score: Array) -> Array:
@@ -36,42 +37,66 @@ def _tukey(score: Array) -> Array:
 
 
 # Weight of a sample by its score; the constants keep 95 % of the efficiency on normal errors.
-LOSSES: dict[str, Callable[[Array], Array]] = {
-    "linear": _linear,
+WEIGHTS: dict[str, Callable[[Array], Array]] = {
+    "all": _linear,
+    "good": _linear,
     "huber": _huber,
     "cauchy": _cauchy,
     "tukey": _tukey,
 }
-# A weight below this leaves a sample out without leaving a hole in the arithmetic.
-_LEAST = 1e-12
+# The weights that a loss goes through, each until it has settled. The next ones are for gross errors only:
+# good samples then count in full, after a loss that no single one could draw away has told which they are.
+LOSSES: dict[str, tuple[str, ...]] = {
+    "auto": ("all", "huber", "good"),
+    "linear": ("all",),
+    "huber": ("huber",),
+    "cauchy": ("cauchy",),
+    "tukey": ("tukey",),
+}
+# Whitened residuals of less variance than this are the fit's own doing.
+LEAST_SPREAD = 1e-3
+# A weight of this leaves a sample out without leaving a hole in the arithmetic.
+NOTHING = 1e-12
 
 
-def scores(chain: Chain, item: Measurement, u: Array) -> Array:
-    """How far each sample (m,) lies from its kind's scatter: standard normal for good ones."""
+def scores(chain: Chain, item: Measurement, u: Array, spread: Array | None = None) -> Array:
+    """How far each sample (m,) lies from its kind's scatter: standard normal for good ones.
+
+    Args:
+        chain: as fitted.
+        item: the samples.
+        u: values of their unknowns.
+        spread: (m, k, k) covariances of their whitened residuals up to a scale; unit ones without it.
+    """
     residual = item.residual(chain.sweep(item.configurations()), u)
     k = len(residual)
+    if spread is None:
+        return scored(np.sum(residual**2, 0) / k, k)
+    # A reading that the fit meets whatever it is tells nothing.
+    freed = spread + LEAST_SPREAD * np.eye(k)
+    return scored(np.sum(residual.T * np.linalg.solve(freed, residual.T[..., None])[..., 0], 1) / k, k)
+
+
+def scored(ratio: Array, k: int) -> Array:
+    """Scores (m,) of mean squares (m,) of k residuals each, against their own median."""
     middle = 1 - 2 / (9 * k)
-    ratio = np.sum(residual**2, 0) / k
     # The median of χ²_k / k is middle³.
     scale = np.median(ratio) / middle**3
     if scale <= 0:
-        return np.zeros(residual.shape[1])
+        return np.zeros(len(ratio))
     return (np.cbrt(ratio / scale) - middle) / np.sqrt(2 / (9 * k))
 
 
-def reweighted(
-    chain: Chain, data: Sequence[Measurement], values: Sequence[Array], loss: str
-) -> tuple[tuple[Measurement, ...], list[Array]]:
-    """The data with every sample's sigmas widened as the loss wants, and the weights (m,) an item.
+def weight(score: Array, how: str) -> Array:
+    """Weights (m,) of scores (m,).
 
     What is named as a gross error counts for nothing whatever the loss: of Huber's a constant pull remains,
     and a tenth of them would cost a quarter of the accuracy.
     """
-    found = [scores(chain, item, u) for item, u in zip(data, values, strict=True)]
-    weights = [np.maximum(np.where(score > OUTLYING, 0.0, LOSSES[loss](score)), _LEAST) for score in found]
-    return tuple(item.weighted(w) for item, w in zip(data, weights, strict=True)), weights
+    gross = (score > OUTLYING) & (how != "all")
+    return np.maximum(np.where(gross, 0.0, WEIGHTS[how](score)), NOTHING)
 
 
-def outliers(chain: Chain, item: Measurement, u: Array) -> Array:
-    """Row numbers of samples that are gross errors."""
-    return item.rows[scores(chain, item, u) > OUTLYING]
+def suspect(score: Array) -> bool:
+    """Whether gross errors may be among samples of scores (m,)."""
+    return bool((score > SUSPECT).any())

@@ -17,6 +17,8 @@ SMALL = {"m": (1e3, " mm"), "rad": (1e3, " mrad"), **RATES}
 PLAIN, MOST = 3, 6
 # Fewer samples than this do not tell an accuracy; a longer text than this may be broken into lines.
 FEW, LONG = 10, 48
+# Gross errors among what was held out are worth a word where the RMS is this share of itself without them.
+TELLING = 0.9
 # Groups of accuracy in words.
 WORDS = {"position": "position error", "orientation": "orientation error", "residual": "residual"}
 # Measures of accuracy in words.
@@ -174,10 +176,18 @@ def headline(comparisons: Sequence[Comparison]) -> Headline:
     unit = end.strip("_") or "m"
     key, spread = f"{group}_rms{end}", f"{group}_rms_std{end}"
     before, after = (shown(side[key], unit, side[spread], True) for side in (best.before, best.after))
-    what = f"RMS {WORDS[group]} {on_samples(best)}: {before} before, {after} after."
+    what = f"RMS {WORDS[group]} {on_samples(best)}: {before} before, {after} after"
+    if best.without and best.without[key] < TELLING * best.after[key]:
+        clean = shown(best.without[key], unit, best.without[spread], True)
+        what += f", {clean} without {_gross(best.gross)} among them"
+    what += f". {_gross(best.aside).capitalize()} left aside." if best.aside else "."
     text = f"{what} {few(best)}".strip() if best.title != "fitted" else f"Nothing was held out. {what}"
     drop = 100 * (1 - best.after[key] / best.before[key]) if best.before[key] else 0.0
     return Headline(text, before, after, drop, group, best)
+
+
+def _gross(count: int) -> str:
+    return f"{count} gross errors" if count > 1 else "one gross error"
 
 
 def on_samples(c: Comparison) -> str:

@@ -29,7 +29,7 @@ LAYERS = (
     {"frames", "observability", "robust", "kinds"},
     {"problem", "uncertainty", "mistakes"},
     {"solver"},
-    {"evaluation", "arms", "placing", "triangles", "passage"},
+    {"evaluation", "arms", "placing", "triangles", "passage", "leverage"},
     {"nullspace", "tables"},
     {"explanations"},
     {"folds"},
