@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
+from . import se3
 from .chain import Chain
 from .errors import DhcalError
 from .kinematics import Sweep
@@ -178,6 +179,20 @@ class Targets(PointReading):
             Unknown(f"target_{name}.{axis}", "m", 0.0, ZERO_PRIOR) for name in names[1:] for axis in _AXES
         )
         return cls(plain.q, plain.reading, plain.sigma, plain.rows, plain.stated, unknowns, label, names)
+
+    def started(self, chain: Chain) -> Targets:
+        """Each further target where the chain's tool has it on average.
+
+        From zero the first steps would turn the tool, which only the offsets between the targets see, and
+        the way back bends.
+        """
+        into = se3.inverse(chain.poses(self.q))
+        local = into[:, :3, 3] + (into[:, :3, :3] @ self.reading[..., None])[..., 0]
+        unknowns = []
+        for unknown, (i, axis) in zip(self.unknowns, np.ndindex(len(self.names) - 1, 3), strict=True):
+            mine = local[self.label == i + 1, axis]
+            unknowns.append(replace(unknown, nominal=float(mine.mean()) if len(mine) else float("nan")))
+        return replace(self, unknowns=tuple(unknowns))
 
     def _offsets(self, sweep: Sweep, u: Array) -> Array:
         """Each sample's target relative to the tool point, (3, m) in axes of the measuring frame."""
