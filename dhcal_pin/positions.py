@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -15,6 +15,7 @@ from .kinematics import Sweep
 from .measurements import (
     LENGTH_SIGMA,
     ZERO_PRIOR,
+    Measurement,
     Noise,
     Unknown,
     checked,
@@ -237,6 +238,28 @@ class Targets(PointReading):
         position = pose[:, :3, 3] + np.einsum("mij,mj->mi", pose[:, :3, :3], places)
         position += noise.position * rng.standard_normal(position.shape)
         return cls.of(q, position, [f"t{i + 1}" for i in label], noise.position or None)
+
+
+def check_targets(data: Mapping[str, Measurement], known: Container[str] = ()) -> None:
+    """Complains where files count their targets from different ones.
+
+    Args:
+        data: measurements by file.
+        known: names of unknowns of instruments that were found before.
+
+    Raises:
+        DhcalError: they do not begin with the same one, or with a known further one.
+    """
+    begun = {path: item.names[0] for path, item in data.items() if isinstance(item, Targets)}
+    for path, name in begun.items():
+        other, first = next(iter(begun.items()))
+        if f"target_{name}.x" in known:
+            other, first = "what was found before", "another"
+        if name != first:
+            raise DhcalError(
+                f"{path}: begins with target {name!r}, from which the others are counted, and {other} with "
+                f"{first!r}; begin every file with a row of the same target, or put them into one"
+            )
 
 
 def labelled(words: Sequence[str], count: int, what: str) -> tuple[tuple[str, ...], Array]:
