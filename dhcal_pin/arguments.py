@@ -129,8 +129,9 @@ def parser() -> argparse.ArgumentParser:
     calibrate.add_argument(
         "--loss",
         metavar="LOSS",
-        default="linear",
-        help="linear, huber, cauchy or tukey: what gross errors count",
+        default="auto",
+        help="what gross errors count: auto (default) nothing, linear as all others; huber, cauchy, tukey "
+        "weigh every sample by its size",
     )
     calibrate.add_argument("--priors", metavar="default|none|FILE", help="default for lm, none for gn")
     calibrate.add_argument("--bounds", metavar="FILE.toml", help="least and largest values by parameter name")

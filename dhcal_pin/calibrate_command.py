@@ -23,6 +23,7 @@ from .outputs import STDOUT, check_outputs, check_urdf_ending, emit, names, same
 from .parameters import EXTENSIONS
 from .payload_files import parse_payload
 from .plausibility import doubts, misfits
+from .positions import check_targets
 from .result import Result
 from .robot_files import (
     read_bounds,
@@ -56,8 +57,10 @@ def _read_data(chain: Chain, args: Job, held_file: str | None, known_frames: boo
     holdout: list[tuple[str, Measurement]] = []
     findings: dict[str, list[Finding]] = {}
     doubtful: dict[str, list[str]] = {}
+    every: dict[str, Measurement] = {}
     for path in [*args.data, *([held_file] if held_file else [])]:
         readings = read_readings(path, chain, args.columns)
+        every[path] = readings.data
         doubtful[path] = doubts(chain, readings)
         # A row can only be called impossible where base and tool are known.
         findings[path] = screen(chain, readings) if known_frames else []
@@ -66,6 +69,7 @@ def _read_data(chain: Chain, args: Job, held_file: str | None, known_frames: boo
         else:
             fit.append(_without(readings.fit, findings[path]))
             holdout.append((path, _without(readings.holdout, findings[path])))
+    check_targets(every)
     if args.holdout is not None and not held_file:
         try:
             fraction = float(args.holdout)

@@ -15,6 +15,7 @@ from .chain import BASE, Chain
 from .error_model import ErrorModel
 from .errors import DhcalError
 from .executors import HERE, Workers
+from .leverage import scores
 from .measurements import Measurement
 from .parameters import select
 from .placing import placed, problem_of, refitted
@@ -200,7 +201,7 @@ def calibrate(
     free: Sequence[str] = (),
     holdout: Sequence[Measurement] = (),
     known: Mapping[str, float] | None = None,
-    loss: str = "linear",
+    loss: str = "auto",
     bounds: Mapping[str, tuple[float, float]] | None = None,
     max_iterations: int = 100,
     progress: Progress | None = None,
@@ -220,7 +221,8 @@ def calibrate(
         holdout: measurements to judge by, not fitted.
         known: values in m and rad of instruments' unknowns by name, such as a surveyed anchor
             `wire1.x`; they are held.
-        loss: "linear", or "huber", "cauchy", "tukey", which gross errors bend little or not at all.
+        loss: "auto" lets every sample count alike but gross errors, which count for nothing; "linear" lets
+            them count, "huber", "cauchy" and "tukey" weigh by size. "auto" is "linear" with the paper's loop.
         bounds: least and largest values in m and rad by the names or patterns of the robot's parameters;
             base and tool stay free.
         max_iterations: most steps of a loop.
@@ -241,7 +243,7 @@ def calibrate(
         raise DhcalError(f"method {method!r}: choose from {', '.join(METHODS)}")
     if loss not in robust.LOSSES:
         raise DhcalError(f"loss {loss!r}: choose from {', '.join(robust.LOSSES)}")
-    if loss != "linear" and method != "lm":
+    if loss not in ("auto", "linear") and method != "lm":
         raise DhcalError(f"loss {loss!r} needs method lm; the paper's loop weighs all rows alike")
     if bounds and method != "lm":
         raise DhcalError("bounds need method lm; the paper's loop knows none")
@@ -271,17 +273,24 @@ def calibrate(
         scales = np.ones(sum(len(item.groups) for item in data))
         expected, ended = problem.weights, False
         families = _families(errors, expected, default)
+        (how, *later), moved = robust.LOSSES[loss], np.inf
         for left in reversed(range(MOST_ROUNDS)):
-            before, found = weights, _scatter(problem, solution, data, weights)
+            found = _scatter(problem, solution, data, weights)
             weighed = _scaled(data, found)
-            if loss != "linear":
-                fitted = errors.at(solution.x[: len(errors.parameters)])
-                values = [problem.values(item, solution.x) for item in data]
-                weighed, weights = robust.reweighted(fitted, weighed, values, loss)
-            moved = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(weights, before, strict=True))
+            if how == "all":
+                moved = 0.0
+            else:
+                score = scores(problem, solution, weighed, weights)
+                weights, moved = robust.reweighted(weights, score, how, moved)
+                weighed = tuple(item.weighted(w) for item, w in zip(weighed, weights, strict=True))
             priors_now = _rescaled(problem, solution, families)
             changes = np.log(found / scales), (priors_now - problem.weights) / np.fmax(expected, 1e-300)
             settled = max(moved, *(np.abs(change).max(initial=0.0) for change in changes)) < 0.01
+            if settled and later:
+                if how != "all" or any(map(robust.suspect, scores(problem, solution, weighed, weights))):
+                    (how, *later), moved = later, np.inf
+                    continue
+                later = []
             if settled and ended:
                 break
             ended = settled or left < 2

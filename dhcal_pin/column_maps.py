@@ -11,7 +11,7 @@ Everything in a map but the columns themselves has a default:
 
     [joints]               # the robot's joints from its base to its tip, or those of `names`
     order = ["A1", "A2"]   # their headers or numbers
-    unit = "deg"
+    unit = "deg"           # or one a joint, as ["deg", "mm"]
     sign = [1, -1]         # optional
     offset = [0.0, 90.0]   # optional, in that unit: ours = sign * theirs + offset
 
@@ -216,13 +216,15 @@ def _joints(raw: Any, joints: Sequence[str], quantities: Mapping[str, str], wher
     _check_keys(raw, ("order", "names", "unit", "sign", "offset"), where)
     order = _several(raw.get("order"), None, f"{where} order")
     names = _several(raw.get("names", joints), len(order), f"{where} names")
+    unit = raw.get("unit", "")
+    units = _several(unit if isinstance(unit, list) else [unit] * len(order), len(order), f"{where} unit")
     sign = _several(raw.get("sign", [1] * len(order)), len(order), f"{where} sign")
     offset = _several(raw.get("offset", [0] * len(order)), len(order), f"{where} offset")
     if any(type(value) is bool or value not in (1, -1) for value in sign):
         raise DhcalError(f"{where} sign: {sign}; write 1 or -1 for each joint")
     return [
-        _entry(str(name), {"unit": raw.get("unit", ""), "scale": s, "offset": o}, quantities, source, where)
-        for name, source, s, o in zip(names, order, sign, offset, strict=True)
+        _entry(str(name), {"unit": unit, "scale": s, "offset": o}, quantities, source, where)
+        for name, source, unit, s, o in zip(names, order, units, sign, offset, strict=True)
     ]
 
 

@@ -34,6 +34,7 @@ from .measurements import Noise
 from .outputs import STDOUT, check_outputs, check_urdf_ending, emit, sidecars
 from .parameters import extract
 from .plausibility import doubts
+from .positions import check_targets
 from .robot_files import (
     existing_sidecar,
     is_table,
@@ -59,11 +60,13 @@ def validate(args: Namespace) -> int:
     data = [item.data for item in readings]
     surveyed = read_instrument(sidecar) if sidecar else {}
     there = {unknown.name for item in data for unknown in item.unknowns}
+    check_targets(dict(zip(args.data, data, strict=True)), surveyed)
     known = {name: value for name, value in surveyed.items() if name in there}
     given = accuracy(chain, data, known)
     found: dict[str, Mapping[str, Any]] = {"base and tool as given": given}
     if args.fit_frames:
-        fit = calibration.calibrate(chain, data, "base,tool", known=known)
+        # Whatever is judged counts.
+        fit = calibration.calibrate(chain, data, "base,tool", known=known, loss="linear")
         found["fitted"] = fit.comparisons[-1].after
         document = report.document(fit, {}, report.fingerprints(inputs))
     else:

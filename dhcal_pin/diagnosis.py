@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from . import robust, se3
+from . import se3
 from .chain import Chain
 from .configurations import joint_range
 from .error_model import ErrorModel
@@ -42,7 +42,7 @@ def outliers(fit: Result) -> list[Outlier]:
     found = deviations(fit.chain, fit.data, fit.instruments)
     out = []
     for i, (item, errors) in enumerate(zip(fit.data, found, strict=True)):
-        score = robust.scores(fit.chain, item, fit.problem.values(item, fit.x))
+        score = fit.scores[i]
         for place in np.flatnonzero(np.isin(item.rows, fit.outliers[i])):
             size = {group_of(name): float(np.linalg.norm(error[place])) for name, error in errors.items()}
             out.append(Outlier(i, int(item.rows[place]), size, float(score[place])))
@@ -101,7 +101,7 @@ def joint_traces(fit: Result) -> list[JointTrace]:
     over the range is an error that the joint has and the model lacks. Empty where no reading belongs to
     one configuration.
     """
-    data = [item for item in fit.holdout or fit.data if item.ends == 1]
+    data = [item for item in fit.holdout or fit.counted if item.ends == 1]
     if not data:
         return []
     found = deviations(fit.chain, data, fit.instruments)

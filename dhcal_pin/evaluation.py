@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from . import robust
 from .chain import Chain
 from .error_model import ErrorModel
 from .measurements import Measurement
@@ -119,6 +120,20 @@ def summary(found: Sequence[Mapping[str, Array]]) -> dict[str, Any]:
     return out
 
 
+def without_gross(found: Sequence[Mapping[str, Array]]) -> tuple[list[dict[str, Array]], int]:
+    """Deviations without the samples that stand out of all others, and how many those are.
+
+    Of several groups the first, the position, tells.
+    """
+    clean, gross = [], 0
+    for item in found:
+        first = next(iter(item.values()))
+        good = robust.scored(np.mean(first**2, 1), first.shape[1]) <= robust.OUTLYING
+        gross += int(np.sum(~good))
+        clean.append({name: error[good] for name, error in item.items()})
+    return clean, gross
+
+
 @dataclass(frozen=True)
 class Comparison:
     """Accuracy before and after a calibration on the same samples.
@@ -127,9 +142,15 @@ class Comparison:
         title: "held out", "left out" (each sample of a fit without it) or "fitted".
         samples: how many.
         before, after: as from `accuracy`.
+        aside: gross errors among the samples of a fit that they take no part in; not in the figures.
+        gross: gross errors that are in the figures.
+        without: `after` without those, where there are any.
     """
 
     title: str
     samples: int
     before: Mapping[str, Any]
     after: Mapping[str, Any]
+    aside: int = 0
+    gross: int = 0
+    without: Mapping[str, Any] = field(default_factory=dict)

@@ -38,7 +38,7 @@ class Job:
     free: str = ""
     holdout: str | None = None
     method: Method = "lm"
-    loss: str = "linear"
+    loss: str = "auto"
     priors: str | None = None
     bounds: str | None = None
     instrument: str | None = None

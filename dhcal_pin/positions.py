@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
+from . import se3
 from .chain import Chain
 from .errors import DhcalError
 from .kinematics import Sweep
 from .measurements import (
     LENGTH_SIGMA,
     ZERO_PRIOR,
+    Measurement,
     Noise,
     Unknown,
     checked,
@@ -179,6 +181,20 @@ class Targets(PointReading):
         )
         return cls(plain.q, plain.reading, plain.sigma, plain.rows, plain.stated, unknowns, label, names)
 
+    def started(self, chain: Chain) -> Targets:
+        """Each further target where the chain's tool has it on average.
+
+        From zero the first steps would turn the tool, which only the offsets between the targets see, and
+        the way back bends.
+        """
+        into = se3.inverse(chain.poses(self.q))
+        local = into[:, :3, 3] + (into[:, :3, :3] @ self.reading[..., None])[..., 0]
+        unknowns = []
+        for unknown, (i, axis) in zip(self.unknowns, np.ndindex(len(self.names) - 1, 3), strict=True):
+            mine = local[self.label == i + 1, axis]
+            unknowns.append(replace(unknown, nominal=float(mine.mean()) if len(mine) else float("nan")))
+        return replace(self, unknowns=tuple(unknowns))
+
     def _offsets(self, sweep: Sweep, u: Array) -> Array:
         """Each sample's target relative to the tool point, (3, m) in axes of the measuring frame."""
         local = np.concatenate([np.zeros((1, 3)), u.reshape(-1, 3)])[self.label]
@@ -222,6 +238,28 @@ class Targets(PointReading):
         position = pose[:, :3, 3] + np.einsum("mij,mj->mi", pose[:, :3, :3], places)
         position += noise.position * rng.standard_normal(position.shape)
         return cls.of(q, position, [f"t{i + 1}" for i in label], noise.position or None)
+
+
+def check_targets(data: Mapping[str, Measurement], known: Container[str] = ()) -> None:
+    """Complains where files count their targets from different ones.
+
+    Args:
+        data: measurements by file.
+        known: names of unknowns of instruments that were found before.
+
+    Raises:
+        DhcalError: they do not begin with the same one, or with a known further one.
+    """
+    begun = {path: item.names[0] for path, item in data.items() if isinstance(item, Targets)}
+    for path, name in begun.items():
+        other, first = next(iter(begun.items()))
+        if f"target_{name}.x" in known:
+            other, first = "what was found before", "another"
+        if name != first:
+            raise DhcalError(
+                f"{path}: begins with target {name!r}, from which the others are counted, and {other} with "
+                f"{first!r}; begin every file with a row of the same target, or put them into one"
+            )
 
 
 def labelled(words: Sequence[str], count: int, what: str) -> tuple[tuple[str, ...], Array]:

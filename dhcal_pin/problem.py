@@ -180,29 +180,39 @@ class Tangent:
 
     def triangle(self, chunk: Chunk, small_angle: bool) -> Array:
         """Triangle (p+1, p+1) of a chunk's whitened rows [J | r]; exact or by the paper's rows."""
-        data, errors = chunk.data, len(self.bodies)
-        p = errors + len(self.places)
-        sweep, u = chunk.sweep(self.chain), chunk.unknowns(self.instruments)
+        data, p = chunk.data, len(self.bodies) + len(self.places)
+        k, m = data.size, len(data.rows)
+        tall = k * m >= TALL
         with LongRows():
-            velocities = scratch("velocities", errors, 6, sweep.tool.shape[-1])
-            self.chain.tool_velocities(sweep, self.bodies, self.twists, velocities)
-            k, m = data.size, len(data.rows)
-            tall = k * m >= TALL
             block = scratch("block", k, p + 1, m).swapaxes(0, 1) if tall else scratch("block", p + 1, k, m)
-            if small_angle:
-                block[p] = data.small_angle(sweep, velocities, u, block[:errors])[0]
-            else:
-                block[p] = data.residual(sweep, u)
-                data.whiten(sweep, velocities, u, block[p], block[:errors])
-            block[errors:p] = 0.0
-            for unknown, rows in zip(data.unknowns, data.own(sweep, u), strict=True):
-                if unknown.name in self.places:
-                    block[self.places[unknown.name]] = rows
-            if not data.metric:
-                count_in_arm(block, self.size, self.rates, data.groups.get("position"))
+            self._fill(block, chunk, small_angle)
         if not tall:
             return qr(block.reshape(p + 1, -1))
         return merged([_narrow(rows) for rows in block.swapaxes(0, 1)])
+
+    def rows(self, chunk: Chunk) -> Array:
+        """A chunk's whitened rows [J | r] (p+1, k, m)."""
+        out = np.empty((len(self.bodies) + len(self.places) + 1, chunk.data.size, len(chunk.data.rows)))
+        with LongRows():
+            self._fill(out, chunk, False)
+        return out
+
+    def _fill(self, block: Array, chunk: Chunk, small_angle: bool) -> None:
+        data, errors, p = chunk.data, len(self.bodies), len(block) - 1
+        sweep, u = chunk.sweep(self.chain), chunk.unknowns(self.instruments)
+        velocities = scratch("velocities", errors, 6, sweep.tool.shape[-1])
+        self.chain.tool_velocities(sweep, self.bodies, self.twists, velocities)
+        if small_angle:
+            block[p] = data.small_angle(sweep, velocities, u, block[:errors])[0]
+        else:
+            block[p] = data.residual(sweep, u)
+            data.whiten(sweep, velocities, u, block[p], block[:errors])
+        block[errors:p] = 0.0
+        for unknown, rows in zip(data.unknowns, data.own(sweep, u), strict=True):
+            if unknown.name in self.places:
+                block[self.places[unknown.name]] = rows
+        if not data.metric:
+            count_in_arm(block, self.size, self.rates, data.groups.get("position"))
 
 
 def _narrow(rows: Array) -> Array:

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from . import explanations, observability, robust, se3, tables
-from .chain import BASE, Chain
+from . import explanations, leverage, observability, robust, tables
+from .chain import Chain
 from .error_model import ErrorModel, Parameter
 from .errors import DhcalError
-from .evaluation import Comparison, accuracy, summary
+from .evaluation import Comparison, accuracy, deviations, summary, without_gross
 from .folds import left_out, random_folds
 from .measurements import Measurement, Unknown
 from .placing import refitted
@@ -77,7 +77,17 @@ class Result:
         """
         if not self.kept:
             return self.chain
-        return refitted(self.errors, self.data, self.problem.known)
+        return refitted(self.errors, tuple(self.counted), self.problem.known)
+
+    @property
+    def counted(self) -> list[Measurement]:
+        """The fitted measurements without samples that count for nothing."""
+        return self._counted(self.data)
+
+    def _counted(self, data: Sequence[Measurement]) -> list[Measurement]:
+        """Those samples of the fitted measurements that count in the fit."""
+        found = [item.take(w > robust.NOTHING) for item, w in zip(data, self.weights, strict=True)]
+        return [item for item in found if len(item.rows)]
 
     @property
     def converged(self) -> bool:
@@ -243,16 +253,16 @@ class Result:
         return self.problem.instruments(self.x)
 
     @cached_property
-    def outliers(self) -> tuple[Array, ...]:
-        """Row numbers of gross errors in each fitted measurement.
+    def scores(self) -> tuple[Array, ...]:
+        """How far each fitted sample (m,) lies from its kind's scatter; see `robust.scores`."""
+        data = [item.weighted(1 / w) for item, w in zip(self.problem.data, self.weights, strict=True)]
+        return tuple(leverage.scores(self.problem, self.solution, data, self.weights))
 
-        None where few samples stand against many unknowns, as then the scatter tells nothing.
-        """
+    @cached_property
+    def outliers(self) -> tuple[Array, ...]:
+        """Row numbers of gross errors in each fitted measurement."""
         return tuple(
-            robust.outliers(self.chain, item, self.problem.values(item, self.x))
-            if len(item.rows) > 2 * len(self.parameters)
-            else np.empty(0, int)
-            for item in self.data
+            item.rows[score > robust.OUTLYING] for item, score in zip(self.data, self.scores, strict=True)
         )
 
     @property
@@ -266,27 +276,29 @@ class Result:
         """Accuracy before and after: on what was not fitted first, then on the fitted.
 
         Where nothing was held out, every sample is judged by a fit without it and others, in ten folds.
+        Gross errors that take no part in the fit are in neither; among what was held out they are.
         """
-        found = tuple(
-            Comparison(
-                title,
-                sum(len(item.rows) for item in data),
-                accuracy(self.reference, data),
-                accuracy(self.chain, data, self.instruments),
-            )
-            for title, data in (("held out", self.holdout), ("fitted", self.data))
-            if data
-        )
-        count = sum(len(item.rows) for item in self.data)
-        if self.holdout or count < 2:
+        kept = self.counted
+        count = sum(len(item.rows) for item in kept)
+        aside = self.samples - count
+        before = accuracy(self.reference, kept)
+        found = (Comparison("fitted", count, before, accuracy(self.chain, kept, self.instruments), aside),)
+        if self.holdout:
+            errors = deviations(self.chain, self.holdout, self.instruments)
+            before, (clean, gross) = accuracy(self.reference, self.holdout), without_gross(errors)
+            held = sum(len(item.rows) for item in self.holdout)
+            without = summary(clean) if gross else {}
+            return (Comparison("held out", held, before, summary(errors), 0, gross, without), *found)
+        if count < 2:
             return found
-        folds = random_folds(self.data, min(FOLDS, count))
+        folds = random_folds(kept, min(FOLDS, count))
+        problem = self.problem.of(self._counted(self.problem.data))
         judged = [
             item
-            for fold, _ in left_out(self.problem, self.solution.x, self.data, folds, self.again, self.kept)
+            for fold, _ in left_out(problem, self.solution.x, kept, folds, self.again, self.kept)
             for item in fold
         ]
-        return (Comparison("left out", count, found[-1].before, summary(judged)), *found)
+        return (Comparison("left out", count, before, summary(judged), aside), *found)
 
     def again(self, problem: Problem) -> Array:
         """Where a fit of some of the samples ends (p,); the same loop stopped as early if this one was.
@@ -305,24 +317,10 @@ class Result:
 
         Base and tool are given by component of their place, the others as nominal plus error.
         """
-        frames = {BASE: self.chain.base}
-        frames[self.chain.tool_station] = self.chain.tool
-        sixes = {at: np.append(pose[:3, 3], se3.log3(pose[:3, :3])) for at, pose in frames.items()}
         with np.errstate(divide="ignore"):
             priors = 1 / self.problem.weights
-        figures = np.stack([self.std, priors, self.seen, self.remaining], 1).tolist()
-        rows = [(p, x, row, False) for p, x, row in zip(self.parameters, self.x, figures, strict=True)]
-        rows += [(p, 0.0, [0.0] * 4, True) for p in self.errors.fixed]
-        out = []
-        for p, x, (std, prior, seen, left), held in rows:
-            nominal, value, place = p.nominal, p.nominal + float(x), "instrument"
-            if isinstance(p, Parameter):
-                place = "frame" if p.station in frames else "robot"
-            if isinstance(p, Parameter) and place == "frame":
-                value = float(sixes[p.station] @ np.array(p.twist))
-                nominal = value if held else nominal
-            out.append(Estimate(p.name, p.unit, nominal, value, std, prior, seen, left, held, place))
-        return tuple(out)
+        figures = np.stack([self.x, self.std, priors, self.seen, self.remaining], 1)
+        return tables.estimates(self.chain, self.parameters, figures, self.errors.fixed)
 
     def __repr__(self) -> str:
         return f"<Result: {tables.headline(self.comparisons).text}>"

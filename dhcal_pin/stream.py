@@ -201,6 +201,7 @@ def calibrate_stream(
         fix=fix,
         free=free,
         known=known,
+        loss="linear",
         max_iterations=max_iterations,
     )
     problem = Stream(fit.errors, (head,), fit.problem.weights, known, where, None, parts, _scales(fit, head))

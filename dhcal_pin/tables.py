@@ -7,7 +7,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
+from . import se3
+from .chain import BASE, Chain
+from .error_model import Parameter
 from .evaluation import ENDINGS, Comparison
+from .measurements import Unknown
+from .se3 import Array
 
 # Factor and name of a unit for reading: of a value, and of a change or an uncertainty.
 RATES = {"rad/Nm": (1e6, " µrad/Nm"), "rad/rad": (1e3, " mrad/rad"), "rad/m": (1e3, " mrad/m")}
@@ -17,6 +24,8 @@ SMALL = {"m": (1e3, " mm"), "rad": (1e3, " mrad"), **RATES}
 PLAIN, MOST = 3, 6
 # Fewer samples than this do not tell an accuracy; a longer text than this may be broken into lines.
 FEW, LONG = 10, 48
+# Gross errors among what was held out are worth a word where the RMS is this share of itself without them.
+TELLING = 0.9
 # Groups of accuracy in words.
 WORDS = {"position": "position error", "orientation": "orientation error", "residual": "residual"}
 # Measures of accuracy in words.
@@ -110,7 +119,34 @@ class Estimate:
         return "not seen" if math.isinf(self.std) else shown(self.std, self.unit, self.std, small=True)
 
 
-def estimate_table(estimates: Sequence[Estimate]) -> Table:
+def estimates(
+    chain: Chain, unknowns: Sequence[Parameter | Unknown], figures: Array, fixed: Sequence[Parameter]
+) -> tuple[Estimate, ...]:
+    """What was found of each unknown, then the parameters that were held.
+
+    Args:
+        chain: calibrated; base and tool are given by component of their place, others as nominal plus error.
+        unknowns: of the robot and the instruments, p of them.
+        figures: (p, 5) found error, standard deviation, prior, observability and share remaining of each.
+        fixed: parameters that were held.
+    """
+    frames = {BASE: chain.base, chain.tool_station: chain.tool}
+    sixes = {at: np.append(pose[:3, 3], se3.log3(pose[:3, :3])) for at, pose in frames.items()}
+    rows = [(p, row, False) for p, row in zip(unknowns, figures.tolist(), strict=True)]
+    rows += [(p, [0.0] * 5, True) for p in fixed]
+    out = []
+    for p, (x, std, prior, seen, left), held in rows:
+        nominal, value, place = p.nominal, p.nominal + x, "instrument"
+        if isinstance(p, Parameter):
+            place = "frame" if p.station in frames else "robot"
+        if isinstance(p, Parameter) and place == "frame":
+            value = float(sixes[p.station] @ np.array(p.twist))
+            nominal = value if held else nominal
+        out.append(Estimate(p.name, p.unit, nominal, value, std, prior, seen, left, held, place))
+    return tuple(out)
+
+
+def estimate_table(found: Sequence[Estimate]) -> Table:
     """Nominal and calibrated values, angles in degrees, changes and deviations in mrad."""
     rows = [
         [
@@ -120,7 +156,7 @@ def estimate_table(estimates: Sequence[Estimate]) -> Table:
             shown(e.change, e.unit, e.std, small=True),
             e.certainty,
         ]
-        for e in estimates
+        for e in found
     ]
     return Table(["parameter", "nominal", "calibrated", "change", "std"], rows)
 
@@ -174,10 +210,18 @@ def headline(comparisons: Sequence[Comparison]) -> Headline:
     unit = end.strip("_") or "m"
     key, spread = f"{group}_rms{end}", f"{group}_rms_std{end}"
     before, after = (shown(side[key], unit, side[spread], True) for side in (best.before, best.after))
-    what = f"RMS {WORDS[group]} {on_samples(best)}: {before} before, {after} after."
+    what = f"RMS {WORDS[group]} {on_samples(best)}: {before} before, {after} after"
+    if best.without and best.without[key] < TELLING * best.after[key]:
+        clean = shown(best.without[key], unit, best.without[spread], True)
+        what += f", {clean} without {_gross(best.gross)} among them"
+    what += f". {_gross(best.aside).capitalize()} left aside." if best.aside else "."
     text = f"{what} {few(best)}".strip() if best.title != "fitted" else f"Nothing was held out. {what}"
     drop = 100 * (1 - best.after[key] / best.before[key]) if best.before[key] else 0.0
     return Headline(text, before, after, drop, group, best)
+
+
+def _gross(count: int) -> str:
+    return f"{count} gross errors" if count > 1 else "one gross error"
 
 
 def on_samples(c: Comparison) -> str:

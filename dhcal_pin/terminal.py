@@ -86,9 +86,15 @@ def doubts(path: str, texts: Sequence[str]) -> None:
 def gross(path: str, rows: Sequence[int], loss: str) -> None:
     """Gross errors, on one line."""
     if rows:
-        shown = ", ".join(map(str, rows[:12])) + (f" and {len(rows) - 12} more" if len(rows) > 12 else "")
-        hint = "; --loss tukey would take their say" if loss == "linear" else ""
-        lines(f"{path}: {len(rows)} gross errors, row {shown}{hint}", style="yellow")
+        listed = ", ".join(map(str, rows[:12])) + (f" and {len(rows) - 12} more" if len(rows) > 12 else "")
+        what = f"{len(rows)} gross errors, rows {listed}" if len(rows) > 1 else f"a gross error, row {listed}"
+        take = "takes" if len(rows) == 1 else "take"
+        hint = (
+            f"{take} part in the fit; --loss auto leaves such out"
+            if loss == "linear"
+            else f"{take} no part in the fit"
+        )
+        lines(f"{path}: {what}: {hint}", style="yellow")
 
 
 def notes(texts: Sequence[str]) -> None:

@@ -293,9 +293,9 @@ ARGUMENTS = {
         ["simulate", "arm.urdf", "-m", "5", "--noise", "0.1", "-o", "s.csv"],
         ["'0.1'", "0.1mm"],
     ),
-    "noise of inches": (
-        ["simulate", "arm.urdf", "-m", "5", "--noise", "1in", "-o", "s.csv"],
-        ["'1in'", "0.1mm"],
+    "noise of feet": (
+        ["simulate", "arm.urdf", "-m", "5", "--noise", "1ft", "-o", "s.csv"],
+        ["'1ft'", "0.1mm"],
     ),
     "noise below zero": (["simulate", "arm.urdf", "-m", "5", "--noise=-1mm", "-o", "s.csv"], ["'-1mm'", "0"]),
     "simulate over the robot": (

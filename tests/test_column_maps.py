@@ -72,6 +72,15 @@ def test_signs_offsets_scales_and_other_names(read):
     np.testing.assert_allclose(data.positions()[:, 0], [-2.0, -2.02], rtol=1e-14)
 
 
+def test_units_joint_by_joint_and_inches(read):
+    how = MAP.replace('unit = "deg"', 'unit = ["deg", "rad", "mrad"]').replace(
+        'from = "X pos", unit = "mm"', 'from = "X pos", unit = "in"'
+    )
+    data = read(how=how).data
+    np.testing.assert_allclose(data.q, [[np.deg2rad(10), -20, 0.030], [np.deg2rad(11), -21, 0.031]])
+    np.testing.assert_allclose(data.reading[:, 0], [100.25 * 0.0254, 101.25 * 0.0254], rtol=1e-15)
+
+
 @pytest.mark.parametrize(("separator", "sign"), [(",", ","), ("tab", "\t"), ("space", "   "), (";", ";")])
 def test_separators_comments_and_no_header(read, separator, sign):
     rows = [["10", "20", "30", "socket-1"], ["11", "21", "31", "socket-2"]]
@@ -221,6 +230,8 @@ ROTATION = '[rotation]\nconvention = "euler"\naxes = "XYZ"\nframe = "intrinsic"\
         (swap('unit = "deg"', ""), ["[joints]: joint_1: unit ''", '"deg"']),
         (swap('"A1", "A2", "A3"', '"A1", "A2"'), ["names: 3 entries for 2 columns"]),
         (swap('unit = "deg"', 'unit = "deg"\nsign = [1, 2, 1]'), ["sign", "1 or -1"]),
+        (swap('unit = "deg"', 'unit = ["deg", "mm"]'), ["unit", "2 entries for 3"]),
+        (swap('unit = "deg"', 'unit = ["deg", "deg", "mm"]'), ["joint_3", "'mm'", '"deg"']),
         (swap('unit = "deg"', 'unit = "deg"\noffset = ["a", 0, 0]'), ["'a' is no number"]),
         (swap('"A1"', '"A9"'), ["theirs.csv:3", "no column 'A9'", "map.toml", "'A1'", "separator ';'"]),
         (swap('"A1"', "99"), ["no column 99"]),

@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 from conftest import URDF
 
+from dhcal_pin import se3
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.cli import main
 from dhcal_pin.errors import DhcalError
 from dhcal_pin.lengths import Wires
 from dhcal_pin.measurement_files import measurement_text
+from dhcal_pin.measurements import Noise
+from dhcal_pin.positions import Targets
 from dhcal_pin.robot_files import read_instrument
 
 
@@ -101,3 +104,41 @@ def test_wrong_values_are_one_line(text, tmp_path):
     path.write_text(text)
     with pytest.raises(DhcalError, match=r"rig\.toml: "):
         read_instrument(path)
+
+
+def test_targets_a_foot_apart_on_the_far_side_of_the_shop_converge(sim_6dof, sim_6dof_actual):
+    """Only the offsets between the targets see how the tool is turned, so a way there bends."""
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        q, label = rng.uniform(-3, 3, (40, 6)), np.arange(40) % 3
+        places = rng.normal(0, 0.2, (3, 3))
+        base = se3.transform(se3.exp3(rng.normal(0, 1, 3)), rng.normal(0, 3, 3))
+        pose = base @ sim_6dof_actual.poses(q)
+        seen = pose[:, :3, 3] + np.einsum("mij,mj->mi", pose[:, :3, :3], places[label])
+        data = Targets.of(q, seen + rng.normal(0, 1e-4, seen.shape), [f"t{i}" for i in label])
+        fit = calibrate(sim_6dof, data, "minimal,base,tool")
+        assert fit.converged
+        assert fit.iterations < 30
+        # How far the targets are from each other is no matter of where the tool's axes are.
+        found = np.reshape([*fit.instruments.values()], (2, 3))
+        expected = np.linalg.norm(places[1:] - places[0], axis=1)
+        np.testing.assert_allclose(np.linalg.norm(found, axis=1), expected, atol=1e-3)
+
+
+def test_files_that_count_their_targets_differently_are_refused(sim_6dof, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    data = Targets.simulate(
+        sim_6dof, np.random.default_rng(0).uniform(-3, 3, (30, 6)), Noise(1e-4), np.random.default_rng(1)
+    )
+    Path("arm.urdf").write_bytes((URDF / "sim_6dof.urdf").read_bytes())
+    Path("a.csv").write_text(measurement_text(data, sim_6dof))
+    Path("b.csv").write_text(measurement_text(data.take(np.arange(1, 30)), sim_6dof))
+    Path("c.csv").write_text(measurement_text(data.take(np.arange(0, 30, 3)), sim_6dof))
+    for held in ([], ["--holdout", "b.csv"]):
+        second = [] if held else ["b.csv"]
+        assert main(["calibrate", "arm.urdf", "a.csv", *second, *held, "-o", "out.urdf"]) == 2
+        assert "b.csv: begins with target 't2'," in capsys.readouterr().err
+        assert not Path("out.urdf").exists()
+    assert main(["calibrate", "arm.urdf", "a.csv", "c.csv", "-o", "out.urdf"]) == 0
+    assert main(["validate", "out.urdf", "b.csv"]) == 2
+    assert "b.csv: begins with target 't2'," in capsys.readouterr().err

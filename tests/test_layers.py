@@ -30,7 +30,7 @@ LAYERS = (
     {"problem", "uncertainty", "mistakes"},
     {"solver"},
     {"restraint"},
-    {"evaluation", "arms", "placing", "triangles", "passage"},
+    {"evaluation", "arms", "placing", "triangles", "passage", "leverage"},
     {"nullspace", "tables"},
     {"explanations"},
     {"folds"},

@@ -1,0 +1,66 @@
+"""How far each sample draws the fit to itself: few readings leave less of an error than it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+
+from . import observability, robust
+from .measurements import Measurement
+from .problem import Chunk, Problem, Tangent
+from .se3 import Array
+from .solver import Solution, posterior_root
+
+# Where a row takes so small a share of the directions seen, what it draws to itself does not matter.
+SMALL = 0.01
+
+
+def scores(
+    problem: Problem, solution: Solution, data: Sequence[Measurement], weights: Sequence[Array]
+) -> list[Array]:
+    """How far each sample (m,) of each item lies from its kind's scatter; see `robust.scores`.
+
+    Zero where no reading is left over: then the scatter tells nothing.
+
+    Args:
+        problem: as it was fitted.
+        solution: where that ended.
+        data: the fitted measurements with the sigmas of good samples.
+        weights: (m,) of each item's samples in the fit.
+    """
+    rows = sum(np.count_nonzero(w > 0.5) * item.size for item, w in zip(data, weights, strict=True))
+    seen = observability.rank(solution.triangle.r)
+    if rows <= seen:
+        return [np.zeros(len(item.rows)) for item in data]
+    chain = problem.errors.at(solution.x[: len(problem.errors.parameters)])
+    spread = spreads(problem, solution, weights) if seen >= SMALL * rows else [None] * len(data)
+    return [
+        robust.scores(chain, item, problem.values(item, solution.x), each) if len(item.rows) else np.empty(0)
+        for item, each in zip(data, spread, strict=True)
+    ]
+
+
+def spreads(problem: Problem, solution: Solution, weights: Sequence[Array]) -> list[Array]:
+    """Covariances (m, k, k) of each item's whitened residuals in a fit of good readings.
+
+    A sample that takes part lies nearer to the fit than its sigma, by what it draws the fit to itself; one
+    that counts for nothing lies farther, by how little the others know there.
+    """
+    root = posterior_root(solution.triangle, problem.weights)[0]
+    found = problem.each(partial(_drawn, problem.tangent(solution.x), root))
+    out = []
+    for item, weight in zip(problem.data, weights, strict=True):
+        parts = [np.empty((0, item.size, item.size))]
+        while sum(map(len, parts)) < len(item.rows):
+            parts.append(next(found))
+        w = weight[:, None, None]
+        out.append(np.eye(item.size) + (1 - 2 * w) * np.concatenate(parts) / w)
+    return out
+
+
+def _drawn(tangent: Tangent, root: Array, chunk: Chunk) -> Array:
+    """What is not known of a chunk's whitened readings: covariances (m, k, k)."""
+    known = np.tensordot(root, tangent.rows(chunk)[:-1], (0, 0))
+    return np.einsum("rim,rjm->mij", known, known)
