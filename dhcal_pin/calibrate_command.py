@@ -139,7 +139,7 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     chain = read_robot(args.robot, args.tip)
     if args.payload:
         chain = chain.carrying(parse_payload(args.payload))
-    sets = args.parameters or chain.parameters
+    sets = chain.parameters if args.parameters is None else args.parameters
     data = _read_data(chain, args, held_file, known_frames=not {"base", "tool"} & set(names(sets)))
     fit, trials = extension.extend(
         chain,

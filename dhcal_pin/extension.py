@@ -232,7 +232,7 @@ def extend(
         raise DhcalError(
             "an extension is chosen by method lm with priors: leave out --method gn, --priors none"
         )
-    parameters = parameters or chain.parameters
+    parameters = chain.parameters if parameters is None else parameters
     fit = calibration.calibrate(chain, data, parameters, **options)
     trials = select_families(fit, families, options.get("progress"))
     widths = {trial.family: trial.prior_width for trial in trials if trial.kept}

@@ -8,6 +8,7 @@ import math
 import os
 import re
 import shutil
+import stat
 import tempfile
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
@@ -48,6 +49,8 @@ def check_place(path: PathLike) -> None:
 def save(contents: Mapping[PathLike, str | bytes]) -> None:
     """Writes all files or none: each beside its place first, then renamed over.
 
+    A link stays a link and what it leads to is written; a file that was there keeps its permissions.
+
     Raises:
         DhcalError: a folder is missing or not writable, a disk is full.
     """
@@ -57,13 +60,12 @@ def save(contents: Mapping[PathLike, str | bytes]) -> None:
     try:
         for path, content in contents.items():
             check_place(path)
-            handle, name = tempfile.mkstemp(prefix=".dhcal-", dir=os.path.dirname(os.path.abspath(path)))
-            staged.append((name, path))
+            real = os.path.realpath(path)
+            handle, name = tempfile.mkstemp(prefix=".dhcal-", dir=os.path.dirname(real))
+            staged.append((name, real))
             with os.fdopen(handle, "wb") as file:
                 file.write(content.encode() if isinstance(content, str) else content)
-            mask = os.umask(0)
-            os.umask(mask)
-            os.chmod(name, 0o666 & ~mask)
+            os.chmod(name, _permissions(real))
         for name, path in staged:
             _keep(path, _spare(name))
             os.replace(name, path)
@@ -82,6 +84,16 @@ def save(contents: Mapping[PathLike, str | bytes]) -> None:
             for rest in (name, _spare(name)):
                 with suppress(FileNotFoundError):
                     os.unlink(rest)
+
+
+def _permissions(path: str) -> int:
+    """Those of the file at a path, or those that a new one gets."""
+    try:
+        return stat.S_IMODE(os.stat(path).st_mode)
+    except FileNotFoundError:
+        mask = os.umask(0)
+        os.umask(mask)
+        return 0o666 & ~mask
 
 
 def _spare(name: str) -> str:

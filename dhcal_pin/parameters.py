@@ -249,12 +249,14 @@ def select(
         free: parameters of any set added one by one.
 
     Raises:
-        DhcalError: an unknown set or parameter, or nothing left to identify.
+        DhcalError: an unknown set or parameter, one both fixed and freed, or nothing left to identify.
     """
     names = [s.strip() for s in sets.split(",")] if isinstance(sets, str) else list(sets)
     unknown = [name for name in names if name not in SETS]
     if unknown:
         raise DhcalError(f"unknown parameter set {unknown[0]!r}; choose from {', '.join(SETS)}")
+    if both := sorted({*fix} & {*free}):
+        raise DhcalError(f"{both[0]!r} is both fixed and freed; leave out one of the two")
     found = {name: SETS[name](chain) for name in names}
     if empty := [name for name, parameters in found.items() if not parameters]:
         raise DhcalError(
@@ -270,6 +272,8 @@ def select(
     if missing := [name for name in free if name not in pool]:
         every = {p.name: p for build in SETS.values() for p in build(chain)}
         for name in missing:
+            if name in SETS:
+                raise DhcalError(f"cannot free {name!r}: it is a whole set; add it to the parameters")
             if name not in every:
                 raise DhcalError(f"cannot free {name!r}: there are {', '.join(every)}")
             pool[name] = every[name]

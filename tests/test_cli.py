@@ -238,6 +238,8 @@ ARGUMENTS = {
     ),
     "tip of a table": ([*CALIBRATE, "--tip", "tool0"], ["arm.dh.toml", "leave out --tip"]),
     "unknown set": ([*CALIBRATE, "--parameters", "dh,gains"], ["'gains'", "dh, modified-dh"]),
+    "empty set": ([*CALIBRATE, "--parameters", ""], ["''", "dh, modified-dh"]),
+    "fixed and freed": ([*CALIBRATE, "--fix", "tool.x", "--free", "tool.x"], ["'tool.x'", "leave out"]),
     "unknown to fix": ([*CALIBRATE, "--fix", "d9"], ["cannot fix 'd9'", "d1"]),
     "unknown to free": ([*CALIBRATE, "--free", "d9"], ["cannot free 'd9'", "d1"]),
     "all fixed": ([*CALIBRATE, "--fix", "dh"], ["fix fewer"]),

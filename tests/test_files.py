@@ -424,6 +424,19 @@ def test_a_written_file_has_the_usual_rights(tmp_path):
     assert (tmp_path / "a").stat().st_mode == (tmp_path / "usual").stat().st_mode
 
 
+def test_what_a_link_leads_to_is_written_and_keeps_its_rights(tmp_path):
+    """So a robot behind a link is calibrated in place where it is, and no more people may read it."""
+    (tmp_path / "far").mkdir()
+    real, link = write(tmp_path / "far", "real", "old"), tmp_path / "link"
+    real.chmod(0o600)
+    link.symlink_to(real)
+    save({link: "new"})
+    assert link.is_symlink()
+    assert real.read_text() == "new"
+    assert real.stat().st_mode & 0o777 == 0o600
+    assert sorted(os.listdir(tmp_path / "far")) == ["real"]
+
+
 @pytest.mark.parametrize(
     ("bad", "words"), [("none/b", "make it first"), ("folder", "name a file in it"), ("a/b", "make it first")]
 )
@@ -449,7 +462,7 @@ def test_a_failing_rename_brings_back_what_was_there(tmp_path, monkeypatch, erro
     monkeypatch.setattr(os, "replace", failing)
     with pytest.raises(DhcalError if isinstance(error, OSError) else KeyboardInterrupt):
         save({tmp_path / "a": "new", tmp_path / "b": "new", tmp_path / "c": "new"})
-    assert places[:3] == [tmp_path / "a", tmp_path / "b", tmp_path / "c"]
+    assert places[:3] == [str((tmp_path / name).resolve()) for name in "abc"]
     assert os.listdir(tmp_path) == ["a"]
     assert (tmp_path / "a").read_text() == "old"
 
