@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from . import calibration, exports, extension, fleet_command, report, terminal
+from .alternative import missed, narrow
 from .chain import Chain
 from .errors import DhcalError
 from .executors import HERE, Workers, workers
@@ -141,23 +142,28 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
         chain = chain.carrying(parse_payload(args.payload))
     sets = chain.parameters if args.parameters is None else args.parameters
     data = _read_data(chain, args, held_file, known_frames=not {"base", "tool"} & set(names(sets)))
+    options: dict[str, Any] = {
+        "priors": read_priors(args.priors),
+        "holdout": [item for _, item in data.holdout],
+        "known": read_instrument(args.instrument) if args.instrument else None,
+        "loss": args.loss,
+        "max_iterations": args.max_iterations,
+        "progress": progress,
+        "where": where,
+    }
+    held = {"bounds": read_bounds(args.bounds), "fix": names(args.fix), "free": names(args.free)}
     fit, trials = extension.extend(
         chain,
         list(data.fit.values()),
         sets,
         _families(args.extend),
         method=args.method,
-        priors=read_priors(args.priors),
-        bounds=read_bounds(args.bounds),
-        fix=names(args.fix),
-        free=names(args.free),
-        holdout=[item for _, item in data.holdout],
-        known=read_instrument(args.instrument) if args.instrument else None,
-        loss=args.loss,
-        max_iterations=args.max_iterations,
-        progress=progress,
-        where=where,
+        **held,
+        **options,
     )
+    # Who holds something, or asks for the paper's loop, knows what is unknown.
+    if args.method == "lm" and not any(held.values()) and narrow(names(sets)):
+        data.doubts[args.robot] = [*filter(None, [missed(fit, chain, list(data.fit.values()), **options)])]
     for path, texts in misfits(fit.chain, data.fit, fit.instruments).items():
         # What a file's columns tell already is not told again.
         data.doubts[path] += texts if not data.doubts[path] else []
@@ -271,11 +277,12 @@ def calibrate(args: Namespace) -> int:
         outcome = run_job(Job.of(args), progress, where)
     if args.json == STDOUT:
         emit(args.json, outcome.document)
+    terminal.trials(outcome.trials)
+    terminal.summary(outcome.fit, outcome.files)
     for path, found in outcome.findings.items():
         terminal.findings(path, found)
         terminal.gross(path, outcome.gross.get(path, []), args.loss)
     for path, texts in outcome.doubts.items():
         terminal.doubts(path, texts)
-    terminal.trials(outcome.trials)
-    terminal.summary(outcome.fit, outcome.files)
+    terminal.verdict(outcome.fit)
     return 0

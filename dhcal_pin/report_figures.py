@@ -42,7 +42,7 @@ def _bins(before: Array, after: Array, title: str, count: int) -> tuple[Axis, Ar
 def histograms(study: Study) -> list[str]:
     """Sizes of errors before and after, a panel a group, held out first."""
     fit, out = study.fit, []
-    for title, data in (("held out", fit.holdout), ("fitted", fit.data)):
+    for title, data in (("held out", fit.holdout), ("fitted", fit.counted)):
         if not data:
             continue
         before = sizes(deviations(fit.reference, data))

@@ -119,7 +119,7 @@ def agreement(robot: str, rows: Sequence[Agreement]) -> None:
 
 
 def summary(fit: Result, files: Mapping[str, str]) -> None:
-    """Parameters, accuracy, what could not be seen, and the headline last, where the eye is."""
+    """Parameters, accuracy, what could not be seen, and where it all is."""
     table("parameters", estimate_table(fit.estimates))
     table("accuracy", accuracy_table(fit.comparisons))
     state = "converged" if fit.converged else "NOT converged"
@@ -136,6 +136,10 @@ def summary(fit: Result, files: Mapping[str, str]) -> None:
         lines(f"weakly seen: {text}", style="yellow")
     for name, path in files.items():
         lines(f"wrote {name}: {path}")
+
+
+def verdict(fit: Result) -> None:
+    """The headline: last, where the eye is."""
     lines("", headline(fit.comparisons).text, style="bold")
 
 

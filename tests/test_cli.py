@@ -15,11 +15,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dhcal_pin import check, cli, commands, demo, extension, terminal
 from dhcal_pin.chain import Chain
 from dhcal_pin.dh_files import read_dh
-from dhcal_pin.measurement_files import read_readings
+from dhcal_pin.measurement_files import measurement_text, read_readings
+from dhcal_pin.positions import Position
 from dhcal_pin.robot_files import read_robot
 from dhcal_pin.urdf import read_urdf
 
@@ -903,3 +905,47 @@ def test_the_installed_command(place):
     assert (bad.returncode, bad.stdout) == (2, "")
     assert bad.stderr.count("\n") == 1
     assert "no.csv" in bad.stderr
+
+
+def test_unknowns_that_cannot_take_up_what_was_measured_are_told(run, tmp_path, monkeypatch):
+    """Parallel axes 2 and 3, tilted by a milliradian: modified DH needs metres of offset for that."""
+    monkeypatch.chdir(tmp_path)
+    rows = [
+        (0, 675, 0, 180),
+        (0, 0, 350, 90),
+        (-90, 0, 1150, 0),
+        (0, -1000, -41, 90),
+        (0, 0, 0, -90),
+        (0, -240, 0, 90),
+    ]
+    keys = ("theta", "d", "a", "alpha")
+    joints = [
+        f'[[joint]]\nname = "A{i}"\ntype = "revolute"\n'
+        + "".join(f"{k} = {v}.0\n" for k, v in zip(keys, row, strict=True))
+        for i, row in enumerate(rows, 1)
+    ]
+    Path("arm.dh.toml").write_text(
+        'convention = "modified"\n[units]\nlength = "mm"\nangle = "deg"\n' + "".join(joints)
+    )
+    rng = np.random.default_rng(0)
+    arm = Chain.from_dh(read_dh("arm.dh.toml"))
+    q = rng.uniform(-2, 2, (40, 6))
+    pose = np.tile(np.eye(4), (40, 1, 1))
+    for i, (theta, d, a, alpha) in enumerate(rows):
+        tilt = Rotation.from_rotvec([0, 2e-3, 0] if i == 2 else [0, 0, 0]).as_matrix()
+        fixed = Rotation.from_euler("x", alpha, degrees=True).as_matrix()
+        spun = Rotation.from_rotvec((q[:, i, None] + np.deg2rad(theta)) * [0, 0, 1]).as_matrix()
+        step = np.tile(np.eye(4), (40, 1, 1))
+        step[:, :3, :3] = fixed @ tilt @ spun
+        step[:, :3, 3] = [a * 1e-3, 0, 0] + step[:, :3, 2] * d * 1e-3
+        pose = pose @ step
+    point = pose[:, :3, 3] + 0.1 * pose[:, :3, 0] + [3, 1, 0] + rng.normal(0, 1e-4, (40, 3))
+    Path("data.csv").write_text(measurement_text(Position.of(q, point), arm))
+    for sets, told in (
+        ("modified-dh,base,tool", True),
+        ("minimal,base,tool", False),
+        ("base,tool", False),
+    ):
+        status, _, err = run("calibrate", "arm.dh.toml", "data.csv", "--parameters", sets, "-o", "out.urdf")
+        assert status == 0
+        assert ("arm.dh.toml: check: --parameters minimal,base,tool would leave" in err) == told

@@ -36,7 +36,7 @@ LAYERS = (
     {"folds"},
     {"batch", "result"},
     {"calibration", "compensation", "crossvalidation"},
-    {"extension", "figures"},
+    {"extension", "figures", "alternative"},
     {"check", "information", "workspace", "study_plot"},
     {"refinement"},
     {"planning"},

@@ -14,7 +14,11 @@ from dhcal_pin.measurements import Noise
 from dhcal_pin.poses import Pose
 from dhcal_pin.positions import Position
 from dhcal_pin.problem import reduce
+from dhcal_pin.report import Provenance
+from dhcal_pin.report_figures import histograms
+from dhcal_pin.report_sections import study
 from dhcal_pin.robust import scores
+from dhcal_pin.tables import headline
 
 
 def spoiled(kind, chain, seed, m=100, share=0.1):
@@ -141,3 +145,18 @@ def test_wrong_losses_are_named(sim_6dof, sim_6dof_actual):
         calibrate(sim_6dof, data, loss="l1")
     with pytest.raises(DhcalError, match="needs method lm"):
         calibrate(sim_6dof, data, method="gn", loss="huber")
+
+
+def test_what_is_told_of_a_fit_is_of_the_samples_that_count(sim_6dof, sim_6dof_actual):
+    """A gross error of 40 mm is in no figure of the fit, and in those of what was held out beside them."""
+    clean, dirty, _ = spoiled(Position, sim_6dof_actual, 3, m=60, share=0.05)
+    best, fit = calibrate(sim_6dof, clean, "dh"), calibrate(sim_6dof, dirty, "dh")
+    told, expected = fit.comparisons[0], best.comparisons[0]
+    assert (told.samples, told.aside) == (57, 3)
+    assert told.after["position_rms_m"] < 1.3 * expected.after["position_rms_m"]
+    assert "3 gross errors left aside." in headline(fit.comparisons).text
+    assert f"Position error, {57} fitted" in "".join(histograms(study(fit, Provenance())))
+    held = calibrate(sim_6dof, clean, "dh", holdout=[dirty]).comparisons[0]
+    assert (held.samples, held.gross) == (60, 3)
+    assert held.after["position_rms_m"] > 10 * held.without["position_rms_m"]
+    assert "without 3 gross errors among them" in headline([held]).text
