@@ -208,7 +208,8 @@ def recovered(chain: Chain, sets: str, seed: int) -> float:
     return fit.validate(Pose.simulate(truth, q[40:], Noise(), rng))["position_max_m"]
 
 
-EVERY_SET = [*SETS, "minimal,base,tool", "placement,base,tool", "dh,base,tool", "hayati,base,tool"]
+WITH_FRAMES = [f"{s},base,tool" for s in ("dh", "modified-dh", "hayati", "minimal", "placement", "offset")]
+EVERY_SET = [*SETS, *WITH_FRAMES]
 
 
 @pytest.mark.parametrize("sets", EVERY_SET)
