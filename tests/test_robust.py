@@ -9,6 +9,7 @@ import pytest
 
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.errors import DhcalError
+from dhcal_pin.lengths import Wires
 from dhcal_pin.leverage import spreads
 from dhcal_pin.measurements import Noise
 from dhcal_pin.poses import Pose
@@ -160,3 +161,14 @@ def test_what_is_told_of_a_fit_is_of_the_samples_that_count(sim_6dof, sim_6dof_a
     assert (held.samples, held.gross) == (60, 3)
     assert held.after["position_rms_m"] > 10 * held.without["position_rms_m"]
     assert "without 3 gross errors among them" in headline([held]).text
+
+
+def test_no_sample_draws_more_than_itself(sim_6dof, sim_6dof_actual):
+    """Wires leave base and anchors where their wide priors have them, and no one knows that better."""
+    rng = np.random.default_rng(0)
+    data = Wires.simulate(sim_6dof_actual, rng.uniform(-3, 3, (150, 6)), Noise(1e-4), rng)
+    fit = calibrate(sim_6dof, data, "minimal,base,tool")
+    own = np.linalg.eigvalsh(spreads(fit.problem, fit.solution, fit.weights)[0])
+    assert own.min() > -1e-6
+    assert own.max() < 1 + 1e-6
+    assert fit.outliers[0].size == 0
