@@ -9,7 +9,7 @@ import numpy as np
 
 from . import observability, robust
 from .measurements import Measurement
-from .problem import Chunk, Problem, Tangent
+from .problem import Chunk, Problem, Tangent, reduce
 from .se3 import Array
 from .solver import Solution, posterior_root
 
@@ -48,7 +48,9 @@ def spreads(problem: Problem, solution: Solution, weights: Sequence[Array]) -> l
     A sample that takes part lies nearer to the fit than its sigma, by what it draws the fit to itself; one
     that counts for nothing lies farther, by how little the others know there.
     """
-    root = posterior_root(solution.triangle, problem.weights)[0]
+    # The loop's last triangle is of a step before, where other directions are unseen, which the wide priors
+    # of frames and instruments make far of: its covariance would not go with these rows.
+    root = posterior_root(reduce(problem, solution.x, small_angle=False), problem.weights)[0]
     found = problem.each(partial(_drawn, problem.tangent(solution.x), root))
     out = []
     for item, weight in zip(problem.data, weights, strict=True):

@@ -9,6 +9,7 @@ import pytest
 
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.errors import DhcalError
+from dhcal_pin.lengths import Wires
 from dhcal_pin.leverage import spreads
 from dhcal_pin.measurements import Noise
 from dhcal_pin.poses import Pose
@@ -160,3 +161,15 @@ def test_what_is_told_of_a_fit_is_of_the_samples_that_count(sim_6dof, sim_6dof_a
     assert (held.samples, held.gross) == (60, 3)
     assert held.after["position_rms_m"] > 10 * held.without["position_rms_m"]
     assert "without 3 gross errors among them" in headline([held]).text
+
+
+def test_what_samples_draw_to_themselves_is_a_share_of_the_unknowns(sim_6dof, sim_6dof_actual):
+    """Wires leave base and anchors where their wide priors have them, and these have no say in it."""
+    rng = np.random.default_rng(4)
+    data = Wires.simulate(sim_6dof_actual, rng.uniform(-3, 3, (60, 6)), Noise(1e-4), rng)
+    fit = calibrate(sim_6dof, data, "minimal,base,tool")
+    rows = fit.problem.tangent(fit.x).rows(fit.problem.chunks[0])[:-1].transpose(2, 1, 0).reshape(180, -1)
+    basis = np.linalg.qr(np.concatenate([rows, np.diag(fit.problem.weights)]))[0][:180].reshape(60, 3, -1)
+    drawn = np.eye(3) - spreads(fit.problem, fit.solution, fit.weights)[0]
+    np.testing.assert_allclose(drawn, basis @ basis.transpose(0, 2, 1), atol=1e-4)
+    assert fit.outliers[0].size == 0
