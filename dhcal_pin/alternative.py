@@ -13,8 +13,8 @@ from .result import Result
 
 # All that positions and poses can tell of any arm, wherever instrument and target are.
 EVERYTHING = "minimal,base,tool"
-# What leaves more than this share of the error is not worth a word.
-WORTH = 0.8
+# What leaves more than this share of the error is not worth a word; nor is what is left of exact readings.
+WORTH, EXACT = 0.8, 1e-6
 
 
 def narrow(sets: Sequence[str]) -> bool:
@@ -33,10 +33,13 @@ def missed(fit: Result, chain: Chain, data: Sequence[Measurement], **options: An
         data: what was fitted.
         options: of `calibrate`, as for the fit.
     """
-    wider = calibration.calibrate(chain, data, EVERYTHING, **options)
-    now, then = fit.comparisons[0], wider.comparisons[0]
+    now = fit.comparisons[0]
     group = next(group for group in ENDINGS if f"{group}_rms{ENDINGS[group]}" in now.after)
     key = f"{group}_rms{ENDINGS[group]}"
+    if now.after[key] < EXACT * now.before[key]:
+        return ""
+    wider = calibration.calibrate(chain, data, EVERYTHING, **options)
+    then = wider.comparisons[0]
     if now.title == "fitted" or not wider.converged or then.after[key] > WORTH * now.after[key]:
         return ""
     left, of = tables.headline([then]), tables.headline([now])

@@ -161,8 +161,9 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
         **held,
         **options,
     )
-    # Who holds something, or asks for the paper's loop, knows what is unknown.
-    if args.method == "lm" and not any(held.values()) and narrow(names(sets)):
+    # Who holds something, or asks for the paper's loop, knows what is unknown; who mixed columns up does not.
+    chosen = args.method != "lm" or any(held.values()) or any(data.doubts.values())
+    if not chosen and narrow(names(sets)):
         data.doubts[args.robot] = [*filter(None, [missed(fit, chain, list(data.fit.values()), **options)])]
     for path, texts in misfits(fit.chain, data.fit, fit.instruments).items():
         # What a file's columns tell already is not told again.
