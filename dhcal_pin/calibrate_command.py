@@ -10,14 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from . import calibration, exports, extension, fleet_command, report, terminal
+from . import calibration, exports, extension, report, terminal
 from .alternative import missed, narrow
 from .chain import Chain
 from .errors import DhcalError
 from .executors import HERE, Workers, workers
 from .files import PathLike, save
-from .fleet import is_fleet
-from .jobs import Job
+from .jobs import Job, is_manifest
 from .measurement_files import read_readings
 from .measurements import Measurement
 from .outputs import STDOUT, check_outputs, check_urdf_ending, emit, names, same, sidecars
@@ -268,9 +267,11 @@ def _calibrate_one(job: Job) -> dict[str, Any]:
 
 def calibrate(args: Namespace) -> int:
     """One robot, or all of a manifest."""
-    if is_fleet(args.robot):
+    if is_manifest(args.robot):
         if args.scheduler:
             raise DhcalError("--scheduler: goes with one robot; a manifest takes --jobs")
+        from . import fleet_command  # a good part of the start-up, and one robot needs none of it
+
         return fleet_command.run(args, _calibrate_one)
     if not args.data:
         raise DhcalError(f"DATA is required: name at least one measurement file behind {args.robot}")

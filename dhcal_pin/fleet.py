@@ -32,7 +32,6 @@ from .jobs import Job
 from .outputs import STDOUT
 from .robot_files import robot_name, sidecar_path
 
-ENDING = ".fleet.toml"
 OK, OPEN, FAILED = "ok", "not converged", "failed"
 
 
@@ -61,11 +60,6 @@ class Outcome:
 
 # Calibrates one robot, writes its files, and returns its document.
 Run = Callable[[Job], Mapping[str, Any]]
-
-
-def is_fleet(path: PathLike) -> bool:
-    """Whether a path names a manifest."""
-    return os.fspath(path).lower().endswith(ENDING)
 
 
 def read_fleet(path: PathLike) -> list[Entry]:

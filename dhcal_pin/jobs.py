@@ -10,6 +10,8 @@ from typing import Any
 
 from .calibration import Method
 
+# A manifest of many jobs.
+MANIFEST = ".fleet.toml"
 # Where a job writes, which changes nothing about what it finds.
 _PLACES = ("output", "in_place", "report", "json", "map")
 
@@ -74,3 +76,8 @@ class Job:
                 flag = f"--{option.name.replace('_', '-')}"
                 words += [flag] if value is True else [flag, names.get(str(value), str(value))]
         return shlex.join(words)
+
+
+def is_manifest(path: str) -> bool:
+    """Whether a path names a manifest of many robots in a robot's place."""
+    return path.lower().endswith(MANIFEST)

@@ -124,6 +124,9 @@ def _at_end(
     relative: float = RELATIVE_STEP,
 ) -> bool:
     """Whether a plain step from x would not matter either; a damped one may be tiny in a narrow valley."""
+    # No step moves the rows farther than all that is left.
+    if problem.bounds is None and _settled(free.r, float(np.linalg.norm(free.z)), cost, last, relative):
+        return True
     return _settled(free.r, _change(free.r, bounded_step(problem, free, x)), cost, last, relative)
 
 

@@ -85,7 +85,15 @@ class Triangles:
 
     def ended(self, cost: Array, last: Array | float = 0.0) -> Array:
         """Whether not even a plain step moves the rows by anything that matters, (b,)."""
-        return self.settled(np.linalg.norm(self.moved(self.step()), axis=1), cost, last)
+        last = np.broadcast_to(last, cost.shape)
+        # No step moves them farther than all that is left.
+        out = self.settled(np.linalg.norm(self.z, axis=1), cost, last)
+        rest = np.flatnonzero(~out)
+        if rest.size:
+            left = self.take(rest)
+            change = np.linalg.norm(left.moved(left.step()), axis=1)
+            out[rest] = left.settled(change, cost[rest], last[rest])
+        return out
 
     def rounding(self) -> Array:
         """What the model's own rounding makes of the rows, (b,)."""

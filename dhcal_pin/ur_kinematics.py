@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-import yaml
 
 from . import se3
 from .chain import Chain
@@ -90,6 +89,8 @@ def read_ur_kinematics(path: PathLike) -> DHTable:
     Raises:
         DhcalError: it is not such a file.
     """
+    import yaml  # a good part of the start-up, and few commands read it
+
     source = os.fspath(path)
     try:
         raw = yaml.safe_load(read_text(path))
