@@ -15,7 +15,7 @@ from .alternative import missed, narrow
 from .chain import Chain
 from .errors import DhcalError
 from .executors import HERE, Workers, workers
-from .files import PathLike, save
+from .files import PathLike
 from .jobs import Job, is_manifest
 from .measurement_files import read_readings
 from .measurements import Measurement
@@ -33,6 +33,7 @@ from .robot_files import (
     sidecar_path,
     urdf_files,
 )
+from .saving import save
 from .screening import Finding, screen
 from .solver import Progress
 

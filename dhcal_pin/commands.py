@@ -27,7 +27,7 @@ from .dh_files import dh_text, is_dh
 from .dh_urdf import dh_to_urdf
 from .errors import DhcalError
 from .evaluation import accuracy
-from .files import parse_noise, save
+from .files import parse_noise
 from .kinds import KINDS
 from .measurement_files import Readings, measurement_text, read_readings
 from .measurements import Noise
@@ -43,6 +43,7 @@ from .robot_files import (
     read_table,
     robot_name,
 )
+from .saving import save
 from .screening import screen
 from .uncertainty import Predictor
 from .uncertainty_files import read_uncertainty

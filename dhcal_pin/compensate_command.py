@@ -11,11 +11,12 @@ from . import se3, terminal
 from .chain import Chain
 from .compensation import SINGULAR, Compensation, compensate
 from .errors import DhcalError
-from .files import ANGLES, LENGTHS, csv_text, save
+from .files import ANGLES, LENGTHS, csv_text
 from .measurement_files import Targets, read_targets
 from .outputs import check_outputs, sidecars
 from .reading_columns import QUATERNION, ROTVEC, units_of
 from .robot_files import is_table, read_robot
+from .saving import save
 from .se3 import Array
 
 # Rows named on stderr; all of them are in the file.

@@ -13,11 +13,12 @@ from .chain import Chain
 from .error_model import ErrorModel
 from .errors import DhcalError
 from .experiment import Experiment, experiment, paper_arm
-from .files import PathLike, save
+from .files import PathLike
 from .kinds import KINDS
 from .measurements import Measurement, Noise
 from .parameters import select
 from .robot_files import paper_file, urdf_files
+from .saving import save
 from .se3 import Array
 from .solver import Problem, gauss_newton, reduce
 from .viewer import scene_html

@@ -10,10 +10,11 @@ from typing import Any
 
 from . import report, terminal
 from .errors import DhcalError
-from .files import PathLike, csv_text, save
+from .files import PathLike, csv_text
 from .fleet import FAILED, Entry, Outcome, Run, places, read_fleet, run_fleet
 from .jobs import Job
 from .outputs import STDOUT, check_outputs, emit
+from .saving import save
 
 _STAGES = ("before", "after", "holdout_before", "holdout_after")
 # Columns of the summary: a key of the accuracy, its name there, and the factor from SI.

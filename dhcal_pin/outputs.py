@@ -8,8 +8,8 @@ from collections.abc import Sequence
 
 from . import report
 from .errors import DhcalError
-from .files import check_place, save
 from .robot_files import existing_sidecar
+from .saving import check_place, save
 
 STDOUT = "-"
 

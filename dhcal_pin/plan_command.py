@@ -12,12 +12,13 @@ from . import report, terminal
 from .configuration_files import configurations_text, read_configurations, read_task
 from .configurations import Space
 from .errors import DhcalError
-from .files import ANGLES, LENGTHS, PathLike, parse_noise, save
+from .files import ANGLES, LENGTHS, PathLike, parse_noise
 from .measurement_files import read_readings
 from .measurements import Noise
 from .outputs import STDOUT, check_outputs, emit, names, sidecars
 from .planning import Plan, plan
 from .robot_files import existing_sidecar, read_instrument, read_priors, read_robot
+from .saving import save
 from .se3 import Array
 from .tables import Table
 from .uncertainty_files import read_uncertainty

@@ -12,10 +12,11 @@ from . import report_figures, report_maps, report_sections, tables, viewer
 from .diagnosis import Workspace
 from .errors import DhcalError
 from .evaluation import ENDINGS, Comparison
-from .files import PathLike, save
+from .files import PathLike
 from .report import Provenance
 from .report_sections import Section, Study
 from .result import Result
+from .saving import save
 from .tables import MEASURES, WORDS, Table, shown
 
 PAGE = Path(__file__).with_name("report.html")

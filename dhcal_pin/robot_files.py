@@ -16,9 +16,10 @@ from .chain import Chain
 from .dh import DHTable
 from .dh_files import is_dh, read_dh, read_frame
 from .errors import DhcalError
-from .files import PathLike, read_toml, save
+from .files import PathLike, read_toml
 from .payload_files import payload_lines, read_payload
 from .result import Result
+from .saving import save
 from .se3 import Array
 from .transmission_files import transmission_lines, with_transmission
 from .uncertainty import Uncertainty

@@ -15,9 +15,10 @@ import numpy as np
 from . import terminal
 from .errors import DhcalError
 from .executors import workers
-from .files import csv_text, read_text, save
+from .files import csv_text, read_text
 from .outputs import check_outputs, sidecars
 from .robot_files import paper_file
+from .saving import save
 from .study import run, table
 from .study_grid import Setting, Study, read_study
 from .study_plot import plot

@@ -11,11 +11,11 @@ import numpy as np
 from . import terminal, viewer
 from .chain import Chain
 from .errors import DhcalError
-from .files import save
 from .measurement_files import read_measurements
 from .measurements import Measurement
 from .outputs import check_outputs, sidecars
 from .robot_files import existing_sidecar, is_table, read_instrument, read_robot, robot_name
+from .saving import save
 from .uncertainty_files import read_uncertainty
 
 

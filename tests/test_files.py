@@ -17,12 +17,13 @@ from dhcal_pin.chain import Chain
 from dhcal_pin.dh import DHTable
 from dhcal_pin.dh_files import dh_text, read_dh
 from dhcal_pin.errors import DhcalError
-from dhcal_pin.files import check_place, parse_noise, read_sheet, read_toml, save
+from dhcal_pin.files import parse_noise, read_sheet, read_toml
 from dhcal_pin.measurement_files import measurement_text, read_measurements, read_readings
 from dhcal_pin.poses import Pose
 from dhcal_pin.positions import Position
 from dhcal_pin.report import json_text
 from dhcal_pin.robot_files import read_priors, read_robot, sidecar_text, urdf_files, write_urdf
+from dhcal_pin.saving import check_place, save
 
 TABLE = ("theta", "d", "a", "alpha", "beta", "lower", "upper")
 SCARA = """convention = "standard"

@@ -41,7 +41,7 @@ LAYERS = (
     {"refinement"},
     {"planning"},
     {"files"},
-    {"reading_columns"},
+    {"reading_columns", "saving"},
     {"column_maps"},
     {"foreign_files"},
     {
