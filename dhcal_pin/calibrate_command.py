@@ -33,6 +33,7 @@ from .robot_files import (
     sidecar_path,
     urdf_files,
 )
+from .robust import NOTHING
 from .saving import save
 from .screening import Finding, screen
 from .solver import Progress
@@ -93,8 +94,8 @@ class Outcome:
         fit: what was found.
         document: the same as JSON.
         files: paths of what was written, by what it is.
-        findings, gross, doubts: by file, the impossible rows, the numbers of gross ones, and what is hard
-            to believe.
+        findings, gross, aside, doubts: by file, the impossible rows, the numbers of gross ones and of those
+            that take no part in the fit, and what is hard to believe.
         trials: what each family of --extend brought.
     """
 
@@ -103,6 +104,7 @@ class Outcome:
     files: dict[str, str]
     findings: dict[str, list[Finding]]
     gross: dict[str, list[int]]
+    aside: dict[str, list[int]]
     doubts: dict[str, list[str]]
     trials: tuple[extension.Trial, ...]
 
@@ -178,6 +180,8 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     if args.json and args.json != STDOUT:
         files["json"] = args.json
     gross = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))
+    unheard = (item.rows[weight <= NOTHING] for item, weight in zip(fit.data, fit.weights, strict=True))
+    aside = dict(zip(data.fit, (rows.tolist() for rows in unheard), strict=True))
     impossible = {path: [finding.row for finding in found] for path, found in data.findings.items()}
     rows = {
         path: sorted(impossible[path] + gross.get(path, []))
@@ -203,7 +207,7 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     if args.json and args.json != STDOUT:
         contents[args.json] = report.json_text(document)
     save(contents)
-    return Outcome(fit, document, files, data.findings, gross, data.doubts, trials)
+    return Outcome(fit, document, files, data.findings, gross, aside, data.doubts, trials)
 
 
 def _provenance(
@@ -284,7 +288,7 @@ def calibrate(args: Namespace) -> int:
     terminal.summary(outcome.fit, outcome.files)
     for path, found in outcome.findings.items():
         terminal.findings(path, found)
-        terminal.gross(path, outcome.gross.get(path, []), args.loss)
+        terminal.gross(path, outcome.gross.get(path, []), outcome.aside.get(path, []))
     for path, texts in outcome.doubts.items():
         terminal.doubts(path, texts)
     terminal.verdict(outcome.fit)

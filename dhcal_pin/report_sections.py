@@ -106,9 +106,9 @@ def warnings(found: Study) -> list[str]:
             "over to tell how uncertain the parameters are."
         )
     if found.outliers:
-        aside = " and left aside" if any(c.aside for c in fit.comparisons) else " that were fitted"
         many = f"{len(found.outliers)} gross errors are" if len(found.outliers) > 1 else "One gross error is"
-        out.append(f"{many} among the samples{aside}; see below.")
+        aside = max(c.aside for c in fit.comparisons)
+        out.append(f"{many} among the samples, {aside or 'none'} left aside; see below.")
     return out
 
 

@@ -83,18 +83,18 @@ def doubts(path: str, texts: Sequence[str]) -> None:
         lines(f"{path}: check: {text}", style="yellow")
 
 
-def gross(path: str, rows: Sequence[int], loss: str) -> None:
-    """Gross errors, on one line."""
-    if rows:
-        listed = ", ".join(map(str, rows[:12])) + (f" and {len(rows) - 12} more" if len(rows) > 12 else "")
-        what = f"{len(rows)} gross errors, rows {listed}" if len(rows) > 1 else f"a gross error, row {listed}"
-        take = "takes" if len(rows) == 1 else "take"
-        hint = (
-            f"{take} part in the fit; --loss auto leaves such out"
-            if loss == "linear"
-            else f"{take} no part in the fit"
-        )
-        lines(f"{path}: {what}: {hint}", style="yellow")
+def gross(path: str, rows: Sequence[int], aside: Sequence[int]) -> None:
+    """Gross errors, on a line those that take no part in the fit, on another those that do."""
+    left, others = [row for row in rows if row in aside], [row for row in rows if row not in aside]
+    for some, hint in (
+        (left, "no part in the fit"),
+        (others, "part in the fit; --loss tukey would leave out such"),
+    ):
+        listed = ", ".join(map(str, some[:12])) + (f" and {len(some) - 12} more" if len(some) > 12 else "")
+        if len(some) == 1:
+            lines(f"{path}: a gross error, row {listed}: takes {hint}", style="yellow")
+        elif some:
+            lines(f"{path}: {len(some)} gross errors, rows {listed}: take {hint}", style="yellow")
 
 
 def notes(texts: Sequence[str]) -> None:

@@ -163,6 +163,17 @@ def test_what_is_told_of_a_fit_is_of_the_samples_that_count(sim_6dof, sim_6dof_a
     assert "without 3 gross errors among them" in headline([held]).text
 
 
+def test_only_the_worst_gross_errors_are_left_aside_unasked(sim_6dof, sim_6dof_actual):
+    """Nine sigmas at one pose may be the model's own error; four hundred are not."""
+    q = np.random.default_rng(3).uniform(-3, 3, (60, 6))
+    data = Pose.simulate(sim_6dof_actual, q, Noise(1e-4, 1e-4), np.random.default_rng(3))
+    poses = data.poses.copy()
+    poses[[5, 20], :3, 3] += [[9e-4, 0, 0], [0, 4e-2, 0]]
+    fit = calibrate(sim_6dof, replace(data, poses=poses), "dh")
+    assert fit.outliers[0].tolist() == [6, 21]
+    assert np.flatnonzero(fit.weights[0] < 0.5).tolist() == [20]
+
+
 def test_what_samples_draw_to_themselves_is_a_share_of_the_unknowns(sim_6dof, sim_6dof_actual):
     """Wires leave base and anchors where their wide priors have them, and these have no say in it."""
     rng = np.random.default_rng(4)
