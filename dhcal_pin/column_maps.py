@@ -44,11 +44,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from .errors import DhcalError
-from .files import ANGLES, LENGTHS, PathLike, read_toml
+from .files import ANGLES, UNITS, PathLike, read_toml
 from .reading_columns import ROTVEC, TO
 
-# What a column of ours holds, and the units it can have.
-UNITS: Mapping[str, Mapping[str, float]] = {"length": LENGTHS, "angle": ANGLES, "number": {}, "text": {}}
 # What stands in braces in a constant.
 PARTS = ("file", "stem", "parent")
 _SEPARATORS = (",", ";", "tab", "space")

@@ -24,6 +24,8 @@ PathLike = str | os.PathLike[str]
 # Divisors, so that 606.8 mm is the double nearest to 0.6068 m. Both signs for micro are in use.
 LENGTHS = {"m": 1.0, "cm": 1e2, "mm": 1e3, "um": 1e6, "\u00b5m": 1e6, "\u03bcm": 1e6, "in": 1 / 0.0254}
 ANGLES = {"rad": 1.0, "mrad": 1e3, "deg": 180.0 / np.pi}
+# What a column of ours holds, and the units it can have.
+UNITS: Mapping[str, Mapping[str, float]] = {"length": LENGTHS, "angle": ANGLES, "number": {}, "text": {}}
 # Metres or radians: no reading, but a wrong unit or a typing error.
 _MOST = 1e6
 # Joint names are column names, and one stands in every line of a table.

@@ -10,10 +10,8 @@ import numpy as np
 
 from . import se3
 from .chain import Chain
-from .column_maps import UNITS, read_map
 from .errors import DhcalError
-from .files import LENGTHS, Column, PathLike, Sheet, csv_text, read_sheet
-from .foreign_files import mapped_sheet
+from .files import LENGTHS, UNITS, Column, PathLike, Sheet, csv_text, read_sheet
 from .measurements import Measurement
 from .poses import Pose
 from .positions import Position
@@ -133,6 +131,9 @@ def reading_sheet(path: PathLike, chain: Chain, columns: PathLike | None) -> She
     """A measurement file as it is, or another maker's by its map."""
     if columns is None:
         return read_sheet(path)
+    from .column_maps import read_map  # a part of the start-up, for other makers' files alone
+    from .foreign_files import mapped_sheet
+
     known = quantities(chain)
     return mapped_sheet(path, read_map(columns, known, chain.joint_names), set(known))
 

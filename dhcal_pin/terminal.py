@@ -6,20 +6,22 @@ import webbrowser
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import Progress as Bar
 from rich.table import Table as Grid
 from rich.text import Text
 
-from .check import Agreement
 from .evaluation import ENDINGS
 from .extension import Trial, trial_table
 from .result import Result
 from .screening import Finding
 from .solver import Progress
 from .tables import MEASURES, WORDS, Table, accuracy_table, estimate_table, headline, shown
+
+if TYPE_CHECKING:
+    from .check import Agreement  # a part of the start-up that one command needs
 
 
 def _console() -> Console:
