@@ -13,7 +13,7 @@ from .problem import Chunk, Problem, Tangent, reduce
 from .se3 import Array
 from .solver import Solution, posterior_root
 
-# Where a row takes so small a share of the directions seen, what it draws to itself does not matter.
+# Where a row takes so small a share of the unknowns, what it draws to itself does not matter.
 SMALL = 0.01
 
 
@@ -31,11 +31,11 @@ def scores(
         weights: (m,) of each item's samples in the fit.
     """
     rows = sum(np.count_nonzero(w > 0.5) * item.size for item, w in zip(data, weights, strict=True))
-    seen = observability.rank(solution.triangle.r)
-    if rows <= seen:
+    most = len(solution.x)
+    if rows <= most and rows <= observability.rank(solution.triangle.r):
         return [np.zeros(len(item.rows)) for item in data]
     chain = problem.errors.at(solution.x[: len(problem.errors.parameters)])
-    spread = spreads(problem, solution, weights) if seen >= SMALL * rows else [None] * len(data)
+    spread = spreads(problem, solution, weights) if most >= SMALL * rows else [None] * len(data)
     return [
         robust.scores(chain, item, problem.values(item, solution.x), each) if len(item.rows) else np.empty(0)
         for item, each in zip(data, spread, strict=True)
