@@ -14,14 +14,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from . import kinematics, se3
+from . import kinematics, loops, se3
 from .dh import DHTable
 from .dh_urdf import dh_to_urdf
 from .errors import DhcalError
@@ -125,7 +125,7 @@ class Chain:
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what can be worked out anew: a model is heavy to send to another process."""
-        return {part.name: getattr(self, part.name) for part in fields(self)}
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
     @property
     def size(self) -> int:
@@ -222,14 +222,22 @@ class Chain:
         return self._into @ self.origins
 
     @cached_property
+    def _ahead(self) -> Array:
+        """(k+1, 4, 4): each joint's body frame in its URDF frame, and no change for the tip."""
+        return np.concatenate([self.axis_frames[1:], _IDENTITY[None]])
+
+    @cached_property
     def links(self) -> Array:
         """Constant transforms (k+1, 4, 4) between the motions; every joint moves about its own z.
 
         The tool's pose is base · links[0] · Z(q_1) · links[1] · … · Z(q_k) · links[k] · tool.
         """
-        out = self._reached.copy()
-        out[:-1] = out[:-1] @ self.axis_frames[1:]
-        return out
+        return self._reached @ self._ahead
+
+    @cached_property
+    def _links_and_tool(self) -> Array:
+        """(k+1, 4, 4): as `links`, but the last one leads on to the tool."""
+        return np.concatenate([self.links[:-1], self.links[-1:] @ self.tool])
 
     def motion(self, q: Array) -> Motion:
         """The moving joints' values, and their cosines and sines, at joint values q (m, n)."""
@@ -251,14 +259,17 @@ class Chain:
         k, m = motion.values.shape
         frames = np.empty((k + 2, 7, 3, m)) if out is None else out
         frames[0, :4] = self.base[:3].T[:, :, None]
-        links = self.links.copy()
-        links[-1] = links[-1] @ self.tool
-        kinematics.carry_frames(links, self.prismatic, motion, frames)
+        loops.carry_frames(self._links_and_tool, self.prismatic, motion, frames)
         return Sweep(frames[:-1], frames[-1, :4], terms)
 
     def poses(self, q: Array) -> Array:
         """Tool poses (m, 4, 4) in the measuring frame at joint values q (m, n) in rad or m."""
         return self.sweep(q).poses()
+
+    @cached_property
+    def _station_bodies(self) -> Array:
+        """(2k+4,): each station's body."""
+        return np.clip((np.arange(self.tool_station + 1) - 1) // 2, 0, len(self.moving))
 
     @cached_property
     def _station_frames(self) -> Array:
@@ -278,11 +289,10 @@ class Chain:
 
         `carry` (p, 4, 4) are the frames that the twists are seen in where these are not the stations' own.
         """
-        stations = np.asarray(stations, int)
-        bodies = np.minimum(np.maximum((stations - 1) // 2, 0), len(self.moving))
         frames = self._station_frames[stations]
-        seen = se3.adjoint(frames if carry is None else frames @ carry)
-        return bodies, (seen @ np.asarray(twists, float)[..., None])[..., 0]
+        return self._station_bodies[stations], se3.carried(
+            frames if carry is None else frames @ carry, np.asarray(twists, float)
+        )
 
     def tool_velocities(self, sweep: Sweep, bodies: Array, twists: Array, out: Array | None = None) -> Array:
         """The tool point's velocity (p, 6, m) per unit of each body twist, axes of the measuring frame.
@@ -296,11 +306,12 @@ class Chain:
         """
         m = sweep.tool.shape[-1]
         out = np.empty((len(bodies), 6, m)) if out is None else out
-        behind = int(np.searchsorted(bodies, len(sweep.frames)))
-        if behind < len(bodies):
+        behind = len(bodies)
+        if behind and bodies[-1] >= len(sweep.frames):
+            behind = int(np.searchsorted(bodies, len(sweep.frames)))
             out[behind:] = self._entry_velocities(sweep, bodies[behind:] - len(sweep.frames))
             bodies, twists = bodies[:behind], twists[:behind]
-        kinematics.point_velocities(sweep.frames, sweep.tool[3], bodies, twists, out[:behind])
+        loops.point_velocities(sweep.frames, sweep.tool[3], bodies, twists, out[:behind])
         return out
 
     def _entry_velocities(self, sweep: Sweep, entries: Array) -> Array:
@@ -327,12 +338,16 @@ class Chain:
 
     def moved(self, motions: Array) -> Chain:
         """The chain with every station's frame moved by a right factor (2k+4, 4, 4), M ← M·motion."""
-        chain = replace(
-            self,
+        chain = object.__new__(Chain)
+        # The axes stay, and so do the frames made of them.
+        vars(chain).update(
+            self.__getstate__(),
             origins=motions[1:-1:2] @ self.origins @ motions[2::2],
             base=self.base @ motions[0],
             tool=self.tool @ motions[-1],
+            axis_frames=self.axis_frames,
+            _into=self._into,
+            _ahead=self._ahead,
+            _station_bodies=self._station_bodies,
         )
-        # The axes stay, and so do the frames made of them.
-        vars(chain).update(axis_frames=self.axis_frames, _into=self._into)
         return chain

@@ -8,6 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from . import se3
 from .scratch import LongRows, scratch
 from .se3 import Array
 
@@ -98,8 +99,8 @@ def carry_frames(links: Array, prismatic: Array, motion: Motion, frames: Array) 
 
 
 @LongRows()
-def point_velocities(frames: Array, point: Array, at: Array, twists: Array, out: Array) -> Array:
-    """A point's velocity (p, 6, m) per unit of each twist of a body, axes of the measuring frame.
+def point_velocities(frames: Array, point: Array, at: Array, twists: Array, out: Array) -> None:
+    """Fills in a point's velocity (p, 6, m) per unit of each twist of a body, axes of the measuring frame.
 
     Args:
         frames: (b, 7, 3, m) columns x, y, z, p of each body's frame, and three that are overwritten.
@@ -122,7 +123,22 @@ def point_velocities(frames: Array, point: Array, at: Array, twists: Array, out:
             velocity = out[rows][some].reshape(n, count, 6, m).swapaxes(1, 2)
             np.matmul(move[rows].reshape(n, 1, count, 7), part, out=velocity[:, :3])
             np.matmul(move[rows, 4:].reshape(n, 1, count, 3), part[:, :, :3], out=velocity[:, 3:])
+
+
+def mix_samples(vectors: Array, matrices: Array, out: Array) -> Array:
+    """Vectors (p, c, m) mixed by a matrix of each sample's own (k, c, m), into `out` (p, k, m) elsewhere."""
+    np.einsum("pcm,kcm->pkm", vectors, matrices, out=out)
     return out
+
+
+def log_rotations(turns: Array) -> Array:
+    """Rotation vectors (3, m) of rotations (3, 3, m)."""
+    return se3.log3(turns.transpose(2, 0, 1)).T
+
+
+def right_jacobian_inverses(rotvecs: Array) -> Array:
+    """Jr⁻¹ (3, 3, m) of rotation vectors (3, m); see `se3.right_jacobian_inverse`."""
+    return se3.right_jacobian_inverse(rotvecs.T).transpose(1, 2, 0)
 
 
 @lru_cache(maxsize=64)

@@ -106,8 +106,9 @@ def weakly_seen(triangle: Array, expected: Array, noise: float) -> tuple[Array, 
         The directions (p, w), each one expected standard deviation long, and the shares (w,) left.
     """
     _, s, vt = np.linalg.svd(triangle * expected)
-    left = 1 / np.hypot(1.0, s / noise)
-    weak = np.flatnonzero(left[: rank(triangle)] >= KNOWN_SHARE)
+    s = s[: rank(triangle)]
+    left = noise / np.hypot(noise, s)
+    weak = np.flatnonzero(left >= KNOWN_SHARE)
     return expected[:, None] * vt[weak].T, left[weak]
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from .chain import Chain
 from .kinematics import Sweep
+from .loops import mix_samples
 from .measurements import Unknown
 from .se3 import Array
 
@@ -99,9 +100,10 @@ class PointReading:
     ) -> Array:
         """(p, k, m)."""
         derivative = self.model(self._points(sweep), u)[1] * self._weights[:, None]
-        ends, _, _, m = derivative.shape
-        moved = velocities[:, :3].reshape(-1, 3, ends, m)
-        return np.einsum("pacm,ckam->pkm", moved, derivative, out=out)
+        ends, k, _, m = derivative.shape
+        out = np.empty((len(velocities), k, m)) if out is None else out
+        matrices = np.ascontiguousarray(derivative.transpose(1, 2, 0, 3)).reshape(k, 3 * ends, m)
+        return mix_samples(velocities[:, :3].reshape(-1, 3 * ends, m), matrices, out)
 
     def own(self, sweep: Sweep, u: Array) -> Array:
         """(s, k, m)."""

@@ -13,6 +13,7 @@ from . import se3
 from .chain import Chain
 from .errors import DhcalError
 from .kinematics import Sweep
+from .loops import log_rotations, mix_samples, right_jacobian_inverses
 from .measurements import (
     ANGLE_SIGMA,
     LENGTH_SIGMA,
@@ -207,7 +208,7 @@ class Pose(PoseReading):
 
     def _rotvec(self, sweep: Sweep) -> Array:
         """The turn's rotation vector (3, m)."""
-        return se3.log3(self._turn(sweep).transpose(2, 0, 1)).T
+        return log_rotations(self._turn(sweep))
 
     def _position(self, sweep: Sweep) -> Array:
         return self._measured[:, 3] - sweep.tool[3]
@@ -223,9 +224,9 @@ class Pose(PoseReading):
         out = np.empty_like(velocities) if out is None else out
         weights = self._weights
         np.multiply(velocities[:, :3], weights[:3], out=out[:, :3])
-        mix = se3.right_jacobian_inverse((residual[3:] / weights[3:]).T)
-        mix = mix.transpose(1, 2, 0) * weights[3:, None]
-        np.einsum("pkm,ikm->pim", velocities[:, 3:], mix, out=out[:, 3:])
+        mix = right_jacobian_inverses(residual[3:] / weights[3:])
+        mix *= weights[3:, None]
+        mix_samples(velocities[:, 3:], mix, out[:, 3:])
         return out
 
     def small_angle(

@@ -9,28 +9,23 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, partial
 from typing import TypeVar
 
 import numpy as np
-from scipy.linalg import lapack
 
 from .chain import Chain
 from .error_model import ErrorModel
 from .executors import HERE, Workers
 from .kinematics import Motion, Sweep
+from .loops import triangle_of
 from .measurements import Measurement, Unknown
 from .scale import Ruler, count_in_arm
 from .scratch import LongRows, scratch
 from .se3 import Array
 
-# Samples a chunk, and columns that are reduced at once where that pays.
-CHUNK, PANEL = 2000, 8
-# OpenBLAS has kernels for narrow products where there is AVX-512: there panels take half the time of LAPACK's
-# plain reduction, elsewhere twice.
-PANELS = not {"AVX512F", "X86_V4"}.isdisjoint(np.show_config(mode="dicts")["SIMD Extensions"]["found"])
-# From so many rows on, each reading's are reduced apart: below, the calls cost more than the arithmetic.
-TALL = 2000
+# Samples a chunk.
+CHUNK = 2000
 _Found = TypeVar("_Found")
 
 
@@ -181,14 +176,10 @@ class Tangent:
     def triangle(self, chunk: Chunk, small_angle: bool) -> Array:
         """Triangle (p+1, p+1) of a chunk's whitened rows [J | r]; exact or by the paper's rows."""
         data, p = chunk.data, len(self.bodies) + len(self.places)
-        k, m = data.size, len(data.rows)
-        tall = k * m >= TALL
+        block = scratch("block", data.size, p + 1, len(data.rows)).swapaxes(0, 1)
         with LongRows():
-            block = scratch("block", k, p + 1, m).swapaxes(0, 1) if tall else scratch("block", p + 1, k, m)
             self._fill(block, chunk, small_angle)
-        if not tall:
-            return qr(block.reshape(p + 1, -1))
-        return merged([_narrow(rows) for rows in block.swapaxes(0, 1)])
+        return triangle_of(block)
 
     def rows(self, chunk: Chunk) -> Array:
         """A chunk's whitened rows [J | r] (p+1, k, m)."""
@@ -208,26 +199,12 @@ class Tangent:
             block[p] = data.residual(sweep, u)
             data.whiten(sweep, velocities, u, block[p], block[:errors])
         block[errors:p] = 0.0
-        for unknown, rows in zip(data.unknowns, data.own(sweep, u), strict=True):
+        own = data.own(sweep, u) if data.unknowns else ()
+        for unknown, rows in zip(data.unknowns, own, strict=True):
             if unknown.name in self.places:
                 block[self.places[unknown.name]] = rows
         if not data.metric:
             count_in_arm(block, self.size, self.rates, data.groups.get("position"))
-
-
-def _narrow(rows: Array) -> Array:
-    """Triangle (u, c) of rows (c, m), which are overwritten, by the u columns that are not zero in all.
-
-    Half the errors of an arm are lengths, which turn nothing: a quarter of the work for rows of rotations.
-    """
-    columns = len(rows)
-    used, rest = np.flatnonzero(rows[:, 0]), np.flatnonzero(rows[:, 0] == 0)
-    if not rest.size or rows[rest].any():
-        return qr(rows)
-    out = np.zeros((len(used), columns))
-    part = scratch("narrow", len(used), rows.shape[1])
-    out[:, used] = qr(np.take(rows, used, 0, out=part, mode="clip"))
-    return out
 
 
 def _cost(chain: Chain, instruments: Mapping[str, float], size: float, chunk: Chunk) -> float:
@@ -273,29 +250,9 @@ class Triangle:
         return self.rest + float(self.z @ self.z)
 
 
-def qr(rows: Array) -> Array:
-    """Upper triangle (c, c) of rows (c, k), a C-order array that LAPACK sees as (k, c) and overwrites."""
-    columns, count = rows.shape
-    out = np.zeros((columns, columns))
-    if not rows.size:
-        return out
-    if PANELS:
-        packed = lapack.dgeqrt(min(PANEL, columns, count), rows.T, overwrite_a=1)[0]
-    else:
-        packed = lapack.dgeqrf(rows.T, overwrite_a=1)[0]
-    top = min(columns, count)
-    np.copyto(out[:top], packed[:top], where=_upper(columns)[:top])
-    return out
-
-
-@lru_cache(maxsize=64)
-def _upper(size: int) -> Array:
-    return np.triu(np.ones((size, size), bool))
-
-
 def merged(triangles: Sequence[Array]) -> Array:
     """The triangle (c, c) of the rows of several (u, c), which may come from anywhere."""
-    return qr(np.concatenate(triangles).T.copy())
+    return triangle_of(np.concatenate(triangles).T[:, None].copy())
 
 
 def reduce(problem: Problem, x: Array, small_angle: bool) -> Triangle:

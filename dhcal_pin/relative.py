@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from . import se3
 from .chain import Chain
 from .kinematics import Sweep
+from .loops import log_rotations, mix_samples, right_jacobian_inverses
 from .measurements import ANGLE_SIGMA, LENGTH_SIGMA, Noise, checked, checked_sigma, gathered, need
 from .poses import PoseReading, pose_columns, poses_of
 from .scratch import scratch
@@ -92,7 +93,7 @@ class RelativePose(PoseReading):
     def residual(self, sweep: Sweep, u: Array) -> Array:
         """(6, m)."""
         shift, turn = self._gap(sweep)
-        return np.concatenate([shift, se3.log3(turn.transpose(2, 0, 1)).T]) * self._weights
+        return np.concatenate([shift, log_rotations(turn)]) * self._weights
 
     def _rates(self, sweep: Sweep, velocities: Array, out: Array | None) -> Array:
         """Rates (p, 6, m) of the translation in a and, as body rates, of the model's rotation in frame b."""
@@ -105,7 +106,7 @@ class RelativePose(PoseReading):
             rate[:, x] -= np.multiply(velocities[:, 3 + y, :m], arm[z], out=product)
             rate[:, x] += np.multiply(velocities[:, 3 + z, :m], arm[y], out=product)
         for frame, part in ((first, slice(0, 3)), (second, slice(3, 6))):
-            np.einsum("pkm,ikm->pim", rate[:, part], frame[:3], out=out[:, part])
+            mix_samples(rate[:, part], frame[:3], out[:, part])
         return out
 
     def whiten(
@@ -113,8 +114,9 @@ class RelativePose(PoseReading):
     ) -> Array:
         """(p, 6, m); log3(exp(-ω)·E) = φ - Jl⁻¹(φ)·ω, Jl⁻¹ being the transpose of Jr⁻¹."""
         out = self._rates(sweep, velocities, out)
-        right = se3.right_jacobian_inverse((residual[3:] / self._weights[3:]).T)
-        out[:, 3:] = np.einsum("pkm,mki->pim", out[:, 3:], right)
+        right = right_jacobian_inverses(residual[3:] / self._weights[3:])
+        turned = scratch("turned", len(out), *out[0, 3:].shape)
+        out[:, 3:] = mix_samples(out[:, 3:], right.swapaxes(0, 1), turned)
         out *= self._weights
         return out
 
@@ -132,7 +134,7 @@ class RelativePose(PoseReading):
     def errors(self, sweep: Sweep, u: Array) -> dict[str, Array]:
         """{"position": (m, 3) in m, "orientation": (m, 3) in rad}."""
         shift, turn = self._gap(sweep)
-        return {"position": shift.T, "orientation": se3.log3(turn.transpose(2, 0, 1))}
+        return {"position": shift.T, "orientation": log_rotations(turn).T}
 
     @classmethod
     def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> RelativePose:

@@ -14,7 +14,8 @@ from scipy.linalg import lapack
 
 from . import observability
 from .errors import DhcalError
-from .problem import Problem, Triangle, qr, reduce
+from .loops import triangle_of
+from .problem import Problem, Triangle, reduce
 from .se3 import Array
 
 Progress = Callable[[int, float], None]
@@ -42,7 +43,7 @@ def with_priors(triangle: Triangle, weights: Array, x: Array, damping: Array) ->
     priors = np.arange(p, p + held.size)
     stacked[held, priors], stacked[p, priors] = weights[held], -(weights * x)[held]
     stacked[damped, p + held.size + np.arange(damped.size)] = damping[damped]
-    full = qr(stacked)
+    full = triangle_of(stacked[:, None])
     return Triangle(full[:p, :p], full[:p, p], triangle.rest + float(full[p, p] ** 2))
 
 

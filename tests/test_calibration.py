@@ -10,7 +10,7 @@ import pytest
 from conftest import paper, random_joints, random_table
 from scipy.linalg import null_space
 
-from dhcal_pin import observability, problem, se3
+from dhcal_pin import observability, problem, reduction, se3
 from dhcal_pin.calibration import calibrate, split
 from dhcal_pin.chain import Chain
 from dhcal_pin.contacts import PointDistance, Touch
@@ -244,11 +244,13 @@ def test_chunks_do_not_change_the_answer(sim_6dof_actual):
     assert found.rest + found.z @ found.z == pytest.approx(np.sum(data.residual(sweep, NONE) ** 2), rel=1e-12)
 
 
-@pytest.mark.parametrize("panels", [True, False])
+@pytest.mark.parametrize("way", ["compiled", "panels", "plain"])
 @pytest.mark.parametrize("samples", [50, 700])
-def test_each_way_of_reduction_keeps_what_the_rows_tell(panels, samples, sim_6dof, monkeypatch):
+def test_each_way_of_reduction_keeps_what_the_rows_tell(way, samples, sim_6dof, monkeypatch):
     """Whole or a row of readings at a time, by panels or not, with columns that are zero in some rows."""
-    monkeypatch.setattr(problem, "PANELS", panels)
+    if way != "compiled":
+        monkeypatch.setattr(reduction, "PANELS", way == "panels")
+        monkeypatch.setattr(problem, "triangle_of", reduction.triangle_of)
     errors, rng = select(sim_6dof, "dh"), np.random.default_rng(0)
     data = Pose.simulate(sim_6dof, rng.uniform(-3, 3, (samples, 6)), Noise(1e-4, 1e-4), rng)
     found = reduce(Problem(errors, (data,), np.zeros(24)), np.zeros(24), False)

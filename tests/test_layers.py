@@ -20,7 +20,9 @@ LAYERS = (
     {"urdf", "extraction"},
     {"urdf_origins", "dh_urdf"},
     {"transmission"},
-    {"paths", "kinematics"},
+    {"paths", "kinematics", "reduction", "_kernel"},
+    {"compiled"},
+    {"loops"},
     {"chain"},
     {"error_model", "factors", "measurements", "scale", "inverse", "trilateration", "clearance", "design"},
     {"parameters", "configurations", "point_readings"},
@@ -77,13 +79,15 @@ LAYERS = (
     {"arguments"},
     {"cli"},
 )
-MODULES = sorted(path.stem for path in HOUSE.glob("*.py") if path.stem != "__init__")
+# What is compiled is known by its stub.
+FILES = {path.stem: path for path in HOUSE.glob("*.py*") if path.suffix in (".py", ".pyi")}
+MODULES = sorted(set(FILES) - {"__init__"})
 
 
 def imports(module: str) -> tuple[set[str], set[str]]:
     """Names of our own modules, and of packages, that a module imports anywhere."""
     own, others = set(), set()
-    for node in ast.walk(ast.parse((HOUSE / f"{module}.py").read_text())):
+    for node in ast.walk(ast.parse(FILES[module].read_text())):
         if isinstance(node, ast.ImportFrom) and node.level:
             own |= {node.module} if node.module else {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:

@@ -1,0 +1,34 @@
+"""The inner loops of every calibration: compiled where the installation could, else by NumPy and LAPACK.
+
+Both ways give the same sums, in another order; what each does stands in `kinematics` and `reduction`.
+"""
+
+from __future__ import annotations
+
+try:
+    from .compiled import (
+        carry_frames,
+        log_rotations,
+        mix_samples,
+        point_velocities,
+        right_jacobian_inverses,
+        triangle_of,
+    )
+except ImportError:
+    from .kinematics import (
+        carry_frames,
+        log_rotations,
+        mix_samples,
+        point_velocities,
+        right_jacobian_inverses,
+    )
+    from .reduction import triangle_of
+
+__all__ = [
+    "carry_frames",
+    "log_rotations",
+    "mix_samples",
+    "point_velocities",
+    "right_jacobian_inverses",
+    "triangle_of",
+]

@@ -1,0 +1,63 @@
+"""Triangles of tall rows by LAPACK: for installations without a compiler; see `loops`."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from scipy.linalg import lapack
+
+from .scratch import scratch
+from .se3 import Array
+
+# Columns that are reduced at once where that pays.
+PANEL = 8
+# OpenBLAS has kernels for narrow products where there is AVX-512: there panels take half the time of LAPACK's
+# plain reduction, elsewhere twice.
+PANELS = not {"AVX512F", "X86_V4"}.isdisjoint(np.show_config(mode="dicts")["SIMD Extensions"]["found"])
+# From so many rows on, each reading's are reduced apart: below, the calls cost more than the arithmetic.
+TALL = 2000
+
+
+def triangle_of(rows: Array) -> Array:
+    """Upper triangle R (c, c) of k·m rows A given as (c, k, m), RᵀR = AᵀA; they may be overwritten."""
+    columns, readings, samples = rows.shape
+    if readings == 1 or readings * samples < TALL:
+        return _qr(np.ascontiguousarray(rows).reshape(columns, -1))
+    parts = [_narrow(np.ascontiguousarray(part)) for part in rows.swapaxes(0, 1)]
+    return _qr(np.concatenate(parts).T.copy())
+
+
+def _narrow(rows: Array) -> Array:
+    """Triangle (u, c) of rows (c, m), which are overwritten, by the u columns that are not zero in all.
+
+    Half the errors of an arm are lengths, which turn nothing: a quarter of the work for rows of rotations.
+    """
+    columns = len(rows)
+    used, rest = np.flatnonzero(rows[:, 0]), np.flatnonzero(rows[:, 0] == 0)
+    if not rest.size or rows[rest].any():
+        return _qr(rows)
+    out = np.zeros((len(used), columns))
+    part = scratch("narrow", len(used), rows.shape[1])
+    out[:, used] = _qr(np.take(rows, used, 0, out=part, mode="clip"))
+    return out
+
+
+def _qr(rows: Array) -> Array:
+    """Upper triangle (c, c) of rows (c, n), a C-order array that LAPACK sees as (n, c) and overwrites."""
+    columns, count = rows.shape
+    out = np.zeros((columns, columns))
+    if not rows.size:
+        return out
+    if PANELS:
+        packed = lapack.dgeqrt(min(PANEL, columns, count), rows.T, overwrite_a=1)[0]
+    else:
+        packed = lapack.dgeqrf(rows.T, overwrite_a=1)[0]
+    top = min(columns, count)
+    np.copyto(out[:top], packed[:top], where=_upper(columns)[:top])
+    return out
+
+
+@lru_cache(maxsize=64)
+def _upper(size: int) -> Array:
+    return np.triu(np.ones((size, size), bool))

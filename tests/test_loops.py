@@ -1,0 +1,187 @@
+"""The compiled inner loops do what NumPy and LAPACK do, at every size, and refuse what does not fit them."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import random_joints, random_table
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dhcal_pin import kinematics, se3
+from dhcal_pin.chain import Chain
+
+try:
+    from dhcal_pin import _kernel, compiled
+except ImportError:
+    if os.environ.get("CI"):
+        raise
+    pytest.skip("this installation had no compiler", allow_module_level=True)
+
+SEEDS = st.integers(0, 2**32 - 1)
+# About the sizes of blocks, and far from them.
+SAMPLES = st.sampled_from([1, 2, 3, 7, 63, 64, 65, 127, 128, 129, 300, 2049])
+
+
+@given(SEEDS, SAMPLES)
+@settings(max_examples=60, deadline=None)
+def test_frames_and_velocities_are_numpys(seed, m):
+    """Revolute and prismatic joints, any twists on any bodies, written into a part of a larger array."""
+    rng = np.random.default_rng(seed)
+    table = random_table(rng)
+    chain = Chain.from_dh(table)
+    motion = chain.motion(random_joints(rng, table, m))
+    k, p = len(chain.moving), int(rng.integers(1, 30))
+    theirs, ours = np.empty((2, k + 2, 7, 3, m))
+    theirs[0, :4] = ours[0, :4] = se3.exp6(rng.standard_normal(6))[:3].T[:, :, None]
+    kinematics.carry_frames(chain.links, chain.prismatic, motion, theirs)
+    compiled.carry_frames(chain.links, chain.prismatic, motion, ours)
+    np.testing.assert_allclose(ours[:, :4], theirs[:, :4], atol=1e-14)
+    at = np.sort(rng.integers(0, k + 1, p))
+    twists = rng.standard_normal((p, 6)) * (rng.random((p, 6)) < 0.4)
+    twists[rng.random(p) < 0.3] = np.eye(6)[rng.integers(6)]
+    wide = np.full((6, p + 1, m + 5), np.nan)
+    out, expected = wide.swapaxes(0, 1)[:p, :, 2 : m + 2], np.empty((p, 6, m))
+    kinematics.point_velocities(theirs[:-1], theirs[-1, 3], at, twists, expected)
+    compiled.point_velocities(ours[:-1], ours[-1, 3], at, twists, out)
+    np.testing.assert_allclose(out, expected, atol=1e-13)
+    assert np.isnan(wide[:, p]).all()
+    assert np.isnan(wide[..., [0, 1, -3, -2, -1]]).all()
+
+
+@given(SEEDS, SAMPLES, st.integers(1, 45), st.integers(1, 6))
+@settings(max_examples=100, deadline=None)
+def test_a_triangle_is_lapacks_but_for_signs(seed, m, columns, readings):
+    """Rows of readings that are zero in columns of their own; the rows are left as they were."""
+    rng = np.random.default_rng(seed)
+    rows = rng.standard_normal((readings, columns, m)).swapaxes(0, 1)
+    rows[rng.random((columns, readings)) < 0.3] = 0.0
+    rows *= 10.0 ** rng.uniform(-3, 3, columns)[:, None, None]
+    before = rows.copy()
+    r = compiled.triangle_of(rows)
+    np.testing.assert_array_equal(rows, before)
+    np.testing.assert_array_equal(r, np.triu(r))
+    whole = before.reshape(columns, -1)
+    scale = np.linalg.norm(whole, axis=1)
+    scale[scale == 0] = 1.0
+    np.testing.assert_allclose(
+        (r / scale).T @ (r / scale), whole @ whole.T / np.outer(scale, scale), atol=1e-13
+    )
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-100, 1e-12, 1.0, 1e100])
+def test_triangles_of_any_size(size):
+    rows = size * np.random.default_rng(0).standard_normal((5, 2, 200))
+    wanted = np.abs(np.linalg.qr(rows.reshape(5, -1).T, mode="r"))
+    np.testing.assert_allclose(np.abs(compiled.triangle_of(rows)), wanted, rtol=1e-12, atol=1e-12 * size)
+
+
+@given(SEEDS, SAMPLES, st.integers(1, 7), st.integers(1, 6), st.integers(1, 20))
+@settings(max_examples=60, deadline=None)
+def test_mixtures_are_sums_of_products(seed, m, components, rows, vectors):
+    rng = np.random.default_rng(seed)
+    given_, matrices = (
+        rng.standard_normal((vectors, components, m)),
+        rng.standard_normal((rows, components, m)),
+    )
+    found = compiled.mix_samples(given_, matrices, np.empty((vectors, rows, m)))
+    np.testing.assert_allclose(found, np.einsum("pcm,kcm->pkm", given_, matrices), atol=1e-13)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-12, 1e-6, 1e-3, 0.02, 0.05, 1.0, 3.0, np.pi - 1e-9])
+def test_rotations_of_any_angle(size):
+    """Against the general functions, which are tested against Pinocchio's."""
+    rng = np.random.default_rng(1)
+    axes = rng.standard_normal((130, 3))
+    rotvecs = np.ascontiguousarray(size * (axes / np.linalg.norm(axes, axis=1)[:, None]).T)
+    turns = np.ascontiguousarray(se3.exp3(rotvecs.T).transpose(1, 2, 0))
+    np.testing.assert_allclose(
+        compiled.log_rotations(turns), se3.log3(turns.transpose(2, 0, 1)).T, atol=2e-15
+    )
+    inverses = compiled.right_jacobian_inverses(rotvecs).transpose(2, 0, 1)
+    np.testing.assert_allclose(inverses, se3.right_jacobian_inverse(rotvecs.T), atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        np.zeros((3, 2, 4), np.float32),
+        np.zeros((3, 8)),
+        np.zeros((4, 2, 3)).T,
+        np.zeros((3, 2, 8))[..., ::2],
+        "rows",
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(rows):
+    with pytest.raises((ValueError, TypeError)):
+        _kernel.triangle(rows, np.zeros((3, 3)))
+
+
+def test_shapes_bodies_and_constants_are_checked(sim_6dof):
+    rows, frozen = np.zeros((3, 2, 4)), np.zeros((3, 3))
+    frozen.flags.writeable = False
+    for out in (
+        np.zeros((3, 4)),
+        np.zeros((4, 4)),
+        np.zeros((6, 6))[::2, ::2],
+        np.zeros((3, 6))[:, :3],
+        frozen,
+    ):
+        with pytest.raises((ValueError, BufferError)):
+            _kernel.triangle(rows, out)
+    with pytest.raises(TypeError):
+        _kernel.triangle(rows)
+    sweep, out = sim_6dof.sweep(np.zeros((5, 6))), np.empty((1, 6, 5))
+    for body in (-1, len(sweep.frames)):
+        with pytest.raises(ValueError, match="shapes"):
+            compiled.point_velocities(sweep.frames, sweep.tool[3], np.array([body]), np.zeros((1, 6)), out)
+    with pytest.raises(ValueError, match="shapes"):
+        compiled.carry_frames(
+            sim_6dof.links[1:], sim_6dof.prismatic, sim_6dof.motion(np.zeros((5, 6))), np.empty((8, 7, 3, 5))
+        )
+
+
+CALIBRATION = """
+import json, sys
+if sys.argv[1] == "numpy":
+    sys.modules["dhcal_pin._kernel"] = None
+import numpy as np
+from conftest import paper
+from dhcal_pin import loops
+from dhcal_pin.calibration import calibrate
+from dhcal_pin.chain import Chain
+from dhcal_pin.measurements import Noise
+from dhcal_pin.poses import Pose
+assert (loops.carry_frames.__module__ == "dhcal_pin.compiled") == (sys.argv[1] == "compiled")
+nominal, actual = Chain.from_dh(paper("sim_6dof")), Chain.from_dh(paper("sim_6dof_actual"))
+rng = np.random.default_rng(0)
+data = Pose.simulate(actual, rng.uniform(-3, 3, (60, 6)), Noise(1e-4, 1e-4), rng)
+fit = calibrate(nominal, data, "dh")
+print(json.dumps([fit.converged, fit.x.tolist(), fit.std.tolist()]))
+"""
+
+
+def test_a_calibration_without_the_compiled_loops_ends_at_the_same_values():
+    here = Path(__file__).resolve().parent
+    environ = os.environ | {"PYTHONPATH": os.pathsep.join([str(here.parent), str(here)])}
+    ends = [
+        json.loads(
+            subprocess.run(
+                [sys.executable, "-c", CALIBRATION, way],
+                env=environ,
+                capture_output=True,
+                text=True,
+                check=True,
+            ).stdout
+        )
+        for way in ("compiled", "numpy")
+    ]
+    assert all(converged for converged, _, _ in ends)
+    np.testing.assert_allclose(ends[0][1], ends[1][1], atol=1e-9)
+    np.testing.assert_allclose(ends[0][2], ends[1][2], rtol=1e-6)
