@@ -261,7 +261,7 @@ def calibrate(
     # Until sigmas and priors are settled, too, where the loop nearly ends is enough.
     loop = partial(levenberg_marquardt, nearly=True) if method == "lm" else METHODS[method]
     solution, earlier = loop(problem, np.zeros(len(problem.weights)), max_iterations, progress), 0
-    if errors.at(solution.x[: len(errors.parameters)]).transmission is not None:
+    if errors.is_driven:
         # Gravity's torques follow the arm as found: once more with those.
         errors = errors.loaded(solution.x[: len(errors.parameters)])
         problem = replace(problem, errors=errors)

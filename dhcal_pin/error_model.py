@@ -70,6 +70,11 @@ class ErrorModel:
     def _entries(self) -> Array:
         return np.array([p.entry for p in self.parameters if p.entry is not None], int)
 
+    @property
+    def is_driven(self) -> bool:
+        """Whether its joints may miss their values."""
+        return bool(self._entries.size) or self.chain.transmission is not None
+
     @cached_property
     def _twists(self) -> Array:
         return np.array([parameter.twist for parameter in self.parameters]).reshape(-1, 6)[: self._geometry]

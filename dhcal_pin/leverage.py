@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 import numpy as np
 
 from . import observability, robust
 from .measurements import Measurement
-from .problem import Chunk, Problem, Tangent, reduce
+from .problem import CHUNK, Chunk, Problem, Tangent, reduce, residual_of
 from .se3 import Array
 from .solver import Solution, posterior_root
 
@@ -35,11 +35,16 @@ def scores(
     if rows <= most and rows <= observability.rank(solution.triangle.r):
         return [np.zeros(len(item.rows)) for item in data]
     chain = problem.errors.at(solution.x[: len(problem.errors.parameters)])
+    found = problem.of(data).each(partial(residual_of, chain, problem.instruments(solution.x)))
+    residuals = [np.concatenate([np.empty((item.size, 0)), *_parts(found, item)], 1) for item in data]
     spread = spreads(problem, solution, weights) if most >= SMALL * rows else [None] * len(data)
-    return [
-        robust.scores(chain, item, problem.values(item, solution.x), each) if len(item.rows) else np.empty(0)
-        for item, each in zip(data, spread, strict=True)
-    ]
+    return [robust.scores(*both) for both in zip(residuals, spread, strict=True)]
+
+
+def _parts(found: Iterator[Array], item: Measurement) -> Iterator[Array]:
+    """What was found in the chunks of one item."""
+    for _ in range(0, len(item.rows), CHUNK):
+        yield next(found)
 
 
 def spreads(problem: Problem, solution: Solution, weights: Sequence[Array]) -> list[Array]:
@@ -54,9 +59,7 @@ def spreads(problem: Problem, solution: Solution, weights: Sequence[Array]) -> l
     found = problem.each(partial(_drawn, problem.tangent(solution.x), root))
     out = []
     for item, weight in zip(problem.data, weights, strict=True):
-        parts = [np.empty((0, item.size, item.size))]
-        while sum(map(len, parts)) < len(item.rows):
-            parts.append(next(found))
+        parts = [np.empty((0, item.size, item.size)), *_parts(found, item)]
         w = weight[:, None, None]
         out.append(np.eye(item.size) + (1 - 2 * w) * np.concatenate(parts) / w)
     return out

@@ -88,9 +88,14 @@ class Problem:
         return Ruler.of(self.errors.chain, np.concatenate([item.q for item in plain]))
 
     def of(self, data: Sequence[Measurement]) -> Problem:
-        """The same problem with some or other samples of the same measurements."""
+        """The same problem with some or other samples of the same measurements, or with other sigmas."""
         out = replace(self, data=tuple(data))
         vars(out)["ruler"] = self.ruler
+        if len(data) == len(self.data) and "chunks" in vars(self):
+            pairs = zip(self.data, data, strict=True)
+            if all(old.configurations() is new.configurations() for old, new in pairs):
+                for old, new in zip(self.chunks, out.chunks, strict=True):
+                    new.moves_like(old)
         return out
 
     @cached_property
@@ -142,6 +147,11 @@ class Chunk:
     def motion(self) -> Motion:
         """Of the samples' configurations."""
         return self.nominal.motion(self.data.configurations())
+
+    def moves_like(self, other: Chunk) -> None:
+        """Takes over the motion of a chunk at the same joint values, if that is known there."""
+        if "motion" in vars(other):
+            vars(self)["motion"] = other.motion
 
     def sweep(self, chain: Chain) -> Sweep:
         """A chain's frames at the samples, in memory that the next chunk's overwrite."""
@@ -207,8 +217,13 @@ class Tangent:
             count_in_arm(block, self.size, self.rates, data.groups.get("position"))
 
 
+def residual_of(chain: Chain, instruments: Mapping[str, float], chunk: Chunk) -> Array:
+    """A chunk's whitened residuals (k, m) for a chain and values of all the instruments' unknowns."""
+    return chunk.data.residual(chunk.sweep(chain), chunk.unknowns(instruments))
+
+
 def _cost(chain: Chain, instruments: Mapping[str, float], size: float, chunk: Chunk) -> float:
-    residual = chunk.data.residual(chunk.sweep(chain), chunk.unknowns(instruments))
+    residual = residual_of(chain, instruments, chunk)
     square = float(np.vdot(residual, residual))
     return square if chunk.data.metric else square / size**2
 

@@ -11,8 +11,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from .chain import Chain
-from .measurements import Measurement
 from .se3 import Array
 
 # Scores beyond this are gross: one good sample in three million.
@@ -64,16 +62,13 @@ TURNS = 0.8
 NOTHING = 1e-12
 
 
-def scores(chain: Chain, item: Measurement, u: Array, spread: Array | None = None) -> Array:
+def scores(residual: Array, spread: Array | None = None) -> Array:
     """How far each sample (m,) lies from its kind's scatter: standard normal for good ones.
 
     Args:
-        chain: as fitted.
-        item: the samples.
-        u: values of their unknowns.
-        spread: (m, k, k) covariances of their whitened residuals up to a scale; unit ones without it.
+        residual: (k, m) whitened.
+        spread: (m, k, k) its covariances up to a scale; unit ones without it.
     """
-    residual = item.residual(chain.sweep(item.configurations()), u)
     k = len(residual)
     if spread is None:
         return scored(np.sum(residual**2, 0) / k, k)
@@ -86,7 +81,7 @@ def scored(ratio: Array, k: int) -> Array:
     """Scores (m,) of mean squares (m,) of k residuals each, against their own median."""
     middle = 1 - 2 / (9 * k)
     # The median of χ²_k / k is middle³.
-    scale = np.median(ratio) / middle**3
+    scale = np.median(ratio) / middle**3 if len(ratio) else 0.0
     if scale <= 0:
         return np.zeros(len(ratio))
     return (np.cbrt(ratio / scale) - middle) / np.sqrt(2 / (9 * k))

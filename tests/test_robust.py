@@ -84,7 +84,7 @@ def test_scores_of_good_samples_are_normal(sim_6dof_actual):
     for kind in (Pose, Position):
         rng = np.random.default_rng(0)
         data = kind.simulate(sim_6dof_actual, rng.uniform(-3, 3, (20000, 6)), Noise(1e-4, 2e-4), rng)
-        found = scores(sim_6dof_actual, data, np.empty(0))
+        found = scores(data.residual(sim_6dof_actual.sweep(data.q), np.empty(0)))
         np.testing.assert_allclose(np.quantile(found, [0.5, 0.841, 0.9987]), [0, 1, 3], atol=0.15)
 
 
