@@ -91,11 +91,14 @@ class Problem:
         """The same problem with some or other samples of the same measurements, or with other sigmas."""
         out = replace(self, data=tuple(data))
         vars(out)["ruler"] = self.ruler
-        if len(data) == len(self.data) and "chunks" in vars(self):
-            pairs = zip(self.data, data, strict=True)
-            if all(old.configurations() is new.configurations() for old, new in pairs):
-                for old, new in zip(self.chunks, out.chunks, strict=True):
-                    new.moves_like(old)
+        if "chunks" not in vars(self) or len(data) != len(self.data):
+            return out
+        pairs = list(zip(self.data, data, strict=True))
+        if all(old is new for old, new in pairs):
+            vars(out)["chunks"] = self.chunks
+        elif all(old.configurations() is new.configurations() for old, new in pairs):
+            for old, new in zip(self.chunks, out.chunks, strict=True):
+                new.moves_like(old)
         return out
 
     @cached_property
