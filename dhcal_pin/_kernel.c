@@ -594,16 +594,16 @@ static PyObject *right_jacobian_inverses(PyObject *self, PyObject *args)
     return answer(a, 2, fine);
 }
 
-static PyObject *triangle(PyObject *self, PyObject *args)
+static PyObject *triangles(PyObject *self, PyObject *args)
 {
     (void)self;
-    static const Wanted wanted[] = {{"rows", 3, 'd'}, {"out", 2, 'D'}};
+    static const Wanted wanted[] = {{"rows", 4, 'd'}, {"out", 3, 'D'}};
     Array a[2];
     if (!take_all(a, args, wanted, 2))
         return NULL;
-    const Py_buffer *rows = &a[0].view;
-    const Size c = rows->shape[0], k = rows->shape[1], m = rows->shape[2];
-    int fine = is_shaped(a + 1, c, c, 0, 0) && is_packed(a + 1);
+    const Py_buffer *rows = &a->view;
+    const Size b = rows->shape[0], c = rows->shape[1], k = rows->shape[2], m = rows->shape[3];
+    int fine = is_shaped(a + 1, b, c, c, 0) && is_packed(a + 1);
     if (fine) {
         Lanes *block = aligned_alloc(64, (c + 1) * ROWS * sizeof(double));
         double *part = malloc((c * c + 1) * sizeof(double));
@@ -611,7 +611,9 @@ static PyObject *triangle(PyObject *self, PyObject *args)
         fine = block && part && work;
         if (fine) {
             Py_BEGIN_ALLOW_THREADS;
-            reduce(a[0].data, c, k, m, a[0].stride[0], a[0].stride[1], a[1].data, block, work, part);
+            for (Size i = 0; i < b; i++)
+                reduce((double *)a->data + i * a->stride[0], c, k, m, a->stride[1], a->stride[2],
+                       (double *)a[1].data + i * c * c, block, work, part);
             Py_END_ALLOW_THREADS;
         } else
             PyErr_NoMemory();
@@ -626,7 +628,7 @@ static PyMethodDef methods[] = {
     {"mix_samples", mix_samples, METH_VARARGS, NULL},
     {"log_rotations", log_rotations, METH_VARARGS, NULL},
     {"right_jacobian_inverses", right_jacobian_inverses, METH_VARARGS, NULL},
-    {"triangle", triangle, METH_VARARGS, NULL},
+    {"triangles", triangles, METH_VARARGS, NULL},
     {NULL, NULL, 0, NULL},
 };
 

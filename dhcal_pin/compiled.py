@@ -41,6 +41,12 @@ def right_jacobian_inverses(rotvecs: Array) -> Array:
 
 def triangle_of(rows: Array) -> Array:
     """As `reduction.triangle_of`; the rows stay."""
-    out = np.empty((len(rows), len(rows)))
-    _kernel.triangle(rows, out)
+    return triangles_of(rows[None])[0]
+
+
+def triangles_of(rows: Array) -> Array:
+    """As `reduction.triangles_of`; the rows stay."""
+    b, c = rows.shape[:2]
+    out = np.empty((b, c, c))
+    _kernel.triangles(rows, out)
     return out

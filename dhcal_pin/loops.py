@@ -13,6 +13,7 @@ try:
         point_velocities,
         right_jacobian_inverses,
         triangle_of,
+        triangles_of,
     )
 except ImportError:
     from .kinematics import (
@@ -22,7 +23,7 @@ except ImportError:
         point_velocities,
         right_jacobian_inverses,
     )
-    from .reduction import triangle_of
+    from .reduction import triangle_of, triangles_of
 
 __all__ = [
     "carry_frames",
@@ -31,4 +32,5 @@ __all__ = [
     "point_velocities",
     "right_jacobian_inverses",
     "triangle_of",
+    "triangles_of",
 ]

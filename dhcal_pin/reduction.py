@@ -28,6 +28,16 @@ def triangle_of(rows: Array) -> Array:
     return _qr(np.concatenate(parts).T.copy())
 
 
+def triangles_of(rows: Array) -> Array:
+    """The triangles (b, c, c) of b members' rows (b, c, k, m)."""
+    b, c = rows.shape[:2]
+    stacked = rows.reshape(b, c, -1)
+    short = c - stacked.shape[2]
+    if short > 0:
+        stacked = np.concatenate([stacked, np.zeros((b, c, short))], 2)
+    return np.asarray(np.linalg.qr(stacked.swapaxes(1, 2), mode="r"))
+
+
 def _narrow(rows: Array) -> Array:
     """Triangle (u, c) of rows (c, m), which are overwritten, by the u columns that are not zero in all.
 

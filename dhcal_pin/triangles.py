@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .loops import triangles_of
 from .observability import RANK_CUT
 from .se3 import Array
 from .solver import RELATIVE_STEP, ROUNDING
@@ -101,11 +102,9 @@ class Triangles:
 
 
 def triangles(columns: Array) -> Triangles:
-    """QR of whitened rows [J | r], column by column: (b, p+1, k)."""
-    b, p, k = columns.shape[0], columns.shape[1] - 1, columns.shape[2]
-    if k <= p:
-        columns = np.concatenate([columns, np.zeros((b, p + 1, p + 1 - k))], 2)
-    full: Array = np.asarray(np.linalg.qr(columns.swapaxes(1, 2), mode="r"))
+    """Of whitened rows [J | r], column by column: (b, p+1, k)."""
+    p = columns.shape[1] - 1
+    full = triangles_of(columns[:, :, None])
     return Triangles(full[:, :p, :p], full[:, :p, p], full[:, p, p] ** 2)
 
 

@@ -14,7 +14,7 @@ from conftest import random_joints, random_table
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dhcal_pin import kinematics, se3
+from dhcal_pin import kinematics, reduction, se3
 from dhcal_pin.chain import Chain
 
 try:
@@ -75,6 +75,17 @@ def test_a_triangle_is_lapacks_but_for_signs(seed, m, columns, readings):
     )
 
 
+def test_triangles_of_many_are_each_ones_own():
+    """Members with more rows than columns, and with fewer."""
+    rng = np.random.default_rng(0)
+    for rows in rng.standard_normal((5, 7, 2, 30)), rng.standard_normal((5, 7, 2, 2)):
+        many = compiled.triangles_of(rows)
+        for member, r in zip(rows, many, strict=True):
+            np.testing.assert_array_equal(r, compiled.triangle_of(member))
+        theirs = reduction.triangles_of(rows)
+        np.testing.assert_allclose(many.swapaxes(1, 2) @ many, theirs.swapaxes(1, 2) @ theirs, atol=1e-12)
+
+
 @pytest.mark.parametrize("size", [0.0, 1e-100, 1e-12, 1.0, 1e100])
 def test_triangles_of_any_size(size):
     rows = size * np.random.default_rng(0).standard_normal((5, 2, 200))
@@ -111,32 +122,32 @@ def test_rotations_of_any_angle(size):
 @pytest.mark.parametrize(
     "rows",
     [
-        np.zeros((3, 2, 4), np.float32),
-        np.zeros((3, 8)),
-        np.zeros((4, 2, 3)).T,
-        np.zeros((3, 2, 8))[..., ::2],
+        np.zeros((1, 3, 2, 4), np.float32),
+        np.zeros((3, 2, 8)),
+        np.zeros((4, 2, 3, 1)).T,
+        np.zeros((1, 3, 2, 8))[..., ::2],
         "rows",
     ],
 )
 def test_arrays_that_do_not_fit_are_refused(rows):
     with pytest.raises((ValueError, TypeError)):
-        _kernel.triangle(rows, np.zeros((3, 3)))
+        _kernel.triangles(rows, np.zeros((1, 3, 3)))
 
 
 def test_shapes_bodies_and_constants_are_checked(sim_6dof):
-    rows, frozen = np.zeros((3, 2, 4)), np.zeros((3, 3))
+    rows, frozen = np.zeros((1, 3, 2, 4)), np.zeros((1, 3, 3))
     frozen.flags.writeable = False
     for out in (
-        np.zeros((3, 4)),
-        np.zeros((4, 4)),
-        np.zeros((6, 6))[::2, ::2],
-        np.zeros((3, 6))[:, :3],
+        np.zeros((1, 3, 4)),
+        np.zeros((2, 3, 3)),
+        np.zeros((1, 6, 6))[:, ::2, ::2],
+        np.zeros((1, 3, 6))[..., :3],
         frozen,
     ):
         with pytest.raises((ValueError, BufferError)):
-            _kernel.triangle(rows, out)
+            _kernel.triangles(rows, out)
     with pytest.raises(TypeError):
-        _kernel.triangle(rows)
+        _kernel.triangles(rows)
     sweep, out = sim_6dof.sweep(np.zeros((5, 6))), np.empty((1, 6, 5))
     for body in (-1, len(sweep.frames)):
         with pytest.raises(ValueError, match="shapes"):
