@@ -193,7 +193,7 @@ def test_an_interrupt_leaves_whole_files(place):
         first = running.stderr.readline()
         os.killpg(running.pid, signal.SIGINT)
         rest = running.stderr.read()
-    assert running.returncode == 130
+    assert running.returncode == 130, rest
     assert "1 of 12" in first.replace("  ", " ")
     assert "interrupted" in rest
     assert "Traceback" not in rest
