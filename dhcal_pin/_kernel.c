@@ -167,6 +167,22 @@ WIDEST static void mix(Size p, Size k, Size c, Size m, const double *vectors, Si
     }
 }
 
+/* Twists (p, 6) seen from frames (p, 4, 4). */
+static void carry_all(Size p, const double *frames, const double *twists, double *out)
+{
+    for (; p--; frames += 16, twists += 6, out += 6) {
+        const double x = frames[3], y = frames[7], z = frames[11];
+        for (int i = 0; i < 3; i++) {
+            const double *r = frames + 4 * i;
+            out[i] = r[0] * twists[0] + r[1] * twists[1] + r[2] * twists[2];
+            out[3 + i] = r[0] * twists[3] + r[1] * twists[4] + r[2] * twists[5];
+        }
+        out[0] += y * out[5] - z * out[4];
+        out[1] += z * out[3] - x * out[5];
+        out[2] += x * out[4] - y * out[3];
+    }
+}
+
 /* ---- rotations ---- */
 
 /* Rotation vectors (3, m) of matrices (3, 3, m); how many are by so obtuse an angle that it takes more care. */
@@ -565,6 +581,22 @@ static PyObject *mix_samples(PyObject *self, PyObject *args)
     return answer(a, 3, fine);
 }
 
+static PyObject *carry_twists(PyObject *self, PyObject *args)
+{
+    (void)self;
+    static const Wanted wanted[] = {{"frames", 3, 'd'}, {"twists", 2, 'd'}, {"out", 2, 'D'}};
+    Array a[3];
+    if (!take_all(a, args, wanted, 3))
+        return NULL;
+    const Size p = a->view.shape[0];
+    int fine = is_shaped(a, p, 4, 4, 0) && is_shaped(a + 1, p, 6, 0, 0) && is_shaped(a + 2, p, 6, 0, 0);
+    for (int i = 0; i < 3; i++)
+        fine = fine && is_packed(a + i);
+    if (fine)
+        carry_all(p, a->data, a[1].data, a[2].data);
+    return answer(a, 3, fine);
+}
+
 static PyObject *log_rotations(PyObject *self, PyObject *args)
 {
     (void)self;
@@ -626,6 +658,7 @@ static PyMethodDef methods[] = {
     {"carry_frames", carry_frames, METH_VARARGS, NULL},
     {"point_velocities", point_velocities, METH_VARARGS, NULL},
     {"mix_samples", mix_samples, METH_VARARGS, NULL},
+    {"carry_twists", carry_twists, METH_VARARGS, NULL},
     {"log_rotations", log_rotations, METH_VARARGS, NULL},
     {"right_jacobian_inverses", right_jacobian_inverses, METH_VARARGS, NULL},
     {"triangles", triangles, METH_VARARGS, NULL},

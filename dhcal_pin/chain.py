@@ -267,7 +267,7 @@ class Chain:
         return self.sweep(q).poses()
 
     @cached_property
-    def _station_bodies(self) -> Array:
+    def station_bodies(self) -> Array:
         """(2k+4,): each station's body."""
         return np.clip((np.arange(self.tool_station + 1) - 1) // 2, 0, len(self.moving))
 
@@ -290,9 +290,23 @@ class Chain:
         `carry` (p, 4, 4) are the frames that the twists are seen in where these are not the stations' own.
         """
         frames = self._station_frames[stations]
-        return self._station_bodies[stations], se3.carried(
-            frames if carry is None else frames @ carry, np.asarray(twists, float)
-        )
+        frames = frames if carry is None else frames @ carry
+        return self.station_bodies[stations], loops.carry_twists(frames, np.asarray(twists, float))
+
+    def unmoved_frames(self, motions: Array, moved: Chain) -> Array:
+        """Each station's frame (2k+4, 4, 4) in its body as `moved` has it, before the station's own motion.
+
+        Args:
+            motions: (2k+4, 4, 4) of the stations, by which this chain becomes `moved`.
+            moved: that chain.
+        """
+        frames = np.empty(motions.shape)
+        # Body 0 is behind the base's motion.
+        frames[0] = se3.inverse(motions[0])
+        frames[1:-1:2] = self._into
+        np.matmul(self._into @ motions[1:-1:2], self.origins, out=frames[2::2])
+        frames[-1] = moved._reached[-1] @ self.tool
+        return frames
 
     def tool_velocities(self, sweep: Sweep, bodies: Array, twists: Array, out: Array | None = None) -> Array:
         """The tool point's velocity (p, 6, m) per unit of each body twist, axes of the measuring frame.
@@ -348,6 +362,6 @@ class Chain:
             axis_frames=self.axis_frames,
             _into=self._into,
             _ahead=self._ahead,
-            _station_bodies=self._station_bodies,
+            station_bodies=self.station_bodies,
         )
         return chain

@@ -25,6 +25,13 @@ def mix_samples(vectors: Array, matrices: Array, out: Array) -> Array:
     return out
 
 
+def carry_twists(frames: Array, twists: Array) -> Array:
+    """As `kinematics.carry_twists`."""
+    out = np.empty(twists.shape)
+    _kernel.carry_twists(frames, twists, out)
+    return out
+
+
 def log_rotations(turns: Array) -> Array:
     """As `kinematics.log_rotations`."""
     out = np.empty(turns.shape[1:])

@@ -18,6 +18,7 @@ import numpy as np
 
 from . import se3
 from .chain import BASE, Chain
+from .loops import carry_twists
 from .se3 import Array
 from .transmission import Transmission
 
@@ -100,13 +101,6 @@ class ErrorModel:
         return int(self._slots[2].max(initial=0)) + 1
 
     @cached_property
-    def _left(self) -> Array:
-        """Which stations with unknowns are links', (g, 1, 1, 1)."""
-        stations = self._slots[0]
-        left = (stations % 2 == 1) & (stations != self.chain.tool_station)
-        return left[:, None, None, None]
-
-    @cached_property
     def _powers(self) -> tuple[Array, Array]:
         """Sizes of the rotations (p,), and the twists as matrices Ξ, Ξ²/|ω|², Ξ³/|ω|³ (p, 3, 16)."""
         twist = np.zeros((len(self._twists), 4, 4))
@@ -134,13 +128,18 @@ class ErrorModel:
     def at(self, x: Array) -> Chain:
         """The chain with errors x (p,) in SI; its joints yield to the nominal arm's masses."""
         factors = self._factors(np.asarray(x, float)[: self._geometry])
-        return self._moved(functools.reduce(np.matmul, np.swapaxes(factors, 0, 1)), x)
+        every = self._every(functools.reduce(np.matmul, np.swapaxes(factors, 0, 1)))
+        return self._driven(self.chain.moved(every), x)
 
-    def _moved(self, motions: Array, x: Array) -> Chain:
+    def _every(self, motions: Array) -> Array:
+        """Motions of all stations (2k+4, 4, 4) from those of the stations with unknowns (g, 4, 4)."""
         every = np.empty((self.chain.tool_station + 1, 4, 4))
         every[:] = _IDENTITY
         every[self._slots[0]] = motions
-        chain = self.chain.moved(every)
+        return every
+
+    def _driven(self, chain: Chain, x: Array) -> Chain:
+        """A chain with the transmission at x (p,)."""
         if not self._entries.size:
             return chain
         held = self._transmission.changed(self._entries, x[self._geometry :])
@@ -158,22 +157,21 @@ class ErrorModel:
     def derivative(self, x: Array) -> tuple[Chain, Array, Array]:
         """The chain at x, and for each parameter the body (p,) and twist (p, 6) it moves there.
 
-        A factor behind the k-th at its station turns the k-th twist; a link's motion is taken up by the
-        next origin from the left, so there the factors before it do. Entries of the transmission come
-        last, numbered behind the bodies (see `Chain.tool_velocities`).
+        The k-th factor at a station turns with those before it, seen from the station as it was before all of
+        them. Entries of the transmission come last, numbered behind the bodies (see `Chain.tool_velocities`).
         """
         x = np.asarray(x, float)
         factors = self._factors(x[: self._geometry])
         _, group, place = self._slots
-        most = self._most
-        before, behind = np.empty_like(factors), np.empty_like(factors)
-        before[:, 0] = behind[:, -1] = _IDENTITY
-        for i in range(1, most):
-            np.matmul(before[:, i - 1], factors[:, i - 1], out=before[:, i])
-            np.matmul(factors[:, most - i], behind[:, most - i], out=behind[:, most - i - 1])
-        chain = self._moved(factors[:, 0] @ behind[:, 0], x)
-        carry = np.where(self._left, before, se3.inverse(behind))
-        bodies, twists = chain.station_twists(self._stations, self._twists, carry[group, place])
+        before = np.empty((len(factors), self._most + 1, 4, 4))
+        before[:, 0] = _IDENTITY
+        for i in range(self._most):
+            np.matmul(before[:, i], factors[:, i], out=before[:, i + 1])
+        every = self._every(before[:, -1])
+        chain = self._driven(self.chain.moved(every), x)
+        frames = self.chain.unmoved_frames(every, chain)[self._stations]
+        twists = carry_twists(frames @ before[group, place], self._twists)
+        bodies = self.chain.station_bodies[self._stations]
         if not self._entries.size:
             return chain, bodies, twists
         entries = len(chain.moving) + 1 + self._entries

@@ -131,6 +131,11 @@ def mix_samples(vectors: Array, matrices: Array, out: Array) -> Array:
     return out
 
 
+def carry_twists(frames: Array, twists: Array) -> Array:
+    """Twists [v, ω] (p, 6) of frames b as those of frames a, given T_ab (p, 4, 4)."""
+    return (se3.adjoint(frames) @ twists[..., None])[..., 0]
+
+
 def log_rotations(turns: Array) -> Array:
     """Rotation vectors (3, m) of rotations (3, 3, m)."""
     return se3.log3(turns.transpose(2, 0, 1)).T

@@ -8,6 +8,7 @@ from __future__ import annotations
 try:
     from .compiled import (
         carry_frames,
+        carry_twists,
         log_rotations,
         mix_samples,
         point_velocities,
@@ -18,6 +19,7 @@ try:
 except ImportError:
     from .kinematics import (
         carry_frames,
+        carry_twists,
         log_rotations,
         mix_samples,
         point_velocities,
@@ -27,6 +29,7 @@ except ImportError:
 
 __all__ = [
     "carry_frames",
+    "carry_twists",
     "log_rotations",
     "mix_samples",
     "point_velocities",

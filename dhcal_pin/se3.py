@@ -49,17 +49,6 @@ def inverse(pose: ArrayLike) -> Array:
     return out
 
 
-def carried(pose: Array, twists: Array) -> Array:
-    """Twists (..., 6) of frames b as those of frames a, given T_ab (..., 4, 4); as `adjoint` does."""
-    turned = pose[..., :3, :3] @ twists.reshape(*twists.shape[:-1], 2, 3).swapaxes(-1, -2)
-    v, w = turned[..., 0], turned[..., 1]
-    out = np.empty(twists.shape)
-    out[..., 3:] = w
-    for x, y, z in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        out[..., x] = v[..., x] + pose[..., y, 3] * w[..., z] - pose[..., z, 3] * w[..., y]
-    return out
-
-
 def adjoint(pose: ArrayLike) -> Array:
     """Matrices (..., 6, 6) that carry twists in frame b to frame a, given T_ab (..., 4, 4)."""
     pose = np.asarray(pose, float)
