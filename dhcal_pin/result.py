@@ -340,11 +340,7 @@ class Result:
 
     def is_converged(self, eps: float = 1e-6) -> bool:
         """Whether a fresh Gauss-Newton step would change no whitened row by more than eps RMS."""
-        full = with_priors(
-            reduce(self.problem, self.solution.x, small_angle=False),
-            self.problem.weights,
-            self.solution.x,
-            np.zeros_like(self.x),
-        )
+        triangle = reduce(self.problem, self.solution.x, small_angle=False)
+        full = with_priors(triangle, self.problem.weights, self.solution.x)
         step = bounded_step(self.problem, full, self.solution.x)
         return float(np.linalg.norm(full.r @ step)) <= eps * np.sqrt(max(1, self.samples))

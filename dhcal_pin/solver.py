@@ -33,18 +33,23 @@ LEAP, LEAP_STEPS = 8, 6
 RUNAWAY = 1e6
 
 
-def with_priors(triangle: Triangle, weights: Array, x: Array, damping: Array) -> Triangle:
-    """The triangle with prior rows -x/σ and damping rows below it."""
-    p, (held,), (damped,) = len(x), weights.nonzero(), damping.nonzero()
-    if not (held.size or damped.size):
+def with_rows(triangle: Triangle, diagonal: Array, right: Array | float) -> Triangle:
+    """The triangle with rows diagonal·δ = right (p,) below it."""
+    p = len(diagonal)
+    if not diagonal.any():
         return triangle
-    stacked = np.zeros((p + 1, p + held.size + damped.size))
+    stacked = np.zeros((p + 1, 2 * p))
     stacked[:p, :p], stacked[p, :p] = triangle.r.T, triangle.z
-    priors = np.arange(p, p + held.size)
-    stacked[held, priors], stacked[p, priors] = weights[held], -(weights * x)[held]
-    stacked[damped, p + held.size + np.arange(damped.size)] = damping[damped]
+    # Entry i of the diagonal stands in column p + i of line i.
+    stacked.reshape(-1)[p : 2 * p * p : 2 * p + 1] = diagonal
+    stacked[p, p:] = right
     full = triangle_of(stacked[:, None])
     return Triangle(full[:p, :p], full[:p, p], triangle.rest + float(full[p, p] ** 2))
+
+
+def with_priors(triangle: Triangle, weights: Array, x: Array | float) -> Triangle:
+    """The triangle with prior rows -x/σ below it."""
+    return with_rows(triangle, weights, -(weights * x))
 
 
 def _regular(r: Array) -> bool:
@@ -80,10 +85,9 @@ def posterior_root(triangle: Triangle, weights: Array) -> tuple[Array, Array]:
 
     The rest are directions that neither data nor a prior tell.
     """
-    zero = np.zeros_like(weights)
-    full = with_priors(triangle, weights, zero, zero).r
+    full = with_priors(triangle, weights, 0.0).r
     if _regular(full):
-        return lapack.dtrtri(full)[0], np.empty((len(zero), 0))
+        return lapack.dtrtri(full)[0], np.empty((len(weights), 0))
     # However exact the data are, what they do not see is the priors' to tell: by what is seen and what not.
     _, s, vt = np.linalg.svd(triangle.r)
     count = int(np.sum(s > observability.RANK_CUT * s[0]))
@@ -160,7 +164,7 @@ def gauss_newton(problem: Problem, x: Array, max_iterations: int, progress: Prog
     path, converged, done = [x], False, 0
     while done < max_iterations and not converged:
         triangle = reduce(problem, x, small_angle=True)
-        full = with_priors(triangle, problem.weights, x, np.zeros_like(x))
+        full = with_priors(triangle, problem.weights, x)
         step = pseudo_inverse(full.r, full.z)
         cost = full.rest + float(full.z @ full.z)
         converged = _settled(full.r, _change(full.r, step), cost)
@@ -178,9 +182,7 @@ def _leap(problem: Problem, x: Array, cost: float) -> tuple[Array, float]:
     """A few plain Gauss-Newton steps, uphill ones too; where they end if that is lower, else x."""
     far, ends = x, math.inf
     for _ in range(LEAP_STEPS):
-        triangle = with_priors(
-            reduce(problem, far, small_angle=False), problem.weights, far, np.zeros_like(x)
-        )
+        triangle = with_priors(reduce(problem, far, small_angle=False), problem.weights, far)
         there = far + bounded_step(problem, triangle, far)
         if not np.abs(there).max() < RUNAWAY:
             break
@@ -206,12 +208,12 @@ def levenberg_marquardt(
     trust = before.trust if before else Trust()
     damping, scale, last = trust.damping, trust.scale, trust.last
     path, done = (list(before.path), before.iterations) if before else ([x], 0)
-    growth, converged, none, leapt = 2.0, False, np.zeros_like(x), 0
+    growth, converged, leapt = 2.0, False, 0
     triangle = before.triangle if before else reduce(problem, x, small_angle=False)
     cost = triangle.cost + float(np.sum((problem.weights * x) ** 2))
     while done < max_iterations and not converged and damping <= 1e16:
         start, reached = x, None
-        free = with_priors(triangle, problem.weights, x, none)
+        free = with_priors(triangle, problem.weights, x)
         scale = np.maximum(scale, np.linalg.norm(free.r, axis=0))
         floor = np.where(scale > 0, scale, 1.0)
         rounding = ROUNDING * float(np.linalg.norm(free.r))
@@ -220,7 +222,7 @@ def levenberg_marquardt(
         creeping = False
         done += 1
         while True:
-            damped = with_priors(free, none, x, np.sqrt(damping) * floor)
+            damped = with_rows(free, np.sqrt(damping) * floor, 0.0)
             step = bounded_step(problem, damped, x)
             change = _change(free.r, step)
             if nearly and damping < 1e-3 and _settled(free.r, change, cost, last, NEARLY):
@@ -271,8 +273,7 @@ def levenberg_marquardt(
 
 def last_step(problem: Problem, solution: Solution) -> Array:
     """Where the least-squares step leads (p,) from where a loop nearly ended."""
-    none = np.zeros_like(solution.x)
-    full = with_priors(solution.triangle, problem.weights, solution.x, none)
+    full = with_priors(solution.triangle, problem.weights, solution.x)
     return solution.x + bounded_step(problem, full, solution.x)
 
 

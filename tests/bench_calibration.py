@@ -48,14 +48,15 @@ def by_pinocchio(errors: ErrorModel, data: Pose, weights: np.ndarray) -> Callabl
 def analytic(problem: Problem) -> tuple[Callable[..., np.ndarray], Callable[..., np.ndarray]]:
     """The same residuals and their Jacobian by our kernel, all samples at once."""
     errors, (data,) = problem.errors, problem.data
+    motion = errors.chain.motion(data.q)
 
     def residual(x: np.ndarray) -> np.ndarray:
-        rows = data.residual(errors.at(x).sweep(data.q), NONE)
+        rows = data.residual(errors.at(x).sweep(motion), NONE)
         return np.concatenate([rows.ravel(), problem.weights * x])
 
     def jacobian(x: np.ndarray) -> np.ndarray:
         chain, bodies, twists = errors.derivative(x)
-        sweep = chain.sweep(data.q)
+        sweep = chain.sweep(motion)
         velocities = chain.tool_velocities(sweep, bodies, twists)
         rows = data.whiten(sweep, velocities, NONE, data.residual(sweep, NONE)).reshape(len(x), -1)
         return np.concatenate([-rows.T, np.diag(problem.weights)])

@@ -80,8 +80,9 @@ def against_ceres(m: int, repeats: int) -> list[Row]:
     found = spoken([sys.executable, HERE / "bench_ceres.py", str(m), str(repeats)], HERE, PYTHONPATH=path)
     assert isinstance(found, list)
     return [
-        Row(f"calibration: Ceres with our Jacobian, {name}, m={m}", ours, other, other / ours, "≥ 8")
-        for name, ours, other in found
+        Row(f"{what}: Ceres with our Jacobian, {name}, m={m}", ours, other, other / ours, wanted)
+        for name, whole, alone, other in found
+        for what, ours, wanted in (("least squares alone", alone, "≥ 8"), ("calibration", whole, ""))
     ]
 
 

@@ -383,7 +383,7 @@ def test_the_step_is_exact_at_condition_1e8():
     q = rng.uniform(-3, 3, (12, 6))
     data = Pose.simulate(errors.at(x + 1e-4 * rng.normal(size=24)), q, Noise(1e-4, 1e-4), rng)
     problem = Problem(errors, (data,), np.zeros(24))
-    full = with_priors(reduce(problem, x, False), problem.weights, x, np.zeros(24))
+    full = with_priors(reduce(problem, x, False), problem.weights, x)
     assert observability.rank(full.r) == 24
     assert 3e7 < observability.condition(full.r) < 3e8
     chain, bodies, twists = errors.derivative(x)

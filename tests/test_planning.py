@@ -48,7 +48,7 @@ def log_det(chain: Chain, kind: str, q) -> float:
     zero = np.zeros(len(weights))
     data = KINDS[kind].simulate(chain, q, NOISE, np.random.default_rng(1))
     triangle = reduce(Problem(errors, (data,), weights), zero, small_angle=False)
-    full = with_priors(triangle, weights, zero, zero).r
+    full = with_priors(triangle, weights, zero).r
     return float(2 * np.sum(np.log(np.abs(np.diag(full)))) + 2 * np.sum(np.log(errors.priors)))
 
 
