@@ -187,6 +187,8 @@ def test_an_interrupt_leaves_whole_files(place):
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        # Where the tests run in the background, interrupts are ignored, and children inherit that.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
         env=os.environ | {"PYTHONPATH": root},
     ) as running:
         assert running.stderr is not None

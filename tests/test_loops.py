@@ -119,6 +119,36 @@ def test_rotations_of_any_angle(size):
     np.testing.assert_allclose(inverses, se3.right_jacobian_inverse(rotvecs.T), atol=1e-14)
 
 
+def test_digits_depend_neither_on_where_arrays_lie_nor_on_their_neighbours(sim_6dof):
+    """Whole vectors and the rest of a loop round alike: else a report would change from run to run."""
+    q = np.random.default_rng(0).uniform(-3, 3, (300, 6))
+    bodies, twists = np.arange(7), np.random.default_rng(1).standard_normal((7, 6))
+    sweep = sim_6dof.sweep(q)
+    velocities = sim_6dof.tool_velocities(sweep, bodies, twists)
+    for first, count in ((0, 1), (3, 1), (5, 2), (66, 3), (1, 67), (100, 64)):
+        part = slice(first, first + count)
+        alone = sim_6dof.sweep(q[part])
+        np.testing.assert_array_equal(alone.bodies, sweep.bodies[..., part])
+        own = sim_6dof.tool_velocities(alone, bodies, twists)
+        np.testing.assert_array_equal(own, velocities[..., part])
+        turns = np.ascontiguousarray(alone.tool[:3])
+        whole = compiled.log_rotations(np.ascontiguousarray(sweep.tool[:3]))
+        np.testing.assert_array_equal(compiled.log_rotations(turns), whole[:, part])
+        rotvecs = np.ascontiguousarray(own[0, 3:])
+        inverses = compiled.right_jacobian_inverses(np.ascontiguousarray(velocities[0, 3:]))
+        np.testing.assert_array_equal(compiled.right_jacobian_inverses(rotvecs), inverses[..., part])
+        out, expected = np.empty_like(own[:, 3:]), np.empty_like(velocities[:, 3:])
+        compiled.mix_samples(velocities[:, 3:], inverses, expected)
+        compiled.mix_samples(own[:, 3:], inverses[..., part], out)
+        np.testing.assert_array_equal(out, expected[..., part])
+    rows = np.random.default_rng(2).standard_normal((9, 3, 67))
+    wanted = compiled.triangle_of(rows)
+    for shift in range(1, 8):
+        moved = np.empty(rows.size + 8)[shift : shift + rows.size].reshape(rows.shape)
+        moved[...] = rows
+        np.testing.assert_array_equal(compiled.triangle_of(moved), wanted)
+
+
 @pytest.mark.parametrize(
     "rows",
     [
