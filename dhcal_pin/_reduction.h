@@ -130,7 +130,8 @@ static int empty(const double *column, Size n)
 }
 
 /* The triangle r (c, c) of rows (c, k, m): those of the k readings that are zero in the same columns are
-   reduced without these. `work` holds k + 2 times c sizes, `part` c times c doubles. */
+   reduced without these. Half the errors of an arm are lengths, which turn nothing: a quarter of the work for
+   rows of rotations. There is room for c by ROWS in `block`, k by c + 1 in `work`, c by c in `part`. */
 static void reduce(const double *rows, Size c, Size k, Size m, Size column, Size reading, double *r,
                    Lanes *block, Size *work, double *part)
 {
@@ -145,7 +146,7 @@ static void reduce(const double *rows, Size c, Size k, Size m, Size column, Size
     Fold whole = {r, block, c, 0};
     for (Size i = 0; i < k; i++) {
         const Size u = counts[i], *mine = used + i * c;
-        if (u == 0 || u > c)
+        if (u == 0)
             continue;
         double *into = u == c ? r : part;
         if (u < c)

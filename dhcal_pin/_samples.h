@@ -19,7 +19,7 @@
 
 typedef Py_ssize_t Size;
 /* As wide as the widest registers; narrower ones take two or four for it. */
-typedef double Lanes __attribute__((vector_size(32)));
+typedef double Lanes __attribute__((vector_size(32), may_alias));
 enum { LANES = 4, SAMPLES = 64, ROWS = 128 };
 
 /* Columns x, y, z, p of frames at a stride, one after the other along a chain. */

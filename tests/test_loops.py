@@ -209,8 +209,8 @@ print(json.dumps([fit.converged, fit.x.tolist(), fit.std.tolist()]))
 
 
 def test_a_calibration_without_the_compiled_loops_ends_at_the_same_values():
-    here = Path(__file__).resolve().parent
-    environ = os.environ | {"PYTHONPATH": os.pathsep.join([str(here.parent), str(here)])}
+    places = Path(compiled.__file__).parent.parent, Path(__file__).parent
+    environ = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, map(Path.resolve, places)))}
     ends = [
         json.loads(
             subprocess.run(
