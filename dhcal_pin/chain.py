@@ -212,14 +212,14 @@ class Chain:
         return np.stack([np.eye(4), *(axis_frame(tuple(axis)) for axis in self.axes.tolist())])
 
     @cached_property
-    def _into(self) -> Array:
+    def into(self) -> Array:
         """(k+1, 4, 4): each body's URDF frame in its body frame."""
         return se3.inverse(self.axis_frames)
 
     @cached_property
-    def _reached(self) -> Array:
+    def reached(self) -> Array:
         """(k+1, 4, 4): each joint's URDF frame, and the tip, in the body frame before it."""
-        return self._into @ self.origins
+        return self.into @ self.origins
 
     @cached_property
     def _ahead(self) -> Array:
@@ -232,7 +232,7 @@ class Chain:
 
         The tool's pose is base · links[0] · Z(q_1) · links[1] · … · Z(q_k) · links[k] · tool.
         """
-        return self._reached @ self._ahead
+        return self.reached @ self._ahead
 
     @cached_property
     def _links_and_tool(self) -> Array:
@@ -265,48 +265,6 @@ class Chain:
     def poses(self, q: Array) -> Array:
         """Tool poses (m, 4, 4) in the measuring frame at joint values q (m, n) in rad or m."""
         return self.sweep(q).poses()
-
-    @cached_property
-    def station_bodies(self) -> Array:
-        """(2k+4,): each station's body."""
-        return np.clip((np.arange(self.tool_station + 1) - 1) // 2, 0, len(self.moving))
-
-    @cached_property
-    def _station_frames(self) -> Array:
-        """(2k+4, 4, 4): each station's frame in its body."""
-        k = len(self.moving)
-        frames = np.empty((2 * k + 4, 4, 4))
-        frames[0] = _IDENTITY
-        frames[1:-1:2] = self._into
-        frames[2::2] = self._reached
-        frames[-1] = frames[-2] @ self.tool
-        return frames
-
-    def station_twists(
-        self, stations: Array, twists: Array, carry: Array | None = None
-    ) -> tuple[Array, Array]:
-        """Bodies (p,) and the same twists (p, 6) in those bodies' frames, of twists at stations.
-
-        `carry` (p, 4, 4) are the frames that the twists are seen in where these are not the stations' own.
-        """
-        frames = self._station_frames[stations]
-        frames = frames if carry is None else frames @ carry
-        return self.station_bodies[stations], loops.carry_twists(frames, np.asarray(twists, float))
-
-    def unmoved_frames(self, motions: Array, moved: Chain) -> Array:
-        """Each station's frame (2k+4, 4, 4) in its body as `moved` has it, before the station's own motion.
-
-        Args:
-            motions: (2k+4, 4, 4) of the stations, by which this chain becomes `moved`.
-            moved: that chain.
-        """
-        frames = np.empty(motions.shape)
-        # Body 0 is behind the base's motion.
-        frames[0] = se3.inverse(motions[0])
-        frames[1:-1:2] = self._into
-        np.matmul(self._into @ motions[1:-1:2], self.origins, out=frames[2::2])
-        frames[-1] = moved._reached[-1] @ self.tool
-        return frames
 
     def tool_velocities(self, sweep: Sweep, bodies: Array, twists: Array, out: Array | None = None) -> Array:
         """The tool point's velocity (p, 6, m) per unit of each body twist, axes of the measuring frame.
@@ -360,8 +318,7 @@ class Chain:
             base=self.base @ motions[0],
             tool=self.tool @ motions[-1],
             axis_frames=self.axis_frames,
-            _into=self._into,
+            into=self.into,
             _ahead=self._ahead,
-            station_bodies=self.station_bodies,
         )
         return chain

@@ -20,6 +20,7 @@ from . import se3
 from .chain import BASE, Chain
 from .loops import carry_twists
 from .se3 import Array
+from .stations import bodies_at, frames_before
 from .transmission import Transmission
 
 _IDENTITY = np.eye(4)
@@ -83,6 +84,10 @@ class ErrorModel:
     @cached_property
     def _stations(self) -> Array:
         return np.array([parameter.station for parameter in self.parameters], int)[: self._geometry]
+
+    @cached_property
+    def _bodies(self) -> Array:
+        return bodies_at(self.chain, self._stations)
 
     @property
     def priors(self) -> Array:
@@ -169,9 +174,9 @@ class ErrorModel:
             np.matmul(before[:, i], factors[:, i], out=before[:, i + 1])
         every = self._every(before[:, -1])
         chain = self._driven(self.chain.moved(every), x)
-        frames = self.chain.unmoved_frames(every, chain)[self._stations]
+        frames = frames_before(self.chain, every, chain)[self._stations]
         twists = carry_twists(frames @ before[group, place], self._twists)
-        bodies = self.chain.station_bodies[self._stations]
+        bodies = self._bodies
         if not self._entries.size:
             return chain, bodies, twists
         entries = len(chain.moving) + 1 + self._entries

@@ -25,7 +25,7 @@ class Path:
     Attributes:
         chain: at the values of the unknowns.
         parameters: (r,).
-        bodies, twists: (r,), (r, 6) what they move there, see `Chain.station_twists`.
+        bodies, twists: (r,), (r, 6) what they move there, see `stations.twists_at`.
     """
 
     chain: Chain

@@ -18,6 +18,7 @@ from .kinematics import Sweep
 from .observability import RANK_CUT
 from .parameters import ErrorModel
 from .se3 import Array
+from .stations import twists_at
 
 # A parameter, or a metre and a radian of the tool, with more than this share of itself unseen is unknown.
 UNKNOWN = 1e-6
@@ -127,7 +128,7 @@ class Uncertainty:
         carry = np.tile(np.eye(4), (count, 1, 1))
         carry[0] = se3.inverse(chain.base)
         stations = np.repeat([link_station(j) for j in range(count)], 6)
-        bodies, twists = chain.station_twists(stations, np.tile(np.eye(6), (count, 1)), carry.repeat(6, 0))
+        bodies, twists = twists_at(chain, stations, np.tile(np.eye(6), (count, 1)), carry.repeat(6, 0))
         return chain.tool_velocities(
             sweep,
             np.concatenate([bodies, count + self.entries]),

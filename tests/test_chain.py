@@ -11,6 +11,7 @@ from dhcal_pin import se3
 from dhcal_pin.chain import Chain
 from dhcal_pin.dh import CONVENTIONS
 from dhcal_pin.errors import DhcalError
+from dhcal_pin.stations import twists_at
 from dhcal_pin.urdf import parse_urdf
 
 
@@ -182,7 +183,7 @@ def test_velocities_are_the_derivative_of_poses(sim_6dof_actual):
     q, h = rng.uniform(-np.pi, np.pi, (10, 6)), 1e-6
     stations = np.repeat(np.arange(chain.tool_station + 1), 6)
     twists = np.tile(np.eye(6), (chain.tool_station + 1, 1))
-    bodies, moved = chain.station_twists(stations, twists)
+    bodies, moved = twists_at(chain, stations, twists)
     velocities = chain.tool_velocities(chain.sweep(q), bodies, moved)
     for k, (station, twist) in enumerate(zip(stations, twists, strict=True)):
         up, down = (chain.displaced({int(station): se3.exp6(s * h * twist)}).poses(q) for s in (1, -1))

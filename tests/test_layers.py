@@ -24,6 +24,7 @@ LAYERS = (
     {"compiled"},
     {"loops"},
     {"chain"},
+    {"stations"},
     {"error_model", "factors", "measurements", "scale", "inverse", "trilateration", "clearance", "design"},
     {"parameters", "configurations", "point_readings"},
     {"poses", "positions"},
