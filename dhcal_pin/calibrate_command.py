@@ -97,6 +97,7 @@ class Outcome:
         findings, gross, aside, doubts: by file, the impossible rows, the numbers of gross ones and of those
             that take no part in the fit, and what is hard to believe.
         trials: what each family of --extend brought.
+        hint: what --extend might bring, where it was not asked for.
     """
 
     fit: Result
@@ -107,6 +108,7 @@ class Outcome:
     aside: dict[str, list[int]]
     doubts: dict[str, list[str]]
     trials: tuple[extension.Trial, ...]
+    hint: str
 
 
 def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) -> Outcome:
@@ -170,6 +172,10 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     for path, texts in misfits(fit.chain, data.fit, fit.instruments).items():
         # What a file's columns tell already is not told again.
         data.doubts[path] += texts if not data.doubts[path] else []
+    # Who has doubts about the data or the sets, or the frames alone to find, is not to look at gears yet.
+    early = any(data.doubts.values()) or set(names(sets)) <= {"base", "tool"}
+    plain = args.method == "lm" and args.priors != "none" and args.extend == "none"
+    hint = extension.hint(fit) if plain and not early else ""
     contents = _written(fit, args)
     files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
     if args.map:
@@ -191,7 +197,7 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     files |= {
         "report" if number == 1 else f"report_{number}": path for number, path in enumerate(args.report, 1)
     }
-    source = _provenance(args, sets, data, inputs, trials)
+    source = _provenance(args, sets, data, inputs, trials, hint)
     if args.report:
         from . import report_page
 
@@ -203,15 +209,21 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
         "command": source.command,
         "settings": source.settings,
         "extension": [asdict(trial) for trial in trials],
+        "hint": hint,
     }
     if args.json and args.json != STDOUT:
         contents[args.json] = report.json_text(document)
     save(contents)
-    return Outcome(fit, document, files, data.findings, gross, aside, data.doubts, trials)
+    return Outcome(fit, document, files, data.findings, gross, aside, data.doubts, trials, hint)
 
 
 def _provenance(
-    args: Job, sets: str, data: _Data, inputs: Sequence[str], trials: Sequence[extension.Trial]
+    args: Job,
+    sets: str,
+    data: _Data,
+    inputs: Sequence[str],
+    trials: Sequence[extension.Trial],
+    hint: str,
 ) -> report.Provenance:
     """What the report says of the files, the command and its choices."""
     short = report.short_names(inputs)
@@ -238,6 +250,7 @@ def _provenance(
         left_out=left_out,
         doubts=doubtful,
         trials=trials,
+        hint=hint,
     )
 
 
@@ -291,5 +304,6 @@ def calibrate(args: Namespace) -> int:
         terminal.gross(path, outcome.gross.get(path, []), outcome.aside.get(path, []))
     for path, texts in outcome.doubts.items():
         terminal.doubts(path, texts)
+    terminal.hint(outcome.hint)
     terminal.verdict(outcome.fit)
     return 0

@@ -8,7 +8,7 @@ may serve under narrow ones: as narrow as does no harm.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,7 +22,7 @@ from .errors import DhcalError
 from .folds import Parts, parts, region_folds, rows, solved, touched
 from .measurements import Measurement
 from .parameters import EXTENSIONS, SETS
-from .problem import Triangle, reduce
+from .problem import Problem, Triangle, reduce
 from .result import Result
 from .se3 import Array
 from .solver import Progress
@@ -34,6 +34,15 @@ WIDTHS = (1.0, 0.3, 0.1, 0.03)
 WORTH = 0.01
 # A family that chance alone would make look so good more often than this is not added.
 CHANCE = 0.01
+# A hint is given of one that leaves less than this share of the error, with so many rows left over for each
+# of its unknowns; so many samples tell.
+WORTH_A_WORD, AMPLE, MOST = 0.9, 5, 500
+WORDS = {
+    "gain": "wrong ratios of the drives",
+    "harmonics": "gears that run out of true",
+    "compliance": "joints that yield to the arm's weight",
+    "coupling": "joints that drive each other",
+}
 # Smaller chances differ by nothing that one could believe.
 LEAST = 1e-6
 
@@ -120,6 +129,11 @@ class _Stage:
         weights, columns = self.narrowed(kept)
         return solved(self.whole, weights, self.x, columns)[1]
 
+    def freedom(self, name: str, kept: dict[str, float]) -> tuple[int, int]:
+        """How many unknowns a family adds to those that are kept, and how many rows are left over then."""
+        more = int(np.sum(self.family == name))
+        return more, self.rows - int(np.sum(self.narrowed(kept)[1])) - more
+
     def trial(self, name: str, kept: dict[str, float]) -> Trial:
         """A family at the narrowest width that is no more than a standard error worse than the best one."""
         before = self.errors(kept)
@@ -130,9 +144,7 @@ class _Stage:
             for errors, width in reversed(tried)
             if np.mean(errors - best) <= standard_error(errors - best)
         )
-        _, columns = self.narrowed(kept)
-        more = int(np.sum(self.family == name))
-        left = self.rows - int(np.sum(columns)) - more
+        more, left = self.freedom(name, kept)
         without, with_it = self.cost(kept), self.cost(kept | {name: 1.0})
         chance = 1.0
         if left > 0 and with_it > 0:
@@ -143,7 +155,20 @@ class _Stage:
         return Trial(name, float(before.mean()), float(after.mean()), error, chance, width)
 
 
-def _stage(fit: Result, families: dict[str, list[Parameter]], progress: Progress | None) -> _Stage:
+def _missing(fit: Result, families: Sequence[str]) -> dict[str, list[Parameter]]:
+    """The parameters of families that have some which the fit does not."""
+    there = {p.name for p in fit.errors.parameters}
+    found = {name: SETS[name](fit.errors.chain) for name in families}
+    return {name: ps for name, ps in found.items() if any(p.name not in there for p in ps)}
+
+
+def _stage(
+    fit: Result,
+    data: Sequence[Measurement],
+    families: dict[str, list[Parameter]],
+    cut: Callable[[Problem, Array], tuple[Parts, ...]],
+) -> _Stage:
+    """The stage of a fit and some of its data, which `cut` parts at x (p,)."""
     names = {p.name for p in fit.errors.parameters}
     new = [p for parameters in families.values() for p in parameters if p.name not in names]
     errors = fit.errors.joined(new)
@@ -159,9 +184,9 @@ def _stage(fit: Result, families: dict[str, list[Parameter]], progress: Progress
     x = np.array([*(value for value, _ in start), *fit.x[robot:]])
     weights = np.array([*(weight for _, weight in start), *fit.problem.weights[robot:]])
     home = {p.name: name for name, parameters in families.items() for p in parameters if p.name not in names}
-    problem = replace(fit.problem, errors=errors, weights=weights)
+    problem = replace(fit.problem, errors=errors, weights=weights, data=tuple(data))
     return _Stage(
-        parts(problem, x, region_folds(problem.data, places=touched(problem, x)), progress),
+        cut(problem, x),
         reduce(problem, x, small_angle=False),
         rows(problem, x),
         x,
@@ -188,12 +213,14 @@ def select_families(
     """
     if unknown := [name for name in families if name not in EXTENSIONS]:
         raise DhcalError(f"no extension {unknown[0]!r}: choose from {', '.join(EXTENSIONS)}, or auto or none")
-    there = {p.name for p in fit.errors.parameters}
-    found = {name: SETS[name](fit.errors.chain) for name in families}
-    found = {name: ps for name, ps in found.items() if any(p.name not in there for p in ps)}
+    found = _missing(fit, families)
     if not found:
         return ()
-    stage = _stage(fit, found, progress)
+
+    def cut(problem: Problem, x: Array) -> tuple[Parts, ...]:
+        return parts(problem, x, region_folds(problem.data, places=touched(problem, x)), progress)
+
+    stage = _stage(fit, fit.problem.data, found, cut)
     kept: dict[str, float] = {}
     out: list[Trial] = []
     while True:
@@ -204,6 +231,31 @@ def select_families(
         best = min(helping, key=lambda trial: trial.cv_after)
         kept[best.family] = best.prior_width
         out.append(replace(best, kept=True))
+
+
+def hint(fit: Result) -> str:
+    """A sentence on the family that would take up most of what a fit leaves; "" if little, or by chance.
+
+    Around the fit, without another one, and from `MOST` samples of each measurement at most.
+    """
+    some = [item.take(np.s_[:: max(1, -(-len(item.rows) // MOST))]) for item in fit.problem.data]
+    found = _missing(fit, EXTENSIONS)
+    stage = _stage(fit, some, found, lambda problem, x: ())
+    now, best = stage.cost({}), (WORTH_A_WORD, "")
+    for name in found:
+        more, left = stage.freedom(name, {})
+        then = stage.cost({name: 1.0})
+        if left < AMPLE * more or not then > 0:
+            continue
+        # Beyond this, a χ² of so many degrees is once in a million times (Laurent and Massart 2000).
+        chance = more + 2 * np.sqrt(14 * more) + 28
+        if (now - then) / (then / left) > chance:
+            best = min(best, (float(np.sqrt(then / left / (now / (left + more)))), name))
+    share, name = best
+    return name and (
+        f"what is left goes with the joints' values as {WORDS[name]} would; --extend auto may leave about "
+        f"{100 * share:.0f} % of it"
+    )
 
 
 def extend(

@@ -35,6 +35,7 @@ class Provenance:
         doubts: what is hard to believe, by file.
         remarks: sentences that belong beside the headline.
         trials: what each family of joints' transmission errors brought, where they were tried.
+        hint: what they might bring, where they were not.
         judged: accuracy on samples that were each left out of a fit, where none were held out.
     """
 
@@ -47,6 +48,7 @@ class Provenance:
     doubts: Mapping[str, Sequence[str]] = field(default_factory=dict)
     remarks: Sequence[str] = ()
     trials: Sequence[Trial] = ()
+    hint: str = ""
     judged: Comparison | None = None
 
 

@@ -153,7 +153,8 @@ def _left(found: Study) -> Section:
 def _extension(found: Study) -> Section:
     title, trials = "Errors of the joints' drives", found.source.trials
     if not trials:
-        return Section("extension", title)
+        hint = found.source.hint
+        return Section("extension", title, [f"{hint[0].upper()}{hint[1:]}."] if hint else [])
     kept = [trial.family for trial in trials if trial.kept]
     said = f"Added to the geometry: {', '.join(kept)}." if kept else "None was added to the geometry."
     text = (

@@ -153,6 +153,12 @@ def trials(found: Sequence[Trial]) -> None:
     table(title, trial_table(found))
 
 
+def hint(text: str) -> None:
+    """What one might try next, if anything."""
+    if text:
+        lines(f"hint: {text}", style="yellow")
+
+
 def open_page(path: str) -> None:
     """Shows a page in the browser, or says where it lies."""
     open_url(Path(path).resolve().as_uri())

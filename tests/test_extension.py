@@ -16,7 +16,7 @@ from dhcal_pin.cli import main
 from dhcal_pin.contacts import PointDistance, Touch
 from dhcal_pin.crossvalidation import cross_validate, standard_error
 from dhcal_pin.errors import DhcalError
-from dhcal_pin.extension import extend
+from dhcal_pin.extension import MOST, WORDS, extend, hint
 from dhcal_pin.folds import group_folds, random_folds, region_folds, touched
 from dhcal_pin.measurement_files import measurement_text
 from dhcal_pin.measurements import Noise
@@ -43,6 +43,36 @@ def fitted(kind=Position, m: int = 40):
         Chain.from_dh(paper("sim_6dof_actual")), rng.uniform(-1, 1, (m, 6)), Noise(1e-4, 1e-4), rng
     )
     return calibrate(arm, data, "dh")
+
+
+@pytest.mark.parametrize("family", ["gain", "harmonics", "compliance", "coupling"])
+def test_a_hint_names_what_is_missing_and_how_much_it_takes_up(family):
+    arm, data = simulated(f"{family},minimal,base,tool", seed=1)
+    plain = calibrate(arm, data, "minimal,base,tool")
+    found = re.fullmatch(
+        r"what is left .* as (.*) would; --extend auto may leave about (\d+) % of it", hint(plain)
+    )
+    assert found
+    assert found[1] == WORDS[family]
+    whole = calibrate(arm, data, f"{family},minimal,base,tool")
+    left = [np.sqrt(fit.solution.triangle.cost / (360 - fit.rank)) for fit in (plain, whole)]
+    assert float(found[2]) == pytest.approx(100 * left[1] / left[0], abs=2, rel=0.3)
+    assert not hint(whole)
+
+
+@pytest.mark.parametrize("seeds", [20, pytest.param(300, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", [Pose, Position])
+def test_geometry_alone_gives_no_hint(kind, seeds):
+    """One false one in a million by chance, whether or not the instrument states its sigmas."""
+    for seed in range(seeds):
+        arm, data = simulated("minimal,base,tool", seed, (20, 40, 80)[seed % 3], kind=kind)
+        data = replace(data, stated=bool(seed % 2))
+        assert not hint(calibrate(arm, data, "minimal,base,tool"))
+
+
+def test_a_hint_looks_at_some_of_many_samples():
+    arm, data = simulated("harmonics,minimal,base,tool", seed=0, m=3 * MOST + 1)
+    assert WORDS["harmonics"] in hint(calibrate(arm, data, "minimal,base,tool"))
 
 
 def test_folds_equal_fits_without_what_they_leave_out():
@@ -180,8 +210,13 @@ def test_the_command_says_what_each_family_brought(tmp_path, monkeypatch, capsys
     assert {"cv_before", "cv_after", "standard_error"} <= set(rows[0])
     assert "compliance_rad_per_nm" in (tmp_path / "out.calibration.toml").read_text()
     assert "gain        left out" in said
-    assert main([*common]) == 0
-    assert json.loads((tmp_path / "r.json").read_text())["extension"] == []
+    assert "hint:" not in said
+    assert main([*common, "--report", "r.md"]) == 0
+    found = json.loads((tmp_path / "r.json").read_text())
+    assert found["extension"] == []
+    assert f"as {WORDS['compliance']} would" in found["hint"]
+    assert f"hint: {found['hint']}" in capsys.readouterr().err
+    assert found["hint"][1:] in (tmp_path / "r.md").read_text()
     for wrong, words in (
         (("--extend", "gains"), "no extension 'gains': choose from gain, harmonics, compliance, coupling"),
         (("--extend", "auto", "--method", "gn"), "leave out --method gn"),
