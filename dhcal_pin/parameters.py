@@ -264,11 +264,13 @@ def select(
             "for coupling another joint, and for compliance a URDF whose links have masses"
         )
     pool = {p.name: p for parameters in found.values() for p in parameters}
-    fixed = {p.name for name in fix if name in SETS for p in SETS[name](chain)}
+    fixed = set[str]()
     for name in fix:
-        if name not in pool and name not in SETS:
-            raise DhcalError(f"cannot fix {name!r}: not a parameter here; there are {', '.join(pool)}")
-        fixed.add(name)
+        members = {p.name for p in SETS[name](chain)} if name in SETS else {name}
+        if not members & set(pool):
+            what = "none of its parameters is unknown here" if name in SETS else "not a parameter here"
+            raise DhcalError(f"cannot fix {name!r}: {what}; there are {', '.join(pool)}")
+        fixed |= members
     if missing := [name for name in free if name not in pool]:
         every = {p.name: p for build in SETS.values() for p in build(chain)}
         for name in missing:

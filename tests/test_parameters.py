@@ -163,6 +163,7 @@ def test_fix_and_free(sim_6dof):
     [
         ({"sets": "dhh"}, "choose from dh, modified-dh"),
         ({"sets": "dh", "fix": ["d9"]}, "cannot fix 'd9'.*theta1"),
+        ({"sets": "dh", "fix": ["tool"]}, "cannot fix 'tool': none of its parameters is unknown.*theta1"),
         ({"sets": "dh", "free": ["q1"]}, "cannot free 'q1'"),
         ({"sets": "dh", "free": ["offset"]}, "'offset'.* whole set; add it to the parameters"),
         ({"sets": "dh", "fix": ["d2", "d3"], "free": ["d3"]}, "'d3' is both fixed and freed"),
