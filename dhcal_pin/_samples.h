@@ -3,11 +3,14 @@
 #include <math.h>
 #include <string.h>
 
-/* One build serves every processor: where it has AVX2, that is used. */
-#if defined(__x86_64__) && defined(__ELF__) && defined(__GLIBC__) && (defined(__clang__) || __GNUC__ >= 12)
+/* One build serves every processor: where it has AVX2, that is used, and fused products where the compiler
+   knows of processors that have both. */
+#if !defined(__x86_64__) || !defined(__ELF__) || !defined(__GLIBC__)
+    #define WIDEST
+#elif defined(__clang__) || __GNUC__ >= 12
     #define WIDEST __attribute__((target_clones("arch=x86-64-v3", "default")))
 #else
-    #define WIDEST
+    #define WIDEST __attribute__((target_clones("avx2", "default")))
 #endif
 
 /* A loop whose rounds do not touch each other's data. */
@@ -174,7 +177,7 @@ static void carry_all(Size p, const double *frames, const double *twists, double
     }
 }
 
-/* Rotation vectors (3, m) of matrices (3, 3, m); how many are by an angle so obtuse that it takes more care. */
+/* Rotation vectors (3, m) of matrices (3, 3, m); how many angles are so obtuse that they take more care. */
 WIDEST static Size rotation_vectors(Size m, const double *turns, Size row, Size column, double *out,
                                     Size axis)
 {
