@@ -8,7 +8,7 @@ may serve under narrow ones: as narrow as does no harm.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -99,25 +99,23 @@ class _Stage:
     """Everything around the fit without extensions: linear, and columns for all families at once.
 
     Attributes:
-        parts: triangles of every fold.
-        whole: of all the data.
-        rows: of all the data.
+        problem: with all families, and default priors of theirs.
+        whole: triangle of all its data.
         x: (p,) where it is linear.
-        weights: (p,) one over the default priors.
         family: (p,) the family of each column, or "".
+        parts: triangles of every fold.
     """
 
-    parts: tuple[Parts, ...]
+    problem: Problem
     whole: Triangle
-    rows: int
     x: Array
-    weights: Array
     family: Array
+    parts: tuple[Parts, ...] = ()
 
     def narrowed(self, kept: dict[str, float]) -> tuple[Array, Array]:
         """Weights (p,) with the priors of some families narrowed, and which columns (p,) count."""
         width = np.array([kept.get(name, 1.0) for name in self.family])
-        return self.weights / width, (self.family == "") | np.isin(self.family, list(kept))
+        return self.problem.weights / width, (self.family == "") | np.isin(self.family, list(kept))
 
     def errors(self, kept: dict[str, float]) -> Array:
         """Each fold's error (k,) with some families at prior widths."""
@@ -132,7 +130,7 @@ class _Stage:
     def freedom(self, name: str, kept: dict[str, float]) -> tuple[int, int]:
         """How many unknowns a family adds to those that are kept, and how many rows are left over then."""
         more = int(np.sum(self.family == name))
-        return more, self.rows - int(np.sum(self.narrowed(kept)[1])) - more
+        return more, rows(self.problem) - int(np.sum(self.narrowed(kept)[1])) - more
 
     def trial(self, name: str, kept: dict[str, float]) -> Trial:
         """A family at the narrowest width that is no more than a standard error worse than the best one."""
@@ -162,13 +160,8 @@ def _missing(fit: Result, families: Sequence[str]) -> dict[str, list[Parameter]]
     return {name: ps for name, ps in found.items() if any(p.name not in there for p in ps)}
 
 
-def _stage(
-    fit: Result,
-    data: Sequence[Measurement],
-    families: dict[str, list[Parameter]],
-    cut: Callable[[Problem, Array], tuple[Parts, ...]],
-) -> _Stage:
-    """The stage of a fit and some of its data, which `cut` parts at x (p,)."""
+def _stage(fit: Result, data: Sequence[Measurement], families: dict[str, list[Parameter]]) -> _Stage:
+    """The stage of a fit and some of its data, which nothing has parted yet."""
     names = {p.name for p in fit.errors.parameters}
     new = [p for parameters in families.values() for p in parameters if p.name not in names]
     errors = fit.errors.joined(new)
@@ -186,11 +179,9 @@ def _stage(
     home = {p.name: name for name, parameters in families.items() for p in parameters if p.name not in names}
     problem = replace(fit.problem, errors=errors, weights=weights, data=tuple(data))
     return _Stage(
-        cut(problem, x),
+        problem,
         reduce(problem, x, small_angle=False),
-        rows(problem, x),
         x,
-        weights,
         np.array([home.get(p.name, "") for p in errors.parameters] + [""] * len(fit.x[robot:])),
     )
 
@@ -216,11 +207,9 @@ def select_families(
     found = _missing(fit, families)
     if not found:
         return ()
-
-    def cut(problem: Problem, x: Array) -> tuple[Parts, ...]:
-        return parts(problem, x, region_folds(problem.data, places=touched(problem, x)), progress)
-
-    stage = _stage(fit, fit.problem.data, found, cut)
+    stage = _stage(fit, fit.problem.data, found)
+    folds = region_folds(stage.problem.data, places=touched(stage.problem, stage.x))
+    stage = replace(stage, parts=parts(stage.problem, stage.x, folds, progress))
     kept: dict[str, float] = {}
     out: list[Trial] = []
     while True:
@@ -240,7 +229,7 @@ def hint(fit: Result) -> str:
     """
     some = [item.take(np.s_[:: max(1, -(-len(item.rows) // MOST))]) for item in fit.problem.data]
     found = _missing(fit, EXTENSIONS)
-    stage = _stage(fit, some, found, lambda problem, x: ())
+    stage = _stage(fit, some, found)
     now, best = stage.cost({}), (WORTH_A_WORD, "")
     for name in found:
         more, left = stage.freedom(name, {})

@@ -178,14 +178,9 @@ def solved(triangle: Triangle, weights: Array, x: Array, columns: Array) -> tupl
     return step, triangle.rest + float(np.sum((a @ step - b) ** 2))
 
 
-def rows(problem: Problem, x: Array) -> int:
+def rows(problem: Problem) -> int:
     """Number of whitened rows."""
-    chain = problem.errors.at(x[: len(problem.errors.parameters)])
-    return sum(
-        item.residual(chain.sweep(item.configurations()), problem.values(item, x)).size
-        for item in problem.data
-        if len(item.rows)
-    )
+    return sum(item.size * len(item.rows) for item in problem.data)
 
 
 def parts(
@@ -207,7 +202,7 @@ def _split(problem: Problem, x: Array, fold: Fold) -> tuple[Problem, Parts]:
         for sides in ([~mask for mask in fold], fold)
     )
     inside = reduce(kept, x, small_angle=False)
-    return kept, Parts(inside, reduce(left, x, small_angle=False), rows(left, x))
+    return kept, Parts(inside, reduce(left, x, small_angle=False), rows(left))
 
 
 def _ending(kept: Problem, part: Parts, x: Array, columns: Array, again: Again) -> Array:
