@@ -8,6 +8,7 @@
 #include <stdlib.h>
 
 #include "_samples.h"
+#include "_errors.h"
 #include "_reduction.h"
 
 /* What a function takes: an array's name, number of axes, and type: d double, s size, ? truth, D doubles that
@@ -98,6 +99,25 @@ static PyObject *answer(Array *a, Size count, int fine)
     return NULL;
 }
 
+static PyObject *cosines_and_sines(PyObject *self, PyObject *args)
+{
+    (void)self;
+    static const Wanted wanted[] = {{"angles", 2, 'd'}, {"cosines", 2, 'D'}, {"sines", 2, 'D'}};
+    Array a[3];
+    if (!take_all(a, args, wanted, 3))
+        return NULL;
+    const Size k = a->view.shape[0], m = a->view.shape[1];
+    int fine = is_packed(a);
+    for (int i = 1; i < 3; i++)
+        fine = fine && is_shaped(a + i, k, m, 0, 0) && is_packed(a + i);
+    if (fine) {
+        Py_BEGIN_ALLOW_THREADS;
+        circle(k * m, a->data, a[1].data, a[2].data);
+        Py_END_ALLOW_THREADS;
+    }
+    return answer(a, 3, fine);
+}
+
 static PyObject *carry_frames(PyObject *self, PyObject *args)
 {
     (void)self;
@@ -123,6 +143,42 @@ static PyObject *carry_frames(PyObject *self, PyObject *args)
     return answer(a, 6, fine);
 }
 
+/* Errors from frames (b, r, 3, n), a point (3, n), bodies (p) and twists (p, 6). */
+static int errors_of(Errors *e, const Array *a)
+{
+    const Array *frames = a, *point = a + 1, *at = a + 2, *twists = a + 3;
+    const Size p = at->view.shape[0], n = point->view.shape[1];
+    int fine = is_shaped(frames, frames->view.shape[0], frames->view.shape[1], 3, n) &&
+               frames->view.shape[1] >= 4 && frames->stride[1] == 3 * frames->stride[2] &&
+               is_shaped(point, 3, n, 0, 0) && is_shaped(twists, p, 6, 0, 0) && is_packed(twists);
+    const Size *bodies = at->data;
+    for (Size i = 0; fine && i < p; i++)
+        fine = bodies[i] >= 0 && bodies[i] < frames->view.shape[0];
+    *e = (Errors){p,
+                  1,
+                  bodies,
+                  twists->data,
+                  frames->data,
+                  point->data,
+                  frames->stride[0],
+                  frames->stride[2],
+                  point->stride[0]};
+    return fine;
+}
+
+/* Mixture from rows (n), components (n) and shares (n, m), for k rows and a number of ends. */
+static int mixture_of(Mixture *x, const Array *a, Size k, Size ends, Size m)
+{
+    const Array *rows = a, *components = a + 1, *shares = a + 2;
+    const Size n = rows->view.shape[0], *row = rows->data, *component = components->data;
+    int fine = is_shaped(components, n, 0, 0, 0) && is_shaped(shares, n, m, 0, 0);
+    for (Size i = 0; fine && i < n; i++)
+        fine = row[i] >= 0 && row[i] < k && component[i] >= 0 && component[i] < 6 * ends &&
+               (!i || row[i] >= row[i - 1]);
+    *x = (Mixture){n, row, component, shares->data, shares->stride[0]};
+    return fine;
+}
+
 static PyObject *point_velocities(PyObject *self, PyObject *args)
 {
     (void)self;
@@ -131,42 +187,41 @@ static PyObject *point_velocities(PyObject *self, PyObject *args)
     Array a[5];
     if (!take_all(a, args, wanted, 5))
         return NULL;
-    const Array *frames = a, *point = a + 1, *at = a + 2, *out = a + 4;
-    const Size p = at->view.shape[0], m = point->view.shape[1];
-    int fine = is_shaped(frames, frames->view.shape[0], frames->view.shape[1], 3, m) &&
-               frames->view.shape[1] >= 4 && frames->stride[1] == 3 * frames->stride[2] &&
-               is_shaped(point, 3, m, 0, 0) && is_shaped(a + 3, p, 6, 0, 0) && is_packed(a + 3) &&
-               is_shaped(out, p, 6, m, 0);
-    const Size *bodies = at->data;
-    for (Size i = 0; fine && i < p; i++)
-        fine = bodies[i] >= 0 && bodies[i] < frames->view.shape[0];
+    const Array *out = a + 4;
+    const Size m = a[1].view.shape[1];
+    Errors errors;
+    const int fine = errors_of(&errors, a) && is_shaped(out, errors.count, 6, m, 0);
     if (fine) {
         Py_BEGIN_ALLOW_THREADS;
-        velocities(p, m, frames->data, frames->stride[0], frames->stride[2], point->data, point->stride[0],
-                   bodies, a[3].data, out->data, out->stride[0], out->stride[1]);
+        velocities(&errors, m, out->data, out->stride[0], out->stride[1]);
         Py_END_ALLOW_THREADS;
     }
     return answer(a, 5, fine);
 }
 
-static PyObject *mix_samples(PyObject *self, PyObject *args)
+static PyObject *mix_velocities(PyObject *self, PyObject *args)
 {
     (void)self;
-    static const Wanted wanted[] = {{"vectors", 3, 'd'}, {"matrices", 3, 'd'}, {"out", 3, 'D'}};
-    Array a[3];
-    if (!take_all(a, args, wanted, 3))
+    static const Wanted wanted[] = {{"velocities", 3, 'd'},
+                                    {"rows", 1, 's'},
+                                    {"components", 1, 's'},
+                                    {"shares", 2, 'd'},
+                                    {"out", 3, 'D'}};
+    Array a[5];
+    if (!take_all(a, args, wanted, 5))
         return NULL;
-    const Array *vectors = a, *matrices = a + 1, *out = a + 2;
-    const Size p = vectors->view.shape[0], c = vectors->view.shape[1], m = vectors->view.shape[2];
-    const Size k = matrices->view.shape[0];
-    const int fine = is_shaped(matrices, k, c, m, 0) && is_shaped(out, p, k, m, 0);
+    const Array *given = a, *out = a + 4;
+    const Size p = out->view.shape[0], k = out->view.shape[1], m = out->view.shape[2];
+    const Size ends = m ? given->view.shape[2] / m : 1;
+    Mixture mixture;
+    const int fine = is_shaped(given, p, 6, ends * m, 0) && mixture_of(&mixture, a + 1, k, ends, m);
     if (fine) {
         Py_BEGIN_ALLOW_THREADS;
-        mix(p, k, c, m, vectors->data, vectors->stride[0], vectors->stride[1], matrices->data,
-            matrices->stride[0], matrices->stride[1], out->data, out->stride[0], out->stride[1]);
+        mix(&mixture, p, k, m, given->data, given->stride[0], given->stride[1], out->data, out->stride[0],
+            out->stride[1]);
         Py_END_ALLOW_THREADS;
     }
-    return answer(a, 3, fine);
+    return answer(a, 5, fine);
 }
 
 static PyObject *carry_twists(PyObject *self, PyObject *args)
@@ -214,42 +269,79 @@ static PyObject *right_jacobian_inverses(PyObject *self, PyObject *args)
     return answer(a, 2, fine);
 }
 
+/* Doubles that a triangle of so many columns, readings and ends is worked out in. */
+static PyObject *room(PyObject *self, PyObject *args)
+{
+    (void)self;
+    Size c, k, ends;
+    return PyArg_ParseTuple(args, "nnn", &c, &k, &ends) ? PyLong_FromSsize_t(room_for(c, k, ends)) : NULL;
+}
+
 static PyObject *triangles(PyObject *self, PyObject *args)
 {
     (void)self;
-    static const Wanted wanted[] = {{"rows", 4, 'd'}, {"out", 3, 'D'}};
-    Array a[2];
-    if (!take_all(a, args, wanted, 2))
+    static const Wanted wanted[] = {{"rows", 4, 'd'}, {"room", 1, 'D'}, {"out", 3, 'D'}};
+    Array a[3];
+    if (!take_all(a, args, wanted, 3))
         return NULL;
-    const Py_buffer *rows = &a->view;
-    const Size b = rows->shape[0], c = rows->shape[1], k = rows->shape[2], m = rows->shape[3];
-    int fine = is_shaped(a + 1, b, c, c, 0) && is_packed(a + 1);
+    const Array *rows = a, *out = a + 2;
+    const Size b = rows->view.shape[0], c = rows->view.shape[1];
+    const Size k = rows->view.shape[2], m = rows->view.shape[3];
+    int fine = is_shaped(out, b, c, c, 0) && is_packed(out) && a[1].view.shape[0] >= room_for(c, k, 0);
     if (fine) {
-        Lanes *block = aligned_alloc(64, (c + 1) * ROWS * sizeof(double));
-        double *part = malloc((c * c + 1) * sizeof(double));
-        Size *work = malloc((k * (c + 1) + 1) * sizeof(Size));
-        fine = block && part && work;
-        if (fine) {
-            Py_BEGIN_ALLOW_THREADS;
-            for (Size i = 0; i < b; i++)
-                reduce((double *)a->data + i * a->stride[0], c, k, m, a->stride[1], a->stride[2],
-                       (double *)a[1].data + i * c * c, block, work, part);
-            Py_END_ALLOW_THREADS;
-        } else
+        static const Errors none = {0};
+        static const Mixture nothing = {0};
+        Py_BEGIN_ALLOW_THREADS;
+        for (Size i = 0; fine && i < b; i++)
+            fine = reduce(&none, &nothing, (double *)rows->data + i * rows->stride[0], c, k, m,
+                          rows->stride[1], rows->stride[2], (double *)out->data + i * c * c, a[1].data);
+        Py_END_ALLOW_THREADS;
+        if (!fine)
             PyErr_NoMemory();
-        free(block), free(part), free(work);
     }
-    return answer(a, 2, fine);
+    return answer(a, 3, fine);
+}
+
+static PyObject *error_triangle(PyObject *self, PyObject *args)
+{
+    (void)self;
+    static const Wanted wanted[] = {
+        {"frames", 4, 'd'},     {"point", 2, 'd'},  {"at", 1, 's'},    {"twists", 2, 'd'}, {"rows", 1, 's'},
+        {"components", 1, 's'}, {"shares", 2, 'd'}, {"given", 3, 'd'}, {"room", 1, 'D'},   {"out", 2, 'D'}};
+    Array a[10];
+    if (!take_all(a, args, wanted, 10))
+        return NULL;
+    const Array *given = a + 7, *room = a + 8, *out = a + 9;
+    const Size k = given->view.shape[1], m = given->view.shape[2], samples = a[1].view.shape[1];
+    Errors errors;
+    Mixture mixture;
+    int fine = errors_of(&errors, a);
+    const Size c = errors.count + given->view.shape[0];
+    errors.ends = m ? samples / m : 1;
+    fine = fine && errors.ends * m == samples && mixture_of(&mixture, a + 4, k, errors.ends, m) &&
+           is_shaped(out, c, c, 0, 0) && is_packed(out) && room->view.shape[0] >= room_for(c, k, errors.ends);
+    if (fine) {
+        Py_BEGIN_ALLOW_THREADS;
+        fine = reduce(&errors, &mixture, given->data, c, k, m, given->stride[0], given->stride[1], out->data,
+                      room->data);
+        Py_END_ALLOW_THREADS;
+        if (!fine)
+            PyErr_NoMemory();
+    }
+    return answer(a, 10, fine);
 }
 
 static PyMethodDef methods[] = {
+    {"cosines_and_sines", cosines_and_sines, METH_VARARGS, NULL},
     {"carry_frames", carry_frames, METH_VARARGS, NULL},
     {"point_velocities", point_velocities, METH_VARARGS, NULL},
-    {"mix_samples", mix_samples, METH_VARARGS, NULL},
+    {"mix_velocities", mix_velocities, METH_VARARGS, NULL},
     {"carry_twists", carry_twists, METH_VARARGS, NULL},
     {"log_rotations", log_rotations, METH_VARARGS, NULL},
     {"right_jacobian_inverses", right_jacobian_inverses, METH_VARARGS, NULL},
+    {"room", room, METH_VARARGS, NULL},
     {"triangles", triangles, METH_VARARGS, NULL},
+    {"error_triangle", error_triangle, METH_VARARGS, NULL},
     {NULL, NULL, 0, NULL},
 };
 

@@ -1,30 +1,15 @@
 /* Triangles of tall rows. */
 
-/* The reflection that takes a column v of lanes below `*top` of a triangle into it: with the column as it
-   was, [top; a] becomes [top - w; a - scale·w·v] with w = tau·(top + scale·v·a) for any other [top; a]. */
+/* With a column v below `top` as it was before, [above; a] becomes [above - w; a - scale·w·v] with
+   w = tau·(above + scale·v·a) for any other column. */
 typedef struct {
     double tau, scale;
 } Reflection;
 
-static inline __attribute__((always_inline)) double sum(const Lanes *a)
+/* The reflection that takes what is below `*top`, of which the sum of squares is given, into it. */
+static inline __attribute__((always_inline)) Reflection reflection(double *top, double below)
 {
-    return ((*a)[0] + (*a)[2]) + ((*a)[1] + (*a)[3]);
-}
-
-static inline __attribute__((always_inline)) double dot(const Lanes *a, const Lanes *b, Size count)
-{
-    Lanes even = {0}, odd = {0};
-    for (Size t = 0; t < count; t += 2) {
-        even += a[t] * b[t];
-        odd += a[t + 1] * b[t + 1];
-    }
-    even += odd;
-    return sum(&even);
-}
-
-static inline __attribute__((always_inline)) Reflection reflection(double *top, const Lanes *v, Size count)
-{
-    const double below = dot(v, v, count), before = *top;
+    const double before = *top;
     if (below == 0)
         return (Reflection){0, 0};
     const double norm = sqrt(before * before + below), beta = before > 0 ? -norm : norm;
@@ -32,56 +17,83 @@ static inline __attribute__((always_inline)) Reflection reflection(double *top, 
     return (Reflection){(beta - before) / beta, 1 / (before - beta)};
 }
 
-/* Takes the rows of a block, `count` lanes a column, into the triangle r (c, c) above them. Two columns are
-   reflected at a time, so that every other one is read and written half as often. */
+static inline __attribute__((always_inline)) double sum(const Lanes *a)
+{
+    return ((*a)[0] + (*a)[2]) + ((*a)[1] + (*a)[3]);
+}
+
+/* Does two reflections, of columns v and u with the product `both`, to some columns side by side with `first`
+   and `second` above them. */
+static inline __attribute__((always_inline)) void reflect(const int columns, double *restrict first,
+                                                          double *restrict second, Lanes *restrict a,
+                                                          const Lanes *restrict v, const Lanes *restrict u,
+                                                          Size count, Reflection one, Reflection two,
+                                                          double both)
+{
+    Lanes av[WIDTH] = {{0}}, au[WIDTH] = {{0}};
+    double f[WIDTH], g[WIDTH];
+    for (Size t = 0; t < count; t++)
+        for (int k = 0; k < columns; k++) {
+            const Lanes at = a[k * count + t];
+            av[k] += v[t] * at, au[k] += u[t] * at;
+        }
+    for (int k = 0; k < columns; k++) {
+        const double x = one.tau * (first[k] + one.scale * sum(&av[k]));
+        f[k] = x * one.scale;
+        const double y = two.tau * (second[k] + two.scale * (sum(&au[k]) - f[k] * both));
+        g[k] = y * two.scale;
+        first[k] -= x, second[k] -= y;
+    }
+    for (Size t = 0; t < count; t++)
+        for (int k = 0; k < columns; k++)
+            a[k * count + t] -= f[k] * v[t] + g[k] * u[t];
+}
+
+/* Takes the rows of a block, `count` lanes a column, an even number, into the triangle r (c, c) above them.
+   Two columns are reflected at a time, so that every other one is read and written half as often. */
 WIDEST static void fold(double *restrict r, Lanes *restrict block, Size c, Size count)
 {
     for (Size j = 0; j < c; j += 2) {
-        const Lanes *v = block + j * count;
+        Lanes *v = block + j * count, *u = j + 1 < c ? v + count : v;
         double *first = r + j * c, *second = first + c;
-        const Reflection one = reflection(first + j, v, count);
+        Lanes vv[2] = {{0}}, vu[2] = {{0}}, uu[2] = {{0}};
+        for (Size t = 0; t < count; t += 2)
+            for (int i = 0; i < 2; i++)
+                vv[i] += v[t + i] * v[t + i], vu[i] += v[t + i] * u[t + i];
+        vv[0] += vv[1], vu[0] += vu[1];
+        const Reflection one = reflection(first + j, sum(vv));
         if (j + 1 == c)
             break;
-        Lanes *u = block + (j + 1) * count;
-        const double w = one.tau * (first[j + 1] + one.scale * dot(v, u, count));
+        const double w = one.tau * (first[j + 1] + one.scale * sum(vu)), f = w * one.scale;
         first[j + 1] -= w;
-        for (Size t = 0; t < count; t++)
-            u[t] -= w * one.scale * v[t];
-        const Reflection two = reflection(second + j + 1, u, count);
-        const double both = dot(v, u, count);
-        Size l = j + 2;
-#define REFLECT(k, av, au, f, g)                                                                             \
-    const double x##k = one.tau * (first[l + k] + one.scale * sum(&av)), f = x##k * one.scale;               \
-    const double y##k = two.tau * (second[l + k] + two.scale * (sum(&au) - f * both)), g = y##k * two.scale; \
-    first[l + k] -= x##k, second[l + k] -= y##k;
-        for (; l + 3 < c; l += 4) {
-            Lanes *a = block + l * count, *b = a + count, *d = b + count, *e = d + count;
-            Lanes av = {0}, bv = {0}, dv = {0}, ev = {0}, au = {0}, bu = {0}, du = {0}, eu = {0};
-            for (Size t = 0; t < count; t++) {
-                av += v[t] * a[t], bv += v[t] * b[t], dv += v[t] * d[t], ev += v[t] * e[t];
-                au += u[t] * a[t], bu += u[t] * b[t], du += u[t] * d[t], eu += u[t] * e[t];
+        vu[0] = vu[1] = uu[0];
+        for (Size t = 0; t < count; t += 2)
+            for (int i = 0; i < 2; i++) {
+                const Lanes left = u[t + i] - f * v[t + i];
+                uu[i] += left * left, vu[i] += left * v[t + i];
+                u[t + i] = left;
             }
-            REFLECT(0, av, au, fa, ga)
-            REFLECT(1, bv, bu, fb, gb)
-            REFLECT(2, dv, du, fd, gd)
-            REFLECT(3, ev, eu, fe, ge)
-            for (Size t = 0; t < count; t++) {
-                const Lanes vt = v[t], ut = u[t];
-                a[t] -= fa * vt + ga * ut;
-                b[t] -= fb * vt + gb * ut;
-                d[t] -= fd * vt + gd * ut;
-                e[t] -= fe * vt + ge * ut;
+        uu[0] += uu[1], vu[0] += vu[1];
+        const Reflection two = reflection(second + j + 1, sum(uu));
+        const double both = sum(vu);
+        for (Size l = j + 2, left; (left = c - l) > 0;) {
+            /* As evenly as it goes. */
+            const Size parts = (left + WIDTH - 1) / WIDTH, columns = (left + parts - 1) / parts;
+#define REFLECT(n)                                                                                           \
+    case n:                                                                                                  \
+        reflect(n, first + l, second + l, block + l * count, v, u, count, one, two, both);                   \
+        break;
+            switch (columns) {
+                REFLECT(1)
+                REFLECT(2)
+                REFLECT(3)
+                REFLECT(4)
+                REFLECT(5)
+                REFLECT(6)
             }
-        }
-        for (; l < c; l++) {
-            Lanes *a = block + l * count, av = {0}, au = {0};
-            for (Size t = 0; t < count; t++)
-                av += v[t] * a[t], au += u[t] * a[t];
-            REFLECT(0, av, au, f, g)
-            for (Size t = 0; t < count; t++)
-                a[t] -= f * v[t] + g * u[t];
-        }
 #undef REFLECT
+            l += columns;
+        }
     }
 }
 
@@ -107,69 +119,126 @@ static void flush(Fold *f)
     f->held = 0;
 }
 
-/* Adds n rows, of which each used column is contiguous; the others are zero. */
-static void gather(Fold *f, const double *rows, Size stride, const Size *used, Size n)
+/* Adds n rows of columns that lie ROWS apart. */
+static void gather(Fold *f, const double *rows, Size n)
 {
     for (Size done = 0; done < n;) {
         const Size some = n - done < ROWS - f->held ? n - done : ROWS - f->held;
         for (Size j = 0; j < f->columns; j++)
-            memcpy((double *)f->block + j * ROWS + f->held, rows + used[j] * stride + done,
-                   some * sizeof(double));
+            memcpy((double *)f->block + j * ROWS + f->held, rows + j * ROWS + done, some * sizeof(double));
         f->held += some, done += some;
         if (f->held == ROWS)
             flush(f);
     }
 }
 
-static int empty(const double *column, Size n)
+static inline __attribute__((always_inline)) int empty(const double *row, Size n)
 {
-    for (Size t = 0; t < n; t++)
-        if (column[t] != 0)
+    const Bits *bits = (const Bits *)row;
+    for (Size start = 0; start < n; start += SAMPLES) {
+        const Size some = n - start < SAMPLES ? n - start : SAMPLES;
+        Bits any = 0;
+        for (Size t = 0; t < some; t++)
+            any |= bits[start + t];
+        /* But for the sign. */
+        if (any << 1)
             return 0;
+    }
     return 1;
 }
 
-/* The triangle r (c, c) of rows (c, k, m): those of the k readings that are zero in the same columns are
-   reduced without these. Half the errors of an arm are lengths, which turn nothing: a quarter of the work for
-   rows of rotations. There is room for c by ROWS in `block`, k by c + 1 in `work`, c by c in `part`. */
-static void reduce(const double *rows, Size c, Size k, Size m, Size column, Size reading, double *r,
-                   Lanes *block, Size *work, double *part)
+/* Which of c columns each of k readings has: how many, which, where a column stands among them or -1, and the
+   first reading that has the same. */
+typedef struct {
+    Size *counts, *columns, *places, *alike;
+} Used;
+
+static int list_used(Used *used, const Errors *e, const Mixture *x, const double *given, Size c, Size k,
+                     Size m, Size column, Size reading)
 {
-    Size *counts = work, *used = work + k;
-    memset(r, 0, c * c * sizeof(double));
+    used->counts = calloc(2 * k * (c + 1) + 1, sizeof(Size));
+    if (!used->counts)
+        return 0;
+    used->alike = used->counts + k, used->columns = used->alike + k, used->places = used->columns + k * c;
     for (Size i = 0; i < k; i++) {
-        counts[i] = 0;
-        for (Size j = 0; j < c; j++)
-            if (!empty(rows + j * column + i * reading, m))
-                used[i * c + counts[i]++] = j;
+        Size *mine = used->columns + i * c, *place = used->places + i * c, u = 0;
+        for (Size j = 0; j < c; j++) {
+            const double *rows = given + (j - e->count) * column + i * reading;
+            const int some = j < e->count ? is_mixed(e, x, j, i) : !empty(rows, m);
+            place[j] = some ? u : -1;
+            if (some)
+                mine[u++] = j;
+        }
+        used->counts[i] = u;
+        Size first = 0;
+        while (used->counts[first] != u || memcmp(used->columns + first * c, mine, u * sizeof(Size)))
+            first++;
+        used->alike[i] = first;
     }
-    Fold whole = {r, block, c, 0};
-    for (Size i = 0; i < k; i++) {
-        const Size u = counts[i], *mine = used + i * c;
-        if (u == 0)
-            continue;
-        double *into = u == c ? r : part;
-        if (u < c)
-            memset(part, 0, u * u * sizeof(double));
-        Fold some = {into, block, u, 0};
-        for (Size l = i; l < k; l++)
-            if (counts[l] == u && !memcmp(used + l * c, mine, u * sizeof(Size))) {
-                gather(&some, rows + l * reading, column, l == i ? mine : used + l * c, m);
-                if (l > i)
-                    counts[l] = 0;
+    return 1;
+}
+
+/* Doubles of memory that `reduce` works in. */
+static Size room_for(Size c, Size k, Size ends)
+{
+    return (k + 1) * c * ROWS + 9 * ends * ROWS + k * c * c + 8;
+}
+
+/* The triangle r (c, c) of rows (c, k, m), the first columns by errors and the others given: those of the k
+   readings that are zero in the same columns are reduced without these. Half the errors of an arm are
+   lengths, which turn nothing: a quarter of the work for rows of rotations. */
+static int reduce(const Errors *e, const Mixture *x, const double *given, Size c, Size k, Size m, Size column,
+                  Size reading, double *r, double *room)
+{
+    Used used;
+    if (!list_used(&used, e, x, given, c, k, m, column, reading))
+        return 0;
+    /* Of each reading a block of rows, one of rows of several, velocities, and triangles of like readings. */
+    double *blocks = room + (64 - (uintptr_t)room % 64) % 64 / sizeof(double);
+    Lanes *spare = (Lanes *)(blocks + k * c * ROWS);
+    double *moved = (double *)spare + c * ROWS, *triangles = moved + 9 * e->ends * ROWS;
+    memset(r, 0, c * c * sizeof(double));
+    memset(triangles, 0, k * c * c * sizeof(double));
+    for (Size start = 0; start < m; start += ROWS) {
+        const Size n = m - start < ROWS ? m - start : ROWS;
+        mix_errors(e, x, start, n, m, c, used.places, moved, blocks);
+        for (Size i = 0; i < k; i++) {
+            const Size u = used.counts[i];
+            if (used.alike[i] != i || !u)
+                continue;
+            Fold some = {u == c ? r : triangles + i * c * c, spare, u, 0};
+            for (Size l = i; l < k; l++) {
+                if (used.alike[l] != i)
+                    continue;
+                double *block = blocks + l * c * ROWS;
+                for (Size j = u; j-- && used.columns[i * c + j] >= e->count;)
+                    memcpy(block + j * ROWS,
+                           given + (used.columns[i * c + j] - e->count) * column + l * reading + start,
+                           n * sizeof(double));
+                if (n == ROWS)
+                    fold(some.triangle, (Lanes *)block, u, ROWS / LANES);
+                else
+                    gather(&some, block, n);
             }
-        flush(&some);
-        if (u == c)
+            flush(&some);
+        }
+    }
+    Fold whole = {r, spare, c, 0};
+    for (Size i = 0; i < k; i++) {
+        const Size u = used.counts[i];
+        if (used.alike[i] != i || u == c)
             continue;
         for (Size row = 0; row < u; row++) {
-            double *at = (double *)block + whole.held;
-            for (Size j = 0; j < c; j++)
-                at[j * ROWS] = 0;
-            for (Size j = row; j < u; j++)
-                at[mine[j] * ROWS] = part[row * u + j];
+            double *at = (double *)spare + whole.held;
+            for (Size j = 0; j < c; j++) {
+                const Size place = used.places[i * c + j];
+                at[j * ROWS] = place < row ? 0 : triangles[i * c * c + row * u + place];
+            }
             if (++whole.held == ROWS)
                 flush(&whole);
         }
         flush(&whole);
     }
+    free(used.counts);
+    return 1;
 }

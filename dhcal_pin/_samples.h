@@ -1,6 +1,7 @@
 /* Kinematics and rotations over many samples at once. */
 
 #include <math.h>
+#include <stdint.h>
 #include <string.h>
 
 /* One build serves every processor: where it has AVX2, that is used, and fused products where the compiler
@@ -21,9 +22,52 @@
 #endif
 
 typedef Py_ssize_t Size;
+typedef uint64_t Bits __attribute__((may_alias));
 /* As wide as the widest registers; narrower ones take two or four for it. */
 typedef double Lanes __attribute__((vector_size(32), may_alias));
-enum { LANES = 4, SAMPLES = 64, ROWS = 128 };
+enum { LANES = 4, SAMPLES = 64, ROWS = 128, WIDTH = 6 };
+
+/* Squares of tangents from which series would need more terms. */
+#define SMALL_TANGENT 4e-3
+/* A quarter turn in three parts, the first two with zeros at their ends, so that some ten thousand of them
+   are exact, and the angle from which there are more. */
+static const double quarter[] = {1.57079632673412561417, 6.07710050630396597660e-11,
+                                 2.02226624879595063154e-21};
+#define MANY_TURNS 1e5
+/* Adding this leaves a number's nearest integer in its last bits. */
+#define ROUNDS 0x1.8p52
+
+/* By the nearest quarter turn and the series of the rest. */
+WIDEST static void circle(Size m, const double *restrict angle, double *restrict cosine,
+                          double *restrict sine)
+{
+    EACH (t, m) {
+        const double rounded = angle[t] * (2 / M_PI) + ROUNDS, n = rounded - ROUNDS;
+        const double r = angle[t] - n * quarter[0] - n * quarter[1] - n * quarter[2], u = r * r;
+        const double s =
+            r + r * u *
+                    (-1.0 / 6 +
+                     u * (1.0 / 120 +
+                          u * (-1.0 / 5040 +
+                               u * (1.0 / 362880 +
+                                    u * (-1.0 / 39916800 + u * (1.0 / 6227020800 - u / 1307674368000))))));
+        const double c =
+            1 - u * (1.0 / 2 -
+                     u * (1.0 / 24 -
+                          u * (1.0 / 720 -
+                               u * (1.0 / 40320 - u * (1.0 / 3628800 -
+                                                       u * (1.0 / 479001600 - u * (1.0 / 87178291200 -
+                                                                                   u / 20922789888000)))))));
+        Bits which;
+        memcpy(&which, &rounded, sizeof which);
+        const double across = which & 1 ? s : c, along = which & 1 ? c : s;
+        cosine[t] = (which + 1) & 2 ? -across : across;
+        sine[t] = which & 2 ? -along : along;
+    }
+    for (Size t = 0; t < m; t++)
+        if (!(fabs(angle[t]) < MANY_TURNS))
+            cosine[t] = cos(angle[t]), sine[t] = sin(angle[t]);
+}
 
 /* Columns x, y, z, p of frames at a stride, one after the other along a chain. */
 WIDEST static void carry(Size links, Size m, const double *link, const char *prismatic, const double *values,
@@ -72,95 +116,6 @@ WIDEST static void carry(Size links, Size m, const double *link, const char *pri
     }
 }
 
-/* out = a vector given in a body's axes, along the measuring frame's; axes at a stride. */
-static inline __attribute__((always_inline)) void turned(double *restrict out, const double *axes, Size row,
-                                                         const double *vector, Size n)
-{
-    Size given[3] = {0}, count = 0;
-    for (Size a = 0; a < 3; a++)
-        if (vector[a] != 0)
-            given[count++] = a;
-    const double *restrict x = axes + 3 * row * given[0], *restrict y = axes + 3 * row * given[1],
-                           *restrict z = axes + 3 * row * given[2];
-    if (count == 0)
-        memset(out, 0, n * sizeof(double));
-    else if (count == 1 && vector[given[0]] == 1)
-        memcpy(out, x, n * sizeof(double));
-    else if (count == 1) {
-        const double f = vector[given[0]];
-        EACH (t, n)
-            out[t] = f * x[t];
-    } else if (count == 2) {
-        const double f = vector[given[0]], g = vector[given[1]];
-        EACH (t, n)
-            out[t] = f * x[t] + g * y[t];
-    } else {
-        const double f = vector[0], g = vector[1], h = vector[2];
-        EACH (t, n)
-            out[t] = f * x[t] + g * y[t] + h * z[t];
-    }
-}
-
-WIDEST static void velocities(Size p, Size m, const double *frames, Size body, Size row, const double *point,
-                              Size point_row, const Size *at, const double *twist, double *out,
-                              Size out_twist, Size out_row)
-{
-    double lever[3][SAMPLES];
-    for (Size start = 0; start < m; start += SAMPLES) {
-        const Size n = m - start < SAMPLES ? m - start : SAMPLES;
-        Size known = -1;
-        for (Size k = 0; k < p; k++) {
-            const double *axes = frames + at[k] * body + start, *w = twist + 6 * k + 3;
-            double *to = out + k * out_twist + start;
-            const int turns = w[0] != 0 || w[1] != 0 || w[2] != 0;
-            for (Size i = 0; i < 3; i++)
-                turned(to + (3 + i) * out_row, axes + i * row, row, w, n);
-            for (Size i = 0; i < 3; i++)
-                turned(to + i * out_row, axes + i * row, row, w - 3, n);
-            if (!turns)
-                continue;
-            if (known != at[k]) {
-                known = at[k];
-                for (Size i = 0; i < 3; i++)
-                    for (Size t = 0; t < n; t++)
-                        lever[i][t] = point[i * point_row + start + t] - axes[(9 + i) * row + t];
-            }
-            for (Size i = 0; i < 3; i++) {
-                const Size y = (i + 1) % 3, z = (i + 2) % 3;
-                const double *restrict wy = to + (3 + y) * out_row, *restrict wz = to + (3 + z) * out_row;
-                double *restrict v = to + i * out_row;
-                EACH (t, n)
-                    v[t] += wy[t] * lever[z][t] - wz[t] * lever[y][t];
-            }
-        }
-    }
-}
-
-/* Vectors of c components mixed by a matrix (k, c) that every sample has its own of. */
-WIDEST static void mix(Size p, Size k, Size c, Size m, const double *vectors, Size vector, Size component,
-                       const double *matrices, Size row, Size column, double *out, Size out_vector,
-                       Size out_row)
-{
-    for (Size start = 0; start < m; start += SAMPLES) {
-        const Size n = m - start < SAMPLES ? m - start : SAMPLES;
-        for (Size j = 0; j < p; j++)
-            for (Size i = 0; i < k; i++) {
-                const double *f = matrices + i * row + start, *v = vectors + j * vector + start;
-                double *to = out + j * out_vector + i * out_row + start;
-                Size l = 3;
-                if (c < 3)
-                    memset(to, 0, n * sizeof(double)), l = 0;
-                else
-                    EACH (t, n)
-                        to[t] = f[t] * v[t] + f[column + t] * v[component + t] +
-                                f[2 * column + t] * v[2 * component + t];
-                for (; l < c; l++)
-                    EACH (t, n)
-                        to[t] += f[l * column + t] * v[l * component + t];
-            }
-    }
-}
-
 /* Twists (p, 6) seen from frames (p, 4, 4). */
 static void carry_all(Size p, const double *frames, const double *twists, double *out)
 {
@@ -184,7 +139,7 @@ WIDEST static Size rotation_vectors(Size m, const double *turns, Size row, Size 
     Size obtuse = 0;
     for (Size start = 0; start < m; start += SAMPLES) {
         const Size n = m - start < SAMPLES ? m - start : SAMPLES;
-        double sine[SAMPLES], cosine[SAMPLES];
+        double sine[SAMPLES], cosine[SAMPLES], f[SAMPLES];
         const double *r = turns + start;
         double *v = out + start;
         EACH (t, n) {
@@ -192,14 +147,22 @@ WIDEST static Size rotation_vectors(Size m, const double *turns, Size row, Size 
             const double y = r[2 * column + t] - r[2 * row + t];
             const double z = r[row + t] - r[column + t];
             v[t] = x, v[axis + t] = y, v[2 * axis + t] = z;
-            sine[t] = sqrt(fmax(x * x + y * y + z * z, 1e-300));
-            cosine[t] = r[t] + r[row + column + t] + r[2 * (row + column) + t] - 1;
+            const double s = fmax(x * x + y * y + z * z, 1e-300);
+            const double c = r[t] + r[row + column + t] + r[2 * (row + column) + t] - 1, u = s / (c * c);
+            sine[t] = s, cosine[t] = c;
+            /* atan of a small tangent, over the sine. */
+            f[t] = (1 + u * (-1.0 / 3 +
+                             u * (1.0 / 5 + u * (-1.0 / 7 + u * (1.0 / 9 + u * (-1.0 / 11 + u / 13)))))) /
+                   c;
         }
-        for (Size t = 0; t < n; t++) {
-            const double f = atan2(sine[t], cosine[t]) / sine[t];
-            v[t] *= f, v[axis + t] *= f, v[2 * axis + t] *= f;
-            obtuse += cosine[t] < -1.8;
-        }
+        for (Size t = 0; t < n; t++)
+            if (!(cosine[t] > 0 && sine[t] < SMALL_TANGENT * cosine[t] * cosine[t])) {
+                const double s = sqrt(sine[t]);
+                f[t] = atan2(s, cosine[t]) / s;
+                obtuse += cosine[t] < -1.8;
+            }
+        EACH (t, n)
+            v[t] *= f[t], v[axis + t] *= f[t], v[2 * axis + t] *= f[t];
     }
     return obtuse;
 }

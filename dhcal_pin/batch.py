@@ -18,6 +18,7 @@ from .arms import Arms
 from .error_model import ErrorModel
 from .errors import DhcalError
 from .executors import HERE, Workers
+from .loops import mix_velocities
 from .measurements import Measurement, joined
 from .scratch import scratch
 from .se3 import Array
@@ -136,12 +137,12 @@ class Batch:
             sweep = arms.sweep(q)
             velocities = arms.tool_velocities(sweep, q.shape[:3], bodies, twists)
             if small_angle:
-                residual, rows = item.small_angle(sweep, velocities, u)
+                residual, mixture = item.small_angle(sweep, u)
             else:
                 residual = item.residual(sweep, u)
-                rows = scratch("batch rows", p, *residual.shape)
-                item.whiten(sweep, velocities, u, residual, rows)
+                mixture = item.mixture(sweep, u, residual)
             k = len(residual)
+            rows = mix_velocities(velocities, mixture, scratch("batch rows", p, *residual.shape))
             block = scratch(f"batch block {len(blocks)}", b, p + 1, k, q.shape[2])
             block[:, :p] = rows.reshape(p, k, b, -1).transpose(2, 0, 1, 3)
             block[:, p] = residual.reshape(k, b, -1).swapaxes(0, 1)

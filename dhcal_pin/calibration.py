@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
 
@@ -148,22 +148,44 @@ def _scatter(
     return out
 
 
-def _families(errors: ErrorModel, expected: Array, default: Array) -> list[tuple[list[int], float, float]]:
-    """Default priors (p,) of one unit and one expected weight: which, that weight, the unit's largest."""
-    outside = (BASE, errors.chain.tool_station)
-    inside = [i for i, p in enumerate(errors.parameters) if default[i] and p.station not in outside]
-    units = {i: (errors.parameters[i].unit, errors.parameters[i].entry is None) for i in inside}
-    narrowest: dict[tuple[str, bool], float] = {}
-    families: dict[tuple[tuple[str, bool], float], list[int]] = {}
-    for i, weight in zip(inside, expected[inside].tolist(), strict=True):
-        narrowest[units[i]] = max(weight, narrowest.get(units[i], 0.0))
-        families.setdefault((units[i], weight), []).append(i)
-    return [(family, weight, narrowest[unit]) for (unit, weight), family in families.items()]
+@dataclass(frozen=True, eq=False)
+class _Families:
+    """Parameters whose default priors share one scale: those of one unit and one expected size.
+
+    Attributes:
+        members: (n,) the parameters.
+        family: (n,) which family each is of.
+        expected: (f,) one over the size that a family's errors are expected to have.
+        narrowest: (f,) the largest of those in its unit.
+    """
+
+    members: Array
+    family: Array
+    expected: Array
+    narrowest: Array
+
+    @classmethod
+    def of(cls, errors: ErrorModel, expected: Array, default: Array) -> _Families:
+        """Of parameters (p,) with such expected weights that have default priors."""
+        outside = (BASE, errors.chain.tool_station)
+        inside = [i for i, p in enumerate(errors.parameters) if default[i] and p.station not in outside]
+        units = [(errors.parameters[i].unit, errors.parameters[i].entry is None) for i in inside]
+        sizes = list(zip(units, expected[inside].tolist(), strict=True))
+        families = list(dict.fromkeys(sizes))
+        narrowest = [max(weight for unit, weight in families if unit == mine) for mine, _ in families]
+        return cls(
+            np.array(inside, int),
+            np.array([families.index(size) for size in sizes], int),
+            np.array([weight for _, weight in families]),
+            np.array(narrowest),
+        )
+
+    def groups(self) -> list[tuple[list[int], float]]:
+        """The members of each and its expected weight."""
+        return [(self.members[self.family == i].tolist(), w) for i, w in enumerate(self.expected.tolist())]
 
 
-def _rescaled(
-    problem: Problem, solution: Solution, families: Sequence[tuple[list[int], float, float]]
-) -> Array:
+def _rescaled(problem: Problem, solution: Solution, families: _Families) -> Array:
     """The weights (p+s,) of priors as wide as the errors that were found.
 
     Default priors of one unit and one expected size have one scale, the one of greatest evidence
@@ -171,15 +193,16 @@ def _rescaled(
     None gets narrower than the narrowest expectation of its unit, as offsets of no more than tilts' size.
     Priors that are not default stay.
     """
-    weights = problem.weights.copy()
-    if not families:
+    weights, members, family = problem.weights.copy(), families.members, families.family
+    if not len(members):
         return weights
-    root = posterior_root(solution.triangle, problem.weights)[0]
-    told = 1 - np.sum((root * problem.weights[:, None]) ** 2, 1)
-    for family, expected, narrowest in families:
-        found, count = np.sum((solution.x[family] * expected) ** 2), told[family].sum()
-        share = EXPECTATION if found <= count else 0.0
-        weights[family] = min(expected * np.sqrt((count + share) / (found + share)), narrowest)
+    expected, root = families.expected, posterior_root(solution.triangle, problem.weights)[0][members]
+    told = 1 - np.einsum("ij,ij->i", root, root) * problem.weights[members] ** 2
+    found = np.bincount(family, solution.x[members] ** 2) * expected**2
+    count = np.bincount(family, told)
+    share = np.where(found <= count, EXPECTATION, 0.0)
+    scaled = np.fmin(expected * np.sqrt((count + share) / (found + share)), families.narrowest)
+    weights[members] = scaled[family]
     return weights
 
 
@@ -272,7 +295,7 @@ def calibrate(
         # Sigmas and weights that the fit itself tells: a few rounds settle them.
         scales = np.ones(sum(len(item.groups) for item in data))
         expected, ended = problem.weights, False
-        families = _families(errors, expected, default)
+        families = _Families.of(errors, expected, default)
         (how, *later), moved = robust.LOSSES[loss], np.inf
         for left in reversed(range(MOST_ROUNDS)):
             found = _scatter(problem, solution, data, weights)
@@ -301,7 +324,7 @@ def calibrate(
                 scales, going_on, earlier = found, None, earlier + solution.iterations
             loop = partial(levenberg_marquardt, before=going_on, nearly=not ended)
             solution = loop(problem, solution.x, max_iterations, progress)
-        kept = kept_share(problem, solution, [(members, usual) for members, usual, _ in families])
+        kept = kept_share(problem, solution, families.groups())
     x = kept * solution.x
     found = errors.at(x[: len(errors.parameters)]).loaded() if kept else refitted(errors, data, known)
     return Result(

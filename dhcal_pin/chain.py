@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from . import kinematics, loops, se3
+from . import loops, se3
 from .dh import DHTable
 from .dh_urdf import dh_to_urdf
 from .errors import DhcalError
@@ -245,7 +245,8 @@ class Chain:
 
     def _motion(self, joints: Array) -> Motion:
         """The motion of independent joints that stand at (n, m)."""
-        return kinematics.motion(joints, self.mixing @ joints + self.shift[:, None])
+        values = self.mixing @ joints + self.shift[:, None]
+        return Motion(joints, values, *loops.cosines_and_sines(values))
 
     def sweep(self, q: Array | Motion, out: Array | None = None) -> Sweep:
         """All frames at joint values q (m, n), or at a motion of this chain, vectorised over the samples.

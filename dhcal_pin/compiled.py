@@ -5,8 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from . import _kernel, kinematics
-from .kinematics import Motion
+from .kinematics import Mixture, Motion
+from .scratch import scratch
 from .se3 import Array
+
+
+def cosines_and_sines(angles: Array) -> tuple[Array, Array]:
+    """As `kinematics.cosines_and_sines`."""
+    cosines, sines = np.empty((2, *angles.shape))
+    _kernel.cosines_and_sines(angles, cosines, sines)
+    return cosines, sines
 
 
 def carry_frames(links: Array, prismatic: Array, motion: Motion, frames: Array) -> None:
@@ -19,9 +27,9 @@ def point_velocities(frames: Array, point: Array, at: Array, twists: Array, out:
     _kernel.point_velocities(frames, point, at, twists, out)
 
 
-def mix_samples(vectors: Array, matrices: Array, out: Array) -> Array:
-    """As `kinematics.mix_samples`."""
-    _kernel.mix_samples(vectors, matrices, out)
+def mix_velocities(velocities: Array, mixture: Mixture, out: Array) -> Array:
+    """As `kinematics.mix_velocities`."""
+    _kernel.mix_velocities(velocities, *_terms(mixture), out)
     return out
 
 
@@ -53,7 +61,30 @@ def triangle_of(rows: Array) -> Array:
 
 def triangles_of(rows: Array) -> Array:
     """As `reduction.triangles_of`; the rows stay."""
-    b, c = rows.shape[:2]
+    b, c, k, _ = rows.shape
     out = np.empty((b, c, c))
-    _kernel.triangles(rows, out)
+    _kernel.triangles(rows, _room(c, k, 0), out)
     return out
+
+
+def error_triangle(
+    frames: Array, point: Array, at: Array, twists: Array, mixture: Mixture, given: Array
+) -> Array:
+    """As `reduction.error_triangle`; the rows stay."""
+    _, k, m = given.shape
+    c = len(at) + len(given)
+    out = np.empty((c, c))
+    room = _room(c, k, point.shape[1] // m if m else 1)
+    _kernel.error_triangle(frames, point, at, twists, *_terms(mixture), given, room, out)
+    return out
+
+
+def _terms(mixture: Mixture) -> tuple[Array, Array, Array]:
+    """Rows, components and shares, whatever their strides were."""
+    rows, components, shares = map(np.ascontiguousarray, (mixture.rows, mixture.components, mixture.shares))
+    return rows, components, shares
+
+
+def _room(columns: int, readings: int, ends: int) -> Array:
+    """Memory to reduce rows in; fresh pages for every triangle would cost as much as a part of the work."""
+    return scratch("room", _kernel.room(columns, readings, ends))

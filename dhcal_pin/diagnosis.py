@@ -12,7 +12,7 @@ from .chain import Chain
 from .configurations import joint_range
 from .error_model import ErrorModel
 from .evaluation import deviations, group_of, instrument_values
-from .measurements import Measurement
+from .measurements import Measurement, derivatives
 from .parameters import offset
 from .result import Result
 from .se3 import Array
@@ -135,7 +135,7 @@ def _asked(chain: Chain, data: Sequence[Measurement], fit: Result) -> tuple[Arra
         u = np.array([values[unknown.name] for unknown in item.unknowns])
         sweep = chain.sweep(item.configurations())
         residual = item.residual(sweep, u)
-        rows = item.whiten(sweep, chain.tool_velocities(sweep, bodies, twists), u, residual)
+        rows = derivatives(item, sweep, chain.tool_velocities(sweep, bodies, twists), u, residual)
         pulls.append(np.sum(rows * residual, 1))
         weights.append(np.sum(rows**2, 1))
     return np.concatenate(pulls, 1), np.concatenate(weights, 1)

@@ -15,7 +15,7 @@ from .design import basis
 from .error_model import ErrorModel
 from .errors import DhcalError
 from .kinds import KINDS
-from .measurements import Measurement, Noise
+from .measurements import Measurement, Noise, derivatives
 from .parameters import SETS, select
 from .problem import reduce
 from .se3 import Array
@@ -74,7 +74,7 @@ class Information:
         data = self.kind.simulate(chain, q, self.noise, np.random.default_rng(0))
         sweep = chain.sweep(q)
         velocities = chain.tool_velocities(sweep, bodies, twists)
-        whitened = data.whiten(sweep, velocities, self.own, data.residual(sweep, self.own))
+        whitened = derivatives(data, sweep, velocities, self.own, data.residual(sweep, self.own))
         out = np.zeros((len(self.scale), *whitened.shape[1:]))
         out[: len(whitened)] = whitened
         free = self.places >= 0

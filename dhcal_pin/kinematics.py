@@ -62,12 +62,29 @@ class Sweep:
         return out
 
 
-def motion(joints: Array, values: Array) -> Motion:
-    """The motion of moving joints that stand at values (k, m) when the independent ones do at (n, m)."""
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """How the rows of m samples follow from the tool's velocity at c configurations of each.
+
+    Each of n terms adds a share of one component of the velocity to one row.
+
+    Attributes:
+        rows: (n,) ascending.
+        components: (n,) 0 to 5 for vx, vy, vz, ωx, ωy, ωz in the first configuration, 6 to 11 in the second.
+        shares: (n, m).
+    """
+
+    rows: Array
+    components: Array
+    shares: Array
+
+
+def cosines_and_sines(angles: Array) -> tuple[Array, Array]:
+    """Of angles (k, m), rad."""
     # One tangent of half the angle costs a fifth of a cosine and a sine.
-    half = np.tan(0.5 * values)
+    half = np.tan(0.5 * angles)
     square = half * half
-    return Motion(joints, values, (1 - square) / (1 + square), 2 * half / (1 + square))
+    return (1 - square) / (1 + square), 2 * half / (1 + square)
 
 
 @LongRows()
@@ -125,9 +142,14 @@ def point_velocities(frames: Array, point: Array, at: Array, twists: Array, out:
             np.matmul(move[rows, 4:].reshape(n, 1, count, 3), part[:, :, :3], out=velocity[:, 3:])
 
 
-def mix_samples(vectors: Array, matrices: Array, out: Array) -> Array:
-    """Vectors (p, c, m) mixed by a matrix of each sample's own (k, c, m), into `out` (p, k, m) elsewhere."""
-    np.einsum("pcm,kcm->pkm", vectors, matrices, out=out)
+def mix_velocities(velocities: Array, mixture: Mixture, out: Array) -> Array:
+    """Fills in what a mixture makes (p, k, m) of velocities (p, 6, c·m)."""
+    out[:] = 0.0
+    p, _, m = out.shape
+    ends = velocities.reshape(p, 6, velocities.shape[2] // max(m, 1), m)
+    product = scratch("product", p, m)
+    for row, component, share in zip(mixture.rows, mixture.components, mixture.shares, strict=True):
+        out[:, row] += np.multiply(ends[:, component % 6, component // 6], share, out=product)
     return out
 
 

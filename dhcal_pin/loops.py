@@ -9,8 +9,10 @@ try:
     from .compiled import (
         carry_frames,
         carry_twists,
+        cosines_and_sines,
+        error_triangle,
         log_rotations,
-        mix_samples,
+        mix_velocities,
         point_velocities,
         right_jacobian_inverses,
         triangle_of,
@@ -20,18 +22,21 @@ except ImportError:
     from .kinematics import (
         carry_frames,
         carry_twists,
+        cosines_and_sines,
         log_rotations,
-        mix_samples,
+        mix_velocities,
         point_velocities,
         right_jacobian_inverses,
     )
-    from .reduction import triangle_of, triangles_of
+    from .reduction import error_triangle, triangle_of, triangles_of
 
 __all__ = [
     "carry_frames",
     "carry_twists",
+    "cosines_and_sines",
+    "error_triangle",
     "log_rotations",
-    "mix_samples",
+    "mix_velocities",
     "point_velocities",
     "right_jacobian_inverses",
     "triangle_of",

@@ -2,9 +2,9 @@
 
 A kind of measurement holds joint values and readings in SI. Given a sweep of frames and the values u of
 its own unknowns (an anchor, a touched point) it returns whitened residuals, measured minus modelled over
-sigma, as (k, m); it turns tool velocities (p, 6, c·m) into the whitened model's derivative (p, k, m), and
-gives the derivative (s, k, m) by its s unknowns. Components come first, so that (p, k·m) seen from LAPACK is
-a Fortran matrix. A step solves derivative·Δx = residual.
+sigma, as (k, m). It says how they mix the tool's velocities (p, 6, c·m), of which `derivatives` makes those
+of the whitened model (p, k, m), and gives the derivative (s, k, m) by its s unknowns. Components come first,
+so that samples are contiguous. A step solves derivative·Δx = residual.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ import numpy as np
 
 from .chain import Chain
 from .errors import DhcalError
-from .kinematics import Sweep
+from .kinematics import Mixture, Sweep
+from .loops import mix_velocities
 from .se3 import Array
 
 # Without a sigma a millimetre weighs as much as a milliradian.
@@ -108,20 +109,16 @@ class Measurement(Protocol):
         """Whitened residuals (k, m); `groups` names its rows."""
         ...
 
-    def whiten(
-        self, sweep: Sweep, velocities: Array, u: Array, residual: Array, out: Array | None = None
-    ) -> Array:
-        """Derivatives (p, k, m) of the whitened model from tool velocities (p, 6, c·m) where residual is."""
+    def mixture(self, sweep: Sweep, u: Array, residual: Array) -> Mixture:
+        """How the k rows of the whitened model follow from the tool's velocities where residual is."""
         ...
 
     def own(self, sweep: Sweep, u: Array) -> Array:
         """Derivatives (s, k, m) of the whitened model by the unknowns."""
         ...
 
-    def small_angle(
-        self, sweep: Sweep, velocities: Array, u: Array, out: Array | None = None
-    ) -> tuple[Array, Array]:
-        """The paper's rows: residual (k, m) by (35) and (36), derivative (p, k, m) by its R."""
+    def small_angle(self, sweep: Sweep, u: Array) -> tuple[Array, Mixture]:
+        """The paper's rows: residual (k, m) by (35) and (36), and what makes its R of velocities."""
         ...
 
     def errors(self, sweep: Sweep, u: Array) -> dict[str, Array]:
@@ -161,6 +158,12 @@ class Measurement(Protocol):
     def to_columns(self) -> dict[str, Any]:
         """The columns (m,) that a file of these readings has, in SI or as text."""
         ...
+
+
+def derivatives(item: Measurement, sweep: Sweep, velocities: Array, u: Array, residual: Array) -> Array:
+    """Of the whitened model (p, k, m), from tool velocities (p, 6, c·m) where the residual (k, m) is."""
+    out = np.empty((len(velocities), *residual.shape))
+    return mix_velocities(velocities, item.mixture(sweep, u, residual), out)
 
 
 _Kind = TypeVar("_Kind", bound=Measurement)

@@ -10,8 +10,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from .chain import Chain
-from .kinematics import Sweep
-from .loops import mix_samples
+from .kinematics import Mixture, Sweep
 from .measurements import Unknown
 from .se3 import Array
 
@@ -95,26 +94,20 @@ class PointReading:
         """(k, m)."""
         return (self._reading - self.model(self._points(sweep), u)[0]) * self._weights
 
-    def whiten(
-        self, sweep: Sweep, velocities: Array, u: Array, residual: Array, out: Array | None = None
-    ) -> Array:
-        """(p, k, m)."""
-        derivative = self.model(self._points(sweep), u)[1] * self._weights[:, None]
-        ends, k, _, m = derivative.shape
-        out = np.empty((len(velocities), k, m)) if out is None else out
-        matrices = np.ascontiguousarray(derivative.transpose(1, 2, 0, 3)).reshape(k, 3 * ends, m)
-        return mix_samples(velocities[:, :3].reshape(-1, 3 * ends, m), matrices, out)
+    def mixture(self, sweep: Sweep, u: Array, residual: Array) -> Mixture:
+        """By what the reading depends on."""
+        derivative = self.model(self._points(sweep), u)[1].swapaxes(0, 1)
+        row, end, axis = np.nonzero(derivative.any(-1))
+        return Mixture(row, 6 * end + axis, derivative[row, end, axis] * self._weights[row])
 
     def own(self, sweep: Sweep, u: Array) -> Array:
         """(s, k, m)."""
         return self.model(self._points(sweep), u)[2] * self._weights
 
-    def small_angle(
-        self, sweep: Sweep, velocities: Array, u: Array, out: Array | None = None
-    ) -> tuple[Array, Array]:
+    def small_angle(self, sweep: Sweep, u: Array) -> tuple[Array, Mixture]:
         """The same rows: there is no rotation in them."""
         residual = self.residual(sweep, u)
-        return residual, self.whiten(sweep, velocities, u, residual, out)
+        return residual, self.mixture(sweep, u, residual)
 
     def errors(self, sweep: Sweep, u: Array) -> dict[str, Array]:
         """{group: (m, k)} in m."""

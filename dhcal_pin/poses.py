@@ -12,8 +12,8 @@ import numpy as np
 from . import se3
 from .chain import Chain
 from .errors import DhcalError
-from .kinematics import Sweep
-from .loops import log_rotations, mix_samples, right_jacobian_inverses
+from .kinematics import Mixture, Sweep
+from .loops import log_rotations, right_jacobian_inverses
 from .measurements import (
     ANGLE_SIGMA,
     LENGTH_SIGMA,
@@ -31,6 +31,11 @@ _AXES = ("x", "y", "z")
 _TURNS = ("rx", "ry", "rz")
 _SIGMAS = tuple(f"sigma_{name}" for name in _AXES)
 _TURN_SIGMAS = tuple(f"sigma_{name}" for name in _TURNS)
+# Rows and components of a mixture: the position's by its own, the rotation's each by all three.
+_EXACT = (
+    np.array([0, 1, 2, *np.repeat([3, 4, 5], 3)]),
+    np.array([0, 1, 2, *np.tile([3, 4, 5], 3)]),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +68,8 @@ class PoseReading:
 
     @cached_property
     def _weights(self) -> Array:
-        """One over both sigmas, (6, m)."""
-        return 1 / np.concatenate([self.sigma.T, self.rotation_sigma.T])
+        """One over both sigmas, (6, m), the samples last in memory."""
+        return 1 / np.ascontiguousarray(np.concatenate([self.sigma, self.rotation_sigma], 1).T)
 
     @cached_property
     def _measured(self) -> Array:
@@ -217,27 +222,20 @@ class Pose(PoseReading):
         """(6, m): x, y, z, then the rotation vector, over sigma."""
         return np.concatenate([self._position(sweep), self._rotvec(sweep)]) * self._weights
 
-    def whiten(
-        self, sweep: Sweep, velocities: Array, u: Array, residual: Array, out: Array | None = None
-    ) -> Array:
-        """(p, 6, m); log3(E·exp(-ω)) = φ - Jr⁻¹(φ)·ω."""
-        out = np.empty_like(velocities) if out is None else out
+    def mixture(self, sweep: Sweep, u: Array, residual: Array) -> Mixture:
+        """log3(E·exp(-ω)) = φ - Jr⁻¹(φ)·ω."""
         weights = self._weights
-        np.multiply(velocities[:, :3], weights[:3], out=out[:, :3])
-        mix = right_jacobian_inverses(residual[3:] / weights[3:])
-        mix *= weights[3:, None]
-        mix_samples(velocities[:, 3:], mix, out[:, 3:])
-        return out
+        turning = right_jacobian_inverses(residual[3:] / weights[3:])
+        turning *= weights[3:, None]
+        return Mixture(*_EXACT, np.concatenate([weights[:3], turning.reshape(9, -1)]))
 
-    def small_angle(
-        self, sweep: Sweep, velocities: Array, u: Array, out: Array | None = None
-    ) -> tuple[Array, Array]:
+    def small_angle(self, sweep: Sweep, u: Array) -> tuple[Array, Mixture]:
         """Half the vee of E - Eᵀ, E = R_measured·R_modelᵀ, is (36) seen in the measuring frame."""
         turn = self._turn(sweep)
         difference = 0.5 * (turn - np.swapaxes(turn, 0, 1))
         sine = np.stack([difference[2, 1], difference[0, 2], difference[1, 0]])
         residual = np.concatenate([self._position(sweep), sine]) * self._weights
-        return residual, np.multiply(velocities, self._weights, out=out)
+        return residual, Mixture(np.arange(6), np.arange(6), self._weights)
 
     def errors(self, sweep: Sweep, u: Array) -> dict[str, Array]:
         """{"position": (m, 3) in m, "orientation": (m, 3) rotation vectors in rad}."""

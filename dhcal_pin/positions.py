@@ -11,7 +11,7 @@ import numpy as np
 from . import se3
 from .chain import Chain
 from .errors import DhcalError
-from .kinematics import Sweep
+from .kinematics import Mixture, Sweep
 from .measurements import (
     LENGTH_SIGMA,
     ZERO_PRIOR,
@@ -25,11 +25,12 @@ from .measurements import (
     need,
 )
 from .point_readings import PointReading
-from .scratch import scratch
 from .se3 import Array
 
 _AXES = ("x", "y", "z")
 _SIGMAS = tuple(f"sigma_{name}" for name in _AXES)
+# Rows and components of v + ω × offset.
+_TARGET = (np.repeat([0, 1, 2], 3), np.array([0, 4, 5, 1, 3, 5, 2, 3, 4]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +67,9 @@ class Position(PointReading):
         m = points.shape[-1]
         return points[0], np.tile(np.eye(3)[None, :, :, None], (1, 1, 1, m)), np.empty((0, 3, m))
 
-    def whiten(
-        self, sweep: Sweep, velocities: Array, u: Array, residual: Array, out: Array | None = None
-    ) -> Array:
-        """(p, 3, m)."""
-        return np.multiply(velocities[:, :3], self._weights, out=out)
+    def mixture(self, sweep: Sweep, u: Array, residual: Array) -> Mixture:
+        """Each axis by its own."""
+        return Mixture(np.arange(3), np.arange(3), self._weights)
 
     def positions(self) -> Array:
         """As measured, (m, 3)."""
@@ -204,19 +203,12 @@ class Targets(PointReading):
         """(3, m)."""
         return (self._reading - sweep.tool[3] - self._offsets(sweep, u)) * self._weights
 
-    def whiten(
-        self, sweep: Sweep, velocities: Array, u: Array, residual: Array, out: Array | None = None
-    ) -> Array:
-        """(p, 3, m): the target's velocity v + ω × offset."""
-        offset = self._offsets(sweep, u)
-        out = np.empty((len(velocities), *offset.shape)) if out is None else out
-        product = scratch("product", len(velocities), offset.shape[1])
-        for x, y, z in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-            np.multiply(velocities[:, 3 + y], offset[z], out=out[:, x])
-            out[:, x] -= np.multiply(velocities[:, 3 + z], offset[y], out=product)
-        out += velocities[:, :3]
-        out *= self._weights
-        return out
+    def mixture(self, sweep: Sweep, u: Array, residual: Array) -> Mixture:
+        """The target's velocity v + ω × offset."""
+        x, y, z = self._offsets(sweep, u)
+        one = np.ones_like(x)
+        shares = np.stack([one, z, -y, one, -z, x, one, y, -x])
+        return Mixture(*_TARGET, shares * np.repeat(self._weights, 3, 0))
 
     def own(self, sweep: Sweep, u: Array) -> Array:
         """(s, 3, m): the tool's axes where the sample is of that target."""

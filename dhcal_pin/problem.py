@@ -17,8 +17,8 @@ import numpy as np
 from .chain import Chain
 from .error_model import ErrorModel
 from .executors import HERE, Workers
-from .kinematics import Motion, Sweep
-from .loops import triangle_of
+from .kinematics import Mixture, Motion, Sweep
+from .loops import error_triangle, mix_velocities, triangle_of
 from .measurements import Measurement, Unknown
 from .scale import Ruler, count_in_arm
 from .scratch import LongRows, scratch
@@ -188,36 +188,48 @@ class Tangent:
 
     def triangle(self, chunk: Chunk, small_angle: bool) -> Array:
         """Triangle (p+1, p+1) of a chunk's whitened rows [J | r]; exact or by the paper's rows."""
-        data, p = chunk.data, len(self.bodies) + len(self.places)
-        block = scratch("block", data.size, p + 1, len(data.rows)).swapaxes(0, 1)
-        with LongRows():
-            self._fill(block, chunk, small_angle)
-        return triangle_of(block)
+        data, sweep = chunk.data, chunk.sweep(self.chain)
+        # Rows by twists are worked out on their way into the triangle, unless they are changed before.
+        plain = int(np.searchsorted(self.bodies, len(sweep.frames))) if data.metric else 0
+        given = scratch("given", data.size, self._columns - plain, len(data.rows)).swapaxes(0, 1)
+        mixture = self._fill(given, chunk, sweep, small_angle)
+        return error_triangle(
+            sweep.frames, sweep.tool[3], self.bodies[:plain], self.twists[:plain], mixture, given
+        )
 
     def rows(self, chunk: Chunk) -> Array:
         """A chunk's whitened rows [J | r] (p+1, k, m)."""
-        out = np.empty((len(self.bodies) + len(self.places) + 1, chunk.data.size, len(chunk.data.rows)))
-        with LongRows():
-            self._fill(out, chunk, False)
+        out = np.empty((self._columns, chunk.data.size, len(chunk.data.rows)))
+        self._fill(out, chunk, chunk.sweep(self.chain), False)
         return out
 
-    def _fill(self, block: Array, chunk: Chunk, small_angle: bool) -> None:
-        data, errors, p = chunk.data, len(self.bodies), len(block) - 1
-        sweep, u = chunk.sweep(self.chain), chunk.unknowns(self.instruments)
-        velocities = scratch("velocities", errors, 6, sweep.tool.shape[-1])
-        self.chain.tool_velocities(sweep, self.bodies, self.twists, velocities)
+    @property
+    def _columns(self) -> int:
+        return len(self.bodies) + len(self.places) + 1
+
+    @LongRows()
+    def _fill(self, block: Array, chunk: Chunk, sweep: Sweep, small_angle: bool) -> Mixture:
+        """Fills in the last columns of the rows, as many as the block has; tells what makes the others."""
+        data, u = chunk.data, chunk.unknowns(self.instruments)
         if small_angle:
-            block[p] = data.small_angle(sweep, velocities, u, block[:errors])[0]
+            block[-1], mixture = data.small_angle(sweep, u)
         else:
-            block[p] = data.residual(sweep, u)
-            data.whiten(sweep, velocities, u, block[p], block[:errors])
-        block[errors:p] = 0.0
+            block[-1] = data.residual(sweep, u)
+            mixture = data.mixture(sweep, u, block[-1])
+        first = self._columns - len(block)
+        errors = len(self.bodies) - first
+        if errors:
+            velocities = scratch("velocities", errors, 6, sweep.tool.shape[-1])
+            self.chain.tool_velocities(sweep, self.bodies[first:], self.twists[first:], velocities)
+            mix_velocities(velocities, mixture, block[:errors])
+        block[errors:-1] = 0.0
         own = data.own(sweep, u) if data.unknowns else ()
         for unknown, rows in zip(data.unknowns, own, strict=True):
             if unknown.name in self.places:
-                block[self.places[unknown.name]] = rows
+                block[self.places[unknown.name] - first] = rows
         if not data.metric:
             count_in_arm(block, self.size, self.rates, data.groups.get("position"))
+        return mixture
 
 
 def residual_of(chain: Chain, instruments: Mapping[str, float], chunk: Chunk) -> Array:

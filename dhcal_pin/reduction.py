@@ -7,7 +7,8 @@ from functools import lru_cache
 import numpy as np
 from scipy.linalg import lapack
 
-from .scratch import scratch
+from .kinematics import Mixture, mix_velocities, point_velocities
+from .scratch import LongRows, scratch
 from .se3 import Array
 
 # Columns that are reduced at once where that pays.
@@ -36,6 +37,29 @@ def triangles_of(rows: Array) -> Array:
     if short > 0:
         stacked = np.concatenate([stacked, np.zeros((b, c, short))], 2)
     return np.asarray(np.linalg.qr(stacked.swapaxes(1, 2), mode="r"))
+
+
+@LongRows()
+def error_triangle(
+    frames: Array, point: Array, at: Array, twists: Array, mixture: Mixture, given: Array
+) -> Array:
+    """Upper triangle (p+s, p+s) of rows of which p columns follow from errors and s are given (s, k, m).
+
+    Args:
+        frames: (b, 7, 3, c·m), as `kinematics.point_velocities` takes them, and so are
+        point: (3, c·m),
+        at: (p,), and
+        twists: (p, 6).
+        mixture: of the point's velocities into k rows.
+        given: (s, k, m); they may be overwritten.
+    """
+    (s, k, m), p = given.shape, len(at)
+    block = scratch("rows", k, p + s, m).swapaxes(0, 1)
+    velocities = scratch("velocities of errors", p, 6, point.shape[1])
+    point_velocities(frames, point, at, twists, velocities)
+    mix_velocities(velocities, mixture, block[:p])
+    block[p:] = given
+    return triangle_of(block)
 
 
 def _narrow(rows: Array) -> Array:

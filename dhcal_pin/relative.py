@@ -11,15 +11,20 @@ from numpy.typing import ArrayLike
 
 from . import se3
 from .chain import Chain
-from .kinematics import Sweep
-from .loops import log_rotations, mix_samples, right_jacobian_inverses
+from .kinematics import Mixture, Sweep
+from .loops import log_rotations, right_jacobian_inverses
 from .measurements import ANGLE_SIGMA, LENGTH_SIGMA, Noise, checked, checked_sigma, gathered, need
 from .poses import PoseReading, pose_columns, poses_of
-from .scratch import scratch
 from .se3 import Array
 
 _SHIFT, _TURN = ("dx", "dy", "dz"), ("drx", "dry", "drz")
 _SHIFT_SIGMA, _TURN_SIGMA = (tuple(f"sigma_{name}" for name in names) for names in (_SHIFT, _TURN))
+
+# Rows and components of a mixture: the translation by v_a, ω_a and v_b, the rotation by ω_a and ω_b.
+_TERMS = (
+    np.concatenate([np.repeat([0, 1, 2], 9), np.repeat([3, 4, 5], 6)]),
+    np.concatenate([np.tile(np.arange(9), 3), np.tile([3, 4, 5, 9, 10, 11], 3)]),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,41 +100,30 @@ class RelativePose(PoseReading):
         shift, turn = self._gap(sweep)
         return np.concatenate([shift, log_rotations(turn)]) * self._weights
 
-    def _rates(self, sweep: Sweep, velocities: Array, out: Array | None) -> Array:
-        """Rates (p, 6, m) of the translation in a and, as body rates, of the model's rotation in frame b."""
+    def _mixture(self, sweep: Sweep, turning: Array) -> Mixture:
+        """Rates of the translation in a, and of the model's rotation from a to b turned by (3, 3, m)."""
         first, second = self._ends(sweep)
-        m = len(self.rows)
-        out = np.empty((len(velocities), 6, m)) if out is None else out
-        rate = velocities[..., m:] - velocities[..., :m]
-        arm, product = second[3] - first[3], scratch("product", len(velocities), m)
-        for x, y, z in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-            rate[:, x] -= np.multiply(velocities[:, 3 + y, :m], arm[z], out=product)
-            rate[:, x] += np.multiply(velocities[:, 3 + z, :m], arm[y], out=product)
-        for frame, part in ((first, slice(0, 3)), (second, slice(3, 6))):
-            mix_samples(rate[:, part], frame[:3], out[:, part])
-        return out
+        arm = second[3] - first[3]
+        # Of the translation by v_a, ω_a and v_b: R_aᵀ·(v_b - v_a - ω_a × arm).
+        shift = first[:3] * self._weights[:3, None]
+        levers = np.cross(shift, arm[None], axis=1)
+        turn = np.einsum("ikm,kjm->ijm", turning, second[:3]) * self._weights[3:, None]
+        linear = np.concatenate([-shift, levers, shift], 1)
+        angular = np.concatenate([-turn, turn], 1)
+        return Mixture(*_TERMS, np.concatenate([linear.reshape(27, -1), angular.reshape(18, -1)]))
 
-    def whiten(
-        self, sweep: Sweep, velocities: Array, u: Array, residual: Array, out: Array | None = None
-    ) -> Array:
-        """(p, 6, m); log3(exp(-ω)·E) = φ - Jl⁻¹(φ)·ω, Jl⁻¹ being the transpose of Jr⁻¹."""
-        out = self._rates(sweep, velocities, out)
+    def mixture(self, sweep: Sweep, u: Array, residual: Array) -> Mixture:
+        """log3(exp(-ω)·E) = φ - Jl⁻¹(φ)·ω, Jl⁻¹ being the transpose of Jr⁻¹."""
         right = right_jacobian_inverses(residual[3:] / self._weights[3:])
-        turned = scratch("turned", len(out), *out[0, 3:].shape)
-        out[:, 3:] = mix_samples(out[:, 3:], right.swapaxes(0, 1), turned)
-        out *= self._weights
-        return out
+        return self._mixture(sweep, right.swapaxes(0, 1))
 
-    def small_angle(
-        self, sweep: Sweep, velocities: Array, u: Array, out: Array | None = None
-    ) -> tuple[Array, Array]:
+    def small_angle(self, sweep: Sweep, u: Array) -> tuple[Array, Mixture]:
         """The rotation as half the vee of E - Eᵀ, and its derivative as the rate itself."""
         gap, turn = self._gap(sweep)
         half = 0.5 * (turn - np.swapaxes(turn, 0, 1))
         sine = np.stack([half[2, 1], half[0, 2], half[1, 0]])
-        rows = self._rates(sweep, velocities, out)
-        rows *= self._weights
-        return np.concatenate([gap, sine]) * self._weights, rows
+        still = np.broadcast_to(np.eye(3)[..., None], turn.shape)
+        return np.concatenate([gap, sine]) * self._weights, self._mixture(sweep, still)
 
     def errors(self, sweep: Sweep, u: Array) -> dict[str, Array]:
         """{"position": (m, 3) in m, "orientation": (m, 3) in rad}."""

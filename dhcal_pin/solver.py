@@ -102,9 +102,24 @@ def posterior_root(triangle: Triangle, weights: Array) -> tuple[Array, Array]:
     return root, unseen @ np.delete(yt, np.flatnonzero(told), 0).T
 
 
+def _square(a: Array) -> float:
+    """Sum of squares."""
+    return float(np.vdot(a, a))
+
+
+def _length(a: Array) -> float:
+    """Root of the sum of squares."""
+    return math.sqrt(_square(a))
+
+
 def _change(r: Array, step: Array) -> float:
     """How far a step moves the whitened rows."""
-    return float(np.linalg.norm(r @ step))
+    return _length(r @ step)
+
+
+def _cost(problem: Problem, triangle: Triangle, x: Array) -> float:
+    """Sum of squared whitened residuals and priors at x (p,), given the data's triangle there."""
+    return triangle.cost + _square(problem.weights * x)
 
 
 def _settled(
@@ -117,7 +132,7 @@ def _settled(
     """
     enough = relative * math.sqrt(cost)
     shrunk = change < 1e-2 * last and change * change < 0.1 * enough * last
-    return change <= enough or shrunk or change <= ROUNDING * float(np.linalg.norm(r))
+    return change <= enough or shrunk or change <= ROUNDING * _length(r)
 
 
 def _at_end(
@@ -130,7 +145,7 @@ def _at_end(
 ) -> bool:
     """Whether a plain step from x would not matter either; a damped one may be tiny in a narrow valley."""
     # No step moves the rows farther than all that is left.
-    if problem.bounds is None and _settled(free.r, float(np.linalg.norm(free.z)), cost, last, relative):
+    if problem.bounds is None and _settled(free.r, _length(free.z), cost, last, relative):
         return True
     return _settled(free.r, _change(free.r, bounded_step(problem, free, x)), cost, last, relative)
 
@@ -210,13 +225,13 @@ def levenberg_marquardt(
     path, done = (list(before.path), before.iterations) if before else ([x], 0)
     growth, converged, leapt = 2.0, False, 0
     triangle = before.triangle if before else reduce(problem, x, small_angle=False)
-    cost = triangle.cost + float(np.sum((problem.weights * x) ** 2))
+    cost = _cost(problem, triangle, x)
     while done < max_iterations and not converged and damping <= 1e16:
         start, reached = x, None
         free = with_priors(triangle, problem.weights, x)
-        scale = np.maximum(scale, np.linalg.norm(free.r, axis=0))
+        scale = np.maximum(scale, np.sqrt(np.einsum("ij,ij->j", free.r, free.r)))
         floor = np.where(scale > 0, scale, 1.0)
-        rounding = ROUNDING * float(np.linalg.norm(free.r))
+        rounding = ROUNDING * _length(free.r)
         # Where all that is left to gain is rounding, costs tell nothing and the step is to be trusted.
         blur = (10 * rounding) ** 2 + 2 * rounding * math.sqrt(cost)
         creeping = False
@@ -230,14 +245,14 @@ def levenberg_marquardt(
                     return Solution(x, triangle, done - 1, False, np.array(path), Trust(damping, scale, last))
                 creeping = leapt == 0
             settled = _settled(free.r, change, cost, last)
-            expected = float(free.z @ free.z - np.sum((free.r @ step - free.z) ** 2))
+            expected = _square(free.z) - _square(free.r @ step - free.z)
             ahead = None
             if settled and expected <= blur:
-                trial = cost - expected
+                trial = max(cost - expected, 0.0)
             elif not settled and growth == 2.0:
                 # A first try mostly holds, and its triangle, which the next step needs, tells its cost too.
                 ahead = reduce(problem, x + step, small_angle=False)
-                trial = ahead.cost + float(np.sum((problem.weights * (x + step)) ** 2))
+                trial = _cost(problem, ahead, x + step)
             else:
                 trial = problem.cost(x + step)
             gain = (cost - trial) / expected if expected > 0 else 0.0

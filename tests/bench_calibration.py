@@ -13,6 +13,7 @@ from scipy.optimize import least_squares
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.chain import Chain
 from dhcal_pin.error_model import ErrorModel
+from dhcal_pin.measurements import derivatives
 from dhcal_pin.poses import Pose
 from dhcal_pin.problem import Problem
 
@@ -58,7 +59,7 @@ def analytic(problem: Problem) -> tuple[Callable[..., np.ndarray], Callable[...,
         chain, bodies, twists = errors.derivative(x)
         sweep = chain.sweep(motion)
         velocities = chain.tool_velocities(sweep, bodies, twists)
-        rows = data.whiten(sweep, velocities, NONE, data.residual(sweep, NONE)).reshape(len(x), -1)
+        rows = derivatives(data, sweep, velocities, NONE, data.residual(sweep, NONE)).reshape(len(x), -1)
         return np.concatenate([-rows.T, np.diag(problem.weights)])
 
     return residual, jacobian

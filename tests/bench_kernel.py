@@ -10,6 +10,7 @@ from scipy.linalg import lapack
 from dhcal_pin import se3
 from dhcal_pin.chain import Chain, link_station
 from dhcal_pin.error_model import ErrorModel
+from dhcal_pin.measurements import derivatives
 from dhcal_pin.parameters import select
 from dhcal_pin.problem import CHUNK, reduce
 from dhcal_pin.scratch import scratch
@@ -29,7 +30,7 @@ def iteration(chain: Chain, sets: str, m: int, repeats: int) -> tuple[float, flo
     nominal, bodies, twists = case.errors.derivative(x)
     sweep = nominal.sweep(data.q)
     residual = data.residual(sweep, none)
-    rows = data.whiten(sweep, nominal.tool_velocities(sweep, bodies, twists), none, residual)
+    rows = derivatives(data, sweep, nominal.tool_velocities(sweep, bodies, twists), none, residual)
     whole = np.concatenate([rows.reshape(len(x), -1), residual.reshape(1, -1)])
     room = np.empty_like(whole)
 

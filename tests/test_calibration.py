@@ -18,7 +18,7 @@ from dhcal_pin.dh import DHTable
 from dhcal_pin.errors import DhcalError
 from dhcal_pin.evaluation import accuracy
 from dhcal_pin.folds import random_folds
-from dhcal_pin.measurements import Noise
+from dhcal_pin.measurements import Noise, derivatives
 from dhcal_pin.parameters import select
 from dhcal_pin.poses import Pose
 from dhcal_pin.positions import Position
@@ -238,7 +238,7 @@ def test_chunks_do_not_change_the_answer(sim_6dof_actual):
     chain, bodies, twists = errors.derivative(zero)
     sweep = chain.sweep(q)
     velocities = chain.tool_velocities(sweep, bodies, twists)
-    rows = data.whiten(sweep, velocities, NONE, data.residual(sweep, NONE)).reshape(24, -1)
+    rows = derivatives(data, sweep, velocities, NONE, data.residual(sweep, NONE)).reshape(24, -1)
     r = np.linalg.qr(rows.T, mode="r")
     np.testing.assert_allclose(np.abs(found.r), np.abs(r), atol=1e-9 * np.abs(r).max())
     assert found.rest + found.z @ found.z == pytest.approx(np.sum(data.residual(sweep, NONE) ** 2), rel=1e-12)
@@ -250,14 +250,14 @@ def test_each_way_of_reduction_keeps_what_the_rows_tell(way, samples, sim_6dof, 
     """Whole or a row of readings at a time, by panels or not, with columns that are zero in some rows."""
     if way != "compiled":
         monkeypatch.setattr(reduction, "PANELS", way == "panels")
-        monkeypatch.setattr(problem, "triangle_of", reduction.triangle_of)
+        monkeypatch.setattr(problem, "error_triangle", reduction.error_triangle)
     errors, rng = select(sim_6dof, "dh"), np.random.default_rng(0)
     data = Pose.simulate(sim_6dof, rng.uniform(-3, 3, (samples, 6)), Noise(1e-4, 1e-4), rng)
     found = reduce(Problem(errors, (data,), np.zeros(24)), np.zeros(24), False)
     chain, bodies, twists = errors.derivative(np.zeros(24))
     sweep = chain.sweep(data.q)
     residual = data.residual(sweep, NONE)
-    rows = data.whiten(sweep, chain.tool_velocities(sweep, bodies, twists), NONE, residual)
+    rows = derivatives(data, sweep, chain.tool_velocities(sweep, bodies, twists), NONE, residual)
     whole = np.concatenate([rows, residual[None]]).reshape(25, -1)
     whole /= np.linalg.norm(whole, axis=1)[:, None]
     packed = np.zeros((25, 25))
@@ -389,7 +389,8 @@ def test_the_step_is_exact_at_condition_1e8():
     chain, bodies, twists = errors.derivative(x)
     sweep = chain.sweep(q)
     residual = data.residual(sweep, NONE)
-    rows = data.whiten(sweep, chain.tool_velocities(sweep, bodies, twists), NONE, residual).reshape(24, -1).T
+    velocities = chain.tool_velocities(sweep, bodies, twists)
+    rows = derivatives(data, sweep, velocities, NONE, residual).reshape(24, -1).T
     with mpmath.workdps(50):
         # Fifty digits can afford the normal equations.
         wanted = mpmath.lu_solve(mpmath.matrix(rows.tolist()), mpmath.matrix(residual.ravel().tolist()))

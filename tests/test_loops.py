@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -93,16 +94,65 @@ def test_triangles_of_any_size(size):
     np.testing.assert_allclose(np.abs(compiled.triangle_of(rows)), wanted, rtol=1e-12, atol=1e-12 * size)
 
 
-@given(SEEDS, SAMPLES, st.integers(1, 7), st.integers(1, 6), st.integers(1, 20))
+def random_mixture(rng: np.random.Generator, readings: int, ends: int, m: int) -> kinematics.Mixture:
+    """Any terms for some of the rows, none for others."""
+    count = int(rng.integers(0, 12))
+    rows = np.sort(rng.integers(0, readings, count))
+    return kinematics.Mixture(rows, rng.integers(0, 6 * ends, count), rng.standard_normal((count, m)))
+
+
+@given(SEEDS, SAMPLES, st.integers(1, 2), st.integers(1, 6), st.integers(1, 20))
 @settings(max_examples=60, deadline=None)
-def test_mixtures_are_sums_of_products(seed, m, components, rows, vectors):
+def test_mixtures_are_sums_of_products(seed, m, ends, readings, vectors):
     rng = np.random.default_rng(seed)
-    given_, matrices = (
-        rng.standard_normal((vectors, components, m)),
-        rng.standard_normal((rows, components, m)),
+    velocities, mixture = (
+        rng.standard_normal((vectors, 6, ends * m)),
+        random_mixture(rng, readings, ends, m),
     )
-    found = compiled.mix_samples(given_, matrices, np.empty((vectors, rows, m)))
-    np.testing.assert_allclose(found, np.einsum("pcm,kcm->pkm", given_, matrices), atol=1e-13)
+    expected = np.zeros((vectors, readings, m))
+    for row, component, share in zip(mixture.rows, mixture.components, mixture.shares, strict=True):
+        end, which = divmod(component, 6)
+        expected[:, row] += share * velocities[:, which, end * m : (end + 1) * m]
+    for way in compiled, kinematics:
+        found = way.mix_velocities(velocities, mixture, np.full(expected.shape, np.nan))
+        np.testing.assert_allclose(found, expected, atol=1e-13)
+
+
+@given(SEEDS, SAMPLES, st.integers(1, 2), st.integers(1, 7), st.integers(0, 4))
+@settings(max_examples=100, deadline=None)
+def test_the_triangle_of_errors_is_that_of_their_rows(seed, m, ends, readings, own):
+    """Twists that turn, slide or rest, rows that see some of it, and columns that are given."""
+    rng = np.random.default_rng(seed)
+    table = random_table(rng)
+    chain, p = Chain.from_dh(table), int(rng.integers(0, 30))
+    sweep = chain.sweep(random_joints(rng, table, ends * m))
+    at = np.sort(rng.integers(0, len(chain.moving) + 1, p))
+    twists = rng.standard_normal((p, 6)) * (rng.random((p, 6)) < 0.4)
+    twists[rng.random(p) < 0.3, 3:] = 0.0
+    given_ = rng.standard_normal((readings, own + 1, m)).swapaxes(0, 1)
+    given_[rng.random((own + 1, readings)) < 0.3] = 0.0
+    terms = sweep.frames, sweep.tool[3], at, twists, random_mixture(rng, readings, ends, m), given_
+    before = given_.copy()
+    r = compiled.error_triangle(*terms)
+    np.testing.assert_array_equal(given_, before)
+    np.testing.assert_array_equal(r, np.triu(r))
+    theirs = reduction.error_triangle(*terms)
+    wanted = theirs.T @ theirs
+    scale = np.sqrt(np.diag(wanted))
+    scale[scale == 0] = 1.0
+    np.testing.assert_allclose((r / scale).T @ (r / scale), wanted / np.outer(scale, scale), atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [1e-9, 0.5, 1.0, 10.0, 1e3, 9.9e4, 1.1e5, 1e12])
+def test_cosines_and_sines_of_any_angle(size):
+    """To the last bit of one, and small ones to their own last bit."""
+    angles = size * np.random.default_rng(2).uniform(-1, 1, (3, 1001))
+    angles[0, :200] = np.round(angles[0, :200] / (np.pi / 4)) * (np.pi / 4)
+    angles[1, :2] = 0.0, -0.0
+    cosines, sines = compiled.cosines_and_sines(angles)
+    np.testing.assert_allclose(cosines, np.cos(angles), rtol=5e-16, atol=0)
+    np.testing.assert_allclose(sines, np.sin(angles), rtol=5e-16, atol=0)
+    assert np.isnan(compiled.cosines_and_sines(np.array([[np.nan, np.inf]]))).all()
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-12, 1e-6, 1e-3, 0.02, 0.05, 1.0, 3.0, np.pi - 1e-9])
@@ -137,10 +187,15 @@ def test_digits_depend_neither_on_where_arrays_lie_nor_on_their_neighbours(sim_6
         rotvecs = np.ascontiguousarray(own[0, 3:])
         inverses = compiled.right_jacobian_inverses(np.ascontiguousarray(velocities[0, 3:]))
         np.testing.assert_array_equal(compiled.right_jacobian_inverses(rotvecs), inverses[..., part])
-        out, expected = np.empty_like(own[:, 3:]), np.empty_like(velocities[:, 3:])
-        compiled.mix_samples(velocities[:, 3:], inverses, expected)
-        compiled.mix_samples(own[:, 3:], inverses[..., part], out)
+        rows, components = np.repeat(np.arange(3), 3), np.tile([3, 4, 5], 3)
+        mixture = kinematics.Mixture(rows, components, inverses.reshape(9, -1))
+        out, expected = np.empty((7, 3, count)), np.empty((7, 3, 300))
+        compiled.mix_velocities(velocities, mixture, expected)
+        compiled.mix_velocities(own, replace(mixture, shares=mixture.shares[:, part]), out)
         np.testing.assert_array_equal(out, expected[..., part])
+        cosines, sines = compiled.cosines_and_sines(np.ascontiguousarray(q.T))
+        mine = compiled.cosines_and_sines(np.ascontiguousarray(q[part].T))
+        np.testing.assert_array_equal(mine, (cosines[:, part], sines[:, part]))
     rows = np.random.default_rng(2).standard_normal((9, 3, 67))
     wanted = compiled.triangle_of(rows)
     for shift in range(1, 8):
@@ -161,7 +216,7 @@ def test_digits_depend_neither_on_where_arrays_lie_nor_on_their_neighbours(sim_6
 )
 def test_arrays_that_do_not_fit_are_refused(rows):
     with pytest.raises((ValueError, TypeError)):
-        _kernel.triangles(rows, np.zeros((1, 3, 3)))
+        _kernel.triangles(rows, np.empty(10_000), np.zeros((1, 3, 3)))
 
 
 def test_shapes_bodies_and_constants_are_checked(sim_6dof):
@@ -175,13 +230,22 @@ def test_shapes_bodies_and_constants_are_checked(sim_6dof):
         frozen,
     ):
         with pytest.raises((ValueError, BufferError)):
-            _kernel.triangles(rows, out)
+            _kernel.triangles(rows, np.empty(10_000), out)
+    with pytest.raises(ValueError, match="shapes"):
+        _kernel.triangles(rows, np.empty(_kernel.room(3, 2, 0) - 1), np.zeros((1, 3, 3)))
     with pytest.raises(TypeError):
         _kernel.triangles(rows)
     sweep, out = sim_6dof.sweep(np.zeros((5, 6))), np.empty((1, 6, 5))
     for body in (-1, len(sweep.frames)):
         with pytest.raises(ValueError, match="shapes"):
             compiled.point_velocities(sweep.frames, sweep.tool[3], np.array([body]), np.zeros((1, 6)), out)
+    errors = sweep.frames, sweep.tool[3], np.zeros(1, int), np.ones((1, 6))
+    for rows, components in (([0], [6]), ([2], [0]), ([1, 0], [0, 0]), ([0], [-1])):
+        mixture = kinematics.Mixture(np.array(rows), np.array(components), np.ones((len(rows), 5)))
+        with pytest.raises(ValueError, match="shapes"):
+            compiled.mix_velocities(out, mixture, np.empty((1, 2, 5)))
+        with pytest.raises(ValueError, match="shapes"):
+            compiled.error_triangle(*errors, mixture, np.zeros((1, 2, 5)))
     with pytest.raises(ValueError, match="shapes"):
         compiled.carry_frames(
             sim_6dof.links[1:], sim_6dof.prismatic, sim_6dof.motion(np.zeros((5, 6))), np.empty((8, 7, 3, 5))

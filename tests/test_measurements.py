@@ -16,8 +16,9 @@ from dhcal_pin.contacts import Plane, PointDistance, Touch
 from dhcal_pin.errors import DhcalError
 from dhcal_pin.evaluation import instrument_values
 from dhcal_pin.kinds import KINDS
+from dhcal_pin.loops import mix_velocities
 from dhcal_pin.measurement_files import measurement_text, read_measurements
-from dhcal_pin.measurements import Noise
+from dhcal_pin.measurements import Noise, derivatives
 from dhcal_pin.parameters import select
 from dhcal_pin.poses import Pose
 from dhcal_pin.positions import Position
@@ -46,7 +47,7 @@ def derivatives_hold(kind, sim_6dof_actual, seeds):
         chain, bodies, twists = errors.derivative(x)
         sweep = chain.sweep(data.configurations())
         residual = data.residual(sweep, u)
-        rows = data.whiten(sweep, chain.tool_velocities(sweep, bodies, twists), u, residual)
+        rows = derivatives(data, sweep, chain.tool_velocities(sweep, bodies, twists), u, residual)
         assert rows.shape == (len(x), *residual.shape)
         bound = 1e-6 * max(1.0, np.abs(rows).max())
         for k in range(len(x)):
@@ -174,7 +175,9 @@ def test_paper_rows_are_its_r_and_sine(sim_6dof, sim_6dof_actual):
     errors = select(sim_6dof, "dh")
     chain, bodies, twists = errors.derivative(np.zeros(24))
     sweep = chain.sweep(q)
-    residual, rows = data.small_angle(sweep, chain.tool_velocities(sweep, bodies, twists), np.array([]))
+    residual, mixture = data.small_angle(sweep, np.array([]))
+    velocities = chain.tool_velocities(sweep, bodies, twists)
+    rows = mix_velocities(velocities, mixture, np.empty((24, *residual.shape)))
     rotation = chain.poses(q)[:, :3, :3]
     into_tool = np.zeros((11, 6, 6))
     into_tool[:, :3, :3] = into_tool[:, 3:, 3:] = np.swapaxes(rotation, 1, 2)
