@@ -154,15 +154,15 @@ static int errors_of(Errors *e, const Array *a)
     const Size *bodies = at->data;
     for (Size i = 0; fine && i < p; i++)
         fine = bodies[i] >= 0 && bodies[i] < frames->view.shape[0];
-    *e = (Errors){p,
-                  1,
-                  bodies,
-                  twists->data,
-                  frames->data,
-                  point->data,
-                  frames->stride[0],
-                  frames->stride[2],
-                  point->stride[0]};
+    *e = (Errors){.count = p,
+                  .ends = 1,
+                  .at = bodies,
+                  .twists = twists->data,
+                  .frames = frames->data,
+                  .body = frames->stride[0],
+                  .row = frames->stride[2],
+                  .point = point->data,
+                  .point_row = point->stride[0]};
     return fine;
 }
 
@@ -175,7 +175,11 @@ static int mixture_of(Mixture *x, const Array *a, Size k, Size ends, Size m)
     for (Size i = 0; fine && i < n; i++)
         fine = row[i] >= 0 && row[i] < k && component[i] >= 0 && component[i] < 6 * ends &&
                (!i || row[i] >= row[i - 1]);
-    *x = (Mixture){n, row, component, shares->data, shares->stride[0]};
+    *x = (Mixture){.count = n,
+                   .rows = row,
+                   .components = component,
+                   .shares = shares->data,
+                   .stride = shares->stride[0]};
     return fine;
 }
 
@@ -331,6 +335,23 @@ static PyObject *error_triangle(PyObject *self, PyObject *args)
     return answer(a, 10, fine);
 }
 
+static PyObject *with_diagonal(PyObject *self, PyObject *args)
+{
+    (void)self;
+    static const Wanted wanted[] = {
+        {"triangle", 2, 'd'}, {"diagonal", 1, 'd'}, {"right", 1, 'd'}, {"room", 1, 'D'}, {"out", 2, 'D'}};
+    Array a[5];
+    if (!take_all(a, args, wanted, 5))
+        return NULL;
+    const Size p = a[1].view.shape[0];
+    const int fine = is_shaped(a, p + 1, p + 1, 0, 0) && is_packed(a) && is_shaped(a + 2, p, 0, 0, 0) &&
+                     a[3].view.shape[0] >= room_for(p + 1, 1, 0) && is_shaped(a + 4, p + 1, p + 1, 0, 0) &&
+                     is_packed(a + 4);
+    if (fine)
+        add_diagonal(a->data, p, a[1].data, a[2].data, a[4].data, a[3].data);
+    return answer(a, 5, fine);
+}
+
 static PyMethodDef methods[] = {
     {"cosines_and_sines", cosines_and_sines, METH_VARARGS, NULL},
     {"carry_frames", carry_frames, METH_VARARGS, NULL},
@@ -342,6 +363,7 @@ static PyMethodDef methods[] = {
     {"room", room, METH_VARARGS, NULL},
     {"triangles", triangles, METH_VARARGS, NULL},
     {"error_triangle", error_triangle, METH_VARARGS, NULL},
+    {"with_diagonal", with_diagonal, METH_VARARGS, NULL},
     {NULL, NULL, 0, NULL},
 };
 

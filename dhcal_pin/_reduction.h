@@ -178,6 +178,12 @@ static int list_used(Used *used, const Errors *e, const Mixture *x, const double
     return 1;
 }
 
+/* Where lanes may lie. */
+static double *aligned(double *room)
+{
+    return room + (64 - (uintptr_t)room % 64) % 64 / sizeof(double);
+}
+
 /* Doubles of memory that `reduce` works in. */
 static Size room_for(Size c, Size k, Size ends)
 {
@@ -194,7 +200,7 @@ static int reduce(const Errors *e, const Mixture *x, const double *given, Size c
     if (!list_used(&used, e, x, given, c, k, m, column, reading))
         return 0;
     /* Of each reading a block of rows, one of rows of several, velocities, and triangles of like readings. */
-    double *blocks = room + (64 - (uintptr_t)room % 64) % 64 / sizeof(double);
+    double *blocks = aligned(room);
     Lanes *spare = (Lanes *)(blocks + k * c * ROWS);
     double *moved = (double *)spare + c * ROWS, *triangles = moved + 9 * e->ends * ROWS;
     memset(r, 0, c * c * sizeof(double));
@@ -241,4 +247,24 @@ static int reduce(const Errors *e, const Mixture *x, const double *given, Size c
     }
     free(used.counts);
     return 1;
+}
+
+/* The triangle r (p + 1, p + 1) of another one and of rows below it: a diagonal (p) and what they are to be.
+ */
+static void add_diagonal(const double *triangle, Size p, const double *diagonal, const double *right,
+                         double *r, double *room)
+{
+    const Size c = p + 1;
+    double *block = aligned(room);
+    memcpy(r, triangle, c * c * sizeof(double));
+    for (Size start = 0; start < p; start += ROWS) {
+        const Size n = p - start < ROWS ? p - start : ROWS;
+        const Size rows = (n + 2 * LANES - 1) / (2 * LANES) * 2 * LANES;
+        memset(block, 0, c * rows * sizeof(double));
+        for (Size i = 0; i < n; i++) {
+            block[(start + i) * rows + i] = diagonal[start + i];
+            block[p * rows + i] = right[start + i];
+        }
+        fold(r, (Lanes *)block, c, rows / LANES);
+    }
 }

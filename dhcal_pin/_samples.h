@@ -27,8 +27,31 @@ typedef uint64_t Bits __attribute__((may_alias));
 typedef double Lanes __attribute__((vector_size(32), may_alias));
 enum { LANES = 4, SAMPLES = 64, ROWS = 128, WIDTH = 6 };
 
-/* Squares of tangents from which series would need more terms. */
-#define SMALL_TANGENT 4e-3
+/* A power series of `count` coefficients, the highest first. */
+static inline __attribute__((always_inline)) double series(double u, const double *coefficients,
+                                                           const int count)
+{
+    double out = coefficients[0];
+    for (int i = 1; i < count; i++)
+        out = out * u + coefficients[i];
+    return out;
+}
+
+/* In the square of x: sine over x, cosine, both right to a quarter of a half turn, and the arc tangent over
+   x, right as long as the square stays below SMALL. */
+static const double sine_series[] = {-1.0 / 1307674368000, 1.0 / 6227020800, -1.0 / 39916800, 1.0 / 362880,
+                                     -1.0 / 5040,          1.0 / 120,        -1.0 / 6,        1};
+static const double cosine_series[] = {1.0 / 20922789888000,
+                                       -1.0 / 87178291200,
+                                       1.0 / 479001600,
+                                       -1.0 / 3628800,
+                                       1.0 / 40320,
+                                       -1.0 / 720,
+                                       1.0 / 24,
+                                       -1.0 / 2,
+                                       1};
+static const double arctan_series[] = {1.0 / 13, -1.0 / 11, 1.0 / 9, -1.0 / 7, 1.0 / 5, -1.0 / 3, 1};
+#define SMALL 4e-3
 /* A quarter turn in three parts, the first two with zeros at their ends, so that some ten thousand of them
    are exact, and the angle from which there are more. */
 static const double quarter[] = {1.57079632673412561417, 6.07710050630396597660e-11,
@@ -44,20 +67,7 @@ WIDEST static void circle(Size m, const double *restrict angle, double *restrict
     EACH (t, m) {
         const double rounded = angle[t] * (2 / M_PI) + ROUNDS, n = rounded - ROUNDS;
         const double r = angle[t] - n * quarter[0] - n * quarter[1] - n * quarter[2], u = r * r;
-        const double s =
-            r + r * u *
-                    (-1.0 / 6 +
-                     u * (1.0 / 120 +
-                          u * (-1.0 / 5040 +
-                               u * (1.0 / 362880 +
-                                    u * (-1.0 / 39916800 + u * (1.0 / 6227020800 - u / 1307674368000))))));
-        const double c =
-            1 - u * (1.0 / 2 -
-                     u * (1.0 / 24 -
-                          u * (1.0 / 720 -
-                               u * (1.0 / 40320 - u * (1.0 / 3628800 -
-                                                       u * (1.0 / 479001600 - u * (1.0 / 87178291200 -
-                                                                                   u / 20922789888000)))))));
+        const double s = r * series(u, sine_series, 8), c = series(u, cosine_series, 9);
         Bits which;
         memcpy(&which, &rounded, sizeof which);
         const double across = which & 1 ? s : c, along = which & 1 ? c : s;
@@ -150,13 +160,10 @@ WIDEST static Size rotation_vectors(Size m, const double *turns, Size row, Size 
             const double s = fmax(x * x + y * y + z * z, 1e-300);
             const double c = r[t] + r[row + column + t] + r[2 * (row + column) + t] - 1, u = s / (c * c);
             sine[t] = s, cosine[t] = c;
-            /* atan of a small tangent, over the sine. */
-            f[t] = (1 + u * (-1.0 / 3 +
-                             u * (1.0 / 5 + u * (-1.0 / 7 + u * (1.0 / 9 + u * (-1.0 / 11 + u / 13)))))) /
-                   c;
+            f[t] = series(u, arctan_series, 7) / c;
         }
         for (Size t = 0; t < n; t++)
-            if (!(cosine[t] > 0 && sine[t] < SMALL_TANGENT * cosine[t] * cosine[t])) {
+            if (!(cosine[t] > 0 && sine[t] < SMALL * cosine[t] * cosine[t])) {
                 const double s = sqrt(sine[t]);
                 f[t] = atan2(s, cosine[t]) / s;
                 obtuse += cosine[t] < -1.8;

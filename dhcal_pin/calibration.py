@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Literal
 
@@ -12,49 +12,24 @@ import numpy as np
 
 from . import observability, robust
 from .chain import BASE, Chain
-from .error_model import ErrorModel
 from .errors import DhcalError
 from .executors import HERE, Workers
 from .leverage import scores
 from .measurements import Measurement
 from .parameters import select
 from .placing import placed, problem_of, refitted
+from .priors import Families, Priors, are_default, prior_weights, rescaled
 from .problem import Problem, shared_unknowns
 from .restraint import kept_share
 from .result import Result
 from .se3 import Array
-from .solver import METHODS, Progress, Solution, levenberg_marquardt, posterior_root
+from .solver import METHODS, Progress, Solution, levenberg_marquardt
 
 Method = Literal["lm", "gn"]
-Priors = Literal["default", "none"] | Mapping[str, float]
 
 # Sigmas are not estimated below a nanometre and a nanoradian.
 LEAST_SCALE = 1e-6
 MOST_ROUNDS = 30
-# Against narrower priors the expected size counts as much as so many errors that were found.
-EXPECTATION = 0.5
-
-
-def prior_weights(errors: ErrorModel, priors: Priors) -> Array:
-    """One over each prior's sigma (p,), zero where there is none.
-
-    Raises:
-        DhcalError: an unknown choice or name, or a sigma that is not positive.
-    """
-    if isinstance(priors, str):
-        if priors not in ("default", "none"):
-            raise DhcalError(f"priors {priors!r}: choose default, none, or sigmas by name")
-        return 1 / errors.priors if priors == "default" else np.zeros(len(errors.parameters))
-    sigma = errors.priors.copy()
-    names = [p.name for p in errors.parameters]
-    for pattern, value in priors.items():
-        hit = [i for i, name in enumerate(names) if fnmatch.fnmatchcase(name, pattern)]
-        if not hit:
-            raise DhcalError(f"prior for {pattern!r}: no such parameter; there are {', '.join(names)}")
-        if not value > 0:
-            raise DhcalError(f"prior for {pattern!r}: {value} must be positive, in its parameter's unit")
-        sigma[hit] = value
-    return 1 / sigma
 
 
 def _bounds(problem: Problem, bounds: Mapping[str, tuple[float, float]]) -> Array:
@@ -75,13 +50,6 @@ def _bounds(problem: Problem, bounds: Mapping[str, tuple[float, float]]) -> Arra
                 )
             out[:, problem.errors.parameters.index(p)] = low - p.nominal, high - p.nominal
     return out
-
-
-def _default(errors: ErrorModel, priors: Priors) -> Array:
-    """Which parameters (p,) have default priors."""
-    if isinstance(priors, str):
-        return np.full(len(errors.parameters), priors == "default")
-    return np.array([not any(fnmatch.fnmatchcase(p.name, key) for key in priors) for p in errors.parameters])
 
 
 def split(
@@ -146,64 +114,6 @@ def _scatter(
         if not stated:
             out[i] = max(float(np.sqrt(squares / (rows * share))), LEAST_SCALE)
     return out
-
-
-@dataclass(frozen=True, eq=False)
-class _Families:
-    """Parameters whose default priors share one scale: those of one unit and one expected size.
-
-    Attributes:
-        members: (n,) the parameters.
-        family: (n,) which family each is of.
-        expected: (f,) one over the size that a family's errors are expected to have.
-        narrowest: (f,) the largest of those in its unit.
-    """
-
-    members: Array
-    family: Array
-    expected: Array
-    narrowest: Array
-
-    @classmethod
-    def of(cls, errors: ErrorModel, expected: Array, default: Array) -> _Families:
-        """Of parameters (p,) with such expected weights that have default priors."""
-        outside = (BASE, errors.chain.tool_station)
-        inside = [i for i, p in enumerate(errors.parameters) if default[i] and p.station not in outside]
-        units = [(errors.parameters[i].unit, errors.parameters[i].entry is None) for i in inside]
-        sizes = list(zip(units, expected[inside].tolist(), strict=True))
-        families = list(dict.fromkeys(sizes))
-        narrowest = [max(weight for unit, weight in families if unit == mine) for mine, _ in families]
-        return cls(
-            np.array(inside, int),
-            np.array([families.index(size) for size in sizes], int),
-            np.array([weight for _, weight in families]),
-            np.array(narrowest),
-        )
-
-    def groups(self) -> list[tuple[list[int], float]]:
-        """The members of each and its expected weight."""
-        return [(self.members[self.family == i].tolist(), w) for i, w in enumerate(self.expected.tolist())]
-
-
-def _rescaled(problem: Problem, solution: Solution, families: _Families) -> Array:
-    """The weights (p+s,) of priors as wide as the errors that were found.
-
-    Default priors of one unit and one expected size have one scale, the one of greatest evidence
-    (MacKay 1992): the mean square of the errors over as many as the data and not the prior determine.
-    None gets narrower than the narrowest expectation of its unit, as offsets of no more than tilts' size.
-    Priors that are not default stay.
-    """
-    weights, members, family = problem.weights.copy(), families.members, families.family
-    if not len(members):
-        return weights
-    expected, root = families.expected, posterior_root(solution.triangle, problem.weights)[0][members]
-    told = 1 - np.einsum("ij,ij->i", root, root) * problem.weights[members] ** 2
-    found = np.bincount(family, solution.x[members] ** 2) * expected**2
-    count = np.bincount(family, told)
-    share = np.where(found <= count, EXPECTATION, 0.0)
-    scaled = np.fmin(expected * np.sqrt((count + share) / (found + share)), families.narrowest)
-    weights[members] = scaled[family]
-    return weights
 
 
 def _scaled(data: tuple[Measurement, ...], scales: Array) -> tuple[Measurement, ...]:
@@ -280,7 +190,7 @@ def calibrate(
     problem = replace(problem_of(errors, data, prior_weights(errors, priors), known), where=where)
     if bounds:
         problem = replace(problem, bounds=_bounds(problem, bounds))
-    default = _default(errors, priors)
+    default = are_default(errors, priors)
     # Until sigmas and priors are settled, too, where the loop nearly ends is enough.
     loop = partial(levenberg_marquardt, nearly=True) if method == "lm" else METHODS[method]
     solution, earlier = loop(problem, np.zeros(len(problem.weights)), max_iterations, progress), 0
@@ -295,7 +205,7 @@ def calibrate(
         # Sigmas and weights that the fit itself tells: a few rounds settle them.
         scales = np.ones(sum(len(item.groups) for item in data))
         expected, ended = problem.weights, False
-        families = _Families.of(errors, expected, default)
+        families = Families.of(errors, expected, default)
         (how, *later), moved = robust.LOSSES[loss], np.inf
         for left in reversed(range(MOST_ROUNDS)):
             found = _scatter(problem, solution, data, weights)
@@ -306,7 +216,7 @@ def calibrate(
                 score = scores(problem, solution, weighed, weights)
                 weights, moved = robust.reweighted(weights, score, how, moved)
                 weighed = tuple(item.weighted(w) for item, w in zip(weighed, weights, strict=True))
-            priors_now = _rescaled(problem, solution, families)
+            priors_now = rescaled(problem, solution, families)
             changes = np.log(found / scales), (priors_now - problem.weights) / np.fmax(expected, 1e-300)
             settled = max(moved, *(np.abs(change).max(initial=0.0) for change in changes)) < 0.01
             if settled and later:

@@ -12,7 +12,7 @@ from .se3 import Array
 
 def cosines_and_sines(angles: Array) -> tuple[Array, Array]:
     """As `kinematics.cosines_and_sines`."""
-    cosines, sines = np.empty((2, *angles.shape))
+    cosines, sines = np.empty_like(angles), np.empty_like(angles)
     _kernel.cosines_and_sines(angles, cosines, sines)
     return cosines, sines
 
@@ -76,6 +76,13 @@ def error_triangle(
     out = np.empty((c, c))
     room = _room(c, k, point.shape[1] // m if m else 1)
     _kernel.error_triangle(frames, point, at, twists, *_terms(mixture), given, room, out)
+    return out
+
+
+def with_diagonal(triangle: Array, diagonal: Array, right: Array) -> Array:
+    """As `reduction.with_diagonal`."""
+    out = np.empty(triangle.shape)
+    _kernel.with_diagonal(triangle, diagonal, right, _room(len(triangle), 1, 0), out)
     return out
 
 

@@ -48,7 +48,6 @@ def starts(chain: Chain, data: Sequence[Measurement], base: bool, tool: bool) ->
     offset is tried at places around the tip. Fewer than three positions tell no start.
     """
     readings = [item for item in data if len(item.positions())]
-    readings = [few(item) for item in readings]
     tips = [replace(chain, base=np.eye(4), tool=np.eye(4)).poses(item.q) for item in readings]
     if sum(len(pose) for pose in tips) < 3 or not (base or tool):
         return

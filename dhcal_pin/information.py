@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from . import observability
-from .calibration import Priors, calibrate, prior_weights
+from .calibration import calibrate
 from .chain import Chain
 from .design import basis
 from .error_model import ErrorModel
@@ -17,6 +17,7 @@ from .errors import DhcalError
 from .kinds import KINDS
 from .measurements import Measurement, Noise, derivatives
 from .parameters import SETS, select
+from .priors import Priors, prior_weights
 from .problem import reduce
 from .se3 import Array
 from .uncertainty import Uncertainty

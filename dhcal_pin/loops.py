@@ -17,6 +17,7 @@ try:
         right_jacobian_inverses,
         triangle_of,
         triangles_of,
+        with_diagonal,
     )
 except ImportError:
     from .kinematics import (
@@ -28,7 +29,7 @@ except ImportError:
         point_velocities,
         right_jacobian_inverses,
     )
-    from .reduction import error_triangle, triangle_of, triangles_of
+    from .reduction import error_triangle, triangle_of, triangles_of, with_diagonal
 
 __all__ = [
     "carry_frames",
@@ -41,4 +42,5 @@ __all__ = [
     "right_jacobian_inverses",
     "triangle_of",
     "triangles_of",
+    "with_diagonal",
 ]

@@ -14,7 +14,7 @@ import numpy as np
 
 from . import se3
 from .chain import Chain
-from .frames import nearest_rotation, starts
+from .frames import few, nearest_rotation, starts
 from .measurements import Measurement
 from .positions import Position, Targets
 from .se3 import Array
@@ -40,7 +40,7 @@ def spread(points: Array) -> float:
 
 def unexplained(chain: Chain, q: Array, seen: Array) -> float:
     """The usual distance in m of positions (m, 3) from an arm's at q (m, n), base and tool placed to fit."""
-    begun = starts(chain, (Position.of(q, seen),), base=True, tool=True)
+    begun = starts(chain, (few(Position.of(q, seen)),), base=True, tool=True)
     return min(_settled(start, q, seen) for start in begun)
 
 

@@ -21,6 +21,8 @@ LENGTH, ANGLE, OFFSET = 1e-3, 5e-3, np.deg2rad(2.0)
 WIDE_LENGTH, WIDE_ANGLE = 10.0, 10.0
 # A term of the transmission that nowhere exceeds this is none, rad or N·m: token masses load no joint.
 LEAST_TERM = 0.1
+# A joint's axis whose largest component is as near to one as this lies along an axis of its frame.
+ALONG = 1e-5
 
 _AXES = np.eye(6)
 
@@ -134,7 +136,7 @@ def minimal(chain: Chain) -> list[Parameter]:
     """
     out = []
     for j, (name, axis, slides) in enumerate(zip(chain.moving, chain.axes, chain.prismatic, strict=True)):
-        if np.isclose(np.abs(axis).max(), 1.0, atol=1e-12):
+        if abs(np.abs(axis).max() - 1) < ALONG:
             skip = int(np.argmax(np.abs(axis)))
             kept = [p for i, p in enumerate(_six(name, joint_station(j + 1), LENGTH, ANGLE)) if i % 3 != skip]
         else:

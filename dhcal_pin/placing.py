@@ -52,7 +52,7 @@ def placed(
     stations = {p.station for p in frames.parameters}
     some = tuple(few(item) for item in data)
     best: tuple[float, Chain] | None = None
-    for start in starts(errors.chain, data, BASE in stations, errors.chain.tool_station in stations):
+    for start in starts(errors.chain, some, BASE in stations, errors.chain.tool_station in stations):
         found = _fitted(replace(frames, chain=start), some, known, max_iterations)
         best = found if best is None else min(best, found, key=lambda each: each[0])
         if misfit(best[1], some) < GOOD_FIT:

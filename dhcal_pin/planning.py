@@ -9,7 +9,6 @@ from functools import cached_property
 import numpy as np
 
 from . import observability
-from .calibration import Priors
 from .chain import Chain
 from .configurations import Room, Space, evened, tour
 from .criteria import Compromise, Criterion, Determinant, Spread, Worst
@@ -17,6 +16,7 @@ from .design import PROMISING, Pool, basis, exchange, greedy
 from .errors import DhcalError
 from .information import Information, unsteady
 from .measurements import Measurement, Noise
+from .priors import Priors
 from .refinement import Aim, refined
 from .se3 import Array
 from .transmission import FAMILIES

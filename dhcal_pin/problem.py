@@ -265,19 +265,36 @@ class Triangle:
     """QR of the whitened [J | r] at one x: ‖J·δ - r‖² = ‖R·δ - z‖² + rest.
 
     Attributes:
-        r: (p, p) upper triangular, of the data alone.
-        z: (p,) right-hand side.
-        rest: the part of the cost that no step removes.
+        rows: (p+1, p+1) upper triangular, R and z with the root of the rest below z.
     """
 
-    r: Array
-    z: Array
-    rest: float
+    rows: Array
+
+    @property
+    def r(self) -> Array:
+        """(p, p) upper triangular, of the data alone."""
+        return self.rows[:-1, :-1]
+
+    @property
+    def z(self) -> Array:
+        """(p,) right-hand side."""
+        return self.rows[:-1, -1]
+
+    @property
+    def rest(self) -> float:
+        """The part of the cost that no step removes."""
+        return float(self.rows[-1, -1] ** 2)
 
     @property
     def cost(self) -> float:
         """Sum of the squared rows, at no step."""
-        return self.rest + float(self.z @ self.z)
+        return float(np.vdot(self.rows[:, -1], self.rows[:, -1]))
+
+    def after(self, step: Array) -> Triangle:
+        """As it is seen from a step (p,) ahead, where that is too small to bend the model."""
+        rows = self.rows.copy()
+        rows[:-1, -1] -= self.r @ step
+        return Triangle(rows)
 
 
 def merged(triangles: Sequence[Array]) -> Array:
@@ -297,4 +314,4 @@ def finished(triangles: Iterable[Array], p: int) -> Triangle:
         whole = triangle if whole is None else merged((whole, triangle))
     if whole is None:
         whole = np.zeros((p + 1, p + 1))
-    return Triangle(whole[:p, :p], whole[:p, p], float(whole[p, p] ** 2))
+    return Triangle(whole)

@@ -62,6 +62,17 @@ def error_triangle(
     return triangle_of(block)
 
 
+def with_diagonal(triangle: Array, diagonal: Array, right: Array) -> Array:
+    """Triangle (p+1, p+1) of [R | z] and of rows diagonal·δ = right (p,) below it."""
+    p = len(diagonal)
+    stacked = np.zeros((p + 1, 2 * p + 1))
+    stacked[:, : p + 1] = triangle.T
+    # Entry i of the diagonal stands in column p + 1 + i of line i.
+    stacked.reshape(-1)[p + 1 : 2 * p * (p + 1) : 2 * p + 2] = diagonal
+    stacked[p, p + 1 :] = right
+    return _qr(stacked)
+
+
 def _narrow(rows: Array) -> Array:
     """Triangle (u, c) of rows (c, m), which are overwritten, by the u columns that are not zero in all.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -19,7 +19,7 @@ from .evaluation import Comparison, accuracy, deviations, summary, without_gross
 from .folds import left_out, random_folds
 from .measurements import Measurement, Unknown
 from .placing import refitted
-from .problem import Problem, reduce
+from .problem import Problem, Triangle, reduce
 from .se3 import Array
 from .solver import METHODS, Solution, bounded_step, levenberg_marquardt, posterior_root, with_priors
 from .tables import Estimate
@@ -197,9 +197,7 @@ class Result:
             root = root * scale
         else:
             # The priors are no data: they stay.
-            root, hidden = posterior_root(
-                replace(triangle, r=triangle.r / max(scale, LEAST)), self.problem.weights
-            )
+            root, hidden = posterior_root(Triangle(triangle.rows / max(scale, LEAST)), self.problem.weights)
         # What the readings ask for and is not kept is an error of its own.
         given_up = (self.solution.x - self.x)[:, None]
         return (np.concatenate([root, given_up], 1) if self.kept < 1 else root), hidden

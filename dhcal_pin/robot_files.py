@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from . import se3
-from .calibration import Priors
 from .chain import Chain
 from .dh import DHTable
 from .dh_files import is_dh, read_dh, read_frame
 from .errors import DhcalError
 from .files import PathLike, read_toml
 from .payload_files import payload_lines, read_payload
+from .priors import Priors
 from .result import Result
 from .saving import save
 from .se3 import Array

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import lapack
 
 from . import observability
 from .errors import DhcalError
-from .loops import triangle_of
+from .loops import with_diagonal
 from .problem import Problem, Triangle, reduce
 from .se3 import Array
 
@@ -33,18 +33,9 @@ LEAP, LEAP_STEPS = 8, 6
 RUNAWAY = 1e6
 
 
-def with_rows(triangle: Triangle, diagonal: Array, right: Array | float) -> Triangle:
+def with_rows(triangle: Triangle, diagonal: Array, right: Array) -> Triangle:
     """The triangle with rows diagonal·δ = right (p,) below it."""
-    p = len(diagonal)
-    if not diagonal.any():
-        return triangle
-    stacked = np.zeros((p + 1, 2 * p))
-    stacked[:p, :p], stacked[p, :p] = triangle.r.T, triangle.z
-    # Entry i of the diagonal stands in column p + i of line i.
-    stacked.reshape(-1)[p : 2 * p * p : 2 * p + 1] = diagonal
-    stacked[p, p:] = right
-    full = triangle_of(stacked[:, None])
-    return Triangle(full[:p, :p], full[:p, p], triangle.rest + float(full[p, p] ** 2))
+    return Triangle(with_diagonal(triangle.rows, diagonal, right)) if diagonal.any() else triangle
 
 
 def with_priors(triangle: Triangle, weights: Array, x: Array | float) -> Triangle:
@@ -237,7 +228,7 @@ def levenberg_marquardt(
         creeping = False
         done += 1
         while True:
-            damped = with_rows(free, np.sqrt(damping) * floor, 0.0)
+            damped = with_rows(free, np.sqrt(damping) * floor, np.zeros(len(x)))
             step = bounded_step(problem, damped, x)
             change = _change(free.r, step)
             if nearly and damping < 1e-3 and _settled(free.r, change, cost, last, NEARLY):
@@ -280,7 +271,7 @@ def levenberg_marquardt(
             progress(done, cost)
         if converged:
             # Too small a step to bend the model.
-            triangle = replace(triangle, z=triangle.z - triangle.r @ (x - start))
+            triangle = triangle.after(x - start)
         elif x is not start:
             triangle = reached or reduce(problem, x, small_angle=False)
     return Solution(x, triangle, done, converged, np.array(path), Trust(damping, scale, last))

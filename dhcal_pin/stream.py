@@ -11,13 +11,14 @@ from typing import Any, TypeVar
 import numpy as np
 
 from . import explanations, observability
-from .calibration import Method, Priors, calibrate
+from .calibration import Method, calibrate
 from .chain import Chain
 from .errors import DhcalError
 from .executors import HERE, Workers
 from .files import PathLike, sheet_of
 from .measurement_files import readings_of
 from .measurements import Measurement
+from .priors import Priors
 from .problem import CHUNK, Chunk, Problem
 from .result import Result
 from .se3 import Array

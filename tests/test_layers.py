@@ -32,7 +32,7 @@ LAYERS = (
     {"frames", "observability", "robust", "kinds"},
     {"problem", "uncertainty", "mistakes"},
     {"solver"},
-    {"restraint"},
+    {"restraint", "priors"},
     {"evaluation", "arms", "placing", "triangles", "passage", "leverage"},
     {"nullspace", "tables"},
     {"explanations"},
