@@ -22,6 +22,7 @@ from dhcal_pin.measurements import Noise, derivatives
 from dhcal_pin.parameters import select
 from dhcal_pin.poses import Pose
 from dhcal_pin.positions import Position
+from dhcal_pin.problem import Problem, reduce
 
 KIND = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 
@@ -64,6 +65,23 @@ def derivatives_hold(kind, sim_6dof_actual, seeds):
             np.testing.assert_allclose(
                 own[k], -(up - down) / (2 * h), atol=max(bound, 1e-6 * np.abs(own).max())
             )
+
+
+@KIND
+def test_the_triangle_keeps_what_the_rows_tell(kind, sim_6dof_actual):
+    """Rows are reduced on the way and in one piece; 300 samples are more than are taken at a time."""
+    data, errors, x, u, _ = setting(sim_6dof_actual, kind, m=300)
+    problem = Problem(errors, (data,), np.zeros(len(x) + len(u)))
+    at = np.concatenate([x, u - [unknown.nominal for unknown in problem.unknowns]])
+    (chunk,) = problem.chunks
+    rows = problem.tangent(at).rows(chunk).reshape(len(at) + 1, -1)
+    found = reduce(problem, at, small_angle=False)
+    packed = np.block([[found.r, found.z[:, None]], [np.zeros(len(at)), np.sqrt(found.rest)]])
+    scale = np.linalg.norm(rows, axis=1)
+    scale[scale == 0] = 1.0
+    np.testing.assert_allclose(
+        (packed / scale).T @ (packed / scale), rows @ rows.T / np.outer(scale, scale), atol=1e-12
+    )
 
 
 @KIND
