@@ -95,11 +95,7 @@ def warnings(found: Study) -> list[str]:
     fit, out = found.fit, []
     if not fit.converged:
         out.append("The loop did not converge: the figures are of its last step.")
-    worse = [c for c in found.comparisons if tables.headline([c]).drop < 0]
-    out += [
-        f"{tables.on_samples(c).capitalize()} the calibrated arm is worse than the nominal one."
-        for c in worse
-    ]
+    out += tables.setbacks(found.comparisons)
     if not np.isfinite(fit.noise):
         out.append(
             f"{fit.samples} samples stand against {fit.rank} directions that they see: no reading is left "

@@ -220,6 +220,16 @@ def headline(comparisons: Sequence[Comparison]) -> Headline:
     return Headline(text, before, after, drop, group, best)
 
 
+def setbacks(comparisons: Sequence[Comparison]) -> list[str]:
+    """Where the calibrated arm is worse than the nominal one, and what to do about it."""
+    worse = [on_samples(c) for c in comparisons if headline([c]).drop < 0]
+    return [
+        f"The calibrated arm is worse than the nominal one {where}: they warrant no such correction. Keep "
+        "the nominal arm, measure more poses, or identify fewer parameters."
+        for where in worse
+    ]
+
+
 def _gross(count: int) -> str:
     return f"{count} gross errors" if count > 1 else "one gross error"
 

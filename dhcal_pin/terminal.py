@@ -18,7 +18,7 @@ from .extension import Trial, trial_table
 from .result import Result
 from .screening import Finding
 from .solver import Progress
-from .tables import MEASURES, WORDS, Table, accuracy_table, estimate_table, headline, shown
+from .tables import MEASURES, WORDS, Table, accuracy_table, estimate_table, headline, setbacks, shown
 
 if TYPE_CHECKING:
     from .check import Agreement  # a part of the start-up that one command needs
@@ -142,6 +142,7 @@ def summary(fit: Result, files: Mapping[str, str]) -> None:
 
 def verdict(fit: Result) -> None:
     """The headline: last, where the eye is."""
+    lines(*setbacks(fit.comparisons), style="yellow")
     lines("", headline(fit.comparisons).text, style="bold")
 
 

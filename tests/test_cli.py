@@ -591,6 +591,17 @@ def test_a_share_is_held_out_by_seed(run, place):
     assert (none["samples"], none["samples_holdout"], none["holdout_after"]) == (20, 0, {})
 
 
+def test_a_correction_that_nothing_warrants_is_pointed_out(run, place):
+    """An arm that is as its model says gains nothing but noise; one that is wrong gets no such remark."""
+    for truth, worse in ((), True), (("--truth", URDF / "sim_6dof_actual.dh.toml"), False):
+        arm = URDF / "sim_6dof.dh.toml"
+        done(run("simulate", arm, *truth, "-m", "30", "--noise", "0.1mm,0.01deg", "-o", "exact.csv"))
+        _, _, err = run("calibrate", arm, "exact.csv", "-o", "found.urdf")
+        *_, remark, _, last = err.splitlines()
+        assert ("the calibrated arm is worse than the nominal one on 30 samples" in remark.lower()) is worse
+        assert last.startswith("RMS position error on 30 samples, each left out")
+
+
 def test_validate_names_impossible_rows_and_counts_them(run, place):
     """Table 5 as printed: its rows 7 and 8 make 473 mm of 25.5 mm, and that is not left without a word."""
     table = str(URDF / "experiment_table5.csv")
