@@ -8,6 +8,7 @@
 #include <stdlib.h>
 
 #include "_samples.h"
+#include "_stations.h"
 #include "_errors.h"
 #include "_reduction.h"
 
@@ -228,20 +229,26 @@ static PyObject *mix_velocities(PyObject *self, PyObject *args)
     return answer(a, 5, fine);
 }
 
-static PyObject *carry_twists(PyObject *self, PyObject *args)
+static PyObject *move_stations(PyObject *self, PyObject *args)
 {
     (void)self;
-    static const Wanted wanted[] = {{"frames", 3, 'd'}, {"twists", 2, 'd'}, {"out", 2, 'D'}};
-    Array a[3];
-    if (!take_all(a, args, wanted, 3))
+    static const Wanted wanted[] = {{"into", 3, 'd'},     {"origins", 3, 'd'}, {"tool", 2, 'd'},
+                                    {"stations", 1, 's'}, {"twists", 2, 'd'},  {"x", 1, 'd'},
+                                    {"motions", 3, 'D'},  {"carried", 2, 'D'}};
+    Array a[8];
+    if (!take_all(a, args, wanted, 8))
         return NULL;
-    const Size p = a->view.shape[0];
-    int fine = is_shaped(a, p, 4, 4, 0) && is_shaped(a + 1, p, 6, 0, 0) && is_shaped(a + 2, p, 6, 0, 0);
-    for (int i = 0; i < 3; i++)
+    const Size b = a->view.shape[0], p = a[3].view.shape[0], *stations = a[3].data;
+    int fine = is_shaped(a, b, 4, 4, 0) && is_shaped(a + 1, b, 4, 4, 0) && is_shaped(a + 2, 4, 4, 0, 0) &&
+               is_shaped(a + 4, p, 6, 0, 0) && is_shaped(a + 5, p, 0, 0, 0) &&
+               is_shaped(a + 6, 2 * b + 2, 4, 4, 0) && is_shaped(a + 7, p, 6, 0, 0);
+    for (int i = 0; i < 8; i++)
         fine = fine && is_packed(a + i);
+    for (Size i = 0; fine && i < p; i++)
+        fine = stations[i] >= (i ? stations[i - 1] : 0) && stations[i] < 2 * b + 2;
     if (fine)
-        carry_all(p, a->data, a[1].data, a[2].data);
-    return answer(a, 3, fine);
+        move(b, p, a->data, a[1].data, a[2].data, stations, a[4].data, a[5].data, a[6].data, a[7].data);
+    return answer(a, 8, fine);
 }
 
 static PyObject *log_rotations(PyObject *self, PyObject *args)
@@ -357,7 +364,7 @@ static PyMethodDef methods[] = {
     {"carry_frames", carry_frames, METH_VARARGS, NULL},
     {"point_velocities", point_velocities, METH_VARARGS, NULL},
     {"mix_velocities", mix_velocities, METH_VARARGS, NULL},
-    {"carry_twists", carry_twists, METH_VARARGS, NULL},
+    {"move_stations", move_stations, METH_VARARGS, NULL},
     {"log_rotations", log_rotations, METH_VARARGS, NULL},
     {"right_jacobian_inverses", right_jacobian_inverses, METH_VARARGS, NULL},
     {"room", room, METH_VARARGS, NULL},

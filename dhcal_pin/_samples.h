@@ -126,22 +126,6 @@ WIDEST static void carry(Size links, Size m, const double *link, const char *pri
     }
 }
 
-/* Twists (p, 6) seen from frames (p, 4, 4). */
-static void carry_all(Size p, const double *frames, const double *twists, double *out)
-{
-    for (; p--; frames += 16, twists += 6, out += 6) {
-        const double x = frames[3], y = frames[7], z = frames[11];
-        for (int i = 0; i < 3; i++) {
-            const double *r = frames + 4 * i;
-            out[i] = r[0] * twists[0] + r[1] * twists[1] + r[2] * twists[2];
-            out[3 + i] = r[0] * twists[3] + r[1] * twists[4] + r[2] * twists[5];
-        }
-        out[0] += y * out[5] - z * out[4];
-        out[1] += z * out[3] - x * out[5];
-        out[2] += x * out[4] - y * out[3];
-    }
-}
-
 /* Rotation vectors (3, m) of matrices (3, 3, m); how many angles are so obtuse that they take more care. */
 WIDEST static Size rotation_vectors(Size m, const double *turns, Size row, Size column, double *out,
                                     Size axis)

@@ -33,11 +33,13 @@ def mix_velocities(velocities: Array, mixture: Mixture, out: Array) -> Array:
     return out
 
 
-def carry_twists(frames: Array, twists: Array) -> Array:
-    """As `kinematics.carry_twists`."""
-    out = np.empty(twists.shape)
-    _kernel.carry_twists(frames, twists, out)
-    return out
+def move_stations(
+    into: Array, origins: Array, tool: Array, stations: Array, twists: Array, x: Array
+) -> tuple[Array, Array]:
+    """As `kinematics.move_stations`."""
+    motions, carried = np.empty((2 * len(into) + 2, 4, 4)), np.empty(twists.shape)
+    _kernel.move_stations(into, origins, tool, stations, twists, x, motions, carried)
+    return motions, carried
 
 
 def log_rotations(turns: Array) -> Array:

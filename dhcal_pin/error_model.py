@@ -9,21 +9,17 @@ joint's value and load.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from . import se3
 from .chain import BASE, Chain
-from .loops import carry_twists
+from .loops import move_stations
 from .se3 import Array
-from .stations import bodies_at, frames_before
+from .stations import bodies_at
 from .transmission import Transmission
-
-_IDENTITY = np.eye(4)
 
 
 @dataclass(frozen=True)
@@ -94,54 +90,17 @@ class ErrorModel:
         """Prior standard deviations (p,), each in its parameter's unit."""
         return np.array([parameter.prior for parameter in self.parameters])
 
-    @cached_property
-    def _slots(self) -> tuple[Array, Array, Array]:
-        """Stations with unknowns (g,), and each parameter's place among them (p,) and at its station (p,)."""
-        stations, group = np.unique(self._stations, return_inverse=True)
-        return stations, group, np.arange(len(group)) - np.searchsorted(group, group)
-
-    @cached_property
-    def _most(self) -> int:
-        """The most parameters at a station, at least one."""
-        return int(self._slots[2].max(initial=0)) + 1
-
-    @cached_property
-    def _powers(self) -> tuple[Array, Array]:
-        """Sizes of the rotations (p,), and the twists as matrices Ξ, Ξ²/|ω|², Ξ³/|ω|³ (p, 3, 16)."""
-        twist = np.zeros((len(self._twists), 4, 4))
-        twist[:, :3, :3], twist[:, :3, 3] = se3.skew(self._twists[:, 3:]), self._twists[:, :3]
-        size = np.linalg.norm(self._twists[:, 3:], axis=1)
-        unit = twist / np.where(size > 0, size, 1.0)[:, None, None]
-        powers = np.stack([twist, unit @ unit, unit @ unit @ unit], 1)
-        return size, powers.reshape(-1, 3, 16)
-
-    def _factors(self, x: Array) -> Array:
-        """The parameters' motions exp(xξ), in the order of their stations (g, most a station, 4, 4)."""
-        size, powers = self._powers
-        angle = size * x
-        # exp(xξ) = I + xΞ + (1 - cos)(Ξ/|ω|)² + (angle - sin)(Ξ/|ω|)³, and I + xΞ for a translation.
-        share = np.empty((len(x), 1, 3))
-        share[:, 0, 0], share[:, 0, 1] = x, 2 * np.sin(0.5 * angle) ** 2
-        share[:, 0, 2] = angle - np.sin(angle)
-        motion = (share @ powers).reshape(-1, 4, 4) + _IDENTITY
-        stations, group, place = self._slots
-        out = np.empty((len(stations), self._most, 4, 4))
-        out[:] = _IDENTITY
-        out[group, place] = motion
-        return out
+    def _moved(self, x: Array) -> tuple[Array, Array]:
+        """Motions of all stations (2k+4, 4, 4), and the plain twists (p, 6) as those of bodies."""
+        chain = self.chain
+        return move_stations(
+            chain.into, chain.origins, chain.tool, self._stations, self._twists, x[: self._geometry]
+        )
 
     def at(self, x: Array) -> Chain:
         """The chain with errors x (p,) in SI; its joints yield to the nominal arm's masses."""
-        factors = self._factors(np.asarray(x, float)[: self._geometry])
-        every = self._every(functools.reduce(np.matmul, np.swapaxes(factors, 0, 1)))
-        return self._driven(self.chain.moved(every), x)
-
-    def _every(self, motions: Array) -> Array:
-        """Motions of all stations (2k+4, 4, 4) from those of the stations with unknowns (g, 4, 4)."""
-        every = np.empty((self.chain.tool_station + 1, 4, 4))
-        every[:] = _IDENTITY
-        every[self._slots[0]] = motions
-        return every
+        x = np.ascontiguousarray(x, float)
+        return self._driven(self.chain.moved(self._moved(x)[0]), x)
 
     def _driven(self, chain: Chain, x: Array) -> Chain:
         """A chain with the transmission at x (p,)."""
@@ -162,21 +121,11 @@ class ErrorModel:
     def derivative(self, x: Array) -> tuple[Chain, Array, Array]:
         """The chain at x, and for each parameter the body (p,) and twist (p, 6) it moves there.
 
-        The k-th factor at a station turns with those before it, seen from the station as it was before all of
-        them. Entries of the transmission come last, numbered behind the bodies (see `Chain.tool_velocities`).
+        Entries of the transmission come last, numbered behind the bodies (see `Chain.tool_velocities`).
         """
-        x = np.asarray(x, float)
-        factors = self._factors(x[: self._geometry])
-        _, group, place = self._slots
-        before = np.empty((len(factors), self._most + 1, 4, 4))
-        before[:, 0] = _IDENTITY
-        for i in range(self._most):
-            np.matmul(before[:, i], factors[:, i], out=before[:, i + 1])
-        every = self._every(before[:, -1])
-        chain = self._driven(self.chain.moved(every), x)
-        frames = frames_before(self.chain, every, chain)[self._stations]
-        twists = carry_twists(frames @ before[group, place], self._twists)
-        bodies = self._bodies
+        x = np.ascontiguousarray(x, float)
+        motions, twists = self._moved(x)
+        chain, bodies = self._driven(self.chain.moved(motions), x), self._bodies
         if not self._entries.size:
             return chain, bodies, twists
         entries = len(chain.moving) + 1 + self._entries

@@ -153,9 +153,45 @@ def mix_velocities(velocities: Array, mixture: Mixture, out: Array) -> Array:
     return out
 
 
-def carry_twists(frames: Array, twists: Array) -> Array:
-    """Twists [v, ω] (p, 6) of frames b as those of frames a, given T_ab (p, 4, 4)."""
-    return (se3.adjoint(frames) @ twists[..., None])[..., 0]
+def station_frames(into: Array, origins: Array, tool: Array, motions: Array) -> Array:
+    """Each station's frame (2k+4, 4, 4) in its body, before its own motion.
+
+    Args:
+        into: (k+1, 4, 4) each body's URDF frame in its body frame.
+        origins: (k+1, 4, 4) of the joints and the tip, without the motions.
+        tool: (4, 4), likewise.
+        motions: (2k+4, 4, 4) of the stations.
+    """
+    frames = np.empty(motions.shape)
+    # Body 0 is behind the base's motion.
+    frames[0] = se3.inverse(motions[0])
+    frames[1:-1:2] = into
+    np.matmul(into @ motions[1:-1:2], origins, out=frames[2::2])
+    frames[-1] = frames[-2] @ motions[-2] @ tool
+    return frames
+
+
+def move_stations(
+    into: Array, origins: Array, tool: Array, stations: Array, twists: Array, x: Array
+) -> tuple[Array, Array]:
+    """Motions of all stations (2k+4, 4, 4) by errors, and the errors' twists (p, 6) as those of bodies.
+
+    An error at a station turns with those before it, seen from the station as it was before all of them.
+
+    Args:
+        into: (k+1, 4, 4), as `station_frames` takes it, and so are
+        origins: (k+1, 4, 4), and
+        tool: (4, 4).
+        stations: (p,) where the errors are, ascending.
+        twists: (p, 6) in the stations' frames.
+        x: (p,) how far they go.
+    """
+    motions, before = np.tile(np.eye(4), (2 * len(into) + 2, 1, 1)), np.empty((len(x), 4, 4))
+    for i, (station, step) in enumerate(zip(stations.tolist(), se3.exp6(x[:, None] * twists), strict=True)):
+        before[i] = motions[station]
+        motions[station] = before[i] @ step
+    frames = station_frames(into, origins, tool, motions)[stations] @ before
+    return motions, (se3.adjoint(frames) @ twists[..., None])[..., 0]
 
 
 def log_rotations(turns: Array) -> Array:

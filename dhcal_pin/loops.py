@@ -8,11 +8,11 @@ from __future__ import annotations
 try:
     from .compiled import (
         carry_frames,
-        carry_twists,
         cosines_and_sines,
         error_triangle,
         log_rotations,
         mix_velocities,
+        move_stations,
         point_velocities,
         right_jacobian_inverses,
         triangle_of,
@@ -22,10 +22,10 @@ try:
 except ImportError:
     from .kinematics import (
         carry_frames,
-        carry_twists,
         cosines_and_sines,
         log_rotations,
         mix_velocities,
+        move_stations,
         point_velocities,
         right_jacobian_inverses,
     )
@@ -33,11 +33,11 @@ except ImportError:
 
 __all__ = [
     "carry_frames",
-    "carry_twists",
     "cosines_and_sines",
     "error_triangle",
     "log_rotations",
     "mix_velocities",
+    "move_stations",
     "point_velocities",
     "right_jacobian_inverses",
     "triangle_of",

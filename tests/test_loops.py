@@ -143,6 +143,22 @@ def test_the_triangle_of_errors_is_that_of_their_rows(seed, m, ends, readings, o
     np.testing.assert_allclose((r / scale).T @ (r / scale), wanted / np.outer(scale, scale), atol=1e-12)
 
 
+@given(SEEDS, st.integers(0, 30))
+@settings(max_examples=60, deadline=None)
+def test_stations_move_as_numpys(seed, count):
+    """Any twists, several at a station, small and large, at base, joints and tool."""
+    rng = np.random.default_rng(seed)
+    chain = Chain.from_dh(random_table(rng))
+    stations = np.sort(rng.integers(0, chain.tool_station + 1, count))
+    twists = rng.standard_normal((count, 6)) * (rng.random((count, 6)) < 0.4)
+    x = rng.standard_normal(count) * 10.0 ** rng.uniform(-9, 0, count)
+    tool = se3.exp6(rng.standard_normal(6))
+    terms = chain.into, chain.origins, tool, stations, twists, x
+    theirs, ours = kinematics.move_stations(*terms), compiled.move_stations(*terms)
+    for mine, other in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(mine, other, atol=1e-13)
+
+
 @pytest.mark.parametrize("size", [1e-9, 0.5, 1.0, 10.0, 1e3, 9.9e4, 1.1e5, 1e12])
 def test_cosines_and_sines_of_any_angle(size):
     """To the last bit of one, and small ones to their own last bit."""
@@ -246,6 +262,10 @@ def test_shapes_bodies_and_constants_are_checked(sim_6dof):
             compiled.mix_velocities(out, mixture, np.empty((1, 2, 5)))
         with pytest.raises(ValueError, match="shapes"):
             compiled.error_triangle(*errors, mixture, np.zeros((1, 2, 5)))
+    for stations in ([sim_6dof.tool_station + 1], [-1], [2, 1]):
+        terms = sim_6dof.into, sim_6dof.origins, np.eye(4), np.array(stations)
+        with pytest.raises(ValueError, match="shapes"):
+            compiled.move_stations(*terms, np.zeros((len(stations), 6)), np.zeros(len(stations)))
     with pytest.raises(ValueError, match="shapes"):
         compiled.carry_frames(
             sim_6dof.links[1:], sim_6dof.prismatic, sim_6dof.motion(np.zeros((5, 6))), np.empty((8, 7, 3, 5))
