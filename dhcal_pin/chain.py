@@ -311,15 +311,19 @@ class Chain:
 
     def moved(self, motions: Array) -> Chain:
         """The chain with every station's frame moved by a right factor (2k+4, 4, 4), M ← M·motion."""
-        chain = object.__new__(Chain)
-        # The axes stay, and so do the frames made of them.
-        vars(chain).update(
-            self.__getstate__(),
+        return self._with(
             origins=motions[1:-1:2] @ self.origins @ motions[2::2],
             base=self.base @ motions[0],
             tool=self.tool @ motions[-1],
-            axis_frames=self.axis_frames,
-            into=self.into,
-            _ahead=self._ahead,
         )
+
+    def framed(self, base: Array, tool: Array) -> Chain:
+        """The chain with another base and tool (4, 4)."""
+        return self._with(base=base, tool=tool)
+
+    def _with(self, **frames: Array) -> Chain:
+        """The chain with other origins, base or tool; the axes stay, and so do the frames made of them."""
+        chain = object.__new__(Chain)
+        known = {"axis_frames": self.axis_frames, "into": self.into, "_ahead": self._ahead}
+        vars(chain).update(self.__getstate__(), **known, **frames)
         return chain

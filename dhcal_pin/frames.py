@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -30,10 +29,13 @@ def nearest_rotation(matrix: Array) -> Array:
 def align(source: Array, target: Array) -> tuple[Array, Array]:
     """Rigid motions (..., 4, 4) that carry points (..., m, 3) best onto others (m, 3); RMS distances, m."""
     centre, goal = source.mean(-2), target.mean(0)
-    rotation = nearest_rotation(np.swapaxes(target - goal, 0, 1) @ (source - centre[..., None, :]))
+    out, wanted = source - centre[..., None, :], target - goal
+    product = wanted.T @ out
+    rotation = nearest_rotation(product)
     motion = se3.transform(rotation, goal - (rotation @ centre[..., None])[..., 0])
-    rest = source @ np.swapaxes(rotation, -1, -2) + motion[..., None, :3, 3] - target
-    return motion, np.sqrt(np.mean(np.sum(rest**2, -1), -1))
+    # |R·s - t|² of points about their middles.
+    rest = np.vdot(wanted, wanted) + np.sum(out**2, (-2, -1)) - 2 * np.sum(rotation * product, (-2, -1))
+    return motion, np.sqrt(np.maximum(rest, 0.0) / len(target))
 
 
 def few(item: Measurement) -> Measurement:
@@ -48,7 +50,8 @@ def starts(chain: Chain, data: Sequence[Measurement], base: bool, tool: bool) ->
     offset is tried at places around the tip. Fewer than three positions tell no start.
     """
     readings = [item for item in data if len(item.positions())]
-    tips = [replace(chain, base=np.eye(4), tool=np.eye(4)).poses(item.q) for item in readings]
+    bare = chain.framed(np.eye(4), np.eye(4))
+    tips = [bare.poses(item.q) for item in readings]
     if sum(len(pose) for pose in tips) < 3 or not (base or tool):
         return
     tip = np.concatenate(tips)
@@ -74,7 +77,7 @@ def starts(chain: Chain, data: Sequence[Measurement], base: bool, tool: bool) ->
         ]
         if tool and turns:
             turn = nearest_rotation(np.concatenate(turns).sum(0))
-        yield replace(chain, base=motion, tool=se3.transform(turn, offset))
+        yield chain.framed(motion, se3.transform(turn, offset))
 
 
 def misfit(chain: Chain, data: Sequence[Measurement]) -> float:

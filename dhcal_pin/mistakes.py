@@ -7,7 +7,7 @@ so what stays unexplained tells it from the file as it stands, wherever the two 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -47,7 +47,7 @@ def unexplained(chain: Chain, q: Array, seen: Array) -> float:
 def _settled(start: Chain, q: Array, seen: Array) -> float:
     """The same from one start, by reweighted Gauss-Newton steps on base and target."""
     base, offset = start.base, start.tool[:3, 3]
-    tip = replace(start, base=np.eye(4), tool=np.eye(4)).poses(q)
+    tip = start.framed(np.eye(4), np.eye(4)).poses(q)
     usual = np.inf
     for _ in range(_ROUNDS):
         turn = base[:3, :3] @ tip[:, :3, :3]

@@ -136,8 +136,9 @@ def minimal(chain: Chain) -> list[Parameter]:
     """
     out = []
     for j, (name, axis, slides) in enumerate(zip(chain.moving, chain.axes, chain.prismatic, strict=True)):
-        if abs(np.abs(axis).max() - 1) < ALONG:
-            skip = int(np.argmax(np.abs(axis)))
+        parts = [abs(part) for part in axis.tolist()]
+        if abs(max(parts) - 1) < ALONG:
+            skip = parts.index(max(parts))
             kept = [p for i, p in enumerate(_six(name, joint_station(j + 1), LENGTH, ANGLE)) if i % 3 != skip]
         else:
             turn = chain.axis_frames[j + 1][:3, :3]

@@ -80,11 +80,12 @@ def kept_share(
         families: errors of the robot whose size nobody knows well, and one over their usual prior's sigma.
     """
     errors, x = problem.errors, solution.x
+    readings = sum(len(item.rows) * item.size for item in problem.data)
+    if readings > len(x) or readings > rank(solution.triangle.r) or not families:
+        return 1.0
     robot, frames = len(errors.parameters), (BASE, errors.chain.tool_station)
     inside = np.array([i for i, p in enumerate(errors.parameters) if p.station not in frames], int)
-    readings = sum(len(item.rows) * item.size for item in problem.data)
-    told = readings > len(x) or readings > rank(solution.triangle.r)
-    if told or not families or not x[inside].any():
+    if not x[inside].any():
         return 1.0
     from .configurations import joint_range  # a good part of the start-up, and few fits need it
 
