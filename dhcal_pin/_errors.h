@@ -66,9 +66,10 @@ static inline __attribute__((always_inline)) void velocity(double *out, Size out
         }
 }
 
-/* Errors of an arm: each is a twist of a body, which moves a point, at samples of some ends each. */
+/* Errors of an arm: each is a twist of a body, which moves a point, at samples of some ends each, the second
+   ends so many samples behind the first. */
 typedef struct {
-    Size count, ends;
+    Size count, ends, apart;
     const Size *at;
     const double *twists, *frames, *point;
     Size body, row, point_row;
@@ -97,15 +98,26 @@ typedef struct {
     Size stride;
 } Mixture;
 
-/* Whether an error has a part in a row. */
-static int is_mixed(const Errors *e, const Mixture *x, Size error, Size row)
+/* Whether a row sees what moves, and what turns. */
+typedef struct {
+    int moves, turns;
+} Seen;
+
+static Seen seen_by(const Mixture *x, Size row)
+{
+    Seen out = {0, 0};
+    for (Size q = 0; q < x->count; q++)
+        if (x->rows[q] == row)
+            *(x->components[q] % 6 < 3 ? &out.moves : &out.turns) = 1;
+    return out;
+}
+
+static int is_seen(const Errors *e, Size error, Seen by)
 {
     const double *twist = e->twists + 6 * error;
-    const int moves = turns(twist) || twist[0] != 0 || twist[1] != 0 || twist[2] != 0;
-    for (Size q = 0; q < x->count; q++)
-        if (x->rows[q] == row && (x->components[q] % 6 < 3 ? moves : turns(twist)))
-            return 1;
-    return 0;
+    if (turns(twist))
+        return by.moves || by.turns;
+    return by.moves && (twist[0] != 0 || twist[1] != 0 || twist[2] != 0);
 }
 
 /* One row of the mixture, from its term q on, of velocities with components at a stride and ends at another;
@@ -170,17 +182,17 @@ WIDEST static void mix(const Mixture *x, Size p, Size k, Size m, const double *v
 
 /* Rows by errors at n samples into blocks of c columns ROWS apart, one block a reading, at the columns'
    places (k, c); `moved` has room for velocities and levers of all ends. */
-WIDEST static void mix_errors(const Errors *e, const Mixture *x, Size start, Size n, Size m, Size c,
+WIDEST static void mix_errors(const Errors *e, const Mixture *x, Size start, Size n, Size c,
                               const Size *places, double *moved, double *blocks)
 {
     double *levers = moved + 6 * e->ends * ROWS;
     for (Size j = 0; j < e->count; j++) {
         const double *twist = e->twists + 6 * j;
         for (Size end = 0; end < e->ends; end++) {
-            const double *frame = e->frames + e->at[j] * e->body + end * m + start;
+            const double *frame = e->frames + e->at[j] * e->body + end * e->apart + start;
             double *lever = levers + 3 * end * ROWS;
             if (!j || e->at[j] != e->at[j - 1])
-                reach(lever, e->point + end * m + start, e->point_row, frame, e->row, n);
+                reach(lever, e->point + end * e->apart + start, e->point_row, frame, e->row, n);
             velocity(moved + 6 * end * ROWS, ROWS, frame, e->row, twist, lever, n);
         }
         for (Size q = 0; q < x->count;) {

@@ -144,19 +144,23 @@ static PyObject *carry_frames(PyObject *self, PyObject *args)
     return answer(a, 6, fine);
 }
 
-/* Errors from frames (b, r, 3, n), a point (3, n), bodies (p) and twists (p, 6). */
+/* Errors from frames (b, r, 3, n), a point (3, n), bodies (p) and twists (p, 6), or those of members (b, p,
+ * 6). */
 static int errors_of(Errors *e, const Array *a)
 {
     const Array *frames = a, *point = a + 1, *at = a + 2, *twists = a + 3;
     const Size p = at->view.shape[0], n = point->view.shape[1];
     int fine = is_shaped(frames, frames->view.shape[0], frames->view.shape[1], 3, n) &&
                frames->view.shape[1] >= 4 && frames->stride[1] == 3 * frames->stride[2] &&
-               is_shaped(point, 3, n, 0, 0) && is_shaped(twists, p, 6, 0, 0) && is_packed(twists);
+               is_shaped(point, 3, n, 0, 0) && is_packed(twists);
+    fine = fine && (twists->view.ndim == 2 ? is_shaped(twists, p, 6, 0, 0)
+                                           : is_shaped(twists, twists->view.shape[0], p, 6, 0));
     const Size *bodies = at->data;
     for (Size i = 0; fine && i < p; i++)
         fine = bodies[i] >= 0 && bodies[i] < frames->view.shape[0];
     *e = (Errors){.count = p,
                   .ends = 1,
+                  .apart = n,
                   .at = bodies,
                   .twists = twists->data,
                   .frames = frames->data,
@@ -313,28 +317,36 @@ static PyObject *triangles(PyObject *self, PyObject *args)
     return answer(a, 3, fine);
 }
 
-static PyObject *error_triangle(PyObject *self, PyObject *args)
+static PyObject *error_triangles(PyObject *self, PyObject *args)
 {
     (void)self;
     static const Wanted wanted[] = {
-        {"frames", 4, 'd'},     {"point", 2, 'd'},  {"at", 1, 's'},    {"twists", 2, 'd'}, {"rows", 1, 's'},
-        {"components", 1, 's'}, {"shares", 2, 'd'}, {"given", 3, 'd'}, {"room", 1, 'D'},   {"out", 2, 'D'}};
+        {"frames", 4, 'd'},     {"point", 2, 'd'},  {"at", 1, 's'},    {"twists", 3, 'd'}, {"rows", 1, 's'},
+        {"components", 1, 's'}, {"shares", 2, 'd'}, {"given", 3, 'd'}, {"room", 1, 'D'},   {"out", 3, 'D'}};
     Array a[10];
     if (!take_all(a, args, wanted, 10))
         return NULL;
     const Array *given = a + 7, *room = a + 8, *out = a + 9;
-    const Size k = given->view.shape[1], m = given->view.shape[2], samples = a[1].view.shape[1];
-    Errors errors;
+    const Size b = a[3].view.shape[0], k = given->view.shape[1], n = given->view.shape[2],
+               samples = a[1].view.shape[1];
+    Errors all;
     Mixture mixture;
-    int fine = errors_of(&errors, a);
-    const Size c = errors.count + given->view.shape[0];
-    errors.ends = m ? samples / m : 1;
-    fine = fine && errors.ends * m == samples && mixture_of(&mixture, a + 4, k, errors.ends, m) &&
-           is_shaped(out, c, c, 0, 0) && is_packed(out) && room->view.shape[0] >= room_for(c, k, errors.ends);
+    int fine = errors_of(&all, a);
+    const Size c = all.count + given->view.shape[0], m = b ? n / b : 0;
+    all.ends = n ? samples / n : 1, all.apart = n;
+    fine = fine && m * b == n && all.ends * n == samples && mixture_of(&mixture, a + 4, k, all.ends, n) &&
+           is_shaped(out, b, c, c, 0) && is_packed(out) && room->view.shape[0] >= room_for(c, k, all.ends);
     if (fine) {
         Py_BEGIN_ALLOW_THREADS;
-        fine = reduce(&errors, &mixture, given->data, c, k, m, given->stride[0], given->stride[1], out->data,
-                      room->data);
+        for (Size i = 0; fine && i < b; i++) {
+            /* The samples of members follow each other. */
+            Errors errors = all;
+            Mixture shares = mixture;
+            errors.frames += i * m, errors.point += i * m, errors.twists += i * 6 * all.count,
+                shares.shares += i * m;
+            fine = reduce(&errors, &shares, (double *)given->data + i * m, c, k, m, given->stride[0],
+                          given->stride[1], (double *)out->data + i * c * c, room->data);
+        }
         Py_END_ALLOW_THREADS;
         if (!fine)
             PyErr_NoMemory();
@@ -369,7 +381,7 @@ static PyMethodDef methods[] = {
     {"right_jacobian_inverses", right_jacobian_inverses, METH_VARARGS, NULL},
     {"room", room, METH_VARARGS, NULL},
     {"triangles", triangles, METH_VARARGS, NULL},
-    {"error_triangle", error_triangle, METH_VARARGS, NULL},
+    {"error_triangles", error_triangles, METH_VARARGS, NULL},
     {"with_diagonal", with_diagonal, METH_VARARGS, NULL},
     {NULL, NULL, 0, NULL},
 };

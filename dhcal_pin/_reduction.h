@@ -162,9 +162,10 @@ static int list_used(Used *used, const Errors *e, const Mixture *x, const double
     used->alike = used->counts + k, used->columns = used->alike + k, used->places = used->columns + k * c;
     for (Size i = 0; i < k; i++) {
         Size *mine = used->columns + i * c, *place = used->places + i * c, u = 0;
+        const Seen by = seen_by(x, i);
         for (Size j = 0; j < c; j++) {
             const double *rows = given + (j - e->count) * column + i * reading;
-            const int some = j < e->count ? is_mixed(e, x, j, i) : !empty(rows, m);
+            const int some = j < e->count ? is_seen(e, j, by) : !empty(rows, m);
             place[j] = some ? u : -1;
             if (some)
                 mine[u++] = j;
@@ -204,10 +205,12 @@ static int reduce(const Errors *e, const Mixture *x, const double *given, Size c
     Lanes *spare = (Lanes *)(blocks + k * c * ROWS);
     double *moved = (double *)spare + c * ROWS, *triangles = moved + 9 * e->ends * ROWS;
     memset(r, 0, c * c * sizeof(double));
-    memset(triangles, 0, k * c * c * sizeof(double));
+    for (Size i = 0; i < k; i++)
+        if (used.alike[i] == i && used.counts[i] < c)
+            memset(triangles + i * c * c, 0, used.counts[i] * used.counts[i] * sizeof(double));
     for (Size start = 0; start < m; start += ROWS) {
         const Size n = m - start < ROWS ? m - start : ROWS;
-        mix_errors(e, x, start, n, m, c, used.places, moved, blocks);
+        mix_errors(e, x, start, n, c, used.places, moved, blocks);
         for (Size i = 0; i < k; i++) {
             const Size u = used.counts[i];
             if (used.alike[i] != i || !u)

@@ -18,7 +18,6 @@ from .chain import BASE, Chain
 from .error_model import ErrorModel
 from .errors import DhcalError
 from .kinematics import Sweep
-from .scratch import scratch
 from .se3 import Array
 
 
@@ -172,36 +171,6 @@ class Arms:
                 after[1] = y * cos[j] - x * sin[j]
         tool = _mixed(bodies[-1], self.links[:, -1] @ self.tool, np.empty((4, 3, *shape)))
         return Sweep(bodies.reshape(len(bodies), 7, 3, -1), tool.reshape(4, 3, -1))
-
-    def tool_velocities(
-        self, sweep: Sweep, shape: tuple[int, int, int], bodies: Array, twists: Array
-    ) -> Array:
-        """The tool point's velocity (p, 6, c·b·m) per unit of each body twist (p, b, 6).
-
-        Args:
-            sweep: of these arms.
-            shape: c, b and m.
-            bodies: (p,) ascending.
-            twists: (p, b, 6) in those bodies' frames; velocities are in axes of the measuring frame.
-
-        The velocities lie in memory that the next ones overwrite.
-        """
-        out = scratch("arms' velocities", len(bodies), 6, *shape)
-        starts = np.searchsorted(bodies, np.arange(len(sweep.bodies) + 1))
-        for j, body in enumerate(sweep.bodies):
-            rows = slice(starts[j], starts[j + 1])
-            if rows.start == rows.stop:
-                continue
-            axes = body[:3].reshape(3, 3, *shape)
-            block, of = out[rows], twists[rows].transpose(2, 0, 1)[:, :, None, None, :, None]
-            lever = (sweep.tool[3] - body[3]).reshape(3, *shape)
-            for part, first in ((block[:, :3], 0), (block[:, 3:], 3)):
-                np.multiply(of[first], axes[0], out=part)
-                part += of[first + 1] * axes[1]
-                part += of[first + 2] * axes[2]
-            for i, (u, v) in enumerate(((1, 2), (2, 0), (0, 1))):
-                block[:, i] += block[:, 3 + u] * lever[v] - block[:, 3 + v] * lever[u]
-        return out.reshape(len(bodies), 6, -1)
 
 
 def _structure(model: ErrorModel) -> tuple[object, ...]:

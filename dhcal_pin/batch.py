@@ -18,9 +18,8 @@ from .arms import Arms
 from .error_model import ErrorModel
 from .errors import DhcalError
 from .executors import HERE, Workers
-from .loops import mix_velocities
+from .loops import error_triangles
 from .measurements import Measurement, joined
-from .scratch import scratch
 from .se3 import Array
 from .solver import LEAP, LEAP_STEPS, RUNAWAY
 from .triangles import Triangles, triangles
@@ -131,28 +130,25 @@ class Batch:
         """The triangles at x (b, p) of the data and of priors of these weights (p,)."""
         arms, bodies, twists = self.arms.derivative(x)
         b, p = x.shape
-        blocks = []
+        twists, found = np.ascontiguousarray(twists.swapaxes(0, 1)), []
         for item in self.data:
-            q, u = self._joints(item), self._values(item)
-            sweep = arms.sweep(q)
-            velocities = arms.tool_velocities(sweep, q.shape[:3], bodies, twists)
+            sweep, u = arms.sweep(self._joints(item)), self._values(item)
             if small_angle:
                 residual, mixture = item.small_angle(sweep, u)
             else:
                 residual = item.residual(sweep, u)
                 mixture = item.mixture(sweep, u, residual)
-            k = len(residual)
-            rows = mix_velocities(velocities, mixture, scratch("batch rows", p, *residual.shape))
-            block = scratch(f"batch block {len(blocks)}", b, p + 1, k, q.shape[2])
-            block[:, :p] = rows.reshape(p, k, b, -1).transpose(2, 0, 1, 3)
-            block[:, p] = residual.reshape(k, b, -1).swapaxes(0, 1)
-            blocks.append(block.reshape(b, p + 1, -1))
+            found.append(
+                error_triangles(sweep.frames, sweep.tool[3], bodies, twists, mixture, residual[None])
+            )
         if (held := np.flatnonzero(weights)).size:
-            block = np.zeros((b, p + 1, len(held)))
-            block[:, held, np.arange(len(held))] = weights[held]
-            block[:, p] = -(weights * x)[:, held]
-            blocks.append(block)
-        return triangles(np.concatenate(blocks, 2) if len(blocks) > 1 else blocks[0])
+            block = np.zeros((b, len(held), p + 1))
+            block[:, np.arange(len(held)), held] = weights[held]
+            block[:, :, p] = -(weights * x)[:, held]
+            found.append(block)
+        if len(found) == 1:
+            return Triangles.of(found[0])
+        return triangles(np.concatenate(found, 1).swapaxes(1, 2))
 
 
 def _filled(item: Measurement, count: int) -> Measurement:

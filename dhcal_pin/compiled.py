@@ -69,15 +69,14 @@ def triangles_of(rows: Array) -> Array:
     return out
 
 
-def error_triangle(
+def error_triangles(
     frames: Array, point: Array, at: Array, twists: Array, mixture: Mixture, given: Array
 ) -> Array:
-    """As `reduction.error_triangle`; the rows stay."""
-    _, k, m = given.shape
-    c = len(at) + len(given)
-    out = np.empty((c, c))
-    room = _room(c, k, point.shape[1] // m if m else 1)
-    _kernel.error_triangle(frames, point, at, twists, *_terms(mixture), given, room, out)
+    """As `reduction.error_triangles`; the rows stay."""
+    (s, k, n), (b, p, _) = given.shape, twists.shape
+    out = np.empty((b, p + s, p + s))
+    room = _room(p + s, k, point.shape[1] // n if n else 1)
+    _kernel.error_triangles(frames, point, at, twists, *_terms(mixture), given, room, out)
     return out
 
 

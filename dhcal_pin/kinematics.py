@@ -142,6 +142,24 @@ def point_velocities(frames: Array, point: Array, at: Array, twists: Array, out:
             np.matmul(move[rows, 4:].reshape(n, 1, count, 3), part[:, :, :3], out=velocity[:, 3:])
 
 
+def member_velocities(frames: Array, point: Array, at: Array, twists: Array, ends: int, out: Array) -> None:
+    """As `point_velocities`, by twists (b, p, 6) of members, whose samples follow each other at each end."""
+    shape = ends, len(twists), point.shape[1] // max(ends * len(twists), 1)
+    starts = np.searchsorted(at, np.arange(len(frames) + 1)).tolist()
+    for start, end, frame in zip(starts, starts[1:], frames, strict=False):
+        if start == end:
+            continue
+        axes, lever = frame[:3].reshape(3, 3, *shape), (point - frame[3]).reshape(3, *shape)
+        of = twists[:, start:end].transpose(2, 1, 0)[:, :, None, None, :, None]
+        block = out[start:end].reshape(end - start, 6, *shape)
+        for part, first in ((block[:, :3], 0), (block[:, 3:], 3)):
+            np.multiply(of[first], axes[0], out=part)
+            part += of[first + 1] * axes[1]
+            part += of[first + 2] * axes[2]
+        for i, (u, v) in enumerate(((1, 2), (2, 0), (0, 1))):
+            block[:, i] += block[:, 3 + u] * lever[v] - block[:, 3 + v] * lever[u]
+
+
 def mix_velocities(velocities: Array, mixture: Mixture, out: Array) -> Array:
     """Fills in what a mixture makes (p, k, m) of velocities (p, 6, c·m)."""
     out[:] = 0.0

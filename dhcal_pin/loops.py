@@ -9,7 +9,7 @@ try:
     from .compiled import (
         carry_frames,
         cosines_and_sines,
-        error_triangle,
+        error_triangles,
         log_rotations,
         mix_velocities,
         move_stations,
@@ -29,12 +29,12 @@ except ImportError:
         point_velocities,
         right_jacobian_inverses,
     )
-    from .reduction import error_triangle, triangle_of, triangles_of, with_diagonal
+    from .reduction import error_triangles, triangle_of, triangles_of, with_diagonal
 
 __all__ = [
     "carry_frames",
     "cosines_and_sines",
-    "error_triangle",
+    "error_triangles",
     "log_rotations",
     "mix_velocities",
     "move_stations",

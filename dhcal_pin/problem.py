@@ -18,7 +18,7 @@ from .chain import Chain
 from .error_model import ErrorModel
 from .executors import HERE, Workers
 from .kinematics import Mixture, Motion, Sweep
-from .loops import error_triangle, mix_velocities, triangle_of
+from .loops import error_triangles, mix_velocities, triangle_of
 from .measurements import Measurement, Unknown
 from .scale import Ruler, count_in_arm
 from .scratch import LongRows, scratch
@@ -193,9 +193,8 @@ class Tangent:
         plain = int(np.searchsorted(self.bodies, len(sweep.frames))) if data.metric else 0
         given = scratch("given", data.size, self._columns - plain, len(data.rows)).swapaxes(0, 1)
         mixture = self._fill(given, chunk, sweep, small_angle)
-        return error_triangle(
-            sweep.frames, sweep.tool[3], self.bodies[:plain], self.twists[:plain], mixture, given
-        )
+        twists = self.twists[None, :plain]
+        return error_triangles(sweep.frames, sweep.tool[3], self.bodies[:plain], twists, mixture, given)[0]
 
     def rows(self, chunk: Chunk) -> Array:
         """A chunk's whitened rows [J | r] (p+1, k, m)."""

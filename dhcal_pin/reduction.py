@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.linalg import lapack
 
-from .kinematics import Mixture, mix_velocities, point_velocities
+from .kinematics import Mixture, member_velocities, mix_velocities, point_velocities
 from .scratch import LongRows, scratch
 from .se3 import Array
 
@@ -40,26 +40,33 @@ def triangles_of(rows: Array) -> Array:
 
 
 @LongRows()
-def error_triangle(
+def error_triangles(
     frames: Array, point: Array, at: Array, twists: Array, mixture: Mixture, given: Array
 ) -> Array:
-    """Upper triangle (p+s, p+s) of rows of which p columns follow from errors and s are given (s, k, m).
+    """Upper triangles (b, p+s, p+s) of members' rows, of which p columns follow from errors and s are given.
+
+    The m samples of one member follow those of the one before, and all second configurations all first ones.
 
     Args:
-        frames: (b, 7, 3, c·m), as `kinematics.point_velocities` takes them, and so are
-        point: (3, c·m),
-        at: (p,), and
-        twists: (p, 6).
-        mixture: of the point's velocities into k rows.
-        given: (s, k, m); they may be overwritten.
+        frames: (j, 7, 3, c·b·m), as `kinematics.point_velocities` takes them, and so are
+        point: (3, c·b·m), and
+        at: (p,).
+        twists: (b, p, 6) of each member's errors.
+        mixture: of the point's velocities into k rows at b·m samples.
+        given: (s, k, b·m); they may be overwritten.
     """
-    (s, k, m), p = given.shape, len(at)
-    block = scratch("rows", k, p + s, m).swapaxes(0, 1)
+    (s, k, n), (b, p, _) = given.shape, twists.shape
+    block = scratch("rows", k, p + s, n).swapaxes(0, 1)
     velocities = scratch("velocities of errors", p, 6, point.shape[1])
-    point_velocities(frames, point, at, twists, velocities)
+    if b == 1:
+        point_velocities(frames, point, at, twists[0], velocities)
+    else:
+        member_velocities(frames, point, at, twists, point.shape[1] // max(n, 1), velocities)
     mix_velocities(velocities, mixture, block[:p])
     block[p:] = given
-    return triangle_of(block)
+    if b == 1:
+        return triangle_of(block)[None]
+    return triangles_of(np.ascontiguousarray(block.reshape(p + s, k, b, -1).transpose(2, 0, 1, 3)))
 
 
 def with_diagonal(triangle: Array, diagonal: Array, right: Array) -> Array:

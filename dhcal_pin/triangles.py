@@ -20,6 +20,11 @@ class Triangles:
     z: Array
     rest: Array
 
+    @classmethod
+    def of(cls, rows: Array) -> Triangles:
+        """From R, z and the root of the rest (b, p+1, p+1)."""
+        return cls(rows[:, :-1, :-1], rows[:, :-1, -1], rows[:, -1, -1] ** 2)
+
     @property
     def cost(self) -> Array:
         """Sums (b,) of the squared rows that they hold."""
@@ -103,9 +108,7 @@ class Triangles:
 
 def triangles(columns: Array) -> Triangles:
     """Of whitened rows [J | r], column by column: (b, p+1, k)."""
-    p = columns.shape[1] - 1
-    full = triangles_of(columns[:, :, None])
-    return Triangles(full[:, :p, :p], full[:, :p, p], full[:, p, p] ** 2)
+    return Triangles.of(triangles_of(np.ascontiguousarray(columns)[:, :, None]))
 
 
 def _size(matrices: Array) -> Array:

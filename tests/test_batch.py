@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from conftest import paper, random_joints, random_table
 
+from dhcal_pin import kinematics
 from dhcal_pin.arms import Arms
 from dhcal_pin.batch import Batch, joined, solve
 from dhcal_pin.calibration import calibrate
@@ -51,7 +52,9 @@ def test_kernel_is_that_of_one_chain(sets, seed):
     q = random_joints(rng, table, 2 * 4 * 3).reshape(2, 4, 3, -1)
     arms, bodies, twists = Arms.of(models).derivative(x)
     sweep = arms.sweep(q)
-    velocities = arms.tool_velocities(sweep, q.shape[:3], bodies, twists).reshape(len(x[0]), 6, 2, 4, 3)
+    velocities, members = np.empty((len(x[0]), 6, 2 * 4 * 3)), np.ascontiguousarray(twists.swapaxes(0, 1))
+    kinematics.member_velocities(sweep.frames, sweep.tool[3], bodies, members, 2, velocities)
+    velocities = velocities.reshape(-1, 6, 2, 4, 3)
     for i, model in enumerate(models):
         chain, own, carried = model.derivative(x[i])
         alone = chain.sweep(chain.motion(q[:, i].reshape(6, -1)))

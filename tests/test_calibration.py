@@ -250,7 +250,7 @@ def test_each_way_of_reduction_keeps_what_the_rows_tell(way, samples, sim_6dof, 
     """Whole or a row of readings at a time, by panels or not, with columns that are zero in some rows."""
     if way != "compiled":
         monkeypatch.setattr(reduction, "PANELS", way == "panels")
-        monkeypatch.setattr(problem, "error_triangle", reduction.error_triangle)
+        monkeypatch.setattr(problem, "error_triangles", reduction.error_triangles)
     errors, rng = select(sim_6dof, "dh"), np.random.default_rng(0)
     data = Pose.simulate(sim_6dof, rng.uniform(-3, 3, (samples, 6)), Noise(1e-4, 1e-4), rng)
     found = reduce(Problem(errors, (data,), np.zeros(24)), np.zeros(24), False)

@@ -118,29 +118,30 @@ def test_mixtures_are_sums_of_products(seed, m, ends, readings, vectors):
         np.testing.assert_allclose(found, expected, atol=1e-13)
 
 
-@given(SEEDS, SAMPLES, st.integers(1, 2), st.integers(1, 7), st.integers(0, 4))
+@given(SEEDS, SAMPLES, st.integers(1, 2), st.integers(1, 7), st.integers(0, 4), st.sampled_from([1, 1, 3]))
 @settings(max_examples=100, deadline=None)
-def test_the_triangle_of_errors_is_that_of_their_rows(seed, m, ends, readings, own):
+def test_triangles_of_errors_are_those_of_their_rows(seed, m, ends, readings, own, members):
     """Twists that turn, slide or rest, rows that see some of it, and columns that are given."""
     rng = np.random.default_rng(seed)
     table = random_table(rng)
     chain, p = Chain.from_dh(table), int(rng.integers(0, 30))
-    sweep = chain.sweep(random_joints(rng, table, ends * m))
+    sweep = chain.sweep(random_joints(rng, table, ends * members * m))
     at = np.sort(rng.integers(0, len(chain.moving) + 1, p))
-    twists = rng.standard_normal((p, 6)) * (rng.random((p, 6)) < 0.4)
-    twists[rng.random(p) < 0.3, 3:] = 0.0
-    given_ = rng.standard_normal((readings, own + 1, m)).swapaxes(0, 1)
+    twists = rng.standard_normal((members, p, 6)) * (rng.random((members, p, 6)) < 0.4)
+    twists[rng.random((members, p)) < 0.3, 3:] = 0.0
+    given_ = rng.standard_normal((readings, own + 1, members * m)).swapaxes(0, 1)
     given_[rng.random((own + 1, readings)) < 0.3] = 0.0
-    terms = sweep.frames, sweep.tool[3], at, twists, random_mixture(rng, readings, ends, m), given_
+    mixture = random_mixture(rng, readings, ends, members * m)
+    terms = sweep.frames, sweep.tool[3], at, twists, mixture, given_
     before = given_.copy()
-    r = compiled.error_triangle(*terms)
+    ours = compiled.error_triangles(*terms)
     np.testing.assert_array_equal(given_, before)
-    np.testing.assert_array_equal(r, np.triu(r))
-    theirs = reduction.error_triangle(*terms)
-    wanted = theirs.T @ theirs
-    scale = np.sqrt(np.diag(wanted))
-    scale[scale == 0] = 1.0
-    np.testing.assert_allclose((r / scale).T @ (r / scale), wanted / np.outer(scale, scale), atol=1e-12)
+    for r, theirs in zip(ours, reduction.error_triangles(*terms), strict=True):
+        np.testing.assert_array_equal(r, np.triu(r))
+        wanted = theirs.T @ theirs
+        scale = np.sqrt(np.diag(wanted))
+        scale[scale == 0] = 1.0
+        np.testing.assert_allclose((r / scale).T @ (r / scale), wanted / np.outer(scale, scale), atol=1e-12)
 
 
 @given(SEEDS, st.integers(0, 30))
@@ -255,13 +256,13 @@ def test_shapes_bodies_and_constants_are_checked(sim_6dof):
     for body in (-1, len(sweep.frames)):
         with pytest.raises(ValueError, match="shapes"):
             compiled.point_velocities(sweep.frames, sweep.tool[3], np.array([body]), np.zeros((1, 6)), out)
-    errors = sweep.frames, sweep.tool[3], np.zeros(1, int), np.ones((1, 6))
+    errors = sweep.frames, sweep.tool[3], np.zeros(1, int), np.ones((1, 1, 6))
     for rows, components in (([0], [6]), ([2], [0]), ([1, 0], [0, 0]), ([0], [-1])):
         mixture = kinematics.Mixture(np.array(rows), np.array(components), np.ones((len(rows), 5)))
         with pytest.raises(ValueError, match="shapes"):
             compiled.mix_velocities(out, mixture, np.empty((1, 2, 5)))
         with pytest.raises(ValueError, match="shapes"):
-            compiled.error_triangle(*errors, mixture, np.zeros((1, 2, 5)))
+            compiled.error_triangles(*errors, mixture, np.zeros((1, 2, 5)))
     for stations in ([sim_6dof.tool_station + 1], [-1], [2, 1]):
         terms = sim_6dof.into, sim_6dof.origins, np.eye(4), np.array(stations)
         with pytest.raises(ValueError, match="shapes"):
