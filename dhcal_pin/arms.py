@@ -18,6 +18,7 @@ from .chain import BASE, Chain
 from .error_model import ErrorModel
 from .errors import DhcalError
 from .kinematics import Sweep
+from .loops import cosines_and_sines
 from .se3 import Array
 
 
@@ -157,8 +158,8 @@ class Arms:
         """All frames at joint values q (c, b, m, n), the samples in a row (c·b·m)."""
         chain = self.model.chain
         values = np.moveaxis(q @ chain.mixing.T + chain.shift, -1, 0).copy()
-        cos, sin = np.cos(values), np.sin(values)
         shape = values.shape[1:]
+        cos, sin = (each.reshape(values.shape) for each in cosines_and_sines(values.reshape(len(values), -1)))
         bodies = np.empty((len(chain.moving) + 1, 7, 3, *shape))
         bodies[0, :4] = self.base[:, :3].transpose(2, 1, 0)[:, :, None, :, None]
         for j in range(len(chain.moving)):
