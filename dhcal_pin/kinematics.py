@@ -12,6 +12,7 @@ from . import se3
 from .scratch import LongRows, scratch
 from .se3 import Array
 
+_STILL = np.eye(4)
 # So many samples of all bodies stay in a processor's cache.
 BLOCK = 2048
 # Of columns x, y, z, p, the same and y, -x.
@@ -204,12 +205,24 @@ def move_stations(
         twists: (p, 6) in the stations' frames.
         x: (p,) how far they go.
     """
-    motions, before = np.tile(np.eye(4), (2 * len(into) + 2, 1, 1)), np.empty((len(x), 4, 4))
-    for i, (station, step) in enumerate(zip(stations.tolist(), se3.exp6(x[:, None] * twists), strict=True)):
+    motions, before = np.empty((2 * len(into) + 2, 4, 4)), np.empty((len(x), 4, 4))
+    motions[:] = _STILL
+    for i, (station, step) in enumerate(zip(stations.tolist(), _exponentials(twists, x), strict=True)):
         before[i] = motions[station]
-        motions[station] = before[i] @ step
+        np.matmul(before[i], step, out=motions[station])
     frames = station_frames(into, origins, tool, motions)[stations] @ before
     return motions, (se3.adjoint(frames) @ twists[..., None])[..., 0]
+
+
+def _exponentials(twists: Array, x: Array) -> Array:
+    """Motions (p, 4, 4) of shares x (p,) of twists (p, 6), by their characteristic equation: Ξ⁴ = -|ω|²Ξ²."""
+    matrices = np.zeros((len(x), 4, 4))
+    matrices[:, :3, :3], matrices[:, :3, 3] = se3.skew(twists[:, 3:]), twists[:, :3]
+    size = np.sqrt(np.einsum("ij,ij->i", twists[:, 3:], twists[:, 3:]))
+    unit = matrices / np.where(size > 0, size, 1.0)[:, None, None]
+    angle, square = size * x, unit @ unit
+    first, second = x[:, None, None] * matrices, (2 * np.sin(0.5 * angle) ** 2)[:, None, None] * square
+    return _STILL + first + second + (angle - np.sin(angle))[:, None, None] * (square @ unit)
 
 
 def log_rotations(turns: Array) -> Array:
