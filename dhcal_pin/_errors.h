@@ -29,7 +29,7 @@ static inline __attribute__((always_inline)) void turned(double *restrict out, c
     }
 }
 
-/* A body's axes and origin from its frame at n samples, and the point's place from there (3, ROWS). */
+/* Where the point is from a body's origin at n samples, along the measuring frame's axes (3, ROWS). */
 static inline __attribute__((always_inline)) void reach(double *lever, const double *point, Size point_row,
                                                         const double *frame, Size row, Size n)
 {

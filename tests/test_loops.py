@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import subprocess
@@ -158,6 +159,9 @@ def test_stations_move_as_numpys(seed, count):
     theirs, ours = kinematics.move_stations(*terms), compiled.move_stations(*terms)
     for mine, other in zip(ours, theirs, strict=True):
         np.testing.assert_allclose(mine, other, atol=1e-13)
+    for station, motion in enumerate(ours[0]):
+        steps = se3.exp6((x[:, None] * twists)[stations == station])
+        np.testing.assert_allclose(motion, functools.reduce(np.matmul, steps, np.eye(4)), atol=1e-13)
 
 
 @pytest.mark.parametrize("size", [1e-9, 0.5, 1.0, 10.0, 1e3, 9.9e4, 1.1e5, 1e12])
