@@ -15,11 +15,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 from . import se3
-from .chain import Chain
-from .errors import DhcalError
-from .frames import nearest_rotation
-from .inverse import (
+from ._typing import Array
+from .exceptions import DhcalError
+from .robot.chain import Chain
+from .robot.inverse_kinematics import (
     REACHED,
     Gap,
     joint_velocities,
@@ -30,21 +32,28 @@ from .inverse import (
     unlimited,
     within,
 )
-from .se3 import Array
-
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
+from .se3 import nearest_rotation
 
 OK, SINGULAR, LIMITS, OUT = "ok", "near singular", "joint limits", "out of reach"
+
+
 # A motion of the tool, by a thousandth of the arm's size or of a radian, that takes the joints 0.2 rad.
 _SINGULAR = 5e-3
+
+
 # Configurations known beforehand, and how many of the best are taken along from round to round.
 _KNOWN, _FOLLOWED = 8192, 4
+
+
 # Round after round for targets that are not reached: from how many of the known ones with how many steps, if
 # the tool came within this share of the arm's size.
 _ROUNDS = ((8, 60, np.inf), (64, 60, np.inf), (512, 300, 0.3))
+
+
 # Targets at a time, so that memory does not grow with them.
 _CHUNK = 512
+
+
 _SKEW = 1e-6
 
 

@@ -6,12 +6,11 @@ three angular ones in radians. T_ab is the pose of frame b in frame a.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+import pinocchio as pin
+from numpy.typing import ArrayLike
 
-Array = NDArray[Any]
+from ._typing import Array
 
 
 def skew(w: ArrayLike) -> Array:
@@ -159,3 +158,15 @@ def log6(pose: ArrayLike) -> Array:
     left_inverse = np.swapaxes(right_jacobian_inverse(w), -1, -2)
     v = (left_inverse @ pose[..., :3, 3:])[..., 0]
     return np.concatenate([v, w], -1)
+
+
+def nearest_rotation(matrix: Array) -> Array:
+    """The rotations (..., 3, 3) nearest to matrices (..., 3, 3), such as sums of rotations."""
+    u, _, vt = np.linalg.svd(matrix)
+    u[..., 2] *= np.linalg.det(u @ vt)[..., None]
+    return u @ vt
+
+
+def six_numbers(origin: Array) -> list[float]:
+    """x, y, z in m and roll, pitch, yaw in rad of an origin (4, 4)."""
+    return [float(v) + 0.0 for v in (*origin[:3, 3], *pin.rpy.matrixToRpy(origin[:3, :3]))]

@@ -14,14 +14,14 @@ from bench_common import Row, clocked
 from conftest import paper
 from scipy.optimize import least_squares
 
-from dhcal_pin.arms import Arms
-from dhcal_pin.batch import Batch, Solutions, joined, solve
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.chain import Chain
-from dhcal_pin.executors import HERE, Workers, workers
-from dhcal_pin.measurements import Noise
-from dhcal_pin.parameters import select
-from dhcal_pin.poses import Pose
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.estimation.batch import Batch, Solutions, solve
+from dhcal_pin.estimation.batch_chains import Arms
+from dhcal_pin.estimation.parameters import select
+from dhcal_pin.measurements.base import Noise, joined
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.parallel import HERE, Workers, workers
+from dhcal_pin.robot.chain import Chain
 
 MANY, FEW, SLOW = 1000, 20, 4
 NOMINAL, ACTUAL = (Chain.from_dh(paper(name)) for name in ("sim_6dof", "sim_6dof_actual"))

@@ -10,12 +10,12 @@ import pinocchio as pin
 from bench_common import Row, clocked, measured, robots
 from scipy.optimize import least_squares
 
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.chain import Chain
-from dhcal_pin.error_model import ErrorModel
-from dhcal_pin.measurements import derivatives
-from dhcal_pin.poses import Pose
-from dhcal_pin.problem import Problem
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.estimation.error_model import ErrorModel
+from dhcal_pin.estimation.problem import Problem
+from dhcal_pin.measurements.base import derivatives
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.robot.chain import Chain
 
 NONE = np.empty(0)
 

@@ -17,9 +17,9 @@ import pyceres  # pyright: ignore[reportMissingImports]
 from bench_calibration import analytic, cases
 from bench_common import clocked
 
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.problem import Problem
-from dhcal_pin.solver import levenberg_marquardt
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.estimation.problem import Problem
+from dhcal_pin.estimation.solver import levenberg_marquardt
 
 
 class Rows:

@@ -10,13 +10,13 @@ import numpy as np
 from conftest import paper, robot_file
 
 from dhcal_pin import se3
-from dhcal_pin.chain import Chain
-from dhcal_pin.dh import DHTable
-from dhcal_pin.error_model import ErrorModel
-from dhcal_pin.measurements import Noise
-from dhcal_pin.parameters import select
-from dhcal_pin.poses import Pose
-from dhcal_pin.problem import Problem
+from dhcal_pin.estimation.error_model import ErrorModel
+from dhcal_pin.estimation.parameters import select
+from dhcal_pin.estimation.problem import Problem
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.robot.chain import Chain
+from dhcal_pin.robot.dh import DHTable
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,13 @@ from bench_common import Row, clocked, panda, problem, robots, serial
 from scipy.linalg import lapack
 
 from dhcal_pin import se3
-from dhcal_pin.chain import Chain, link_station
-from dhcal_pin.error_model import ErrorModel
-from dhcal_pin.measurements import derivatives
-from dhcal_pin.parameters import select
-from dhcal_pin.problem import CHUNK, reduce
-from dhcal_pin.scratch import scratch
-from dhcal_pin.solver import pseudo_inverse, with_priors
+from dhcal_pin._kernels.work_arrays import scratch
+from dhcal_pin.estimation.error_model import ErrorModel
+from dhcal_pin.estimation.parameters import select
+from dhcal_pin.estimation.problem import CHUNK, reduce
+from dhcal_pin.estimation.qr import pseudo_inverse, with_priors
+from dhcal_pin.measurements.base import derivatives
+from dhcal_pin.robot.chain import Chain, link_station
 
 
 def iteration(chain: Chain, sets: str, m: int, repeats: int) -> tuple[float, float]:

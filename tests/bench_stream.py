@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from conftest import paper
 
-from dhcal_pin.chain import Chain
-from dhcal_pin.measurements import Noise
-from dhcal_pin.positions import Position
-from dhcal_pin.stream import calibrate_stream
+from dhcal_pin.calibration.streaming import calibrate_stream
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.position import Position
+from dhcal_pin.robot.chain import Chain
 
 PART = 4096
 NOMINAL, ACTUAL = (Chain.from_dh(paper(name)) for name in ("sim_6dof", "sim_6dof_actual"))

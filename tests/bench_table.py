@@ -33,12 +33,12 @@ import pinocchio as pin
 from bench_common import Row, clocked, measured, robots, serial
 from conftest import robot_file
 
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.chain import Chain
-from dhcal_pin.measurement_files import measurement_text
-from dhcal_pin.measurements import Noise
-from dhcal_pin.parameters import select
-from dhcal_pin.positions import Position
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.estimation.parameters import select
+from dhcal_pin.io.measurement_csv import measurement_text
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.position import Position
+from dhcal_pin.robot.chain import Chain
 
 HERE = Path(__file__).resolve().parent
 CACHE = Path(tempfile.gettempdir()) / "dhcal-bench"

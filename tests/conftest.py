@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from pages import ARGUMENTS, CHROMIUM, VIEWPORT, Window, window_of
 
-from dhcal_pin.chain import Chain
-from dhcal_pin.dh import DHTable
-from dhcal_pin.dh_files import read_dh
-from dhcal_pin.urdf import parse_urdf
+from dhcal_pin.io.dh_file import read_dh
+from dhcal_pin.robot.chain import Chain
+from dhcal_pin.robot.dh import DHTable
+from dhcal_pin.robot.urdf import parse_urdf
 
 # Benchmarks need rivals in environments of their own.
 collect_ignore_glob = ["bench_*.py"]

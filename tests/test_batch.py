@@ -6,22 +6,22 @@ import numpy as np
 import pytest
 from conftest import paper, random_joints, random_table
 
-from dhcal_pin import kinematics
-from dhcal_pin.arms import Arms
-from dhcal_pin.batch import Batch, joined, solve
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.chain import Chain
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.executors import workers
-from dhcal_pin.kinds import KINDS
-from dhcal_pin.lengths import Wires
-from dhcal_pin.measurements import Noise
-from dhcal_pin.observability import row_space
-from dhcal_pin.parameters import select
-from dhcal_pin.poses import Pose
-from dhcal_pin.positions import Position
-from dhcal_pin.problem import Problem
-from dhcal_pin.solver import METHODS
+from dhcal_pin._kernels import kinematics
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.estimation.batch import Batch, solve
+from dhcal_pin.estimation.batch_chains import Arms
+from dhcal_pin.estimation.parameters import select
+from dhcal_pin.estimation.problem import Problem
+from dhcal_pin.estimation.qr import row_space
+from dhcal_pin.estimation.solver import METHODS
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.measurements.base import Noise, joined
+from dhcal_pin.measurements.length import Wires
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.measurements.position import Position
+from dhcal_pin.measurements.registry import KINDS
+from dhcal_pin.parallel import workers
+from dhcal_pin.robot.chain import Chain
 
 NOISE = Noise(1e-4, 1e-4)
 

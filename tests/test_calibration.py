@@ -10,20 +10,23 @@ import pytest
 from conftest import paper, random_joints, random_table
 from scipy.linalg import null_space
 
-from dhcal_pin import observability, problem, reduction, se3
-from dhcal_pin.calibration import calibrate, split
-from dhcal_pin.chain import Chain
-from dhcal_pin.contacts import PointDistance, Touch
-from dhcal_pin.dh import DHTable
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.evaluation import accuracy
-from dhcal_pin.folds import random_folds
-from dhcal_pin.measurements import Noise, derivatives
-from dhcal_pin.parameters import select
-from dhcal_pin.poses import Pose
-from dhcal_pin.positions import Position
-from dhcal_pin.problem import CHUNK, Problem, reduce
-from dhcal_pin.solver import levenberg_marquardt, pseudo_inverse, with_priors
+from dhcal_pin import se3
+from dhcal_pin._kernels import qr as householder
+from dhcal_pin.calibration.cross_validation import random_folds
+from dhcal_pin.calibration.evaluation import accuracy
+from dhcal_pin.calibration.procedure import calibrate, split
+from dhcal_pin.estimation import problem, qr
+from dhcal_pin.estimation.parameters import select
+from dhcal_pin.estimation.problem import CHUNK, Problem, reduce
+from dhcal_pin.estimation.qr import pseudo_inverse, with_priors
+from dhcal_pin.estimation.solver import levenberg_marquardt
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.measurements.base import Noise, derivatives
+from dhcal_pin.measurements.contact import PointDistance, Touch
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.measurements.position import Position
+from dhcal_pin.robot.chain import Chain
+from dhcal_pin.robot.dh import DHTable
 
 NONE = np.empty(0)
 
@@ -249,8 +252,8 @@ def test_chunks_do_not_change_the_answer(sim_6dof_actual):
 def test_each_way_of_reduction_keeps_what_the_rows_tell(way, samples, sim_6dof, monkeypatch):
     """Whole or a row of readings at a time, by panels or not, with columns that are zero in some rows."""
     if way != "compiled":
-        monkeypatch.setattr(reduction, "PANELS", way == "panels")
-        monkeypatch.setattr(problem, "error_triangles", reduction.error_triangles)
+        monkeypatch.setattr(householder, "PANELS", way == "panels")
+        monkeypatch.setattr(problem, "error_triangles", householder.error_triangles)
     errors, rng = select(sim_6dof, "dh"), np.random.default_rng(0)
     data = Pose.simulate(sim_6dof, rng.uniform(-3, 3, (samples, 6)), Noise(1e-4, 1e-4), rng)
     found = reduce(Problem(errors, (data,), np.zeros(24)), np.zeros(24), False)
@@ -289,8 +292,8 @@ def test_rank_is_not_taken_from_a_square():
     u, _ = np.linalg.qr(rng.normal(size=(50, 6)))
     v, _ = np.linalg.qr(rng.normal(size=(6, 6)))
     triangle = np.linalg.qr(u * np.logspace(0, -8, 6) @ v, mode="r")
-    assert observability.rank(triangle) == 6
-    assert observability.condition(triangle) == pytest.approx(1e8, rel=1e-6)
+    assert qr.rank(triangle) == 6
+    assert qr.condition(triangle) == pytest.approx(1e8, rel=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -384,8 +387,8 @@ def test_the_step_is_exact_at_condition_1e8():
     data = Pose.simulate(errors.at(x + 1e-4 * rng.normal(size=24)), q, Noise(1e-4, 1e-4), rng)
     problem = Problem(errors, (data,), np.zeros(24))
     full = with_priors(reduce(problem, x, False), problem.weights, x)
-    assert observability.rank(full.r) == 24
-    assert 3e7 < observability.condition(full.r) < 3e8
+    assert qr.rank(full.r) == 24
+    assert 3e7 < qr.condition(full.r) < 3e8
     chain, bodies, twists = errors.derivative(x)
     sweep = chain.sweep(q)
     residual = data.residual(sweep, NONE)

@@ -8,11 +8,10 @@ import pytest
 from conftest import paper, random_joints, random_table
 
 from dhcal_pin import se3
-from dhcal_pin.chain import Chain
-from dhcal_pin.dh import CONVENTIONS
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.stations import twists_at
-from dhcal_pin.urdf import parse_urdf
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.robot.chain import Chain, twists_at
+from dhcal_pin.robot.dh import CONVENTIONS
+from dhcal_pin.robot.urdf import parse_urdf
 
 
 def pinocchio_poses(chain: Chain, q):

@@ -17,13 +17,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dhcal_pin import check, cli, commands, demo, extension, terminal
-from dhcal_pin.chain import Chain
-from dhcal_pin.dh_files import read_dh
-from dhcal_pin.measurement_files import measurement_text, read_readings
-from dhcal_pin.positions import Position
-from dhcal_pin.robot_files import read_robot
-from dhcal_pin.urdf import read_urdf
+from dhcal_pin.calibration import model_selection
+from dhcal_pin.cli import arguments, console, main, simulate
+from dhcal_pin.io.dh_file import read_dh
+from dhcal_pin.io.measurement_csv import measurement_text, read_readings
+from dhcal_pin.io.robot import read_robot
+from dhcal_pin.measurements.position import Position
+from dhcal_pin.paper import error_factors, jacobian_check, simulations
+from dhcal_pin.robot.chain import Chain
+from dhcal_pin.robot.urdf import read_urdf
 
 URDF = Path(__file__).resolve().parent.parent / "urdf"
 KEYS = {
@@ -68,7 +70,7 @@ def run(capsys):
     def call(*args):
         """Exit status, stdout and stderr of a command."""
         try:
-            status = cli.main([str(arg) for arg in args])
+            status = main.main([str(arg) for arg in args])
         except SystemExit as stop:
             status = stop.code
         said = capsys.readouterr()
@@ -413,7 +415,7 @@ def test_an_interrupt_leaves_nothing(run, place, monkeypatch):
         raise KeyboardInterrupt
 
     before = contents(place)
-    monkeypatch.setattr(extension, "extend", stop)
+    monkeypatch.setattr(model_selection, "extend", stop)
     assert run(*CALIBRATE, "--json", "-") == (130, "", "dhcal: interrupted; nothing written\n")
     assert contents(place) == before
 
@@ -422,7 +424,7 @@ def test_too_much_is_one_line(refused, monkeypatch):
     def endless(*_):
         raise MemoryError
 
-    monkeypatch.setattr(commands, "joint_range", endless)
+    monkeypatch.setattr(simulate, "joint_range", endless)
     refused(["not enough memory", "fewer"], "simulate", "arm.urdf", "-m", "1000000000000", "-o", "s.csv")
 
 
@@ -818,7 +820,7 @@ def test_check_finds_the_misprint_of_15(run, place, monkeypatch):
     """k1 as printed has sine and cosine of alpha in each other's place, with the wrong sign."""
 
     def printed(table, q):
-        right = error_factors(table, q)
+        right = error_factors.error_factors(table, q)
         n = table.size
         s, c, a = np.sin(table.alpha), np.cos(table.alpha), table.a
         gap = np.stack([0 * a, a * (s - c), a * (s - c)], -1)
@@ -831,8 +833,7 @@ def test_check_finds_the_misprint_of_15(run, place, monkeypatch):
             )
         return right
 
-    error_factors = check.error_factors
-    monkeypatch.setattr(check, "error_factors", printed)
+    monkeypatch.setattr(jacobian_check, "error_factors", printed)
     status, out, err = run("check", URDF / "sim_6dof.dh.toml", "--json", "-")
     found = strict(out)
     assert (status, found["agree"]) == (1, False)
@@ -841,10 +842,10 @@ def test_check_finds_the_misprint_of_15(run, place, monkeypatch):
 
 
 def test_demo(run, place, monkeypatch):
-    whole = demo.simulation_rows
-    monkeypatch.setattr(demo, "simulation_rows", lambda: whole(seeds=2))
+    whole = simulations.simulation_rows
+    monkeypatch.setattr(simulations, "simulation_rows", lambda: whole(seeds=2))
     opened = []
-    monkeypatch.setattr(terminal, "open_page", opened.append)
+    monkeypatch.setattr(console, "open_page", opened.append)
     assert strict(done(run("demo", "--out", "shown", "--json", "-", "--open")))["outliers"] == [7, 8]
     # Of all that it writes the report is what explains itself, and it holds the scene.
     assert opened == [os.path.join("shown", "report.html")]
@@ -874,7 +875,7 @@ def test_demo(run, place, monkeypatch):
 
 # --- the command itself ----------------------------------------------------------------------------
 
-COMMANDS = tuple(cli.COMMANDS)
+COMMANDS = tuple(main.COMMANDS)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -882,7 +883,7 @@ def test_every_command_has_an_example_that_parses(run, name):
     status, out, err = run(name, "--help")
     assert (status, err) == (0, "")
     example = out.split("example:\n")[1].strip()
-    args = cli.parser().parse_args(example.split()[1:])
+    args = arguments.parser().parse_args(example.split()[1:])
     assert args.command == name
 
 
@@ -897,7 +898,7 @@ def test_help_and_version(run):
 def test_help_loads_nothing_heavy(args):
     script = (
         "import sys\n"
-        "from dhcal_pin.cli import main\n"
+        "from dhcal_pin.cli.main import main\n"
         "try:\n    main(sys.argv[1:])\nexcept SystemExit:\n    pass\n"
         "print(*sorted({'numpy', 'scipy', 'pinocchio', 'rich'} & set(sys.modules)), file=sys.stderr)"
     )

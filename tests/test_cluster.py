@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from test_study import MANY, table_of
 
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.executors import workers
-from dhcal_pin.measurement_files import measurement_text
-from dhcal_pin.measurements import Noise
-from dhcal_pin.positions import Position
-from dhcal_pin.stream import calibrate_stream, file_parts
-from dhcal_pin.study import run
-from dhcal_pin.study_grid import read_study
+from dhcal_pin.calibration.streaming import calibrate_stream
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io.measurement_csv import file_parts, measurement_text
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.position import Position
+from dhcal_pin.parallel import workers
+from dhcal_pin.studies.grid import read_study
+from dhcal_pin.studies.runner import run
 
 distributed = pytest.importorskip("distributed")
 

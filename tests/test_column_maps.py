@@ -10,14 +10,14 @@ import pytest
 from conftest import URDF, paper
 from scipy.spatial.transform import Rotation
 
-from dhcal_pin import cli, se3
-from dhcal_pin.chain import Chain
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.foreign_files import euler
-from dhcal_pin.measurement_files import measurement_text, read_measurements, read_readings
-from dhcal_pin.poses import Pose
-from dhcal_pin.positions import Position
-from dhcal_pin.relative import RelativePose
+from dhcal_pin import se3
+from dhcal_pin.cli import main
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io.column_mapping import euler
+from dhcal_pin.io.measurement_csv import measurement_text, read_measurements, read_readings
+from dhcal_pin.measurements.pose import Pose, RelativePose
+from dhcal_pin.measurements.position import Position
+from dhcal_pin.robot.chain import Chain
 
 JOINTS = ("joint_1", "joint_2", "joint_3")
 MAP = """separator = ";"
@@ -302,14 +302,14 @@ def test_the_map_on_the_command_line(tmp_path, arm, monkeypatch, capsys):
     for command in (("calibrate", "-o", "out.urdf"), ("validate",)):
         name, *more = command
         arguments = [name, "arm.dh.toml", "theirs.csv", "--columns", "map.toml", "--json", "r.json", *more]
-        assert cli.main(arguments) == 0, capsys.readouterr().err
+        assert main.main(arguments) == 0, capsys.readouterr().err
         result = json.loads((tmp_path / "r.json").read_text())
         assert result["after"]["position_rms_m"] < 1e-12
         assert "map.toml" in result["inputs"]
     with pytest.raises(SystemExit):
-        cli.main(["calibrate", "arm.dh.toml", "theirs.csv", "--columns"])
+        main.main(["calibrate", "arm.dh.toml", "theirs.csv", "--columns"])
     assert (
-        cli.main(["validate", "arm.dh.toml", "theirs.csv", "--columns", "map.toml", "--json", "map.toml"])
+        main.main(["validate", "arm.dh.toml", "theirs.csv", "--columns", "map.toml", "--json", "map.toml"])
         == 2
     )
-    assert cli.main(["validate", "arm.dh.toml", "theirs.csv", "--columns", "none.toml"]) == 2
+    assert main.main(["validate", "arm.dh.toml", "theirs.csv", "--columns", "none.toml"]) == 2

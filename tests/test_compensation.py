@@ -12,16 +12,17 @@ import pytest
 from conftest import paper, robot_file
 from scipy.spatial.transform import Rotation
 
-from dhcal_pin import cli, se3
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.chain import Chain
+from dhcal_pin import se3
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.cli import main
 from dhcal_pin.compensation import compensate
-from dhcal_pin.dh import DHTable
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.measurement_files import read_targets
-from dhcal_pin.measurements import Noise
-from dhcal_pin.poses import Pose
-from dhcal_pin.robot_files import write_urdf
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io.measurement_csv import read_targets
+from dhcal_pin.io.robot import write_urdf
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.robot.chain import Chain
+from dhcal_pin.robot.dh import DHTable
 
 URDF = Path(__file__).resolve().parent.parent / "urdf"
 ERROR = np.array([5e-3] * 3 + [np.deg2rad(1.0)] * 3)
@@ -281,7 +282,7 @@ def test_the_command_writes_what_lands(place, capsys, rotation):
     table = np.hstack([1e3 * poses[:, :3, 3], extra[rotation[:1]]]).tolist()
     header = "x[mm],y[mm],z[mm]" + ("," + rotation if rotation else "")
     Path("targets.csv").write_text("\n".join([header, *(",".join(map(repr, row)) for row in table)]))
-    assert cli.main(COMMAND) == 0
+    assert main.main(COMMAND) == 0
     said = capsys.readouterr().err
     assert "1 of 20 out of reach: row 4" in said
     found = rows()
@@ -315,7 +316,7 @@ def test_joint_columns_choose_the_branch(place):
     )
     table = np.hstack([np.rad2deg(q), poses[:, :3, 3], se3.log3(poses[:, :3, :3])]).tolist()
     Path("targets.csv").write_text("\n".join([header, *(",".join(map(repr, row)) for row in table)]))
-    assert cli.main(COMMAND) == 0
+    assert main.main(COMMAND) == 0
     found = rows()
     assert {"x[m]", "rz[rad]", "miss_position[m]", "miss_rotation[deg]"} <= set(found[0])
     got = np.array([[float(row[f"{name}[rad]"]) for name in nominal.joint_names] for row in found])
@@ -341,7 +342,7 @@ def test_joint_columns_choose_the_branch(place):
 )
 def test_wrong_target_files(place, capsys, text, words):
     Path("targets.csv").write_text(text)
-    assert cli.main(COMMAND) == 2
+    assert main.main(COMMAND) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     for word in words:
@@ -357,7 +358,7 @@ def test_robots_that_do_not_go_together(place, capsys):
         ("other.urdf", [], ["other.urdf", "joint_1"]),
         ("true.urdf", ["--tip", "nowhere"], ["nowhere"]),
     ):
-        assert cli.main(["compensate", "ur5.urdf", second, "targets.csv", "-o", "out.csv", *tips]) == 2
+        assert main.main(["compensate", "ur5.urdf", second, "targets.csv", "-o", "out.csv", *tips]) == 2
         said = capsys.readouterr().err
         assert said.count("\n") == 1
         for word in words:
@@ -368,7 +369,7 @@ def test_robots_that_do_not_go_together(place, capsys):
         '<link name="probe"/><joint name="p" type="fixed"><parent link="tool0"/><child link="probe"/></joint>'
     )
     Path("true.urdf").write_text(text.replace("</robot>", f"{more}</robot>"))
-    assert cli.main(["compensate", "ur5.urdf", "true.urdf", "targets.csv", "-o", "out.csv"]) == 2
+    assert main.main(["compensate", "ur5.urdf", "true.urdf", "targets.csv", "-o", "out.csv"]) == 2
     assert "--tip" in capsys.readouterr().err
-    assert cli.main([*COMMAND[:-1], "targets.csv"]) == 2
+    assert main.main([*COMMAND[:-1], "targets.csv"]) == 2
     assert "is an input" in capsys.readouterr().err

@@ -7,8 +7,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from dhcal_pin.criteria import Compromise, Determinant, Spread, Worst
-from dhcal_pin.design import Pool, basis, exchange, greedy
+from dhcal_pin.planning.criteria import Compromise, Determinant, Spread, Worst
+from dhcal_pin.planning.exchange import Pool, basis, exchange, greedy
 
 NONE = np.empty((0, 1))
 

@@ -10,18 +10,20 @@ import pinocchio as pin
 import pytest
 from conftest import paper, robot_file
 
-from dhcal_pin import explanations, observability, se3
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.chain import Chain
-from dhcal_pin.dh import DHTable
-from dhcal_pin.kinds import KINDS
-from dhcal_pin.measurements import Noise
-from dhcal_pin.nullspace import Experiment, Group, groups
-from dhcal_pin.parameters import select
-from dhcal_pin.passage import Path
-from dhcal_pin.poses import Pose
-from dhcal_pin.positions import Position
-from dhcal_pin.problem import Problem, reduce
+from dhcal_pin import se3
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.estimation import qr
+from dhcal_pin.estimation.parameters import select
+from dhcal_pin.estimation.problem import Problem, reduce
+from dhcal_pin.identifiability import explanations
+from dhcal_pin.identifiability.null_space import Experiment, Group, groups
+from dhcal_pin.identifiability.propagation import Path
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.measurements.position import Position
+from dhcal_pin.measurements.registry import KINDS
+from dhcal_pin.robot.chain import Chain
+from dhcal_pin.robot.dh import DHTable
 
 
 def table(theta, d, a, alpha, prismatic=()):
@@ -82,7 +84,7 @@ def said(of: Problem) -> list[str]:
 
 
 def rank(of: Problem) -> int:
-    return observability.rank(reduce(of, np.zeros(len(of.weights)), False).r)
+    return qr.rank(reduce(of, np.zeros(len(of.weights)), False).r)
 
 
 def grouped(of: Problem) -> list[Group]:

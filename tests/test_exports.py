@@ -12,18 +12,18 @@ import yaml
 from conftest import paper, robot_file
 
 from dhcal_pin import se3
-from dhcal_pin.chain import Chain
-from dhcal_pin.cli import main
-from dhcal_pin.dh import DHTable
-from dhcal_pin.dh_files import dh_text
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.exports import origins_text, with_tool_frame, with_world
-from dhcal_pin.measurement_files import measurement_text
-from dhcal_pin.measurements import Noise
-from dhcal_pin.poses import Pose
-from dhcal_pin.robot_files import read_robot
-from dhcal_pin.ur_kinematics import read_ur_kinematics, ur_kinematics, ur_kinematics_text
-from dhcal_pin.urdf import parse_urdf
+from dhcal_pin.cli.main import main
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io.dh_file import dh_text
+from dhcal_pin.io.measurement_csv import measurement_text
+from dhcal_pin.io.robot import origins_text, read_robot
+from dhcal_pin.io.ur_kinematics import read_ur_kinematics, ur_kinematics, ur_kinematics_text
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.robot.chain import Chain
+from dhcal_pin.robot.dh import DHTable
+from dhcal_pin.robot.urdf import parse_urdf
+from dhcal_pin.robot.urdf_edit import with_tool_frame, with_world
 
 FACTORY = (
     Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "ur_factory" / "ur10_delta_dh.csv"

@@ -10,21 +10,27 @@ import numpy as np
 import pytest
 from conftest import paper, robot_file
 
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.chain import Chain
-from dhcal_pin.cli import main
-from dhcal_pin.contacts import PointDistance, Touch
-from dhcal_pin.crossvalidation import cross_validate, standard_error
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.extension import MOST, WORDS, extend, hint
-from dhcal_pin.folds import group_folds, random_folds, region_folds, touched
-from dhcal_pin.measurement_files import measurement_text
-from dhcal_pin.measurements import Noise
-from dhcal_pin.parameters import select
-from dhcal_pin.poses import Pose
-from dhcal_pin.positions import Position
-from dhcal_pin.result import accuracy
-from dhcal_pin.solver import levenberg_marquardt
+from dhcal_pin.calibration.cross_validation import (
+    cross_validate,
+    group_folds,
+    random_folds,
+    region_folds,
+    standard_error,
+    touched,
+)
+from dhcal_pin.calibration.evaluation import accuracy
+from dhcal_pin.calibration.model_selection import MOST, WORDS, extend, hint
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.cli.main import main
+from dhcal_pin.estimation.parameters import select
+from dhcal_pin.estimation.solver import levenberg_marquardt
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io.measurement_csv import measurement_text
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.contact import PointDistance, Touch
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.measurements.position import Position
+from dhcal_pin.robot.chain import Chain
 
 
 def simulated(sets: str, seed: int, m: int = 60, noise: float = 1e-4, kind=Pose):

@@ -10,9 +10,9 @@ import pinocchio as pin
 import pytest
 
 from dhcal_pin import se3
-from dhcal_pin.dh import CONVENTIONS, DHTable
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.extraction import Extraction, extract_dh
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.robot.dh import CONVENTIONS, DHTable
+from dhcal_pin.robot.dh_extraction import Extraction, extract_dh
 
 ROBOTS = Path(
     str(distribution("example-robot-data").locate_file("cmeel.prefix/share/example-robot-data/robots"))

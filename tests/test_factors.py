@@ -9,11 +9,9 @@ import pytest
 from conftest import URDF, paper, random_table
 
 from dhcal_pin import se3
-from dhcal_pin.chain import Chain
-from dhcal_pin.check import crosscheck, differences
-from dhcal_pin.dh import DHTable
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.factors import (
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io.robot import read_robot
+from dhcal_pin.paper.error_factors import (
     alpf,
     differential_motion,
     error_factors,
@@ -27,7 +25,9 @@ from dhcal_pin.factors import (
     thf,
     tool_error,
 )
-from dhcal_pin.robot_files import read_robot
+from dhcal_pin.paper.jacobian_check import crosscheck, differences
+from dhcal_pin.robot.chain import Chain
+from dhcal_pin.robot.dh import DHTable
 
 ARMS = ["sim_6dof", "sim_6dof_actual", "sim_3dof", "sim_3dof_actual", "experiment", "experiment_published"]
 KEYS = ("theta", "d", "a", "alpha")

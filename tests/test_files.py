@@ -13,17 +13,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dhcal_pin import se3
-from dhcal_pin.chain import Chain
-from dhcal_pin.dh import DHTable
-from dhcal_pin.dh_files import dh_text, read_dh
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.files import parse_noise, read_sheet, read_toml
-from dhcal_pin.measurement_files import measurement_text, read_measurements, read_readings
-from dhcal_pin.poses import Pose
-from dhcal_pin.positions import Position
-from dhcal_pin.report import json_text
-from dhcal_pin.robot_files import read_priors, read_robot, sidecar_text, urdf_files, write_urdf
-from dhcal_pin.saving import check_place, save
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io.atomic import check_place, save
+from dhcal_pin.io.dh_file import dh_text, read_dh
+from dhcal_pin.io.measurement_csv import measurement_text, read_measurements, read_readings
+from dhcal_pin.io.robot import read_robot, urdf_files, write_urdf
+from dhcal_pin.io.settings import read_priors
+from dhcal_pin.io.sidecar import sidecar_text
+from dhcal_pin.io.tabular import read_sheet, read_toml
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.measurements.position import Position
+from dhcal_pin.report.document import json_text
+from dhcal_pin.robot.chain import Chain
+from dhcal_pin.robot.dh import DHTable
+from dhcal_pin.units import parse_noise
 
 TABLE = ("theta", "d", "a", "alpha", "beta", "lower", "upper")
 SCARA = """convention = "standard"

@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 from conftest import paper
 
-from dhcal_pin import cli
-from dhcal_pin.chain import Chain
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.fleet import FAILED, read_fleet, run_fleet
-from dhcal_pin.measurement_files import measurement_text
-from dhcal_pin.measurements import Noise
-from dhcal_pin.poses import Pose
+from dhcal_pin.cli import main
+from dhcal_pin.cli.fleet import FAILED, read_fleet, run_fleet
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io.measurement_csv import measurement_text
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.robot.chain import Chain
 
 URDF = Path(__file__).resolve().parent.parent / "urdf"
 
@@ -62,7 +62,7 @@ def test_a_failure_stops_no_other(place, capsys):
         + job("arm.dh.toml", "b.urdf", 'parameters = "offset"', "seed = 5", "max-iterations = 50")
         + missing,
     )
-    assert cli.main([*RUN, "--jobs", "2", "--json", "summary.json"]) == 1
+    assert main.main([*RUN, "--jobs", "2", "--json", "summary.json"]) == 1
     said = capsys.readouterr().err
     assert sum("failed" in line for line in said.splitlines()) == 1
     assert "2 of 3 robots calibrated" in said
@@ -79,7 +79,7 @@ def test_a_failure_stops_no_other(place, capsys):
     assert whole["jobs"][2]["result"] is None
     # Each robot's files are those that it gets alone, from its own folder.
     os.chdir(place)
-    assert cli.main(["calibrate", "arm.dh.toml", "data.csv", "-o", "a2.urdf", "--holdout", "0.3"]) == 0
+    assert main.main(["calibrate", "arm.dh.toml", "data.csv", "-o", "a2.urdf", "--holdout", "0.3"]) == 0
     assert Path("a.urdf").read_bytes() == Path("a2.urdf").read_bytes()
     alone = json.loads(Path("a.json").read_text())
     assert whole["jobs"][0]["result"]["holdout_after"] == alone["holdout_after"]
@@ -108,7 +108,7 @@ def test_a_failure_stops_no_other(place, capsys):
 def test_a_wrong_manifest_is_refused_before_anything_runs(place, capsys, text, words):
     fleet(place, text)
     before = sorted(place.iterdir())
-    assert cli.main(RUN) == 2
+    assert main.main(RUN) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     for word in words:
@@ -127,7 +127,7 @@ def test_a_wrong_manifest_is_refused_before_anything_runs(place, capsys, text, w
 )
 def test_options_beside_a_manifest(place, capsys, more, words):
     fleet(place, job("arm.dh.toml", "a.urdf"))
-    assert cli.main([RUN[0], RUN[1], *more, *RUN[2:]]) == 2
+    assert main.main([RUN[0], RUN[1], *more, *RUN[2:]]) == 2
     said = capsys.readouterr().err
     for word in words:
         assert word in said
@@ -151,7 +151,7 @@ def test_what_is_hard_to_believe_of_a_robot_is_told(place, capsys):
     wrong = [",".join([*row[:2], repr(-float(row[2])), *row[3:]]) for row in rows]
     (place / "wrong.csv").write_text("\n".join([lines[0], *wrong]))
     fleet(place, job("arm.dh.toml", "a.urdf") + job("arm.dh.toml", "b.urdf", data="wrong.csv"))
-    assert cli.main([*RUN, "--jobs", "1", "--json", "summary.json"]) == 0
+    assert main.main([*RUN, "--jobs", "1", "--json", "summary.json"]) == 0
     said = capsys.readouterr().err.splitlines()
     (line,) = [line for line in said if "check:" in line]
     assert "wrong.csv: check: " in line

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from test_urdf import EXAMPLES, LENIENT, mutated
 
-from dhcal_pin.cli import main
+from dhcal_pin.cli.main import main
 
 
 def run(*arguments: str) -> int:

@@ -11,14 +11,14 @@ import pytest
 from conftest import URDF
 
 from dhcal_pin import se3
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.cli import main
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.lengths import Wires
-from dhcal_pin.measurement_files import measurement_text
-from dhcal_pin.measurements import Noise
-from dhcal_pin.positions import Targets
-from dhcal_pin.robot_files import read_instrument
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.cli.main import main
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io.measurement_csv import measurement_text
+from dhcal_pin.io.sidecar import read_instrument
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.length import Wires
+from dhcal_pin.measurements.position import Targets
 
 
 def wires(chain, m, seed=0):

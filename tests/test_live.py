@@ -16,10 +16,10 @@ from conftest import URDF
 from pages import LIVE_FIND
 
 from dhcal_pin import se3
-from dhcal_pin.chain import Chain
-from dhcal_pin.cli import main
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.live import PATIENCE, Live, serve
+from dhcal_pin.cli.main import main
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.robot.chain import Chain
+from dhcal_pin.visualization.live import PATIENCE, Live, serve
 
 
 def arms(chain: Chain) -> tuple[Chain, Chain]:

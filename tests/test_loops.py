@@ -16,11 +16,12 @@ from conftest import random_joints, random_table
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dhcal_pin import kinematics, reduction, se3
-from dhcal_pin.chain import Chain
+from dhcal_pin import se3
+from dhcal_pin._kernels import kinematics, qr, types
+from dhcal_pin.robot.chain import Chain
 
 try:
-    from dhcal_pin import _kernel, compiled
+    from dhcal_pin._kernels import _native, native
 except ImportError:
     if os.environ.get("CI"):
         raise
@@ -43,7 +44,7 @@ def test_frames_and_velocities_are_numpys(seed, m):
     theirs, ours = np.empty((2, k + 2, 7, 3, m))
     theirs[0, :4] = ours[0, :4] = se3.exp6(rng.standard_normal(6))[:3].T[:, :, None]
     kinematics.carry_frames(chain.links, chain.prismatic, motion, theirs)
-    compiled.carry_frames(chain.links, chain.prismatic, motion, ours)
+    native.carry_frames(chain.links, chain.prismatic, motion, ours)
     np.testing.assert_allclose(ours[:, :4], theirs[:, :4], atol=1e-14)
     at = np.sort(rng.integers(0, k + 1, p))
     twists = rng.standard_normal((p, 6)) * (rng.random((p, 6)) < 0.4)
@@ -51,7 +52,7 @@ def test_frames_and_velocities_are_numpys(seed, m):
     wide = np.full((6, p + 1, m + 5), np.nan)
     out, expected = wide.swapaxes(0, 1)[:p, :, 2 : m + 2], np.empty((p, 6, m))
     kinematics.point_velocities(theirs[:-1], theirs[-1, 3], at, twists, expected)
-    compiled.point_velocities(ours[:-1], ours[-1, 3], at, twists, out)
+    native.point_velocities(ours[:-1], ours[-1, 3], at, twists, out)
     np.testing.assert_allclose(out, expected, atol=1e-13)
     assert np.isnan(wide[:, p]).all()
     assert np.isnan(wide[..., [0, 1, -3, -2, -1]]).all()
@@ -66,7 +67,7 @@ def test_a_triangle_is_lapacks_but_for_signs(seed, m, columns, readings):
     rows[rng.random((columns, readings)) < 0.3] = 0.0
     rows *= 10.0 ** rng.uniform(-3, 3, columns)[:, None, None]
     before = rows.copy()
-    r = compiled.triangle_of(rows)
+    r = native.triangle_of(rows)
     np.testing.assert_array_equal(rows, before)
     np.testing.assert_array_equal(r, np.triu(r))
     whole = before.reshape(columns, -1)
@@ -81,10 +82,10 @@ def test_triangles_of_many_are_each_ones_own():
     """Members with more rows than columns, and with fewer."""
     rng = np.random.default_rng(0)
     for rows in rng.standard_normal((5, 7, 2, 30)), rng.standard_normal((5, 7, 2, 2)):
-        many = compiled.triangles_of(rows)
+        many = native.triangles_of(rows)
         for member, r in zip(rows, many, strict=True):
-            np.testing.assert_array_equal(r, compiled.triangle_of(member))
-        theirs = reduction.triangles_of(rows)
+            np.testing.assert_array_equal(r, native.triangle_of(member))
+        theirs = qr.triangles_of(rows)
         np.testing.assert_allclose(many.swapaxes(1, 2) @ many, theirs.swapaxes(1, 2) @ theirs, atol=1e-12)
 
 
@@ -92,14 +93,14 @@ def test_triangles_of_many_are_each_ones_own():
 def test_triangles_of_any_size(size):
     rows = size * np.random.default_rng(0).standard_normal((5, 2, 200))
     wanted = np.abs(np.linalg.qr(rows.reshape(5, -1).T, mode="r"))
-    np.testing.assert_allclose(np.abs(compiled.triangle_of(rows)), wanted, rtol=1e-12, atol=1e-12 * size)
+    np.testing.assert_allclose(np.abs(native.triangle_of(rows)), wanted, rtol=1e-12, atol=1e-12 * size)
 
 
-def random_mixture(rng: np.random.Generator, readings: int, ends: int, m: int) -> kinematics.Mixture:
+def random_mixture(rng: np.random.Generator, readings: int, ends: int, m: int) -> types.Mixture:
     """Any terms for some of the rows, none for others."""
     count = int(rng.integers(0, 12))
     rows = np.sort(rng.integers(0, readings, count))
-    return kinematics.Mixture(rows, rng.integers(0, 6 * ends, count), rng.standard_normal((count, m)))
+    return types.Mixture(rows, rng.integers(0, 6 * ends, count), rng.standard_normal((count, m)))
 
 
 @given(SEEDS, SAMPLES, st.integers(1, 2), st.integers(1, 6), st.integers(1, 20))
@@ -114,7 +115,7 @@ def test_mixtures_are_sums_of_products(seed, m, ends, readings, vectors):
     for row, component, share in zip(mixture.rows, mixture.components, mixture.shares, strict=True):
         end, which = divmod(component, 6)
         expected[:, row] += share * velocities[:, which, end * m : (end + 1) * m]
-    for way in compiled, kinematics:
+    for way in native, kinematics:
         found = way.mix_velocities(velocities, mixture, np.full(expected.shape, np.nan))
         np.testing.assert_allclose(found, expected, atol=1e-13)
 
@@ -135,9 +136,9 @@ def test_triangles_of_errors_are_those_of_their_rows(seed, m, ends, readings, ow
     mixture = random_mixture(rng, readings, ends, members * m)
     terms = sweep.frames, sweep.tool[3], at, twists, mixture, given_
     before = given_.copy()
-    ours = compiled.error_triangles(*terms)
+    ours = native.error_triangles(*terms)
     np.testing.assert_array_equal(given_, before)
-    for r, theirs in zip(ours, reduction.error_triangles(*terms), strict=True):
+    for r, theirs in zip(ours, qr.error_triangles(*terms), strict=True):
         np.testing.assert_array_equal(r, np.triu(r))
         wanted = theirs.T @ theirs
         scale = np.sqrt(np.diag(wanted))
@@ -156,7 +157,7 @@ def test_stations_move_as_numpys(seed, count):
     x = rng.standard_normal(count) * 10.0 ** rng.uniform(-9, 0, count)
     tool = se3.exp6(rng.standard_normal(6))
     terms = chain.into, chain.origins, tool, stations, twists, x
-    theirs, ours = kinematics.move_stations(*terms), compiled.move_stations(*terms)
+    theirs, ours = kinematics.move_stations(*terms), native.move_stations(*terms)
     for mine, other in zip(ours, theirs, strict=True):
         np.testing.assert_allclose(mine, other, atol=1e-13)
     for station, motion in enumerate(ours[0]):
@@ -170,10 +171,10 @@ def test_cosines_and_sines_of_any_angle(size):
     angles = size * np.random.default_rng(2).uniform(-1, 1, (3, 1001))
     angles[0, :200] = np.round(angles[0, :200] / (np.pi / 4)) * (np.pi / 4)
     angles[1, :2] = 0.0, -0.0
-    cosines, sines = compiled.cosines_and_sines(angles)
+    cosines, sines = native.cosines_and_sines(angles)
     np.testing.assert_allclose(cosines, np.cos(angles), rtol=5e-16, atol=0)
     np.testing.assert_allclose(sines, np.sin(angles), rtol=5e-16, atol=0)
-    assert np.isnan(compiled.cosines_and_sines(np.array([[np.nan, np.inf]]))).all()
+    assert np.isnan(native.cosines_and_sines(np.array([[np.nan, np.inf]]))).all()
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-12, 1e-6, 1e-3, 0.02, 0.05, 1.0, 3.0, np.pi - 1e-9])
@@ -183,10 +184,8 @@ def test_rotations_of_any_angle(size):
     axes = rng.standard_normal((130, 3))
     rotvecs = np.ascontiguousarray(size * (axes / np.linalg.norm(axes, axis=1)[:, None]).T)
     turns = np.ascontiguousarray(se3.exp3(rotvecs.T).transpose(1, 2, 0))
-    np.testing.assert_allclose(
-        compiled.log_rotations(turns), se3.log3(turns.transpose(2, 0, 1)).T, atol=2e-15
-    )
-    inverses = compiled.right_jacobian_inverses(rotvecs).transpose(2, 0, 1)
+    np.testing.assert_allclose(native.log_rotations(turns), se3.log3(turns.transpose(2, 0, 1)).T, atol=2e-15)
+    inverses = native.right_jacobian_inverses(rotvecs).transpose(2, 0, 1)
     np.testing.assert_allclose(inverses, se3.right_jacobian_inverse(rotvecs.T), atol=1e-14)
 
 
@@ -203,26 +202,26 @@ def test_digits_depend_neither_on_where_arrays_lie_nor_on_their_neighbours(sim_6
         own = sim_6dof.tool_velocities(alone, bodies, twists)
         np.testing.assert_array_equal(own, velocities[..., part])
         turns = np.ascontiguousarray(alone.tool[:3])
-        whole = compiled.log_rotations(np.ascontiguousarray(sweep.tool[:3]))
-        np.testing.assert_array_equal(compiled.log_rotations(turns), whole[:, part])
+        whole = native.log_rotations(np.ascontiguousarray(sweep.tool[:3]))
+        np.testing.assert_array_equal(native.log_rotations(turns), whole[:, part])
         rotvecs = np.ascontiguousarray(own[0, 3:])
-        inverses = compiled.right_jacobian_inverses(np.ascontiguousarray(velocities[0, 3:]))
-        np.testing.assert_array_equal(compiled.right_jacobian_inverses(rotvecs), inverses[..., part])
+        inverses = native.right_jacobian_inverses(np.ascontiguousarray(velocities[0, 3:]))
+        np.testing.assert_array_equal(native.right_jacobian_inverses(rotvecs), inverses[..., part])
         rows, components = np.repeat(np.arange(3), 3), np.tile([3, 4, 5], 3)
-        mixture = kinematics.Mixture(rows, components, inverses.reshape(9, -1))
+        mixture = types.Mixture(rows, components, inverses.reshape(9, -1))
         out, expected = np.empty((7, 3, count)), np.empty((7, 3, 300))
-        compiled.mix_velocities(velocities, mixture, expected)
-        compiled.mix_velocities(own, replace(mixture, shares=mixture.shares[:, part]), out)
+        native.mix_velocities(velocities, mixture, expected)
+        native.mix_velocities(own, replace(mixture, shares=mixture.shares[:, part]), out)
         np.testing.assert_array_equal(out, expected[..., part])
-        cosines, sines = compiled.cosines_and_sines(np.ascontiguousarray(q.T))
-        mine = compiled.cosines_and_sines(np.ascontiguousarray(q[part].T))
+        cosines, sines = native.cosines_and_sines(np.ascontiguousarray(q.T))
+        mine = native.cosines_and_sines(np.ascontiguousarray(q[part].T))
         np.testing.assert_array_equal(mine, (cosines[:, part], sines[:, part]))
     rows = np.random.default_rng(2).standard_normal((9, 3, 67))
-    wanted = compiled.triangle_of(rows)
+    wanted = native.triangle_of(rows)
     for shift in range(1, 8):
         moved = np.empty(rows.size + 8)[shift : shift + rows.size].reshape(rows.shape)
         moved[...] = rows
-        np.testing.assert_array_equal(compiled.triangle_of(moved), wanted)
+        np.testing.assert_array_equal(native.triangle_of(moved), wanted)
 
 
 @pytest.mark.parametrize(
@@ -237,7 +236,7 @@ def test_digits_depend_neither_on_where_arrays_lie_nor_on_their_neighbours(sim_6
 )
 def test_arrays_that_do_not_fit_are_refused(rows):
     with pytest.raises((ValueError, TypeError)):
-        _kernel.triangles(rows, np.empty(10_000), np.zeros((1, 3, 3)))
+        _native.triangles(rows, np.empty(10_000), np.zeros((1, 3, 3)))
 
 
 def test_shapes_bodies_and_constants_are_checked(sim_6dof):
@@ -251,28 +250,28 @@ def test_shapes_bodies_and_constants_are_checked(sim_6dof):
         frozen,
     ):
         with pytest.raises((ValueError, BufferError)):
-            _kernel.triangles(rows, np.empty(10_000), out)
+            _native.triangles(rows, np.empty(10_000), out)
     with pytest.raises(ValueError, match="shapes"):
-        _kernel.triangles(rows, np.empty(_kernel.room(3, 2, 0) - 1), np.zeros((1, 3, 3)))
+        _native.triangles(rows, np.empty(_native.room(3, 2, 0) - 1), np.zeros((1, 3, 3)))
     with pytest.raises(TypeError):
-        _kernel.triangles(rows)
+        _native.triangles(rows)
     sweep, out = sim_6dof.sweep(np.zeros((5, 6))), np.empty((1, 6, 5))
     for body in (-1, len(sweep.frames)):
         with pytest.raises(ValueError, match="shapes"):
-            compiled.point_velocities(sweep.frames, sweep.tool[3], np.array([body]), np.zeros((1, 6)), out)
+            native.point_velocities(sweep.frames, sweep.tool[3], np.array([body]), np.zeros((1, 6)), out)
     errors = sweep.frames, sweep.tool[3], np.zeros(1, int), np.ones((1, 1, 6))
     for rows, components in (([0], [6]), ([2], [0]), ([1, 0], [0, 0]), ([0], [-1])):
-        mixture = kinematics.Mixture(np.array(rows), np.array(components), np.ones((len(rows), 5)))
+        mixture = types.Mixture(np.array(rows), np.array(components), np.ones((len(rows), 5)))
         with pytest.raises(ValueError, match="shapes"):
-            compiled.mix_velocities(out, mixture, np.empty((1, 2, 5)))
+            native.mix_velocities(out, mixture, np.empty((1, 2, 5)))
         with pytest.raises(ValueError, match="shapes"):
-            compiled.error_triangles(*errors, mixture, np.zeros((1, 2, 5)))
+            native.error_triangles(*errors, mixture, np.zeros((1, 2, 5)))
     for stations in ([sim_6dof.tool_station + 1], [-1], [2, 1]):
         terms = sim_6dof.into, sim_6dof.origins, np.eye(4), np.array(stations)
         with pytest.raises(ValueError, match="shapes"):
-            compiled.move_stations(*terms, np.zeros((len(stations), 6)), np.zeros(len(stations)))
+            native.move_stations(*terms, np.zeros((len(stations), 6)), np.zeros(len(stations)))
     with pytest.raises(ValueError, match="shapes"):
-        compiled.carry_frames(
+        native.carry_frames(
             sim_6dof.links[1:], sim_6dof.prismatic, sim_6dof.motion(np.zeros((5, 6))), np.empty((8, 7, 3, 5))
         )
 
@@ -280,15 +279,12 @@ def test_shapes_bodies_and_constants_are_checked(sim_6dof):
 CALIBRATION = """
 import json, sys
 if sys.argv[1] == "numpy":
-    sys.modules["dhcal_pin._kernel"] = None
+    sys.modules["dhcal_pin._kernels._native"] = None
 import numpy as np
 from conftest import paper
-from dhcal_pin import loops
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.chain import Chain
-from dhcal_pin.measurements import Noise
-from dhcal_pin.poses import Pose
-assert (loops.carry_frames.__module__ == "dhcal_pin.compiled") == (sys.argv[1] == "compiled")
+from dhcal_pin import _kernels
+from dhcal_pin import Chain, Noise, Pose, calibrate
+assert (_kernels.carry_frames.__module__ == "dhcal_pin._kernels.native") == (sys.argv[1] == "compiled")
 nominal, actual = Chain.from_dh(paper("sim_6dof")), Chain.from_dh(paper("sim_6dof_actual"))
 rng = np.random.default_rng(0)
 data = Pose.simulate(actual, rng.uniform(-3, 3, (60, 6)), Noise(1e-4, 1e-4), rng)
@@ -298,7 +294,7 @@ print(json.dumps([fit.converged, fit.x.tolist(), fit.std.tolist()]))
 
 
 def test_a_calibration_without_the_compiled_loops_ends_at_the_same_values():
-    places = Path(compiled.__file__).parent.parent, Path(__file__).parent
+    places = Path(native.__file__).parent.parent, Path(__file__).parent
     environ = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, map(Path.resolve, places)))}
     ends = [
         json.loads(

@@ -10,19 +10,19 @@ import pytest
 from conftest import URDF
 
 from dhcal_pin import se3
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.cli import main
-from dhcal_pin.contacts import Plane, PointDistance, Touch
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.evaluation import instrument_values
-from dhcal_pin.kinds import KINDS
-from dhcal_pin.loops import mix_velocities
-from dhcal_pin.measurement_files import measurement_text, read_measurements
-from dhcal_pin.measurements import Noise, derivatives
-from dhcal_pin.parameters import select
-from dhcal_pin.poses import Pose
-from dhcal_pin.positions import Position
-from dhcal_pin.problem import Problem, reduce
+from dhcal_pin._kernels import mix_velocities
+from dhcal_pin.calibration.evaluation import instrument_values
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.cli.main import main
+from dhcal_pin.estimation.parameters import select
+from dhcal_pin.estimation.problem import Problem, reduce
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io.measurement_csv import measurement_text, read_measurements
+from dhcal_pin.measurements.base import Noise, derivatives
+from dhcal_pin.measurements.contact import Plane, PointDistance, Touch
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.measurements.position import Position
+from dhcal_pin.measurements.registry import KINDS
 
 KIND = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 
@@ -186,7 +186,7 @@ def test_paper_rows_are_its_r_and_sine(sim_6dof, sim_6dof_actual):
     """Seen in the tool frame, the small-angle rows are R and (35), (36)."""
     from conftest import paper
 
-    from dhcal_pin.factors import error_factors, tool_error
+    from dhcal_pin.paper.error_factors import error_factors, tool_error
 
     q = np.random.default_rng(3).uniform(-3, 3, (11, 6))
     data = Pose.simulate(sim_6dof_actual, q, Noise(), np.random.default_rng(0))

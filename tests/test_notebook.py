@@ -11,7 +11,7 @@ from pages import LOOK, READY
 
 CELL = """
 import numpy as np, dhcal_pin as dh
-from dhcal_pin.demo import paper_arm
+from dhcal_pin.paper.experiment import paper_arm
 arm, truth = paper_arm("sim_6dof"), paper_arm("sim_6dof_actual")
 q = np.random.default_rng(0).uniform(-2, 2, (12, 6))
 fit = dh.calibrate(arm, dh.Position.simulate(truth, q, dh.Noise(1e-4), np.random.default_rng(1)))

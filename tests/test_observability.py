@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dhcal_pin import observability
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.chain import Chain
-from dhcal_pin.measurements import Noise
-from dhcal_pin.parameters import select
-from dhcal_pin.poses import Pose
-from dhcal_pin.positions import Position
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.estimation.parameters import select
+from dhcal_pin.identifiability import observability
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.measurements.position import Position
+from dhcal_pin.robot.chain import Chain
 
 NOISE = Noise(1e-4, np.deg2rad(0.01))
 

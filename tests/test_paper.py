@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dhcal_pin import demo
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.evaluation import accuracy
-from dhcal_pin.measurements import Noise
-from dhcal_pin.parameters import select
-from dhcal_pin.poses import Pose
-from dhcal_pin.positions import Position
+from dhcal_pin.calibration.evaluation import accuracy
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.cli import demo
+from dhcal_pin.estimation.parameters import select
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.measurements.position import Position
+from dhcal_pin.paper import simulations
+from dhcal_pin.paper.experiment import paper_arm, run_experiment
 
 # Medians over 50 seeds: largest angle error in degrees, largest length error in mm, as printed, and the
 # test poses' error in mm, whose poses are free.
@@ -34,12 +36,12 @@ def rounded(value: float, like: str) -> str:
 
 @pytest.fixture(scope="module")
 def six_two():
-    return demo.simulate("sim_6dof", "pose", 2, redrawn=False)
+    return simulations.simulate("sim_6dof", "pose", 2, redrawn=False)
 
 
 @pytest.fixture(scope="module")
 def six_ten():
-    return demo.simulate("sim_6dof", "pose", 10, redrawn=False)
+    return simulations.simulate("sim_6dof", "pose", 10, redrawn=False)
 
 
 @pytest.mark.parametrize("poses", FIGURES)
@@ -96,16 +98,16 @@ def test_unseen_directions_are_named(sim_6dof, sim_6dof_actual):
 
 
 def test_redrawn_sets_creep_to_the_truth():
-    run = demo.simulate("sim_6dof", "pose", 2, redrawn=True)
+    run = simulations.simulate("sim_6dof", "pose", 2, redrawn=True)
     medians = 1e3 * np.median(run.test, 0)
     for step, wanted in ((1, 17.1), (2, 10.2), (3, 7.0), (4, 3.9), (5, 2.3), (10, 0.43)):
         assert medians[step] == pytest.approx(wanted, rel=0.35)
 
 
 def test_three_dof_ten_positions():
-    run = demo.simulate("sim_3dof", "position", 10, redrawn=False)
+    run = simulations.simulate("sim_3dof", "position", 10, redrawn=False)
     assert (run.rank, run.rank_found) == (10, 11)
-    names = [p.name for p in select(demo.paper_arm("sim_3dof"), "dh").parameters]
+    names = [p.name for p in select(paper_arm("sim_3dof"), "dh").parameters]
     assert [name for name, unseen in zip(names, run.hidden, strict=True) if unseen] == ["alpha3"]
     medians = 1e3 * np.median(run.test, 0)
     for step, wanted in ((0, 18.8), (1, 0.705), (2, 0.00168), (3, 1.6e-6)):
@@ -115,7 +117,7 @@ def test_three_dof_ten_positions():
 
 
 def test_three_dof_three_positions():
-    run = demo.simulate("sim_3dof", "position", 3, redrawn=False)
+    run = simulations.simulate("sim_3dof", "position", 3, redrawn=False)
     assert np.all(run.residual < 1e-9)
     assert 1e3 * np.median(run.test[:, -1]) == pytest.approx(2.59, rel=0.2)
 
@@ -153,7 +155,7 @@ def test_noise_is_averaged_out(poses, wanted, sim_6dof, sim_6dof_actual):
 
 @pytest.fixture(scope="module")
 def experiment():
-    return demo.experiment()
+    return run_experiment()
 
 
 def test_experiment_figures(experiment):
@@ -197,8 +199,8 @@ def test_impossible_rows_are_found_with_their_reasons(experiment):
 
 def test_rows_are_found_wherever_they_stand(experiment, tmp_path):
     """Shuffled, and without the columns that say where the arm was sent."""
-    from dhcal_pin.measurement_files import measurement_text, read_readings
-    from dhcal_pin.screening import screen
+    from dhcal_pin.diagnostics.reachability import screen
+    from dhcal_pin.io.measurement_csv import measurement_text, read_readings
 
     data = experiment.readings.data.take(np.array([7, 0, 1, 6, 2, 3, 4, 5]))
     path = tmp_path / "t.csv"
@@ -214,8 +216,8 @@ def test_held_parameters_are_those_that_cannot_be_seen(experiment):
 
 def test_good_rows_are_not_called_impossible(sim_6dof, sim_6dof_actual):
     """An arm as wrong as the paper's, with noise, in any pose."""
-    from dhcal_pin.measurement_files import Readings
-    from dhcal_pin.screening import screen
+    from dhcal_pin.diagnostics.reachability import screen
+    from dhcal_pin.io.measurement_csv import Readings
 
     for seed in range(20):
         rng = np.random.default_rng(seed)
@@ -231,8 +233,8 @@ def test_an_arm_right_at_its_reference_is_not_impossible_elsewhere(sim_6dof, sim
 
     And nothing is impossible about a controller that once stops 2 mm early.
     """
-    from dhcal_pin.measurement_files import Readings
-    from dhcal_pin.screening import screen
+    from dhcal_pin.diagnostics.reachability import screen
+    from dhcal_pin.io.measurement_csv import Readings
 
     rng = np.random.default_rng(0)
     q = np.concatenate([np.tile(0.3, (30, 6)), rng.uniform(-2, 2, (20, 6))])

@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 from conftest import paper, random_table, with_masses
 
-from dhcal_pin import observability, se3
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.chain import Chain
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.measurements import Noise
-from dhcal_pin.parameters import SETS, select
-from dhcal_pin.poses import Pose
-from dhcal_pin.positions import Position
-from dhcal_pin.problem import Problem, reduce
+from dhcal_pin import se3
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.estimation import qr
+from dhcal_pin.estimation.parameters import SETS, select
+from dhcal_pin.estimation.problem import Problem, reduce
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.measurements.position import Position
+from dhcal_pin.robot.chain import Chain
 
 
 def rank(chain: Chain, sets: str, kind=Pose, m: int = 60) -> int:
@@ -24,7 +25,7 @@ def rank(chain: Chain, sets: str, kind=Pose, m: int = 60) -> int:
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (m, chain.size))
     zero = np.zeros(len(errors.parameters))
     data = kind.simulate(chain, q, Noise(), np.random.default_rng(0))
-    return observability.rank(reduce(Problem(errors, (data,), zero), zero, False).r)
+    return qr.rank(reduce(Problem(errors, (data,), zero), zero, False).r)
 
 
 @pytest.mark.parametrize("sets", [*SETS, "minimal,base,tool,offset", "dh,placement"])

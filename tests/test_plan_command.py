@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from conftest import URDF, robot_file
 
-from dhcal_pin import cli
-from dhcal_pin.configuration_files import read_configurations
-from dhcal_pin.robot_files import read_robot
+from dhcal_pin.cli import main
+from dhcal_pin.io.measurement_csv import read_configurations
+from dhcal_pin.io.robot import read_robot
 
 ROBOT = str(URDF / "sim_6dof.dh.toml")
 TRUTH = str(URDF / "sim_6dof_actual.dh.toml")
 
 
 def run(capsys, *args) -> tuple[int, str, str]:
-    status = cli.main([*map(str, args)])
+    status = main.main([*map(str, args)])
     said = capsys.readouterr()
     return status, said.out, said.err
 

@@ -9,22 +9,22 @@ import pinocchio as pin
 import pytest
 from conftest import paper, robot_file
 
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.chain import Chain
-from dhcal_pin.configurations import Room, Space, tour
-from dhcal_pin.criteria import Determinant
-from dhcal_pin.design import Pool, basis, exchange, greedy
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.information import Information
-from dhcal_pin.kinds import KINDS
-from dhcal_pin.measurements import Noise
-from dhcal_pin.parameters import select
-from dhcal_pin.planning import plan
-from dhcal_pin.problem import Problem, reduce
-from dhcal_pin.robot_files import read_robot, write_urdf
-from dhcal_pin.solver import with_priors
-from dhcal_pin.uncertainty_files import read_uncertainty
-from dhcal_pin.urdf import parse_urdf
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.estimation.parameters import select
+from dhcal_pin.estimation.problem import Problem, reduce
+from dhcal_pin.estimation.qr import with_priors
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io.robot import read_robot, write_urdf
+from dhcal_pin.io.sidecar import read_uncertainty
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.registry import KINDS
+from dhcal_pin.planning.criteria import Determinant
+from dhcal_pin.planning.exchange import Pool, basis, exchange, greedy
+from dhcal_pin.planning.information import Information
+from dhcal_pin.planning.planner import plan
+from dhcal_pin.robot.chain import Chain
+from dhcal_pin.robot.sampling import Room, Space, tour
+from dhcal_pin.robot.urdf import parse_urdf
 
 NOISE = Noise(1e-4, np.deg2rad(0.01))
 SETS = "minimal,base,tool"

@@ -9,15 +9,16 @@ import pytest
 from conftest import URDF, paper, robot_file
 from scipy.spatial.transform import Rotation
 
-from dhcal_pin import cli, se3
-from dhcal_pin.chain import Chain, joint_station
-from dhcal_pin.inverse import within
-from dhcal_pin.kinds import KINDS
-from dhcal_pin.lengths import Wires
-from dhcal_pin.measurement_files import measurement_text, read_readings
-from dhcal_pin.measurements import Noise
-from dhcal_pin.plausibility import doubts
-from dhcal_pin.positions import Position
+from dhcal_pin import se3
+from dhcal_pin.cli import main
+from dhcal_pin.diagnostics.input_checks import doubts
+from dhcal_pin.io.measurement_csv import measurement_text, read_readings
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.length import Wires
+from dhcal_pin.measurements.position import Position
+from dhcal_pin.measurements.registry import KINDS
+from dhcal_pin.robot.chain import Chain, joint_station
+from dhcal_pin.robot.inverse_kinematics import within
 
 
 @pytest.fixture(scope="module")
@@ -307,10 +308,10 @@ def test_the_command_line_says_so(tmp_path, monkeypatch, capsys, command):
     ]
     (tmp_path / "data.csv").write_text("\n".join(lines))
     more = ["-o", "out.urdf"] if command == "calibrate" else []
-    assert cli.main([command, "arm.dh.toml", "data.csv", *more]) == 0
+    assert main.main([command, "arm.dh.toml", "data.csv", *more]) == 0
     assert ": check: " not in capsys.readouterr().err
     (tmp_path / "data.csv").write_text("\n".join([*lines, lines[1]]))
-    assert cli.main([command, "arm.dh.toml", "data.csv", *more]) == 0
+    assert main.main([command, "arm.dh.toml", "data.csv", *more]) == 0
     found = [line for line in capsys.readouterr().err.splitlines() if "check:" in line]
     assert len(found) == 1
     assert found[0].startswith("data.csv: check: row 13: the same as others")
@@ -325,9 +326,9 @@ def test_two_wires_of_one_name_are_told(tmp_path, monkeypatch, capsys):
         q = joints(arm, 60, len(file) + int(anchor[0]))
         length = np.linalg.norm(arm.poses(q)[:, :3, 3] - anchor, axis=1)
         (tmp_path / file).write_text(measurement_text(Wires.of(q, length[:, None]), arm))
-    assert cli.main(["calibrate", "arm.dh.toml", "one.csv", "-o", "out.urdf"]) == 0
+    assert main.main(["calibrate", "arm.dh.toml", "one.csv", "-o", "out.urdf"]) == 0
     assert ": check: " not in capsys.readouterr().err
-    assert cli.main(["calibrate", "arm.dh.toml", "one.csv", "two.csv", "-o", "out.urdf"]) == 0
+    assert main.main(["calibrate", "arm.dh.toml", "one.csv", "two.csv", "-o", "out.urdf"]) == 0
     found = [line for line in capsys.readouterr().err.splitlines() if "check:" in line]
     assert found
     assert all(

@@ -13,15 +13,14 @@ import numpy as np
 import pytest
 from conftest import robot_file
 
-from dhcal_pin import cli
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.chain import Chain
-from dhcal_pin.crossvalidation import cross_validate
-from dhcal_pin.folds import random_folds, region_folds
-from dhcal_pin.measurement_files import read_measurements, read_readings
-from dhcal_pin.measurements import Noise
-from dhcal_pin.planning import plan
-from dhcal_pin.robot_files import read_robot
+from dhcal_pin.calibration.cross_validation import cross_validate, random_folds, region_folds
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.cli import main
+from dhcal_pin.io.measurement_csv import read_measurements, read_readings
+from dhcal_pin.io.robot import read_robot
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.planning.planner import plan
+from dhcal_pin.robot.chain import Chain
 
 MAPS = Path(__file__).resolve().parent / "maps"
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -50,7 +49,7 @@ def dhcal(tmp_path, capsys):
     def call(command, robot, *args):
         """The JSON of a command that must succeed."""
         out = tmp_path / "result.json"
-        status = cli.main([command, *map(str, (robot, *args, "--json", out))])
+        status = main.main([command, *map(str, (robot, *args, "--json", out))])
         said = capsys.readouterr()
         assert status == 0, said.err
         assert ": check: " not in said.err, said.err

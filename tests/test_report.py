@@ -16,18 +16,22 @@ import pinocchio as pin
 import pytest
 from conftest import URDF, paper, robot_file
 
-from dhcal_pin import Provenance, cli, diagnosis, figures, report, report_page, se3, tables, write_report
-from dhcal_pin.calibration import calibrate, split
-from dhcal_pin.chain import Chain
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.evaluation import accuracy, summary
-from dhcal_pin.figures import Axis
-from dhcal_pin.kinds import KINDS
-from dhcal_pin.measurements import Noise
-from dhcal_pin.poses import Pose
-from dhcal_pin.positions import Position
-from dhcal_pin.report_sections import markdown, study
-from dhcal_pin.result import Result
+from dhcal_pin import Provenance, formatting, se3, write_report
+from dhcal_pin.calibration.evaluation import accuracy, error_statistics
+from dhcal_pin.calibration.procedure import calibrate, split
+from dhcal_pin.calibration.result import Result
+from dhcal_pin.cli import main
+from dhcal_pin.diagnostics import residuals
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.measurements.position import Position
+from dhcal_pin.measurements.registry import KINDS
+from dhcal_pin.report import document, html
+from dhcal_pin.report.sections import markdown, study
+from dhcal_pin.robot.chain import Chain
+from dhcal_pin.visualization import figures
+from dhcal_pin.visualization.figures import Axis
 
 AXE = Path(sys.prefix) / "node_modules" / "axe-core" / "axe.min.js"
 # The text of an A4 page between its margins of 14 mm, CSS pixels.
@@ -51,7 +55,7 @@ def fit() -> Result:
 @pytest.fixture
 def quick(monkeypatch):
     """Fewer configurations over the workspace."""
-    monkeypatch.setattr(diagnosis, "SAMPLES", 300)
+    monkeypatch.setattr(residuals, "SAMPLES", 300)
 
 
 # --- numbers ---------------------------------------------------------------------------------------
@@ -71,18 +75,18 @@ def quick(monkeypatch):
     ],
 )
 def test_numbers_have_the_digits_that_are_known(value, std, text):
-    assert tables.shown(value, "m", std) == text
+    assert formatting.shown(value, "m", std) == text
 
 
 def test_rates_and_pure_numbers():
-    assert tables.shown(1.2346e-5, "rad/Nm", 1e-7) == "12.35 µrad/Nm"
-    assert tables.shown(-2.5e-3, "rad/rad", 4e-4, small=True) == "-2.5 mrad/rad"
-    assert tables.shown(-0.00125, "1", 1e-5) == "-0.00125"
+    assert formatting.shown(1.2346e-5, "rad/Nm", 1e-7) == "12.35 µrad/Nm"
+    assert formatting.shown(-2.5e-3, "rad/rad", 4e-4, small=True) == "-2.5 mrad/rad"
+    assert formatting.shown(-0.00125, "1", 1e-5) == "-0.00125"
 
 
 def test_the_standard_error_of_an_rms_is_its_scatter():
     rng = np.random.default_rng(1)
-    runs = [summary([{"position": rng.standard_normal((200, 3))}]) for _ in range(400)]
+    runs = [error_statistics([{"position": rng.standard_normal((200, 3))}]) for _ in range(400)]
     scatter = np.std([run["position_rms_m"] for run in runs])
     stated = np.mean([run["position_rms_std_m"] for run in runs])
     assert stated == pytest.approx(scatter, rel=0.15)
@@ -90,7 +94,9 @@ def test_the_standard_error_of_an_rms_is_its_scatter():
 
 def test_accuracy_by_hand():
     error = np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 2.0]])
-    found = summary([{"position": error[:2]}, {"position": error[2:], "orientation": np.zeros((1, 3))}])
+    found = error_statistics(
+        [{"position": error[:2]}, {"position": error[2:], "orientation": np.zeros((1, 3))}]
+    )
     assert found["position_mean_m"] == pytest.approx(8 / 3)
     assert found["position_rms_m"] == pytest.approx(np.sqrt(10))
     assert found["position_max_m"] == 5
@@ -107,11 +113,11 @@ def test_a_joint_that_waves_is_seen_in_that_joint_alone():
     wave[:, 2] = 2e-3 * np.sin(q[:, 2])
     data = Pose.simulate(arm, q + wave, Noise(1e-4, 1e-4), rng)
     found = calibrate(arm, replace(data, q=q), "tool", fix=["tool.y"])
-    traces = diagnosis.joint_traces(found)
+    traces = residuals.joint_traces(found)
     assert [t.name for t in traces] == list(arm.moving)
     for j, t in enumerate(traces):
         wanted = 2e-3 * np.sin(t.centres) if j == 2 else 0 * t.centres
-        assert len(t.centres) == diagnosis.BINS
+        assert len(t.centres) == residuals.BINS
         # A part is 0.42 rad wide: within it the wave's mean lies this far from its value in the middle.
         assert np.abs(t.after - wanted).max() < (6e-5 if j == 2 else 4.5 * t.after_std.max())
         assert np.all(t.after_std > 0)
@@ -122,7 +128,7 @@ def test_the_workspace_is_in_the_base_frame(quick):
     truth = replace(actual, base=se3.exp6(np.array([3.0, -2.0, 1.0, 0.3, 0.2, 2.0])))
     rng = np.random.default_rng(0)
     data = Pose.simulate(truth, rng.uniform(-1.5, 1.5, (40, 6)), Noise(1e-4, 1e-4), rng)
-    found = diagnosis.workspace(calibrate(nominal, data, "dh,base"), [data])
+    found = residuals.workspace(calibrate(nominal, data, "dh,base"), [data])
     model, state = actual.model, actual.model.createData()
     for q, point in zip(data.q, found.measured, strict=True):
         pin.framesForwardKinematics(model, state, actual.configurations(q)[0])
@@ -211,7 +217,7 @@ class Texts(HTMLParser):
 
 def test_the_headline_is_the_error_on_what_was_not_fitted(fit, quick):
     held = accuracy(fit.chain, fit.holdout)["position_rms_m"]
-    page = Texts(report_page.page(study(fit, Provenance())))
+    page = Texts(html.page(study(fit, Provenance())))
     assert page.texts["h1"] == ["Position error on 12 samples that were not fitted"]
     first = page.texts["dd"]
     assert float(first[1].split()[0]) == pytest.approx(1e3 * held, abs=0.051)
@@ -224,7 +230,7 @@ def test_the_headline_is_the_error_on_what_was_not_fitted(fit, quick):
 @pytest.mark.parametrize("count", [0, 1])
 def test_few_held_out_or_none_is_said(count, quick):
     found = study(fitted(held=count / 40), Provenance())
-    page, text = Texts(report_page.page(found)), markdown(found)
+    page, text = Texts(html.page(found)), markdown(found)
     if count:
         assert page.texts["h1"] == ["Position error on 1 sample that was not fitted"]
         assert "So few samples say little." in text
@@ -244,7 +250,7 @@ def test_every_kind_and_few_data_have_a_report(kind, quick):
         found = study(
             calibrate(nominal, data, "minimal,base,tool", priors=priors, max_iterations=5), Provenance()
         )
-        page, text = report_page.page(found), markdown(found)
+        page, text = html.page(found), markdown(found)
         Texts(page)
         for words in (page.split("<iframe")[0], text):
             assert not re.search(r"\b(nan|inf)\b", words), words
@@ -255,7 +261,7 @@ def test_every_kind_and_few_data_have_a_report(kind, quick):
 def test_the_same_command_writes_the_same_report(tmp_path, monkeypatch, quick):
     robot, data = URDF / "sim_6dof.dh.toml", tmp_path / "data.csv"
     truth = ("--truth", URDF / "sim_6dof_actual.dh.toml", "-m", 30, "--noise", "0.1mm,0.01deg", "-o", data)
-    assert cli.main([str(a) for a in ("simulate", robot, *truth)]) == 0
+    assert main.main([str(a) for a in ("simulate", robot, *truth)]) == 0
     pages = []
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
@@ -269,9 +275,9 @@ def test_the_same_command_writes_the_same_report(tmp_path, monkeypatch, quick):
             "--json",
             f"{name}.json",
         )
-        assert cli.main([str(a) for a in ("calibrate", robot, data, "--holdout", "0.2", *out)]) == 0
+        assert main.main([str(a) for a in ("calibrate", robot, data, "--holdout", "0.2", *out)]) == 0
         pages.append([Path(f"{name}.{end}").read_bytes() for end in ("html", "md")])
-        assert report.fingerprints([data])[str(data)].encode() in pages[-1][0]
+        assert document.fingerprints([data])[str(data)].encode() in pages[-1][0]
     assert pages[0] == pages[1]
     for text in pages[0]:
         assert b"dhcal calibrate sim_6dof.dh.toml data.csv --holdout 0.2" in text
@@ -284,7 +290,7 @@ def test_a_report_of_another_kind_is_refused(fit, tmp_path, capsys):
     out = str(tmp_path / "out.urdf")
     arm = str(URDF / "experiment.dh.toml")
     args = ["calibrate", arm, str(URDF / "experiment_table5.csv"), "-o", out, "--report", "report.pdf"]
-    assert cli.main(args) == 2
+    assert main.main(args) == 2
     assert "report.pdf: unknown ending" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 

@@ -11,17 +11,18 @@ import pinocchio as pin
 import pytest
 from conftest import robot_file
 
-from dhcal_pin import observability, se3
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.chain import Chain
-from dhcal_pin.check import crosscheck, regressor, vectorised
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.measurements import Noise
-from dhcal_pin.parameters import SETS, extract, select
-from dhcal_pin.poses import Pose
-from dhcal_pin.problem import Problem, reduce
-from dhcal_pin.robot_files import read_robot, write_urdf
-from dhcal_pin.urdf import read_urdf
+from dhcal_pin import se3
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.estimation import qr
+from dhcal_pin.estimation.parameters import SETS, select
+from dhcal_pin.estimation.problem import Problem, reduce
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io.robot import read_robot, write_urdf
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.paper.jacobian_check import crosscheck, regressor, vectorised
+from dhcal_pin.robot.chain import Chain, extract
+from dhcal_pin.robot.urdf import read_urdf
 
 ARMS = {
     "ur3": ("ur_description/urdf/ur3_robot.urdf", "tool0"),
@@ -177,7 +178,7 @@ def test_to_dh_and_back(arm, convention):
 def rank(errors, q) -> int:
     zero = np.zeros(len(errors.parameters))
     data = Pose.simulate(errors.chain, q, Noise(), np.random.default_rng(0))
-    return observability.rank(reduce(Problem(errors, (data,), zero), zero, False).r)
+    return qr.rank(reduce(Problem(errors, (data,), zero), zero, False).r)
 
 
 def counts(chain: Chain) -> tuple[int, int]:

@@ -7,19 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.lengths import Wires
-from dhcal_pin.leverage import spreads
-from dhcal_pin.measurements import Noise
-from dhcal_pin.poses import Pose
-from dhcal_pin.positions import Position
-from dhcal_pin.problem import reduce
-from dhcal_pin.report import Provenance
-from dhcal_pin.report_figures import histograms
-from dhcal_pin.report_sections import study
-from dhcal_pin.robust import scores
-from dhcal_pin.tables import headline
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.calibration.summary import headline
+from dhcal_pin.estimation.problem import reduce
+from dhcal_pin.estimation.robust import spreads, standardized_residuals
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.length import Wires
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.measurements.position import Position
+from dhcal_pin.report.document import Provenance
+from dhcal_pin.report.figures import histograms
+from dhcal_pin.report.sections import study
 
 
 def spoiled(kind, chain, seed, m=100, share=0.1):
@@ -84,7 +83,7 @@ def test_scores_of_good_samples_are_normal(sim_6dof_actual):
     for kind in (Pose, Position):
         rng = np.random.default_rng(0)
         data = kind.simulate(sim_6dof_actual, rng.uniform(-3, 3, (20000, 6)), Noise(1e-4, 2e-4), rng)
-        found = scores(data.residual(sim_6dof_actual.sweep(data.q), np.empty(0)))
+        found = standardized_residuals(data.residual(sim_6dof_actual.sweep(data.q), np.empty(0)))
         np.testing.assert_allclose(np.quantile(found, [0.5, 0.841, 0.9987]), [0, 1, 3], atol=0.15)
 
 

@@ -10,10 +10,10 @@ import pytest
 from conftest import robot_file
 from scipy.spatial import cKDTree
 
-from dhcal_pin.chain import Chain
-from dhcal_pin.shapes import GRID, Looks, Mesh, looks, shares
-from dhcal_pin.urdf import parse_urdf
-from dhcal_pin.viewer import TRIANGLES, scene_html, tree
+from dhcal_pin.robot.chain import Chain
+from dhcal_pin.robot.urdf import parse_urdf
+from dhcal_pin.visualization.meshes import GRID, Looks, Mesh, looks, shares
+from dhcal_pin.visualization.scene import TRIANGLES, scene_html, tree
 
 UR5 = "ur_description/urdf/ur5_robot.urdf"
 EVERYTHING = 10**9

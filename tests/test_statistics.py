@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from conftest import paper, robot_file
 
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.chain import Chain
-from dhcal_pin.dh import DHTable
-from dhcal_pin.measurements import Noise
-from dhcal_pin.parameters import select
-from dhcal_pin.poses import Pose
-from dhcal_pin.positions import Position
-from dhcal_pin.problem import Problem, reduce
-from dhcal_pin.solver import posterior_root
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.estimation.parameters import select
+from dhcal_pin.estimation.problem import Problem, reduce
+from dhcal_pin.estimation.qr import posterior_root
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.measurements.position import Position
+from dhcal_pin.robot.chain import Chain
+from dhcal_pin.robot.dh import DHTable
 
 POSITION, ROTATION = 1e-4, np.deg2rad(0.01)
 

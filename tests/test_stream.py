@@ -9,16 +9,16 @@ from functools import partial
 import numpy as np
 import pytest
 
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.executors import workers
-from dhcal_pin.lengths import Wires
-from dhcal_pin.measurement_files import measurement_text
-from dhcal_pin.measurements import Noise
-from dhcal_pin.poses import Pose
-from dhcal_pin.positions import Position
-from dhcal_pin.result import accuracy
-from dhcal_pin.stream import calibrate_stream, file_parts
+from dhcal_pin.calibration.evaluation import accuracy
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.calibration.streaming import calibrate_stream
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io.measurement_csv import file_parts, measurement_text
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.length import Wires
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.measurements.position import Position
+from dhcal_pin.parallel import workers
 
 
 @pytest.fixture
@@ -79,10 +79,7 @@ import sys
 import numpy as np
 sys.path.insert(0, "tests")
 from conftest import paper
-from dhcal_pin.chain import Chain
-from dhcal_pin.measurements import Noise
-from dhcal_pin.positions import Position
-from dhcal_pin.stream import calibrate_stream
+from dhcal_pin import Chain, Noise, Position, calibrate_stream
 nominal, actual = (Chain.from_dh(paper(name)) for name in ("sim_6dof", "sim_6dof_actual"))
 def part(seed):
     rng = np.random.default_rng(seed)

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from conftest import URDF
 
-from dhcal_pin import cli
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.measurements import Noise
-from dhcal_pin.planning import plan
-from dhcal_pin.robot_files import read_robot
-from dhcal_pin.study import run, table
-from dhcal_pin.study_grid import read_study
+from dhcal_pin.cli import main
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io.robot import read_robot
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.planning.planner import plan
+from dhcal_pin.studies.grid import read_study
+from dhcal_pin.studies.runner import run, table
 
 SIX = """
 seeds = 50
@@ -110,7 +110,7 @@ errors = "0.5mm,0.1deg"
 def table_of(folder, name: str, *options: str, text: str = MANY) -> str:
     (folder / "s.study.toml").write_text(text)
     out = folder / f"{name}.csv"
-    assert cli.main(["study", str(folder / "s.study.toml"), "-o", str(out), *options]) == 0
+    assert main.main(["study", str(folder / "s.study.toml"), "-o", str(out), *options]) == 0
     # The table, its plot where a number varies, and no journal.
     assert {path.suffix for path in folder.glob(f"{name}*")} - {".svg"} == {".csv"}
     return out.read_text()
@@ -165,7 +165,7 @@ def killed_and_resumed(folder, text: str, lines: int, *options: str) -> str:
         assert process.poll() is None
         os.killpg(process.pid, signal.SIGKILL)
     assert not out.exists()
-    assert cli.main([*command[3:], *options]) == 0
+    assert main.main([*command[3:], *options]) == 0
     return out.read_text()
 
 
@@ -186,7 +186,7 @@ def test_ten_thousand_calibrations(tmp_path):
 def test_journal_of_another_study_is_left_alone(tmp_path, capsys):
     (tmp_path / "s.study.toml").write_text(MANY)
     (tmp_path / "r.csv.part").write_text("0000\n")
-    assert cli.main(["study", str(tmp_path / "s.study.toml"), "-o", str(tmp_path / "r.csv")]) == 2
+    assert main.main(["study", str(tmp_path / "s.study.toml"), "-o", str(tmp_path / "r.csv")]) == 2
     assert "belongs to another study" in capsys.readouterr().err
     assert (tmp_path / "r.csv.part").read_text() == "0000\n"
 
@@ -246,10 +246,10 @@ def test_a_studys_robot_is_no_output(tmp_path, capsys):
     path.write_text(MANY)
     robot.write_bytes((URDF / robot.name).read_bytes())
     before = robot.read_bytes()
-    assert cli.main(["study", str(path), "-o", str(robot)]) == 2
+    assert main.main(["study", str(path), "-o", str(robot)]) == 2
     assert "is an input" in capsys.readouterr().err
     assert robot.read_bytes() == before
-    assert cli.main(["study", str(tmp_path / "none.toml"), "-o", str(tmp_path / "r.csv")]) == 2
+    assert main.main(["study", str(tmp_path / "none.toml"), "-o", str(tmp_path / "r.csv")]) == 2
     assert "none.toml: cannot read it" in capsys.readouterr().err
 
 

@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from dhcal_pin.study_plot import plot
+from dhcal_pin.visualization.study_plot import plot
 
 HEADER = ["noise", "poses", "position_rms[m]", "orientation_rms[rad]", "length_error[m]", "angle_error[rad]"]
 ROWS = [

@@ -11,18 +11,18 @@ import pinocchio as pin
 import pytest
 from conftest import paper, random_table, robot_file, with_masses
 
-from dhcal_pin.arms import Arms
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.chain import Chain
-from dhcal_pin.cli import main
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.measurement_files import measurement_text
-from dhcal_pin.measurements import Noise
-from dhcal_pin.parameters import EXTENSIONS, select
-from dhcal_pin.poses import Pose
-from dhcal_pin.robot_files import read_robot, write_urdf
-from dhcal_pin.transmission import Payload
-from dhcal_pin.urdf import parse_urdf
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.cli.main import main
+from dhcal_pin.estimation.batch_chains import Arms
+from dhcal_pin.estimation.parameters import EXTENSIONS, select
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io.measurement_csv import measurement_text
+from dhcal_pin.io.robot import read_robot, write_urdf
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.robot.chain import Chain
+from dhcal_pin.robot.transmission import Payload
+from dhcal_pin.robot.urdf import parse_urdf
 
 
 def ur10() -> Chain:

@@ -5,12 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.lengths import Wires
-from dhcal_pin.measurements import Noise
-from dhcal_pin.positions import Position
-from dhcal_pin.trilateration import anchors_of, device_anchors, dilution, three_wires, trilaterate
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.length import Wires
+from dhcal_pin.measurements.position import Position
+from dhcal_pin.measurements.trilateration import (
+    anchors_of,
+    device_anchors,
+    dilution,
+    three_wires,
+    trilaterate,
+)
 
 A, B, C = 0.3, 0.25, -0.1
 # Anchors of an equilateral rig of 300 mm in the plane x = 0.

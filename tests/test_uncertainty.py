@@ -10,20 +10,20 @@ import pytest
 from conftest import URDF, robot_file
 
 from dhcal_pin import se3
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.chain import Chain
-from dhcal_pin.cli import main
-from dhcal_pin.dh_files import read_dh
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.measurement_files import measurement_text, read_measurements
-from dhcal_pin.measurements import Noise
-from dhcal_pin.parameters import select
-from dhcal_pin.poses import Pose
-from dhcal_pin.positions import Position
-from dhcal_pin.result import Result
-from dhcal_pin.robot_files import read_robot, sidecar_path, write_urdf
-from dhcal_pin.uncertainty import UNKNOWN
-from dhcal_pin.uncertainty_files import read_uncertainty
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.calibration.result import Result
+from dhcal_pin.cli.main import main
+from dhcal_pin.estimation.parameters import select
+from dhcal_pin.estimation.uncertainty import UNKNOWN
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io.dh_file import read_dh
+from dhcal_pin.io.measurement_csv import measurement_text, read_measurements
+from dhcal_pin.io.robot import read_robot, write_urdf
+from dhcal_pin.io.sidecar import read_uncertainty, sidecar_path
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.measurements.position import Position
+from dhcal_pin.robot.chain import Chain
 
 AWAY = se3.exp6(np.array([2.0, -1.0, 0.5, 0.3, -0.2, 2.0]))
 

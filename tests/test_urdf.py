@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 from lxml import etree
 
 from dhcal_pin import se3
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.urdf import parse_urdf, read_urdf
-from dhcal_pin.urdf_origins import with_origins
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.robot.urdf import parse_urdf, read_urdf
+from dhcal_pin.robot.urdf_edit import with_origins
 
 ROBOTS = Path(
     str(distribution("example-robot-data").locate_file("cmeel.prefix/share/example-robot-data/robots"))

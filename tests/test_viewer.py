@@ -15,19 +15,19 @@ from conftest import URDF, paper, robot_file
 from pages import CLICK, READY, SLIDE, Window, window_of
 
 from dhcal_pin import se3
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.chain import Chain
-from dhcal_pin.cli import main
-from dhcal_pin.errors import DhcalError
-from dhcal_pin.lengths import Distance
-from dhcal_pin.measurement_files import measurement_text
-from dhcal_pin.measurements import Noise
-from dhcal_pin.poses import Pose
-from dhcal_pin.positions import Position, Targets
-from dhcal_pin.result import Result
-from dhcal_pin.transmission import COUPLED, COUPLING_PRIOR, TERMS, Transmission
-from dhcal_pin.urdf import parse_urdf
-from dhcal_pin.viewer import scene_html, show
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.calibration.result import Result
+from dhcal_pin.cli.main import main
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io.measurement_csv import measurement_text
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.length import Distance
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.measurements.position import Position, Targets
+from dhcal_pin.robot.chain import Chain
+from dhcal_pin.robot.transmission import COUPLED, COUPLING_PRIOR, TERMS, Transmission
+from dhcal_pin.robot.urdf import parse_urdf
+from dhcal_pin.visualization.scene import scene_html, show
 
 FILES = {
     "ur10": ("ur_description/urdf/ur10_robot.urdf", None),

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dhcal_pin.calibration import calibrate
-from dhcal_pin.configurations import Room, Space
-from dhcal_pin.measurements import Noise
-from dhcal_pin.parameters import select
-from dhcal_pin.poses import Pose
-from dhcal_pin.workspace import workspace_map
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.diagnostics.workspace import workspace_map
+from dhcal_pin.estimation.parameters import select
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.robot.sampling import Room, Space
 
 NOISE = Noise(1e-4, np.deg2rad(0.01))
 

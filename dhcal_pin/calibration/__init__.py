@@ -1,0 +1,1 @@
+"""Calibration: from a nominal chain and measurements to a result with its accuracy."""

@@ -1,0 +1,24 @@
+"""What the small commands of `dhcal` do, once the command line is read.
+
+Wrong input is found before anything is written or shown; JSON goes to stdout, all else to stderr.
+"""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from dataclasses import asdict
+
+from ..io.robot import read_robot
+from ..paper.jacobian_check import crosscheck
+from . import console
+from .options import check_outputs, emit
+
+
+def check(args: Namespace) -> int:
+    """All routes to the Jacobian side by side; 1 where they disagree."""
+    check_outputs([args.json], [args.robot])
+    rows = crosscheck(read_robot(args.robot, args.tip))
+    agree = all(row.holds for row in rows)
+    emit(args.json, {"agree": agree, "routes": [asdict(row) | {"holds": row.holds} for row in rows]})
+    console.agreement(args.robot, rows)
+    return 0 if agree else 1

@@ -1,0 +1,1 @@
+"""Diagnostics: checks of input data and of residuals."""

@@ -1,0 +1,1 @@
+"""Least-squares estimation: error parameters, problem, QR, solvers, robust weights."""

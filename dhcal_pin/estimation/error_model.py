@@ -1,0 +1,143 @@
+"""A chain's unknown errors: each is a twist at a station, some scaled by what the joint does.
+
+Changes at one station act in the order of the list, M ← M·exp(x₁ξ₁)·exp(x₂ξ₂)…, so a parameter's value
+is always its whole error from the nominal chain, DH's changes are exact (its rotations and translations
+about one axis commute), and the derivative at any value is a twist again. A scaled one, such as a gain or
+a compliance, is an entry of the chain's transmission: its twist is the joint's own, times a term of the
+joint's value and load.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from .._kernels import move_stations
+from .._typing import Array
+from ..robot.chain import BASE, Chain, bodies_at
+from ..robot.transmission import Transmission
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One scalar error.
+
+    Attributes:
+        name: what users call it, as `d2` or `elbow_joint.rx`.
+        unit: "m" or "rad"; of a scaled one "1", "rad", "rad/Nm", "rad/rad", "rad/m".
+        nominal: the value that a drawing would show; zero for a pure error.
+        station: where it acts (see `chain`).
+        twist: (6,) [v, ω] in the station's frame.
+        prior: standard deviation expected before any measurement, in its unit.
+        entry: of a scaled one, where its coefficient stands in the transmission's flat coefficients.
+    """
+
+    name: str
+    unit: str
+    nominal: float
+    station: int
+    twist: tuple[float, ...]
+    prior: float
+    entry: int | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorModel:
+    """A nominal chain and p unknown errors, sorted by station.
+
+    Attributes:
+        chain: nominal.
+        parameters: (p,) the unknowns.
+        fixed: parameters of the same sets that are held at nominal.
+    """
+
+    chain: Chain
+    parameters: tuple[Parameter, ...]
+    fixed: tuple[Parameter, ...] = ()
+
+    @cached_property
+    def _geometry(self) -> int:
+        """How many parameters, the first ones, are plain twists."""
+        return sum(parameter.entry is None for parameter in self.parameters)
+
+    @cached_property
+    def _entries(self) -> Array:
+        return np.array([p.entry for p in self.parameters if p.entry is not None], int)
+
+    @property
+    def is_driven(self) -> bool:
+        """Whether its joints may miss their values."""
+        return bool(self._entries.size) or self.chain.transmission is not None
+
+    @cached_property
+    def _twists(self) -> Array:
+        return np.array([parameter.twist for parameter in self.parameters]).reshape(-1, 6)[: self._geometry]
+
+    @cached_property
+    def _stations(self) -> Array:
+        return np.array([parameter.station for parameter in self.parameters], int)[: self._geometry]
+
+    @cached_property
+    def _bodies(self) -> Array:
+        return bodies_at(self.chain, self._stations)
+
+    @property
+    def priors(self) -> Array:
+        """Prior standard deviations (p,), each in its parameter's unit."""
+        return np.array([parameter.prior for parameter in self.parameters])
+
+    def _moved(self, x: Array) -> tuple[Array, Array]:
+        """Motions of all stations (2k+4, 4, 4), and the plain twists (p, 6) as those of bodies."""
+        chain = self.chain
+        return move_stations(
+            chain.into, chain.origins, chain.tool, self._stations, self._twists, x[: self._geometry]
+        )
+
+    def at(self, x: Array) -> Chain:
+        """The chain with errors x (p,) in SI; its joints yield to the nominal arm's masses."""
+        x = np.ascontiguousarray(x, float)
+        return self._driven(self.chain.moved(self._moved(x)[0]), x)
+
+    def _driven(self, chain: Chain, x: Array) -> Chain:
+        """A chain with the transmission at x (p,)."""
+        if not self._entries.size:
+            return chain
+        held = self._transmission.changed(self._entries, x[self._geometry :])
+        return chain.driven(held)
+
+    @cached_property
+    def _transmission(self) -> Transmission:
+        return self.chain.transmission or Transmission.ideal(self.chain.loads)
+
+    def loaded(self, x: Array) -> ErrorModel:
+        """The same unknowns, with joints that yield to the masses as they are placed at x."""
+        held = replace(self._transmission, loads=self.at(x).loads)
+        return replace(self, chain=self.chain.driven(held))
+
+    def derivative(self, x: Array) -> tuple[Chain, Array, Array]:
+        """The chain at x, and for each parameter the body (p,) and twist (p, 6) it moves there.
+
+        Entries of the transmission come last, numbered behind the bodies (see `Chain.tool_velocities`).
+        """
+        x = np.ascontiguousarray(x, float)
+        motions, twists = self._moved(x)
+        chain, bodies = self._driven(self.chain.moved(motions), x), self._bodies
+        if not self._entries.size:
+            return chain, bodies, twists
+        entries = len(chain.moving) + 1 + self._entries
+        return chain, np.concatenate([bodies, entries]), np.pad(twists, ((0, len(entries)), (0, 0)))
+
+    def joined(self, parameters: Iterable[Parameter]) -> ErrorModel:
+        """With more unknowns, each where it belongs: by station, entries of the transmission last."""
+        both = (*self.parameters, *parameters)
+        ordered = sorted(both, key=lambda p: (-1 if p.entry is None else p.entry, p.station))
+        return replace(self, parameters=tuple(ordered))
+
+    def frames(self) -> ErrorModel | None:
+        """Base and tool alone, if any of them is unknown."""
+        outside = (BASE, self.chain.tool_station)
+        kept = tuple(p for p in self.parameters if p.station in outside)
+        return replace(self, parameters=kept) if kept else None

@@ -1,0 +1,1 @@
+"""Identifiability: what the measurements can determine."""

@@ -1,0 +1,1 @@
+"""Files: robots, measurements, sidecars, settings."""

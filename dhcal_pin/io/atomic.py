@@ -1,0 +1,90 @@
+"""Files written all or none, whatever comes in between."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import stat
+import tempfile
+from collections.abc import Mapping
+from contextlib import suppress
+
+from .._typing import PathLike
+from ..exceptions import DhcalError
+
+
+def check_place(path: PathLike) -> None:
+    """Complains unless a file can stand at a path.
+
+    Raises:
+        DhcalError: its folder is missing, or it is a folder itself.
+    """
+    folder = os.path.dirname(path) or os.curdir
+    if os.path.isdir(path):
+        raise DhcalError(f"{path}: is a folder; name a file in it")
+    if not os.path.isdir(folder):
+        raise DhcalError(f"{path}: there is no folder {folder}; make it first, or write elsewhere")
+
+
+def save(contents: Mapping[PathLike, str | bytes]) -> None:
+    """Writes all files or none: each beside its place first, then renamed over.
+
+    A link stays a link and what it leads to is written; a file that was there keeps its permissions.
+
+    Raises:
+        DhcalError: a folder is missing or not writable, a disk is full.
+    """
+    staged: list[tuple[str, PathLike]] = []
+    placed: list[tuple[str, PathLike]] = []
+    path: PathLike = ""
+    try:
+        for path, content in contents.items():
+            check_place(path)
+            real = os.path.realpath(path)
+            handle, name = tempfile.mkstemp(prefix=".dhcal-", dir=os.path.dirname(real))
+            staged.append((name, real))
+            with os.fdopen(handle, "wb") as file:
+                file.write(content.encode() if isinstance(content, str) else content)
+            os.chmod(name, _permissions(real))
+        for name, path in staged:
+            _keep(path, _spare(name))
+            os.replace(name, path)
+            placed.append((name, path))
+    except BaseException as error:
+        for name, done in reversed(placed):
+            if os.path.exists(_spare(name)):
+                os.replace(_spare(name), done)
+            else:
+                os.unlink(done)
+        if isinstance(error, OSError):
+            raise DhcalError(f"{path}: cannot write there: {error.strerror}; choose another place") from error
+        raise
+    finally:
+        for name, _ in staged:
+            for rest in (name, _spare(name)):
+                with suppress(FileNotFoundError):
+                    os.unlink(rest)
+
+
+def _permissions(path: str) -> int:
+    """Those of the file at a path, or those that a new one gets."""
+    try:
+        return stat.S_IMODE(os.stat(path).st_mode)
+    except FileNotFoundError:
+        mask = os.umask(0)
+        os.umask(mask)
+        return 0o666 & ~mask
+
+
+def _spare(name: str) -> str:
+    return f"{name}-old"
+
+
+def _keep(path: PathLike, spare: str) -> None:
+    """A second name for what stands at a path, if anything does."""
+    try:
+        os.link(path, spare)
+    except FileNotFoundError:
+        pass
+    except OSError:
+        shutil.copy2(path, spare)  # a file system without links

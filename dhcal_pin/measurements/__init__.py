@@ -1,0 +1,1 @@
+"""Measurement models: residuals and Jacobians of every supported instrument."""

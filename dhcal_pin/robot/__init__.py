@@ -1,0 +1,1 @@
+"""Robot models: kinematic chains from URDF and Denavit-Hartenberg tables."""

@@ -1,0 +1,245 @@
+"""The grid of a study: settings, their robots, how poses are chosen, and the file that names them."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._typing import Array, PathLike
+from ..estimation.batch import Batch
+from ..estimation.batch_chains import Arms
+from ..estimation.parameters import select
+from ..estimation.solver import METHODS
+from ..exceptions import DhcalError
+from ..io.robot import read_robot
+from ..io.shipped_files import paper_file
+from ..io.tabular import read_toml
+from ..measurements.base import Noise
+from ..measurements.registry import KINDS
+from ..planning.planner import plan
+from ..robot.chain import Chain
+from ..robot.sampling import joint_range
+from ..units import parse_noise
+
+# Calibrations a task: some tenths of a second.
+BLOCK = 100
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One point of the grid; every entry can be a list in the file.
+
+    Attributes:
+        robot: the nominal robot's file, beside the study or shipped.
+        tip: the tip link of URDFs; the deepest leaf without it.
+        truth: the true robot's file; without it the truth is the nominal robot with errors drawn.
+        errors: standard deviations of the true robot's parameters, length and angle.
+        wrong: the sets that these errors are in.
+        parameters: the sets that are identified.
+        kind: of measurement, one without unknowns of its own.
+        noise: its standard deviations an axis.
+        poses: how many are measured.
+        choice: how they are chosen, of `CHOICES`.
+        redrawn: whether the poses are drawn anew at each iteration; planned ones cannot be.
+        method: "lm" or "gn".
+        priors: "default" or "none".
+        iterations: most steps.
+    """
+
+    robot: str
+    tip: str = ""
+    truth: str = ""
+    errors: str = "1mm,0.3deg"
+    wrong: str = "placement"
+    parameters: str = "minimal,base,tool"
+    kind: str = "position"
+    noise: str = "0.1mm,0.01deg"
+    poses: int = 30
+    choice: str = "random"
+    redrawn: bool = False
+    method: str = "lm"
+    priors: str = "default"
+    iterations: int = 100
+
+
+def configurations(chain: Chain, count: int, rng: np.random.Generator, share: float = 1.0) -> Array:
+    """Uniform joint values (count, n) in the lower `share` of each joint's range."""
+    low, high = joint_range(chain)
+    return rng.uniform(low, low + share * (high - low), (count, chain.size))
+
+
+# How each arm's poses are drawn: all over the joints' ranges, or in their lowest quarter alone.
+DRAWN: dict[str, Callable[[Chain, int, np.random.Generator], Array]] = {
+    "random": configurations,
+    "corner": partial(configurations, share=0.25),
+}
+
+
+# Or all arms of a setting take those that `planning` chooses for the nominal one.
+PLANNED = "planned"
+
+
+CHOICES = (*DRAWN, PLANNED)
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A setting with its robots.
+
+    Attributes:
+        setting: what is simulated.
+        nominal: what the robots are thought to be.
+        truth: what they are; None where each draws its own errors.
+        poses: (poses, n) joint values that all of them take; None where each draws its own.
+    """
+
+    setting: Setting
+    nominal: Chain
+    truth: Chain | None
+    poses: Array | None = None
+
+    def planned(self, count: int, candidates: int = 5000) -> Array:
+        """Joint values (count, n) planned for the nominal robot, its kind, noise and parameters."""
+        setting = self.setting
+        return plan(
+            self.nominal,
+            count,
+            kind=setting.kind,
+            noise=Noise(*parse_noise(setting.noise)),
+            parameters=setting.parameters,
+            candidates=max(candidates, count),
+        ).q
+
+    def drawn(self, rng: np.random.Generator) -> Array:
+        """One arm's joint values (poses, n)."""
+        if self.poses is not None:
+            return self.poses
+        return DRAWN[self.setting.choice](self.nominal, self.setting.poses, rng)
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """A grid of settings.
+
+    Attributes:
+        title: what it asks.
+        seeds: calibrations a setting, seeded 0, 1, ….
+        cases: the settings, in the order of the file's lists, the last one fastest.
+        digest: of everything that the result depends on.
+        robots: the files that the settings' robots were read from.
+    """
+
+    title: str
+    seeds: int
+    cases: tuple[Case, ...]
+    digest: str
+    robots: tuple[str, ...]
+
+    def tasks(self) -> list[tuple[Case, int, int]]:
+        """Blocks of calibrations: case, first seed, and how many."""
+        return [
+            (case, first, min(BLOCK, self.seeds - first))
+            for case in self.cases
+            for first in range(0, self.seeds, BLOCK)
+        ]
+
+
+def read_study(path: PathLike) -> Study:
+    """A study's TOML file: `title`, `seeds`, and `[settings]` with `Setting`'s entries or lists of them.
+
+    Raises:
+        DhcalError: an unknown key, a value that does not fit, a robot that cannot be read.
+    """
+    document = read_toml(path)
+    where = os.fspath(path)
+    if odd := sorted(set(document) - {"title", "seeds", "settings"}):
+        raise DhcalError(f"{where}: {odd[0]!r} is not known; a study has title, seeds and [settings]")
+    seeds, table = document.get("seeds", 100), document.get("settings")
+    if isinstance(seeds, bool) or not isinstance(seeds, int) or not 1 <= seeds <= 10**6:
+        raise DhcalError(f"{where}: seeds = {seeds!r}: must be a whole number from 1 to 1000000")
+    if not isinstance(table, dict) or "robot" not in table:
+        raise DhcalError(f'{where}: no robot; write [settings] with robot = "arm.urdf" in it')
+    settings = [_checked(setting, where) for setting in _grid(table, where)]
+    arms = {(name, s.tip) for s in settings for name in (s.robot, s.truth) if name}
+    files = {name: os.fspath(_beside(name, path)) for name in sorted({name for name, _ in arms})}
+    chains = {(name, tip): read_robot(files[name], tip or None) for name, tip in sorted(arms)}
+    cases = [Case(s, chains[s.robot, s.tip], chains.get((s.truth, s.tip))) for s in settings]
+    different = {
+        (s.robot, s.tip, s.truth, s.kind, s.parameters, s.wrong, s.choice, s.noise): case
+        for case in cases
+        if (s := case.setting)
+    }
+    for case in different.values():
+        _tried(case, where)
+    digest = hashlib.sha256(repr((seeds, settings)).encode())
+    for chain in chains.values():
+        digest.update(chain.urdf.data + chain.origins.tobytes())
+    title, robots = str(document.get("title", "")), tuple(files.values())
+    return Study(title, seeds, tuple(cases), digest.hexdigest(), robots)
+
+
+def _grid(table: Mapping[str, Any], where: str) -> Iterator[Setting]:
+    types = {field.name: field.type for field in fields(Setting)}
+    lists = {}
+    for key, value in table.items():
+        if key not in types:
+            raise DhcalError(f"{where}: setting {key!r} is not known; there are {', '.join(types)}")
+        lists[key] = value if isinstance(value, list) else [value]
+        for entry in lists[key]:
+            if type(entry).__name__ != types[key]:
+                kind = {"str": "a text", "int": "a whole number", "bool": "true or false"}[str(types[key])]
+                raise DhcalError(f"{where}: setting {key} = {entry!r}: must be {kind}, or a list of such")
+        if not lists[key]:
+            raise DhcalError(f"{where}: setting {key} = []: give at least one value")
+    for values in product(*lists.values()):
+        yield Setting(**dict(zip(lists, values, strict=True)))
+
+
+def _checked(setting: Setting, where: str) -> Setting:
+    for key, known in (
+        ("kind", KINDS),
+        ("choice", CHOICES),
+        ("method", METHODS),
+        ("priors", ("default", "none")),
+    ):
+        if getattr(setting, key) not in known:
+            raise DhcalError(f"{where}: {key} = {getattr(setting, key)!r}: choose from {', '.join(known)}")
+    for key, least in (("poses", 1), ("iterations", 0)):
+        if not least <= getattr(setting, key) <= 10**5:
+            raise DhcalError(f"{where}: {key} = {getattr(setting, key)}: must be from {least} to 100000")
+    if setting.redrawn and setting.choice == PLANNED:
+        raise DhcalError(f"{where}: redrawn = true: planned poses are not drawn anew; set it to false")
+    for key in ("noise", "errors"):
+        parse_noise(getattr(setting, key), f"{where}: {key}")
+    return setting
+
+
+def _beside(name: str, path: PathLike) -> Path:
+    """A robot's file beside the study, or one of those shipped."""
+    near = Path(path).resolve().parent / name
+    return near if near.exists() else paper_file(name)
+
+
+def _tried(case: Case, where: str) -> None:
+    """Complains about what would only fail in the middle of the work."""
+    setting, nominal = case.setting, case.nominal
+    errors = select(nominal, setting.parameters)
+    select(nominal, setting.wrong)
+    if case.truth is not None:
+        Arms.of([errors, select(case.truth, setting.parameters)])
+    q = configurations(nominal, 8, np.random.default_rng(0))
+    data = KINDS[setting.kind].simulate(nominal, q, Noise(), np.random.default_rng(0))
+    try:
+        Batch(Arms.of([errors]), (data,), np.zeros(len(errors.parameters)))
+        if setting.choice == PLANNED:
+            case.planned(1, candidates=8)
+    except DhcalError as error:
+        raise DhcalError(f"{where}: kind = {setting.kind!r}: {error}") from None

@@ -1,0 +1,1 @@
+"""Visualization: plots and three-dimensional scenes."""

@@ -1,0 +1,286 @@
+"""What a robot's links look like: the visual geometry of its URDF, or rods and drums in its place.
+
+A shape is a dictionary for the page: the `body` it moves with, its `placement` there (12 numbers, upper
+rows, m), and `box`, `sphere`, `cylinder` with sizes in metres or `mesh`, a number in the list of meshes.
+"""
+
+from __future__ import annotations
+
+import base64
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import fast_simplification
+import numpy as np
+import pinocchio as pin
+
+from .. import se3
+from .._typing import Array
+from ..robot.chain import Chain
+from ..robot.dh_urdf import MATERIALS
+
+PathLike = str | os.PathLike[str]
+
+
+GRID = 8000  # mesh corners sit on a grid of this many steps along the longest side, 0.1 mm on most links
+
+
+COARSER = (400, 200, 100, 50, 25, 12, 6)  # grids for meshes that are simplified, one after the other
+
+
+NAMED = 3  # lost meshes that a note lists
+
+
+TRIAD = [MATERIALS[f"{axis}_axis"] for axis in "xyz"]
+
+
+@dataclass(frozen=True, eq=False)
+class Looks:
+    """How an arm is drawn.
+
+    Attributes:
+        shapes: of all bodies.
+        meshes: that the shapes refer to by number.
+        note: what is drawn in another way than the URDF says, for people; empty if nothing is.
+    """
+
+    shapes: list[dict[str, Any]]
+    meshes: list[Mesh]
+    note: str
+
+
+def looks(
+    chain: Chain, bodies: Sequence[dict[str, Any]], package_dirs: Sequence[PathLike] | None, triangles: int
+) -> Looks:
+    """What to draw for each body of an arm.
+
+    Args:
+        chain: the arm.
+        bodies: its tree, for the rods: each with `parent`, `placement` (12) and where it moves `axes`.
+        package_dirs: where to look for meshes; the folders above the URDF without it.
+        triangles: most of them that all meshes together keep.
+    """
+    if package_dirs is None:
+        package_dirs = list(Path(chain.urdf.source).absolute().parents)
+    # Pinocchio splits numbers at spaces only; XML allows any white space.
+    text = chain.urdf.data.decode("utf-8-sig").translate(dict.fromkeys(b"\t\r\n", " "))
+    model = pin.buildModelFromXML(text)
+    found, lost = _visuals(model, text, [os.fspath(path) for path in package_dirs])
+    if not len(found) and not lost:
+        every = set(range(len(bodies)))
+        return Looks(_skeleton(bodies, every), [], "Drawn as a skeleton: the URDF has no visual geometry.")
+    numbers: dict[tuple[bytes, ...], int] = {}
+    meshes: list[Mesh] = []
+    shapes = []
+    for item in found:
+        if any(np.allclose(item.meshColor, axis, atol=1e-6) for axis in TRIAD):
+            continue  # the URDF of a DH table draws its own tool frame; the page's is a layer
+        shape = _primitive(item.geometry)
+        if shape is None:
+            mesh = Mesh.of(item.geometry)
+            # Equal parts, such as the same motor five times, are sent once.
+            number = numbers.setdefault(mesh.key, len(meshes))
+            if number == len(meshes):
+                meshes.append(mesh)
+            shape = {"mesh": number}
+        body, placement = _home(model, chain, item.parentFrame, item.placement)
+        shapes.append({"body": body, "placement": rows(np.round(placement, 9)), **shape})
+    bare = {
+        _home(model, chain, model.getFrameId(link, pin.FrameType.BODY), pin.SE3.Identity())[0]
+        for link in lost
+    }
+    kept = shares([len(mesh.triangles) for mesh in meshes], triangles)
+    drawn = [mesh.simplified(most) for mesh, most in zip(meshes, kept, strict=True)]
+    return Looks(shapes + _skeleton(bodies, bare), drawn, _lost_note(lost))
+
+
+def rows(pose: Array) -> list[float]:
+    """The upper three rows of a pose (4, 4), in full."""
+    return (np.asarray(pose, float)[:3] + 0.0).ravel().tolist()
+
+
+# --- the URDF's visual geometry --------------------------------------------------------------------
+def _visuals(
+    model: pin.Model, text: str, folders: Sequence[str]
+) -> tuple[Sequence[pin.GeometryObject], dict[str, list[str]]]:
+    """What Pinocchio can draw, and by link the names of the meshes that are missing or unreadable."""
+    if (found := _loaded(model, text, folders)) is not None:
+        return found, {}
+    # One lost mesh makes Pinocchio refuse all: each is tried alone, in a robot that has nothing else.
+    robot = ElementTree.fromstring(text)
+    lost: dict[str, list[str]] = {}
+    for link in robot.findall("link"):
+        for visual in link.findall("visual"):
+            mesh = visual.find("geometry/mesh")
+            alone = ElementTree.Element("robot", name="one")
+            ElementTree.SubElement(alone, "link", name="one").append(visual)
+            one = ElementTree.tostring(alone, "unicode")
+            if mesh is not None and _loaded(pin.buildModelFromXML(one), one, folders) is None:
+                link.remove(visual)
+                lost.setdefault(link.get("name", ""), []).append(mesh.get("filename", ""))
+    return _loaded(model, ElementTree.tostring(robot, "unicode"), folders) or [], lost
+
+
+def _loaded(model: pin.Model, text: str, folders: Sequence[str]) -> Sequence[pin.GeometryObject] | None:
+    """All visual geometry, or None where a mesh of it cannot be had."""
+    try:
+        found = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.VISUAL, package_dirs=[*folders])
+    except (ValueError, RuntimeError):
+        return None
+    return found.geometryObjects
+
+
+def _lost_note(lost: dict[str, list[str]]) -> str:
+    if not lost:
+        return ""
+    names = [f"{os.path.basename(name)} ({link})" for link, files in lost.items() for name in files]
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return f"Drawn as rods, because meshes are missing or unreadable: {', '.join(names[:NAMED])}{more}."
+
+
+def _home(model: pin.Model, chain: Chain, frame: int, placement: pin.SE3) -> tuple[int, Array]:
+    """The body that a thing on a link's frame belongs to and its pose (4, 4) there.
+
+    What is fixed to the tip moves with the tip. `placement` is the thing's in its moving joint.
+    """
+    tip, joint = chain.frame_id, int(model.frames[frame].parentJoint)
+    while frame != tip and model.frames[frame].type != pin.FrameType.JOINT and frame > 0:
+        frame = model.frames[frame].parentFrame
+    if frame != tip:
+        return joint, placement.homogeneous
+    return model.njoints, (model.frames[tip].placement.inverse() * placement).homogeneous
+
+
+def _primitive(geometry: Any) -> dict[str, Any] | None:
+    """A box, sphere or cylinder with its sizes in metres; None for a mesh."""
+    kind = type(geometry).__name__
+    if kind == "Box":
+        return {"box": (2 * geometry.halfSide).tolist()}
+    if kind == "Sphere":
+        return {"sphere": geometry.radius}
+    if kind in ("Cylinder", "Capsule"):
+        return {"cylinder": [geometry.radius, 2 * geometry.halfLength]}
+    return None
+
+
+# --- meshes ----------------------------------------------------------------------------------------
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles (t, 3) between corners (v, 3) that are `origin` + `step` · whole numbers, m."""
+
+    origin: Array
+    step: float
+    corners: Array
+    triangles: Array
+
+    @classmethod
+    def of(cls, geometry: Any) -> Mesh:
+        """What coal read from a file."""
+        faces = [(t[0], t[1], t[2]) for t in map(geometry.tri_indices, range(geometry.num_tris))]
+        return cls.on_grid(np.asarray(geometry.vertices(), float), np.array(faces, int).reshape(-1, 3))
+
+    @classmethod
+    def on_grid(cls, corners: Array, triangles: Array, grid: int = GRID) -> Mesh:
+        """Corners that fall together are one; triangles that vanish or come twice are left out."""
+        origin, size = corners.min(0), np.ptp(corners, axis=0).max()
+        step = size / grid or 1.0
+        x, y, z = np.round((corners - origin) / step).astype(np.int64).T
+        # One whole number a corner is found again faster than three.
+        kept, place = np.unique((x << 32) + (y << 16) + z, return_inverse=True)
+        cells = np.stack([kept >> 32, kept >> 16 & 0xFFFF, kept & 0xFFFF], -1).astype("<u2")
+        triangles = place[triangles]
+        a, b, c = triangles.T
+        triangles = triangles[(a != b) & (b != c) & (c != a)]
+        low, middle, high = np.sort(triangles, axis=1).T
+        once = np.unique((low * len(kept) + middle) * len(kept) + high, return_index=True)[1]
+        return cls(np.round(origin, 9), float(step), cells, triangles[np.sort(once)])
+
+    @property
+    def places(self) -> Array:
+        """The corners (v, 3), m."""
+        return self.origin + self.step * self.corners
+
+    @property
+    def key(self) -> tuple[bytes, ...]:
+        """The same for equal meshes."""
+        return self.origin.tobytes(), self.corners.tobytes(), self.triangles.tobytes()
+
+    def simplified(self, most: int) -> Mesh:
+        """With at most so many triangles, by collapsing the edges that change its form least."""
+        mesh = self
+        for grid in COARSER:
+            if len(mesh.triangles) <= most:
+                break
+            # Slivers between the teeth of a thread keep edges from collapsing: a coarser grid takes them.
+            mesh = Mesh.on_grid(mesh.places, mesh.triangles, grid)
+            if len(mesh.triangles) > most:
+                corners, triangles = fast_simplification.simplify(
+                    mesh.places / mesh.step, mesh.triangles, target_count=most
+                )[:2]
+                mesh = Mesh.on_grid(mesh.step * corners, np.asarray(triangles, int))
+        return mesh
+
+    def encoded(self) -> dict[str, Any]:
+        """For the page: base64 of little-endian integers, the triangles' of `bytes` bytes each."""
+        width = 2 if len(self.corners) <= 1 << 16 else 4
+        return {
+            "origin": self.origin.tolist(),
+            "step": self.step,
+            "bytes": width,
+            "corners": base64.b64encode(self.corners.tobytes()).decode(),
+            "triangles": base64.b64encode(self.triangles.astype(f"<u{width}").tobytes()).decode(),
+        }
+
+
+def shares(counts: Sequence[int], total: int) -> list[int]:
+    """How many of its triangles each mesh keeps, all together at most `total`.
+
+    A mesh of four times as many as another keeps twice as many, so that both lose detail alike; small
+    ones stay whole.
+    """
+    left, roots = float(total), np.sqrt(counts)
+    rate = np.inf
+    for i in np.argsort(roots):
+        rate = left / roots[roots >= roots[i]].sum()
+        if roots[i] > rate:
+            break
+        left -= counts[i]
+    return np.minimum(counts, rate * roots).astype(int).tolist()
+
+
+# --- rods and drums --------------------------------------------------------------------------------
+def _skeleton(bodies: Sequence[dict[str, Any]], bare: set[int]) -> list[dict[str, Any]]:
+    """For bare bodies, a drum on the moving joint and rods from it to all the joints behind."""
+    ends = [np.reshape(body["placement"], (3, 4))[:, 3] for body in bodies]
+    radius = 0.02 * (sum(float(np.linalg.norm(end)) for end in ends[1:]) or 1.0)
+    return [
+        {"body": body, "placement": rows(np.round(pose, 9)), "cylinder": size}
+        for body, pose, size in _rods(bodies, ends, radius)
+        if body in bare
+    ]
+
+
+def _rods(
+    bodies: Sequence[dict[str, Any]], ends: Sequence[Array], radius: float
+) -> Iterator[tuple[int, Array, list[float]]]:
+    """Body, pose (4, 4) there, and radius and length in m of every rod and drum."""
+    yield 0, *_rod(np.zeros(3), np.array([0.0, 0.0, -0.6 * radius]), 4 * radius)
+    for i, (body, end) in enumerate(zip(bodies, ends, strict=True)):
+        if i and np.linalg.norm(end) > 1e-6:
+            yield body["parent"], *_rod(np.zeros(3), end, radius)
+        if "axes" in body:
+            half = 1.8 * radius * np.array(body["axes"][0])
+            yield i, *_rod(-half, half, 1.6 * radius)
+
+
+def _rod(start: Array, end: Array, radius: float) -> tuple[Array, list[float]]:
+    """A cylinder between two points (3,): its pose (4, 4), radius and length, m."""
+    z = (end - start) / np.linalg.norm(end - start)
+    x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
+    x /= np.linalg.norm(x)
+    pose = se3.transform(np.stack([x, np.cross(z, x), z], -1), 0.5 * (start + end))
+    return pose, [radius, float(np.linalg.norm(end - start))]
