@@ -13,9 +13,8 @@ import numpy as np
 from .._typing import Array
 from ..estimation import robust
 from ..estimation.parameters import select
-from ..estimation.priors import Families, Priors, are_default, prior_weights, rescaled
+from ..estimation.priors import Families, Priors, are_default, prior_weights
 from ..estimation.problem import Problem, shared_unknowns
-from ..estimation.robust import studentized_residuals
 from ..estimation.solver import METHODS, Progress, levenberg_marquardt
 from ..exceptions import DhcalError
 from ..measurements.base import Measurement
@@ -23,7 +22,7 @@ from ..parallel import HERE, Workers
 from ..robot.chain import BASE, Chain
 from .initialization import placed, problem_of, refitted
 from .result import Result
-from .reweighting import MOST_ROUNDS, estimate_variance_components, with_sigma_scales
+from .reweighting import Fit, reweight
 from .shrinkage import kept_share
 
 Method = Literal["lm", "gn"]
@@ -124,16 +123,7 @@ def calibrate(
         DhcalError: no data, unknown names, or a plain Gauss-Newton loop that runs away.
     """
     data = tuple(data) if isinstance(data, Sequence) else (data,)
-    if not sum(len(item.rows) for item in data):
-        raise DhcalError("no measurements to fit")
-    if method not in METHODS:
-        raise DhcalError(f"method {method!r}: choose from {', '.join(METHODS)}")
-    if loss not in robust.LOSSES:
-        raise DhcalError(f"loss {loss!r}: choose from {', '.join(robust.LOSSES)}")
-    if loss not in ("auto", "linear") and method != "lm":
-        raise DhcalError(f"loss {loss!r} needs method lm; the paper's loop weighs all rows alike")
-    if bounds and method != "lm":
-        raise DhcalError("bounds need method lm; the paper's loop knows none")
+    _check_options(data, method, loss, bounds)
     for item in (*data, *holdout):
         chain.checked(item.configurations())
     priors = priors if priors is not None else ("none" if method == "gn" else "default")
@@ -144,64 +134,66 @@ def calibrate(
     problem = replace(problem_of(errors, data, prior_weights(errors, priors), known), where=where)
     if bounds:
         problem = replace(problem, bounds=_bounds(problem, bounds))
-    default = are_default(errors, priors)
-    # Until sigmas and priors are settled, too, where the loop nearly ends is enough.
-    loop = partial(levenberg_marquardt, nearly=True) if method == "lm" else METHODS[method]
-    solution, earlier = loop(problem, np.zeros(len(problem.weights)), max_iterations, progress), 0
-    if errors.is_driven:
-        # Gravity's torques follow the arm as found: once more with those.
-        errors = errors.loaded(solution.x[: len(errors.parameters)])
-        problem = replace(problem, errors=errors)
-        earlier = solution.iterations
-        solution = loop(problem, solution.x, max_iterations, progress)
-    weights, kept = [np.ones(len(item.rows)) for item in data], 1.0
+    fit = _solve(problem, method, max_iterations, progress)
+    kept = 1.0
     if method == "lm":
-        # Sigmas and weights that the fit itself tells: a few rounds settle them.
-        scales = np.ones(sum(len(item.groups) for item in data))
-        expected, ended = problem.weights, False
-        families = Families.of(errors, expected, default)
-        (how, *later), moved = robust.LOSSES[loss], np.inf
-        for left in reversed(range(MOST_ROUNDS)):
-            found = estimate_variance_components(problem, solution, data, weights)
-            weighed = with_sigma_scales(data, found)
-            if how == "all":
-                moved = 0.0
-            else:
-                score = studentized_residuals(problem, solution, weighed, weights)
-                weights, moved = robust.reweighted(weights, score, how, moved)
-                weighed = tuple(item.weighted(w) for item, w in zip(weighed, weights, strict=True))
-            priors_now = rescaled(problem, solution, families)
-            changes = np.log(found / scales), (priors_now - problem.weights) / np.fmax(expected, 1e-300)
-            settled = max(moved, *(np.abs(change).max(initial=0.0) for change in changes)) < 0.01
-            if settled and later:
-                if how != "all" or any(
-                    map(robust.suspect, studentized_residuals(problem, solution, weighed, weights))
-                ):
-                    (how, *later), moved = later, np.inf
-                    continue
-                later = []
-            if settled and ended:
-                break
-            ended = settled or left < 2
-            if settled or all(new is old for new, old in zip(weighed, problem.data, strict=True)):
-                problem, going_on = problem.held(priors_now), solution
-            else:
-                problem = problem.of(weighed).held(priors_now)
-                scales, going_on, earlier = found, None, earlier + solution.iterations
-            loop = partial(levenberg_marquardt, before=going_on, nearly=not ended)
-            solution = loop(problem, solution.x, max_iterations, progress)
-        kept = kept_share(problem, solution, families.groups())
-    x = kept * solution.x
-    found = errors.at(x[: len(errors.parameters)]).loaded() if kept else refitted(errors, data, known)
+        families = Families.of(errors, problem.weights, are_default(errors, priors))
+        fit = reweight(fit, loss, families, max_iterations, progress)
+        kept = kept_share(fit.problem, fit.solution, families.groups())
+    return _result(fit, kept, tuple(holdout), method)
+
+
+def _check_options(
+    data: Sequence[Measurement],
+    method: str,
+    loss: str,
+    bounds: Mapping[str, tuple[float, float]] | None,
+) -> None:
+    """Raise DhcalError if there are no data or options contradict each other."""
+    if not sum(len(item.rows) for item in data):
+        raise DhcalError("no measurements to fit")
+    if method not in METHODS:
+        raise DhcalError(f"method {method!r}: choose from {', '.join(METHODS)}")
+    if loss not in robust.LOSSES:
+        raise DhcalError(f"loss {loss!r}: choose from {', '.join(robust.LOSSES)}")
+    if loss not in ("auto", "linear") and method != "lm":
+        raise DhcalError(f"loss {loss!r} needs method lm; the paper's loop weighs all rows alike")
+    if bounds and method != "lm":
+        raise DhcalError("bounds need method lm; the paper's loop knows none")
+
+
+def _solve(problem: Problem, method: Method, max_iterations: int, progress: Progress | None) -> Fit:
+    """Solve a problem with unit weights; `reweight` iterates method "lm" to full convergence later."""
+    solve = partial(levenberg_marquardt, nearly=True) if method == "lm" else METHODS[method]
+    solution = solve(problem, np.zeros(len(problem.weights)), max_iterations, progress)
+    weights = tuple(np.ones(len(item.rows)) for item in problem.data)
+    fit = Fit(problem.data, problem, solution, weights)
+    errors = problem.errors
+    if not errors.is_driven:
+        return fit
+    # The gravity torques depend on the arm that was found: solve again with those.
+    problem = replace(problem, errors=errors.loaded(solution.x[: len(errors.parameters)]))
+    again = solve(problem, solution.x, max_iterations, progress)
+    return replace(fit, problem=problem, solution=again, previous_iterations=solution.iterations)
+
+
+def _result(fit: Fit, kept: float, holdout: tuple[Measurement, ...], method: str) -> Result:
+    """Build the result from a fit and the fraction of its correction that is kept."""
+    problem, errors = fit.problem, fit.problem.errors
+    x = kept * fit.solution.x
+    if kept:
+        found = errors.at(x[: len(errors.parameters)]).loaded()
+    else:
+        found = refitted(errors, fit.data, problem.known)
     return Result(
         errors=errors,
         x=x,
         chain=found,
-        data=data,
-        holdout=tuple(holdout),
+        data=fit.data,
+        holdout=holdout,
         problem=problem,
-        solution=replace(solution, iterations=earlier + solution.iterations),
+        solution=replace(fit.solution, iterations=fit.iterations),
         method=method,
-        weights=tuple(weights),
+        weights=fit.weights,
         kept=kept,
     )

@@ -1,22 +1,146 @@
-"""From a nominal chain and measurements to a calibrated one."""
+"""Iterative reweighting: noise scales, prior widths and robust weights that the fit itself determines.
+
+The least-squares problem depends on three sets of numbers that are not known beforehand:
+
+- the standard deviation of each group of residuals whose instrument does not state it (variance components),
+- the width of the default priors (evidence procedure, MacKay 1992),
+- the weight of each sample under a robust loss (iteratively reweighted least squares).
+
+Each round estimates all three from the current solution, and solves the problem again. The rounds end when
+none of the numbers changes by more than 1 %.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from .._typing import Array
-from ..estimation import qr
+from ..estimation import qr, robust
+from ..estimation.priors import Families, rescaled
 from ..estimation.problem import Problem
-from ..estimation.solver import Solution
+from ..estimation.robust import studentized_residuals
+from ..estimation.solver import Progress, Solution, levenberg_marquardt
 from ..measurements.base import Measurement
 
-# Sigmas are not estimated below a nanometre and a nanoradian.
+# Smallest scale of a standard deviation: a nanometre or a nanoradian for a placeholder of 1 mm or 1 mrad.
 LEAST_SCALE = 1e-6
-
-
+# Largest number of rounds.
 MOST_ROUNDS = 30
+# Rounds end when no scale, prior or weight changes by more than this fraction.
+CHANGE_TOL = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Solved least-squares problem with the sample weights that it was solved with.
+
+    Attributes:
+        data: Measurements with their own standard deviations, without robust weights.
+        problem: Problem as it was solved, with scaled standard deviations and robust weights.
+        solution: Solution of `problem`.
+        weights: Robust weight of each sample, one array of shape (m,) per measurement.
+        previous_iterations: Number of iterations of the solutions before this one.
+    """
+
+    data: tuple[Measurement, ...]
+    problem: Problem
+    solution: Solution
+    weights: tuple[Array, ...]
+    previous_iterations: int = 0
+
+    @property
+    def iterations(self) -> int:
+        """Number of iterations of all solutions."""
+        return self.previous_iterations + self.solution.iterations
+
+
+@dataclass(frozen=True, eq=False)
+class ReweightState:
+    """State between two rounds of `reweight`.
+
+    Attributes:
+        fit: Current fit.
+        scales: Scale of the standard deviation of each residual group, shape (g,).
+        stages: Robust stages that are left, the current one first; see `robust.LOSSES`.
+        weight_change: Largest change of a robust weight in the last round.
+        is_final: Whether the last solution was iterated to full convergence.
+        is_done: Whether all numbers have settled.
+    """
+
+    fit: Fit
+    scales: Array
+    stages: tuple[str, ...]
+    weight_change: float = np.inf
+    is_final: bool = False
+    is_done: bool = False
+
+
+def reweight(fit: Fit, loss: str, groups: Families, max_iterations: int, progress: Progress | None) -> Fit:
+    """Solve a problem again until noise scales, prior widths and robust weights have settled.
+
+    Args:
+        fit: Fit with unit scales, unit weights and the expected prior widths.
+        loss: Key of `robust.LOSSES`.
+        groups: Parameters whose default priors share one scale.
+        max_iterations: Largest number of iterations of one solution.
+        progress: Called with the iteration and the cost.
+
+    Returns:
+        The fit of the last round.
+    """
+    expected = fit.problem.weights
+    state = ReweightState(fit, np.ones(sum(len(item.groups) for item in fit.data)), robust.LOSSES[loss])
+    for rounds_left in reversed(range(MOST_ROUNDS)):
+        state = _next_round(state, groups, expected, rounds_left, max_iterations, progress)
+        if state.is_done:
+            break
+    return state.fit
+
+
+def _next_round(
+    state: ReweightState,
+    groups: Families,
+    expected: Array,
+    rounds_left: int,
+    max_iterations: int,
+    progress: Progress | None,
+) -> ReweightState:
+    """Estimate scales, priors and weights from the current solution, and solve again if they changed."""
+    fit, stage = state.fit, state.stages[0]
+    problem, solution, weights, change = fit.problem, fit.solution, fit.weights, 0.0
+    scales = estimate_variance_components(problem, solution, fit.data, weights)
+    weighted = with_sigma_scales(fit.data, scales)
+    if stage != "all":
+        residuals = studentized_residuals(problem, solution, weighted, weights)
+        weights, change = robust.reweighted(weights, residuals, stage, state.weight_change)
+        weighted = tuple(item.weighted(w) for item, w in zip(weighted, weights, strict=True))
+    priors = rescaled(problem, solution, groups)
+    relative = np.log(scales / state.scales), (priors - problem.weights) / np.fmax(expected, 1e-300)
+    has_settled = max(change, *(np.abs(each).max(initial=0.0) for each in relative)) < CHANGE_TOL
+    state = replace(state, fit=replace(fit, weights=tuple(weights)), weight_change=change)
+    if has_settled and len(state.stages) > 1:
+        if stage != "all" or any(
+            map(robust.suspect, studentized_residuals(problem, solution, weighted, weights))
+        ):
+            return replace(state, stages=state.stages[1:], weight_change=np.inf)
+        state = replace(state, stages=state.stages[:1])
+    if has_settled and state.is_final:
+        return replace(state, is_done=True)
+    is_final = has_settled or rounds_left < 2
+    if has_settled or all(new is old for new, old in zip(weighted, problem.data, strict=True)):
+        # Same rows: continue the previous iteration with the new priors.
+        problem, before, earlier = problem.held(priors), solution, fit.previous_iterations
+    else:
+        problem, before, earlier = problem.of(weighted).held(priors), None, fit.iterations
+        state = replace(state, scales=scales)
+    solution = levenberg_marquardt(
+        problem, solution.x, max_iterations, progress, before=before, nearly=not is_final
+    )
+    fit = replace(state.fit, problem=problem, solution=solution, previous_iterations=earlier)
+    return replace(state, fit=fit, is_final=is_final)
 
 
 def estimate_variance_components(
