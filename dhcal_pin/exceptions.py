@@ -1,7 +1,25 @@
-"""The one root of everything a user can cause."""
-
-from __future__ import annotations
+"""Exceptions: every error that a user can cause is a `DhcalError` with a message of one line."""
 
 
-class DhcalError(ValueError):
-    """Wrong input: its text is one line that names the place, what is wrong and what would be right."""
+class DhcalError(Exception):
+    """Base class of all errors that a user can cause."""
+
+
+class FileFormatError(DhcalError):
+    """A file cannot be read or written, or its content is invalid."""
+
+
+class UnknownNameError(DhcalError):
+    """A name is not among the known ones: a parameter, set, measurement kind, joint, link, column or option."""
+
+
+class InvalidArgumentError(DhcalError):
+    """An argument has a wrong type, shape or value, or arguments contradict each other."""
+
+
+class NotObservableError(DhcalError):
+    """The measurements cannot determine what was asked for."""
+
+
+class ConvergenceError(DhcalError):
+    """An iteration diverged."""

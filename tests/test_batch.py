@@ -15,11 +15,11 @@ from dhcal_pin.estimation.problem import Problem
 from dhcal_pin.estimation.qr import row_space
 from dhcal_pin.estimation.solver import METHODS
 from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.measurements import KINDS
 from dhcal_pin.measurements.base import Noise, joined
 from dhcal_pin.measurements.length import Wires
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.measurements.position import Position
-from dhcal_pin.measurements.registry import KINDS
 from dhcal_pin.parallel import workers
 from dhcal_pin.robot.chain import Chain
 

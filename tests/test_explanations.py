@@ -18,10 +18,10 @@ from dhcal_pin.estimation.problem import Problem, reduce
 from dhcal_pin.identifiability import explanations
 from dhcal_pin.identifiability.null_space import Experiment, Group, groups
 from dhcal_pin.identifiability.propagation import Path
+from dhcal_pin.measurements import KINDS
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.measurements.position import Position
-from dhcal_pin.measurements.registry import KINDS
 from dhcal_pin.robot.chain import Chain
 from dhcal_pin.robot.dh import DHTable
 

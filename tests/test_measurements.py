@@ -18,11 +18,11 @@ from dhcal_pin.estimation.parameters import select
 from dhcal_pin.estimation.problem import Problem, reduce
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io.measurement_csv import measurement_text, read_measurements
+from dhcal_pin.measurements import KINDS
 from dhcal_pin.measurements.base import Noise, derivatives
 from dhcal_pin.measurements.contact import Plane, PointDistance, Touch
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.measurements.position import Position
-from dhcal_pin.measurements.registry import KINDS
 
 KIND = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 

@@ -16,8 +16,8 @@ from dhcal_pin.estimation.qr import with_priors
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io.robot import read_robot, write_urdf
 from dhcal_pin.io.sidecar import read_uncertainty
+from dhcal_pin.measurements import KINDS
 from dhcal_pin.measurements.base import Noise
-from dhcal_pin.measurements.registry import KINDS
 from dhcal_pin.planning.criteria import Determinant
 from dhcal_pin.planning.exchange import Pool, basis, exchange, greedy
 from dhcal_pin.planning.information import Information

@@ -13,10 +13,10 @@ from dhcal_pin import se3
 from dhcal_pin.cli import main
 from dhcal_pin.diagnostics.input_checks import doubts
 from dhcal_pin.io.measurement_csv import measurement_text, read_readings
+from dhcal_pin.measurements import KINDS
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.length import Wires
 from dhcal_pin.measurements.position import Position
-from dhcal_pin.measurements.registry import KINDS
 from dhcal_pin.robot.chain import Chain, joint_station
 from dhcal_pin.robot.inverse_kinematics import within
 

@@ -23,10 +23,10 @@ from dhcal_pin.calibration.result import Result
 from dhcal_pin.cli import main
 from dhcal_pin.diagnostics import residuals
 from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.measurements import KINDS
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.measurements.position import Position
-from dhcal_pin.measurements.registry import KINDS
 from dhcal_pin.report import document, html
 from dhcal_pin.report.sections import markdown, study
 from dhcal_pin.robot.chain import Chain

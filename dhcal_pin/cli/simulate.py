@@ -13,8 +13,8 @@ from ..exceptions import DhcalError
 from ..io.atomic import save
 from ..io.measurement_csv import measurement_text
 from ..io.robot import is_table, read_robot
+from ..measurements import KINDS
 from ..measurements.base import Noise
-from ..measurements.registry import KINDS
 from ..robot.sampling import joint_range
 from ..units import parse_noise
 from . import console

@@ -6,8 +6,8 @@ import difflib
 from collections.abc import Iterable, Mapping
 
 from ..exceptions import DhcalError
+from ..measurements import KINDS
 from ..measurements.base import Measurement
-from ..measurements.registry import KINDS
 from ..robot.chain import Chain
 from ..units import ANGLES, LENGTHS
 from .tabular import Sheet, check_names

@@ -14,8 +14,8 @@ from ..estimation.problem import Problem, reduce
 from ..estimation.solver import gauss_newton
 from ..exceptions import DhcalError
 from ..identifiability import observability
+from ..measurements import KINDS
 from ..measurements.base import Measurement, Noise
-from ..measurements.registry import KINDS
 from ..robot.chain import Chain
 from .experiment import paper_arm
 

@@ -17,8 +17,8 @@ from ..estimation.priors import Priors, prior_weights
 from ..estimation.problem import reduce
 from ..estimation.uncertainty import Uncertainty
 from ..exceptions import DhcalError
+from ..measurements import KINDS
 from ..measurements.base import Measurement, Noise, derivatives
-from ..measurements.registry import KINDS
 from ..robot.chain import Chain
 from .exchange import basis
 

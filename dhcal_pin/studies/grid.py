@@ -22,8 +22,8 @@ from ..exceptions import DhcalError
 from ..io.robot import read_robot
 from ..io.shipped_files import paper_file
 from ..io.tabular import read_toml
+from ..measurements import KINDS
 from ..measurements.base import Noise
-from ..measurements.registry import KINDS
 from ..planning.planner import plan
 from ..robot.chain import Chain
 from ..robot.sampling import joint_range

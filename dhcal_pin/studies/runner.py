@@ -19,8 +19,8 @@ from .._typing import Array
 from ..estimation.batch import Batch, solve
 from ..estimation.batch_chains import Arms
 from ..estimation.parameters import select
+from ..measurements import KINDS
 from ..measurements.base import Noise, joined
-from ..measurements.registry import KINDS
 from ..parallel import HERE, Workers
 from ..units import parse_noise
 from .grid import PLANNED, Case, Setting, Study, configurations

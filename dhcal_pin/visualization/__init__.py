@@ -1,1 +1,9 @@
-"""Visualization: plots and three-dimensional scenes."""
+"""Visualization: plots, and three-dimensional scenes in MeshCat."""
+
+from .scene import Scene, scene_html, show
+
+__all__ = [
+    "Scene",
+    "scene_html",
+    "show",
+]
