@@ -1,7 +1,7 @@
 """Robot kinematic calibration on Pinocchio: a robot and measurements in, the corrected URDF out.
 
-Lengths are metres and angles radians everywhere. Joint positions q have shape (m, n), one row per sample; poses
-have shape (m, 4, 4); twists are [v, ω]; T_ab is the pose of frame b in frame a.
+Lengths are metres and angles radians everywhere. Joint positions q have shape (m, n), one row per sample;
+poses have shape (m, 4, 4); twists are [v, ω]; T_ab is the pose of frame b in frame a.
 
 The public names are listed in `__init__.pyi`. Each is loaded on first use, so that `import dhcal_pin` and
 `dhcal --help` are fast.

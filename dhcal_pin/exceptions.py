@@ -1,7 +1,7 @@
 """Exceptions: every error that a user can cause is a `DhcalError` with a message of one line."""
 
 
-class DhcalError(Exception):
+class DhcalError(ValueError):
     """Base class of all errors that a user can cause."""
 
 
@@ -10,7 +10,7 @@ class FileFormatError(DhcalError):
 
 
 class UnknownNameError(DhcalError):
-    """A name is not among the known ones: a parameter, set, measurement kind, joint, link, column or option."""
+    """A parameter, parameter set, measurement kind, joint, link, column or option is unknown."""
 
 
 class InvalidArgumentError(DhcalError):
