@@ -1,9 +1,9 @@
 """Public names of dhcal_pin; `__init__.py` loads each on first use."""
 
+from .calibration.cross_validation import blocked_folds as blocked_folds
 from .calibration.cross_validation import cross_validate as cross_validate
-from .calibration.cross_validation import group_folds as group_folds
-from .calibration.cross_validation import random_folds as random_folds
-from .calibration.cross_validation import region_folds as region_folds
+from .calibration.cross_validation import k_fold as k_fold
+from .calibration.cross_validation import leave_one_group_out as leave_one_group_out
 from .calibration.evaluation import accuracy as accuracy
 from .calibration.model_selection import extend as extend
 from .calibration.procedure import calibrate as calibrate
@@ -13,9 +13,9 @@ from .calibration.streaming import calibrate_stream as calibrate_stream
 from .compensation import Compensation as Compensation
 from .compensation import compensate as compensate
 from .diagnostics.workspace import workspace_map as workspace_map
-from .estimation.batch import Batch as Batch
-from .estimation.batch import solve as solve
-from .estimation.parameters import select as select
+from .estimation.batch import BatchProblem as BatchProblem
+from .estimation.batch import solve_batch as solve_batch
+from .estimation.parameters import select_parameters as select_parameters
 from .estimation.uncertainty import Prediction as Prediction
 from .exceptions import DhcalError as DhcalError
 from .io.dh_file import read_dh as read_dh
@@ -25,21 +25,21 @@ from .io.measurement_csv import read_targets as read_targets
 from .io.robot import read_robot as read_robot
 from .io.robot import write_urdf as write_urdf
 from .measurements.base import Noise as Noise
+from .measurements.contact import PointContact as PointContact
 from .measurements.contact import PointDistance as PointDistance
-from .measurements.contact import Touch as Touch
 from .measurements.pose import Pose as Pose
 from .measurements.position import Position as Position
-from .paper.error_factors import error_factors as error_factors
+from .paper.factors import error_factors as error_factors
 from .paper.jacobian_check import crosscheck as crosscheck
 from .planning.planner import Plan as Plan
 from .planning.planner import plan as plan
 from .report.document import Provenance as Provenance
 from .report.html import write_report as write_report
 from .robot.chain import Chain as Chain
-from .robot.chain import extract as extract
+from .robot.chain import extract_dh_table as extract_dh_table
 from .robot.dh import DHTable as DHTable
 from .robot.dh_urdf import dh_to_urdf as dh_to_urdf
-from .robot.sampling import Space as Space
+from .robot.sampling import WorkspaceConstraints as WorkspaceConstraints
 from .robot.transmission import Payload as Payload
 from .visualization.live import Live as Live
 from .visualization.live import serve as serve

@@ -22,15 +22,15 @@ from ._typing import Array
 from .exceptions import DhcalError
 from .robot.chain import Chain
 from .robot.inverse_kinematics import (
-    REACHED,
-    Gap,
-    joint_velocities,
-    size,
-    solve,
-    to_poses,
-    to_positions,
-    unlimited,
-    within,
+    REACHED_TOL,
+    TaskError,
+    characteristic_length,
+    pose_task,
+    position_task,
+    solve_ik,
+    tool_pose_and_jacobian,
+    without_rotary_limits,
+    wrap_into_limits,
 )
 from .se3 import nearest_rotation
 
@@ -38,11 +38,11 @@ OK, SINGULAR, LIMITS, OUT = "ok", "near singular", "joint limits", "out of reach
 
 
 # A motion of the tool, by a thousandth of the arm's size or of a radian, that takes the joints 0.2 rad.
-_SINGULAR = 5e-3
+_NEAR_SINGULAR_TOL = 5e-3
 
 
 # Configurations known beforehand, and how many of the best are taken along from round to round.
-_KNOWN, _FOLLOWED = 8192, 4
+_N_CONFIGURATIONS, _N_BEST = 8192, 4
 
 
 # Round after round for targets that are not reached: from how many of the known ones with how many steps, if
@@ -54,7 +54,7 @@ _ROUNDS = ((8, 60, np.inf), (64, 60, np.inf), (512, 300, 0.3))
 _CHUNK = 512
 
 
-_SKEW = 1e-6
+_ROTATION_TOL = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,14 +67,14 @@ class Compensation:
             with its own base and tool, has the tool at `q`.
         status: (m,) "ok", "near singular" (reached, but little of the tool takes much of the joints),
             "joint limits" (reached only beyond them) or "out of reach".
-        miss: (m, 2) how far the calibrated tool stays from the targets, m and rad; the nearest that was
+        residual_error: (m, 2) how far the calibrated tool stays from the targets, m and rad; the nearest that was
             found where they are not reached. The second is 0 for targets without a rotation.
     """
 
     q: Array
     poses: Array
     status: tuple[str, ...]
-    miss: Array
+    residual_error: Array
 
     @property
     def reached(self) -> Array:
@@ -113,22 +113,22 @@ def compensate(
             f"they must be those of {nominal.urdf.source}: {', '.join(nominal.joint_names)}"
         )
     targets = _checked(targets)
-    near = calibrated.checked(_middle(calibrated) if near is None else np.asarray(near, float))
+    near = calibrated.validated_q(_mid_range(calibrated) if near is None else np.asarray(near, float))
     if len(near) not in (1, len(targets)):
         raise DhcalError(f"near has {len(near)} rows; give one, or one a target ({len(targets)})")
-    near = np.broadcast_to(near, (len(targets), calibrated.size))
-    search = _Search.of(calibrated, targets.ndim == 3)
+    near = np.broadcast_to(near, (len(targets), calibrated.n_joints))
+    search = _Search.from_chain(calibrated, targets.ndim == 3)
     parts = []
     for first in range(0, len(targets), _CHUNK):
         chunk = slice(first, first + _CHUNK)
-        parts.append(search.found(targets[chunk], near[chunk]))
+        parts.append(search.find(targets[chunk], near[chunk]))
         if progress is not None:
             progress(min(first + _CHUNK, len(targets)))
     q, status, miss = (np.concatenate(part) for part in zip(*parts, strict=True))
     reached = np.flatnonzero(status == OK)
     poses = np.full((len(q), 4, 4), np.nan)
     poses[reached] = nominal.poses(q[reached])
-    delicate = _delicate(nominal, calibrated, targets[reached], q[reached])
+    delicate = _is_near_singular(nominal, calibrated, targets[reached], q[reached])
     status[reached[delicate]] = SINGULAR
     return Compensation(q, poses, tuple(status.tolist()), miss)
 
@@ -142,13 +142,13 @@ def _checked(targets: ArrayLike) -> Array:
         )
     if out.ndim == 3:
         turns = nearest_rotation(out[:, :3, :3])
-        if np.abs(turns - out[:, :3, :3]).max() > _SKEW or np.any(out[:, 3] != (0, 0, 0, 1)):
+        if np.abs(turns - out[:, :3, :3]).max() > _ROTATION_TOL or np.any(out[:, 3] != (0, 0, 0, 1)):
             raise DhcalError("targets: a pose is a rotation and a position over a last row 0 0 0 1")
         out[:, :3, :3] = turns
     return out
 
 
-def _middle(chain: Chain) -> Array:
+def _mid_range(chain: Chain) -> Array:
     """The middle (n,) of each joint's limits, or what is nearest to zero where there is one or none."""
     both = np.isfinite(chain.lower) & np.isfinite(chain.upper)
     with np.errstate(invalid="ignore"):
@@ -163,75 +163,81 @@ class _Search:
         chain: base and tool included.
         q: (c, n) joint values within the limits.
         tree: of their tools.
-        turned: whether rotations matter.
+        with_rotations: whether rotations matter.
     """
 
     chain: Chain
     q: Array
     tree: cKDTree
-    turned: bool
+    with_rotations: bool
 
     @classmethod
-    def of(cls, chain: Chain, turned: bool) -> _Search:
+    def from_chain(cls, chain: Chain, turned: bool) -> _Search:
         """Always the same configurations."""
-        span = np.where(chain.sliding, size(chain), np.pi)
-        middle = _middle(chain)
+        span = np.where(chain.is_prismatic, characteristic_length(chain), np.pi)
+        middle = _mid_range(chain)
         low, high = np.maximum(chain.lower, middle - span), np.minimum(chain.upper, middle + span)
-        q = np.random.default_rng(0).uniform(low, high, (_KNOWN, chain.size))
+        q = np.random.default_rng(0).uniform(low, high, (_N_CONFIGURATIONS, chain.n_joints))
         # A heavy import that no other command needs.
         from scipy.spatial import cKDTree
 
-        return cls(chain, q, cKDTree(_places(chain.poses(q), turned, size(chain))), turned)
+        return cls(
+            chain, q, cKDTree(_search_points(chain.poses(q), turned, characteristic_length(chain))), turned
+        )
 
     def starts(self, targets: Array, count: int) -> Array:
         """Joint values (m, count, n) that bring the tool near targets."""
-        places = _places(targets, True, size(self.chain)) if self.turned else targets
+        places = (
+            _search_points(targets, True, characteristic_length(self.chain))
+            if self.with_rotations
+            else targets
+        )
         return self.q[self.tree.query(places, range(1, count + 1))[1]]
 
-    def solved(self, chain: Chain, targets: Array, starts: Array, steps: int) -> tuple[Array, Array]:
+    def solve(self, chain: Chain, targets: Array, starts: Array, steps: int) -> tuple[Array, Array]:
         """Joint values (m, c, n) of a chain from starts, and how far (m, c) they miss the targets, m."""
         m, count, n = starts.shape
-        q, wide = solve(
-            chain, _gap(chain, targets), starts.reshape(-1, n), steps, np.repeat(np.arange(m), count)
+        q, wide = solve_ik(
+            chain, _task_error(chain, targets), starts.reshape(-1, n), steps, np.repeat(np.arange(m), count)
         )
         return q.reshape(m, count, n), wide.reshape(m, count)
 
-    def found(self, targets: Array, near: Array) -> tuple[Array, Array, Array]:
+    def find(self, targets: Array, near: Array) -> tuple[Array, Array, Array]:
         """Joint values (m, n), status (m,) and miss (m, 2) of targets, nearest to `near` (m, n)."""
         m, n = near.shape
         q, status, miss = np.full((m, n), np.nan), np.full(m, OUT, dtype=object), np.full((m, 2), np.nan)
-        scale = np.where(self.chain.sliding, size(self.chain), 1.0)
-        best, missed = np.repeat(near[:, None], _FOLLOWED, 1), np.zeros(m)
+        scale = np.where(self.chain.is_prismatic, characteristic_length(self.chain), 1.0)
+        best, missed = np.repeat(near[:, None], _N_BEST, 1), np.zeros(m)
         for count, steps, share in _ROUNDS:
-            left = np.flatnonzero((status == OUT) & (missed <= share * size(self.chain)))
+            left = np.flatnonzero((status == OUT) & (missed <= share * characteristic_length(self.chain)))
             if not left.size:
                 continue
             starts = np.concatenate([best[left], self.starts(targets[left], count)], 1)
-            tried, _ = self.solved(self.chain, targets[left], starts, steps)
+            tried, _ = self.solve(self.chain, targets[left], starts, steps)
             # Whole turns less; an arm's errors need not repeat with them.
-            tried, _ = within(self.chain, tried, near[left, None])
-            tried, wide = self.solved(self.chain, targets[left], tried, steps)
+            tried, _ = wrap_into_limits(self.chain, tried, near[left, None])
+            tried, wide = self.solve(self.chain, targets[left], tried, steps)
             away = np.linalg.norm((tried - near[left, None]) / scale, axis=2)
             # Those that are there first, the nearest before others; then those that miss least.
-            order = np.lexsort([np.where(wide <= REACHED, away, wide), wide > REACHED])[:, :_FOLLOWED]
+            order = np.lexsort([np.where(wide <= REACHED_TOL, away, wide), wide > REACHED_TOL])[:, :_N_BEST]
             best[left] = np.take_along_axis(tried, order[..., None], 1)
             missed[left] = wide.min(1)
             chosen = best[left, 0]
-            miss[left] = _miss(self.chain, chosen, targets[left])
+            miss[left] = _tool_error(self.chain, chosen, targets[left])
             inside = np.all((chosen >= self.chain.lower) & (chosen <= self.chain.upper), 1)
-            good = np.all(miss[left] <= REACHED, 1) & inside
+            good = np.all(miss[left] <= REACHED_TOL, 1) & inside
             q[left[good]], status[left[good]] = chosen[good], OK
         left = np.flatnonzero(status == OUT)
-        _, wide = self.solved(unlimited(self.chain), targets[left], best[left], _ROUNDS[-1][1])
-        status[left[np.any(wide <= REACHED, 1)]] = LIMITS
+        _, wide = self.solve(without_rotary_limits(self.chain), targets[left], best[left], _ROUNDS[-1][1])
+        status[left[np.any(wide <= REACHED_TOL, 1)]] = LIMITS
         return q, status, miss
 
 
-def _gap(chain: Chain, targets: Array) -> Gap:
-    return to_positions(targets) if targets.ndim == 2 else to_poses(targets, size(chain))
+def _task_error(chain: Chain, targets: Array) -> TaskError:
+    return position_task(targets) if targets.ndim == 2 else pose_task(targets, characteristic_length(chain))
 
 
-def _places(poses: Array, turned: bool, length: float) -> Array:
+def _search_points(poses: Array, turned: bool, length: float) -> Array:
     """Points (m, 3), or (m, 12) with rotations in them, that are near to each other where poses are."""
     if not turned:
         return poses[:, :3, 3]
@@ -239,7 +245,7 @@ def _places(poses: Array, turned: bool, length: float) -> Array:
     return np.concatenate([poses[:, :3, 3], poses[:, :3, :3].reshape(-1, 9) * length / np.sqrt(2)], 1)
 
 
-def _miss(chain: Chain, q: Array, targets: Array) -> Array:
+def _tool_error(chain: Chain, q: Array, targets: Array) -> Array:
     """Distance in m and angle in rad (m, 2) of the tool from targets; no angle where they have none."""
     poses = chain.poses(q)
     if targets.ndim == 2:
@@ -250,23 +256,26 @@ def _miss(chain: Chain, q: Array, targets: Array) -> Array:
     )
 
 
-def _delicate(nominal: Chain, calibrated: Chain, targets: Array, q: Array) -> Array:
+def _is_near_singular(nominal: Chain, calibrated: Chain, targets: Array, q: Array) -> Array:
     """Which solutions (m,) stand at a singularity, or so near that the correction leads across it."""
     # A controller is told a pose in any case.
     asked = slice(6 if targets.ndim == 3 else 3)
-    out = np.minimum(_least(nominal, q, slice(6)), _least(calibrated, q, asked)) < _SINGULAR
-    if nominal.size > 6:
+    out = (
+        np.minimum(_min_singular_value(nominal, q, slice(6)), _min_singular_value(calibrated, q, asked))
+        < _NEAR_SINGULAR_TOL
+    )
+    if nominal.n_joints > 6:
         return out  # A redundant arm's controller is free in any case.
     # A controller that comes from the uncorrected target must end in the same joint values.
     told = replace(nominal, base=calibrated.base, tool=calibrated.tool)
-    before, _ = solve(told, _gap(told, targets), q)
-    commanded, _ = solve(nominal, to_poses(nominal.poses(q), size(nominal)), before)
-    return out | np.any(_miss(calibrated, commanded, targets) > REACHED, 1)
+    before, _ = solve_ik(told, _task_error(told, targets), q)
+    commanded, _ = solve_ik(nominal, pose_task(nominal.poses(q), characteristic_length(nominal)), before)
+    return out | np.any(_tool_error(calibrated, commanded, targets) > REACHED_TOL, 1)
 
 
-def _least(chain: Chain, q: Array, rows: slice) -> Array:
+def _min_singular_value(chain: Chain, q: Array, rows: slice) -> Array:
     """The smallest motion (m,) of the tool, lengths in sizes of the arm, that a unit of the joints makes."""
-    twists = joint_velocities(chain, q)[1]
-    twists[:, :3] /= size(chain)
-    twists[:, :, chain.sliding] *= size(chain)
+    twists = tool_pose_and_jacobian(chain, q)[1]
+    twists[:, :3] /= characteristic_length(chain)
+    twists[:, :, chain.is_prismatic] *= characteristic_length(chain)
     return np.linalg.svd(twists[:, rows], compute_uv=False)[:, -1]

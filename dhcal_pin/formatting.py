@@ -14,34 +14,36 @@ RATES = {"rad/Nm": (1e6, " µrad/Nm"), "rad/rad": (1e3, " mrad/rad"), "rad/m": (
 UNITS = {"m": (1e3, " mm"), "rad": (180 / math.pi, "°"), **RATES}
 
 
-SMALL = {"m": (1e3, " mm"), "rad": (1e3, " mrad"), **RATES}
+SMALL_UNITS = {"m": (1e3, " mm"), "rad": (1e3, " mrad"), **RATES}
 
 
 # Digits behind the point where no uncertainty says how many are known; and never more than MOST.
-PLAIN = 3
+DEFAULT_DECIMALS = 3
 
 
-MOST = 6
+MAX_DECIMALS = 6
 
 
-LONG = 48
+MAX_UNBROKEN_CHARS = 48
 
 
-def digits(std: float) -> int:
+def significant_decimals(std: float) -> int:
     """Digits behind the point for an uncertainty: two of its own up to 35, else one (Particle Data Group)."""
     if not (math.isfinite(std) and std > 0):
-        return PLAIN
+        return DEFAULT_DECIMALS
     power = math.floor(math.log10(std))
     leading = std / 10.0**power
-    return min(max((1 if leading < 3.55 or leading >= 9.5 else 0) - power - (leading >= 9.5), 0), MOST)
+    return min(
+        max((1 if leading < 3.55 or leading >= 9.5 else 0) - power - (leading >= 9.5), 0), MAX_DECIMALS
+    )
 
 
-def fixed(value: float, places: int) -> str:
+def format_fixed(value: float, places: int) -> str:
     """A number with so many digits behind the point; a dash where it is unknown, and no minus zero."""
     return f"{round(value, places) + 0.0:.{places}f}" if math.isfinite(value) else "–"
 
 
-def shown(value: float, unit: str, std: float = math.nan, small: bool = False) -> str:
+def format_quantity(value: float, unit: str, std: float = math.nan, small: bool = False) -> str:
     """A value with its unit, rounded to its standard deviation where that is known.
 
     Args:
@@ -54,8 +56,8 @@ def shown(value: float, unit: str, std: float = math.nan, small: bool = False) -
         return "–"
     if unit not in UNITS:
         return f"{value:.3g} {unit}".removesuffix(" 1")
-    factor, name = (SMALL if small else UNITS)[unit]
-    return f"{fixed(factor * value, digits(factor * std))}{name}"
+    factor, name = (SMALL_UNITS if small else UNITS)[unit]
+    return f"{format_fixed(factor * value, significant_decimals(factor * std))}{name}"
 
 
 @dataclass(frozen=True)
@@ -65,13 +67,13 @@ class Table:
     Attributes:
         header: names of the columns.
         rows: their cells.
-        texts: how many of the first columns are text; the others are numbers.
+        n_text_columns: how many of the first columns are text; the others are numbers.
         caption: what it shows.
     """
 
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
-    texts: int = 1
+    n_text_columns: int = 1
     caption: str = ""
 
 
@@ -80,13 +82,19 @@ def html_table(table: Table, drawings: Mapping[str, Sequence[str]] | None = None
     drawn = drawings or {}
 
     def cell(tag: str, i: int, text: str) -> str:
-        look = ' class="number"' if i >= table.texts else ' class="long"' if len(text) > LONG else ""
+        look = (
+            ' class="number"'
+            if i >= table.n_text_columns
+            else ' class="long"'
+            if len(text) > MAX_UNBROKEN_CHARS
+            else ""
+        )
         scope = ' scope="row"' if tag == "th" else ""
-        content = html.escape(text).replace("-", "−") if i >= table.texts else html.escape(text)
+        content = html.escape(text).replace("-", "−") if i >= table.n_text_columns else html.escape(text)
         return f"<{tag}{scope}{look}>{content}</{tag}>"
 
     head = "".join(
-        f'<th scope="col"{" class=number" if i >= table.texts else ""}>{html.escape(name)}</th>'
+        f'<th scope="col"{" class=number" if i >= table.n_text_columns else ""}>{html.escape(name)}</th>'
         for i, name in enumerate(table.header)
     )
     head += "".join(f'<th scope="col">{html.escape(name)}</th>' for name in drawn)
@@ -101,7 +109,7 @@ def html_table(table: Table, drawings: Mapping[str, Sequence[str]] | None = None
 
 def markdown_table(table: Table) -> str:
     """A Markdown table, numbers to the right."""
-    rules = [" --- " if i < table.texts else " ---: " for i in range(len(table.header))]
+    rules = [" --- " if i < table.n_text_columns else " ---: " for i in range(len(table.header))]
     lines = ["| " + " | ".join(table.header) + " |", "|" + "|".join(rules) + "|"]
     lines += ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in table.rows]
     return "\n".join(lines)

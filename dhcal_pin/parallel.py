@@ -19,16 +19,16 @@ _Done = TypeVar("_Done")
 
 
 @dataclass(frozen=True)
-class Workers:
+class TaskExecutor:
     """Any `concurrent.futures` executor, or none for this process.
 
     Attributes:
         executor: processes, threads, a cluster's.
-        ahead: how many tasks are handed out before the first of them is back.
+        max_in_flight: how many tasks are handed out before the first of them is back.
     """
 
     executor: Executor | None = None
-    ahead: int = 8
+    max_in_flight: int = 8
 
     def map(self, function: Callable[[_Task], _Done], tasks: Iterable[_Task]) -> Iterator[_Done]:
         """Results in the order of the tasks, of which never more than `ahead` are in memory."""
@@ -40,7 +40,7 @@ class Workers:
         try:
             for task in tasks:
                 waiting.append(self.executor.submit(function, task))
-                if len(waiting) >= self.ahead:
+                if len(waiting) >= self.max_in_flight:
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()
@@ -49,11 +49,11 @@ class Workers:
                 future.cancel()
 
 
-HERE = Workers()
+SERIAL = TaskExecutor()
 
 
 @contextmanager
-def workers(jobs: int = 1, scheduler: str | None = None) -> Iterator[Workers]:
+def open_executor(jobs: int = 1, scheduler: str | None = None) -> Iterator[TaskExecutor]:
     """This process, `jobs` processes, or the cluster of a Dask scheduler at an address.
 
     Raises:
@@ -62,12 +62,12 @@ def workers(jobs: int = 1, scheduler: str | None = None) -> Iterator[Workers]:
     if scheduler:
         with _cluster(scheduler) as client:
             threads = sum(client.nthreads().values())
-            yield Workers(client.get_executor(pure=False), 2 * max(threads, 1))
+            yield TaskExecutor(client.get_executor(pure=False), 2 * max(threads, 1))
     elif jobs > 1:
         with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
-            yield Workers(pool, 2 * jobs)
+            yield TaskExecutor(pool, 2 * jobs)
     else:
-        yield HERE
+        yield SERIAL
 
 
 def _cluster(address: str) -> Any:

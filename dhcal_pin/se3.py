@@ -167,6 +167,6 @@ def nearest_rotation(matrix: Array) -> Array:
     return u @ vt
 
 
-def six_numbers(origin: Array) -> list[float]:
+def to_xyz_rpy(origin: Array) -> list[float]:
     """x, y, z in m and roll, pitch, yaw in rad of an origin (4, 4)."""
     return [float(v) + 0.0 for v in (*origin[:3, 3], *pin.rpy.matrixToRpy(origin[:3, :3]))]

@@ -15,17 +15,17 @@ from conftest import paper
 from scipy.optimize import least_squares
 
 from dhcal_pin.calibration.procedure import calibrate
-from dhcal_pin.estimation.batch import Batch, Solutions, solve
-from dhcal_pin.estimation.batch_chains import Arms
-from dhcal_pin.estimation.parameters import select
-from dhcal_pin.measurements.base import Noise, joined
+from dhcal_pin.estimation.batch import BatchProblem, BatchResult, solve_batch
+from dhcal_pin.estimation.batch_chains import ChainBatch
+from dhcal_pin.estimation.parameters import select_parameters
+from dhcal_pin.measurements.base import Noise, concatenate
 from dhcal_pin.measurements.pose import Pose
-from dhcal_pin.parallel import HERE, Workers, workers
+from dhcal_pin.parallel import SERIAL, TaskExecutor, open_executor
 from dhcal_pin.robot.chain import Chain
 
 MANY, FEW, SLOW = 1000, 20, 4
 NOMINAL, ACTUAL = (Chain.from_dh(paper(name)) for name in ("sim_6dof", "sim_6dof_actual"))
-ERRORS = select(NOMINAL, "dh")
+ERRORS = select_parameters(NOMINAL, "dh")
 
 
 def measured(seed: int) -> Pose:
@@ -35,13 +35,13 @@ def measured(seed: int) -> Pose:
 
 def differences(data: Pose) -> np.ndarray:
     """What people do: SciPy, two-point differences, and Pinocchio a sample at a time."""
-    model, k = NOMINAL.model.copy(), len(NOMINAL.moving)
+    model, k = NOMINAL.model.copy(), len(NOMINAL.moving_joints)
     state = model.createData()
-    joints = [model.getJointId(name) for name in NOMINAL.moving]
+    joints = [model.getJointId(name) for name in NOMINAL.moving_joints]
     origins = [model.jointPlacements[i].copy() for i in joints]
     tip = model.frames[NOMINAL.frame_id].placement.copy()
     goals = [pin.SE3(pose) for pose in data.poses]
-    twists = [(p.station, np.array(p.twist)) for p in ERRORS.parameters]
+    twists = [(p.error_frame, np.array(p.twist)) for p in ERRORS.parameters]
 
     def residual(x: np.ndarray) -> np.ndarray:
         left = [pin.SE3.Identity() for _ in range(k + 1)]
@@ -69,10 +69,12 @@ def differences(data: Pose) -> np.ndarray:
 def rows(repeats: int) -> list[Row]:
     """Stacked calibrations against single ones and differences, and two processes against one."""
     data = [measured(seed) for seed in range(MANY)]
-    batch = Batch(Arms.of([ERRORS] * MANY), (joined(data),), np.zeros(len(ERRORS.parameters)))
+    batch = BatchProblem(
+        ChainBatch.from_models([ERRORS] * MANY), (concatenate(data),), np.zeros(len(ERRORS.parameters))
+    )
 
-    def stacked(where: Workers = HERE) -> Solutions:
-        return solve(batch, "lm", where=where)
+    def stacked(where: TaskExecutor = SERIAL) -> BatchResult:
+        return solve_batch(batch, "lm", executor=where)
 
     def singles() -> None:
         for item in data[:FEW]:
@@ -84,11 +86,11 @@ def rows(repeats: int) -> list[Row]:
 
     ours, single, other = clocked([stacked, singles, slow], repeats)
     ours, single, other = ours / MANY, single / FEW, other / SLOW
-    with workers(jobs=2) as two:
+    with open_executor(jobs=2) as two:
         stacked(two)
         spent: tuple[list[float], list[float]] = ([], [])
         for _ in range(repeats):
-            for where, times in zip((two, HERE), spent, strict=True):
+            for where, times in zip((two, SERIAL), spent, strict=True):
                 start = time.perf_counter()
                 stacked(where)
                 times.append(time.perf_counter() - start)

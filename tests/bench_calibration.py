@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.estimation.error_model import ErrorModel
 from dhcal_pin.estimation.problem import Problem
-from dhcal_pin.measurements.base import derivatives
+from dhcal_pin.measurements.base import whitened_jacobian
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.robot.chain import Chain
 
@@ -26,7 +26,7 @@ def by_pinocchio(errors: ErrorModel, data: Pose, weights: np.ndarray) -> Callabl
     scratch = model.createData()
     rows = errors.chain.configurations(data.q)
     seen = [pin.SE3(pose) for pose in data.poses]
-    joints = [model.getJointId(name) for name in errors.chain.moving]
+    joints = [model.getJointId(name) for name in errors.chain.moving_joints]
     sigmas = np.concatenate([data.sigma, data.rotation_sigma], 1)
 
     def residual(x: np.ndarray) -> np.ndarray:
@@ -49,17 +49,19 @@ def by_pinocchio(errors: ErrorModel, data: Pose, weights: np.ndarray) -> Callabl
 def analytic(problem: Problem) -> tuple[Callable[..., np.ndarray], Callable[..., np.ndarray]]:
     """The same residuals and their Jacobian by our kernel, all samples at once."""
     errors, (data,) = problem.errors, problem.data
-    motion = errors.chain.motion(data.q)
+    motion = errors.chain.joint_state(data.q)
 
     def residual(x: np.ndarray) -> np.ndarray:
-        rows = data.residual(errors.at(x).sweep(motion), NONE)
+        rows = data.residual(errors.at(x).forward_kinematics(motion), NONE)
         return np.concatenate([rows.ravel(), problem.weights * x])
 
     def jacobian(x: np.ndarray) -> np.ndarray:
         chain, bodies, twists = errors.derivative(x)
-        sweep = chain.sweep(motion)
-        velocities = chain.tool_velocities(sweep, bodies, twists)
-        rows = derivatives(data, sweep, velocities, NONE, data.residual(sweep, NONE)).reshape(len(x), -1)
+        frames = chain.forward_kinematics(motion)
+        velocities = chain.tool_jacobian(frames, bodies, twists)
+        rows = whitened_jacobian(data, frames, velocities, NONE, data.residual(frames, NONE)).reshape(
+            len(x), -1
+        )
         return np.concatenate([-rows.T, np.diag(problem.weights)])
 
     return residual, jacobian

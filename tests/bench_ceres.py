@@ -69,7 +69,7 @@ def solved(residual, jacobian, start: np.ndarray, parts: list) -> np.ndarray:
 
 def alone(problem: Problem, start: np.ndarray) -> np.ndarray:
     """Where our own loop ends on the same least squares."""
-    return levenberg_marquardt(problem.of(problem.data), start, 100, None).x
+    return levenberg_marquardt(problem.with_data(problem.data), start, 100, None).x
 
 
 def main(m: int, repeats: int) -> None:

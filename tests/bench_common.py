@@ -11,7 +11,7 @@ from conftest import paper, robot_file
 
 from dhcal_pin import se3
 from dhcal_pin.estimation.error_model import ErrorModel
-from dhcal_pin.estimation.parameters import select
+from dhcal_pin.estimation.parameters import select_parameters
 from dhcal_pin.estimation.problem import Problem
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.pose import Pose
@@ -88,19 +88,21 @@ def serial(joints: int) -> DHTable:
 def measured(chain: Chain, sets: str, m: int, seed: int = 0) -> tuple[ErrorModel, np.ndarray, Pose]:
     """An arm with errors of a millimetre and a milliradian in a frame of its own: model, truth, poses."""
     rng = np.random.default_rng(seed)
-    errors = select(chain, sets)
+    errors = select_parameters(chain, sets)
     truth = 1e-3 * rng.standard_normal(len(errors.parameters))
     real = errors.at(truth)
     if "base" in sets:
-        real = real.displaced({0: se3.exp6(np.array([0.4, -0.2, 0.1, 0.2, -0.3, 1.0]))})
-    q = rng.uniform(-2.5, 2.5, (m, chain.size))
+        real = real.perturbed_at({0: se3.exp6(np.array([0.4, -0.2, 0.1, 0.2, -0.3, 1.0]))})
+    q = rng.uniform(-2.5, 2.5, (m, chain.n_joints))
     return errors, truth, Pose.simulate(real, q, Noise(1e-4, 1e-4), rng)
 
 
 def problem(chain: Chain, sets: str, m: int) -> tuple[Problem, np.ndarray]:
     """The calibration as the solver sees it, and the truth, near which an iteration is clocked."""
     rng = np.random.default_rng(0)
-    errors = select(chain, sets)
+    errors = select_parameters(chain, sets)
     truth = 1e-3 * rng.standard_normal(len(errors.parameters))
-    data = Pose.simulate(errors.at(truth), rng.uniform(-2.5, 2.5, (m, chain.size)), Noise(1e-4, 1e-4), rng)
+    data = Pose.simulate(
+        errors.at(truth), rng.uniform(-2.5, 2.5, (m, chain.n_joints)), Noise(1e-4, 1e-4), rng
+    )
     return Problem(errors, (data,), 1 / errors.priors), truth

@@ -8,13 +8,13 @@ from bench_common import Row, clocked, panda, problem, robots, serial
 from scipy.linalg import lapack
 
 from dhcal_pin import se3
-from dhcal_pin._kernels.work_arrays import scratch
+from dhcal_pin._kernels.work_arrays import work_array
 from dhcal_pin.estimation.error_model import ErrorModel
-from dhcal_pin.estimation.parameters import select
-from dhcal_pin.estimation.problem import CHUNK, reduce
-from dhcal_pin.estimation.qr import pseudo_inverse, with_priors
-from dhcal_pin.measurements.base import derivatives
-from dhcal_pin.robot.chain import Chain, link_station
+from dhcal_pin.estimation.parameters import select_parameters
+from dhcal_pin.estimation.problem import CHUNK_SIZE, linearize_and_factor
+from dhcal_pin.estimation.qr import append_priors, pseudo_inverse
+from dhcal_pin.measurements.base import whitened_jacobian
+from dhcal_pin.robot.chain import Chain, link_frame
 
 
 def iteration(chain: Chain, sets: str, m: int, repeats: int) -> tuple[float, float]:
@@ -23,14 +23,14 @@ def iteration(chain: Chain, sets: str, m: int, repeats: int) -> tuple[float, flo
     none = np.empty(0)
 
     def ours() -> np.ndarray:
-        free = with_priors(reduce(case, x, small_angle=False), case.weights, x)
+        free = append_priors(linearize_and_factor(case, x, small_angle=False), case.weights, x)
         return pseudo_inverse(free.r, free.z)
 
     (data,) = case.data
     nominal, bodies, twists = case.errors.derivative(x)
-    sweep = nominal.sweep(data.q)
-    residual = data.residual(sweep, none)
-    rows = derivatives(data, sweep, nominal.tool_velocities(sweep, bodies, twists), none, residual)
+    frames = nominal.forward_kinematics(data.q)
+    residual = data.residual(frames, none)
+    rows = whitened_jacobian(data, frames, nominal.tool_jacobian(frames, bodies, twists), none, residual)
     whole = np.concatenate([rows.reshape(len(x), -1), residual.reshape(1, -1)])
     room = np.empty_like(whole)
 
@@ -59,18 +59,18 @@ def iterations(sizes: tuple[int, ...], repeats: int) -> list[Row]:
 
 def jacobian(chain: Chain, sets: str, m: int, repeats: int) -> tuple[float, float, float]:
     """Seconds of our kernel and of Pinocchio's loop, and the largest difference of their Jacobians."""
-    errors = select(chain, sets)
-    q = np.random.default_rng(1).uniform(-2.5, 2.5, (m, chain.size))
+    errors = select_parameters(chain, sets)
+    q = np.random.default_rng(1).uniform(-2.5, 2.5, (m, chain.n_joints))
     _, bodies, twists = errors.derivative(np.zeros(len(errors.parameters)))
     out = np.empty((len(bodies), 6, m))
 
     def ours() -> None:
         # In pieces that stay in the caches, as the solver takes them.
-        for at in range(0, m, CHUNK):
-            motion = chain.motion(q[at : at + CHUNK])
-            k, some = motion.values.shape
-            sweep = chain.sweep(motion, scratch("sweep", k + 2, 7, 3, some))
-            chain.tool_velocities(sweep, bodies, twists, out[..., at : at + CHUNK])
+        for at in range(0, m, CHUNK_SIZE):
+            motion = chain.joint_state(q[at : at + CHUNK_SIZE])
+            k, some = motion.positions.shape
+            frames = chain.forward_kinematics(motion, work_array("sweep", k + 2, 7, 3, some))
+            chain.tool_jacobian(frames, bodies, twists, out[..., at : at + CHUNK_SIZE])
 
     model, frame = chain.model, chain.frame_id
     data = model.createData()
@@ -99,11 +99,11 @@ def _mixing(errors: ErrorModel, model: pin.Model) -> tuple[np.ndarray, np.ndarra
     """
     chain = errors.chain
     out = np.zeros((6 * model.njoints, len(errors.parameters)))
-    firsts = [6 * (model.getJointId(name) - 1) for name in chain.moving] + [len(out) - 6]
+    firsts = [6 * (model.getJointId(name) - 1) for name in chain.moving_joints] + [len(out) - 6]
     for column, parameter in enumerate(errors.parameters):
-        j = (parameter.station - 1) // 2
+        j = (parameter.error_frame - 1) // 2
         twist = np.array(parameter.twist)
-        if parameter.station == link_station(j):
+        if parameter.error_frame == link_frame(j):
             twist = se3.adjoint(se3.inverse(chain.origins[j])) @ twist
         out[firsts[j] : firsts[j] + 6, column] = twist
     return out[:-6], out[-6:]
@@ -143,4 +143,4 @@ def by_joints(joints: tuple[int, ...], repeats: int) -> list[float]:
 
 def _one(chain: Chain, sets: str, m: int, repeats: int) -> float:
     case, x = problem(chain, sets, m)
-    return clocked([lambda: reduce(case, x, small_angle=False)], repeats)[0]
+    return clocked([lambda: linearize_and_factor(case, x, small_angle=False)], repeats)[0]

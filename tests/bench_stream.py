@@ -29,7 +29,7 @@ def main() -> None:
     parts = int(sys.argv[1])
     found = calibrate_stream(NOMINAL, lambda: (partial(part, i) for i in range(parts)), "dh")
     assert found.converged
-    assert found.samples == PART * parts
+    assert found.n_samples == PART * parts
     # Not getrusage, which counts what the parent held before this program was loaded.
     status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
     print(int(status["VmHWM"].split()[0]) / 1024)

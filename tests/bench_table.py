@@ -34,7 +34,7 @@ from bench_common import Row, clocked, measured, robots, serial
 from conftest import robot_file
 
 from dhcal_pin.calibration.procedure import calibrate
-from dhcal_pin.estimation.parameters import select
+from dhcal_pin.estimation.parameters import select_parameters
 from dhcal_pin.io.measurement_csv import measurement_text
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.position import Position
@@ -122,7 +122,7 @@ def against_pybotics(m: int, repeats: int) -> list[Row]:
     rng = np.random.default_rng(0)
     table = replace(serial(6), convention="modified")
     chain = Chain.from_dh(table)
-    errors = select(chain, "modified-dh")
+    errors = select_parameters(chain, "modified-dh")
     real = errors.at(1e-3 * rng.standard_normal(len(errors.parameters)))
     data = Position.simulate(real, rng.uniform(-2.5, 2.5, (m + 200, 6)), Noise(1e-4), rng)
     fit, held = data.take(np.s_[:m]), data.take(np.s_[m:])
@@ -131,7 +131,7 @@ def against_pybotics(m: int, repeats: int) -> list[Row]:
         rows = np.stack([table.alpha, table.a, table.theta, table.d], 1)
         np.savetxt(folder / "arm.csv", rows, "%.17g", ",")
         for file, part in (("fit.csv", fit), ("holdout.csv", held)):
-            np.savetxt(folder / file, np.hstack([part.q, part.reading]), "%.17g", ",")
+            np.savetxt(folder / file, np.hstack([part.q, part.values]), "%.17g", ",")
         found = spoken([python, HERE / "bench_pybotics.py"], folder, PYTHONPATH="")
     assert isinstance(found, dict)
     (ours,) = clocked([lambda: calibrate(chain, fit, "modified-dh")], repeats)

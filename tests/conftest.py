@@ -55,7 +55,7 @@ def random_table(rng: np.random.Generator, convention: str = "standard", size: i
 
 def random_joints(rng: np.random.Generator, table: DHTable, m: int) -> np.ndarray:
     """Any angle, and half a metre of slide each way."""
-    return rng.uniform(-1, 1, (m, table.size)) * np.where(table.prismatic, 0.5, np.pi)
+    return rng.uniform(-1, 1, (m, table.n_joints)) * np.where(table.prismatic, 0.5, np.pi)
 
 
 def with_masses(chain: Chain, rng: np.random.Generator) -> Chain:

@@ -12,17 +12,17 @@ from scipy.linalg import null_space
 
 from dhcal_pin import se3
 from dhcal_pin._kernels import qr as householder
-from dhcal_pin.calibration.cross_validation import random_folds
+from dhcal_pin.calibration.cross_validation import k_fold
 from dhcal_pin.calibration.evaluation import accuracy
 from dhcal_pin.calibration.procedure import calibrate, split
 from dhcal_pin.estimation import problem, qr
-from dhcal_pin.estimation.parameters import select
-from dhcal_pin.estimation.problem import CHUNK, Problem, reduce
-from dhcal_pin.estimation.qr import pseudo_inverse, with_priors
+from dhcal_pin.estimation.parameters import select_parameters
+from dhcal_pin.estimation.problem import CHUNK_SIZE, Problem, linearize_and_factor
+from dhcal_pin.estimation.qr import append_priors, pseudo_inverse
 from dhcal_pin.estimation.solver import levenberg_marquardt
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.measurements.base import Noise, derivatives
-from dhcal_pin.measurements.contact import PointDistance, Touch
+from dhcal_pin.measurements.base import Noise, whitened_jacobian
+from dhcal_pin.measurements.contact import PointContact, PointDistance
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.measurements.position import Position
 from dhcal_pin.robot.chain import Chain
@@ -43,7 +43,7 @@ def placed(chain: Chain, rng: np.random.Generator) -> Chain:
     away = lambda reach: reach * rng.uniform(-1, 1, 3) / np.sqrt(3)  # noqa: E731
     base = se3.transform(any_rotation(rng), away(5.0))
     tool = se3.transform(any_rotation(rng), away(0.5))
-    return chain.displaced({0: base, chain.tool_station: tool})
+    return chain.perturbed_at({0: base, chain.tool_frame_index: tool})
 
 
 def frames_found(kind, sim_6dof, sim_6dof_actual, seeds):
@@ -73,12 +73,12 @@ def test_before_differs_from_after_by_the_robot_alone(sim_6dof, sim_6dof_actual)
     data = Pose.simulate(placed(sim_6dof_actual, rng), rng.uniform(-3, 3, (60, 6)), Noise(), rng)
     fit = calibrate(sim_6dof, data, "minimal,base,tool", priors="none")
     assert fit.validate(data)["position_rms_m"] < 1e-9
-    assert 1e-3 < accuracy(fit.reference, [data])["position_rms_m"] < 0.05
+    assert 1e-3 < accuracy(fit.nominal_refitted, [data])["position_rms_m"] < 0.05
 
 
 def test_stated_spread_is_the_scatter_over_repeats(sim_6dof, sim_6dof_actual):
     """Standard deviations of seen parameters cover the truth as normal ones do."""
-    truth = {p.name: p.nominal for p in select(sim_6dof_actual, "dh").parameters}
+    truth = {p.name: p.nominal for p in select_parameters(sim_6dof_actual, "dh").parameters}
     scores = []
     for seed in range(100):
         rng = np.random.default_rng(seed)
@@ -126,7 +126,7 @@ def test_predicted_spread_says_where_nothing_is_known(sim_6dof):
 
 def told_by_priors(fit):
     """Standard deviations that priors leave where exact data see nothing, with scipy's null space."""
-    blind = null_space(fit.solution.triangle.r, rcond=1e-9)
+    blind = null_space(fit.solution.system.r, rcond=1e-9)
     precision = blind.T @ (fit.problem.weights[:, None] ** 2 * blind)
     return np.sqrt(np.diag(blind @ np.linalg.solve(precision, blind.T)))
 
@@ -140,7 +140,7 @@ def test_exact_data_leave_what_they_do_not_see_as_unknown_as_it_was(sim_6dof, si
     expected = told_by_priors(fit)
     assert fit.std == pytest.approx(expected, rel=1e-6, abs=1e-8)
     names = [p.name for p in fit.parameters]
-    assert fit.remaining[names.index("joint_1.rx")] > 0.7
+    assert fit.posterior_to_prior_std[names.index("joint_1.rx")] > 0.7
     assert not np.isinf(fit.std).any()
 
 
@@ -151,10 +151,10 @@ def test_sigmas_that_are_too_small_widen_what_the_data_tell_alone(sim_6dof, sim_
         rng = np.random.default_rng(1)
         q = rng.uniform(-3, 3, (200, 6))
         read = Pose.simulate(placed(sim_6dof_actual, rng), q, Noise(1e-4, 1e-4), rng)
-        data = Pose.of(q, read.poses, 1e-4 * share, 1e-4 * share)
+        data = Pose.from_arrays(q, read.poses, 1e-4 * share, 1e-4 * share)
         found.append(calibrate(sim_6dof, data, "minimal,base,tool", priors={"*": 1e-2}))
     right, wrong = found
-    assert wrong.noise == pytest.approx(10, rel=0.1)
+    assert wrong.unit_weight_std == pytest.approx(10, rel=0.1)
     assert wrong.std == pytest.approx(right.std, rel=0.1)
 
 
@@ -162,13 +162,13 @@ def test_sigmas_that_are_too_small_widen_what_the_data_tell_alone(sim_6dof, sim_
 def test_a_single_distance_tells_no_scatter_of_its_own(sim_6dof, sim_6dof_actual, stated, expected):
     """It can be met exactly, and is no better for that: it counts as the touches, unless theirs is stated."""
     rng = np.random.default_rng(4)
-    touches = Touch.simulate(sim_6dof_actual, rng.uniform(-2.5, 2.5, (200, 6)), Noise(1e-4), rng)
-    tip = touches.started(sim_6dof_actual)
-    places = np.reshape([unknown.nominal for unknown in tip.unknowns], (-1, 3))
+    touches = PointContact.simulate(sim_6dof_actual, rng.uniform(-2.5, 2.5, (200, 6)), Noise(1e-4), rng)
+    tip = touches.initialized(sim_6dof_actual)
+    places = np.reshape([unknown.nominal for unknown in tip.instrument_parameters], (-1, 3))
     far = np.linalg.norm(places[1] - places[0]) + 1e-3
-    known = PointDistance.of(6, [touches.names[:2]], [far])
+    known = PointDistance.from_arrays(6, [touches.names[:2]], [far])
     names = [touches.names[i] for i in touches.label]
-    data = Touch.of(touches.q, names, 1e-4 if stated else None)
+    data = PointContact.from_arrays(touches.q, names, 1e-4 if stated else None)
     fit = calibrate(sim_6dof, [data, known], "minimal,tool")
     assert fit.problem.data[1].sigma.item() == pytest.approx(expected, rel=0.2)
 
@@ -178,7 +178,7 @@ def test_unstated_sigmas_are_found(sim_6dof, sim_6dof_actual):
     rng = np.random.default_rng(0)
     q = rng.uniform(-3, 3, (300, 6))
     data = Pose.simulate(sim_6dof_actual, q, Noise(2e-2, 5e-5), rng)
-    fit = calibrate(sim_6dof, Pose.of(q, data.poses), "dh")
+    fit = calibrate(sim_6dof, Pose.from_arrays(q, data.poses), "dh")
     (used,) = fit.problem.data
     assert used.sigma.mean() == pytest.approx(2e-2, rel=0.1)
     assert used.rotation_sigma.mean() == pytest.approx(5e-5, rel=0.1)
@@ -203,7 +203,7 @@ def test_unseen_directions_do_not_move(sim_6dof):
         last = [p.name for p in fit.parameters].index("alpha3")
         assert abs(fit.x[last]) < 1e-12
         assert any("alpha3" in text for text in fit.unobservable)
-        assert fit.seen[last] < 1e-9
+        assert fit.observable_fraction[last] < 1e-9
     assert np.isinf(calibrate(arm, data, "dh", priors="none").std[last])
 
 
@@ -225,7 +225,7 @@ def test_result_is_the_minimum_that_scipy_finds(sim_6dof, sim_6dof_actual):
     rng = np.random.default_rng(4)
     data = Pose.simulate(sim_6dof_actual, rng.uniform(-3, 3, (15, 6)), Noise(1e-4, 1e-4), rng)
     fit = calibrate(sim_6dof, data, "dh", priors="none")
-    residual = lambda x: data.residual(fit.errors.at(x).sweep(data.q), NONE).ravel()  # noqa: E731
+    residual = lambda x: data.residual(fit.errors.at(x).forward_kinematics(data.q), NONE).ravel()  # noqa: E731
     other = least_squares(residual, np.zeros(24), xtol=1e-14, ftol=1e-14, gtol=1e-14)
     assert np.sum(residual(fit.x) ** 2) <= 2 * other.cost * (1 + 1e-9)
 
@@ -233,18 +233,20 @@ def test_result_is_the_minimum_that_scipy_finds(sim_6dof, sim_6dof_actual):
 def test_chunks_do_not_change_the_answer(sim_6dof_actual):
     """The triangle of many chunks equals the QR of all rows at once."""
     rng = np.random.default_rng(0)
-    q = rng.uniform(-3, 3, (2 * CHUNK + 17, 6))
+    q = rng.uniform(-3, 3, (2 * CHUNK_SIZE + 17, 6))
     data = Pose.simulate(sim_6dof_actual, q, Noise(1e-4, 1e-4), rng)
-    errors = select(sim_6dof_actual, "dh")
+    errors = select_parameters(sim_6dof_actual, "dh")
     zero = np.zeros(24)
-    found = reduce(Problem(errors, (data,), zero), zero, False)
+    found = linearize_and_factor(Problem(errors, (data,), zero), zero, False)
     chain, bodies, twists = errors.derivative(zero)
-    sweep = chain.sweep(q)
-    velocities = chain.tool_velocities(sweep, bodies, twists)
-    rows = derivatives(data, sweep, velocities, NONE, data.residual(sweep, NONE)).reshape(24, -1)
+    frames = chain.forward_kinematics(q)
+    velocities = chain.tool_jacobian(frames, bodies, twists)
+    rows = whitened_jacobian(data, frames, velocities, NONE, data.residual(frames, NONE)).reshape(24, -1)
     r = np.linalg.qr(rows.T, mode="r")
     np.testing.assert_allclose(np.abs(found.r), np.abs(r), atol=1e-9 * np.abs(r).max())
-    assert found.rest + found.z @ found.z == pytest.approx(np.sum(data.residual(sweep, NONE) ** 2), rel=1e-12)
+    assert found.min_cost + found.z @ found.z == pytest.approx(
+        np.sum(data.residual(frames, NONE) ** 2), rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("way", ["compiled", "panels", "plain"])
@@ -252,19 +254,19 @@ def test_chunks_do_not_change_the_answer(sim_6dof_actual):
 def test_each_way_of_reduction_keeps_what_the_rows_tell(way, samples, sim_6dof, monkeypatch):
     """Whole or a row of readings at a time, by panels or not, with columns that are zero in some rows."""
     if way != "compiled":
-        monkeypatch.setattr(householder, "PANELS", way == "panels")
-        monkeypatch.setattr(problem, "error_triangles", householder.error_triangles)
-    errors, rng = select(sim_6dof, "dh"), np.random.default_rng(0)
+        monkeypatch.setattr(householder, "USE_PANELS", way == "panels")
+        monkeypatch.setattr(problem, "factor_jacobian", householder.factor_jacobian)
+    errors, rng = select_parameters(sim_6dof, "dh"), np.random.default_rng(0)
     data = Pose.simulate(sim_6dof, rng.uniform(-3, 3, (samples, 6)), Noise(1e-4, 1e-4), rng)
-    found = reduce(Problem(errors, (data,), np.zeros(24)), np.zeros(24), False)
+    found = linearize_and_factor(Problem(errors, (data,), np.zeros(24)), np.zeros(24), False)
     chain, bodies, twists = errors.derivative(np.zeros(24))
-    sweep = chain.sweep(data.q)
-    residual = data.residual(sweep, NONE)
-    rows = derivatives(data, sweep, chain.tool_velocities(sweep, bodies, twists), NONE, residual)
+    frames = chain.forward_kinematics(data.q)
+    residual = data.residual(frames, NONE)
+    rows = whitened_jacobian(data, frames, chain.tool_jacobian(frames, bodies, twists), NONE, residual)
     whole = np.concatenate([rows, residual[None]]).reshape(25, -1)
     whole /= np.linalg.norm(whole, axis=1)[:, None]
     packed = np.zeros((25, 25))
-    packed[:24, :24], packed[:24, 24], packed[24, 24] = found.r, found.z, np.sqrt(found.rest)
+    packed[:24, :24], packed[:24, 24], packed[24, 24] = found.r, found.z, np.sqrt(found.min_cost)
     assert np.array_equal(packed, np.triu(packed))
     packed /= np.linalg.norm(packed, axis=0)
     np.testing.assert_allclose(packed.T @ packed, whole @ whole.T, atol=1e-13)
@@ -274,16 +276,16 @@ def test_each_way_of_reduction_keeps_what_the_rows_tell(way, samples, sim_6dof, 
 def test_a_loop_that_stopped_near_its_end_goes_on_as_if_it_had_not(sets, sim_6dof, sim_6dof_actual):
     rng = np.random.default_rng(0)
     data = Position.simulate(sim_6dof_actual, rng.uniform(-3, 3, (20, 6)), Noise(1e-4), rng)
-    errors = select(sim_6dof, sets)
+    errors = select_parameters(sim_6dof, sets)
     case, zero = Problem(errors, (data,), 1 / errors.priors), np.zeros(len(errors.parameters))
     whole = levenberg_marquardt(case, zero, 100, None)
-    near = levenberg_marquardt(case, zero, 100, None, nearly=True)
-    after = levenberg_marquardt(case, near.x, 100, None, before=near)
+    near = levenberg_marquardt(case, zero, 100, None, loose=True)
+    after = levenberg_marquardt(case, near.x, 100, None, warm_start=near)
     assert whole.converged
     assert after.converged
     assert not near.converged
     assert near.iterations < whole.iterations
-    np.testing.assert_array_equal(after.path, whole.path)
+    np.testing.assert_array_equal(after.iterates, whole.iterates)
 
 
 def test_rank_is_not_taken_from_a_square():
@@ -301,7 +303,7 @@ def test_mixed_kinds_on_random_arms(seed):
     rng = np.random.default_rng(seed)
     table = random_table(rng, size=5)
     nominal = Chain.from_dh(table)
-    errors = select(nominal, "minimal,base,tool")
+    errors = select_parameters(nominal, "minimal,base,tool")
     x = np.array([0.02 if p.unit == "rad" else 0.005 for p in errors.parameters]) * rng.normal(
         size=len(errors.parameters)
     )
@@ -350,11 +352,11 @@ def test_a_fit_without_hold_out_is_judged_by_samples_left_out(sim_6dof, sim_6dof
     fit = calibrate(sim_6dof, data, "dh", priors="none")
     squares = [
         accuracy(calibrate(sim_6dof, data.take(~mask), "dh", priors="none").chain, [data.take(mask)])
-        for (mask,) in random_folds([data], 10)
+        for (mask,) in k_fold([data], 10)
     ]
     wanted = np.sqrt(np.mean([found["position_rms_m"] ** 2 for found in squares]))
     judged = fit.comparisons[0]
-    assert judged.title == "left out"
+    assert judged.title == "cross-validated"
     assert judged.after["position_rms_m"] == pytest.approx(wanted, rel=0.02)
     assert judged.after["position_rms_m"] > 1.05 * fit.comparisons[1].after["position_rms_m"]
 
@@ -378,7 +380,7 @@ def test_samples_that_are_met_exactly_do_not_foretell_the_others(sim_6dof, sim_6
 def test_the_step_is_exact_at_condition_1e8():
     """Nearly parallel axes: the same rows solved with fifty digits give the same step."""
     nominal = Chain.from_dh(paper("sim_6dof"))
-    errors = select(nominal, "dh")
+    errors = select_parameters(nominal, "dh")
     tilts = [i for i, p in enumerate(errors.parameters) if p.name in ("alpha2", "alpha3", "alpha5")]
     x = np.zeros(24)
     x[tilts] = 1e-4, -2e-4, 1e-4
@@ -386,14 +388,14 @@ def test_the_step_is_exact_at_condition_1e8():
     q = rng.uniform(-3, 3, (12, 6))
     data = Pose.simulate(errors.at(x + 1e-4 * rng.normal(size=24)), q, Noise(1e-4, 1e-4), rng)
     problem = Problem(errors, (data,), np.zeros(24))
-    full = with_priors(reduce(problem, x, False), problem.weights, x)
+    full = append_priors(linearize_and_factor(problem, x, False), problem.weights, x)
     assert qr.rank(full.r) == 24
     assert 3e7 < qr.condition(full.r) < 3e8
     chain, bodies, twists = errors.derivative(x)
-    sweep = chain.sweep(q)
-    residual = data.residual(sweep, NONE)
-    velocities = chain.tool_velocities(sweep, bodies, twists)
-    rows = derivatives(data, sweep, velocities, NONE, residual).reshape(24, -1).T
+    frames = chain.forward_kinematics(q)
+    residual = data.residual(frames, NONE)
+    velocities = chain.tool_jacobian(frames, bodies, twists)
+    rows = whitened_jacobian(data, frames, velocities, NONE, residual).reshape(24, -1).T
     with mpmath.workdps(50):
         # Fifty digits can afford the normal equations.
         wanted = mpmath.lu_solve(mpmath.matrix(rows.tolist()), mpmath.matrix(residual.ravel().tolist()))
@@ -408,7 +410,7 @@ def test_bounds_hold_and_the_rest_is_least_squares(sim_6dof, sim_6dof_actual):
 
     rng = np.random.default_rng(5)
     data = Pose.simulate(sim_6dof_actual, rng.uniform(-3, 3, (15, 6)), Noise(1e-4, 1e-4), rng)
-    errors = select(sim_6dof, "dh")
+    errors = select_parameters(sim_6dof, "dh")
     nominal = {p.name: p.nominal for p in errors.parameters}
     bounds = {
         "a2": (nominal["a2"], nominal["a2"] + 1e-3),
@@ -423,7 +425,7 @@ def test_bounds_hold_and_the_rest_is_least_squares(sim_6dof, sim_6dof_actual):
     assert fit.comparisons[0].after["position_rms_m"] > 1e-3
     low, high = fit.problem.bounds
     assert np.all((low - 1e-12 <= fit.x) & (fit.x <= high + 1e-12))
-    residual = lambda x: data.residual(errors.at(x).sweep(data.q), NONE).ravel()  # noqa: E731
+    residual = lambda x: data.residual(errors.at(x).forward_kinematics(data.q), NONE).ravel()  # noqa: E731
     other = least_squares(residual, np.zeros(24), bounds=(low - 1e-12, high + 1e-12), xtol=1e-14, ftol=1e-14)
     assert np.sum(residual(fit.x) ** 2) <= 2 * other.cost * (1 + 1e-6)
     free = calibrate(sim_6dof, data, "dh", priors="none")
@@ -434,10 +436,10 @@ def test_bounds_hold_and_the_rest_is_least_squares(sim_6dof, sim_6dof_actual):
 def test_touches_without_a_length_leave_the_size_of_the_arm_to_the_priors(sim_6dof, noise):
     """The smallest arm would touch every point best, the more so the larger the noise."""
     rng = np.random.default_rng(1)
-    errors = select(sim_6dof, "minimal")
+    errors = select_parameters(sim_6dof, "minimal")
     truth = errors.at(errors.priors * rng.normal(size=len(errors.parameters)))
     q = rng.uniform(-2.5, 2.5, (300, 6))
-    data = replace(Touch.simulate(truth, q, Noise(noise), rng), stated=False)
+    data = replace(PointContact.simulate(truth, q, Noise(noise), rng), has_stated_sigma=False)
     fixed = ("tool.rx", "tool.ry", "tool.rz")
     fit = calibrate(sim_6dof, data, "minimal,tool", fix=fixed)
     assert [text for text in fit.unobservable if "how large" in text]
@@ -449,7 +451,7 @@ def test_touches_without_a_length_leave_the_size_of_the_arm_to_the_priors(sim_6d
     assert fit.problem.data[0].sigma.mean() == pytest.approx(noise, rel=0.2)
     # One known distance between two of the points, and its size is known.
     first, second = truth.poses(q[:2])[:, :3, 3]
-    known = PointDistance.of(6, [data.names[:2]], [np.linalg.norm(second - first)], 1e-5)
+    known = PointDistance.from_arrays(6, [data.names[:2]], [np.linalg.norm(second - first)], 1e-5)
     sized = calibrate(sim_6dof, [data, known], "minimal,tool", fix=fixed)
     assert not [text for text in sized.unobservable if "how large" in text]
     assert spread(sized.chain) / spread(truth) == pytest.approx(1, abs=5e-5 + 0.5 * noise)
@@ -457,13 +459,13 @@ def test_touches_without_a_length_leave_the_size_of_the_arm_to_the_priors(sim_6d
 
 def spread(chain):
     """How far the tool spreads about its middle, RMS over the joint space."""
-    points = chain.poses(np.random.default_rng(1).uniform(-2.5, 2.5, (500, chain.size)))[:, :3, 3]
+    points = chain.poses(np.random.default_rng(1).uniform(-2.5, 2.5, (500, chain.n_joints)))[:, :3, 3]
     return np.linalg.norm(points - points.mean(0)) / np.sqrt(500)
 
 
 def test_lengths_that_are_held_tell_how_large_an_arm_is_that_touches(sim_6dof):
     rng = np.random.default_rng(1)
-    data = Touch.simulate(sim_6dof, rng.uniform(-2.5, 2.5, (300, 6)), Noise(1e-4), rng)
+    data = PointContact.simulate(sim_6dof, rng.uniform(-2.5, 2.5, (300, 6)), Noise(1e-4), rng)
     said = calibrate(sim_6dof, data, "offset,tool").unobservable
     assert said
     assert not [text for text in said if "how large" in text]
@@ -491,10 +493,10 @@ def test_a_step_that_damping_makes_small_is_no_end(seed, prismatic, theta, d, a,
         np.full(n, np.inf),
     )
     arm, rng = Chain.from_dh(table), np.random.default_rng(seed)
-    errors = select(arm, "dh,base,tool")
+    errors = select_parameters(arm, "dh,base,tool")
     size = np.array([np.deg2rad(2) if p.unit == "rad" else 0.01 for p in errors.parameters])
     truth = errors.at(size * rng.uniform(-1, 1, len(size)))
     q = random_joints(rng, table, 80)
-    fit = calibrate(arm, Pose.of(q[:40], truth.poses(q[:40])), "dh,base,tool", priors="none")
+    fit = calibrate(arm, Pose.from_arrays(q[:40], truth.poses(q[:40])), "dh,base,tool", priors="none")
     assert fit.converged
     assert np.abs(fit.chain.poses(q[40:]) - truth.poses(q[40:])).max() < 1e-9

@@ -9,7 +9,7 @@ from conftest import paper, random_joints, random_table
 
 from dhcal_pin import se3
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.robot.chain import Chain, twists_at
+from dhcal_pin.robot.chain import Chain, twists_in_bodies
 from dhcal_pin.robot.dh import CONVENTIONS
 from dhcal_pin.robot.urdf import parse_urdf
 
@@ -47,7 +47,7 @@ def test_base_and_tool_stand_outside():
     chain = Chain.from_dh(table)
     base, tool = se3.exp6(rng.normal(size=6)), se3.exp6(rng.normal(size=6))
     q = rng.uniform(-1, 1, (7, 4))
-    placed = chain.displaced({0: base, chain.tool_station: tool})
+    placed = chain.perturbed_at({0: base, chain.tool_frame_index: tool})
     np.testing.assert_allclose(placed.poses(q), base @ table.poses(q) @ tool, atol=1e-14)
     np.testing.assert_array_equal(placed.origins, chain.origins)
 
@@ -55,7 +55,9 @@ def test_base_and_tool_stand_outside():
 def test_model_carries_the_moved_placements():
     rng = np.random.default_rng(3)
     chain = Chain.from_dh(paper("sim_6dof"))
-    moved = chain.displaced({s: se3.exp6(0.05 * rng.normal(size=6)) for s in range(1, chain.tool_station)})
+    moved = chain.perturbed_at(
+        {s: se3.exp6(0.05 * rng.normal(size=6)) for s in range(1, chain.tool_frame_index)}
+    )
     q = rng.uniform(-np.pi, np.pi, (20, 6))
     np.testing.assert_allclose(moved.poses(q), pinocchio_poses(moved, q), atol=1e-14)
     assert np.abs(moved.poses(q) - chain.poses(q)).max() > 1e-3
@@ -144,7 +146,7 @@ def test_nobody_calibrates_a_rope(count):
     )
     urdf = parse_urdf(f'<robot name="rope">{links}{joints}</robot>'.encode(), "rope.urdf")
     if count == 64:
-        assert Chain.from_urdf(urdf).size == 64
+        assert Chain.from_urdf(urdf).n_joints == 64
         return
     with pytest.raises(DhcalError, match=r"65 moving joints between 'l0' and 'l65'; at most 64.*--tip"):
         Chain.from_urdf(urdf)
@@ -176,16 +178,16 @@ def test_velocities_are_the_derivative_of_poses(sim_6dof_actual):
     """Every station, all six directions, by central differences of displaced chains."""
     chain = sim_6dof_actual
     rng = np.random.default_rng(4)
-    chain = chain.displaced(
-        {0: se3.exp6(rng.normal(size=6)), chain.tool_station: se3.exp6(rng.normal(size=6))}
+    chain = chain.perturbed_at(
+        {0: se3.exp6(rng.normal(size=6)), chain.tool_frame_index: se3.exp6(rng.normal(size=6))}
     )
     q, h = rng.uniform(-np.pi, np.pi, (10, 6)), 1e-6
-    stations = np.repeat(np.arange(chain.tool_station + 1), 6)
-    twists = np.tile(np.eye(6), (chain.tool_station + 1, 1))
-    bodies, moved = twists_at(chain, stations, twists)
-    velocities = chain.tool_velocities(chain.sweep(q), bodies, moved)
+    stations = np.repeat(np.arange(chain.tool_frame_index + 1), 6)
+    twists = np.tile(np.eye(6), (chain.tool_frame_index + 1, 1))
+    bodies, moved = twists_in_bodies(chain, stations, twists)
+    velocities = chain.tool_jacobian(chain.forward_kinematics(q), bodies, moved)
     for k, (station, twist) in enumerate(zip(stations, twists, strict=True)):
-        up, down = (chain.displaced({int(station): se3.exp6(s * h * twist)}).poses(q) for s in (1, -1))
+        up, down = (chain.perturbed_at({int(station): se3.exp6(s * h * twist)}).poses(q) for s in (1, -1))
         linear = (up - down)[:, :3, 3] / (2 * h)
         angular = se3.log3(up[:, :3, :3] @ np.swapaxes(down[:, :3, :3], 1, 2)) / (2 * h)
         np.testing.assert_allclose(velocities[k].T, np.concatenate([linear, angular], 1), atol=2e-9)

@@ -20,10 +20,10 @@ from scipy.spatial.transform import Rotation
 from dhcal_pin.calibration import model_selection
 from dhcal_pin.cli import arguments, console, main, simulate
 from dhcal_pin.io.dh_file import read_dh
-from dhcal_pin.io.measurement_csv import measurement_text, read_readings
+from dhcal_pin.io.measurement_csv import measurement_text, read_measurement_file
 from dhcal_pin.io.robot import read_robot
 from dhcal_pin.measurements.position import Position
-from dhcal_pin.paper import error_factors, jacobian_check, simulations
+from dhcal_pin.paper import factors, jacobian_check, simulations
 from dhcal_pin.robot.chain import Chain
 from dhcal_pin.robot.urdf import read_urdf
 
@@ -452,7 +452,7 @@ def test_the_json_of_a_calibration(run, place):
             "value",
             "std",
             "observability",
-            "remaining",
+            "posterior_to_prior_std",
             "fixed",
         }
         assert 0 <= row["observability"] <= 1
@@ -613,9 +613,9 @@ def test_validate_names_impossible_rows_and_counts_them(run, place):
     found = strict(out)
     assert (status, found["samples"]) == (0, 8)
     assert found["after"]["position_rms_m"] == pytest.approx(np.sqrt(np.mean(off**2)), rel=1e-9)
-    assert [text.split(":")[0] for text in found["doubts"][table]] == ["row 7", "row 8"]
-    assert "check: row 7: its joint values lead 1095 mm away" in err
-    assert run("validate", URDF / "experiment.dh.toml", table, "--fit-frames")[2].count("check: row") == 0
+    assert [text.split(": ")[1] for text in found["warnings"]] == ["row 7", "row 8"]
+    assert "warning: row 7: its joint values lead 1095 mm away" in err
+    assert run("validate", URDF / "experiment.dh.toml", table, "--fit-frames")[2].count("warning: row") == 0
 
 
 def test_a_file_is_held_out(run, place):
@@ -711,17 +711,19 @@ def test_the_same_seed_gives_the_same_bytes(run, place):
 
 def test_simulated_positions_are_the_formula_s(run, place):
     done(run("simulate", "arm.urdf", "-m", "50", "--kind", "position", "-o", "s.csv"))
-    readings = read_readings("s.csv", Chain.from_urdf("arm.urdf")).data
+    readings = read_measurement_file("s.csv", Chain.from_urdf("arm.urdf")).data
     np.testing.assert_allclose(readings.positions() * 1e3, tip(np.degrees(readings.q)), atol=1e-10)
 
 
 def test_simulated_noise_has_the_size_asked_for(run, place):
     done(run("simulate", "arm.urdf", "-m", "3000", "--noise", "0.2mm,1mrad", "-o", "s.csv"))
-    readings = read_readings("s.csv", Chain.from_urdf("arm.urdf")).data
+    readings = read_measurement_file("s.csv", Chain.from_urdf("arm.urdf")).data
     off = readings.positions() * 1e3 - tip(np.degrees(readings.q))
     np.testing.assert_allclose(off.std(0), 0.2, rtol=0.05)
-    assert readings.stated
-    errors = readings.errors(Chain.from_urdf("arm.urdf").sweep(readings.q), np.empty(0))["orientation"]
+    assert readings.has_stated_sigma
+    errors = readings.errors(Chain.from_urdf("arm.urdf").forward_kinematics(readings.q), np.empty(0))[
+        "orientation"
+    ]
     np.testing.assert_allclose(errors.std(0), 1e-3, rtol=0.05)
 
 
@@ -733,7 +735,7 @@ def test_simulated_joints_keep_their_limits(run, place, lower, upper):
     first = table.index("[[joint]]", table.index("[[joint]]") + 1)
     Path("tight.dh.toml").write_text(f"{table[:first]}lower = {lower}\nupper = {upper}\n{table[first:]}")
     done(run("simulate", "tight.dh.toml", "-m", "200", "-o", "s.csv"))
-    q = np.degrees(read_readings("s.csv", read_robot("tight.dh.toml")).data.q)
+    q = np.degrees(read_measurement_file("s.csv", read_robot("tight.dh.toml")).data.q)
     assert lower <= q[:, 0].min() < q[:, 0].max() <= upper
     assert np.ptp(q[:, 0]) > 0.5 * min(upper - lower, 180)
     assert np.abs(q[:, 1:]).max() <= 180
@@ -744,7 +746,7 @@ def test_simulated_joints_keep_their_limits(run, place, lower, upper):
 
 def poses_agree(a, b, atol=1e-12):
     one, two = read_robot(a), read_robot(b)
-    q = np.random.default_rng(0).uniform(-3, 3, (50, one.size))
+    q = np.random.default_rng(0).uniform(-3, 3, (50, one.n_joints))
     np.testing.assert_allclose(one.poses(q), two.poses(q), atol=atol)
 
 
@@ -813,15 +815,15 @@ def test_check_agrees(run, place):
     found = strict(out)
     assert (status, found["agree"]) == (0, True)
     assert len(found["routes"]) == 6
-    assert all(route["holds"] and route["difference"] <= route["allowed"] for route in found["routes"])
+    assert all(route["agrees"] and route["difference"] <= route["tolerance"] for route in found["routes"])
 
 
 def test_check_finds_the_misprint_of_15(run, place, monkeypatch):
     """k1 as printed has sine and cosine of alpha in each other's place, with the wrong sign."""
 
     def printed(table, q):
-        right = error_factors.error_factors(table, q)
-        n = table.size
+        right = factors.error_factors(table, q)
+        n = table.n_joints
         s, c, a = np.sin(table.alpha), np.cos(table.alpha), table.a
         gap = np.stack([0 * a, a * (s - c), a * (s - c)], -1)
         for i in range(n):
@@ -837,7 +839,7 @@ def test_check_finds_the_misprint_of_15(run, place, monkeypatch):
     status, out, err = run("check", URDF / "sim_6dof.dh.toml", "--json", "-")
     found = strict(out)
     assert (status, found["agree"]) == (1, False)
-    assert not any(route["holds"] for route in found["routes"] if route["columns"])
+    assert not any(route["agrees"] for route in found["routes"] if route["columns"])
     assert "DISAGREES" in err
 
 
@@ -952,7 +954,7 @@ def test_unknowns_that_cannot_take_up_what_was_measured_are_told(run, tmp_path, 
         step[:, :3, 3] = [a * 1e-3, 0, 0] + step[:, :3, 2] * d * 1e-3
         pose = pose @ step
     point = pose[:, :3, 3] + 0.1 * pose[:, :3, 0] + [3, 1, 0] + rng.normal(0, 1e-4, (40, 3))
-    Path("data.csv").write_text(measurement_text(Position.of(q, point), arm))
+    Path("data.csv").write_text(measurement_text(Position.from_arrays(q, point), arm))
     for sets, told in (
         ("modified-dh,base,tool", True),
         ("minimal,base,tool", False),
@@ -960,4 +962,4 @@ def test_unknowns_that_cannot_take_up_what_was_measured_are_told(run, tmp_path, 
     ):
         status, _, err = run("calibrate", "arm.dh.toml", "data.csv", "--parameters", sets, "-o", "out.urdf")
         assert status == 0
-        assert ("arm.dh.toml: check: --parameters minimal,base,tool would leave" in err) == told
+        assert ("arm.dh.toml: warning: --parameters minimal,base,tool would leave" in err) == told

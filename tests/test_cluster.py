@@ -16,7 +16,7 @@ from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io.measurement_csv import file_parts, measurement_text
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.position import Position
-from dhcal_pin.parallel import workers
+from dhcal_pin.parallel import open_executor
 from dhcal_pin.studies.grid import read_study
 from dhcal_pin.studies.runner import run
 
@@ -51,7 +51,7 @@ def test_a_worker_lost_in_the_middle_changes_nothing(cluster, tmp_path):
     (tmp_path / "s.study.toml").write_text(MANY.replace("seeds = 120", "seeds = 400"))
     study = read_study(tmp_path / "s.study.toml")
     here = list(run(study))
-    with workers(scheduler=cluster.scheduler_address) as where, distributed.Client(cluster) as client:
+    with open_executor(scheduler=cluster.scheduler_address) as where, distributed.Client(cluster) as client:
         victim = client.run(os.getpid)
         found = []
         for block in run(study, 0, where):
@@ -71,9 +71,9 @@ def test_a_stream_gives_the_same_digits_with_a_worker_lost(cluster, tmp_path, si
     path.write_text(measurement_text(data, sim_6dof))
     parts = partial(file_parts, path, sim_6dof, 100)
     here = calibrate_stream(sim_6dof, parts, "dh")
-    with workers(scheduler=cluster.scheduler_address) as where, distributed.Client(cluster) as client:
+    with open_executor(scheduler=cluster.scheduler_address) as where, distributed.Client(cluster) as client:
         client.wait_for_workers(2)
-        np.testing.assert_array_equal(calibrate_stream(sim_6dof, parts, "dh", where=where).x, here.x)
+        np.testing.assert_array_equal(calibrate_stream(sim_6dof, parts, "dh", executor=where).x, here.x)
         victims = client.run(os.getpid)
         killed = []
 
@@ -82,14 +82,17 @@ def test_a_stream_gives_the_same_digits_with_a_worker_lost(cluster, tmp_path, si
                 killed.append(next(iter(victims.values())))
                 os.kill(killed[0], signal.SIGKILL)
 
-        there = calibrate_stream(sim_6dof, parts, "dh", where=where, progress=progress)
+        there = calibrate_stream(sim_6dof, parts, "dh", executor=where, progress=progress)
         survivors = client.run(os.getpid)
     np.testing.assert_array_equal(there.x, here.x)
-    np.testing.assert_array_equal(there.solution.triangle.r, here.solution.triangle.r)
+    np.testing.assert_array_equal(there.solution.system.r, here.solution.system.r)
     assert killed
     assert killed[0] not in survivors.values()
 
 
 def test_no_scheduler_is_said():
-    with pytest.raises(DhcalError, match="no Dask scheduler there"), workers(scheduler="tcp://127.0.0.1:1"):
+    with (
+        pytest.raises(DhcalError, match="no Dask scheduler there"),
+        open_executor(scheduler="tcp://127.0.0.1:1"),
+    ):
         pass

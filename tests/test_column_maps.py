@@ -14,7 +14,7 @@ from dhcal_pin import se3
 from dhcal_pin.cli import main
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io.column_mapping import euler
-from dhcal_pin.io.measurement_csv import measurement_text, read_measurements, read_readings
+from dhcal_pin.io.measurement_csv import measurement_text, read_measurement_file, read_measurements
 from dhcal_pin.measurements.pose import Pose, RelativePose
 from dhcal_pin.measurements.position import Position
 from dhcal_pin.robot.chain import Chain
@@ -50,7 +50,7 @@ def read(tmp_path, arm):
     def call(text=FILE, how=MAP, name="theirs.csv"):
         (tmp_path / "map.toml").write_text(how)
         (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
-        return read_readings(tmp_path / name, arm, tmp_path / "map.toml")
+        return read_measurement_file(tmp_path / name, arm, tmp_path / "map.toml")
 
     return call
 
@@ -59,7 +59,7 @@ def test_columns_in_another_order_with_decimal_commas(read):
     data = read().data
     assert isinstance(data, Position)
     np.testing.assert_allclose(np.rad2deg(data.q), [[10, -20, 30], [11, -21, 31]], rtol=1e-15)
-    assert data.reading.tolist() == [[0.10025, -0.007, 0.0105], [0.10125, -0.008, 0.0115]]
+    assert data.values.tolist() == [[0.10025, -0.007, 0.0105], [0.10125, -0.008, 0.0115]]
 
 
 def test_signs_offsets_scales_and_other_names(read):
@@ -78,7 +78,7 @@ def test_units_joint_by_joint_and_inches(read):
     )
     data = read(how=how).data
     np.testing.assert_allclose(data.q, [[np.deg2rad(10), -20, 0.030], [np.deg2rad(11), -21, 0.031]])
-    np.testing.assert_allclose(data.reading[:, 0], [100.25 * 0.0254, 101.25 * 0.0254], rtol=1e-15)
+    np.testing.assert_allclose(data.values[:, 0], [100.25 * 0.0254, 101.25 * 0.0254], rtol=1e-15)
 
 
 @pytest.mark.parametrize(("separator", "sign"), [(",", ","), ("tab", "\t"), ("space", "   "), (";", ";")])
@@ -182,14 +182,14 @@ def test_a_rotation_by_the_name_of_its_convention(read, how, columns):
     mapped += "".join(f'sigma_{axis} = {{from = "x", unit = "deg"}}\n' for axis in ("rx", "ry", "rz"))
     data = read(text, f"{mapped}[rotation]\n{how}\ncolumns = {json.dumps(names)}\n").data
     assert isinstance(data, Pose)
-    assert data.stated
+    assert data.has_stated_sigma
     np.testing.assert_allclose(data.rotations(), turns.as_matrix(), atol=5e-15)
 
 
 def test_a_second_configuration_and_back(read, arm):
     rng = np.random.default_rng(0)
     q, q_to = rng.uniform(-1, 1, (2, 4, 3))
-    data = RelativePose.of(q, q_to, se3.inverse(arm.poses(q)) @ arm.poses(q_to))
+    data = RelativePose.from_arrays(q, q_to, se3.inverse(arm.poses(q)) @ arm.poses(q_to))
     text = measurement_text(data, arm)
     how = "".join(
         f'[{key}]\norder = {json.dumps([f"{before}{name}[rad]" for name in JOINTS])}\nunit = "rad"\n'

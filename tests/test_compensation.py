@@ -59,12 +59,12 @@ ROBOTS = {
 
 def wrong(chain: Chain, rng: np.random.Generator) -> Chain:
     """The chain with every joint and the tip misplaced by up to 1° and 5 mm an axis."""
-    stations = range(2, 2 * len(chain.moving) + 3, 2)
-    return chain.displaced({station: se3.exp6(ERROR * rng.uniform(-1, 1, 6)) for station in stations})
+    stations = range(2, 2 * len(chain.moving_joints) + 3, 2)
+    return chain.perturbed_at({station: se3.exp6(ERROR * rng.uniform(-1, 1, 6)) for station in stations})
 
 
 def draw(chain: Chain, m: int, rng: np.random.Generator):
-    return rng.uniform(np.maximum(chain.lower, -np.pi), np.minimum(chain.upper, np.pi), (m, chain.size))
+    return rng.uniform(np.maximum(chain.lower, -np.pi), np.minimum(chain.upper, np.pi), (m, chain.n_joints))
 
 
 def pinocchio_pose(chain: Chain, q) -> pin.SE3:
@@ -116,7 +116,7 @@ def check_landing(name: str, m: int, seed: int):
         assert np.linalg.norm(pin.log3(there.rotation.T @ goal.rotation)) <= 1e-9
         assert np.abs(pinocchio_pose(nominal, q).homogeneous - found.poses[i]).max() <= 1e-12
         # A redundant arm's controller comes from where it is sent; others from somewhere near.
-        near = q if nominal.size > 6 else q + rng.uniform(-5e-3, 5e-3, nominal.size)
+        near = q if nominal.n_joints > 6 else q + rng.uniform(-5e-3, 5e-3, nominal.n_joints)
         if found.status[i] == "ok":
             driven = pinocchio_pose(true, controller(nominal, found.poses[i], near))
             assert np.linalg.norm(driven.translation - goal.translation) <= 1e-9
@@ -179,14 +179,14 @@ def test_the_paper_s_eight_objects():
     wanted = read_targets(URDF / "experiment_targets.csv", nominal)
     printed = np.loadtxt(URDF / "experiment_table5.csv", delimiter=",", skiprows=4)[:, :3]
     for calibrated in (nominal, Chain.from_dh(paper("experiment_published"))):
-        found = compensate(nominal, calibrated, wanted.targets, np.deg2rad([15, 15, -60]))
+        found = compensate(nominal, calibrated, wanted.values, np.deg2rad([15, 15, -60]))
         assert found.status == (*["ok"] * 7, "out of reach")
-        assert np.abs(calibrated.poses(found.q[:7])[:, :3, 3] - wanted.targets[:7]).max() <= 1e-9
-    ideal = compensate(nominal, nominal, wanted.targets, np.deg2rad([15, 15, -60]))
+        assert np.abs(calibrated.poses(found.q[:7])[:, :3, 3] - wanted.values[:7]).max() <= 1e-9
+    ideal = compensate(nominal, nominal, wanted.values, np.deg2rad([15, 15, -60]))
     assert np.abs(np.rad2deg(ideal.q[:5]) - printed[:5]).max() <= 0.03
     assert np.abs(np.rad2deg(ideal.q[6]) - (29.95, 29.70, -29.39)).max() <= 0.01
     # 1305.8 mm from the shoulder of an arm of 745 mm.
-    assert ideal.miss[7, 0] == pytest.approx(1.3058 - 0.745, abs=1e-4)
+    assert ideal.residual_error[7, 0] == pytest.approx(1.3058 - 0.745, abs=1e-4)
 
 
 def test_at_a_singularity_it_says_so():

@@ -7,24 +7,24 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from dhcal_pin.planning.criteria import Compromise, Determinant, Spread, Worst
-from dhcal_pin.planning.exchange import Pool, basis, exchange, greedy
+from dhcal_pin.planning.criteria import AOptimality, BiasVarianceCriterion, DOptimality, EOptimality
+from dhcal_pin.planning.exchange import CandidateSet, exchange, greedy, sqrt_covariance
 
 NONE = np.empty((0, 1))
 
 
-def draw(p: int, k: int, m: int, seed: int = 0) -> Pool:
+def draw(p: int, k: int, m: int, seed: int = 0) -> CandidateSet:
     rng = np.random.default_rng(seed)
     rows = rng.standard_normal((p, k, m)) * rng.lognormal(size=m)
-    return Pool.of(rows, np.arange(m, dtype=float)[:, None])
+    return CandidateSet.from_rows(rows, np.arange(m, dtype=float)[:, None])
 
 
-def information(pool: Pool, chosen) -> np.ndarray:
+def information(pool: CandidateSet, chosen) -> np.ndarray:
     rows = pool.at(np.array(chosen, int)).reshape(-1, len(pool.rows))
     return np.eye(len(pool.rows)) + rows.T @ rows
 
 
-def measures(pool: Pool, chosen, weights: np.ndarray) -> dict[str, float]:
+def measures(pool: CandidateSet, chosen, weights: np.ndarray) -> dict[str, float]:
     """What each criterion weighs, formed from the covariance itself."""
     covariance = np.linalg.inv(information(pool, chosen))
     return {
@@ -34,26 +34,26 @@ def measures(pool: Pool, chosen, weights: np.ndarray) -> dict[str, float]:
     }
 
 
-CRITERIA = {"D": Determinant(), "A": Spread(np.eye(5)[:, :3]), "E": Worst(np.eye(5))}
+CRITERIA = {"D": DOptimality(), "A": AOptimality(np.eye(5)[:, :3]), "E": EOptimality(np.eye(5))}
 WEIGHTS = np.eye(5)[:, :3]
 
 
 @pytest.mark.parametrize("name", CRITERIA)
 def test_values_are_those_of_the_covariance(name):
     pool = draw(5, 2, 30)
-    root = basis(np.eye(5), pool.at(np.arange(4)))
+    root = sqrt_covariance(np.eye(5), pool.at(np.arange(4)))
     assert CRITERIA[name].value(root) == pytest.approx(measures(pool, range(4), WEIGHTS)[name], rel=1e-12)
 
 
 def test_gains_are_what_another_candidate_brings():
     pool, chosen = draw(5, 3, 20), [0, 3]
-    root = basis(np.eye(5), pool.at(np.array(chosen)))
+    root = sqrt_covariance(np.eye(5), pool.at(np.array(chosen)))
     before = np.linalg.inv(information(pool, chosen))
     after = [np.linalg.inv(information(pool, [*chosen, i])) for i in range(20)]
     determinant = [np.linalg.slogdet(before)[1] - np.linalg.slogdet(one)[1] for one in after]
     spread = [np.trace(WEIGHTS.T @ (before - one) @ WEIGHTS) for one in after]
-    assert Determinant().gains(pool.rows, root) == pytest.approx(determinant, rel=1e-10)
-    assert Spread(WEIGHTS).gains(pool.rows, root) == pytest.approx(spread, rel=1e-10)
+    assert DOptimality().gains(pool.rows, root) == pytest.approx(determinant, rel=1e-10)
+    assert AOptimality(WEIGHTS).gains(pool.rows, root) == pytest.approx(spread, rel=1e-10)
 
 
 def test_a_compromise_weighs_noise_and_what_is_left_out():
@@ -61,7 +61,7 @@ def test_a_compromise_weighs_noise_and_what_is_left_out():
     pool, rng = draw(7, 2, 30), np.random.default_rng(1)
     fitted = np.array([True, True, False, True, True, False, True])
     wanted = rng.standard_normal((3, 2))
-    criterion = Compromise(fitted, WEIGHTS, wanted)
+    criterion = BiasVarianceCriterion(fitted, WEIGHTS, wanted)
 
     def expected(chosen) -> float:
         every = information(pool, chosen)
@@ -71,7 +71,7 @@ def test_a_compromise_weighs_noise_and_what_is_left_out():
         return 0.5 * float(np.log(variance * np.sum((WEIGHTS.T @ bias - wanted) ** 2)))
 
     chosen = [0, 3, 4]
-    root = basis(np.eye(7), pool.at(np.array(chosen)))
+    root = sqrt_covariance(np.eye(7), pool.at(np.array(chosen)))
     assert criterion.value(root) == pytest.approx(expected(chosen), rel=1e-12)
     after = [expected([*chosen, i]) for i in range(30)]
     assert criterion.gains(pool.rows, root) == pytest.approx(-np.array(after), rel=1e-10)
@@ -93,9 +93,9 @@ def test_exchange_comes_near_the_best_of_all_sets(name, seed):
 def test_impossible_and_crowded_candidates_are_left_out():
     rng = np.random.default_rng(0)
     places = rng.uniform(0, 1, (200, 2))
-    pool = Pool.of(rng.standard_normal((5, 2, 200)), places, 0.15, lambda i: i % 3 > 0)
-    found = greedy(pool, np.eye(5), 8, Determinant(), np.zeros(0, int), places[:1])
-    found = exchange(pool, np.eye(5), found, Determinant(), places[:1])
+    pool = CandidateSet.from_rows(rng.standard_normal((5, 2, 200)), places, 0.15, lambda i: i % 3 > 0)
+    found = greedy(pool, np.eye(5), 8, DOptimality(), np.zeros(0, int), places[:1])
+    found = exchange(pool, np.eye(5), found, DOptimality(), places[:1])
     assert (found % 3 > 0).all()
     there = np.concatenate([places[:1], places[found]])
     between = np.linalg.norm(there[:, None] - there, axis=2) + np.eye(9)
@@ -103,8 +103,8 @@ def test_impossible_and_crowded_candidates_are_left_out():
 
 
 def test_fewer_are_chosen_where_no_more_are_possible():
-    pool = Pool.of(draw(5, 2, 20).rows, np.zeros((20, 1)), 0.0, lambda i: i < 3)
-    assert sorted(greedy(pool, np.eye(5), 8, Determinant(), np.zeros(0, int), NONE)) == [0, 1, 2]
+    pool = CandidateSet.from_rows(draw(5, 2, 20).rows, np.zeros((20, 1)), 0.0, lambda i: i < 3)
+    assert sorted(greedy(pool, np.eye(5), 8, DOptimality(), np.zeros(0, int), NONE)) == [0, 1, 2]
 
 
 def test_a_weak_prior_takes_no_digits():
@@ -112,7 +112,7 @@ def test_a_weak_prior_takes_no_digits():
     pool = draw(5, 3, 10)
     scaled = np.concatenate([1e8 * pool.rows[:3], pool.rows[3:]])
     chosen = np.arange(6)
-    root = basis(np.eye(5), Pool.of(scaled, pool.places).at(chosen))
+    root = sqrt_covariance(np.eye(5), CandidateSet.from_rows(scaled, pool.coordinates).at(chosen))
     wide = information(pool, chosen) - np.eye(5) + np.diag([1e-16] * 3 + [1.0] * 2)
     expected = -(np.linalg.slogdet(wide)[1] + 2 * 3 * np.log(1e8)) / 5
-    assert Determinant().value(root) == pytest.approx(expected, rel=1e-9)
+    assert DOptimality().value(root) == pytest.approx(expected, rel=1e-9)

@@ -84,7 +84,7 @@ def test_pinocchio_reads_the_table_back():
     worst = 0.0
     for _ in range(200):
         table = random_arm(rng)
-        q = rng.uniform(-np.pi, np.pi, (5, table.size))
+        q = rng.uniform(-np.pi, np.pi, (5, table.n_joints))
         q[:, table.prismatic] = rng.uniform(-0.3, 0.3, (5, int(table.prismatic.sum())))
         worst = max(worst, np.abs(pinocchio_poses(dh_to_urdf(table, "arm"), q) - table.poses(q)).max())
     assert worst < 1e-14

@@ -13,11 +13,11 @@ from conftest import paper, robot_file
 from dhcal_pin import se3
 from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.estimation import qr
-from dhcal_pin.estimation.parameters import select
-from dhcal_pin.estimation.problem import Problem, reduce
+from dhcal_pin.estimation.parameters import select_parameters
+from dhcal_pin.estimation.problem import Problem, linearize_and_factor
 from dhcal_pin.identifiability import explanations
-from dhcal_pin.identifiability.null_space import Experiment, Group, groups
-from dhcal_pin.identifiability.propagation import Path
+from dhcal_pin.identifiability.null_space import ObservabilityProbe, UnobservableGroup, group_directions
+from dhcal_pin.identifiability.propagation import PlainErrors
 from dhcal_pin.measurements import KINDS
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.pose import Pose
@@ -68,33 +68,35 @@ def load(arm: str) -> Chain:
 
 
 def anywhere(chain: Chain, m: int, seed: int = 0):
-    return np.random.default_rng(seed).uniform(-3, 3, (m, chain.size))
+    return np.random.default_rng(seed).uniform(-3, 3, (m, chain.n_joints))
 
 
 def problem(chain: Chain, sets: str, kind=Pose, q=None, m: int = 40) -> Problem:
     q = anywhere(chain, m) if q is None else q
-    data = kind.simulate(chain, q, Noise(), np.random.default_rng(0)).started(chain)
-    found = Problem(select(chain, sets), (data,), np.empty(0))
-    return replace(found, weights=np.zeros(len(found.errors.parameters) + len(found.unknowns)))
+    data = kind.simulate(chain, q, Noise(), np.random.default_rng(0)).initialized(chain)
+    found = Problem(select_parameters(chain, sets), (data,), np.empty(0))
+    return replace(found, weights=np.zeros(len(found.errors.parameters) + len(found.instrument_parameters)))
 
 
 def said(of: Problem) -> list[str]:
     zero = np.zeros(len(of.weights))
-    return explanations.unobservable(of, zero, reduce(of, zero, False))
+    return explanations.explain_unobservable(of, zero, linearize_and_factor(of, zero, False))
 
 
 def rank(of: Problem) -> int:
-    return qr.rank(reduce(of, np.zeros(len(of.weights)), False).r)
+    return qr.rank(linearize_and_factor(of, np.zeros(len(of.weights)), False).r)
 
 
-def grouped(of: Problem) -> list[Group]:
+def grouped(of: Problem) -> list[UnobservableGroup]:
     zero = np.zeros(len(of.weights))
-    layers = Experiment(of, zero).layers(reduce(of, zero, False).r)
-    return groups(layers, Path.of(of.errors, zero[: len(of.errors.parameters)]).stations)
+    layers = ObservabilityProbe(of, zero).layers(linearize_and_factor(of, zero, False).r)
+    return group_directions(
+        layers, PlainErrors.from_model(of.errors, zero[: len(of.errors.parameters)]).error_frames
+    )
 
 
 def named(of: Problem, text: str) -> set[str]:
-    names = {p.name for p in (*of.errors.parameters, *of.unknowns)}
+    names = {p.name for p in (*of.errors.parameters, *of.instrument_parameters)}
     return names & set(re.findall(r"[\w.]+", text))
 
 
@@ -173,7 +175,7 @@ def lines(chain: Chain, q):
     model = chain.model
     data = model.createData()
     pin.forwardKinematics(model, data, chain.configurations(q[None])[0])
-    at = [data.oMi[model.getJointId(name)] for name in chain.moving]
+    at = [data.oMi[model.getJointId(name)] for name in chain.moving_joints]
     return np.array([m.rotation @ a for m, a in zip(at, chain.axes, strict=True)]), np.array(
         [m.translation for m in at]
     )

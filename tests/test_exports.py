@@ -183,7 +183,7 @@ def test_taken_names_are_refused(sim_6dof):
 
 def test_table_of_origins_is_what_pinocchio_reads(sim_6dof_actual):
     rows = list(csv.DictReader(origins_text(sim_6dof_actual).splitlines()))
-    assert [row["joint"] for row in rows] == [*sim_6dof_actual.moving, "tool"]
+    assert [row["joint"] for row in rows] == [*sim_6dof_actual.moving_joints, "tool"]
     for row, origin in zip(rows, sim_6dof_actual.origins, strict=True):
         rotation = pin.rpy.rpyToMatrix(*(float(row[f"{k}[rad]"]) for k in ("roll", "pitch", "yaw")))
         np.testing.assert_allclose(rotation, origin[:3, :3], atol=1e-14)
@@ -200,8 +200,8 @@ def measured(tmp_path):
     robot.write_bytes(robot_file("ur_description/urdf/ur10_robot.urdf").read_bytes())
     chain = Chain.from_urdf(robot, "tool0")
     rng = np.random.default_rng(0)
-    truth = chain.displaced(
-        {0: se3.exp6([1, 2, 0.5, 0.1, 0.2, 2.0]), chain.tool_station: se3.exp6([0.1, 0, 0.05, 0.3, 0, 0])}
+    truth = chain.perturbed_at(
+        {0: se3.exp6([1, 2, 0.5, 0.1, 0.2, 2.0]), chain.tool_frame_index: se3.exp6([0.1, 0, 0.05, 0.3, 0, 0])}
         | {2 * j: se3.exp6(1e-3 * rng.normal(size=6)) for j in range(1, 7)}
     )
     q = rng.uniform(-2, 2, (40, 6))

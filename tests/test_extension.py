@@ -11,23 +11,23 @@ import pytest
 from conftest import paper, robot_file
 
 from dhcal_pin.calibration.cross_validation import (
+    blocked_folds,
+    contact_groups,
     cross_validate,
-    group_folds,
-    random_folds,
-    region_folds,
+    k_fold,
+    leave_one_group_out,
     standard_error,
-    touched,
 )
 from dhcal_pin.calibration.evaluation import accuracy
-from dhcal_pin.calibration.model_selection import MOST, WORDS, extend, hint
+from dhcal_pin.calibration.model_selection import FAMILY_DESCRIPTIONS, MAX_HINT_SAMPLES, extend, family_hint
 from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.cli.main import main
-from dhcal_pin.estimation.parameters import select
+from dhcal_pin.estimation.parameters import select_parameters
 from dhcal_pin.estimation.solver import levenberg_marquardt
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io.measurement_csv import measurement_text
 from dhcal_pin.measurements.base import Noise
-from dhcal_pin.measurements.contact import PointDistance, Touch
+from dhcal_pin.measurements.contact import PointContact, PointDistance
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.measurements.position import Position
 from dhcal_pin.robot.chain import Chain
@@ -37,8 +37,10 @@ def simulated(sets: str, seed: int, m: int = 60, noise: float = 1e-4, kind=Pose)
     """A UR10 with errors of the size of the priors, and what is measured of it."""
     rng = np.random.default_rng(seed)
     arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
-    errors = select(arm, sets)
-    truth = errors.at(rng.normal(size=len(errors.parameters)) * np.minimum(errors.priors, 0.1)).loaded()
+    errors = select_parameters(arm, sets)
+    truth = errors.at(
+        rng.normal(size=len(errors.parameters)) * np.minimum(errors.priors, 0.1)
+    ).with_current_loads()
     return arm, kind.simulate(truth, rng.uniform(-2.5, 2.5, (m, 6)), Noise(noise, noise), rng)
 
 
@@ -56,14 +58,14 @@ def test_a_hint_names_what_is_missing_and_how_much_it_takes_up(family):
     arm, data = simulated(f"{family},minimal,base,tool", seed=1)
     plain = calibrate(arm, data, "minimal,base,tool")
     found = re.fullmatch(
-        r"what is left .* as (.*) would; --extend auto may leave about (\d+) % of it", hint(plain)
+        r"what is left .* as (.*) would; --extend auto may leave about (\d+) % of it", family_hint(plain)
     )
     assert found
-    assert found[1] == WORDS[family]
+    assert found[1] == FAMILY_DESCRIPTIONS[family]
     whole = calibrate(arm, data, f"{family},minimal,base,tool")
-    left = [np.sqrt(fit.solution.triangle.cost / (360 - fit.rank)) for fit in (plain, whole)]
+    left = [np.sqrt(fit.solution.system.cost / (360 - fit.rank)) for fit in (plain, whole)]
     assert float(found[2]) == pytest.approx(100 * left[1] / left[0], abs=2, rel=0.3)
-    assert not hint(whole)
+    assert not family_hint(whole)
 
 
 @pytest.mark.parametrize("seeds", [20, pytest.param(300, marks=pytest.mark.slow)])
@@ -72,18 +74,18 @@ def test_geometry_alone_gives_no_hint(kind, seeds):
     """One false one in a million by chance, whether or not the instrument states its sigmas."""
     for seed in range(seeds):
         arm, data = simulated("minimal,base,tool", seed, (20, 40, 80)[seed % 3], kind=kind)
-        data = replace(data, stated=bool(seed % 2))
-        assert not hint(calibrate(arm, data, "minimal,base,tool"))
+        data = replace(data, has_stated_sigma=bool(seed % 2))
+        assert not family_hint(calibrate(arm, data, "minimal,base,tool"))
 
 
 def test_a_hint_looks_at_some_of_many_samples():
-    arm, data = simulated("harmonics,minimal,base,tool", seed=0, m=3 * MOST + 1)
-    assert WORDS["harmonics"] in hint(calibrate(arm, data, "minimal,base,tool"))
+    arm, data = simulated("harmonics,minimal,base,tool", seed=0, m=3 * MAX_HINT_SAMPLES + 1)
+    assert FAMILY_DESCRIPTIONS["harmonics"] in family_hint(calibrate(arm, data, "minimal,base,tool"))
 
 
 def test_folds_equal_fits_without_what_they_leave_out():
     fit = fitted(Pose)
-    folds = random_folds(fit.data, 4, seed=1)
+    folds = k_fold(fit.data, 4, seed=1)
     found = cross_validate(fit, folds)
     for fold, judged, error in zip(folds, found.folds, found.errors, strict=True):
         kept = replace(
@@ -93,7 +95,7 @@ def test_folds_equal_fits_without_what_they_leave_out():
         left = [d.take(m) for d, m in zip(fit.problem.data, fold, strict=True)]
         chain = fit.errors.at(x)
         assert judged["position_rms_m"] == pytest.approx(accuracy(chain, left)["position_rms_m"], rel=2e-3)
-        rows = left[0].residual(chain.sweep(left[0].q), np.empty(0))
+        rows = left[0].residual(chain.forward_kinematics(left[0].q), np.empty(0))
         assert error == pytest.approx(np.sqrt(np.mean(rows**2)), rel=2e-3)
     counts = [fold["position_samples"] for fold in found.folds]
     whole = np.sqrt(np.average([fold["position_rms_m"] ** 2 for fold in found.folds], weights=counts))
@@ -103,17 +105,17 @@ def test_folds_equal_fits_without_what_they_leave_out():
 
 def test_random_folds_and_groups_leave_each_sample_out_once():
     data = fitted().data
-    for folds in (random_folds(data, 5), group_folds(data, np.arange(40) // 8)):
+    for folds in (k_fold(data, 5), leave_one_group_out(data, np.arange(40) // 8)):
         assert len(folds) == 5
         np.testing.assert_array_equal(np.sum([fold[0] for fold in folds], 0), np.ones(40))
     with pytest.raises(DhcalError, match="choose from 2 to 40"):
-        random_folds(data, 41)
+        k_fold(data, 41)
     with pytest.raises(DhcalError, match="40 samples need"):
-        group_folds(data, np.arange(3))
+        leave_one_group_out(data, np.arange(3))
     with pytest.raises(DhcalError, match="one group"):
-        group_folds(data, np.zeros(40))
+        leave_one_group_out(data, np.zeros(40))
     with pytest.raises(DhcalError, match="made for other data"):
-        cross_validate(fitted(m=30), random_folds(data, 5))
+        cross_validate(fitted(m=30), k_fold(data, 5))
 
 
 def test_regions_are_the_ends_of_joint_space():
@@ -122,10 +124,10 @@ def test_regions_are_the_ends_of_joint_space():
     q[:, 1] = np.arange(8)
     q[:, 4] = -2 * np.arange(8)
     data = replace(fitted(m=8).data[0], q=q)
-    low, high = sorted(fold[0].nonzero()[0].tolist() for fold in region_folds([data]))
+    low, high = sorted(fold[0].nonzero()[0].tolist() for fold in blocked_folds([data]))
     assert (low, high) == ([0, 1], [6, 7])
     with pytest.raises(DhcalError, match="different joint values"):
-        region_folds([replace(data, q=np.ones((8, 6)))])
+        blocked_folds([replace(data, q=np.ones((8, 6)))])
 
 
 def test_what_was_touched_is_left_out_as_a_whole():
@@ -134,11 +136,11 @@ def test_what_was_touched_is_left_out_as_a_whole():
     label = np.repeat(np.arange(5), 4)
     arm = Chain.from_dh(paper("sim_6dof"))
     q = 0.4 * label[:, None] + np.random.default_rng(0).uniform(-0.1, 0.1, (20, 6))
-    touches = Touch.of(q, names[label].tolist())
-    known = PointDistance.of(6, [("c", "d"), ("a", "b"), ("a", "i")], [0.1, 0.1, 0.1])
+    touches = PointContact.from_arrays(q, names[label].tolist())
+    known = PointDistance.from_arrays(6, [("c", "d"), ("a", "b"), ("a", "i")], [0.1, 0.1, 0.1])
     problem = calibrate(arm, [touches, known], "dh", max_iterations=1).problem
-    places = touched(problem, np.zeros(len(problem.weights)))
-    folds = region_folds(problem.data, places=places)
+    places = contact_groups(problem, np.zeros(len(problem.weights)))
+    folds = blocked_folds(problem.data, groups=places)
     for of_touches, of_distances in folds:
         by_name = {name: set(of_touches[label == i].tolist()) for i, name in enumerate("abcde")}
         assert all(len(found) == 1 for found in by_name.values())
@@ -147,9 +149,9 @@ def test_what_was_touched_is_left_out_as_a_whole():
     left = {tuple(fold[0].tolist()) for fold in folds}
     assert len(left) == len(folds) >= 2
     # One place is no region of its own: there samples are left out one by one.
-    one = Touch.of(q, ["a"] * 20)
-    alone = [fold[0] for fold in region_folds([one], places=np.zeros(20, int))]
-    np.testing.assert_array_equal(alone, [fold[0] for fold in region_folds([one])])
+    one = PointContact.from_arrays(q, ["a"] * 20)
+    alone = [fold[0] for fold in blocked_folds([one], groups=np.zeros(20, int))]
+    np.testing.assert_array_equal(alone, [fold[0] for fold in blocked_folds([one])])
 
 
 def test_few_folds_must_agree_more():
@@ -160,7 +162,7 @@ def test_few_folds_must_agree_more():
 
 
 def test_a_point_that_only_left_out_samples_touch_is_fitted_to_them():
-    fit = fitted(Touch, 60)
+    fit = fitted(PointContact, 60)
     groups = [item.kind for item in fit.data]
     assert groups == ["point"]
     found = cross_validate(fit)
@@ -171,7 +173,7 @@ def test_a_point_that_only_left_out_samples_touch_is_fitted_to_them():
 def test_nothing_is_added_to_an_arm_without(seed):
     _, trials = extend(*simulated("minimal,base,tool", seed))
     assert len(trials) == 4
-    assert not [trial.family for trial in trials if trial.kept]
+    assert not [trial.family for trial in trials if trial.is_selected]
 
 
 @pytest.mark.slow
@@ -181,7 +183,7 @@ def test_nothing_is_added_to_two_hundred_arms_without(kind):
     for seed in range(200):
         m = (30, 60, 120)[seed % 3]
         _, trials = extend(*simulated("minimal,base,tool", 100 + seed, m, kind=kind))
-        added += any(trial.kept for trial in trials)
+        added += any(trial.is_selected for trial in trials)
     assert added <= 10
 
 
@@ -189,7 +191,7 @@ def test_nothing_is_added_to_two_hundred_arms_without(kind):
 def test_what_is_there_is_added(family):
     arm, data = simulated(f"minimal,base,tool,{family}", 3)
     fit, trials = extend(arm, data)
-    assert next(trial.family for trial in trials if trial.kept) == family
+    assert next(trial.family for trial in trials if trial.is_selected) == family
     one = trials[0]
     assert one.cv_after < one.cv_before - one.standard_error
     plain = calibrate(arm, data)
@@ -208,19 +210,19 @@ def test_the_command_says_what_each_family_brought(tmp_path, monkeypatch, capsys
     rows = json.loads((tmp_path / "r.json").read_text())["extension"]
     report = (tmp_path / "r.md").read_text()
     for row in rows:
-        verdict = "added" if row["kept"] else "left out"
+        verdict = "added" if row["is_selected"] else "not selected"
         assert f"| {row['family']} | {verdict} | {row['cv_before']:.3f} | {row['cv_after']:.3f} |" in report
     assert "µrad/Nm" in report
     assert not re.search(r"\b(nan|inf|infinity)\b", report, re.IGNORECASE)
-    assert [(row["family"], row["kept"]) for row in rows] == [("compliance", True), ("gain", False)]
+    assert [(row["family"], row["is_selected"]) for row in rows] == [("compliance", True), ("gain", False)]
     assert {"cv_before", "cv_after", "standard_error"} <= set(rows[0])
     assert "compliance_rad_per_nm" in (tmp_path / "out.calibration.toml").read_text()
-    assert "gain        left out" in said
+    assert "gain        not selected" in said
     assert "hint:" not in said
     assert main([*common, "--report", "r.md"]) == 0
     found = json.loads((tmp_path / "r.json").read_text())
     assert found["extension"] == []
-    assert f"as {WORDS['compliance']} would" in found["hint"]
+    assert f"as {FAMILY_DESCRIPTIONS['compliance']} would" in found["hint"]
     assert f"hint: {found['hint']}" in capsys.readouterr().err
     assert found["hint"][1:] in (tmp_path / "r.md").read_text()
     for wrong, words in (

@@ -11,7 +11,7 @@ from conftest import URDF, paper, random_table
 from dhcal_pin import se3
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io.robot import read_robot
-from dhcal_pin.paper.error_factors import (
+from dhcal_pin.paper.factors import (
     alpf,
     differential_motion,
     error_factors,
@@ -34,7 +34,7 @@ KEYS = ("theta", "d", "a", "alpha")
 
 
 def joints(table: DHTable, m: int = 30, seed: int = 0):
-    return np.random.default_rng(seed).uniform(-np.pi, np.pi, (m, table.size))
+    return np.random.default_rng(seed).uniform(-np.pi, np.pi, (m, table.n_joints))
 
 
 @pytest.mark.parametrize("file", sorted(p.name for p in [*URDF.glob("*.urdf"), *URDF.glob("*.dh.toml")]))
@@ -52,7 +52,7 @@ def test_all_routes_agree_on_a_single_joint(convention, slides):
     one = {key: np.array([value]) for key, value in zip(KEYS, (0.3, 0.2, -0.1, 0.7), strict=True)}
     limits = {"beta": np.zeros(1), "lower": np.array([-1.0]), "upper": np.ones(1)}
     table = DHTable(convention, ("only",), np.array([slides]), **one, **limits)
-    assert all(row.holds for row in crosscheck(Chain.from_dh(table)))
+    assert all(row.agrees for row in crosscheck(Chain.from_dh(table)))
 
 
 def test_link_derivatives_are_products_with_q():
@@ -88,7 +88,7 @@ def test_factors_of_random_arms_with_sliding_joints():
     rng = np.random.default_rng(7)
     for _ in range(20):
         table = random_table(rng)
-        table = replace(table, beta=rng.uniform(-0.1, 0.1, table.size), tool=se3.exp6(rng.normal(size=6)))
+        table = replace(table, beta=rng.uniform(-0.1, 0.1, table.n_joints), tool=se3.exp6(rng.normal(size=6)))
         q = joints(table, 5)
         np.testing.assert_allclose(error_factors(table, q), differences(table, q), atol=1e-8)
 
@@ -167,10 +167,10 @@ def test_check_refuses_nothing_that_is_a_chain():
     for convention in ("standard", "modified"):
         table = random_table(rng, convention, 5)
         for row in crosscheck(Chain.from_dh(table), 20):
-            assert row.holds, row
+            assert row.agrees, row
 
 
 def test_check_refuses_no_mimic_joint(mimicking):
-    assert mimicking.size < len(mimicking.moving)
+    assert mimicking.n_joints < len(mimicking.moving_joints)
     for row in crosscheck(mimicking, 20):
-        assert row.holds, row
+        assert row.agrees, row

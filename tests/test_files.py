@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 
 from dhcal_pin import se3
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io.atomic import check_place, save
+from dhcal_pin.io.atomic import require_writable, write_files
 from dhcal_pin.io.dh_file import dh_text, read_dh
-from dhcal_pin.io.measurement_csv import measurement_text, read_measurements, read_readings
+from dhcal_pin.io.measurement_csv import measurement_text, read_measurement_file, read_measurements
 from dhcal_pin.io.robot import read_robot, urdf_files, write_urdf
 from dhcal_pin.io.settings import read_priors
 from dhcal_pin.io.sidecar import sidecar_text
-from dhcal_pin.io.tabular import read_sheet, read_toml
+from dhcal_pin.io.tabular import read_csv_table, read_toml
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.measurements.position import Position
 from dhcal_pin.report.document import json_text
@@ -257,13 +257,13 @@ HEADER = "shoulder[deg],lift[mm],x[mm],y[mm],z[mm]\n"
 
 def test_readings_come_in_si_and_in_the_file_s_order(tmp_path):
     text = "# FARO\n\n" + HEADER + "90,-100,606.8,1,2\n\n# pause\n45,0,3,4,5\n"
-    readings = read_readings(write(tmp_path, "a.csv", text), scara(tmp_path))
+    readings = read_measurement_file(write(tmp_path, "a.csv", text), scara(tmp_path))
     assert readings.data.q.tolist() == [[np.pi / 2, -0.1], [np.pi / 4, 0.0]]
     assert readings.data.positions().tolist() == [[0.6068, 0.001, 0.002], [0.003, 0.004, 0.005]]
     assert readings.data.rows.tolist() == [1, 2]
-    assert not readings.data.stated
+    assert not readings.data.has_stated_sigma
     assert readings.commanded is None
-    assert readings.after is None
+    assert readings.measured_after is None
 
 
 @pytest.mark.parametrize(
@@ -306,9 +306,9 @@ def test_sigmas_and_sets_and_commanded_positions(tmp_path):
         + ",sigma_x[um],sigma_y[um],sigma_z[um],set,pose_id,commanded_x[mm],commanded_y[mm],commanded_z[mm]\n"
         + "0,0,1,2,3,10,20,30,fit,a,7,8,9\n90,0,1,2,3,10,20,40,holdout,b,7,8,9\n"
     )
-    readings = read_readings(write(tmp_path, "a.csv", text), scara(tmp_path))
+    readings = read_measurement_file(write(tmp_path, "a.csv", text), scara(tmp_path))
     assert isinstance(readings.data, Position)
-    assert readings.data.stated
+    assert readings.data.has_stated_sigma
     assert readings.data.sigma.tolist() == [[1e-5, 2e-5, 3e-5], [1e-5, 2e-5, 4e-5]]
     assert readings.fit.rows.tolist() == [1]
     assert readings.holdout.rows.tolist() == [2]
@@ -327,12 +327,12 @@ def test_positions_are_written_to_the_last_digit(tmp_path_factory, rows, data):
     folder, rows = tmp_path_factory.mktemp("csv"), np.array(rows)
     chain = scara(folder)
     sigma = data.draw(st.one_of(st.none(), st.floats(1e-9, 1.0)))
-    wrote = Position.of(rows[:, :2], rows[:, 2:], sigma)
+    wrote = Position.from_arrays(rows[:, :2], rows[:, 2:], sigma)
     again = read_measurements(write(folder, "a.csv", measurement_text(wrote, chain, ["a", "b"])), chain)
     assert isinstance(again, Position)
     assert again.q.tolist() == wrote.q.tolist()
-    assert again.reading.tolist() == wrote.reading.tolist()
-    assert again.stated == (sigma is not None)
+    assert again.values.tolist() == wrote.values.tolist()
+    assert again.has_stated_sigma == (sigma is not None)
     assert again.sigma.tolist() == wrote.sigma.tolist()
 
 
@@ -347,7 +347,7 @@ def test_poses_keep_their_rotation(tmp_path_factory, rows, axis, angle):
     chain = scara(folder)
     turn = se3.exp3(angle * np.array(axis) / np.linalg.norm(axis))
     poses = se3.transform(np.tile(turn, (len(rows), 1, 1)), rows[:, 2:])
-    wrote = Pose.of(rows[:, :2], poses, 1e-4, 1e-5)
+    wrote = Pose.from_arrays(rows[:, :2], poses, 1e-4, 1e-5)
     again = read_measurements(write(folder, "a.csv", measurement_text(wrote, chain)), chain)
     assert isinstance(again, Pose)
     assert again.q.tolist() == wrote.q.tolist()
@@ -360,8 +360,8 @@ def test_poses_keep_their_rotation(tmp_path_factory, rows, axis, angle):
 def test_a_joint_named_like_a_reading_is_refused(tmp_path):
     gantry = Chain.from_dh(read_dh(write(tmp_path, "g.dh.toml", SCARA.replace('"lift"', '"x"'))))
     for act in (
-        lambda: read_readings(write(tmp_path, "a.csv", HEADER + "0,0,1,2,3\n"), gantry),
-        lambda: measurement_text(Position.of(np.zeros((1, 2)), np.zeros((1, 3))), gantry),
+        lambda: read_measurement_file(write(tmp_path, "a.csv", HEADER + "0,0,1,2,3\n"), gantry),
+        lambda: measurement_text(Position.from_arrays(np.zeros((1, 2)), np.zeros((1, 3))), gantry),
     ):
         with pytest.raises(DhcalError, match="'x' has the name of a reading; rename"):
             act()
@@ -370,12 +370,12 @@ def test_a_joint_named_like_a_reading_is_refused(tmp_path):
 def test_a_stray_quote_stays_in_its_row(tmp_path):
     path = write(tmp_path, "a.csv", 'a,b\n1,2\n"3,4\n5,6\n')
     with pytest.raises(DhcalError, match=r"a\.csv:3: 1 values under a header of 2 columns"):
-        read_sheet(path)
+        read_csv_table(path)
 
 
 def test_a_cell_beyond_all_bounds_is_a_message(tmp_path):
     with pytest.raises(DhcalError, match=r"a\.csv:2: not comma-separated text"):
-        read_sheet(write(tmp_path, "a.csv", f"a,b\n1,{'2' * 200_000}\n"))
+        read_csv_table(write(tmp_path, "a.csv", f"a,b\n1,{'2' * 200_000}\n"))
 
 
 # --- noise, priors, TOML ---------------------------------------------------------------------------
@@ -416,7 +416,7 @@ def test_priors_by_name(tmp_path):
 
 
 def test_all_files_are_written(tmp_path):
-    save({tmp_path / "a": "ä", str(tmp_path / "b"): b"\xff"})
+    write_files({tmp_path / "a": "ä", str(tmp_path / "b"): b"\xff"})
     assert (tmp_path / "a").read_bytes() == "ä".encode()
     assert (tmp_path / "b").read_bytes() == b"\xff"
     assert sorted(os.listdir(tmp_path)) == ["a", "b"]
@@ -424,7 +424,7 @@ def test_all_files_are_written(tmp_path):
 
 def test_a_written_file_has_the_usual_rights(tmp_path):
     (tmp_path / "usual").touch()
-    save({tmp_path / "a": ""})
+    write_files({tmp_path / "a": ""})
     assert (tmp_path / "a").stat().st_mode == (tmp_path / "usual").stat().st_mode
 
 
@@ -434,7 +434,7 @@ def test_what_a_link_leads_to_is_written_and_keeps_its_rights(tmp_path):
     real, link = write(tmp_path / "far", "real", "old"), tmp_path / "link"
     real.chmod(0o600)
     link.symlink_to(real)
-    save({link: "new"})
+    write_files({link: "new"})
     assert link.is_symlink()
     assert real.read_text() == "new"
     assert real.stat().st_mode & 0o777 == 0o600
@@ -448,7 +448,7 @@ def test_a_second_file_that_cannot_be_leaves_nothing_of_the_first(tmp_path, bad,
     (tmp_path / "folder").mkdir()
     before = sorted(os.listdir(tmp_path))
     with pytest.raises(DhcalError, match=f"{bad}: .*{words}"):
-        save({tmp_path / "a": "new", tmp_path / bad: "new"})
+        write_files({tmp_path / "a": "new", tmp_path / bad: "new"})
     assert sorted(os.listdir(tmp_path)) == before
 
 
@@ -465,7 +465,7 @@ def test_a_failing_rename_brings_back_what_was_there(tmp_path, monkeypatch, erro
 
     monkeypatch.setattr(os, "replace", failing)
     with pytest.raises(DhcalError if isinstance(error, OSError) else KeyboardInterrupt):
-        save({tmp_path / "a": "new", tmp_path / "b": "new", tmp_path / "c": "new"})
+        write_files({tmp_path / "a": "new", tmp_path / "b": "new", tmp_path / "c": "new"})
     assert places[:3] == [str((tmp_path / name).resolve()) for name in "abc"]
     assert os.listdir(tmp_path) == ["a"]
     assert (tmp_path / "a").read_text() == "old"
@@ -477,7 +477,7 @@ def test_without_links_a_copy_is_kept(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "link", none)
     write(tmp_path, "a", "old")
-    save({tmp_path / "a": "new"})
+    write_files({tmp_path / "a": "new"})
     assert os.listdir(tmp_path) == ["a"]
     assert (tmp_path / "a").read_text() == "new"
 
@@ -485,16 +485,16 @@ def test_without_links_a_copy_is_kept(tmp_path, monkeypatch):
 def test_a_reader_never_sees_half_a_file(tmp_path):
     write(tmp_path, "a", "old")
     with open(tmp_path / "a") as reader:
-        save({tmp_path / "a": "new"})
+        write_files({tmp_path / "a": "new"})
         assert reader.read() == "old"
     assert (tmp_path / "a").read_text() == "new"
 
 
 def test_a_place_in_the_working_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    check_place("a.urdf")
+    require_writable("a.urdf")
     with pytest.raises(DhcalError, match="no folder sub; make it first"):
-        check_place("sub/a.urdf")
+        require_writable("sub/a.urdf")
 
 
 def test_json_has_no_nan_and_any_file_name(tmp_path):

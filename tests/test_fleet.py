@@ -153,15 +153,15 @@ def test_what_is_hard_to_believe_of_a_robot_is_told(place, capsys):
     fleet(place, job("arm.dh.toml", "a.urdf") + job("arm.dh.toml", "b.urdf", data="wrong.csv"))
     assert main.main([*RUN, "--jobs", "1", "--json", "summary.json"]) == 0
     said = capsys.readouterr().err.splitlines()
-    (line,) = [line for line in said if "check:" in line]
-    assert "wrong.csv: check: " in line
+    (line,) = [line for line in said if "warning:" in line]
+    assert "warning: wrong.csv: " in line
     assert "joint joint_3 moving the other way" in line
     first, second = csv.DictReader(Path("summary.csv").read_text().splitlines())
     assert first["message"] == ""
     assert "joint_3" in second["message"]
     jobs = json.loads(Path("summary.json").read_text())["jobs"]
-    assert jobs[0]["result"]["doubts"] == {}
-    assert list(jobs[1]["result"]["doubts"]) == ["wrong.csv"]
+    assert jobs[0]["result"]["warnings"] == []
+    assert [text.split(":")[0] for text in jobs[1]["result"]["warnings"]] == ["wrong.csv"]
 
 
 def test_a_process_that_dies_takes_no_other_with_it(place):

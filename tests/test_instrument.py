@@ -18,7 +18,7 @@ from dhcal_pin.io.measurement_csv import measurement_text
 from dhcal_pin.io.sidecar import read_instrument
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.length import Wires
-from dhcal_pin.measurements.position import Targets
+from dhcal_pin.measurements.position import MultiTargetPosition
 
 
 def wires(chain, m, seed=0):
@@ -28,14 +28,14 @@ def wires(chain, m, seed=0):
     q = rng.uniform(-2.5, 2.5, (m, 6))
     length = np.linalg.norm(chain.poses(q)[:, None, :3, 3] - anchors, axis=2)
     true = {f"wire{i + 1}.{axis}": float(anchors[i, j]) for i in range(3) for j, axis in enumerate("xyz")}
-    return Wires.of(q, length), true
+    return Wires.from_arrays(q, length), true
 
 
 def test_surveyed_anchors_are_held_and_fix_the_base(sim_6dof, sim_6dof_actual):
     """With the rig surveyed in the base's frame the wires see what positions see."""
     data, true = wires(sim_6dof_actual, 60)
     fit = calibrate(sim_6dof, data, "dh", priors="none", known=true)
-    assert fit.problem.unknowns == ()
+    assert fit.problem.instrument_parameters == ()
     q = np.random.default_rng(1).uniform(-2.5, 2.5, (50, 6))
     gap = fit.chain.poses(q)[:, :3, 3] - sim_6dof_actual.poses(q)[:, :3, 3]
     assert np.abs(gap).max() < 1e-9
@@ -115,7 +115,9 @@ def test_targets_a_foot_apart_on_the_far_side_of_the_shop_converge(sim_6dof, sim
         base = se3.transform(se3.exp3(rng.normal(0, 1, 3)), rng.normal(0, 3, 3))
         pose = base @ sim_6dof_actual.poses(q)
         seen = pose[:, :3, 3] + np.einsum("mij,mj->mi", pose[:, :3, :3], places[label])
-        data = Targets.of(q, seen + rng.normal(0, 1e-4, seen.shape), [f"t{i}" for i in label])
+        data = MultiTargetPosition.from_arrays(
+            q, seen + rng.normal(0, 1e-4, seen.shape), [f"t{i}" for i in label]
+        )
         fit = calibrate(sim_6dof, data, "minimal,base,tool")
         assert fit.converged
         assert fit.iterations < 30
@@ -127,7 +129,7 @@ def test_targets_a_foot_apart_on_the_far_side_of_the_shop_converge(sim_6dof, sim
 
 def test_files_that_count_their_targets_differently_are_refused(sim_6dof, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    data = Targets.simulate(
+    data = MultiTargetPosition.simulate(
         sim_6dof, np.random.default_rng(0).uniform(-3, 3, (30, 6)), Noise(1e-4), np.random.default_rng(1)
     )
     Path("arm.urdf").write_bytes((URDF / "sim_6dof.urdf").read_bytes())

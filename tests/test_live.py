@@ -19,13 +19,13 @@ from dhcal_pin import se3
 from dhcal_pin.cli.main import main
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.robot.chain import Chain
-from dhcal_pin.visualization.live import PATIENCE, Live, serve
+from dhcal_pin.visualization.live import TIMEOUT_MS, Live, serve
 
 
 def arms(chain: Chain) -> tuple[Chain, Chain]:
     """An arm, and the same with another origin, base and tool."""
     error = np.array([1e-3, 0, -2e-3, 0, 3e-3, 1e-3])
-    wrong = chain.displaced({4: se3.exp6(error)})
+    wrong = chain.perturbed_at({4: se3.exp6(error)})
     return chain, replace(wrong, base=se3.translation([2.0, 0, 1]), tool=se3.translation([0, 0, 0.1]))
 
 
@@ -54,7 +54,7 @@ def test_the_browser_shows_what_pinocchio_says(scene, browser, sim_6dof):
     nominal, calibrated = arms(sim_6dof)
     q = np.array([0.3, -0.7, 0.9, 0.2, -1.1, 0.5])
     # A twist magnified 30 times, and both arms in the frame of the calibrated base.
-    grown = nominal.displaced({4: se3.exp6(30 * np.array([1e-3, 0, -2e-3, 0, 3e-3, 1e-3]))})
+    grown = nominal.perturbed_at({4: se3.exp6(30 * np.array([1e-3, 0, -2e-3, 0, 3e-3, 1e-3]))})
     scene.show(q)
     page = browser.new_page(viewport={"width": 300, "height": 200})
     page.goto(scene.url)
@@ -71,7 +71,7 @@ def test_the_browser_shows_what_pinocchio_says(scene, browser, sim_6dof):
 
 @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_server_that_is_gone_is_named_in_time(scene, end):
-    assert PATIENCE < 3000
+    assert TIMEOUT_MS < 3000
     for process in processes(scene):
         process.send_signal(end)
     for _ in range(2):

@@ -39,20 +39,20 @@ def test_frames_and_velocities_are_numpys(seed, m):
     rng = np.random.default_rng(seed)
     table = random_table(rng)
     chain = Chain.from_dh(table)
-    motion = chain.motion(random_joints(rng, table, m))
-    k, p = len(chain.moving), int(rng.integers(1, 30))
+    motion = chain.joint_state(random_joints(rng, table, m))
+    k, p = len(chain.moving_joints), int(rng.integers(1, 30))
     theirs, ours = np.empty((2, k + 2, 7, 3, m))
     theirs[0, :4] = ours[0, :4] = se3.exp6(rng.standard_normal(6))[:3].T[:, :, None]
-    kinematics.carry_frames(chain.links, chain.prismatic, motion, theirs)
-    native.carry_frames(chain.links, chain.prismatic, motion, ours)
+    kinematics.propagate_frames(chain.link_transforms, chain.prismatic, motion, theirs)
+    native.propagate_frames(chain.link_transforms, chain.prismatic, motion, ours)
     np.testing.assert_allclose(ours[:, :4], theirs[:, :4], atol=1e-14)
     at = np.sort(rng.integers(0, k + 1, p))
     twists = rng.standard_normal((p, 6)) * (rng.random((p, 6)) < 0.4)
     twists[rng.random(p) < 0.3] = np.eye(6)[rng.integers(6)]
     wide = np.full((6, p + 1, m + 5), np.nan)
     out, expected = wide.swapaxes(0, 1)[:p, :, 2 : m + 2], np.empty((p, 6, m))
-    kinematics.point_velocities(theirs[:-1], theirs[-1, 3], at, twists, expected)
-    native.point_velocities(ours[:-1], ours[-1, 3], at, twists, out)
+    kinematics.point_jacobian(theirs[:-1], theirs[-1, 3], at, twists, expected)
+    native.point_jacobian(ours[:-1], ours[-1, 3], at, twists, out)
     np.testing.assert_allclose(out, expected, atol=1e-13)
     assert np.isnan(wide[:, p]).all()
     assert np.isnan(wide[..., [0, 1, -3, -2, -1]]).all()
@@ -67,7 +67,7 @@ def test_a_triangle_is_lapacks_but_for_signs(seed, m, columns, readings):
     rows[rng.random((columns, readings)) < 0.3] = 0.0
     rows *= 10.0 ** rng.uniform(-3, 3, columns)[:, None, None]
     before = rows.copy()
-    r = native.triangle_of(rows)
+    r = native.r_factor(rows)
     np.testing.assert_array_equal(rows, before)
     np.testing.assert_array_equal(r, np.triu(r))
     whole = before.reshape(columns, -1)
@@ -82,10 +82,10 @@ def test_triangles_of_many_are_each_ones_own():
     """Members with more rows than columns, and with fewer."""
     rng = np.random.default_rng(0)
     for rows in rng.standard_normal((5, 7, 2, 30)), rng.standard_normal((5, 7, 2, 2)):
-        many = native.triangles_of(rows)
+        many = native.r_factors(rows)
         for member, r in zip(rows, many, strict=True):
-            np.testing.assert_array_equal(r, native.triangle_of(member))
-        theirs = qr.triangles_of(rows)
+            np.testing.assert_array_equal(r, native.r_factor(member))
+        theirs = qr.r_factors(rows)
         np.testing.assert_allclose(many.swapaxes(1, 2) @ many, theirs.swapaxes(1, 2) @ theirs, atol=1e-12)
 
 
@@ -93,14 +93,14 @@ def test_triangles_of_many_are_each_ones_own():
 def test_triangles_of_any_size(size):
     rows = size * np.random.default_rng(0).standard_normal((5, 2, 200))
     wanted = np.abs(np.linalg.qr(rows.reshape(5, -1).T, mode="r"))
-    np.testing.assert_allclose(np.abs(native.triangle_of(rows)), wanted, rtol=1e-12, atol=1e-12 * size)
+    np.testing.assert_allclose(np.abs(native.r_factor(rows)), wanted, rtol=1e-12, atol=1e-12 * size)
 
 
-def random_mixture(rng: np.random.Generator, readings: int, ends: int, m: int) -> types.Mixture:
+def random_mixture(rng: np.random.Generator, readings: int, ends: int, m: int) -> types.ObservationMatrix:
     """Any terms for some of the rows, none for others."""
     count = int(rng.integers(0, 12))
     rows = np.sort(rng.integers(0, readings, count))
-    return types.Mixture(rows, rng.integers(0, 6 * ends, count), rng.standard_normal((count, m)))
+    return types.ObservationMatrix(rows, rng.integers(0, 6 * ends, count), rng.standard_normal((count, m)))
 
 
 @given(SEEDS, SAMPLES, st.integers(1, 2), st.integers(1, 6), st.integers(1, 20))
@@ -112,11 +112,11 @@ def test_mixtures_are_sums_of_products(seed, m, ends, readings, vectors):
         random_mixture(rng, readings, ends, m),
     )
     expected = np.zeros((vectors, readings, m))
-    for row, component, share in zip(mixture.rows, mixture.components, mixture.shares, strict=True):
+    for row, component, share in zip(mixture.rows, mixture.components, mixture.coefficients, strict=True):
         end, which = divmod(component, 6)
         expected[:, row] += share * velocities[:, which, end * m : (end + 1) * m]
     for way in native, kinematics:
-        found = way.mix_velocities(velocities, mixture, np.full(expected.shape, np.nan))
+        found = way.apply_observation_matrix(velocities, mixture, np.full(expected.shape, np.nan))
         np.testing.assert_allclose(found, expected, atol=1e-13)
 
 
@@ -127,18 +127,18 @@ def test_triangles_of_errors_are_those_of_their_rows(seed, m, ends, readings, ow
     rng = np.random.default_rng(seed)
     table = random_table(rng)
     chain, p = Chain.from_dh(table), int(rng.integers(0, 30))
-    sweep = chain.sweep(random_joints(rng, table, ends * members * m))
-    at = np.sort(rng.integers(0, len(chain.moving) + 1, p))
+    frames = chain.forward_kinematics(random_joints(rng, table, ends * members * m))
+    at = np.sort(rng.integers(0, len(chain.moving_joints) + 1, p))
     twists = rng.standard_normal((members, p, 6)) * (rng.random((members, p, 6)) < 0.4)
     twists[rng.random((members, p)) < 0.3, 3:] = 0.0
     given_ = rng.standard_normal((readings, own + 1, members * m)).swapaxes(0, 1)
     given_[rng.random((own + 1, readings)) < 0.3] = 0.0
     mixture = random_mixture(rng, readings, ends, members * m)
-    terms = sweep.frames, sweep.tool[3], at, twists, mixture, given_
+    terms = frames.columns, frames.tool[3], at, twists, mixture, given_
     before = given_.copy()
-    ours = native.error_triangles(*terms)
+    ours = native.factor_jacobian(*terms)
     np.testing.assert_array_equal(given_, before)
-    for r, theirs in zip(ours, qr.error_triangles(*terms), strict=True):
+    for r, theirs in zip(ours, qr.factor_jacobian(*terms), strict=True):
         np.testing.assert_array_equal(r, np.triu(r))
         wanted = theirs.T @ theirs
         scale = np.sqrt(np.diag(wanted))
@@ -152,12 +152,12 @@ def test_stations_move_as_numpys(seed, count):
     """Any twists, several at a station, small and large, at base, joints and tool."""
     rng = np.random.default_rng(seed)
     chain = Chain.from_dh(random_table(rng))
-    stations = np.sort(rng.integers(0, chain.tool_station + 1, count))
+    stations = np.sort(rng.integers(0, chain.tool_frame_index + 1, count))
     twists = rng.standard_normal((count, 6)) * (rng.random((count, 6)) < 0.4)
     x = rng.standard_normal(count) * 10.0 ** rng.uniform(-9, 0, count)
     tool = se3.exp6(rng.standard_normal(6))
-    terms = chain.into, chain.origins, tool, stations, twists, x
-    theirs, ours = kinematics.move_stations(*terms), native.move_stations(*terms)
+    terms = chain.body_from_urdf, chain.origins, tool, stations, twists, x
+    theirs, ours = kinematics.perturb_frames(*terms), native.perturb_frames(*terms)
     for mine, other in zip(ours, theirs, strict=True):
         np.testing.assert_allclose(mine, other, atol=1e-13)
     for station, motion in enumerate(ours[0]):
@@ -171,10 +171,10 @@ def test_cosines_and_sines_of_any_angle(size):
     angles = size * np.random.default_rng(2).uniform(-1, 1, (3, 1001))
     angles[0, :200] = np.round(angles[0, :200] / (np.pi / 4)) * (np.pi / 4)
     angles[1, :2] = 0.0, -0.0
-    cosines, sines = native.cosines_and_sines(angles)
+    cosines, sines = native.cos_sin(angles)
     np.testing.assert_allclose(cosines, np.cos(angles), rtol=5e-16, atol=0)
     np.testing.assert_allclose(sines, np.sin(angles), rtol=5e-16, atol=0)
-    assert np.isnan(native.cosines_and_sines(np.array([[np.nan, np.inf]]))).all()
+    assert np.isnan(native.cos_sin(np.array([[np.nan, np.inf]]))).all()
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-12, 1e-6, 1e-3, 0.02, 0.05, 1.0, 3.0, np.pi - 1e-9])
@@ -185,7 +185,7 @@ def test_rotations_of_any_angle(size):
     rotvecs = np.ascontiguousarray(size * (axes / np.linalg.norm(axes, axis=1)[:, None]).T)
     turns = np.ascontiguousarray(se3.exp3(rotvecs.T).transpose(1, 2, 0))
     np.testing.assert_allclose(native.log_rotations(turns), se3.log3(turns.transpose(2, 0, 1)).T, atol=2e-15)
-    inverses = native.right_jacobian_inverses(rotvecs).transpose(2, 0, 1)
+    inverses = native.right_jacobian_inverse_batch(rotvecs).transpose(2, 0, 1)
     np.testing.assert_allclose(inverses, se3.right_jacobian_inverse(rotvecs.T), atol=1e-14)
 
 
@@ -193,35 +193,37 @@ def test_digits_depend_neither_on_where_arrays_lie_nor_on_their_neighbours(sim_6
     """Whole vectors and the rest of a loop round alike: else a report would change from run to run."""
     q = np.random.default_rng(0).uniform(-3, 3, (300, 6))
     bodies, twists = np.arange(7), np.random.default_rng(1).standard_normal((7, 6))
-    sweep = sim_6dof.sweep(q)
-    velocities = sim_6dof.tool_velocities(sweep, bodies, twists)
+    frames = sim_6dof.forward_kinematics(q)
+    velocities = sim_6dof.tool_jacobian(frames, bodies, twists)
     for first, count in ((0, 1), (3, 1), (5, 2), (66, 3), (1, 67), (100, 64)):
         part = slice(first, first + count)
-        alone = sim_6dof.sweep(q[part])
-        np.testing.assert_array_equal(alone.bodies, sweep.bodies[..., part])
-        own = sim_6dof.tool_velocities(alone, bodies, twists)
+        alone = sim_6dof.forward_kinematics(q[part])
+        np.testing.assert_array_equal(alone.bodies, frames.bodies[..., part])
+        own = sim_6dof.tool_jacobian(alone, bodies, twists)
         np.testing.assert_array_equal(own, velocities[..., part])
         turns = np.ascontiguousarray(alone.tool[:3])
-        whole = native.log_rotations(np.ascontiguousarray(sweep.tool[:3]))
+        whole = native.log_rotations(np.ascontiguousarray(frames.tool[:3]))
         np.testing.assert_array_equal(native.log_rotations(turns), whole[:, part])
         rotvecs = np.ascontiguousarray(own[0, 3:])
-        inverses = native.right_jacobian_inverses(np.ascontiguousarray(velocities[0, 3:]))
-        np.testing.assert_array_equal(native.right_jacobian_inverses(rotvecs), inverses[..., part])
+        inverses = native.right_jacobian_inverse_batch(np.ascontiguousarray(velocities[0, 3:]))
+        np.testing.assert_array_equal(native.right_jacobian_inverse_batch(rotvecs), inverses[..., part])
         rows, components = np.repeat(np.arange(3), 3), np.tile([3, 4, 5], 3)
-        mixture = types.Mixture(rows, components, inverses.reshape(9, -1))
+        mixture = types.ObservationMatrix(rows, components, inverses.reshape(9, -1))
         out, expected = np.empty((7, 3, count)), np.empty((7, 3, 300))
-        native.mix_velocities(velocities, mixture, expected)
-        native.mix_velocities(own, replace(mixture, shares=mixture.shares[:, part]), out)
+        native.apply_observation_matrix(velocities, mixture, expected)
+        native.apply_observation_matrix(
+            own, replace(mixture, coefficients=mixture.coefficients[:, part]), out
+        )
         np.testing.assert_array_equal(out, expected[..., part])
-        cosines, sines = native.cosines_and_sines(np.ascontiguousarray(q.T))
-        mine = native.cosines_and_sines(np.ascontiguousarray(q[part].T))
+        cosines, sines = native.cos_sin(np.ascontiguousarray(q.T))
+        mine = native.cos_sin(np.ascontiguousarray(q[part].T))
         np.testing.assert_array_equal(mine, (cosines[:, part], sines[:, part]))
     rows = np.random.default_rng(2).standard_normal((9, 3, 67))
-    wanted = native.triangle_of(rows)
+    wanted = native.r_factor(rows)
     for shift in range(1, 8):
         moved = np.empty(rows.size + 8)[shift : shift + rows.size].reshape(rows.shape)
         moved[...] = rows
-        np.testing.assert_array_equal(native.triangle_of(moved), wanted)
+        np.testing.assert_array_equal(native.r_factor(moved), wanted)
 
 
 @pytest.mark.parametrize(
@@ -236,7 +238,7 @@ def test_digits_depend_neither_on_where_arrays_lie_nor_on_their_neighbours(sim_6
 )
 def test_arrays_that_do_not_fit_are_refused(rows):
     with pytest.raises((ValueError, TypeError)):
-        _native.triangles(rows, np.empty(10_000), np.zeros((1, 3, 3)))
+        _native.r_factors(rows, np.empty(10_000), np.zeros((1, 3, 3)))
 
 
 def test_shapes_bodies_and_constants_are_checked(sim_6dof):
@@ -250,29 +252,32 @@ def test_shapes_bodies_and_constants_are_checked(sim_6dof):
         frozen,
     ):
         with pytest.raises((ValueError, BufferError)):
-            _native.triangles(rows, np.empty(10_000), out)
+            _native.r_factors(rows, np.empty(10_000), out)
     with pytest.raises(ValueError, match="shapes"):
-        _native.triangles(rows, np.empty(_native.room(3, 2, 0) - 1), np.zeros((1, 3, 3)))
+        _native.r_factors(rows, np.empty(_native.work_size(3, 2, 0) - 1), np.zeros((1, 3, 3)))
     with pytest.raises(TypeError):
-        _native.triangles(rows)
-    sweep, out = sim_6dof.sweep(np.zeros((5, 6))), np.empty((1, 6, 5))
-    for body in (-1, len(sweep.frames)):
+        _native.r_factors(rows)
+    frames, out = sim_6dof.forward_kinematics(np.zeros((5, 6))), np.empty((1, 6, 5))
+    for body in (-1, len(frames.columns)):
         with pytest.raises(ValueError, match="shapes"):
-            native.point_velocities(sweep.frames, sweep.tool[3], np.array([body]), np.zeros((1, 6)), out)
-    errors = sweep.frames, sweep.tool[3], np.zeros(1, int), np.ones((1, 1, 6))
+            native.point_jacobian(frames.columns, frames.tool[3], np.array([body]), np.zeros((1, 6)), out)
+    errors = frames.columns, frames.tool[3], np.zeros(1, int), np.ones((1, 1, 6))
     for rows, components in (([0], [6]), ([2], [0]), ([1, 0], [0, 0]), ([0], [-1])):
-        mixture = types.Mixture(np.array(rows), np.array(components), np.ones((len(rows), 5)))
+        mixture = types.ObservationMatrix(np.array(rows), np.array(components), np.ones((len(rows), 5)))
         with pytest.raises(ValueError, match="shapes"):
-            native.mix_velocities(out, mixture, np.empty((1, 2, 5)))
+            native.apply_observation_matrix(out, mixture, np.empty((1, 2, 5)))
         with pytest.raises(ValueError, match="shapes"):
-            native.error_triangles(*errors, mixture, np.zeros((1, 2, 5)))
-    for stations in ([sim_6dof.tool_station + 1], [-1], [2, 1]):
-        terms = sim_6dof.into, sim_6dof.origins, np.eye(4), np.array(stations)
+            native.factor_jacobian(*errors, mixture, np.zeros((1, 2, 5)))
+    for stations in ([sim_6dof.tool_frame_index + 1], [-1], [2, 1]):
+        terms = sim_6dof.body_from_urdf, sim_6dof.origins, np.eye(4), np.array(stations)
         with pytest.raises(ValueError, match="shapes"):
-            native.move_stations(*terms, np.zeros((len(stations), 6)), np.zeros(len(stations)))
+            native.perturb_frames(*terms, np.zeros((len(stations), 6)), np.zeros(len(stations)))
     with pytest.raises(ValueError, match="shapes"):
-        native.carry_frames(
-            sim_6dof.links[1:], sim_6dof.prismatic, sim_6dof.motion(np.zeros((5, 6))), np.empty((8, 7, 3, 5))
+        native.propagate_frames(
+            sim_6dof.link_transforms[1:],
+            sim_6dof.prismatic,
+            sim_6dof.joint_state(np.zeros((5, 6))),
+            np.empty((8, 7, 3, 5)),
         )
 
 
@@ -284,7 +289,7 @@ import numpy as np
 from conftest import paper
 from dhcal_pin import _kernels
 from dhcal_pin import Chain, Noise, Pose, calibrate
-assert (_kernels.carry_frames.__module__ == "dhcal_pin._kernels.native") == (sys.argv[1] == "compiled")
+assert (_kernels.propagate_frames.__module__ == "dhcal_pin._kernels.native") == (sys.argv[1] == "compiled")
 nominal, actual = Chain.from_dh(paper("sim_6dof")), Chain.from_dh(paper("sim_6dof_actual"))
 rng = np.random.default_rng(0)
 data = Pose.simulate(actual, rng.uniform(-3, 3, (60, 6)), Noise(1e-4, 1e-4), rng)

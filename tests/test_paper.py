@@ -8,7 +8,7 @@ import pytest
 from dhcal_pin.calibration.evaluation import accuracy
 from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.cli import demo
-from dhcal_pin.estimation.parameters import select
+from dhcal_pin.estimation.parameters import select_parameters
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.measurements.position import Position
@@ -36,12 +36,12 @@ def rounded(value: float, like: str) -> str:
 
 @pytest.fixture(scope="module")
 def six_two():
-    return simulations.simulate("sim_6dof", "pose", 2, redrawn=False)
+    return simulations.simulate("sim_6dof", "pose", 2, resample_each_iteration=False)
 
 
 @pytest.fixture(scope="module")
 def six_ten():
-    return simulations.simulate("sim_6dof", "pose", 10, redrawn=False)
+    return simulations.simulate("sim_6dof", "pose", 10, resample_each_iteration=False)
 
 
 @pytest.mark.parametrize("poses", FIGURES)
@@ -55,7 +55,7 @@ def test_six_dof_medians_by_iteration(poses, six_two, six_ten):
 
 def test_six_dof_ten_sets_find_the_truth(six_ten):
     assert (six_ten.rank, six_ten.rank_found) == (21, 24)
-    assert not six_ten.hidden.any()
+    assert not six_ten.null_space.any()
     assert np.all(np.rad2deg(six_ten.angle[:, 6]) < 1e-6)
     assert np.all(1e3 * six_ten.length[:, 6] < 1e-6)
 
@@ -98,17 +98,17 @@ def test_unseen_directions_are_named(sim_6dof, sim_6dof_actual):
 
 
 def test_redrawn_sets_creep_to_the_truth():
-    run = simulations.simulate("sim_6dof", "pose", 2, redrawn=True)
+    run = simulations.simulate("sim_6dof", "pose", 2, resample_each_iteration=True)
     medians = 1e3 * np.median(run.test, 0)
     for step, wanted in ((1, 17.1), (2, 10.2), (3, 7.0), (4, 3.9), (5, 2.3), (10, 0.43)):
         assert medians[step] == pytest.approx(wanted, rel=0.35)
 
 
 def test_three_dof_ten_positions():
-    run = simulations.simulate("sim_3dof", "position", 10, redrawn=False)
+    run = simulations.simulate("sim_3dof", "position", 10, resample_each_iteration=False)
     assert (run.rank, run.rank_found) == (10, 11)
-    names = [p.name for p in select(paper_arm("sim_3dof"), "dh").parameters]
-    assert [name for name, unseen in zip(names, run.hidden, strict=True) if unseen] == ["alpha3"]
+    names = [p.name for p in select_parameters(paper_arm("sim_3dof"), "dh").parameters]
+    assert [name for name, unseen in zip(names, run.null_space, strict=True) if unseen] == ["alpha3"]
     medians = 1e3 * np.median(run.test, 0)
     for step, wanted in ((0, 18.8), (1, 0.705), (2, 0.00168), (3, 1.6e-6)):
         assert medians[step] == pytest.approx(wanted, rel=0.2)
@@ -117,7 +117,7 @@ def test_three_dof_ten_positions():
 
 
 def test_three_dof_three_positions():
-    run = simulations.simulate("sim_3dof", "position", 3, redrawn=False)
+    run = simulations.simulate("sim_3dof", "position", 3, resample_each_iteration=False)
     assert np.all(run.residual < 1e-9)
     assert 1e3 * np.median(run.test[:, -1]) == pytest.approx(2.59, rel=0.2)
 
@@ -144,7 +144,7 @@ def test_noise_is_averaged_out(poses, wanted, sim_6dof, sim_6dof_actual):
         rng = np.random.default_rng(seed)
         q = rng.uniform(-np.pi, np.pi, (poses, 6))
         data = Pose.simulate(sim_6dof_actual, q, Noise(1e-4, np.deg2rad(0.01)), rng)
-        fit = calibrate(sim_6dof, Pose.of(q, data.poses), "dh", method="gn")
+        fit = calibrate(sim_6dof, Pose.from_arrays(q, data.poses), "dh", method="gn")
         test = Pose.simulate(sim_6dof_actual, rng.uniform(-np.pi, np.pi, (100, 6)), Noise(), rng)
         worst.append(1e3 * fit.validate(test)["position_max_m"])
     assert np.median(worst) == pytest.approx(wanted, rel=0.15)
@@ -182,7 +182,7 @@ def test_experiment_figures(experiment):
 def test_a_result_alone_says_the_same_of_points_left_out(experiment, options, fitted, left_out):
     """Folds so far from linear that they are fitted again, one step of the paper's loop included."""
     first, second = calibrate(experiment.chain, experiment.data, "dh", **options).comparisons
-    assert (first.title, second.title) == ("left out", "fitted")
+    assert (first.title, second.title) == ("cross-validated", "fitted")
     assert 1e3 * second.after["position_rms_m"] == pytest.approx(fitted, abs=5e-4)
     assert 1e3 * first.after["position_rms_m"] == pytest.approx(left_out, abs=2e-3)
 
@@ -199,33 +199,35 @@ def test_impossible_rows_are_found_with_their_reasons(experiment):
 
 def test_rows_are_found_wherever_they_stand(experiment, tmp_path):
     """Shuffled, and without the columns that say where the arm was sent."""
-    from dhcal_pin.diagnostics.reachability import screen
-    from dhcal_pin.io.measurement_csv import measurement_text, read_readings
+    from dhcal_pin.diagnostics.reachability import find_unreachable_rows
+    from dhcal_pin.io.measurement_csv import measurement_text, read_measurement_file
 
     data = experiment.readings.data.take(np.array([7, 0, 1, 6, 2, 3, 4, 5]))
     path = tmp_path / "t.csv"
     path.write_text(measurement_text(data, experiment.chain))
-    assert [f.row for f in screen(experiment.chain, read_readings(path, experiment.chain))] == [1, 4]
+    assert [
+        f.row for f in find_unreachable_rows(experiment.chain, read_measurement_file(path, experiment.chain))
+    ] == [1, 4]
 
 
 def test_held_parameters_are_those_that_cannot_be_seen(experiment):
-    assert experiment.held == ["alpha3", "d3"]
+    assert experiment.fixed == ["alpha3", "d3"]
     assert "do not determine" in demo._verdict(experiment)[0]
     assert "51.6 mm" in demo._verdict(experiment)[2]
 
 
 def test_good_rows_are_not_called_impossible(sim_6dof, sim_6dof_actual):
     """An arm as wrong as the paper's, with noise, in any pose."""
-    from dhcal_pin.diagnostics.reachability import screen
-    from dhcal_pin.io.measurement_csv import Readings
+    from dhcal_pin.diagnostics.reachability import find_unreachable_rows
+    from dhcal_pin.io.measurement_csv import MeasurementFile
 
     for seed in range(20):
         rng = np.random.default_rng(seed)
         q = rng.uniform(-np.pi, np.pi, (40, 6))
         data = Position.simulate(sim_6dof_actual, q, Noise(1e-4), rng)
         commanded = sim_6dof.poses(q)[:, :3, 3]
-        readings = Readings("t", data, data, data.take(np.array([], int)), commanded, None)
-        assert screen(sim_6dof, readings) == []
+        readings = MeasurementFile("t", data, data, data.take(np.array([], int)), commanded, None)
+        assert find_unreachable_rows(sim_6dof, readings) == []
 
 
 def test_an_arm_right_at_its_reference_is_not_impossible_elsewhere(sim_6dof, sim_6dof_actual):
@@ -233,8 +235,8 @@ def test_an_arm_right_at_its_reference_is_not_impossible_elsewhere(sim_6dof, sim
 
     And nothing is impossible about a controller that once stops 2 mm early.
     """
-    from dhcal_pin.diagnostics.reachability import screen
-    from dhcal_pin.io.measurement_csv import Readings
+    from dhcal_pin.diagnostics.reachability import find_unreachable_rows
+    from dhcal_pin.io.measurement_csv import MeasurementFile
 
     rng = np.random.default_rng(0)
     q = np.concatenate([np.tile(0.3, (30, 6)), rng.uniform(-2, 2, (20, 6))])
@@ -242,10 +244,12 @@ def test_an_arm_right_at_its_reference_is_not_impossible_elsewhere(sim_6dof, sim
     measured += (sim_6dof.poses(q[:1]) - sim_6dof_actual.poses(q[:1]))[0, :3, 3]
     commanded = sim_6dof.poses(q)[:, :3, 3]
     commanded[40] += [0.002, 0.0, 0.0]
-    data = Position.of(q, measured)
+    data = Position.from_arrays(q, measured)
 
     def found(told):
-        return [f.row for f in screen(sim_6dof, Readings("t", data, data, data, told, None))]
+        return [
+            f.row for f in find_unreachable_rows(sim_6dof, MeasurementFile("t", data, data, data, told, None))
+        ]
 
     assert np.linalg.norm(measured - sim_6dof.poses(q)[:, :3, 3], axis=1).max() > 0.02
     assert found(None) == found(commanded) == []

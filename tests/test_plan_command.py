@@ -37,7 +37,7 @@ def test_a_plan_is_written_simulated_and_calibrated(tmp_path, capsys):
     curve = {row["poses"]: row["predicted_position_rms_m"] for row in document["curve"]}
     assert curve[12] == pytest.approx(document["predicted_position_rms_m"], rel=1e-9)
     assert curve[24] < curve[12] < curve[min(curve)]
-    assert document["ratio_to_random"] < 1
+    assert document["relative_error"] < 1
     assert document["rows"] is None
 
 

@@ -10,20 +10,20 @@ import pytest
 from conftest import paper, robot_file
 
 from dhcal_pin.calibration.procedure import calibrate
-from dhcal_pin.estimation.parameters import select
-from dhcal_pin.estimation.problem import Problem, reduce
-from dhcal_pin.estimation.qr import with_priors
+from dhcal_pin.estimation.parameters import select_parameters
+from dhcal_pin.estimation.problem import Problem, linearize_and_factor
+from dhcal_pin.estimation.qr import append_priors
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io.robot import read_robot, write_urdf
 from dhcal_pin.io.sidecar import read_uncertainty
 from dhcal_pin.measurements import KINDS
 from dhcal_pin.measurements.base import Noise
-from dhcal_pin.planning.criteria import Determinant
-from dhcal_pin.planning.exchange import Pool, basis, exchange, greedy
+from dhcal_pin.planning.criteria import DOptimality
+from dhcal_pin.planning.exchange import CandidateSet, exchange, greedy, sqrt_covariance
 from dhcal_pin.planning.information import Information
 from dhcal_pin.planning.planner import plan
 from dhcal_pin.robot.chain import Chain
-from dhcal_pin.robot.sampling import Room, Space, tour
+from dhcal_pin.robot.sampling import ConfigurationSampler, WorkspaceConstraints, shortest_tour
 from dhcal_pin.robot.urdf import parse_urdf
 
 NOISE = Noise(1e-4, np.deg2rad(0.01))
@@ -43,12 +43,12 @@ def arm(name: str) -> Chain:
 
 def log_det(chain: Chain, kind: str, q) -> float:
     """Log det of the information by the solver's own triangle, unknowns in units of their priors."""
-    errors = select(chain, SETS)
+    errors = select_parameters(chain, SETS)
     weights = 1 / errors.priors
     zero = np.zeros(len(weights))
     data = KINDS[kind].simulate(chain, q, NOISE, np.random.default_rng(1))
-    triangle = reduce(Problem(errors, (data,), weights), zero, small_angle=False)
-    full = with_priors(triangle, weights, zero).r
+    triangle = linearize_and_factor(Problem(errors, (data,), weights), zero, small_angle=False)
+    full = append_priors(triangle, weights, zero).r
     return float(2 * np.sum(np.log(np.abs(np.diag(full)))) + 2 * np.sum(np.log(errors.priors)))
 
 
@@ -79,15 +79,15 @@ def free(chain: Chain, q) -> np.ndarray:
 
 def random_ones(chain: Chain, count: int, seed: int) -> np.ndarray:
     """Configurations within the limits and free of collision."""
-    room = Room.of(chain, Space(), 0.0, 0.0)
+    room = ConfigurationSampler.from_chain(chain, WorkspaceConstraints(), 0.0, 0.0)
     q = room.draw(2 * count + 20, np.random.default_rng(seed))
-    return np.array([one for one in q if room.allows(one)])[:count]
+    return np.array([one for one in q if room.is_feasible(one)])[:count]
 
 
 def compared(name: str, kind: str, candidates: int, draws: int) -> None:
     chain = arm(name)
     found = plan(chain, 20, kind=kind, noise=NOISE, parameters=SETS, candidates=candidates, seed=3)
-    assert found.q.shape == (20, chain.size)
+    assert found.q.shape == (20, chain.n_joints)
     assert ((found.q > chain.lower) & (found.q < chain.upper)).all()
     if name != "sim_6dof":
         assert free(chain, found.q).all()
@@ -95,20 +95,22 @@ def compared(name: str, kind: str, candidates: int, draws: int) -> None:
     assert found.log_det == pytest.approx(reached, abs=0.01)
     information = found.information
     q = random_ones(chain, candidates, 4)
-    pool = Pool.of(information.rows(q), q)
+    pool = CandidateSet.from_rows(information.rows(q), q)
     scores = []
     rng = np.random.default_rng(5)
     for _ in range(draws):
         rows = pool.at(rng.choice(len(q), 20, replace=False))
-        scores.append(-2 * np.sum(np.log(np.abs(np.diag(basis(information.start, rows))))))
+        scores.append(-2 * np.sum(np.log(np.abs(np.diag(sqrt_covariance(information.prior_factor, rows))))))
     assert reached >= max(scores)
     # A choice among these candidates, exchanged one against any other until nothing is gained.
-    best = greedy(pool, information.start, 20, Determinant(), np.zeros(0, int), q[:0])
+    best = greedy(pool, information.prior_factor, 20, DOptimality(), np.zeros(0, int), q[:0])
     value = np.inf
-    while (now := Determinant().value(basis(information.start, pool.at(best)))) < value - 1e-12:
+    while (
+        now := DOptimality().value(sqrt_covariance(information.prior_factor, pool.at(best)))
+    ) < value - 1e-12:
         value = now
-        best = exchange(pool, information.start, best, Determinant(), q[:0])
-    assert np.exp((reached - log_det(chain, kind, q[best])) / len(information.scale)) >= 0.99
+        best = exchange(pool, information.prior_factor, best, DOptimality(), q[:0])
+    assert np.exp((reached - log_det(chain, kind, q[best])) / len(information.prior_sigma)) >= 0.99
 
 
 @pytest.mark.parametrize(("name", "kind"), [("ur10", "position"), ("panda", "pose")])
@@ -126,12 +128,12 @@ def test_a_plan_beats_ten_thousand_random_sets_and_an_exchange(name, kind):
 def simulated(chain: Chain, kind: str, choices, seed: int) -> list[float]:
     """RMS position errors in m, anywhere, of calibrations with each choice of poses, for one random robot."""
     rng = np.random.default_rng(seed)
-    errors = select(chain, SETS)
+    errors = select_parameters(chain, SETS)
     # The base stands anywhere; the tool is known to some millimetres.
-    frames = [0.3 if parameter.station == 0 else 2e-3 for parameter in errors.parameters]
+    frames = [0.3 if parameter.error_frame == 0 else 2e-3 for parameter in errors.parameters]
     prior = np.where(errors.priors < 1, errors.priors, frames)
     truth = errors.at(prior * rng.standard_normal(len(prior)))
-    held = Room.of(chain, Space(), 0.0, 0.0).draw(100, rng)
+    held = ConfigurationSampler.from_chain(chain, WorkspaceConstraints(), 0.0, 0.0).draw(100, rng)
     out = []
     for q in choices(seed):
         fit = calibrate(chain, KINDS[kind].simulate(truth, q, NOISE, rng), SETS)
@@ -148,7 +150,7 @@ def ratios(name: str, kind: str, seeds: int) -> tuple[float, float]:
         simulated(chain, kind, lambda seed: (found.q, random_ones(chain, 20, seed)), seed)
         for seed in range(seeds)
     ]
-    return float(np.median([planned / random for planned, random in pairs])), found.ratio
+    return float(np.median([planned / random for planned, random in pairs])), found.relative_error
 
 
 def test_planned_poses_leave_less_error_than_random_ones():
@@ -174,10 +176,13 @@ def misfits(name: str, kind: str, seeds: int) -> np.ndarray:
     The arms have gains, harmonics and compliance of a tenth of their priors, which no fit looks for.
     """
     chain = arm(name)
-    space = Room.of(chain, Space(), 0.0, 0.0)
+    space = ConfigurationSampler.from_chain(chain, WorkspaceConstraints(), 0.0, 0.0)
     pool, held = space.draw(400, np.random.default_rng(77)), space.draw(150, np.random.default_rng(5))
-    sizes = {p.name: 0.3 if p.station == 0 else min(p.prior, 2e-3) for p in select(chain, SETS).parameters}
-    errors = select(chain, f"{SETS},gain,harmonics,compliance")
+    sizes = {
+        p.name: 0.3 if p.error_frame == 0 else min(p.prior, 2e-3)
+        for p in select_parameters(chain, SETS).parameters
+    }
+    errors = select_parameters(chain, f"{SETS},gain,harmonics,compliance")
     size = np.array([sizes.get(p.name, 0.1 * p.prior) for p in errors.parameters])
     options = {"kind": kind, "noise": NOISE, "parameters": SETS, "candidates": pool}
     robust, plain = (plan(chain, 20, criterion=name, **options) for name in ("robust", "D"))
@@ -235,12 +240,12 @@ def test_readings_already_taken_count():
     """Ten more: what a plan expects of them is what the fit to all of them then says of itself."""
     chain = arm("ur10")
     rng = np.random.default_rng(2)
-    errors = select(chain, SETS)
+    errors = select_parameters(chain, SETS)
     truth = errors.at(np.where(errors.priors < 1, errors.priors, 0.3) * rng.standard_normal(36))
     # A corner of the space: what is left to learn is elsewhere.
     taken = rng.uniform(0.2, 0.8, (25, 6))
     old = KINDS["pose"].simulate(truth, taken, NOISE, rng)
-    task = Room.of(chain, Space(), 0.0, 0.0).draw(200, rng)
+    task = ConfigurationSampler.from_chain(chain, WorkspaceConstraints(), 0.0, 0.0).draw(200, rng)
     found = plan(chain, 10, parameters=SETS, criterion="task", data=[old], task=task, candidates=1500)
     assert found.information.noise.position == pytest.approx(NOISE.position)
     before = float(np.sqrt(np.mean(calibrate(chain, old, SETS).predict(task).position_std ** 2)))
@@ -256,29 +261,29 @@ def test_a_calibration_says_itself_what_is_left_to_learn(tmp_path):
     """What a calibrated robot's file keeps counts as the readings themselves do, whatever sets come next."""
     chain = arm("ur10")
     rng = np.random.default_rng(2)
-    errors = select(chain, SETS)
+    errors = select_parameters(chain, SETS)
     truth = errors.at(np.where(errors.priors < 1, errors.priors, 0.3) * rng.standard_normal(36))
     old = KINDS["pose"].simulate(truth, rng.uniform(0.2, 0.8, (25, 6)), NOISE, rng)
     write_urdf(calibrate(chain, old, SETS), tmp_path / "arm.urdf")
     sidecar, there = tmp_path / "arm.calibration.toml", read_robot(tmp_path / "arm.urdf", "tool0")
     learnt = read_uncertainty(sidecar, there)
-    task = Room.of(chain, Space(), 0.0, 0.0).draw(200, rng)
+    task = ConfigurationSampler.from_chain(chain, WorkspaceConstraints(), 0.0, 0.0).draw(200, rng)
     options = {"noise": NOISE, "criterion": "task", "task": task, "candidates": 800}
     beside = plan(chain, 10, parameters=SETS, data=[old], **options)
-    found = plan(there, 10, parameters=SETS, learnt=learnt, **options)
+    found = plan(there, 10, parameters=SETS, prior_uncertainty=learnt, **options)
     assert found.error == pytest.approx(beside.error, rel=0.03)
-    none = Information.before(there, task, "pose", NOISE, SETS, learnt=learnt)
+    none = Information.from_prior(there, task, "pose", NOISE, SETS, prior_uncertainty=learnt)
     before = np.sqrt(np.mean(calibrate(chain, old, SETS).predict(task).position_std ** 2))
-    empty = np.zeros((0, 6, len(none.scale)))
+    empty = np.zeros((0, 6, len(none.prior_sigma)))
     assert none.error(empty, none.task(task)) == pytest.approx(before, rel=1e-6)
     assert found.error < 0.5 * before
     # Six a joint say the same with more unknowns; what was not looked for keeps its prior.
-    wide = Information.before(there, task, "pose", NOISE, "placement,base,tool", learnt=learnt)
-    empty = np.zeros((0, 6, len(wide.scale)))
+    wide = Information.from_prior(there, task, "pose", NOISE, "placement,base,tool", prior_uncertainty=learnt)
+    empty = np.zeros((0, 6, len(wide.prior_sigma)))
     assert wide.error(empty, wide.task(task)) == pytest.approx(before, rel=1e-6)
-    gain = Information.before(there, task, "pose", NOISE, f"{SETS},gain", learnt=learnt)
-    empty = np.zeros((0, 6, len(gain.scale)))
-    prior = Information.before(there, task, "pose", NOISE, "gain")
+    gain = Information.from_prior(there, task, "pose", NOISE, f"{SETS},gain", prior_uncertainty=learnt)
+    empty = np.zeros((0, 6, len(gain.prior_sigma)))
+    prior = Information.from_prior(there, task, "pose", NOISE, "gain")
     alone = prior.error(np.zeros((0, 6, 6)), prior.task(task))
     assert gain.error(empty, gain.task(task)) == pytest.approx(np.hypot(before, alone), rel=0.01)
 
@@ -286,7 +291,7 @@ def test_a_calibration_says_itself_what_is_left_to_learn(tmp_path):
 def test_the_tool_stays_in_the_box_and_in_sight():
     chain = arm("ur10")
     eye = np.array([2.5, 0.0, 1.0])
-    space = Space(np.array([[0.0, -0.8, 0.1], [1.2, 0.8, 1.0]]), eye, np.deg2rad(40.0))
+    space = WorkspaceConstraints(np.array([[0.0, -0.8, 0.1], [1.2, 0.8, 1.0]]), eye, np.deg2rad(40.0))
     found = plan(chain, 12, kind="position", noise=NOISE, candidates=1000, space=space)
     poses = chain.poses(found.q)
     assert ((poses[:, :3, 3] >= space.box[0]) & (poses[:, :3, 3] <= space.box[1])).all()
@@ -307,14 +312,16 @@ PILLAR = """<robot name="r"><link name="l0"><collision><origin xyz="1 0 0"/><geo
 def test_a_pillar_hides_the_tool():
     """The instrument at x = 3 m looks past a pillar at x = 1 m to a tool that goes round at half a metre."""
     chain = Chain.from_urdf(parse_urdf(PILLAR.encode(), "r.urdf"), "l2")
-    room = Room.of(chain, Space(eye=np.array([3.0, 0, 0])), 0.0, 0.0)
+    room = ConfigurationSampler.from_chain(
+        chain, WorkspaceConstraints(instrument_position=np.array([3.0, 0, 0])), 0.0, 0.0
+    )
     turn = np.linspace(-np.pi, np.pi, 181)
     tool = 0.5 * np.stack([np.cos(turn), np.sin(turn)], -1)
     # Where the line from the instrument crosses the pillar's two faces across it.
     slope = tool[:, 1] / (3.0 - tool[:, 0])
     hidden = (np.abs(slope) * 2.1 < 0.1) | (np.abs(slope) * 1.9 < 0.1)
     clear = np.abs(np.abs(slope) * 1.9 - 0.1) > 0.02
-    seen = np.array([room.allows(np.array([angle, 0.0])) for angle in turn])
+    seen = np.array([room.is_feasible(np.array([angle, 0.0])) for angle in turn])
     assert np.array_equal(seen[clear], ~hidden[clear])
     assert 10 < hidden.sum() < 100
 
@@ -338,14 +345,14 @@ def test_a_plan_is_the_same_every_time():
 def test_other_instruments(kind):
     chain = arm("sim_6dof")
     found = plan(chain, 25, kind=kind, noise=NOISE, parameters=SETS, candidates=600)
-    assert 0 < found.error < found.random
+    assert 0 < found.error < found.random_error
     assert (np.diff(found.errors) <= 1e-12).all()
 
 
 def test_a_tour_is_short():
     rng = np.random.default_rng(0)
     q = rng.uniform(-2, 2, (40, 6))
-    order = tour(q)
+    order = shortest_tour(q)
     assert sorted(order) == list(range(40))
 
     def length(order) -> float:
@@ -353,7 +360,7 @@ def test_a_tour_is_short():
 
     assert length(order) < 0.75 * np.median([length(rng.permutation(40)) for _ in range(200)])
     line = np.random.default_rng(1).permutation(30)
-    found = line[tour(line[:, None].astype(float))]
+    found = line[shortest_tour(line[:, None].astype(float))]
     assert np.array_equal(found, np.arange(30)) or np.array_equal(found, np.arange(30)[::-1])
 
 
@@ -366,7 +373,7 @@ def test_a_tour_is_short():
         ({"noise": None}, "no sigma is known"),
         ({"noise": Noise(1e-4, 0.0)}, "0.1mm,0.01deg"),
         ({"priors": "none"}, "needs priors"),
-        ({"space": Space(np.array([[5.0, 5, 5], [6.0, 6, 6]]))}, "widen the box"),
+        ({"space": WorkspaceConstraints(np.array([[5.0, 5, 5], [6.0, 6, 6]]))}, "widen the box"),
         ({"candidates": np.zeros((3, 6))}, "only 3 of 3"),
     ],
 )

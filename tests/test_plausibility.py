@@ -11,14 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from dhcal_pin import se3
 from dhcal_pin.cli import main
-from dhcal_pin.diagnostics.input_checks import doubts
-from dhcal_pin.io.measurement_csv import measurement_text, read_readings
+from dhcal_pin.diagnostics.input_checks import find_input_warnings
+from dhcal_pin.io.measurement_csv import measurement_text, read_measurement_file
 from dhcal_pin.measurements import KINDS
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.length import Wires
 from dhcal_pin.measurements.position import Position
-from dhcal_pin.robot.chain import Chain, joint_station
-from dhcal_pin.robot.inverse_kinematics import within
+from dhcal_pin.robot.chain import Chain, joint_frame
+from dhcal_pin.robot.inverse_kinematics import wrap_into_limits
 
 
 @pytest.fixture(scope="module")
@@ -31,13 +31,13 @@ def told(tmp_path):
     def call(chain, text):
         path = tmp_path / "data.csv"
         path.write_text(text)
-        return doubts(chain, read_readings(path, chain))
+        return find_input_warnings(chain, read_measurement_file(path, chain))
 
     return call
 
 
 def joints(chain, m=30, seed=0):
-    return np.random.default_rng(seed).uniform(-2.5, 2.5, (m, chain.size))
+    return np.random.default_rng(seed).uniform(-2.5, 2.5, (m, chain.n_joints))
 
 
 def frames():
@@ -150,7 +150,7 @@ def test_a_tool_point_that_stays_is_believed(told, ur10):
     data = KINDS["point"].simulate(ur10, joints(ur10), Noise(), np.random.default_rng(0))
     data = data.take(data.label == 0)
     seen = ur10.poses(data.q)[:, :3, 3] + 1e-5 * np.random.default_rng(0).normal(size=(len(data.q), 3))
-    assert told(ur10, measurement_text(Position.of(data.q, seen), ur10)) == []
+    assert told(ur10, measurement_text(Position.from_arrays(data.q, seen), ur10)) == []
 
 
 @pytest.mark.parametrize(
@@ -232,7 +232,7 @@ def real_ur10():
     rng = np.random.default_rng(3)
     arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
     scale = np.repeat([2e-3, 4e-3], 3)
-    return arm.displaced({joint_station(j): se3.exp6(scale * rng.uniform(-1, 1, 6)) for j in range(1, 7)})
+    return arm.perturbed_at({joint_frame(j): se3.exp6(scale * rng.uniform(-1, 1, 6)) for j in range(1, 7)})
 
 
 @pytest.mark.parametrize("swap", [("x", "y"), ("y", "z")])
@@ -288,10 +288,10 @@ def test_the_same_configuration_read_again_is_believed(told, ur10):
 def test_simulated_files_bring_up_nothing(told, ur10, sim_6dof, kind):
     for chain, noise in ((ur10, Noise(1e-4, 1e-4)), (sim_6dof, Noise(1e-3, 1e-3))):
         rng = np.random.default_rng(1)
-        q = rng.uniform(-2.8, 2.8, (25, chain.size))
+        q = rng.uniform(-2.8, 2.8, (25, chain.n_joints))
         data = KINDS[kind].simulate(chain, q, noise, rng)
         configurations = data.configurations()
-        assert within(chain, configurations)[1].all()
+        assert wrap_into_limits(chain, configurations)[1].all()
         assert told(chain, measurement_text(data, chain)) == []
 
 
@@ -309,12 +309,12 @@ def test_the_command_line_says_so(tmp_path, monkeypatch, capsys, command):
     (tmp_path / "data.csv").write_text("\n".join(lines))
     more = ["-o", "out.urdf"] if command == "calibrate" else []
     assert main.main([command, "arm.dh.toml", "data.csv", *more]) == 0
-    assert ": check: " not in capsys.readouterr().err
+    assert ": warning: " not in capsys.readouterr().err
     (tmp_path / "data.csv").write_text("\n".join([*lines, lines[1]]))
     assert main.main([command, "arm.dh.toml", "data.csv", *more]) == 0
-    found = [line for line in capsys.readouterr().err.splitlines() if "check:" in line]
+    found = [line for line in capsys.readouterr().err.splitlines() if "warning:" in line]
     assert len(found) == 1
-    assert found[0].startswith("data.csv: check: row 13: the same as others")
+    assert found[0].startswith("data.csv: warning: row 13: the same as others")
 
 
 def test_two_wires_of_one_name_are_told(tmp_path, monkeypatch, capsys):
@@ -325,11 +325,11 @@ def test_two_wires_of_one_name_are_told(tmp_path, monkeypatch, capsys):
     for file, anchor in (("one.csv", [2.0, 1, 0]), ("two.csv", [-1.0, 2, 0.5])):
         q = joints(arm, 60, len(file) + int(anchor[0]))
         length = np.linalg.norm(arm.poses(q)[:, :3, 3] - anchor, axis=1)
-        (tmp_path / file).write_text(measurement_text(Wires.of(q, length[:, None]), arm))
+        (tmp_path / file).write_text(measurement_text(Wires.from_arrays(q, length[:, None]), arm))
     assert main.main(["calibrate", "arm.dh.toml", "one.csv", "-o", "out.urdf"]) == 0
-    assert ": check: " not in capsys.readouterr().err
+    assert ": warning: " not in capsys.readouterr().err
     assert main.main(["calibrate", "arm.dh.toml", "one.csv", "two.csv", "-o", "out.urdf"]) == 0
-    found = [line for line in capsys.readouterr().err.splitlines() if "check:" in line]
+    found = [line for line in capsys.readouterr().err.splitlines() if "warning:" in line]
     assert found
     assert all(
         "after the fit, length is usually" in line and "whether its wire1 is" in line for line in found

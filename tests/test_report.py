@@ -28,7 +28,7 @@ from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.measurements.position import Position
 from dhcal_pin.report import document, html
-from dhcal_pin.report.sections import markdown, study
+from dhcal_pin.report.sections import markdown, report_context
 from dhcal_pin.robot.chain import Chain
 from dhcal_pin.visualization import figures
 from dhcal_pin.visualization.figures import Axis
@@ -55,7 +55,7 @@ def fit() -> Result:
 @pytest.fixture
 def quick(monkeypatch):
     """Fewer configurations over the workspace."""
-    monkeypatch.setattr(residuals, "SAMPLES", 300)
+    monkeypatch.setattr(residuals, "N_SAMPLES", 300)
 
 
 # --- numbers ---------------------------------------------------------------------------------------
@@ -75,13 +75,13 @@ def quick(monkeypatch):
     ],
 )
 def test_numbers_have_the_digits_that_are_known(value, std, text):
-    assert formatting.shown(value, "m", std) == text
+    assert formatting.format_quantity(value, "m", std) == text
 
 
 def test_rates_and_pure_numbers():
-    assert formatting.shown(1.2346e-5, "rad/Nm", 1e-7) == "12.35 µrad/Nm"
-    assert formatting.shown(-2.5e-3, "rad/rad", 4e-4, small=True) == "-2.5 mrad/rad"
-    assert formatting.shown(-0.00125, "1", 1e-5) == "-0.00125"
+    assert formatting.format_quantity(1.2346e-5, "rad/Nm", 1e-7) == "12.35 µrad/Nm"
+    assert formatting.format_quantity(-2.5e-3, "rad/rad", 4e-4, small=True) == "-2.5 mrad/rad"
+    assert formatting.format_quantity(-0.00125, "1", 1e-5) == "-0.00125"
 
 
 def test_the_standard_error_of_an_rms_is_its_scatter():
@@ -113,11 +113,11 @@ def test_a_joint_that_waves_is_seen_in_that_joint_alone():
     wave[:, 2] = 2e-3 * np.sin(q[:, 2])
     data = Pose.simulate(arm, q + wave, Noise(1e-4, 1e-4), rng)
     found = calibrate(arm, replace(data, q=q), "tool", fix=["tool.y"])
-    traces = residuals.joint_traces(found)
-    assert [t.name for t in traces] == list(arm.moving)
+    traces = residuals.joint_offset_profiles(found)
+    assert [t.name for t in traces] == list(arm.moving_joints)
     for j, t in enumerate(traces):
         wanted = 2e-3 * np.sin(t.centres) if j == 2 else 0 * t.centres
-        assert len(t.centres) == residuals.BINS
+        assert len(t.centres) == residuals.N_BINS
         # A part is 0.42 rad wide: within it the wave's mean lies this far from its value in the middle.
         assert np.abs(t.after - wanted).max() < (6e-5 if j == 2 else 4.5 * t.after_std.max())
         assert np.all(t.after_std > 0)
@@ -162,7 +162,7 @@ def test_ticks_of_a_logarithm_are_powers():
 
 def test_a_dot_is_where_its_axes_say():
     x, y = Axis(0, 10, "x"), Axis(0, 1, "y")
-    svg = figures.panel("k", "A & B", "What <it> shows", x, y, [figures.dots([5.0], [0.5], "after")])
+    svg = figures.axes("k", "A & B", "What <it> shows", x, y, [figures.dots([5.0], [0.5], "after")])
     root = ElementTree.fromstring(svg)
     assert [root.find("title").text, root.find("desc").text] == ["A & B", "What <it> shows"]
     assert root.attrib["aria-labelledby"].split() == [
@@ -217,11 +217,11 @@ class Texts(HTMLParser):
 
 def test_the_headline_is_the_error_on_what_was_not_fitted(fit, quick):
     held = accuracy(fit.chain, fit.holdout)["position_rms_m"]
-    page = Texts(html.page(study(fit, Provenance())))
+    page = Texts(html.page(report_context(fit, Provenance())))
     assert page.texts["h1"] == ["Position error on 12 samples that were not fitted"]
     first = page.texts["dd"]
     assert float(first[1].split()[0]) == pytest.approx(1e3 * held, abs=0.051)
-    assert f"{first[0]} before, {first[1]} after." in markdown(study(fit, Provenance()))
+    assert f"{first[0]} before, {first[1]} after." in markdown(report_context(fit, Provenance()))
     assert len(page.ids) == len(set(page.ids))
     assert "12 held out" in fit._repr_html_()
     assert "not fitted" in fit._repr_html_()
@@ -229,7 +229,7 @@ def test_the_headline_is_the_error_on_what_was_not_fitted(fit, quick):
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_few_held_out_or_none_is_said(count, quick):
-    found = study(fitted(held=count / 40), Provenance())
+    found = report_context(fitted(held=count / 40), Provenance())
     page, text = Texts(html.page(found)), markdown(found)
     if count:
         assert page.texts["h1"] == ["Position error on 1 sample that was not fitted"]
@@ -247,7 +247,7 @@ def test_every_kind_and_few_data_have_a_report(kind, quick):
     actual = Chain.from_dh(paper("sim_6dof_actual"))
     for count, noise, priors in ((30, Noise(1e-4, 1e-4), "default"), (3, Noise(), "none")):
         data = KINDS[kind].simulate(actual, rng.uniform(-1, 1, (count, 6)), noise, rng)
-        found = study(
+        found = report_context(
             calibrate(nominal, data, "minimal,base,tool", priors=priors, max_iterations=5), Provenance()
         )
         page, text = html.page(found), markdown(found)
@@ -277,7 +277,7 @@ def test_the_same_command_writes_the_same_report(tmp_path, monkeypatch, quick):
         )
         assert main.main([str(a) for a in ("calibrate", robot, data, "--holdout", "0.2", *out)]) == 0
         pages.append([Path(f"{name}.{end}").read_bytes() for end in ("html", "md")])
-        assert document.fingerprints([data])[str(data)].encode() in pages[-1][0]
+        assert document.file_digests([data])[str(data)].encode() in pages[-1][0]
     assert pages[0] == pages[1]
     for text in pages[0]:
         assert b"dhcal calibrate sim_6dof.dh.toml data.csv --holdout 0.2" in text
@@ -299,9 +299,9 @@ def test_gross_errors_are_listed_with_file_row_and_size(quick):
     nominal = Chain.from_dh(paper("sim_3dof"))
     rng = np.random.default_rng(0)
     data = Position.simulate(nominal, rng.uniform(-1.5, 1.5, (60, 3)), Noise(1e-4), rng)
-    data.reading[16] += [0.0, 0.03, 0.04]
-    source = Provenance(names=["in/laser.csv"], left_out={"laser.csv": {3: "because"}})
-    text = markdown(study(calibrate(nominal, data, "dh", loss="tukey"), source))
+    data.values[16] += [0.0, 0.03, 0.04]
+    source = Provenance(names=["in/laser.csv"], excluded_rows={"laser.csv": {3: "because"}})
+    text = markdown(report_context(calibrate(nominal, data, "dh", loss="tukey"), source))
     row = next(line for line in text.splitlines() if line.startswith("| laser.csv | 17 |"))
     assert float(row.split("|")[3].split()[0]) == pytest.approx(50, abs=1)
     assert "laser.csv, row 3, is left out: because" in text

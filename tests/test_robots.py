@@ -14,14 +14,14 @@ from conftest import robot_file
 from dhcal_pin import se3
 from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.estimation import qr
-from dhcal_pin.estimation.parameters import SETS, select
-from dhcal_pin.estimation.problem import Problem, reduce
+from dhcal_pin.estimation.parameters import PARAMETER_SETS, select_parameters
+from dhcal_pin.estimation.problem import Problem, linearize_and_factor
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io.robot import read_robot, write_urdf
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.paper.jacobian_check import crosscheck, regressor, vectorised
-from dhcal_pin.robot.chain import Chain, extract
+from dhcal_pin.robot.chain import Chain, extract_dh_table
 from dhcal_pin.robot.urdf import read_urdf
 
 ARMS = {
@@ -53,7 +53,7 @@ def load(arm: str) -> Chain:
 def draw(chain: Chain, m: int, seed: int = 0):
     """Joint values within limits and within a turn."""
     low, high = np.maximum(chain.lower, -np.pi), np.minimum(chain.upper, np.pi)
-    return np.random.default_rng(seed).uniform(low, high, (m, chain.size))
+    return np.random.default_rng(seed).uniform(low, high, (m, chain.n_joints))
 
 
 def stripped(arm: str) -> str:
@@ -94,10 +94,10 @@ def test_poses_equal_mujoco(arm):
     model = mujoco.MjModel.from_xml_string(stripped(arm))  # pyright: ignore[reportAttributeAccessIssue]
     data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
     root = model.body(chain.urdf.root).id if chain.urdf.root != "world" else 0
-    values = q @ chain.mixing.T + chain.shift
+    values = q @ chain.mimic_matrix.T + chain.mimic_offset
     worst = 0.0
     for row, pose in zip(values, chain.poses(q), strict=True):
-        for name, value in zip(chain.moving, row, strict=True):
+        for name, value in zip(chain.moving_joints, row, strict=True):
             data.joint(name).qpos[0] = value
         mujoco.mj_kinematics(model, data)  # pyright: ignore[reportAttributeAccessIssue]
         base, body = (
@@ -116,16 +116,16 @@ def test_poses_equal_kinpy(arm):
         tree = kinpy.build_chain_from_urdf(stripped(arm).encode())
     chain = load(arm)
     q = draw(chain, 200)
-    values = q @ chain.mixing.T + chain.shift
+    values = q @ chain.mimic_matrix.T + chain.mimic_offset
     for row, pose in zip(values, chain.poses(q), strict=True):
-        found = tree.forward_kinematics(dict(zip(chain.moving, row, strict=True)))[chain.tip]
+        found = tree.forward_kinematics(dict(zip(chain.moving_joints, row, strict=True)))[chain.tip]
         assert np.abs(found.matrix() - pose).max() <= 1e-9
 
 
 @ARM
 def test_jacobian_equals_pinocchios_regressor(arm):
     chain = load(arm)
-    errors = select(chain, "placement")
+    errors = select_parameters(chain, "placement")
     q = draw(chain, 50)
     assert np.abs(vectorised(chain, errors, q) - regressor(chain, errors, q)).max() <= 1e-11
 
@@ -134,7 +134,9 @@ def test_jacobian_equals_pinocchios_regressor(arm):
 def test_perturbed_model_equals_the_chain(arm):
     chain = load(arm)
     rng = np.random.default_rng(1)
-    moved = chain.displaced({s: se3.exp6(0.02 * rng.normal(size=6)) for s in range(1, chain.tool_station)})
+    moved = chain.perturbed_at(
+        {s: se3.exp6(0.02 * rng.normal(size=6)) for s in range(1, chain.tool_frame_index)}
+    )
     q = draw(chain, 50)
     np.testing.assert_allclose(moved.poses(q), pinocchio_poses(moved, q), atol=1e-12)
 
@@ -143,8 +145,8 @@ def test_perturbed_model_equals_the_chain(arm):
 def test_written_back_it_is_the_same_robot_and_no_other_line_changes(arm, tmp_path):
     chain = load(arm)
     rng = np.random.default_rng(2)
-    moved = chain.displaced(
-        {2 * j: se3.exp6(0.02 * rng.normal(size=6)) for j in range(1, len(chain.moving) + 1)}
+    moved = chain.perturbed_at(
+        {2 * j: se3.exp6(0.02 * rng.normal(size=6)) for j in range(1, len(chain.moving_joints) + 1)}
     )
     path = tmp_path / "out.urdf"
     write_urdf(moved, path)
@@ -153,7 +155,7 @@ def test_written_back_it_is_the_same_robot_and_no_other_line_changes(arm, tmp_pa
     assert np.abs(again.poses(q) - moved.poses(q)).max() <= 1e-12
     before, after = chain.urdf.data.splitlines(), path.read_bytes().splitlines()
     changed = [(a, b) for a, b in zip(before, after, strict=True) if a != b]
-    assert len(changed) == len(chain.moving)
+    assert len(changed) == len(chain.moving_joints)
     assert all(b"<origin" in a and b"<origin" in b for a, b in changed)
     write_urdf(chain, tmp_path / "same.urdf")
     assert (tmp_path / "same.urdf").read_bytes() == chain.urdf.data
@@ -162,14 +164,14 @@ def test_written_back_it_is_the_same_robot_and_no_other_line_changes(arm, tmp_pa
 @ARM
 def test_factors_agree_through_the_extracted_table(arm):
     for row in crosscheck(load(arm), 50):
-        assert row.holds, row
+        assert row.agrees, row
 
 
 @pytest.mark.parametrize("convention", ["standard", "modified"])
 @ARM
 def test_to_dh_and_back(arm, convention):
     chain = load(arm)
-    table = extract(chain, convention).table
+    table = extract_dh_table(chain, convention).table
     q = draw(chain, 100)
     assert np.abs(table.poses(q) - chain.poses(q)).max() <= 1e-12
     assert np.abs(Chain.from_dh(table).poses(q) - chain.poses(q)).max() <= 1e-12
@@ -178,12 +180,12 @@ def test_to_dh_and_back(arm, convention):
 def rank(errors, q) -> int:
     zero = np.zeros(len(errors.parameters))
     data = Pose.simulate(errors.chain, q, Noise(), np.random.default_rng(0))
-    return qr.rank(reduce(Problem(errors, (data,), zero), zero, False).r)
+    return qr.rank(linearize_and_factor(Problem(errors, (data,), zero), zero, False).r)
 
 
 def counts(chain: Chain) -> tuple[int, int]:
     slides = int(chain.prismatic.sum())
-    return len(chain.moving) - slides, slides
+    return len(chain.moving_joints) - slides, slides
 
 
 @ARM
@@ -192,25 +194,25 @@ def test_complete_sets_have_the_rank_of_theory(arm):
     chain = load(arm)
     revolute, slides = counts(chain)
     theory = 4 * revolute + 2 * slides + 6
-    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (100, chain.size))
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (100, chain.n_joints))
     for sets in ("minimal,base,tool", "placement,base,tool", "dh,hayati,minimal,base,tool,offset"):
-        assert rank(select(chain, sets), q) == theory, sets
+        assert rank(select_parameters(chain, sets), q) == theory, sets
 
 
 def recovered(chain: Chain, sets: str, seed: int) -> float:
     """Largest held-out position error in m after fitting noise-free poses of an arm off by 2° and 10 mm."""
     rng = np.random.default_rng(seed)
-    errors = select(chain, sets)
+    errors = select_parameters(chain, sets)
     size = np.array([np.deg2rad(2) if p.unit == "rad" else 0.01 for p in errors.parameters])
     truth = errors.at(size * rng.uniform(-1, 1, len(size)))
-    q = rng.uniform(-np.pi, np.pi, (80, chain.size))
+    q = rng.uniform(-np.pi, np.pi, (80, chain.n_joints))
     data = Pose.simulate(truth, q[:40], Noise(), rng)
     fit = calibrate(chain, data, sets, priors="none")
     return fit.validate(Pose.simulate(truth, q[40:], Noise(), rng))["position_max_m"]
 
 
 WITH_FRAMES = [f"{s},base,tool" for s in ("dh", "modified-dh", "hayati", "minimal", "placement", "offset")]
-EVERY_SET = [*SETS, *WITH_FRAMES]
+EVERY_SET = [*PARAMETER_SETS, *WITH_FRAMES]
 
 
 @pytest.mark.parametrize("sets", EVERY_SET)
@@ -231,7 +233,7 @@ def test_every_set_finds_a_noise_free_arm_in_every_seed(arm, sets):
 
 
 def test_ur10_has_the_makers_lengths():
-    table = extract(load("ur10"), "standard").table
+    table = extract_dh_table(load("ur10"), "standard").table
     np.testing.assert_allclose(np.sort(np.abs(table.a))[-2:], [0.5723, 0.612], atol=1e-9)
     np.testing.assert_allclose(
         [abs(table.d[4]), abs(table.d[5] + table.tool[2, 3])], [0.1157, 0.0922], atol=2e-4
@@ -245,10 +247,10 @@ def test_shaken_ur_arms_stay_readable():
         length = np.linalg.norm(chain.origins[:, :3, 3], axis=1).sum()
         for seed in range(20):
             rng = np.random.default_rng(seed)
-            shake = {s: se3.exp6(1e-3 * rng.uniform(-1, 1, 6)) for s in range(2, chain.tip_station, 2)}
-            moved = chain.displaced(shake)
+            shake = {s: se3.exp6(1e-3 * rng.uniform(-1, 1, 6)) for s in range(2, chain.tip_frame, 2)}
+            moved = chain.perturbed_at(shake)
             for convention in ("standard", "modified"):
-                table = extract(moved, convention).table
+                table = extract_dh_table(moved, convention).table
                 assert np.abs(np.concatenate([table.d, table.a])).max() < length
                 q = draw(chain, 10)
                 np.testing.assert_allclose(table.poses(q), moved.poses(q), atol=1e-12)
@@ -268,7 +270,7 @@ def test_joints_off_the_path_stay_neutral():
     chain = load("tiago")
     assert chain.joint_names[0] == "torso_lift_joint"
     assert chain.prismatic.tolist() == [True] + [False] * 7
-    assert chain.size < chain.model.nv
+    assert chain.n_joints < chain.model.nv
 
 
 def test_frames_of_an_instrument_do_not_enter_the_robot(tmp_path):

@@ -9,8 +9,8 @@ import pytest
 
 from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.calibration.summary import headline
-from dhcal_pin.estimation.problem import reduce
-from dhcal_pin.estimation.robust import spreads, standardized_residuals
+from dhcal_pin.estimation.problem import linearize_and_factor
+from dhcal_pin.estimation.robust import residual_covariances, standardized_residuals
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.length import Wires
@@ -18,7 +18,7 @@ from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.measurements.position import Position
 from dhcal_pin.report.document import Provenance
 from dhcal_pin.report.figures import histograms
-from dhcal_pin.report.sections import study
+from dhcal_pin.report.sections import report_context
 
 
 def spoiled(kind, chain, seed, m=100, share=0.1):
@@ -32,9 +32,9 @@ def spoiled(kind, chain, seed, m=100, share=0.1):
         poses = data.poses.copy()
         poses[bad, :3, 3] += jump
         return data, replace(data, poses=poses), np.sort(bad) + 1
-    reading = data.reading.copy()
+    reading = data.values.copy()
     reading[bad] += jump
-    return data, replace(data, reading=reading), np.sort(bad) + 1
+    return data, replace(data, values=reading), np.sort(bad) + 1
 
 
 def trial(kind, loss, sim_6dof, actual, seeds):
@@ -83,7 +83,7 @@ def test_scores_of_good_samples_are_normal(sim_6dof_actual):
     for kind in (Pose, Position):
         rng = np.random.default_rng(0)
         data = kind.simulate(sim_6dof_actual, rng.uniform(-3, 3, (20000, 6)), Noise(1e-4, 2e-4), rng)
-        found = standardized_residuals(data.residual(sim_6dof_actual.sweep(data.q), np.empty(0)))
+        found = standardized_residuals(data.residual(sim_6dof_actual.forward_kinematics(data.q), np.empty(0)))
         np.testing.assert_allclose(np.quantile(found, [0.5, 0.841, 0.9987]), [0, 1, 3], atol=0.15)
 
 
@@ -125,12 +125,14 @@ def test_spreads_of_residuals_are_those_of_many_draws(sim_6dof, sim_6dof_actual)
     q = np.random.default_rng(0).uniform(-3, 3, (14, 6))
     exact = Position.simulate(sim_6dof_actual, q, Noise(), np.random.default_rng(0))
     weights = np.where(np.arange(14) == 3, 1e-12, 1.0)
-    fit = calibrate(sim_6dof, Position.of(q, exact.reading, np.full((14, 3), 1e-4)), "dh", priors="none")
-    problem = fit.problem.of([fit.problem.data[0].weighted(weights)])
-    solution = replace(fit.solution, triangle=reduce(problem, fit.x, small_angle=False))
-    expected = spreads(problem, solution, [weights])[0]
+    fit = calibrate(
+        sim_6dof, Position.from_arrays(q, exact.values, np.full((14, 3), 1e-4)), "dh", priors="none"
+    )
+    problem = fit.problem.with_data([fit.problem.data[0].with_weights(weights)])
+    solution = replace(fit.solution, system=linearize_and_factor(problem, fit.x, small_angle=False))
+    expected = residual_covariances(problem, solution, [weights])[0]
     # Linear least squares by numpy on the same rows, its misses over many draws of noise.
-    rows = problem.tangent(fit.x).rows(fit.problem.chunks[0])[:-1].transpose(2, 1, 0).reshape(42, -1)
+    rows = problem.linearize(fit.x).rows(fit.problem.chunks[0])[:-1].transpose(2, 1, 0).reshape(42, -1)
     noise = np.random.default_rng(1).normal(size=(42, 20000))
     root = np.sqrt(np.repeat(weights, 3))[:, None]
     missed = noise - rows @ np.linalg.pinv(root * rows, rcond=1e-9) @ (root * noise)
@@ -152,13 +154,13 @@ def test_what_is_told_of_a_fit_is_of_the_samples_that_count(sim_6dof, sim_6dof_a
     clean, dirty, _ = spoiled(Position, sim_6dof_actual, 3, m=60, share=0.05)
     best, fit = calibrate(sim_6dof, clean, "dh"), calibrate(sim_6dof, dirty, "dh")
     told, expected = fit.comparisons[0], best.comparisons[0]
-    assert (told.samples, told.aside) == (57, 3)
+    assert (told.n_samples, told.n_rejected) == (57, 3)
     assert told.after["position_rms_m"] < 1.3 * expected.after["position_rms_m"]
     assert "3 gross errors left aside." in headline(fit.comparisons).text
-    assert f"Position error, {57} fitted" in "".join(histograms(study(fit, Provenance())))
+    assert f"Position error, {57} fitted" in "".join(histograms(report_context(fit, Provenance())))
     held = calibrate(sim_6dof, clean, "dh", holdout=[dirty]).comparisons[0]
-    assert (held.samples, held.gross) == (60, 3)
-    assert held.after["position_rms_m"] > 10 * held.without["position_rms_m"]
+    assert (held.n_samples, held.n_outliers) == (60, 3)
+    assert held.after["position_rms_m"] > 10 * held.after_without_outliers["position_rms_m"]
     assert "without 3 gross errors among them" in headline([held]).text
 
 
@@ -178,8 +180,8 @@ def test_what_samples_draw_to_themselves_is_a_share_of_the_unknowns(sim_6dof, si
     rng = np.random.default_rng(4)
     data = Wires.simulate(sim_6dof_actual, rng.uniform(-3, 3, (60, 6)), Noise(1e-4), rng)
     fit = calibrate(sim_6dof, data, "minimal,base,tool")
-    rows = fit.problem.tangent(fit.x).rows(fit.problem.chunks[0])[:-1].transpose(2, 1, 0).reshape(180, -1)
+    rows = fit.problem.linearize(fit.x).rows(fit.problem.chunks[0])[:-1].transpose(2, 1, 0).reshape(180, -1)
     basis = np.linalg.qr(np.concatenate([rows, np.diag(fit.problem.weights)]))[0][:180].reshape(60, 3, -1)
-    drawn = np.eye(3) - spreads(fit.problem, fit.solution, fit.weights)[0]
+    drawn = np.eye(3) - residual_covariances(fit.problem, fit.solution, fit.weights)[0]
     np.testing.assert_allclose(drawn, basis @ basis.transpose(0, 2, 1), atol=1e-4)
     assert fit.outliers[0].size == 0

@@ -12,15 +12,15 @@ from scipy.spatial import cKDTree
 
 from dhcal_pin.robot.chain import Chain
 from dhcal_pin.robot.urdf import parse_urdf
-from dhcal_pin.visualization.meshes import GRID, Looks, Mesh, looks, shares
-from dhcal_pin.visualization.scene import TRIANGLES, scene_html, tree
+from dhcal_pin.visualization.meshes import GRID, Mesh, Visuals, allocate_triangles, visuals_of
+from dhcal_pin.visualization.scene import MAX_TRIANGLES, kinematic_tree, scene_html
 
 UR5 = "ur_description/urdf/ur5_robot.urdf"
 EVERYTHING = 10**9
 
 
-def looked(chain: Chain, folders=None, triangles: int = EVERYTHING) -> Looks:
-    return looks(chain, tree(chain, chain)["bodies"], folders, triangles)
+def looked(chain: Chain, folders=None, triangles: int = EVERYTHING) -> Visuals:
+    return visuals_of(chain, kinematic_tree(chain, chain)["bodies"], folders, triangles)
 
 
 def ball(rings: int = 60) -> tuple[np.ndarray, np.ndarray]:
@@ -36,7 +36,7 @@ def ball(rings: int = 60) -> tuple[np.ndarray, np.ndarray]:
 
 
 def volume(mesh: Mesh) -> float:
-    a, b, c = np.moveaxis(mesh.places[mesh.triangles] - mesh.places.mean(0), 1, 0)
+    a, b, c = np.moveaxis(mesh.vertices[mesh.triangles] - mesh.vertices.mean(0), 1, 0)
     return float(np.abs(np.einsum("ij,ij->", a, np.cross(b, c))) / 6)
 
 
@@ -44,15 +44,15 @@ def test_the_grid_moves_no_corner_by_more_than_half_a_step():
     corners, triangles = ball()
     mesh = Mesh.on_grid(corners, triangles)
     assert np.ptp(corners, axis=0).max() / GRID == pytest.approx(mesh.step)
-    far = cKDTree(mesh.places).query(corners, p=np.inf)[0]
+    far = cKDTree(mesh.vertices).query(corners, p=np.inf)[0]
     assert far.max() <= 0.51 * mesh.step
     assert volume(mesh) == pytest.approx(4 / 3 * np.pi * 1e-3, rel=5e-3)
 
 
 def test_a_simplified_mesh_keeps_its_form():
-    mesh = Mesh.on_grid(*ball()).simplified(1000)
+    mesh = Mesh.on_grid(*ball()).simplify(1000)
     assert 500 < len(mesh.triangles) <= 1000
-    radius = np.linalg.norm(mesh.places - [1.0, 2.0, 3.0], axis=1)
+    radius = np.linalg.norm(mesh.vertices - [1.0, 2.0, 3.0], axis=1)
     assert np.abs(radius - 0.1).max() < 1e-3
     assert volume(mesh) == pytest.approx(4 / 3 * np.pi * 1e-3, rel=0.02)
 
@@ -60,7 +60,7 @@ def test_a_simplified_mesh_keeps_its_form():
 def spread(mesh: Mesh, count: int) -> np.ndarray:
     """Points (count, 3) all over a mesh, as many on each triangle as its area asks for."""
     rng = np.random.default_rng(0)
-    a, b, c = np.moveaxis(mesh.places[mesh.triangles], 1, 0)
+    a, b, c = np.moveaxis(mesh.vertices[mesh.triangles], 1, 0)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     at = rng.choice(len(area), count, p=area / area.sum())
     u, v = np.sort(rng.random((2, count, 1)), axis=0)
@@ -71,20 +71,20 @@ def spread(mesh: Mesh, count: int) -> np.ndarray:
 def test_a_robot_keeps_as_many_triangles_as_it_may_and_its_form(file):
     whole = looked(Chain.from_urdf(robot_file(file)))
     counts = [len(mesh.triangles) for mesh in whole.meshes]
-    kept = shares(counts, TRIANGLES)
-    few = [mesh.simplified(most) for mesh, most in zip(whole.meshes, kept, strict=True)]
-    assert 0.9 * TRIANGLES < sum(len(mesh.triangles) for mesh in few) <= TRIANGLES
+    kept = allocate_triangles(counts, MAX_TRIANGLES)
+    few = [mesh.simplify(most) for mesh, most in zip(whole.meshes, kept, strict=True)]
+    assert 0.9 * MAX_TRIANGLES < sum(len(mesh.triangles) for mesh in few) <= MAX_TRIANGLES
     for mesh, cut in zip(whole.meshes, few, strict=True):
         away = cKDTree(spread(cut, 50_000)).query(spread(mesh, 2000))[0]
-        assert np.quantile(away, 0.9) < 0.02 * np.ptp(mesh.places, axis=0).max()
-        assert np.quantile(away, 0.99) < 0.03 * np.ptp(mesh.places, axis=0).max()
+        assert np.quantile(away, 0.9) < 0.02 * np.ptp(mesh.vertices, axis=0).max()
+        assert np.quantile(away, 0.99) < 0.03 * np.ptp(mesh.vertices, axis=0).max()
 
 
 def test_small_meshes_stay_whole():
-    assert shares([4, 1600, 9, 400], 613) == [4, 400, 9, 200]
-    assert shares([10, 20], 400) == [10, 20]
-    assert shares([100, 100, 100], 30) == [10, 10, 10]
-    assert shares([], 30) == []
+    assert allocate_triangles([4, 1600, 9, 400], 613) == [4, 400, 9, 200]
+    assert allocate_triangles([10, 20], 400) == [10, 20]
+    assert allocate_triangles([100, 100, 100], 30) == [10, 10, 10]
+    assert allocate_triangles([], 30) == []
 
 
 def test_two_meshed_arms_stay_small_and_come_out_the_same():
@@ -94,7 +94,7 @@ def test_two_meshed_arms_stay_small_and_come_out_the_same():
     assert first == second
     sizes = [
         len(first.encode()),
-        *(len(scene_html(nominal, nominal, q=q, triangles=n).encode()) for n in (TRIANGLES, 15_000)),
+        *(len(scene_html(nominal, nominal, q=q, triangles=n).encode()) for n in (MAX_TRIANGLES, 15_000)),
     ]
     assert sizes[0] < 6e6
     assert sizes[1] < 2e6

@@ -9,9 +9,9 @@ import pytest
 from conftest import paper, robot_file
 
 from dhcal_pin.calibration.procedure import calibrate
-from dhcal_pin.estimation.parameters import select
-from dhcal_pin.estimation.problem import Problem, reduce
-from dhcal_pin.estimation.qr import posterior_root
+from dhcal_pin.estimation.parameters import select_parameters
+from dhcal_pin.estimation.problem import Problem, linearize_and_factor
+from dhcal_pin.estimation.qr import posterior_sqrt_covariance
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.measurements.position import Position
@@ -49,7 +49,7 @@ def arm(name: str) -> Chain:
 def drawn(chain: Chain, m: int, rng: np.random.Generator):
     low = np.where(chain.prismatic, -0.4, np.fmax(chain.lower, -np.pi))
     high = np.where(chain.prismatic, 0.4, np.fmin(chain.upper, np.pi))
-    return rng.uniform(low, high, (m, chain.size))
+    return rng.uniform(low, high, (m, chain.n_joints))
 
 
 @dataclass
@@ -66,7 +66,7 @@ class Tally:
 def trial(nominal: Chain, seed: int, tally: Tally):
     """One robot with errors up to 2° and 10 mm everywhere, 10 to 100 poses, fitted and judged elsewhere."""
     rng = np.random.default_rng(seed)
-    errors = select(nominal, "minimal,base,tool")
+    errors = select_parameters(nominal, "minimal,base,tool")
     size = np.array([np.deg2rad(2.0) if p.unit == "rad" else 1e-2 for p in errors.parameters])
     x = size * rng.uniform(-1, 1, len(size))
     truth = errors.at(x)
@@ -78,9 +78,9 @@ def trial(nominal: Chain, seed: int, tally: Tally):
 
     # At the truth, the lowest cost and the least variance that any unbiased estimate can have.
     problem = Problem(errors, (data,), np.zeros(len(x)))
-    triangle = reduce(problem, x, small_angle=False)
-    at_truth = triangle.rest + triangle.z @ triangle.z
-    found = data.residual(fit.chain.sweep(data.q), np.empty(0))
+    triangle = linearize_and_factor(problem, x, small_angle=False)
+    at_truth = triangle.min_cost + triangle.z @ triangle.z
+    found = data.residual(fit.chain.forward_kinematics(data.q), np.empty(0))
     assert np.sum(found**2) < at_truth, seed
 
     links = [
@@ -93,8 +93,8 @@ def trial(nominal: Chain, seed: int, tally: Tally):
     q = drawn(nominal, 50, rng)
     miss = fit.chain.poses(q)[:, :3, 3] - truth.poses(q)[:, :3, 3]
     chain, bodies, twists = errors.derivative(x)
-    velocities = chain.tool_velocities(chain.sweep(q), bodies, twists)[:, :3]
-    root = posterior_root(triangle, problem.weights)[0]
+    velocities = chain.tool_jacobian(chain.forward_kinematics(q), bodies, twists)[:, :3]
+    root = posterior_sqrt_covariance(triangle, problem.weights)[0]
     tally.squares += np.mean(np.sum(miss**2, 1))
     tally.bound += np.mean(np.sum(np.einsum("pim,pr->mir", velocities, root) ** 2, (1, 2)))
     tally.claimed += np.mean(fit.predict(q).position_std ** 2)
@@ -135,7 +135,7 @@ def worse_than_nominal(name: str, sets: str, kind, poses, seeds) -> int:
     nominal, worse = arm(name), 0
     for seed in seeds:
         rng = np.random.default_rng(seed)
-        errors = select(nominal, sets)
+        errors = select_parameters(nominal, sets)
         size = np.array([np.deg2rad(2.0) if p.unit == "rad" else 1e-2 for p in errors.parameters])
         size = size if seed % 2 else size / 10
         truth = errors.at(size * rng.uniform(-1, 1, len(size)))
@@ -145,10 +145,10 @@ def worse_than_nominal(name: str, sets: str, kind, poses, seeds) -> int:
         wanted = truth.poses(q)[:, :3, 3]
         before, after = (
             np.mean(np.sum((chain.poses(q)[:, :3, 3] - wanted) ** 2, 1))
-            for chain in (fit.reference, fit.chain)
+            for chain in (fit.nominal_refitted, fit.chain)
         )
         worse += after > before
-        assert bool(fit.held_back) == (fit.kept < 1)
+        assert bool(fit.shrinkage_notes) == (fit.shrinkage_factor < 1)
     return worse
 
 
@@ -161,7 +161,7 @@ def four(chain: Chain, rng: np.random.Generator):
 
 
 def one_corner(chain: Chain, rng: np.random.Generator):
-    return drawn(chain, 1, rng) + rng.uniform(-0.2, 0.2, (30, chain.size))
+    return drawn(chain, 1, rng) + rng.uniform(-0.2, 0.2, (30, chain.n_joints))
 
 
 POOR = pytest.mark.parametrize(
@@ -195,9 +195,9 @@ def test_poor_data_do_no_harm_in_200(name, sets, kind, poses):
 
 def test_enough_readings_are_kept_whole():
     nominal = arm("ur5")
-    errors, rng = select(nominal, "minimal,base,tool"), np.random.default_rng(0)
+    errors, rng = select_parameters(nominal, "minimal,base,tool"), np.random.default_rng(0)
     truth = errors.at(1e-3 * rng.standard_normal(len(errors.parameters)))
     data = Pose.simulate(truth, drawn(nominal, 12, rng), Noise(POSITION, ROTATION), rng)
     fit = calibrate(nominal, data)
-    assert fit.kept == 1
-    assert fit.held_back == []
+    assert fit.shrinkage_factor == 1
+    assert fit.shrinkage_notes == []

@@ -18,7 +18,7 @@ from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.length import Wires
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.measurements.position import Position
-from dhcal_pin.parallel import workers
+from dhcal_pin.parallel import open_executor
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def test_a_stream_tells_what_memory_tells(laser, sim_6dof):
     found = calibrate_stream(sim_6dof, parts, "minimal,base,tool", priors="none")
     fit = calibrate(sim_6dof, data, "minimal,base,tool", priors="none")
     assert found.converged
-    assert found.samples == 1000
+    assert found.n_samples == 1000
     assert found.rank == fit.rank
     assert any("tool.rx, tool.ry and tool.rz" in text for text in found.unobservable)
     q = np.random.default_rng(1).uniform(-3, 3, (100, 6))
@@ -55,7 +55,7 @@ def test_sigmas_are_told_by_the_first_part(sim_6dof, sim_6dof_actual):
     """Rotations a hundred times better than the placeholder: weighed as in memory, within their scatter."""
     rng = np.random.default_rng(0)
     data = Pose.simulate(sim_6dof_actual, rng.uniform(-3, 3, (2000, 6)), Noise(2e-3, 1e-5), rng)
-    plain = Pose.of(data.q, data.poses)
+    plain = Pose.from_arrays(data.q, data.poses)
     parts = [plain.take(np.s_[i : i + 500]) for i in range(0, 2000, 500)]
     found = calibrate_stream(sim_6dof, lambda: parts, "dh", priors="none")
     best = calibrate(sim_6dof, data, "dh", priors="none")
@@ -67,10 +67,10 @@ def test_processes_give_the_same_digits(laser, sim_6dof):
     path, data = laser
     parts = partial(file_parts, path, sim_6dof, 100)
     alone = calibrate_stream(sim_6dof, parts, "dh")
-    with workers(jobs=2) as where:
-        np.testing.assert_array_equal(calibrate_stream(sim_6dof, parts, "dh", where=where).x, alone.x)
+    with open_executor(jobs=2) as where:
+        np.testing.assert_array_equal(calibrate_stream(sim_6dof, parts, "dh", executor=where).x, alone.x)
         np.testing.assert_array_equal(
-            calibrate(sim_6dof, data, "dh", where=where).x, calibrate(sim_6dof, data, "dh").x
+            calibrate(sim_6dof, data, "dh", executor=where).x, calibrate(sim_6dof, data, "dh").x
         )
 
 
@@ -86,7 +86,7 @@ def part(seed):
     return Position.simulate(actual, rng.uniform(-3, 3, (4096, 6)), Noise(1e-4), rng)
 from functools import partial
 found = calibrate_stream(nominal, lambda: (partial(part, i) for i in range(int(sys.argv[1]))), "dh")
-assert found.converged and found.samples == 4096 * int(sys.argv[1])
+assert found.converged and found.n_samples == 4096 * int(sys.argv[1])
 # Not getrusage, which counts what the parent held before this program was loaded.
 status = dict(line.split(":", 1) for line in open("/proc/self/status").read().splitlines())
 print(int(status["VmHWM"].split()[0]) / 1024)

@@ -13,8 +13,8 @@ from conftest import paper, random_table, robot_file, with_masses
 
 from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.cli.main import main
-from dhcal_pin.estimation.batch_chains import Arms
-from dhcal_pin.estimation.parameters import EXTENSIONS, select
+from dhcal_pin.estimation.batch_chains import ChainBatch
+from dhcal_pin.estimation.parameters import EXTENSIONS, select_parameters
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io.measurement_csv import measurement_text
 from dhcal_pin.io.robot import read_robot, write_urdf
@@ -31,9 +31,9 @@ def ur10() -> Chain:
 
 def drawn(chain: Chain, sets: str, rng: np.random.Generator):
     """A chain with errors of the size of the priors, frames a little off, and those errors by name."""
-    errors = select(chain, sets)
+    errors = select_parameters(chain, sets)
     x = rng.normal(size=len(errors.parameters)) * np.minimum(errors.priors, 0.01)
-    return errors.at(x).loaded(), dict(zip([p.name for p in errors.parameters], x, strict=True))
+    return errors.at(x).with_current_loads(), dict(zip([p.name for p in errors.parameters], x, strict=True))
 
 
 def test_effective_value_is_the_formula():
@@ -75,15 +75,15 @@ MIMIC = """<robot name="r"><link name="base"/><link name="a"/><link name="b"/>
 
 def test_a_mimic_joint_follows_what_its_leader_really_does():
     arm = Chain.from_urdf(parse_urdf(MIMIC.encode(), "mimic.urdf"))
-    errors = select(arm, "gain")
+    errors = select_parameters(arm, "gain")
     assert [p.name for p in errors.parameters] == ["lead.gain"]
     q = np.linspace(-1, 1, 5)[:, None]
     np.testing.assert_allclose(errors.at(np.array([0.01])).poses(q), arm.poses(1.01 * q), atol=1e-15)
     placed, bodies, twists = errors.derivative(np.array([0.01]))
-    sweep = placed.sweep(q)
+    frames = placed.forward_kinematics(q)
     step = 1e-6
     change = arm.poses((1.01 + step) * q)[:, :3, 3] - arm.poses((1.01 - step) * q)[:, :3, 3]
-    velocity = placed.tool_velocities(sweep, bodies, twists)[0, :3].T
+    velocity = placed.tool_jacobian(frames, bodies, twists)[0, :3].T
     np.testing.assert_allclose(velocity, change / (2 * step), atol=1e-9)
 
 
@@ -102,19 +102,22 @@ def test_torques_of_a_mimic_joint_load_its_leader():
 
 def test_sets_that_a_robot_cannot_have(sim_6dof):
     with pytest.raises(DhcalError, match=r"'compliance'.*masses"):
-        select(sim_6dof, "base,compliance")
+        select_parameters(sim_6dof, "base,compliance")
     slides = replace(random_table(np.random.default_rng(0), size=2), prismatic=np.array([True, True]))
     with pytest.raises(DhcalError, match=r"'harmonics'.*turns"):
-        select(Chain.from_dh(slides), "harmonics")
-    assert [p.name for p in select(Chain.from_dh(slides), "gain").parameters] == ["j1.gain", "j2.gain"]
+        select_parameters(Chain.from_dh(slides), "harmonics")
+    assert [p.name for p in select_parameters(Chain.from_dh(slides), "gain").parameters] == [
+        "j1.gain",
+        "j2.gain",
+    ]
 
 
 def test_many_arms_at_once_have_ideal_joints():
     arm = ur10()
     driven, _ = drawn(arm, "gain", np.random.default_rng(0))
-    for errors in (select(arm, "base,gain"), select(driven, "base")):
+    for errors in (select_parameters(arm, "base,gain"), select_parameters(driven, "base")):
         with pytest.raises(DhcalError, match="calibrate one by one"):
-            Arms.of([errors])
+            ChainBatch.from_models([errors])
 
 
 # --- the sidecar -----------------------------------------------------------------------------------
@@ -216,7 +219,7 @@ def test_a_family_is_found_again(family):
         fit = calibrate(arm, data, f"minimal,base,tool,{family}")
         assert fit.converged
         for p, value, std in zip(fit.parameters, fit.x, fit.std, strict=True):
-            if getattr(p, "entry", None) is not None:
+            if getattr(p, "coefficient_index", None) is not None:
                 off.append((value - x[p.name]) / std)
     assert np.sum(np.abs(off) > 3) <= 1
     assert np.abs(off).max() < 4.5
@@ -249,7 +252,7 @@ def carried_in_the_file() -> bytes:
 def test_a_payload_weighs_as_much_as_a_link_of_the_file():
     q = np.random.default_rng(0).uniform(-2, 2, (6, 20))
     wanted = Chain.from_urdf(parse_urdf(carried_in_the_file(), "held.urdf"), "tool0").loads.torques(q)
-    bare, carrying = ur10(), ur10().carrying(CARRIED)
+    bare, carrying = ur10(), ur10().with_payload(CARRIED)
     np.testing.assert_allclose(carrying.loads.torques(q), wanted, atol=1e-10)
     assert np.abs(bare.loads.torques(q) - wanted).max() > 20
     np.testing.assert_array_equal(carrying.poses(q.T), bare.poses(q.T))
@@ -260,7 +263,7 @@ def test_what_a_carrying_arm_gives_is_found_and_kept(tmp_path, monkeypatch, caps
     monkeypatch.chdir(tmp_path)
     (tmp_path / "arm.urdf").write_bytes(robot_file("ur_description/urdf/ur10_robot.urdf").read_bytes())
     rng = np.random.default_rng(2)
-    truth, x = drawn(ur10().carrying(CARRIED), "minimal,compliance", rng)
+    truth, x = drawn(ur10().with_payload(CARRIED), "minimal,compliance", rng)
     for name, m in (("fit", 60), ("other", 30)):
         data = Pose.simulate(truth, rng.uniform(-2, 2, (m, 6)), Noise(1e-5, 1e-5), rng)
         (tmp_path / f"{name}.csv").write_text(measurement_text(data, truth, []))

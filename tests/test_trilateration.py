@@ -125,7 +125,7 @@ def test_geometry_is_found_with_the_robot(sim_6dof, sim_6dof_actual):
     q = rng.uniform(-np.pi, np.pi, (60, 6))
     data = Wires.simulate(sim_6dof_actual, q, Noise(), rng)
     fit = calibrate(sim_6dof, data, "dh", priors="none", fix=["theta1", "d1"])
-    anchors = np.array([fit.instruments[u.name] for u in data.unknowns]).reshape(3, 3)
+    anchors = np.array([fit.instruments[u.name] for u in data.instrument_parameters]).reshape(3, 3)
     # The base is not known to the wires: compare what does not move with it.
     truth = np.array([[np.linalg.norm(a - b) for a in RIG] for b in RIG])
     found = np.array([[np.linalg.norm(a - b) for a in anchors] for b in anchors])
@@ -146,7 +146,7 @@ def test_trilaterated_positions_calibrate_like_positions(sim_6dof, sim_6dof_actu
     side = int(np.sign(np.cross(RIG[1] - RIG[0], RIG[2] - RIG[0])[0]))
     found = trilaterate(lengths(points, anchors), anchors, side)
     np.testing.assert_allclose(found, points, atol=1e-9)
-    fit = calibrate(sim_6dof, Position.of(q, found), "dh", priors="none")
+    fit = calibrate(sim_6dof, Position.from_arrays(q, found), "dh", priors="none")
     assert (
         np.linalg.norm(fit.chain.poses(-q)[:, :3, 3] - sim_6dof_actual.poses(-q)[:, :3, 3], axis=1).max()
         < 1e-8

@@ -13,8 +13,8 @@ from dhcal_pin import se3
 from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.calibration.result import Result
 from dhcal_pin.cli.main import main
-from dhcal_pin.estimation.parameters import select
-from dhcal_pin.estimation.uncertainty import UNKNOWN
+from dhcal_pin.estimation.parameters import select_parameters
+from dhcal_pin.estimation.uncertainty import UNBOUNDED_TOL
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io.dh_file import read_dh
 from dhcal_pin.io.measurement_csv import measurement_text, read_measurements
@@ -51,7 +51,7 @@ def carried(fit: Result, q: np.ndarray) -> np.ndarray:
 
 def fitted(chain: Chain, sets: str, kind: type = Pose, count: int = 40, **options) -> Result:
     rng = np.random.default_rng(0)
-    errors = select(chain, sets)
+    errors = select_parameters(chain, sets)
     truth = replace(chain, base=AWAY, tool=se3.translation([0.02, 0.01, 0.1]))
     truth = replace(errors, chain=truth).at(
         np.minimum(errors.priors, 1e-3) * rng.standard_normal(len(errors.priors))
@@ -93,7 +93,7 @@ def test_what_nothing_tells_stays_unknown(sim_6dof, tmp_path):
     write_urdf(fit, tmp_path / "out.urdf")
     known = read_uncertainty(sidecar_path(tmp_path / "out.urdf"), read_robot(tmp_path / "out.urdf"))
     assert known is not None
-    assert np.sum(known.hidden**2) > UNKNOWN
+    assert np.sum(known.unbounded_directions**2) > UNBOUNDED_TOL
     q = np.random.default_rng(1).uniform(-3, 3, (50, 6))
     assert np.isinf(known.predict(q).position_std).any()
     np.testing.assert_array_equal(np.isinf(known.predict(q).covariance), np.isinf(fit.predict(q).covariance))
@@ -158,8 +158,8 @@ def test_a_map_as_a_page_and_what_is_refused(calibrated, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ('root = """', 'root = """!', "no base64"),
-        ('root = """', 'root = """\nAAAA', "no base64 of"),
+        ('sqrt_covariance = """', 'sqrt_covariance = """!', "no base64"),
+        ('sqrt_covariance = """', 'sqrt_covariance = """\nAAAA', "no base64 of"),
         ('"joint_1"', '"shoulder"', "is of joints"),
         ("terms = []", 'terms = ["elbow.play"]', "elbow.play"),
         ("terms = []", "", "must be a table of"),

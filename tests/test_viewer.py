@@ -23,9 +23,9 @@ from dhcal_pin.io.measurement_csv import measurement_text
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.length import Distance
 from dhcal_pin.measurements.pose import Pose
-from dhcal_pin.measurements.position import Position, Targets
+from dhcal_pin.measurements.position import MultiTargetPosition, Position
 from dhcal_pin.robot.chain import Chain
-from dhcal_pin.robot.transmission import COUPLED, COUPLING_PRIOR, TERMS, Transmission
+from dhcal_pin.robot.transmission import COUPLING_PRIOR, COUPLING_TERM, TERMS, Transmission
 from dhcal_pin.robot.urdf import parse_urdf
 from dhcal_pin.visualization.scene import scene_html, show
 
@@ -49,15 +49,15 @@ def arms(name: str) -> tuple[Chain, Chain]:
 
 def perturbed(nominal: Chain, scale: float = 5e-4) -> tuple[Chain, Chain]:
     rng = np.random.default_rng(1)
-    stations = range(2, nominal.tool_station, 2)
-    return nominal, nominal.displaced({s: se3.exp6(scale * rng.standard_normal(6)) for s in stations})
+    stations = range(2, nominal.tool_frame_index, 2)
+    return nominal, nominal.perturbed_at({s: se3.exp6(scale * rng.standard_normal(6)) for s in stations})
 
 
 def poses(chain: Chain, m: int) -> np.ndarray:
     """Joint values (m, n) well inside the limits, at most 1.3 rad or 0.3 m from zero."""
     reach = 1.3 if not chain.prismatic.any() else 0.3
     lower, upper = np.maximum(chain.lower, -reach), np.minimum(chain.upper, reach)
-    return np.random.default_rng(2).uniform(lower, upper, (m, chain.size))
+    return np.random.default_rng(2).uniform(lower, upper, (m, chain.n_joints))
 
 
 def check_tips(window: Window, nominal: Chain, calibrated: Chain) -> None:
@@ -117,7 +117,7 @@ def check_layers(window: Window, *layers: str) -> None:
 
 def test_the_tips_are_pinocchios(opened):
     opened.window.call("setMagnification", 1)
-    check_tips(opened.window, opened.fit.reference, opened.fit.chain)
+    check_tips(opened.window, opened.fit.nominal_refitted, opened.fit.chain)
 
 
 # One drawn by us, one with seven joints, one of many meshes.
@@ -218,13 +218,13 @@ WEIGHTS = re.sub(
 
 def driven(chain: Chain, seed: int) -> Chain:
     """With every term that its joints can have, some also off the diagonal."""
-    rng, n = np.random.default_rng(seed), chain.size
+    rng, n = np.random.default_rng(seed), chain.n_joints
     held = np.zeros((len(TERMS), n, n))
     held[:, range(n), range(n)] = [
-        [term.prior * (term.sliding or not s) for s in chain.sliding] for term in TERMS
+        [term.prior * (term.applies_to_prismatic or not s) for s in chain.is_prismatic] for term in TERMS
     ]
-    held[COUPLED] += COUPLING_PRIOR * ~np.eye(n, dtype=bool)
-    return chain.driven(Transmission(held * rng.uniform(1, 3, held.shape), chain.loads))
+    held[COUPLING_TERM] += COUPLING_PRIOR * ~np.eye(n, dtype=bool)
+    return chain.with_transmission(Transmission(held * rng.uniform(1, 3, held.shape), chain.loads))
 
 
 @pytest.mark.parametrize("robot", ["ur10", "odd"])
@@ -236,14 +236,14 @@ def test_joints_that_miss_their_values_stand_where_pinocchio_has_them(window, tm
     missed = np.abs(pair[1].poses(poses(nominal, 5)) - calibrated.poses(poses(nominal, 5))).max()
     assert missed > 1e-3
     # Enlarged, the calibrated joints leave the nominal ones in proportion.
-    other = calibrated.driven(nominal.transmission)
+    other = calibrated.with_transmission(nominal.transmission)
     window.open(tmp_path / "scene.html", scene_html(pair[0], other, package_dirs=[tmp_path]))
     window.call("setMagnification", 10)
     q = poses(nominal, 1)
     window.call("setJoints", q[0].tolist())
     grown = replace(nominal.transmission, coefficients=10 * nominal.transmission.coefficients)
     errors = se3.log6(se3.inverse(pair[0].origins) @ pair[1].origins)
-    there = replace(pair[0], origins=pair[0].origins @ se3.exp6(10 * errors)).driven(grown)
+    there = replace(pair[0], origins=pair[0].origins @ se3.exp6(10 * errors)).with_transmission(grown)
     assert np.abs(window.tip("calibrated") - there.poses(q)[0]).max() <= 1e-9
 
 
@@ -262,16 +262,18 @@ def test_a_result_shows_its_own_data_in_a_notebook(window, tmp_path, sim_6dof, s
         np.abs(np.array(frame.evaluate("dhcal.tip('calibrated')")) - fit.chain.poses(data.q[:1])[0]).max()
         <= 1e-9
     )
-    before = fit.reference.poses(data.q[:1])[0]
+    before = fit.nominal_refitted.poses(data.q[:1])[0]
     assert np.abs(np.array(frame.evaluate("dhcal.tip('nominal')")) - before).max() <= 1e-9
 
 
 def test_reflectors_beside_the_tool_and_lengths_are_no_residuals(window, tmp_path, sim_6dof):
     rng = np.random.default_rng(0)
     q = poses(sim_6dof, 9)
-    data = [kind.simulate(sim_6dof, q, Noise(), rng) for kind in (Targets, Distance)]
+    data = [kind.simulate(sim_6dof, q, Noise(), rng) for kind in (MultiTargetPosition, Distance)]
     places = (0.05, 0, 0.01, 0, 0.04, -0.02)
-    known = {unknown.name: place for unknown, place in zip(data[0].unknowns, places, strict=True)}
+    known = {
+        unknown.name: place for unknown, place in zip(data[0].instrument_parameters, places, strict=True)
+    }
     html = scene_html(sim_6dof, measurements=data, known=known)
     window.open(tmp_path / "scene.html", html)
     assert window.page.evaluate("dhcal.scene.poses.length") == 27

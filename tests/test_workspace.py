@@ -7,20 +7,20 @@ import pytest
 
 from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.diagnostics.workspace import workspace_map
-from dhcal_pin.estimation.parameters import select
+from dhcal_pin.estimation.parameters import select_parameters
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.pose import Pose
-from dhcal_pin.robot.sampling import Room, Space
+from dhcal_pin.robot.sampling import ConfigurationSampler, WorkspaceConstraints
 
 NOISE = Noise(1e-4, np.deg2rad(0.01))
 
 
 def test_cells_hold_the_errors_that_calibrated_robots_have(sim_6dof):
     """Poses of one corner calibrate well there and badly elsewhere, and the map says how badly."""
-    errors = select(sim_6dof, "minimal,base,tool")
+    errors = select_parameters(sim_6dof, "minimal,base,tool")
     prior = np.where(errors.priors < 1, errors.priors, 1e-3)
     rng = np.random.default_rng(0)
-    q = Room.of(sim_6dof, Space(), 0.0, 0.0).draw(1500, rng)
+    q = ConfigurationSampler.from_chain(sim_6dof, WorkspaceConstraints(), 0.0, 0.0).draw(1500, rng)
     squares, expected = [], []
     for _ in range(6):
         truth = errors.at(prior * rng.standard_normal(len(prior)))
@@ -46,7 +46,9 @@ def test_every_configuration_has_its_cell(sim_6dof):
     fit = calibrate(sim_6dof, Pose.simulate(sim_6dof, rng.uniform(-2, 2, (20, 6)), NOISE, rng))
     found = workspace_map(fit, cell=0.25, samples=3000, seed=5)
     assert found.count.sum() == 3000
-    q = Room.of(fit.chain, Space(), 0.0, 0.0).draw(3000, np.random.default_rng(5))
+    q = ConfigurationSampler.from_chain(fit.chain, WorkspaceConstraints(), 0.0, 0.0).draw(
+        3000, np.random.default_rng(5)
+    )
     prediction = fit.predict(q)
     assert found.worst.max() == pytest.approx(prediction.position_std.max(), rel=1e-12)
     inside = np.abs(prediction.poses[:, None, :3, 3] - found.centre).max(-1) <= 0.125

@@ -7,40 +7,40 @@ from __future__ import annotations
 
 try:
     from .native import (
-        carry_frames,
-        cosines_and_sines,
-        error_triangles,
+        append_diagonal,
+        apply_observation_matrix,
+        cos_sin,
+        factor_jacobian,
         log_rotations,
-        mix_velocities,
-        move_stations,
-        point_velocities,
-        right_jacobian_inverses,
-        triangle_of,
-        triangles_of,
-        with_diagonal,
+        perturb_frames,
+        point_jacobian,
+        propagate_frames,
+        r_factor,
+        r_factors,
+        right_jacobian_inverse_batch,
     )
 except ImportError:
     from .kinematics import (
-        carry_frames,
-        cosines_and_sines,
+        apply_observation_matrix,
+        cos_sin,
         log_rotations,
-        mix_velocities,
-        move_stations,
-        point_velocities,
-        right_jacobian_inverses,
+        perturb_frames,
+        point_jacobian,
+        propagate_frames,
+        right_jacobian_inverse_batch,
     )
-    from .qr import error_triangles, triangle_of, triangles_of, with_diagonal
+    from .qr import append_diagonal, factor_jacobian, r_factor, r_factors
 
 __all__ = [
-    "carry_frames",
-    "cosines_and_sines",
-    "error_triangles",
+    "append_diagonal",
+    "apply_observation_matrix",
+    "cos_sin",
+    "factor_jacobian",
     "log_rotations",
-    "mix_velocities",
-    "move_stations",
-    "point_velocities",
-    "right_jacobian_inverses",
-    "triangle_of",
-    "triangles_of",
-    "with_diagonal",
+    "perturb_frames",
+    "point_jacobian",
+    "propagate_frames",
+    "r_factor",
+    "r_factors",
+    "right_jacobian_inverse_batch",
 ]

@@ -100,7 +100,7 @@ static PyObject *answer(Array *a, Size count, int fine)
     return NULL;
 }
 
-static PyObject *cosines_and_sines(PyObject *self, PyObject *args)
+static PyObject *cos_sin(PyObject *self, PyObject *args)
 {
     (void)self;
     static const Wanted wanted[] = {{"angles", 2, 'd'}, {"cosines", 2, 'D'}, {"sines", 2, 'D'}};
@@ -119,7 +119,7 @@ static PyObject *cosines_and_sines(PyObject *self, PyObject *args)
     return answer(a, 3, fine);
 }
 
-static PyObject *carry_frames(PyObject *self, PyObject *args)
+static PyObject *propagate_frames(PyObject *self, PyObject *args)
 {
     (void)self;
     static const Wanted wanted[] = {{"links", 3, 'd'}, {"prismatic", 1, '?'}, {"values", 2, 'd'},
@@ -188,7 +188,7 @@ static int mixture_of(Mixture *x, const Array *a, Size k, Size ends, Size m)
     return fine;
 }
 
-static PyObject *point_velocities(PyObject *self, PyObject *args)
+static PyObject *point_jacobian(PyObject *self, PyObject *args)
 {
     (void)self;
     static const Wanted wanted[] = {
@@ -208,7 +208,7 @@ static PyObject *point_velocities(PyObject *self, PyObject *args)
     return answer(a, 5, fine);
 }
 
-static PyObject *mix_velocities(PyObject *self, PyObject *args)
+static PyObject *apply_observation_matrix(PyObject *self, PyObject *args)
 {
     (void)self;
     static const Wanted wanted[] = {{"velocities", 3, 'd'},
@@ -233,7 +233,7 @@ static PyObject *mix_velocities(PyObject *self, PyObject *args)
     return answer(a, 5, fine);
 }
 
-static PyObject *move_stations(PyObject *self, PyObject *args)
+static PyObject *perturb_frames(PyObject *self, PyObject *args)
 {
     (void)self;
     static const Wanted wanted[] = {{"into", 3, 'd'},     {"origins", 3, 'd'}, {"tool", 2, 'd'},
@@ -270,7 +270,7 @@ static PyObject *log_rotations(PyObject *self, PyObject *args)
     return PyLong_FromSsize_t(obtuse);
 }
 
-static PyObject *right_jacobian_inverses(PyObject *self, PyObject *args)
+static PyObject *right_jacobian_inverse_batch(PyObject *self, PyObject *args)
 {
     (void)self;
     static const Wanted wanted[] = {{"vectors", 2, 'd'}, {"out", 3, 'D'}};
@@ -317,7 +317,7 @@ static PyObject *triangles(PyObject *self, PyObject *args)
     return answer(a, 3, fine);
 }
 
-static PyObject *error_triangles(PyObject *self, PyObject *args)
+static PyObject *factor_jacobian(PyObject *self, PyObject *args)
 {
     (void)self;
     static const Wanted wanted[] = {
@@ -354,7 +354,7 @@ static PyObject *error_triangles(PyObject *self, PyObject *args)
     return answer(a, 10, fine);
 }
 
-static PyObject *with_diagonal(PyObject *self, PyObject *args)
+static PyObject *append_diagonal(PyObject *self, PyObject *args)
 {
     (void)self;
     static const Wanted wanted[] = {
@@ -372,17 +372,17 @@ static PyObject *with_diagonal(PyObject *self, PyObject *args)
 }
 
 static PyMethodDef methods[] = {
-    {"cosines_and_sines", cosines_and_sines, METH_VARARGS, NULL},
-    {"carry_frames", carry_frames, METH_VARARGS, NULL},
-    {"point_velocities", point_velocities, METH_VARARGS, NULL},
-    {"mix_velocities", mix_velocities, METH_VARARGS, NULL},
-    {"move_stations", move_stations, METH_VARARGS, NULL},
+    {"cos_sin", cos_sin, METH_VARARGS, NULL},
+    {"propagate_frames", propagate_frames, METH_VARARGS, NULL},
+    {"point_jacobian", point_jacobian, METH_VARARGS, NULL},
+    {"apply_observation_matrix", apply_observation_matrix, METH_VARARGS, NULL},
+    {"perturb_frames", perturb_frames, METH_VARARGS, NULL},
     {"log_rotations", log_rotations, METH_VARARGS, NULL},
-    {"right_jacobian_inverses", right_jacobian_inverses, METH_VARARGS, NULL},
-    {"room", room, METH_VARARGS, NULL},
-    {"triangles", triangles, METH_VARARGS, NULL},
-    {"error_triangles", error_triangles, METH_VARARGS, NULL},
-    {"with_diagonal", with_diagonal, METH_VARARGS, NULL},
+    {"right_jacobian_inverse_batch", right_jacobian_inverse_batch, METH_VARARGS, NULL},
+    {"work_size", room, METH_VARARGS, NULL},
+    {"r_factors", triangles, METH_VARARGS, NULL},
+    {"factor_jacobian", factor_jacobian, METH_VARARGS, NULL},
+    {"append_diagonal", append_diagonal, METH_VARARGS, NULL},
     {NULL, NULL, 0, NULL},
 };
 

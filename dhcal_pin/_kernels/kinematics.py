@@ -9,21 +9,21 @@ import numpy as np
 
 from .. import se3
 from .._typing import Array
-from .types import Mixture, Motion
-from .work_arrays import LongRows, scratch
+from .types import JointState, ObservationMatrix
+from .work_arrays import UnbufferedRows, work_array
 
-_STILL = np.eye(4)
+_IDENTITY = np.eye(4)
 
 
 # So many samples of all bodies stay in a processor's cache.
-BLOCK = 2048
+BLOCK_SIZE = 2048
 
 
 # Of columns x, y, z, p, the same and y, -x.
-_TURNING = np.vstack([np.eye(4), [[0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0]]])
+_ROTATION_MIX = np.vstack([np.eye(4), [[0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0]]])
 
 
-def cosines_and_sines(angles: Array) -> tuple[Array, Array]:
+def cos_sin(angles: Array) -> tuple[Array, Array]:
     """Of angles (k, m), rad."""
     # One tangent of half the angle costs a fifth of a cosine and a sine.
     half = np.tan(0.5 * angles)
@@ -31,8 +31,8 @@ def cosines_and_sines(angles: Array) -> tuple[Array, Array]:
     return (1 - square) / (1 + square), 2 * half / (1 + square)
 
 
-@LongRows()
-def carry_frames(links: Array, prismatic: Array, motion: Motion, frames: Array) -> None:
+@UnbufferedRows()
+def propagate_frames(links: Array, prismatic: Array, motion: JointState, frames: Array) -> None:
     """Fills the columns x, y, z, p of frames (k+2, 7, 3, m), whose first is the base's, to the tool's.
 
     Args:
@@ -43,12 +43,12 @@ def carry_frames(links: Array, prismatic: Array, motion: Motion, frames: Array) 
     """
     # The columns of F·L are the columns of F mixed by L: one small product for all samples. A turn by q
     # makes of x and y their cos q-fold, and to that adds the sin q-fold of y and -x.
-    mixing, columns = _TURNING @ np.swapaxes(links, 1, 2), frames.reshape(*frames.shape[:2], -1)
+    mixing, columns = _ROTATION_MIX @ np.swapaxes(links, 1, 2), frames.reshape(*frames.shape[:2], -1)
     steps = zip(mixing, columns[:, :4], columns[1:, :6], frames[1:], prismatic.tolist(), strict=False)
     for j, (mix, before, mixed, after, slides) in enumerate(steps):
         if slides:
             np.matmul(mix[:4], before, out=mixed[:4])
-            np.multiply(after[2], motion.values[j], out=after[4])
+            np.multiply(after[2], motion.positions[j], out=after[4])
             after[3] += after[4]
         else:
             np.matmul(mix, before, out=mixed)
@@ -59,8 +59,8 @@ def carry_frames(links: Array, prismatic: Array, motion: Motion, frames: Array) 
     np.matmul(mixing[-1, :4], columns[-2, :4], out=columns[-1, :4])
 
 
-@LongRows()
-def point_velocities(frames: Array, point: Array, at: Array, twists: Array, out: Array) -> None:
+@UnbufferedRows()
+def point_jacobian(frames: Array, point: Array, at: Array, twists: Array, out: Array) -> None:
     """Fills in a point's velocity (p, 6, m) per unit of each twist of a body, axes of the measuring frame.
 
     Args:
@@ -73,9 +73,9 @@ def point_velocities(frames: Array, point: Array, at: Array, twists: Array, out:
     # A twist mixes what its body's axes do, one small product for all samples and components.
     move = np.zeros((len(at), 7))
     move[:, :3], move[:, 4:] = twists[:, :3], twists[:, 3:]
-    runs = _runs(tuple(np.bincount(at).tolist()))
-    for start in range(0, point.shape[-1], BLOCK):
-        some = np.s_[..., start : start + BLOCK]
+    runs = _equal_runs(tuple(np.bincount(at).tolist()))
+    for start in range(0, point.shape[-1], BLOCK_SIZE):
+        some = np.s_[..., start : start + BLOCK_SIZE]
         for bodies, rows, count in runs:
             part = frames[bodies][some]
             _turn_about_axes(part, point[some])
@@ -86,7 +86,9 @@ def point_velocities(frames: Array, point: Array, at: Array, twists: Array, out:
             np.matmul(move[rows, 4:].reshape(n, 1, count, 3), part[:, :, :3], out=velocity[:, 3:])
 
 
-def member_velocities(frames: Array, point: Array, at: Array, twists: Array, ends: int, out: Array) -> None:
+def batch_point_jacobian(
+    frames: Array, point: Array, at: Array, twists: Array, ends: int, out: Array
+) -> None:
     """As `point_velocities`, by twists (b, p, 6) of members, whose samples follow each other at each end."""
     shape = ends, len(twists), point.shape[1] // max(ends * len(twists), 1)
     starts = np.searchsorted(at, np.arange(len(frames) + 1)).tolist()
@@ -104,22 +106,22 @@ def member_velocities(frames: Array, point: Array, at: Array, twists: Array, end
             block[:, i] += block[:, 3 + u] * lever[v] - block[:, 3 + v] * lever[u]
 
 
-def mix_velocities(velocities: Array, mixture: Mixture, out: Array) -> Array:
+def apply_observation_matrix(velocities: Array, mixture: ObservationMatrix, out: Array) -> Array:
     """Fills in what a mixture makes (p, k, m) of velocities (p, 6, c·m)."""
     out[:] = 0.0
     p, _, m = out.shape
     ends = velocities.reshape(p, 6, velocities.shape[2] // max(m, 1), m)
-    product = scratch("product", p, m)
-    for row, component, share in zip(mixture.rows, mixture.components, mixture.shares, strict=True):
+    product = work_array("product", p, m)
+    for row, component, share in zip(mixture.rows, mixture.components, mixture.coefficients, strict=True):
         out[:, row] += np.multiply(ends[:, component % 6, component // 6], share, out=product)
     return out
 
 
-def station_frames(into: Array, origins: Array, tool: Array, motions: Array) -> Array:
+def error_frame_poses(body_from_urdf: Array, origins: Array, tool: Array, motions: Array) -> Array:
     """Each station's frame (2k+4, 4, 4) in its body, before its own motion.
 
     Args:
-        into: (k+1, 4, 4) each body's URDF frame in its body frame.
+        body_from_urdf: (k+1, 4, 4) each body's URDF frame in its body frame.
         origins: (k+1, 4, 4) of the joints and the tip, without the motions.
         tool: (4, 4), likewise.
         motions: (2k+4, 4, 4) of the stations.
@@ -127,33 +129,33 @@ def station_frames(into: Array, origins: Array, tool: Array, motions: Array) -> 
     frames = np.empty(motions.shape)
     # Body 0 is behind the base's motion.
     frames[0] = se3.inverse(motions[0])
-    frames[1:-1:2] = into
-    np.matmul(into @ motions[1:-1:2], origins, out=frames[2::2])
+    frames[1:-1:2] = body_from_urdf
+    np.matmul(body_from_urdf @ motions[1:-1:2], origins, out=frames[2::2])
     frames[-1] = frames[-2] @ motions[-2] @ tool
     return frames
 
 
-def move_stations(
-    into: Array, origins: Array, tool: Array, stations: Array, twists: Array, x: Array
+def perturb_frames(
+    body_from_urdf: Array, origins: Array, tool: Array, error_frames: Array, twists: Array, x: Array
 ) -> tuple[Array, Array]:
     """Motions of all stations (2k+4, 4, 4) by errors, and the errors' twists (p, 6) as those of bodies.
 
     An error at a station turns with those before it, seen from the station as it was before all of them.
 
     Args:
-        into: (k+1, 4, 4), as `station_frames` takes it, and so are
+        body_from_urdf: (k+1, 4, 4), as `station_frames` takes it, and so are
         origins: (k+1, 4, 4), and
         tool: (4, 4).
-        stations: (p,) where the errors are, ascending.
+        error_frames: (p,) where the errors are, ascending.
         twists: (p, 6) in the stations' frames.
         x: (p,) how far they go.
     """
-    motions, before = np.empty((2 * len(into) + 2, 4, 4)), np.empty((len(x), 4, 4))
-    motions[:] = _STILL
-    for i, (station, step) in enumerate(zip(stations.tolist(), _exponentials(twists, x), strict=True)):
+    motions, before = np.empty((2 * len(body_from_urdf) + 2, 4, 4)), np.empty((len(x), 4, 4))
+    motions[:] = _IDENTITY
+    for i, (station, step) in enumerate(zip(error_frames.tolist(), _exponentials(twists, x), strict=True)):
         before[i] = motions[station]
         np.matmul(before[i], step, out=motions[station])
-    frames = station_frames(into, origins, tool, motions)[stations] @ before
+    frames = error_frame_poses(body_from_urdf, origins, tool, motions)[error_frames] @ before
     return motions, (se3.adjoint(frames) @ twists[..., None])[..., 0]
 
 
@@ -165,7 +167,7 @@ def _exponentials(twists: Array, x: Array) -> Array:
     unit = matrices / np.where(size > 0, size, 1.0)[:, None, None]
     angle, square = size * x, unit @ unit
     first, second = x[:, None, None] * matrices, (2 * np.sin(0.5 * angle) ** 2)[:, None, None] * square
-    return _STILL + first + second + (angle - np.sin(angle))[:, None, None] * (square @ unit)
+    return _IDENTITY + first + second + (angle - np.sin(angle))[:, None, None] * (square @ unit)
 
 
 def log_rotations(turns: Array) -> Array:
@@ -173,13 +175,13 @@ def log_rotations(turns: Array) -> Array:
     return se3.log3(turns.transpose(2, 0, 1)).T
 
 
-def right_jacobian_inverses(rotvecs: Array) -> Array:
+def right_jacobian_inverse_batch(rotvecs: Array) -> Array:
     """Jr⁻¹ (3, 3, m) of rotation vectors (3, m); see `se3.right_jacobian_inverse`."""
     return se3.right_jacobian_inverse(rotvecs.T).transpose(1, 2, 0)
 
 
 @lru_cache(maxsize=64)
-def _runs(counts: tuple[int, ...]) -> list[tuple[slice, slice, int]]:
+def _equal_runs(counts: tuple[int, ...]) -> list[tuple[slice, slice, int]]:
     """Neighbouring bodies with as many twists each: which bodies, which twists, how many a body."""
     out, body, row = [], 0, 0
     for count, alike in itertools.groupby(counts):
@@ -194,7 +196,7 @@ def _turn_about_axes(frames: Array, point: Array) -> None:
     """Fills the last columns of frames (b, 7, 3, m): how a point (3, m) moves that turns about x, y, z."""
     count, _, _, m = frames.shape
     axes, turns = frames[:, :3], frames[:, 4:]
-    lever, product = scratch("lever", count, 1, 3, m), scratch("product", count, 3, m)
+    lever, product = work_array("lever", count, 1, 3, m), work_array("product", count, 3, m)
     np.subtract(point, frames[:, 3:4], out=lever)
     # The cross products of all bodies at once, a component at a time.
     for x, y, z in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):

@@ -8,33 +8,33 @@ import numpy as np
 from scipy.linalg import lapack
 
 from .._typing import Array
-from .kinematics import member_velocities, mix_velocities, point_velocities
-from .types import Mixture
-from .work_arrays import LongRows, scratch
+from .kinematics import apply_observation_matrix, batch_point_jacobian, point_jacobian
+from .types import ObservationMatrix
+from .work_arrays import UnbufferedRows, work_array
 
 # Columns that are reduced at once where that pays.
-PANEL = 8
+PANEL_WIDTH = 8
 
 
 # OpenBLAS has kernels for narrow products where there is AVX-512: there panels take half the time of LAPACK's
 # plain reduction, elsewhere twice.
-PANELS = not {"AVX512F", "X86_V4"}.isdisjoint(np.show_config(mode="dicts")["SIMD Extensions"]["found"])
+USE_PANELS = not {"AVX512F", "X86_V4"}.isdisjoint(np.show_config(mode="dicts")["SIMD Extensions"]["found"])
 
 
 # From so many rows on, each reading's are reduced apart: below, the calls cost more than the arithmetic.
-TALL = 2000
+MIN_TALL_ROWS = 2000
 
 
-def triangle_of(rows: Array) -> Array:
+def r_factor(rows: Array) -> Array:
     """Upper triangle R (c, c) of k·m rows A given as (c, k, m), RᵀR = AᵀA; they may be overwritten."""
     columns, readings, samples = rows.shape
-    if readings == 1 or readings * samples < TALL:
+    if readings == 1 or readings * samples < MIN_TALL_ROWS:
         return _qr(np.ascontiguousarray(rows).reshape(columns, -1))
-    parts = [_narrow(np.ascontiguousarray(part)) for part in rows.swapaxes(0, 1)]
+    parts = [_factor_nonzero_columns(np.ascontiguousarray(part)) for part in rows.swapaxes(0, 1)]
     return _qr(np.concatenate(parts).T.copy())
 
 
-def triangles_of(rows: Array) -> Array:
+def r_factors(rows: Array) -> Array:
     """The triangles (b, c, c) of b members' rows (b, c, k, m)."""
     b, c = rows.shape[:2]
     stacked = rows.reshape(b, c, -1)
@@ -44,9 +44,9 @@ def triangles_of(rows: Array) -> Array:
     return np.asarray(np.linalg.qr(stacked.swapaxes(1, 2), mode="r"))
 
 
-@LongRows()
-def error_triangles(
-    frames: Array, point: Array, at: Array, twists: Array, mixture: Mixture, given: Array
+@UnbufferedRows()
+def factor_jacobian(
+    frames: Array, point: Array, at: Array, twists: Array, mixture: ObservationMatrix, given: Array
 ) -> Array:
     """Upper triangles (b, p+s, p+s) of members' rows, of which p columns follow from errors and s are given.
 
@@ -61,20 +61,20 @@ def error_triangles(
         given: (s, k, b·m); they may be overwritten.
     """
     (s, k, n), (b, p, _) = given.shape, twists.shape
-    block = scratch("rows", k, p + s, n).swapaxes(0, 1)
-    velocities = scratch("velocities of errors", p, 6, point.shape[1])
+    block = work_array("rows", k, p + s, n).swapaxes(0, 1)
+    velocities = work_array("velocities of errors", p, 6, point.shape[1])
     if b == 1:
-        point_velocities(frames, point, at, twists[0], velocities)
+        point_jacobian(frames, point, at, twists[0], velocities)
     else:
-        member_velocities(frames, point, at, twists, point.shape[1] // max(n, 1), velocities)
-    mix_velocities(velocities, mixture, block[:p])
+        batch_point_jacobian(frames, point, at, twists, point.shape[1] // max(n, 1), velocities)
+    apply_observation_matrix(velocities, mixture, block[:p])
     block[p:] = given
     if b == 1:
-        return triangle_of(block)[None]
-    return triangles_of(np.ascontiguousarray(block.reshape(p + s, k, b, -1).transpose(2, 0, 1, 3)))
+        return r_factor(block)[None]
+    return r_factors(np.ascontiguousarray(block.reshape(p + s, k, b, -1).transpose(2, 0, 1, 3)))
 
 
-def with_diagonal(triangle: Array, diagonal: Array, right: Array) -> Array:
+def append_diagonal(triangle: Array, diagonal: Array, right: Array) -> Array:
     """Triangle (p+1, p+1) of [R | z] and of rows diagonal·δ = right (p,) below it."""
     p = len(diagonal)
     stacked = np.zeros((p + 1, 2 * p + 1))
@@ -85,7 +85,7 @@ def with_diagonal(triangle: Array, diagonal: Array, right: Array) -> Array:
     return _qr(stacked)
 
 
-def _narrow(rows: Array) -> Array:
+def _factor_nonzero_columns(rows: Array) -> Array:
     """Triangle (u, c) of rows (c, m), which are overwritten, by the u columns that are not zero in all.
 
     Half the errors of an arm are lengths, which turn nothing: a quarter of the work for rows of rotations.
@@ -95,7 +95,7 @@ def _narrow(rows: Array) -> Array:
     if not rest.size or rows[rest].any():
         return _qr(rows)
     out = np.zeros((len(used), columns))
-    part = scratch("narrow", len(used), rows.shape[1])
+    part = work_array("narrow", len(used), rows.shape[1])
     out[:, used] = _qr(np.take(rows, used, 0, out=part, mode="clip"))
     return out
 
@@ -106,8 +106,8 @@ def _qr(rows: Array) -> Array:
     out = np.zeros((columns, columns))
     if not rows.size:
         return out
-    if PANELS:
-        packed = lapack.dgeqrt(min(PANEL, columns, count), rows.T, overwrite_a=1)[0]
+    if USE_PANELS:
+        packed = lapack.dgeqrt(min(PANEL_WIDTH, columns, count), rows.T, overwrite_a=1)[0]
     else:
         packed = lapack.dgeqrf(rows.T, overwrite_a=1)[0]
     top = min(columns, count)

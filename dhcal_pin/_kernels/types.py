@@ -10,40 +10,40 @@ from .._typing import Array
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class JointState:
     """What m configurations ask of a chain's joints; errors do not change it, so one serves a whole search.
 
     Attributes:
-        joints: (n, m) values of the independent joints, rad or m.
-        values: (k, m) of the moving joints, rad or m.
+        independent: (n, m) values of the independent joints, rad or m.
+        positions: (k, m) of the moving joints, rad or m.
         cos, sin: (k, m) of the values.
     """
 
-    joints: Array
-    values: Array
+    independent: Array
+    positions: Array
     cos: Array
     sin: Array
 
 
 @dataclass(frozen=True, eq=False)
-class Sweep:
+class FrameBatch:
     """Frames of a chain at m samples, components first so that the samples are contiguous.
 
     Attributes:
-        frames: (k+1, 7, 3, m) columns x, y, z, p of each body's frame in the measuring frame, and room for
+        columns: (k+1, 7, 3, m) columns x, y, z, p of each body's frame in the measuring frame, and room for
             how a point moves that turns about x, y and z. A body's frame has its joint's axis along z.
         tool: (4, 3, m) columns of the tool's frame.
         terms: (t, n, m) of the independent joints' transmission, where the chain has one.
     """
 
-    frames: Array
+    columns: Array
     tool: Array
     terms: Array | None = None
 
     @property
     def bodies(self) -> Array:
         """Columns x, y, z, p (k+1, 4, 3, m) of each body's frame."""
-        return self.frames[:, :4]
+        return self.columns[:, :4]
 
     def poses(self) -> Array:
         """Tool poses (m, 4, 4) in the measuring frame."""
@@ -54,7 +54,7 @@ class Sweep:
 
 
 @dataclass(frozen=True, eq=False)
-class Mixture:
+class ObservationMatrix:
     """How the rows of m samples follow from the tool's velocity at c configurations of each.
 
     Each of n terms adds a share of one component of the velocity to one row.
@@ -62,9 +62,9 @@ class Mixture:
     Attributes:
         rows: (n,) ascending.
         components: (n,) 0 to 5 for vx, vy, vz, ωx, ωy, ωz in the first configuration, 6 to 11 in the second.
-        shares: (n, m).
+        coefficients: (n, m).
     """
 
     rows: Array
     components: Array
-    shares: Array
+    coefficients: Array

@@ -13,7 +13,7 @@ from .._typing import Array
 _store = threading.local()
 
 
-def scratch(name: str, *shape: int) -> Array:
+def work_array(name: str, *shape: int) -> Array:
     """An uninitialised array, which the next one of that name in this thread overwrites.
 
     Fresh pages would cost as much as filling them. It must not leave the function that asked for it,
@@ -26,7 +26,7 @@ def scratch(name: str, *shape: int) -> Array:
     return held[:size].reshape(shape)
 
 
-class LongRows(ContextDecorator):
+class UnbufferedRows(ContextDecorator):
     """Keeps NumPy from gathering rows of samples into its buffer first, which doubles an operation's time."""
 
     def __enter__(self) -> None:
@@ -42,5 +42,5 @@ class LongRows(ContextDecorator):
             np.setbufsize(self.before)
             _store.long_rows = False
 
-    def _recreate_cm(self) -> LongRows:
-        return LongRows()
+    def _recreate_cm(self) -> UnbufferedRows:
+        return UnbufferedRows()

@@ -1,27 +1,34 @@
 """Calibration: from a nominal chain and measurements to a result with evidence of its accuracy."""
 
-from .cross_validation import CrossValidation, Fold, cross_validate, group_folds, random_folds, region_folds
+from .cross_validation import (
+    CrossValidation,
+    Fold,
+    blocked_folds,
+    cross_validate,
+    k_fold,
+    leave_one_group_out,
+)
 from .evaluation import Comparison, accuracy
-from .model_selection import Trial, extend
+from .model_selection import FamilyTrial, extend
 from .procedure import Method, calibrate, split
 from .result import Result
-from .streaming import Streamed, calibrate_stream
+from .streaming import StreamResult, calibrate_stream
 
 __all__ = [
     "Comparison",
     "CrossValidation",
+    "FamilyTrial",
     "Fold",
     "Method",
     "Result",
-    "Streamed",
-    "Trial",
+    "StreamResult",
     "accuracy",
+    "blocked_folds",
     "calibrate",
     "calibrate_stream",
     "cross_validate",
     "extend",
-    "group_folds",
-    "random_folds",
-    "region_folds",
+    "k_fold",
+    "leave_one_group_out",
     "split",
 ]

@@ -16,25 +16,25 @@ from scipy.linalg import lstsq
 
 from .._typing import Array
 from ..estimation import qr
-from ..estimation.problem import Problem, reduce, shared_unknowns
-from ..estimation.qr import Triangle
+from ..estimation.problem import Problem, linearize_and_factor, merge_instrument_parameters
+from ..estimation.qr import TriangularSystem
 from ..exceptions import DhcalError
 from ..measurements.base import Measurement
-from .evaluation import deviations, error_statistics
+from .evaluation import compute_errors, error_statistics
 
 if TYPE_CHECKING:
     from .result import Result
 
 # The share of the samples at either end of a principal direction that a fold leaves out.
-SHARE = 0.25
+BLOCK_FRACTION = 0.25
 
 
 # Directions with less than this share of the widest one's spread are none.
-_FLAT = 1e-6
+_MIN_RELATIVE_SPREAD = 1e-6
 
 
 # A fold's fit may cost more than its triangle foretells by this share of one fitted sample's cost.
-_BENT = 1e-3
+_NONLINEARITY_TOL = 1e-3
 
 
 # For each measurement of a fit which of its samples (m,) a fold leaves out.
@@ -42,10 +42,10 @@ Fold = tuple[Array, ...]
 
 
 # Where a fit of a problem ends (p,).
-Again = Callable[[Problem], Array]
+Refit = Callable[[Problem], Array]
 
 
-def random_folds(data: Sequence[Measurement], count: int, seed: int = 0) -> tuple[Fold, ...]:
+def k_fold(data: Sequence[Measurement], count: int, seed: int = 0) -> tuple[Fold, ...]:
     """Each sample left out in one of `count` folds at random: k-fold.
 
     Raises:
@@ -55,10 +55,10 @@ def random_folds(data: Sequence[Measurement], count: int, seed: int = 0) -> tupl
     if not 2 <= count <= samples:
         raise DhcalError(f"{count} folds: choose from 2 to {samples}, the number of samples")
     labels = np.random.default_rng(seed).permutation(samples) % count
-    return group_folds(data, labels)
+    return leave_one_group_out(data, labels)
 
 
-def group_folds(data: Sequence[Measurement], labels: Array) -> tuple[Fold, ...]:
+def leave_one_group_out(data: Sequence[Measurement], labels: Array) -> tuple[Fold, ...]:
     """A fold a group: leave one group out.
 
     Args:
@@ -73,11 +73,11 @@ def group_folds(data: Sequence[Measurement], labels: Array) -> tuple[Fold, ...]:
         raise DhcalError(f"labels have shape {labels.shape}; {samples} samples need ({samples},)")
     if len(groups := np.unique(labels)) < 2:
         raise DhcalError("one group: leaving it out leaves nothing to fit")
-    return tuple(_parted(data, labels == group) for group in groups)
+    return tuple(_split_mask(data, labels == group) for group in groups)
 
 
-def region_folds(
-    data: Sequence[Measurement], share: float = SHARE, places: Array | None = None
+def blocked_folds(
+    data: Sequence[Measurement], share: float = BLOCK_FRACTION, groups: Array | None = None
 ) -> tuple[Fold, ...]:
     """Two folds a principal direction of the joint values: its lowest and its highest share of samples.
 
@@ -87,37 +87,37 @@ def region_folds(
     Args:
         data: measurements, m samples in all.
         share: of the samples or places at either end that a fold leaves out.
-        places: (m,) labels of samples that belong together, as from `touched`; each by itself without it.
+        groups: (m,) labels of samples that belong together, as from `touched`; each by itself without it.
             Readings without joint values go with their place, or are always fitted.
 
     Raises:
         DhcalError: all samples have the same joint values.
     """
-    moving = np.concatenate([np.full(len(item.rows), item.ends > 0) for item in data])
+    moving = np.concatenate([np.full(len(item.rows), item.configurations_per_row > 0) for item in data])
     q = np.concatenate([item.q for item in data])
-    label = np.unique(np.arange(len(q)) if places is None else places, return_inverse=True)[1]
+    label = np.unique(np.arange(len(q)) if groups is None else groups, return_inverse=True)[1]
     count = np.bincount(label[moving], minlength=label.max(initial=-1) + 1)
     if np.count_nonzero(count) == 1:
-        return region_folds(data, share)
+        return blocked_folds(data, share)
     middle = np.stack([np.bincount(label[moving], column, len(count)) for column in q[moving].T], 1)
     middle = middle[count > 0] / count[count > 0, None]
     spread = middle.std(0)
     scaled = (middle - middle.mean(0))[:, spread > 0] / spread[spread > 0]
     _, size, directions = np.linalg.svd(scaled, full_matrices=False)
     found: dict[bytes, Fold] = {}
-    for along in (scaled @ directions[size > _FLAT * size.max(initial=0.0)].T).T:
+    for along in (scaled @ directions[size > _MIN_RELATIVE_SPREAD * size.max(initial=0.0)].T).T:
         low, high = np.quantile(along, [share, 1 - share])
         for left in (along <= low, along >= high):
             if not left.all():
                 gone = np.zeros(len(count), bool)
                 gone[count > 0] = left
-                found.setdefault(gone.tobytes(), _parted(data, gone[label]))
+                found.setdefault(gone.tobytes(), _split_mask(data, gone[label]))
     if not found:
         raise DhcalError("cross-validation by regions needs samples at different joint values")
     return tuple(found.values())
 
 
-def touched(problem: Problem, x: Array) -> Array:
+def contact_groups(problem: Problem, x: Array) -> Array:
     """Labels (m,) of the samples' places: alike where they touch the same thing, or what is known from there.
 
     Points that a known distance joins are one place; a sample of free space is one by itself.
@@ -126,34 +126,36 @@ def touched(problem: Problem, x: Array) -> Array:
     from scipy.sparse.csgraph import connected_components
 
     chain = problem.errors.at(x[: len(problem.errors.parameters)])
-    place = {unknown.name: i for i, unknown in enumerate(shared_unknowns(problem.data))}
+    place = {unknown.name: i for i, unknown in enumerate(merge_instrument_parameters(problem.data))}
     first, samples, things = len(place), [], []
     for item in problem.data:
-        if (item.touches or not item.ends) and len(item.rows):
-            sweep = chain.sweep(item.configurations())
-            own, sample = np.nonzero(item.own(sweep, problem.values(item, x)).any(1))
+        if (item.is_contact or not item.configurations_per_row) and len(item.rows):
+            frames = chain.forward_kinematics(item.configurations())
+            own, sample = np.nonzero(
+                item.instrument_jacobian(frames, problem.instrument_values_of(item, x)).any(1)
+            )
             samples.append(first + sample)
-            things.append(np.array([place[unknown.name] for unknown in item.unknowns], int)[own])
+            things.append(np.array([place[unknown.name] for unknown in item.instrument_parameters], int)[own])
         first += len(item.rows)
     rows, columns = (np.concatenate([*found, np.empty(0, int)]) for found in (samples, things))
     links = coo_array((np.ones(len(rows)), (rows, columns)), shape=(first, first))
     return connected_components(links, directed=False)[1][len(place) :]
 
 
-def _parted(data: Sequence[Measurement], mask: Array) -> Fold:
+def _split_mask(data: Sequence[Measurement], mask: Array) -> Fold:
     return tuple(np.split(mask, np.cumsum([len(item.rows) for item in data])[:-1]))
 
 
 @dataclass(frozen=True, eq=False)
-class Parts:
+class FoldSystems:
     """A fold's triangles around one x: of what it fits and of what it leaves out, and the latter's rows."""
 
-    fitted: Triangle
-    left: Triangle
-    rows: int
+    fitted: TriangularSystem
+    held_out: TriangularSystem
+    n_rows: int
 
     @property
-    def unseen(self) -> Array:
+    def unobserved(self) -> Array:
         """Columns (p,) that the fitted rows do not depend on, such as a point that was touched elsewhere."""
         return np.logical_not(self.fitted.r.any(0))
 
@@ -162,17 +164,19 @@ class Parts:
 
         What only the left-out rows depend on is fitted to them.
         """
-        step, _ = solved(self.fitted, weights, x, columns)
-        own = self.left.r[:, columns]
-        rest = self.left.z - own @ step
-        alone = self.unseen[columns] & own.any(0)
+        step, _ = solve_columns(self.fitted, weights, x, columns)
+        own = self.held_out.r[:, columns]
+        rest = self.held_out.z - own @ step
+        alone = self.unobserved[columns] & own.any(0)
         if alone.any():
             basis = np.linalg.qr(own[:, alone])[0]
             rest = rest - basis @ (basis.T @ rest)
-        return float(np.sqrt((rest @ rest + self.left.rest) / self.rows))
+        return float(np.sqrt((rest @ rest + self.held_out.min_cost) / self.n_rows))
 
 
-def solved(triangle: Triangle, weights: Array, x: Array, columns: Array) -> tuple[Array, float]:
+def solve_columns(
+    triangle: TriangularSystem, weights: Array, x: Array, columns: Array
+) -> tuple[Array, float]:
     """The step (c,) of the columns that count (p,) with priors of weights (p,) about 0, and its cost.
 
     What neither rows nor priors tell goes back to 0, as x may have it from rows that are left out.
@@ -185,19 +189,19 @@ def solved(triangle: Triangle, weights: Array, x: Array, columns: Array) -> tupl
     step = found[0]
     if not held.all():
         _, s, vt = np.linalg.svd(a)
-        untold = vt[s <= qr.RANK_CUT * s[0]]
+        untold = vt[s <= qr.RANK_RTOL * s[0]]
         step = step - untold.T @ (untold @ (x[columns] + step))
-    return step, triangle.rest + float(np.sum((a @ step - b) ** 2))
+    return step, triangle.min_cost + float(np.sum((a @ step - b) ** 2))
 
 
-def rows(problem: Problem) -> int:
+def count_rows(problem: Problem) -> int:
     """Number of whitened rows."""
-    return sum(item.size * len(item.rows) for item in problem.data)
+    return sum(item.residual_dim * len(item.rows) for item in problem.data)
 
 
-def parts(
+def factor_folds(
     problem: Problem, x: Array, folds: Sequence[Fold], progress: Callable[[int, float], None] | None = None
-) -> tuple[Parts, ...]:
+) -> tuple[FoldSystems, ...]:
     """Each fold's triangles around x (p,)."""
     found = []
     for fold in folds:
@@ -207,36 +211,36 @@ def parts(
     return tuple(found)
 
 
-def _split(problem: Problem, x: Array, fold: Fold) -> tuple[Problem, Parts]:
+def _split(problem: Problem, x: Array, fold: Fold) -> tuple[Problem, FoldSystems]:
     """The problem of what a fold fits, and the fold's triangles around x (p,)."""
     kept, left = (
-        problem.of([item.take(side) for item, side in zip(problem.data, sides, strict=True)])
+        problem.with_data([item.take(side) for item, side in zip(problem.data, sides, strict=True)])
         for sides in ([~mask for mask in fold], fold)
     )
-    inside = reduce(kept, x, small_angle=False)
-    return kept, Parts(inside, reduce(left, x, small_angle=False), rows(left))
+    inside = linearize_and_factor(kept, x, small_angle=False)
+    return kept, FoldSystems(inside, linearize_and_factor(left, x, small_angle=False), count_rows(left))
 
 
-def _ending(kept: Problem, part: Parts, x: Array, columns: Array, again: Again) -> Array:
+def _refit_estimate(kept: Problem, part: FoldSystems, x: Array, columns: Array, refit: Refit) -> Array:
     """Where the fit of what a fold keeps ends (p,), from the fit of all at x with its free columns."""
     moved = x.copy()
-    step, cost = solved(part.fitted, kept.weights, x, columns)
+    step, cost = solve_columns(part.fitted, kept.weights, x, columns)
     moved[columns] += step
     cost += float(np.sum((kept.weights * x)[~columns] ** 2))
     samples = sum(len(item.rows) for item in kept.data)
     # One step is all where the model is as straight as its triangle.
-    if kept.cost(moved) <= cost + _BENT * cost / max(1, samples):
+    if kept.cost(moved) <= cost + _NONLINEARITY_TOL * cost / max(1, samples):
         return moved
-    return again(kept)
+    return refit(kept)
 
 
-def left_out(
+def cross_validate_folds(
     problem: Problem,
     x: Array,
     data: Sequence[Measurement],
     folds: Sequence[Fold],
-    again: Again,
-    share: float = 1.0,
+    refit: Refit,
+    shrinkage_factor: float = 1.0,
 ) -> Iterator[tuple[list[dict[str, Array]], float]]:
     """For each fold the deviations of its left-out samples, and their RMS in standard deviations.
 
@@ -245,8 +249,8 @@ def left_out(
         x: (p,) where it ended.
         data: the fitted measurements, whose samples are judged.
         folds: made for them.
-        again: the same fit of some of its samples, where one step from x does not reach it.
-        share: of each fold's x that its samples are judged by.
+        refit: the same fit of some of its samples, where one step from x does not reach it.
+        shrinkage_factor: of each fold's x that its samples are judged by.
 
     Raises:
         DhcalError: folds that were made for other data.
@@ -254,14 +258,18 @@ def left_out(
     sizes = [len(item.rows) for item in data]
     if any([len(mask) for mask in fold] != sizes for fold in folds):
         raise DhcalError(f"folds were made for other data; {len(sizes)} measurements have {sizes} samples")
-    columns, robot = problem.free(x), len(problem.errors.parameters)
+    columns, robot = problem.is_interior(x), len(problem.errors.parameters)
     for fold in folds:
         kept, part = _split(problem, x, fold)
-        moved = share * _ending(kept, part, x, columns, again)
-        unseen = {u.name for u, alone in zip(problem.unknowns, part.unseen[robot:], strict=True) if alone}
+        moved = shrinkage_factor * _refit_estimate(kept, part, x, columns, refit)
+        unseen = {
+            u.name
+            for u, alone in zip(problem.instrument_parameters, part.unobserved[robot:], strict=True)
+            if alone
+        }
         known = {name: value for name, value in problem.instruments(moved).items() if name not in unseen}
         left = [item.take(mask) for item, mask in zip(data, fold, strict=True) if mask.any()]
-        found = deviations(problem.errors.at(moved[:robot]), left, known)
+        found = compute_errors(problem.errors.at(moved[:robot]), left, known)
         yield found, part.error(problem.weights, x, columns)
 
 
@@ -303,8 +311,8 @@ def cross_validate(fit: Result, folds: Sequence[Fold] | None = None) -> CrossVal
         DhcalError: folds that were not made for the fitted data.
     """
     if folds is None:
-        folds = region_folds(fit.data, places=touched(fit.problem, fit.x))
-    judged = list(left_out(fit.problem, fit.solution.x, fit.data, folds, fit.again))
+        folds = blocked_folds(fit.data, groups=contact_groups(fit.problem, fit.x))
+    judged = list(cross_validate_folds(fit.problem, fit.solution.x, fit.data, folds, fit.refit))
     every = [item for found, _ in judged for item in found]
     return CrossValidation(
         tuple(error_statistics(found) for found, _ in judged),

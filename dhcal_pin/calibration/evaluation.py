@@ -11,26 +11,26 @@ import numpy as np
 from .._typing import Array
 from ..estimation import robust
 from ..estimation.error_model import ErrorModel
-from ..estimation.problem import Problem, shared_unknowns
+from ..estimation.problem import Problem, merge_instrument_parameters
 from ..estimation.solver import levenberg_marquardt
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 
 # What a kind calls its errors, where not position or orientation, counts as residual; and its key's ending.
-ENDINGS = {"position": "_m", "orientation": "_rad", "residual": ""}
+UNIT_SUFFIXES = {"position": "_m", "orientation": "_rad", "residual": ""}
 
 
-def group_of(name: str) -> str:
+def error_group(name: str) -> str:
     """The group of ENDINGS that a kind's errors of that name belong to."""
-    return name if name in ENDINGS else "residual"
+    return name if name in UNIT_SUFFIXES else "residual"
 
 
 def instrument_values(
     chain: Chain, data: Sequence[Measurement], known: Mapping[str, float]
 ) -> dict[str, float]:
     """Values of started data's unknowns by name, those that are not known fitted to the data alone."""
-    every = shared_unknowns(data)
-    given = {u.name: known[u.name] for u in every if u.name in known and not u.local}
+    every = merge_instrument_parameters(data)
+    given = {u.name: known[u.name] for u in every if u.name in known and not u.is_local}
     weights = np.array([1 / u.prior for u in every if u.name not in given])
     problem = Problem(ErrorModel(chain, ()), tuple(data), weights, given)
     if not len(weights):
@@ -38,7 +38,7 @@ def instrument_values(
     return problem.instruments(levenberg_marquardt(problem, np.zeros(len(weights)), 100, None).x)
 
 
-def deviations(
+def compute_errors(
     chain: Chain, data: Sequence[Measurement], known: Mapping[str, float] | None = None
 ) -> list[dict[str, Array]]:
     """Measured minus modelled: for each item its unweighted errors (m, ·) by name, m or rad.
@@ -49,11 +49,12 @@ def deviations(
         known: values of instruments' unknowns; others (a point that only these data touch) are fitted
             to the data first.
     """
-    data = [item.started(chain) for item in data]
+    data = [item.initialized(chain) for item in data]
     values = instrument_values(chain, data, known or {})
     return [
         item.errors(
-            chain.sweep(item.configurations()), np.array([values[unknown.name] for unknown in item.unknowns])
+            chain.forward_kinematics(item.configurations()),
+            np.array([values[unknown.name] for unknown in item.instrument_parameters]),
         )
         for item in data
     ]
@@ -63,21 +64,21 @@ def position_errors(
     chain: Chain, data: Sequence[Measurement], known: Mapping[str, float] | None = None
 ) -> tuple[Array, Array]:
     """Joint values (m, n) of all measured positions, and how far the chain is from each (m,), m."""
-    q, sizes = [np.empty((0, chain.size))], [np.empty(0)]
+    q, sizes = [np.empty((0, chain.n_joints))], [np.empty(0)]
     placed = [item for item in data if len(item.positions())]
-    for item, errors in zip(placed, deviations(chain, placed, known), strict=True):
+    for item, errors in zip(placed, compute_errors(chain, placed, known), strict=True):
         q.append(item.configurations())
         sizes.append(np.linalg.norm(errors["position"], axis=1))
     return np.concatenate(q), np.concatenate(sizes)
 
 
-def sizes(found: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
+def error_norms(found: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
     """Sizes (m,) of deviations by group, those of all items in a row."""
     out: dict[str, list[Array]] = {}
     for item in found:
         for name, error in item.items():
-            out.setdefault(group_of(name), []).append(np.linalg.norm(error, axis=1))
-    return {group: np.concatenate(out[group]) for group in ENDINGS if group in out}
+            out.setdefault(error_group(name), []).append(np.linalg.norm(error, axis=1))
+    return {group: np.concatenate(out[group]) for group in UNIT_SUFFIXES if group in out}
 
 
 def accuracy(
@@ -94,14 +95,14 @@ def accuracy(
         data: measurements of any kinds.
         known: values of instruments' unknowns; others are fitted to the data first.
     """  # noqa: D205
-    return error_statistics(deviations(chain, data, known))
+    return error_statistics(compute_errors(chain, data, known))
 
 
 def error_statistics(found: Sequence[Mapping[str, Array]]) -> dict[str, Any]:
     """What `accuracy` says, of deviations."""
     out: dict[str, Any] = {}
-    for group, size in sizes(found).items():
-        end = ENDINGS[group]
+    for group, size in error_norms(found).items():
+        end = UNIT_SUFFIXES[group]
         square = size**2
         rms = float(np.sqrt(np.mean(square)))
         out |= {
@@ -120,7 +121,7 @@ def error_statistics(found: Sequence[Mapping[str, Array]]) -> dict[str, Any]:
     return out
 
 
-def without_gross(found: Sequence[Mapping[str, Array]]) -> tuple[list[dict[str, Array]], int]:
+def remove_outliers(found: Sequence[Mapping[str, Array]]) -> tuple[list[dict[str, Array]], int]:
     """Deviations without the samples that stand out of all others, and how many those are.
 
     Of several groups the first, the position, tells.
@@ -128,7 +129,9 @@ def without_gross(found: Sequence[Mapping[str, Array]]) -> tuple[list[dict[str, 
     clean, gross = [], 0
     for item in found:
         first = next(iter(item.values()))
-        good = robust.scored(np.mean(first**2, 1), first.shape[1]) <= robust.OUTLYING
+        good = (
+            robust.standardize_mean_squares(np.mean(first**2, 1), first.shape[1]) <= robust.OUTLIER_THRESHOLD
+        )
         gross += int(np.sum(~good))
         clean.append({name: error[good] for name, error in item.items()})
     return clean, gross
@@ -139,18 +142,18 @@ class Comparison:
     """Accuracy before and after a calibration on the same samples.
 
     Attributes:
-        title: "held out", "left out" (each sample of a fit without it) or "fitted".
-        samples: how many.
+        title: "held out", "cross-validated" (each sample of a fit without it) or "fitted".
+        n_samples: how many.
         before, after: as from `accuracy`.
-        aside: gross errors among the samples of a fit that they take no part in; not in the figures.
-        gross: gross errors that are in the figures.
-        without: `after` without those, where there are any.
+        n_rejected: gross errors among the samples of a fit that they take no part in; not in the figures.
+        n_outliers: gross errors that are in the figures.
+        after_without_outliers: `after` without those, where there are any.
     """
 
     title: str
-    samples: int
+    n_samples: int
     before: Mapping[str, Any]
     after: Mapping[str, Any]
-    aside: int = 0
-    gross: int = 0
-    without: Mapping[str, Any] = field(default_factory=dict)
+    n_rejected: int = 0
+    n_outliers: int = 0
+    after_without_outliers: Mapping[str, Any] = field(default_factory=dict)

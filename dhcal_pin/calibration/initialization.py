@@ -10,22 +10,22 @@ import numpy as np
 from .. import se3
 from .._typing import Array
 from ..estimation.error_model import ErrorModel
-from ..estimation.problem import Problem, shared_unknowns
-from ..estimation.solver import last_step, levenberg_marquardt
+from ..estimation.problem import Problem, merge_instrument_parameters
+from ..estimation.solver import levenberg_marquardt, next_iterate
 from ..measurements.base import Measurement
-from ..robot.chain import BASE, Chain
+from ..robot.chain import BASE_FRAME, Chain
 from ..se3 import nearest_rotation
 
 # Tool offsets tried where the target's place on the tip is unknown, in metres.
-_REACH = 0.25
+_TOOL_OFFSET = 0.25
 
 
 # Samples of each measurement that a start needs.
-_PROBES = 100
+_MAX_SAMPLES = 100
 
 
 # The most promising of them are followed to the end.
-_TRIED = 4
+_MAX_CANDIDATES = 4
 
 
 def align(source: Array, target: Array) -> tuple[Array, Array]:
@@ -40,19 +40,19 @@ def align(source: Array, target: Array) -> tuple[Array, Array]:
     return motion, np.sqrt(np.maximum(rest, 0.0) / len(target))
 
 
-def few(item: Measurement) -> Measurement:
+def subsample(item: Measurement) -> Measurement:
     """So many of a measurement's samples as a start needs, drawn so that no order in them matters."""
-    return item.take(np.sort(np.random.default_rng(0).permutation(len(item.rows))[:_PROBES]))
+    return item.take(np.sort(np.random.default_rng(0).permutation(len(item.rows))[:_MAX_SAMPLES]))
 
 
-def starts(chain: Chain, data: Sequence[Measurement], base: bool, tool: bool) -> Iterator[Chain]:
+def candidate_frames(chain: Chain, data: Sequence[Measurement], base: bool, tool: bool) -> Iterator[Chain]:
     """Chains with base and tool placed from the measured positions, the most promising first.
 
     Positions alone carry the base; rotations, where there are any, then give the tool's. The target's
     offset is tried at places around the tip. Fewer than three positions tell no start.
     """
     readings = [item for item in data if len(item.positions())]
-    bare = chain.framed(np.eye(4), np.eye(4))
+    bare = chain.with_base_and_tool(np.eye(4), np.eye(4))
     tips = [bare.poses(item.q) for item in readings]
     if sum(len(pose) for pose in tips) < 3 or not (base or tool):
         return
@@ -64,12 +64,12 @@ def starts(chain: Chain, data: Sequence[Measurement], base: bool, tool: bool) ->
         offset = np.mean((local[:, :3, :3] @ seen[..., None])[..., 0] + local[:, :3, 3], 0)
         best = [(chain.base, offset)]
     else:
-        steps = [0.0, -_REACH, _REACH]
+        steps = [0.0, -_TOOL_OFFSET, _TOOL_OFFSET]
         grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
         offsets = grid if tool else chain.tool[None, :3, 3]
         points = tip[:, :3, 3] + (tip[:, :3, :3] @ offsets.T).transpose(2, 0, 1)
         motions, rests = align(points, seen)
-        best = [(motions[k], offsets[k]) for k in np.argsort(rests, kind="stable")[:_TRIED]]
+        best = [(motions[k], offsets[k]) for k in np.argsort(rests, kind="stable")[:_MAX_CANDIDATES]]
     for motion, offset in best:
         turn = chain.tool[:3, :3]
         turns = [
@@ -79,10 +79,10 @@ def starts(chain: Chain, data: Sequence[Measurement], base: bool, tool: bool) ->
         ]
         if tool and turns:
             turn = nearest_rotation(np.concatenate(turns).sum(0))
-        yield chain.framed(motion, se3.transform(turn, offset))
+        yield chain.with_base_and_tool(motion, se3.transform(turn, offset))
 
 
-def misfit(chain: Chain, data: Sequence[Measurement]) -> float:
+def relative_misfit(chain: Chain, data: Sequence[Measurement]) -> float:
     """RMS distance of the measured positions from the chain's, over that from their own middle."""
     readings = [item for item in data if len(item.positions())]
     seen = np.concatenate([item.positions() for item in readings])
@@ -91,54 +91,58 @@ def misfit(chain: Chain, data: Sequence[Measurement]) -> float:
 
 
 # Starts for the frames are tried until one leaves so small a share of the positions' spread.
-GOOD_FIT = 0.01
+GOOD_RELATIVE_MISFIT = 0.01
 
 
-def problem_of(
+def make_problem(
     errors: ErrorModel, data: tuple[Measurement, ...], weights: Array, known: Mapping[str, float]
 ) -> Problem:
     """The problem whose instruments have their own wide priors where the robot has any, weights (p,)."""
-    wide = np.array([1 / unknown.prior for unknown in shared_unknowns(data) if unknown.name not in known])
+    wide = np.array(
+        [1 / unknown.prior for unknown in merge_instrument_parameters(data) if unknown.name not in known]
+    )
     return Problem(errors, data, np.concatenate([weights, wide * np.any(weights)]), known)
 
 
-def _fitted(
+def _fit_frames(
     frames: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float], max_iterations: int
 ) -> tuple[float, Chain]:
     """The chain with the frames that fit the data best, and about the cost that they leave."""
-    data = tuple(item.started(frames.chain) for item in data)
-    problem = problem_of(frames, data, 1 / frames.priors, known)
+    data = tuple(item.initialized(frames.chain) for item in data)
+    problem = make_problem(frames, data, 1 / frames.priors, known)
     nominal = np.zeros(len(problem.weights))
-    solution = levenberg_marquardt(problem, nominal, max_iterations, None, nearly=True)
-    cost = solution.triangle.cost + float(np.sum((problem.weights * solution.x) ** 2))
-    return cost, frames.at(last_step(problem, solution)[: len(frames.parameters)])
+    solution = levenberg_marquardt(problem, nominal, max_iterations, None, loose=True)
+    cost = solution.system.cost + float(np.sum((problem.weights * solution.x) ** 2))
+    return cost, frames.at(next_iterate(problem, solution)[: len(frames.parameters)])
 
 
-def placed(
+def initialize_frames(
     errors: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float], max_iterations: int
 ) -> ErrorModel:
     """The same unknowns on the nominal chain with its unknown base and tool about where the data have them.
 
     Where positions tell starts, samples enough for one choose among them and carry it on.
     """
-    frames = errors.frames()
+    frames = errors.only_frames()
     if frames is None:
         return errors
-    stations = {p.station for p in frames.parameters}
-    some = tuple(few(item) for item in data)
+    stations = {p.error_frame for p in frames.parameters}
+    some = tuple(subsample(item) for item in data)
     best: tuple[float, Chain] | None = None
-    for start in starts(errors.chain, some, BASE in stations, errors.chain.tool_station in stations):
-        found = _fitted(replace(frames, chain=start), some, known, max_iterations)
+    for start in candidate_frames(
+        errors.chain, some, BASE_FRAME in stations, errors.chain.tool_frame_index in stations
+    ):
+        found = _fit_frames(replace(frames, chain=start), some, known, max_iterations)
         best = found if best is None else min(best, found, key=lambda each: each[0])
-        if misfit(best[1], some) < GOOD_FIT:
+        if relative_misfit(best[1], some) < GOOD_RELATIVE_MISFIT:
             break
-    best = best or _fitted(frames, data, known, max_iterations)
+    best = best or _fit_frames(frames, data, known, max_iterations)
     return replace(errors, chain=best[1])
 
 
-def refitted(errors: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float]) -> Chain:
+def fit_frames(errors: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float]) -> Chain:
     """The nominal chain with its unknown base and tool where all the data have them."""
-    frames = errors.frames()
+    frames = errors.only_frames()
     if frames is None:
-        return errors.chain.loaded()
-    return _fitted(replace(frames, chain=errors.chain.loaded()), data, known, 100)[1]
+        return errors.chain.with_current_loads()
+    return _fit_frames(replace(frames, chain=errors.chain.with_current_loads()), data, known, 100)[1]

@@ -15,45 +15,45 @@ from typing import Any
 import numpy as np
 
 from .._typing import Array
-from ..estimation.error_model import Parameter
-from ..estimation.parameters import EXTENSIONS, SETS
-from ..estimation.problem import Problem, reduce
-from ..estimation.qr import Triangle
+from ..estimation.error_model import ErrorParameter
+from ..estimation.parameters import EXTENSIONS, PARAMETER_SETS
+from ..estimation.problem import Problem, linearize_and_factor
+from ..estimation.qr import TriangularSystem
 from ..estimation.solver import Progress
 from ..exceptions import DhcalError
-from ..formatting import Table, fixed
+from ..formatting import Table, format_fixed
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from . import procedure
 from .cross_validation import (
-    Parts,
-    parts,
-    region_folds,
-    rows,
-    solved,
+    FoldSystems,
+    blocked_folds,
+    contact_groups,
+    count_rows,
+    factor_folds,
+    solve_columns,
     standard_error,
-    touched,
 )
 from .result import Result
 
 # Widths of a family's priors that are tried, as shares of the default ones.
-WIDTHS = (1.0, 0.3, 0.1, 0.03)
+PRIOR_WIDTHS = (1.0, 0.3, 0.1, 0.03)
 
 
 # A family that lowers the error by a smaller share is not worth its unknowns.
-WORTH = 0.01
+MIN_IMPROVEMENT = 0.01
 
 
 # A family that chance alone would make look so good more often than this is not added.
-CHANCE = 0.01
+MAX_P_VALUE = 0.01
 
 
 # A hint is given of one that leaves less than this share of the error, with so many rows left over for each
 # of its unknowns; so many samples tell.
-WORTH_A_WORD, AMPLE, MOST = 0.9, 5, 500
+MAX_HINT_RATIO, MIN_ROWS_PER_PARAMETER, MAX_HINT_SAMPLES = 0.9, 5, 500
 
 
-WORDS = {
+FAMILY_DESCRIPTIONS = {
     "gain": "wrong ratios of the drives",
     "harmonics": "gears that run out of true",
     "compliance": "joints that yield to the arm's weight",
@@ -62,105 +62,107 @@ WORDS = {
 
 
 # Smaller chances differ by nothing that one could believe.
-LEAST = 1e-6
+MIN_SHOWN_P_VALUE = 1e-6
 
 
 @dataclass(frozen=True)
-class Trial:
+class FamilyTrial:
     """What a family would bring on top of those kept before it.
 
     Attributes:
         family: a set of `parameters.EXTENSIONS`.
         cv_before, cv_after: cross-validated error without and with it, in standard deviations.
         standard_error: of the difference.
-        chance: how often chance alone would lower the fit's own cost as much.
+        p_value: how often chance alone would lower the fit's own cost as much.
         prior_width: its priors, as a share of the default ones.
-        kept: whether it was added.
+        is_selected: whether it was added.
     """
 
     family: str
     cv_before: float
     cv_after: float
     standard_error: float
-    chance: float
+    p_value: float
     prior_width: float
-    kept: bool = False
+    is_selected: bool = False
 
     @property
-    def helps(self) -> bool:
+    def is_significant(self) -> bool:
         """Whether the data ask for it."""
         gained = self.cv_before - self.cv_after
-        return gained > max(self.standard_error, WORTH * self.cv_before) and self.chance < CHANCE
+        return (
+            gained > max(self.standard_error, MIN_IMPROVEMENT * self.cv_before) and self.p_value < MAX_P_VALUE
+        )
 
 
-def trial_table(found: Sequence[Trial]) -> Table:
+def trial_table(found: Sequence[FamilyTrial]) -> Table:
     """What each family brought, or would bring on top of those added before it."""
     header = ["family", "verdict", "before", "after"]
     header += ["standard error of the change", "by chance", "prior width"]
     rows = [
         [
             one.family,
-            "added" if one.kept else "left out",
-            fixed(one.cv_before, 3),
-            fixed(one.cv_after, 3),
-            fixed(one.standard_error, 3),
-            f"{one.chance:.1g}" if one.chance > LEAST else f"< {LEAST:g}",
+            "added" if one.is_selected else "not selected",
+            format_fixed(one.cv_before, 3),
+            format_fixed(one.cv_after, 3),
+            format_fixed(one.standard_error, 3),
+            f"{one.p_value:.1g}" if one.p_value > MIN_SHOWN_P_VALUE else f"< {MIN_SHOWN_P_VALUE:g}",
             f"{one.prior_width:g} of default",
         ]
         for one in found
     ]
-    return Table(header, rows, texts=2)
+    return Table(header, rows, n_text_columns=2)
 
 
 @dataclass(frozen=True, eq=False)
-class _Stage:
+class _LinearizedFit:
     """Everything around the fit without extensions: linear, and columns for all families at once.
 
     Attributes:
         problem: with all families, and default priors of theirs.
-        whole: triangle of all its data.
+        system: triangle of all its data.
         x: (p,) where it is linear.
         family: (p,) the family of each column, or "".
-        parts: triangles of every fold.
+        folds: triangles of every fold.
     """
 
     problem: Problem
-    whole: Triangle
+    system: TriangularSystem
     x: Array
     family: Array
-    parts: tuple[Parts, ...] = ()
+    folds: tuple[FoldSystems, ...] = ()
 
-    def narrowed(self, kept: dict[str, float]) -> tuple[Array, Array]:
+    def with_prior_widths(self, kept: dict[str, float]) -> tuple[Array, Array]:
         """Weights (p,) with the priors of some families narrowed, and which columns (p,) count."""
         width = np.array([kept.get(name, 1.0) for name in self.family])
         return self.problem.weights / width, (self.family == "") | np.isin(self.family, list(kept))
 
     def errors(self, kept: dict[str, float]) -> Array:
         """Each fold's error (k,) with some families at prior widths."""
-        weights, columns = self.narrowed(kept)
-        return np.array([part.error(weights, self.x, columns) for part in self.parts])
+        weights, columns = self.with_prior_widths(kept)
+        return np.array([part.error(weights, self.x, columns) for part in self.folds])
 
     def cost(self, kept: dict[str, float]) -> float:
         """The least cost of all data and priors."""
-        weights, columns = self.narrowed(kept)
-        return solved(self.whole, weights, self.x, columns)[1]
+        weights, columns = self.with_prior_widths(kept)
+        return solve_columns(self.system, weights, self.x, columns)[1]
 
-    def freedom(self, name: str, kept: dict[str, float]) -> tuple[int, int]:
+    def degrees_of_freedom(self, name: str, kept: dict[str, float]) -> tuple[int, int]:
         """How many unknowns a family adds to those that are kept, and how many rows are left over then."""
         more = int(np.sum(self.family == name))
-        return more, rows(self.problem) - int(np.sum(self.narrowed(kept)[1])) - more
+        return more, count_rows(self.problem) - int(np.sum(self.with_prior_widths(kept)[1])) - more
 
-    def trial(self, name: str, kept: dict[str, float]) -> Trial:
+    def trial(self, name: str, kept: dict[str, float]) -> FamilyTrial:
         """A family at the narrowest width that is no more than a standard error worse than the best one."""
         before = self.errors(kept)
-        tried = [(self.errors(kept | {name: width}), width) for width in WIDTHS]
+        tried = [(self.errors(kept | {name: width}), width) for width in PRIOR_WIDTHS]
         best = min((errors for errors, _ in tried), key=np.mean)
         after, width = next(
             (errors, width)
             for errors, width in reversed(tried)
             if np.mean(errors - best) <= standard_error(errors - best)
         )
-        more, left = self.freedom(name, kept)
+        more, left = self.degrees_of_freedom(name, kept)
         without, with_it = self.cost(kept), self.cost(kept | {name: 1.0})
         chance = 1.0
         if left > 0 and with_it > 0:
@@ -170,21 +172,23 @@ class _Stage:
 
             chance = float(fdtrc(more, left, (without - with_it) / more / (with_it / left)))
         error = standard_error(before - after)
-        return Trial(name, float(before.mean()), float(after.mean()), error, chance, width)
+        return FamilyTrial(name, float(before.mean()), float(after.mean()), error, chance, width)
 
 
-def _missing(fit: Result, families: Sequence[str]) -> dict[str, list[Parameter]]:
+def _missing_parameters(fit: Result, families: Sequence[str]) -> dict[str, list[ErrorParameter]]:
     """The parameters of families that have some which the fit does not."""
     there = {p.name for p in fit.errors.parameters}
-    found = {name: SETS[name](fit.errors.chain) for name in families}
+    found = {name: PARAMETER_SETS[name](fit.errors.chain) for name in families}
     return {name: ps for name, ps in found.items() if any(p.name not in there for p in ps)}
 
 
-def _stage(fit: Result, data: Sequence[Measurement], families: dict[str, list[Parameter]]) -> _Stage:
+def _linearize_fit(
+    fit: Result, data: Sequence[Measurement], families: dict[str, list[ErrorParameter]]
+) -> _LinearizedFit:
     """The stage of a fit and some of its data, which nothing has parted yet."""
     names = {p.name for p in fit.errors.parameters}
     new = [p for parameters in families.values() for p in parameters if p.name not in names]
-    errors = fit.errors.joined(new)
+    errors = fit.errors.with_parameters(new)
     robot = len(fit.errors.parameters)
     at = dict(
         zip(
@@ -198,17 +202,17 @@ def _stage(fit: Result, data: Sequence[Measurement], families: dict[str, list[Pa
     weights = np.array([*(weight for _, weight in start), *fit.problem.weights[robot:]])
     home = {p.name: name for name, parameters in families.items() for p in parameters if p.name not in names}
     problem = replace(fit.problem, errors=errors, weights=weights, data=tuple(data))
-    return _Stage(
+    return _LinearizedFit(
         problem,
-        reduce(problem, x, small_angle=False),
+        linearize_and_factor(problem, x, small_angle=False),
         x,
         np.array([home.get(p.name, "") for p in errors.parameters] + [""] * len(fit.x[robot:])),
     )
 
 
-def select_families(
+def select_error_families(
     fit: Result, families: Sequence[str] = EXTENSIONS, progress: Progress | None = None
-) -> tuple[Trial, ...]:
+) -> tuple[FamilyTrial, ...]:
     """Tries families on top of a fit and keeps the best that helps, until none does.
 
     Args:
@@ -224,37 +228,37 @@ def select_families(
     """
     if unknown := [name for name in families if name not in EXTENSIONS]:
         raise DhcalError(f"no extension {unknown[0]!r}: choose from {', '.join(EXTENSIONS)}, or auto or none")
-    found = _missing(fit, families)
+    found = _missing_parameters(fit, families)
     if not found:
         return ()
-    stage = _stage(fit, fit.problem.data, found)
-    folds = region_folds(stage.problem.data, places=touched(stage.problem, stage.x))
-    stage = replace(stage, parts=parts(stage.problem, stage.x, folds, progress))
+    stage = _linearize_fit(fit, fit.problem.data, found)
+    folds = blocked_folds(stage.problem.data, groups=contact_groups(stage.problem, stage.x))
+    stage = replace(stage, folds=factor_folds(stage.problem, stage.x, folds, progress))
     kept: dict[str, float] = {}
-    out: list[Trial] = []
+    out: list[FamilyTrial] = []
     while True:
         trials = [stage.trial(name, kept) for name in found if name not in kept]
-        helping = [trial for trial in trials if trial.helps]
+        helping = [trial for trial in trials if trial.is_significant]
         if not helping:
             return (*out, *trials)
         best = min(helping, key=lambda trial: trial.cv_after)
         kept[best.family] = best.prior_width
-        out.append(replace(best, kept=True))
+        out.append(replace(best, is_selected=True))
 
 
-def hint(fit: Result) -> str:
+def family_hint(fit: Result) -> str:
     """A sentence on the family that would take up most of what a fit leaves; "" if little, or by chance.
 
     Around the fit, without another one, and from `MOST` samples of each measurement at most.
     """
-    some = [item.take(np.s_[:: max(1, -(-len(item.rows) // MOST))]) for item in fit.problem.data]
-    found = _missing(fit, EXTENSIONS)
-    stage = _stage(fit, some, found)
-    now, best = stage.cost({}), (WORTH_A_WORD, "")
+    some = [item.take(np.s_[:: max(1, -(-len(item.rows) // MAX_HINT_SAMPLES))]) for item in fit.problem.data]
+    found = _missing_parameters(fit, EXTENSIONS)
+    stage = _linearize_fit(fit, some, found)
+    now, best = stage.cost({}), (MAX_HINT_RATIO, "")
     for name in found:
-        more, left = stage.freedom(name, {})
+        more, left = stage.degrees_of_freedom(name, {})
         then = stage.cost({name: 1.0})
-        if left < AMPLE * more or not then > 0:
+        if left < MIN_ROWS_PER_PARAMETER * more or not then > 0:
             continue
         # Beyond this, a χ² of so many degrees is once in a million times (Laurent and Massart 2000).
         chance = more + 2 * np.sqrt(14 * more) + 28
@@ -262,7 +266,7 @@ def hint(fit: Result) -> str:
             best = min(best, (float(np.sqrt(then / left / (now / (left + more)))), name))
     share, name = best
     return name and (
-        f"what is left goes with the joints' values as {WORDS[name]} would; --extend auto may leave about "
+        f"what is left goes with the joints' values as {FAMILY_DESCRIPTIONS[name]} would; --extend auto may leave about "
         f"{100 * share:.0f} % of it"
     )
 
@@ -273,7 +277,7 @@ def extend(
     parameters: str | None = None,
     families: Sequence[str] = EXTENSIONS,
     **options: Any,
-) -> tuple[Result, tuple[Trial, ...]]:
+) -> tuple[Result, tuple[FamilyTrial, ...]]:
     """`calibrate`, with those families of joints' transmission errors added that the data ask for.
 
     All unknowns are solved together in the end, as an extension shares directions with the geometry.
@@ -295,21 +299,23 @@ def extend(
         )
     parameters = chain.parameters if parameters is None else parameters
     fit = procedure.calibrate(chain, data, parameters, **options)
-    trials = select_families(fit, families, options.get("progress"))
-    widths = {trial.family: trial.prior_width for trial in trials if trial.kept}
+    trials = select_error_families(fit, families, options.get("progress"))
+    widths = {trial.family: trial.prior_width for trial in trials if trial.is_selected}
     if not widths:
         return fit, trials
-    narrowed = {p.name: p.prior * width for name, width in widths.items() for p in SETS[name](chain)}
+    narrowed = {
+        p.name: p.prior * width for name, width in widths.items() for p in PARAMETER_SETS[name](chain)
+    }
     own = {} if isinstance(priors, str) else dict(priors)
     options["priors"] = narrowed | own
     return procedure.calibrate(chain, data, ",".join([parameters, *widths]), **options), trials
 
 
 # All that positions and poses can tell of any arm, wherever instrument and target are.
-EVERYTHING = "minimal,base,tool"
+FULL_SET = "minimal,base,tool"
 
 
-def narrow(sets: Sequence[str]) -> bool:
+def is_restricted(sets: Sequence[str]) -> bool:
     """Whether sets are of the robot, and fewer than EVERYTHING."""
     frames = {"base", "tool"}
     full = frames <= set(sets) and {"minimal", "placement"} & set(sets)

@@ -12,26 +12,26 @@ import numpy as np
 
 from .._typing import Array
 from ..estimation import robust
-from ..estimation.parameters import select
-from ..estimation.priors import Families, Priors, are_default, prior_weights
-from ..estimation.problem import Problem, shared_unknowns
+from ..estimation.parameters import select_parameters
+from ..estimation.priors import PriorGroups, Priors, has_default_prior, prior_weights
+from ..estimation.problem import Problem, merge_instrument_parameters
 from ..estimation.solver import METHODS, Progress, levenberg_marquardt
 from ..exceptions import DhcalError
 from ..measurements.base import Measurement
-from ..parallel import HERE, Workers
-from ..robot.chain import BASE, Chain
-from .initialization import placed, problem_of, refitted
+from ..parallel import SERIAL, TaskExecutor
+from ..robot.chain import BASE_FRAME, Chain
+from .initialization import fit_frames, initialize_frames, make_problem
 from .result import Result
 from .reweighting import Fit, reweight
-from .shrinkage import kept_share
+from .shrinkage import compute_shrinkage_factor
 
 Method = Literal["lm", "gn"]
 
 
 def _bounds(problem: Problem, bounds: Mapping[str, tuple[float, float]]) -> Array:
     """Least and largest x (2, p+s) of values that are bounded by name."""
-    outside = (BASE, problem.errors.chain.tool_station)
-    inside = [p for p in problem.errors.parameters if p.station not in outside]
+    outside = (BASE_FRAME, problem.errors.chain.tool_frame_index)
+    inside = [p for p in problem.errors.parameters if p.error_frame not in outside]
     out = np.tile([[-np.inf], [np.inf]], len(problem.weights))
     for pattern, (low, high) in bounds.items():
         hit = [p for p in inside if fnmatch.fnmatchcase(p.name, pattern)]
@@ -64,9 +64,9 @@ def split(
     return tuple(fit), tuple(item for item in held if len(item.rows))
 
 
-def _known(data: tuple[Measurement, ...], known: Mapping[str, float]) -> Mapping[str, float]:
+def _validated_known(data: tuple[Measurement, ...], known: Mapping[str, float]) -> Mapping[str, float]:
     """The known values, after checking that each belongs to an unknown of the data."""
-    names = [unknown.name for unknown in shared_unknowns(data) if not unknown.local]
+    names = [unknown.name for unknown in merge_instrument_parameters(data) if not unknown.is_local]
     for name, value in known.items():
         if name not in names:
             there = f"there are {', '.join(names)}" if names else "these measurements bring none"
@@ -91,7 +91,7 @@ def calibrate(
     bounds: Mapping[str, tuple[float, float]] | None = None,
     max_iterations: int = 100,
     progress: Progress | None = None,
-    where: Workers = HERE,
+    executor: TaskExecutor = SERIAL,
 ) -> Result:
     """Identify a chain's errors from measurements.
 
@@ -113,7 +113,7 @@ def calibrate(
             base and tool stay free.
         max_iterations: most steps of a loop.
         progress: called with the iteration and the cost.
-        where: what chunks of many samples are shared out to.
+        executor: what chunks of many samples are shared out to.
 
     Sigmas that no instrument states are estimated with the fit, a group of rows at a time, and default
     priors take the size of the errors that are found, so that data and priors weigh right against each
@@ -125,21 +125,21 @@ def calibrate(
     data = tuple(data) if isinstance(data, Sequence) else (data,)
     _check_options(data, method, loss, bounds)
     for item in (*data, *holdout):
-        chain.checked(item.configurations())
+        chain.validated_q(item.configurations())
     priors = priors if priors is not None else ("none" if method == "gn" else "default")
-    errors = select(chain, parameters if parameters is not None else chain.parameters, fix, free)
-    known = _known(data, known or {})
-    errors = placed(errors, data, known, max_iterations)
-    data = tuple(item.started(errors.chain) for item in data)
-    problem = replace(problem_of(errors, data, prior_weights(errors, priors), known), where=where)
+    errors = select_parameters(chain, parameters if parameters is not None else chain.parameters, fix, free)
+    known = _validated_known(data, known or {})
+    errors = initialize_frames(errors, data, known, max_iterations)
+    data = tuple(item.initialized(errors.chain) for item in data)
+    problem = replace(make_problem(errors, data, prior_weights(errors, priors), known), executor=executor)
     if bounds:
         problem = replace(problem, bounds=_bounds(problem, bounds))
     fit = _solve(problem, method, max_iterations, progress)
     kept = 1.0
     if method == "lm":
-        families = Families.of(errors, problem.weights, are_default(errors, priors))
+        families = PriorGroups.from_expected(errors, problem.weights, has_default_prior(errors, priors))
         fit = reweight(fit, loss, families, max_iterations, progress)
-        kept = kept_share(fit.problem, fit.solution, families.groups())
+        kept = compute_shrinkage_factor(fit.problem, fit.solution, families.groups())
     return _result(fit, kept, tuple(holdout), method)
 
 
@@ -164,15 +164,15 @@ def _check_options(
 
 def _solve(problem: Problem, method: Method, max_iterations: int, progress: Progress | None) -> Fit:
     """Solve a problem with unit weights; `reweight` iterates method "lm" to full convergence later."""
-    solve = partial(levenberg_marquardt, nearly=True) if method == "lm" else METHODS[method]
+    solve = partial(levenberg_marquardt, loose=True) if method == "lm" else METHODS[method]
     solution = solve(problem, np.zeros(len(problem.weights)), max_iterations, progress)
     weights = tuple(np.ones(len(item.rows)) for item in problem.data)
     fit = Fit(problem.data, problem, solution, weights)
     errors = problem.errors
-    if not errors.is_driven:
+    if not errors.has_transmission:
         return fit
     # The gravity torques depend on the arm that was found: solve again with those.
-    problem = replace(problem, errors=errors.loaded(solution.x[: len(errors.parameters)]))
+    problem = replace(problem, errors=errors.with_current_loads(solution.x[: len(errors.parameters)]))
     again = solve(problem, solution.x, max_iterations, progress)
     return replace(fit, problem=problem, solution=again, previous_iterations=solution.iterations)
 
@@ -182,9 +182,9 @@ def _result(fit: Fit, kept: float, holdout: tuple[Measurement, ...], method: str
     problem, errors = fit.problem, fit.problem.errors
     x = kept * fit.solution.x
     if kept:
-        found = errors.at(x[: len(errors.parameters)]).loaded()
+        found = errors.at(x[: len(errors.parameters)]).with_current_loads()
     else:
-        found = refitted(errors, fit.data, problem.known)
+        found = fit_frames(errors, fit.data, problem.known)
     return Result(
         errors=errors,
         x=x,
@@ -195,5 +195,5 @@ def _result(fit: Fit, kept: float, holdout: tuple[Measurement, ...], method: str
         solution=replace(fit.solution, iterations=fit.iterations),
         method=method,
         weights=fit.weights,
-        kept=kept,
+        shrinkage_factor=kept,
     )

@@ -14,41 +14,41 @@ import pinocchio as pin
 from .. import formatting
 from .._typing import Array
 from ..estimation import qr, robust
-from ..estimation.error_model import ErrorModel, Parameter
-from ..estimation.problem import Problem, reduce
-from ..estimation.qr import Triangle, posterior_root, with_priors
-from ..estimation.solver import METHODS, Solution, bounded_step, levenberg_marquardt
-from ..estimation.uncertainty import UNKNOWN, Prediction, Uncertainty
+from ..estimation.error_model import ErrorModel, ErrorParameter
+from ..estimation.problem import Problem, linearize_and_factor
+from ..estimation.qr import TriangularSystem, append_priors, posterior_sqrt_covariance
+from ..estimation.solver import METHODS, SolverResult, bounded_step, levenberg_marquardt
+from ..estimation.uncertainty import UNBOUNDED_TOL, Prediction, Uncertainty
 from ..exceptions import DhcalError
 from ..identifiability import explanations, observability
-from ..measurements.base import Measurement, Unknown
+from ..measurements.base import InstrumentParameter, Measurement
 from ..robot.chain import Chain
 from . import estimates, summary
-from .cross_validation import left_out, random_folds
+from .cross_validation import cross_validate_folds, k_fold
 from .estimates import Estimate
 from .evaluation import (
     Comparison,
     accuracy,
-    deviations,
+    compute_errors,
     error_statistics,
-    without_gross,
+    remove_outliers,
 )
-from .initialization import refitted
+from .initialization import fit_frames
 
 # Residuals that are larger than stated by so many standard deviations of chance contradict the sigmas.
-CONTRADICTION = 3.0
+CONTRADICTION_SIGMAS = 3.0
 
 
 # Exact rows are taken to scatter by this share of their sigmas.
-LEAST = 1e-9
+MIN_SCALE = 1e-9
 
 
 # Folds that samples are left out in where none were held out.
-FOLDS = 10
+N_FOLDS = 10
 
 
 # Most steps of a fit without them.
-AGAIN = 100
+MAX_REFIT_ITERATIONS = 100
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -65,7 +65,7 @@ class Result:
         solution: the loop's end.
         method: "lm" or "gn".
         weights: (m,) of each fitted measurement's samples, 1 but for a robust loss.
-        kept: how much of what fits the readings best, `solution.x`, x is: 1, or less where so few readings
+        shrinkage_factor: how much of what fits the readings best, `solution.x`, x is: 1, or less where so few readings
             might leave the arm worse than nominal.
     """
 
@@ -75,10 +75,10 @@ class Result:
     data: tuple[Measurement, ...]
     holdout: tuple[Measurement, ...]
     problem: Problem
-    solution: Solution
+    solution: SolverResult
     method: str
     weights: tuple[Array, ...]
-    kept: float = 1.0
+    shrinkage_factor: float = 1.0
 
     @property
     def model(self) -> pin.Model:
@@ -86,23 +86,23 @@ class Result:
         return self.chain.model
 
     @cached_property
-    def reference(self) -> Chain:
+    def nominal_refitted(self) -> Chain:
         """The nominal chain, with base and tool as fitted to the same data where they were unknown.
 
         So before and after differ by the robot alone.
         """
-        if not self.kept:
+        if not self.shrinkage_factor:
             return self.chain
-        return refitted(self.errors, tuple(self.counted), self.problem.known)
+        return fit_frames(self.errors, tuple(self.inliers), self.problem.known)
 
     @property
-    def counted(self) -> list[Measurement]:
+    def inliers(self) -> list[Measurement]:
         """The fitted measurements without samples that count for nothing."""
-        return self._counted(self.data)
+        return self._inliers(self.data)
 
-    def _counted(self, data: Sequence[Measurement]) -> list[Measurement]:
+    def _inliers(self, data: Sequence[Measurement]) -> list[Measurement]:
         """Those samples of the fitted measurements that count in the fit."""
-        found = [item.take(w > robust.NOTHING) for item, w in zip(data, self.weights, strict=True)]
+        found = [item.take(w > robust.ZERO_WEIGHT) for item, w in zip(data, self.weights, strict=True)]
         return [item for item in found if len(item.rows)]
 
     @property
@@ -116,59 +116,59 @@ class Result:
         return self.solution.iterations
 
     @property
-    def samples(self) -> int:
+    def n_samples(self) -> int:
         """Number of fitted samples."""
         return sum(len(d.rows) for d in self.data)
 
     @property
     def rank(self) -> int:
         """Number of directions that the data see, without priors."""
-        return qr.rank(self.solution.triangle.r)
+        return qr.rank(self.solution.system.r)
 
     @property
     def condition(self) -> float:
         """Largest over smallest singular value of the directions seen."""
-        return qr.condition(self.solution.triangle.r)
+        return qr.condition(self.solution.system.r)
 
     @property
     def observability_indices(self) -> dict[str, float]:
         """O1 to O5 of the samples, over the directions seen; see `observability.indices`."""
-        return observability.indices(self.solution.triangle.r, self.samples)
+        return observability.observability_indices(self.solution.system.r, self.n_samples)
 
     @cached_property
     def unobservable(self) -> list[str]:
         """What the data cannot tell apart, why, and what would tell it; one sentence a group."""
-        return explanations.unobservable(self.problem, self.x, self.solution.triangle)
+        return explanations.explain_unobservable(self.problem, self.x, self.solution.system)
 
     @cached_property
-    def weakly_seen(self) -> list[str]:
+    def weakly_observable(self) -> list[str]:
         """What counts in the rank but is hardly better known than before the measurement."""
-        return explanations.weakly_seen(
-            self.problem, self.x, self.solution.triangle, self.expected, self._scale
+        return explanations.explain_weakly_observable(
+            self.problem, self.x, self.solution.system, self.prior_std, self._scale
         )
 
     @property
-    def held_back(self) -> list[str]:
+    def shrinkage_notes(self) -> list[str]:
         """What of the correction is not kept, and why; a sentence, or none."""
-        if self.kept == 1:
+        if self.shrinkage_factor == 1:
             return []
-        much = f"only {100 * self.kept:.0f} %" if self.kept else "nothing"
+        much = f"only {100 * self.shrinkage_factor:.0f} %" if self.shrinkage_factor else "nothing"
         return [
             f"{much} of the correction that fits best is kept: so few readings fit many arms, and more of it "
             "might leave this one worse than nominal; measure more poses"
         ]
 
     @property
-    def expected(self) -> Array:
+    def prior_std(self) -> Array:
         """Standard deviations (p,) expected before the measurement: the priors used, or usual ones."""
         usual = np.array([parameter.prior for parameter in self.parameters])
         weights = self.problem.weights
         return np.where(weights > 0, 1 / np.where(weights > 0, weights, 1.0), usual)
 
     @property
-    def remaining(self) -> Array:
+    def posterior_to_prior_std(self) -> Array:
         """How much of each parameter's expected spread is left, (p,): 0 well known, 1 or more unknown."""
-        return self.std / self.expected
+        return self.std / self.prior_std
 
     @property
     def correlation(self) -> Array:
@@ -176,47 +176,55 @@ class Result:
         return observability.correlation(self.covariance)
 
     @cached_property
-    def freedom(self) -> float:
+    def degrees_of_freedom(self) -> float:
         """Rows left over; unknowns count as far as data and not priors tell them (MacKay's number)."""
         count = 0.0
         for item, weights in zip(self.data, self.weights, strict=True):
-            sweep = self.chain.sweep(item.configurations())
-            count += len(item.residual(sweep, self.problem.values(item, self.x))) * weights.sum()
-        left = count - float(np.sum((self.solution.triangle.r @ self._root[0]) ** 2))
+            frames = self.chain.forward_kinematics(item.configurations())
+            count += (
+                len(item.residual(frames, self.problem.instrument_values_of(item, self.x))) * weights.sum()
+            )
+        left = count - float(np.sum((self.solution.system.r @ self._sqrt_covariance[0]) ** 2))
         return left if left > 1e-6 * count else 0.0
 
     @property
-    def noise(self) -> float:
+    def unit_weight_std(self) -> float:
         """Standard deviation of the whitened residuals, about 1 for right sigmas; NaN if no row is left."""
-        triangle = self.solution.triangle
-        cost = triangle.rest + float(np.sum(triangle.z**2))
-        return float(np.sqrt(cost / self.freedom)) if self.freedom else float("nan")
+        triangle = self.solution.system
+        cost = triangle.min_cost + float(np.sum(triangle.z**2))
+        return float(np.sqrt(cost / self.degrees_of_freedom)) if self.degrees_of_freedom else float("nan")
 
     @cached_property
     def _scale(self) -> float:
         """The scatter of a whitened row that is believed; NaN where nothing tells it."""
-        if all(item.stated for item in self.data):
-            surprise = 1 + CONTRADICTION * np.sqrt(2 / self.freedom) if self.freedom else np.inf
-            return self.noise if self.noise**2 > surprise else 1.0
-        return self.noise
+        if all(item.has_stated_sigma for item in self.data):
+            surprise = (
+                1 + CONTRADICTION_SIGMAS * np.sqrt(2 / self.degrees_of_freedom)
+                if self.degrees_of_freedom
+                else np.inf
+            )
+            return self.unit_weight_std if self.unit_weight_std**2 > surprise else 1.0
+        return self.unit_weight_std
 
     @cached_property
-    def _root(self) -> tuple[Array, Array]:
-        return posterior_root(self.solution.triangle, self.problem.weights)
+    def _sqrt_covariance(self) -> tuple[Array, Array]:
+        return posterior_sqrt_covariance(self.solution.system, self.problem.weights)
 
     @cached_property
-    def _spread(self) -> tuple[Array, Array]:
+    def _scaled_sqrt_covariance(self) -> tuple[Array, Array]:
         """As `_root`, with rows that scatter as was seen where no sigma or too small a one is stated."""
-        root, hidden = self._root
-        scale, triangle = self._scale, self.solution.triangle
+        root, hidden = self._sqrt_covariance
+        scale, triangle = self._scale, self.solution.system
         if np.isnan(scale) or scale == 1:
             root = root * scale
         else:
             # The priors are no data: they stay.
-            root, hidden = posterior_root(Triangle(triangle.rows / max(scale, LEAST)), self.problem.weights)
+            root, hidden = posterior_sqrt_covariance(
+                TriangularSystem(triangle.rows / max(scale, MIN_SCALE)), self.problem.weights
+            )
         # What the readings ask for and is not kept is an error of its own.
         given_up = (self.solution.x - self.x)[:, None]
-        return (np.concatenate([root, given_up], 1) if self.kept < 1 else root), hidden
+        return (np.concatenate([root, given_up], 1) if self.shrinkage_factor < 1 else root), hidden
 
     @cached_property
     def covariance(self) -> Array:
@@ -225,18 +233,18 @@ class Result:
         Sigmas that instruments state are believed unless the residuals contradict them. NaN where one is
         not stated and there are not more rows than unknown directions, and so no noise to go by.
         """
-        root, hidden = self._spread
+        root, hidden = self._scaled_sqrt_covariance
         out = root @ root.T
-        lost = np.sum(hidden**2, 1) > UNKNOWN
+        lost = np.sum(hidden**2, 1) > UNBOUNDED_TOL
         out[lost, lost] = np.inf
         return out
 
     @cached_property
     def uncertainty(self) -> Uncertainty:
         """The robot's part of the covariance, as the calibrated arm alone needs it."""
-        root, hidden = self._spread
+        root, hidden = self._scaled_sqrt_covariance
         robot = len(self.errors.parameters)
-        return Uncertainty.of(self.errors, self.x[:robot], self.chain, root[:robot], hidden[:robot])
+        return Uncertainty.from_errors(self.errors, self.x[:robot], self.chain, root[:robot], hidden[:robot])
 
     def predict(self, q: Array) -> Prediction:
         """The calibrated tool poses at joint values q (m, n), rad or m, and how well they are known.
@@ -252,14 +260,14 @@ class Result:
         return np.sqrt(np.diag(self.covariance))
 
     @property
-    def seen(self) -> Array:
+    def observable_fraction(self) -> Array:
         """How far the data see each parameter, (p,) between 0 and 1."""
-        return observability.seen_share(self.solution.triangle.r)
+        return observability.observable_fraction(self.solution.system.r)
 
     @property
-    def parameters(self) -> tuple[Parameter | Unknown, ...]:
+    def parameters(self) -> tuple[ErrorParameter | InstrumentParameter, ...]:
         """The robot's and the instruments' unknowns, in the order of x."""
-        return (*self.errors.parameters, *self.problem.unknowns)
+        return (*self.errors.parameters, *self.problem.instrument_parameters)
 
     @property
     def instruments(self) -> dict[str, float]:
@@ -267,22 +275,23 @@ class Result:
         return self.problem.instruments(self.x)
 
     @cached_property
-    def scores(self) -> tuple[Array, ...]:
+    def studentized_residuals(self) -> tuple[Array, ...]:
         """How far each fitted sample (m,) lies from its kind's scatter; see `studentized_residuals`."""
-        data = [item.weighted(1 / w) for item, w in zip(self.problem.data, self.weights, strict=True)]
+        data = [item.with_weights(1 / w) for item, w in zip(self.problem.data, self.weights, strict=True)]
         return tuple(robust.studentized_residuals(self.problem, self.solution, data, self.weights))
 
     @cached_property
     def outliers(self) -> tuple[Array, ...]:
         """Row numbers of gross errors in each fitted measurement."""
         return tuple(
-            item.rows[score > robust.OUTLYING] for item, score in zip(self.data, self.scores, strict=True)
+            item.rows[score > robust.OUTLIER_THRESHOLD]
+            for item, score in zip(self.data, self.studentized_residuals, strict=True)
         )
 
     @property
-    def portable(self) -> dict[str, float]:
+    def transferable_instruments(self) -> dict[str, float]:
         """Those of the instruments' values that hold for other measurements with it, too."""
-        local = {unknown.name for unknown in self.problem.unknowns if unknown.local}
+        local = {unknown.name for unknown in self.problem.instrument_parameters if unknown.is_local}
         return {name: value for name, value in self.instruments.items() if name not in local}
 
     @cached_property
@@ -292,29 +301,31 @@ class Result:
         Where nothing was held out, every sample is judged by a fit without it and others, in ten folds.
         Gross errors that take no part in the fit are in neither; among what was held out they are.
         """
-        kept = self.counted
+        kept = self.inliers
         count = sum(len(item.rows) for item in kept)
-        aside = self.samples - count
-        before = accuracy(self.reference, kept)
+        aside = self.n_samples - count
+        before = accuracy(self.nominal_refitted, kept)
         found = (Comparison("fitted", count, before, accuracy(self.chain, kept, self.instruments), aside),)
         if self.holdout:
-            errors = deviations(self.chain, self.holdout, self.instruments)
-            before, (clean, gross) = accuracy(self.reference, self.holdout), without_gross(errors)
+            errors = compute_errors(self.chain, self.holdout, self.instruments)
+            before, (clean, gross) = accuracy(self.nominal_refitted, self.holdout), remove_outliers(errors)
             held = sum(len(item.rows) for item in self.holdout)
             without = error_statistics(clean) if gross else {}
             return (Comparison("held out", held, before, error_statistics(errors), 0, gross, without), *found)
         if count < 2:
             return found
-        folds = random_folds(kept, min(FOLDS, count))
-        problem = self.problem.of(self._counted(self.problem.data))
+        folds = k_fold(kept, min(N_FOLDS, count))
+        problem = self.problem.with_data(self._inliers(self.problem.data))
         judged = [
             item
-            for fold, _ in left_out(problem, self.solution.x, kept, folds, self.again, self.kept)
+            for fold, _ in cross_validate_folds(
+                problem, self.solution.x, kept, folds, self.refit, self.shrinkage_factor
+            )
             for item in fold
         ]
-        return (Comparison("left out", count, before, error_statistics(judged), aside), *found)
+        return (Comparison("cross-validated", count, before, error_statistics(judged), aside), *found)
 
-    def again(self, problem: Problem) -> Array:
+    def refit(self, problem: Problem) -> Array:
         """Where a fit of some of the samples ends (p,); the same loop stopped as early if this one was.
 
         It starts from nominal: x has from all the samples what some of them do not tell.
@@ -323,7 +334,7 @@ class Result:
         if not self.converged:
             with suppress(DhcalError):  # on few samples the paper's loop may run away
                 return METHODS[self.method](problem, nominal, self.iterations, None).x
-        return levenberg_marquardt(problem, nominal, AGAIN, None).x
+        return levenberg_marquardt(problem, nominal, MAX_REFIT_ITERATIONS, None).x
 
     @cached_property
     def estimates(self) -> tuple[Estimate, ...]:
@@ -333,7 +344,9 @@ class Result:
         """
         with np.errstate(divide="ignore"):
             priors = 1 / self.problem.weights
-        figures = np.stack([self.x, self.std, priors, self.seen, self.remaining], 1)
+        figures = np.stack(
+            [self.x, self.std, priors, self.observable_fraction, self.posterior_to_prior_std], 1
+        )
         return estimates.estimates(self.chain, self.parameters, figures, self.errors.fixed)
 
     def __repr__(self) -> str:
@@ -342,7 +355,7 @@ class Result:
     def _repr_html_(self) -> str:
         """The headline, before and after, and the parameters, as a notebook shows them."""
         found = (summary.accuracy_table(self.comparisons), summary.estimate_table(self.estimates))
-        doubts = [*([] if self.converged else ["It did not converge."]), *self.held_back]
+        doubts = [*([] if self.converged else ["It did not converge."]), *self.shrinkage_notes]
         doubt = "".join(f"<p>{text}</p>" for text in doubts)
         said = f"<p><strong>{summary.headline(self.comparisons).text}</strong></p>{doubt}"
         return "\n".join([said, *map(formatting.html_table, found)])
@@ -354,7 +367,7 @@ class Result:
 
     def is_converged(self, eps: float = 1e-6) -> bool:
         """Whether a fresh Gauss-Newton step would change no whitened row by more than eps RMS."""
-        triangle = reduce(self.problem, self.solution.x, small_angle=False)
-        full = with_priors(triangle, self.problem.weights, self.solution.x)
+        triangle = linearize_and_factor(self.problem, self.solution.x, small_angle=False)
+        full = append_priors(triangle, self.problem.weights, self.solution.x)
         step = bounded_step(self.problem, full, self.solution.x)
-        return float(np.linalg.norm(full.r @ step)) <= eps * np.sqrt(max(1, self.samples))
+        return float(np.linalg.norm(full.r @ step)) <= eps * np.sqrt(max(1, self.n_samples))

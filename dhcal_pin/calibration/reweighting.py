@@ -19,16 +19,16 @@ import numpy as np
 
 from .._typing import Array
 from ..estimation import qr, robust
-from ..estimation.priors import Families, rescaled
+from ..estimation.priors import PriorGroups, update_prior_scales
 from ..estimation.problem import Problem
 from ..estimation.robust import studentized_residuals
-from ..estimation.solver import Progress, Solution, levenberg_marquardt
+from ..estimation.solver import Progress, SolverResult, levenberg_marquardt
 from ..measurements.base import Measurement
 
 # Smallest scale of a standard deviation: a nanometre or a nanoradian for a placeholder of 1 mm or 1 mrad.
-LEAST_SCALE = 1e-6
+MIN_SIGMA_SCALE = 1e-6
 # Largest number of rounds.
-MOST_ROUNDS = 30
+MAX_ROUNDS = 30
 # Rounds end when no scale, prior or weight changes by more than this fraction.
 CHANGE_TOL = 0.01
 
@@ -47,7 +47,7 @@ class Fit:
 
     data: tuple[Measurement, ...]
     problem: Problem
-    solution: Solution
+    solution: SolverResult
     weights: tuple[Array, ...]
     previous_iterations: int = 0
 
@@ -78,7 +78,7 @@ class ReweightState:
     is_done: bool = False
 
 
-def reweight(fit: Fit, loss: str, groups: Families, max_iterations: int, progress: Progress | None) -> Fit:
+def reweight(fit: Fit, loss: str, groups: PriorGroups, max_iterations: int, progress: Progress | None) -> Fit:
     """Solve a problem again until noise scales, prior widths and robust weights have settled.
 
     Args:
@@ -92,8 +92,10 @@ def reweight(fit: Fit, loss: str, groups: Families, max_iterations: int, progres
         The fit of the last round.
     """
     expected = fit.problem.weights
-    state = ReweightState(fit, np.ones(sum(len(item.groups) for item in fit.data)), robust.LOSSES[loss])
-    for rounds_left in reversed(range(MOST_ROUNDS)):
+    state = ReweightState(
+        fit, np.ones(sum(len(item.residual_groups) for item in fit.data)), robust.LOSSES[loss]
+    )
+    for rounds_left in reversed(range(MAX_ROUNDS)):
         state = _next_round(state, groups, expected, rounds_left, max_iterations, progress)
         if state.is_done:
             break
@@ -102,7 +104,7 @@ def reweight(fit: Fit, loss: str, groups: Families, max_iterations: int, progres
 
 def _next_round(
     state: ReweightState,
-    groups: Families,
+    groups: PriorGroups,
     expected: Array,
     rounds_left: int,
     max_iterations: int,
@@ -113,17 +115,17 @@ def _next_round(
     problem, solution, weights, change = fit.problem, fit.solution, fit.weights, 0.0
     scales = estimate_variance_components(problem, solution, fit.data, weights)
     weighted = with_sigma_scales(fit.data, scales)
-    if stage != "all":
+    if stage != "uniform":
         residuals = studentized_residuals(problem, solution, weighted, weights)
-        weights, change = robust.reweighted(weights, residuals, stage, state.weight_change)
-        weighted = tuple(item.weighted(w) for item, w in zip(weighted, weights, strict=True))
-    priors = rescaled(problem, solution, groups)
+        weights, change = robust.update_weights(weights, residuals, stage, state.weight_change)
+        weighted = tuple(item.with_weights(w) for item, w in zip(weighted, weights, strict=True))
+    priors = update_prior_scales(problem, solution, groups)
     relative = np.log(scales / state.scales), (priors - problem.weights) / np.fmax(expected, 1e-300)
     has_settled = max(change, *(np.abs(each).max(initial=0.0) for each in relative)) < CHANGE_TOL
     state = replace(state, fit=replace(fit, weights=tuple(weights)), weight_change=change)
     if has_settled and len(state.stages) > 1:
-        if stage != "all" or any(
-            map(robust.suspect, studentized_residuals(problem, solution, weighted, weights))
+        if stage != "uniform" or any(
+            map(robust.has_possible_outliers, studentized_residuals(problem, solution, weighted, weights))
         ):
             return replace(state, stages=state.stages[1:], weight_change=np.inf)
         state = replace(state, stages=state.stages[:1])
@@ -132,19 +134,23 @@ def _next_round(
     is_final = has_settled or rounds_left < 2
     if has_settled or all(new is old for new, old in zip(weighted, problem.data, strict=True)):
         # Same rows: continue the previous iteration with the new priors.
-        problem, before, earlier = problem.held(priors), solution, fit.previous_iterations
+        problem, before, earlier = problem.with_prior_weights(priors), solution, fit.previous_iterations
     else:
-        problem, before, earlier = problem.of(weighted).held(priors), None, fit.iterations
+        problem, before, earlier = (
+            problem.with_data(weighted).with_prior_weights(priors),
+            None,
+            fit.iterations,
+        )
         state = replace(state, scales=scales)
     solution = levenberg_marquardt(
-        problem, solution.x, max_iterations, progress, before=before, nearly=not is_final
+        problem, solution.x, max_iterations, progress, warm_start=before, loose=not is_final
     )
     fit = replace(state.fit, problem=problem, solution=solution, previous_iterations=earlier)
     return replace(state, fit=fit, is_final=is_final)
 
 
 def estimate_variance_components(
-    problem: Problem, solution: Solution, data: tuple[Measurement, ...], weights: Sequence[Array]
+    problem: Problem, solution: SolverResult, data: tuple[Measurement, ...], weights: Sequence[Array]
 ) -> Array:
     """How many of its sigmas each group of rows scatters in the fit, all items' groups in a row (g,).
 
@@ -152,20 +158,23 @@ def estimate_variance_components(
     group of no more rows than that could be met exactly, whatever it reads, and tells no scatter of its
     own: it takes the one of all rows of its unit, and where the others are stated that of a placeholder.
     """
-    if all(item.stated for item in data):
-        return np.ones(sum(len(item.groups) for item in data))
+    if all(item.has_stated_sigma for item in data):
+        return np.ones(sum(len(item.residual_groups) for item in data))
     chain = problem.errors.at(solution.x[: len(problem.errors.parameters)])
     residuals = [
-        item.residual(chain.sweep(item.configurations()), problem.values(item, solution.x)) for item in data
+        item.residual(
+            chain.forward_kinematics(item.configurations()), problem.instrument_values_of(item, solution.x)
+        )
+        for item in data
     ]
     counts = [w.sum() for w in weights]
-    seen = qr.rank(solution.triangle.r)
+    seen = qr.rank(solution.system.r)
     share = 1 - seen / sum(len(r) * count for r, count in zip(residuals, counts, strict=True))
     # Of each group: whether it is of angles, whether it is stated, its rows, and the sum of their squares.
     groups = [
-        (name == "orientation", item.stated, len(r[rows]) * count, np.sum(r[rows] ** 2 * w))
+        (name == "orientation", item.has_stated_sigma, len(r[rows]) * count, np.sum(r[rows] ** 2 * w))
         for item, r, w, count in zip(data, residuals, weights, counts, strict=True)
-        for name, rows in item.groups.items()
+        for name, rows in item.residual_groups.items()
     ]
     out = np.ones(len(groups))
     for i, (angle, stated, rows, squares) in enumerate(groups if share > 0 else ()):
@@ -175,7 +184,7 @@ def estimate_variance_components(
             rows, squares = (sum(group[k] for group in pooled) for k in (2, 3))
             stated = stated or len(pooled) == 1
         if not stated:
-            out[i] = max(float(np.sqrt(squares / (rows * share))), LEAST_SCALE)
+            out[i] = max(float(np.sqrt(squares / (rows * share))), MIN_SIGMA_SCALE)
     return out
 
 
@@ -184,4 +193,4 @@ def with_sigma_scales(data: tuple[Measurement, ...], scales: Array) -> tuple[Mea
     if np.all(scales == 1):
         return data
     left = iter(scales.tolist())
-    return tuple(item.scaled({name: next(left) for name in item.groups}) for item in data)
+    return tuple(item.with_scaled_sigma({name: next(left) for name in item.residual_groups}) for item in data)

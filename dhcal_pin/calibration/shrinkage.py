@@ -15,24 +15,24 @@ import numpy as np
 
 from .._typing import Array
 from ..estimation.problem import Problem
-from ..estimation.qr import RANK_CUT, Triangle, rank
-from ..estimation.solver import Solution
-from ..robot.chain import BASE
+from ..estimation.qr import RANK_RTOL, TriangularSystem, rank
+from ..estimation.solver import SolverResult
+from ..robot.chain import BASE_FRAME
 
 # The greatest chance of an arm that is worse than nominal.
-CHANCE = 0.002
+MAX_HARM_PROBABILITY = 0.002
 
 
 # Widths of the priors, as multiples of the usual ones, and the standard deviation of their logarithm.
-WIDTHS, SPREAD = 2.0 ** np.arange(-4, 5), 1.5
+PRIOR_WIDTHS, LOG_WIDTH_STD = 2.0 ** np.arange(-4, 5), 1.5
 
 
 # Configurations where the tool is judged.
-SAMPLES = 32
+N_CONFIGURATIONS = 32
 
 
 # Readings are taken for no better than this share of the largest that an error could make of them.
-EXACT = 1e-6
+NOISE_FLOOR = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,40 +40,48 @@ class _Evidence:
     """What readings say of errors in f groups, each of a width of its own, along one change of the tool.
 
     Attributes:
-        rows: (f, r, r) variances of the whitened readings that each group makes at its usual width.
-        both: (f, r) covariances of the readings with the errors' effect along the change.
-        effect: (f,) variances of that effect.
-        read: (r,) the readings.
+        covariances: (f, r, r) variances of the whitened readings that each group makes at its usual width.
+        cross_covariance: (f, r) covariances of the readings with the errors' effect along the change.
+        effect_variances: (f,) variances of that effect.
+        readings: (r,) the readings.
     """
 
-    rows: Array
-    both: Array
-    effect: Array
-    read: Array
+    covariances: Array
+    cross_covariance: Array
+    effect_variances: Array
+    readings: Array
 
     def at(self, widths: Array) -> tuple[Array, Array, Array]:
         """Logarithm of the evidence, mean and standard deviation of the effect (w,) by widths (w, f)."""
         square = widths**2
-        spread = np.tensordot(square, self.rows, 1) + np.eye(len(self.read))
+        spread = np.tensordot(square, self.covariances, 1) + np.eye(len(self.readings))
         root = np.linalg.cholesky(spread)
-        sides = np.stack([np.broadcast_to(self.read, (len(widths), len(self.read))), square @ self.both], 2)
+        sides = np.stack(
+            [
+                np.broadcast_to(self.readings, (len(widths), len(self.readings))),
+                square @ self.cross_covariance,
+            ],
+            2,
+        )
         read, both = np.moveaxis(np.linalg.solve(root, sides), 2, 0)
         log = -np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1) - 0.5 * np.sum(read**2, 1)
-        variance = square @ self.effect - np.sum(both**2, 1)
+        variance = square @ self.effect_variances - np.sum(both**2, 1)
         return log, np.sum(read * both, 1), np.sqrt(np.maximum(variance, np.finfo(float).tiny))
 
 
-def _without(triangle: Triangle, x: Array, inside: Array, others: Array) -> tuple[Array, Array, Array]:
+def _eliminate(
+    triangle: TriangularSystem, x: Array, inside: Array, others: Array
+) -> tuple[Array, Array, Array]:
     """How `others` follow what is `inside` (o, i), and the rows (r, i) and readings (r,) left of it."""
     read = triangle.z + triangle.r @ x
     u, s, vt = np.linalg.svd(triangle.r[:, others], full_matrices=False)
-    seen = s > RANK_CUT * s.max(initial=0.0)
+    seen = s > RANK_RTOL * s.max(initial=0.0)
     u, s, vt, rows = u[:, seen], s[seen], vt[seen], triangle.r[:, inside]
     return -vt.T @ ((u.T @ rows) / s[:, None]), rows - u @ (u.T @ rows), read - u @ (u.T @ read)
 
 
-def kept_share(
-    problem: Problem, solution: Solution, families: Sequence[tuple[Sequence[int], float]]
+def compute_shrinkage_factor(
+    problem: Problem, solution: SolverResult, families: Sequence[tuple[Sequence[int], float]]
 ) -> float:
     """The share of a solution's x, 0 to 1, to keep; the rest of the way leads back to the nominal arm.
 
@@ -86,34 +94,36 @@ def kept_share(
         families: errors of the robot whose size nobody knows well, and one over their usual prior's sigma.
     """
     errors, x = problem.errors, solution.x
-    readings = sum(len(item.rows) * item.size for item in problem.data)
-    if readings > len(x) or readings > rank(solution.triangle.r) or not families:
+    readings = sum(len(item.rows) * item.residual_dim for item in problem.data)
+    if readings > len(x) or readings > rank(solution.system.r) or not families:
         return 1.0
-    robot, frames = len(errors.parameters), (BASE, errors.chain.tool_station)
-    inside = np.array([i for i, p in enumerate(errors.parameters) if p.station not in frames], int)
+    robot, frames = len(errors.parameters), (BASE_FRAME, errors.chain.tool_frame_index)
+    inside = np.array([i for i, p in enumerate(errors.parameters) if p.error_frame not in frames], int)
     if not x[inside].any():
         return 1.0
     from ..robot.sampling import (
         joint_range,  # a good part of the start-up, and few fits need it
     )
 
-    follow, rows, read = _without(solution.triangle, x, inside, np.setdiff1d(np.arange(len(x)), inside))
+    follow, rows, read = _eliminate(solution.system, x, inside, np.setdiff1d(np.arange(len(x)), inside))
     chain, bodies, twists = errors.derivative(x[:robot])
-    q = np.random.default_rng(0).uniform(*joint_range(chain), (SAMPLES, chain.size))
-    moved = np.zeros((3 * SAMPLES, len(x)))
-    moved[:, :robot] = chain.tool_velocities(chain.sweep(q), bodies, twists)[:, :3].reshape(robot, -1).T
+    q = np.random.default_rng(0).uniform(*joint_range(chain), (N_CONFIGURATIONS, chain.n_joints))
+    moved = np.zeros((3 * N_CONFIGURATIONS, len(x)))
+    moved[:, :robot] = (
+        chain.tool_jacobian(chain.forward_kinematics(q), bodies, twists)[:, :3].reshape(robot, -1).T
+    )
     moved = moved[:, inside] + np.delete(moved, inside, 1) @ follow
     change = moved @ x[inside]
     # What has no width to look for, as a stated prior or a joint's own errors, keeps the one it has.
     sigma, groups = 1 / problem.weights[inside], []
     for members, usual in families:
-        if errors.parameters[members[0]].entry is None:
+        if errors.parameters[members[0]].coefficient_index is None:
             groups.append(np.isin(inside, members))
             sigma[groups[-1]] = 1 / usual
-    widths = np.array([[*some, 1.0] for some in itertools.product(WIDTHS, repeat=len(groups))])
+    widths = np.array([[*some, 1.0] for some in itertools.product(PRIOR_WIDTHS, repeat=len(groups))])
     groups.append(~np.any(groups, 0))
     rows, effect = rows * sigma, moved.T @ change * sigma
-    noise = max(1.0, EXACT * float(np.abs(rows).max()) * WIDTHS.max())
+    noise = max(1.0, NOISE_FLOOR * float(np.abs(rows).max()) * PRIOR_WIDTHS.max())
     rows, read = rows / noise, read / noise
     log, mean, std = _Evidence(
         np.stack([rows[:, group] @ rows[:, group].T for group in groups]),
@@ -121,12 +131,12 @@ def kept_share(
         np.array([np.sum(effect[group] ** 2) for group in groups]),
         read,
     ).at(widths)
-    log -= 0.5 * np.sum((np.log(widths) / SPREAD) ** 2, 1)
+    log -= 0.5 * np.sum((np.log(widths) / LOG_WIDTH_STD) ** 2, 1)
     likely = np.exp(log - log.max())
-    return _largest(mean, std, likely / likely.sum(), float(change @ change))
+    return _largest_safe_factor(mean, std, likely / likely.sum(), float(change @ change))
 
 
-def _largest(mean: Array, std: Array, likely: Array, size: float) -> float:
+def _largest_safe_factor(mean: Array, std: Array, likely: Array, size: float) -> float:
     """The largest share with a small enough chance of harm, zero if there is none.
 
     A share c of a change of the tool d leaves it worse than without where c·|d|² > 2·d·e, e the true one.
@@ -141,5 +151,5 @@ def _largest(mean: Array, std: Array, likely: Array, size: float) -> float:
 
     shares = np.linspace(1, 0, 101)
     chance = ndtr((0.5 * shares[:, None] * size - mean) / std) @ likely
-    good = np.flatnonzero(chance <= CHANCE)
+    good = np.flatnonzero(chance <= MAX_HARM_PROBABILITY)
     return float(shares[good[0]]) if good.size else 0.0

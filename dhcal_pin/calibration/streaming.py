@@ -13,13 +13,13 @@ from .._typing import Array
 from ..estimation import qr
 from ..estimation.priors import Priors
 from ..estimation.problem import Chunk, Problem
-from ..estimation.qr import posterior_root
-from ..estimation.solver import METHODS, Progress, Solution
+from ..estimation.qr import posterior_sqrt_covariance
+from ..estimation.solver import METHODS, Progress, SolverResult
 from ..exceptions import DhcalError
 from ..identifiability import explanations
 from ..io.measurement_csv import Part
 from ..measurements.base import Measurement
-from ..parallel import HERE, Workers
+from ..parallel import SERIAL, TaskExecutor
 from ..robot.chain import Chain
 from .procedure import Method, calibrate
 from .result import Result
@@ -28,7 +28,7 @@ _Found = TypeVar("_Found")
 
 
 @dataclass(frozen=True, eq=False)
-class Stream(Problem):
+class StreamProblem(Problem):
     """A problem whose samples come anew, part by part, each time that they are asked for.
 
     Attributes:
@@ -39,16 +39,16 @@ class Stream(Problem):
     parts: Callable[[], Iterable[Part]] = tuple
     scales: Mapping[str, float] | None = None
 
-    def each(self, function: Callable[[Chunk], _Found]) -> Iterator[_Found]:
+    def map_chunks(self, function: Callable[[Chunk], _Found]) -> Iterator[_Found]:
         """What a function finds in each part, in order."""
-        return self.where.map(partial(_loaded, function, self.errors.chain, self.scales), self.parts())
+        return self.executor.map(partial(_loaded, function, self.errors.chain, self.scales), self.parts())
 
 
 def _loaded(
     function: Callable[[Chunk], _Found], nominal: Chain, scales: Mapping[str, float] | None, part: Part
 ) -> _Found:
     item = _read(part)
-    return function(Chunk(item.scaled(scales) if scales else item, nominal))
+    return function(Chunk(item.with_scaled_sigma(scales) if scales else item, nominal))
 
 
 def _read(part: Part) -> Measurement:
@@ -56,7 +56,7 @@ def _read(part: Part) -> Measurement:
 
 
 @dataclass(frozen=True, eq=False)
-class Streamed:
+class StreamResult:
     """What a stream told of a chain's errors.
 
     Attributes:
@@ -64,15 +64,15 @@ class Streamed:
         x: (p,) identified errors, m and rad.
         chain: the calibrated chain.
         solution: the loop's end.
-        samples: how many there were.
+        n_samples: how many there were.
         before, after: RMS errors of all samples by group: "position" in m, "orientation" in rad.
     """
 
-    problem: Stream
+    problem: StreamProblem
     x: Array
     chain: Chain
-    solution: Solution
-    samples: int
+    solution: SolverResult
+    n_samples: int
     before: Mapping[str, float]
     after: Mapping[str, float]
 
@@ -84,17 +84,17 @@ class Streamed:
     @property
     def rank(self) -> int:
         """Number of directions that the data see, without priors."""
-        return qr.rank(self.solution.triangle.r)
+        return qr.rank(self.solution.system.r)
 
     @property
     def unobservable(self) -> list[str]:
         """What the data cannot tell apart, one sentence a group."""
-        return explanations.unobservable(self.problem, self.x, self.solution.triangle)
+        return explanations.explain_unobservable(self.problem, self.x, self.solution.system)
 
     @cached_property
     def std(self) -> Array:
         """Standard deviations (p,) of x, m and rad; infinite where neither data nor a prior tell."""
-        root, hidden = posterior_root(self.solution.triangle, self.problem.weights)
+        root, hidden = posterior_sqrt_covariance(self.solution.system, self.problem.weights)
         return np.where(np.sum(hidden**2, 1) > 1e-6, np.inf, np.linalg.norm(root, axis=1))
 
 
@@ -109,9 +109,9 @@ def calibrate_stream(
     free: Sequence[str] = (),
     known: Mapping[str, float] | None = None,
     max_iterations: int = 100,
-    where: Workers = HERE,
+    executor: TaskExecutor = SERIAL,
     progress: Progress | None = None,
-) -> Streamed:
+) -> StreamResult:
     """Identifies a chain's errors from samples of one kind that are never all in memory.
 
     The first part alone places base and tool and tells sigmas that no instrument states; then all parts are
@@ -128,7 +128,7 @@ def calibrate_stream(
         free: single parameters of any set added.
         known: values in m and rad of the instrument's unknowns by name.
         max_iterations: most steps of a loop.
-        where: what parts are shared out to.
+        executor: what parts are shared out to.
         progress: called with the iteration and the cost.
 
     Raises:
@@ -139,7 +139,7 @@ def calibrate_stream(
         raise DhcalError("no measurements to fit")
     head = _read(first)
     known = known or {}
-    if missing := [unknown.name for unknown in head.unknowns if unknown.name not in known]:
+    if missing := [unknown.name for unknown in head.instrument_parameters if unknown.name not in known]:
         raise DhcalError(
             f"{head.kind}: {missing[0]} is unknown; a stream needs surveyed instruments, so give it as known"
         )
@@ -155,11 +155,13 @@ def calibrate_stream(
         loss="linear",
         max_iterations=max_iterations,
     )
-    problem = Stream(fit.errors, (head,), fit.problem.weights, known, where, None, parts, _scales(fit, head))
+    problem = StreamProblem(
+        fit.errors, (head,), fit.problem.weights, known, executor, None, parts, _scales(fit, head)
+    )
     solution = METHODS[method](problem, fit.x, max_iterations, progress)
     end = fit.errors.at(solution.x)
     samples, before, after = 0, {}, {}
-    for count, squares in problem.each(partial(_squares, (fit.reference, end), known)):
+    for count, squares in problem.map_chunks(partial(_squares, (fit.nominal_refitted, end), known)):
         samples += count
         for total, found in zip((before, after), squares, strict=True):
             for name, value in found.items():
@@ -167,19 +169,22 @@ def calibrate_stream(
     before, after = (
         {name: float(np.sqrt(value / samples)) for name, value in total.items()} for total in (before, after)
     )
-    return Streamed(problem, solution.x, end, solution, samples, before, after)
+    return StreamResult(problem, solution.x, end, solution, samples, before, after)
 
 
 def _scales(fit: Result, head: Measurement) -> dict[str, float] | None:
     """What the first part tells of its sigmas, where the instrument does not."""
-    if head.stated:
+    if head.has_stated_sigma:
         return None
     (used,) = fit.problem.data
-    sweep, u = fit.chain.sweep(head.configurations()), fit.problem.values(head, fit.x)
-    plain, scaled = (item.residual(sweep, u) for item in (head, used))
+    frames, u = (
+        fit.chain.forward_kinematics(head.configurations()),
+        fit.problem.instrument_values_of(head, fit.x),
+    )
+    plain, scaled = (item.residual(frames, u) for item in (head, used))
     return {
         name: float(np.linalg.norm(plain[rows]) / np.linalg.norm(scaled[rows])) or 1.0
-        for name, rows in head.groups.items()
+        for name, rows in head.residual_groups.items()
     }
 
 
@@ -187,8 +192,8 @@ def _squares(
     chains: tuple[Chain, ...], known: Mapping[str, float], chunk: Chunk
 ) -> tuple[int, list[dict[str, Any]]]:
     """A part's number of samples, and its summed squared errors by group under each chain."""
-    u, item = chunk.unknowns(known), chunk.data
+    u, item = chunk.instrument_values(known), chunk.data
     return len(item.rows), [
-        {name: float(np.sum(error**2)) for name, error in item.errors(chunk.sweep(chain), u).items()}
+        {name: float(np.sum(error**2)) for name, error in item.errors(chunk.frames(chain), u).items()}
         for chain in chains
     ]

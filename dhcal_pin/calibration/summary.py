@@ -6,24 +6,24 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from ..formatting import SMALL, Table, digits, fixed, shown
+from ..formatting import SMALL_UNITS, Table, format_fixed, format_quantity, significant_decimals
 from .estimates import Estimate
-from .evaluation import ENDINGS, Comparison
+from .evaluation import UNIT_SUFFIXES, Comparison
 
 # Fewer samples than this do not tell an accuracy; a longer text than this may be broken into lines.
-FEW = 10
+MIN_SAMPLES = 10
 
 
 # Gross errors among what was held out are worth a word where the RMS is this share of itself without them.
-TELLING = 0.9
+OUTLIER_RMS_RATIO = 0.9
 
 
 # Groups of accuracy in words.
-WORDS = {"position": "position error", "orientation": "orientation error", "residual": "residual"}
+GROUP_LABELS = {"position": "position error", "orientation": "orientation error", "residual": "residual"}
 
 
 # Measures of accuracy in words.
-MEASURES = {"mean": "mean", "rms": "RMS", "p95": "95 % within", "max": "largest"}
+STATISTIC_LABELS = {"mean": "mean", "rms": "RMS", "p95": "95 % within", "max": "largest"}
 
 
 def estimate_table(found: Sequence[Estimate]) -> Table:
@@ -31,9 +31,9 @@ def estimate_table(found: Sequence[Estimate]) -> Table:
     rows = [
         [
             e.name,
-            shown(e.nominal, e.unit, e.std),
-            shown(e.value, e.unit, e.std),
-            shown(e.change, e.unit, e.std, small=True),
+            format_quantity(e.nominal, e.unit, e.std),
+            format_quantity(e.value, e.unit, e.std),
+            format_quantity(e.change, e.unit, e.std, small=True),
             e.certainty,
         ]
         for e in found
@@ -45,20 +45,27 @@ def accuracy_table(comparisons: Sequence[Comparison]) -> Table:
     """Before and after, held out and fitted, a line each; lengths in mm, angles in mrad."""
     rows = []
     for c in comparisons:
-        for group, end in ENDINGS.items():
+        for group, end in UNIT_SUFFIXES.items():
             if f"{group}_rms{end}" not in c.after:
                 continue
-            factor, unit = SMALL[end.strip("_") or "m"]
+            factor, unit = SMALL_UNITS[end.strip("_") or "m"]
             for state, side in (("before", c.before), ("after", c.after)):
-                places = digits(factor * side[f"{group}_rms_std{end}"])
-                figures = [side[f"{group}_{key}{end}"] for key in MEASURES]
+                places = significant_decimals(factor * side[f"{group}_rms_std{end}"])
+                figures = [side[f"{group}_{key}{end}"] for key in STATISTIC_LABELS]
                 figures += side.get(f"{group}_axes_rms{end}", [math.nan] * 3)
-                cells = [fixed(factor * figure, places) for figure in figures]
+                cells = [format_fixed(factor * figure, places) for figure in figures]
                 rows.append(
-                    [f"{c.after[f'{group}_samples']} {c.title}", f"{WORDS[group]},{unit}", state, *cells]
+                    [
+                        f"{c.after[f'{group}_samples']} {c.title}",
+                        f"{GROUP_LABELS[group]},{unit}",
+                        state,
+                        *cells,
+                    ]
                 )
     axes = [f"{axis}, RMS" for axis in "xyz"]
-    return Table(["samples", "error", "calibration", *MEASURES.values(), *axes], rows, texts=3)
+    return Table(
+        ["samples", "error", "calibration", *STATISTIC_LABELS.values(), *axes], rows, n_text_columns=3
+    )
 
 
 @dataclass(frozen=True)
@@ -68,41 +75,49 @@ class Headline:
     Attributes:
         text: in words.
         before, after: the figures with their unit.
-        drop: how much smaller in percent; negative where the error grew.
+        percent_reduction: how much smaller in percent; negative where the error grew.
         group: of ENDINGS.
-        of: the accuracy it is of, with as many samples as the group has.
+        comparison: the accuracy it is of, with as many samples as the group has.
     """
 
     text: str
     before: str
     after: str
-    drop: float
+    percent_reduction: float
     group: str
-    of: Comparison
+    comparison: Comparison
 
 
 def headline(comparisons: Sequence[Comparison]) -> Headline:
     """The error on what was not fitted where there is such, and an honest word where there is not."""
     best = comparisons[0]
-    group = next(group for group in ENDINGS if f"{group}_rms{ENDINGS[group]}" in best.after)
-    best = replace(best, samples=best.after[f"{group}_samples"])
-    end = ENDINGS[group]
+    group = next(group for group in UNIT_SUFFIXES if f"{group}_rms{UNIT_SUFFIXES[group]}" in best.after)
+    best = replace(best, n_samples=best.after[f"{group}_samples"])
+    end = UNIT_SUFFIXES[group]
     unit = end.strip("_") or "m"
     key, spread = f"{group}_rms{end}", f"{group}_rms_std{end}"
-    before, after = (shown(side[key], unit, side[spread], True) for side in (best.before, best.after))
-    what = f"RMS {WORDS[group]} {on_samples(best)}: {before} before, {after} after"
-    if best.without and best.without[key] < TELLING * best.after[key]:
-        clean = shown(best.without[key], unit, best.without[spread], True)
-        what += f", {clean} without {_gross(best.gross)} among them"
-    what += f". {_gross(best.aside).capitalize()} left aside." if best.aside else "."
-    text = f"{what} {few(best)}".strip() if best.title != "fitted" else f"Nothing was held out. {what}"
+    before, after = (
+        format_quantity(side[key], unit, side[spread], True) for side in (best.before, best.after)
+    )
+    what = f"RMS {GROUP_LABELS[group]} {describe_samples(best)}: {before} before, {after} after"
+    if best.after_without_outliers and best.after_without_outliers[key] < OUTLIER_RMS_RATIO * best.after[key]:
+        clean = format_quantity(
+            best.after_without_outliers[key], unit, best.after_without_outliers[spread], True
+        )
+        what += f", {clean} without {_outlier_count(best.n_outliers)} among them"
+    what += f". {_outlier_count(best.n_rejected).capitalize()} left aside." if best.n_rejected else "."
+    text = (
+        f"{what} {small_sample_note(best)}".strip()
+        if best.title != "fitted"
+        else f"Nothing was held out. {what}"
+    )
     drop = 100 * (1 - best.after[key] / best.before[key]) if best.before[key] else 0.0
     return Headline(text, before, after, drop, group, best)
 
 
-def setbacks(comparisons: Sequence[Comparison]) -> list[str]:
+def regressions(comparisons: Sequence[Comparison]) -> list[str]:
     """Where the calibrated arm is worse than the nominal one, and what to do about it."""
-    worse = [on_samples(c) for c in comparisons if headline([c]).drop < 0]
+    worse = [describe_samples(c) for c in comparisons if headline([c]).percent_reduction < 0]
     return [
         f"The calibrated arm is worse than the nominal one {where}: they warrant no such correction. Keep "
         "the nominal arm, measure more poses, or identify fewer parameters."
@@ -110,21 +125,21 @@ def setbacks(comparisons: Sequence[Comparison]) -> list[str]:
     ]
 
 
-def _gross(count: int) -> str:
+def _outlier_count(count: int) -> str:
     return f"{count} gross errors" if count > 1 else "one gross error"
 
 
-def on_samples(c: Comparison) -> str:
+def describe_samples(c: Comparison) -> str:
     """Which samples a comparison is about, in words."""
-    many, was = ("sample", "was") if c.samples == 1 else ("samples", "were")
+    many, was = ("sample", "was") if c.n_samples == 1 else ("samples", "were")
     ends = {
         "held out": f"{many} that {was} not fitted",
-        "left out": f"{many}, each left out of the fit that it judges",
+        "cross-validated": f"{many}, each left out of the fit that it judges",
         "fitted": f"fitted {many}",
     }
-    return f"on {c.samples} {ends[c.title]}"
+    return f"on {c.n_samples} {ends[c.title]}"
 
 
-def few(c: Comparison) -> str:
+def small_sample_note(c: Comparison) -> str:
     """A warning where a comparison has too few samples to be sure of."""
-    return "So few samples say little." if c.samples < FEW else ""
+    return "So few samples say little." if c.n_samples < MIN_SAMPLES else ""

@@ -12,26 +12,26 @@ import numpy as np
 
 from .._typing import PathLike
 from ..calibration import model_selection, procedure, summary
-from ..calibration.evaluation import ENDINGS
-from ..calibration.model_selection import EVERYTHING, narrow
+from ..calibration.evaluation import UNIT_SUFFIXES
+from ..calibration.model_selection import FULL_SET, is_restricted
 from ..calibration.result import Result
-from ..diagnostics.input_checks import doubts, misfits
-from ..diagnostics.reachability import Finding, screen
+from ..diagnostics.input_checks import find_input_warnings, poorly_fitted_files
+from ..diagnostics.reachability import UnreachableRow, find_unreachable_rows
 from ..estimation.parameters import EXTENSIONS
-from ..estimation.robust import NOTHING
+from ..estimation.robust import ZERO_WEIGHT
 from ..estimation.solver import Progress
 from ..exceptions import DhcalError
-from ..io.atomic import save
-from ..io.measurement_csv import read_readings
+from ..io.atomic import write_files
+from ..io.measurement_csv import read_measurement_file
 from ..io.robot import read_robot, urdf_files
 from ..io.settings import read_bounds, read_priors
 from ..io.sidecar import parse_payload, read_instrument, sidecar_path
 from ..measurements.base import Measurement
-from ..measurements.position import check_targets
-from ..parallel import HERE, Workers, workers
+from ..measurements.position import require_common_reference_target
+from ..parallel import SERIAL, TaskExecutor, open_executor
 from ..report.document import (
     Provenance,
-    fingerprints,
+    file_digests,
     json_text,
     result_to_dict,
     short_names,
@@ -42,12 +42,12 @@ from . import console
 from .job import Job, is_manifest
 from .options import (
     STDOUT,
-    check_outputs,
-    check_urdf_ending,
-    emit,
-    names,
-    same,
+    is_same_file,
+    require_urdf_ending,
+    require_writable_outputs,
     sidecars,
+    split_commas,
+    write_json,
 )
 
 
@@ -57,11 +57,11 @@ class _Data:
 
     fit: dict[str, Measurement]
     holdout: list[tuple[str, Measurement]]
-    findings: dict[str, list[Finding]]
-    doubts: dict[str, list[str]]
+    findings: dict[str, list[UnreachableRow]]
+    warnings: dict[str, list[str]]
 
 
-def _without(data: Measurement, findings: Sequence[Finding]) -> Measurement:
+def _without(data: Measurement, findings: Sequence[UnreachableRow]) -> Measurement:
     return data.take(~np.isin(data.rows, [finding.row for finding in findings]))
 
 
@@ -69,21 +69,21 @@ def _read_data(chain: Chain, args: Job, held_file: str | None, known_frames: boo
     """All measurements, split as the files' `set` columns and --holdout ask."""
     fit: list[Measurement] = []
     holdout: list[tuple[str, Measurement]] = []
-    findings: dict[str, list[Finding]] = {}
+    findings: dict[str, list[UnreachableRow]] = {}
     doubtful: dict[str, list[str]] = {}
     every: dict[str, Measurement] = {}
     for path in [*args.data, *([held_file] if held_file else [])]:
-        readings = read_readings(path, chain, args.columns)
+        readings = read_measurement_file(path, chain, args.columns)
         every[path] = readings.data
-        doubtful[path] = doubts(chain, readings)
+        doubtful[path] = find_input_warnings(chain, readings)
         # A row can only be called impossible where base and tool are known.
-        findings[path] = screen(chain, readings) if known_frames else []
+        findings[path] = find_unreachable_rows(chain, readings) if known_frames else []
         if path == held_file:
             holdout.append((path, _without(readings.data, findings[path])))
         else:
             fit.append(_without(readings.fit, findings[path]))
             holdout.append((path, _without(readings.holdout, findings[path])))
-    check_targets(every)
+    require_common_reference_target(every)
     if args.holdout is not None and not held_file:
         try:
             fraction = float(args.holdout)
@@ -99,14 +99,14 @@ def _read_data(chain: Chain, args: Job, held_file: str | None, known_frames: boo
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class CalibrationOutcome:
     """A calibration whose files are written.
 
     Attributes:
         fit: what was found.
         document: the same as JSON.
         files: paths of what was written, by what it is.
-        findings, gross, aside, doubts: by file, the impossible rows, the numbers of gross ones and of those
+        findings, outliers, rejected, warnings: by file, the impossible rows, the numbers of gross ones and of those
             that take no part in the fit, and what is hard to believe.
         trials: what each family of --extend brought.
         hint: what --extend might bring, where it was not asked for.
@@ -115,15 +115,17 @@ class Outcome:
     fit: Result
     document: dict[str, Any]
     files: dict[str, str]
-    findings: dict[str, list[Finding]]
-    gross: dict[str, list[int]]
-    aside: dict[str, list[int]]
-    doubts: dict[str, list[str]]
-    trials: tuple[model_selection.Trial, ...]
+    findings: dict[str, list[UnreachableRow]]
+    outliers: dict[str, list[int]]
+    rejected: dict[str, list[int]]
+    warnings: dict[str, list[str]]
+    trials: tuple[model_selection.FamilyTrial, ...]
     hint: str
 
 
-def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) -> Outcome:
+def run_job(
+    args: Job, progress: Progress | None = None, executor: TaskExecutor = SERIAL
+) -> CalibrationOutcome:
     """Calibrates one robot and writes its files, in this process or another; shows nothing.
 
     Raises:
@@ -132,17 +134,19 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     held_file = args.holdout if args.holdout is not None and os.path.exists(args.holdout) else None
     measured = [*args.data, *([held_file] if held_file else [])]
     for number, path in enumerate(measured):
-        if any(same(path, other) for other in measured[:number]):
+        if any(is_same_file(path, other) for other in measured[:number]):
             raise DhcalError(f"{path}: is given twice; each measurement counts once, to fit or to hold out")
     robot = [args.robot, *sidecars([args.robot])]
     priors = [args.priors] if args.priors not in (None, "default", "none") else []
     priors += [path for path in (args.bounds, args.instrument) if path]
     maps = [args.columns] if args.columns else []
     inputs = [*robot, *measured, *priors, *maps]
-    check_urdf_ending(args.output)
-    check_outputs([args.json, *args.report], inputs)
+    require_urdf_ending(args.output)
+    require_writable_outputs([args.json, *args.report], inputs)
     kept = [*measured, *priors, *maps] if args.in_place else inputs
-    check_outputs([args.output, sidecar_path(args.output), args.map, args.json, *args.report], kept)
+    require_writable_outputs(
+        [args.output, sidecar_path(args.output), args.map, args.json, *args.report], kept
+    )
     if args.report:
         from ..report import html  # its figures are a good part of the start-up
 
@@ -155,9 +159,9 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
 
     chain = read_robot(args.robot, args.tip)
     if args.payload:
-        chain = chain.carrying(parse_payload(args.payload))
+        chain = chain.with_payload(parse_payload(args.payload))
     sets = chain.parameters if args.parameters is None else args.parameters
-    data = _read_data(chain, args, held_file, known_frames=not {"base", "tool"} & set(names(sets)))
+    data = _read_data(chain, args, held_file, known_frames=not {"base", "tool"} & set(split_commas(sets)))
     options: dict[str, Any] = {
         "priors": read_priors(args.priors),
         "holdout": [item for _, item in data.holdout],
@@ -165,9 +169,13 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
         "loss": args.loss,
         "max_iterations": args.max_iterations,
         "progress": progress,
-        "where": where,
+        "executor": executor,
     }
-    held = {"bounds": read_bounds(args.bounds), "fix": names(args.fix), "free": names(args.free)}
+    held = {
+        "bounds": read_bounds(args.bounds),
+        "fix": split_commas(args.fix),
+        "free": split_commas(args.free),
+    }
     fit, trials = model_selection.extend(
         chain,
         list(data.fit.values()),
@@ -178,16 +186,18 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
         **options,
     )
     # Who holds something, or asks for the paper's loop, knows what is unknown; who mixed columns up does not.
-    chosen = args.method != "lm" or any(held.values()) or any(data.doubts.values())
-    if not chosen and narrow(names(sets)):
-        data.doubts[args.robot] = [*filter(None, [missed(fit, chain, list(data.fit.values()), **options)])]
-    for path, texts in misfits(fit.chain, data.fit, fit.instruments).items():
+    chosen = args.method != "lm" or any(held.values()) or any(data.warnings.values())
+    if not chosen and is_restricted(split_commas(sets)):
+        data.warnings[args.robot] = [
+            *filter(None, [improvement_hint(fit, chain, list(data.fit.values()), **options)])
+        ]
+    for path, texts in poorly_fitted_files(fit.chain, data.fit, fit.instruments).items():
         # What a file's columns tell already is not told again.
-        data.doubts[path] += texts if not data.doubts[path] else []
+        data.warnings[path] += texts if not data.warnings[path] else []
     # Who has doubts about the data or the sets, or the frames alone to find, is not to look at gears yet.
-    early = any(data.doubts.values()) or set(names(sets)) <= {"base", "tool"}
+    early = any(data.warnings.values()) or set(split_commas(sets)) <= {"base", "tool"}
     plain = args.method == "lm" and args.priors != "none" and args.extend == "none"
-    hint = model_selection.hint(fit) if plain and not early else ""
+    hint = model_selection.family_hint(fit) if plain and not early else ""
     contents = _written(fit, args)
     files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
     if args.map:
@@ -198,7 +208,7 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     if args.json and args.json != STDOUT:
         files["json"] = args.json
     gross = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))
-    unheard = (item.rows[weight <= NOTHING] for item, weight in zip(fit.data, fit.weights, strict=True))
+    unheard = (item.rows[weight <= ZERO_WEIGHT] for item, weight in zip(fit.data, fit.weights, strict=True))
     aside = dict(zip(data.fit, (rows.tolist() for rows in unheard), strict=True))
     impossible = {path: [finding.row for finding in found] for path, found in data.findings.items()}
     rows = {
@@ -217,7 +227,7 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     document = result_to_dict(fit, files, source.inputs, [row for found in rows.values() for row in found])
     document |= {
         "outliers_by_file": rows,
-        "doubts": {path: texts for path, texts in data.doubts.items() if texts},
+        "warnings": [f"{path}: {text}" for path, texts in data.warnings.items() for text in texts],
         "command": source.command,
         "settings": source.settings,
         "extension": [asdict(trial) for trial in trials],
@@ -225,8 +235,8 @@ def run_job(args: Job, progress: Progress | None = None, where: Workers = HERE) 
     }
     if args.json and args.json != STDOUT:
         contents[args.json] = json_text(document)
-    save(contents)
-    return Outcome(fit, document, files, data.findings, gross, aside, data.doubts, trials, hint)
+    write_files(contents)
+    return CalibrationOutcome(fit, document, files, data.findings, gross, aside, data.warnings, trials, hint)
 
 
 def _provenance(
@@ -234,7 +244,7 @@ def _provenance(
     sets: str,
     data: _Data,
     inputs: Sequence[str],
-    trials: Sequence[model_selection.Trial],
+    trials: Sequence[model_selection.FamilyTrial],
     hint: str,
 ) -> Provenance:
     """What the report says of the files, the command and its choices."""
@@ -252,15 +262,15 @@ def _provenance(
         short[path]: {finding.row: finding.reason for finding in found}
         for path, found in data.findings.items()
     }
-    doubtful = {short[path]: texts for path, texts in data.doubts.items()}
+    doubtful = {short[path]: texts for path, texts in data.warnings.items()}
     return Provenance(
         command=args.command(short),
-        inputs=fingerprints(inputs),
+        inputs=file_digests(inputs),
         names=list(data.fit),
         holdout_names=[path for path, _ in data.holdout],
         settings=settings,
-        left_out=left_out,
-        doubts=doubtful,
+        excluded_rows=left_out,
+        warnings=doubtful,
         trials=trials,
         hint=hint,
     )
@@ -268,7 +278,7 @@ def _provenance(
 
 def _families(extend: str) -> tuple[str, ...]:
     """The families that --extend may add."""
-    return {"none": (), "auto": EXTENSIONS}.get(extend, tuple(names(extend)))
+    return {"none": (), "auto": EXTENSIONS}.get(extend, tuple(split_commas(extend)))
 
 
 def _written(fit: Result, args: Job) -> dict[PathLike, str | bytes]:
@@ -276,10 +286,10 @@ def _written(fit: Result, args: Job) -> dict[PathLike, str | bytes]:
     chain = fit.chain
     # A base that the URDF holds must not stand in the sidecar too.
     bare = replace(chain, base=np.eye(4)) if args.world_joint else chain
-    contents = urdf_files(bare, args.output, fit.portable, fit.uncertainty)
+    contents = urdf_files(bare, args.output, fit.transferable_instruments, fit.uncertainty)
     data = contents[args.output]
     assert isinstance(data, bytes)
-    if args.world_joint and chain.transmission is not None and chain.transmission.yields:
+    if args.world_joint and chain.transmission is not None and chain.transmission.has_compliance:
         raise DhcalError(
             "--world-joint: gravity's torques on the joints count on the robot's own root, z up; leave it out"
         )
@@ -307,30 +317,30 @@ def calibrate(args: Namespace) -> int:
         return fleet.run(args, _calibrate_one)
     if not args.data:
         raise DhcalError(f"DATA is required: name at least one measurement file behind {args.robot}")
-    with workers(args.jobs or 1, args.scheduler) as where, console.progress("fitting") as progress:
-        outcome = run_job(Job.of(args), progress, where)
+    with open_executor(args.jobs or 1, args.scheduler) as where, console.show_progress("fitting") as progress:
+        outcome = run_job(Job.from_args(args), progress, where)
     if args.json == STDOUT:
-        emit(args.json, outcome.document)
-    console.trials(outcome.trials)
-    console.summary(outcome.fit, outcome.files)
+        write_json(args.json, outcome.document)
+    console.print_trials(outcome.trials)
+    console.print_summary(outcome.fit, outcome.files)
     for path, found in outcome.findings.items():
-        console.findings(path, found)
-        console.gross(path, outcome.gross.get(path, []), outcome.aside.get(path, []))
-    for path, texts in outcome.doubts.items():
-        console.doubts(path, texts)
-    console.hint(outcome.hint)
-    console.verdict(outcome.fit)
+        console.print_unreachable_rows(path, found)
+        console.print_outliers(path, outcome.outliers.get(path, []), outcome.rejected.get(path, []))
+    for path, texts in outcome.warnings.items():
+        console.print_warnings(path, texts)
+    console.print_hint(outcome.hint)
+    console.print_verdict(outcome.fit)
     return 0
 
 
 # What leaves more than this share of the error is not worth a word; nor is what is left of exact readings.
-WORTH = 0.8
+MAX_ERROR_RATIO = 0.8
 
 
-EXACT = 1e-6
+EXACT_FIT_RATIO = 1e-6
 
 
-def missed(fit: Result, chain: Chain, data: Sequence[Measurement], **options: Any) -> str:
+def improvement_hint(fit: Result, chain: Chain, data: Sequence[Measurement], **options: Any) -> str:
     """A sentence on what EVERYTHING would bring on the samples that were not fitted; "" if little.
 
     Args:
@@ -340,16 +350,16 @@ def missed(fit: Result, chain: Chain, data: Sequence[Measurement], **options: An
         options: of `calibrate`, as for the fit.
     """
     now = fit.comparisons[0]
-    group = next(group for group in ENDINGS if f"{group}_rms{ENDINGS[group]}" in now.after)
-    key = f"{group}_rms{ENDINGS[group]}"
-    if now.after[key] < EXACT * now.before[key]:
+    group = next(group for group in UNIT_SUFFIXES if f"{group}_rms{UNIT_SUFFIXES[group]}" in now.after)
+    key = f"{group}_rms{UNIT_SUFFIXES[group]}"
+    if now.after[key] < EXACT_FIT_RATIO * now.before[key]:
         return ""
-    wider = procedure.calibrate(chain, data, EVERYTHING, **options)
+    wider = procedure.calibrate(chain, data, FULL_SET, **options)
     then = wider.comparisons[0]
-    if now.title == "fitted" or not wider.converged or then.after[key] > WORTH * now.after[key]:
+    if now.title == "fitted" or not wider.converged or then.after[key] > MAX_ERROR_RATIO * now.after[key]:
         return ""
     left, of = summary.headline([then]), summary.headline([now])
     return (
-        f"--parameters {EVERYTHING} would leave {left.after} RMS {summary.WORDS[group]} on samples left out, "
+        f"--parameters {FULL_SET} would leave {left.after} RMS {summary.GROUP_LABELS[group]} on samples left out, "
         f"and not {of.after}: the unknowns that were chosen cannot take up what was measured"
     )

@@ -11,14 +11,14 @@ from dataclasses import asdict
 from ..io.robot import read_robot
 from ..paper.jacobian_check import crosscheck
 from . import console
-from .options import check_outputs, emit
+from .options import require_writable_outputs, write_json
 
 
 def check(args: Namespace) -> int:
     """All routes to the Jacobian side by side; 1 where they disagree."""
-    check_outputs([args.json], [args.robot])
+    require_writable_outputs([args.json], [args.robot])
     rows = crosscheck(read_robot(args.robot, args.tip))
-    agree = all(row.holds for row in rows)
-    emit(args.json, {"agree": agree, "routes": [asdict(row) | {"holds": row.holds} for row in rows]})
-    console.agreement(args.robot, rows)
+    agree = all(row.agrees for row in rows)
+    write_json(args.json, {"agree": agree, "routes": [asdict(row) | {"agrees": row.agrees} for row in rows]})
+    console.print_crosscheck(args.robot, rows)
     return 0 if agree else 1

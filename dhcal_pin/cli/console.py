@@ -13,20 +13,20 @@ from rich.progress import Progress as Bar
 from rich.table import Table as Grid
 from rich.text import Text
 
-from ..calibration.evaluation import ENDINGS
-from ..calibration.model_selection import Trial, trial_table
+from ..calibration.evaluation import UNIT_SUFFIXES
+from ..calibration.model_selection import FamilyTrial, trial_table
 from ..calibration.result import Result
 from ..calibration.summary import (
-    MEASURES,
-    WORDS,
+    GROUP_LABELS,
+    STATISTIC_LABELS,
     accuracy_table,
     estimate_table,
     headline,
-    setbacks,
+    regressions,
 )
-from ..diagnostics.reachability import Finding
+from ..diagnostics.reachability import UnreachableRow
 from ..estimation.solver import Progress
-from ..formatting import Table, shown
+from ..formatting import Table, format_quantity
 
 if TYPE_CHECKING:
     from ..paper.jacobian_check import Agreement
@@ -40,12 +40,12 @@ def _console() -> Console:
     return console
 
 
-def table(title: str, content: Table) -> None:
+def print_table(title: str, content: Table) -> None:
     """A table under its title."""
     console = _console()
     out = Grid(header_style="bold", box=None, pad_edge=False)
     for i, name in enumerate(content.header):
-        out.add_column(name, justify="left" if i < content.texts else "right")
+        out.add_column(name, justify="left" if i < content.n_text_columns else "right")
     for row in content.rows:
         out.add_row(*map(Text, row))
     console.print()
@@ -54,7 +54,7 @@ def table(title: str, content: Table) -> None:
     console.print(out)
 
 
-def lines(*texts: str, style: str = "") -> None:
+def print_lines(*texts: str, style: str = "") -> None:
     """Plain sentences."""
     console = _console()
     for text in texts:
@@ -62,7 +62,7 @@ def lines(*texts: str, style: str = "") -> None:
 
 
 @contextmanager
-def progress(title: str) -> Iterator[Progress | None]:
+def show_progress(title: str) -> Iterator[Progress | None]:
     """A status line while a loop runs; nothing where stderr is not a terminal."""
     console = _console()
     if not console.is_terminal:
@@ -73,7 +73,7 @@ def progress(title: str) -> Iterator[Progress | None]:
 
 
 @contextmanager
-def counted(title: str, total: int, done: int = 0) -> Iterator[Callable[[int], None]]:
+def progress_bar(title: str, total: int, done: int = 0) -> Iterator[Callable[[int], None]]:
     """A bar for so many pieces of work, told how many are done; nothing where it is no terminal."""
     console = _console()
     with Bar(console=console, disable=not console.is_terminal) as bar:
@@ -81,19 +81,19 @@ def counted(title: str, total: int, done: int = 0) -> Iterator[Callable[[int], N
         yield lambda count: bar.update(task, completed=count)
 
 
-def findings(path: str, found: Sequence[Finding]) -> None:
+def print_unreachable_rows(path: str, found: Sequence[UnreachableRow]) -> None:
     """Impossible rows, one line each."""
     for finding in found:
-        lines(f"{path}: row {finding.row} is left out: {finding.reason}", style="yellow")
+        print_lines(f"{path}: row {finding.row} is left out: {finding.reason}", style="yellow")
 
 
-def doubts(path: str, texts: Sequence[str]) -> None:
+def print_warnings(path: str, texts: Sequence[str]) -> None:
     """What is hard to believe in a file, one line each."""
     for text in texts:
-        lines(f"{path}: check: {text}", style="yellow")
+        print_lines(f"{path}: warning: {text}", style="yellow")
 
 
-def gross(path: str, rows: Sequence[int], aside: Sequence[int]) -> None:
+def print_outliers(path: str, rows: Sequence[int], aside: Sequence[int]) -> None:
     """Gross errors, on a line those that take no part in the fit, on another those that do."""
     left, others = [row for row in rows if row in aside], [row for row in rows if row not in aside]
     for some, hint in (
@@ -102,70 +102,70 @@ def gross(path: str, rows: Sequence[int], aside: Sequence[int]) -> None:
     ):
         listed = ", ".join(map(str, some[:12])) + (f" and {len(some) - 12} more" if len(some) > 12 else "")
         if len(some) == 1:
-            lines(f"{path}: a gross error, row {listed}: takes {hint}", style="yellow")
+            print_lines(f"{path}: a gross error, row {listed}: takes {hint}", style="yellow")
         elif some:
-            lines(f"{path}: {len(some)} gross errors, rows {listed}: take {hint}", style="yellow")
+            print_lines(f"{path}: {len(some)} gross errors, rows {listed}: take {hint}", style="yellow")
 
 
-def notes(texts: Sequence[str]) -> None:
+def print_notes(texts: Sequence[str]) -> None:
     """Remarks on a conversion."""
-    lines(*(f"note: {text}" for text in texts))
+    print_lines(*(f"note: {text}" for text in texts))
 
 
-def agreement(robot: str, rows: Sequence[Agreement]) -> None:
+def print_crosscheck(robot: str, rows: Sequence[Agreement]) -> None:
     """The routes of `dhcal check` against the paper's factors."""
     cells = [
         [
             row.route,
             str(row.columns) if row.columns else "",
             f"{row.difference:.1e}",
-            f"{row.allowed:.0e}",
-            "agrees" if row.holds else "DISAGREES",
+            f"{row.tolerance:.0e}",
+            "agrees" if row.agrees else "DISAGREES",
         ]
         for row in rows
     ]
     header = ["route", "columns", "difference", "allowed", "verdict"]
-    table(f"{robot}: largest difference from the paper's factors (m, rad)", Table(header, cells))
+    print_table(f"{robot}: largest difference from the paper's factors (m, rad)", Table(header, cells))
 
 
-def summary(fit: Result, files: Mapping[str, str]) -> None:
+def print_summary(fit: Result, files: Mapping[str, str]) -> None:
     """Parameters, accuracy, what could not be seen, and where it all is."""
-    table("parameters", estimate_table(fit.estimates))
-    table("accuracy", accuracy_table(fit.comparisons))
+    print_table("parameters", estimate_table(fit.estimates))
+    print_table("accuracy", accuracy_table(fit.comparisons))
     state = "converged" if fit.converged else "NOT converged"
-    lines(
+    print_lines(
         "",
-        f"{state} after {fit.iterations} iterations; {fit.samples} samples; "
+        f"{state} after {fit.iterations} iterations; {fit.n_samples} samples; "
         f"rank {fit.rank} of {len(fit.parameters)}; condition {fit.condition:.3g}",
     )
-    for text in fit.held_back:
-        lines(f"held back: {text}", style="yellow")
+    for text in fit.shrinkage_notes:
+        print_lines(f"held back: {text}", style="yellow")
     for text in fit.unobservable:
-        lines(f"not observable: {text}", style="yellow")
-    for text in fit.weakly_seen:
-        lines(f"weakly seen: {text}", style="yellow")
+        print_lines(f"not observable: {text}", style="yellow")
+    for text in fit.weakly_observable:
+        print_lines(f"weakly seen: {text}", style="yellow")
     for name, path in files.items():
-        lines(f"wrote {name}: {path}")
+        print_lines(f"wrote {name}: {path}")
 
 
-def verdict(fit: Result) -> None:
+def print_verdict(fit: Result) -> None:
     """The headline: last, where the eye is."""
-    lines(*setbacks(fit.comparisons), style="yellow")
-    lines("", headline(fit.comparisons).text, style="bold")
+    print_lines(*regressions(fit.comparisons), style="yellow")
+    print_lines("", headline(fit.comparisons).text, style="bold")
 
 
-def trials(found: Sequence[Trial]) -> None:
+def print_trials(found: Sequence[FamilyTrial]) -> None:
     """What each family of joints' transmission errors brought, or would bring."""
     if not found:
         return
     title = "extensions: error on left-out regions of joint space, in standard deviations"
-    table(title, trial_table(found))
+    print_table(title, trial_table(found))
 
 
-def hint(text: str) -> None:
+def print_hint(text: str) -> None:
     """What one might try next, if anything."""
     if text:
-        lines(f"hint: {text}", style="yellow")
+        print_lines(f"hint: {text}", style="yellow")
 
 
 def open_page(path: str) -> None:
@@ -176,19 +176,19 @@ def open_page(path: str) -> None:
 def open_url(url: str) -> None:
     """Shows an address in the browser, or says it."""
     if not webbrowser.open(url):
-        lines(f"no browser here; open {url}")
+        print_lines(f"no browser here; open {url}")
 
 
-def validation(title: str, found: Mapping[str, Mapping[str, Any]]) -> None:
+def print_validation(title: str, found: Mapping[str, Mapping[str, Any]]) -> None:
     """Accuracies of a model on data, by what was done before."""
     rows = []
-    for group, end in ENDINGS.items():
-        for key, word in MEASURES.items():
+    for group, end in UNIT_SUFFIXES.items():
+        for key, word in STATISTIC_LABELS.items():
             name, spread = f"{group}_{key}{end}", f"{group}_rms_std{end}"
             cells = [
-                shown(one[name], end.strip("_") or "m", one[spread], small=True)
+                format_quantity(one[name], end.strip("_") or "m", one[spread], small=True)
                 for one in found.values()
                 if name in one
             ]
-            rows += [[f"{WORDS[group]}, {word}", *cells]] if cells else []
-    table(title, Table(["error", *found], rows))
+            rows += [[f"{GROUP_LABELS[group]}, {word}", *cells]] if cells else []
+    print_table(title, Table(["error", *found], rows))

@@ -13,10 +13,10 @@ from .. import formatting
 from .._typing import PathLike
 from ..calibration import summary
 from ..exceptions import DhcalError
-from ..io.atomic import save
+from ..io.atomic import write_files
 from ..io.robot import urdf_files
-from ..io.shipped_files import paper_file
-from ..paper.experiment import Experiment, run_experiment
+from ..io.shipped_files import shipped_file
+from ..paper.experiment import PaperExperiment, run_experiment
 from ..paper.simulations import (
     SEEDS,
     SIMULATION_HEADER,
@@ -25,24 +25,24 @@ from ..paper.simulations import (
     simulation_rows,
 )
 from ..report import html
-from ..report.document import Provenance, fingerprints, json_text, result_to_dict
+from ..report.document import Provenance, file_digests, json_text, result_to_dict
 from ..visualization.scene import scene_html
 from . import console
-from .options import check_outputs, emit
+from .options import require_writable_outputs, write_json
 
 
 def demo(args: Namespace) -> int:
     """The paper's arm, end to end."""
-    check_outputs([args.json], [])
+    require_writable_outputs([args.json], [])
     document = run(args.out)
-    emit(args.json, document)
+    write_json(args.json, document)
     if args.open:
         console.open_page(document["files"]["report"])
     return 0
 
 
 # --- the command -----------------------------------------------------------------------------------
-def _verdict(found: Experiment) -> list[str]:
+def _verdict(found: PaperExperiment) -> list[str]:
     mm = {key: f"{1e3 * value:.1f} mm" for key, value in found.figures.items()}
     count, unknown = 3 * len(found.data.q), len(found.fit.parameters)
     missed = mm["published_parameters"]
@@ -50,7 +50,7 @@ def _verdict(found: Experiment) -> list[str]:
         f"{len(found.data.q)} points do not determine the parameters: {count} readings stand against "
         f"{unknown} unknowns, and a point that was left out is missed by {mm['least_squares_left_out']} "
         f"where fitted ones are missed by {mm['least_squares']}.",
-        f"{' and '.join(found.held)} cannot be seen from these positions at the nominal arm, and were held.",
+        f"{' and '.join(found.fixed)} cannot be seen from these positions at the nominal arm, and were held.",
         "The published parameters (Table 4) do not reproduce the measurements of Table 5: with them the "
         f"model misses the measured points by {missed} RMS, the nominal one by {mm['before']}. "
         "Nothing here was adjusted to match them.",
@@ -65,22 +65,22 @@ def run(out: PathLike) -> dict[str, Any]:
     except OSError as error:
         raise DhcalError(f"{folder}: cannot make this folder: {error.strerror}") from error
     found = run_experiment()
-    console.findings("Table 5", found.findings)
+    console.print_unreachable_rows("Table 5", found.findings)
     header = ["position RMS in mm", "fitted", "left one out"]
     title = f"The experiment, {len(found.data.q)} of {len(found.readings.data.q)} rows"
     verdict = formatting.Table(header, found.rows)
-    console.table(title, verdict)
+    console.print_table(title, verdict)
     parameters = summary.estimate_table(found.fit.estimates)
-    console.table("Parameters, least squares", parameters)
-    console.lines("", *_verdict(found))
+    console.print_table("Parameters, least squares", parameters)
+    console.print_lines("", *_verdict(found))
     rows = simulation_rows()
     simulation_title = (
         f"The simulations: worst of {TESTS} test poses in mm by iteration, median of {SEEDS} seeds; how many "
         "end with an exact fit, and how many with the true parameters"
     )
     simulations = formatting.Table(SIMULATION_HEADER, rows)
-    console.table(simulation_title, simulations)
-    console.lines(*SIMULATION_REMARKS)
+    console.print_table(simulation_title, simulations)
+    console.print_lines(*SIMULATION_REMARKS)
     urdf = os.path.join(folder, "experiment_calibrated.urdf")
     nominal = os.path.join(folder, "experiment.urdf")
     contents = urdf_files(found.fit.chain, urdf) | {nominal: found.chain.urdf.data}
@@ -92,16 +92,16 @@ def run(out: PathLike) -> dict[str, Any]:
         "scene": os.path.join(folder, "scene.html"),
         "report": os.path.join(folder, "report.html"),
     }
-    inputs = [paper_file("experiment.dh.toml"), paper_file("experiment_table5.csv")]
-    digests = zip(inputs, fingerprints(inputs).values(), strict=True)
+    inputs = [shipped_file("experiment.dh.toml"), shipped_file("experiment_table5.csv")]
+    digests = zip(inputs, file_digests(inputs).values(), strict=True)
     source = Provenance(
         command="dhcal demo",
         inputs={path.name: digest for path, digest in digests},
         names=[inputs[1].name],
         settings={"parameters": "dh"},
-        left_out={inputs[1].name: {f.row: f.reason for f in found.findings}},
+        excluded_rows={inputs[1].name: {f.row: f.reason for f in found.findings}},
         remarks=_verdict(found),
-        judged=found.judged,
+        comparison=found.comparison,
     )
     rejected = [finding.row for finding in found.findings]
     document = result_to_dict(found.fit, files, source.inputs, rejected) | {"experiment_m": found.figures}
@@ -123,6 +123,6 @@ def run(out: PathLike) -> dict[str, Any]:
             "",
         ]
     )
-    save(contents)
-    console.lines("", *(f"wrote {path}" for path in files.values()))
+    write_files(contents)
+    console.print_lines("", *(f"wrote {path}" for path in files.values()))
     return document

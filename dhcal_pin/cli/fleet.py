@@ -29,20 +29,20 @@ from typing import Any, get_args
 from .._typing import PathLike
 from ..calibration.procedure import Method
 from ..exceptions import DhcalError
-from ..io.atomic import save
+from ..io.atomic import write_files
 from ..io.robot import robot_name
 from ..io.sidecar import sidecar_path
 from ..io.tabular import csv_text, read_toml
 from ..report.document import json_text
 from . import console
 from .job import Job
-from .options import STDOUT, check_outputs, emit
+from .options import STDOUT, require_writable_outputs, write_json
 
-OK, OPEN, FAILED = "ok", "not converged", "failed"
+OK, NOT_CONVERGED, FAILED = "ok", "not converged", "failed"
 
 
 @dataclass(frozen=True)
-class Entry:
+class FleetJob:
     """One robot of a fleet: what it is called, and its job with paths relative to the manifest."""
 
     name: str
@@ -50,7 +50,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class FleetJobOutcome:
     """How a robot of a fleet came out.
 
     Attributes:
@@ -68,7 +68,7 @@ class Outcome:
 Run = Callable[[Job], Mapping[str, Any]]
 
 
-def read_fleet(path: PathLike) -> list[Entry]:
+def read_fleet(path: PathLike) -> list[FleetJob]:
     """The robots of a manifest.
 
     Raises:
@@ -89,8 +89,8 @@ def read_fleet(path: PathLike) -> list[Entry]:
             if not options.get(key):
                 raise DhcalError(f"{where}: no {key}; every [[job]] needs robot, data and output")
         job = Job(**options)
-        entries.append(Entry(str(name or robot_name(job.robot)), job))
-    _check_apart(entries, path)
+        entries.append(FleetJob(str(name or robot_name(job.robot)), job))
+    _require_distinct_files(entries, path)
     return entries
 
 
@@ -120,11 +120,11 @@ def _option(key: str, value: Any, where: str) -> Any:
     return value
 
 
-def _check_apart(entries: Sequence[Entry], path: PathLike) -> None:
+def _require_distinct_files(entries: Sequence[FleetJob], path: PathLike) -> None:
     """Complains about a file that one job writes and another one writes or reads."""
     folder = os.path.dirname(os.path.abspath(path))
     jobs = [entry.job for entry in entries]
-    written = [(i, p) for i, job in enumerate(jobs, 1) for p in _written(job)]
+    written = [(i, p) for i, job in enumerate(jobs, 1) for p in _output_paths(job)]
     read = [(i, p) for i, job in enumerate(jobs, 1) for p in (job.robot, *job.data)]
     writer: dict[str, int] = {}
 
@@ -136,30 +136,34 @@ def _check_apart(entries: Sequence[Entry], path: PathLike) -> None:
             )
 
     for number, place in written:
-        check(number, place, writer.setdefault(_whole(folder, place), number))
+        check(number, place, writer.setdefault(_absolute(folder, place), number))
     for number, place in read:
-        check(number, place, writer.get(_whole(folder, place), number))
+        check(number, place, writer.get(_absolute(folder, place), number))
 
 
-def _whole(folder: str, place: str) -> str:
+def _absolute(folder: str, place: str) -> str:
     return os.path.realpath(os.path.join(folder, place))
 
 
-def _written(job: Job) -> list[str]:
+def _output_paths(job: Job) -> list[str]:
     kept = (job.output, sidecar_path(job.output), job.map, job.json, *job.report)
     return [place for place in kept if place]
 
 
-def places(entries: Sequence[Entry], path: PathLike) -> list[str]:
+def file_paths(entries: Sequence[FleetJob], path: PathLike) -> list[str]:
     """Paths of the files that a fleet reads or writes, seen from here."""
     folder = os.path.dirname(os.fspath(path))
-    every = [place for e in entries for place in (e.job.robot, *e.job.data, *_written(e.job))]
+    every = [place for e in entries for place in (e.job.robot, *e.job.data, *_output_paths(e.job))]
     return [os.path.join(folder, place) for place in every]
 
 
 def run_fleet(
-    entries: Sequence[Entry], path: PathLike, run: Run, workers: int, done: Callable[[int, Outcome], None]
-) -> list[Outcome]:
+    entries: Sequence[FleetJob],
+    path: PathLike,
+    run: Run,
+    workers: int,
+    done: Callable[[int, FleetJobOutcome], None],
+) -> list[FleetJobOutcome]:
     """Calibrates every robot, in processes that work in the manifest's folder; one failure stops no other.
 
     Args:
@@ -170,14 +174,14 @@ def run_fleet(
         done: called with a robot's number and outcome as soon as it is known.
     """
     folder = os.path.dirname(os.path.abspath(path))
-    out: dict[int, Outcome] = {}
+    out: dict[int, FleetJobOutcome] = {}
 
     def gather(numbers: Sequence[int], count: int) -> list[int]:
         """Runs some robots; returns those whose process died, or that waited for one that did."""
         lost = []
         # A fresh interpreter each: forking a process with threads can hang.
         context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(count, context, initializer=_enter, initargs=(folder,))
+        pool = ProcessPoolExecutor(count, context, initializer=_initialize_process, initargs=(folder,))
         try:
             futures = {pool.submit(_work, run, entries[number].job): number for number in numbers}
             for future in as_completed(futures):
@@ -195,32 +199,32 @@ def run_fleet(
     for number in sorted(gather(range(len(entries)), min(workers, len(entries)))):
         # One of them brought its process down; alone, it cannot harm the others.
         if gather([number], 1):
-            out[number] = Outcome(FAILED, "its process was killed, perhaps for want of memory")
+            out[number] = FleetJobOutcome(FAILED, "its process was killed, perhaps for want of memory")
             done(number, out[number])
     return [out[number] for number in range(len(entries))]
 
 
-def _enter(folder: str) -> None:
+def _initialize_process(folder: str) -> None:
     """Readies a process: paths are relative to the manifest, and an interrupt only ends a job."""
     os.chdir(folder)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _work(run: Run, job: Job) -> Outcome:
+def _work(run: Run, job: Job) -> FleetJobOutcome:
     """One job in its process."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         document = run(job)
-        doubts = [
-            f"{path}: check: {text}" for path, texts in document.get("doubts", {}).items() for text in texts
-        ]
-        return Outcome(OK if document["converged"] else OPEN, "; ".join(doubts), document)
+        doubts = [f"warning: {text}" for text in document.get("warnings", [])]
+        return FleetJobOutcome(OK if document["converged"] else NOT_CONVERGED, "; ".join(doubts), document)
     except DhcalError as error:
-        return Outcome(FAILED, " ".join(str(error).split()))
+        return FleetJobOutcome(FAILED, " ".join(str(error).split()))
     except KeyboardInterrupt:
-        return Outcome(FAILED, "interrupted; nothing written")
+        return FleetJobOutcome(FAILED, "interrupted; nothing written")
     except Exception as error:  # A defect in one robot's run must not lose the others'.
-        return Outcome(FAILED, f"{type(error).__name__}: {' '.join(str(error).split())}; please report it")
+        return FleetJobOutcome(
+            FAILED, f"{type(error).__name__}: {' '.join(str(error).split())}; please report it"
+        )
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
@@ -242,7 +246,7 @@ _FIGURES = ("iterations", "samples", "samples_holdout", "rank", "parameters_tota
 def run(args: Namespace, calibrate: Run) -> int:
     """Calibrates the robots of a manifest; 0 all done, 1 some failed. `calibrate` does one of them."""
     plain = Job(args.robot, (), args.output, json=args.json)
-    told = Job.of(args)
+    told = Job.from_args(args)
     if args.data:
         raise DhcalError(f"{args.data[0]}: beside a manifest; the data stand in its [[job]] tables")
     for option in fields(Job):
@@ -254,37 +258,37 @@ def run(args: Namespace, calibrate: Run) -> int:
     if not args.output.lower().endswith(".csv"):
         raise DhcalError(f"{args.output}: the summary of a fleet is a table; name a .csv file")
     entries = read_fleet(args.robot)
-    check_outputs([args.output, args.json], [args.robot, *places(entries, args.robot)])
+    require_writable_outputs([args.output, args.json], [args.robot, *file_paths(entries, args.robot)])
     width = max(len(entry.name) for entry in entries)
     total, count = len(entries), 0
 
-    def done(number: int, outcome: Outcome) -> None:
+    def done(number: int, outcome: FleetJobOutcome) -> None:
         nonlocal count
         count += 1
         style = "" if outcome.status == "ok" else "red" if outcome.status == FAILED else "yellow"
         line = f"{count:{len(str(total))}} of {total}  {entries[number].name:{width}}  {_line(outcome)}"
-        console.lines(line, style=style)
+        console.print_lines(line, style=style)
         if outcome.status != FAILED and outcome.message:
-            console.lines(f"        {outcome.message}", style="yellow")
+            console.print_lines(f"        {outcome.message}", style="yellow")
 
     try:
         found = run_fleet(entries, args.robot, calibrate, args.jobs or os.cpu_count() or 1, done)
     except KeyboardInterrupt:
-        console.lines(f"dhcal: interrupted; {count} of {total} robots are done; no summary written")
+        console.print_lines(f"dhcal: interrupted; {count} of {total} robots are done; no summary written")
         return 130
     contents: dict[PathLike, str | bytes] = {args.output: summary_text(entries, found)}
     document = _document(entries, found)
     if args.json and args.json != STDOUT:
         contents[args.json] = json_text(document)
-    save(contents)
+    write_files(contents)
     if args.json == STDOUT:
-        emit(args.json, document)
+        write_json(args.json, document)
     failed = sum(outcome.status == FAILED for outcome in found)
-    console.lines(f"{total - failed} of {total} robots calibrated", f"wrote {args.output}")
+    console.print_lines(f"{total - failed} of {total} robots calibrated", f"wrote {args.output}")
     return 1 if failed else 0
 
 
-def _line(outcome: Outcome) -> str:
+def _line(outcome: FleetJobOutcome) -> str:
     """A robot's outcome for people: the error held out, or that of the fit where nothing is."""
     if outcome.status == FAILED:
         return f"failed: {outcome.message}"
@@ -300,7 +304,7 @@ def _line(outcome: Outcome) -> str:
     return f"{', '.join(parts)} {'held out' if held else 'as fitted'}; {outcome.status}"
 
 
-def summary_text(entries: Sequence[Entry], found: Sequence[Outcome]) -> str:
+def summary_text(entries: Sequence[FleetJob], found: Sequence[FleetJobOutcome]) -> str:
     """The CSV of a fleet, a row a robot; empty where a robot failed or has no such figure."""
     rows = []
     for entry, outcome in zip(entries, found, strict=True):
@@ -315,7 +319,7 @@ def summary_text(entries: Sequence[Entry], found: Sequence[Outcome]) -> str:
     return csv_text({name: [row[name] for row in rows] for name in rows[0]})
 
 
-def _document(entries: Sequence[Entry], found: Sequence[Outcome]) -> dict[str, Any]:
+def _document(entries: Sequence[FleetJob], found: Sequence[FleetJobOutcome]) -> dict[str, Any]:
     """The fleet as JSON: every robot's document, or why it failed."""
     jobs = [
         {"name": entry.name, "robot": entry.job.robot, "output": entry.job.output}

@@ -15,7 +15,7 @@ MANIFEST = ".fleet.toml"
 
 
 # Where a job writes, which changes nothing about what it finds.
-_PLACES = ("output", "in_place", "report", "json", "map")
+_OUTPUTS = ("output", "in_place", "report", "json", "map")
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Job:
     map: str | None = None
 
     @classmethod
-    def of(cls, args: Namespace) -> Job:
+    def from_args(cls, args: Namespace) -> Job:
         """The job that a command line asks for."""
         values: dict[str, Any] = {}
         for option in fields(cls):
@@ -74,7 +74,7 @@ class Job:
         words = ["dhcal", "calibrate", *(names.get(path, path) for path in (self.robot, *self.data))]
         for option in fields(self):
             value = getattr(self, option.name)
-            if option.name not in (*_PLACES, "robot", "data") and value != option.default:
+            if option.name not in (*_OUTPUTS, "robot", "data") and value != option.default:
                 flag = f"--{option.name.replace('_', '-')}"
                 words += [flag] if value is True else [flag, names.get(str(value), str(value))]
         return shlex.join(words)

@@ -7,48 +7,48 @@ import sys
 from collections.abc import Sequence
 
 from ..exceptions import DhcalError
-from ..io.atomic import check_place, save
+from ..io.atomic import require_writable, write_files
 from ..io.sidecar import existing_sidecar
 from ..report import document
 
 STDOUT = "-"
 
 
-def names(text: str) -> list[str]:
+def split_commas(text: str) -> list[str]:
     """The entries of a comma-separated option."""
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
-def same(a: str, b: str) -> bool:
+def is_same_file(a: str, b: str) -> bool:
     """Whether two paths are one file, there or not."""
     if os.path.exists(a) and os.path.exists(b):
         return os.path.samefile(a, b)
     return os.path.realpath(a) == os.path.realpath(b)
 
 
-def check_outputs(outputs: Sequence[str | None], inputs: Sequence[str]) -> None:
+def require_writable_outputs(outputs: Sequence[str | None], inputs: Sequence[str]) -> None:
     """Complains about an output that cannot be written, or would write over an input or another output."""
     paths = [path for path in outputs if path and path != STDOUT]
     for number, path in enumerate(paths):
-        if any(same(path, other) for other in inputs):
+        if any(is_same_file(path, other) for other in inputs):
             raise DhcalError(f"{path}: is an input; name another output")
-        if any(same(path, other) for other in paths[:number]):
+        if any(is_same_file(path, other) for other in paths[:number]):
             raise DhcalError(f"{path}: is another output already; name a second file")
-        check_place(path)
+        require_writable(path)
 
 
-def check_urdf_ending(path: str, other: str = "") -> None:
+def require_urdf_ending(path: str, other: str = "") -> None:
     """Complains about a path of a URDF to write that does not end like one; `other` is what else could be."""
     if not path.lower().endswith(".urdf"):
         raise DhcalError(f"{path}: unknown ending; write a URDF as .urdf {other}".rstrip())
 
 
-def emit(target: str | None, content: object) -> None:
+def write_json(target: str | None, content: object) -> None:
     """JSON to a file, or alone on stdout for `-`."""
     if target == STDOUT:
         sys.stdout.write(document.json_text(content))
     elif target:
-        save({target: document.json_text(content)})
+        write_files({target: document.json_text(content)})
 
 
 def sidecars(robots: Sequence[str]) -> list[str]:

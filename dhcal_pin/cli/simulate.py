@@ -10,7 +10,7 @@ from argparse import Namespace
 import numpy as np
 
 from ..exceptions import DhcalError
-from ..io.atomic import save
+from ..io.atomic import write_files
 from ..io.measurement_csv import measurement_text
 from ..io.robot import is_table, read_robot
 from ..measurements import KINDS
@@ -18,13 +18,13 @@ from ..measurements.base import Noise
 from ..robot.sampling import joint_range
 from ..units import parse_noise
 from . import console
-from .options import check_outputs, sidecars
+from .options import require_writable_outputs, sidecars
 
 
 def simulate(args: Namespace) -> int:
     """Measurements of a robot that is known to be wrong."""
     robots = [args.robot, *([args.truth] if args.truth else [])]
-    check_outputs([args.output], [*robots, *sidecars(robots)])
+    require_writable_outputs([args.output], [*robots, *sidecars(robots)])
     noise = Noise(*parse_noise(args.noise))
     if args.kind not in KINDS:
         raise DhcalError(f"--kind {args.kind}: choose from {', '.join(KINDS)}")
@@ -37,9 +37,9 @@ def simulate(args: Namespace) -> int:
                 f"they must be those of {args.robot}: {', '.join(chain.joint_names)}"
             )
     rng = np.random.default_rng(args.seed)
-    q = rng.uniform(*joint_range(chain), (args.samples, chain.size))
+    q = rng.uniform(*joint_range(chain), (args.samples, chain.n_joints))
     data = KINDS[args.kind].simulate(truth, q, noise, rng)
     comments = [f"simulated {args.kind} of {args.truth or args.robot}, noise {args.noise}, seed {args.seed}"]
-    save({args.output: measurement_text(data, chain, comments)})
-    console.lines(f"wrote {args.output}")
+    write_files({args.output: measurement_text(data, chain, comments)})
+    console.print_lines(f"wrote {args.output}")
     return 0

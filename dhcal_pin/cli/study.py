@@ -14,34 +14,34 @@ import numpy as np
 
 from ..exceptions import DhcalError
 from ..formatting import Table
-from ..io.atomic import save
-from ..io.shipped_files import paper_file
+from ..io.atomic import write_files
+from ..io.shipped_files import shipped_file
 from ..io.tabular import csv_text, read_text
-from ..parallel import workers
-from ..studies.grid import Setting, Study, read_study
+from ..parallel import open_executor
+from ..studies.grid import Setting, StudyGrid, read_study
 from ..studies.runner import run, table
 from ..visualization.study_plot import plot
 from . import console
-from .options import check_outputs, sidecars
+from .options import require_writable_outputs, sidecars
 
 
 def study(args: Namespace) -> int:
     """Runs a study, or what is left of it."""
     given = os.path.exists(args.study) or args.study.endswith(".toml")
-    path = args.study if given else paper_file(f"{args.study}.study.toml")
+    path = args.study if given else shipped_file(f"{args.study}.study.toml")
     journal = f"{args.output}.part"
     picture = f"{os.path.splitext(args.output)[0]}.svg"
     wanted = read_study(path)
     inputs = [os.fspath(path), *wanted.robots, *sidecars(wanted.robots)]
-    check_outputs([args.output, journal, picture], inputs)
+    require_writable_outputs([args.output, journal, picture], inputs)
     blocks = _resumed(journal, wanted)
     total = len(wanted.tasks())
     if blocks:
-        console.lines(f"{journal}: goes on after {len(blocks)} of {total} blocks")
+        console.print_lines(f"{journal}: goes on after {len(blocks)} of {total} blocks")
     try:
         with (
-            workers(args.jobs, args.scheduler) as where,
-            console.counted(wanted.title or "study", total, len(blocks)) as progress,
+            open_executor(args.jobs, args.scheduler) as where,
+            console.progress_bar(wanted.title or "study", total, len(blocks)) as progress,
             _opened(journal, wanted, blocks) as file,
         ):
             for block in run(wanted, len(blocks), where):
@@ -52,20 +52,20 @@ def study(args: Namespace) -> int:
                 progress(len(blocks))
     except KeyboardInterrupt:
         kept = f"{journal} keeps {len(blocks)} of {total} blocks, and the same command goes on from there"
-        console.lines(f"dhcal: interrupted; {kept}")
+        console.print_lines(f"dhcal: interrupted; {kept}")
         return 130
     header, rows = table(wanted, blocks)
     drawn = plot(wanted.title or "study", len(fields(Setting)), header, rows)
     columns = dict(zip(header, zip(*rows, strict=True), strict=True))
     contents = {args.output: csv_text(columns)} | ({picture: drawn} if drawn else {})
-    save(contents)
+    write_files(contents)
     os.unlink(journal)
     _shown(wanted, header, rows)
-    console.lines(*(f"wrote {path}" for path in contents))
+    console.print_lines(*(f"wrote {path}" for path in contents))
     return 0
 
 
-def _resumed(journal: str, wanted: Study) -> list[list[list[float]]]:
+def _resumed(journal: str, wanted: StudyGrid) -> list[list[list[float]]]:
     """The blocks that a run before this one finished."""
     if not os.path.exists(journal):
         return []
@@ -82,13 +82,13 @@ def _resumed(journal: str, wanted: Study) -> list[list[list[float]]]:
     return blocks
 
 
-def _opened(journal: str, wanted: Study, blocks: Sequence[list[list[float]]]) -> TextIO:
+def _opened(journal: str, wanted: StudyGrid, blocks: Sequence[list[list[float]]]) -> TextIO:
     """The journal with its whole lines, to be written on."""
-    save({journal: "".join(f"{line}\n" for line in (wanted.digest, *map(json.dumps, blocks)))})
+    write_files({journal: "".join(f"{line}\n" for line in (wanted.digest, *map(json.dumps, blocks)))})
     return open(journal, "a", encoding="utf-8")
 
 
-def _shown(wanted: Study, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+def _shown(wanted: StudyGrid, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     """The settings that differ, and the figures, in mm and degrees."""
     count = len(fields(Setting))
     varied = [i for i in range(count) if len({row[i] for row in rows}) > 1]
@@ -100,4 +100,4 @@ def _shown(wanted: Study, header: Sequence[str], rows: Sequence[Sequence[Any]]) 
         for row in rows
     ]
     title = f"{wanted.title or 'study'}: medians of {wanted.seeds} calibrations a line"
-    console.table(title, Table([names[i] for i in (*varied, *told)], lines, texts=len(varied)))
+    console.print_table(title, Table([names[i] for i in (*varied, *told)], lines, n_text_columns=len(varied)))

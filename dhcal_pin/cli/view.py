@@ -9,7 +9,7 @@ from argparse import Namespace
 import numpy as np
 
 from ..exceptions import DhcalError
-from ..io.atomic import save
+from ..io.atomic import write_files
 from ..io.measurement_csv import read_measurements
 from ..io.robot import is_table, read_robot, robot_name
 from ..io.sidecar import existing_sidecar, read_instrument, read_uncertainty
@@ -17,7 +17,7 @@ from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from ..visualization import scene
 from . import console
-from .options import check_outputs, sidecars
+from .options import require_writable_outputs, sidecars
 
 
 def view(args: Namespace) -> int:
@@ -27,7 +27,7 @@ def view(args: Namespace) -> int:
     given = [args.nominal, *([args.calibrated] if args.calibrated else [])]
     beside = sidecars(given)
     page = args.html or os.path.join(tempfile.mkdtemp(prefix="dhcal-"), f"{robot_name(args.nominal)}.html")
-    check_outputs([page], [*given, *beside, *args.data])
+    require_writable_outputs([page], [*given, *beside, *args.data])
     arms = [read_robot(path, None if is_table(path) else args.tip) for path in given]
     data = [read_measurements(path, arms[0]) for path in args.data]
     if args.live:
@@ -42,8 +42,8 @@ def view(args: Namespace) -> int:
         magnification=args.magnification,
         triangles=args.simplify,
     )
-    save({page: text})
-    console.lines(f"wrote {page}")
+    write_files({page: text})
+    console.print_lines(f"wrote {page}")
     if args.open or not args.html:
         console.open_page(page)
     return 0
@@ -55,9 +55,9 @@ def _live(arms: list[Chain], data: list[Measurement], args: Namespace) -> int:
         live,  # MeshCat's Python side takes half a second to import
     )
 
-    poses = np.concatenate([item.configurations() for item in data] or [np.zeros((1, arms[0].size))])
+    poses = np.concatenate([item.configurations() for item in data] or [np.zeros((1, arms[0].n_joints))])
     with live.serve(*arms, magnification=args.magnification, triangles=args.simplify) as scene:
-        console.lines(f"live at {scene.url}; end with Ctrl-C")
+        console.print_lines(f"live at {scene.url}; end with Ctrl-C")
         console.open_url(scene.url)
         try:
             while True:

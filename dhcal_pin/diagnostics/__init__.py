@@ -1,19 +1,19 @@
 """Diagnostics: checks of the input before a fit, and of the residuals after it."""
 
-from .column_mixups import mixed_up
-from .input_checks import doubts, misfits
-from .reachability import Finding, screen
-from .residuals import joint_traces, outliers
+from .column_mixups import diagnose_mixups
+from .input_checks import find_input_warnings, poorly_fitted_files
+from .reachability import UnreachableRow, find_unreachable_rows
+from .residuals import joint_offset_profiles, outliers
 from .workspace import WorkspaceMap, workspace_map
 
 __all__ = [
-    "Finding",
+    "UnreachableRow",
     "WorkspaceMap",
-    "doubts",
-    "joint_traces",
-    "misfits",
-    "mixed_up",
+    "diagnose_mixups",
+    "find_input_warnings",
+    "find_unreachable_rows",
+    "joint_offset_profiles",
     "outliers",
-    "screen",
+    "poorly_fitted_files",
     "workspace_map",
 ]

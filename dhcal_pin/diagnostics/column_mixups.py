@@ -14,51 +14,51 @@ import numpy as np
 
 from .. import se3
 from .._typing import Array
-from ..calibration.initialization import few, starts
+from ..calibration.initialization import candidate_frames, subsample
 from ..measurements.base import Measurement
-from ..measurements.position import Position, Targets
+from ..measurements.position import MultiTargetPosition, Position
 from ..robot.chain import Chain
 from ..se3 import nearest_rotation
 
 # So much of the positions' spread may stay unexplained by a nominal arm, and in any case so many metres;
 # so much by no arm but another.
-_NOMINAL, _NEAR, _FOREIGN = 0.05, 0.01, 0.2
+_MAX_NOMINAL_MISFIT, _MAX_NOMINAL_MISFIT_M, _WRONG_ROBOT_MISFIT = 0.05, 0.01, 0.2
 
 
 # A guess is one if it leaves so many times less; others that leave as little are told beside it.
-_BETTER, _ALIKE = 4.0, 1.5
+_MIN_IMPROVEMENT, _MAX_TIE_RATIO = 4.0, 1.5
 
 
 # Fewer positions fit too many guesses.
-_ENOUGH = 10
+_MIN_POSITIONS = 10
 
 
 # Positions that the arm is tried on, and that a guess is.
 _SAMPLE, _PROBES = 100, 40
 
 
-_ROUNDS, _FOLLOWED = 12, 3
+_ROUNDS, _MAX_SOLUTIONS = 12, 3
 
 
 # Positions so many times as far from their middle as is usual are gross errors.
-_GROSS = 5.0
+_OUTLIER_RATIO = 5.0
 
 
-def spread(points: Array) -> float:
+def median_radius(points: Array) -> float:
     """The usual distance of points (m, 3) from their middle, whatever a few of them are."""
     return float(np.median(np.linalg.norm(points - np.median(points, 0), axis=1)))
 
 
-def unexplained(chain: Chain, q: Array, seen: Array) -> float:
+def position_misfit(chain: Chain, q: Array, seen: Array) -> float:
     """The usual distance in m of positions (m, 3) from an arm's at q (m, n), base and tool placed to fit."""
-    begun = starts(chain, (few(Position.of(q, seen)),), base=True, tool=True)
-    return min(_settled(start, q, seen) for start in begun)
+    begun = candidate_frames(chain, (subsample(Position.from_arrays(q, seen)),), base=True, tool=True)
+    return min(_fit_from(start, q, seen) for start in begun)
 
 
-def _settled(start: Chain, q: Array, seen: Array) -> float:
+def _fit_from(start: Chain, q: Array, seen: Array) -> float:
     """The same from one start, by reweighted Gauss-Newton steps on base and target."""
     base, offset = start.base, start.tool[:3, 3]
-    tip = start.framed(np.eye(4), np.eye(4)).poses(q)
+    tip = start.with_base_and_tool(np.eye(4), np.eye(4)).poses(q)
     usual = np.inf
     for _ in range(_ROUNDS):
         turn = base[:3, :3] @ tip[:, :3, :3]
@@ -75,7 +75,7 @@ def _settled(start: Chain, q: Array, seen: Array) -> float:
     return usual
 
 
-def misturned(modelled: Array, seen: Array) -> float:
+def orientation_misfit(modelled: Array, seen: Array) -> float:
     """The usual angle in rad of rotations (m, 3, 3) from an arm's (m, 3, 3), base and target turned to fit.
 
     Both enter a Kronecker product linearly (Shah, J. Mechanisms Robotics 5, 2013); its best few solutions,
@@ -83,7 +83,7 @@ def misturned(modelled: Array, seen: Array) -> float:
     """
     product = np.einsum("mij,mkl->ikjl", seen, modelled).reshape(9, 9)
     usual = np.inf
-    for found in np.linalg.svd(product)[0].T[:_FOLLOWED].reshape(-1, 3, 3):
+    for found in np.linalg.svd(product)[0].T[:_MAX_SOLUTIONS].reshape(-1, 3, 3):
         base, tool = nearest_rotation(found * np.sign(np.linalg.det(found))), np.eye(3)
         for _ in range(_ROUNDS):
             tool = nearest_rotation(np.sum(np.swapaxes(base @ modelled, 1, 2) @ seen, 0))
@@ -94,69 +94,69 @@ def misturned(modelled: Array, seen: Array) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Guess:
+class MixupHypothesis:
     """What may have been mixed up.
 
     Attributes:
-        words: what is otherwise than in the file.
+        description: what is otherwise than in the file.
         check: what to look at then.
-        q, seen: joint values (m, n) and positions (m, 3) without the mistake.
+        q, positions: joint values (m, n) and positions (m, 3) without the mistake.
     """
 
-    words: str
+    description: str
     check: str
     q: Array
-    seen: Array
+    positions: Array
 
 
-def _guesses(chain: Chain, data: Measurement, index: Array) -> Iterator[Guess]:
+def _hypotheses(chain: Chain, data: Measurement, index: Array) -> Iterator[MixupHypothesis]:
     """What may be otherwise with the rows of an index."""
     every = data.positions()
     q, seen = data.q[index], every[index]
     for step, side in ((-1, "before"), (1, "after")):
         there = (index + step >= 0) & (index + step < len(every))
         words = f"the readings of the row {side}"
-        yield Guess(words, "how rows were put together", q[there], every[index[there] + step])
-    yield Guess("the frame mirrored", "the order and the signs of x, y and z", q, seen * [1, 1, -1])
+        yield MixupHypothesis(words, "how rows were put together", q[there], every[index[there] + step])
+    yield MixupHypothesis("the frame mirrored", "the order and the signs of x, y and z", q, seen * [1, 1, -1])
     for j, name in enumerate(chain.joint_names):
-        one = np.arange(chain.size) == j
-        yield Guess(f"joint {name} moving the other way", "its sign", np.where(one, -q, q), seen)
-        for degrees in (90, -90, 180) if not chain.sliding[j] else ():
+        one = np.arange(chain.n_joints) == j
+        yield MixupHypothesis(f"joint {name} moving the other way", "its sign", np.where(one, -q, q), seen)
+        for degrees in (90, -90, 180) if not chain.is_prismatic[j] else ():
             words = f"{degrees} deg added to joint {name}"
-            yield Guess(words, "its zero", q + np.deg2rad(degrees) * one, seen)
-    for i, j in combinations(range(chain.size), 2):
-        if chain.sliding[i] == chain.sliding[j]:
-            order = np.arange(chain.size)
+            yield MixupHypothesis(words, "its zero", q + np.deg2rad(degrees) * one, seen)
+    for i, j in combinations(range(chain.n_joints), 2):
+        if chain.is_prismatic[i] == chain.is_prismatic[j]:
+            order = np.arange(chain.n_joints)
             order[[i, j]] = j, i
             words = f"joints {chain.joint_names[i]} and {chain.joint_names[j]} in each other's place"
-            yield Guess(words, "the joints' order", q[:, order], seen)
+            yield MixupHypothesis(words, "the joints' order", q[:, order], seen)
 
 
-def mixed_up(chain: Chain, data: Measurement) -> list[str]:
+def diagnose_mixups(chain: Chain, data: Measurement) -> list[str]:
     """A sentence on positions that do not fit the arm, and on what would; none for most files."""
-    if isinstance(data, Targets):
+    if isinstance(data, MultiTargetPosition):
         data = data.take(data.label == np.bincount(data.label).argmax())
-    if len(data.positions()) < _ENOUGH:
+    if len(data.positions()) < _MIN_POSITIONS:
         return []
     every = data.positions()
     near = np.linalg.norm(every - np.median(every, 0), axis=1)
     # Gross errors would draw the frames away.
-    rows = np.flatnonzero(near <= _GROSS * np.median(near))
+    rows = np.flatnonzero(near <= _OUTLIER_RATIO * np.median(near))
     index = np.sort(np.random.default_rng(0).permutation(rows)[:_SAMPLE])
     q, seen = data.q[index], every[index]
-    size, left = spread(seen), unexplained(chain, q, seen)
-    if left <= max(_NOMINAL * size, _NEAR):
+    size, left = median_radius(seen), position_misfit(chain, q, seen)
+    if left <= max(_MAX_NOMINAL_MISFIT * size, _MAX_NOMINAL_MISFIT_M):
         return []
     off = f"the positions are usually {1e3 * left:.3g} mm off this arm wherever instrument and target are"
-    guesses = _guesses(chain, data, np.sort(np.random.default_rng(1).permutation(index)[:_PROBES]))
-    found = [(unexplained(chain, guess.q, guess.seen), guess) for guess in guesses]
+    guesses = _hypotheses(chain, data, np.sort(np.random.default_rng(1).permutation(index)[:_PROBES]))
+    found = [(position_misfit(chain, guess.q, guess.positions), guess) for guess in guesses]
     best = min(rest for rest, _ in found)
-    if best * _BETTER < left:
-        alike = [guess for rest, guess in found if rest <= _ALIKE * best]
+    if best * _MIN_IMPROVEMENT < left:
+        alike = [guess for rest, guess in found if rest <= _MAX_TIE_RATIO * best]
         words, checks = (
-            dict.fromkeys(part) for part in zip(*((g.words, g.check) for g in alike), strict=True)
+            dict.fromkeys(part) for part in zip(*((g.description, g.check) for g in alike), strict=True)
         )
         return [f"{off}, but {1e3 * best:.3g} mm with {' or '.join(words)}; check {' or '.join(checks)}"]
-    if left > _FOREIGN * size:
+    if left > _WRONG_ROBOT_MISFIT * size:
         return [f"{off}; check robot and tip, units, and the joints' order, signs and zeros"]
     return []

@@ -9,21 +9,21 @@ import numpy as np
 
 from .. import se3
 from .._typing import Array
-from ..calibration.evaluation import deviations, group_of, instrument_values
+from ..calibration.evaluation import compute_errors, error_group, instrument_values
 from ..calibration.result import Result
 from ..estimation.error_model import ErrorModel
 from ..estimation.parameters import offset
 from ..estimation.uncertainty import Predictor
-from ..measurements.base import Measurement, derivatives
+from ..measurements.base import Measurement, whitened_jacobian
 from ..robot.chain import Chain
 from ..robot.sampling import joint_range
 
 # Configurations that the workspace is judged by, and bins that a joint's range is parted into.
-SAMPLES, BINS = 16000, 12
+N_SAMPLES, N_BINS = 16000, 12
 
 
 # A joint that hardly moves the measured point asks for nothing: its error is known worse than this, rad or m.
-LOOSE = 0.02
+MAX_PROFILE_STD = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +41,12 @@ class Outlier:
 
 def outliers(fit: Result) -> list[Outlier]:
     """The gross errors, by item and row."""
-    found = deviations(fit.chain, fit.data, fit.instruments)
+    found = compute_errors(fit.chain, fit.data, fit.instruments)
     out = []
     for i, (item, errors) in enumerate(zip(fit.data, found, strict=True)):
-        score = fit.scores[i]
+        score = fit.studentized_residuals[i]
         for place in np.flatnonzero(np.isin(item.rows, fit.outliers[i])):
-            size = {group_of(name): float(np.linalg.norm(error[place])) for name, error in errors.items()}
+            size = {error_group(name): float(np.linalg.norm(error[place])) for name, error in errors.items()}
             out.append(Outlier(i, int(item.rows[place]), size, float(score[place])))
     return out
 
@@ -55,10 +55,13 @@ def sigmas(fit: Result) -> list[dict[str, float]]:
     """Median standard deviation an axis, m or rad, by group of rows that each fitted item went in with."""
     out = []
     for item, weights in zip(fit.problem.data, fit.weights, strict=True):
-        sweep, u = fit.chain.sweep(item.configurations()), fit.problem.values(item, fit.x)
-        whitened, errors = item.residual(sweep, u), item.errors(sweep, u)
+        frames, u = (
+            fit.chain.forward_kinematics(item.configurations()),
+            fit.problem.instrument_values_of(item, fit.x),
+        )
+        whitened, errors = item.residual(frames, u), item.errors(frames, u)
         found = {}
-        for name, rows in item.groups.items():
+        for name, rows in item.residual_groups.items():
             with np.errstate(divide="ignore", invalid="ignore"):
                 # A robust loss widens the sigmas of single samples; that is no noise of the instrument.
                 ratio = np.abs(errors[name].T / whitened[rows]) * np.sqrt(weights)
@@ -70,12 +73,12 @@ def sigmas(fit: Result) -> list[dict[str, float]]:
 
 # --- by joint --------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
-class JointTrace:
+class JointProfile:
     """What the readings ask of one joint in each part of its range.
 
     Attributes:
         name: of the joint.
-        slides: whether it is prismatic.
+        is_prismatic: whether it is prismatic.
         values: (m,) joint values of the samples, rad or m.
         sizes: (m,) errors of the samples after the calibration, m, or rad where only rotations are measured.
         centres: (b,) middles of the parts with samples.
@@ -84,7 +87,7 @@ class JointTrace:
     """
 
     name: str
-    slides: bool
+    is_prismatic: bool
     values: Array
     sizes: Array
     centres: Array
@@ -94,48 +97,51 @@ class JointTrace:
     after_std: Array
 
 
-def joint_traces(fit: Result) -> list[JointTrace]:
+def joint_offset_profiles(fit: Result) -> list[JointProfile]:
     """Each moving joint's trace over the samples held out, or over the fitted where none are.
 
     Least squares over the joint's own offset in each part of its range, whatever was measured: a wave
     over the range is an error that the joint has and the model lacks. Empty where no reading belongs to
     one configuration.
     """
-    data = [item for item in fit.holdout or fit.counted if item.ends == 1]
+    data = [item for item in fit.holdout or fit.inliers if item.configurations_per_row == 1]
     if not data:
         return []
-    found = deviations(fit.chain, data, fit.instruments)
-    after, before = _asked(fit.chain, data, fit), _asked(fit.reference, data, fit)
+    found = compute_errors(fit.chain, data, fit.instruments)
+    after, before = (
+        _joint_offset_terms(fit.chain, data, fit),
+        _joint_offset_terms(fit.nominal_refitted, data, fit),
+    )
     q = np.concatenate([item.q for item in data])
-    values = q @ fit.chain.mixing.T + fit.chain.shift
+    values = q @ fit.chain.mimic_matrix.T + fit.chain.mimic_offset
     sizes = np.concatenate([np.linalg.norm(next(iter(errors.values())), axis=1) for errors in found])
     out = []
-    for j, name in enumerate(fit.chain.moving):
-        edges = np.linspace(values[:, j].min(), values[:, j].max(), BINS + 1)
-        part = np.clip(np.searchsorted(edges, values[:, j], side="right") - 1, 0, BINS - 1)
-        full = np.array([b for b in range(BINS) if np.sum(part == b) >= 5], int)
+    for j, name in enumerate(fit.chain.moving_joints):
+        edges = np.linspace(values[:, j].min(), values[:, j].max(), N_BINS + 1)
+        part = np.clip(np.searchsorted(edges, values[:, j], side="right") - 1, 0, N_BINS - 1)
+        full = np.array([b for b in range(N_BINS) if np.sum(part == b) >= 5], int)
         rows = np.array(
             [row for pull, weight in (before, after) for row in _slope(pull[j], weight[j], part, full)]
         )
-        told = (rows[1::2] < LOOSE).all(0)
+        told = (rows[1::2] < MAX_PROFILE_STD).all(0)
         centres = 0.5 * (edges[:-1] + edges[1:])[full[told]]
         slides = bool(fit.chain.prismatic[j])
-        out.append(JointTrace(name, slides, values[:, j], sizes, centres, *rows[:, told]))
+        out.append(JointProfile(name, slides, values[:, j], sizes, centres, *rows[:, told]))
     return out
 
 
-def _asked(chain: Chain, data: Sequence[Measurement], fit: Result) -> tuple[Array, Array]:
+def _joint_offset_terms(chain: Chain, data: Sequence[Measurement], fit: Result) -> tuple[Array, Array]:
     """By moving joint and sample (k, m): derivative·residual and derivative·derivative, both whitened."""
-    data = [item.started(chain) for item in data]
+    data = [item.initialized(chain) for item in data]
     values = instrument_values(chain, data, fit.instruments if chain is fit.chain else {})
     errors = ErrorModel(chain, tuple(offset(chain)))
     _, bodies, twists = errors.derivative(np.zeros(len(errors.parameters)))
     pulls, weights = [], []
     for item in data:
-        u = np.array([values[unknown.name] for unknown in item.unknowns])
-        sweep = chain.sweep(item.configurations())
-        residual = item.residual(sweep, u)
-        rows = derivatives(item, sweep, chain.tool_velocities(sweep, bodies, twists), u, residual)
+        u = np.array([values[unknown.name] for unknown in item.instrument_parameters])
+        frames = chain.forward_kinematics(item.configurations())
+        residual = item.residual(frames, u)
+        rows = whitened_jacobian(item, frames, chain.tool_jacobian(frames, bodies, twists), u, residual)
         pulls.append(np.sum(rows * residual, 1))
         weights.append(np.sum(rows**2, 1))
     return np.concatenate(pulls, 1), np.concatenate(weights, 1)
@@ -171,9 +177,9 @@ class Workspace:
 
 def workspace(model: Predictor, data: Sequence[Measurement]) -> Workspace:
     """Predicted accuracy at configurations drawn over the joints' ranges, and at measured samples."""
-    every = np.random.default_rng(0).uniform(*joint_range(model.chain), (SAMPLES, model.chain.size))
-    used = [item.configurations() for item in data if item.ends > 0]
-    there = np.concatenate(used) if used else np.empty((0, model.chain.size))
+    every = np.random.default_rng(0).uniform(*joint_range(model.chain), (N_SAMPLES, model.chain.n_joints))
+    used = [item.configurations() for item in data if item.configurations_per_row > 0]
+    there = np.concatenate(used) if used else np.empty((0, model.chain.n_joints))
     into = se3.inverse(model.chain.base)
 
     def judged(q: Array) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ from .._typing import Array
 from ..calibration.evaluation import position_errors
 from ..estimation.uncertainty import Predictor
 from ..measurements.base import Measurement
-from ..robot.sampling import Room, Space
+from ..robot.sampling import ConfigurationSampler, WorkspaceConstraints
 
 # Configurations that a map is made of, and predictions made at once.
 SAMPLES, CHUNK = 20_000, 2000
@@ -65,7 +65,7 @@ def workspace_map(
         samples: how many configurations.
         seed: of their choice.
     """
-    room = Room.of(model.chain, Space(), 0.0, 0.0)
+    room = ConfigurationSampler.from_chain(model.chain, WorkspaceConstraints(), 0.0, 0.0)
     points, square = _predicted(model, room.draw(samples, np.random.default_rng(seed)))
     q, errors = position_errors(model.chain, data, known)
     there, expected = _predicted(model, q)

@@ -1,34 +1,34 @@
 """Least-squares estimation: error parameters, problem, QR factorization, solvers, robust weights, batches."""
 
-from .batch import Batch, Solutions, solve
-from .error_model import ErrorModel, Parameter
-from .parameters import SETS, select
+from .batch import BatchProblem, BatchResult, solve_batch
+from .error_model import ErrorModel, ErrorParameter
+from .parameters import PARAMETER_SETS, select_parameters
 from .priors import Priors
-from .problem import Problem, reduce
-from .qr import Triangle
+from .problem import Problem, linearize_and_factor
+from .qr import TriangularSystem
 from .robust import LOSSES
-from .solver import METHODS, Progress, Solution, gauss_newton, levenberg_marquardt
+from .solver import METHODS, Progress, SolverResult, gauss_newton, levenberg_marquardt
 from .uncertainty import Prediction, Predictor, Uncertainty
 
 __all__ = [
     "LOSSES",
     "METHODS",
-    "SETS",
-    "Batch",
+    "PARAMETER_SETS",
+    "BatchProblem",
+    "BatchResult",
     "ErrorModel",
-    "Parameter",
+    "ErrorParameter",
     "Prediction",
     "Predictor",
     "Priors",
     "Problem",
     "Progress",
-    "Solution",
-    "Solutions",
-    "Triangle",
+    "SolverResult",
+    "TriangularSystem",
     "Uncertainty",
     "gauss_newton",
     "levenberg_marquardt",
-    "reduce",
-    "select",
-    "solve",
+    "linearize_and_factor",
+    "select_parameters",
+    "solve_batch",
 ]

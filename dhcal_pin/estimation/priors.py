@@ -11,17 +11,17 @@ import numpy as np
 
 from .._typing import Array
 from ..exceptions import DhcalError
-from ..robot.chain import BASE
+from ..robot.chain import BASE_FRAME
 from .error_model import ErrorModel
 from .problem import Problem
-from .qr import posterior_root
-from .solver import Solution
+from .qr import posterior_sqrt_covariance
+from .solver import SolverResult
 
 Priors = Literal["default", "none"] | Mapping[str, float]
 
 
 # Against narrower priors the expected size counts as much as so many errors that were found.
-EXPECTATION = 0.5
+EXPECTATION_COUNT = 0.5
 
 
 def prior_weights(errors: ErrorModel, priors: Priors) -> Array:
@@ -46,7 +46,7 @@ def prior_weights(errors: ErrorModel, priors: Priors) -> Array:
     return 1 / sigma
 
 
-def are_default(errors: ErrorModel, priors: Priors) -> Array:
+def has_default_prior(errors: ErrorModel, priors: Priors) -> Array:
     """Which parameters (p,) have default priors."""
     if isinstance(priors, str):
         return np.full(len(errors.parameters), priors == "default")
@@ -54,27 +54,27 @@ def are_default(errors: ErrorModel, priors: Priors) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Families:
+class PriorGroups:
     """Parameters whose default priors share one scale: those of one unit and one expected size.
 
     Attributes:
         members: (n,) the parameters.
-        family: (n,) which family each is of.
-        expected: (f,) one over the size that a family's errors are expected to have.
-        narrowest: (f,) the largest of those in its unit.
+        group_index: (n,) which family each is of.
+        expected_weights: (f,) one over the size that a family's errors are expected to have.
+        max_weights: (f,) the largest of those in its unit.
     """
 
     members: Array
-    family: Array
-    expected: Array
-    narrowest: Array
+    group_index: Array
+    expected_weights: Array
+    max_weights: Array
 
     @classmethod
-    def of(cls, errors: ErrorModel, expected: Array, default: Array) -> Families:
+    def from_expected(cls, errors: ErrorModel, expected: Array, default: Array) -> PriorGroups:
         """Of parameters (p,) with such expected weights that have default priors."""
-        outside = (BASE, errors.chain.tool_station)
-        inside = [i for i, p in enumerate(errors.parameters) if default[i] and p.station not in outside]
-        units = [(errors.parameters[i].unit, errors.parameters[i].entry is None) for i in inside]
+        outside = (BASE_FRAME, errors.chain.tool_frame_index)
+        inside = [i for i, p in enumerate(errors.parameters) if default[i] and p.error_frame not in outside]
+        units = [(errors.parameters[i].unit, errors.parameters[i].coefficient_index is None) for i in inside]
         sizes = list(zip(units, expected[inside].tolist(), strict=True))
         families = list(dict.fromkeys(sizes))
         narrowest = [max(weight for unit, weight in families if unit == mine) for mine, _ in families]
@@ -87,10 +87,13 @@ class Families:
 
     def groups(self) -> list[tuple[list[int], float]]:
         """The members of each and its expected weight."""
-        return [(self.members[self.family == i].tolist(), w) for i, w in enumerate(self.expected.tolist())]
+        return [
+            (self.members[self.group_index == i].tolist(), w)
+            for i, w in enumerate(self.expected_weights.tolist())
+        ]
 
 
-def rescaled(problem: Problem, solution: Solution, families: Families) -> Array:
+def update_prior_scales(problem: Problem, solution: SolverResult, families: PriorGroups) -> Array:
     """The weights (p+s,) of priors as wide as the errors that were found.
 
     Default priors of one unit and one expected size have one scale, the one of greatest evidence
@@ -98,14 +101,17 @@ def rescaled(problem: Problem, solution: Solution, families: Families) -> Array:
     None gets narrower than the narrowest expectation of its unit, as offsets of no more than tilts' size.
     Priors that are not default stay.
     """
-    weights, members, family = problem.weights.copy(), families.members, families.family
+    weights, members, family = problem.weights.copy(), families.members, families.group_index
     if not len(members):
         return weights
-    expected, root = families.expected, posterior_root(solution.triangle, problem.weights)[0][members]
+    expected, root = (
+        families.expected_weights,
+        posterior_sqrt_covariance(solution.system, problem.weights)[0][members],
+    )
     told = 1 - np.einsum("ij,ij->i", root, root) * problem.weights[members] ** 2
     found = np.bincount(family, solution.x[members] ** 2) * expected**2
     count = np.bincount(family, told)
-    share = np.where(found <= count, EXPECTATION, 0.0)
-    scaled = np.fmin(expected * np.sqrt((count + share) / (found + share)), families.narrowest)
+    share = np.where(found <= count, EXPECTATION_COUNT, 0.0)
+    scaled = np.fmin(expected * np.sqrt((count + share) / (found + share)), families.max_weights)
     weights[members] = scaled[family]
     return weights

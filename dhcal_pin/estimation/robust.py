@@ -15,12 +15,12 @@ import numpy as np
 from .._typing import Array
 from ..measurements.base import Measurement
 from . import qr
-from .problem import CHUNK, Chunk, Problem, Tangent, reduce, residual_of
-from .qr import posterior_root
-from .solver import Solution
+from .problem import CHUNK_SIZE, Chunk, Linearization, Problem, chunk_residual, linearize_and_factor
+from .qr import posterior_sqrt_covariance
+from .solver import SolverResult
 
 # Scores beyond this are gross: one good sample in three million.
-OUTLYING = 5.0
+OUTLIER_THRESHOLD = 5.0
 
 
 def _linear(score: Array) -> Array:
@@ -44,20 +44,20 @@ def _tukey(score: Array) -> Array:
 # errors cost a quarter of the accuracy. What is left aside unasked must be more than a far corner of the
 # workspace that the model does not bend to.
 WEIGHTS: dict[str, tuple[Callable[[Array], Array], float]] = {
-    "all": (_linear, np.inf),
-    "gentle": (_huber, np.inf),
-    "good": (_linear, 12.0),
-    "huber": (_huber, OUTLYING),
-    "cauchy": (_cauchy, OUTLYING),
-    "tukey": (_tukey, OUTLYING),
+    "uniform": (_linear, np.inf),
+    "huber_no_cutoff": (_huber, np.inf),
+    "reject": (_linear, 12.0),
+    "huber": (_huber, OUTLIER_THRESHOLD),
+    "cauchy": (_cauchy, OUTLIER_THRESHOLD),
+    "tukey": (_tukey, OUTLIER_THRESHOLD),
 }
 
 
 # The weights that a loss goes through, each until it has settled. The next ones are for gross errors only:
 # good samples then count in full, after a loss that no single one could draw away has told which they are.
 LOSSES: dict[str, tuple[str, ...]] = {
-    "auto": ("all", "gentle", "good"),
-    "linear": ("all",),
+    "auto": ("uniform", "huber_no_cutoff", "reject"),
+    "linear": ("uniform",),
     "huber": ("huber",),
     "cauchy": ("cauchy",),
     "tukey": ("tukey",),
@@ -65,15 +65,15 @@ LOSSES: dict[str, tuple[str, ...]] = {
 
 
 # Whitened residuals of less variance than this are the fit's own doing.
-LEAST_SPREAD = 1e-3
+MIN_VARIANCE = 1e-3
 
 
 # Weights that change by more than this share of what they did last are not about to settle.
-TURNS = 0.8
+OSCILLATION_RATIO = 0.8
 
 
 # A weight of this leaves a sample out without leaving a hole in the arithmetic.
-NOTHING = 1e-12
+ZERO_WEIGHT = 1e-12
 
 
 def standardized_residuals(residual: Array, spread: Array | None = None) -> Array:
@@ -85,13 +85,15 @@ def standardized_residuals(residual: Array, spread: Array | None = None) -> Arra
     """
     k = len(residual)
     if spread is None:
-        return scored(np.sum(residual**2, 0) / k, k)
+        return standardize_mean_squares(np.sum(residual**2, 0) / k, k)
     # A reading that the fit meets whatever it is tells nothing.
-    freed = spread + LEAST_SPREAD * np.eye(k)
-    return scored(np.sum(residual.T * np.linalg.solve(freed, residual.T[..., None])[..., 0], 1) / k, k)
+    freed = spread + MIN_VARIANCE * np.eye(k)
+    return standardize_mean_squares(
+        np.sum(residual.T * np.linalg.solve(freed, residual.T[..., None])[..., 0], 1) / k, k
+    )
 
 
-def scored(ratio: Array, k: int) -> Array:
+def standardize_mean_squares(ratio: Array, k: int) -> Array:
     """Scores (m,) of mean squares (m,) of k residuals each, against their own median."""
     middle = 1 - 2 / (9 * k)
     # The median of χ²_k / k is middle³.
@@ -101,37 +103,37 @@ def scored(ratio: Array, k: int) -> Array:
     return (np.cbrt(ratio / scale) - middle) / np.sqrt(2 / (9 * k))
 
 
-def weight(score: Array, how: str) -> Array:
+def sample_weights(score: Array, stage: str) -> Array:
     """Weights (m,) of scores (m,)."""
-    weights, gross = WEIGHTS[how]
-    return np.maximum(np.where(score > gross, 0.0, weights(score)), NOTHING)
+    weights, gross = WEIGHTS[stage]
+    return np.maximum(np.where(score > gross, 0.0, weights(score)), ZERO_WEIGHT)
 
 
-def reweighted(
-    before: Sequence[Array], score: Sequence[Array], how: str, last: float
+def update_weights(
+    previous: Sequence[Array], score: Sequence[Array], stage: str, last_change: float
 ) -> tuple[list[Array], float]:
     """Weights of each item's samples by their scores, and by how much the largest change is.
 
     Where that is hardly less than the `last`, two sets of weights take turns, and what lies between is next.
     """
-    weights = [weight(each, how) for each in score]
-    moved = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(weights, before, strict=True))
-    if moved > TURNS * last:
-        weights = [0.5 * (a + b) for a, b in zip(weights, before, strict=True)]
+    weights = [sample_weights(each, stage) for each in score]
+    moved = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(weights, previous, strict=True))
+    if moved > OSCILLATION_RATIO * last_change:
+        weights = [0.5 * (a + b) for a, b in zip(weights, previous, strict=True)]
     return weights, moved
 
 
-def suspect(score: Array) -> bool:
+def has_possible_outliers(score: Array) -> bool:
     """Whether gross errors, which hide behind each other, may be among samples of scores (m,)."""
-    return bool((score > OUTLYING).any())
+    return bool((score > OUTLIER_THRESHOLD).any())
 
 
 # Where a row takes so small a share of the unknowns, what it draws to itself does not matter.
-SMALL = 0.01
+NEGLIGIBLE_LEVERAGE = 0.01
 
 
 def studentized_residuals(
-    problem: Problem, solution: Solution, data: Sequence[Measurement], weights: Sequence[Array]
+    problem: Problem, solution: SolverResult, data: Sequence[Measurement], weights: Sequence[Array]
 ) -> list[Array]:
     """How far each sample (m,) of each item lies from its kind's scatter; see `standardized_residuals`.
 
@@ -143,24 +145,30 @@ def studentized_residuals(
         data: the fitted measurements with the sigmas of good samples.
         weights: (m,) of each item's samples in the fit.
     """
-    rows = sum(np.count_nonzero(w > 0.5) * item.size for item, w in zip(data, weights, strict=True))
+    rows = sum(np.count_nonzero(w > 0.5) * item.residual_dim for item, w in zip(data, weights, strict=True))
     most = len(solution.x)
-    if rows <= most and rows <= qr.rank(solution.triangle.r):
+    if rows <= most and rows <= qr.rank(solution.system.r):
         return [np.zeros(len(item.rows)) for item in data]
     chain = problem.errors.at(solution.x[: len(problem.errors.parameters)])
-    found = problem.of(data).each(partial(residual_of, chain, problem.instruments(solution.x)))
-    residuals = [np.concatenate([np.empty((item.size, 0)), *_parts(found, item)], 1) for item in data]
-    spread = spreads(problem, solution, weights) if most >= SMALL * rows else [None] * len(data)
+    found = problem.with_data(data).map_chunks(
+        partial(chunk_residual, chain, problem.instruments(solution.x))
+    )
+    residuals = [np.concatenate([np.empty((item.residual_dim, 0)), *_parts(found, item)], 1) for item in data]
+    spread = (
+        residual_covariances(problem, solution, weights)
+        if most >= NEGLIGIBLE_LEVERAGE * rows
+        else [None] * len(data)
+    )
     return [standardized_residuals(*both) for both in zip(residuals, spread, strict=True)]
 
 
 def _parts(found: Iterator[Array], item: Measurement) -> Iterator[Array]:
     """What was found in the chunks of one item."""
-    for _ in range(0, len(item.rows), CHUNK):
+    for _ in range(0, len(item.rows), CHUNK_SIZE):
         yield next(found)
 
 
-def spreads(problem: Problem, solution: Solution, weights: Sequence[Array]) -> list[Array]:
+def residual_covariances(problem: Problem, solution: SolverResult, weights: Sequence[Array]) -> list[Array]:
     """Covariances (m, k, k) of each item's whitened residuals in a fit of good readings.
 
     A sample that takes part lies nearer to the fit than its sigma, by what it draws the fit to itself; one
@@ -168,17 +176,19 @@ def spreads(problem: Problem, solution: Solution, weights: Sequence[Array]) -> l
     """
     # The loop's last triangle is of a step before, where other directions are unseen, which the wide priors
     # of frames and instruments make far of: its covariance would not go with these rows.
-    root = posterior_root(reduce(problem, solution.x, small_angle=False), problem.weights)[0]
-    found = problem.each(partial(_drawn, problem.tangent(solution.x), root))
+    root = posterior_sqrt_covariance(
+        linearize_and_factor(problem, solution.x, small_angle=False), problem.weights
+    )[0]
+    found = problem.map_chunks(partial(_prediction_covariance, problem.linearize(solution.x), root))
     out = []
     for item, weight in zip(problem.data, weights, strict=True):
-        parts = [np.empty((0, item.size, item.size)), *_parts(found, item)]
+        parts = [np.empty((0, item.residual_dim, item.residual_dim)), *_parts(found, item)]
         w = weight[:, None, None]
-        out.append(np.eye(item.size) + (1 - 2 * w) * np.concatenate(parts) / w)
+        out.append(np.eye(item.residual_dim) + (1 - 2 * w) * np.concatenate(parts) / w)
     return out
 
 
-def _drawn(tangent: Tangent, root: Array, chunk: Chunk) -> Array:
+def _prediction_covariance(tangent: Linearization, root: Array, chunk: Chunk) -> Array:
     """What is not known of a chunk's whitened readings: covariances (m, k, k)."""
     known = np.tensordot(root, tangent.rows(chunk)[:-1], (0, 0))
     return np.einsum("rim,rjm->mij", known, known)

@@ -21,7 +21,7 @@ _SAMPLES = 100
 
 
 @dataclass(frozen=True, eq=False)
-class Ruler:
+class ScaleGauge:
     """Measures an arm's size: how far the tool spreads about its middle, RMS, in units of the nominal arm's.
 
     Attributes:
@@ -33,15 +33,19 @@ class Ruler:
     nominal: float
 
     @classmethod
-    def of(cls, chain: Chain, q: Array) -> Ruler:
+    def from_configurations(cls, chain: Chain, q: Array) -> ScaleGauge:
         """For readings at joint values (m, n), which are shuffled joint by joint."""
         rng = np.random.default_rng(0)
         drawn = np.stack([rng.choice(column, _SAMPLES) for column in q.T], 1)
-        return cls(drawn, _spread(_about_middle(chain.sweep(drawn).tool[3])))
+        return cls(drawn, _rms_radius(_centered(chain.forward_kinematics(drawn).tool[3])))
 
     def size(self, chain: Chain) -> float:
         """Of an arm, the nominal one's being 1."""
-        return _spread(_about_middle(chain.sweep(self.q).tool[3])) / self.nominal if self.nominal else 1.0
+        return (
+            _rms_radius(_centered(chain.forward_kinematics(self.q).tool[3])) / self.nominal
+            if self.nominal
+            else 1.0
+        )
 
     def rates(self, chain: Chain, bodies: Array, twists: Array) -> Array:
         """How fast an arm grows, and turns on average in the measuring frame, with each of e errors (e, 4).
@@ -53,10 +57,10 @@ class Ruler:
         """
         rates = np.zeros((len(bodies), 4))
         if self.nominal:
-            sweep = chain.sweep(self.q)
-            out = _about_middle(sweep.tool[3])
-            moved = chain.tool_velocities(sweep, bodies, twists)[:, :3]
-            rates[:, 0] = np.tensordot(moved, out) / (_SAMPLES * _spread(out) * self.nominal)
+            frames = chain.forward_kinematics(self.q)
+            out = _centered(frames.tool[3])
+            moved = chain.tool_jacobian(frames, bodies, twists)[:, :3]
+            rates[:, 0] = np.tensordot(moved, out) / (_SAMPLES * _rms_radius(out) * self.nominal)
             inertia = np.vdot(out, out) * np.eye(3) - out @ out.T
             rates[:, 1:] = np.cross(out[None], moved, axis=1).sum(-1) @ np.linalg.pinv(
                 inertia, hermitian=True
@@ -64,15 +68,15 @@ class Ruler:
         return rates
 
 
-def _about_middle(points: Array) -> Array:
+def _centered(points: Array) -> Array:
     return points - points.mean(1, keepdims=True)
 
 
-def _spread(out: Array) -> float:
+def _rms_radius(out: Array) -> float:
     return float(np.sqrt(np.vdot(out, out) / _SAMPLES))
 
 
-def count_in_arm(block: Array, size: float, rates: Array, vectors: slice | None) -> None:
+def normalize_by_scale(block: Array, size: float, rates: Array, vectors: slice | None) -> None:
     """Counts whitened misses and their derivatives in the arm's size and along axes that turn with it.
 
     Args:

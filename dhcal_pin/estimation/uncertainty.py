@@ -13,18 +13,18 @@ from typing import Protocol
 import numpy as np
 
 from .. import se3
-from .._kernels.types import Sweep
+from .._kernels.types import FrameBatch
 from .._typing import Array
-from ..robot.chain import Chain, link_station, twists_at
+from ..robot.chain import Chain, link_frame, twists_in_bodies
 from .error_model import ErrorModel
-from .qr import RANK_CUT
+from .qr import RANK_RTOL
 
 # A parameter, or a metre and a radian of the tool, with more than this share of itself unseen is unknown.
-UNKNOWN = 1e-6
+UNBOUNDED_TOL = 1e-6
 
 
 # Configurations at which the motions of two sets of errors are compared.
-TOLD = 200
+N_MATCHING_SAMPLES = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,29 +71,31 @@ class Uncertainty:
     Attributes:
         chain: calibrated.
         entries: (e,) of the transmission's flat coefficients that are uncertain.
-        root: (6(k+1)+e, r) root of the covariance: of twists [v, ω] of the bodies' frames, the base link's
+        sqrt_covariance: (6(k+1)+e, r) root of the covariance: of twists [v, ω] of the bodies' frames, the base link's
             in the measuring frame and the others' in their own link's, then of the entries.
-        hidden: (6(k+1)+e, h) of the directions that neither data nor a prior tell.
+        unbounded_directions: (6(k+1)+e, h) of the directions that neither data nor a prior tell.
     """
 
     chain: Chain
     entries: Array
-    root: Array
-    hidden: Array
+    sqrt_covariance: Array
+    unbounded_directions: Array
 
     @classmethod
-    def of(cls, errors: ErrorModel, x: Array, chain: Chain, root: Array, hidden: Array) -> Uncertainty:
+    def from_errors(
+        cls, errors: ErrorModel, x: Array, chain: Chain, sqrt_covariance: Array, unbounded_directions: Array
+    ) -> Uncertainty:
         """The uncertainty of identified errors.
 
         Args:
             errors: the unknowns.
             x: (p,) their values.
             chain: the calibrated arm.
-            root: (p, r) of the unknowns' covariance.
-            hidden: (p, h) of the directions of them that nothing tells.
+            sqrt_covariance: (p, r) of the unknowns' covariance.
+            unbounded_directions: (p, h) of the directions of them that nothing tells.
         """
         _, bodies, twists = errors.derivative(x)
-        count = len(chain.moving) + 1
+        count = len(chain.moving_joints) + 1
         entries = bodies[bodies >= count] - count
         plain = len(bodies) - len(entries)
         # From the bodies' frames, whose z are the joints' axes, to the links' own and the measuring frame.
@@ -103,9 +105,9 @@ class Uncertainty:
             "pij,pj->pi", into[bodies[:plain]], twists[:plain]
         )
         rows = np.concatenate([motions.reshape(6 * count, -1), np.eye(len(bodies))[plain:]])
-        return cls(chain, entries, rows @ root, rows @ hidden)
+        return cls(chain, entries, rows @ sqrt_covariance, rows @ unbounded_directions)
 
-    def of_unknowns(self, errors: ErrorModel, scale: Array) -> tuple[Array, Array]:
+    def of_parameters(self, errors: ErrorModel, scale: Array) -> tuple[Array, Array]:
         """Root (p, r) of the covariance of this arm's p further errors, and what of them is hidden (p, h).
 
         They are told by what they do to the tool; what several of them do alike is shared out by their scale,
@@ -115,23 +117,23 @@ class Uncertainty:
             errors: unknowns of the calibrated arm.
             scale: (p,) units to count them in, such as their priors' sigmas.
         """
-        q = np.random.default_rng(0).uniform(-np.pi, np.pi, (TOLD, self.chain.size))
+        q = np.random.default_rng(0).uniform(-np.pi, np.pi, (N_MATCHING_SAMPLES, self.chain.n_joints))
         chain, bodies, twists = errors.derivative(np.zeros(len(scale)))
-        moved = chain.tool_velocities(chain.sweep(q), bodies, twists) * scale[:, None, None]
-        inverse = np.linalg.pinv(moved.reshape(len(scale), -1).T, rcond=RANK_CUT)
-        carried = self._velocities(self.chain.sweep(q)).reshape(len(self.root), -1)
+        moved = chain.tool_jacobian(chain.forward_kinematics(q), bodies, twists) * scale[:, None, None]
+        inverse = np.linalg.pinv(moved.reshape(len(scale), -1).T, rcond=RANK_RTOL)
+        carried = self._tool_jacobian(self.chain.forward_kinematics(q)).reshape(len(self.sqrt_covariance), -1)
         told = inverse @ carried.T
-        return told @ self.root, told @ self.hidden
+        return told @ self.sqrt_covariance, told @ self.unbounded_directions
 
-    def _velocities(self, sweep: Sweep) -> Array:
+    def _tool_jacobian(self, frames: FrameBatch) -> Array:
         """Of the tool (6(k+1)+e, 6, m) by each of the motions and entries, as `Chain.tool_velocities`."""
-        chain, count = self.chain, len(self.chain.moving) + 1
+        chain, count = self.chain, len(self.chain.moving_joints) + 1
         carry = np.tile(np.eye(4), (count, 1, 1))
         carry[0] = se3.inverse(chain.base)
-        stations = np.repeat([link_station(j) for j in range(count)], 6)
-        bodies, twists = twists_at(chain, stations, np.tile(np.eye(6), (count, 1)), carry.repeat(6, 0))
-        return chain.tool_velocities(
-            sweep,
+        stations = np.repeat([link_frame(j) for j in range(count)], 6)
+        bodies, twists = twists_in_bodies(chain, stations, np.tile(np.eye(6), (count, 1)), carry.repeat(6, 0))
+        return chain.tool_jacobian(
+            frames,
             np.concatenate([bodies, count + self.entries]),
             np.pad(twists, ((0, len(self.entries)), (0, 0))),
         )
@@ -142,10 +144,13 @@ class Uncertainty:
         The covariance is that of the identified errors carried to the tool to first order; noise of a
         future measurement is not in it.
         """
-        sweep = self.chain.sweep(q)
-        velocities = self._velocities(sweep)
-        carried, lost = (np.einsum("pim,pr->mir", velocities, part) for part in (self.root, self.hidden))
+        frames = self.chain.forward_kinematics(q)
+        velocities = self._tool_jacobian(frames)
+        carried, lost = (
+            np.einsum("pim,pr->mir", velocities, part)
+            for part in (self.sqrt_covariance, self.unbounded_directions)
+        )
         covariance = carried @ np.swapaxes(carried, 1, 2)
-        rows, axes = np.nonzero(np.sum(lost**2, -1) > UNKNOWN)
+        rows, axes = np.nonzero(np.sum(lost**2, -1) > UNBOUNDED_TOL)
         covariance[rows, axes, axes] = np.inf
-        return Prediction(sweep.poses(), covariance)
+        return Prediction(frames.poses(), covariance)

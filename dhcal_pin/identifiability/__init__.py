@@ -1,13 +1,13 @@
 """Identifiability: which parameters the measurements determine, and why not the others."""
 
-from .explanations import unobservable, weakly_seen
-from .observability import clusters, correlation, indices, seen_share
+from .explanations import explain_unobservable, explain_weakly_observable
+from .observability import clusters, correlation, observability_indices, observable_fraction
 
 __all__ = [
     "clusters",
     "correlation",
-    "indices",
-    "seen_share",
-    "unobservable",
-    "weakly_seen",
+    "explain_unobservable",
+    "explain_weakly_observable",
+    "observability_indices",
+    "observable_fraction",
 ]

@@ -17,26 +17,26 @@ import numpy as np
 from .. import se3
 from .._typing import Array
 from ..estimation import qr
-from ..estimation.problem import Problem, reduce
+from ..estimation.problem import Problem, linearize_and_factor
 from ..measurements.base import Measurement
 from ..measurements.pose import Pose
 from ..measurements.position import Position
 from ..robot.chain import Chain
-from .propagation import NONE
+from .propagation import NEGLIGIBLE
 
 Cause = Literal["arm", "instrument", "poses", "still"]
 
 
 # Joint values drawn to see what other poses would show: this many rows an unknown.
-_ROWS = 6
+_ROWS_PER_UNKNOWN = 6
 
 
 # A direction that other readings show stands out from their rounding by far more than this.
-_CUT = 1e-8
+_RTOL = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
+class UnobservableGroup:
     """Unseen directions that share a cause and a part of the arm.
 
     Attributes:
@@ -50,26 +50,26 @@ class Group:
     @property
     def members(self) -> list[int]:
         """The unknowns that take part."""
-        return np.flatnonzero(np.abs(self.vectors).max(1) > NONE).tolist()
+        return np.flatnonzero(np.abs(self.vectors).max(1) > NEGLIGIBLE).tolist()
 
 
-def _kernel(rows: Array) -> Array:
+def _vanishing_combinations(rows: Array) -> Array:
     """Orthonormal basis of the combinations of columns that vanish in rows of an orthonormal basis."""
     _, s, vt = np.linalg.svd(rows)
-    return vt[int(np.sum(s > NONE)) :].T
+    return vt[int(np.sum(s > NEGLIGIBLE)) :].T
 
 
-def _within(space: Array, triangle: Array) -> Array:
+def _unseen_part(space: Array, triangle: Array) -> Array:
     """Basis of the part of a space (p, d) that a triangle does not see either."""
     size = np.linalg.norm(triangle, 2) if triangle.size else 0.0
     if not space.shape[1] or size == 0:
         return space
     _, s, vt = np.linalg.svd(triangle @ space)
-    return space @ vt[int(np.sum(s > _CUT * size)) :].T
+    return space @ vt[int(np.sum(s > _RTOL * size)) :].T
 
 
 @dataclass(frozen=True, eq=False)
-class Experiment:
+class ObservabilityProbe:
     """What was measured, and what could be measured instead.
 
     Attributes:
@@ -86,31 +86,31 @@ class Experiment:
         return self.problem.errors.at(self.x[: len(self.problem.errors.parameters)])
 
     @property
-    def rounds(self) -> int:
+    def n_repetitions(self) -> int:
         """How many times the data's samples are drawn anew, so that there are enough of them."""
-        return 1 + _ROWS * len(self.x) // sum(len(item.rows) for item in self.problem.data)
+        return 1 + _ROWS_PER_UNKNOWN * len(self.x) // sum(len(item.rows) for item in self.problem.data)
 
-    def rows(self) -> int:
+    def count_rows(self) -> int:
         """How many numbers were read."""
-        return sum(item.size * len(item.rows) for item in self.problem.data)
+        return sum(item.residual_dim * len(item.rows) for item in self.problem.data)
 
-    def aside(self) -> Experiment:
+    def with_offset_point(self) -> ObservabilityProbe:
         """The same with the measured point some way off."""
         errors = self.problem.errors
-        off = {errors.chain.tool_station: se3.translation([0.11, 0.07, 0.05])}
-        return Experiment(
-            replace(self.problem, errors=replace(errors, chain=errors.chain.displaced(off))), self.x
+        off = {errors.chain.tool_frame_index: se3.translation([0.11, 0.07, 0.05])}
+        return ObservabilityProbe(
+            replace(self.problem, errors=replace(errors, chain=errors.chain.perturbed_at(off))), self.x
         )
 
     def draw(self, rng: np.random.Generator, m: int) -> Array:
         """Joint values (m, n) anywhere within the limits and within half a turn or π metres each way."""
         chain = self.chain
         low, high = np.maximum(chain.lower, -np.pi), np.minimum(chain.upper, np.pi)
-        return rng.uniform(low, high, (m, chain.size))
+        return rng.uniform(low, high, (m, chain.n_joints))
 
-    def _moved(self, item: Any, joints: Sequence[int], rng: np.random.Generator) -> Any:
+    def _resampled(self, item: Any, joints: Sequence[int], rng: np.random.Generator) -> Any:
         """The same readings with some joints anywhere; who touches something must stay on it."""
-        if item.touches:
+        if item.is_contact:
             return item
         ends = {}
         for name in ("q", "q_to"):
@@ -119,43 +119,45 @@ class Experiment:
                 ends[name][:, joints] = self.draw(rng, len(ends[name]))[:, joints]
         return replace(item, **ends)
 
-    def triangle(self, joints: Sequence[int], *extra: type[Pose] | type[Position]) -> Array:
+    def hypothetical_r_factor(self, joints: Sequence[int], *extra: type[Pose] | type[Position]) -> Array:
         """What the same instruments would see with some joints drawn anew, and with more readings."""
         rng = np.random.default_rng(0)
         data = self.problem.data
         p = len(self.x)
         every: list[Measurement] = [
-            self._moved(item, joints, rng) for _ in range(self.rounds) for item in data
+            self._resampled(item, joints, rng) for _ in range(self.n_repetitions) for item in data
         ]
-        q = self.draw(rng, _ROWS * p)
+        q = self.draw(rng, _ROWS_PER_UNKNOWN * p)
         pose = self.chain.poses(q)
         for kind in extra:
             every.append(
-                Pose.of(q, pose, 1e-3, 1e-3) if kind is Pose else Position.of(q, pose[:, :3, 3], 1e-3)
+                Pose.from_arrays(q, pose, 1e-3, 1e-3)
+                if kind is Pose
+                else Position.from_arrays(q, pose[:, :3, 3], 1e-3)
             )
-        return reduce(replace(self.problem, data=tuple(every)), self.x, small_angle=False).r
+        return linearize_and_factor(replace(self.problem, data=tuple(every)), self.x, small_angle=False).r
 
-    def still(self) -> list[int]:
+    def unmoved_joints(self) -> list[int]:
         """Independent joints, from 0, that have one value in all the data."""
-        moved = [item.configurations() for item in self.problem.data if item.ends]
+        moved = [item.configurations() for item in self.problem.data if item.configurations_per_row]
         return np.flatnonzero(np.ptp(np.concatenate(moved), axis=0) < 1e-9).tolist() if moved else []
 
-    def size_is_open(self, triangle: Array) -> bool:
+    def is_scale_unobservable(self, triangle: Array) -> bool:
         """Whether a direction that a triangle does not see makes the arm larger."""
-        if self.problem.ruler is None:
+        if self.problem.scale_gauge is None:
             return False
         robot = len(self.problem.errors.parameters)
-        growth = self.problem.ruler.rates(*self.problem.errors.derivative(self.x[:robot]))[:, 0]
-        return bool(np.abs(growth @ qr.unseen(triangle)[:robot]).max(initial=0.0) > NONE)
+        growth = self.problem.scale_gauge.rates(*self.problem.errors.derivative(self.x[:robot]))[:, 0]
+        return bool(np.abs(growth @ qr.null_space(triangle)[:robot]).max(initial=0.0) > NEGLIGIBLE)
 
     def layers(self, triangle: Array) -> list[tuple[Cause, Array]]:
         """Bases (p, ·) of what stays unseen, each within the next: by the arm, and by all that was done."""
-        joints = list(range(self.chain.size))
-        data = qr.unseen(triangle)
-        still = self.still()
-        poses = _within(data, self.triangle(still)) if still else data
-        instrument = _within(poses, self.triangle(joints))
-        arm = _within(instrument, self.triangle(joints, Pose))
+        joints = list(range(self.chain.n_joints))
+        data = qr.null_space(triangle)
+        still = self.unmoved_joints()
+        poses = _unseen_part(data, self.hypothetical_r_factor(still)) if still else data
+        instrument = _unseen_part(poses, self.hypothetical_r_factor(joints))
+        arm = _unseen_part(instrument, self.hypothetical_r_factor(joints, Pose))
         return [("arm", arm), ("instrument", instrument), ("poses", poses), ("still", data)]
 
 
@@ -167,7 +169,7 @@ def _echelon(space: Array, order: Array) -> Iterator[Array]:
         if done == len(rows):
             break
         pivot = done + int(np.argmax(np.abs(rows[done:, column])))
-        if abs(rows[pivot, column]) < NONE:
+        if abs(rows[pivot, column]) < NEGLIGIBLE:
             continue
         rows[[done, pivot]] = rows[[pivot, done]]
         rows[done] /= rows[done, column]
@@ -178,32 +180,32 @@ def _echelon(space: Array, order: Array) -> Iterator[Array]:
         yield row / row[np.argmax(np.abs(row))]
 
 
-def _beyond(known: Array, vector: Array) -> Array:
+def _orthogonal_part(known: Array, vector: Array) -> Array:
     """What of a unit vector (p,), or of several (p, k), lies outside an orthonormal basis (p, d)."""
     return vector - known @ (known.T @ vector)
 
 
-def _length(row: Array) -> tuple[int, int, int]:
+def _sort_key(row: Array) -> tuple[int, int, int]:
     """Short combinations of neighbours come first."""
-    taking = np.flatnonzero(np.abs(row) > NONE)
+    taking = np.flatnonzero(np.abs(row) > NEGLIGIBLE)
     return len(taking), int(taking[-1] - taking[0]), int(taking[0])
 
 
-def groups(layers: Sequence[tuple[Cause, Array]], stations: Array) -> list[Group]:
+def group_directions(layers: Sequence[tuple[Cause, Array]], error_frames: Array) -> list[UnobservableGroup]:
     """Every unseen direction once: short combinations, each on as short a piece of the arm as it can be.
 
     Args:
         layers: of `Experiment.layers`.
-        stations: (r,) where each of the robot's plain errors acts; they are the first of the unknowns.
+        error_frames: (r,) where each of the robot's plain errors acts; they are the first of the unknowns.
     """
     p = layers[-1][1].shape[0]
-    at = np.unique(stations)
+    at = np.unique(error_frames)
     spans = sorted(((i, j) for i in at for j in at if i <= j), key=lambda span: (span[1] - span[0], span[0]))
     parts = []
-    for with_others in (False, True)[: 1 + (len(stations) < p)]:
+    for with_others in (False, True)[: 1 + (len(error_frames) < p)]:
         for first, end in spans:
             inside = np.full(p, with_others)
-            inside[: len(stations)] = (stations >= first) & (stations <= end)
+            inside[: len(error_frames)] = (error_frames >= first) & (error_frames <= end)
             parts.append(inside)
     known = np.empty((p, 0))
     out = []
@@ -211,19 +213,19 @@ def groups(layers: Sequence[tuple[Cause, Array]], stations: Array) -> list[Group
         for inside in parts:
             if known.shape[1] == space.shape[1]:
                 break
-            local = space @ _kernel(space[~inside]) if (~inside).any() else space
-            if np.abs(_beyond(known, local)).max(initial=0) < 10 * NONE:
+            local = space @ _vanishing_combinations(space[~inside]) if (~inside).any() else space
+            if np.abs(_orthogonal_part(known, local)).max(initial=0) < 10 * NEGLIGIBLE:
                 continue
             members = np.flatnonzero(inside)
             found = [row for order in (members, members[::-1]) for row in _echelon(local, order)]
-            found.sort(key=_length)
+            found.sort(key=_sort_key)
             new = []
             for row in found:
-                rest = _beyond(known, row / np.linalg.norm(row))
-                if np.linalg.norm(rest) > 10 * NONE:
+                rest = _orthogonal_part(known, row / np.linalg.norm(row))
+                if np.linalg.norm(rest) > 10 * NEGLIGIBLE:
                     new.append(row)
-                    rest = _beyond(known, rest / np.linalg.norm(rest))
+                    rest = _orthogonal_part(known, rest / np.linalg.norm(rest))
                     known = np.concatenate([known, rest[:, None] / np.linalg.norm(rest)], 1)
             if new:
-                out.append(Group(cause, np.array(new).T))
+                out.append(UnobservableGroup(cause, np.array(new).T))
     return out

@@ -14,15 +14,15 @@ from .._typing import Array
 from ..estimation.qr import rank, row_space, singular_values
 
 # A direction is known by the data if they leave less than this share of what was expected before them.
-KNOWN_SHARE = 0.5
+MAX_KNOWN_STD_RATIO = 0.5
 
 
-def seen_share(triangle: Array) -> Array:
+def observable_fraction(triangle: Array) -> Array:
     """How far each parameter lies in what the data see, (p,) between 0 (not at all) and 1 (fully)."""
     return np.clip(np.sum(row_space(triangle) ** 2, 0), 0.0, 1.0)
 
 
-def indices(triangle: Array, samples: int) -> dict[str, float]:
+def observability_indices(triangle: Array, samples: int) -> dict[str, float]:
     """Observability indices O1 to O5 over the directions seen; the larger, the better; 0 if there is none.
 
     With σ₁ ≥ … ≥ σ_L the singular values of the whitened Jacobian (metres and radians) and m samples:
@@ -59,7 +59,7 @@ def correlation(covariance: Array) -> Array:
     return out
 
 
-def weakly_seen(triangle: Array, expected: Array, noise: float) -> tuple[Array, Array]:
+def weakly_observable(triangle: Array, expected: Array, noise: float) -> tuple[Array, Array]:
     """Directions that count in the rank but of which the data tell next to nothing.
 
     Each column of the triangle is scaled by what was expected of its parameter, so that metres and radians
@@ -78,7 +78,7 @@ def weakly_seen(triangle: Array, expected: Array, noise: float) -> tuple[Array, 
     _, s, vt = np.linalg.svd(triangle * expected)
     s = s[: rank(triangle)]
     left = noise / np.hypot(noise, s)
-    weak = np.flatnonzero(left >= KNOWN_SHARE)
+    weak = np.flatnonzero(left >= MAX_KNOWN_STD_RATIO)
     return expected[:, None] * vt[weak].T, left[weak]
 
 
@@ -96,7 +96,7 @@ def clusters(linked: Array) -> list[tuple[int, ...]]:
     return out
 
 
-def unseen_groups(triangle: Array) -> list[tuple[tuple[int, ...], int]]:
+def unobservable_groups(triangle: Array) -> list[tuple[tuple[int, ...], int]]:
     """Groups of parameters that cannot be told apart, each with its number of unseen directions."""
     basis = row_space(triangle)
     hidden = np.eye(triangle.shape[1]) - basis.T @ basis

@@ -13,7 +13,7 @@ from .._typing import PathLike
 from ..exceptions import DhcalError
 
 
-def check_place(path: PathLike) -> None:
+def require_writable(path: PathLike) -> None:
     """Complains unless a file can stand at a path.
 
     Raises:
@@ -26,7 +26,7 @@ def check_place(path: PathLike) -> None:
         raise DhcalError(f"{path}: there is no folder {folder}; make it first, or write elsewhere")
 
 
-def save(contents: Mapping[PathLike, str | bytes]) -> None:
+def write_files(contents: Mapping[PathLike, str | bytes]) -> None:
     """Writes all files or none: each beside its place first, then renamed over.
 
     A link stays a link and what it leads to is written; a file that was there keeps its permissions.
@@ -39,7 +39,7 @@ def save(contents: Mapping[PathLike, str | bytes]) -> None:
     path: PathLike = ""
     try:
         for path, content in contents.items():
-            check_place(path)
+            require_writable(path)
             real = os.path.realpath(path)
             handle, name = tempfile.mkstemp(prefix=".dhcal-", dir=os.path.dirname(real))
             staged.append((name, real))
@@ -47,13 +47,13 @@ def save(contents: Mapping[PathLike, str | bytes]) -> None:
                 file.write(content.encode() if isinstance(content, str) else content)
             os.chmod(name, _permissions(real))
         for name, path in staged:
-            _keep(path, _spare(name))
+            _make_backup(path, _backup_path(name))
             os.replace(name, path)
             placed.append((name, path))
     except BaseException as error:
         for name, done in reversed(placed):
-            if os.path.exists(_spare(name)):
-                os.replace(_spare(name), done)
+            if os.path.exists(_backup_path(name)):
+                os.replace(_backup_path(name), done)
             else:
                 os.unlink(done)
         if isinstance(error, OSError):
@@ -61,7 +61,7 @@ def save(contents: Mapping[PathLike, str | bytes]) -> None:
         raise
     finally:
         for name, _ in staged:
-            for rest in (name, _spare(name)):
+            for rest in (name, _backup_path(name)):
                 with suppress(FileNotFoundError):
                     os.unlink(rest)
 
@@ -76,15 +76,15 @@ def _permissions(path: str) -> int:
         return 0o666 & ~mask
 
 
-def _spare(name: str) -> str:
+def _backup_path(name: str) -> str:
     return f"{name}-old"
 
 
-def _keep(path: PathLike, spare: str) -> None:
+def _make_backup(path: PathLike, backup: str) -> None:
     """A second name for what stands at a path, if anything does."""
     try:
-        os.link(path, spare)
+        os.link(path, backup)
     except FileNotFoundError:
         pass
     except OSError:
-        shutil.copy2(path, spare)  # a file system without links
+        shutil.copy2(path, backup)  # a file system without links

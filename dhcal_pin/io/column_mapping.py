@@ -51,8 +51,8 @@ from .. import se3
 from .._typing import Array, PathLike
 from ..exceptions import DhcalError
 from ..units import ANGLES, UNITS
-from .measurement_columns import ROTVEC, TO
-from .tabular import Column, Sheet, read_sheet, read_text, read_toml
+from .measurement_columns import ROTVEC, SECOND_PREFIX
+from .tabular import Column, CsvTable, read_csv_table, read_text, read_toml
 
 # What stands in braces in a constant.
 PARTS = ("file", "stem", "parent")
@@ -90,20 +90,20 @@ _WORDS = {
 }
 
 
-_WIDEST = 1e300
+_MAX_VALUE = 1e300
 
 
 @dataclass(frozen=True)
-class Entry:
+class ColumnRule:
     """A column of ours: its unit, which of theirs, and ours = scale * theirs + offset in that unit.
 
     `what` is "length", "angle", "number" or "text"; "" where the project has no such column.
     """
 
     name: str
-    what: str
+    quantity: str
     unit: str
-    theirs: str | int
+    source_column: str | int
     scale: float = 1.0
     offset: float = 0.0
 
@@ -129,14 +129,14 @@ class ColumnMap:
 
     Attributes:
         source: the map's file.
-        entries: the columns of ours that are columns of theirs.
+        rules: the columns of ours that are columns of theirs.
         rotation: how theirs is written, or None.
         constants: columns of ours that are one text a file.
         separator, decimal, skip, header, comment, encoding: of their file.
     """
 
     source: str
-    entries: tuple[Entry, ...]
+    rules: tuple[ColumnRule, ...]
     rotation: Rotation | None
     constants: Mapping[str, str]
     separator: str = ","
@@ -160,8 +160,8 @@ def read_map(path: PathLike, quantities: Mapping[str, str], joints: Sequence[str
     """
     where, raw = str(path), read_toml(path)
     _check_keys(raw, (*_PLAIN, *_TABLES), where)
-    entries: list[Entry] = []
-    for key, before in (("joints", ""), ("to_joints", TO)):
+    entries: list[ColumnRule] = []
+    for key, before in (("joints", ""), ("to_joints", SECOND_PREFIX)):
         if key in raw:
             names = [before + name for name in joints]
             entries += _joints(raw[key], names, quantities, f"{where}: [{key}]")
@@ -202,9 +202,9 @@ def _settings(raw: Mapping[str, Any], default: ColumnMap) -> dict[str, Any]:
     return out
 
 
-def _entry(
+def _rule(
     name: str, raw: Mapping[str, Any], quantities: Mapping[str, str], source: Any, where: str
-) -> Entry:
+) -> ColumnRule:
     """A column of ours from `unit`, `scale` and `offset`, and whatever names theirs."""
     what, unit = quantities.get(name, ""), raw.get("unit", "")
     units = UNITS.get(what, {})
@@ -216,10 +216,10 @@ def _entry(
     scale, offset = _number(raw.get("scale", 1), where), _number(raw.get("offset", 0), where)
     if what == "text" and (scale, offset) != (1.0, 0.0):
         raise DhcalError(f"{where}: {name}: is text; leave scale and offset out")
-    return Entry(name, what, unit, _theirs(source, where), scale, offset)
+    return ColumnRule(name, what, unit, _source_column(source, where), scale, offset)
 
 
-def _columns(raw: Any, quantities: Mapping[str, str], where: str) -> list[Entry]:
+def _columns(raw: Any, quantities: Mapping[str, str], where: str) -> list[ColumnRule]:
     if not isinstance(raw, dict):
         raise DhcalError(f'{where}: {raw!r} is no table; write entries such as x = {{from = 1, unit = "mm"}}')
     out = []
@@ -227,27 +227,27 @@ def _columns(raw: Any, quantities: Mapping[str, str], where: str) -> list[Entry]
         _check_keys(entry, ("from", "unit", "scale", "offset"), f"{where} {name}")
         if "from" not in entry:
             raise DhcalError(f'{where} {name}: has no `from`; write {name} = {{from = "their header"}}')
-        out.append(_entry(name, entry, quantities, entry["from"], f"{where} {name}"))
+        out.append(_rule(name, entry, quantities, entry["from"], f"{where} {name}"))
     return out
 
 
-def _joints(raw: Any, joints: Sequence[str], quantities: Mapping[str, str], where: str) -> list[Entry]:
+def _joints(raw: Any, joints: Sequence[str], quantities: Mapping[str, str], where: str) -> list[ColumnRule]:
     _check_keys(raw, ("order", "names", "unit", "sign", "offset"), where)
-    order = _several(raw.get("order"), None, f"{where} order")
-    names = _several(raw.get("names", joints), len(order), f"{where} names")
+    order = _column_list(raw.get("order"), None, f"{where} order")
+    names = _column_list(raw.get("names", joints), len(order), f"{where} names")
     unit = raw.get("unit", "")
-    units = _several(unit if isinstance(unit, list) else [unit] * len(order), len(order), f"{where} unit")
-    sign = _several(raw.get("sign", [1] * len(order)), len(order), f"{where} sign")
-    offset = _several(raw.get("offset", [0] * len(order)), len(order), f"{where} offset")
+    units = _column_list(unit if isinstance(unit, list) else [unit] * len(order), len(order), f"{where} unit")
+    sign = _column_list(raw.get("sign", [1] * len(order)), len(order), f"{where} sign")
+    offset = _column_list(raw.get("offset", [0] * len(order)), len(order), f"{where} offset")
     if any(type(value) is bool or value not in (1, -1) for value in sign):
         raise DhcalError(f"{where} sign: {sign}; write 1 or -1 for each joint")
     return [
-        _entry(str(name), {"unit": unit, "scale": s, "offset": o}, quantities, source, where)
+        _rule(str(name), {"unit": unit, "scale": s, "offset": o}, quantities, source, where)
         for name, source, unit, s, o in zip(names, order, units, sign, offset, strict=True)
     ]
 
 
-def _several(value: Any, count: int | None, where: str) -> list[Any]:
+def _column_list(value: Any, count: int | None, where: str) -> list[Any]:
     if not isinstance(value, Sequence) or isinstance(value, str) or not value:
         raise DhcalError(f"{where}: write a list in brackets, one entry a column")
     if count not in (None, len(value)):
@@ -255,14 +255,14 @@ def _several(value: Any, count: int | None, where: str) -> list[Any]:
     return list(value)
 
 
-def _theirs(value: Any, where: str) -> str | int:
+def _source_column(value: Any, where: str) -> str | int:
     if type(value) is str or (type(value) is int and value > 0):
         return value
     raise DhcalError(f"{where}: {value!r} names no column; write its header, or its number from 1")
 
 
 def _number(value: Any, where: str) -> float:
-    if type(value) not in (int, float) or not abs(value) < _WIDEST:
+    if type(value) not in (int, float) or not abs(value) < _MAX_VALUE:
         raise DhcalError(f"{where}: {value!r} is no number for a scale or an offset")
     return float(value)
 
@@ -281,9 +281,9 @@ def _rotation(raw: Any, where: str) -> Rotation:
             raise DhcalError(f"{where}: no {key}; {convention} needs {_WORDS[key][1]}")
         if fits and not (isinstance(value, str) and re.fullmatch(_WORDS[key][0], value)):
             raise DhcalError(f"{where} {key} = {value!r}; {convention} needs {_WORDS[key][1]}")
-    columns = _several(raw.get("columns"), count, f"{where} columns")
+    columns = _column_list(raw.get("columns"), count, f"{where} columns")
     rest = {key: raw[key] if key == "unit" else raw[key].lower() for key in needs}
-    return Rotation(convention, tuple(_theirs(name, where) for name in columns), **rest)
+    return Rotation(convention, tuple(_source_column(name, where) for name in columns), **rest)
 
 
 def _constants(raw: Any, quantities: Mapping[str, str], where: str) -> dict[str, str]:
@@ -301,22 +301,22 @@ _DELIMITERS = {",": ",", ";": ";", "tab": "\t"}
 
 
 # A matrix that is less of a rotation than this was not rounded but mistaken.
-_MOST_SKEW = 1e-3
+_MAX_SKEW = 1e-3
 
 
 @dataclass(frozen=True)
-class _Raw:
+class _VendorTable:
     """Their file: names of its columns, cells by line, the header's line, comments, and how it is written."""
 
     source: str
-    how: ColumnMap
+    column_map: ColumnMap
     names: Sequence[str]
     rows: Sequence[Sequence[str]]
     lines: list[int]
     header: int
     comments: tuple[str, ...]
 
-    def place(self, name: str | int) -> int | None:
+    def column_index(self, name: str | int) -> int | None:
         """Where a column stands, from 0; None if it is not there."""
         if isinstance(name, int):
             return name - 1 if name <= len(self.names) else None
@@ -326,21 +326,21 @@ class _Raw:
             )
         return self.names.index(name) if name in self.names else None
 
-    def lacking(self) -> list[str | int]:
+    def missing_columns(self) -> list[str | int]:
         """The columns that the map names and the file does not have."""
-        rotation = self.how.rotation.columns if self.how.rotation else ()
-        theirs = [*(entry.theirs for entry in self.how.entries), *rotation]
-        return [name for name in theirs if self.place(name) is None]
+        rotation = self.column_map.rotation.columns if self.column_map.rotation else ()
+        theirs = [*(entry.source_column for entry in self.column_map.rules), *rotation]
+        return [name for name in theirs if self.column_index(name) is None]
 
     def text(self, name: str | int) -> list[str]:
         """A column's cells."""
-        index = self.place(name)
+        index = self.column_index(name)
         assert index is not None
         return [row[index] for row in self.rows]
 
     def numbers(self, name: str | int) -> tuple[list[str], Array]:
         """A column's cells with a decimal point, and its numbers (m,)."""
-        cells, decimal = self.text(name), self.how.decimal
+        cells, decimal = self.text(name), self.column_map.decimal
         other = "." if decimal == "," else ","
         for cell, line in zip(cells, self.lines, strict=True):
             if other in cell:
@@ -349,38 +349,38 @@ class _Raw:
                     "write it with that sign, and none for thousands"
                 )
         cells = [cell.replace(decimal, ".") for cell in cells]
-        sheet = Sheet(self.source, (), {}, [[cell] for cell in cells], self.lines, self.header)
+        sheet = CsvTable(self.source, (), {}, [[cell] for cell in cells], self.lines, self.header)
         return cells, sheet.numbers(Column(str(name), "", 0))
 
 
-def mapped_sheet(path: PathLike, how: ColumnMap, known: Set[str]) -> Sheet:
+def read_mapped_table(path: PathLike, column_map: ColumnMap, known: Set[str]) -> CsvTable:
     """Another maker's file as a sheet of the project's own.
 
     Args:
         path: the file.
-        how: the map.
+        column_map: the map.
         known: columns that a file of the project's own can have.
 
     Raises:
         DhcalError: the file is not as the map says.
     """
-    if _is_own(path, known) and not _fits(path, how):
-        return read_sheet(path)
-    raw = _read(path, how)
-    if lacking := raw.lacking():
+    if _is_native(path, known) and not _matches(path, column_map):
+        return read_csv_table(path)
+    raw = _read(path, column_map)
+    if lacking := raw.missing_columns():
         raise DhcalError(
-            f"{path}:{raw.header}: no column {lacking[0]!r}, which {how.source} names; with separator "
-            f"{how.separator!r} there are {', '.join(map(repr, raw.names[:30]))}"
+            f"{path}:{raw.header}: no column {lacking[0]!r}, which {column_map.source} names; with separator "
+            f"{column_map.separator!r} there are {', '.join(map(repr, raw.names[:30]))}"
         )
-    found = {entry.name: (entry.unit, _cells(raw, entry)) for entry in how.entries}
-    found |= _turned(raw, how.rotation) if how.rotation else {}
+    found = {entry.name: (entry.unit, _cells(raw, entry)) for entry in column_map.rules}
+    found |= _rotation_columns(raw, column_map.rotation) if column_map.rotation else {}
     place = Path(path).absolute()
     parts: dict[str, str] = dict(zip(PARTS, (place.name, place.stem, place.parent.name), strict=True))
-    for name, text in how.constants.items():
+    for name, text in column_map.constants.items():
         # No str.format: a path may have braces too.
         full = re.sub("|".join(f"{{{part}}}" for part in PARTS), lambda hit: parts[hit[0][1:-1]], text)
         found[name] = "", [full] * len(raw.rows)
-    return Sheet(
+    return CsvTable(
         raw.source,
         raw.comments,
         {name: Column(name, unit, i) for i, (name, (unit, _)) in enumerate(found.items())},
@@ -390,7 +390,7 @@ def mapped_sheet(path: PathLike, how: ColumnMap, known: Set[str]) -> Sheet:
     )
 
 
-def _read(path: PathLike, how: ColumnMap) -> _Raw:
+def _read(path: PathLike, how: ColumnMap) -> _VendorTable:
     """Their lines cut into cells."""
     comments: list[str] = []
     kept: list[tuple[int, list[str]]] = []
@@ -423,7 +423,7 @@ def _read(path: PathLike, how: ColumnMap) -> _Raw:
                 f"{path}:{number}: {len(cells)} values for {len(names)} columns; correct the row, or "
                 f"separator and decimal in {how.source}"
             )
-    return _Raw(
+    return _VendorTable(
         str(path),
         how,
         names,
@@ -434,33 +434,33 @@ def _read(path: PathLike, how: ColumnMap) -> _Raw:
     )
 
 
-def _is_own(path: PathLike, known: Set[str]) -> bool:
+def _is_native(path: PathLike, known: Set[str]) -> bool:
     """Whether a file's header is the project's own."""
     try:
-        return set(read_sheet(path).columns) <= known
+        return set(read_csv_table(path).columns) <= known
     except DhcalError:
         return False
 
 
-def _fits(path: PathLike, how: ColumnMap) -> bool:
+def _matches(path: PathLike, how: ColumnMap) -> bool:
     """Whether a file has a header with all the columns of a map."""
     try:
-        return how.header and not _read(path, how).lacking()
+        return how.header and not _read(path, how).missing_columns()
     except DhcalError:
         return False
 
 
-def _cells(raw: _Raw, entry: Entry) -> list[str]:
+def _cells(raw: _VendorTable, entry: ColumnRule) -> list[str]:
     """One column of ours; digits stay as they are where nothing is computed."""
-    if entry.what == "text":
-        return raw.text(entry.theirs)
-    cells, values = raw.numbers(entry.theirs)
+    if entry.quantity == "text":
+        return raw.text(entry.source_column)
+    cells, values = raw.numbers(entry.source_column)
     if (entry.scale, entry.offset) == (1.0, 0.0):
         return cells
     return [repr(value) for value in (entry.scale * values + entry.offset).tolist()]
 
 
-def _turned(raw: _Raw, how: Rotation) -> dict[str, tuple[str, list[str]]]:
+def _rotation_columns(raw: _VendorTable, how: Rotation) -> dict[str, tuple[str, list[str]]]:
     """The columns of ours for a rotation of theirs, each with its unit."""
     pairs = [raw.numbers(name) for name in how.columns]
     if how.convention in ("rotvec", "quaternion"):
@@ -486,11 +486,11 @@ def euler(angles: Array, axes: str, frame: str) -> Array:
     return first @ second @ third if frame == "intrinsic" else third @ second @ first
 
 
-def _nearest(matrices: Array, raw: _Raw) -> Array:
+def _nearest(matrices: Array, raw: _VendorTable) -> Array:
     """Rotations (m, 3, 3) nearest to matrices, or DhcalError where one is none."""
     u, s, vt = np.linalg.svd(matrices)
     off = np.abs(s - 1).max(-1) + (np.linalg.det(matrices) < 0)
-    if (bad := np.flatnonzero(off > _MOST_SKEW)).size:
+    if (bad := np.flatnonzero(off > _MAX_SKEW)).size:
         raise DhcalError(
             f"{raw.source}:{raw.lines[bad[0]]}: the nine numbers are no rotation, by {off[bad[0]]:.2g}; "
             "give them row by row, right-handed, within a thousandth"

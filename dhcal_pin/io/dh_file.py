@@ -14,7 +14,7 @@ from .._typing import Array, PathLike
 from ..exceptions import DhcalError
 from ..robot.dh import CONVENTIONS, DHTable
 from ..units import ANGLES, LENGTHS
-from .tabular import Column, Sheet, check_names, number, read_sheet, read_toml
+from .tabular import Column, CsvTable, number, read_csv_table, read_toml, require_usable_names
 
 _UNITS = {"theta": ANGLES, "d": LENGTHS, "a": LENGTHS, "alpha": ANGLES, "beta": ANGLES}
 
@@ -22,13 +22,13 @@ _UNITS = {"theta": ANGLES, "d": LENGTHS, "a": LENGTHS, "alpha": ANGLES, "beta": 
 _LIMITS = {"lower": -math.inf, "upper": math.inf}
 
 
-_NEEDED = ("theta", "d", "a", "alpha")
+_REQUIRED = ("theta", "d", "a", "alpha")
 
 
 _LARGEST = 1e300  # that still is a finite double in any unit
 
 
-_MOST = 1e4  # m or rad: beyond it no robot, and no URDF
+_MAX_VALUE = 1e4  # m or rad: beyond it no robot, and no URDF
 
 
 def is_dh(path: PathLike) -> bool:
@@ -68,7 +68,7 @@ def read_frame(values: object, source: str, name: str) -> Array:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _MOST
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _MAX_VALUE
 
 
 # --- TOML ------------------------------------------------------------------------------------------
@@ -110,7 +110,7 @@ def _read_dh_toml(path: PathLike) -> DHTable:
 
 def _entry(joint: Mapping[str, object], key: str, where: str, default: float = 0.0) -> float:
     if key not in joint:
-        if key in _NEEDED:
+        if key in _REQUIRED:
             raise DhcalError(f"{where}: {key} is missing; write {key} = 0.0 if it is zero")
         return default
     value = joint[key]
@@ -121,7 +121,7 @@ def _entry(joint: Mapping[str, object], key: str, where: str, default: float = 0
 
 # --- CSV -------------------------------------------------------------------------------------------
 def _read_dh_csv(path: PathLike) -> DHTable:
-    sheet = read_sheet(path)
+    sheet = read_csv_table(path)
     where = f"{sheet.source}:{sheet.header}"
     notes = dict(part.split(":", 1) for part in sheet.comments if ":" in part)
     notes = {key.strip().lower(): value.strip() for key, value in notes.items()}
@@ -130,7 +130,7 @@ def _read_dh_csv(path: PathLike) -> DHTable:
     for name in sheet.columns:
         if name not in known:
             raise DhcalError(f"{where}: unknown column {name!r}; allowed: {', '.join(known)}")
-    for name in ("joint", "type", *_NEEDED):
+    for name in ("joint", "type", *_REQUIRED):
         if name not in sheet.columns:
             raise DhcalError(
                 f"{where}: column {name!r} is missing; write joint,type,theta[deg],d[mm],a[mm],alpha[deg]"
@@ -141,7 +141,7 @@ def _read_dh_csv(path: PathLike) -> DHTable:
     }
     for key, units in _UNITS.items():
         column = sheet.columns.get(key)
-        columns[key] = [0.0] * len(sheet.cells) if column is None else sheet.si(column, units).tolist()
+        columns[key] = [0.0] * len(sheet.cells) if column is None else sheet.to_si(column, units).tolist()
     for key, none in _LIMITS.items():
         column = sheet.columns.get(key)
         columns[key] = (
@@ -165,7 +165,7 @@ def _read_dh_csv(path: PathLike) -> DHTable:
     return _table(sheet.source, convention, columns, frames)
 
 
-def _limit(sheet: Sheet, column: Column, row: int, slides: bool, none: float) -> float:
+def _limit(sheet: CsvTable, column: Column, row: int, slides: bool, none: float) -> float:
     """One joint's limit; the column's unit is an angle, a length, or both as in `lower[rad|m]`."""
     cell = sheet.cells[row][column.index].strip()
     if not cell:
@@ -200,11 +200,13 @@ def _table(source: str, convention: str, columns: Mapping[str, list], frames: Ma
             raise DhcalError(f"{where}: type {kind!r} must be revolute or prismatic")
         for key in (*_UNITS, *_LIMITS):
             value = columns[key][row]
-            if math.isfinite(value) and abs(value) > _MOST:
-                raise DhcalError(f"{where}: {key} is {value:g} m or rad, beyond ±{_MOST:g}; check its unit")
+            if math.isfinite(value) and abs(value) > _MAX_VALUE:
+                raise DhcalError(
+                    f"{where}: {key} is {value:g} m or rad, beyond ±{_MAX_VALUE:g}; check its unit"
+                )
         if columns["lower"][row] > columns["upper"][row]:
             raise DhcalError(f"{where}: lower is above upper; swap them")
-    check_names(columns["name"], source)
+    require_usable_names(columns["name"], source)
     slides = np.array([kind == "prismatic" for kind in columns["type"]])
     numbers = {key: np.array(columns[key], float) for key in (*_UNITS, *_LIMITS)}
     try:
@@ -219,13 +221,13 @@ def dh_text(table: DHTable, path: PathLike) -> str:
     Raises:
         DhcalError: a joint's name does not go into a table.
     """
-    check_names(table.names, os.fspath(path))
+    require_usable_names(table.names, os.fspath(path))
     frames = {
         key: [*pose[:3, 3].tolist(), *se3.log3(pose[:3, :3]).tolist()]
         for key, pose in (("base", table.base), ("tool", table.tool))
         if not np.array_equal(pose, np.eye(4))
     }
-    keys = [key for key in _UNITS if key in _NEEDED or np.any(table.beta)]
+    keys = [key for key in _UNITS if key in _REQUIRED or np.any(table.beta)]
     keys += [key for key in _LIMITS if np.isfinite(getattr(table, key)).any()]
     rows = [
         (name, "prismatic" if slides else "revolute", dict(zip(keys, values, strict=True)))

@@ -10,7 +10,7 @@ from ..measurements import KINDS
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from ..units import ANGLES, LENGTHS
-from .tabular import Sheet, check_names
+from .tabular import CsvTable, require_usable_names
 
 QUATERNION = ("qw", "qx", "qy", "qz")
 
@@ -26,17 +26,17 @@ COMMANDED = ("commanded_x", "commanded_y", "commanded_z")
 AFTER = ("after_x", "after_y", "after_z")
 
 
-_ASIDE = frozenset(("set", "pose_id", *COMMANDED, *AFTER))
+_AUXILIARY = frozenset(("set", "pose_id", *COMMANDED, *AFTER))
 
 
 # The second configuration of a row stands under the joints' names with this before them.
-TO = "to:"
+SECOND_PREFIX = "to:"
 
 
 _READINGS = frozenset(name for kind in KINDS.values() for name in kind.columns) | frozenset(QUATERNION)
 
 
-_KNOWN = _READINGS | _ASIDE
+_KNOWN = _READINGS | _AUXILIARY
 
 
 # What each column but the joints' holds: "length", "angle", "number" or "text".
@@ -59,14 +59,14 @@ def quantities(chain: Chain) -> dict[str, str]:
     joints = {
         before + joint.name: "length" if joint.type == "prismatic" else "angle"
         for joint in chain.urdf.joints
-        for before in ("", TO)
+        for before in ("", SECOND_PREFIX)
     }
     return {**_QUANTITIES, **joints}
 
 
 def check_joint_names(chain: Chain) -> None:
     """Complains about joints whose names cannot head a column beside the readings."""
-    check_names(chain.joint_names, chain.urdf.source)
+    require_usable_names(chain.joint_names, chain.urdf.source)
     if clash := sorted(_KNOWN & set(chain.joint_names)):
         raise DhcalError(
             f"{chain.urdf.source}: joint {clash[0]!r} has the name of a reading; rename it there"
@@ -79,10 +79,10 @@ def _nearest(name: str, known: Iterable[str]) -> set[str]:
     return {other for other, ratio in alike.items() if ratio == max(0.7, *alike.values())}
 
 
-def check_columns(sheet: Sheet, chain: Chain) -> None:
+def check_columns(sheet: CsvTable, chain: Chain) -> None:
     """Complains about a column that is neither a joint nor a reading."""
     names = [joint.name for joint in chain.urdf.joints]
-    joints = {*names, *(TO + name for name in names)}
+    joints = {*names, *(SECOND_PREFIX + name for name in names)}
     for name in sheet.columns:
         if name not in _KNOWN | joints:
             near = _nearest(name, _KNOWN | joints)
@@ -99,7 +99,7 @@ def check_columns(sheet: Sheet, chain: Chain) -> None:
             )
 
 
-def kind_of(sheet: Sheet) -> type[Measurement]:
+def find_kind(sheet: CsvTable) -> type[Measurement]:
     """The kind with the most of its columns there, or DhcalError if a column does not go with it."""
     there = set(sheet.columns) & _READINGS
     if there & set(QUATERNION):
@@ -107,7 +107,7 @@ def kind_of(sheet: Sheet) -> type[Measurement]:
     fits = [
         (len(wanted), -len(kind.columns), kind)
         for kind in KINDS.values()
-        for wanted in kind.needs
+        for wanted in kind.required_columns
         if wanted <= there
     ]
     where = f"{sheet.source}:{sheet.header}"

@@ -12,7 +12,7 @@ import numpy as np
 
 from .. import se3
 from .._typing import Array, PathLike
-from ..estimation.problem import CHUNK
+from ..estimation.problem import CHUNK_SIZE
 from ..exceptions import DhcalError
 from ..measurements.base import Measurement
 from ..measurements.pose import Pose
@@ -24,21 +24,21 @@ from .measurement_columns import (
     COMMANDED,
     QUATERNION,
     ROTVEC,
-    TO,
+    SECOND_PREFIX,
     check_columns,
     check_joint_names,
-    kind_of,
+    find_kind,
     quantities,
     units_of,
 )
-from .tabular import Column, Sheet, csv_text, read_sheet, sheet_of
+from .tabular import Column, CsvTable, csv_text, parse_csv_table, read_csv_table
 
 # No instrument is that good: m or rad.
-_LEAST_SIGMA = 1e-15
+_MIN_SIGMA = 1e-15
 
 
 @dataclass(frozen=True, eq=False)
-class Readings:
+class MeasurementFile:
     """A measurement file.
 
     Attributes:
@@ -46,7 +46,7 @@ class Readings:
         data: all its rows.
         fit, holdout: the rows by the column `set`; all are to be fitted without it.
         commanded: (m, 3) positions the controller was told, m; None without the columns.
-        after: (m, 3) positions reached once more with calibrated parameters, m; None without.
+        measured_after: (m, 3) positions reached once more with calibrated parameters, m; None without.
         values: the columns (m,) of the readings as they stood in the file, in SI or as text.
         units: the unit that each column was written in.
     """
@@ -56,12 +56,12 @@ class Readings:
     fit: Measurement
     holdout: Measurement
     commanded: Array | None
-    after: Array | None
+    measured_after: Array | None
     values: Mapping[str, Any] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
 
 
-def _group(sheet: Sheet, names: Sequence[str], units: Mapping[str, float] | None) -> Array | None:
+def _group(sheet: CsvTable, names: Sequence[str], units: Mapping[str, float] | None) -> Array | None:
     """Columns (m, k) in SI; None if none of them is there, DhcalError if only some are."""
     missing = [name for name in names if name not in sheet.columns]
     if len(missing) == len(names):
@@ -77,32 +77,32 @@ def _group(sheet: Sheet, names: Sequence[str], units: Mapping[str, float] | None
             if sheet.columns[name].unit:
                 raise DhcalError(f"{where}: column {name!r} is a pure number; write {name} without a unit")
         return np.stack([sheet.numbers(sheet.columns[name]) for name in names], -1)
-    return np.stack([sheet.si(sheet.columns[name], units) for name in names], -1)
+    return np.stack([sheet.to_si(sheet.columns[name], units) for name in names], -1)
 
 
-def joint_values(sheet: Sheet, chain: Chain, before: str = "") -> Array:
+def joint_values(sheet: CsvTable, chain: Chain, prefix: str = "") -> Array:
     """Joint values (m, n) under the joints' names, each with `before` in front."""
-    missing = [name for name in chain.joint_names if before + name not in sheet.columns]
+    missing = [name for name in chain.joint_names if prefix + name not in sheet.columns]
     if missing:
         units = {name: "mm" if units_of(chain, name) is LENGTHS else "deg" for name in chain.joint_names}
-        every = ",".join(f"{before}{name}[{unit}]" for name, unit in units.items())
+        every = ",".join(f"{prefix}{name}[{unit}]" for name, unit in units.items())
         raise DhcalError(
-            f"{sheet.source}:{sheet.header}: no column for joint {before + missing[0]!r}; "
+            f"{sheet.source}:{sheet.header}: no column for joint {prefix + missing[0]!r}; "
             f"this robot needs {every}"
         )
-    columns = [(sheet.columns[before + name], units_of(chain, name)) for name in chain.joint_names]
-    return np.stack([sheet.si(column, units) for column, units in columns], -1)
+    columns = [(sheet.columns[prefix + name], units_of(chain, name)) for name in chain.joint_names]
+    return np.stack([sheet.to_si(column, units) for column, units in columns], -1)
 
 
-def _values(sheet: Sheet, kind: type[Measurement]) -> dict[str, Any]:
+def _values(sheet: CsvTable, kind: type[Measurement]) -> dict[str, Any]:
     """The kind's columns in SI, or as text; a quaternion as a rotation vector."""
     out: dict[str, Any] = {}
     for name, what in kind.columns.items():
         if name not in sheet.columns:
             continue
         column = sheet.columns[name]
-        out[name] = sheet.text(column) if what == "text" else sheet.si(column, UNITS[what])
-        if "sigma" in name and (bad := np.flatnonzero(out[name] < _LEAST_SIGMA)).size:
+        out[name] = sheet.text(column) if what == "text" else sheet.to_si(column, UNITS[what])
+        if "sigma" in name and (bad := np.flatnonzero(out[name] < _MIN_SIGMA)).size:
             raise DhcalError(
                 f"{sheet.source}:{sheet.lines[bad[0]]}: column {name!r}: must be above zero; "
                 "leave the sigma columns out where they are not known"
@@ -118,7 +118,7 @@ def _values(sheet: Sheet, kind: type[Measurement]) -> dict[str, Any]:
     return out
 
 
-def _whole_sigmas(sheet: Sheet, kind: type[Measurement], values: Mapping[str, Any]) -> None:
+def _whole_sigmas(sheet: CsvTable, kind: type[Measurement], values: Mapping[str, Any]) -> None:
     """Complains about some sigmas without the others."""
     wanted = [f"sigma_{name}" for name in kind.columns if name in values and f"sigma_{name}" in kind.columns]
     wanted = wanted or [name for name in kind.columns if name.startswith("sigma_")]
@@ -131,20 +131,20 @@ def _whole_sigmas(sheet: Sheet, kind: type[Measurement], values: Mapping[str, An
         )
 
 
-def reading_sheet(path: PathLike, chain: Chain, columns: PathLike | None) -> Sheet:
+def open_measurement_table(path: PathLike, chain: Chain, columns: PathLike | None) -> CsvTable:
     """A measurement file as it is, or another maker's by its map."""
     if columns is None:
-        return read_sheet(path)
+        return read_csv_table(path)
     from .column_mapping import (
-        mapped_sheet,
         read_map,  # a part of the start-up, for other makers' files alone
+        read_mapped_table,
     )
 
     known = quantities(chain)
-    return mapped_sheet(path, read_map(columns, known, chain.joint_names), set(known))
+    return read_mapped_table(path, read_map(columns, known, chain.joint_names), set(known))
 
 
-def read_readings(path: PathLike, chain: Chain, columns: PathLike | None = None) -> Readings:
+def read_measurement_file(path: PathLike, chain: Chain, columns: PathLike | None = None) -> MeasurementFile:
     """A measurement file of any kind, for a chain's joints.
 
     Args:
@@ -156,22 +156,22 @@ def read_readings(path: PathLike, chain: Chain, columns: PathLike | None = None)
         DhcalError: what is wrong, with file, line and column, and what would be right.
     """
     check_joint_names(chain)
-    return readings_of(reading_sheet(path, chain, columns), chain)
+    return parse_measurements(open_measurement_table(path, chain, columns), chain)
 
 
-def readings_of(sheet: Sheet, chain: Chain) -> Readings:
+def parse_measurements(sheet: CsvTable, chain: Chain) -> MeasurementFile:
     """The readings of a sheet, which may be a part of a file; as `read_readings`."""
     check_columns(sheet, chain)
-    kind = kind_of(sheet)
+    kind = find_kind(sheet)
     values = _values(sheet, kind)
     _whole_sigmas(sheet, kind, values)
-    q = [joint_values(sheet, chain, before) for before in ("", TO)[: kind.ends]]
+    q = [joint_values(sheet, chain, before) for before in ("", SECOND_PREFIX)[: kind.configurations_per_row]]
     try:
-        data = kind.from_columns(q or [np.zeros((len(sheet.cells), chain.size))], values)
+        data = kind.from_columns(q or [np.zeros((len(sheet.cells), chain.n_joints))], values)
     except DhcalError as error:
         raise DhcalError(f"{sheet.source}: {error}") from None
-    held = _held(sheet)
-    return Readings(
+    held = _holdout_mask(sheet)
+    return MeasurementFile(
         sheet.source,
         data,
         data.take(~held),
@@ -183,7 +183,7 @@ def readings_of(sheet: Sheet, chain: Chain) -> Readings:
     )
 
 
-def _from_quaternion(sheet: Sheet, quaternion: Array | None) -> Array:
+def _from_quaternion(sheet: CsvTable, quaternion: Array | None) -> Array:
     assert quaternion is not None
     with np.errstate(over="ignore"):
         norm = np.linalg.norm(quaternion, axis=1)
@@ -198,7 +198,7 @@ def _from_quaternion(sheet: Sheet, quaternion: Array | None) -> Array:
     return np.eye(3) + 2 * w[:, None, None] * cross + 2 * cross @ cross
 
 
-def _held(sheet: Sheet) -> Array:
+def _holdout_mask(sheet: CsvTable) -> Array:
     column: Column | None = sheet.columns.get("set")
     if column is None:
         return np.zeros(len(sheet.cells), bool)
@@ -215,50 +215,52 @@ def read_measurements(path: PathLike, chain: Chain, columns: PathLike | None = N
     Raises:
         DhcalError: what is wrong, with file, line and column, and what would be right.
     """
-    return read_readings(path, chain, columns).data
+    return read_measurement_file(path, chain, columns).data
 
 
 @dataclass(frozen=True, eq=False)
-class Targets:
+class TargetPoses:
     """Where a tool is wanted.
 
     Attributes:
         source: the file's name.
-        targets: (m, 3) positions in m, or (m, 4, 4) poses where the file has rotations.
+        values: (m, 3) positions in m, or (m, 4, 4) poses where the file has rotations.
         near: (m, n) joint values of the file, near which solutions are wanted; None without them.
         units: the unit that each column was written in.
     """
 
     source: str
-    targets: Array
+    values: Array
     near: Array | None
     units: Mapping[str, str]
 
 
-def read_targets(path: PathLike, chain: Chain) -> Targets:
+def read_targets(path: PathLike, chain: Chain) -> TargetPoses:
     """Target positions or poses for a chain's tool: columns as in measurements, the joints' not needed.
 
     Raises:
         DhcalError: what is wrong, with file, line and column, and what would be right.
     """
     check_joint_names(chain)
-    sheet = read_sheet(path)
+    sheet = read_csv_table(path)
     check_columns(sheet, chain)
-    kind = kind_of(sheet)
+    kind = find_kind(sheet)
     if kind not in (Pose, Position):
         raise DhcalError(
             f"{sheet.source}:{sheet.header}: these are readings of kind {kind.kind}; targets have "
             "x[mm],y[mm],z[mm], with or without qw,qx,qy,qz or rx[rad],ry[rad],rz[rad]"
         )
     near = joint_values(sheet, chain) if set(chain.joint_names) & set(sheet.columns) else None
-    nowhere = np.zeros((len(sheet.cells), chain.size))
+    nowhere = np.zeros((len(sheet.cells), chain.n_joints))
     values = _values(sheet, kind)
     try:
         data = kind.from_columns([nowhere], values)
     except DhcalError as error:
         raise DhcalError(f"{sheet.source}: {error}") from None
     targets = data.poses if isinstance(data, Pose) else data.positions()
-    return Targets(sheet.source, targets, near, {name: column.unit for name, column in sheet.columns.items()})
+    return TargetPoses(
+        sheet.source, targets, near, {name: column.unit for name, column in sheet.columns.items()}
+    )
 
 
 def measurement_text(data: Measurement, chain: Chain, comments: Sequence[str] = ()) -> str:
@@ -270,7 +272,9 @@ def measurement_text(data: Measurement, chain: Chain, comments: Sequence[str] = 
     check_joint_names(chain)
     columns: dict[str, Any] = {}
     for before, q in zip(
-        ("", TO)[: data.ends], np.split(data.configurations(), max(data.ends, 1)), strict=False
+        ("", SECOND_PREFIX)[: data.configurations_per_row],
+        np.split(data.configurations(), max(data.configurations_per_row, 1)),
+        strict=False,
     ):
         columns |= joint_columns(q, chain, before)
     for name, values in data.to_columns().items():
@@ -279,10 +283,10 @@ def measurement_text(data: Measurement, chain: Chain, comments: Sequence[str] = 
     return csv_text(columns, comments)
 
 
-def joint_columns(q: Array, chain: Chain, before: str = "") -> dict[str, list[float]]:
+def joint_columns(q: Array, chain: Chain, prefix: str = "") -> dict[str, list[float]]:
     """Columns (m,) of joint values (m, n), each name with `before` in front, in metres and radians."""
     return {
-        f"{before}{name}[{'m' if units_of(chain, name) is LENGTHS else 'rad'}]": q[:, j].tolist()
+        f"{prefix}{name}[{'m' if units_of(chain, name) is LENGTHS else 'rad'}]": q[:, j].tolist()
         for j, name in enumerate(chain.joint_names)
     }
 
@@ -294,7 +298,7 @@ def read_configurations(path: PathLike, chain: Chain, columns: PathLike | None =
         DhcalError: what is wrong, with file, line and column, and what would be right.
     """
     check_joint_names(chain)
-    sheet = reading_sheet(path, chain, columns)
+    sheet = open_measurement_table(path, chain, columns)
     check_columns(sheet, chain)
     return joint_values(sheet, chain)
 
@@ -313,7 +317,7 @@ def configurations_text(q: Array, chain: Chain, comments: Sequence[str]) -> str:
 Part = Measurement | Callable[[], Measurement]
 
 
-def file_parts(path: PathLike, chain: Chain, rows: int = CHUNK) -> Iterator[Callable[[], Measurement]]:
+def file_parts(path: PathLike, chain: Chain, rows: int = CHUNK_SIZE) -> Iterator[Callable[[], Measurement]]:
     """The fitted rows of a measurement file, at most so many a part, each read only when it is called.
 
     The file must lie where the parts are read: on a cluster, on a disk that all workers see.
@@ -358,4 +362,4 @@ def _file_part(
     except UnicodeDecodeError as error:
         place = start + error.start
         raise DhcalError(f"{source}: byte {place} is not UTF-8; save the file as UTF-8") from error
-    return readings_of(sheet_of(source, [head, *enumerate(lines, first)]), chain).fit
+    return parse_measurements(parse_csv_table(source, [head, *enumerate(lines, first)]), chain).fit

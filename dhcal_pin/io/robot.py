@@ -18,8 +18,8 @@ from ..robot.chain import Chain
 from ..robot.dh import DHTable
 from ..robot.urdf import parse_urdf
 from ..robot.urdf_edit import with_origins
-from ..se3 import six_numbers
-from .atomic import save
+from ..se3 import to_xyz_rpy
+from .atomic import write_files
 from .dh_file import is_dh, read_dh, read_frame
 from .sidecar import (
     existing_sidecar,
@@ -35,7 +35,7 @@ from .tabular import read_toml
 from .ur_kinematics import ORIGIN_KEYS, read_ur_kinematics
 
 # A written URDF must read back as the same robot to this many metres and radians.
-READ_BACK = 1e-12
+READ_BACK_TOL = 1e-12
 
 
 def robot_name(path: PathLike) -> str:
@@ -94,7 +94,7 @@ def _with_sidecar(chain: Chain, path: PathLike) -> Chain:
     if "payload" in raw:
         if tip != chain.tip:
             raise DhcalError(f"{os.fspath(path)}: [payload] is carried by {tip!r}; name that with --tip")
-        placed = placed.carrying(read_payload(raw["payload"], os.fspath(path)))
+        placed = placed.with_payload(read_payload(raw["payload"], os.fspath(path)))
     return with_transmission(placed, raw["joint"], os.fspath(path)) if "joint" in raw else placed
 
 
@@ -151,12 +151,12 @@ def urdf_files(
     if chain.transmission is not None:
         # From here on the written masses load the joints.
         written = replace(chain.transmission, loads=again.loads)
-        chain, again = chain.driven(written), again.driven(written)
+        chain, again = chain.with_transmission(written), again.with_transmission(written)
     rng = np.random.default_rng(0)
-    q = rng.uniform(-np.pi, np.pi, (50, chain.size))
+    q = rng.uniform(-np.pi, np.pi, (50, chain.n_joints))
     wanted = chain.poses(q)
     gap = np.abs(again.poses(q) - wanted).max()
-    if not gap <= READ_BACK * max(1.0, np.abs(wanted).max()):
+    if not gap <= READ_BACK_TOL * max(1.0, np.abs(wanted).max()):
         raise DhcalError(
             f"{os.fspath(path)}: not written: read back, the tool is off by {gap:.2g}; please report it"
         )
@@ -180,7 +180,7 @@ class CalibratedRobot(Protocol):
         ...
 
     @property
-    def portable(self) -> Mapping[str, float]:
+    def transferable_instruments(self) -> Mapping[str, float]:
         """Instrument parameters that hold for other measurements too, by name [m or rad]."""
         ...
 
@@ -205,8 +205,10 @@ def write_urdf(fit: CalibratedRobot | Chain, path: PathLike) -> None:
         and os.path.samefile(path, chain.urdf.source)
     ):
         raise DhcalError(f"{os.fspath(path)}: is the nominal robot itself; write to another file")
-    instrument, known = (None, None) if isinstance(fit, Chain) else (fit.portable, fit.uncertainty)
-    save(urdf_files(chain, path, instrument, known))
+    instrument, known = (
+        (None, None) if isinstance(fit, Chain) else (fit.transferable_instruments, fit.uncertainty)
+    )
+    write_files(urdf_files(chain, path, instrument, known))
 
 
 def origins_text(chain: Chain) -> str:
@@ -214,5 +216,5 @@ def origins_text(chain: Chain) -> str:
     moved, _ = joint_origins(chain)
     lines = ["joint," + ",".join(f"{k}[{'m' if k in 'xyz' else 'rad'}]" for k in ORIGIN_KEYS)]
     for joint in chain.urdf.path(chain.tip):
-        lines.append(",".join([joint.name, *map(repr, six_numbers(moved.get(joint.name, joint.origin)))]))
+        lines.append(",".join([joint.name, *map(repr, to_xyz_rpy(moved.get(joint.name, joint.origin)))]))
     return "\n".join(lines) + "\n"

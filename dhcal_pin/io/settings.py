@@ -9,7 +9,7 @@ from ..estimation.priors import Priors
 from ..exceptions import DhcalError
 from .tabular import read_toml
 
-_WIDEST = 1e300
+_MAX_VALUE = 1e300
 
 
 def read_bounds(path: PathLike | None) -> dict[str, tuple[float, float]]:
@@ -42,7 +42,7 @@ def read_priors(choice: str | None) -> Priors | None:
         raise DhcalError(f"--priors {choice}: neither default, none, nor a file of sigmas by parameter")
     raw = read_toml(choice)
     for name, value in raw.items():
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= _WIDEST:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= _MAX_VALUE:
             raise DhcalError(
                 f"{choice}: {name} = {value!r} is not a sigma; write a positive number in m or rad, "
                 'such as "theta*" = 0.01'

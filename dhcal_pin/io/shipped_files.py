@@ -7,7 +7,7 @@ from pathlib import Path
 from ..exceptions import DhcalError
 
 
-def paper_file(name: str) -> Path:
+def shipped_file(name: str) -> Path:
     """A file that ships with the package, such as the paper's tables, installed or in the source tree."""
     package = Path(__file__).resolve().parent.parent
     for folder in (package / "data", package.parent / "urdf"):

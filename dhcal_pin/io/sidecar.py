@@ -14,11 +14,11 @@ import numpy as np
 
 from .. import se3
 from .._typing import Array, PathLike
-from ..estimation.parameters import EXTENSIONS, SETS
+from ..estimation.parameters import EXTENSIONS, PARAMETER_SETS
 from ..estimation.uncertainty import Uncertainty
 from ..exceptions import DhcalError
 from ..robot.chain import Chain
-from ..robot.transmission import COUPLED, TERMS, Payload, Transmission
+from ..robot.transmission import COUPLING_TERM, TERMS, Payload, Transmission
 from .tabular import read_toml
 
 
@@ -100,7 +100,7 @@ _TEXT = re.compile(rf"({_NUMBER})kg(?:@({_NUMBER}),({_NUMBER}),({_NUMBER})(mm|cm
 
 
 # Heavier loads and longer arms are slips of the unit.
-_HEAVIEST, _FARTHEST = 1e5, 1e2
+_MAX_MASS_KG, _MAX_DISTANCE_M = 1e5, 1e2
 
 
 def parse_payload(text: str, what: str = "--payload") -> Payload:
@@ -145,16 +145,16 @@ def _is_number(value: object) -> bool:
 
 
 def _checked(mass: float, centre: list[float], where: str) -> Payload:
-    if not 0 < mass <= _HEAVIEST:
+    if not 0 < mass <= _MAX_MASS_KG:
         raise DhcalError(f"{where}: a mass of {mass:g} kg; write a positive one")
-    if not all(abs(value) <= _FARTHEST for value in centre):
+    if not all(abs(value) <= _MAX_DISTANCE_M for value in centre):
         off = max(map(abs, centre))
         raise DhcalError(f"{where}: its centre is {off:g} m off the tip; write its place in the tip frame")
     x, y, z = centre
     return Payload(mass, (x, y, z))
 
 
-_MOST = 1e6
+_MAX_VALUE = 1e6
 
 
 def transmission_lines(chain: Chain) -> list[str]:
@@ -166,8 +166,8 @@ def transmission_lines(chain: Chain) -> list[str]:
     for i, name in enumerate(names):
         own = [f"{term.key} = {held[t, i, i].item()!r}" for t, term in enumerate(TERMS) if held[t, i, i]]
         others = [
-            f"{json.dumps(names[j])} = {held[COUPLED, i, j].item()!r}"
-            for j in np.flatnonzero(held[COUPLED, i])
+            f"{json.dumps(names[j])} = {held[COUPLING_TERM, i, j].item()!r}"
+            for j in np.flatnonzero(held[COUPLING_TERM, i])
             if j != i
         ]
         if own or others:
@@ -185,41 +185,43 @@ def with_transmission(chain: Chain, tables: object, source: str) -> Chain:
     Raises:
         DhcalError: an unknown joint or key, or a value that is not a finite number.
     """
-    held = Transmission.ideal(chain.loads).coefficients
+    held = Transmission.zero(chain.loads).coefficients
     for name, table in _table(tables, f"{source}: [joint]").items():
         if name in chain.joint_names:
             i = chain.joint_names.index(name)
             _read_joint(chain, i, _table(table, f"{source}: [joint.{name}]"), held, source)
-        elif name not in _elsewhere(chain):
+        elif name not in _joints_off_path(chain):
             raise DhcalError(
                 f"{source}: [joint.{name}]: no joint of this robot; there are {', '.join(chain.joint_names)}"
             )
-    return chain.driven(Transmission(held, chain.loads))
+    return chain.with_transmission(Transmission(held, chain.loads))
 
 
-def _elsewhere(chain: Chain) -> set[str]:
+def _joints_off_path(chain: Chain) -> set[str]:
     """The robot's joints off the path."""
-    return {joint.name for joint in chain.urdf.joints} - set(chain.moving)
+    return {joint.name for joint in chain.urdf.joints} - set(chain.moving_joints)
 
 
 def _read_joint(chain: Chain, i: int, table: Mapping[str, Any], held: Array, source: str) -> None:
     """Enters one joint's table into coefficients (t, n, n)."""
     here = f"{source}: [joint.{chain.joint_names[i]}]"
-    keys = {term.key: t for t, term in enumerate(TERMS) if term.sliding or not chain.sliding[i]}
+    keys = {
+        term.key: t for t, term in enumerate(TERMS) if term.applies_to_prismatic or not chain.is_prismatic[i]
+    }
     others = {name: j for j, name in enumerate(chain.joint_names) if j != i}
     for key, value in table.items():
-        if key == "coupling" and not chain.sliding[i]:
+        if key == "coupling" and not chain.is_prismatic[i]:
             for name, share in _table(value, f"{here} coupling").items():
                 number = _number(share, f"{here} coupling {name}")
                 if name in others:
-                    held[COUPLED, i, others[name]] = number
-                elif name not in _elsewhere(chain):
+                    held[COUPLING_TERM, i, others[name]] = number
+                elif name not in _joints_off_path(chain):
                     raise DhcalError(
                         f"{here} coupling: {name!r} is no other joint; there are {', '.join(others)}"
                     )
         elif key not in keys:
-            kind = "a sliding joint" if chain.sliding[i] else "a joint"
-            allowed = [*keys, *([] if chain.sliding[i] else ["coupling"])]
+            kind = "a sliding joint" if chain.is_prismatic[i] else "a joint"
+            allowed = [*keys, *([] if chain.is_prismatic[i] else ["coupling"])]
             raise DhcalError(f"{here}: unknown key {key!r}; {kind} has {', '.join(allowed)}")
         else:
             held[keys[key], i, i] = _number(value, f"{here} {key}")
@@ -232,12 +234,12 @@ def _table(value: object, here: str) -> Mapping[str, Any]:
 
 
 def _number(value: object, here: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= _MOST:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= _MAX_VALUE:
         raise DhcalError(f"{here} = {value!r} is not a finite number")
     return float(value)
 
 
-_KEYS = ("joints", "terms", "root", "hidden")
+_KEYS = ("joints", "terms", "sqrt_covariance", "unbounded_directions")
 
 
 _COLUMNS = 76
@@ -245,7 +247,7 @@ _COLUMNS = 76
 
 def uncertainty_lines(known: Uncertainty) -> list[str]:
     """The TOML lines of an uncertainty; none where no noise could be told, and so nothing is known of it."""
-    if not np.isfinite(known.root).all():
+    if not np.isfinite(known.sqrt_covariance).all():
         return []
     names = {entry: name for name, entry in _entries(known.chain).items()}
     terms = [names[int(entry)] for entry in known.entries]
@@ -254,10 +256,13 @@ def uncertainty_lines(known: Uncertainty) -> list[str]:
         "# Roots of the errors' covariance, and directions that nothing tells, by rows: six of each link's",
         "# motion (m, rad; the base's in the measuring frame), then the terms; doubles, base64.",
         "[uncertainty]",
-        f"joints = {json.dumps(list(known.chain.moving), ensure_ascii=False)}",
+        f"joints = {json.dumps(list(known.chain.moving_joints), ensure_ascii=False)}",
         f"terms = {json.dumps(terms, ensure_ascii=False)}",
     ]
-    for key, rows in (("root", known.root), ("hidden", known.hidden)):
+    for key, rows in (
+        ("sqrt_covariance", known.sqrt_covariance),
+        ("unbounded_directions", known.unbounded_directions),
+    ):
         text = base64.b64encode(np.ascontiguousarray(rows, "<f8").tobytes()).decode()
         wrapped = [text[i : i + _COLUMNS] for i in range(0, len(text), _COLUMNS)]
         out += [f'{key} = """', *wrapped, '"""']
@@ -279,22 +284,26 @@ def read_uncertainty(path: PathLike, chain: Chain) -> Uncertainty | None:
         return None
     if not isinstance(table, dict) or set(table) != set(_KEYS):
         raise DhcalError(f"{here} must be a table of {', '.join(_KEYS)}")
-    if table["joints"] != list(chain.moving):
-        raise DhcalError(f"{here} is of joints {table['joints']}; the arm's are {', '.join(chain.moving)}")
+    if table["joints"] != list(chain.moving_joints):
+        raise DhcalError(
+            f"{here} is of joints {table['joints']}; the arm's are {', '.join(chain.moving_joints)}"
+        )
     entries, terms = _entries(chain), table["terms"]
     if not isinstance(terms, list) or not all(isinstance(name, str) and name in entries for name in terms):
         raise DhcalError(f"{here} terms = {terms!r}: every one must be one of {', '.join(entries)}")
-    count = 6 * (len(chain.moving) + 1) + len(terms)
-    root, hidden = (_rows(table[key], count, f"{here} {key}") for key in ("root", "hidden"))
+    count = 6 * (len(chain.moving_joints) + 1) + len(terms)
+    root, hidden = (
+        _rows(table[key], count, f"{here} {key}") for key in ("sqrt_covariance", "unbounded_directions")
+    )
     if terms and chain.transmission is None:
-        chain = chain.driven(Transmission.ideal(chain.loads))
+        chain = chain.with_transmission(Transmission.zero(chain.loads))
     return Uncertainty(chain, np.array([entries[name] for name in terms], int), root, hidden)
 
 
 def _entries(chain: Chain) -> dict[str, int]:
     """Flat entries of the transmission's coefficients by parameter."""
-    every = (p for name in EXTENSIONS for p in SETS[name](chain))
-    return {p.name: p.entry for p in every if p.entry is not None}
+    every = (p for name in EXTENSIONS for p in PARAMETER_SETS[name](chain))
+    return {p.name: p.coefficient_index for p in every if p.coefficient_index is not None}
 
 
 def _rows(text: Any, count: int, here: str) -> Array:

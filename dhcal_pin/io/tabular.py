@@ -20,7 +20,7 @@ from .._typing import Array, PathLike
 from ..exceptions import DhcalError
 
 # Metres or radians: no reading, but a wrong unit or a typing error.
-_MOST = 1e6
+_MAX_VALUE = 1e6
 
 
 # Joint names are column names, and one stands in every line of a table.
@@ -47,7 +47,7 @@ def read_toml(path: PathLike) -> dict:
         raise DhcalError(f"{path}: not TOML: {error}; correct that line") from error
 
 
-def check_names(names: Sequence[str], source: str) -> None:
+def require_usable_names(names: Sequence[str], source: str) -> None:
     """Complains about joint names that a table or a measurement file cannot carry.
 
     Raises:
@@ -81,7 +81,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Sheet:
+class CsvTable:
     """A CSV file: comments, columns, and cells with the line each row stands on.
 
     `parsed` has the numbers (m,) of columns, by index, that a quick parser understood as a whole.
@@ -95,15 +95,15 @@ class Sheet:
     header: int
     parsed: Mapping[int, Array] = field(default_factory=dict)
 
-    def si(self, column: Column, units: Mapping[str, float]) -> Array:
+    def to_si(self, column: Column, units: Mapping[str, float]) -> Array:
         """A column's numbers (m,) in metres or radians, or DhcalError naming line and column."""
         out = self.numbers(column) / column.scale(units, f"{self.source}:{self.header}")
-        bad = np.flatnonzero(np.abs(out) > _MOST)
+        bad = np.flatnonzero(np.abs(out) > _MAX_VALUE)
         if bad.size:
             text = self.cells[bad[0]][column.index].strip()
             raise DhcalError(
                 f"{self.source}:{self.lines[bad[0]]}: column {column.name!r}: {text} {column.unit} is beyond "
-                f"{_MOST:g} {next(iter(units))}; correct the number or the unit"
+                f"{_MAX_VALUE:g} {next(iter(units))}; correct the number or the unit"
             )
         return out
 
@@ -136,16 +136,16 @@ def number(text: str) -> float:
     return float(text)
 
 
-def read_sheet(path: PathLike) -> Sheet:
+def read_csv_table(path: PathLike) -> CsvTable:
     """A comma-separated UTF-8 file with `#` comments and one header line.
 
     Raises:
         DhcalError: it is empty, its header is none, or a row is too short or too long.
     """
-    return sheet_of(os.fspath(path), enumerate(read_text(path).splitlines(), 1))
+    return parse_csv_table(os.fspath(path), enumerate(read_text(path).splitlines(), 1))
 
 
-def sheet_of(source: str, numbered: Iterable[tuple[int, str]]) -> Sheet:
+def parse_csv_table(source: str, numbered: Iterable[tuple[int, str]]) -> CsvTable:
     """The sheet of numbered lines, which need not be all of a file; as `read_sheet`."""
     comments, kept = [], []
     for number, line in numbered:
@@ -170,7 +170,7 @@ def sheet_of(source: str, numbered: Iterable[tuple[int, str]]) -> Sheet:
             )
     if not lines:
         raise DhcalError(f"{source}: no rows under the header in line {first}; add at least one row")
-    return Sheet(source, tuple(comments), columns, cells, lines, first, cells.numbers())
+    return CsvTable(source, tuple(comments), columns, cells, lines, first, cells.numbers())
 
 
 class _Rows(Sequence[list[str]]):

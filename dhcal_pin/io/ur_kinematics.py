@@ -13,10 +13,10 @@ import pinocchio as pin
 from .. import se3
 from .._typing import PathLike
 from ..exceptions import DhcalError
-from ..robot.chain import Chain, extract
+from ..robot.chain import Chain, extract_dh_table
 from ..robot.dh import DHTable
 from ..robot.dh_extraction import extract_dh
-from ..se3 import six_numbers
+from ..se3 import to_xyz_rpy
 from .tabular import read_text
 
 # UR's joints and what its description calls their origins.
@@ -53,7 +53,7 @@ def ur_kinematics(chain: Chain) -> dict[str, Any]:
         DhcalError: the joints are not UR's, or the tip is not on the last axis.
     """
     names = _ur_names(chain)
-    table = extract(chain, "modified").table
+    table = extract_dh_table(chain, "modified").table
     origins = table.origins()
     turn = np.arctan2(table.tool[1, 0], table.tool[0, 0])
     slide = se3.transform(se3.exp3([0.0, 0.0, turn]), [0.0, 0.0, table.tool[2, 3]])
@@ -65,7 +65,7 @@ def ur_kinematics(chain: Chain) -> dict[str, Any]:
         )
     origins[-2] = origins[-2] @ slide
     return {
-        key: dict(zip(ORIGIN_KEYS, six_numbers(origin), strict=True))
+        key: dict(zip(ORIGIN_KEYS, to_xyz_rpy(origin), strict=True))
         for key, origin in zip(names.values(), origins[:-1], strict=True)
     }
 

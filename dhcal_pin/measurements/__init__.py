@@ -4,43 +4,43 @@ A measurement kind is one class in a module of this package and one entry of `KI
 calibration and planning take the kinds from `KINDS` alone.
 """
 
-from .base import Measurement, Noise, Unknown
-from .contact import Plane, PointDistance, Sphere, Touch
+from .base import InstrumentParameter, Measurement, Noise
+from .contact import PlaneContact, PointContact, PointDistance, SphereContact
 from .length import Distance, Wires
 from .pose import Pose, RelativePose
-from .position import Axes, Position, Targets
+from .position import MultiTargetPosition, Position, PositionComponents
 
 KINDS: dict[str, type[Measurement]] = {
     kind.kind: kind
     for kind in (
         Pose,
         Position,
-        Axes,
-        Targets,
+        PositionComponents,
+        MultiTargetPosition,
         Wires,
         Distance,
-        Touch,
+        PointContact,
         PointDistance,
-        Plane,
-        Sphere,
+        PlaneContact,
+        SphereContact,
         RelativePose,
     )
 }
 
 __all__ = [
     "KINDS",
-    "Axes",
     "Distance",
+    "InstrumentParameter",
     "Measurement",
+    "MultiTargetPosition",
     "Noise",
-    "Plane",
+    "PlaneContact",
+    "PointContact",
     "PointDistance",
     "Pose",
     "Position",
+    "PositionComponents",
     "RelativePose",
-    "Sphere",
-    "Targets",
-    "Touch",
-    "Unknown",
+    "SphereContact",
     "Wires",
 ]

@@ -15,8 +15,8 @@ from typing import Any, ClassVar, Protocol, Self, TypeVar
 
 import numpy as np
 
-from .._kernels import mix_velocities
-from .._kernels.types import Mixture, Sweep
+from .._kernels import apply_observation_matrix
+from .._kernels.types import FrameBatch, ObservationMatrix
 from .._typing import Array
 from ..exceptions import DhcalError
 from ..robot.chain import Chain
@@ -26,11 +26,11 @@ LENGTH_SIGMA, ANGLE_SIGMA = 1e-3, 1e-3
 
 
 # An anchor or a touched point may be anywhere in a hall; a wire's zero within arm's length.
-PLACE_PRIOR, ZERO_PRIOR = 10.0, 1.0
+POINT_PRIOR, ZERO_PRIOR = 10.0, 1.0
 
 
 @dataclass(frozen=True)
-class Unknown:
+class InstrumentParameter:
     """A scalar that an instrument brings with it.
 
     Attributes:
@@ -38,14 +38,14 @@ class Unknown:
         unit: "m" or "rad".
         nominal: where the search starts.
         prior: standard deviation about that, in its unit.
-        local: whether its value only means something to the very measurement that started it.
+        is_local: whether its value only means something to the very measurement that started it.
     """
 
     name: str
     unit: str
     nominal: float
     prior: float
-    local: bool = False
+    is_local: bool = False
 
 
 @dataclass(frozen=True)
@@ -60,19 +60,19 @@ class Measurement(Protocol):
     """What the solver asks of a kind with m samples, c configurations a sample and s unknowns."""
 
     kind: ClassVar[str]
-    groups: ClassVar[Mapping[str, slice]]
+    residual_groups: ClassVar[Mapping[str, slice]]
     # The kind's columns in a file and what they hold: "length", "angle" or "text"; sigmas included.
     columns: ClassVar[Mapping[str, str]]
     # A file is of this kind if it has all columns of one of these.
-    needs: ClassVar[tuple[frozenset[str], ...]]
+    required_columns: ClassVar[tuple[frozenset[str], ...]]
     # Configurations a row: 0, 1, or 2, the second under to:JOINT.
-    ends: ClassVar[int]
+    configurations_per_row: ClassVar[int]
     # Fields with an entry a sample.
-    per_row: ClassVar[tuple[str, ...]]
+    sample_fields: ClassVar[tuple[str, ...]]
     # Whether the tool must be on something for a sample; if not, any configuration can be measured.
-    touches: ClassVar[bool]
+    is_contact: ClassVar[bool]
     # Whether a reading holds a length; if not, an arm of any size fits as well.
-    metric: ClassVar[bool]
+    has_length_scale: ClassVar[bool]
 
     @property
     def q(self) -> Array:
@@ -85,17 +85,17 @@ class Measurement(Protocol):
         ...
 
     @property
-    def size(self) -> int:
+    def residual_dim(self) -> int:
         """Number k of residuals a sample."""
         ...
 
     @property
-    def stated(self) -> bool:
+    def has_stated_sigma(self) -> bool:
         """Whether the sigmas are the instrument's own, not a placeholder to be estimated."""
         ...
 
     @property
-    def unknowns(self) -> tuple[Unknown, ...]:
+    def instrument_parameters(self) -> tuple[InstrumentParameter, ...]:
         """The s unknowns, in the order of u."""
         ...
 
@@ -103,27 +103,27 @@ class Measurement(Protocol):
         """Joint values (c·m, n) that a sweep for this measurement has, one configuration after the other."""
         ...
 
-    def started(self, chain: Chain) -> Self:
+    def initialized(self, chain: Chain) -> Self:
         """The same readings with unknowns that start where a chain puts them."""
         ...
 
-    def residual(self, sweep: Sweep, u: Array) -> Array:
+    def residual(self, frames: FrameBatch, u: Array) -> Array:
         """Whitened residuals (k, m); `groups` names its rows."""
         ...
 
-    def mixture(self, sweep: Sweep, u: Array, residual: Array) -> Mixture:
+    def observation_matrix(self, frames: FrameBatch, u: Array, residual: Array) -> ObservationMatrix:
         """How the k rows of the whitened model follow from the tool's velocities where residual is."""
         ...
 
-    def own(self, sweep: Sweep, u: Array) -> Array:
+    def instrument_jacobian(self, frames: FrameBatch, u: Array) -> Array:
         """Derivatives (s, k, m) of the whitened model by the unknowns."""
         ...
 
-    def small_angle(self, sweep: Sweep, u: Array) -> tuple[Array, Mixture]:
+    def small_angle(self, frames: FrameBatch, u: Array) -> tuple[Array, ObservationMatrix]:
         """The paper's rows: residual (k, m) by (35) and (36), and what makes its R of velocities."""
         ...
 
-    def errors(self, sweep: Sweep, u: Array) -> dict[str, Array]:
+    def errors(self, frames: FrameBatch, u: Array) -> dict[str, Array]:
         """Unweighted errors (m, ·): "position" in m, "orientation" in rad, or the kind's own in m."""
         ...
 
@@ -135,11 +135,11 @@ class Measurement(Protocol):
         """Measured rotations (m, 3, 3) of the tool, or (0, 3, 3) where the kind has none."""
         ...
 
-    def scaled(self, scales: Mapping[str, float]) -> Self:
+    def with_scaled_sigma(self, scales: Mapping[str, float]) -> Self:
         """The same readings with each group's sigmas multiplied."""
         ...
 
-    def weighted(self, weights: Array) -> Self:
+    def with_weights(self, weights: Array) -> Self:
         """The same readings with each sample counting for a weight (m,), by wider sigmas."""
         ...
 
@@ -162,52 +162,54 @@ class Measurement(Protocol):
         ...
 
 
-def derivatives(item: Measurement, sweep: Sweep, velocities: Array, u: Array, residual: Array) -> Array:
+def whitened_jacobian(
+    item: Measurement, frames: FrameBatch, velocities: Array, u: Array, residual: Array
+) -> Array:
     """Of the whitened model (p, k, m), from tool velocities (p, 6, c·m) where the residual (k, m) is."""
     out = np.empty((len(velocities), *residual.shape))
-    return mix_velocities(velocities, item.mixture(sweep, u, residual), out)
+    return apply_observation_matrix(velocities, item.observation_matrix(frames, u, residual), out)
 
 
 _Kind = TypeVar("_Kind", bound=Measurement)
 
 
-def joined(items: Sequence[_Kind]) -> _Kind:
+def concatenate(items: Sequence[_Kind]) -> _Kind:
     """The samples of several measurements as one measurement's, in this order.
 
     Raises:
         DhcalError: they are of different kinds, or differ in more than their samples.
     """
     first = items[0]
-    common = [f.name for f in fields(first) if f.name not in first.per_row]  # pyright: ignore[reportArgumentType]
+    common = [f.name for f in fields(first) if f.name not in first.sample_fields]  # pyright: ignore[reportArgumentType]
     for item in items[1:]:
         if type(item) is not type(first) or not all(
-            _alike(getattr(item, name), getattr(first, name)) for name in common
+            _is_equal(getattr(item, name), getattr(first, name)) for name in common
         ):
             raise DhcalError(f"{item.kind}: differs from the first {first.kind} in more than its samples")
-    samples = {name: np.concatenate([getattr(item, name) for item in items]) for name in first.per_row}
+    samples = {name: np.concatenate([getattr(item, name) for item in items]) for name in first.sample_fields}
     return replace(first, **samples)  # pyright: ignore[reportArgumentType]
 
 
-def _alike(a: Any, b: Any) -> bool:
+def _is_equal(a: Any, b: Any) -> bool:
     return np.array_equal(a, b, equal_nan=True) if isinstance(a, np.ndarray) else a == b
 
 
-def need(*names: str) -> frozenset[str]:
+def columns_together(*names: str) -> frozenset[str]:
     """Columns that go together."""
     return frozenset(names)
 
 
-def gathered(values: Mapping[str, Any], names: Sequence[str]) -> Any:
+def stack_columns(values: Mapping[str, Any], names: Sequence[str]) -> Any:
     """Columns (m, k), or None where they are not all there."""
     return np.stack([values[name] for name in names], -1) if all(name in values for name in names) else None
 
 
-def lengths(*names: str) -> dict[str, str]:
+def length_columns(*names: str) -> dict[str, str]:
     """Columns of lengths and their sigmas."""
     return {**dict.fromkeys(names, "length"), **{f"sigma_{name}": "length" for name in names}}
 
 
-def checked_sigma(value: Any, shape: tuple[int, int], what: str) -> Array:
+def validated_sigma(value: Any, shape: tuple[int, int], what: str) -> Array:
     """Sigmas of that shape from one number or as many, positive and finite; or DhcalError."""
     value = np.asarray(value, float)
     try:
@@ -219,7 +221,7 @@ def checked_sigma(value: Any, shape: tuple[int, int], what: str) -> Array:
     return value
 
 
-def checked(value: Any, shape: tuple[int | None, ...], what: str) -> Array:
+def validated_array(value: Any, shape: tuple[int | None, ...], what: str) -> Array:
     """A finite array of that shape, None being any size; or DhcalError."""
     value = np.asarray(value, float)
     fits = value.ndim == len(shape) and all(w in (None, g) for w, g in zip(shape, value.shape, strict=True))
@@ -230,9 +232,9 @@ def checked(value: Any, shape: tuple[int | None, ...], what: str) -> Array:
     return value
 
 
-def places(prefix: str, at: Array) -> tuple[Unknown, ...]:
+def point_parameters(prefix: str, at: Array) -> tuple[InstrumentParameter, ...]:
     """Three unknown coordinates of a point that is at about (3,) m."""
     return tuple(
-        Unknown(f"{prefix}.{axis}", "m", float(value), PLACE_PRIOR)
+        InstrumentParameter(f"{prefix}.{axis}", "m", float(value), POINT_PRIOR)
         for axis, value in zip("xyz", at, strict=True)
     )

@@ -12,20 +12,20 @@ from numpy.typing import ArrayLike
 from .._typing import Array
 from ..exceptions import DhcalError
 from ..robot.chain import Chain
-from ..robot.inverse_kinematics import land, to_positions
+from ..robot.inverse_kinematics import position_task, solve_within_limits
 from .base import (
     LENGTH_SIGMA,
-    PLACE_PRIOR,
+    POINT_PRIOR,
+    InstrumentParameter,
     Noise,
-    Unknown,
-    checked,
-    checked_sigma,
-    gathered,
-    lengths,
-    need,
-    places,
+    columns_together,
+    length_columns,
+    point_parameters,
+    stack_columns,
+    validated_array,
+    validated_sigma,
 )
-from .position import PointReading, labelled
+from .position import PointReading, encode_labels
 from .trilateration import anchors_of
 
 _NOWHERE = np.zeros(3)
@@ -34,7 +34,7 @@ _NOWHERE = np.zeros(3)
 _SIGMAS = ("sigma_x", "sigma_y", "sigma_z")
 
 
-def only(words: Sequence[str], what: str) -> str:
+def only_value(words: Sequence[str], what: str) -> str:
     """The one word that all of them are, or DhcalError."""
     if len(set(words)) != 1:
         raise DhcalError(f"{what}: {', '.join(sorted(set(words)))} in one file; give each a file of its own")
@@ -42,7 +42,7 @@ def only(words: Sequence[str], what: str) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class Touch(PointReading):
+class PointContact(PointReading):
     """The tool point at fixed but unknown points, each touched from many configurations: sockets, pins.
 
     Rows of one name are the same point (three unknowns `point_NAME.x, .y, .z` in the measuring frame).
@@ -57,31 +57,33 @@ class Touch(PointReading):
     names: tuple[str, ...] = ()
 
     kind: ClassVar[str] = "point"
-    touches: ClassVar[bool] = True
-    metric: ClassVar[bool] = False
-    groups: ClassVar[Mapping[str, slice]] = {"position": slice(0, 3)}
+    is_contact: ClassVar[bool] = True
+    has_length_scale: ClassVar[bool] = False
+    residual_groups: ClassVar[Mapping[str, slice]] = {"position": slice(0, 3)}
     columns: ClassVar[Mapping[str, str]] = {"point": "text", **dict.fromkeys(_SIGMAS, "length")}
-    needs: ClassVar[tuple[frozenset[str], ...]] = (need("point"),)
-    per_row: ClassVar = (*PointReading.per_row, "label")
+    required_columns: ClassVar[tuple[frozenset[str], ...]] = (columns_together("point"),)
+    sample_fields: ClassVar = (*PointReading.sample_fields, "label")
 
     @classmethod
-    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> Touch:
+    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> PointContact:
         """`point`, and sigmas."""
-        return cls.of(q[0], values["point"], gathered(values, _SIGMAS))
+        return cls.from_arrays(q[0], values["point"], stack_columns(values, _SIGMAS))
 
     def to_columns(self) -> dict[str, Any]:
         """`point`, and sigmas."""
         out: dict[str, Any] = {"point": [self.names[i] for i in self.label]}
-        return out | ({name: self.sigma[:, i] for i, name in enumerate(_SIGMAS)} if self.stated else {})
+        return out | (
+            {name: self.sigma[:, i] for i, name in enumerate(_SIGMAS)} if self.has_stated_sigma else {}
+        )
 
     @classmethod
-    def of(cls, q: ArrayLike, points: Sequence[str], sigma: ArrayLike | None = None) -> Touch:
+    def from_arrays(cls, q: ArrayLike, points: Sequence[str], sigma: ArrayLike | None = None) -> PointContact:
         """Checked contacts at joint values (m, n) with named points (m,); sigma in m."""
-        q = checked(q, (None, None), "q")
-        names, label = labelled(points, len(q), "points")
-        sigmas = checked_sigma(LENGTH_SIGMA if sigma is None else sigma, (len(q), 3), "sigma")
+        q = validated_array(q, (None, None), "q")
+        names, label = encode_labels(points, len(q), "points")
+        sigmas = validated_sigma(LENGTH_SIGMA if sigma is None else sigma, (len(q), 3), "sigma")
         rows, zero = np.arange(1, len(q) + 1), np.zeros((len(q), 3))
-        unknowns = tuple(u for name in names for u in places(f"point_{name}", _NOWHERE))
+        unknowns = tuple(u for name in names for u in point_parameters(f"point_{name}", _NOWHERE))
         return cls(q, zero, sigmas, rows, sigma is not None, unknowns, label, names)
 
     def model(self, points: Array, u: Array) -> tuple[Array, Array, Array]:
@@ -92,24 +94,24 @@ class Touch(PointReading):
         at = u.reshape(-1, 3)[self.label].T
         return points[0] - at, np.tile(np.eye(3)[None, :, :, None], (1, 1, 1, m)), own.reshape(-1, 3, m)
 
-    def started(self, chain: Chain) -> Self:
+    def initialized(self, chain: Chain) -> Self:
         """Each point where the chain touches it on average."""
         tool = chain.poses(self.q)[:, :3, 3]
-        unknowns: list[Unknown] = []
+        unknowns: list[InstrumentParameter] = []
         for i, name in enumerate(self.names):
             mine = tool[self.label == i]
-            unknowns += places(f"point_{name}", mine.mean(0) if len(mine) else _NOWHERE)
-        return replace(self, unknowns=tuple(unknowns))
+            unknowns += point_parameters(f"point_{name}", mine.mean(0) if len(mine) else _NOWHERE)
+        return replace(self, instrument_parameters=tuple(unknowns))
 
     @classmethod
-    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Touch:
+    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> PointContact:
         """Configurations moved so that they touch four points near where they were."""
-        q = chain.checked(q)
+        q = chain.validated_q(q)
         at = chain.poses(q)[:4, :3, 3]
         label = np.arange(len(q)) % len(at)
         targets = at[label] + noise.position * rng.standard_normal((len(q), 3))
-        q = land(chain, to_positions(targets), q, rng)
-        return cls.of(q, [f"p{i + 1}" for i in label], noise.position or None)
+        q = solve_within_limits(chain, position_task(targets), q, rng)
+        return cls.from_arrays(q, [f"p{i + 1}" for i in label], noise.position or None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,22 +129,28 @@ class PointDistance(PointReading):
     names: tuple[str, ...] = ()
 
     kind: ClassVar[str] = "point_distance"
-    groups: ClassVar[Mapping[str, slice]] = {"length": slice(0, 1)}
-    columns: ClassVar[Mapping[str, str]] = {"point_a": "text", "point_b": "text", **lengths("distance")}
-    needs: ClassVar[tuple[frozenset[str], ...]] = (need("point_a", "point_b", "distance"),)
-    ends: ClassVar[int] = 0
-    per_row: ClassVar = (*PointReading.per_row, "label")
+    residual_groups: ClassVar[Mapping[str, slice]] = {"length": slice(0, 1)}
+    columns: ClassVar[Mapping[str, str]] = {
+        "point_a": "text",
+        "point_b": "text",
+        **length_columns("distance"),
+    }
+    required_columns: ClassVar[tuple[frozenset[str], ...]] = (
+        columns_together("point_a", "point_b", "distance"),
+    )
+    configurations_per_row: ClassVar[int] = 0
+    sample_fields: ClassVar = (*PointReading.sample_fields, "label")
 
     @classmethod
-    def of(
+    def from_arrays(
         cls, size: int, pairs: Sequence[tuple[str, str]], distance: ArrayLike, sigma: ArrayLike | None = None
     ) -> PointDistance:
         """Checked distances (m,) in m between named points (m, 2), for a chain of `size` joints."""
-        distance = checked(distance, (len(pairs),), "distance")[:, None]
-        names, label = labelled([name for pair in pairs for name in pair], 2 * len(pairs), "points")
-        sigmas = checked_sigma(LENGTH_SIGMA if sigma is None else sigma, distance.shape, "sigma")
+        distance = validated_array(distance, (len(pairs),), "distance")[:, None]
+        names, label = encode_labels([name for pair in pairs for name in pair], 2 * len(pairs), "points")
+        sigmas = validated_sigma(LENGTH_SIGMA if sigma is None else sigma, distance.shape, "sigma")
         # Where the points are, those who touch them know.
-        unknowns = tuple(u for name in names for u in places(f"point_{name}", np.full(3, np.nan)))
+        unknowns = tuple(u for name in names for u in point_parameters(f"point_{name}", np.full(3, np.nan)))
         q, rows = np.zeros((len(pairs), size)), np.arange(1, len(pairs) + 1)
         return cls(q, distance, sigmas, rows, sigma is not None, unknowns, label.reshape(-1, 2), names)
 
@@ -152,7 +160,7 @@ class PointDistance(PointReading):
         sigma = values.get("sigma_distance")
         pairs = list(zip(values["point_a"], values["point_b"], strict=True))
         size = q[0].shape[1]
-        return cls.of(size, pairs, values["distance"], None if sigma is None else sigma[:, None])
+        return cls.from_arrays(size, pairs, values["distance"], None if sigma is None else sigma[:, None])
 
     def to_columns(self) -> dict[str, Any]:
         """`point_a`, `point_b`, `distance`, and its sigma."""
@@ -178,11 +186,11 @@ class PointDistance(PointReading):
         length = np.array([np.linalg.norm(at[i] - at[j]) for i, j in pairs])
         length += noise.position * rng.standard_normal(len(pairs))
         named = [(f"p{i + 1}", f"p{j + 1}") for i, j in pairs]
-        return cls.of(chain.size, named, length, noise.position or None)
+        return cls.from_arrays(chain.n_joints, named, length, noise.position or None)
 
 
 @dataclass(frozen=True, eq=False)
-class Plane(PointReading):
+class PlaneContact(PointReading):
     """The tool point on an unknown plane: a surface plate, a wall. Three unknowns: two tilts and a height.
 
     Sees neither where the robot stands nor its scale: a robot and a height twice as large touch as well.
@@ -199,32 +207,34 @@ class Plane(PointReading):
     axes: Array = field(default_factory=lambda: np.eye(3))
 
     kind: ClassVar[str] = "plane"
-    touches: ClassVar[bool] = True
-    metric: ClassVar[bool] = False
-    groups: ClassVar[Mapping[str, slice]] = {"height": slice(0, 1)}
+    is_contact: ClassVar[bool] = True
+    has_length_scale: ClassVar[bool] = False
+    residual_groups: ClassVar[Mapping[str, slice]] = {"height": slice(0, 1)}
     columns: ClassVar[Mapping[str, str]] = {"plane": "text", "sigma_plane": "length"}
-    needs: ClassVar[tuple[frozenset[str], ...]] = (need("plane"),)
+    required_columns: ClassVar[tuple[frozenset[str], ...]] = (columns_together("plane"),)
 
     @classmethod
-    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> Plane:
+    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> PlaneContact:
         """`plane`, one name a file, and the sigma along its normal."""
         sigma = values.get("sigma_plane")
-        return cls.of(q[0], None if sigma is None else sigma[:, None], only(values["plane"], "plane"))
+        return cls.from_arrays(
+            q[0], None if sigma is None else sigma[:, None], only_value(values["plane"], "plane")
+        )
 
     def to_columns(self) -> dict[str, Any]:
         """`plane`, and the sigma along its normal."""
         out: dict[str, Any] = {"plane": [self.name] * len(self.rows)}
-        return out | ({"sigma_plane": self.sigma[:, 0]} if self.stated else {})
+        return out | ({"sigma_plane": self.sigma[:, 0]} if self.has_stated_sigma else {})
 
     @classmethod
-    def of(cls, q: ArrayLike, sigma: ArrayLike | None = None, name: str = "1") -> Plane:
+    def from_arrays(cls, q: ArrayLike, sigma: ArrayLike | None = None, name: str = "1") -> PlaneContact:
         """Checked contacts at joint values (m, n) with the plane `name`; sigma along its normal in m."""
-        q = checked(q, (None, None), "q")
-        sigmas = checked_sigma(LENGTH_SIGMA if sigma is None else sigma, (len(q), 1), "sigma")
+        q = validated_array(q, (None, None), "q")
+        sigmas = validated_sigma(LENGTH_SIGMA if sigma is None else sigma, (len(q), 1), "sigma")
         unknowns = (
-            Unknown(f"plane_{name}.tilt_1", "rad", 0.0, PLACE_PRIOR, local=True),
-            Unknown(f"plane_{name}.tilt_2", "rad", 0.0, PLACE_PRIOR, local=True),
-            Unknown(f"plane_{name}.height", "m", 0.0, PLACE_PRIOR, local=True),
+            InstrumentParameter(f"plane_{name}.tilt_1", "rad", 0.0, POINT_PRIOR, is_local=True),
+            InstrumentParameter(f"plane_{name}.tilt_2", "rad", 0.0, POINT_PRIOR, is_local=True),
+            InstrumentParameter(f"plane_{name}.height", "m", 0.0, POINT_PRIOR, is_local=True),
         )
         rows = np.arange(1, len(q) + 1)
         return cls(q, np.zeros((len(q), 1)), sigmas, rows, sigma is not None, unknowns, name=name)
@@ -241,7 +251,7 @@ class Plane(PointReading):
         own = np.concatenate([tilts, -np.ones((1, m))])[:, None]
         return (height - u[2])[None], np.tile(normal[None, None, :, None], (1, 1, 1, m)), own
 
-    def started(self, chain: Chain) -> Self:
+    def initialized(self, chain: Chain) -> Self:
         """The plane that fits the chain's tool points best."""
         points = chain.poses(self.q)[:, :3, 3]
         origin = points.mean(0)
@@ -249,9 +259,9 @@ class Plane(PointReading):
         return replace(self, origin=origin, axes=axes)
 
     @classmethod
-    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Plane:
+    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> PlaneContact:
         """Configurations moved so that they touch a tilted plate through the middle of where they were."""
-        q = chain.checked(q)
+        q = chain.validated_q(q)
         middle = chain.poses(q)[:, :3, 3].mean(0)
         normal = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
         height = noise.position * rng.standard_normal(len(q))
@@ -260,11 +270,11 @@ class Plane(PointReading):
             wide = (poses[:, :3, 3] - middle) @ normal - height[which]
             return wide[:, None], np.broadcast_to(normal, (len(poses), 1, 3))
 
-        return cls.of(land(chain, gap, q, rng), noise.position or None)
+        return cls.from_arrays(solve_within_limits(chain, gap, q, rng), noise.position or None)
 
 
 @dataclass(frozen=True, eq=False)
-class Sphere(PointReading):
+class SphereContact(PointReading):
     """The tool point on a sphere of known radius and unknown centre (`sphere_NAME.x, .y, .z`).
 
     The reading is the radius.
@@ -276,30 +286,34 @@ class Sphere(PointReading):
     name: str = "1"
 
     kind: ClassVar[str] = "sphere"
-    touches: ClassVar[bool] = True
-    groups: ClassVar[Mapping[str, slice]] = {"radius": slice(0, 1)}
-    columns: ClassVar[Mapping[str, str]] = {"sphere": "text", **lengths("radius")}
-    needs: ClassVar[tuple[frozenset[str], ...]] = (need("sphere", "radius"),)
+    is_contact: ClassVar[bool] = True
+    residual_groups: ClassVar[Mapping[str, slice]] = {"radius": slice(0, 1)}
+    columns: ClassVar[Mapping[str, str]] = {"sphere": "text", **length_columns("radius")}
+    required_columns: ClassVar[tuple[frozenset[str], ...]] = (columns_together("sphere", "radius"),)
 
     @classmethod
-    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> Sphere:
+    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> SphereContact:
         """`sphere`, one name a file, `radius`, and its sigma."""
         sigma = values.get("sigma_radius")
-        name = only(values["sphere"], "sphere")
-        return cls.of(q[0], values["radius"], None if sigma is None else sigma[:, None], name)
+        name = only_value(values["sphere"], "sphere")
+        return cls.from_arrays(q[0], values["radius"], None if sigma is None else sigma[:, None], name)
 
     def to_columns(self) -> dict[str, Any]:
         """`sphere`, `radius`, and its sigma."""
         return {"sphere": [self.name] * len(self.rows)} | super().to_columns()
 
     @classmethod
-    def of(cls, q: ArrayLike, radius: ArrayLike, sigma: ArrayLike | None = None, name: str = "1") -> Sphere:
+    def from_arrays(
+        cls, q: ArrayLike, radius: ArrayLike, sigma: ArrayLike | None = None, name: str = "1"
+    ) -> SphereContact:
         """Checked contacts at joint values (m, n) with a sphere of radius m, one number or (m,)."""
-        q = checked(q, (None, None), "q")
-        reading = checked(np.broadcast_to(np.asarray(radius, float), len(q)), (len(q),), "radius")[:, None]
-        sigmas = checked_sigma(LENGTH_SIGMA if sigma is None else sigma, reading.shape, "sigma")
+        q = validated_array(q, (None, None), "q")
+        reading = validated_array(np.broadcast_to(np.asarray(radius, float), len(q)), (len(q),), "radius")[
+            :, None
+        ]
+        sigmas = validated_sigma(LENGTH_SIGMA if sigma is None else sigma, reading.shape, "sigma")
         rows = np.arange(1, len(q) + 1)
-        unknowns = places(f"sphere_{name}", _NOWHERE)
+        unknowns = point_parameters(f"sphere_{name}", _NOWHERE)
         return cls(q, reading.copy(), sigmas, rows, sigma is not None, unknowns, name)
 
     def model(self, points: Array, u: Array) -> tuple[Array, Array, Array]:
@@ -309,15 +323,20 @@ class Sphere(PointReading):
         direction = reach / np.maximum(length, 1e-12)
         return length[None], direction[None, None], -direction[:, None]
 
-    def started(self, chain: Chain) -> Self:
+    def initialized(self, chain: Chain) -> Self:
         """The centre that fits the chain's tool points best."""
         points = chain.poses(self.q)[:, :3, 3]
-        return replace(self, unknowns=places(f"sphere_{self.name}", anchors_of(points, self.reading[:, 0])))
+        return replace(
+            self,
+            instrument_parameters=point_parameters(
+                f"sphere_{self.name}", anchors_of(points, self.values[:, 0])
+            ),
+        )
 
     @classmethod
-    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Sphere:
+    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> SphereContact:
         """Configurations moved so that they touch a sphere of 150 mm about where they were."""
-        q = chain.checked(q)
+        q = chain.validated_q(q)
         centre = chain.poses(q)[0, :3, 3]
         radius = 0.15
         length = radius + noise.position * rng.standard_normal(len(q))
@@ -327,4 +346,4 @@ class Sphere(PointReading):
             size = np.linalg.norm(reach, axis=1)
             return (size - length[which])[:, None], (reach / np.maximum(size, 1e-12)[:, None])[:, None]
 
-        return cls.of(land(chain, gap, q, rng), radius, noise.position or None)
+        return cls.from_arrays(solve_within_limits(chain, gap, q, rng), radius, noise.position or None)

@@ -15,19 +15,19 @@ from ..robot.chain import Chain
 from .base import (
     LENGTH_SIGMA,
     ZERO_PRIOR,
+    InstrumentParameter,
     Noise,
-    Unknown,
-    checked,
-    checked_sigma,
-    gathered,
-    lengths,
-    need,
-    places,
+    columns_together,
+    length_columns,
+    point_parameters,
+    stack_columns,
+    validated_array,
+    validated_sigma,
 )
 from .position import PointReading
 from .trilateration import anchors_of
 
-MOST_WIRES = 9
+MAX_WIRES = 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,16 +41,21 @@ class Wires(PointReading):
 
     Attributes:
         anchors: (w, 3) m, NaN where unknown.
-        zeros: (w,) m, NaN where unknown.
+        offsets: (w,) m, NaN where unknown.
     """
 
     anchors: Array = field(default_factory=lambda: np.empty((0, 3)))
-    zeros: Array = field(default_factory=lambda: np.empty(0))
+    offsets: Array = field(default_factory=lambda: np.empty(0))
 
     kind: ClassVar[str] = "wires"
-    groups: ClassVar[Mapping[str, slice]] = {"length": slice(None)}
-    columns: ClassVar[Mapping[str, str]] = lengths("length", *(f"L{i}" for i in range(1, MOST_WIRES + 1)))
-    needs: ClassVar[tuple[frozenset[str], ...]] = (need("length"), need("L1"))
+    residual_groups: ClassVar[Mapping[str, slice]] = {"length": slice(None)}
+    columns: ClassVar[Mapping[str, str]] = length_columns(
+        "length", *(f"L{i}" for i in range(1, MAX_WIRES + 1))
+    )
+    required_columns: ClassVar[tuple[frozenset[str], ...]] = (
+        columns_together("length"),
+        columns_together("L1"),
+    )
 
     @classmethod
     def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> Wires:
@@ -58,15 +63,17 @@ class Wires(PointReading):
         names = ["length"] if "length" in values else [n for n in cls.columns if n[0] == "L" and n in values]
         if names != ["length"] and names != [f"L{i + 1}" for i in range(len(names))]:
             raise DhcalError(f"wires {', '.join(names)}: number them L1, L2, … without a gap")
-        return cls.of(q[0], gathered(values, names), gathered(values, [f"sigma_{name}" for name in names]))
+        return cls.from_arrays(
+            q[0], stack_columns(values, names), stack_columns(values, [f"sigma_{name}" for name in names])
+        )
 
-    def reads(self) -> tuple[str, ...]:
+    def value_columns(self) -> tuple[str, ...]:
         """`length` for one wire, L1, L2, … for more."""
-        count = self.reading.shape[1]
+        count = self.values.shape[1]
         return ("length",) if count == 1 else tuple(f"L{i + 1}" for i in range(count))
 
     @classmethod
-    def of(
+    def from_arrays(
         cls,
         q: ArrayLike,
         length: ArrayLike,
@@ -78,12 +85,12 @@ class Wires(PointReading):
 
         zeros is a number, (w,), or None to have them estimated.
         """
-        q = checked(q, (None, None), "q")
-        length = checked(length, (len(q), None), "length")
+        q = validated_array(q, (None, None), "q")
+        length = validated_array(length, (len(q), None), "length")
         w = length.shape[1]
-        anchors = np.full((w, 3), np.nan) if anchors is None else checked(anchors, (w, 3), "anchors")
+        anchors = np.full((w, 3), np.nan) if anchors is None else validated_array(anchors, (w, 3), "anchors")
         zeros = np.full(w, np.nan) if zeros is None else np.broadcast_to(np.asarray(zeros, float), w).copy()
-        sigmas = checked_sigma(LENGTH_SIGMA if sigma is None else sigma, length.shape, "sigma")
+        sigmas = validated_sigma(LENGTH_SIGMA if sigma is None else sigma, length.shape, "sigma")
         rows = np.arange(1, len(q) + 1)
         return cls(
             q,
@@ -98,7 +105,7 @@ class Wires(PointReading):
 
     def _instrument(self, u: Array) -> tuple[Array, Array]:
         """Anchors (w, 3) and zeros (w,) with the unknowns filled in."""
-        anchors, zeros = self.anchors.copy(), self.zeros.copy()
+        anchors, zeros = self.anchors.copy(), self.offsets.copy()
         free = np.isnan(anchors[:, 0])
         count = 3 * int(free.sum())
         anchors[free] = u[:count].reshape(-1, 3)
@@ -113,7 +120,7 @@ class Wires(PointReading):
         direction = reach / np.maximum(length, 1e-12)[:, None]
         w, m = length.shape
         free = np.flatnonzero(np.isnan(self.anchors[:, 0]))
-        loose = np.flatnonzero(np.isnan(self.zeros))
+        loose = np.flatnonzero(np.isnan(self.offsets))
         own = np.zeros((3 * len(free) + len(loose), w, m))
         for i, wire in enumerate(free):
             own[3 * i : 3 * i + 3, wire] = -direction[wire]
@@ -121,32 +128,32 @@ class Wires(PointReading):
             own[3 * len(free) + i, wire] = 1.0
         return length + zeros[:, None], direction[None], own
 
-    def started(self, chain: Chain) -> Self:
+    def initialized(self, chain: Chain) -> Self:
         """Unknown anchors where spheres about the chain's tool points meet best."""
         points = chain.poses(self.q)[:, :3, 3]
         found = np.stack([anchors_of(points, length - np.nan_to_num(zero))
-                          for length, zero in zip(self.reading.T, self.zeros, strict=True)])  # fmt: skip
-        return replace(self, unknowns=_wire_unknowns(self.anchors, self.zeros, found))
+                          for length, zero in zip(self.values.T, self.offsets, strict=True)])  # fmt: skip
+        return replace(self, instrument_parameters=_wire_unknowns(self.anchors, self.offsets, found))
 
     @classmethod
     def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Wires:
         """The three-wire device, an equilateral rig of 300 mm a metre and a half away; raw lengths."""
-        q = chain.checked(q)
-        points = chain.sweep(q).tool[3].T
+        q = chain.validated_q(q)
+        points = chain.forward_kinematics(q).tool[3].T
         anchors = (
             points.mean(0) + [-1.5, 0, 0] + 0.3 * np.array([[0, 0, 1], [0, 0.866, -0.5], [0, -0.866, -0.5]])
         )
         length = np.linalg.norm(points[:, None] - anchors, axis=2)
         length += noise.position * rng.standard_normal(length.shape)
-        return cls.of(q, length, noise.position or None)
+        return cls.from_arrays(q, length, noise.position or None)
 
 
-def _wire_unknowns(anchors: Array, zeros: Array, start: Array) -> tuple[Unknown, ...]:
-    out: list[Unknown] = []
+def _wire_unknowns(anchors: Array, zeros: Array, start: Array) -> tuple[InstrumentParameter, ...]:
+    out: list[InstrumentParameter] = []
     for i in np.flatnonzero(np.isnan(anchors[:, 0])):
-        out += places(f"wire{i + 1}", start[i])
+        out += point_parameters(f"wire{i + 1}", start[i])
     for i in np.flatnonzero(np.isnan(zeros)):
-        out.append(Unknown(f"wire{i + 1}.zero", "m", 0.0, ZERO_PRIOR))
+        out.append(InstrumentParameter(f"wire{i + 1}.zero", "m", 0.0, ZERO_PRIOR))
     return tuple(out)
 
 
@@ -164,28 +171,28 @@ class Distance(PointReading):
     q_to: Array = field(default_factory=lambda: np.empty((0, 0)))
 
     kind: ClassVar[str] = "distance"
-    groups: ClassVar[Mapping[str, slice]] = {"length": slice(0, 1)}
-    columns: ClassVar[Mapping[str, str]] = lengths("distance")
-    needs: ClassVar[tuple[frozenset[str], ...]] = (need("distance"),)
-    ends: ClassVar[int] = 2
-    per_row: ClassVar = (*PointReading.per_row, "q_to")
+    residual_groups: ClassVar[Mapping[str, slice]] = {"length": slice(0, 1)}
+    columns: ClassVar[Mapping[str, str]] = length_columns("distance")
+    required_columns: ClassVar[tuple[frozenset[str], ...]] = (columns_together("distance"),)
+    configurations_per_row: ClassVar[int] = 2
+    sample_fields: ClassVar = (*PointReading.sample_fields, "q_to")
 
     @classmethod
-    def of(
+    def from_arrays(
         cls, q: ArrayLike, q_to: ArrayLike, distance: ArrayLike, sigma: ArrayLike | None = None
     ) -> Distance:
         """Checked distances (m,) in m between configurations (m, n) and (m, n)."""
-        q = checked(q, (None, None), "q")
-        q_to = checked(q_to, q.shape, "q_to")
-        distance = checked(distance, (len(q),), "distance")[:, None]
-        sigmas = checked_sigma(LENGTH_SIGMA if sigma is None else sigma, distance.shape, "sigma")
+        q = validated_array(q, (None, None), "q")
+        q_to = validated_array(q_to, q.shape, "q_to")
+        distance = validated_array(distance, (len(q),), "distance")[:, None]
+        sigmas = validated_sigma(LENGTH_SIGMA if sigma is None else sigma, distance.shape, "sigma")
         return cls(q, distance, sigmas, np.arange(1, len(q) + 1), sigma is not None, (), q_to)
 
     @classmethod
     def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> Distance:
         """`distance` between the configurations JOINT and to:JOINT."""
         sigma = values.get("sigma_distance")
-        return cls.of(q[0], q[1], values["distance"], None if sigma is None else sigma[:, None])
+        return cls.from_arrays(q[0], q[1], values["distance"], None if sigma is None else sigma[:, None])
 
     def configurations(self) -> Array:
         """First ends, then other ends, (2m, n)."""
@@ -201,8 +208,8 @@ class Distance(PointReading):
     @classmethod
     def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Distance:
         """Distances between each configuration and the next, the last and the first."""
-        q = chain.checked(q)
-        points = chain.sweep(q).tool[3].T
+        q = chain.validated_q(q)
+        points = chain.forward_kinematics(q).tool[3].T
         other = np.roll(np.arange(len(q)), -1)
         length = np.linalg.norm(points[other] - points, axis=1) + noise.position * rng.standard_normal(len(q))
-        return cls.of(q, q[other], length, noise.position or None)
+        return cls.from_arrays(q, q[other], length, noise.position or None)

@@ -1,6 +1,7 @@
 """The paper: its error factors, simulations and experiment (Cho, Ha, Lee, Park)."""
 
-from .error_factors import (
+from .experiment import PaperExperiment, paper_arm, run_experiment
+from .factors import (
     alpf,
     error_factors,
     laf,
@@ -12,13 +13,12 @@ from .error_factors import (
     thf,
     tool_error,
 )
-from .experiment import Experiment, paper_arm, run_experiment
 from .jacobian_check import Agreement, crosscheck
 from .simulations import Simulation, simulate
 
 __all__ = [
     "Agreement",
-    "Experiment",
+    "PaperExperiment",
     "Simulation",
     "alpf",
     "crosscheck",

@@ -9,33 +9,33 @@ from typing import Any
 import numpy as np
 
 from .._typing import Array
-from ..calibration.evaluation import Comparison, accuracy, deviations, error_statistics
+from ..calibration.evaluation import Comparison, accuracy, compute_errors, error_statistics
 from ..calibration.procedure import calibrate
 from ..calibration.result import Result
-from ..diagnostics.reachability import Finding, screen
-from ..estimation.parameters import select
-from ..estimation.problem import Problem, reduce
+from ..diagnostics.reachability import UnreachableRow, find_unreachable_rows
+from ..estimation.parameters import select_parameters
+from ..estimation.problem import Problem, linearize_and_factor
 from ..identifiability import observability
 from ..io.dh_file import read_dh
-from ..io.measurement_csv import Readings, read_readings
-from ..io.shipped_files import paper_file
+from ..io.measurement_csv import MeasurementFile, read_measurement_file
+from ..io.shipped_files import shipped_file
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 
 
 def paper_arm(name: str) -> Chain:
     """One of the paper's arms by the name of its DH file, such as `sim_6dof`."""
-    return Chain.from_dh(read_dh(paper_file(f"{name}.dh.toml")), name)
+    return Chain.from_dh(read_dh(shipped_file(f"{name}.dh.toml")), name)
 
 
-def identifiable(chain: Chain, data: Sequence[Measurement]) -> list[str]:
+def parameters_to_fix(chain: Chain, data: Sequence[Measurement]) -> list[str]:
     """Parameters to hold so that no direction is unseen at the nominal arm: the last of each group."""
-    errors = select(chain, "dh")
+    errors = select_parameters(chain, "dh")
     zero = np.zeros(len(errors.parameters))
-    triangle = reduce(Problem(errors, tuple(data), zero), zero, small_angle=False)
+    triangle = linearize_and_factor(Problem(errors, tuple(data), zero), zero, small_angle=False)
     held = [
         errors.parameters[i].name
-        for members, unseen in observability.unseen_groups(triangle.r)
+        for members, unseen in observability.unobservable_groups(triangle.r)
         for i in members[len(members) - unseen :]
     ]
     return sorted(held)
@@ -44,7 +44,7 @@ def identifiable(chain: Chain, data: Sequence[Measurement]) -> list[str]:
 def leave_one_out(fit: Callable[[Measurement], Result], data: Measurement) -> dict[str, Any]:
     """Accuracy, as from `accuracy`, on each sample under the fit to all the others."""
     rows = np.arange(len(data.q))
-    found = [deviations(fit(data.take(rows != row)).chain, [data.take(rows == row)])[0] for row in rows]
+    found = [compute_errors(fit(data.take(rows != row)).chain, [data.take(rows == row)])[0] for row in rows]
     return error_statistics(found)
 
 
@@ -53,7 +53,7 @@ def _rms(difference: Array) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Experiment:
+class PaperExperiment:
     """The paper's measured robot.
 
     Attributes:
@@ -61,33 +61,33 @@ class Experiment:
         readings: Table 5 as printed.
         findings: its impossible rows.
         data: the rows that remain.
-        held: parameters that these poses cannot see.
+        fixed: parameters that these poses cannot see.
         fit: least squares on the rest.
-        judged: its accuracy on each sample left out of the fit to the others.
+        comparison: its accuracy on each sample left out of the fit to the others.
         rows: the comparison for people, numbers in mm.
         figures: the same numbers in m.
     """
 
     chain: Chain
-    readings: Readings
-    findings: list[Finding]
+    readings: MeasurementFile
+    findings: list[UnreachableRow]
     data: Measurement
-    held: list[str]
+    fixed: list[str]
     fit: Result
-    judged: Comparison
+    comparison: Comparison
     rows: list[list[str]]
     figures: dict[str, float]
 
 
-def run_experiment() -> Experiment:
+def run_experiment() -> PaperExperiment:
     """Screens Table 5, calibrates Table 3 on what is left, and compares with what the paper printed."""
     chain = paper_arm("experiment")
-    readings = read_readings(paper_file("experiment_table5.csv"), chain)
-    findings = screen(chain, readings)
+    readings = read_measurement_file(shipped_file("experiment_table5.csv"), chain)
+    findings = find_unreachable_rows(chain, readings)
     good = ~np.isin(readings.data.rows, [finding.row for finding in findings])
     data = readings.data.take(good)
-    held = identifiable(chain, [data])
-    commanded, after = readings.commanded, readings.after
+    held = parameters_to_fix(chain, [data])
+    commanded, after = readings.commanded, readings.measured_after
     assert commanded is not None
     assert after is not None
 
@@ -122,5 +122,5 @@ def run_experiment() -> Experiment:
         ["the paper's own distance from the object, before", mm["paper_before"], ""],
         ["the paper's own distance from the object, after", mm["paper_after"], ""],
     ]
-    judged = Comparison("left out", len(data.q), accuracy(chain, [data]), left_out)
-    return Experiment(chain, readings, findings, data, held, fit, judged, rows, figures)
+    judged = Comparison("cross-validated", len(data.q), accuracy(chain, [data]), left_out)
+    return PaperExperiment(chain, readings, findings, data, held, fit, judged, rows, figures)

@@ -10,10 +10,10 @@ import pinocchio as pin
 from .. import se3
 from .._typing import Array
 from ..estimation.error_model import ErrorModel
-from ..estimation.parameters import select
-from ..robot.chain import Chain, extract, link_station, unlinked
+from ..estimation.parameters import select_parameters
+from ..robot.chain import Chain, extract_dh_table, link_frame, without_mimics
 from ..robot.dh import DHTable
-from .error_factors import error_factors
+from .factors import error_factors
 
 ALGEBRAIC, NUMERICAL = 1e-12, 1e-7
 
@@ -28,12 +28,12 @@ class Agreement:
     route: str
     columns: int
     difference: float
-    allowed: float
+    tolerance: float
 
     @property
-    def holds(self) -> bool:
+    def agrees(self) -> bool:
         """Whether the route agrees."""
-        return self.difference <= self.allowed
+        return self.difference <= self.tolerance
 
 
 def _order(errors: ErrorModel, n: int) -> Array:
@@ -45,9 +45,9 @@ def _order(errors: ErrorModel, n: int) -> Array:
 def vectorised(chain: Chain, errors: ErrorModel, q: Array) -> Array:
     """The kernel's Jacobian (m, 6, p) in the tool frame."""
     _, bodies, twists = errors.derivative(np.zeros(len(errors.parameters)))
-    sweep = chain.sweep(q)
-    velocities = chain.tool_velocities(sweep, bodies, twists)
-    rotation = sweep.tool[:3]  # columns, components, samples
+    frames = chain.forward_kinematics(q)
+    velocities = chain.tool_jacobian(frames, bodies, twists)
+    rotation = frames.tool[:3]  # columns, components, samples
     linear = np.einsum("crm,prm->mcp", rotation, velocities[:, :3])
     angular = np.einsum("crm,prm->mcp", rotation, velocities[:, 3:])
     return np.concatenate([linear, angular], 1)
@@ -57,7 +57,7 @@ def frame_jacobian(chain: Chain, q: Array) -> Array:
     """Pinocchio's LOCAL frame Jacobian (m, 6, n) at the tip, moving joints in path order."""
     model, frame = chain.model, chain.frame_id
     data = model.createData()
-    columns = [model.joints[model.getJointId(name)].idx_v for name in chain.moving]
+    columns = [model.joints[model.getJointId(name)].idx_v for name in chain.moving_joints]
     found = [
         pin.computeFrameJacobian(model, data, configuration, frame, pin.ReferenceFrame.LOCAL)
         for configuration in chain.configurations(q)
@@ -70,7 +70,7 @@ def augmented_jacobian(table: DHTable, q: Array) -> Array:
     """Pinocchio's Jacobian (m, 6, 4n) of a chain that has a virtual joint for every DH entry."""
     model = pin.Model()
     parent, place = 0, pin.SE3(table.base)
-    for i in range(table.size):
+    for i in range(table.n_joints):
         joints = [pin.JointModelRZ(), pin.JointModelPZ(), pin.JointModelPX(), pin.JointModelRX()]
         for joint, name in zip(joints, ("theta", "d", "a", "alpha"), strict=True):
             parent = model.addJoint(parent, joint, place, f"{name}{i + 1}")
@@ -81,7 +81,7 @@ def augmented_jacobian(table: DHTable, q: Array) -> Array:
     values = np.tile(np.stack([table.theta, table.d, table.a, table.alpha], -1), (len(q), 1, 1))
     values[:, :, 0] += np.where(table.prismatic, 0.0, q)
     values[:, :, 1] += np.where(table.prismatic, q, 0.0)
-    order = np.arange(4 * table.size).reshape(-1, 4).T.reshape(-1)
+    order = np.arange(4 * table.n_joints).reshape(-1, 4).T.reshape(-1)
     return np.array(
         [
             pin.computeFrameJacobian(model, data, row, frame, pin.ReferenceFrame.LOCAL)[:, order]
@@ -94,16 +94,16 @@ def regressor(chain: Chain, errors: ErrorModel, q: Array) -> Array:
     """Pinocchio's kinematic regressor times K (m, 6, p): placements' right perturbations to errors."""
     model, frame = chain.model, chain.frame_id
     data = model.createData()
-    k = len(chain.moving)
+    k = len(chain.moving_joints)
     mixing = np.zeros((6 * k + 6, len(errors.parameters)))
     for column, parameter in enumerate(errors.parameters):
         twist = np.array(parameter.twist)
         # Placement j stands between station link j and station joint j+1; the last one is the tip.
-        j = (parameter.station - 1) // 2
-        if parameter.station == link_station(j):
+        j = (parameter.error_frame - 1) // 2
+        if parameter.error_frame == link_frame(j):
             twist = se3.adjoint(se3.inverse(chain.origins[j])) @ twist
         mixing[6 * j : 6 * j + 6, column] = twist
-    blocks = np.concatenate([np.arange(6) + 6 * (model.getJointId(name) - 1) for name in chain.moving])
+    blocks = np.concatenate([np.arange(6) + 6 * (model.getJointId(name) - 1) for name in chain.moving_joints])
     out = np.empty((len(q), 6, len(errors.parameters)))
     for i, configuration in enumerate(chain.configurations(q)):
         pin.forwardKinematics(model, data, configuration)
@@ -117,8 +117,8 @@ def differences(table: DHTable, q: Array) -> Array:
     """Central differences (m, 6, 4n) of the plain DH product in every table entry."""
     columns = []
     for key in ("theta", "d", "a", "alpha"):
-        for i in range(table.size):
-            shift = np.eye(table.size)[i] * _STEP
+        for i in range(table.n_joints):
+            shift = np.eye(table.n_joints)[i] * _STEP
             up, down = (
                 replace(table, **{key: getattr(table, key) + sign * shift}).poses(q) for sign in (1.0, -1.0)
             )
@@ -131,12 +131,12 @@ def crosscheck(chain: Chain, samples: int = 100, seed: int = 0) -> list[Agreemen
 
     A joint that mimics another is a row of the table like any other, and moves by itself here.
     """
-    chain = unlinked(replace(chain, base=np.eye(4), tool=np.eye(4), transmission=None))
-    found = extract(chain)
-    table, n = found.table, found.table.size
+    chain = without_mimics(replace(chain, base=np.eye(4), tool=np.eye(4), transmission=None))
+    found = extract_dh_table(chain)
+    table, n = found.table, found.table.n_joints
     q = np.random.default_rng(seed).uniform(-np.pi, np.pi, (samples, n))
     paper = error_factors(table, q)
-    errors = select(chain, "dh")
+    errors = select_parameters(chain, "dh")
     order = _order(errors, n)
     motion = np.where(table.prismatic, np.arange(n) + n, np.arange(n))
     kernel = vectorised(chain, errors, q)[:, :, order]

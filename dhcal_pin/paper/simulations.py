@@ -9,8 +9,8 @@ import numpy as np
 from .._typing import Array
 from ..estimation import qr
 from ..estimation.error_model import ErrorModel
-from ..estimation.parameters import select
-from ..estimation.problem import Problem, reduce
+from ..estimation.parameters import select_parameters
+from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.solver import gauss_newton
 from ..exceptions import DhcalError
 from ..identifiability import observability
@@ -36,7 +36,7 @@ class Simulation:
         residual: (seeds,) largest whitened row left at the end, over the sigma of 1 mm or 1 mrad.
         rank: of the stacked factors at the nominal arm, first seed.
         rank_found: the same at the arm where the loop ends.
-        hidden: (p,) parameters that no pose sees at the true arm.
+        null_space: (p,) parameters that no pose sees at the true arm.
     """
 
     angle: Array
@@ -45,11 +45,11 @@ class Simulation:
     residual: Array
     rank: int
     rank_found: int
-    hidden: Array
+    null_space: Array
 
 
 def simulate(
-    arm: str, kind: str, poses: int, redrawn: bool, steps: int = 10, seeds: int = SEEDS
+    arm: str, kind: str, poses: int, resample_each_iteration: bool, steps: int = 10, seeds: int = SEEDS
 ) -> Simulation:
     """The paper's loop from an arm's nominal table to its actual one, noise-free.
 
@@ -57,34 +57,36 @@ def simulate(
         arm: `sim_6dof` or `sim_3dof`.
         kind: of measurement, `pose` or `position`.
         poses: joint sets an iteration.
-        redrawn: draw the joint sets anew at each iteration, or keep them.
+        resample_each_iteration: draw the joint sets anew at each iteration, or keep them.
         steps: iterations.
         seeds: runs, seeded 0, 1, …; a run that diverges keeps its last error.
     """
     nominal, actual = paper_arm(arm), paper_arm(f"{arm}_actual")
-    errors = select(nominal, "dh")
-    truth = _errors_between(errors, select(actual, "dh"))
+    errors = select_parameters(nominal, "dh")
+    truth = _errors_between(errors, select_parameters(actual, "dh"))
     angles = np.array([p.unit == "rad" for p in errors.parameters])
     weights = np.zeros(len(truth))
-    many = _draw(np.random.default_rng(10**6), 500, nominal.size)
-    seen = reduce(
-        Problem(select(actual, "dh"), (_exact(actual, kind, many),), weights), 0 * truth, small_angle=False
+    many = _draw(np.random.default_rng(10**6), 500, nominal.n_joints)
+    seen = linearize_and_factor(
+        Problem(select_parameters(actual, "dh"), (_exact(actual, kind, many),), weights),
+        0 * truth,
+        small_angle=False,
     )
-    hidden = observability.seen_share(seen.r) < 1 - 1e-6
+    hidden = observability.observable_fraction(seen.r) < 1 - 1e-6
     out = np.zeros((3, seeds, steps + 1))
     residual = np.zeros(seeds)
     ranks = (0, 0)
     for seed in range(seeds):
         rng = np.random.default_rng(seed)
-        data = _exact(actual, kind, _draw(rng, poses, nominal.size))
-        test = _draw(np.random.default_rng(10**6 + 1 + seed), TESTS, nominal.size)
+        data = _exact(actual, kind, _draw(rng, poses, nominal.n_joints))
+        test = _draw(np.random.default_rng(10**6 + 1 + seed), TESTS, nominal.n_joints)
         goal = actual.poses(test)[:, :3, 3]
         start = Problem(errors, (data,), weights)
         path = _loop(start, steps)
-        if redrawn:
+        if resample_each_iteration:
             path = path[:2]
             while len(path) <= steps:
-                data = _exact(actual, kind, _draw(rng, poses, nominal.size))
+                data = _exact(actual, kind, _draw(rng, poses, nominal.n_joints))
                 path = np.concatenate([path, _loop(Problem(errors, (data,), weights), 1, path[-1])[1:]])
         for step in range(steps + 1):
             x = path[min(step, len(path) - 1)]
@@ -92,9 +94,11 @@ def simulate(
             off = np.linalg.norm(errors.at(x).poses(test)[:, :3, 3] - goal, axis=1)
             out[:, seed, step] = gap[angles].max(), gap[~angles].max(), off.max()
         chain = errors.at(path[-1])
-        residual[seed] = np.abs(data.residual(chain.sweep(data.q), np.array([]))).max()
+        residual[seed] = np.abs(data.residual(chain.forward_kinematics(data.q), np.array([]))).max()
         if seed == 0:
-            first, last = (qr.rank(reduce(start, x, small_angle=False).r) for x in (0 * truth, path[-1]))
+            first, last = (
+                qr.rank(linearize_and_factor(start, x, small_angle=False).r) for x in (0 * truth, path[-1])
+            )
             ranks = first, last
     return Simulation(out[0], out[1], out[2], residual, ranks[0], ranks[1], hidden)
 
@@ -103,7 +107,7 @@ def _loop(problem: Problem, steps: int, x: Array | None = None) -> Array:
     """Every x on the paper's loop, (steps+1, p) or fewer where it settles; it stays put where it diverges."""
     x = np.zeros(len(problem.weights)) if x is None else x
     try:
-        return gauss_newton(problem, x, steps, None).path
+        return gauss_newton(problem, x, steps, None).iterates
     except DhcalError:
         return np.stack([x, x])
 
@@ -146,7 +150,7 @@ def simulation_rows(seeds: int = SEEDS) -> list[list[str]]:
     rows = []
     for title, arm, kind, poses, redrawn in SETTINGS:
         run = simulate(arm, kind, poses, redrawn, seeds=seeds)
-        total = 4 * paper_arm(arm).size
+        total = 4 * paper_arm(arm).n_joints
         medians = [f"{1e3 * np.median(run.test[:, step]):.2g}" for step in _STEPS]
         zero = int(np.sum(run.residual < 1e-9))
         true = int(np.sum((run.angle[:, -1] < np.deg2rad(1e-6)) & (run.length[:, -1] < 1e-9)))

@@ -27,7 +27,7 @@ class Criterion(Protocol):
         ...
 
 
-def _turned(rows: Array, by: Array) -> Array:
+def _transform_rows(rows: Array, by: Array) -> Array:
     """Rows (p, k, m) in coordinates by (p, w): (w, k, m)."""
     p, k, m = rows.shape
     return (by.T @ rows.reshape(p, k * m)).reshape(-1, k, m)
@@ -49,7 +49,7 @@ def _factor(rows: Array) -> Array:
     return out
 
 
-def _over(rows: Array, factor: Array) -> Array:
+def _solve_factor(rows: Array, factor: Array) -> Array:
     """Rows (w, k, m) times the inverse transposes of lower factors (k, k, m), in place."""
     for j in range(rows.shape[1]):
         for i in range(j):
@@ -59,7 +59,7 @@ def _over(rows: Array, factor: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Determinant:
+class DOptimality:
     """D: the volume of the unknowns' uncertainty, as the geometric mean of p standard deviations, squared."""
 
     def value(self, root: Array) -> float:
@@ -68,12 +68,12 @@ class Determinant:
 
     def gains(self, rows: Array, root: Array) -> Array:
         """By how much log det of the information grows: det(I + A·C·Aᵀ)."""
-        factor = _factor(_turned(rows, root))
+        factor = _factor(_transform_rows(rows, root))
         return 2 * np.log(np.einsum("iim->im", factor)).sum(0)
 
 
 @dataclass(frozen=True, eq=False)
-class Spread:
+class AOptimality:
     """A and task: the sum of the variances of some combinations of the unknowns.
 
     Attributes:
@@ -88,34 +88,34 @@ class Spread:
 
     def gains(self, rows: Array, root: Array) -> Array:
         """By how much the sum falls: tr((I + A·C·Aᵀ)⁻¹·A·C·W·C·Aᵀ)."""
-        turned = _turned(rows, root)
+        turned = _transform_rows(rows, root)
         factor = _factor(turned)
-        left = _over(_turned(turned, root.T @ self.combinations), factor)
+        left = _solve_factor(_transform_rows(turned, root.T @ self.combinations), factor)
         return np.einsum("wkm,wkm->m", left, left)
 
 
 @dataclass(frozen=True, eq=False)
-class Worst:
+class EOptimality:
     """E: the variance of the worst known among the combinations that can be known at all.
 
     Attributes:
-        seen: (r, p) orthonormal directions that the candidates see.
+        observable: (r, p) orthonormal directions that the candidates see.
     """
 
-    seen: Array
+    observable: Array
 
     def value(self, root: Array) -> float:
         """Log of the largest variance."""
-        return 2 * float(np.log(np.linalg.norm(self.seen @ root, 2)))
+        return 2 * float(np.log(np.linalg.norm(self.observable @ root, 2)))
 
     def gains(self, rows: Array, root: Array) -> Array:
         """By how much a sum of variances falls in which the worst ones count nearly alone."""
-        directions, size, _ = np.linalg.svd(self.seen @ root, full_matrices=False)
-        return Spread(self.seen.T @ directions * (size / size[0]) ** 6).gains(rows, root)
+        directions, size, _ = np.linalg.svd(self.observable @ root, full_matrices=False)
+        return AOptimality(self.observable.T @ directions * (size / size[0]) ** 6).gains(rows, root)
 
 
 @dataclass(frozen=True, eq=False)
-class Compromise:
+class BiasVarianceCriterion:
     """Robust: the error of some combinations by noise and by what the fit's model leaves out, both alike.
 
     A fit that takes f of the unknowns for zero while they are not puts them down to the others: with rows A
@@ -152,13 +152,13 @@ class Compromise:
         """By how much the mean of both falls, up to what is the same for all candidates."""
         held, bias = self._known(root)
         own, lost = rows[self.fitted], rows[~self.fitted]
-        turned = _turned(own, held)
+        turned = _transform_rows(own, held)
         factor = _factor(turned)
-        seen = _over(_turned(turned, held.T @ self.combinations), factor)
-        news = _over(lost - _turned(own, bias), factor)
+        seen = _solve_factor(_transform_rows(turned, held.T @ self.combinations), factor)
+        news = _solve_factor(lost - _transform_rows(own, bias), factor)
         off = self.combinations.T @ bias - self.wanted
         variance = np.sum((self.combinations.T @ held) ** 2) - np.einsum("wkm,wkm->m", seen, seen)
-        square = np.sum(off**2) + 2 * np.einsum("fkm,fkm->m", _turned(seen, off), news)
+        square = np.sum(off**2) + 2 * np.einsum("fkm,fkm->m", _transform_rows(seen, off), news)
         for i in range(rows.shape[1]):
             for j in range(rows.shape[1]):
                 both = np.einsum("wm,wm->m", seen[:, i], seen[:, j])

@@ -20,50 +20,50 @@ from .._typing import Array
 from .criteria import Criterion
 
 # A pass of exchanges that gains less than this is the last one: a thousandth of efficiency.
-ENOUGH = 1e-3
+MIN_PASS_GAIN = 1e-3
 
 
-MOST_PASSES = 20
+MAX_PASSES = 20
 
 
 # Exchange looks at so many candidates, those which would add most to the design as it is.
-PROMISING = 600
+MAX_EXCHANGE_CANDIDATES = 600
 
 
-def basis(start: Array, rows: Array) -> Array:
+def sqrt_covariance(prior_factor: Array, rows: Array) -> Array:
     """R⁻¹ (p, p) of the QR of a triangle (p, p) and rows (n, k, p) below it: a root of the covariance."""
-    p = start.shape[1]
-    triangle = np.linalg.qr(np.concatenate([start, rows.reshape(-1, p)]), mode="r")
+    p = prior_factor.shape[1]
+    triangle = np.linalg.qr(np.concatenate([prior_factor, rows.reshape(-1, p)]), mode="r")
     return lapack.dtrtri(triangle)[0]
 
 
-def _free(_: int) -> bool:
+def _always(_: int) -> bool:
     return True
 
 
 @dataclass(frozen=True, eq=False)
-class Pool:
+class CandidateSet:
     """Candidates to choose from.
 
     Attributes:
         rows: (p, k, m) whitened, the unknowns in units of their priors.
-        places: (m, d) where they stand. What no model holds is alike for neighbours, so two of them tell less
+        coordinates: (m, d) where they stand. What no model holds is alike for neighbours, so two of them tell less
             than their rows say.
-        apart: the distance that two chosen ones keep.
-        possible: tells of a candidate whether it can be measured at all; asked only of those that are wanted.
-        closed: (m,) candidates known to be impossible; grows as they are asked about.
+        min_distance: the distance that two chosen ones keep.
+        is_feasible: tells of a candidate whether it can be measured at all; asked only of those that are wanted.
+        infeasible: (m,) candidates known to be impossible; grows as they are asked about.
     """
 
     rows: Array
-    places: Array
-    apart: float = 0.0
-    possible: Callable[[int], bool] = _free
-    closed: Array = field(default_factory=lambda: np.zeros(0, bool))
+    coordinates: Array
+    min_distance: float = 0.0
+    is_feasible: Callable[[int], bool] = _always
+    infeasible: Array = field(default_factory=lambda: np.zeros(0, bool))
 
     @classmethod
-    def of(
-        cls, rows: Array, places: Array, apart: float = 0.0, possible: Callable[[int], bool] = _free
-    ) -> Pool:
+    def from_rows(
+        cls, rows: Array, places: Array, apart: float = 0.0, possible: Callable[[int], bool] = _always
+    ) -> CandidateSet:
         """Candidates none of which is known to be impossible."""
         return cls(rows, places, apart, possible, np.zeros(rows.shape[2], bool))
 
@@ -79,43 +79,45 @@ class Pool:
             among: (w,) their numbers.
             others: (n, d) places to keep away from.
         """
-        gains = np.where(self.closed[among] | self._crowded(among, others), -np.inf, gains)
+        gains = np.where(self.infeasible[among] | self._is_too_close(among, others), -np.inf, gains)
         while gains.size:
             at = int(np.argmax(gains))
             if gains[at] == -np.inf:
                 break
-            if self.possible(int(among[at])):
+            if self.is_feasible(int(among[at])):
                 return int(among[at])
-            self.closed[among[at]] = True
+            self.infeasible[among[at]] = True
             gains[at] = -np.inf
         return None
 
-    def _crowded(self, among: Array, others: Array) -> Array:
+    def _is_too_close(self, among: Array, others: Array) -> Array:
         """Which of the candidates (w,) stand too near to other places (n, d)."""
-        if not self.apart:
+        if not self.min_distance:
             return np.zeros(len(among), bool)
-        here = self.places[among]
+        here = self.coordinates[among]
         squares = np.sum(here**2, 1)[:, None] + np.sum(others**2, 1) - 2 * here @ others.T
-        return np.any(squares < self.apart**2, 1)
+        return np.any(squares < self.min_distance**2, 1)
 
 
-def greedy(pool: Pool, start: Array, count: int, criterion: Criterion, chosen: Array, kept: Array) -> Array:
+def greedy(
+    pool: CandidateSet, prior_factor: Array, count: int, criterion: Criterion, chosen: Array, existing: Array
+) -> Array:
     """Numbers of the chosen ones and of `count` more, each the best to add; fewer if no more are possible.
 
     Args:
         pool: candidates.
-        start: (p, p) triangle of what is known.
+        prior_factor: (p, p) triangle of what is known.
         count: how many to add.
         criterion: what for.
         chosen: (c,) numbers.
-        kept: (n, d) further places to keep away from.
+        existing: (n, d) further places to keep away from.
     """
     every = np.arange(pool.rows.shape[2])
     out = list(map(int, chosen))
     for _ in range(count):
-        gains = criterion.gains(pool.rows, basis(start, pool.at(np.array(out, int))))
+        gains = criterion.gains(pool.rows, sqrt_covariance(prior_factor, pool.at(np.array(out, int))))
         gains[out] = -np.inf
-        found = pool.best(gains, every, np.concatenate([kept, pool.places[out]]))
+        found = pool.best(gains, every, np.concatenate([existing, pool.coordinates[out]]))
         if found is None:
             break
         out.append(found)
@@ -123,38 +125,43 @@ def greedy(pool: Pool, start: Array, count: int, criterion: Criterion, chosen: A
 
 
 def exchange(
-    pool: Pool, start: Array, chosen: Array, criterion: Criterion, kept: Array, passes: int = MOST_PASSES
+    pool: CandidateSet,
+    prior_factor: Array,
+    chosen: Array,
+    criterion: Criterion,
+    existing: Array,
+    passes: int = MAX_PASSES,
 ) -> Array:
     """The chosen ones (n,) after exchanging each for the best in its place, until that gains next to nothing.
 
     Args:
         pool: candidates.
-        start: (p, p) triangle of what is known.
+        prior_factor: (p, p) triangle of what is known.
         chosen: (n,) numbers.
         criterion: what for.
-        kept: (c, d) further places to keep away from.
+        existing: (c, d) further places to keep away from.
         passes: the most of them.
     """
     chosen = chosen.copy()
-    value = criterion.value(basis(start, pool.at(chosen)))
+    value = criterion.value(sqrt_covariance(prior_factor, pool.at(chosen)))
     for _ in range(passes):
         before = value
-        gains = criterion.gains(pool.rows, basis(start, pool.at(chosen)))
+        gains = criterion.gains(pool.rows, sqrt_covariance(prior_factor, pool.at(chosen)))
         gains[chosen] = np.inf
-        near = np.argsort(-gains)[: max(PROMISING, 2 * len(chosen))]
+        near = np.argsort(-gains)[: max(MAX_EXCHANGE_CANDIDATES, 2 * len(chosen))]
         rows = np.ascontiguousarray(pool.rows[:, :, near])
         for slot in range(len(chosen)):
             others = np.delete(chosen, slot)
-            gains = criterion.gains(rows, basis(start, pool.at(others)))
+            gains = criterion.gains(rows, sqrt_covariance(prior_factor, pool.at(others)))
             gains[np.isin(near, others)] = -np.inf
-            found = pool.best(gains, near, np.concatenate([kept, pool.places[others]]))
+            found = pool.best(gains, near, np.concatenate([existing, pool.coordinates[others]]))
             if found is None or found == chosen[slot]:
                 continue
             trial = chosen.copy()
             trial[slot] = found
-            reached = criterion.value(basis(start, pool.at(trial)))
+            reached = criterion.value(sqrt_covariance(prior_factor, pool.at(trial)))
             if reached < value:
                 chosen, value = trial, reached
-        if before - value < ENOUGH:
+        if before - value < MIN_PASS_GAIN:
             break
     return chosen

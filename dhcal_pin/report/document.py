@@ -14,7 +14,7 @@ from typing import Any
 
 from .._typing import PathLike
 from ..calibration.evaluation import Comparison, accuracy
-from ..calibration.model_selection import Trial
+from ..calibration.model_selection import FamilyTrial
 from ..calibration.result import Result
 from ..estimation import qr
 from ..measurements.base import Measurement
@@ -31,12 +31,12 @@ class Provenance:
         names: the file of each item of the fitted data; empty where they came from Python.
         holdout_names: the same of the items held out.
         settings: further choices, in words by name.
-        left_out: reasons by file and row of what was not used at all.
-        doubts: what is hard to believe, by file.
+        excluded_rows: reasons by file and row of what was not used at all.
+        warnings: what is hard to believe, by file.
         remarks: sentences that belong beside the headline.
         trials: what each family of joints' transmission errors brought, where they were tried.
         hint: what they might bring, where they were not.
-        judged: accuracy on samples that were each left out of a fit, where none were held out.
+        comparison: accuracy on samples that were each left out of a fit, where none were held out.
     """
 
     command: str = ""
@@ -44,15 +44,15 @@ class Provenance:
     names: Sequence[str] = ()
     holdout_names: Sequence[str] = ()
     settings: Mapping[str, str] = field(default_factory=dict)
-    left_out: Mapping[str, Mapping[int, str]] = field(default_factory=dict)
-    doubts: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    excluded_rows: Mapping[str, Mapping[int, str]] = field(default_factory=dict)
+    warnings: Mapping[str, Sequence[str]] = field(default_factory=dict)
     remarks: Sequence[str] = ()
-    trials: Sequence[Trial] = ()
+    trials: Sequence[FamilyTrial] = ()
     hint: str = ""
-    judged: Comparison | None = None
+    comparison: Comparison | None = None
 
 
-def fingerprints(paths: Sequence[PathLike]) -> dict[str, str]:
+def file_digests(paths: Sequence[PathLike]) -> dict[str, str]:
     """SHA-256 of each input file, by path as given."""
     return {str(path): hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in paths}
 
@@ -84,16 +84,16 @@ def short_names(paths: Sequence[PathLike]) -> dict[str, str]:
 _ACCURACY = "position_rms_m position_max_m orientation_rms_rad residual_rms residual_max unit".split()
 
 
-_PARAMETER = "name unit nominal value std observability remaining fixed".split()
+_PARAMETER = "name unit nominal value std observability posterior_to_prior_std fixed".split()
 
 
-def _only(found: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
+def _select_keys(found: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
     return {key: found[key] for key in keys if key in found}
 
 
 def main_statistics(found: Mapping[str, Any]) -> dict[str, Any]:
     """RMS and largest errors of what `accuracy` found."""
-    return _only(found, _ACCURACY)
+    return _select_keys(found, _ACCURACY)
 
 
 def result_to_dict(
@@ -106,23 +106,23 @@ def result_to_dict(
         "converged": fit.converged,
         "iterations": fit.iterations,
         "method": fit.method,
-        "samples": fit.samples,
-        "samples_holdout": held.samples if held else 0,
+        "samples": fit.n_samples,
+        "samples_holdout": held.n_samples if held else 0,
         "rank": fit.rank,
         "parameters_total": len(fit.parameters),
         "condition": fit.condition,
-        "singular_values": qr.singular_values(fit.solution.triangle.r).tolist(),
+        "singular_values": qr.singular_values(fit.solution.system.r).tolist(),
         "before": main_statistics(found["fitted"].before),
         "after": main_statistics(found["fitted"].after),
         "holdout_before": main_statistics(held.before) if held else {},
         "holdout_after": main_statistics(held.after) if held else {},
         "comparisons": [asdict(comparison) for comparison in fit.comparisons],
-        "parameters": [_only(asdict(estimate), _PARAMETER) for estimate in fit.estimates],
+        "parameters": [_select_keys(asdict(estimate), _PARAMETER) for estimate in fit.estimates],
         "priors": {estimate.name: estimate.prior for estimate in fit.estimates if not estimate.fixed},
-        "kept": fit.kept,
-        "held_back": fit.held_back,
+        "shrinkage_factor": fit.shrinkage_factor,
+        "shrinkage_notes": fit.shrinkage_notes,
         "unobservable": fit.unobservable,
-        "weakly_seen": fit.weakly_seen,
+        "weakly_observable": fit.weakly_observable,
         "observability_indices": fit.observability_indices,
         "outliers": list(outliers),
         "files": dict(files),
@@ -151,9 +151,9 @@ def validation_to_dict(
         "holdout_after": {},
         "parameters": [],
         "unobservable": [],
-        "kept": 1.0,
-        "held_back": [],
-        "weakly_seen": [],
+        "shrinkage_factor": 1.0,
+        "shrinkage_notes": [],
+        "weakly_observable": [],
         "observability_indices": {},
         "outliers": [],
         "files": {},

@@ -11,17 +11,17 @@ from pathlib import Path
 from .. import formatting
 from .._typing import PathLike
 from ..calibration import summary
-from ..calibration.evaluation import ENDINGS, Comparison
+from ..calibration.evaluation import UNIT_SUFFIXES, Comparison
 from ..calibration.result import Result
-from ..calibration.summary import MEASURES, WORDS
+from ..calibration.summary import GROUP_LABELS, STATISTIC_LABELS
 from ..diagnostics.residuals import Workspace
 from ..exceptions import DhcalError
-from ..formatting import Table, shown
-from ..io.atomic import save
+from ..formatting import Table, format_quantity
+from ..io.atomic import write_files
 from ..visualization import scene
 from . import figures, maps, sections
 from .document import Provenance
-from .sections import Section, Study
+from .sections import ReportContext, Section
 
 PAGE = Path(__file__).with_name("report.html")
 
@@ -39,7 +39,7 @@ def report_files(fit: Result, paths: Sequence[PathLike], source: Provenance) -> 
         return {}
     for path in paths:
         check_ending(path)
-    found = sections.study(fit, source)
+    found = sections.report_context(fit, source)
     return {path: page(found) if _is_page(path) else sections.markdown(found) for path in paths}
 
 
@@ -64,10 +64,10 @@ def write_report(fit: Result, path: PathLike, source: Provenance | None = None) 
     Raises:
         DhcalError: another ending, or a place that cannot be written.
     """
-    save(report_files(fit, [path], source or Provenance()))
+    write_files(report_files(fit, [path], source or Provenance()))
 
 
-def page(found: Study) -> str:
+def page(found: ReportContext) -> str:
     """The HTML page; the same text for the same input."""
     body = [_head(found), *(_section(found, section) for section in sections.sections(found))]
     return _filled(f"Calibration of {found.robot}", body)
@@ -86,22 +86,28 @@ def _filled(title: str, body: Sequence[str]) -> str:
     return re.sub("|".join(parts), lambda mark: parts[mark[0]], PAGE.read_text("utf-8"))
 
 
-def _head(found: Study) -> str:
+def _head(found: ReportContext) -> str:
     head = summary.headline(found.comparisons)
-    best = head.of
-    what = f"{WORDS[head.group][0].upper()}{WORDS[head.group][1:]}"
-    many = "sample" if best.samples == 1 else "samples"
+    best = head.comparison
+    what = f"{GROUP_LABELS[head.group][0].upper()}{GROUP_LABELS[head.group][1:]}"
+    many = "sample" if best.n_samples == 1 else "samples"
     if best.title != "fitted":
-        title, note = f"{what} {summary.on_samples(best)}", summary.few(best)
+        title, note = f"{what} {summary.describe_samples(best)}", summary.small_sample_note(best)
     else:
         title = "Nothing was held out"
         note = (
-            f"The figures are of the {best.samples} fitted {many} themselves and say little about any other; "
+            f"The figures are of the {best.n_samples} fitted {many} themselves and say little about any other; "
             "calibrate with --holdout 0.3, or validate on other measurements, to judge the arm."
         )
     big = [("before", "before, RMS", head.before), ("after", "after, RMS", head.after)]
-    if best.before[f"{head.group}_rms{ENDINGS[head.group]}"]:
-        big.append(("", "smaller" if head.drop >= 0 else "larger", f"{abs(head.drop):.0f} %"))
+    if best.before[f"{head.group}_rms{UNIT_SUFFIXES[head.group]}"]:
+        big.append(
+            (
+                "",
+                "smaller" if head.percent_reduction >= 0 else "larger",
+                f"{abs(head.percent_reduction):.0f} %",
+            )
+        )
     notes = [note] if note else []
     notes += sections.warnings(found)
     out = [
@@ -117,7 +123,7 @@ def _head(found: Study) -> str:
     return "\n".join([*out, "</header>"])
 
 
-def _files(found: Study) -> str:
+def _files(found: ReportContext) -> str:
     names = sorted({*found.source.names, *found.source.holdout_names})
     if not names:
         return ""
@@ -133,9 +139,9 @@ def _figures(rows: Sequence[tuple[str, str, str]], look: str) -> str:
 def _details(best: Comparison, chosen: str) -> list[tuple[str, str, str]]:
     """The headline's other measures, and the RMS of other groups, after calibration."""
     out = []
-    for group, end in ENDINGS.items():
+    for group, end in UNIT_SUFFIXES.items():
         unit = end.strip("_") or "m"
-        for key, word in MEASURES.items():
+        for key, word in STATISTIC_LABELS.items():
             name = f"{group}_{key}{end}"
             if (
                 name in best.after
@@ -143,17 +149,17 @@ def _details(best: Comparison, chosen: str) -> list[tuple[str, str, str]]:
                 and (group == chosen or key == "rms")
             ):
                 std = best.after[f"{group}_rms_std{end}"]
-                value = shown(best.after[name], unit, std, small=True)
+                value = format_quantity(best.after[name], unit, std, small=True)
                 if group != chosen:
-                    value = f"{shown(best.before[name], unit, std, small=True)} → {value}"
-                    word = f"{WORDS[group]}, {word}"
+                    value = f"{format_quantity(best.before[name], unit, std, small=True)} → {value}"
+                    word = f"{GROUP_LABELS[group]}, {word}"
                 else:
                     word = f"after, {word}"
                 out.append(("", word, value))
     return out
 
 
-def _section(found: Study, section: Section) -> str:
+def _section(found: ReportContext, section: Section) -> str:
     drawn = FIGURES.get(section.key, lambda _: "")(found)
     texts = [f"<p>{html.escape(text)}</p>" for text in section.sentences]
     items = "".join(f"<li>{html.escape(text)}</li>" for text in section.items)
@@ -168,7 +174,7 @@ def _section(found: Study, section: Section) -> str:
     )
 
 
-def _table(found: Study, section: Section, table: Table) -> str:
+def _table(found: ReportContext, section: Section, table: Table) -> str:
     bars = None
     if section.key == "parameters":
         bars = figures.estimate_bars(found, [row[0] for row in table.rows])
@@ -197,21 +203,21 @@ def _panels(
     return "\n".join([head, _legend(legend) if legend else "", f'<div class="{look}">', *drawn, "</div>"])
 
 
-def _histograms(found: Study) -> str:
+def _histograms(found: ReportContext) -> str:
     drawn = figures.histograms(found)
     return _panels(drawn, BEFORE_AFTER, look="panels two" if len(drawn) in (2, 4) else "panels")
 
 
-def _left_figures(found: Study) -> str:
+def _left_figures(found: ReportContext) -> str:
     looks = figures.sample_looks(found)
     dots = [(f"dots {look}", name) for look, name in zip(looks, ("fitted", "held out"), strict=False)]
     dots += [("dots gross", "gross error")] if found.outliers else []
-    lines = [(f"line {look}", look) for look in figures.states(found)]
+    lines = [(f"line {look}", look) for look in figures.visible_states(found)]
     one = [("dots faint", "a sample"), ("line after", "median")]
     return "\n".join(
         [
             _panels(
-                figures.asked(found),
+                figures.plot_joint_offset_profile(found),
                 lines,
                 "Error that each part of a joint's range asks of that joint alone",
             ),
@@ -226,15 +232,15 @@ def _left_figures(found: Study) -> str:
     )
 
 
-def _map_figures(found: Study) -> str:
+def _map_figures(found: ReportContext) -> str:
     drawn, legend = maps.map_panels(found.workspace)
     return _panels(drawn, legend, look="panels wide")
 
 
-def _scene(found: Study) -> str:
+def _scene(found: ReportContext) -> str:
     fit = found.fit
     page = scene.scene_html(
-        fit.reference,
+        fit.nominal_refitted,
         fit,
         title=found.robot,
         magnification=maps.magnification(found),

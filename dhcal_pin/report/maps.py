@@ -12,9 +12,9 @@ from .. import se3
 from .._typing import Array
 from ..diagnostics.residuals import Workspace
 from ..visualization import figures
-from ..visualization.figures import Axis, panel
-from .figures import FEW, MOST_DOTS
-from .sections import Study
+from ..visualization.figures import Axis, axes
+from .figures import MAX_DOTS, MAX_SEPARATE_DOTS
+from .sections import ReportContext
 
 # Cells a side of a map.
 GRID = 32
@@ -81,19 +81,19 @@ def map_panels(w: Workspace) -> tuple[list[str], list[tuple[str, str]]]:
         return [], []
     edges, out = levels(found), []
     good = w.std[np.isfinite(w.std)]
-    thin = figures.thinned(len(w.measured), 500)
+    thin = figures.subsample_indices(len(w.measured), 500)
     for m, title in zip(found, ("Seen from above", "Seen from the side"), strict=True):
         pick = ["xyz".index(name) for name in m.key]
         x, y = _square(w.points[:, pick], m.key)
-        marks = [figures.cells(m.corners[:, 0], m.corners[:, 1], m.size, figures.level_of(m.std, edges))]
+        marks = [figures.heatmap(m.corners[:, 0], m.corners[:, 1], m.size, figures.level_of(m.std, edges))]
         marks.append(figures.dots(w.measured[thin, pick[0]], w.measured[thin, pick[1]], "measured"))
         text = (
             f"Map of the predicted standard deviation of the tool's position over {m.key[0]} and {m.key[1]}: "
             f"half of the configurations below {1e3 * float(np.median(good)):.3g} mm, 95 % below "
             f"{1e3 * float(np.quantile(good, 0.95)):.3g} mm."
         )
-        out.append(panel(f"m-{m.key}", title, text, x, y, marks, figures.WIDE, SQUARE))
-    places = figures.places(0.1 * 1e3 * (edges[1] - edges[0]))
+        out.append(axes(f"m-{m.key}", title, text, x, y, marks, figures.WIDE, SQUARE))
+    places = figures.decimals(0.1 * 1e3 * (edges[1] - edges[0]))
     words = [f"{1e3 * edge:.{places}f}" for edge in edges]
     legend = [(f"level{i}", f"{a}–{b} mm") for i, (a, b) in enumerate(pairwise(words))]
     legend[0], legend[-1] = ("level0", f"below {words[1]} mm"), (legend[-1][0], f"above {words[-2]} mm")
@@ -111,49 +111,49 @@ def _square(points: Array, names: str) -> tuple[Axis, Axis]:
     return x, y
 
 
-def magnification(study: Study) -> float:
+def magnification(study: ReportContext) -> float:
     """How many times larger errors are drawn so that they show: round, from 1 to 500."""
     points = [
-        np.array([body[3, :, 0] for body in chain.sweep(_pose(study)).bodies])
-        for chain in (study.fit.reference, study.fit.chain)
+        np.array([body[3, :, 0] for body in chain.forward_kinematics(_pose(study)).bodies])
+        for chain in (study.fit.nominal_refitted, study.fit.chain)
     ]
     off = float(np.linalg.norm(points[1] - points[0], axis=1).max())
     wanted = 0.05 * float(np.ptp(points[0], axis=0).max()) / max(off, 1e-12)
     return min(max(figures.nice_step(max(wanted, 1e-3) / 2), 1.0), 500.0)
 
 
-def _pose(study: Study) -> Array:
+def _pose(study: ReportContext) -> Array:
     """Joint values (1, n) of the fitted sample that is nearest the middle of all."""
-    used = [item.configurations() for item in study.fit.data if item.ends > 0]
+    used = [item.configurations() for item in study.fit.data if item.configurations_per_row > 0]
     if not used:
-        return np.zeros((1, study.fit.chain.size))
+        return np.zeros((1, study.fit.chain.n_joints))
     points = study.workspace.measured
     nearest = int(np.argmin(np.linalg.norm(points - points.mean(0), axis=1)))
     return np.concatenate(used)[nearest : nearest + 1]
 
 
-def arm(study: Study) -> list[str]:
+def arm(study: ReportContext) -> list[str]:
     """The arm's skeleton at one sample before and after, errors drawn larger, from two sides."""
     fit, larger = study.fit, magnification(study)
     into = se3.inverse(fit.chain.base)
     shapes = []
-    for chain in (fit.reference, fit.chain):
-        sweep = chain.sweep(_pose(study))
-        points = np.array([*(body[3, :, 0] for body in sweep.bodies), sweep.tool[3, :, 0]])
+    for chain in (fit.nominal_refitted, fit.chain):
+        frames = chain.forward_kinematics(_pose(study))
+        points = np.array([*(body[3, :, 0] for body in frames.bodies), frames.tool[3, :, 0]])
         shapes.append(points @ into[:3, :3].T + into[:3, 3])
     nominal = shapes[0]
     drawn = nominal + larger * (shapes[1] - nominal)
     cloud = study.workspace.measured
-    cloud = cloud[figures.thinned(len(cloud), MOST_DOTS)]
+    cloud = cloud[figures.subsample_indices(len(cloud), MAX_DOTS)]
     out = []
     for key, pick, title in (("xz", [0, 2], "From the side"), ("xy", [0, 1], "From above")):
         x, y = _square(np.concatenate([nominal, drawn, cloud])[:, pick], key)
-        size = " large" if len(cloud) < FEW else ""
+        size = " large" if len(cloud) < MAX_SEPARATE_DOTS else ""
         marks = [figures.dots(cloud[:, pick[0]], cloud[:, pick[1]], f"faint{size}")]
         for points, look in ((nominal, "before"), (drawn, "after")):
             across, up = points[:, pick].T
             marks += [draw(across, up, look) for draw in (figures.line, figures.dots)]
         name = f"{title}, " + (f"errors drawn {larger:g} times larger" if larger > 1 else "true to scale")
         text = f"The arm's joints before and after calibration over {key[0]} and {key[1]}."
-        out.append(panel(f"arm-{key}", name, text, x, y, marks, figures.WIDE, SQUARE))
+        out.append(axes(f"arm-{key}", name, text, x, y, marks, figures.WIDE, SQUARE))
     return out

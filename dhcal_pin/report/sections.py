@@ -13,31 +13,31 @@ from ..calibration.evaluation import Comparison
 from ..calibration.model_selection import trial_table
 from ..calibration.result import Result
 from ..diagnostics.residuals import (
-    JointTrace,
+    JointProfile,
     Outlier,
     Workspace,
-    joint_traces,
+    joint_offset_profiles,
     outliers,
     sigmas,
     workspace,
 )
 from ..estimation import robust
-from ..formatting import Table, fixed, shown
-from ..robot.chain import BASE
+from ..formatting import Table, format_fixed, format_quantity
+from ..robot.chain import BASE_FRAME
 from .document import Provenance, short_names, versions
 
 # A longer list of outliers is cut: its file is to be looked at, not its rows.
-MOST_OUTLIERS = 40
+MAX_OUTLIERS = 40
 
 
 @dataclass(frozen=True, eq=False)
-class Study:
+class ReportContext:
     """A result and everything that is computed for its report, once."""
 
     fit: Result
     source: Provenance
     outliers: Sequence[Outlier]
-    traces: Sequence[JointTrace]
+    joint_profiles: Sequence[JointProfile]
     workspace: Workspace
 
     @property
@@ -53,7 +53,7 @@ class Study:
     @property
     def comparisons(self) -> tuple[Comparison, ...]:
         """Accuracy before and after, the most honest first."""
-        judged, own = self.source.judged, self.fit.comparisons
+        judged, own = self.source.comparison, self.fit.comparisons
         return (judged, *(c for c in own if c.title == "fitted")) if judged and not self.fit.holdout else own
 
     @property
@@ -69,9 +69,9 @@ def _names(given: Sequence[str], kinds: Sequence[str]) -> list[str]:
     return [f"{kind} measurements {i}" for i, kind in enumerate(kinds, 1)]
 
 
-def study(fit: Result, source: Provenance) -> Study:
+def report_context(fit: Result, source: Provenance) -> ReportContext:
     """Everything that the report of a result needs."""
-    return Study(fit, source, outliers(fit), joint_traces(fit), workspace(fit, fit.data))
+    return ReportContext(fit, source, outliers(fit), joint_offset_profiles(fit), workspace(fit, fit.data))
 
 
 @dataclass(frozen=True)
@@ -85,41 +85,41 @@ class Section:
     tables: Sequence[Table] = ()
 
 
-def sections(found: Study) -> list[Section]:
+def sections(found: ReportContext) -> list[Section]:
     """The whole report below its headline."""
     return [
         _accuracy(found),
-        _left(found),
+        _residual_section(found),
         _extension(found),
         _workspace(found),
         Section("scene", "The arm"),
         _parameters(found),
-        _seen(found),
+        _observability_section(found),
         _rows(found),
-        _done(found),
+        _provenance_section(found),
     ]
 
 
-def warnings(found: Study) -> list[str]:
+def warnings(found: ReportContext) -> list[str]:
     """What a reader must know before believing the figures."""
     fit, out = found.fit, []
     if not fit.converged:
         out.append("The loop did not converge: the figures are of its last step.")
-    out += summary.setbacks(found.comparisons)
-    if not np.isfinite(fit.noise):
+    out += summary.regressions(found.comparisons)
+    if not np.isfinite(fit.unit_weight_std):
         out.append(
-            f"{fit.samples} samples stand against {fit.rank} directions that they see: no reading is left "
+            f"{fit.n_samples} samples stand against {fit.rank} directions that they see: no reading is left "
             "over to tell how uncertain the parameters are."
         )
     if found.outliers:
         many = f"{len(found.outliers)} gross errors are" if len(found.outliers) > 1 else "One gross error is"
-        aside = max(c.aside for c in fit.comparisons)
+        aside = max(c.n_rejected for c in fit.comparisons)
         out.append(f"{many} among the samples, {aside or 'none'} left aside; see below.")
     return out
 
 
-def _accuracy(found: Study) -> Section:
-    frames = {e.name.split(".")[0] for e in found.fit.estimates if e.place == "frame" and not e.fixed}
+def _accuracy(found: ReportContext) -> Section:
+    frames = {e.name.split(".")[0] for e in found.fit.estimates if e.category == "frame" and not e.fixed}
     same = f", its {' and '.join(sorted(frames))} where they fit best" if frames else ""
     return Section(
         "accuracy",
@@ -129,39 +129,41 @@ def _accuracy(found: Study) -> Section:
     )
 
 
-def _left(found: Study) -> Section:
+def _residual_section(found: ReportContext) -> Section:
     title, key = "What the model leaves unexplained", "left"
-    if not found.traces:
+    if not found.joint_profiles:
         return Section(key, title)
     which = "held out" if found.fit.holdout else "fitted"
     rows = []
-    for t in found.traces:
-        unit = "m" if t.slides else "rad"
+    for t in found.joint_profiles:
+        unit = "m" if t.is_prismatic else "rad"
         if len(t.centres):
             worst = int(np.nanargmax(np.abs(t.after)))
             std, at = float(t.after_std[worst]), float(t.centres[worst])
             figures = (float(np.nanmax(np.abs(t.before))), float(t.after[worst]), std)
-            place = f"{1e3 * at:.0f} mm" if t.slides else f"{np.degrees(at):.0f}°"
-            rows.append([t.name, *(shown(figure, unit, std, small=True) for figure in figures), place])
+            place = f"{1e3 * at:.0f} mm" if t.is_prismatic else f"{np.degrees(at):.0f}°"
+            rows.append(
+                [t.name, *(format_quantity(figure, unit, std, small=True) for figure in figures), place]
+            )
     text = (
         "In each part of a joint's range, the error of that joint alone that would explain the samples "
         f"{which} best. Scatter about zero is noise; a wave points to an error that the model lacks: an "
         "eccentric gear, elasticity, backlash."
     )
     table = Table(["joint", "largest before", "largest after", "std", "at"], rows)
-    if silent := [t.name for t in found.traces if not len(t.centres)]:
+    if silent := [t.name for t in found.joint_profiles if not len(t.centres)]:
         text += f" Nothing is said of {', '.join(silent)}: too few samples, or it hardly moves the point."
     if not rows:
         return Section(key, title, ["There are too few samples to see how each joint errs over its range."])
     return Section(key, title, [text], tables=[table])
 
 
-def _extension(found: Study) -> Section:
+def _extension(found: ReportContext) -> Section:
     title, trials = "Errors of the joints' drives", found.source.trials
     if not trials:
         hint = found.source.hint
         return Section("extension", title, [f"{hint[0].upper()}{hint[1:]}."] if hint else [])
-    kept = [trial.family for trial in trials if trial.kept]
+    kept = [trial.family for trial in trials if trial.is_selected]
     said = f"Added to the geometry: {', '.join(kept)}." if kept else "None was added to the geometry."
     text = (
         "Errors are those on regions of joint space that were left out of the fit, in standard deviations "
@@ -171,7 +173,7 @@ def _extension(found: Study) -> Section:
     return Section("extension", title, [said, text], tables=[trial_table(trials)])
 
 
-def _workspace(found: Study) -> Section:
+def _workspace(found: ReportContext) -> Section:
     w = found.workspace
     known = np.isfinite(w.std)
     rows = []
@@ -182,7 +184,7 @@ def _workspace(found: Study) -> Section:
         if len(std):
             good = std[np.isfinite(std)]
             cells = [
-                fixed(1e3 * float(np.quantile(good, at)), 3) if good.size else "–"
+                format_fixed(1e3 * float(np.quantile(good, at)), 3) if good.size else "–"
                 for at in (0.05, 0.5, 0.95, 1)
             ]
             rows.append([title, *cells, f"{100 * (1 - good.size / len(std)):.0f} %"])
@@ -205,13 +207,15 @@ def _workspace(found: Study) -> Section:
     )
 
 
-def _parameters(found: Study) -> Section:
+def _parameters(found: ReportContext) -> Section:
     titles = {
         "robot": "Robot",
         "frame": "Where the robot stands and where the target sits",
         "instrument": "Instruments",
     }
-    every = [(title, [e for e in found.fit.estimates if e.place == place]) for place, title in titles.items()]
+    every = [
+        (title, [e for e in found.fit.estimates if e.category == place]) for place, title in titles.items()
+    ]
     out = []
     for title, rows in every:
         if rows:
@@ -222,7 +226,7 @@ def _parameters(found: Study) -> Section:
             full = [
                 [
                     *row,
-                    shown(e.prior, e.unit, e.prior, True) if not e.fixed else "",
+                    format_quantity(e.prior, e.unit, e.prior, True) if not e.fixed else "",
                     "" if e.fixed else f"{e.observability:.2f}",
                 ]
                 for row, e in zip(table.rows, rows, strict=True)
@@ -238,7 +242,7 @@ def _parameters(found: Study) -> Section:
     return Section("parameters", "Parameters", [text], tables=out)
 
 
-def _seen(found: Study) -> Section:
+def _observability_section(found: ReportContext) -> Section:
     fit = found.fit
     text = (
         f"The data see {fit.rank} of {len(fit.parameters)} directions of the parameters; the largest "
@@ -251,46 +255,48 @@ def _seen(found: Study) -> Section:
     if held := [e.name for e in fit.estimates if e.fixed]:
         sentences.append(f"Held at nominal, and so not judged: {', '.join(held)}.")
     items = [
-        *(f"held back: {text}" for text in fit.held_back),
+        *(f"held back: {text}" for text in fit.shrinkage_notes),
         *fit.unobservable,
-        *(f"weakly seen: {text}" for text in fit.weakly_seen),
+        *(f"weakly seen: {text}" for text in fit.weakly_observable),
     ]
     return Section("seen", "What could not be told apart", sentences, items)
 
 
-def _rows(found: Study) -> Section:
+def _rows(found: ReportContext) -> Section:
     names, rows = found.names, []
-    for o in found.outliers[:MOST_OUTLIERS]:
+    for o in found.outliers[:MAX_OUTLIERS]:
         size = ", ".join(
-            shown(v, "rad" if g == "orientation" else "m", v / 10, True) for g, v in o.sizes.items()
+            format_quantity(v, "rad" if g == "orientation" else "m", v / 10, True) for g, v in o.sizes.items()
         )
         rows.append([names[o.item], str(o.row), size, f"{o.score:.0f}"])
-    sentences = [f"No fitted sample scores beyond {robust.OUTLYING:g} against the scatter of the others."]
+    sentences = [
+        f"No fitted sample scores beyond {robust.OUTLIER_THRESHOLD:g} against the scatter of the others."
+    ]
     if rows:
         more = len(found.outliers) - len(rows)
         sentences = [
-            f"Fitted samples that score beyond {robust.OUTLYING:g} against the scatter of the others; a good "
+            f"Fitted samples that score beyond {robust.OUTLIER_THRESHOLD:g} against the scatter of the others; a good "
             "sample does that once in three million." + (f" {more} more are not listed." if more else "")
         ]
     items = [
         f"{name}, row {row}, is left out: {reason}"
-        for name, reasons in found.source.left_out.items()
+        for name, reasons in found.source.excluded_rows.items()
         for row, reason in reasons.items()
     ]
-    items += [f"{name}: check: {text}" for name, texts in found.source.doubts.items() for text in texts]
+    items += [f"{name}: warning: {text}" for name, texts in found.source.warnings.items() for text in texts]
     return Section(
         "rows", "Outliers", sentences, items, [Table(["file", "row", "error", "score"], rows)] if rows else []
     )
 
 
-def _done(found: Study) -> Section:
+def _provenance_section(found: ReportContext) -> Section:
     fit, source = found.fit, found.source
     facts = [["robot", f"{found.robot}, tip {fit.chain.tip}, joints {', '.join(fit.chain.joint_names)}"]]
     if source.command:
         facts.append(["command", source.command])
     free = {e.name for e in fit.estimates if not e.fixed}
-    for what, station in (("base", BASE), ("tool", fit.chain.tool_station)):
-        count = sum(p.station == station and p.name in free for p in fit.errors.parameters)
+    for what, station in (("base", BASE_FRAME), ("tool", fit.chain.tool_frame_index)):
+        count = sum(p.error_frame == station and p.name in free for p in fit.errors.parameters)
         facts.append(
             [what, f"{count} of 6 components found from the data" if count else "as given, not changed"]
         )
@@ -311,9 +317,9 @@ def _done(found: Study) -> Section:
     for name, item in zip(found.holdout_names, fit.holdout, strict=True):
         held_out[name] = held_out.get(name, 0) + len(item.rows)
     for name, item, sigma in zip(found.names, fit.data, sigmas(fit), strict=True):
-        how = "stated" if item.stated else ("estimated" if fit.method == "lm" else "assumed")
+        how = "stated" if item.has_stated_sigma else ("estimated" if fit.method == "lm" else "assumed")
         each = ", ".join(
-            f"{group} {shown(v, 'rad' if group == 'orientation' else 'm', v, small=True)}"
+            f"{group} {format_quantity(v, 'rad' if group == 'orientation' else 'm', v, small=True)}"
             for group, v in sigma.items()
         )
         rows.append([name, item.kind, f"{each}, {how}", str(len(item.rows)), str(held_out.pop(name, 0))])
@@ -321,15 +327,17 @@ def _done(found: Study) -> Section:
     short = short_names(list(source.inputs))
     hashes = [[short[path], digest] for path, digest in source.inputs.items()]
     out = [
-        Table(["data", "kind", "standard deviation of an axis", "fitted", "held out"], rows, texts=3),
-        Table(["choice", "value"], facts, texts=2),
-        Table(["file", "SHA-256"], hashes, texts=2),
-        Table(["software", "version"], list(map(list, versions().items())), texts=2),
+        Table(
+            ["data", "kind", "standard deviation of an axis", "fitted", "held out"], rows, n_text_columns=3
+        ),
+        Table(["choice", "value"], facts, n_text_columns=2),
+        Table(["file", "SHA-256"], hashes, n_text_columns=2),
+        Table(["software", "version"], list(map(list, versions().items())), n_text_columns=2),
     ]
     return Section("done", "How this was made", tables=[table for table in out if table.rows])
 
 
-def markdown(found: Study) -> str:
+def markdown(found: ReportContext) -> str:
     """The report without its figures."""
     head = summary.headline(found.comparisons)
     parts = [f"# Calibration of {found.robot}", f"**{head.text}**", *found.source.remarks, *warnings(found)]

@@ -22,36 +22,36 @@ import numpy as np
 import pinocchio as pin
 
 from .. import _kernels, se3
-from .._kernels.kinematics import station_frames
-from .._kernels.types import Motion, Sweep
+from .._kernels.kinematics import error_frame_poses
+from .._kernels.types import FrameBatch, JointState
 from .._typing import Array
 from ..exceptions import DhcalError
 from .dh import Convention, DHTable
 from .dh_extraction import Extraction, extract_dh
 from .dh_urdf import dh_to_urdf
-from .transmission import Loads, Payload, Transmission
+from .transmission import GravityLoads, Payload, Transmission
 from .urdf import Urdf, parse_urdf, read_urdf
 from .urdf_path import (
     axis_frame,
     build_model,
     default_tip,
+    find_moving_joints,
     independent_joints,
-    moving_joints,
     placements,
 )
 
-BASE = 0
+BASE_FRAME = 0
 
 
-_IDENTITY = np.eye(4)
+_EYE = np.eye(4)
 
 
-def joint_station(j: int) -> int:
+def joint_frame(j: int) -> int:
     """Station of the j-th moving joint's origin, j from 1."""
     return 2 * j
 
 
-def link_station(j: int) -> int:
+def link_frame(j: int) -> int:
     """Station behind the j-th moving joint's motion; 0 is the base link."""
     return 2 * j + 1
 
@@ -64,12 +64,12 @@ class Chain:
         urdf: the file it came from.
         tip: name of the tip link.
         joint_names: (n,) the columns of q, in path order.
-        moving: (k,) names of the joints that move along the path.
+        moving_joints: (k,) names of the joints that move along the path.
         origins: (k+1, 4, 4) each moving joint's frame in the moving frame before it (fixed joints
             merged), then the tip in the last one; metres.
         axes: (k, 3) unit axes in the joints' frames.
         prismatic: (k,) True where a joint slides.
-        mixing, shift: (k, n), (k,): the moving joints' values are mixing @ q + shift.
+        mimic_matrix, mimic_offset: (k, n), (k,): the moving joints' values are mixing @ q + shift.
         lower, upper: (n,) limits, rad or m; infinite where there is none.
         base: (4, 4) base link in the measuring frame.
         tool: (4, 4) measured point in the tip frame.
@@ -81,12 +81,12 @@ class Chain:
     urdf: Urdf
     tip: str
     joint_names: tuple[str, ...]
-    moving: tuple[str, ...]
+    moving_joints: tuple[str, ...]
     origins: Array
     axes: Array
     prismatic: Array
-    mixing: Array
-    shift: Array
+    mimic_matrix: Array
+    mimic_offset: Array
     lower: Array
     upper: Array
     base: Array = field(default_factory=lambda: np.eye(4))
@@ -108,7 +108,7 @@ class Chain:
         """
         urdf = source if isinstance(source, Urdf) else read_urdf(source)
         tip = tip if tip is not None else default_tip(urdf)
-        joints = moving_joints(urdf, tip)
+        joints = find_moving_joints(urdf, tip)
         names, rows, shift = independent_joints(urdf, [joint.name for joint in joints])
         sources = [urdf.joint(name) for name in names]
         model = build_model(urdf)
@@ -117,12 +117,12 @@ class Chain:
             urdf=urdf,
             tip=tip,
             joint_names=tuple(names),
-            moving=tuple(joint.name for joint in joints),
+            moving_joints=tuple(joint.name for joint in joints),
             origins=origins,
             axes=axes,
             prismatic=np.array([joint.type == "prismatic" for joint in joints]),
-            mixing=rows,
-            shift=shift,
+            mimic_matrix=rows,
+            mimic_offset=shift,
             lower=np.array([joint.lower for joint in sources]),
             upper=np.array([joint.upper for joint in sources]),
         )
@@ -139,30 +139,30 @@ class Chain:
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
     @property
-    def size(self) -> int:
+    def n_joints(self) -> int:
         """Number n of independent joints, the columns of q."""
         return len(self.joint_names)
 
     @property
-    def sliding(self) -> Array:
+    def is_prismatic(self) -> Array:
         """Which independent joints (n,) move a prismatic one."""
-        return np.any(self.mixing[self.prismatic] != 0, 0)
+        return np.any(self.mimic_matrix[self.prismatic] != 0, 0)
 
     @property
-    def tip_station(self) -> int:
+    def tip_frame(self) -> int:
         """Station of the tip, before the tool."""
-        return 2 * len(self.moving) + 2
+        return 2 * len(self.moving_joints) + 2
 
     @property
-    def tool_station(self) -> int:
+    def tool_frame_index(self) -> int:
         """Station of the measured point."""
-        return 2 * len(self.moving) + 3
+        return 2 * len(self.moving_joints) + 3
 
     @cached_property
     def model(self) -> pin.Model:
         """Pinocchio's model of the whole robot with this chain's joint placements and tip frame."""
         model = build_model(self.urdf)
-        for name, origin in zip(self.moving, self.origins[:-1], strict=True):
+        for name, origin in zip(self.moving_joints, self.origins[:-1], strict=True):
             model.jointPlacements[model.getJointId(name)] = pin.SE3(origin)
         tip = model.frames[model.getFrameId(self.tip, pin.FrameType.BODY)]
         tip.placement = pin.SE3(self.origins[-1])
@@ -177,45 +177,45 @@ class Chain:
         return self.model.getFrameId(self.tip, pin.FrameType.BODY)
 
     @cached_property
-    def loads(self) -> Loads:
+    def loads(self) -> GravityLoads:
         """The masses of the whole robot with this chain's joint placements."""
-        return Loads(self.model, self.moving, self.mixing, self.shift)
+        return GravityLoads(self.model, self.moving_joints, self.mimic_matrix, self.mimic_offset)
 
     def configurations(self, q: Array) -> Array:
         """Pinocchio's configurations (m, nq) at q (m, n); joints off the path stay at neutral."""
-        return self.loads.configurations(self.effective(self.checked(q).T)[0])
+        return self.loads.configurations(self.actual_positions(self.validated_q(q).T)[0])
 
-    def checked(self, q: Array) -> Array:
+    def validated_q(self, q: Array) -> Array:
         """Joint values as a finite (m, n) array, or DhcalError."""
         q = np.atleast_2d(np.asarray(q, float))
-        if q.ndim != 2 or q.shape[1] != self.size:
+        if q.ndim != 2 or q.shape[1] != self.n_joints:
             raise DhcalError(
-                f"q has shape {q.shape}; this chain needs {self.size} columns: {', '.join(self.joint_names)}"
+                f"q has shape {q.shape}; this chain needs {self.n_joints} columns: {', '.join(self.joint_names)}"
             )
         if not np.isfinite(q).all():
             raise DhcalError("q: every joint value must be finite")
         return q
 
-    def effective(self, q: Array) -> tuple[Array, Array | None]:
+    def actual_positions(self, q: Array) -> tuple[Array, Array | None]:
         """Where commanded values q (n, m) take the independent joints (n, m), and the terms (t, n, m)."""
         if self.transmission is None:
             return q, None
         terms = self.transmission.terms(q)
         return q + self.transmission.errors(terms), terms
 
-    def driven(self, transmission: Transmission) -> Chain:
+    def with_transmission(self, transmission: Transmission) -> Chain:
         """The chain with other joints."""
         return replace(self, transmission=transmission)
 
-    def carrying(self, payload: Payload | None) -> Chain:
+    def with_payload(self, payload: Payload | None) -> Chain:
         """The chain with something in its hand, to whose weight its joints yield too."""
-        return replace(self, payload=payload).loaded()
+        return replace(self, payload=payload).with_current_loads()
 
-    def loaded(self) -> Chain:
+    def with_current_loads(self) -> Chain:
         """The chain whose joints yield to its own masses as placed now, not to those it was started with."""
         if self.transmission is None:
             return self
-        return self.driven(replace(self.transmission, loads=self.loads))
+        return self.with_transmission(replace(self.transmission, loads=self.loads))
 
     @cached_property
     def axis_frames(self) -> Array:
@@ -223,62 +223,64 @@ class Chain:
         return np.stack([np.eye(4), *(axis_frame(tuple(axis)) for axis in self.axes.tolist())])
 
     @cached_property
-    def into(self) -> Array:
+    def body_from_urdf(self) -> Array:
         """(k+1, 4, 4): each body's URDF frame in its body frame."""
         return se3.inverse(self.axis_frames)
 
     @cached_property
-    def reached(self) -> Array:
+    def next_from_body(self) -> Array:
         """(k+1, 4, 4): each joint's URDF frame, and the tip, in the body frame before it."""
-        return self.into @ self.origins
+        return self.body_from_urdf @ self.origins
 
     @cached_property
-    def _ahead(self) -> Array:
+    def _urdf_from_body(self) -> Array:
         """(k+1, 4, 4): each joint's body frame in its URDF frame, and no change for the tip."""
-        return np.concatenate([self.axis_frames[1:], _IDENTITY[None]])
+        return np.concatenate([self.axis_frames[1:], _EYE[None]])
 
     @cached_property
-    def links(self) -> Array:
+    def link_transforms(self) -> Array:
         """Constant transforms (k+1, 4, 4) between the motions; every joint moves about its own z.
 
         The tool's pose is base · links[0] · Z(q_1) · links[1] · … · Z(q_k) · links[k] · tool.
         """
-        return self.reached @ self._ahead
+        return self.next_from_body @ self._urdf_from_body
 
     @cached_property
-    def _links_and_tool(self) -> Array:
+    def _link_and_tool_transforms(self) -> Array:
         """(k+1, 4, 4): as `links`, but the last one leads on to the tool."""
-        return np.concatenate([self.links[:-1], self.links[-1:] @ self.tool])
+        return np.concatenate([self.link_transforms[:-1], self.link_transforms[-1:] @ self.tool])
 
-    def motion(self, q: Array) -> Motion:
+    def joint_state(self, q: Array) -> JointState:
         """The moving joints' values, and their cosines and sines, at joint values q (m, n)."""
-        return self._motion(np.ascontiguousarray(self.checked(q).T))
+        return self._joint_state(np.ascontiguousarray(self.validated_q(q).T))
 
-    def _motion(self, joints: Array) -> Motion:
+    def _joint_state(self, joints: Array) -> JointState:
         """The motion of independent joints that stand at (n, m)."""
-        values = self.mixing @ joints + self.shift[:, None]
-        return Motion(joints, values, *_kernels.cosines_and_sines(values))
+        values = self.mimic_matrix @ joints + self.mimic_offset[:, None]
+        return JointState(joints, values, *_kernels.cos_sin(values))
 
-    def sweep(self, q: Array | Motion, out: Array | None = None) -> Sweep:
+    def forward_kinematics(self, q: Array | JointState, out: Array | None = None) -> FrameBatch:
         """All frames at joint values q (m, n), or at a motion of this chain, vectorised over the samples.
 
         `out` (k+2, 7, 3, m) holds them when given.
         """
-        motion, terms = q if isinstance(q, Motion) else self.motion(q), None
+        motion, terms = q if isinstance(q, JointState) else self.joint_state(q), None
         if self.transmission is not None:
-            joints, terms = self.effective(motion.joints)
-            motion = self._motion(joints)
-        k, m = motion.values.shape
+            joints, terms = self.actual_positions(motion.independent)
+            motion = self._joint_state(joints)
+        k, m = motion.positions.shape
         frames = np.empty((k + 2, 7, 3, m)) if out is None else out
         frames[0, :4] = self.base[:3].T[:, :, None]
-        _kernels.carry_frames(self._links_and_tool, self.prismatic, motion, frames)
-        return Sweep(frames[:-1], frames[-1, :4], terms)
+        _kernels.propagate_frames(self._link_and_tool_transforms, self.prismatic, motion, frames)
+        return FrameBatch(frames[:-1], frames[-1, :4], terms)
 
     def poses(self, q: Array) -> Array:
         """Tool poses (m, 4, 4) in the measuring frame at joint values q (m, n) in rad or m."""
-        return self.sweep(q).poses()
+        return self.forward_kinematics(q).poses()
 
-    def tool_velocities(self, sweep: Sweep, bodies: Array, twists: Array, out: Array | None = None) -> Array:
+    def tool_jacobian(
+        self, frames: FrameBatch, bodies: Array, twists: Array, out: Array | None = None
+    ) -> Array:
         """The tool point's velocity (p, 6, m) per unit of each body twist, axes of the measuring frame.
 
         Args:
@@ -288,39 +290,39 @@ class Chain:
             twists: (p, 6) twists in those bodies' frames; an entry needs none.
             out: (p, 6, m) written in place when given.
         """
-        m = sweep.tool.shape[-1]
+        m = frames.tool.shape[-1]
         out = np.empty((len(bodies), 6, m)) if out is None else out
         behind = len(bodies)
-        if behind and bodies[-1] >= len(sweep.frames):
-            behind = int(np.searchsorted(bodies, len(sweep.frames)))
-            out[behind:] = self._entry_velocities(sweep, bodies[behind:] - len(sweep.frames))
+        if behind and bodies[-1] >= len(frames.columns):
+            behind = int(np.searchsorted(bodies, len(frames.columns)))
+            out[behind:] = self._transmission_jacobian(frames, bodies[behind:] - len(frames.columns))
             bodies, twists = bodies[:behind], twists[:behind]
-        _kernels.point_velocities(sweep.frames, sweep.tool[3], bodies, twists, out[:behind])
+        _kernels.point_jacobian(frames.columns, frames.tool[3], bodies, twists, out[:behind])
         return out
 
-    def _entry_velocities(self, sweep: Sweep, entries: Array) -> Array:
+    def _transmission_jacobian(self, frames: FrameBatch, entries: Array) -> Array:
         """The same (e, 6, m) per unit of entries (e,) of the flat transmission."""
         assert self.transmission is not None
-        assert sweep.terms is not None
+        assert frames.terms is not None
         term, joint, source = np.unravel_index(entries, self.transmission.coefficients.shape)
-        return self.joint_velocities(sweep)[joint] * sweep.terms[term, source][:, None]
+        return self.joint_jacobian(frames)[joint] * frames.terms[term, source][:, None]
 
-    def joint_velocities(self, sweep: Sweep) -> Array:
+    def joint_jacobian(self, frames: FrameBatch) -> Array:
         """The tool point's velocity (n, 6, m) per unit of each independent joint's effective value."""
-        k = len(self.moving)
+        k = len(self.moving_joints)
         twists = np.zeros((k, 6))
         twists[np.arange(k), np.where(self.prismatic, 2, 5)] = 1.0
-        moving = self.tool_velocities(sweep, np.arange(1, k + 1), twists)
-        return np.tensordot(self.mixing, moving, (0, 0))
+        moving = self.tool_jacobian(frames, np.arange(1, k + 1), twists)
+        return np.tensordot(self.mimic_matrix, moving, (0, 0))
 
-    def displaced(self, motions: Mapping[int, Array]) -> Chain:
+    def perturbed_at(self, motions: Mapping[int, Array]) -> Chain:
         """The chain with each station's frame moved by a right factor (4, 4), M ← M·motion."""
-        every = np.tile(np.eye(4), (self.tool_station + 1, 1, 1))
+        every = np.tile(np.eye(4), (self.tool_frame_index + 1, 1, 1))
         for station, motion in motions.items():
             every[station] = motion
-        return self.moved(every)
+        return self.perturbed(every)
 
-    def moved(self, motions: Array) -> Chain:
+    def perturbed(self, motions: Array) -> Chain:
         """The chain with every station's frame moved by a right factor (2k+4, 4, 4), M ← M·motion."""
         return self._with(
             origins=motions[1:-1:2] @ self.origins @ motions[2::2],
@@ -328,53 +330,70 @@ class Chain:
             tool=self.tool @ motions[-1],
         )
 
-    def framed(self, base: Array, tool: Array) -> Chain:
+    def with_base_and_tool(self, base: Array, tool: Array) -> Chain:
         """The chain with another base and tool (4, 4)."""
         return self._with(base=base, tool=tool)
 
     def _with(self, **frames: Array) -> Chain:
         """The chain with other origins, base or tool; the axes stay, and so do the frames made of them."""
         chain = object.__new__(Chain)
-        known = {"axis_frames": self.axis_frames, "into": self.into, "_ahead": self._ahead}
+        known = {
+            "axis_frames": self.axis_frames,
+            "body_from_urdf": self.body_from_urdf,
+            "_urdf_from_body": self._urdf_from_body,
+        }
         vars(chain).update(self.__getstate__(), **known, **frames)
         return chain
 
 
-def bodies_at(chain: Chain, stations: Array) -> Array:
+def bodies_of_frames(chain: Chain, error_frames: Array) -> Array:
     """The bodies (p,) that errors at stations (p,) move."""
-    return np.clip((np.asarray(stations, int) - 1) // 2, 0, len(chain.moving))
+    return np.clip((np.asarray(error_frames, int) - 1) // 2, 0, len(chain.moving_joints))
 
 
-def twists_at(
-    chain: Chain, stations: Array, twists: Array, carry: Array | None = None
+def twists_in_bodies(
+    chain: Chain, error_frames: Array, twists: Array, frame_transforms: Array | None = None
 ) -> tuple[Array, Array]:
     """Bodies (p,) and the same twists (p, 6) in those bodies' frames, of twists at stations (p,).
 
     `carry` (p, 4, 4) are the frames that the twists are seen in where these are not the stations' own.
     """
-    still = np.tile(np.eye(4), (chain.tool_station + 1, 1, 1))
-    frames = station_frames(chain.into, chain.origins, chain.tool, still)[stations]
-    frames = frames if carry is None else frames @ carry
-    return bodies_at(chain, stations), (se3.adjoint(frames) @ np.asarray(twists, float)[..., None])[..., 0]
+    still = np.tile(np.eye(4), (chain.tool_frame_index + 1, 1, 1))
+    frames = error_frame_poses(chain.body_from_urdf, chain.origins, chain.tool, still)[error_frames]
+    frames = frames if frame_transforms is None else frames @ frame_transforms
+    return bodies_of_frames(chain, error_frames), (
+        se3.adjoint(frames) @ np.asarray(twists, float)[..., None]
+    )[..., 0]
 
 
-def unlinked(chain: Chain) -> Chain:
+def without_mimics(chain: Chain) -> Chain:
     """The same path whose every moving joint is commanded by itself, none following another."""
-    k = len(chain.moving)
+    k = len(chain.moving_joints)
     free = np.full(k, np.inf)
     return replace(
-        chain, joint_names=chain.moving, mixing=np.eye(k), shift=np.zeros(k), lower=-free, upper=free
+        chain,
+        joint_names=chain.moving_joints,
+        mimic_matrix=np.eye(k),
+        mimic_offset=np.zeros(k),
+        lower=-free,
+        upper=free,
     )
 
 
-def extract(chain: Chain, convention: Convention = "standard", hayati: bool = False) -> Extraction:
+def extract_dh_table(chain: Chain, convention: Convention = "standard", hayati: bool = False) -> Extraction:
     """The chain's DH table, base and tool apart, by common normals."""
-    if not (np.array_equal(chain.mixing, np.eye(chain.size)) and not chain.shift.any()):
-        follows = next(name for name in chain.moving if name not in chain.joint_names)
+    if not (np.array_equal(chain.mimic_matrix, np.eye(chain.n_joints)) and not chain.mimic_offset.any()):
+        follows = next(name for name in chain.moving_joints if name not in chain.joint_names)
         raise DhcalError(
             f"{chain.urdf.source}: joint {follows!r} mimics another, which a DH table cannot hold; "
             "calibrate the URDF itself"
         )
     return extract_dh(
-        chain.links, chain.joint_names, chain.prismatic, chain.lower, chain.upper, convention, hayati
+        chain.link_transforms,
+        chain.joint_names,
+        chain.prismatic,
+        chain.lower,
+        chain.upper,
+        convention,
+        hayati,
     )

@@ -18,11 +18,11 @@ from .._typing import Array
 from .chain import Chain
 
 # A line of sight is as thick as a pencil.
-SIGHT = 5e-3
+SIGHT_DIAMETER = 5e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Clearance:
+class CollisionChecker:
     """A robot's collision geometry.
 
     Attributes:
@@ -36,7 +36,9 @@ class Clearance:
     note: str = ""
 
     @classmethod
-    def of(cls, chain: Chain, package_dirs: Sequence[str | os.PathLike[str]] | None = None) -> Clearance:
+    def from_chain(
+        cls, chain: Chain, package_dirs: Sequence[str | os.PathLike[str]] | None = None
+    ) -> CollisionChecker:
         """The collision geometry of a chain's URDF.
 
         Pairs on one link or on neighbours are left out, and those that meet both at neutral and in the middle
@@ -71,7 +73,7 @@ class Clearance:
         low, high = (np.clip(limit, -np.pi, np.pi) for limit in (chain.lower, chain.upper))
         middle = chain.configurations((low + high) / 2)[0]
         neutral = pin.neutral(chain.model)
-        for pair in out._meeting(neutral) & out._meeting(middle):
+        for pair in out._colliding_pairs(neutral) & out._colliding_pairs(middle):
             geometry.removeCollisionPair(pin.CollisionPair(*pair))
         return out
 
@@ -79,7 +81,7 @@ class Clearance:
     def _data(self) -> tuple[pin.Data, pin.GeometryData]:
         return self.chain.model.createData(), pin.GeometryData(self.geometry)
 
-    def _meeting(self, configuration: Array) -> set[tuple[int, int]]:
+    def _colliding_pairs(self, configuration: Array) -> set[tuple[int, int]]:
         """Pairs of shapes that meet."""
         data = pin.GeometryData(self.geometry)
         model = self.chain.model
@@ -90,7 +92,7 @@ class Clearance:
             if result.isCollision()
         }
 
-    def free(self, q: Array) -> bool:
+    def is_collision_free(self, q: Array) -> bool:
         """Whether no two shapes meet at joint values q (n,); True where there are no shapes."""
         if self.geometry is None:
             return True
@@ -98,7 +100,7 @@ class Clearance:
         configuration = self.chain.configurations(q)[0]
         return not pin.computeCollisions(self.chain.model, data, self.geometry, shapes, configuration, True)
 
-    def sees(self, q: Array, eye: Array, point: Array) -> bool:
+    def has_line_of_sight(self, q: Array, eye: Array, point: Array) -> bool:
         """Whether nothing of the robot but its last link stands between two points at joint values q (n,).
 
         Args:
@@ -111,11 +113,11 @@ class Clearance:
         data, shapes = self._data
         model = self.chain.model
         pin.updateGeometryPlacements(model, data, self.geometry, shapes, self.chain.configurations(q)[0])
-        last = model.getJointId(self.chain.moving[-1])
+        last = model.getJointId(self.chain.moving_joints[-1])
         away = point - eye
         length = float(np.linalg.norm(away))
         turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), away / length).matrix()
-        line = coal.Capsule(SIGHT / 2, length)
+        line = coal.Capsule(SIGHT_DIAMETER / 2, length)
         place = coal.Transform3s(turn, (eye + point) / 2)
         return not any(
             coal.collide(

@@ -94,15 +94,15 @@ class DHTable:
             object.__setattr__(self, key, value)
 
     @property
-    def size(self) -> int:
+    def n_joints(self) -> int:
         """Number of joints n."""
         return len(self.names)
 
     def rows(self, q: Array) -> Array:
         """Link transforms A_i (m, n, 4, 4) at joint values q (m, n) in rad or m (equation 1)."""
         q = np.atleast_2d(np.asarray(q, float))
-        if q.shape[1] != self.size:
-            raise DhcalError(f"q has {q.shape[1]} columns, the table has {self.size} joints")
+        if q.shape[1] != self.n_joints:
+            raise DhcalError(f"q has {q.shape[1]} columns, the table has {self.n_joints} joints")
         spin = axis_rotation(2, self.theta + np.where(self.prismatic, 0.0, q))
         slide = axis_translation(2, self.d + np.where(self.prismatic, q, 0.0))
         link = axis_translation(0, self.a) @ axis_rotation(0, self.alpha) @ axis_rotation(1, self.beta)
@@ -114,7 +114,7 @@ class DHTable:
         """Tool poses (m, 4, 4) in the robot's base frame, the plain product (equation 2)."""
         rows = self.rows(q)
         out = np.broadcast_to(self.base, (len(rows), 4, 4))
-        for i in range(self.size):
+        for i in range(self.n_joints):
             out = out @ rows[:, i]
         return out @ self.tool
 
@@ -125,7 +125,7 @@ class DHTable:
         joint i+1's is row i, the tool carries row n. Modified: joint i's origin is row i. Every
         change of a table entry is exactly a change of one origin.
         """
-        rows = self.rows(np.zeros((1, self.size)))[0]
+        rows = self.rows(np.zeros((1, self.n_joints)))[0]
         if self.convention == "standard":
             out = np.concatenate([self.base[None], rows])
             out[-1] = out[-1] @ self.tool

@@ -27,28 +27,28 @@ from .dh import CONVENTIONS, Convention, DHTable, axis_rotation, axis_translatio
 
 # Below this tilt a pair of axes is meant to be parallel and tilted by tolerances. Its plain row may
 # have offsets that look sane by luck, but they move by a / tilt per radian of correction.
-NEARLY_PARALLEL = np.radians(1.0)
+NEARLY_PARALLEL_RAD = np.radians(1.0)
 
 
 # The wider window that is used where Hayati's β is asked for.
-HAYATI = np.radians(5.0)
+HAYATI_MAX_RAD = np.radians(5.0)
 
 
 # Plain offsets beyond this many times the robot's whole length are not lengths of the robot. A foot is never
 # farther than |p| / sin(tilt), so 2 is only exceeded below 30° of tilt, where the form with β is safe.
-OFFSET_LIMIT = 2.0
+MAX_OFFSET_RATIO = 2.0
 
 
 # Metres per metre of robot: a tool whose z passes the last axis this closely is meant to be in line with it.
-NEARLY_COINCIDENT = 0.01
+COINCIDENT_RTOL = 0.01
 
 
 # A chain that sliding its frames shortens to this share had offsets that cancel.
-SHORTER = 2 / 3
+SHORTER_RATIO = 2 / 3
 
 
 # Radians, and metres per metre of robot. Smaller differences from 0 or a quarter turn are rounding.
-ROUNDING = 5e-15
+QUARTER_TURN_TOL = 5e-15
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Extraction:
 
 
 @dataclass(frozen=True)
-class _Split:
+class _OriginParameters:
     """The seven numbers of an origin, in radians and metres, and the offset that a plain row would need."""
 
     t1: float = 0.0
@@ -87,7 +87,7 @@ class _Split:
     @property
     def before(self) -> Array:
         """Rz(t1)·Tz(d1), (4, 4)."""
-        return _screw(self.t1, self.d1)
+        return _screw_transform(self.t1, self.d1)
 
     @property
     def link(self) -> Array:
@@ -102,7 +102,7 @@ class _Split:
     @property
     def after(self) -> Array:
         """Tz(d2)·Rz(t2), (4, 4)."""
-        return _screw(self.t2, self.d2)
+        return _screw_transform(self.t2, self.d2)
 
 
 def extract_dh(
@@ -149,17 +149,17 @@ def extract_dh(
     if not np.isfinite(origins).all():
         raise DhcalError("origins: every number must be finite")
     reach = float(np.linalg.norm(origins[:, :3, 3], axis=1).sum()) or 1.0
-    window = HAYATI if hayati else NEARLY_PARALLEL
+    window = HAYATI_MAX_RAD if hayati else NEARLY_PARALLEL_RAD
     standard = convention == "standard"
     # A standard row ends with its x axis, so nothing should be left behind it; a modified row
     # begins with it, so nothing should be left before it.
-    base, first = _mount(origins[0], reach, window, standard)
+    base, first = _base_transform(origins[0], reach, window, standard)
     splits = [first]
     for origin in origins[1:] if standard else origins[1:-1]:
-        splits.append(_split(origin, splits[-1].t2, reach, window, leading=standard))
+        splits.append(_split_origin(origin, splits[-1].t2, reach, window, leading=standard))
     tool = origins[-1]
-    if standard and _is_straight(splits[-1], reach):
-        splits[-1] = _straight(splits[-1])
+    if standard and _is_tool_aligned(splits[-1], reach):
+        splits[-1] = _aligned_tool_row(splits[-1])
         tool = se3.inverse(splits[-1].before @ splits[-1].link) @ tool
     elif standard:
         tool = splits[-1].after
@@ -192,7 +192,7 @@ def extract_dh(
     return Extraction(table, np.array(frames), tuple(notes))
 
 
-def settled(table: DHTable) -> DHTable:
+def normalize_offsets(table: DHTable) -> DHTable:
     """The same arm without offsets of metres that only cancel each other; most tables come back as they are.
 
     Plain rows hide a milliradian between parallel axes behind feet far outside the robot. Sliding each
@@ -207,46 +207,50 @@ def settled(table: DHTable) -> DHTable:
         slid[i] = axis_translation(2, np.array(-back)) @ slid[i]
         last = i == len(origins) - 1
         back = 0.0
-        if not last and ROUNDING < _tilt(slid[i]) < NEARLY_PARALLEL:
+        if not last and QUARTER_TURN_TOL < _tilt(slid[i]) < NEARLY_PARALLEL_RAD:
             back = -slid[i][2, 3] / slid[i][2, 2]
             slid[i] = slid[i] @ axis_translation(2, np.array(back))
     before, after = (np.linalg.norm(chain[:, :3, 3], axis=1).sum() for chain in (origins, slid))
-    if after > SHORTER * before:
+    if after > SHORTER_RATIO * before:
         return table
     return extract_dh(slid, table.names, table.prismatic, table.lower, table.upper, table.convention).table
 
 
-def _mount(origin: Array, reach: float, window: float, standard: bool) -> tuple[Array, _Split]:
+def _base_transform(
+    origin: Array, reach: float, window: float, standard: bool
+) -> tuple[Array, _OriginParameters]:
     """The base (4, 4) and what is left of joint 1's origin for row 1.
 
     The base can hold any motion, so it takes all but the offset along axis 1 where that is upright.
     Only an origin that is a modified row as it stands goes to the table.
     """
-    row = _split(origin, 0.0, reach, window, leading=False)
+    row = _split_origin(origin, 0.0, reach, window, leading=False)
     if not standard and row.t1 == 0 and row.d1 == 0:
         return np.eye(4), row
-    slide = _Split(d2=row.d2 if _tilt(origin) < window else 0.0)
+    slide = _OriginParameters(d2=row.d2 if _tilt(origin) < window else 0.0)
     return origin @ se3.inverse(slide.after), slide
 
 
-def _split(origin: Array, carry: float, reach: float, window: float, leading: bool) -> _Split:
+def _split_origin(
+    origin: Array, carry: float, reach: float, window: float, leading: bool
+) -> _OriginParameters:
     """The seven numbers of an origin (4, 4) behind a joint that already has the turn ``carry`` from before.
 
     What is free goes to t1 and d1 if ``leading``, else to t2 and d2.
     """
     tilt = _tilt(origin)
-    t1, d2 = _common_normal(origin) if tilt > ROUNDING else (0.0, 0.0)
+    t1, d2 = _common_normal(origin) if tilt > QUARTER_TURN_TOL else (0.0, 0.0)
     offset = max(abs(origin[2, 3] - d2 * origin[2, 2]), abs(d2))
-    if tilt < window or offset > OFFSET_LIMIT * reach:
+    if tilt < window or offset > MAX_OFFSET_RATIO * reach:
         t1, d2 = _through_origin(origin, reach, leading)
 
-    def ugliness(way: _Split) -> tuple[int, int, bool, bool]:
+    def ugliness(way: _OriginParameters) -> tuple[int, int, bool, bool]:
         left = way.t2 if leading else way.t1
         return _turned(left), _turned(carry + way.t1), way.a < 0, way.alpha < 0
 
     # Half a turn more negates a, α and β. The way that leaves less turn on the other side is the
     # one in which a table was written; ties go to the smaller θ, then to positive a and α.
-    return min((_rest(origin, t, d2, reach, offset) for t in (t1, t1 + np.pi)), key=ugliness)
+    return min((_remaining_parameters(origin, t, d2, reach, offset) for t in (t1, t1 + np.pi)), key=ugliness)
 
 
 def _tilt(origin: Array) -> float:
@@ -277,7 +281,7 @@ def _through_origin(origin: Array, reach: float, leading: bool) -> tuple[float, 
     rotation, p = origin[:3, :3], origin[:3, 3]
     d2 = 0.0 if leading else float(p[2] / rotation[2, 2])
     x, y, _ = p - d2 * rotation[:, 2]
-    if np.hypot(x, y) > ROUNDING * reach:
+    if np.hypot(x, y) > QUARTER_TURN_TOL * reach:
         return float(np.arctan2(y, x)), d2
     if leading:  # the axes meet in the plane: any x will do, and this one leaves t2 = 0
         sign = np.sign(rotation[2, 2])
@@ -285,12 +289,14 @@ def _through_origin(origin: Array, reach: float, leading: bool) -> tuple[float, 
     return 0.0, d2
 
 
-def _rest(origin: Array, t1: float, d2: float, reach: float, offset: float) -> _Split:
+def _remaining_parameters(
+    origin: Array, t1: float, d2: float, reach: float, offset: float
+) -> _OriginParameters:
     """The other five numbers, once t1 and d2 are known; each is read behind the ones before it."""
     rotation = axis_rotation(2, np.array(-t1))[:3, :3] @ origin[:3, :3]
     foot = origin[:3, 3] - d2 * origin[:3, 2]
     beta = np.arctan2(rotation[0, 2], np.hypot(rotation[1, 2], rotation[2, 2]))
-    return _Split(
+    return _OriginParameters(
         t1=_angle(t1),
         d1=_length(foot[2], reach),
         a=_length(np.cos(t1) * foot[0] + np.sin(t1) * foot[1], reach),
@@ -302,34 +308,34 @@ def _rest(origin: Array, t1: float, d2: float, reach: float, offset: float) -> _
     )
 
 
-def _is_straight(split: _Split, reach: float) -> bool:
+def _is_tool_aligned(split: _OriginParameters, reach: float) -> bool:
     """Whether the tool's z is meant to be the last axis, but for tolerances."""
-    return split.beta != 0 and abs(split.a) < NEARLY_COINCIDENT * reach
+    return split.beta != 0 and abs(split.a) < COINCIDENT_RTOL * reach
 
 
-def _straight(split: _Split) -> _Split:
+def _aligned_tool_row(split: _OriginParameters) -> _OriginParameters:
     """The row of such a tool: its slide alone, so that x need not turn the way of a tolerance."""
-    return _Split(d1=split.d1, alpha=_angle(round(split.alpha / np.pi) * np.pi))
+    return _OriginParameters(d1=split.d1, alpha=_angle(round(split.alpha / np.pi) * np.pi))
 
 
 def _angle(value: float) -> float:
     """An angle in (-π, π], quarter turns within rounding made exact, zero without a sign."""
     value = float(value)
     turns = round(value / (np.pi / 2))
-    if abs(value - turns * (np.pi / 2)) < ROUNDING:
+    if abs(value - turns * (np.pi / 2)) < QUARTER_TURN_TOL:
         return ((turns + 1) % 4 - 1) * (np.pi / 2)
     return math.remainder(value, 2 * np.pi)
 
 
 def _length(value: float, reach: float) -> float:
-    return 0.0 if abs(value) < ROUNDING * reach else float(value)
+    return 0.0 if abs(value) < QUARTER_TURN_TOL * reach else float(value)
 
 
-def _screw(turn: float, slide: float) -> Array:
+def _screw_transform(turn: float, slide: float) -> Array:
     return axis_rotation(2, np.array(turn)) @ axis_translation(2, np.array(slide))
 
 
-def _note(split: _Split, axes: tuple[str, str]) -> str:
+def _note(split: _OriginParameters, axes: tuple[str, str]) -> str:
     return (
         f"{axes[0]} and {axes[1]} are {1e3 * _tilt(split.link):.3g} mrad from parallel: "
         f"the row between them has Hayati's beta, "

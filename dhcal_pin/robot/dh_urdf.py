@@ -14,8 +14,8 @@ import numpy as np
 
 from .._typing import Array
 from .dh import DHTable
-from .dh_extraction import settled
-from .urdf import quoted
+from .dh_extraction import normalize_offsets
+from .urdf import xml_attribute
 
 # Okabe and Ito's palette: told apart by colour-blind eyes and on grey paper.
 MATERIALS = {
@@ -62,12 +62,12 @@ def dh_to_urdf(table: DHTable, name: str) -> str:
     Returns:
         The whole file, which Pinocchio, MuJoCo and other readers load as it is.
     """
-    table = settled(table)
+    table = normalize_offsets(table)
     origins = table.origins()
     paths = _paths(table)
     tool_joint = next(t for t in _tool_names() if t not in table.names)
-    links = ["base_link", *(f"link_{i + 1}" for i in range(table.size)), "tool0"]
-    lines = ['<?xml version="1.0"?>', *_preamble(table), f"<robot name={quoted(name)}>", ""]
+    links = ["base_link", *(f"link_{i + 1}" for i in range(table.n_joints)), "tool0"]
+    lines = ['<?xml version="1.0"?>', *_preamble(table), f"<robot name={xml_attribute(name)}>", ""]
     for i, joint in enumerate(table.names):
         lines += _joint(
             joint, "prismatic" if table.prismatic[i] else "revolute", origins[i], links[i : i + 2]
@@ -80,7 +80,7 @@ def dh_to_urdf(table: DHTable, name: str) -> str:
     for i, link in enumerate(links):
         lines += ["", f'  <link name="{link}">']
         lines += [f"    {visual}" for visual in _visuals(table, origins, paths, i)]
-        lines += _inertial() if 0 < i <= table.size else []
+        lines += _inertial() if 0 < i <= table.n_joints else []
         lines.append("  </link>")
     return "\n".join([*lines, "</robot>", ""])
 
@@ -113,7 +113,7 @@ def _preamble(table: DHTable) -> list[str]:
         "",
         "  row  " + "".join(f"{f'{h} [{u}]':>14}" for h, u in zip(heads, units, strict=True)),
     ]
-    for i in range(table.size):
+    for i in range(table.n_joints):
         values = [
             getattr(table, h)[i] * (1e3 if u == "mm" else 180 / np.pi)
             for h, u in zip(heads, units, strict=True)
@@ -127,7 +127,7 @@ def _joint(name: str, kind: str, origin: Array, links: list[str]) -> list[str]:
     xyz = " ".join(_exact(v) for v in origin[:3, 3])
     rpy = " ".join(_exact(v) for v in _rpy(origin[:3, :3]))
     return [
-        f'  <joint name={quoted(name)} type="{kind}">',
+        f'  <joint name={xml_attribute(name)} type="{kind}">',
         f'    <origin xyz="{xyz}" rpy="{rpy}"/>',
         f'    <parent link="{links[0]}"/>',
         f'    <child link="{links[1]}"/>',
@@ -168,16 +168,16 @@ def _paths(table: DHTable) -> list[_Path]:
 
     Standard: link i carries row i, d then a. Modified: link i-1 carries row i, a then d.
     """
-    row = table.rows(np.zeros((1, table.size)))[0]
+    row = table.rows(np.zeros((1, table.n_joints)))[0]
     start, zero = table.base[:3, 3], np.zeros(3)
     paths = []
     if table.convention == "standard":
         paths.append(_Path([zero, start], ["corner"]))
-        for i in range(table.size):
+        for i in range(table.n_joints):
             paths.append(_Path([zero, np.array([0, 0, table.d[i]]), row[i, :3, 3]], ["along_d", "along_a"]))
         end = (row[-1] @ table.tool)[:3, 3]
     else:
-        for i in range(table.size):
+        for i in range(table.n_joints):
             frame = table.base if i == 0 else np.eye(4)
             corner = frame @ [table.a[i], 0, 0, 1]
             points = [frame[:3, 3], corner[:3], (frame @ row[i])[:3, 3]]
@@ -200,7 +200,7 @@ def _visuals(table: DHTable, origins: Array, paths: list[_Path], link: int) -> I
     """The drawing of one link, an element a line."""
     scale = _scale(table, paths)
     r = 0.02 * scale
-    if link > table.size:
+    if link > table.n_joints:
         yield from _triad(6.0 * r, 0.4 * r)
         return
     if link == 0:
@@ -220,7 +220,7 @@ def _visuals(table: DHTable, origins: Array, paths: list[_Path], link: int) -> I
         if np.linalg.norm(b - a) > 1e-6 * scale:
             yield _rod(a, b, r, material)
             yield _visual(b, np.zeros(3), f'<sphere radius="{_short([1.15 * r])}"/>', "corner")
-    if link < table.size and table.prismatic[link]:
+    if link < table.n_joints and table.prismatic[link]:
         # The sleeve stays with the link before the joint.
         box = f'<box size="{_short([3 * r, 3 * r, 5 * r])}"/>'
         yield _visual(origins[link, :3, 3], _rpy(origins[link, :3, :3]), box, "prismatic")

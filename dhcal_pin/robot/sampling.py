@@ -10,40 +10,40 @@ from .. import se3
 from .._typing import Array
 from ..exceptions import DhcalError
 from .chain import Chain
-from .collision import Clearance
+from .collision import CollisionChecker
 
 # Draws for each configuration before the space is called too narrow.
-PATIENCE = 200
+MAX_DRAWS_PER_SAMPLE = 200
 
 
 # Half a metre of a slide is as much of the arm's motion as half a turn.
-SLIDE = 2 * np.pi
+RAD_PER_METRE = 2 * np.pi
 
 
 @dataclass(frozen=True, eq=False)
-class Space:
+class WorkspaceConstraints:
     """Where the tool may be; places in the measuring frame, which is the base link's own if nobody said more.
 
     Attributes:
         box: (2, 3) least and most x, y, z of the tool point, m; None for anywhere.
-        eye: (3,) the instrument, m, which must see the tool point past the robot; None for anywhere.
-        cone: half angle about the tool's z axis in which the instrument must stand, rad; π for any.
+        instrument_position: (3,) the instrument, m, which must see the tool point past the robot; None for anywhere.
+        max_view_angle: half angle about the tool's z axis in which the instrument must stand, rad; π for any.
     """
 
     box: Array | None = None
-    eye: Array | None = None
-    cone: float = np.pi
+    instrument_position: Array | None = None
+    max_view_angle: float = np.pi
 
-    def holds(self, poses: Array) -> Array:
+    def contains(self, poses: Array) -> Array:
         """Which tool poses (m, 4, 4) are inside the box and look at the instrument, (m,)."""
         point = poses[:, :3, 3]
         good = np.ones(len(poses), bool)
         if self.box is not None:
             good &= np.all((point >= self.box[0]) & (point <= self.box[1]), 1)
-        if self.eye is not None:
-            away = self.eye - point
+        if self.instrument_position is not None:
+            away = self.instrument_position - point
             towards = np.einsum("mi,mi->m", poses[:, :3, 2], away)
-            good &= towards >= np.cos(self.cone) * np.linalg.norm(away, axis=1)
+            good &= towards >= np.cos(self.max_view_angle) * np.linalg.norm(away, axis=1)
         return good
 
 
@@ -67,26 +67,28 @@ def joint_range(chain: Chain, angle: float = 0.0, length: float = 0.0) -> tuple[
 
 
 @dataclass(frozen=True, eq=False)
-class Room:
+class ConfigurationSampler:
     """Where a robot may stand.
 
     Attributes:
         chain: the robot; base and tool as far as they are known.
-        space: where its tool may be.
+        workspace: where its tool may be.
         low, high: (n,) its joints' range, rad or m.
-        clearance: its collision geometry.
+        collision: its collision geometry.
     """
 
     chain: Chain
-    space: Space
+    workspace: WorkspaceConstraints
     low: Array
     high: Array
-    clearance: Clearance
+    collision: CollisionChecker
 
     @classmethod
-    def of(cls, chain: Chain, space: Space, angle: float, length: float) -> Room:
+    def from_chain(
+        cls, chain: Chain, space: WorkspaceConstraints, angle: float, length: float
+    ) -> ConfigurationSampler:
         """A chain's room with margins to its limits, rad and m."""
-        return cls(chain, space, *joint_range(chain, angle, length), Clearance.of(chain))
+        return cls(chain, space, *joint_range(chain, angle, length), CollisionChecker.from_chain(chain))
 
     def draw(self, count: int, rng: np.random.Generator) -> Array:
         """Uniform joint values (count, n) whose tool the space holds.
@@ -94,41 +96,41 @@ class Room:
         Raises:
             DhcalError: there are next to none.
         """
-        out = np.empty((0, self.chain.size))
-        for _ in range(PATIENCE):
-            q = rng.uniform(self.low, self.high, (count, self.chain.size))
-            out = np.concatenate([out, q[self.space.holds(self.chain.poses(q))]])
+        out = np.empty((0, self.chain.n_joints))
+        for _ in range(MAX_DRAWS_PER_SAMPLE):
+            q = rng.uniform(self.low, self.high, (count, self.chain.n_joints))
+            out = np.concatenate([out, q[self.workspace.contains(self.chain.poses(q))]])
             if len(out) >= count:
                 return out[:count]
         raise DhcalError(
-            f"the tool is in the space asked for in {len(out)} of {PATIENCE * count} configurations; "
+            f"the tool is in the space asked for in {len(out)} of {MAX_DRAWS_PER_SAMPLE * count} configurations; "
             "widen the box or the cone, or ask for fewer candidates"
         )
 
-    def near(self, q: Array, step: float, count: int, rng: np.random.Generator) -> Array:
+    def perturb(self, q: Array, step: float, count: int, rng: np.random.Generator) -> Array:
         """Configurations (m·count, n) about each of q (m, n), a step being a share of the joints' range."""
-        moves = rng.standard_normal((len(q), count, self.chain.size)) * step * (self.high - self.low)
-        return np.clip(q[:, None] + moves, self.low, self.high).reshape(-1, self.chain.size)
+        moves = rng.standard_normal((len(q), count, self.chain.n_joints)) * step * (self.high - self.low)
+        return np.clip(q[:, None] + moves, self.low, self.high).reshape(-1, self.chain.n_joints)
 
-    def allows(self, q: Array) -> bool:
+    def is_feasible(self, q: Array) -> bool:
         """Whether the robot can stand at q (n,), and the instrument sees the tool if it must."""
-        if not self.clearance.free(q):
+        if not self.collision.is_collision_free(q):
             return False
-        if self.space.eye is None:
+        if self.workspace.instrument_position is None:
             return True
         into = se3.inverse(self.chain.base)
         point = self.chain.poses(q)[0, :3, 3]
-        eye, point = (into[:3, :3] @ at + into[:3, 3] for at in (self.space.eye, point))
-        return self.clearance.sees(q, eye, point)
+        eye, point = (into[:3, :3] @ at + into[:3, 3] for at in (self.workspace.instrument_position, point))
+        return self.collision.has_line_of_sight(q, eye, point)
 
 
-def evened(chain: Chain, q: Array) -> Array:
+def scale_joint_units(chain: Chain, q: Array) -> Array:
     """Joint values (m, n) in which a step of any joint counts alike, a slide's metres as radians."""
     slides = np.array([chain.urdf.joint(name).type == "prismatic" for name in chain.joint_names])
-    return q * np.where(slides, SLIDE, 1.0)
+    return q * np.where(slides, RAD_PER_METRE, 1.0)
 
 
-def tour(q: Array) -> Array:
+def shortest_tour(q: Array) -> Array:
     """An order (n,) of configurations (n, dof) with little motion from each to the next, by 2-opt."""
     count = len(q)
     way = np.zeros((count + 1, count + 1))

@@ -20,7 +20,7 @@ from .._typing import Array
 
 
 @dataclass(frozen=True)
-class Term:
+class TransmissionTerm:
     """One way in which a joint's value comes out wrong.
 
     Attributes:
@@ -30,7 +30,7 @@ class Term:
         unit: of its coefficient.
         prior: standard deviation of the coefficient expected before any measurement.
         value: from joint values and generalised forces (n, m) to the term (n, m), both in SI.
-        sliding: whether prismatic joints have it, too.
+        applies_to_prismatic: whether prismatic joints have it, too.
     """
 
     name: str
@@ -39,23 +39,25 @@ class Term:
     unit: str
     prior: float
     value: Callable[[Array, Array], Array]
-    sliding: bool = False
+    applies_to_prismatic: bool = False
 
 
 # A drive's ratio holds to some tenths of a percent, gears run out of true by some tenths of a degree at
 # most, and an arm's joint gives by some millidegrees a newton metre.
 TERMS = (
-    Term("gain", "gain", "gain", "1", 2e-3, lambda q, load: q, sliding=True),
-    Term("sin", "sin_rad", "harmonics", "rad", 1e-3, lambda q, load: np.sin(q)),
-    Term("cos", "cos_rad", "harmonics", "rad", 1e-3, lambda q, load: np.cos(q)),
-    Term("sin2", "sin2_rad", "harmonics", "rad", 1e-3, lambda q, load: np.sin(2 * q)),
-    Term("cos2", "cos2_rad", "harmonics", "rad", 1e-3, lambda q, load: np.cos(2 * q)),
-    Term("compliance", "compliance_rad_per_nm", "compliance", "rad/Nm", 1e-4, lambda q, load: load),
+    TransmissionTerm("gain", "gain", "gain", "1", 2e-3, lambda q, load: q, applies_to_prismatic=True),
+    TransmissionTerm("sin", "sin_rad", "harmonics", "rad", 1e-3, lambda q, load: np.sin(q)),
+    TransmissionTerm("cos", "cos_rad", "harmonics", "rad", 1e-3, lambda q, load: np.cos(q)),
+    TransmissionTerm("sin2", "sin2_rad", "harmonics", "rad", 1e-3, lambda q, load: np.sin(2 * q)),
+    TransmissionTerm("cos2", "cos2_rad", "harmonics", "rad", 1e-3, lambda q, load: np.cos(2 * q)),
+    TransmissionTerm(
+        "compliance", "compliance_rad_per_nm", "compliance", "rad/Nm", 1e-4, lambda q, load: load
+    ),
 )
 
 
 # The term whose coefficients off the diagonal couple joints.
-COUPLED = 0
+COUPLING_TERM = 0
 
 
 FAMILIES = tuple(dict.fromkeys(term.family for term in TERMS))
@@ -65,7 +67,7 @@ COUPLING_PRIOR = 2e-3
 
 
 # Sets of joint values whose torques are remembered.
-TORQUES_KEPT = 256
+MAX_CACHED_TORQUES = 256
 
 
 @dataclass(frozen=True)
@@ -82,25 +84,27 @@ class Payload:
 
 
 @dataclass(frozen=True, eq=False)
-class Loads:
+class GravityLoads:
     """The masses that load a path's joints.
 
     Attributes:
         model: Pinocchio's, of the whole robot.
-        moving: (k,) names of the joints that move along the path.
-        mixing, shift: (k, n), (k,): the moving joints' values are mixing @ q + shift.
+        moving_joints: (k,) names of the joints that move along the path.
+        mimic_matrix, mimic_offset: (k, n), (k,): the moving joints' values are mixing @ q + shift.
     """
 
     model: pin.Model
-    moving: tuple[str, ...]
-    mixing: Array
-    shift: Array
-    _known: dict[bytes, Array] = field(default_factory=dict, repr=False)
+    moving_joints: tuple[str, ...]
+    mimic_matrix: Array
+    mimic_offset: Array
+    _cache: dict[bytes, Array] = field(default_factory=dict, repr=False)
 
     def configurations(self, q: Array) -> Array:
         """Pinocchio's configurations (m, nq) at values q (n, m); joints off the path stay at neutral."""
         out = np.tile(pin.neutral(self.model), (q.shape[1], 1))
-        for name, value in zip(self.moving, self.mixing @ q + self.shift[:, None], strict=True):
+        for name, value in zip(
+            self.moving_joints, self.mimic_matrix @ q + self.mimic_offset[:, None], strict=True
+        ):
             joint = self.model.joints[self.model.getJointId(name)]
             if joint.nq == 2:
                 out[:, joint.idx_q], out[:, joint.idx_q + 1] = np.cos(value), np.sin(value)
@@ -111,16 +115,16 @@ class Loads:
     def torques(self, q: Array) -> Array:
         """Pinocchio's generalised gravity (n, m) at values q (n, m), N·m or N; z of the root is up."""
         key = np.ascontiguousarray(q).tobytes()
-        if key not in self._known:
+        if key not in self._cache:
             data = self.model.createData()
-            columns = [self.model.joints[self.model.getJointId(name)].idx_v for name in self.moving]
+            columns = [self.model.joints[self.model.getJointId(name)].idx_v for name in self.moving_joints]
             held = np.empty((q.shape[1], len(columns)))
             for row, configuration in zip(held, self.configurations(q), strict=True):
                 row[:] = pin.computeGeneralizedGravity(self.model, data, configuration)[columns]
-            if len(self._known) >= TORQUES_KEPT:
-                self._known.clear()
-            self._known[key] = self.mixing.T @ held.T
-        return self._known[key]
+            if len(self._cache) >= MAX_CACHED_TORQUES:
+                self._cache.clear()
+            self._cache[key] = self.mimic_matrix.T @ held.T
+        return self._cache[key]
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,16 +137,16 @@ class Transmission:
     """
 
     coefficients: Array
-    loads: Loads
+    loads: GravityLoads
 
     @classmethod
-    def ideal(cls, loads: Loads) -> Transmission:
+    def zero(cls, loads: GravityLoads) -> Transmission:
         """Joints that do as they are told."""
-        n = loads.mixing.shape[1]
+        n = loads.mimic_matrix.shape[1]
         return cls(np.zeros((len(TERMS), n, n)), loads)
 
     @property
-    def yields(self) -> bool:
+    def has_compliance(self) -> bool:
         """Whether a load moves a joint."""
         return any(self.coefficients[t].any() for t, term in enumerate(TERMS) if term.family == "compliance")
 
@@ -155,7 +159,7 @@ class Transmission:
         """What the terms (t, n, m) add to the joints' values (n, m)."""
         return np.tensordot(self.coefficients, terms, ((0, 2), (0, 1)))
 
-    def changed(self, entries: Array, changes: Array) -> Transmission:
+    def with_coefficients_added(self, entries: Array, changes: Array) -> Transmission:
         """With entries of the flat coefficients changed."""
         coefficients = self.coefficients.copy()
         coefficients.reshape(-1)[entries] += changes

@@ -39,24 +39,24 @@ class Tag:
     attributes: dict[str, str]
     children: dict[str, Tag] = field(default_factory=dict)
 
-    def bad(self, text: str) -> DhcalError:
+    def error(self, text: str) -> DhcalError:
         """The error that says what is wrong here, with file and line."""
         return DhcalError(f"{self.source}:{self.line}: {self.label}: {text}")
 
 
-def show(text: str) -> str:
+def quote(text: str) -> str:
     """The text quoted, on one line and not too long for a message."""
     return repr(text if len(text) <= 60 else text[:57] + "...")
 
 
-def instead(name: str, known: Iterable[str]) -> str:
+def suggest(name: str, known: Iterable[str]) -> str:
     """A hint at the names that would have been right."""
     # Matching is quadratic in the length of a name, and names come from a file.
     short = [other for other in known if len(other) <= 100]
     close = difflib.get_close_matches(name[:100], short, 3)
     if close:
-        return f"did you mean {' or '.join(map(show, close))}?"
-    return f"there are {', '.join(map(show, short[:12]))}{', ...' if len(short) > 12 else ''}"
+        return f"did you mean {' or '.join(map(quote, close))}?"
+    return f"there are {', '.join(map(quote, short[:12]))}{', ...' if len(short) > 12 else ''}"
 
 
 def numbers(tag: Tag, key: str, count: int) -> list[float]:
@@ -65,10 +65,10 @@ def numbers(tag: Tag, key: str, count: int) -> list[float]:
     words = [word for word in tag.attributes[key].split(" ") if word]
     if len(words) != count:
         plural = "number" if len(words) == 1 else "numbers"
-        raise tag.bad(f"{key} has {len(words)} {plural}; it needs {count}, with blanks between them")
+        raise tag.error(f"{key} has {len(words)} {plural}; it needs {count}, with blanks between them")
     for word in words:
         if not _NUMBER.fullmatch(word) or not math.isfinite(float(word)):
-            raise tag.bad(f"{key} has {show(word)}; it needs a finite number such as 0.25 or -1e-3")
+            raise tag.error(f"{key} has {quote(word)}; it needs a finite number such as 0.25 or -1e-3")
     return [float(word) for word in words]
 
 
@@ -84,14 +84,14 @@ def scan(data: bytes, source: str) -> tuple[Tag, dict[str, Tag], dict[str, Tag]]
     def declaration(_version: str, encoding: str | None, _standalone: int) -> None:
         name = (encoding or "utf-8").lower()
         if name not in ("utf-8", "utf8") and not (name in ("us-ascii", "ascii") and data.isascii()):
-            raise tag("<?xml>", {}).bad(f"the encoding is {show(name)}; convert the file to UTF-8")
+            raise tag("<?xml>", {}).error(f"the encoding is {quote(name)}; convert the file to UTF-8")
 
     def doctype(*_: object) -> None:
-        raise tag("<!DOCTYPE>", {}).bad("document types and entities are not accepted; remove it")
+        raise tag("<!DOCTYPE>", {}).error("document types and entities are not accepted; remove it")
 
     def instruction(target: str, _: str) -> None:
         if depth > 0:  # before the robot they are common and harmless; inside, Pinocchio fails on them
-            raise tag(f"<?{target[:60]}?>", {}).bad("processing instructions are not accepted; remove it")
+            raise tag(f"<?{target[:60]}?>", {}).error("processing instructions are not accepted; remove it")
 
     def end(_: str) -> None:
         nonlocal depth
@@ -101,34 +101,34 @@ def scan(data: bytes, source: str) -> tuple[Tag, dict[str, Tag], dict[str, Tag]]
         nonlocal depth, robot, joint
         depth, label = depth + 1, f"<{name[:60]}>"
         if depth > _MAX_DEPTH:
-            raise tag(label, {}).bad(f"nested too deep; at most {_MAX_DEPTH} levels are accepted")
+            raise tag(label, {}).error(f"nested too deep; at most {_MAX_DEPTH} levels are accepted")
         if name.startswith("xacro:") or any("${" in text or "$(" in text for text in attributes.values()):
-            raise tag(label, {}).bad("unexpanded xacro; expand it first: xacro FILE > out.urdf")
+            raise tag(label, {}).error("unexpanded xacro; expand it first: xacro FILE > out.urdf")
         if depth == 1:
             robot = tag(label, attributes)
             if name != "robot":
                 hint = "this is SDF, not URDF" if name == "sdf" else "this is no URDF"
-                raise robot.bad(f"{hint}; the outermost element must be <robot>")
+                raise robot.error(f"{hint}; the outermost element must be <robot>")
             if not attributes.get("name"):
-                raise robot.bad('no name; it needs name="..."')
+                raise robot.error('no name; it needs name="..."')
         elif depth == 2:
             joint = None
             if name not in named:
                 return
             called, known = attributes.get("name", ""), named[name]
-            one = tag(f"{name} {show(called)}", attributes)
+            one = tag(f"{name} {quote(called)}", attributes)
             if not called:
-                raise one.bad('no name; it needs name="..."')
+                raise one.error('no name; it needs name="..."')
             if called in known:
-                raise one.bad(f"the name is taken on line {known[called].line}; give it another")
+                raise one.error(f"the name is taken on line {known[called].line}; give it another")
             if len(known) > _MAX_JOINTS:
-                raise one.bad(f"too many; at most {_MAX_JOINTS} are accepted")
+                raise one.error(f"too many; at most {_MAX_JOINTS} are accepted")
             known[called] = one
             joint = one if name == "joint" else None
         elif depth == 3 and joint is not None:
             child = tag(f"{joint.label} {label}", attributes)
             if name in _ONCE and name in joint.children:
-                raise child.bad("a second one; keep one")
+                raise child.error("a second one; keep one")
             joint.children.setdefault(name, child)
 
     parser.XmlDeclHandler, parser.StartDoctypeDeclHandler = declaration, doctype
@@ -145,7 +145,7 @@ def scan(data: bytes, source: str) -> tuple[Tag, dict[str, Tag], dict[str, Tag]]
     return robot, named["link"], named["joint"]
 
 
-def quoted(text: str) -> str:
+def xml_attribute(text: str) -> str:
     """An attribute's value as XML has it, quotes included; `xml.sax.saxutils` would import an HTTP client."""
     return f'"{html.escape(text)}"'
 
@@ -247,7 +247,7 @@ class Urdf:
             DhcalError: there is none; the message names the nearest ones.
         """
         if name not in self._named:
-            raise DhcalError(f"{self.source}: no joint {show(name)}; {instead(name, self._named)}")
+            raise DhcalError(f"{self.source}: no joint {quote(name)}; {suggest(name, self._named)}")
         return self._named[name]
 
     def leaves(self) -> tuple[str, ...]:
@@ -262,7 +262,7 @@ class Urdf:
             DhcalError: there is no such link; the message names the nearest ones.
         """
         if tip != self.root and tip not in self._above:
-            raise DhcalError(f"{self.source}: no link {show(tip)}; {instead(tip, self.links)}")
+            raise DhcalError(f"{self.source}: no link {quote(tip)}; {suggest(tip, self.links)}")
         joints = []
         while tip in self._above:
             joints.append(self._above[tip])
@@ -285,12 +285,12 @@ def _rotation(roll: float, pitch: float, yaw: float) -> Array:
 def _origin(tag: Tag) -> Array:
     """The pose (4, 4) that an <origin> gives."""
     if "quat_xyzw" in tag.attributes:
-        raise tag.bad("quat_xyzw is ignored by most readers of URDF; write the rotation as rpy")
+        raise tag.error("quat_xyzw is ignored by most readers of URDF; write the rotation as rpy")
     values = {key: [0.0, 0.0, 0.0] for key in ("xyz", "rpy")}
     for key in [key for key in values if key in tag.attributes]:
         values[key] = numbers(tag, key, 3)
         if max(map(abs, values[key])) > MAX_ORIGIN:
-            raise tag.bad(f"{key} is beyond ±{MAX_ORIGIN:g}; it needs metres in xyz and radians in rpy")
+            raise tag.error(f"{key} is beyond ±{MAX_ORIGIN:g}; it needs metres in xyz and radians in rpy")
     return se3.transform(_rotation(*values["rpy"]), values["xyz"])
 
 
@@ -301,7 +301,7 @@ def _axis(tag: Tag, moving: bool) -> Array:
     if 1e-6 <= norm <= 1e6:
         return axis / norm
     if moving:
-        raise tag.bad(f"its length is {norm:g}; it needs a direction of length 1, such as 0 0 1")
+        raise tag.error(f"its length is {norm:g}; it needs a direction of length 1, such as 0 0 1")
     return np.array([1.0, 0.0, 0.0])
 
 
@@ -309,16 +309,16 @@ def _joint(tag: Tag) -> UrdfJoint:
     """A joint from its tag."""
     kind, inside = tag.attributes.get("type"), tag.children
     if kind is None:
-        raise tag.bad(f"no type; it needs one of {', '.join(_TYPES)}")
+        raise tag.error(f"no type; it needs one of {', '.join(_TYPES)}")
     if kind not in _TYPES:
-        raise tag.bad(f"unknown type {show(kind)}; it needs one of {', '.join(_TYPES)}")
+        raise tag.error(f"unknown type {quote(kind)}; it needs one of {', '.join(_TYPES)}")
     for name in ("parent", "child"):
         if name not in inside:
-            raise tag.bad(f'no <{name}>; it needs <{name} link="..."/>')
+            raise tag.error(f'no <{name}>; it needs <{name} link="..."/>')
     for name, keys in _NEEDED.items():
         for key in keys:
             if name in inside and key not in inside[name].attributes:
-                raise inside[name].bad(f"no {key}; it needs {key}=...")
+                raise inside[name].error(f"no {key}; it needs {key}=...")
     values = {
         (name, key): numbers(inside[name], key, 1)[0]
         for name, keys in _NUMBERS.items()
@@ -326,14 +326,14 @@ def _joint(tag: Tag) -> UrdfJoint:
         if name in inside and key in inside[name].attributes
     }
     if "dynamics" in inside and not any(name == "dynamics" for name, _ in values):
-        raise inside["dynamics"].bad("neither damping nor friction; add one or remove it")
+        raise inside["dynamics"].error("neither damping nor friction; add one or remove it")
     lower, upper = -math.inf, math.inf
     if kind in ("revolute", "prismatic"):
         if "limit" not in inside:
-            raise tag.bad(f"a {kind} joint has no <limit>; it needs lower, upper, effort and velocity")
+            raise tag.error(f"a {kind} joint has no <limit>; it needs lower, upper, effort and velocity")
         lower, upper = values.get(("limit", "lower"), lower), values.get(("limit", "upper"), upper)
         if lower > upper:
-            raise inside["limit"].bad(f"lower {lower:g} is above upper {upper:g}; swap them")
+            raise inside["limit"].error(f"lower {lower:g} is above upper {upper:g}; swap them")
     mimic = None
     if "mimic" in inside:
         factor, offset = values.get(("mimic", "multiplier"), 1.0), values.get(("mimic", "offset"), 0.0)
@@ -377,25 +377,25 @@ def _root(robot: Tag, links: dict[str, Tag], joints: dict[str, UrdfJoint], tags:
         tag = tags[joint.name]
         for role, link in (("parent", joint.parent), ("child", joint.child)):
             if link not in links:
-                raise tag.children[role].bad(f"no link {show(link)}; {instead(link, links)}")
+                raise tag.children[role].error(f"no link {quote(link)}; {suggest(link, links)}")
         if joint.child in above:
             other = above[joint.child].name
-            raise tag.bad(
-                f"its child {show(joint.child)} already hangs on joint {show(other)}; "
+            raise tag.error(
+                f"its child {quote(joint.child)} already hangs on joint {quote(other)}; "
                 "a link has one parent, so remove one of them"
             )
         above[joint.child] = joint
     mimics = {joint.name: joint.mimic[0] for joint in joints.values() if joint.mimic}
     if (name := _on_loop(mimics)) is not None:
-        raise tags[name].children["mimic"].bad("it mimics itself in a circle; let one joint of it be free")
+        raise tags[name].children["mimic"].error("it mimics itself in a circle; let one joint of it be free")
     if (link := _on_loop({link: joint.parent for link, joint in above.items()})) is not None:
-        raise tags[above[link].name].bad("its child is also above its parent; links must form a tree")
+        raise tags[above[link].name].error("its child is also above its parent; links must form a tree")
     roots = [link for link in links if link not in above]
     if not roots:
-        raise robot.bad('no links; it needs at least one <link name="..."/>')
+        raise robot.error('no links; it needs at least one <link name="..."/>')
     if len(roots) > 1:
-        raise links[roots[1]].bad(
-            f"no joint leads here nor to link {show(roots[0])}; join them: a robot has one root"
+        raise links[roots[1]].error(
+            f"no joint leads here nor to link {quote(roots[0])}; join them: a robot has one root"
         )
     depth = {roots[0]: 0}
     for link in above:
@@ -406,7 +406,7 @@ def _root(robot: Tag, links: dict[str, Tag], joints: dict[str, UrdfJoint], tags:
         for below in reversed(trail):
             depth[below] = depth[above[below].parent] + 1
             if depth[below] > _MAX_CHAIN:
-                raise tags[above[below].name].bad(f"more than {_MAX_CHAIN} joints in a row; check the file")
+                raise tags[above[below].name].error(f"more than {_MAX_CHAIN} joints in a row; check the file")
     return roots[0]
 
 

@@ -11,8 +11,8 @@ import pinocchio as pin
 
 from .._typing import Array
 from ..exceptions import DhcalError
-from ..se3 import six_numbers
-from .urdf import MAX_ORIGIN, Urdf, UrdfJoint, parse_urdf, quoted
+from ..se3 import to_xyz_rpy
+from .urdf import MAX_ORIGIN, Urdf, UrdfJoint, parse_urdf, xml_attribute
 
 _RIGID = 1e-9  # how far from orthonormal a rotation may be before it is no rotation
 
@@ -112,13 +112,13 @@ def _end_of_robot(data: bytes) -> int:
 
 def _appended(data: bytes, link: str, joint: str, parent: str, child: str, origin: Array) -> bytes:
     """The URDF with one more link and the fixed joint that holds it."""
-    xyz, rpy = (" ".join(map(repr, part)) for part in (six_numbers(origin)[:3], six_numbers(origin)[3:]))
+    xyz, rpy = (" ".join(map(repr, part)) for part in (to_xyz_rpy(origin)[:3], to_xyz_rpy(origin)[3:]))
     lines = [
-        f"  <link name={quoted(link)}/>",
-        f'  <joint name={quoted(joint)} type="fixed">',
+        f"  <link name={xml_attribute(link)}/>",
+        f'  <joint name={xml_attribute(joint)} type="fixed">',
         f'    <origin xyz="{xyz}" rpy="{rpy}"/>',
-        f"    <parent link={quoted(parent)}/>",
-        f"    <child link={quoted(child)}/>",
+        f"    <parent link={xml_attribute(parent)}/>",
+        f"    <child link={xml_attribute(child)}/>",
         "  </joint>",
         "",
     ]

@@ -10,7 +10,7 @@ import pinocchio as pin
 from .. import se3
 from .._typing import Array
 from ..exceptions import DhcalError
-from .urdf import Urdf, UrdfJoint, instead, show
+from .urdf import Urdf, UrdfJoint, quote, suggest
 
 _MAX_MOVING = 64  # what is unknown grows with the path, and work with its cube; no arm comes near
 
@@ -44,7 +44,7 @@ def default_tip(urdf: Urdf) -> str:
     return farthest[0]
 
 
-def moving_joints(urdf: Urdf, tip: str) -> list[UrdfJoint]:
+def find_moving_joints(urdf: Urdf, tip: str) -> list[UrdfJoint]:
     """The joints that move between the root and a tip, in that order.
 
     Raises:
@@ -84,8 +84,8 @@ def independent_joints(urdf: Urdf, moving: list[str]) -> tuple[list[str], Array,
         while (mimic := urdf.joint(name).mimic) is not None:
             if mimic[0] not in free:
                 raise DhcalError(
-                    f"{urdf.source}:{urdf.joint(name).line}: joint {show(name)}: it mimics {show(mimic[0])}, "
-                    f"which is no joint that moves; {instead(mimic[0], free)}"
+                    f"{urdf.source}:{urdf.joint(name).line}: joint {quote(name)}: it mimics {quote(mimic[0])}, "
+                    f"which is no joint that moves; {suggest(mimic[0], free)}"
                 )
             name, shift, factor = mimic[0], shift + factor * mimic[2], factor * mimic[1]
         entries.append((name, factor, shift))

@@ -1,11 +1,11 @@
 """Studies: grids of simulated calibrations."""
 
-from .grid import Setting, Study, read_study
+from .grid import Setting, StudyGrid, read_study
 from .runner import run
 
 __all__ = [
     "Setting",
-    "Study",
+    "StudyGrid",
     "read_study",
     "run",
 ]

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 
 from .._typing import Array, PathLike
-from ..estimation.batch import Batch
-from ..estimation.batch_chains import Arms
-from ..estimation.parameters import select
+from ..estimation.batch import BatchProblem
+from ..estimation.batch_chains import ChainBatch
+from ..estimation.parameters import select_parameters
 from ..estimation.solver import METHODS
 from ..exceptions import DhcalError
 from ..io.robot import read_robot
-from ..io.shipped_files import paper_file
+from ..io.shipped_files import shipped_file
 from ..io.tabular import read_toml
 from ..measurements import KINDS
 from ..measurements.base import Noise
@@ -30,7 +30,7 @@ from ..robot.sampling import joint_range
 from ..units import parse_noise
 
 # Calibrations a task: some tenths of a second.
-BLOCK = 100
+BLOCK_SIZE = 100
 
 
 @dataclass(frozen=True)
@@ -41,14 +41,14 @@ class Setting:
         robot: the nominal robot's file, beside the study or shipped.
         tip: the tip link of URDFs; the deepest leaf without it.
         truth: the true robot's file; without it the truth is the nominal robot with errors drawn.
-        errors: standard deviations of the true robot's parameters, length and angle.
-        wrong: the sets that these errors are in.
+        error_std: standard deviations of the true robot's parameters, length and angle.
+        error_parameters: the sets that these errors are in.
         parameters: the sets that are identified.
         kind: of measurement, one without unknowns of its own.
         noise: its standard deviations an axis.
         poses: how many are measured.
-        choice: how they are chosen, of `CHOICES`.
-        redrawn: whether the poses are drawn anew at each iteration; planned ones cannot be.
+        pose_selection: how they are chosen, of `CHOICES`.
+        resample_each_iteration: whether the poses are drawn anew at each iteration; planned ones cannot be.
         method: "lm" or "gn".
         priors: "default" or "none".
         iterations: most steps.
@@ -57,14 +57,14 @@ class Setting:
     robot: str
     tip: str = ""
     truth: str = ""
-    errors: str = "1mm,0.3deg"
-    wrong: str = "placement"
+    error_std: str = "1mm,0.3deg"
+    error_parameters: str = "placement"
     parameters: str = "minimal,base,tool"
     kind: str = "position"
     noise: str = "0.1mm,0.01deg"
     poses: int = 30
-    choice: str = "random"
-    redrawn: bool = False
+    pose_selection: str = "random"
+    resample_each_iteration: bool = False
     method: str = "lm"
     priors: str = "default"
     iterations: int = 100
@@ -73,11 +73,11 @@ class Setting:
 def configurations(chain: Chain, count: int, rng: np.random.Generator, share: float = 1.0) -> Array:
     """Uniform joint values (count, n) in the lower `share` of each joint's range."""
     low, high = joint_range(chain)
-    return rng.uniform(low, low + share * (high - low), (count, chain.size))
+    return rng.uniform(low, low + share * (high - low), (count, chain.n_joints))
 
 
 # How each arm's poses are drawn: all over the joints' ranges, or in their lowest quarter alone.
-DRAWN: dict[str, Callable[[Chain, int, np.random.Generator], Array]] = {
+SAMPLERS: dict[str, Callable[[Chain, int, np.random.Generator], Array]] = {
     "random": configurations,
     "corner": partial(configurations, share=0.25),
 }
@@ -87,7 +87,7 @@ DRAWN: dict[str, Callable[[Chain, int, np.random.Generator], Array]] = {
 PLANNED = "planned"
 
 
-CHOICES = (*DRAWN, PLANNED)
+POSE_SELECTIONS = (*SAMPLERS, PLANNED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,11 +122,11 @@ class Case:
         """One arm's joint values (poses, n)."""
         if self.poses is not None:
             return self.poses
-        return DRAWN[self.setting.choice](self.nominal, self.setting.poses, rng)
+        return SAMPLERS[self.setting.pose_selection](self.nominal, self.setting.poses, rng)
 
 
 @dataclass(frozen=True, eq=False)
-class Study:
+class StudyGrid:
     """A grid of settings.
 
     Attributes:
@@ -146,13 +146,13 @@ class Study:
     def tasks(self) -> list[tuple[Case, int, int]]:
         """Blocks of calibrations: case, first seed, and how many."""
         return [
-            (case, first, min(BLOCK, self.seeds - first))
+            (case, first, min(BLOCK_SIZE, self.seeds - first))
             for case in self.cases
-            for first in range(0, self.seeds, BLOCK)
+            for first in range(0, self.seeds, BLOCK_SIZE)
         ]
 
 
-def read_study(path: PathLike) -> Study:
+def read_study(path: PathLike) -> StudyGrid:
     """A study's TOML file: `title`, `seeds`, and `[settings]` with `Setting`'s entries or lists of them.
 
     Raises:
@@ -167,23 +167,23 @@ def read_study(path: PathLike) -> Study:
         raise DhcalError(f"{where}: seeds = {seeds!r}: must be a whole number from 1 to 1000000")
     if not isinstance(table, dict) or "robot" not in table:
         raise DhcalError(f'{where}: no robot; write [settings] with robot = "arm.urdf" in it')
-    settings = [_checked(setting, where) for setting in _grid(table, where)]
+    settings = [_validated(setting, where) for setting in _grid(table, where)]
     arms = {(name, s.tip) for s in settings for name in (s.robot, s.truth) if name}
-    files = {name: os.fspath(_beside(name, path)) for name in sorted({name for name, _ in arms})}
+    files = {name: os.fspath(_find_robot_file(name, path)) for name in sorted({name for name, _ in arms})}
     chains = {(name, tip): read_robot(files[name], tip or None) for name, tip in sorted(arms)}
     cases = [Case(s, chains[s.robot, s.tip], chains.get((s.truth, s.tip))) for s in settings]
     different = {
-        (s.robot, s.tip, s.truth, s.kind, s.parameters, s.wrong, s.choice, s.noise): case
+        (s.robot, s.tip, s.truth, s.kind, s.parameters, s.error_parameters, s.pose_selection, s.noise): case
         for case in cases
         if (s := case.setting)
     }
     for case in different.values():
-        _tried(case, where)
+        _require_runnable(case, where)
     digest = hashlib.sha256(repr((seeds, settings)).encode())
     for chain in chains.values():
         digest.update(chain.urdf.data + chain.origins.tobytes())
     title, robots = str(document.get("title", "")), tuple(files.values())
-    return Study(title, seeds, tuple(cases), digest.hexdigest(), robots)
+    return StudyGrid(title, seeds, tuple(cases), digest.hexdigest(), robots)
 
 
 def _grid(table: Mapping[str, Any], where: str) -> Iterator[Setting]:
@@ -203,10 +203,10 @@ def _grid(table: Mapping[str, Any], where: str) -> Iterator[Setting]:
         yield Setting(**dict(zip(lists, values, strict=True)))
 
 
-def _checked(setting: Setting, where: str) -> Setting:
+def _validated(setting: Setting, where: str) -> Setting:
     for key, known in (
         ("kind", KINDS),
-        ("choice", CHOICES),
+        ("pose_selection", POSE_SELECTIONS),
         ("method", METHODS),
         ("priors", ("default", "none")),
     ):
@@ -215,31 +215,33 @@ def _checked(setting: Setting, where: str) -> Setting:
     for key, least in (("poses", 1), ("iterations", 0)):
         if not least <= getattr(setting, key) <= 10**5:
             raise DhcalError(f"{where}: {key} = {getattr(setting, key)}: must be from {least} to 100000")
-    if setting.redrawn and setting.choice == PLANNED:
-        raise DhcalError(f"{where}: redrawn = true: planned poses are not drawn anew; set it to false")
-    for key in ("noise", "errors"):
+    if setting.resample_each_iteration and setting.pose_selection == PLANNED:
+        raise DhcalError(
+            f"{where}: resample_each_iteration = true: planned poses are not drawn anew; set it to false"
+        )
+    for key in ("noise", "error_std"):
         parse_noise(getattr(setting, key), f"{where}: {key}")
     return setting
 
 
-def _beside(name: str, path: PathLike) -> Path:
+def _find_robot_file(name: str, path: PathLike) -> Path:
     """A robot's file beside the study, or one of those shipped."""
     near = Path(path).resolve().parent / name
-    return near if near.exists() else paper_file(name)
+    return near if near.exists() else shipped_file(name)
 
 
-def _tried(case: Case, where: str) -> None:
+def _require_runnable(case: Case, where: str) -> None:
     """Complains about what would only fail in the middle of the work."""
     setting, nominal = case.setting, case.nominal
-    errors = select(nominal, setting.parameters)
-    select(nominal, setting.wrong)
+    errors = select_parameters(nominal, setting.parameters)
+    select_parameters(nominal, setting.error_parameters)
     if case.truth is not None:
-        Arms.of([errors, select(case.truth, setting.parameters)])
+        ChainBatch.from_models([errors, select_parameters(case.truth, setting.parameters)])
     q = configurations(nominal, 8, np.random.default_rng(0))
     data = KINDS[setting.kind].simulate(nominal, q, Noise(), np.random.default_rng(0))
     try:
-        Batch(Arms.of([errors]), (data,), np.zeros(len(errors.parameters)))
-        if setting.choice == PLANNED:
+        BatchProblem(ChainBatch.from_models([errors]), (data,), np.zeros(len(errors.parameters)))
+        if setting.pose_selection == PLANNED:
             case.planned(1, candidates=8)
     except DhcalError as error:
         raise DhcalError(f"{where}: kind = {setting.kind!r}: {error}") from None

@@ -62,7 +62,7 @@ class Axis:
             return [(10.0**e, _power(e)) for e in range(first, last + 1, step)]
         step = nice_step((self.high - self.low) / 5)
         numbers = range(math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9) + 1)
-        return [(n * step, _minus(f"{n * step:.{places(step)}f}")) for n in numbers]
+        return [(n * step, _minus(f"{n * step:.{decimals(step)}f}")) for n in numbers]
 
 
 def nice_step(least: float) -> float:
@@ -71,7 +71,7 @@ def nice_step(least: float) -> float:
     return next(k * power for k in (1, 2, 5, 10) if k * power >= least * (1 - 1e-9))
 
 
-def places(step: float) -> int:
+def decimals(step: float) -> int:
     """Digits behind the point that multiples of a round step need."""
     return max(0, -math.floor(math.log10(step) + 1e-9))
 
@@ -85,7 +85,7 @@ def _power(exponent: int) -> str:
     return "1" if exponent == 0 else "10" if exponent == 1 else f"10{raised}"
 
 
-def spanning(values: ArrayLike, title: str, *, zero: bool = False, round_up: bool = True) -> Axis:
+def axis_over(values: ArrayLike, title: str, *, zero: bool = False, round_up: bool = True) -> Axis:
     """An axis over all finite values, from zero if asked, ending on round numbers if asked."""
     values = np.asarray(values, float).ravel()
     values = values[np.isfinite(values)]
@@ -122,11 +122,11 @@ class Frame:
         """The right end of the plotting area, pixels."""
         return self.width - RIGHT
 
-    def across(self, values: ArrayLike) -> Array:
+    def x_pixels(self, values: ArrayLike) -> Array:
         """Pixels from the left."""
         return LEFT + np.clip(self.x.share(values), -0.02, 1.02) * (self.right - LEFT)
 
-    def down(self, values: ArrayLike) -> Array:
+    def y_pixels(self, values: ArrayLike) -> Array:
         """Pixels from the top."""
         return (
             self.height - BOTTOM - np.clip(self.y.share(values), -0.02, 1.02) * (self.height - TOP - BOTTOM)
@@ -142,55 +142,57 @@ def _number(value: float) -> str:
 
 
 def _pairs(frame: Frame, x: ArrayLike, y: ArrayLike) -> list[str]:
-    across, down = np.broadcast_arrays(frame.across(x), frame.down(y))
+    across, down = np.broadcast_arrays(frame.x_pixels(x), frame.y_pixels(y))
     pairs = zip(across.tolist(), down.tolist(), strict=True)
     return [f"{_number(a)} {_number(d)}" for a, d in pairs if math.isfinite(a) and math.isfinite(d)]
 
 
-def dots(x: ArrayLike, y: ArrayLike, look: str) -> Mark:
+def dots(x: ArrayLike, y: ArrayLike, css_class: str) -> Mark:
     """Round dots, one path for all of them."""
     return lambda frame: (
-        f'<path class="dots {look}" d="{"".join(f"M{at}h0" for at in _pairs(frame, x, y))}"/>'
+        f'<path class="dots {css_class}" d="{"".join(f"M{at}h0" for at in _pairs(frame, x, y))}"/>'
     )
 
 
-def line(x: ArrayLike, y: ArrayLike, look: str) -> Mark:
+def line(x: ArrayLike, y: ArrayLike, css_class: str) -> Mark:
     """A line through points."""
-    return lambda frame: f'<path class="line {look}" d="M{"L".join(_pairs(frame, x, y))}"/>'
+    return lambda frame: f'<path class="line {css_class}" d="M{"L".join(_pairs(frame, x, y))}"/>'
 
 
-def steps(edges: ArrayLike, counts: ArrayLike, look: str) -> Mark:
+def histogram(edges: ArrayLike, counts: ArrayLike, css_class: str) -> Mark:
     """A histogram's outline over a filled area."""
     edges = np.asarray(edges, float)
     x = np.repeat(edges, 2)
     y = np.concatenate([[0.0], np.repeat(np.asarray(counts, float), 2), [0.0]])
-    return lambda frame: f'<path class="steps {look}" d="M{"L".join(_pairs(frame, x, y))}"/>'
+    return lambda frame: f'<path class="steps {css_class}" d="M{"L".join(_pairs(frame, x, y))}"/>'
 
 
-def spans(x: ArrayLike, low: ArrayLike, high: ArrayLike, look: str) -> Mark:
+def error_bars(x: ArrayLike, low: ArrayLike, high: ArrayLike, css_class: str) -> Mark:
     """Vertical bars from low to high."""
 
     def draw(frame: Frame) -> str:
-        across, top, bottom = (v.tolist() for v in (frame.across(x), frame.down(high), frame.down(low)))
+        across, top, bottom = (
+            v.tolist() for v in (frame.x_pixels(x), frame.y_pixels(high), frame.y_pixels(low))
+        )
         parts = (
             f"M{_number(a)} {_number(t)}V{_number(b)}"
             for a, t, b in zip(across, top, bottom, strict=True)
             if math.isfinite(t + b)
         )
-        return f'<path class="line {look}" d="{"".join(parts)}"/>'
+        return f'<path class="line {css_class}" d="{"".join(parts)}"/>'
 
     return draw
 
 
-def across_at(value: float, look: str) -> Mark:
+def hline(value: float, css_class: str) -> Mark:
     """A horizontal line through the whole panel."""
     return lambda frame: (
-        f'<path class="line {look}" d="M{_number(LEFT)} {_number(float(frame.down(value)))}'
+        f'<path class="line {css_class}" d="M{_number(LEFT)} {_number(float(frame.y_pixels(value)))}'
         f'H{_number(frame.right)}"/>'
     )
 
 
-def cells(x: ArrayLike, y: ArrayLike, size: float, level: ArrayLike) -> Mark:
+def heatmap(x: ArrayLike, y: ArrayLike, size: float, level: ArrayLike) -> Mark:
     """Squares of a map with lower corners (x, y) and side `size`, coloured by level; -1 is unknown."""
     x, y, level = np.asarray(x, float), np.asarray(y, float), np.asarray(level, int)
 
@@ -198,8 +200,8 @@ def cells(x: ArrayLike, y: ArrayLike, size: float, level: ArrayLike) -> Mark:
         out = []
         for value in np.unique(level):
             mine = level == value
-            left, right = frame.across(x[mine]), frame.across(x[mine] + size)
-            low, high = frame.down(y[mine]), frame.down(y[mine] + size)
+            left, right = frame.x_pixels(x[mine]), frame.x_pixels(x[mine] + size)
+            low, high = frame.y_pixels(y[mine]), frame.y_pixels(y[mine] + size)
             parts = "".join(
                 f"M{_number(a)} {_number(d)}H{_number(b)}V{_number(c)}H{_number(a)}Z"
                 for a, b, c, d in zip(left.tolist(), right.tolist(), low.tolist(), high.tolist(), strict=True)
@@ -210,7 +212,7 @@ def cells(x: ArrayLike, y: ArrayLike, size: float, level: ArrayLike) -> Mark:
     return draw
 
 
-def panel(
+def axes(
     key: str,
     title: str,
     description: str,
@@ -225,13 +227,13 @@ def panel(
     floor = height - BOTTOM
     lines, labels = [], []
     for value, label in y.ticks():
-        at = float(frame.down(value))
+        at = float(frame.y_pixels(value))
         lines.append(f"M{_number(LEFT)} {_number(at)}H{_number(frame.right)}")
         labels.append(
             f'<text class="tick end" x="{_number(LEFT - 5)}" y="{_number(at + 3.5)}">{label}</text>'
         )
     for value, label in x.ticks():
-        at = float(frame.across(value))
+        at = float(frame.x_pixels(value))
         lines.append(f"M{_number(at)} {_number(TOP)}V{_number(floor)}")
         labels.append(f'<text class="tick middle" x="{_number(at)}" y="{_number(floor + 13)}">{label}</text>')
     middle = _number(0.5 * (LEFT + frame.right))
@@ -252,7 +254,7 @@ def panel(
     )
 
 
-def thinned(count: int, most: int) -> Array:
+def subsample_indices(count: int, most: int) -> Array:
     """At most so many numbers below `count`, evenly spread."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
 

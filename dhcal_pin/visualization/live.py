@@ -29,19 +29,19 @@ from .._typing import Array
 from ..calibration.result import Result
 from ..exceptions import DhcalError
 from ..robot.chain import Chain
-from .meshes import Looks, looks
-from .scene import TRIANGLES, PathLike, alike, tree
+from .meshes import Visuals, visuals_of
+from .scene import MAX_TRIANGLES, PathLike, kinematic_tree, with_shared_frames
 
-PATIENCE = 2000  # ms that the server may take for one command
-
-
-START = 30.0  # s that it may take to start, imports from a slow disk included
+TIMEOUT_MS = 2000  # ms that the server may take for one command
 
 
-PICTURES = 30  # a second, while poses are played
+START_TIMEOUT_S = 30.0  # s that it may take to start, imports from a slow disk included
 
 
-LOOK = {"nominal": (0x0072B2, 0.35), "calibrated": (0xE69F00, 1.0), "arm": (0x0072B2, 1.0)}
+FRAMES_PER_SECOND = 30  # a second, while poses are played
+
+
+STYLES = {"nominal": (0x0072B2, 0.35), "calibrated": (0xE69F00, 1.0), "arm": (0x0072B2, 1.0)}
 
 
 def serve(
@@ -50,7 +50,7 @@ def serve(
     *,
     package_dirs: Sequence[PathLike] | None = None,
     magnification: float = 1.0,
-    triangles: int = TRIANGLES,
+    triangles: int = MAX_TRIANGLES,
 ) -> Live:
     """Starts a live scene of an arm, or of an arm before and after its calibration.
 
@@ -68,29 +68,31 @@ def serve(
         DhcalError: the two arms have different joints, or the server does not start.
     """
     if isinstance(calibrated, Result):
-        nominal = replace(nominal, base=calibrated.reference.base, tool=calibrated.reference.tool)
+        nominal = replace(
+            nominal, base=calibrated.nominal_refitted.base, tool=calibrated.nominal_refitted.tool
+        )
         calibrated = calibrated.chain
     arm = calibrated or nominal
-    bodies = tree(nominal, arm)["bodies"]
-    drawn = looks(nominal, bodies, package_dirs, triangles)
+    bodies = kinematic_tree(nominal, arm)["bodies"]
+    drawn = visuals_of(nominal, bodies, package_dirs, triangles)
     if calibrated is None:
         arms = {"arm": arm}
     else:
         errors = se3.log6(se3.inverse(nominal.origins) @ arm.origins)
         grown = replace(arm, origins=nominal.origins @ se3.exp6(magnification * errors))
-        arms = {"nominal": alike(nominal, arm), "calibrated": grown}
-    window = _Window.started()
+        arms = {"nominal": with_shared_frames(nominal, arm), "calibrated": grown}
+    window = _Window.start()
     scene = Live(window.web_url, arms, window)
     for name in arms:
         view = meshcat.Visualizer(window=window)[name]
         view.set_transform(se3.inverse(arm.base))
-        _draw(view, LOOK[name], drawn, len(bodies) - 1)
+        _draw(view, STYLES[name], drawn, len(bodies) - 1)
     size = float(np.linalg.norm(arm.origins[:, :3, 3], axis=1).sum())
     page = meshcat.Visualizer(window=window)
     page["/Cameras/default/rotated/<object>"].set_property("position", [0.7 * size, 0.4 * size, 0.8 * size])
     page["/Background"].set_property("top_color", [0.97, 0.98, 0.99])
     page["/Background"].set_property("bottom_color", [0.86, 0.9, 0.93])
-    scene.show(np.zeros(nominal.size))
+    scene.show(np.zeros(nominal.n_joints))
     return scene
 
 
@@ -114,7 +116,7 @@ class Live:
             DhcalError: q does not fit, or the server is gone, within 3 s.
         """
         for name, chain in self.arms.items():
-            for number, pose in enumerate(_places(chain, q)):
+            for number, pose in enumerate(_body_poses(chain, q)):
                 meshcat.Visualizer(window=self._window)[f"{name}/{number}"].set_transform(pose)
 
     def play(self, q: Array, seconds: float = 1.0) -> None:
@@ -123,12 +125,12 @@ class Live:
         Raises:
             DhcalError: as `show`.
         """
-        q = next(iter(self.arms.values())).checked(q)
-        steps = max(1, round(seconds * PICTURES))
+        q = next(iter(self.arms.values())).validated_q(q)
+        steps = max(1, round(seconds * FRAMES_PER_SECOND))
         for start, end in zip(q, np.concatenate([q[1:], q[-1:]]), strict=True):
             for share in np.arange(steps) / steps:
                 self.show(start + share * (end - start))
-                time.sleep(1 / PICTURES)
+                time.sleep(1 / FRAMES_PER_SECOND)
 
     def close(self) -> None:
         """Ends the server."""
@@ -141,7 +143,7 @@ class Live:
         self.close()
 
 
-def _places(chain: Chain, q: Array) -> list[Array]:
+def _body_poses(chain: Chain, q: Array) -> list[Array]:
     """Poses (4, 4) of the bodies that `viewer.tree` lists, as Pinocchio has them, in the measuring frame."""
     model, data = chain.model, chain.model.createData()
     pin.framesForwardKinematics(model, data, chain.configurations(q)[0])
@@ -150,7 +152,7 @@ def _places(chain: Chain, q: Array) -> list[Array]:
     return [*poses, poses[-1] @ chain.tool]
 
 
-def _draw(view: meshcat.Visualizer, look: tuple[int, float], drawn: Looks, tool: int) -> None:
+def _draw(view: meshcat.Visualizer, look: tuple[int, float], drawn: Visuals, tool: int) -> None:
     """Sends an arm's shapes, each under its body's number, and a triad for the tool."""
     color, opacity = look
     material = g.MeshPhongMaterial(color=color, opacity=opacity, transparent=opacity < 1)
@@ -166,7 +168,7 @@ def _draw(view: meshcat.Visualizer, look: tuple[int, float], drawn: Looks, tool:
             geometry, turn = g.Cylinder(length, radius), se3.exp6(np.array([0, 0, 0, np.pi / 2, 0, 0]))
         else:
             mesh = drawn.meshes[shape["mesh"]]
-            geometry = g.TriangularMeshGeometry(mesh.places, mesh.triangles)
+            geometry = g.TriangularMeshGeometry(mesh.vertices, mesh.triangles)
         place = np.concatenate([np.reshape(shape["placement"], (3, 4)), [[0, 0, 0, 1]]])
         view[f"{shape['body']}/{number}"].set_object(geometry, material)
         view[f"{shape['body']}/{number}"].set_transform(place @ turn)
@@ -190,7 +192,7 @@ class _Window:
     web_url: str
 
     @classmethod
-    def started(cls) -> _Window:
+    def start(cls) -> _Window:
         """With a server of its own."""
         folder = TemporaryDirectory(prefix="dhcal-")
         address = f"ipc://{folder.name}/commands"
@@ -205,16 +207,16 @@ class _Window:
             start_new_session=True,
         )
         assert process.stdout is not None
-        ready = select.select([process.stdout], [], [], START)[0]
+        ready = select.select([process.stdout], [], [], START_TIMEOUT_S)[0]
         url = process.stdout.readline().strip() if ready else ""
         socket = zmq.Context.instance().socket(zmq.REQ)
         socket.setsockopt(zmq.LINGER, 0)
-        socket.setsockopt(zmq.SNDTIMEO, PATIENCE)
-        socket.setsockopt(zmq.RCVTIMEO, PATIENCE)
+        socket.setsockopt(zmq.SNDTIMEO, TIMEOUT_MS)
+        socket.setsockopt(zmq.RCVTIMEO, TIMEOUT_MS)
         window = cls(process, socket, folder, url)
         if not url:
             window.close()
-            raise DhcalError(f"the MeshCat server did not start within {START:.0f} s")
+            raise DhcalError(f"the MeshCat server did not start within {START_TIMEOUT_S:.0f} s")
         socket.connect(address)
         return window
 

@@ -29,17 +29,17 @@ PathLike = str | os.PathLike[str]
 GRID = 8000  # mesh corners sit on a grid of this many steps along the longest side, 0.1 mm on most links
 
 
-COARSER = (400, 200, 100, 50, 25, 12, 6)  # grids for meshes that are simplified, one after the other
+COARSER_GRIDS = (400, 200, 100, 50, 25, 12, 6)  # grids for meshes that are simplified, one after the other
 
 
-NAMED = 3  # lost meshes that a note lists
+MAX_NAMED = 3  # lost meshes that a note lists
 
 
 TRIAD = [MATERIALS[f"{axis}_axis"] for axis in "xyz"]
 
 
 @dataclass(frozen=True, eq=False)
-class Looks:
+class Visuals:
     """How an arm is drawn.
 
     Attributes:
@@ -53,9 +53,9 @@ class Looks:
     note: str
 
 
-def looks(
+def visuals_of(
     chain: Chain, bodies: Sequence[dict[str, Any]], package_dirs: Sequence[PathLike] | None, triangles: int
-) -> Looks:
+) -> Visuals:
     """What to draw for each body of an arm.
 
     Args:
@@ -72,7 +72,7 @@ def looks(
     found, lost = _visuals(model, text, [os.fspath(path) for path in package_dirs])
     if not len(found) and not lost:
         every = set(range(len(bodies)))
-        return Looks(_skeleton(bodies, every), [], "Drawn as a skeleton: the URDF has no visual geometry.")
+        return Visuals(_skeleton(bodies, every), [], "Drawn as a skeleton: the URDF has no visual geometry.")
     numbers: dict[tuple[bytes, ...], int] = {}
     meshes: list[Mesh] = []
     shapes = []
@@ -81,21 +81,21 @@ def looks(
             continue  # the URDF of a DH table draws its own tool frame; the page's is a layer
         shape = _primitive(item.geometry)
         if shape is None:
-            mesh = Mesh.of(item.geometry)
+            mesh = Mesh.from_geometry(item.geometry)
             # Equal parts, such as the same motor five times, are sent once.
             number = numbers.setdefault(mesh.key, len(meshes))
             if number == len(meshes):
                 meshes.append(mesh)
             shape = {"mesh": number}
-        body, placement = _home(model, chain, item.parentFrame, item.placement)
+        body, placement = _parent_body(model, chain, item.parentFrame, item.placement)
         shapes.append({"body": body, "placement": rows(np.round(placement, 9)), **shape})
     bare = {
-        _home(model, chain, model.getFrameId(link, pin.FrameType.BODY), pin.SE3.Identity())[0]
+        _parent_body(model, chain, model.getFrameId(link, pin.FrameType.BODY), pin.SE3.Identity())[0]
         for link in lost
     }
-    kept = shares([len(mesh.triangles) for mesh in meshes], triangles)
-    drawn = [mesh.simplified(most) for mesh, most in zip(meshes, kept, strict=True)]
-    return Looks(shapes + _skeleton(bodies, bare), drawn, _lost_note(lost))
+    kept = allocate_triangles([len(mesh.triangles) for mesh in meshes], triangles)
+    drawn = [mesh.simplify(most) for mesh, most in zip(meshes, kept, strict=True)]
+    return Visuals(shapes + _skeleton(bodies, bare), drawn, _missing_meshes_note(lost))
 
 
 def rows(pose: Array) -> list[float]:
@@ -134,15 +134,15 @@ def _loaded(model: pin.Model, text: str, folders: Sequence[str]) -> Sequence[pin
     return found.geometryObjects
 
 
-def _lost_note(lost: dict[str, list[str]]) -> str:
+def _missing_meshes_note(lost: dict[str, list[str]]) -> str:
     if not lost:
         return ""
     names = [f"{os.path.basename(name)} ({link})" for link, files in lost.items() for name in files]
-    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return f"Drawn as rods, because meshes are missing or unreadable: {', '.join(names[:NAMED])}{more}."
+    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
+    return f"Drawn as rods, because meshes are missing or unreadable: {', '.join(names[:MAX_NAMED])}{more}."
 
 
-def _home(model: pin.Model, chain: Chain, frame: int, placement: pin.SE3) -> tuple[int, Array]:
+def _parent_body(model: pin.Model, chain: Chain, frame: int, placement: pin.SE3) -> tuple[int, Array]:
     """The body that a thing on a link's frame belongs to and its pose (4, 4) there.
 
     What is fixed to the tip moves with the tip. `placement` is the thing's in its moving joint.
@@ -178,7 +178,7 @@ class Mesh:
     triangles: Array
 
     @classmethod
-    def of(cls, geometry: Any) -> Mesh:
+    def from_geometry(cls, geometry: Any) -> Mesh:
         """What coal read from a file."""
         faces = [(t[0], t[1], t[2]) for t in map(geometry.tri_indices, range(geometry.num_tris))]
         return cls.on_grid(np.asarray(geometry.vertices(), float), np.array(faces, int).reshape(-1, 3))
@@ -200,7 +200,7 @@ class Mesh:
         return cls(np.round(origin, 9), float(step), cells, triangles[np.sort(once)])
 
     @property
-    def places(self) -> Array:
+    def vertices(self) -> Array:
         """The corners (v, 3), m."""
         return self.origin + self.step * self.corners
 
@@ -209,17 +209,17 @@ class Mesh:
         """The same for equal meshes."""
         return self.origin.tobytes(), self.corners.tobytes(), self.triangles.tobytes()
 
-    def simplified(self, most: int) -> Mesh:
+    def simplify(self, most: int) -> Mesh:
         """With at most so many triangles, by collapsing the edges that change its form least."""
         mesh = self
-        for grid in COARSER:
+        for grid in COARSER_GRIDS:
             if len(mesh.triangles) <= most:
                 break
             # Slivers between the teeth of a thread keep edges from collapsing: a coarser grid takes them.
-            mesh = Mesh.on_grid(mesh.places, mesh.triangles, grid)
+            mesh = Mesh.on_grid(mesh.vertices, mesh.triangles, grid)
             if len(mesh.triangles) > most:
                 corners, triangles = fast_simplification.simplify(
-                    mesh.places / mesh.step, mesh.triangles, target_count=most
+                    mesh.vertices / mesh.step, mesh.triangles, target_count=most
                 )[:2]
                 mesh = Mesh.on_grid(mesh.step * corners, np.asarray(triangles, int))
         return mesh
@@ -236,7 +236,7 @@ class Mesh:
         }
 
 
-def shares(counts: Sequence[int], total: int) -> list[int]:
+def allocate_triangles(counts: Sequence[int], total: int) -> list[int]:
     """How many of its triangles each mesh keeps, all together at most `total`.
 
     A mesh of four times as many as another keeps twice as many, so that both lose detail alike; small

@@ -32,25 +32,25 @@ from ..estimation.uncertainty import Predictor
 from ..exceptions import DhcalError
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
-from ..robot.transmission import TERMS, Loads
-from .meshes import looks, rows
+from ..robot.transmission import TERMS, GravityLoads
+from .meshes import rows, visuals_of
 
 PathLike = str | os.PathLike[str]
 
 
-MOST_POINTS = 2000  # more are thinned out evenly: the page keeps moving smoothly
+MAX_POINTS = 2000  # more are thinned out evenly: the page keeps moving smoothly
 
 
-MOST_ELLIPSOIDS = 400  # more would hide each other
+MAX_ELLIPSOIDS = 400  # more would hide each other
 
 
-TRIANGLES = 60_000  # that the meshes keep: with more the page would hardly turn, and be large
+MAX_TRIANGLES = 60_000  # that the meshes keep: with more the page would hardly turn, and be large
 
 
-LEAST_TRIANGLES = 100
+MIN_TRIANGLES = 100
 
 
-SLIDE = 0.5  # m each way for a sliding joint without limits
+DEFAULT_STROKE_M = 0.5  # m each way for a sliding joint without limits
 
 
 PAGE = Path(__file__).with_name("viewer.html")
@@ -67,7 +67,7 @@ def scene_html(
     title: str = "Robot calibration",
     package_dirs: Sequence[PathLike] | None = None,
     magnification: float = 1.0,
-    triangles: int = TRIANGLES,
+    triangles: int = MAX_TRIANGLES,
 ) -> str:
     """One offline HTML page of an arm, or of an arm before and after its calibration.
 
@@ -94,22 +94,28 @@ def scene_html(
     """
     if not 1 <= magnification <= 500:
         raise DhcalError(f"magnification {magnification:g}: must be between 1 and 500")
-    if triangles < LEAST_TRIANGLES:
-        raise DhcalError(f"{triangles} triangles draw no robot: allow {LEAST_TRIANGLES} at least")
+    if triangles < MIN_TRIANGLES:
+        raise DhcalError(f"{triangles} triangles draw no robot: allow {MIN_TRIANGLES} at least")
     if isinstance(calibrated, Result):
         predictor = predictor or calibrated
         measurements = calibrated.data if measurements is None else measurements
         known = calibrated.instruments if known is None else known
-        nominal = replace(nominal, base=calibrated.reference.base, tool=calibrated.reference.tool)
+        nominal = replace(
+            nominal, base=calibrated.nominal_refitted.base, tool=calibrated.nominal_refitted.tool
+        )
         calibrated = calibrated.chain
     measurements = measurements or ()
     arm = nominal if calibrated is None else calibrated
-    arms = tree(nominal, arm)
-    drawn = looks(nominal, arms["bodies"], package_dirs, triangles)
-    played = [q] if q is not None else [item.configurations() for item in measurements if item.ends]
-    poses = np.concatenate([np.empty((0, nominal.size)), *map(nominal.checked, played)])
+    arms = kinematic_tree(nominal, arm)
+    drawn = visuals_of(nominal, arms["bodies"], package_dirs, triangles)
+    played = (
+        [q]
+        if q is not None
+        else [item.configurations() for item in measurements if item.configurations_per_row]
+    )
+    poses = np.concatenate([np.empty((0, nominal.n_joints)), *map(nominal.validated_q, played)])
     samples, points, residuals = _points(arm, measurements, known or {})
-    thinned = _thin(len(samples), MOST_POINTS)
+    thinned = _subsample_indices(len(samples), MAX_POINTS)
     notes = [drawn.note]
     if len(thinned) < len(samples):
         notes.append(f"{len(thinned)} of {len(samples)} measured points are drawn.")
@@ -122,7 +128,7 @@ def scene_html(
         "compared": calibrated is not None,
         "magnification": magnification,
         "joints": _joints(nominal, np.concatenate([poses, samples])),
-        "poses": poses[_thin(len(poses), MOST_POINTS)].tolist(),
+        "poses": poses[_subsample_indices(len(poses), MAX_POINTS)].tolist(),
         "samples": samples[thinned].tolist(),
         "points": np.round((points[thinned] - arm.base[:3, 3]) @ arm.base[:3, :3], 9).tolist(),
         "residuals": np.round(residuals[thinned] @ arm.base[:3, :3], 9).tolist(),
@@ -180,7 +186,7 @@ def _meshcat() -> str:
     return "\n".join(parts).replace("</script", "<\\/script")
 
 
-def alike(nominal: Chain, arm: Chain) -> Chain:
+def with_shared_frames(nominal: Chain, arm: Chain) -> Chain:
     """The nominal arm as drawn and compared: with the other's base and tool where it has none of its own."""
     same = np.eye(4)
     return replace(
@@ -190,7 +196,7 @@ def alike(nominal: Chain, arm: Chain) -> Chain:
     )
 
 
-def tree(nominal: Chain, arm: Chain) -> dict[str, Any]:
+def kinematic_tree(nominal: Chain, arm: Chain) -> dict[str, Any]:
     """The tree of bodies and the two arms' frames.
 
     Body 0 is the base link, body i the model's joint i, and the last two are tip and tool; each has
@@ -199,14 +205,14 @@ def tree(nominal: Chain, arm: Chain) -> dict[str, Any]:
     Of each of `arms`, `terms` say how its joints miss their values, and where they yield to weights
     `loads` are the bodies that these pull at.
     """
-    if (arm.joint_names, arm.moving) != (nominal.joint_names, nominal.moving):
+    if (arm.joint_names, arm.moving_joints) != (nominal.joint_names, nominal.moving_joints):
         raise DhcalError(
-            f"the arms differ: one moves {', '.join(nominal.moving)}, the other {', '.join(arm.moving)}; "
+            f"the arms differ: one moves {', '.join(nominal.moving_joints)}, the other {', '.join(arm.moving_joints)}; "
             "give both the same tip"
         )
-    drawn = alike(nominal, arm)
-    model, k = nominal.model, len(nominal.moving)
-    index = [model.getJointId(name) for name in nominal.moving]
+    drawn = with_shared_frames(nominal, arm)
+    model, k = nominal.model, len(nominal.moving_joints)
+    index = [model.getJointId(name) for name in nominal.moving_joints]
     bodies = [_body(-1, se3.inverse(arm.base) @ drawn.base, np.eye(4))]
     bodies += [
         _body(parent, placement.homogeneous, placement.homogeneous)
@@ -215,11 +221,15 @@ def tree(nominal: Chain, arm: Chain) -> dict[str, Any]:
     for j, i in enumerate(index):
         bodies[i] = _body(int(model.parents[i]), nominal.origins[j], arm.origins[j]) | {
             "axes": [nominal.axes[j].tolist(), arm.axes[j].tolist()],
-            **_drive(nominal, j),
+            **_joint_input(nominal, j),
         }
     bodies.append(_body(index[-1], nominal.origins[k], arm.origins[k]))
     bodies.append(_body(len(bodies) - 1, drawn.tool, arm.tool))
-    return {"bodies": bodies, "stands": rows(arm.base), "arms": [_misses(nominal), _misses(arm)]}
+    return {
+        "bodies": bodies,
+        "base_in_measuring_frame": rows(arm.base),
+        "arms": [_transmission_terms(nominal), _transmission_terms(arm)],
+    }
 
 
 def _body(parent: int, placement: Array, calibrated: Array) -> dict[str, Any]:
@@ -228,7 +238,7 @@ def _body(parent: int, placement: Array, calibrated: Array) -> dict[str, Any]:
     return {"parent": int(parent), "placement": rows(placement), "twist": twist.tolist()}
 
 
-def _misses(chain: Chain) -> dict[str, Any]:
+def _transmission_terms(chain: Chain) -> dict[str, Any]:
     """An arm's transmission, term by term: which joint by what of which joint, and its coefficient."""
     if chain.transmission is None:
         return {"terms": []}
@@ -238,14 +248,16 @@ def _misses(chain: Chain) -> dict[str, Any]:
         for t, i, j in np.argwhere(held)
     ]
     return {"terms": terms} | (
-        {"loads": _weights(chain, chain.transmission.loads)} if chain.transmission.yields else {}
+        {"loads": _gravity_bodies(chain, chain.transmission.loads)}
+        if chain.transmission.has_compliance
+        else {}
     )
 
 
-def _weights(chain: Chain, loads: Loads) -> list[dict[str, Any]]:
+def _gravity_bodies(chain: Chain, loads: GravityLoads) -> list[dict[str, Any]]:
     """The tree of what loads a chain's joints: each body's weight, N, its centre, and what moves it."""
     model = loads.model
-    moved = {model.getJointId(name): j for j, name in enumerate(chain.moving)}
+    moved = {model.getJointId(name): j for j, name in enumerate(chain.moving_joints)}
     out = []
     for i, inertia in enumerate(model.inertias):
         body = {
@@ -255,24 +267,27 @@ def _weights(chain: Chain, loads: Loads) -> list[dict[str, Any]]:
             "centre": inertia.lever.tolist(),
         }
         out.append(
-            body | ({"axis": chain.axes[moved[i]].tolist()} | _drive(chain, moved[i]) if i in moved else {})
+            body
+            | ({"axis": chain.axes[moved[i]].tolist()} | _joint_input(chain, moved[i]) if i in moved else {})
         )
     return out
 
 
-def _drive(chain: Chain, j: int) -> dict[str, Any]:
+def _joint_input(chain: Chain, j: int) -> dict[str, Any]:
     """What moves the moving joint j by how much."""
     return {
         "slides": bool(chain.prismatic[j]),
-        "mixing": chain.mixing[j].tolist(),
-        "shift": float(chain.shift[j]),
+        "mixing": chain.mimic_matrix[j].tolist(),
+        "shift": float(chain.mimic_offset[j]),
     }
 
 
 def _joints(chain: Chain, poses: Array) -> list[dict[str, Any]]:
     """Sliders: range, wide enough for all poses (m, n), and where they start, rad or m."""
-    slides = [bool(chain.prismatic[np.flatnonzero(chain.mixing[:, i])[0]]) for i in range(chain.size)]
-    wide = np.where(slides, SLIDE, np.pi)
+    slides = [
+        bool(chain.prismatic[np.flatnonzero(chain.mimic_matrix[:, i])[0]]) for i in range(chain.n_joints)
+    ]
+    wide = np.where(slides, DEFAULT_STROKE_M, np.pi)
     lower = np.where(np.isfinite(chain.lower), chain.lower, np.minimum(chain.upper, wide) - 2 * wide)
     lower = np.where(np.isfinite(lower), lower, -wide)
     upper = np.where(np.isfinite(chain.upper), chain.upper, np.maximum(lower, -wide) + 2 * wide)
@@ -292,18 +307,18 @@ def _points(
     chain: Chain, measurements: Sequence[Measurement], known: Mapping[str, float]
 ) -> tuple[Array, Array, Array]:
     """Joint values (m, n), measured positions and residuals (m, 3) in the measuring frame, m."""
-    q, points, residuals = [np.empty((0, chain.size))], [np.empty((0, 3))], [np.empty((0, 3))]
+    q, points, residuals = [np.empty((0, chain.n_joints))], [np.empty((0, 3))], [np.empty((0, 3))]
     for item in measurements:
         if len(item.positions()):
-            unknowns = item.started(chain).unknowns
+            unknowns = item.initialized(chain).instrument_parameters
             u = np.array([known.get(unknown.name, unknown.nominal) for unknown in unknowns])
-            q.append(chain.checked(item.q))
+            q.append(chain.validated_q(item.q))
             points.append(item.positions())
-            residuals.append(item.errors(chain.sweep(item.q), u)["position"])
+            residuals.append(item.errors(chain.forward_kinematics(item.q), u)["position"])
     return np.concatenate(q), np.concatenate(points), np.concatenate(residuals)
 
 
-def _thin(count: int, most: int) -> Array:
+def _subsample_indices(count: int, most: int) -> Array:
     """At most so many indices, evenly spread over `count`."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
@@ -315,7 +330,7 @@ def _ellipsoids(model: Predictor, poses: Array) -> list[dict[str, Any]]:
     axes of one standard deviation, m, in axes of the calibrated base link. Poses at which a direction
     is not known at all have none.
     """
-    poses = poses[_thin(len(poses), MOST_ELLIPSOIDS)]
+    poses = poses[_subsample_indices(len(poses), MAX_ELLIPSOIDS)]
     covariance = model.predict(poses).covariance[:, :3, :3]
     told = np.isfinite(covariance).all((1, 2))
     squares, axes = np.linalg.eigh(covariance[told])

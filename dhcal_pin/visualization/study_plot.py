@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .._typing import Array
-from .figures import HEIGHT, WIDE, Axis, dots, line, panel, spanning
+from .figures import HEIGHT, WIDE, Axis, axes, axis_over, dots, line
 
 # What is drawn: a column, its title, and its factor from SI.
 PANELS = (
@@ -29,7 +29,7 @@ DASHES = ("", "6 3", "2 2.5")
 
 
 # Smaller shares of the largest error are rounding; from the first ratio on an axis is logarithmic.
-ROUNDING, MANY, LEAST = 1e-9, 8.0, 30.0
+ROUNDING, MIN_LOG_RATIO, MIN_TICK_SPACING = 1e-9, 8.0, 30.0
 
 
 _GAP, _ROW = 14.0, 18.0
@@ -111,9 +111,12 @@ def _panel(
         for mark in (line, dots)
         if len(pairs)
     ]
-    x, y = _axis(every[:, 0], name, MANY), _axis(np.maximum(every[:, 1], floor), "median", LEAST)
+    x, y = (
+        _axis(every[:, 0], name, MIN_LOG_RATIO),
+        _axis(np.maximum(every[:, 1], floor), "median", MIN_TICK_SPACING),
+    )
     told = f"Median {words} over {name}, {len(series)} lines; the study's CSV has the numbers."
-    return panel(key, words, told, x, y, marks, WIDE, tall)
+    return axes(key, words, told, x, y, marks, WIDE, tall)
 
 
 def _axis(values: Array, title: str, many: float) -> Axis:
@@ -121,7 +124,7 @@ def _axis(values: Array, title: str, many: float) -> Axis:
     low, high = float(values.min()), float(values.max())
     if low > 0 and high / low > many:
         return Axis(low / 1.1, high * 1.1, title, log=True)
-    return spanning(values, title, zero=low >= 0)
+    return axis_over(values, title, zero=low >= 0)
 
 
 def _style(count: int) -> str:

@@ -30,7 +30,7 @@ def q_matrices(table: DHTable) -> Array:
     Erratum, probably of the transcription: Q_α has -1 at row 2, column 3.
     """
     s, c = np.sin(table.alpha), np.cos(table.alpha)
-    out = np.zeros((4, table.size, 4, 4))
+    out = np.zeros((4, table.n_joints, 4, 4))
     out[0, :, 0, 1], out[0, :, 0, 2] = -c, s
     out[0, :, 1, 0], out[0, :, 1, 3] = c, table.a * c
     out[0, :, 2, 0], out[0, :, 2, 3] = -s, -table.a * s
@@ -46,10 +46,10 @@ def link_vectors(table: DHTable) -> tuple[Array, Array, Array]:
     Erratum: (15) prints k1 = [0, a·sα, -a·cα], which contradicts (13). Right is [0, a·cα, -a·sα].
     A row with Hayati's β ends in Ry(β), so its vectors are seen in a frame turned by β.
     """
-    s, c, zero = np.sin(table.alpha), np.cos(table.alpha), np.zeros(table.size)
+    s, c, zero = np.sin(table.alpha), np.cos(table.alpha), np.zeros(table.n_joints)
     k1 = np.stack([zero, table.a * c, -table.a * s], -1)
     k2 = np.stack([zero, s, c], -1)
-    k3 = np.tile([1.0, 0.0, 0.0], (table.size, 1))
+    k3 = np.tile([1.0, 0.0, 0.0], (table.n_joints, 1))
     turn = se3.exp3(-table.beta[:, None] * np.array([0.0, 1.0, 0.0]))
     return (
         np.einsum("nij,nj->ni", turn, k1),
@@ -66,7 +66,7 @@ def tail_matrices(table: DHTable, q: Array) -> Array:
     rows = table.rows(q)
     out = np.empty_like(rows)
     tail = np.broadcast_to(table.tool, rows[:, 0].shape)
-    for i in reversed(range(table.size)):
+    for i in reversed(range(table.n_joints)):
         out[:, i] = tail
         tail = rows[:, i] @ tail
     return out
@@ -163,5 +163,5 @@ def pseudo_inverse_step(factors: Array, error: Array, cut: float = 1e-9) -> Arra
 
 def moved(table: DHTable, change: Array) -> DHTable:
     """The table with PAR' = PAR + ΔPAR, equation (39); change (4n,) in the order of R's columns."""
-    theta, d, a, alpha = np.asarray(change, float).reshape(4, table.size)
+    theta, d, a, alpha = np.asarray(change, float).reshape(4, table.n_joints)
     return replace(table, theta=table.theta + theta, d=table.d + d, a=table.a + a, alpha=table.alpha + alpha)
