@@ -11,7 +11,7 @@ import time
 import numpy as np
 import pinocchio as pin
 from bench_common import Row, clocked
-from conftest import paper
+from robots import paper
 from scipy.optimize import least_squares
 
 from dhcal_pin.calibration.procedure import calibrate

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from conftest import paper, robot_file
+from robots import paper, robot_file
 
 from dhcal_pin import se3
 from dhcal_pin.estimation.error_model import ErrorModel

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from conftest import paper
+from robots import paper
 
 from dhcal_pin.calibration.streaming import calibrate_stream
 from dhcal_pin.measurements.base import Noise

@@ -31,7 +31,7 @@ import bench_kernel
 import numpy as np
 import pinocchio as pin
 from bench_common import Row, clocked, measured, robots, serial
-from conftest import robot_file
+from robots import robot_file
 
 from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.estimation.parameters import select_parameters

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import paper, robot_file
+from robots import URDF, paper, robot_file
 from scipy.spatial.transform import Rotation
 
 from dhcal_pin import se3
@@ -24,7 +24,6 @@ from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.robot.chain import Chain
 from dhcal_pin.robot.dh import DHTable
 
-URDF = Path(__file__).resolve().parent.parent / "urdf"
 ERROR = np.array([5e-3] * 3 + [np.deg2rad(1.0)] * 3)
 
 

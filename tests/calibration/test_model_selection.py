@@ -1,0 +1,235 @@
+"""Cross-validation against real refits, and families added only where the data ask for them."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from robots import paper, robot_file
+
+from dhcal_pin.calibration.cross_validation import (
+    blocked_folds,
+    contact_groups,
+    cross_validate,
+    k_fold,
+    leave_one_group_out,
+    standard_error,
+)
+from dhcal_pin.calibration.evaluation import accuracy
+from dhcal_pin.calibration.model_selection import FAMILY_DESCRIPTIONS, MAX_HINT_SAMPLES, extend, family_hint
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.cli.main import main
+from dhcal_pin.estimation.parameters import select_parameters
+from dhcal_pin.estimation.solver import levenberg_marquardt
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io.measurement_csv import measurement_text
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.contact import PointContact, PointDistance
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.measurements.position import Position
+from dhcal_pin.robot.chain import Chain
+
+
+def simulated(sets: str, seed: int, m: int = 60, noise: float = 1e-4, kind=Pose):
+    """A UR10 with errors of the size of the priors, and what is measured of it."""
+    rng = np.random.default_rng(seed)
+    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    errors = select_parameters(arm, sets)
+    truth = errors.at(
+        rng.normal(size=len(errors.parameters)) * np.minimum(errors.priors, 0.1)
+    ).with_current_loads()
+    return arm, kind.simulate(truth, rng.uniform(-2.5, 2.5, (m, 6)), Noise(noise, noise), rng)
+
+
+def fitted(kind=Position, m: int = 40):
+    arm = Chain.from_dh(paper("sim_6dof"))
+    rng = np.random.default_rng(0)
+    data = kind.simulate(
+        Chain.from_dh(paper("sim_6dof_actual")), rng.uniform(-1, 1, (m, 6)), Noise(1e-4, 1e-4), rng
+    )
+    return calibrate(arm, data, "dh")
+
+
+@pytest.mark.parametrize("family", ["gain", "harmonics", "compliance", "coupling"])
+def test_a_hint_names_what_is_missing_and_how_much_it_takes_up(family):
+    arm, data = simulated(f"{family},minimal,base,tool", seed=1)
+    plain = calibrate(arm, data, "minimal,base,tool")
+    found = re.fullmatch(
+        r"what is left .* as (.*) would; --extend auto may leave about (\d+) % of it", family_hint(plain)
+    )
+    assert found
+    assert found[1] == FAMILY_DESCRIPTIONS[family]
+    whole = calibrate(arm, data, f"{family},minimal,base,tool")
+    left = [np.sqrt(fit.solution.system.cost / (360 - fit.rank)) for fit in (plain, whole)]
+    assert float(found[2]) == pytest.approx(100 * left[1] / left[0], abs=2, rel=0.3)
+    assert not family_hint(whole)
+
+
+@pytest.mark.parametrize("seeds", [20, pytest.param(300, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", [Pose, Position])
+def test_geometry_alone_gives_no_hint(kind, seeds):
+    """One false one in a million by chance, whether or not the instrument states its sigmas."""
+    for seed in range(seeds):
+        arm, data = simulated("minimal,base,tool", seed, (20, 40, 80)[seed % 3], kind=kind)
+        data = replace(data, has_stated_sigma=bool(seed % 2))
+        assert not family_hint(calibrate(arm, data, "minimal,base,tool"))
+
+
+def test_a_hint_looks_at_some_of_many_samples():
+    arm, data = simulated("harmonics,minimal,base,tool", seed=0, m=3 * MAX_HINT_SAMPLES + 1)
+    assert FAMILY_DESCRIPTIONS["harmonics"] in family_hint(calibrate(arm, data, "minimal,base,tool"))
+
+
+def test_folds_equal_fits_without_what_they_leave_out():
+    fit = fitted(Pose)
+    folds = k_fold(fit.data, 4, seed=1)
+    found = cross_validate(fit, folds)
+    for fold, judged, error in zip(folds, found.folds, found.errors, strict=True):
+        kept = replace(
+            fit.problem, data=tuple(d.take(~m) for d, m in zip(fit.problem.data, fold, strict=True))
+        )
+        x = levenberg_marquardt(kept, np.zeros(len(fit.x)), 100, None).x
+        left = [d.take(m) for d, m in zip(fit.problem.data, fold, strict=True)]
+        chain = fit.errors.at(x)
+        assert judged["position_rms_m"] == pytest.approx(accuracy(chain, left)["position_rms_m"], rel=2e-3)
+        rows = left[0].residual(chain.forward_kinematics(left[0].q), np.empty(0))
+        assert error == pytest.approx(np.sqrt(np.mean(rows**2)), rel=2e-3)
+    counts = [fold["position_samples"] for fold in found.folds]
+    whole = np.sqrt(np.average([fold["position_rms_m"] ** 2 for fold in found.folds], weights=counts))
+    assert found.accuracy["position_rms_m"] == pytest.approx(whole)
+    assert whole > 1.1 * fit.validate(fit.data)["position_rms_m"]
+
+
+def test_random_folds_and_groups_leave_each_sample_out_once():
+    data = fitted().data
+    for folds in (k_fold(data, 5), leave_one_group_out(data, np.arange(40) // 8)):
+        assert len(folds) == 5
+        np.testing.assert_array_equal(np.sum([fold[0] for fold in folds], 0), np.ones(40))
+    with pytest.raises(DhcalError, match="choose from 2 to 40"):
+        k_fold(data, 41)
+    with pytest.raises(DhcalError, match="40 samples need"):
+        leave_one_group_out(data, np.arange(3))
+    with pytest.raises(DhcalError, match="one group"):
+        leave_one_group_out(data, np.zeros(40))
+    with pytest.raises(DhcalError, match="made for other data"):
+        cross_validate(fitted(m=30), k_fold(data, 5))
+
+
+def test_regions_are_the_ends_of_joint_space():
+    """One joint moves in steps and another with it: one direction, its lowest and highest quarter."""
+    q = np.zeros((8, 6))
+    q[:, 1] = np.arange(8)
+    q[:, 4] = -2 * np.arange(8)
+    data = replace(fitted(m=8).data[0], q=q)
+    low, high = sorted(fold[0].nonzero()[0].tolist() for fold in blocked_folds([data]))
+    assert (low, high) == ([0, 1], [6, 7])
+    with pytest.raises(DhcalError, match="different joint values"):
+        blocked_folds([replace(data, q=np.ones((8, 6)))])
+
+
+def test_what_was_touched_is_left_out_as_a_whole():
+    """Points a, b are joined by a distance, as c, d are; e stands alone and i is never touched."""
+    names = np.array(list("abcde"))
+    label = np.repeat(np.arange(5), 4)
+    arm = Chain.from_dh(paper("sim_6dof"))
+    q = 0.4 * label[:, None] + np.random.default_rng(0).uniform(-0.1, 0.1, (20, 6))
+    touches = PointContact.from_arrays(q, names[label].tolist())
+    known = PointDistance.from_arrays(6, [("c", "d"), ("a", "b"), ("a", "i")], [0.1, 0.1, 0.1])
+    problem = calibrate(arm, [touches, known], "dh", max_iterations=1).problem
+    places = contact_groups(problem, np.zeros(len(problem.weights)))
+    folds = blocked_folds(problem.data, groups=places)
+    for of_touches, of_distances in folds:
+        by_name = {name: set(of_touches[label == i].tolist()) for i, name in enumerate("abcde")}
+        assert all(len(found) == 1 for found in by_name.values())
+        assert by_name["a"] == by_name["b"] == set(of_distances[1:].tolist())
+        assert by_name["c"] == by_name["d"] == set(of_distances[:1].tolist())
+    left = {tuple(fold[0].tolist()) for fold in folds}
+    assert len(left) == len(folds) >= 2
+    # One place is no region of its own: there samples are left out one by one.
+    one = PointContact.from_arrays(q, ["a"] * 20)
+    alone = [fold[0] for fold in blocked_folds([one], groups=np.zeros(20, int))]
+    np.testing.assert_array_equal(alone, [fold[0] for fold in blocked_folds([one])])
+
+
+def test_few_folds_must_agree_more():
+    """Student's t that a normal deviate passes one sigma as often: 1.84 for two folds, 1.32 for three."""
+    assert standard_error(np.array([0.0, 1.0])) == pytest.approx(0.5 * 1.837, rel=1e-3)
+    assert standard_error(np.array([0.0, 1.0, 2.0])) == pytest.approx(1.321 / np.sqrt(3), rel=1e-3)
+    assert standard_error(np.array([1.0])) == np.inf
+
+
+def test_a_point_that_only_left_out_samples_touch_is_fitted_to_them():
+    fit = fitted(PointContact, 60)
+    groups = [item.kind for item in fit.data]
+    assert groups == ["point"]
+    found = cross_validate(fit)
+    assert found.accuracy["position_rms_m"] < 0.05
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_nothing_is_added_to_an_arm_without(seed):
+    _, trials = extend(*simulated("minimal,base,tool", seed))
+    assert len(trials) == 4
+    assert not [trial.family for trial in trials if trial.is_selected]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [Pose, Position])
+def test_nothing_is_added_to_two_hundred_arms_without(kind):
+    added = 0
+    for seed in range(200):
+        m = (30, 60, 120)[seed % 3]
+        _, trials = extend(*simulated("minimal,base,tool", 100 + seed, m, kind=kind))
+        added += any(trial.is_selected for trial in trials)
+    assert added <= 10
+
+
+@pytest.mark.parametrize("family", ["compliance", "harmonics"])
+def test_what_is_there_is_added(family):
+    arm, data = simulated(f"minimal,base,tool,{family}", 3)
+    fit, trials = extend(arm, data)
+    assert next(trial.family for trial in trials if trial.is_selected) == family
+    one = trials[0]
+    assert one.cv_after < one.cv_before - one.standard_error
+    plain = calibrate(arm, data)
+    _, more = simulated(f"minimal,base,tool,{family}", 3, m=200)
+    assert fit.validate(more)["position_rms_m"] < 0.5 * plain.validate(more)["position_rms_m"]
+
+
+def test_the_command_says_what_each_family_brought(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    arm, data = simulated("minimal,base,tool,compliance", 4)
+    (tmp_path / "data.csv").write_text(measurement_text(data, arm, []))
+    robot = str(robot_file("ur_description/urdf/ur10_robot.urdf"))
+    common = ("calibrate", robot, "data.csv", "--tip", "tool0", "-o", "out.urdf", "--json", "r.json")
+    assert main([*common, "--extend", "gain,compliance", "--report", "r.md"]) == 0
+    said = capsys.readouterr().err
+    rows = json.loads((tmp_path / "r.json").read_text())["extension"]
+    report = (tmp_path / "r.md").read_text()
+    for row in rows:
+        verdict = "added" if row["is_selected"] else "not selected"
+        assert f"| {row['family']} | {verdict} | {row['cv_before']:.3f} | {row['cv_after']:.3f} |" in report
+    assert "µrad/Nm" in report
+    assert not re.search(r"\b(nan|inf|infinity)\b", report, re.IGNORECASE)
+    assert [(row["family"], row["is_selected"]) for row in rows] == [("compliance", True), ("gain", False)]
+    assert {"cv_before", "cv_after", "standard_error"} <= set(rows[0])
+    assert "compliance_rad_per_nm" in (tmp_path / "out.calibration.toml").read_text()
+    assert "gain        not selected" in said
+    assert "hint:" not in said
+    assert main([*common, "--report", "r.md"]) == 0
+    found = json.loads((tmp_path / "r.json").read_text())
+    assert found["extension"] == []
+    assert f"as {FAMILY_DESCRIPTIONS['compliance']} would" in found["hint"]
+    assert f"hint: {found['hint']}" in capsys.readouterr().err
+    assert found["hint"][1:] in (tmp_path / "r.md").read_text()
+    for wrong, words in (
+        (("--extend", "gains"), "no extension 'gains': choose from gain, harmonics, compliance, coupling"),
+        (("--extend", "auto", "--method", "gn"), "leave out --method gn"),
+        (("--extend", "auto", "--priors", "none"), "leave out"),
+    ):
+        capsys.readouterr()
+        assert main([*common, *wrong]) == 2
+        assert words in capsys.readouterr().err

@@ -1,0 +1,326 @@
+"""Sentences on what cannot be told apart: against theory, exact poses, Pinocchio's axes, followed advice."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from robots import paper, robot_file
+
+from dhcal_pin import se3
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.estimation import qr
+from dhcal_pin.estimation.parameters import select_parameters
+from dhcal_pin.estimation.problem import Problem, linearize_and_factor
+from dhcal_pin.identifiability import explanations
+from dhcal_pin.identifiability.null_space import ObservabilityProbe, UnobservableGroup, group_directions
+from dhcal_pin.identifiability.propagation import PlainErrors
+from dhcal_pin.measurements import KINDS
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.measurements.position import Position
+from dhcal_pin.robot.chain import Chain
+from dhcal_pin.robot.dh import DHTable
+
+
+def table(theta, d, a, alpha, prismatic=()):
+    zero = np.zeros(len(theta))
+    return DHTable(
+        "standard",
+        tuple(f"j{i + 1}" for i in range(len(theta))),
+        np.isin(np.arange(len(theta)), prismatic),
+        *(np.array(column, float) for column in (theta, d, a, alpha)),
+        zero,
+        zero - np.inf,
+        zero + np.inf,
+    )
+
+
+RIGHT = np.pi / 2
+TABLES = {
+    "scara": table([0] * 4, [0.4, 0, 0, 0.1], [0.3, 0.25, 0, 0], [0, np.pi, 0, 0], prismatic=[2]),
+    "prismatic": table(
+        [0, 0.3, 0, 0.2, 0], [0.4, 0.1, 0.2, 0.1, 0.1], [0.1, 0.3, 0, 0.1, 0.05],
+        [RIGHT, RIGHT, 0.4, -RIGHT, 0.3], prismatic=[2],
+    ),
+    "gantry": table([0, 0, 0, 0.1], [0.3, 0.4, 0.5, 0.1], [0, 0, 0, 0.1], [RIGHT, RIGHT, 0.2, 0], [0, 1, 2]),
+    "coaxial": table([0, 0, 0], [0.4, 0.2, 0.1], [0, 0.3, 0.2], [0, RIGHT, 0.2]),
+    "intersecting": table([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [0.4, 0, 0, 0.4, 0, 0.1], [0, 0.4, 0.02, 0, 0, 0],
+                          [-RIGHT, 0, -RIGHT, RIGHT, -RIGHT, 0]),
+    "antiparallel": table([0.1, 0.2, 0.3], [0.4, 0.1, 0.1], [0.2, 0.3, 0.2], [np.pi, RIGHT, 0.2]),
+}  # fmt: skip
+URDFS = {
+    "ur5": ("ur_description/urdf/ur5_robot.urdf", "tool0"),
+    "ur10": ("ur_description/urdf/ur10_robot.urdf", "tool0"),
+    "panda": ("panda_description/urdf/panda.urdf", "panda_hand"),
+    "tiago": ("tiago_description/robots/tiago.urdf", "arm_tool_link"),
+}
+PAPER = ("sim_6dof", "sim_6dof_actual", "sim_3dof", "sim_3dof_actual", "experiment")
+
+
+def load(arm: str) -> Chain:
+    if arm in URDFS:
+        return Chain.from_urdf(robot_file(URDFS[arm][0]), URDFS[arm][1])
+    return Chain.from_dh(TABLES[arm] if arm in TABLES else paper(arm))
+
+
+def anywhere(chain: Chain, m: int, seed: int = 0):
+    return np.random.default_rng(seed).uniform(-3, 3, (m, chain.n_joints))
+
+
+def problem(chain: Chain, sets: str, kind=Pose, q=None, m: int = 40) -> Problem:
+    q = anywhere(chain, m) if q is None else q
+    data = kind.simulate(chain, q, Noise(), np.random.default_rng(0)).initialized(chain)
+    found = Problem(select_parameters(chain, sets), (data,), np.empty(0))
+    return replace(found, weights=np.zeros(len(found.errors.parameters) + len(found.instrument_parameters)))
+
+
+def said(of: Problem) -> list[str]:
+    zero = np.zeros(len(of.weights))
+    return explanations.explain_unobservable(of, zero, linearize_and_factor(of, zero, False))
+
+
+def rank(of: Problem) -> int:
+    return qr.rank(linearize_and_factor(of, np.zeros(len(of.weights)), False).r)
+
+
+def grouped(of: Problem) -> list[UnobservableGroup]:
+    zero = np.zeros(len(of.weights))
+    layers = ObservabilityProbe(of, zero).layers(linearize_and_factor(of, zero, False).r)
+    return group_directions(
+        layers, PlainErrors.from_model(of.errors, zero[: len(of.errors.parameters)]).error_frames
+    )
+
+
+def named(of: Problem, text: str) -> set[str]:
+    names = {p.name for p in (*of.errors.parameters, *of.instrument_parameters)}
+    return names & set(re.findall(r"[\w.]+", text))
+
+
+# --- the paper's arms ------------------------------------------------------------------------------
+
+NOTHING = "no measurement of this arm tells more"
+TURNS = "the tool only turns about the measured point, and that is not read"
+THEORY = [
+    ("sim_6dof", Pose, 21, [f"axes 2, 3 and 4 are parallel: only d2 + d3 + d4 is seen; {NOTHING}",
+                            f"axes 5 and 6 are parallel: only d5 + d6 is seen; {NOTHING}"]),
+    ("sim_6dof_actual", Pose, 24, []),
+    *[(arm, Position, 10, [
+        f"axes 2 and 3 are parallel: only d2 + d3 is seen; {NOTHING}",
+        f"alpha3: {TURNS}; the readings do not depend on it; the tool's orientation would tell",
+    ]) for arm in ("sim_3dof", "experiment")],
+    ("sim_3dof_actual", Position, 11,
+     [f"alpha3: {TURNS}; the readings do not depend on it; the tool's orientation would tell"]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("arm", "kind", "seen", "sentences"), THEORY)
+def test_the_papers_arms_say_what_theory_says(arm, kind, seen, sentences):
+    of = problem(load(arm), "dh", kind)
+    assert rank(of) == seen
+    assert said(of) == sentences
+
+
+@pytest.mark.parametrize(("poses", "more"), [(2, 2), (3, 1)])
+def test_few_poses_say_how_many_are_missing(poses, more):
+    """At Table 2 four poses see all there is to see (verified: 12, 18, 21 with 2, 3, 4)."""
+    chain = load("sim_6dof")
+    texts = said(problem(chain, "dh", m=poses))
+    assert "only d2 + d3 + d4 can be seen" in texts[0]
+    assert f"{6 * poses} readings for 24 unknowns" in texts[-1]
+    assert f"at least {more} more pose" in texts[-1]
+    assert rank(problem(chain, "dh", m=poses + more)) == 21
+    assert rank(problem(chain, "dh", m=poses + more - 1)) < 21
+
+
+# --- every direction once, and nothing claimed that is not so --------------------------------------
+
+ARMS = (*PAPER, *TABLES, *URDFS)
+CASES = [
+    *((arm, sets) for arm in ARMS for sets in ("dh", "minimal,base,tool")),
+    *((arm, "placement,base,tool") for arm in ("scara", "ur10", "panda")),
+    *(
+        pytest.param(arm, sets, marks=pytest.mark.slow)
+        for arm in ARMS
+        for sets in ("placement,base,tool", "modified-dh,tool", "hayati,tool", "offset")
+    ),
+]
+
+
+def changes(of: Problem, q, direction):
+    """Exact change of the tool's poses per unit of a direction, by central differences."""
+    errors, step = of.errors, 1e-5
+    return (errors.at(step * direction).poses(q) - errors.at(-step * direction).poses(q)) / (2 * step)
+
+
+@pytest.mark.parametrize(("arm", "sets"), CASES)
+def test_each_unseen_direction_is_in_one_group_and_moves_nothing(arm, sets):
+    of = problem(load(arm), sets)
+    p = len(of.weights)
+    found = grouped(of)
+    vectors = np.concatenate([np.empty((p, 0)), *(group.vectors for group in found)], 1)
+    assert vectors.shape[1] == p - rank(of)
+    assert np.linalg.matrix_rank(vectors, 1e-4) == vectors.shape[1]
+    q = anywhere(of.errors.chain, 30, seed=5)
+    for vector in vectors.T:
+        assert np.abs(changes(of, q, vector)).max() < 1e-7
+    assert {group.cause for group in found} <= {"arm"}
+
+
+def lines(chain: Chain, q):
+    """Directions and points (k, 3) of the joints' axes as Pinocchio sees them."""
+    model = chain.model
+    data = model.createData()
+    pin.forwardKinematics(model, data, chain.configurations(q[None])[0])
+    at = [data.oMi[model.getJointId(name)] for name in chain.moving_joints]
+    return np.array([m.rotation @ a for m, a in zip(at, chain.axes, strict=True)]), np.array(
+        [m.translation for m in at]
+    )
+
+
+@pytest.mark.parametrize(("arm", "sets"), CASES)
+def test_what_a_sentence_claims_is_so(arm, sets):
+    """Parallel and coincident axes by Pinocchio, sums against the null space of exact differences."""
+    of = problem(load(arm), sets)
+    chain, q = of.errors.chain, anywhere(of.errors.chain, 30, seed=6)
+    names = [p.name for p in of.errors.parameters]
+    jacobian = np.stack([changes(of, q, unit).ravel() for unit in np.eye(len(names))], 1)
+    _, s, vt = np.linalg.svd(jacobian, full_matrices=False)
+    hidden = vt[s < 1e-6 * s[0]].T
+    texts = said(of)
+    assert bool(texts) == bool(hidden.shape[1])
+    for text in texts:
+        assert text.endswith(NOTHING)
+        if axes := re.search(r"axes ([\d, and]+?)(?: \([^)]*\))? (are parallel|lie on one line)", text):
+            numbers = [int(n) - 1 for n in re.findall(r"\d+", axes[1])]
+            assert len(numbers) > 1
+            for one in q[:5]:
+                along, at = (values[numbers] for values in lines(chain, one))
+                assert np.abs(np.cross(along[0], along)).max() < 1e-9
+                if "line" in axes[2]:
+                    assert np.abs(np.cross(along[0], at - at[0])).max() < 1e-9
+        if total := re.search(r"only ([-+\w. ]+) is seen", text):
+            terms = re.findall(r"([-+]?) ?(?:([\d.]+) )?([A-Za-z_][\w.]*)", total[1])
+            if terms[0][2] in names:
+                weights = np.zeros(len(names))
+                for sign, size, name in terms:
+                    weights[names.index(name)] = float(size or 1) * (-1 if sign == "-" else 1)
+                taking = np.flatnonzero(weights)
+                assert np.abs(weights @ hidden).max() < 5e-3 * np.abs(hidden[taking]).max()
+                assert np.linalg.matrix_rank(hidden[taking], 1e-6) == len(taking) - 1
+    # Nothing is named that is seen, and nothing left out that takes part; long lists leave some out.
+    part, told = np.abs(hidden).max(1, initial=0), set().union(*(named(of, text) for text in texts))
+    assert told <= {names[i] for i in np.flatnonzero(part > 1e-6)}
+    if not any(" more:" in text for text in texts):
+        assert told >= {names[i] for i in np.flatnonzero(part > 1e-2)}
+
+
+def test_signs_follow_the_axes():
+    """Where the second axis points against the first, their offsets subtract."""
+    (text,) = said(problem(load("antiparallel"), "dh"))
+    assert text == f"axes 1 and 2 are parallel: only d1 - d2 is seen; {NOTHING}"
+
+
+def test_coincident_zeros():
+    assert said(problem(load("coaxial"), "offset")) == [
+        f"axes 1 and 2 lie on one line: only j1.offset + j2.offset is seen; {NOTHING}"
+    ]
+
+
+def test_frames_of_a_ur10_have_a_reason_each():
+    """Base and first joint, and what passes the first axis: 6 directions in two sentences."""
+    texts = said(problem(load("ur10"), "minimal,base,tool"))
+    assert len(texts) == 2
+    assert "no joint moves between the base and the origin of joint 1 (shoulder_pan_joint)" in texts[0]
+    assert "only 4 combinations of the 8 are seen" in texts[0]
+    assert "a turn about and a shift along axis 1 (shoulder_pan_joint)" in texts[1]
+    assert {"base.z", "base.rz"} <= named(problem(load("ur10"), "minimal,base,tool"), texts[1])
+
+
+# --- instruments and poses: the advice is followed --------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [kind for name, kind in KINDS.items() if name != "point_distance"])
+def test_every_kind_accounts_for_all_it_does_not_see(kind):
+    of = problem(load("sim_6dof_actual"), "minimal,base,tool", kind)
+    p = len(of.weights)
+    found = grouped(of)
+    assert sum(group.vectors.shape[1] for group in found) == p - rank(of)
+    # Six directions lie in the arm, whatever measures it.
+    assert sum(group.vectors.shape[1] for group in found if group.cause == "arm") == 6
+    assert all(text.endswith(("tells more", "would tell")) for text in said(of))
+
+
+BASE = "the readings stay the same when the whole robot moves so"
+
+
+@pytest.mark.parametrize(
+    ("kind", "reasons"),
+    [
+        ("position", [TURNS]),
+        ("distance", [BASE, TURNS]),
+        ("relative", [BASE]),
+        ("wires", [TURNS, "the robot and the instrument can move as one"]),
+        ("point", [TURNS, "the robot and the instrument can move as one", "how large the robot is"]),
+    ],
+)
+def test_instruments_have_their_reasons(kind, reasons):
+    texts = said(problem(load("sim_6dof_actual"), "minimal,base,tool", KINDS[kind]))
+    instrument = [text for text in texts if NOTHING not in text]
+    assert len(instrument) == len(reasons)
+    assert all(reason in text for reason, text in zip(reasons, instrument, strict=True))
+
+
+def test_orientation_tells_what_position_does_not():
+    chain = load("ur10")
+    texts = said(problem(chain, "minimal,base,tool", Position))
+    last = [text for text in texts if text.endswith("orientation would tell")]
+    assert len(last) == 2
+    assert "the measured point lies on axis 6 (wrist_3_joint) and does not move with it" in last[0]
+    # Followed: poses see all but what lies in the arm, and so does a point beside the axis but for its turns.
+    assert rank(problem(chain, "minimal,base,tool", Pose)) == 30
+    aside = replace(chain, tool=np.array([[1.0, 0, 0, 0.1], [0, 1, 0, 0.05], [0, 0, 1, 0], [0, 0, 0, 1]]))
+    assert rank(problem(aside, "minimal,base,tool", Position)) == 27
+
+
+def test_a_joint_that_never_moved_is_named():
+    chain = load("ur10")
+    q = anywhere(chain, 40)
+    q[:, 3] = 0.3
+    (text,) = [text for text in said(problem(chain, "minimal,base,tool", q=q)) if NOTHING not in text]
+    assert "wrist_1_joint never moved" in text
+    assert text.endswith("moving it would tell more")
+    q[:, 3] = anywhere(chain, 40, seed=1)[:, 3]
+    assert rank(problem(chain, "minimal,base,tool", q=q)) == 30
+
+
+def test_poses_too_much_alike_name_the_joint_to_move():
+    """A joint at two values half a turn apart sees less than one all over its range."""
+    chain = load("sim_6dof_actual")
+    q = anywhere(chain, 40)
+    q[:, 4] = np.where(q[:, 4] > 0, 0.2, 0.2 + np.pi)
+    before = rank(problem(chain, "dh", Position, q=q))
+    texts = [text for text in said(problem(chain, "dh", Position, q=q)) if "too much alike" in text]
+    q[:, 4] = anywhere(chain, 40, seed=1)[:, 4]
+    assert bool(texts) == (before < rank(problem(chain, "dh", Position, q=q)))
+    assert all("joint_5" in text for text in texts)
+
+
+@pytest.mark.parametrize("arm", [*TABLES, "ur10", "tiago", "sim_6dof_actual"])
+def test_a_fit_to_poses_all_over_the_range_asks_for_no_more(arm):
+    """Four a revolute joint, two a sliding one and six are all there is to see, wherever the tracker is."""
+    chain = load(arm)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        placed = replace(chain, base=se3.exp6(rng.normal(0, 1, 6)), tool=se3.exp6(rng.normal(0, 0.5, 6)))
+        data = Pose.simulate(placed, anywhere(chain, 60, seed), Noise(1e-4, 1e-4), rng)
+        fit = calibrate(chain, data, "minimal,base,tool")
+        assert fit.rank == 6 + sum(2 if slides else 4 for slides in chain.prismatic)
+        assert [text for text in fit.unobservable if NOTHING not in text] == []
+
+
+def test_an_arm_that_is_all_seen_says_nothing():
+    assert said(problem(load("panda"), "dh")) == []

@@ -1,0 +1,176 @@
+"""The paper's factors against finite differences and Pinocchio, its errata included."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from robots import URDF, paper, random_table
+
+from dhcal_pin import se3
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io.robot import read_robot
+from dhcal_pin.paper.factors import (
+    alpf,
+    differential_motion,
+    error_factors,
+    laf,
+    ldf,
+    link_vectors,
+    moved,
+    pseudo_inverse_step,
+    q_matrices,
+    tail_matrices,
+    thf,
+    tool_error,
+)
+from dhcal_pin.paper.jacobian_check import crosscheck, differences
+from dhcal_pin.robot.chain import Chain
+from dhcal_pin.robot.dh import DHTable
+
+ARMS = ["sim_6dof", "sim_6dof_actual", "sim_3dof", "sim_3dof_actual", "experiment", "experiment_published"]
+KEYS = ("theta", "d", "a", "alpha")
+
+
+def joints(table: DHTable, m: int = 30, seed: int = 0):
+    return np.random.default_rng(seed).uniform(-np.pi, np.pi, (m, table.n_joints))
+
+
+@pytest.mark.parametrize("file", sorted(p.name for p in [*URDF.glob("*.urdf"), *URDF.glob("*.dh.toml")]))
+def test_all_routes_agree_on_every_robot_that_ships(file):
+    rows = crosscheck(read_robot(URDF / file))
+    assert len(rows) == 6
+    for row in rows:
+        assert row.difference <= (1e-7 if "differences" in row.route else 1e-12), row.route
+
+
+@pytest.mark.parametrize("convention", ["standard", "modified"])
+@pytest.mark.parametrize("slides", [False, True])
+def test_all_routes_agree_on_a_single_joint(convention, slides):
+    """Of which Pinocchio's Jacobian is a vector."""
+    one = {key: np.array([value]) for key, value in zip(KEYS, (0.3, 0.2, -0.1, 0.7), strict=True)}
+    limits = {"beta": np.zeros(1), "lower": np.array([-1.0]), "upper": np.ones(1)}
+    table = DHTable(convention, ("only",), np.array([slides]), **one, **limits)
+    assert all(row.agrees for row in crosscheck(Chain.from_dh(table)))
+
+
+def test_link_derivatives_are_products_with_q():
+    """Equations (7) to (10): ∂A/∂x = A·Q_x."""
+    table, h = paper("sim_6dof_actual"), 1e-6
+    q = joints(table, 1)
+    rows = table.rows(q)[0]
+    for key, matrix in zip(KEYS, q_matrices(table), strict=True):
+        up, down = (replace(table, **{key: getattr(table, key) + s * h}).rows(q)[0] for s in (1, -1))
+        np.testing.assert_allclose(rows @ matrix, (up - down) / (2 * h), atol=1e-9)
+
+
+def test_small_motion_of_a_link_is_the_sum_of_its_vectors():
+    """Equations (11) to (14): the vectors k are what the matrices Q say."""
+    table = paper("sim_6dof_actual")
+    k1, k2, k3 = link_vectors(table)
+    zero = np.zeros_like(k1)
+    for matrix, linear, angular in zip(
+        q_matrices(table), (k1, k2, k3, zero), (k2, zero, zero, k3), strict=True
+    ):
+        np.testing.assert_allclose(matrix[:, :3, 3], linear, atol=1e-16)
+        np.testing.assert_allclose(matrix[:, :3, :3], se3.skew(angular), atol=1e-16)
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_factors_are_the_derivative(arm):
+    table = paper(arm)
+    q = joints(table)
+    np.testing.assert_allclose(error_factors(table, q), differences(table, q), atol=1e-9)
+
+
+def test_factors_of_random_arms_with_sliding_joints():
+    rng = np.random.default_rng(7)
+    for _ in range(20):
+        table = random_table(rng)
+        table = replace(table, beta=rng.uniform(-0.1, 0.1, table.n_joints), tool=se3.exp6(rng.normal(size=6)))
+        q = joints(table, 5)
+        np.testing.assert_allclose(error_factors(table, q), differences(table, q), atol=1e-8)
+
+
+def test_printed_vector_15_is_wrong():
+    """As printed, k1 = [0, a·sα, -a·cα] misses the derivative by up to 145 mm a radian."""
+    table = paper("sim_6dof_actual")
+    q = joints(table, 100)
+    k1, k2, k3 = link_vectors(table)
+    printed = np.stack([0 * table.a, table.a * np.sin(table.alpha), -table.a * np.cos(table.alpha)], -1)
+    u, numeric = tail_matrices(table, q), differences(table, q)
+
+    def gap(first):
+        blocks = [thf(u, first, k2), ldf(u, k2), laf(u, k3), alpf(u, k3)]
+        return np.abs(np.concatenate([np.swapaxes(b, 1, 2) for b in blocks], -1) - numeric).max()
+
+    assert gap(k1) < 1e-9
+    assert gap(printed) == pytest.approx(0.145, abs=0.002)
+
+
+def test_a_loop_with_the_printed_vector_still_converges():
+    """So convergence does not validate R: the trap that the difference test above is there for."""
+    nominal, actual = paper("sim_6dof"), paper("sim_6dof_actual")
+    q = joints(nominal, 10)
+    goal, table = actual.poses(q), nominal
+    for _ in range(25):
+        _, k2, k3 = link_vectors(table)
+        printed = np.stack([0 * table.a, table.a * np.sin(table.alpha), -table.a * np.cos(table.alpha)], -1)
+        u = tail_matrices(table, q)
+        blocks = [thf(u, printed, k2), ldf(u, k2), laf(u, k3), alpf(u, k3)]
+        factors = np.concatenate([np.swapaxes(b, 1, 2) for b in blocks], -1)
+        table = moved(table, pseudo_inverse_step(factors, tool_error(goal, table.poses(q))))
+    np.testing.assert_allclose(table.d, actual.d, atol=1e-9)
+
+
+def test_ldf_and_laf_turn_nothing():
+    table = paper("sim_6dof_actual")
+    factors = error_factors(table, joints(table))
+    assert np.abs(factors[:, 3:, 6:18]).max() == 0.0
+
+
+def test_differential_motion_is_the_change_of_the_matrix():
+    """Equations (30) to (34), erratum of (31) included, against a finite small motion."""
+    table = paper("sim_6dof_actual")
+    pose = table.poses(joints(table))
+    change = np.random.default_rng(3).normal(size=(len(pose), 6))
+    h = 1e-7
+    numeric = (pose @ se3.exp6(h * change) - pose @ se3.exp6(-h * change)) / (2 * h)
+    np.testing.assert_allclose(differential_motion(change, pose), numeric[:, :3], atol=1e-8)
+
+
+def test_tool_error_is_a_sine_and_near_the_logarithm():
+    """(35) and (36): d = Rᵀ·dp, and sin(φ)·u instead of φ·u; at most 0.087° apart on the paper's arm."""
+    nominal, actual = paper("sim_6dof"), paper("sim_6dof_actual")
+    gaps = []
+    for seed in range(50):
+        q = joints(nominal, 10, seed)
+        measured, model = actual.poses(q), nominal.poses(q)
+        error = tool_error(measured, model)
+        relative = se3.inverse(model) @ measured
+        np.testing.assert_allclose(error[:, :3], relative[:, :3, 3], atol=1e-15)
+        log = se3.log3(relative[:, :3, :3])
+        angle = np.linalg.norm(log, axis=1, keepdims=True)
+        np.testing.assert_allclose(error[:, 3:], log / angle * np.sin(angle), atol=1e-14)
+        gaps.append(np.abs(error[:, 3:] - log).max())
+    assert np.rad2deg(max(gaps)) < 0.088
+
+
+def test_modified_tables_are_refused():
+    with pytest.raises(DhcalError, match="standard"):
+        error_factors(random_table(np.random.default_rng(0), "modified"), np.zeros((1, 1)))
+
+
+def test_check_refuses_nothing_that_is_a_chain():
+    rng = np.random.default_rng(5)
+    for convention in ("standard", "modified"):
+        table = random_table(rng, convention, 5)
+        for row in crosscheck(Chain.from_dh(table), 20):
+            assert row.agrees, row
+
+
+def test_check_refuses_no_mimic_joint(mimicking):
+    assert mimicking.n_joints < len(mimicking.moving_joints)
+    for row in crosscheck(mimicking, 20):
+        assert row.agrees, row

@@ -1,0 +1,313 @@
+"""Gains, harmonics, compliance and coupling: the formula, the sidecar, and what simulations give back."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from robots import paper, random_table, robot_file, with_masses
+
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.cli.main import main
+from dhcal_pin.estimation.batch_chains import ChainBatch
+from dhcal_pin.estimation.parameters import EXTENSIONS, select_parameters
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io.measurement_csv import measurement_text
+from dhcal_pin.io.robot import read_robot, write_urdf
+from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.robot.chain import Chain
+from dhcal_pin.robot.transmission import Payload
+from dhcal_pin.robot.urdf import parse_urdf
+
+
+def ur10() -> Chain:
+    return Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+
+
+def drawn(chain: Chain, sets: str, rng: np.random.Generator):
+    """A chain with errors of the size of the priors, frames a little off, and those errors by name."""
+    errors = select_parameters(chain, sets)
+    x = rng.normal(size=len(errors.parameters)) * np.minimum(errors.priors, 0.01)
+    return errors.at(x).with_current_loads(), dict(zip([p.name for p in errors.parameters], x, strict=True))
+
+
+def test_effective_value_is_the_formula():
+    """By a fresh Pinocchio model and plain arithmetic, a joint at a time."""
+    rng = np.random.default_rng(0)
+    plain = ur10()
+    arm, x = drawn(plain, "gain,harmonics,compliance,coupling", rng)
+    model = pin.buildModelFromUrdf(str(robot_file("ur_description/urdf/ur10_robot.urdf")))
+    data = model.createData()
+    q = rng.uniform(-2, 2, (10, 6))
+    wanted = q.copy()
+    for row, found in zip(q, wanted, strict=True):
+        torque = pin.computeGeneralizedGravity(model, data, row)
+        for i, name in enumerate(plain.joint_names):
+            v = row[i]
+            found[i] += x[f"{name}.gain"] * v
+            found[i] += x[f"{name}.sin"] * np.sin(v) + x[f"{name}.cos"] * np.cos(v)
+            found[i] += x[f"{name}.sin2"] * np.sin(2 * v) + x[f"{name}.cos2"] * np.cos(2 * v)
+            found[i] += x.get(f"{name}.compliance", 0.0) * torque[i]
+            found[i] += sum(x[f"{name}.{o}"] * row[j] for j, o in enumerate(plain.joint_names) if j != i)
+    assert sum(name.endswith(".compliance") for name in x) >= 2
+    assert np.abs(wanted - q).max() > 1e-3
+    np.testing.assert_allclose(arm.poses(q), plain.poses(wanted), atol=1e-13)
+    placed = [pin.SE3(pose) for pose in plain.poses(wanted)]
+    model, frame = arm.model, arm.frame_id
+    data = model.createData()
+    for configuration, pose in zip(arm.configurations(q), placed, strict=True):
+        pin.framesForwardKinematics(model, data, configuration)
+        assert data.oMf[frame].isApprox(pose, 1e-12)
+
+
+MIMIC = """<robot name="r"><link name="base"/><link name="a"/><link name="b"/>
+  <joint name="lead" type="revolute"><parent link="base"/><child link="a"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
+  <joint name="follower" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0 0 .3"/>
+    <axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="1" velocity="1"/>
+    <mimic joint="lead" multiplier="-2" offset="0.1"/></joint></robot>"""
+
+
+def test_a_mimic_joint_follows_what_its_leader_really_does():
+    arm = Chain.from_urdf(parse_urdf(MIMIC.encode(), "mimic.urdf"))
+    errors = select_parameters(arm, "gain")
+    assert [p.name for p in errors.parameters] == ["lead.gain"]
+    q = np.linspace(-1, 1, 5)[:, None]
+    np.testing.assert_allclose(errors.at(np.array([0.01])).poses(q), arm.poses(1.01 * q), atol=1e-15)
+    placed, bodies, twists = errors.derivative(np.array([0.01]))
+    frames = placed.forward_kinematics(q)
+    step = 1e-6
+    change = arm.poses((1.01 + step) * q)[:, :3, 3] - arm.poses((1.01 - step) * q)[:, :3, 3]
+    velocity = placed.tool_jacobian(frames, bodies, twists)[0, :3].T
+    np.testing.assert_allclose(velocity, change / (2 * step), atol=1e-9)
+
+
+def test_torques_of_a_mimic_joint_load_its_leader():
+    """By the work of gravity: the generalised force is the slope of the potential energy."""
+    arm = with_masses(Chain.from_urdf(parse_urdf(MIMIC.encode(), "mimic.urdf")), np.random.default_rng(3))
+    q, h = np.array([[0.3, -0.7]]), 1e-6
+    data = arm.model.createData()
+
+    def energy(value):
+        return pin.computePotentialEnergy(arm.model, data, arm.configurations(np.array([[value]]))[0])
+
+    slope = [(energy(v + h) - energy(v - h)) / (2 * h) for v in q[0]]
+    np.testing.assert_allclose(arm.loads.torques(q)[0], slope, atol=1e-8)
+
+
+def test_sets_that_a_robot_cannot_have(sim_6dof):
+    with pytest.raises(DhcalError, match=r"'compliance'.*masses"):
+        select_parameters(sim_6dof, "base,compliance")
+    slides = replace(random_table(np.random.default_rng(0), size=2), prismatic=np.array([True, True]))
+    with pytest.raises(DhcalError, match=r"'harmonics'.*turns"):
+        select_parameters(Chain.from_dh(slides), "harmonics")
+    assert [p.name for p in select_parameters(Chain.from_dh(slides), "gain").parameters] == [
+        "j1.gain",
+        "j2.gain",
+    ]
+
+
+def test_many_arms_at_once_have_ideal_joints():
+    arm = ur10()
+    driven, _ = drawn(arm, "gain", np.random.default_rng(0))
+    for errors in (select_parameters(arm, "base,gain"), select_parameters(driven, "base")):
+        with pytest.raises(DhcalError, match="calibrate one by one"):
+            ChainBatch.from_models([errors])
+
+
+# --- the sidecar -----------------------------------------------------------------------------------
+
+
+def test_written_and_read_back_it_is_the_same_robot(tmp_path):
+    rng = np.random.default_rng(1)
+    arm, x = drawn(ur10(), "minimal,base,tool,gain,harmonics,compliance,coupling", rng)
+    write_urdf(arm, tmp_path / "out.urdf")
+    q = rng.uniform(-2, 2, (20, 6))
+    np.testing.assert_allclose(read_robot(tmp_path / "out.urdf", "tool0").poses(q), arm.poses(q), atol=1e-12)
+    table = tomllib.loads((tmp_path / "out.calibration.toml").read_text())["joint"]["elbow_joint"]
+    keys = {"gain", "sin_rad", "cos_rad", "sin2_rad", "cos2_rad", "compliance_rad_per_nm", "coupling"}
+    assert set(table) == keys
+    assert table["cos2_rad"] == x["elbow_joint.cos2"]
+    assert table["coupling"]["wrist_1_joint"] == x["elbow_joint.wrist_1_joint"]
+    # Seen to another tip, the joints are the same.
+    elbow = read_robot(tmp_path / "out.urdf", "forearm_link")
+    assert elbow.transmission is not None
+    assert elbow.transmission.coefficients[0, 2, 2] == x["elbow_joint.gain"]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("joint = 1", r"\[joint\] must be a table"),
+        ("[joint.elbow]\ngain = 0.1", "'?elbow'?.*no joint of this robot.*elbow_joint"),
+        ("[joint.elbow_joint]\nsine = 0.1", "unknown key 'sine'.*sin_rad"),
+        ("[joint.elbow_joint]\ngain = true", "gain = True is not a finite number"),
+        ("[joint.elbow_joint]\nsin_rad = nan", "sin_rad = nan is not a finite number"),
+        ("[joint.elbow_joint]\ngain = [1.0]", "is not a finite number"),
+        ("[joint]\nelbow_joint = 1", "must be a table"),
+        ("[joint.elbow_joint.coupling]\nelbow_joint = 0.1", "no other joint; there are shoulder_pan_joint"),
+        ("[joint.elbow_joint]\ncoupling = 0.1", "coupling must be a table"),
+    ],
+)
+def test_a_wrong_joint_table_is_refused(tmp_path, text, words):
+    write_urdf(ur10(), tmp_path / "arm.urdf")
+    (tmp_path / "arm.calibration.toml").write_text(text)
+    with pytest.raises(DhcalError, match=words) as caught:
+        read_robot(tmp_path / "arm.urdf", "tool0")
+    assert "arm.calibration.toml" in str(caught.value)
+
+
+def test_a_sliding_joint_has_a_gain_alone(tmp_path):
+    table = replace(random_table(np.random.default_rng(0), size=2), prismatic=np.array([True, False]))
+    write_urdf(Chain.from_dh(table), tmp_path / "arm.urdf")
+    (tmp_path / "arm.calibration.toml").write_text("[joint.j1]\nsin_rad = 0.1")
+    with pytest.raises(DhcalError, match=r"unknown key 'sin_rad'; a sliding joint has gain$"):
+        read_robot(tmp_path / "arm.urdf")
+
+
+def test_commands_read_what_calibrate_wrote(tmp_path, monkeypatch, capsys):
+    """A drooping arm: calibrated, validated, calibrated again; its root stays where gravity counts on it."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(2)
+    plain = ur10()
+    truth, _ = drawn(plain, "tool,compliance", rng)
+    write_urdf(plain, "arm.urdf")
+    for name in ("one", "two"):
+        data = Pose.simulate(truth, rng.uniform(-2, 2, (60, 6)), Noise(1e-6, 1e-6), rng)
+        (tmp_path / f"{name}.csv").write_text(measurement_text(data, plain, []))
+
+    def dhcal(*args):
+        status = main([*args, "--tip", "tool0"])
+        return status, capsys.readouterr().err
+
+    assert dhcal("calibrate", "arm.urdf", "one.csv", "-o", "rigid.urdf")[0] == 0
+    sets = ("--parameters", "minimal,base,tool,compliance")
+    assert dhcal("calibrate", "arm.urdf", "one.csv", *sets, "-o", "found.urdf")[0] == 0
+    errors = {}
+    for robot in ("rigid.urdf", "found.urdf"):
+        assert dhcal("validate", robot, "two.csv", "--json", "v.json")[0] == 0
+        errors[robot] = json.loads((tmp_path / "v.json").read_text())["after"]["position_rms_m"]
+    assert errors["found.urdf"] < 5e-6 < 50e-6 < errors["rigid.urdf"]
+    # Calibrated again without the set: its compliance is kept.
+    assert dhcal("calibrate", "found.urdf", "two.csv", "-o", "again.urdf")[0] == 0
+    first, second = (
+        tomllib.loads((tmp_path / f"{n}.calibration.toml").read_text()) for n in ("found", "again")
+    )
+    assert first["joint"] == second["joint"]
+    status, said = dhcal("calibrate", "found.urdf", "two.csv", "-o", "w.urdf", "--world-joint")
+    assert status == 2
+    assert "--world-joint: gravity" in said
+    assert not (tmp_path / "w.urdf").exists()
+
+
+# --- what simulations give back --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("family", EXTENSIONS)
+def test_a_family_is_found_again(family):
+    """All coefficients within 3 σ but for the one that chance may put beyond, and their spread as claimed."""
+    off, arm = [], ur10()
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        truth, x = drawn(arm, f"minimal,base,tool,{family}", rng)
+        data = Pose.simulate(truth, rng.uniform(-2.5, 2.5, (80, 6)), Noise(1e-4, 1e-4), rng)
+        fit = calibrate(arm, data, f"minimal,base,tool,{family}")
+        assert fit.converged
+        for p, value, std in zip(fit.parameters, fit.x, fit.std, strict=True):
+            if getattr(p, "coefficient_index", None) is not None:
+                off.append((value - x[p.name]) / std)
+    assert np.sum(np.abs(off) > 3) <= 1
+    assert np.abs(off).max() < 4.5
+    assert 0.6 < np.sqrt(np.mean(np.square(off))) < 1.4
+
+
+def test_the_nominal_of_a_calibrated_robot_is_what_it_had(tmp_path):
+    rng = np.random.default_rng(5)
+    arm = Chain.from_dh(paper("sim_6dof"))
+    had, x = drawn(arm, "gain", rng)
+    data = Pose.simulate(had, rng.uniform(-2, 2, (40, 6)), Noise(1e-6, 1e-6), rng)
+    fit = calibrate(had, data, "gain")
+    assert [p.nominal for p in fit.errors.parameters] == list(x.values())
+    assert np.abs(fit.x).max() < 1e-5
+
+
+CARRIED = Payload(4.0, (0.02, -0.01, 0.15))
+
+
+def carried_in_the_file() -> bytes:
+    """The UR10 with the payload as a link of its own behind the tip."""
+    text = robot_file("ur_description/urdf/ur10_robot.urdf").read_text()
+    x, y, z = CARRIED.centre
+    more = f"""<link name="held"><inertial><origin xyz="{x} {y} {z}"/><mass value="{CARRIED.mass}"/>
+      <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial></link>
+      <joint name="hold" type="fixed"><parent link="tool0"/><child link="held"/></joint></robot>"""
+    return text.replace("</robot>", more).encode()
+
+
+def test_a_payload_weighs_as_much_as_a_link_of_the_file():
+    q = np.random.default_rng(0).uniform(-2, 2, (6, 20))
+    wanted = Chain.from_urdf(parse_urdf(carried_in_the_file(), "held.urdf"), "tool0").loads.torques(q)
+    bare, carrying = ur10(), ur10().with_payload(CARRIED)
+    np.testing.assert_allclose(carrying.loads.torques(q), wanted, atol=1e-10)
+    assert np.abs(bare.loads.torques(q) - wanted).max() > 20
+    np.testing.assert_array_equal(carrying.poses(q.T), bare.poses(q.T))
+
+
+def test_what_a_carrying_arm_gives_is_found_and_kept(tmp_path, monkeypatch, capsys):
+    """Told of the payload, calibrate finds the compliance that the truth has, and the sidecar says so."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "arm.urdf").write_bytes(robot_file("ur_description/urdf/ur10_robot.urdf").read_bytes())
+    rng = np.random.default_rng(2)
+    truth, x = drawn(ur10().with_payload(CARRIED), "minimal,compliance", rng)
+    for name, m in (("fit", 60), ("other", 30)):
+        data = Pose.simulate(truth, rng.uniform(-2, 2, (m, 6)), Noise(1e-5, 1e-5), rng)
+        (tmp_path / f"{name}.csv").write_text(measurement_text(data, truth, []))
+    common = ["calibrate", "arm.urdf", "fit.csv", "--tip", "tool0", "--parameters", "minimal,compliance"]
+    carried = ["--payload", "4kg@20,-10,150mm"]
+    assert main([*common, *carried, "-o", "out.urdf", "--json", "r.json"]) == 0
+    found = {p["name"]: p for p in json.loads((tmp_path / "r.json").read_text())["parameters"]}
+    for name, value in x.items():
+        if name.endswith(".compliance"):
+            assert abs(found[name]["value"] - value) < 4 * found[name]["std"]
+    sidecar = tomllib.loads((tmp_path / "out.calibration.toml").read_text())
+    assert sidecar["payload"] == {"mass_kg": 4.0, "centre_m": list(CARRIED.centre)}
+    assert main([*common, "-o", "without.urdf"]) == 0
+
+    def judged(robot: str) -> float:
+        assert main(["validate", robot, "other.csv", "--tip", "tool0", "--json", "v.json"]) == 0
+        return json.loads((tmp_path / "v.json").read_text())["after"]["position_rms_m"]
+
+    assert judged("out.urdf") < 5e-5 < 2 * judged("without.urdf")
+    again = read_robot("out.urdf", "tool0")
+    assert again.payload == CARRIED
+    q = rng.uniform(-2, 2, (5, 6))
+    write_urdf(again, "again.urdf")
+    np.testing.assert_allclose(read_robot("again.urdf", "tool0").poses(q), again.poses(q), atol=1e-12)
+    capsys.readouterr()
+    assert main([*common, "--payload", "4lb", "-o", "no.urdf"]) == 2
+    assert "as 5kg or 5kg@0,0,80mm" in capsys.readouterr().err
+    assert main([*common, "--payload", "0kg", "-o", "no.urdf"]) == 2
+    assert "write a positive one" in capsys.readouterr().err
+    assert not (tmp_path / "no.urdf").exists()
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ("mass_kg = -1", "a mass of -1 kg"),
+        ("centre_m = [0.0, 0.0, 0.1]", "needs mass_kg"),
+        ("mass_kg = 2\ncentre_m = [0, 1]", "needs mass_kg"),
+        ("mass_kg = 2\ncentre_m = [0, 0, 150]", "its centre is 150 m off the tip"),
+        ("mass_kg = 2\nmass = 2", "needs mass_kg"),
+    ],
+)
+def test_a_wrong_payload_is_refused(tmp_path, table, words):
+    (tmp_path / "arm.urdf").write_bytes(robot_file("ur_description/urdf/ur10_robot.urdf").read_bytes())
+    (tmp_path / "arm.calibration.toml").write_text(f"[payload]\n{table}\n")
+    with pytest.raises(DhcalError, match=words):
+        read_robot(tmp_path / "arm.urdf", "tool0")

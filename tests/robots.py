@@ -1,0 +1,79 @@
+"""Robots that tests share: the paper's tables, robots of example-robot-data, random arms."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from importlib import metadata
+from pathlib import Path
+from typing import NoReturn
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from dhcal_pin.io import read_dh
+from dhcal_pin.robot import Chain, DHTable, parse_urdf
+
+ROOT = Path(__file__).resolve().parents[1]
+URDF = ROOT / "urdf"
+# Column maps of real measurements, and the folder beside the project that holds the measurements.
+MAPS = ROOT / "tests" / "maps"
+DATA = ROOT.parent / "shared" / "data"
+
+
+def missing(what: str) -> NoReturn:
+    """Skip a test, or fail it if DHCAL_REQUIRE_DATA=1."""
+    if os.environ.get("DHCAL_REQUIRE_DATA") == "1":
+        pytest.fail(f"missing: {what}")
+    pytest.skip(f"missing: {what}")
+
+
+def paper(name: str) -> DHTable:
+    return read_dh(URDF / f"{name}.dh.toml")
+
+
+def robot_file(path: str) -> Path:
+    """A URDF of example-robot-data, by its path under robots/."""
+    root = metadata.distribution("example-robot-data").locate_file("cmeel.prefix/share/example-robot-data")
+    return Path(str(root)) / "robots" / path
+
+
+def random_table(rng: np.random.Generator, convention: str = "standard", size: int | None = None) -> DHTable:
+    """A table of revolute and prismatic joints, a metre long at most a link."""
+    n = size or int(rng.integers(1, 9))
+    zero = np.zeros(n)
+    return DHTable(
+        convention,  # pyright: ignore[reportArgumentType]
+        tuple(f"j{i + 1}" for i in range(n)),
+        rng.random(n) < 0.3,
+        rng.uniform(-np.pi, np.pi, n),
+        rng.uniform(-0.5, 0.5, n),
+        rng.uniform(-0.5, 0.5, n),
+        rng.uniform(-np.pi, np.pi, n),
+        zero,
+        zero - np.inf,
+        zero + np.inf,
+    )
+
+
+def random_joints(rng: np.random.Generator, table: DHTable, m: int) -> np.ndarray:
+    """Any angle, and half a metre of slide each way."""
+    return rng.uniform(-1, 1, (m, table.n_joints)) * np.where(table.prismatic, 0.5, np.pi)
+
+
+def with_masses(chain: Chain, rng: np.random.Generator) -> Chain:
+    """The same arm with some kilograms on every link, off its axes."""
+    root = ElementTree.fromstring(chain.urdf.data)
+    for link in root.iter("link"):
+        for old in link.findall("inertial"):
+            link.remove(old)
+        xyz = " ".join(map(repr, rng.uniform(-0.2, 0.2, 3).tolist()))
+        link.append(
+            ElementTree.fromstring(
+                f'<inertial><origin xyz="{xyz}"/><mass value="{rng.uniform(1, 3)}"/>'
+                '<inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/></inertial>'
+            )
+        )
+    heavy = Chain.from_urdf(parse_urdf(ElementTree.tostring(root), "heavy.urdf"), chain.tip)
+    return replace(heavy, parameters=chain.parameters)
