@@ -1,8 +1,4 @@
-"""Rigid motions as stacks of homogeneous matrices, and their exponential coordinates.
-
-Everything broadcasts over leading axes. A twist is [v, ω]: three linear components in metres, then
-three angular ones in radians. T_ab is the pose of frame b in frame a.
-"""
+"""Type aliases that all packages share."""
 
 from __future__ import annotations
 
@@ -11,7 +7,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+# NumPy array; docstrings give its shape and unit.
 Array = NDArray[Any]
-
-
+# Path of a file, as `open` accepts it.
 PathLike = str | os.PathLike[str]

@@ -1,4 +1,7 @@
-"""Exceptions: every error that a user can cause is a `DhcalError` with a message of one line."""
+"""Exceptions: every error that a user can cause is a `DhcalError` with a message of one line.
+
+Messages have the form `<where>: <what is wrong>; <what is expected>`.
+"""
 
 
 class DhcalError(ValueError):

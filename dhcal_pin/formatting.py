@@ -1,4 +1,8 @@
-"""Numbers and tables as people read them: millimetres, degrees, digits as far as they are known."""
+"""Text of numbers with units and of tables, for reports and the console.
+
+Lengths are shown in mm and angles in degrees or mrad. The standard deviation of a value decides how many
+decimals are shown (rounding rule of the Particle Data Group).
+"""
 
 from __future__ import annotations
 
@@ -7,28 +11,32 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-# Factor and name of a unit for reading: of a value, and of a change or an uncertainty.
-RATES = {"rad/Nm": (1e6, " µrad/Nm"), "rad/rad": (1e3, " mrad/rad"), "rad/m": (1e3, " mrad/m")}
-
-
-UNITS = {"m": (1e3, " mm"), "rad": (180 / math.pi, "°"), **RATES}
-
-
-SMALL_UNITS = {"m": (1e3, " mm"), "rad": (1e3, " mrad"), **RATES}
-
-
-# Digits behind the point where no uncertainty says how many are known; and never more than MOST.
+# SI unit -> (factor, text of the shown unit).
+RATE_UNITS = {"rad/Nm": (1e6, " µrad/Nm"), "rad/rad": (1e3, " mrad/rad"), "rad/m": (1e3, " mrad/m")}
+# Shown units of values.
+UNITS = {"m": (1e3, " mm"), "rad": (180 / math.pi, "°"), **RATE_UNITS}
+# Shown units of changes and standard deviations.
+SMALL_UNITS = {"m": (1e3, " mm"), "rad": (1e3, " mrad"), **RATE_UNITS}
+# Decimals of a value without standard deviation.
 DEFAULT_DECIMALS = 3
-
-
+# Largest number of decimals.
 MAX_DECIMALS = 6
-
-
+# Table cells with more characters get the CSS class "long", which allows line breaks.
 MAX_UNBROKEN_CHARS = 48
 
 
 def significant_decimals(std: float) -> int:
-    """Digits behind the point for an uncertainty: two of its own up to 35, else one (Particle Data Group)."""
+    """Choose the number of decimals for a value with a standard deviation.
+
+    The standard deviation keeps two significant digits if these are at most 35, otherwise one (rounding rule
+    of the Particle Data Group).
+
+    Args:
+        std: Standard deviation, in the unit that is shown.
+
+    Returns:
+        Number of decimals; `DEFAULT_DECIMALS` if `std` is zero or not finite.
+    """
     if not (math.isfinite(std) and std > 0):
         return DEFAULT_DECIMALS
     power = math.floor(math.log10(std))
@@ -38,19 +46,31 @@ def significant_decimals(std: float) -> int:
     )
 
 
-def format_fixed(value: float, places: int) -> str:
-    """A number with so many digits behind the point; a dash where it is unknown, and no minus zero."""
-    return f"{round(value, places) + 0.0:.{places}f}" if math.isfinite(value) else "–"
+def format_fixed(value: float, decimals: int) -> str:
+    """Format a number with a fixed number of decimals, without negative zero.
+
+    Args:
+        value: Number.
+        decimals: Number of decimals.
+
+    Returns:
+        Text of the number; a dash if it is not finite.
+    """
+    return f"{round(value, decimals) + 0.0:.{decimals}f}" if math.isfinite(value) else "–"
 
 
 def format_quantity(value: float, unit: str, std: float = math.nan, small: bool = False) -> str:
-    """A value with its unit, rounded to its standard deviation where that is known.
+    """Format a value with its unit, rounded according to its standard deviation.
 
     Args:
-        value: m, rad, or in another unit and then shown as it is, to three digits.
-        unit: of the value; "1" for a pure number.
-        std: standard deviation in that unit.
-        small: whether it is a change or an uncertainty: then angles are in mrad, not degrees.
+        value: Value in `unit`.
+        unit: SI unit of the value, "1" for a pure number. A unit that `UNITS` does not contain is shown
+            unchanged and with three significant digits.
+        std: Standard deviation in `unit`; NaN if unknown.
+        small: Whether the value is a change or a standard deviation; angles are then shown in mrad.
+
+    Returns:
+        Text of the value with its unit; a dash if it is not finite.
     """
     if not math.isfinite(value):
         return "–"
@@ -62,13 +82,13 @@ def format_quantity(value: float, unit: str, std: float = math.nan, small: bool 
 
 @dataclass(frozen=True)
 class Table:
-    """A table of texts.
+    """Table whose cells are texts; it can be rendered as HTML, Markdown or console text.
 
     Attributes:
-        header: names of the columns.
-        rows: their cells.
-        n_text_columns: how many of the first columns are text; the others are numbers.
-        caption: what it shows.
+        header: Column titles.
+        rows: Cells, one sequence per row.
+        n_text_columns: Number of leading columns with text; the other columns contain numbers.
+        caption: Title of the table.
     """
 
     header: Sequence[str]
@@ -78,11 +98,19 @@ class Table:
 
 
 def html_table(table: Table, drawings: Mapping[str, Sequence[str]] | None = None) -> str:
-    """A table for a page; `drawings` are further columns of one svg a row, by their header."""
+    """Render a table as HTML.
+
+    Args:
+        table: Table to render; its texts are escaped.
+        drawings: Additional columns by title, each with one SVG per row; they are not escaped.
+
+    Returns:
+        HTML element `table`.
+    """
     drawn = drawings or {}
 
     def cell(tag: str, i: int, text: str) -> str:
-        look = (
+        css_class = (
             ' class="number"'
             if i >= table.n_text_columns
             else ' class="long"'
@@ -91,7 +119,7 @@ def html_table(table: Table, drawings: Mapping[str, Sequence[str]] | None = None
         )
         scope = ' scope="row"' if tag == "th" else ""
         content = html.escape(text).replace("-", "−") if i >= table.n_text_columns else html.escape(text)
-        return f"<{tag}{scope}{look}>{content}</{tag}>"
+        return f"<{tag}{scope}{css_class}>{content}</{tag}>"
 
     head = "".join(
         f'<th scope="col"{" class=number" if i >= table.n_text_columns else ""}>{html.escape(name)}</th>'
@@ -108,7 +136,14 @@ def html_table(table: Table, drawings: Mapping[str, Sequence[str]] | None = None
 
 
 def markdown_table(table: Table) -> str:
-    """A Markdown table, numbers to the right."""
+    """Render a table as Markdown with numbers aligned to the right.
+
+    Args:
+        table: Table to render.
+
+    Returns:
+        Lines of Markdown, joined by line feeds.
+    """
     rules = [" --- " if i < table.n_text_columns else " ---: " for i in range(len(table.header))]
     lines = ["| " + " | ".join(table.header) + " |", "|" + "|".join(rules) + "|"]
     lines += ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in table.rows]

@@ -1,4 +1,8 @@
-"""Where independent pieces of work run: here, in processes, or on a cluster; the results always in order."""
+"""Executors for independent tasks: this process, local processes, or a Dask cluster.
+
+The order of the results is the order of the tasks for every executor, so that sums over results do not
+depend on the executor and neither does any digit of a calibration.
+"""
 
 from __future__ import annotations
 
@@ -10,57 +14,70 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from typing import Any, TypeVar
 
-from .exceptions import DhcalError
+from .exceptions import InvalidArgumentError
 
 _Task = TypeVar("_Task")
-
-
-_Done = TypeVar("_Done")
+_Output = TypeVar("_Output")
+# Seconds to wait for a Dask scheduler.
+_CONNECT_TIMEOUT_S = 3
 
 
 @dataclass(frozen=True)
 class TaskExecutor:
-    """Any `concurrent.futures` executor, or none for this process.
+    """Ordered, memory-bounded `map` on a `concurrent.futures` executor or in the calling thread.
 
     Attributes:
-        executor: processes, threads, a cluster's.
-        max_in_flight: how many tasks are handed out before the first of them is back.
+        executor: Executor of processes, threads or a cluster; None runs the tasks in the calling thread.
+        max_in_flight: Largest number of submitted tasks whose results have not been consumed.
     """
 
     executor: Executor | None = None
     max_in_flight: int = 8
 
-    def map(self, function: Callable[[_Task], _Done], tasks: Iterable[_Task]) -> Iterator[_Done]:
-        """Results in the order of the tasks, of which never more than `ahead` are in memory."""
+    def map(self, function: Callable[[_Task], _Output], tasks: Iterable[_Task]) -> Iterator[_Output]:
+        """Apply a function to each task, with at most `max_in_flight` tasks in memory.
+
+        Args:
+            function: Function of one task; it must be picklable for processes and clusters.
+            tasks: Tasks, read only as far as they are submitted.
+
+        Yields:
+            Results in the order of the tasks.
+        """
         if self.executor is None:
             for task in tasks:
                 yield function(task)
             return
-        waiting = deque()
+        pending = deque()
         try:
             for task in tasks:
-                waiting.append(self.executor.submit(function, task))
-                if len(waiting) >= self.max_in_flight:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
+                pending.append(self.executor.submit(function, task))
+                if len(pending) >= self.max_in_flight:
+                    yield pending.popleft().result()
+            while pending:
+                yield pending.popleft().result()
         finally:
-            for future in waiting:
+            for future in pending:
                 future.cancel()
 
 
+# Runs all tasks in the calling thread.
 SERIAL = TaskExecutor()
 
 
 @contextmanager
 def open_executor(jobs: int = 1, scheduler: str | None = None) -> Iterator[TaskExecutor]:
-    """This process, `jobs` processes, or the cluster of a Dask scheduler at an address.
+    """Open an executor and close it at the end of the `with` block.
 
-    Raises:
-        DhcalError: Dask is not installed, or there is no scheduler at that address.
+    Args:
+        jobs: Number of processes; 1 runs all tasks in the calling thread.
+        scheduler: Address of a Dask scheduler, such as `tcp://host:8786`; it takes precedence over `jobs`.
+
+    Yields:
+        Executor for the `with` block.
     """
     if scheduler:
-        with _cluster(scheduler) as client:
+        with _connect_to_dask(scheduler) as client:
             threads = sum(client.nthreads().values())
             yield TaskExecutor(client.get_executor(pure=False), 2 * max(threads, 1))
     elif jobs > 1:
@@ -70,14 +87,19 @@ def open_executor(jobs: int = 1, scheduler: str | None = None) -> Iterator[TaskE
         yield SERIAL
 
 
-def _cluster(address: str) -> Any:
+def _connect_to_dask(address: str) -> Any:
+    """Connect to a Dask scheduler; raise InvalidArgumentError if Dask or the scheduler is missing."""
     try:
         from distributed import Client
     except ImportError:
-        raise DhcalError(
-            "--scheduler needs Dask: pip install 'dhcal-pin[cluster]', here and on the workers"
+        raise InvalidArgumentError(
+            "--scheduler: Dask is not installed; run pip install 'dhcal-pin[cluster]' on this machine "
+            "and on the workers"
         ) from None
     try:
-        return Client(address, timeout=3)
+        return Client(address, timeout=_CONNECT_TIMEOUT_S)
     except (OSError, ValueError) as error:
-        raise DhcalError(f"--scheduler {address}: no Dask scheduler there: {error}") from error
+        raise InvalidArgumentError(
+            f"--scheduler {address}: no Dask scheduler found; expected an address such as tcp://host:8786 "
+            f"({error})"
+        ) from error

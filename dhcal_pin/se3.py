@@ -1,7 +1,16 @@
-"""Rigid motions as stacks of homogeneous matrices, and their exponential coordinates.
+"""Rigid-body transformations: homogeneous matrices, exponential and logarithm of SO(3) and SE(3).
 
-Everything broadcasts over leading axes. A twist is [v, ω]: three linear components in metres, then
-three angular ones in radians. T_ab is the pose of frame b in frame a.
+Conventions:
+
+* T_ab (4, 4) is the pose of frame b in frame a: p_a = T_ab·p_b.
+* A twist is ξ = [v, ω] (6,): linear part [m], then angular part [rad].
+* [ω]× is the cross-product matrix: [ω]×·x = ω × x.
+* All functions broadcast over leading axes, written "..." in shapes.
+
+With θ = |ω| (Rodrigues' formula; Lynch & Park, Modern Robotics, 2017, chapter 3):
+
+* exp3(ω) = I + (sin θ/θ)·[ω]× + ((1 - cos θ)/θ²)·[ω]×²;
+* exp6(ξ) = (exp3(ω), V·v) with V = I + ((1 - cos θ)/θ²)·[ω]× + ((θ - sin θ)/θ³)·[ω]×².
 """
 
 from __future__ import annotations
@@ -14,7 +23,14 @@ from ._typing import Array
 
 
 def skew(w: ArrayLike) -> Array:
-    """Cross-product matrix [w]× of w (..., 3), shape (..., 3, 3)."""
+    """Build cross-product matrices.
+
+    Args:
+        w: Vectors, shape (..., 3).
+
+    Returns:
+        Matrices [w]×, shape (..., 3, 3), with [w]×·x = w × x.
+    """
     w = np.asarray(w, float)
     out = np.zeros((*w.shape, 3))
     out[..., 0, 1], out[..., 0, 2] = -w[..., 2], w[..., 1]
@@ -24,7 +40,15 @@ def skew(w: ArrayLike) -> Array:
 
 
 def transform(rotation: ArrayLike, position: ArrayLike) -> Array:
-    """Homogeneous matrices (..., 4, 4) from rotations (..., 3, 3) and positions (..., 3) in metres."""
+    """Combine rotations and positions to homogeneous matrices.
+
+    Args:
+        rotation: Rotation matrices, shape (..., 3, 3).
+        position: Positions, shape (..., 3) [m].
+
+    Returns:
+        Homogeneous matrices, shape (..., 4, 4).
+    """
     rotation, position = np.asarray(rotation, float), np.asarray(position, float)
     shape = np.broadcast_shapes(rotation.shape[:-2], position.shape[:-1])
     out = np.zeros((*shape, 4, 4))
@@ -33,12 +57,26 @@ def transform(rotation: ArrayLike, position: ArrayLike) -> Array:
 
 
 def translation(xyz: ArrayLike) -> Array:
-    """Pure translations (..., 4, 4) by xyz (..., 3) metres."""
+    """Build homogeneous matrices of pure translations.
+
+    Args:
+        xyz: Displacements, shape (..., 3) [m].
+
+    Returns:
+        Homogeneous matrices, shape (..., 4, 4).
+    """
     return transform(np.eye(3), xyz)
 
 
 def inverse(pose: ArrayLike) -> Array:
-    """Inverse of rigid motions (..., 4, 4), by transposing the rotation."""
+    """Invert rigid transformations by transposing the rotation.
+
+    Args:
+        pose: Homogeneous matrices, shape (..., 4, 4).
+
+    Returns:
+        Inverse matrices, shape (..., 4, 4).
+    """
     pose = np.asarray(pose, float)
     out = np.zeros(pose.shape)
     rotation = np.swapaxes(pose[..., :3, :3], -1, -2)
@@ -49,7 +87,16 @@ def inverse(pose: ArrayLike) -> Array:
 
 
 def adjoint(pose: ArrayLike) -> Array:
-    """Matrices (..., 6, 6) that carry twists in frame b to frame a, given T_ab (..., 4, 4)."""
+    """Build the matrices that express twists of frame b in frame a.
+
+    With T_ab = (R, p): Ad = [[R, [p]×·R], [0, R]] and ξ_a = Ad·ξ_b.
+
+    Args:
+        pose: T_ab, shape (..., 4, 4).
+
+    Returns:
+        Adjoint matrices, shape (..., 6, 6).
+    """
     pose = np.asarray(pose, float)
     rotation = pose[..., :3, :3]
     out = np.zeros((*pose.shape[:-2], 6, 6))
@@ -58,8 +105,15 @@ def adjoint(pose: ArrayLike) -> Array:
     return out
 
 
-def series(angle: Array) -> tuple[Array, Array, Array]:
-    """sin(t)/t, (1-cos t)/t², (t-sin t)/t³ of angles (...,) in radians, exact to rounding at any t."""
+def exp_coefficients(angle: Array) -> tuple[Array, Array, Array]:
+    """Compute the three coefficients of the exponential maps without cancellation at small angles.
+
+    Args:
+        angle: Rotation angles t, shape (...) [rad].
+
+    Returns:
+        sin(t)/t, (1 - cos t)/t² and (t - sin t)/t³, each of shape (...).
+    """
     half = np.sinc(angle / (2 * np.pi))
     small = np.abs(angle) < 0.1
     t2 = np.square(angle)
@@ -73,37 +127,51 @@ def series(angle: Array) -> tuple[Array, Array, Array]:
 
 
 def exp3(rotvec: ArrayLike) -> Array:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians."""
+    """Compute rotation matrices from rotation vectors.
+
+    Args:
+        rotvec: Rotation vectors, shape (..., 3) [rad].
+
+    Returns:
+        Rotation matrices, shape (..., 3, 3).
+    """
     rotvec = np.asarray(rotvec, float)
-    first, second, _ = series(np.linalg.norm(rotvec, axis=-1))
+    first, second, _ = exp_coefficients(np.linalg.norm(rotvec, axis=-1))
     k = skew(rotvec)
     return np.eye(3) + first[..., None, None] * k + second[..., None, None] * (k @ k)
 
 
 def log3(rotation: ArrayLike) -> Array:
-    """Rotation vectors (..., 3) in radians, of norm up to π, of rotations (..., 3, 3), precise everywhere.
+    """Compute rotation vectors from rotation matrices, accurate at all angles from 0 to π.
 
-    Arrays with the samples last in memory, seen through a transpose, are the quickest, and the result is
-    such an array too.
+    The computation is fastest if the last two axes have the largest strides in memory, as in a transposed
+    array of shape (3, 3, m). The result has the same layout.
+
+    Args:
+        rotation: Rotation matrices, shape (..., 3, 3).
+
+    Returns:
+        Rotation vectors of norm at most π, shape (..., 3) [rad].
     """
     r = np.asarray(rotation, float)
     out = np.empty((3, *r.shape[:-2]))
     for i, (j, k) in enumerate(((2, 1), (0, 2), (1, 0))):
         np.subtract(r[..., j, k], r[..., k, j], out=out[i, ...])
-    # Twice the angle's sine and cosine; the sine alone is blind near π, the cosine near 0.
+    # `sine` and `cosine` are 2·sin θ and 2·cos θ; arctan2 of both is accurate at small and at large angles.
     sine = np.sqrt(np.maximum(np.einsum("i...,i...->...", out, out), 1e-300))
     cosine = r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2] - 1
     out *= np.arctan2(sine, cosine) / sine
-    back = cosine < -1.8
-    if back.any():
-        out[:, back] = _log3_near_half_turn(r[back]).T
+    near_half_turn = cosine < -1.8
+    if near_half_turn.any():
+        out[:, near_half_turn] = _log3_near_half_turn(r[near_half_turn]).T
     return out.transpose(*range(1, out.ndim), 0)
 
 
 def _log3_near_half_turn(r: Array) -> Array:
-    """Rotation vectors (m, 3) of rotations (m, 3, 3) by an obtuse angle, through the unit quaternion.
+    """Compute rotation vectors (m, 3) of rotations (m, 3, 3) near π from their unit quaternions.
 
-    Rows of 4·q·qᵀ, [w, x, y, z], are all proportional to q; that of the largest component is the safest.
+    Each row of 4·q·qᵀ with q = [w, x, y, z] is proportional to q. The row of the largest vector component
+    is used because it has the smallest rounding error.
     """
     m, trace = len(r), np.trace(r, axis1=1, axis2=2)
     rows = np.empty((m, 3, 4))
@@ -118,9 +186,19 @@ def _log3_near_half_turn(r: Array) -> Array:
 
 
 def right_jacobian_inverse(rotvec: ArrayLike) -> Array:
-    """Jr⁻¹ (..., 3, 3): log3(R·exp3(δ)) = φ + Jr⁻¹(φ)·δ to first order, φ = rotvec (..., 3).
+    """Compute the inverse right Jacobian of SO(3).
 
-    The result has the samples last in memory.
+    To first order log3(exp3(φ)·exp3(δ)) = φ + Jr⁻¹(φ)·δ, with
+
+        Jr⁻¹(φ) = I + ½[φ]× + f·[φ]×²,    f = 1/θ² - 1/(2θ·tan(θ/2)),    θ = |φ|.
+
+    For θ² < 1e-3 the series f = 1/12 + θ²/720 + θ⁴/30240 is used.
+
+    Args:
+        rotvec: Rotation vectors φ, shape (..., 3) [rad].
+
+    Returns:
+        Matrices Jr⁻¹, shape (..., 3, 3). The first two axes of the underlying memory are the matrix axes.
     """
     rotvec = np.asarray(rotvec, float)
     v = rotvec.transpose(-1, *range(rotvec.ndim - 1))
@@ -142,17 +220,31 @@ def right_jacobian_inverse(rotvec: ArrayLike) -> Array:
 
 
 def exp6(twist: ArrayLike) -> Array:
-    """Rigid motions (..., 4, 4) of twists [v, ω] (..., 6)."""
+    """Compute rigid transformations from twists.
+
+    Args:
+        twist: Twists [v, ω], shape (..., 6) [m, rad].
+
+    Returns:
+        Homogeneous matrices, shape (..., 4, 4).
+    """
     twist = np.asarray(twist, float)
     v, w = twist[..., :3], twist[..., 3:]
-    _, second, third = series(np.linalg.norm(w, axis=-1))
+    _, second, third = exp_coefficients(np.linalg.norm(w, axis=-1))
     k = skew(w)
     left = np.eye(3) + second[..., None, None] * k + third[..., None, None] * (k @ k)
     return transform(exp3(w), (left @ v[..., None])[..., 0])
 
 
 def log6(pose: ArrayLike) -> Array:
-    """Twists [v, ω] (..., 6) of rigid motions (..., 4, 4), rotations up to π."""
+    """Compute twists from rigid transformations.
+
+    Args:
+        pose: Homogeneous matrices, shape (..., 4, 4).
+
+    Returns:
+        Twists [v, ω] with |ω| at most π, shape (..., 6) [m, rad].
+    """
     pose = np.asarray(pose, float)
     w = log3(pose[..., :3, :3])
     left_inverse = np.swapaxes(right_jacobian_inverse(w), -1, -2)
@@ -161,12 +253,28 @@ def log6(pose: ArrayLike) -> Array:
 
 
 def nearest_rotation(matrix: Array) -> Array:
-    """The rotations (..., 3, 3) nearest to matrices (..., 3, 3), such as sums of rotations."""
+    """Find the rotations nearest to given matrices in the Frobenius norm.
+
+    With the singular value decomposition U·S·Vᵀ the rotation is U·diag(1, 1, ±1)·Vᵀ (Kabsch 1976).
+
+    Args:
+        matrix: Matrices, for example sums of rotations, shape (..., 3, 3).
+
+    Returns:
+        Rotation matrices, shape (..., 3, 3).
+    """
     u, _, vt = np.linalg.svd(matrix)
     u[..., 2] *= np.linalg.det(u @ vt)[..., None]
     return u @ vt
 
 
 def to_xyz_rpy(origin: Array) -> list[float]:
-    """x, y, z in m and roll, pitch, yaw in rad of an origin (4, 4)."""
+    """Convert a transformation to the numbers of a URDF origin.
+
+    Args:
+        origin: Homogeneous matrix, shape (4, 4).
+
+    Returns:
+        x, y, z [m], roll, pitch, yaw [rad]; zeros have no minus sign.
+    """
     return [float(v) + 0.0 for v in (*origin[:3, 3], *pin.rpy.matrixToRpy(origin[:3, :3]))]

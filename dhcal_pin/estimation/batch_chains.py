@@ -115,7 +115,7 @@ class ChainBatch:
         """Each parameter's motion exp(x·A) (p, b, 4, 4) at x (b, p); A³ ends it, as A⁴ = -rate²·A²."""
         powers, rate = self._powers
         x = x.T
-        _, two, three = se3.series(x * rate)
+        _, two, three = se3.exp_coefficients(x * rate)
         terms = np.stack([np.ones_like(x), x, x**2 * two, x**3 * three], -1)
         return (terms[..., None, :] @ powers).reshape(*x.shape, 4, 4)
 

@@ -92,7 +92,7 @@ def test_a_stream_gives_the_same_digits_with_a_worker_lost(cluster, tmp_path, si
 
 def test_no_scheduler_is_said():
     with (
-        pytest.raises(DhcalError, match="no Dask scheduler there"),
+        pytest.raises(DhcalError, match="no Dask scheduler found"),
         open_executor(scheduler="tcp://127.0.0.1:1"),
     ):
         pass

@@ -211,7 +211,7 @@ def test_journal_of_another_study_is_left_alone(tmp_path, capsys):
         ),
         (("poses = 12", "pose_selection = 'planned'\nnoise = '0mm'"), "a pose needs sigmas above zero"),
         (('"pose", "position"', '"wires"'), r"kind = 'wires': wires: wire1.x is unknown"),
-        (("0.5mm,0.1deg", "0.5"), "error_std '0.5': write a number with a unit"),
+        (("0.5mm,0.1deg", "0.5"), "error_std '0.5': not a number with a unit"),
         (("sim_6dof.dh.toml", "none.urdf"), "none.urdf: no such file"),
         (("poses = 12", "truth = 'sim_3dof.dh.toml'"), "arm 2 has other joints"),
         (("poses = 12", "parameters = 'dh,tol'"), "unknown parameter set 'tol'"),
