@@ -24,6 +24,7 @@ from ..exceptions import DhcalError
 from ..formatting import Table, format_fixed
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
+from ..robot.error_families import FAMILIES
 from . import procedure
 from .cross_validation import (
     FoldSystems,
@@ -51,14 +52,6 @@ MAX_P_VALUE = 0.01
 # A hint is given of one that leaves less than this share of the error, with so many rows left over for each
 # of its unknowns; so many samples tell.
 MAX_HINT_RATIO, MIN_ROWS_PER_PARAMETER, MAX_HINT_SAMPLES = 0.9, 5, 500
-
-
-FAMILY_DESCRIPTIONS = {
-    "gain": "wrong ratios of the drives",
-    "harmonics": "gears that run out of true",
-    "compliance": "joints that yield to the arm's weight",
-    "coupling": "joints that drive each other",
-}
 
 
 # Smaller chances differ by nothing that one could believe.
@@ -266,8 +259,8 @@ def family_hint(fit: Result) -> str:
             best = min(best, (float(np.sqrt(then / left / (now / (left + more)))), name))
     share, name = best
     return name and (
-        f"what is left goes with the joints' values as {FAMILY_DESCRIPTIONS[name]} would; --extend auto may leave about "
-        f"{100 * share:.0f} % of it"
+        f"what is left goes with the joints' values as {FAMILIES[name].description} would; "
+        f"--extend auto may leave about {100 * share:.0f} % of it"
     )
 
 

@@ -6,6 +6,8 @@ import argparse
 import sys
 from typing import Any, NoReturn
 
+from ..robot.error_families import FAMILIES
+
 
 class _Parser(argparse.ArgumentParser):
     """A parser whose complaint is one line, as every other one is."""
@@ -116,15 +118,16 @@ def parser() -> argparse.ArgumentParser:
     calibrate.add_argument(
         "--parameters",
         metavar="SET[,SET]",
-        help="what is unknown: dh, modified-dh, hayati, minimal, placement, base, tool, offset, gain, "
-        "harmonics, compliance, coupling (default: minimal,base,tool for a URDF, dh for a DH file)",
+        help="what is unknown: dh, modified-dh, hayati, minimal, placement, base, tool, offset, "
+        f"{', '.join(FAMILIES)} (default: minimal,base,tool for a URDF, dh for a DH file)",
     )
     calibrate.add_argument(
         "--extend",
         metavar="auto|none|FAMILY[,FAMILY]",
         default="none",
-        help="add gain, harmonics, compliance, coupling of the joints where cross-validation by regions of "
-        "joint space gains by it: all that do, none (default), or some of those named",
+        help="add families of joint errors that lower the error cross-validated by regions of joint space: "
+        "any of them (auto), none (default), or some of those named. Families: "
+        f"{'; '.join(f'{f.name} ({f.description})' for f in FAMILIES.values())}",
     )
     calibrate.add_argument(
         "--fix", metavar="NAME[,NAME]", default="", help="hold parameters or sets at nominal"

@@ -19,6 +19,7 @@ from .._kernels.types import FrameBatch
 from .._typing import Array
 from ..exceptions import DhcalError
 from ..robot.chain import BASE_FRAME, Chain
+from ..robot.error_families import FAMILIES
 from .error_model import ErrorModel
 
 
@@ -56,14 +57,16 @@ class ChainBatch:
         if first.chain.transmission is not None or any(
             p.coefficient_index is not None for p in first.parameters
         ):
-            raise DhcalError("arms with gains, harmonics, compliance or couplings calibrate one by one")
+            raise DhcalError(
+                f"arm 1 has joint transmission errors ({', '.join(FAMILIES)}); calibrate such arms one by one"
+            )
         for number, model in enumerate(models, 1):
             if model.chain.transmission is not None or any(
                 p.coefficient_index is not None for p in model.parameters
             ):
                 raise DhcalError(
-                    f"arm {number} has errors of its joints' transmission (gain, harmonics, compliance, "
-                    "coupling); calibrate it by itself"
+                    f"arm {number} has joint transmission errors ({', '.join(FAMILIES)}); "
+                    "calibrate it by itself"
                 )
             if model is not first and _structure(model) != _structure(first):
                 raise DhcalError(

@@ -11,7 +11,8 @@ from .. import se3
 from ..exceptions import DhcalError
 from ..robot.chain import BASE_FRAME, Chain, extract_dh_table, joint_frame, link_frame, without_mimics
 from ..robot.dh import Convention
-from ..robot.transmission import COUPLING_PRIOR, COUPLING_TERM, FAMILIES, TERMS, Transmission
+from ..robot.error_families import COUPLING, FAMILIES
+from ..robot.transmission import COUPLING_PRIOR, COUPLING_TERM, TERM_FAMILIES, TERMS, Transmission
 from .error_model import ErrorModel, ErrorParameter
 
 # Standard deviations that manufacturing and assembly lead one to expect, and frames anywhere in a room.
@@ -233,12 +234,12 @@ PARAMETER_SETS: dict[str, Callable[[Chain], list[ErrorParameter]]] = {
     "base": base,
     "tool": tool,
     "offset": offset,
-    **{name: functools.partial(family, name=name) for name in FAMILIES},
-    "coupling": coupling,
+    **{name: functools.partial(family, name=name) for name in TERM_FAMILIES},
+    COUPLING: coupling,
 }
 
 
-EXTENSIONS = (*FAMILIES, "coupling")
+EXTENSIONS = tuple(FAMILIES)
 
 
 def select_parameters(
@@ -264,8 +265,8 @@ def select_parameters(
     found = {name: PARAMETER_SETS[name](chain) for name in names}
     if empty := [name for name, parameters in found.items() if not parameters]:
         raise DhcalError(
-            f"{chain.urdf.source}: no joint of {empty[0]!r}: it takes a joint that turns, "
-            "for coupling another joint, and for compliance a URDF whose links have masses"
+            f"{chain.urdf.source}: no joint has parameters of the set {empty[0]!r}; "
+            f"the set needs {FAMILIES[empty[0]].requirement}"
         )
     pool = {p.name: p for parameters in found.values() for p in parameters}
     fixed = set[str]()

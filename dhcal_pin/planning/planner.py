@@ -16,7 +16,7 @@ from ..exceptions import DhcalError
 from ..measurements.base import Measurement, Noise
 from ..robot.chain import Chain
 from ..robot.sampling import ConfigurationSampler, WorkspaceConstraints, scale_joint_units, shortest_tour
-from ..robot.transmission import FAMILIES
+from ..robot.transmission import TERM_FAMILIES
 from .criteria import AOptimality, BiasVarianceCriterion, Criterion, DOptimality, EOptimality
 from .exchange import MAX_EXCHANGE_CANDIDATES, CandidateSet, exchange, greedy, sqrt_covariance
 from .information import Information, with_joint_scatter
@@ -185,7 +185,7 @@ def plan(
         where = q if task is None else chain.validated_q(task)
     left_out = ()
     if criterion == "robust":
-        left_out, noise = FAMILIES, noise and with_joint_scatter(chain, q, noise)
+        left_out, noise = TERM_FAMILIES, noise and with_joint_scatter(chain, q, noise)
     wide = Information.from_prior(
         chain, q, kind, noise, parameters, priors, fix, free, data, known, left_out, prior_uncertainty
     )

@@ -1,32 +1,12 @@
-"""Robot models: kinematic chains, DH tables, URDF files, transmissions, inverse kinematics."""
+"""Robot models: kinematic chains, DH tables, URDF files, joint transmissions, inverse kinematics.
 
-from .chain import BASE_FRAME, Chain, extract_dh_table, joint_frame, link_frame
-from .collision import CollisionChecker
-from .dh import Convention, DHTable
-from .dh_extraction import Extraction, extract_dh
-from .dh_urdf import dh_to_urdf
-from .sampling import ConfigurationSampler, WorkspaceConstraints, joint_range
-from .transmission import Payload, Transmission
-from .urdf import Urdf, parse_urdf, read_urdf
+This package holds what is known about a robot without measurements. Error parameters and their estimation
+belong to `estimation`; reading and writing of files other than URDF belongs to `io`.
 
-__all__ = [
-    "BASE_FRAME",
-    "Chain",
-    "CollisionChecker",
-    "ConfigurationSampler",
-    "Convention",
-    "DHTable",
-    "Extraction",
-    "Payload",
-    "Transmission",
-    "Urdf",
-    "WorkspaceConstraints",
-    "dh_to_urdf",
-    "extract_dh",
-    "extract_dh_table",
-    "joint_frame",
-    "joint_range",
-    "link_frame",
-    "parse_urdf",
-    "read_urdf",
-]
+The public names are listed in `__init__.pyi`. Each is loaded on first use, so that the command line can list
+the families of joint errors without loading Pinocchio.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -138,7 +138,14 @@ def scene_html(
         **arms,
     }
     data = json.dumps(scene, separators=(",", ":"), ensure_ascii=False).replace("<", "\\u003c")
-    parts = {"@TITLE@": html.escape(title), "/*@MESHCAT@*/": _meshcat(), "@SCENE@": data}
+    terms = ", ".join(f"{term.name}: (q, torque) => {term.javascript}" for term in TERMS)
+    parts = {
+        "@TITLE@": html.escape(title),
+        "/*@MESHCAT@*/": _meshcat(),
+        # Script text, not data of the scene: the page's security policy forbids evaluating strings.
+        "/*@TERMS@*/": terms,
+        "@SCENE@": data,
+    }
     return re.sub("|".join(map(re.escape, parts)), lambda mark: parts[mark[0]], PAGE.read_text("utf-8"))
 
 

@@ -19,7 +19,7 @@ from dhcal_pin.calibration.cross_validation import (
     standard_error,
 )
 from dhcal_pin.calibration.evaluation import accuracy
-from dhcal_pin.calibration.model_selection import FAMILY_DESCRIPTIONS, MAX_HINT_SAMPLES, extend, family_hint
+from dhcal_pin.calibration.model_selection import MAX_HINT_SAMPLES, extend, family_hint
 from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation.parameters import select_parameters
@@ -31,6 +31,7 @@ from dhcal_pin.measurements.contact import PointContact, PointDistance
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.measurements.position import Position
 from dhcal_pin.robot.chain import Chain
+from dhcal_pin.robot.error_families import FAMILIES
 
 
 def simulated(sets: str, seed: int, m: int = 60, noise: float = 1e-4, kind=Pose):
@@ -61,7 +62,7 @@ def test_a_hint_names_what_is_missing_and_how_much_it_takes_up(family):
         r"what is left .* as (.*) would; --extend auto may leave about (\d+) % of it", family_hint(plain)
     )
     assert found
-    assert found[1] == FAMILY_DESCRIPTIONS[family]
+    assert found[1] == FAMILIES[family].description
     whole = calibrate(arm, data, f"{family},minimal,base,tool")
     left = [np.sqrt(fit.solution.system.cost / (360 - fit.rank)) for fit in (plain, whole)]
     assert float(found[2]) == pytest.approx(100 * left[1] / left[0], abs=2, rel=0.3)
@@ -80,7 +81,7 @@ def test_geometry_alone_gives_no_hint(kind, seeds):
 
 def test_a_hint_looks_at_some_of_many_samples():
     arm, data = simulated("harmonics,minimal,base,tool", seed=0, m=3 * MAX_HINT_SAMPLES + 1)
-    assert FAMILY_DESCRIPTIONS["harmonics"] in family_hint(calibrate(arm, data, "minimal,base,tool"))
+    assert FAMILIES["harmonics"].description in family_hint(calibrate(arm, data, "minimal,base,tool"))
 
 
 def test_folds_equal_fits_without_what_they_leave_out():
@@ -222,7 +223,7 @@ def test_the_command_says_what_each_family_brought(tmp_path, monkeypatch, capsys
     assert main([*common, "--report", "r.md"]) == 0
     found = json.loads((tmp_path / "r.json").read_text())
     assert found["extension"] == []
-    assert f"as {FAMILY_DESCRIPTIONS['compliance']} would" in found["hint"]
+    assert f"as {FAMILIES['compliance'].description} would" in found["hint"]
     assert f"hint: {found['hint']}" in capsys.readouterr().err
     assert found["hint"][1:] in (tmp_path / "r.md").read_text()
     for wrong, words in (

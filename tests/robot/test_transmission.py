@@ -21,7 +21,8 @@ from dhcal_pin.io.robot import read_robot, write_urdf
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.robot.chain import Chain
-from dhcal_pin.robot.transmission import Payload
+from dhcal_pin.robot.error_families import COUPLING, FAMILIES
+from dhcal_pin.robot.transmission import TERM_FAMILIES, TERMS, Payload
 from dhcal_pin.robot.urdf import parse_urdf
 
 
@@ -65,6 +66,16 @@ def test_effective_value_is_the_formula():
         assert data.oMf[frame].isApprox(pose, 1e-12)
 
 
+def test_every_family_has_a_row_and_every_term_the_same_formula_in_javascript():
+    """The expression is evaluated with NumPy in the place of `Math`."""
+    assert (*TERM_FAMILIES, COUPLING) == tuple(FAMILIES)
+    q, torque = np.random.default_rng(0).uniform(-2, 2, (2, 3, 4))
+    for term in TERMS:
+        value = eval(term.javascript, {"Math": np, "q": q, "torque": torque})
+        np.testing.assert_array_equal(value, term.value(q, torque))
+        assert term.depends_on_load == ("torque" in term.javascript)
+
+
 MIMIC = """<robot name="r"><link name="base"/><link name="a"/><link name="b"/>
   <joint name="lead" type="revolute"><parent link="base"/><child link="a"/><axis xyz="0 1 0"/>
     <limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
@@ -101,10 +112,10 @@ def test_torques_of_a_mimic_joint_load_its_leader():
 
 
 def test_sets_that_a_robot_cannot_have(sim_6dof):
-    with pytest.raises(DhcalError, match=r"'compliance'.*masses"):
+    with pytest.raises(DhcalError, match=r"set 'compliance'.*masses"):
         select_parameters(sim_6dof, "base,compliance")
     slides = replace(random_table(np.random.default_rng(0), size=2), prismatic=np.array([True, True]))
-    with pytest.raises(DhcalError, match=r"'harmonics'.*turns"):
+    with pytest.raises(DhcalError, match=r"set 'harmonics'.*revolute joint"):
         select_parameters(Chain.from_dh(slides), "harmonics")
     assert [p.name for p in select_parameters(Chain.from_dh(slides), "gain").parameters] == [
         "j1.gain",
@@ -116,7 +127,7 @@ def test_many_arms_at_once_have_ideal_joints():
     arm = ur10()
     driven, _ = drawn(arm, "gain", np.random.default_rng(0))
     for errors in (select_parameters(arm, "base,gain"), select_parameters(driven, "base")):
-        with pytest.raises(DhcalError, match="calibrate one by one"):
+        with pytest.raises(DhcalError, match=r"gain, harmonics.*one by one"):
             ChainBatch.from_models([errors])
 
 

@@ -1,0 +1,42 @@
+"""Families of joint errors: the parameter sets that describe how a joint misses its commanded position.
+
+A family is one parameter set, such as `harmonics`, and one candidate of the automatic model selection. The
+formulas of its terms are the rows of `transmission.TERMS`. This module imports nothing heavy, because the
+help of the command line lists the families.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ErrorFamily:
+    """Family of joint errors that users select by one name.
+
+    Attributes:
+        name: Name of the parameter set.
+        description: Physical cause, a noun phrase in the plural or without a number, for help and reports.
+        requirement: What a robot must have for the family to have parameters, for error messages.
+    """
+
+    name: str
+    description: str
+    requirement: str
+
+
+COUPLING = "coupling"
+
+FAMILIES = {
+    family.name: family
+    for family in (
+        ErrorFamily("gain", "gear ratio errors", "a moving joint"),
+        ErrorFamily("harmonics", "gear eccentricity", "a revolute joint"),
+        ErrorFamily(
+            "compliance",
+            "joint elasticity under gravity",
+            "a revolute joint that gravity loads, and links with masses in the URDF",
+        ),
+        ErrorFamily(COUPLING, "coupling between joints", "a revolute joint and another joint"),
+    )
+}
