@@ -4,13 +4,28 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from typing import Any, NoReturn
 
 from ..robot.error_families import FAMILIES
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser whose complaint is one line, as every other one is."""
+    """A parser whose complaint is one line, as every other one is.
+
+    Attributes:
+        details: Function that returns text for the end of the help. It is called only when the help is
+            printed, so that it can import modules that are slow to import.
+    """
+
+    details: Callable[[], str] | None = None
+
+    def format_help(self) -> str:
+        """Return the help, with the details before the example."""
+        if self.details is not None:
+            self.epilog = f"{self.details()}\n\n{self.epilog}"
+            self.details = None
+        return super().format_help()
 
     def error(self, message: str) -> NoReturn:
         print(f"{self.prog}: {' '.join(message.split())}; see {self.prog} --help", file=sys.stderr)
@@ -34,7 +49,7 @@ class _Help(argparse.RawDescriptionHelpFormatter):
         super().__init__(prog, max_help_position=30, **options)
 
 
-def _add(commands, name: str, summary: str, example: str) -> argparse.ArgumentParser:
+def _add(commands, name: str, summary: str, example: str) -> _Parser:
     return commands.add_parser(
         name,
         help=summary,
@@ -60,6 +75,12 @@ _JSON: dict[str, Any] = {"metavar": "FILE", "help": "the result as JSON; - for s
 
 
 _SCHEDULER: dict[str, Any] = {"metavar": "ADDRESS", "help": "a Dask cluster, as tcp://host:8786"}
+
+
+def _robot_formats() -> str:
+    from ..io.robot import formats_help  # lazy import: Pinocchio is slow to import
+
+    return formats_help()
 
 
 def _count(text: str) -> int:
@@ -208,13 +229,12 @@ def parser() -> argparse.ArgumentParser:
     convert = _add(
         commands,
         "convert",
-        "a DH file to a URDF, a URDF to a DH file, to UR's YAML, or to a table of origins",
+        "a robot file in another format, such as a DH table as a URDF",
         "dhcal convert arm.dh.toml arm.urdf",
     )
-    convert.add_argument(
-        "input", metavar="IN", help="URDF, DH file (.toml, .csv), or UR's kinematics (.yaml)"
-    )
-    convert.add_argument("output", metavar="OUT", help=".urdf, .dh.toml, .dh.csv, .origins.csv, .yaml")
+    convert.details = _robot_formats
+    convert.add_argument("input", metavar="IN", help="robot file in one of the formats below")
+    convert.add_argument("output", metavar="OUT", help="file to write; its ending selects the format")
     convert.add_argument("--tip", **_TIP)
     convert.add_argument(
         "--convention", choices=("standard", "modified"), help="of a DH file that is written"

@@ -14,7 +14,7 @@ from ..exceptions import DhcalError
 from ..io.atomic import write_files
 from ..io.measurement_columns import QUATERNION, ROTVEC, units_of
 from ..io.measurement_csv import TargetPoses, read_targets
-from ..io.robot import is_table, read_robot
+from ..io.robot import has_dh_table, read_robot
 from ..io.tabular import csv_text
 from ..robot.chain import Chain
 from ..units import ANGLES, LENGTHS
@@ -29,7 +29,7 @@ def run(args: Namespace) -> int:
     """Reads both robots with their sidecars and the targets, writes the corrected ones, names the others."""
     given = [args.nominal, args.calibrated]
     require_writable_outputs([args.output], [*given, *sidecars(given), args.targets])
-    nominal, calibrated = (read_robot(path, None if is_table(path) else args.tip) for path in given)
+    nominal, calibrated = (read_robot(path, None if has_dh_table(path) else args.tip) for path in given)
     if nominal.tip != calibrated.tip and args.tip is None:
         raise DhcalError(
             f"{args.calibrated}: its tip is {calibrated.tip!r}, that of {args.nominal} is {nominal.tip!r}; "

@@ -37,10 +37,10 @@ def require_writable_outputs(outputs: Sequence[str | None], inputs: Sequence[str
         require_writable(path)
 
 
-def require_urdf_ending(path: str, other: str = "") -> None:
-    """Complains about a path of a URDF to write that does not end like one; `other` is what else could be."""
+def require_urdf_ending(path: str) -> None:
+    """Raise DhcalError unless the path of a URDF to write ends with .urdf."""
     if not path.lower().endswith(".urdf"):
-        raise DhcalError(f"{path}: unknown ending; write a URDF as .urdf {other}".rstrip())
+        raise DhcalError(f"{path}: unknown ending; write a URDF as .urdf")
 
 
 def write_json(target: str | None, content: object) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from ..exceptions import DhcalError
 from ..io.atomic import write_files
 from ..io.measurement_csv import measurement_text
-from ..io.robot import is_table, read_robot
+from ..io.robot import has_dh_table, read_robot
 from ..measurements import KINDS
 from ..measurements.base import Noise
 from ..robot.sampling import joint_range
@@ -30,7 +30,7 @@ def simulate(args: Namespace) -> int:
         raise DhcalError(f"--kind {args.kind}: choose from {', '.join(KINDS)}")
     chain = truth = read_robot(args.robot, args.tip)
     if args.truth:
-        truth = read_robot(args.truth, None if is_table(args.truth) else args.tip)
+        truth = read_robot(args.truth, None if has_dh_table(args.truth) else args.tip)
         if truth.joint_names != chain.joint_names:
             raise DhcalError(
                 f"{args.truth}: its joints are {', '.join(truth.joint_names)}; "

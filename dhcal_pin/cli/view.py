@@ -11,7 +11,7 @@ import numpy as np
 from ..exceptions import DhcalError
 from ..io.atomic import write_files
 from ..io.measurement_csv import read_measurements
-from ..io.robot import is_table, read_robot, robot_name
+from ..io.robot import has_dh_table, read_robot, robot_name
 from ..io.sidecar import existing_sidecar, read_instrument, read_uncertainty
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
@@ -28,7 +28,7 @@ def view(args: Namespace) -> int:
     beside = sidecars(given)
     page = args.html or os.path.join(tempfile.mkdtemp(prefix="dhcal-"), f"{robot_name(args.nominal)}.html")
     require_writable_outputs([page], [*given, *beside, *args.data])
-    arms = [read_robot(path, None if is_table(path) else args.tip) for path in given]
+    arms = [read_robot(path, None if has_dh_table(path) else args.tip) for path in given]
     data = [read_measurements(path, arms[0]) for path in args.data]
     if args.live:
         return _live(arms, data, args)

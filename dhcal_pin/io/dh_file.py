@@ -12,8 +12,11 @@ import numpy as np
 from .. import se3
 from .._typing import Array, PathLike
 from ..exceptions import DhcalError
+from ..robot.chain import extract_dh_table
 from ..robot.dh import CONVENTIONS, DHTable
 from ..units import ANGLES, LENGTHS
+from .robot_format import ConvertedRobot, RobotSource
+from .sidecar import existing_sidecar
 from .tabular import Column, CsvTable, number, read_csv_table, read_toml, require_usable_names
 
 _UNITS = {"theta": ANGLES, "d": LENGTHS, "a": LENGTHS, "alpha": ANGLES, "beta": ANGLES}
@@ -29,11 +32,6 @@ _LARGEST = 1e300  # that still is a finite double in any unit
 
 
 _MAX_VALUE = 1e4  # m or rad: beyond it no robot, and no URDF
-
-
-def is_dh(path: PathLike) -> bool:
-    """Whether a path names a DH file: .toml or .csv."""
-    return os.fspath(path).lower().endswith((".toml", ".csv"))
 
 
 def read_dh(path: PathLike) -> DHTable:
@@ -240,6 +238,19 @@ def dh_text(table: DHTable, path: PathLike) -> str:
     ]
     text = _csv_text if os.fspath(path).lower().endswith(".csv") else _toml_text
     return "\n".join(text(table.convention, frames, keys, rows)) + "\n"
+
+
+def convert_to_dh(robot: RobotSource, path: PathLike) -> ConvertedRobot:
+    """Convert a robot to a DH file.
+
+    A table that already has the convention is written as it is; another one is extracted from the chain.
+    """
+    if robot.table is not None and robot.convention in (None, robot.table.convention):
+        return ConvertedRobot(dh_text(robot.table, path))
+    extraction = extract_dh_table(robot.chain, robot.convention or "standard")
+    sidecar = existing_sidecar(robot.path)
+    notes = [f"base, tool and joints in {sidecar} do not go to the table"] if sidecar else []
+    return ConvertedRobot(dh_text(extraction.table, path), [*extraction.notes, *notes])
 
 
 _Row = tuple[str, str, dict[str, float]]

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from .. import se3
-from .._typing import Array, PathLike
+from .._typing import PathLike
 from ..estimation.uncertainty import Uncertainty
-from ..exceptions import DhcalError
+from ..exceptions import DhcalError, FileFormatError, InvalidArgumentError
 from ..robot.chain import Chain
-from ..robot.dh import DHTable
-from ..robot.urdf import parse_urdf
+from ..robot.dh import Convention, DHTable
+from ..robot.urdf import parse_urdf, read_urdf
 from ..robot.urdf_edit import with_origins
-from ..se3 import to_xyz_rpy
 from .atomic import write_files
-from .dh_file import is_dh, read_dh, read_frame
+from .dh_file import convert_to_dh, read_dh, read_frame
+from .joint_origins import convert_to_origins, joint_origins
+from .robot_format import ConvertedRobot, RobotFormat, RobotSource
 from .sidecar import (
     existing_sidecar,
     payload_lines,
@@ -32,7 +32,7 @@ from .sidecar import (
     with_transmission,
 )
 from .tabular import read_toml
-from .ur_kinematics import ORIGIN_KEYS, read_ur_kinematics
+from .ur_kinematics import convert_to_ur_kinematics, read_ur_kinematics
 
 # A written URDF must read back as the same robot to this many metres and radians.
 READ_BACK_TOL = 1e-12
@@ -43,39 +43,149 @@ def robot_name(path: PathLike) -> str:
     return Path(path).name.split(".")[0] or "arm"
 
 
-def is_table(path: PathLike) -> bool:
-    """Whether a path names a DH file or UR's kinematics YAML."""
-    return is_dh(path) or os.fspath(path).lower().endswith((".yaml", ".yml"))
+def _urdf_of_table(robot: RobotSource, path: PathLike) -> ConvertedRobot:
+    """Convert a DH table to its exact URDF."""
+    if robot.table is None:
+        others = ", ".join(_endings(FORMATS[1:]))
+        raise InvalidArgumentError(f"{os.fspath(path)}: {robot.path} is already a URDF; choose from {others}")
+    if robot.convention is not None:
+        raise InvalidArgumentError(f"{robot.path}: a URDF has no DH convention; leave out --convention")
+    sidecar = existing_sidecar(path)
+    notes = [f"{sidecar} lies beside it and is read with it"] if sidecar else []
+    return ConvertedRobot(robot.chain.urdf.data.decode(), notes)
 
 
-def read_table(path: PathLike) -> DHTable:
-    """A DH table from a DH file, or from UR's kinematics YAML.
+# The formats that robots are read from and written to. An ending selects its row; the longest one wins.
+FORMATS = (
+    RobotFormat("URDF", (".urdf",), _urdf_of_table, read_urdf=read_urdf),
+    RobotFormat(
+        "DH table",
+        (".dh.toml", ".dh.csv"),
+        convert_to_dh,
+        read_table=read_dh,
+        other_endings=(".toml", ".csv"),
+    ),
+    RobotFormat(
+        "kinematics of Universal Robots",
+        (".yaml",),
+        convert_to_ur_kinematics,
+        read_table=read_ur_kinematics,
+        other_endings=(".yml",),
+    ),
+    RobotFormat("table of joint origins", (".origins.csv",), convert_to_origins),
+)
 
-    Raises:
-        DhcalError: the file is missing or wrong.
+
+def _endings(formats: Iterable[RobotFormat]) -> list[str]:
+    return [ending for robot_format in formats for ending in robot_format.endings]
+
+
+def find_format(path: PathLike) -> RobotFormat | None:
+    """Find the format of a robot file by the ending of its name.
+
+    Args:
+        path: Path of the file, which need not exist.
+
+    Returns:
+        Row of `FORMATS`; None if no format has the ending.
     """
-    return read_dh(path) if is_dh(path) else read_ur_kinematics(path)
+    name = os.fspath(path).lower()
+    by_ending = {
+        ending: robot_format
+        for robot_format in FORMATS
+        for ending in (*robot_format.endings, *robot_format.other_endings)
+        if name.endswith(ending)
+    }
+    return by_ending[max(by_ending, key=len)] if by_ending else None
+
+
+def formats_help() -> str:
+    """Return one line per robot file format, for help texts."""
+    width = max(len(robot_format.name) for robot_format in FORMATS)
+    lines = []
+    for robot_format in FORMATS:
+        endings = ", ".join((*robot_format.endings, *robot_format.other_endings))
+        note = "" if robot_format.is_readable else "; only written"
+        lines.append(f"  {robot_format.name:{width}}  {endings}{note}")
+    return "\n".join(["file formats of robots:", *lines])
+
+
+def has_dh_table(path: PathLike) -> bool:
+    """Return whether a path names a robot file that holds a DH table.
+
+    Args:
+        path: Path of the file, which need not exist.
+
+    Returns:
+        True if the robot has one tip only, so that it cannot be chosen by name.
+    """
+    robot_format = find_format(path)
+    return robot_format is not None and robot_format.read_table is not None
+
+
+def _read(path: PathLike, tip: str | None, sidecar: PathLike | None) -> tuple[Chain, DHTable | None]:
+    """Read the chain of a robot file and its sidecar, and its DH table if it has one."""
+    robot_format = find_format(path)
+    table = None
+    if robot_format is None:
+        chain = Chain.from_urdf(path, tip)
+    elif robot_format.read_table is not None:
+        if tip is not None:
+            raise InvalidArgumentError(f"{os.fspath(path)}: a DH table has one tip; leave out --tip")
+        table = robot_format.read_table(path)
+        chain = Chain.from_dh(table, robot_name(path))
+    elif robot_format.read_urdf is not None:
+        chain = Chain.from_urdf(robot_format.read_urdf(path), tip)
+    else:
+        readable = ", ".join(_endings(other for other in FORMATS if other.is_readable))
+        raise FileFormatError(
+            f"{os.fspath(path)}: a {robot_format.name} cannot be read as a robot; choose from {readable}"
+        )
+    sidecar = sidecar or existing_sidecar(path)
+    return (chain if sidecar is None else _with_sidecar(chain, sidecar)), table
 
 
 def read_robot(path: PathLike, tip: str | None = None, sidecar: PathLike | None = None) -> Chain:
-    """A chain from a URDF or a DH file, with what its sidecar holds where there is one.
+    """Read a robot and its sidecar.
 
     Args:
-        path: `.urdf`, a DH table as `.toml` or `.csv`, or UR's kinematics as `.yaml`.
-        tip: the tip link of a URDF.
-        sidecar: another sidecar than the one beside the robot.
+        path: File in one of `FORMATS`; a file with another ending is read as a URDF.
+        tip: Tip link of a URDF; the deepest leaf if None.
+        sidecar: Sidecar to read in place of the one beside the robot.
+
+    Returns:
+        The chain from the base link to the tip.
 
     Raises:
-        DhcalError: a file is missing or wrong.
+        DhcalError: A file is missing or invalid, or a tip is given for a DH table.
     """
-    if is_table(path):
-        if tip is not None:
-            raise DhcalError(f"{os.fspath(path)}: a DH table has one tip; leave out --tip")
-        chain = Chain.from_dh(read_table(path), robot_name(path))
-    else:
-        chain = Chain.from_urdf(path, tip)
-    sidecar = sidecar or existing_sidecar(path)
-    return chain if sidecar is None else _with_sidecar(chain, sidecar)
+    return _read(path, tip, sidecar)[0]
+
+
+def convert_robot(
+    source: PathLike, target: PathLike, tip: str | None = None, convention: Convention | None = None
+) -> ConvertedRobot:
+    """Convert a robot file to another format, chosen by the ending of the target.
+
+    Args:
+        source: File to read.
+        target: File to write; only its name is used.
+        tip: Tip link of a URDF; the deepest leaf if None.
+        convention: Convention of a DH table that is written.
+
+    Returns:
+        Text of the target file, and notes on what it could not hold.
+
+    Raises:
+        DhcalError: A file is missing or invalid, or the target's format cannot hold the robot.
+    """
+    robot_format = find_format(target)
+    if robot_format is None:
+        raise InvalidArgumentError(
+            f"{os.fspath(target)}: unknown ending; choose from {', '.join(_endings(FORMATS))}"
+        )
+    chain, table = _read(source, tip, None)
+    return robot_format.convert(RobotSource(os.fspath(source), chain, table, convention), target)
 
 
 def _with_sidecar(chain: Chain, path: PathLike) -> Chain:
@@ -96,31 +206,6 @@ def _with_sidecar(chain: Chain, path: PathLike) -> Chain:
             raise DhcalError(f"{os.fspath(path)}: [payload] is carried by {tip!r}; name that with --tip")
         placed = placed.with_payload(read_payload(raw["payload"], os.fspath(path)))
     return with_transmission(placed, raw["joint"], os.fspath(path)) if "joint" in raw else placed
-
-
-def joint_origins(chain: Chain) -> tuple[dict[str, Array], Array]:
-    """Each changed joint's own origin in its parent link, and the tool (4, 4) with what found no joint.
-
-    Fixed joints before a moving one stay, so that one's own origin takes up the change. A change of the
-    tip goes to the last fixed joint behind the last moving one, or to the tool where there is none.
-    """
-    nominal = Chain.from_urdf(chain.urdf, chain.tip)
-    out: dict[str, Array] = {}
-    before, moving, last = np.eye(4), 0, None
-    for joint in chain.urdf.path(chain.tip):
-        if joint.type != "fixed":
-            if not np.array_equal(chain.origins[moving], nominal.origins[moving]):
-                out[joint.name] = se3.inverse(before) @ chain.origins[moving]
-            before, moving, last = np.eye(4), moving + 1, None
-        else:
-            last = joint.name, before
-            before = before @ joint.origin
-    if np.array_equal(chain.origins[-1], nominal.origins[-1]):
-        return out, chain.tool
-    if last is None:
-        return out, se3.inverse(nominal.origins[-1]) @ chain.origins[-1] @ chain.tool
-    out[last[0]] = se3.inverse(last[1]) @ chain.origins[-1]
-    return out, chain.tool
 
 
 def urdf_files(
@@ -209,12 +294,3 @@ def write_urdf(fit: CalibratedRobot | Chain, path: PathLike) -> None:
         (None, None) if isinstance(fit, Chain) else (fit.transferable_instruments, fit.uncertainty)
     )
     write_files(urdf_files(chain, path, instrument, known))
-
-
-def origins_text(chain: Chain) -> str:
-    """CSV of every joint's own origin on the path, for people who keep their robot in xacro; m and rad."""
-    moved, _ = joint_origins(chain)
-    lines = ["joint," + ",".join(f"{k}[{'m' if k in 'xyz' else 'rad'}]" for k in ORIGIN_KEYS)]
-    for joint in chain.urdf.path(chain.tip):
-        lines.append(",".join([joint.name, *map(repr, to_xyz_rpy(moved.get(joint.name, joint.origin)))]))
-    return "\n".join(lines) + "\n"

@@ -17,6 +17,8 @@ from ..robot.chain import Chain, extract_dh_table
 from ..robot.dh import DHTable
 from ..robot.dh_extraction import extract_dh
 from ..se3 import to_xyz_rpy
+from .joint_origins import ORIGIN_KEYS
+from .robot_format import ConvertedRobot, RobotSource
 from .tabular import read_text
 
 # UR's joints and what its description calls their origins.
@@ -28,9 +30,6 @@ UR_JOINTS = {
     "wrist_2_joint": "wrist_2",
     "wrist_3_joint": "wrist_3",
 }
-
-
-ORIGIN_KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
 def _ur_names(chain: Chain) -> Mapping[str, str]:
@@ -107,3 +106,8 @@ def read_ur_kinematics(path: PathLike) -> DHTable:
     origins.append(np.eye(4))
     six = np.zeros(6)
     return extract_dh(origins, list(UR_JOINTS), six, six - np.inf, six + np.inf, "modified").table
+
+
+def convert_to_ur_kinematics(robot: RobotSource, path: PathLike) -> ConvertedRobot:
+    """Convert a robot to UR's kinematics YAML."""
+    return ConvertedRobot(ur_kinematics_text(robot.chain))

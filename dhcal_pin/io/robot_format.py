@@ -1,0 +1,72 @@
+"""Robot file formats: how files of one format are recognized, read and written.
+
+A format is one module of this package with its functions, and one row of `robot.FORMATS`. Two kinds of
+robot description can be read: a DH table, whose only tip is the end of its last row, and a URDF, whose tip is
+chosen by name. Every format is written from a `RobotSource`, the robot that is to be converted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from .._typing import PathLike
+from ..robot.chain import Chain
+from ..robot.dh import Convention, DHTable
+from ..robot.urdf import Urdf
+
+
+@dataclass(frozen=True)
+class RobotSource:
+    """Robot that is to be written in another format.
+
+    Attributes:
+        path: File that the robot was read from.
+        chain: The robot with base, tool and joint errors from its sidecar.
+        table: DH table of the file; None if the format holds none.
+        convention: Convention requested for a DH table; None if any will do.
+    """
+
+    path: str
+    chain: Chain
+    table: DHTable | None
+    convention: Convention | None
+
+
+class ConvertedRobot(NamedTuple):
+    """Text of a robot file, and notes on what the format could not hold.
+
+    Attributes:
+        text: Content of the file.
+        notes: One sentence each.
+    """
+
+    text: str
+    notes: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class RobotFormat:
+    """File format of a robot.
+
+    Attributes:
+        name: Name in help texts and messages.
+        endings: Recommended endings of file names, lower case.
+        convert: Function that returns the text of a robot at a path.
+        read_table: Function that reads a DH table; None if the format holds none.
+        read_urdf: Function that reads a URDF; None if the format holds none.
+        other_endings: Endings that are accepted, too.
+    """
+
+    name: str
+    endings: tuple[str, ...]
+    convert: Callable[[RobotSource, PathLike], ConvertedRobot]
+    read_table: Callable[[PathLike], DHTable] | None = None
+    read_urdf: Callable[[PathLike], Urdf] | None = None
+    other_endings: tuple[str, ...] = ()
+
+    @property
+    def is_readable(self) -> bool:
+        """Whether robots can be read from the format."""
+        return self.read_table is not None or self.read_urdf is not None
