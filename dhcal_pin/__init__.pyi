@@ -19,7 +19,7 @@ from .estimation.parameters import select_parameters as select_parameters
 from .estimation.uncertainty import Prediction as Prediction
 from .exceptions import DhcalError as DhcalError
 from .io.dh_file import read_dh as read_dh
-from .io.measurement_csv import file_parts as file_parts
+from .io.measurement_csv import iter_measurements as iter_measurements
 from .io.measurement_csv import read_measurements as read_measurements
 from .io.measurement_csv import read_targets as read_targets
 from .io.robot import read_robot as read_robot

@@ -54,7 +54,7 @@ def table(text: str) -> dict[str, list[str]]:
 
 RENAMES = table("""
 Batch=BatchProblem Space=WorkspaceConstraints Touch=PointContact extend=select_error_families
-extract=extract_dh_table|extract_dh file_parts=iter_measurements group_folds=leave_one_group_out random_folds=k_fold
+extract=extract_dh_table|extract_dh iter_measurements=iter_measurements group_folds=leave_one_group_out random_folds=k_fold
 region_folds=blocked_folds select=select_parameters solve=solve_batch
 aside=n_rejected at=perturbed carrying=with_payload chain=robot enough=recommended_size expected=prior_std
 freedom=degrees_of_freedom frames=row_frames gross=n_outliers helps=is_significant
@@ -638,7 +638,7 @@ def streams(lab: Lab) -> dict[str, Any]:
     data = lab.places(lab.six_true, 600, 17, None)
     path = lab.folder.parent / VARIANTS[0] / "simulate-pose/data.csv"
     parts = [data.take(slice(i, i + 150)) for i in range(0, 600, 150)]
-    stream, read = lab.dh.calibrate_stream, lab.dh.file_parts
+    stream, read = lab.dh.calibrate_stream, lab.dh.iter_measurements
     return {
         "memory": pick(stream(lab.six, lambda: parts, "minimal,base,tool"), names),
         "file": pick(stream(lab.six, lambda: read(path, lab.six, 8), "dh"), names),

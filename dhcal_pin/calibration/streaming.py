@@ -119,7 +119,7 @@ def calibrate_stream(
 
     Args:
         chain: the nominal robot.
-        parts: gives the parts anew at each call, as `lambda: file_parts("laser.csv", chain)`; some thousand
+        parts: gives the parts anew at each call, as `lambda: iter_measurements("laser.csv", chain)`; some thousand
             samples a part are best.
         parameters: sets of `parameters.SETS`; the chain's own default without it.
         method: "lm", or "gn" for the paper's loop.

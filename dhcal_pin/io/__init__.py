@@ -5,7 +5,7 @@ from .dh_file import dh_text, read_dh
 from .measurement_csv import (
     MeasurementFile,
     TargetPoses,
-    file_parts,
+    iter_measurements,
     measurement_text,
     read_measurement_file,
     read_measurements,
@@ -20,7 +20,7 @@ __all__ = [
     "MeasurementFile",
     "TargetPoses",
     "dh_text",
-    "file_parts",
+    "iter_measurements",
     "measurement_text",
     "read_bounds",
     "read_dh",

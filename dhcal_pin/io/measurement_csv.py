@@ -317,7 +317,9 @@ def configurations_text(q: Array, chain: Chain, comments: Sequence[str]) -> str:
 Part = Measurement | Callable[[], Measurement]
 
 
-def file_parts(path: PathLike, chain: Chain, rows: int = CHUNK_SIZE) -> Iterator[Callable[[], Measurement]]:
+def iter_measurements(
+    path: PathLike, chain: Chain, rows: int = CHUNK_SIZE
+) -> Iterator[Callable[[], Measurement]]:
     """The fitted rows of a measurement file, at most so many a part, each read only when it is called.
 
     The file must lie where the parts are read: on a cluster, on a disk that all workers see.

@@ -13,7 +13,7 @@ from dhcal_pin.calibration.evaluation import accuracy
 from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.calibration.streaming import calibrate_stream
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io.measurement_csv import file_parts, measurement_text
+from dhcal_pin.io.measurement_csv import iter_measurements, measurement_text
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.length import Wires
 from dhcal_pin.measurements.pose import Pose
@@ -36,7 +36,7 @@ def laser(tmp_path, sim_6dof_actual):
 
 def test_a_stream_tells_what_memory_tells(laser, sim_6dof):
     path, data = laser
-    parts = partial(file_parts, path, sim_6dof, 64)
+    parts = partial(iter_measurements, path, sim_6dof, 64)
     assert [len(part().rows) for part in parts()] == [64] * 15 + [40]
     found = calibrate_stream(sim_6dof, parts, "minimal,base,tool", priors="none")
     fit = calibrate(sim_6dof, data, "minimal,base,tool", priors="none")
@@ -65,7 +65,7 @@ def test_sigmas_are_told_by_the_first_part(sim_6dof, sim_6dof_actual):
 
 def test_processes_give_the_same_digits(laser, sim_6dof):
     path, data = laser
-    parts = partial(file_parts, path, sim_6dof, 100)
+    parts = partial(iter_measurements, path, sim_6dof, 100)
     alone = calibrate_stream(sim_6dof, parts, "dh")
     with open_executor(jobs=2) as where:
         np.testing.assert_array_equal(calibrate_stream(sim_6dof, parts, "dh", executor=where).x, alone.x)
@@ -115,7 +115,7 @@ def test_wrong_streams_are_named(laser, tmp_path, sim_6dof, sim_6dof_actual):
     with pytest.raises(DhcalError, match="no measurements"):
         calibrate_stream(sim_6dof, tuple, "dh")
     with pytest.raises(DhcalError, match="cannot read it"):
-        calibrate_stream(sim_6dof, partial(file_parts, tmp_path / "none.csv", sim_6dof), "dh")
+        calibrate_stream(sim_6dof, partial(iter_measurements, tmp_path / "none.csv", sim_6dof), "dh")
     rng = np.random.default_rng(0)
     wires = Wires.simulate(sim_6dof_actual, rng.uniform(-3, 3, (40, 6)), Noise(1e-4), rng)
     with pytest.raises(DhcalError, match=r"wire1\.x is unknown; a stream needs"):
@@ -125,4 +125,4 @@ def test_wrong_streams_are_named(laser, tmp_path, sim_6dof, sim_6dof_actual):
     lines[number] = "x" + lines[number]
     path.write_text("\n".join(lines))
     with pytest.raises(DhcalError, match=rf"laser\.csv:{number + 1}: column 'joint_1'"):
-        calibrate_stream(sim_6dof, partial(file_parts, path, sim_6dof, 64), "dh")
+        calibrate_stream(sim_6dof, partial(iter_measurements, path, sim_6dof, 64), "dh")

@@ -13,7 +13,7 @@ from test_study import MANY, table_of
 
 from dhcal_pin.calibration.streaming import calibrate_stream
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io.measurement_csv import file_parts, measurement_text
+from dhcal_pin.io.measurement_csv import iter_measurements, measurement_text
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.position import Position
 from dhcal_pin.parallel import open_executor
@@ -69,7 +69,7 @@ def test_a_stream_gives_the_same_digits_with_a_worker_lost(cluster, tmp_path, si
     data = Position.simulate(sim_6dof_actual, rng.uniform(-3, 3, (1200, 6)), Noise(1e-4), rng)
     path = tmp_path / "laser.csv"
     path.write_text(measurement_text(data, sim_6dof))
-    parts = partial(file_parts, path, sim_6dof, 100)
+    parts = partial(iter_measurements, path, sim_6dof, 100)
     here = calibrate_stream(sim_6dof, parts, "dh")
     with open_executor(scheduler=cluster.scheduler_address) as where, distributed.Client(cluster) as client:
         client.wait_for_workers(2)
