@@ -8,15 +8,17 @@ from .cross_validation import (
     k_fold,
     leave_one_group_out,
 )
-from .evaluation import Comparison, accuracy
+from .evaluation import Accuracy, Comparison, ErrorStatistics, accuracy
 from .model_selection import FamilyTrial, extend
 from .procedure import Method, calibrate, split
 from .result import Result
 from .streaming import StreamResult, calibrate_stream
 
 __all__ = [
+    "Accuracy",
     "Comparison",
     "CrossValidation",
+    "ErrorStatistics",
     "FamilyTrial",
     "Fold",
     "Method",

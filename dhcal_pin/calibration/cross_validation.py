@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import lstsq
@@ -20,7 +20,7 @@ from ..estimation.problem import Problem, linearize_and_factor, merge_instrument
 from ..estimation.qr import TriangularSystem
 from ..exceptions import DhcalError
 from ..measurements.base import Measurement
-from .evaluation import compute_errors, error_statistics
+from .evaluation import Accuracy, compute_errors
 
 if TYPE_CHECKING:
     from .result import Result
@@ -207,7 +207,7 @@ def factor_folds(
     for fold in folds:
         found.append(_split(problem, x, fold)[1])
         if progress:
-            progress(len(found), found[-1].fitted.rest)
+            progress(len(found), found[-1].fitted.min_cost)
     return tuple(found)
 
 
@@ -283,9 +283,9 @@ class CrossValidation:
         accuracy: the same as a fold's, of all folds' samples together.
     """
 
-    folds: tuple[dict[str, Any], ...]
+    folds: tuple[Accuracy, ...]
     errors: Array
-    accuracy: dict[str, Any]
+    accuracy: Accuracy
 
 
 def standard_error(values: Array) -> float:
@@ -315,7 +315,7 @@ def cross_validate(fit: Result, folds: Sequence[Fold] | None = None) -> CrossVal
     judged = list(cross_validate_folds(fit.problem, fit.solution.x, fit.data, folds, fit.refit))
     every = [item for found, _ in judged for item in found]
     return CrossValidation(
-        tuple(error_statistics(found) for found, _ in judged),
+        tuple(Accuracy.from_errors(found) for found, _ in judged),
         np.array([error for _, error in judged]),
-        error_statistics(every),
+        Accuracy.from_errors(every),
     )

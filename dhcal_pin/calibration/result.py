@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -27,10 +26,10 @@ from . import estimates, summary
 from .cross_validation import cross_validate_folds, k_fold
 from .estimates import Estimate
 from .evaluation import (
+    Accuracy,
     Comparison,
     accuracy,
     compute_errors,
-    error_statistics,
     remove_outliers,
 )
 from .initialization import fit_frames
@@ -308,10 +307,11 @@ class Result:
         found = (Comparison("fitted", count, before, accuracy(self.chain, kept, self.instruments), aside),)
         if self.holdout:
             errors = compute_errors(self.chain, self.holdout, self.instruments)
-            before, (clean, gross) = accuracy(self.nominal_refitted, self.holdout), remove_outliers(errors)
+            before, after = accuracy(self.nominal_refitted, self.holdout), Accuracy.from_errors(errors)
+            clean, gross = remove_outliers(errors)
             held = sum(len(item.rows) for item in self.holdout)
-            without = error_statistics(clean) if gross else {}
-            return (Comparison("held out", held, before, error_statistics(errors), 0, gross, without), *found)
+            without = Accuracy.from_errors(clean) if gross else Accuracy()
+            return (Comparison("held out", held, before, after, 0, gross, without), *found)
         if count < 2:
             return found
         folds = k_fold(kept, min(N_FOLDS, count))
@@ -323,7 +323,7 @@ class Result:
             )
             for item in fold
         ]
-        return (Comparison("cross-validated", count, before, error_statistics(judged), aside), *found)
+        return (Comparison("cross-validated", count, before, Accuracy.from_errors(judged), aside), *found)
 
     def refit(self, problem: Problem) -> Array:
         """Where a fit of some of the samples ends (p,); the same loop stopped as early if this one was.
@@ -360,7 +360,7 @@ class Result:
         said = f"<p><strong>{summary.headline(self.comparisons).text}</strong></p>{doubt}"
         return "\n".join([said, *map(formatting.html_table, found)])
 
-    def validate(self, data: Measurement | Sequence[Measurement]) -> dict[str, Any]:
+    def validate(self, data: Measurement | Sequence[Measurement]) -> Accuracy:
         """Accuracy of the calibrated chain on other data: position in m, orientation in rad."""
         data = (data,) if not isinstance(data, Sequence) else data
         return accuracy(self.chain, data, self.instruments)

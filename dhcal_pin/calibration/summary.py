@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from ..formatting import SMALL_UNITS, Table, format_fixed, format_quantity, significant_decimals
 from .estimates import Estimate
-from .evaluation import UNIT_SUFFIXES, Comparison
+from .evaluation import Comparison
 
 # Fewer samples than this do not tell an accuracy; a longer text than this may be broken into lines.
 MIN_SAMPLES = 10
@@ -45,23 +45,15 @@ def accuracy_table(comparisons: Sequence[Comparison]) -> Table:
     """Before and after, held out and fitted, a line each; lengths in mm, angles in mrad."""
     rows = []
     for c in comparisons:
-        for group, end in UNIT_SUFFIXES.items():
-            if f"{group}_rms{end}" not in c.after:
-                continue
-            factor, unit = SMALL_UNITS[end.strip("_") or "m"]
+        for group, after in c.after.groups.items():
+            factor, unit = SMALL_UNITS[after.unit]
             for state, side in (("before", c.before), ("after", c.after)):
-                places = significant_decimals(factor * side[f"{group}_rms_std{end}"])
-                figures = [side[f"{group}_{key}{end}"] for key in STATISTIC_LABELS]
-                figures += side.get(f"{group}_axes_rms{end}", [math.nan] * 3)
-                cells = [format_fixed(factor * figure, places) for figure in figures]
-                rows.append(
-                    [
-                        f"{c.after[f'{group}_samples']} {c.title}",
-                        f"{GROUP_LABELS[group]},{unit}",
-                        state,
-                        *cells,
-                    ]
-                )
+                statistics = side.groups[group]
+                places = significant_decimals(factor * statistics.rms_std)
+                values = [getattr(statistics, key) for key in STATISTIC_LABELS]
+                values += statistics.axes_rms or [math.nan] * 3
+                cells = [format_fixed(factor * value, places) for value in values]
+                rows.append([f"{after.samples} {c.title}", f"{GROUP_LABELS[group]},{unit}", state, *cells])
     axes = [f"{axis}, RMS" for axis in "xyz"]
     return Table(
         ["samples", "error", "calibration", *STATISTIC_LABELS.values(), *axes], rows, n_text_columns=3
@@ -76,7 +68,7 @@ class Headline:
         text: in words.
         before, after: the figures with their unit.
         percent_reduction: how much smaller in percent; negative where the error grew.
-        group: of ENDINGS.
+        group: name of the group of errors, see `evaluation.GROUP_UNITS`.
         comparison: the accuracy it is of, with as many samples as the group has.
     """
 
@@ -91,28 +83,25 @@ class Headline:
 def headline(comparisons: Sequence[Comparison]) -> Headline:
     """The error on what was not fitted where there is such, and an honest word where there is not."""
     best = comparisons[0]
-    group = next(group for group in UNIT_SUFFIXES if f"{group}_rms{UNIT_SUFFIXES[group]}" in best.after)
-    best = replace(best, n_samples=best.after[f"{group}_samples"])
-    end = UNIT_SUFFIXES[group]
-    unit = end.strip("_") or "m"
-    key, spread = f"{group}_rms{end}", f"{group}_rms_std{end}"
-    before, after = (
-        format_quantity(side[key], unit, side[spread], True) for side in (best.before, best.after)
+    group, after = next(iter(best.after.groups.items()))
+    before = best.before.groups[group]
+    best = replace(best, n_samples=after.samples)
+    before_text, after_text = (
+        format_quantity(side.rms, side.unit, side.rms_std, True) for side in (before, after)
     )
-    what = f"RMS {GROUP_LABELS[group]} {describe_samples(best)}: {before} before, {after} after"
-    if best.after_without_outliers and best.after_without_outliers[key] < OUTLIER_RMS_RATIO * best.after[key]:
-        clean = format_quantity(
-            best.after_without_outliers[key], unit, best.after_without_outliers[spread], True
-        )
-        what += f", {clean} without {_outlier_count(best.n_outliers)} among them"
+    what = f"RMS {GROUP_LABELS[group]} {describe_samples(best)}: {before_text} before, {after_text} after"
+    clean = best.after_without_outliers.groups.get(group)
+    if clean and clean.rms < OUTLIER_RMS_RATIO * after.rms:
+        clean_text = format_quantity(clean.rms, clean.unit, clean.rms_std, True)
+        what += f", {clean_text} without {_outlier_count(best.n_outliers)} among them"
     what += f". {_outlier_count(best.n_rejected).capitalize()} left aside." if best.n_rejected else "."
     text = (
         f"{what} {small_sample_note(best)}".strip()
         if best.title != "fitted"
         else f"Nothing was held out. {what}"
     )
-    drop = 100 * (1 - best.after[key] / best.before[key]) if best.before[key] else 0.0
-    return Headline(text, before, after, drop, group, best)
+    drop = 100 * (1 - after.rms / before.rms) if before.rms else 0.0
+    return Headline(text, before_text, after_text, drop, group, best)
 
 
 def regressions(comparisons: Sequence[Comparison]) -> list[str]:

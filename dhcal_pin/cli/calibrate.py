@@ -12,7 +12,6 @@ import numpy as np
 
 from .._typing import PathLike
 from ..calibration import model_selection, procedure, summary
-from ..calibration.evaluation import UNIT_SUFFIXES
 from ..calibration.model_selection import FULL_SET, is_restricted
 from ..calibration.result import Result
 from ..diagnostics.input_checks import find_input_warnings, poorly_fitted_files
@@ -350,13 +349,13 @@ def improvement_hint(fit: Result, chain: Chain, data: Sequence[Measurement], **o
         options: of `calibrate`, as for the fit.
     """
     now = fit.comparisons[0]
-    group = next(group for group in UNIT_SUFFIXES if f"{group}_rms{UNIT_SUFFIXES[group]}" in now.after)
-    key = f"{group}_rms{UNIT_SUFFIXES[group]}"
-    if now.after[key] < EXACT_FIT_RATIO * now.before[key]:
+    group, after = next(iter(now.after.groups.items()))
+    if after.rms < EXACT_FIT_RATIO * now.before.groups[group].rms:
         return ""
     wider = procedure.calibrate(chain, data, FULL_SET, **options)
     then = wider.comparisons[0]
-    if now.title == "fitted" or not wider.converged or then.after[key] > MAX_ERROR_RATIO * now.after[key]:
+    is_worse = then.after.groups[group].rms > MAX_ERROR_RATIO * after.rms
+    if now.title == "fitted" or not wider.converged or is_worse:
         return ""
     left, of = summary.headline([then]), summary.headline([now])
     return (

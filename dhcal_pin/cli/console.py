@@ -6,14 +6,14 @@ import webbrowser
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import Progress as Bar
 from rich.table import Table as Grid
 from rich.text import Text
 
-from ..calibration.evaluation import UNIT_SUFFIXES
+from ..calibration.evaluation import GROUP_UNITS, Accuracy
 from ..calibration.model_selection import FamilyTrial, trial_table
 from ..calibration.result import Result
 from ..calibration.summary import (
@@ -179,16 +179,14 @@ def open_url(url: str) -> None:
         print_lines(f"no browser here; open {url}")
 
 
-def print_validation(title: str, found: Mapping[str, Mapping[str, Any]]) -> None:
+def print_validation(title: str, found: Mapping[str, Accuracy]) -> None:
     """Accuracies of a model on data, by what was done before."""
     rows = []
-    for group, end in UNIT_SUFFIXES.items():
+    for group in GROUP_UNITS:
+        measured = [one.groups[group] for one in found.values() if group in one.groups]
         for key, word in STATISTIC_LABELS.items():
-            name, spread = f"{group}_{key}{end}", f"{group}_rms_std{end}"
             cells = [
-                format_quantity(one[name], end.strip("_") or "m", one[spread], small=True)
-                for one in found.values()
-                if name in one
+                format_quantity(getattr(one, key), one.unit, one.rms_std, small=True) for one in measured
             ]
             rows += [[f"{GROUP_LABELS[group]}, {word}", *cells]] if cells else []
     print_table(title, Table(["error", *found], rows))

@@ -6,11 +6,9 @@ Wrong input is found before anything is written or shown; JSON goes to stdout, a
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Mapping
-from typing import Any
 
 from ..calibration import procedure
-from ..calibration.evaluation import accuracy
+from ..calibration.evaluation import Accuracy, accuracy
 from ..diagnostics.input_checks import find_input_warnings
 from ..diagnostics.reachability import find_unreachable_rows
 from ..estimation.uncertainty import Predictor
@@ -46,7 +44,7 @@ def validate(args: Namespace) -> int:
     require_common_reference_target(dict(zip(args.data, data, strict=True)), surveyed)
     known = {name: value for name, value in surveyed.items() if name in there}
     given = accuracy(chain, data, known)
-    found: dict[str, Mapping[str, Any]] = {"base and tool as given": given}
+    found: dict[str, Accuracy] = {"base and tool as given": given}
     if args.fit_frames:
         # Whatever is judged counts.
         fit = procedure.calibrate(chain, data, "base,tool", known=known, loss="linear")

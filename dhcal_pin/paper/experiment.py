@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from .._typing import Array
-from ..calibration.evaluation import Comparison, accuracy, compute_errors, error_statistics
+from ..calibration.evaluation import Accuracy, Comparison, accuracy, compute_errors
 from ..calibration.procedure import calibrate
 from ..calibration.result import Result
 from ..diagnostics.reachability import UnreachableRow, find_unreachable_rows
@@ -41,11 +40,11 @@ def parameters_to_fix(chain: Chain, data: Sequence[Measurement]) -> list[str]:
     return sorted(held)
 
 
-def leave_one_out(fit: Callable[[Measurement], Result], data: Measurement) -> dict[str, Any]:
+def leave_one_out(fit: Callable[[Measurement], Result], data: Measurement) -> Accuracy:
     """Accuracy, as from `accuracy`, on each sample under the fit to all the others."""
     rows = np.arange(len(data.q))
     found = [compute_errors(fit(data.take(rows != row)).chain, [data.take(rows == row)])[0] for row in rows]
-    return error_statistics(found)
+    return Accuracy.from_errors(found)
 
 
 def _rms(difference: Array) -> float:

@@ -116,7 +116,7 @@ def result_to_dict(
         "after": main_statistics(found["fitted"].after),
         "holdout_before": main_statistics(held.before) if held else {},
         "holdout_after": main_statistics(held.after) if held else {},
-        "comparisons": [asdict(comparison) for comparison in fit.comparisons],
+        "comparisons": [comparison.to_dict() for comparison in fit.comparisons],
         "parameters": [_select_keys(asdict(estimate), _PARAMETER) for estimate in fit.estimates],
         "priors": {estimate.name: estimate.prior for estimate in fit.estimates if not estimate.fixed},
         "shrinkage_factor": fit.shrinkage_factor,

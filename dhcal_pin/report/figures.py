@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from .._typing import Array
-from ..calibration.evaluation import UNIT_SUFFIXES, compute_errors, error_norms
+from ..calibration.evaluation import GROUP_UNITS, compute_errors, error_norms
 from ..calibration.summary import GROUP_LABELS
 from ..diagnostics.residuals import JointProfile
 from ..estimation import qr
@@ -31,7 +31,7 @@ MAX_PANELS = 4
 
 
 def _unit(group: str) -> tuple[float, str]:
-    factor, name = SMALL_UNITS[UNIT_SUFFIXES[group].strip("_") or "m"]
+    factor, name = SMALL_UNITS[GROUP_UNITS[group]]
     return factor, name.strip()
 
 
@@ -108,7 +108,7 @@ def by_sample(study: ReportContext) -> list[str]:
     """Errors after calibration over the samples' order, a panel a group."""
     found, out = _places(study), []
     several = len(set(study.names) | set(study.holdout_names)) > 1
-    for group in UNIT_SUFFIXES:
+    for group in GROUP_UNITS:
         mine = [(title, rows, size[group], bad) for title, rows, size, bad in found if group in size]
         if not mine:
             continue
@@ -142,8 +142,7 @@ def by_joint(study: ReportContext) -> list[str]:
     traces = study.joint_profiles
     if not traces:
         return []
-    group = next(iter(study.fit.comparisons)).after
-    name = next(g for g in UNIT_SUFFIXES if f"{g}_rms{UNIT_SUFFIXES[g]}" in group)
+    name = next(iter(study.fit.comparisons[0].after.groups))
     factor, unit = _unit(name)
     out = []
     y = axis_over(

@@ -11,7 +11,7 @@ from pathlib import Path
 from .. import formatting
 from .._typing import PathLike
 from ..calibration import summary
-from ..calibration.evaluation import UNIT_SUFFIXES, Comparison
+from ..calibration.evaluation import Comparison
 from ..calibration.result import Result
 from ..calibration.summary import GROUP_LABELS, STATISTIC_LABELS
 from ..diagnostics.residuals import Workspace
@@ -100,7 +100,7 @@ def _head(found: ReportContext) -> str:
             "calibrate with --holdout 0.3, or validate on other measurements, to judge the arm."
         )
     big = [("before", "before, RMS", head.before), ("after", "after, RMS", head.after)]
-    if best.before[f"{head.group}_rms{UNIT_SUFFIXES[head.group]}"]:
+    if best.before.groups[head.group].rms:
         big.append(
             (
                 "",
@@ -139,23 +139,17 @@ def _figures(rows: Sequence[tuple[str, str, str]], look: str) -> str:
 def _details(best: Comparison, chosen: str) -> list[tuple[str, str, str]]:
     """The headline's other measures, and the RMS of other groups, after calibration."""
     out = []
-    for group, end in UNIT_SUFFIXES.items():
-        unit = end.strip("_") or "m"
+    for group, after in best.after.groups.items():
         for key, word in STATISTIC_LABELS.items():
-            name = f"{group}_{key}{end}"
-            if (
-                name in best.after
-                and ((group == chosen) == (key in ("p95", "max")))
-                and (group == chosen or key == "rms")
-            ):
-                std = best.after[f"{group}_rms_std{end}"]
-                value = format_quantity(best.after[name], unit, std, small=True)
-                if group != chosen:
-                    value = f"{format_quantity(best.before[name], unit, std, small=True)} → {value}"
-                    word = f"{GROUP_LABELS[group]}, {word}"
-                else:
-                    word = f"after, {word}"
-                out.append(("", word, value))
+            if group == chosen and key in ("p95", "max"):
+                value = format_quantity(getattr(after, key), after.unit, after.rms_std, small=True)
+                out.append(("", f"after, {word}", value))
+            elif group != chosen and key == "rms":
+                before, value = (
+                    format_quantity(one.rms, after.unit, after.rms_std, small=True)
+                    for one in (best.before.groups[group], after)
+                )
+                out.append(("", f"{GROUP_LABELS[group]}, {word}", f"{before} → {value}"))
     return out
 
 

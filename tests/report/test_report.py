@@ -16,7 +16,7 @@ import pytest
 from robots import URDF, missing, paper, robot_file
 
 from dhcal_pin import Provenance, formatting, se3, write_report
-from dhcal_pin.calibration.evaluation import accuracy, error_statistics
+from dhcal_pin.calibration.evaluation import accuracy
 from dhcal_pin.calibration.procedure import calibrate, split
 from dhcal_pin.calibration.result import Result
 from dhcal_pin.cli import main
@@ -81,27 +81,6 @@ def test_rates_and_pure_numbers():
     assert formatting.format_quantity(1.2346e-5, "rad/Nm", 1e-7) == "12.35 µrad/Nm"
     assert formatting.format_quantity(-2.5e-3, "rad/rad", 4e-4, small=True) == "-2.5 mrad/rad"
     assert formatting.format_quantity(-0.00125, "1", 1e-5) == "-0.00125"
-
-
-def test_the_standard_error_of_an_rms_is_its_scatter():
-    rng = np.random.default_rng(1)
-    runs = [error_statistics([{"position": rng.standard_normal((200, 3))}]) for _ in range(400)]
-    scatter = np.std([run["position_rms_m"] for run in runs])
-    stated = np.mean([run["position_rms_std_m"] for run in runs])
-    assert stated == pytest.approx(scatter, rel=0.15)
-
-
-def test_accuracy_by_hand():
-    error = np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 2.0]])
-    found = error_statistics(
-        [{"position": error[:2]}, {"position": error[2:], "orientation": np.zeros((1, 3))}]
-    )
-    assert found["position_mean_m"] == pytest.approx(8 / 3)
-    assert found["position_rms_m"] == pytest.approx(np.sqrt(10))
-    assert found["position_max_m"] == 5
-    assert found["position_p95_m"] == pytest.approx(2 + 0.9 * 3)
-    assert found["position_axes_rms_m"] == pytest.approx([np.sqrt(3), 4 / np.sqrt(3), np.sqrt(5 / 3)])
-    assert found["orientation_rms_rad"] == 0
 
 
 def test_a_joint_that_waves_is_seen_in_that_joint_alone():
