@@ -53,6 +53,7 @@ def table(text: str) -> dict[str, list[str]]:
 
 
 RENAMES = table("""
+chance=p_value
 Batch=BatchProblem Space=WorkspaceConstraints Touch=PointContact extend=select_error_families
 extract=extract_dh_table|extract_dh iter_measurements=iter_measurements group_folds=leave_one_group_out random_folds=k_fold
 region_folds=blocked_folds select=select_parameters solve=solve_batch
@@ -60,15 +61,16 @@ aside=n_rejected at=perturbed carrying=with_payload chain=robot enough=recommend
 freedom=degrees_of_freedom frames=row_frames gross=n_outliers helps=is_significant
 hidden=unbounded_directions holds=agrees kept=shrinkage_factor|shrinkage|is_selected|is_kept miss=residual_error noise=unit_weight_std
 of=from_arrays|from_models portable=transferable_instruments random=random_error ratio=relative_error
-reference=nominal_refitted remaining=posterior_to_prior_std rest=residual_cost root=sqrt_covariance
+reference=nominal_refitted remaining=posterior_to_prior_std rest=min_cost|residual_cost targets=values unknowns=instrument_parameters root=sqrt_covariance
 samples=n_samples scores=standardized_residuals|studentized_residuals seen=observable_fraction
-triangle=system|triangular_system weakly_seen=weakly_observable without=without_outliers
+triangle=system|triangular_system weakly_seen=weakly_observable without=after_without_outliers
 learnt=prior_uncertainty space=constraints|workspace
 """)
 KEY_RENAMES = table("""
 kept=shrinkage_factor|shrinkage|is_selected|is_kept held_back=shrinkage_notes doubts=warnings samples=n_samples samples_holdout=n_holdout
 parameters_total=n_parameters before=nominal after=calibrated remaining=posterior_to_prior_std
-weakly_seen=weakly_observable aside=n_rejected gross=n_outliers without=without_outliers
+weakly_seen=weakly_observable aside=n_rejected gross=n_outliers without=after_without_outliers
+allowed=tolerance chance=p_value ratio_to_random=relative_error
 enough=recommended_size holds=agrees root=sqrt_covariance hidden=unbounded_directions
 wrong=error_parameters redrawn=resample_each_iteration choice=pose_selection errors=error_std
 stands=base_in_measuring_frame
@@ -76,8 +78,8 @@ stands=base_in_measuring_frame
 WORD_RENAMES = table("""
 wrong=error_parameters redrawn=resample_each_iteration choice=pose_selection errors=error_std
 """)
-# Keys whose values belong to a run or to its files: versions, paths, digests.
-IGNORED_KEYS = {"versions", "files", "inputs"}
+# Keys whose values belong to a run or to its files: versions, paths, digests; and warnings, which are texts.
+IGNORED_KEYS = {"versions", "files", "inputs", "doubts", "warnings"}
 # Compared for information only: what is drawn or said.
 INFORMATIVE = {".html", ".md", ".svg", ".txt"}
 
@@ -446,7 +448,7 @@ class Lab:
 
     def joints(self, chain: Any, count: int, seed: int) -> Any:
         """Draw joint values (count, n)."""
-        return self.np.random.default_rng(seed).uniform(-1.5, 1.5, (count, chain.size))
+        return self.np.random.default_rng(seed).uniform(-1.5, 1.5, (count, len(chain.joint_names)))
 
     def places(self, chain: Any, count: int, seed: int, sigma: float | None = 1e-4, gross: int = 0) -> Any:
         """Measure positions with noise of 0.1 mm, some of them off by 50 mm."""
@@ -544,7 +546,7 @@ def contacts(lab: Lab) -> dict[str, Any]:
     at = lab.six_true.poses(q)[:4, :3, 3]
     touched = make(lab.dh.Touch, q, [f"p{i % 4 + 1}" for i in range(len(q))])
     names, length = [(f"p{i + 1}", f"p{j + 1}") for i, j in pairs], [norm(at[i] - at[j]) for i, j in pairs]
-    gauge = make(lab.dh.PointDistance, lab.six.size, names, length, 1e-5)
+    gauge = make(lab.dh.PointDistance, len(lab.six.joint_names), names, length, 1e-5)
     surfaces = [lab.places(lab.six_true, 12, 8), lab.read("plane"), lab.read("sphere")]
     return {
         "points": lab.fit(lab.six, [touched, gauge], "dh"),
@@ -760,7 +762,8 @@ def freeze(folder: Path) -> int:
     quiet = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "120", "MPLBACKEND": "agg"}
     start, failed = time.perf_counter(), 0
     for variant in VARIANTS:
-        path = str(folder / "blocked") if variant == "numpy" else ""
+        paths = [str(folder / "blocked")] if variant == "numpy" else []
+        path = os.pathsep.join([*paths, *filter(None, [os.environ.get("PYTHONPATH")])])
         environment = {**os.environ, **quiet, "PYTHONPATH": path}
         found = [run_case(folder / variant / name, words, environment) for name, words in cases(variant)]
         spent = time.perf_counter() - start
