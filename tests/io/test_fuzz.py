@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
-from test_urdf import EXAMPLES, LENIENT, mutated
+from urdf_mutations import EXAMPLES, LENIENT, mutated
 
 from dhcal_pin.cli.main import main
 

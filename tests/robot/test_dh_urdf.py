@@ -21,7 +21,7 @@ def arm(alpha, a, d, convention="standard", theta=None, prismatic=None, lower=No
     """A table from degrees and millimetres."""
     n = len(alpha)
     return DHTable(
-        convention,
+        convention,  # pyright: ignore[reportArgumentType]
         tuple(f"joint_{i + 1}" for i in range(n)),
         np.zeros(n, bool) if prismatic is None else prismatic,
         np.radians(np.zeros(n) if theta is None else theta),
@@ -191,6 +191,13 @@ def test_names_are_escaped_and_kept_apart():
     np.testing.assert_allclose(pinocchio_poses(text, q), table.poses(q), atol=1e-15)
 
 
+def attributes(element: ET.Element, path: str) -> dict[str, str]:
+    """The attributes of the first descendant on a path."""
+    child = element.find(path)
+    assert child is not None, path
+    return child.attrib
+
+
 def test_drawing_follows_the_rows():
     """Every segment of the drawing starts where the last one ended; zero lengths draw nothing."""
     robot = ET.fromstring(dh_to_urdf(paper_arm(), "arm"))
@@ -200,7 +207,7 @@ def test_drawing_follows_the_rows():
     # d: 200, 100, 10 and 100 mm; a: four of them; one drum a joint; three arrows at the tool.
     counts = [used.count(m) for m in ("along_d", "along_a", "revolute", "x_axis", "y_axis", "z_axis")]
     assert counts == [4, 4, 6, 1, 1, 1]
-    lengths = [float(c.get("length")) for c in robot.findall("link/visual/geometry/cylinder")]
+    lengths = [float(c.attrib["length"]) for c in robot.findall("link/visual/geometry/cylinder")]
     assert min(lengths) > 0
     shapes = {g[0].tag for g in robot.findall("link/visual/geometry")}
     assert shapes == {"cylinder", "sphere"}
@@ -208,15 +215,12 @@ def test_drawing_follows_the_rows():
     for link in robot.findall("link")[1:-1]:
         corner = np.zeros(3)
         for visual in link.findall("visual"):
-            if visual.find("material").get("name") in ("along_d", "along_a"):
-                origin = visual.find("origin")
-                middle = np.array(origin.get("xyz").split(), float)
-                rpy = np.array(origin.get("rpy").split(), float)
-                half = (
-                    pin.rpy.rpyToMatrix(*rpy)[:, 2]
-                    * float(visual.find("geometry/cylinder").get("length"))
-                    / 2
-                )
+            if attributes(visual, "material")["name"] in ("along_d", "along_a"):
+                origin = attributes(visual, "origin")
+                middle = np.array(origin["xyz"].split(), float)
+                rpy = np.array(origin["rpy"].split(), float)
+                length = float(attributes(visual, "geometry/cylinder")["length"])
+                half = pin.rpy.rpyToMatrix(*rpy)[:, 2] * length / 2
                 np.testing.assert_allclose(middle - half, corner, atol=1e-5)
                 corner = middle + half
         ends.append(corner)

@@ -113,7 +113,7 @@ def test_poses_equal_kinpy(arm):
         warnings.simplefilter("ignore")  # what it imports
         import kinpy
 
-        tree = kinpy.build_chain_from_urdf(stripped(arm).encode())
+        tree = kinpy.build_chain_from_urdf(stripped(arm).encode())  # pyright: ignore[reportArgumentType]
     chain = load(arm)
     q = draw(chain, 200)
     values = q @ chain.mimic_matrix.T + chain.mimic_offset

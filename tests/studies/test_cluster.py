@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from test_study import MANY, table_of
+from study_runs import LARGE_STUDY, SMALL_STUDY, table_of
 
 from dhcal_pin.calibration.streaming import calibrate_stream
 from dhcal_pin.exceptions import DhcalError
@@ -41,14 +41,13 @@ def test_a_cluster_gives_the_same_table(cluster, tmp_path):
 
 @pytest.mark.slow
 def test_ten_thousand_calibrations_on_a_cluster(cluster, tmp_path):
-    text = MANY.replace("seeds = 120", "seeds = 1000").replace("poses = 12", "poses = [8, 10, 12, 20, 30]")
-    there = table_of(tmp_path, "there", "--scheduler", cluster.scheduler_address, text=text)
-    assert there == table_of(tmp_path, "here", text=text)
+    there = table_of(tmp_path, "there", "--scheduler", cluster.scheduler_address, text=LARGE_STUDY)
+    assert there == table_of(tmp_path, "here", text=LARGE_STUDY)
 
 
 @pytest.mark.slow
 def test_a_worker_lost_in_the_middle_changes_nothing(cluster, tmp_path):
-    (tmp_path / "s.study.toml").write_text(MANY.replace("seeds = 120", "seeds = 400"))
+    (tmp_path / "s.study.toml").write_text(SMALL_STUDY.replace("seeds = 120", "seeds = 400"))
     study = read_study(tmp_path / "s.study.toml")
     here = list(run(study))
     with open_executor(scheduler=cluster.scheduler_address) as where, distributed.Client(cluster) as client:

@@ -13,6 +13,7 @@ import time
 import numpy as np
 import pytest
 from robots import URDF
+from study_runs import LARGE_STUDY, SMALL_STUDY, table_of
 
 from dhcal_pin.cli import main
 from dhcal_pin.exceptions import DhcalError
@@ -96,26 +97,6 @@ def test_noise_is_averaged_out(tmp_path):
     np.testing.assert_allclose(found, [0.241, 0.111, 0.064], rtol=0.2)
 
 
-MANY = """
-title = "small"
-seeds = 120
-[settings]
-robot = "sim_6dof.dh.toml"
-kind = ["pose", "position"]
-poses = 12
-error_std = "0.5mm,0.1deg"
-"""
-
-
-def table_of(folder, name: str, *options: str, text: str = MANY) -> str:
-    (folder / "s.study.toml").write_text(text)
-    out = folder / f"{name}.csv"
-    assert main.main(["study", str(folder / "s.study.toml"), "-o", str(out), *options]) == 0
-    # The table, its plot where a number varies, and no journal.
-    assert {path.suffix for path in folder.glob(f"{name}*")} - {".svg"} == {".csv"}
-    return out.read_text()
-
-
 def test_two_processes_give_the_same_table(tmp_path):
     assert table_of(tmp_path, "one") == table_of(tmp_path, "two", "--jobs", "2")
 
@@ -170,21 +151,20 @@ def killed_and_resumed(folder, text: str, lines: int, *options: str) -> str:
 
 
 def test_a_killed_run_continues_to_the_same_table(tmp_path):
-    text = MANY.replace("120", "300")
+    text = SMALL_STUDY.replace("120", "300")
     assert killed_and_resumed(tmp_path, text, 2) == table_of(tmp_path, "whole", text=text)
 
 
 @pytest.mark.slow
 def test_ten_thousand_calibrations(tmp_path):
-    text = MANY.replace("seeds = 120", "seeds = 1000").replace("poses = 12", "poses = [8, 10, 12, 20, 30]")
-    one = table_of(tmp_path, "one", text=text)
-    assert one == table_of(tmp_path, "two", "--jobs", "2", text=text)
-    assert one == killed_and_resumed(tmp_path, text, 30, "--jobs", "2")
+    one = table_of(tmp_path, "one", text=LARGE_STUDY)
+    assert one == table_of(tmp_path, "two", "--jobs", "2", text=LARGE_STUDY)
+    assert one == killed_and_resumed(tmp_path, LARGE_STUDY, 30, "--jobs", "2")
     assert sum(int(row["calibrations"]) for row in csv.DictReader(one.splitlines())) == 10_000
 
 
 def test_journal_of_another_study_is_left_alone(tmp_path, capsys):
-    (tmp_path / "s.study.toml").write_text(MANY)
+    (tmp_path / "s.study.toml").write_text(SMALL_STUDY)
     (tmp_path / "r.csv.part").write_text("0000\n")
     assert main.main(["study", str(tmp_path / "s.study.toml"), "-o", str(tmp_path / "r.csv")]) == 2
     assert "belongs to another study" in capsys.readouterr().err
@@ -220,7 +200,7 @@ def test_journal_of_another_study_is_left_alone(tmp_path, capsys):
 )
 def test_wrong_studies_are_named(tmp_path, change, message):
     path = tmp_path / "s.study.toml"
-    path.write_text(MANY.replace(*change))
+    path.write_text(SMALL_STUDY.replace(*change))
     with pytest.raises(DhcalError, match=message):
         read_study(path)
 
@@ -249,7 +229,7 @@ def test_a_study_of_an_arm_with_two_hands(tmp_path):
 
 def test_a_studys_robot_is_no_output(tmp_path, capsys):
     path, robot = tmp_path / "s.study.toml", tmp_path / "sim_6dof.dh.toml"
-    path.write_text(MANY)
+    path.write_text(SMALL_STUDY)
     robot.write_bytes((URDF / robot.name).read_bytes())
     before = robot.read_bytes()
     assert main.main(["study", str(path), "-o", str(robot)]) == 2
