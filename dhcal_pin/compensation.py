@@ -113,7 +113,7 @@ def compensate(
             f"they must be those of {nominal.urdf.source}: {', '.join(nominal.joint_names)}"
         )
     targets = _checked(targets)
-    near = calibrated.validated_q(_mid_range(calibrated) if near is None else np.asarray(near, float))
+    near = calibrated.validated_q(np.atleast_2d(_mid_range(calibrated) if near is None else near))
     if len(near) not in (1, len(targets)):
         raise DhcalError(f"near has {len(near)} rows; give one, or one a target ({len(targets)})")
     near = np.broadcast_to(near, (len(targets), calibrated.n_joints))

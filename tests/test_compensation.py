@@ -68,7 +68,7 @@ def draw(chain: Chain, m: int, rng: np.random.Generator):
 
 def pinocchio_pose(chain: Chain, q) -> pin.SE3:
     data = chain.model.createData()
-    pin.framesForwardKinematics(chain.model, data, chain.configurations(q)[0])
+    pin.framesForwardKinematics(chain.model, data, chain.configurations(q[None])[0])
     return pin.SE3(chain.base) * data.oMf[chain.frame_id] * pin.SE3(chain.tool)
 
 
@@ -78,7 +78,7 @@ def controller(chain: Chain, pose, start):
     moving = [model.joints[model.getJointId(name)].idx_v for name in chain.joint_names]
     goal, q = pin.SE3(pose), np.array(start)
     for _ in range(50):
-        full = chain.configurations(q)[0]
+        full = chain.configurations(q[None])[0]
         pin.framesForwardKinematics(model, data, full)
         jacobian = pin.computeFrameJacobian(model, data, full, chain.frame_id, pin.LOCAL)[:, moving]
         gap = pin.log6((pin.SE3(chain.base) * data.oMf[chain.frame_id]).actInv(goal)).vector

@@ -1,13 +1,26 @@
-"""A serial path through a robot: Pinocchio's model, a tip, and kinematics over many samples at once.
+"""Serial kinematic chains: the path from the root of a robot to a tip link, for many samples at once.
 
-The path's bodies are numbered 0 (the base link) to k (behind the last moving joint); its *stations*,
-where errors act as right perturbations M ← M·exp(ξ), lie between them in this order:
+The chain has n independent joints, the columns of the joint positions q, and k moving joints (k > n only with
+mimic joints). Its bodies are numbered 0 (the base link) to k (behind the last moving joint). The tool pose in
+the measuring frame is
+
+    T(q) = B · L_0 · Z(q_1) · L_1 · Z(q_2) · … · Z(q_k) · L_k · T_tool
+
+with the base B, the constant link transforms L_j and the motion Z(q_j) about or along the z axis of joint j.
+
+Errors act at *error frames*, as right perturbations M ← M·exp(ξ) by a twist ξ = [v, ω]. Their indices are
 
     0 base · 1 link 0 · 2 joint 1 · 3 link 1 · 4 joint 2 · … · 2k joint k · 2k+1 link k · 2k+2 tip · 2k+3 tool
 
-`joint j` is that joint's origin before its motion, `link j` the same frame after it. `base` is the
-base link's pose in the measuring frame, `tool` the measured point's pose in the tip frame. A change at
-`base` or `tool` stays outside the robot; every other one belongs into the URDF.
+where `joint j` is the origin of that joint before its motion and `link j` is the frame after the motion.
+`base` is the pose of the base link in the measuring frame. `tool` is the pose of the measured point in the
+tip frame. A perturbation of `base` or `tool` stays outside the robot; every other one changes a joint origin
+of the URDF.
+
+Pinocchio parses the URDF and provides the joint origins, the whole-body model and gravity torques. Frames and
+Jacobians of many samples come from the kernels in `dhcal_pin._kernels`.
+
+Shapes: m samples, n independent joints, k moving joints, p error parameters, t transmission terms.
 """
 
 from __future__ import annotations
@@ -20,16 +33,17 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
 from .. import _kernels, se3
 from .._kernels.kinematics import error_frame_poses
 from .._kernels.types import FrameBatch, JointState
 from .._typing import Array
-from ..exceptions import DhcalError
+from ..exceptions import DhcalError, InvalidArgumentError
 from .dh import Convention, DHTable
 from .dh_extraction import Extraction, extract_dh
 from .dh_urdf import dh_to_urdf
-from .transmission import GravityLoads, Payload, Transmission
+from .transmission import TERMS, GravityLoads, Payload, Transmission
 from .urdf import Urdf, parse_urdf, read_urdf
 from .urdf_path import (
     axis_frame,
@@ -40,42 +54,58 @@ from .urdf_path import (
     placements,
 )
 
+# Index of the error frame of the base.
 BASE_FRAME = 0
 
-
-_EYE = np.eye(4)
+_IDENTITY = np.eye(4)
 
 
 def joint_frame(j: int) -> int:
-    """Station of the j-th moving joint's origin, j from 1."""
+    """Return the index of the error frame at the origin of a joint, before its motion.
+
+    Args:
+        j: Number of the moving joint, 1 to k.
+
+    Returns:
+        Index of the error frame.
+    """
     return 2 * j
 
 
 def link_frame(j: int) -> int:
-    """Station behind the j-th moving joint's motion; 0 is the base link."""
+    """Return the index of the error frame after the motion of a joint.
+
+    Args:
+        j: Number of the moving joint, 1 to k, or 0 for the base link.
+
+    Returns:
+        Index of the error frame.
+    """
     return 2 * j + 1
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Chain:
-    """A base-to-tip path of n independent and k moving joints (k > n only with mimic joints).
+    """Kinematic chain from the root link of a robot to a tip link.
 
     Attributes:
-        urdf: the file it came from.
-        tip: name of the tip link.
-        joint_names: (n,) the columns of q, in path order.
-        moving_joints: (k,) names of the joints that move along the path.
-        origins: (k+1, 4, 4) each moving joint's frame in the moving frame before it (fixed joints
-            merged), then the tip in the last one; metres.
-        axes: (k, 3) unit axes in the joints' frames.
-        prismatic: (k,) True where a joint slides.
-        mimic_matrix, mimic_offset: (k, n), (k,): the moving joints' values are mixing @ q + shift.
-        lower, upper: (n,) limits, rad or m; infinite where there is none.
-        base: (4, 4) base link in the measuring frame.
-        tool: (4, 4) measured point in the tip frame.
-        parameters: the sets that are identified when nobody says otherwise.
-        transmission: how the independent joints miss their values; None where they do as they are told.
-        payload: what the tip carries, for joints that yield to loads.
+        urdf: URDF file of the robot.
+        tip: Name of the tip link.
+        joint_names: Names of the n independent joints, the columns of q, in chain order.
+        moving_joints: Names of the k moving joints, in chain order.
+        origins: Pose of each moving joint in the frame of the moving joint before it (fixed joints are
+            merged), then the pose of the tip in the last one, shape (k+1, 4, 4) [m].
+        axes: Unit axes in the joint frames, shape (k, 3).
+        prismatic: True for prismatic joints, shape (k,).
+        mimic_matrix: Matrix (k, n) of the moving joint positions `mimic_matrix @ q + mimic_offset`.
+        mimic_offset: Constant part of the moving joint positions, shape (k,) [rad or m].
+        lower: Lower joint limits, shape (n,) [rad or m]; -inf if there is none.
+        upper: Upper joint limits, shape (n,) [rad or m]; inf if there is none.
+        base: Pose of the base link in the measuring frame, shape (4, 4) [m].
+        tool: Pose of the measured point in the tip frame, shape (4, 4) [m].
+        parameters: Parameter sets that a calibration estimates by default.
+        transmission: Transmission errors of the independent joints; None for ideal joints.
+        payload: Point mass at the tip that loads compliant joints.
     """
 
     urdf: Urdf
@@ -97,20 +127,28 @@ class Chain:
 
     @classmethod
     def from_urdf(cls, source: str | os.PathLike[str] | Urdf, tip: str | None = None) -> Chain:
-        """The path from the root link to `tip` of a URDF file.
+        """Build the chain from the root link to a tip link of a URDF.
+
+        A `DhcalError` names file and line if the URDF is invalid, the tip is unknown or ambiguous, or no
+        joint moves.
 
         Args:
-            source: a path, or a file already read.
-            tip: a link; without it the deepest leaf.
+            source: Path of a URDF file, or a file that was already read.
+            tip: Name of the tip link; by default the leaf behind the most moving joints.
+
+        Returns:
+            Chain with identity base and tool.
 
         Raises:
-            DhcalError: the file is not a sound URDF, the tip is unknown or ambiguous, nothing moves.
+            InvalidArgumentError: The source is neither a path nor a `Urdf`.
         """
+        if not isinstance(source, (str, os.PathLike, Urdf)):
+            raise InvalidArgumentError(f"source has type {type(source).__name__}; expected a path or a Urdf")
         urdf = source if isinstance(source, Urdf) else read_urdf(source)
         tip = tip if tip is not None else default_tip(urdf)
         joints = find_moving_joints(urdf, tip)
-        names, rows, shift = independent_joints(urdf, [joint.name for joint in joints])
-        sources = [urdf.joint(name) for name in names]
+        names, mimic_matrix, mimic_offset = independent_joints(urdf, [joint.name for joint in joints])
+        independent = [urdf.joint(name) for name in names]
         model = build_model(urdf)
         origins, axes = placements(model, tip, [joint.name for joint in joints])
         return cls(
@@ -121,21 +159,37 @@ class Chain:
             origins=origins,
             axes=axes,
             prismatic=np.array([joint.type == "prismatic" for joint in joints]),
-            mimic_matrix=rows,
-            mimic_offset=shift,
-            lower=np.array([joint.lower for joint in sources]),
-            upper=np.array([joint.upper for joint in sources]),
+            mimic_matrix=mimic_matrix,
+            mimic_offset=mimic_offset,
+            lower=np.array([joint.lower for joint in independent]),
+            upper=np.array([joint.upper for joint in independent]),
         )
 
     @classmethod
     def from_dh(cls, table: DHTable, name: str = "arm") -> Chain:
-        """The arm of a DH table, through its exact URDF; its tip is `tool0`."""
+        """Build the chain of a DH table through its exact URDF.
+
+        Args:
+            table: DH table.
+            name: Name of the robot in the URDF.
+
+        Returns:
+            Chain with the tip link `tool0`, whose default parameter set is `dh`.
+
+        Raises:
+            InvalidArgumentError: The table is not a `DHTable`.
+        """
+        if not isinstance(table, DHTable):
+            raise InvalidArgumentError(f"table has type {type(table).__name__}; expected a DHTable")
         text = dh_to_urdf(table, name)
         chain = cls.from_urdf(parse_urdf(text.encode(), f"{name}.urdf"), "tool0")
         return replace(chain, parameters="dh")
 
+    def __repr__(self) -> str:
+        return f"Chain(name={self.urdf.name!r}, tip={self.tip!r}, n_joints={self.n_joints})"
+
     def __getstate__(self) -> dict[str, Any]:
-        """Without what can be worked out anew: a model is heavy to send to another process."""
+        """Return the fields only: cached models are slow to pickle and quick to rebuild."""
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
     @property
@@ -145,185 +199,303 @@ class Chain:
 
     @property
     def is_prismatic(self) -> Array:
-        """Which independent joints (n,) move a prismatic one."""
+        """Whether each independent joint moves a prismatic joint, shape (n,)."""
         return np.any(self.mimic_matrix[self.prismatic] != 0, 0)
 
     @property
     def tip_frame(self) -> int:
-        """Station of the tip, before the tool."""
+        """Index of the error frame of the tip, before the tool."""
         return 2 * len(self.moving_joints) + 2
 
     @property
     def tool_frame_index(self) -> int:
-        """Station of the measured point."""
+        """Index of the error frame of the tool, the measured point."""
         return 2 * len(self.moving_joints) + 3
 
     @cached_property
     def model(self) -> pin.Model:
-        """Pinocchio's model of the whole robot with this chain's joint placements and tip frame."""
+        """Pinocchio model of the whole robot with the joint origins, tip frame and payload of this chain."""
         model = build_model(self.urdf)
         for name, origin in zip(self.moving_joints, self.origins[:-1], strict=True):
             model.jointPlacements[model.getJointId(name)] = pin.SE3(origin)
         tip = model.frames[model.getFrameId(self.tip, pin.FrameType.BODY)]
         tip.placement = pin.SE3(self.origins[-1])
         if self.payload:
-            carried = pin.Inertia(self.payload.mass, np.array(self.payload.centre), np.zeros((3, 3)))
-            model.appendBodyToJoint(tip.parentJoint, carried, tip.placement)
+            inertia = pin.Inertia(self.payload.mass, np.array(self.payload.centre), np.zeros((3, 3)))
+            model.appendBodyToJoint(tip.parentJoint, inertia, tip.placement)
         return model
 
     @cached_property
     def frame_id(self) -> int:
-        """Pinocchio's index of the tip's frame; links and joints may share names."""
+        """Pinocchio's index of the tip frame; it is of type BODY because a joint may have the same name."""
         return self.model.getFrameId(self.tip, pin.FrameType.BODY)
 
     @cached_property
     def loads(self) -> GravityLoads:
-        """The masses of the whole robot with this chain's joint placements."""
+        """Gravity torques of the whole robot with the joint origins of this chain."""
         return GravityLoads(self.model, self.moving_joints, self.mimic_matrix, self.mimic_offset)
 
-    def configurations(self, q: Array) -> Array:
-        """Pinocchio's configurations (m, nq) at q (m, n); joints off the path stay at neutral."""
+    def configurations(self, q: ArrayLike) -> Array:
+        """Return Pinocchio configurations; joints that are not on the chain stay at neutral.
+
+        Args:
+            q: Commanded joint positions, shape (m, n) [rad or m].
+
+        Returns:
+            Configurations of `model` at the actual joint positions, shape (m, nq).
+        """
         return self.loads.configurations(self.actual_positions(self.validated_q(q).T)[0])
 
-    def validated_q(self, q: Array) -> Array:
-        """Joint values as a finite (m, n) array, or DhcalError."""
-        q = np.atleast_2d(np.asarray(q, float))
-        if q.ndim != 2 or q.shape[1] != self.n_joints:
-            raise DhcalError(
-                f"q has shape {q.shape}; this chain needs {self.n_joints} columns: {', '.join(self.joint_names)}"
+    def validated_q(self, q: ArrayLike) -> Array:
+        """Return joint positions as an array after checking shape and values.
+
+        Args:
+            q: Joint positions, shape (m, n) [rad or m].
+
+        Returns:
+            Joint positions as floats, shape (m, n).
+
+        Raises:
+            InvalidArgumentError: The shape is not (m, n), or a value is not finite.
+        """
+        q = np.asarray(q, float)
+        n = self.n_joints
+        if q.ndim != 2 or q.shape[1] != n:
+            raise InvalidArgumentError(
+                f"q has shape {q.shape}; expected shape (m, {n}), one row per sample with the {n} columns "
+                f"{', '.join(self.joint_names)}"
             )
         if not np.isfinite(q).all():
-            raise DhcalError("q: every joint value must be finite")
+            raise InvalidArgumentError("q has a value that is not finite; expected finite joint positions")
         return q
 
     def actual_positions(self, q: Array) -> tuple[Array, Array | None]:
-        """Where commanded values q (n, m) take the independent joints (n, m), and the terms (t, n, m)."""
+        """Compute the actual joint positions, which differ from the commanded ones by transmission errors.
+
+        Args:
+            q: Commanded positions of the independent joints, shape (n, m) [rad or m].
+
+        Returns:
+            Actual positions, shape (n, m), and transmission terms, shape (t, n, m), or None for ideal joints.
+        """
         if self.transmission is None:
             return q, None
         terms = self.transmission.terms(q)
         return q + self.transmission.errors(terms), terms
 
     def with_transmission(self, transmission: Transmission) -> Chain:
-        """The chain with other joints."""
+        """Return a copy with other transmission errors.
+
+        Args:
+            transmission: Transmission errors of the independent joints.
+
+        Returns:
+            Copy of the chain.
+
+        Raises:
+            InvalidArgumentError: The type or the shape of the coefficients does not fit the chain.
+        """
+        shape = (len(TERMS), self.n_joints, self.n_joints)
+        if not isinstance(transmission, Transmission):
+            raise InvalidArgumentError(
+                f"transmission has type {type(transmission).__name__}; expected a Transmission"
+            )
+        if transmission.coefficients.shape != shape:
+            raise InvalidArgumentError(
+                f"transmission coefficients have shape {transmission.coefficients.shape}; expected {shape}"
+            )
         return replace(self, transmission=transmission)
 
     def with_payload(self, payload: Payload | None) -> Chain:
-        """The chain with something in its hand, to whose weight its joints yield too."""
+        """Return a copy with another payload, whose weight loads compliant joints.
+
+        Args:
+            payload: Point mass at the tip, or None.
+
+        Returns:
+            Copy of the chain.
+
+        Raises:
+            InvalidArgumentError: The payload is not a `Payload`.
+        """
+        if not (payload is None or isinstance(payload, Payload)):
+            raise InvalidArgumentError(
+                f"payload has type {type(payload).__name__}; expected a Payload or None"
+            )
         return replace(self, payload=payload).with_current_loads()
 
     def with_current_loads(self) -> Chain:
-        """The chain whose joints yield to its own masses as placed now, not to those it was started with."""
+        """Return a copy whose transmission uses the gravity loads of its joint origins and payload."""
         if self.transmission is None:
             return self
         return self.with_transmission(replace(self.transmission, loads=self.loads))
 
     @cached_property
     def axis_frames(self) -> Array:
-        """(k+1, 4, 4): body frame (joint axis along z) in each body's URDF frame; body 0 as it is."""
+        """Body frame of each body in its URDF frame, shape (k+1, 4, 4); its z axis is the joint axis."""
         return np.stack([np.eye(4), *(axis_frame(tuple(axis)) for axis in self.axes.tolist())])
 
     @cached_property
     def body_from_urdf(self) -> Array:
-        """(k+1, 4, 4): each body's URDF frame in its body frame."""
+        """URDF frame of each body in its body frame, shape (k+1, 4, 4)."""
         return se3.inverse(self.axis_frames)
 
     @cached_property
     def next_from_body(self) -> Array:
-        """(k+1, 4, 4): each joint's URDF frame, and the tip, in the body frame before it."""
+        """URDF frame of each joint, then the tip, in the body frame before it, shape (k+1, 4, 4)."""
         return self.body_from_urdf @ self.origins
 
     @cached_property
     def _urdf_from_body(self) -> Array:
-        """(k+1, 4, 4): each joint's body frame in its URDF frame, and no change for the tip."""
-        return np.concatenate([self.axis_frames[1:], _EYE[None]])
+        """Body frame of each joint in its URDF frame, and the identity for the tip, shape (k+1, 4, 4)."""
+        return np.concatenate([self.axis_frames[1:], _IDENTITY[None]])
 
     @cached_property
     def link_transforms(self) -> Array:
-        """Constant transforms (k+1, 4, 4) between the motions; every joint moves about its own z.
-
-        The tool's pose is base · links[0] · Z(q_1) · links[1] · … · Z(q_k) · links[k] · tool.
-        """
+        """Constant transforms L_0 … L_k between the joint motions, shape (k+1, 4, 4)."""
         return self.next_from_body @ self._urdf_from_body
 
     @cached_property
     def _link_and_tool_transforms(self) -> Array:
-        """(k+1, 4, 4): as `links`, but the last one leads on to the tool."""
+        """Link transforms with the tool appended to the last one, shape (k+1, 4, 4)."""
         return np.concatenate([self.link_transforms[:-1], self.link_transforms[-1:] @ self.tool])
 
-    def joint_state(self, q: Array) -> JointState:
-        """The moving joints' values, and their cosines and sines, at joint values q (m, n)."""
+    def joint_state(self, q: ArrayLike) -> JointState:
+        """Compute positions, cosines and sines of the moving joints.
+
+        Args:
+            q: Joint positions, shape (m, n) [rad or m].
+
+        Returns:
+            Joint state that `forward_kinematics` accepts in the place of q. Errors of the geometry do not
+            change it, so one state serves a whole optimization.
+        """
         return self._joint_state(np.ascontiguousarray(self.validated_q(q).T))
 
-    def _joint_state(self, joints: Array) -> JointState:
-        """The motion of independent joints that stand at (n, m)."""
-        values = self.mimic_matrix @ joints + self.mimic_offset[:, None]
-        return JointState(joints, values, *_kernels.cos_sin(values))
+    def _joint_state(self, independent: Array) -> JointState:
+        """Compute the joint state of independent joint positions, shape (n, m)."""
+        positions = self.mimic_matrix @ independent + self.mimic_offset[:, None]
+        return JointState(independent, positions, *_kernels.cos_sin(positions))
 
-    def forward_kinematics(self, q: Array | JointState, out: Array | None = None) -> FrameBatch:
-        """All frames at joint values q (m, n), or at a motion of this chain, vectorised over the samples.
+    def forward_kinematics(self, q: ArrayLike | JointState, out: Array | None = None) -> FrameBatch:
+        """Compute all frames of the chain, vectorized over the samples.
 
-        `out` (k+2, 7, 3, m) holds them when given.
+        Args:
+            q: Joint positions, shape (m, n) [rad or m], or a joint state of this chain.
+            out: Work array of shape (k+2, 7, 3, m) that holds the result.
+
+        Returns:
+            Frames in the measuring frame.
         """
-        motion, terms = q if isinstance(q, JointState) else self.joint_state(q), None
+        state, terms = q if isinstance(q, JointState) else self.joint_state(q), None
         if self.transmission is not None:
-            joints, terms = self.actual_positions(motion.independent)
-            motion = self._joint_state(joints)
-        k, m = motion.positions.shape
+            actual, terms = self.actual_positions(state.independent)
+            state = self._joint_state(actual)
+        k, m = state.positions.shape
         frames = np.empty((k + 2, 7, 3, m)) if out is None else out
         frames[0, :4] = self.base[:3].T[:, :, None]
-        _kernels.propagate_frames(self._link_and_tool_transforms, self.prismatic, motion, frames)
+        _kernels.propagate_frames(self._link_and_tool_transforms, self.prismatic, state, frames)
         return FrameBatch(frames[:-1], frames[-1, :4], terms)
 
-    def poses(self, q: Array) -> Array:
-        """Tool poses (m, 4, 4) in the measuring frame at joint values q (m, n) in rad or m."""
+    def poses(self, q: ArrayLike) -> Array:
+        """Compute tool poses.
+
+        Args:
+            q: Joint positions, shape (m, n) [rad or m].
+
+        Returns:
+            Poses of the tool in the measuring frame, shape (m, 4, 4) [m].
+        """
         return self.forward_kinematics(q).poses()
 
     def tool_jacobian(
         self, frames: FrameBatch, bodies: Array, twists: Array, out: Array | None = None
     ) -> Array:
-        """The tool point's velocity (p, 6, m) per unit of each body twist, axes of the measuring frame.
+        """Compute the tool twist per unit of each body twist or transmission coefficient.
 
         Args:
-            sweep: frames at m samples.
-            bodies: (p,) body numbers, ascending; k+1+e is entry e of the
-                transmission's flat coefficients.
-            twists: (p, 6) twists in those bodies' frames; an entry needs none.
-            out: (p, 6, m) written in place when given.
+            frames: Frames of this chain at m samples.
+            bodies: Body numbers in ascending order, shape (p,). The number k+1+e stands for entry e of the
+                flattened transmission coefficients.
+            twists: Twists [v, ω] in the frames of the bodies, shape (p, 6); not used for coefficients.
+            out: Array of shape (p, 6, m) that holds the result.
+
+        Returns:
+            Twists [v, ω] of the tool point in axes of the measuring frame, shape (p, 6, m).
         """
         m = frames.tool.shape[-1]
         out = np.empty((len(bodies), 6, m)) if out is None else out
-        behind = len(bodies)
-        if behind and bodies[-1] >= len(frames.columns):
-            behind = int(np.searchsorted(bodies, len(frames.columns)))
-            out[behind:] = self._transmission_jacobian(frames, bodies[behind:] - len(frames.columns))
-            bodies, twists = bodies[:behind], twists[:behind]
-        _kernels.point_jacobian(frames.columns, frames.tool[3], bodies, twists, out[:behind])
+        n_bodies, n_geometric = len(frames.columns), len(bodies)
+        if n_geometric and bodies[-1] >= n_bodies:
+            n_geometric = int(np.searchsorted(bodies, n_bodies))
+            out[n_geometric:] = self._transmission_jacobian(frames, bodies[n_geometric:] - n_bodies)
+            bodies, twists = bodies[:n_geometric], twists[:n_geometric]
+        _kernels.point_jacobian(frames.columns, frames.tool[3], bodies, twists, out[:n_geometric])
         return out
 
     def _transmission_jacobian(self, frames: FrameBatch, entries: Array) -> Array:
-        """The same (e, 6, m) per unit of entries (e,) of the flat transmission."""
+        """Compute the tool twist per unit of entries (e,) of the flattened coefficients, shape (e, 6, m)."""
         assert self.transmission is not None
         assert frames.terms is not None
         term, joint, source = np.unravel_index(entries, self.transmission.coefficients.shape)
         return self.joint_jacobian(frames)[joint] * frames.terms[term, source][:, None]
 
     def joint_jacobian(self, frames: FrameBatch) -> Array:
-        """The tool point's velocity (n, 6, m) per unit of each independent joint's effective value."""
+        """Compute the geometric Jacobian with respect to the actual positions of the independent joints.
+
+        Args:
+            frames: Frames of this chain at m samples.
+
+        Returns:
+            Twists [v, ω] of the tool point in axes of the measuring frame, shape (n, 6, m).
+        """
         k = len(self.moving_joints)
         twists = np.zeros((k, 6))
         twists[np.arange(k), np.where(self.prismatic, 2, 5)] = 1.0
-        moving = self.tool_jacobian(frames, np.arange(1, k + 1), twists)
-        return np.tensordot(self.mimic_matrix, moving, (0, 0))
+        jacobian = self.tool_jacobian(frames, np.arange(1, k + 1), twists)
+        return np.tensordot(self.mimic_matrix, jacobian, (0, 0))
 
     def perturbed_at(self, motions: Mapping[int, Array]) -> Chain:
-        """The chain with each station's frame moved by a right factor (4, 4), M ← M·motion."""
+        """Return a copy with perturbations M ← M·motion of some error frames.
+
+        Args:
+            motions: Rigid motion (4, 4) by index of the error frame.
+
+        Returns:
+            Perturbed chain.
+
+        Raises:
+            InvalidArgumentError: An index is not an error frame, or a motion does not have shape (4, 4).
+        """
         every = np.tile(np.eye(4), (self.tool_frame_index + 1, 1, 1))
-        for station, motion in motions.items():
-            every[station] = motion
+        for frame, motion in motions.items():
+            if not 0 <= frame <= self.tool_frame_index:
+                raise InvalidArgumentError(
+                    f"error frame {frame} does not exist; expected an index from 0 to {self.tool_frame_index}"
+                )
+            if np.shape(motion) != (4, 4):
+                raise InvalidArgumentError(
+                    f"the motion of error frame {frame} has shape {np.shape(motion)}; expected (4, 4)"
+                )
+            every[frame] = motion
         return self.perturbed(every)
 
     def perturbed(self, motions: Array) -> Chain:
-        """The chain with every station's frame moved by a right factor (2k+4, 4, 4), M ← M·motion."""
+        """Return a copy with perturbations M ← M·motion of all error frames.
+
+        Args:
+            motions: Rigid motions by index of the error frame, shape (2k+4, 4, 4).
+
+        Returns:
+            Perturbed chain.
+
+        Raises:
+            InvalidArgumentError: The motions have another shape.
+        """
+        if motions.shape != (self.tool_frame_index + 1, 4, 4):
+            raise InvalidArgumentError(
+                f"motions have shape {motions.shape}; expected ({self.tool_frame_index + 1}, 4, 4)"
+            )
         return self._with(
             origins=motions[1:-1:2] @ self.origins @ motions[2::2],
             base=self.base @ motions[0],
@@ -331,35 +503,66 @@ class Chain:
         )
 
     def with_base_and_tool(self, base: Array, tool: Array) -> Chain:
-        """The chain with another base and tool (4, 4)."""
+        """Return a copy with another base and tool.
+
+        Args:
+            base: Pose of the base link in the measuring frame, shape (4, 4).
+            tool: Pose of the measured point in the tip frame, shape (4, 4).
+
+        Returns:
+            Copy of the chain.
+
+        Raises:
+            InvalidArgumentError: A pose does not have shape (4, 4).
+        """
+        if not np.shape(base) == np.shape(tool) == (4, 4):
+            raise InvalidArgumentError(
+                f"base and tool have the shapes {np.shape(base)} and {np.shape(tool)}; expected (4, 4)"
+            )
         return self._with(base=base, tool=tool)
 
     def _with(self, **frames: Array) -> Chain:
-        """The chain with other origins, base or tool; the axes stay, and so do the frames made of them."""
+        """Return a copy with other origins, base or tool that keeps the cached frames of the joint axes."""
         chain = object.__new__(Chain)
-        known = {
+        cached = {
             "axis_frames": self.axis_frames,
             "body_from_urdf": self.body_from_urdf,
             "_urdf_from_body": self._urdf_from_body,
         }
-        vars(chain).update(self.__getstate__(), **known, **frames)
+        vars(chain).update(self.__getstate__(), **cached, **frames)
         return chain
 
 
-def bodies_of_frames(chain: Chain, error_frames: Array) -> Array:
-    """The bodies (p,) that errors at stations (p,) move."""
+def bodies_of_frames(chain: Chain, error_frames: ArrayLike) -> Array:
+    """Return the bodies that perturbations of error frames move.
+
+    Args:
+        chain: Kinematic chain.
+        error_frames: Indices of error frames, shape (p,).
+
+    Returns:
+        Body numbers, shape (p,).
+    """
     return np.clip((np.asarray(error_frames, int) - 1) // 2, 0, len(chain.moving_joints))
 
 
 def twists_in_bodies(
-    chain: Chain, error_frames: Array, twists: Array, frame_transforms: Array | None = None
+    chain: Chain, error_frames: Array, twists: ArrayLike, frame_transforms: Array | None = None
 ) -> tuple[Array, Array]:
-    """Bodies (p,) and the same twists (p, 6) in those bodies' frames, of twists at stations (p,).
+    """Transform twists at error frames into the frames of the bodies that they move.
 
-    `carry` (p, 4, 4) are the frames that the twists are seen in where these are not the stations' own.
+    Args:
+        chain: Kinematic chain.
+        error_frames: Indices of error frames, shape (p,).
+        twists: Twists [v, ω] at the error frames, shape (p, 6).
+        frame_transforms: Frames in which the twists are given, relative to the error frames, shape (p, 4, 4).
+            By default these are the error frames themselves.
+
+    Returns:
+        Body numbers, shape (p,), and twists in the frames of those bodies, shape (p, 6).
     """
-    still = np.tile(np.eye(4), (chain.tool_frame_index + 1, 1, 1))
-    frames = error_frame_poses(chain.body_from_urdf, chain.origins, chain.tool, still)[error_frames]
+    unperturbed = np.tile(np.eye(4), (chain.tool_frame_index + 1, 1, 1))
+    frames = error_frame_poses(chain.body_from_urdf, chain.origins, chain.tool, unperturbed)[error_frames]
     frames = frames if frame_transforms is None else frames @ frame_transforms
     return bodies_of_frames(chain, error_frames), (
         se3.adjoint(frames) @ np.asarray(twists, float)[..., None]
@@ -367,26 +570,45 @@ def twists_in_bodies(
 
 
 def without_mimics(chain: Chain) -> Chain:
-    """The same path whose every moving joint is commanded by itself, none following another."""
+    """Return a copy in which every moving joint is independent.
+
+    Args:
+        chain: Kinematic chain, possibly with mimic joints.
+
+    Returns:
+        Chain with n = k joints without limits.
+    """
     k = len(chain.moving_joints)
-    free = np.full(k, np.inf)
+    unlimited = np.full(k, np.inf)
     return replace(
         chain,
         joint_names=chain.moving_joints,
         mimic_matrix=np.eye(k),
         mimic_offset=np.zeros(k),
-        lower=-free,
-        upper=free,
+        lower=-unlimited,
+        upper=unlimited,
     )
 
 
 def extract_dh_table(chain: Chain, convention: Convention = "standard", hayati: bool = False) -> Extraction:
-    """The chain's DH table, base and tool apart, by common normals."""
+    """Extract the DH table of a chain by common normals; base and tool are kept apart.
+
+    Args:
+        chain: Kinematic chain without mimic joints.
+        convention: "standard" or "modified".
+        hayati: Whether to use Hayati's β for axes up to 5° from parallel instead of 1°.
+
+    Returns:
+        Table and the frames of its x axes.
+
+    Raises:
+        DhcalError: A joint mimics another one.
+    """
     if not (np.array_equal(chain.mimic_matrix, np.eye(chain.n_joints)) and not chain.mimic_offset.any()):
-        follows = next(name for name in chain.moving_joints if name not in chain.joint_names)
+        mimic = next(name for name in chain.moving_joints if name not in chain.joint_names)
         raise DhcalError(
-            f"{chain.urdf.source}: joint {follows!r} mimics another, which a DH table cannot hold; "
-            "calibrate the URDF itself"
+            f"{chain.urdf.source}: joint {mimic!r} mimics another joint; a DH table cannot describe mimic "
+            "joints, so calibrate the URDF itself"
         )
     return extract_dh(
         chain.link_transforms,

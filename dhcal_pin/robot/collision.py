@@ -71,7 +71,7 @@ class CollisionChecker:
                     geometry.addCollisionPair(pin.CollisionPair(first, second))
         out = cls(chain, geometry)
         low, high = (np.clip(limit, -np.pi, np.pi) for limit in (chain.lower, chain.upper))
-        middle = chain.configurations((low + high) / 2)[0]
+        middle = chain.configurations((low + high)[None] / 2)[0]
         neutral = pin.neutral(chain.model)
         for pair in out._colliding_pairs(neutral) & out._colliding_pairs(middle):
             geometry.removeCollisionPair(pin.CollisionPair(*pair))
@@ -97,7 +97,7 @@ class CollisionChecker:
         if self.geometry is None:
             return True
         data, shapes = self._data
-        configuration = self.chain.configurations(q)[0]
+        configuration = self.chain.configurations(q[None])[0]
         return not pin.computeCollisions(self.chain.model, data, self.geometry, shapes, configuration, True)
 
     def has_line_of_sight(self, q: Array, eye: Array, point: Array) -> bool:
@@ -112,7 +112,9 @@ class CollisionChecker:
             return True
         data, shapes = self._data
         model = self.chain.model
-        pin.updateGeometryPlacements(model, data, self.geometry, shapes, self.chain.configurations(q)[0])
+        pin.updateGeometryPlacements(
+            model, data, self.geometry, shapes, self.chain.configurations(q[None])[0]
+        )
         last = model.getJointId(self.chain.moving_joints[-1])
         away = point - eye
         length = float(np.linalg.norm(away))

@@ -119,7 +119,7 @@ class ConfigurationSampler:
         if self.workspace.instrument_position is None:
             return True
         into = se3.inverse(self.chain.base)
-        point = self.chain.poses(q)[0, :3, 3]
+        point = self.chain.poses(q[None])[0, :3, 3]
         eye, point = (into[:3, :3] @ at + into[:3, 3] for at in (self.workspace.instrument_position, point))
         return self.collision.has_line_of_sight(q, eye, point)
 

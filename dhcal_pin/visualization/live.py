@@ -146,7 +146,7 @@ class Live:
 def _body_poses(chain: Chain, q: Array) -> list[Array]:
     """Poses (4, 4) of the bodies that `viewer.tree` lists, as Pinocchio has them, in the measuring frame."""
     model, data = chain.model, chain.model.createData()
-    pin.framesForwardKinematics(model, data, chain.configurations(q)[0])
+    pin.framesForwardKinematics(model, data, chain.configurations(np.atleast_2d(q))[0])
     placed = [*data.oMi, data.oMf[chain.frame_id]]
     poses = [chain.base @ pose.homogeneous for pose in placed]
     return [*poses, poses[-1] @ chain.tool]

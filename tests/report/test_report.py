@@ -109,7 +109,7 @@ def test_the_workspace_is_in_the_base_frame(quick):
     found = residuals.workspace(calibrate(nominal, data, "dh,base"), [data])
     model, state = actual.model, actual.model.createData()
     for q, point in zip(data.q, found.measured, strict=True):
-        pin.framesForwardKinematics(model, state, actual.configurations(q)[0])
+        pin.framesForwardKinematics(model, state, actual.configurations(q[None])[0])
         # Base and first joint share directions that only a prior parts: millimetres.
         assert np.abs(state.oMf[actual.frame_id].translation - point).max() < 0.02
     assert found.std.shape == (300,)

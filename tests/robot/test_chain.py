@@ -1,4 +1,4 @@
-"""The vectorised chain against Pinocchio, the plain DH product, and finite differences."""
+"""Chain: kinematics against Pinocchio, the DH product and finite differences; refused arguments."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import pytest
 from robots import paper, random_joints, random_table
 
 from dhcal_pin import se3
-from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.robot.chain import Chain, twists_in_bodies
+from dhcal_pin.exceptions import DhcalError, InvalidArgumentError
+from dhcal_pin.robot import Chain, Payload, Transmission, parse_urdf
+from dhcal_pin.robot.chain import twists_in_bodies
 from dhcal_pin.robot.dh import CONVENTIONS
-from dhcal_pin.robot.urdf import parse_urdf
 
 
 def pinocchio_poses(chain: Chain, q):
-    """Base link to tip, a configuration at a time."""
+    """Return poses of the tip in the base link, computed one configuration at a time."""
     model = chain.model
     data = model.createData()
     frame = model.getFrameId(chain.tip, pin.FrameType.BODY)
@@ -41,7 +41,7 @@ def test_dh_to_urdf_to_pinocchio_is_the_dh_product(convention):
     assert worst <= 1e-14
 
 
-def test_base_and_tool_stand_outside():
+def test_base_and_tool_do_not_change_the_origins():
     rng = np.random.default_rng(2)
     table = random_table(rng, size=4)
     chain = Chain.from_dh(table)
@@ -52,7 +52,7 @@ def test_base_and_tool_stand_outside():
     np.testing.assert_array_equal(placed.origins, chain.origins)
 
 
-def test_model_carries_the_moved_placements():
+def test_pinocchio_model_has_the_perturbed_origins():
     rng = np.random.default_rng(3)
     chain = Chain.from_dh(paper("sim_6dof"))
     moved = chain.perturbed_at(
@@ -79,7 +79,7 @@ ROBOT = """<robot name="r">
 </robot>"""
 
 
-def test_any_axis_any_joint_and_shared_names():
+def test_chain_with_any_axes_and_a_joint_named_like_its_link():
     chain = Chain.from_urdf(parse_urdf(ROBOT.format(mimic="").encode(), "r.urdf"))
     assert chain.tip == "end"
     assert chain.joint_names == ("one", "two", "end")
@@ -88,7 +88,7 @@ def test_any_axis_any_joint_and_shared_names():
     np.testing.assert_array_equal(chain.upper, [2, 0.3, np.inf])
 
 
-def test_mimic_joint_follows_its_source():
+def test_mimic_joint_moves_with_its_source():
     mimic = '<mimic joint="out" multiplier="-2" offset=".5"/>'
     chain = Chain.from_urdf(parse_urdf(ROBOT.format(mimic=mimic).encode(), "r.urdf"), "end")
     assert chain.joint_names == ("one", "two", "out")
@@ -98,7 +98,7 @@ def test_mimic_joint_follows_its_source():
     np.testing.assert_allclose(chain.poses(q), pinocchio_poses(free, followed), atol=1e-15)
 
 
-def test_mimic_of_nothing_matters_on_the_path_only():
+def test_mimic_of_an_unknown_joint_is_refused_on_the_chain_only():
     text = ROBOT.format(mimic='<mimic joint="nobody"/>')
     with pytest.raises(
         DhcalError, match=r"r.urdf:9: joint 'end': it mimics 'nobody', which is no joint that"
@@ -107,13 +107,13 @@ def test_mimic_of_nothing_matters_on_the_path_only():
     assert Chain.from_urdf(parse_urdf(text.encode(), "r.urdf"), "side").joint_names == ("one", "out")
 
 
-def test_a_joint_cannot_mimic_one_that_stands_still():
+def test_mimic_of_a_fixed_joint_is_refused():
     text = ROBOT.format(mimic='<mimic joint="glue"/>')
     with pytest.raises(DhcalError, match=r"r.urdf:9: joint 'end': it mimics 'glue', which is no joint that"):
         Chain.from_urdf(parse_urdf(text.encode(), "r.urdf"), "end")
 
 
-def test_a_mimic_that_takes_nothing_of_its_source_stands_still():
+def test_mimic_with_multiplier_zero_is_constant():
     text = ROBOT.format(mimic='<mimic joint="out" multiplier="0" offset=".5"/>')
     chain = Chain.from_urdf(parse_urdf(text.encode(), "r.urdf"), "end")
     assert chain.joint_names == ("one", "two")
@@ -130,15 +130,15 @@ def test_a_mimic_that_takes_nothing_of_its_source_stands_still():
         ('"continuous"', '"fixed"', "base", "no moving joint between 'base' and 'base'; choose a tip behind"),
     ],
 )
-def test_paths_that_cannot_be_calibrated_say_what_would(old, new, tip, message):
+def test_unsupported_paths_are_refused_with_a_remedy(old, new, tip, message):
     text = ROBOT.format(mimic="").replace(old, new)
     with pytest.raises(DhcalError, match=message):
         Chain.from_urdf(parse_urdf(text.encode(), "r.urdf"), tip)
 
 
 @pytest.mark.parametrize("count", [64, 65])
-def test_nobody_calibrates_a_rope(count):
-    """Commands take minutes on a path of hundreds of joints; it ends where no arm is."""
+def test_at_most_64_moving_joints_are_accepted(count):
+    """Commands would take minutes on a chain of hundreds of joints."""
     links = "".join(f'<link name="l{i}"/>' for i in range(count + 1))
     joints = "".join(
         f'<joint name="j{i}" type="continuous"><parent link="l{i}"/><child link="l{i + 1}"/></joint>'
@@ -159,7 +159,7 @@ def test_tabs_and_newlines_between_numbers():
     np.testing.assert_array_equal(found.origins, wanted.origins)
 
 
-def test_ambiguous_tip_lists_the_choices():
+def test_ambiguous_tip_is_refused_with_the_choices():
     text = ROBOT.format(mimic="").replace(
         'name="out" type="revolute"><parent link="a"', 'name="out" type="revolute"><parent link="c"'
     )
@@ -167,15 +167,47 @@ def test_ambiguous_tip_lists_the_choices():
         Chain.from_urdf(parse_urdf(text.encode(), "r.urdf"))
 
 
-def test_wrong_joint_values_are_named(sim_6dof):
-    with pytest.raises(DhcalError, match=r"needs 6 columns: joint_1"):
-        sim_6dof.poses(np.zeros((3, 5)))
-    with pytest.raises(DhcalError, match="finite"):
-        sim_6dof.poses(np.full((1, 6), np.nan))
+@pytest.mark.parametrize("method", ["poses", "forward_kinematics", "configurations", "joint_state"])
+def test_joint_positions_of_another_shape_are_refused(sim_6dof, method):
+    for q in (np.zeros((3, 5)), np.zeros(6), 0.0, np.zeros((1, 2, 6))):
+        with pytest.raises(
+            InvalidArgumentError, match=r"shape \(.*expected shape \(m, 6\).*joint_1, joint_2"
+        ):
+            getattr(sim_6dof, method)(q)
+    with pytest.raises(InvalidArgumentError, match="not finite"):
+        getattr(sim_6dof, method)(np.full((1, 6), np.nan))
 
 
-def test_velocities_are_the_derivative_of_poses(sim_6dof_actual):
-    """Every station, all six directions, by central differences of displaced chains."""
+@pytest.mark.parametrize(
+    ("method", "arguments", "message"),
+    [
+        ("from_urdf", (5,), "source has type int; expected a path or a Urdf"),
+        ("from_dh", ("arm.dh.toml",), "table has type str; expected a DHTable"),
+        ("with_payload", (2.0,), "payload has type float; expected a Payload or None"),
+        ("with_transmission", (None,), "transmission has type NoneType; expected a Transmission"),
+        ("with_base_and_tool", (np.eye(4), np.eye(3)), r"shapes \(4, 4\) and \(3, 3\); expected \(4, 4\)"),
+        ("perturbed", (np.zeros((3, 4, 4)),), r"shape \(3, 4, 4\); expected \(16, 4, 4\)"),
+        ("perturbed_at", ({16: np.eye(4)},), "error frame 16 does not exist; expected an index from 0 to 15"),
+        ("perturbed_at", ({2: np.eye(3)},), r"error frame 2 has shape \(3, 3\); expected \(4, 4\)"),
+    ],
+)
+def test_wrong_arguments_are_refused(sim_6dof, method, arguments, message):
+    with pytest.raises(InvalidArgumentError, match=message):
+        getattr(sim_6dof, method)(*arguments)
+
+
+def test_a_transmission_of_another_chain_is_refused(sim_6dof, sim_3dof):
+    with pytest.raises(InvalidArgumentError, match=r"shape \(6, 3, 3\); expected \(6, 6, 6\)"):
+        sim_6dof.with_transmission(Transmission.zero(sim_3dof.loads))
+    assert sim_6dof.with_payload(Payload(1.0)).payload == Payload(1.0)
+
+
+def test_repr_is_short(sim_6dof):
+    assert repr(sim_6dof) == "Chain(name='arm', tip='tool0', n_joints=6)"
+
+
+def test_tool_jacobian_is_the_derivative_of_the_poses(sim_6dof_actual):
+    """All six directions at every error frame, by central differences of perturbed chains."""
     chain = sim_6dof_actual
     rng = np.random.default_rng(4)
     chain = chain.perturbed_at(

@@ -60,7 +60,7 @@ def test_the_browser_shows_what_pinocchio_says(scene, browser, sim_6dof):
     page.goto(scene.url)
     for name, chain in (("nominal", nominal), ("calibrated", grown)):
         model, data = chain.model, chain.model.createData()
-        pin.framesForwardKinematics(model, data, chain.configurations(q)[0])
+        pin.framesForwardKinematics(model, data, chain.configurations(q[None])[0])
         tool = data.oMf[chain.frame_id].homogeneous @ calibrated.tool
         body = model.njoints + 1
         page.wait_for_function("([find, ...it]) => eval(find)(...it)", arg=[LIVE_FIND, name, body])

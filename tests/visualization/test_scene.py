@@ -64,10 +64,10 @@ def check_tips(window: Window, nominal: Chain, calibrated: Chain) -> None:
     for q in poses(nominal, 5):
         window.call("setJoints", q.tolist())
         for arm, chain in (("nominal", nominal), ("calibrated", calibrated)):
-            assert np.abs(window.tip(arm) - chain.poses(q)[0]).max() <= 1e-9
+            assert np.abs(window.tip(arm) - chain.poses(q[None])[0]).max() <= 1e-9
             # And without our own kinematics in between.
             data = chain.model.createData()
-            pin.framesForwardKinematics(chain.model, data, chain.configurations(q)[0])
+            pin.framesForwardKinematics(chain.model, data, chain.configurations(q[None])[0])
             there = chain.base @ data.oMf[chain.frame_id].homogeneous @ chain.tool
             assert np.abs(window.tip(arm) - there).max() <= 1e-9
 
