@@ -1,4 +1,4 @@
-"""Rigid motions against Pinocchio and the group's laws."""
+"""Rigid transformations against Pinocchio and against the group laws."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ANGLES = [0.0, 1e-12, 1e-8, 1e-4, 0.099, 0.101, 1.0, 2.0, 3.0, 3.1415, np.pi - 1
 
 
 @pytest.mark.parametrize("angle", ANGLES)
-def test_equals_pinocchio(angle):
+def test_exponential_logarithm_and_adjoint_equal_pinocchio(angle):
     rng = np.random.default_rng(0)
     axes = rng.normal(size=(50, 3))
     twist = np.concatenate(
@@ -30,7 +30,7 @@ def test_equals_pinocchio(angle):
         np.testing.assert_allclose(se3.right_jacobian_inverse(x[3:]), wanted, atol=1e-13)
 
 
-def test_log_of_half_turns_keeps_its_norm():
+def test_logarithm_of_half_turns_has_norm_pi():
     for axis in (*np.eye(3), np.ones(3) / np.sqrt(3), np.array([0.6, -0.8, 0.0])):
         turn = 2 * np.outer(axis, axis) - np.eye(3)
         rotvec = se3.log3(turn)
@@ -40,7 +40,7 @@ def test_log_of_half_turns_keeps_its_norm():
 
 @given(twists, twists)
 @settings(max_examples=100, deadline=None)
-def test_adjoint_carries_twists(x, y):
+def test_adjoint_transforms_twists(x, y):
     pose = se3.exp6(x)
     np.testing.assert_allclose(
         se3.exp6(se3.adjoint(pose) @ y), pose @ se3.exp6(y) @ se3.inverse(pose), atol=1e-13
@@ -49,7 +49,7 @@ def test_adjoint_carries_twists(x, y):
 
 @given(arrays(float, 3, elements=st.floats(-1.5, 1.5)))
 @settings(max_examples=100, deadline=None)
-def test_right_jacobian_inverse_is_the_derivative_of_the_log(rotvec):
+def test_right_jacobian_inverse_is_the_derivative_of_the_logarithm(rotvec):
     h = 1e-6
     rotation = se3.exp3(rotvec)
     numeric = np.stack(
@@ -62,7 +62,7 @@ def test_right_jacobian_inverse_is_the_derivative_of_the_log(rotvec):
     np.testing.assert_allclose(se3.right_jacobian_inverse(rotvec), numeric, atol=1e-8)
 
 
-def test_broadcasts_over_leading_axes():
+def test_functions_broadcast_over_leading_axes():
     twist = np.random.default_rng(1).normal(size=(2, 3, 6))
     stacked = se3.inverse(se3.exp6(twist))
     assert stacked.shape == (2, 3, 4, 4)

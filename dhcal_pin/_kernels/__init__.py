@@ -1,6 +1,12 @@
-"""The inner loops of every calibration: compiled where the installation could, else by NumPy and LAPACK.
+"""Inner loops of every calibration: compiled C kernels, or NumPy and LAPACK if the build had no compiler.
 
-Both ways give the same sums, in another order; what each does stands in `kinematics` and `reduction`.
+Both implementations evaluate the same formulas; results differ only by rounding, because the order of sums
+differs. `kinematics.py` and `qr.py` are the NumPy implementation and document shapes and formulas.
+`native.py` has the same functions and calls the compiled module `_native`.
+
+Only functions that treat many samples at once belong here. Letters in shapes: m samples, n independent
+joints, k moving joints or residuals per sample, p errors, b bodies or batch members, c columns. Arrays have
+the samples on the last axis, so that the samples of one component are contiguous in memory.
 """
 
 from __future__ import annotations

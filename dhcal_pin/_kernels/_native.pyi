@@ -1,39 +1,44 @@
-"""What `_native.c` offers; arrays are of doubles, components first, and as `loops` describes them."""
+"""Type stub of the compiled module built from `_native.c`.
+
+Arrays hold doubles unless stated otherwise, components first and samples last; the last axis must be
+contiguous. Arguments named `out` and all arguments after the inputs are written in place. The functions of
+`native.py` allocate them; `kinematics.py` and `qr.py` document shapes and formulas.
+"""
 
 from .._typing import Array
 
 def cos_sin(angles: Array, cosines: Array, sines: Array, /) -> None: ...
 def propagate_frames(
-    links: Array, prismatic: Array, values: Array, cos: Array, sin: Array, frames: Array, /
+    link_transforms: Array, prismatic: Array, values: Array, cosines: Array, sines: Array, frames: Array, /
 ) -> None: ...
-def point_jacobian(frames: Array, point: Array, at: Array, twists: Array, out: Array, /) -> None: ...
+def point_jacobian(frames: Array, point: Array, bodies: Array, twists: Array, out: Array, /) -> None: ...
 def apply_observation_matrix(
-    velocities: Array, rows: Array, components: Array, shares: Array, out: Array, /
+    jacobian: Array, rows: Array, components: Array, coefficients: Array, out: Array, /
 ) -> None: ...
 def perturb_frames(
-    into: Array,
+    body_from_urdf: Array,
     origins: Array,
     tool: Array,
-    stations: Array,
+    error_frames: Array,
     twists: Array,
     x: Array,
-    motions: Array,
-    carried: Array,
+    displacements: Array,
+    body_twists: Array,
     /,
 ) -> None: ...
-def log_rotations(turns: Array, out: Array, /) -> int: ...
-def right_jacobian_inverse_batch(vectors: Array, out: Array, /) -> None: ...
-def work_size(columns: int, readings: int, ends: int, /) -> int: ...
+def log_rotations(rotations: Array, out: Array, /) -> int: ...
+def right_jacobian_inverse_batch(rotvecs: Array, out: Array, /) -> None: ...
+def work_size(columns: int, residuals: int, ends: int, /) -> int: ...
 def r_factors(rows: Array, work: Array, out: Array, /) -> None: ...
-def append_diagonal(triangle: Array, diagonal: Array, right: Array, work: Array, out: Array, /) -> None: ...
+def append_diagonal(r_factor: Array, diagonal: Array, target: Array, work: Array, out: Array, /) -> None: ...
 def factor_jacobian(
     frames: Array,
     point: Array,
-    at: Array,
+    bodies: Array,
     twists: Array,
     rows: Array,
     components: Array,
-    shares: Array,
+    coefficients: Array,
     given: Array,
     work: Array,
     out: Array,

@@ -1,9 +1,30 @@
-/* Stations of a chain, moved by errors; frames are 4 by 4, by rows. */
+/* Error frames of a chain, displaced by kinematic errors; transforms are (4, 4) in row-major order.
+
+   A chain of b bodies (body 0 is the base link, one more per moving joint) has 2b + 2 error frames: 0 base,
+   2j + 1 link j, 2j + 2 joint j + 1 (for the last body: the tip), 2b + 1 tool. Error i is a twist ξ_i = [v,
+   ω] at error frame s_i with value x_i. The errors are sorted by s_i. The displacement of error frame s is
+
+       E_s = exp(x_i·ξ_i)·exp(x_(i+1)·ξ_(i+1))·...    over the errors at s.
+
+   The pose F_s of error frame s in its body, before its own displacement, follows from B_j (URDF link frame
+   in body j), O_j (origin of joint j + 1, or the tip) and T (tool):
+
+       F_0 = E_0⁻¹,  F_(2j+1) = B_j,  F_(2j+2) = B_j·E_(2j+1)·O_j,  F_tool = F_tip·E_tip·T.
+
+   The derivative of the chain by x_i is the twist Ad(F_s·exp(x_h·ξ_h)·...·exp(x_(i-1)·ξ_(i-1)))·ξ_i of that
+   body, with the product over the errors at s that precede i.
+
+   Exponential of x·[v, ω] with θ = x·|ω| and the unit axis a = ω/|ω| (Rodrigues' formula):
+
+       R = I + sin θ·[a]× + (1 - cos θ)·[a]×²,
+       p = (θ·v + (1 - cos θ)·[a]×·v + (θ - sin θ)·[a]×²·v)/|ω|,
+
+   with 1 - cos θ = 2·sin²(θ/2), which does not cancel at small angles. */
 
 static const double identity[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
 
-/* out = a b, which may be one of them. */
-static void follow(double *out, const double *a, const double *b)
+/* Compute out = a·b; out may be a or b. */
+static void compose(double *out, const double *a, const double *b)
 {
     double c[16];
     for (int i = 0; i < 3; i++)
@@ -14,6 +35,7 @@ static void follow(double *out, const double *a, const double *b)
     memcpy(out, c, sizeof c);
 }
 
+/* Compute the inverse of a rigid transform; out must not be `frame`. */
 static void invert(double *out, const double *frame)
 {
     for (int i = 0; i < 3; i++) {
@@ -24,8 +46,8 @@ static void invert(double *out, const double *frame)
     memcpy(out + 12, identity + 12, 4 * sizeof(double));
 }
 
-/* The motion of a share x of a twist. */
-static void exponential(double *out, const double *twist, double x)
+/* Compute exp(x·twist) for a twist [v, ω]. */
+static void scaled_exp6(double *out, const double *twist, double x)
 {
     const double *v = twist, *w = twist + 3, size = sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]);
     memcpy(out, identity, sizeof identity);
@@ -34,24 +56,24 @@ static void exponential(double *out, const double *twist, double x)
             out[4 * i + 3] = x * v[i];
         return;
     }
-    const double angle = x * size, half = sin(0.5 * angle), sine = sin(angle), across = 2 * half * half;
+    const double angle = x * size, half = sin(0.5 * angle), sine = sin(angle), versine = 2 * half * half;
     const double a = w[0] / size, b = w[1] / size, c = w[2] / size;
     const double cross[9] = {0, -c, b, c, 0, -a, -b, a, 0};
     for (int i = 0; i < 3; i++) {
-        double along = angle * v[i];
+        double p = angle * v[i];
         for (int j = 0; j < 3; j++) {
             double square = 0;
             for (int k = 0; k < 3; k++)
                 square += cross[3 * i + k] * cross[3 * k + j];
-            out[4 * i + j] += sine * cross[3 * i + j] + across * square;
-            along += (across * cross[3 * i + j] + (angle - sine) * square) * v[j];
+            out[4 * i + j] += sine * cross[3 * i + j] + versine * square;
+            p += (versine * cross[3 * i + j] + (angle - sine) * square) * v[j];
         }
-        out[4 * i + 3] = along / size;
+        out[4 * i + 3] = p / size;
     }
 }
 
-/* A twist as it is seen from a frame that it is given in. */
-static void carry_twist(double *out, const double *frame, const double *twist)
+/* Compute out = Ad(frame)·twist, a twist of `frame` expressed in the frame's parent. */
+static void transform_twist(double *out, const double *frame, const double *twist)
 {
     const double x = frame[3], y = frame[7], z = frame[11];
     for (int i = 0; i < 3; i++) {
@@ -64,43 +86,46 @@ static void carry_twist(double *out, const double *frame, const double *twist)
     out[2] += x * out[4] - y * out[3];
 }
 
-/* A station's frame in its body, before its own motion, once the stations before it have moved. */
-static void station_frame(double *out, Size station, Size bodies, const double *into, const double *origins,
-                          const double *tool, const double *motions)
+/* Compute the pose of an error frame in its body, before its own displacement.
+
+   `displacements` of the preceding error frames must be complete. */
+static void error_frame_pose(double *out, Size error_frame, Size bodies, const double *body_from_urdf,
+                             const double *origins, const double *tool, const double *displacements)
 {
-    const Size body = (station - 1) / 2;
-    if (station == 0)
-        invert(out, motions);
-    else if (station == 2 * bodies + 1) {
-        station_frame(out, station - 1, bodies, into, origins, tool, motions);
-        follow(out, out, motions + 16 * (station - 1));
-        follow(out, out, tool);
-    } else if (station % 2)
-        memcpy(out, into + 16 * body, 16 * sizeof(double));
+    const Size body = (error_frame - 1) / 2;
+    if (error_frame == 0)
+        invert(out, displacements);
+    else if (error_frame == 2 * bodies + 1) {
+        error_frame_pose(out, error_frame - 1, bodies, body_from_urdf, origins, tool, displacements);
+        compose(out, out, displacements + 16 * (error_frame - 1));
+        compose(out, out, tool);
+    } else if (error_frame % 2)
+        memcpy(out, body_from_urdf + 16 * body, 16 * sizeof(double));
     else {
-        follow(out, into + 16 * body, motions + 16 * (station - 1));
-        follow(out, out, origins + 16 * body);
+        compose(out, body_from_urdf + 16 * body, displacements + 16 * (error_frame - 1));
+        compose(out, out, origins + 16 * body);
     }
 }
 
-/* What errors x of twists (p, 6) make of the stations they are at, ascending, and the twists in the frames of
-   the bodies that they move: one at a station turns with those before it. */
-static void move(Size bodies, Size p, const double *into, const double *origins, const double *tool,
-                 const Size *stations, const double *twists, const double *x, double *motions,
-                 double *carried)
+/* Compute the displacements (2b + 2, 4, 4) of all error frames and the twists (p, 6) in body frames.
+
+   The errors are sorted by their error frame; x (p) are their values. */
+static void perturb_frames(Size bodies, Size p, const double *body_from_urdf, const double *origins,
+                           const double *tool, const Size *error_frames, const double *twists,
+                           const double *x, double *displacements, double *body_twists)
 {
     for (Size i = 0; i < 2 * bodies + 2; i++)
-        memcpy(motions + 16 * i, identity, sizeof identity);
+        memcpy(displacements + 16 * i, identity, sizeof identity);
     double step[16], frame[16];
     for (Size i = 0; i < p; i++) {
-        exponential(step, twists + 6 * i, x[i]);
-        follow(motions + 16 * stations[i], motions + 16 * stations[i], step);
+        scaled_exp6(step, twists + 6 * i, x[i]);
+        compose(displacements + 16 * error_frames[i], displacements + 16 * error_frames[i], step);
     }
     for (Size i = 0; i < p; i++) {
-        if (!i || stations[i] != stations[i - 1])
-            station_frame(frame, stations[i], bodies, into, origins, tool, motions);
-        carry_twist(carried + 6 * i, frame, twists + 6 * i);
-        exponential(step, twists + 6 * i, x[i]);
-        follow(frame, frame, step);
+        if (!i || error_frames[i] != error_frames[i - 1])
+            error_frame_pose(frame, error_frames[i], bodies, body_from_urdf, origins, tool, displacements);
+        transform_twist(body_twists + 6 * i, frame, twists + 6 * i);
+        scaled_exp6(step, twists + 6 * i, x[i]);
+        compose(frame, frame, step);
     }
 }

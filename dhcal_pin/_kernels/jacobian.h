@@ -1,8 +1,21 @@
-/* How an arm's errors move the tool, and what of that readings see. */
+/* Jacobian of a point by kinematic errors, and the rows of measurements that follow from it.
 
-/* out = a vector given in a body's axes, along the measuring frame's; axes at a stride. */
-static inline __attribute__((always_inline)) void turned(double *restrict out, const double *axes, Size row,
-                                                         const double *vector, Size n)
+   A unit error of twist [v, ω] in the axes of body b, with rotation R and origin o at one sample, moves a
+   point p by
+
+       angular velocity   ω' = R·ω,
+       linear velocity    v' = R·v + ω' × (p - o),          p - o is the lever arm.
+
+   A sample is observed at one or two configurations ("ends"; two for relative measurements). With the
+   velocities y = [v', ω'] (6 components per end) the Jacobian row of residual k at sample t is
+
+       J[k, t] = Σ_q coefficient[q, t]·y[component[q]]       over the terms q with row[q] = k,
+
+   a sparse product by the whitened observation matrix H of the measurement. Strides count doubles. */
+
+/* Rotate a vector given in body axes to the base axes, at n samples; zero components are skipped. */
+static inline __attribute__((always_inline)) void rotate_to_base(double *restrict out, const double *axes,
+                                                                 Size row, const double *vector, Size n)
 {
     Size given[3] = {0}, count = 0;
     for (Size a = 0; a < 3; a++)
@@ -16,192 +29,209 @@ static inline __attribute__((always_inline)) void turned(double *restrict out, c
         memcpy(out, x, n * sizeof(double));
     else if (count == 1) {
         const double f = vector[given[0]];
-        EACH (t, n)
+        VECTORIZE (t, n)
             out[t] = f * x[t];
     } else if (count == 2) {
         const double f = vector[given[0]], g = vector[given[1]];
-        EACH (t, n)
+        VECTORIZE (t, n)
             out[t] = f * x[t] + g * y[t];
     } else {
         const double f = vector[0], g = vector[1], h = vector[2];
-        EACH (t, n)
+        VECTORIZE (t, n)
             out[t] = f * x[t] + g * y[t] + h * z[t];
     }
 }
 
-/* Where the point is from a body's origin at n samples, along the measuring frame's axes (3, ROWS). */
-static inline __attribute__((always_inline)) void reach(double *lever, const double *point, Size point_row,
-                                                        const double *frame, Size row, Size n)
+/* Compute the vector from a body's origin to the point in base axes (3, BLOCK_ROWS), at n samples. */
+static inline __attribute__((always_inline)) void
+lever_arm(double *lever, const double *point, Size point_row, const double *frame, Size row, Size n)
 {
     for (Size i = 0; i < 3; i++) {
         const double *restrict p = point + i * point_row, *restrict o = frame + (9 + i) * row;
-        double *restrict to = lever + i * ROWS;
-        EACH (t, n)
+        double *restrict to = lever + i * BLOCK_ROWS;
+        VECTORIZE (t, n)
             to[t] = p[t] - o[t];
     }
 }
 
-static inline __attribute__((always_inline)) int turns(const double *twist)
+static inline __attribute__((always_inline)) int has_rotation(const double *twist)
 {
     return twist[3] != 0 || twist[4] != 0 || twist[5] != 0;
 }
 
-/* The point's velocity (6, n) by a twist of a body. */
-static inline __attribute__((always_inline)) void velocity(double *out, Size out_row, const double *frame,
-                                                           Size row, const double *twist, const double *lever,
-                                                           Size n)
+/* Compute the velocity [v', ω'] (6, n) of the point by a unit twist of a body. */
+static inline __attribute__((always_inline)) void point_velocity(double *out, Size out_row,
+                                                                 const double *frame, Size row,
+                                                                 const double *twist, const double *lever,
+                                                                 Size n)
 {
     for (Size i = 0; i < 3; i++)
-        turned(out + (3 + i) * out_row, frame + i * row, row, twist + 3, n);
+        rotate_to_base(out + (3 + i) * out_row, frame + i * row, row, twist + 3, n);
     for (Size i = 0; i < 3; i++)
-        turned(out + i * out_row, frame + i * row, row, twist, n);
-    if (turns(twist))
+        rotate_to_base(out + i * out_row, frame + i * row, row, twist, n);
+    if (has_rotation(twist))
         for (Size i = 0; i < 3; i++) {
             const Size y = (i + 1) % 3, z = (i + 2) % 3;
             const double *restrict wy = out + (3 + y) * out_row, *restrict wz = out + (3 + z) * out_row;
-            const double *restrict ly = lever + y * ROWS, *restrict lz = lever + z * ROWS;
+            const double *restrict ly = lever + y * BLOCK_ROWS, *restrict lz = lever + z * BLOCK_ROWS;
             double *restrict v = out + i * out_row;
-            EACH (t, n)
+            VECTORIZE (t, n)
                 v[t] += wy[t] * lz[t] - wz[t] * ly[t];
         }
 }
 
-/* Errors of an arm: each is a twist of a body, which moves a point, at samples of some ends each, the second
-   ends so many samples behind the first. */
-typedef struct {
-    Size count, ends, apart;
-    const Size *at;
-    const double *twists, *frames, *point;
-    Size body, row, point_row;
-} Errors;
+/* Twists of kinematic errors (count), sorted by body, with the frames and the point that they act on.
 
-WIDEST static void velocities(const Errors *e, Size m, double *out, Size out_twist, Size out_row)
+   The samples of end e start at e·end_offset. */
+typedef struct {
+    Size count, n_ends, end_offset;
+    const Size *bodies;
+    const double *twists, *frames, *point;
+    Size frame_stride, row_stride, point_stride;
+} ErrorTwists;
+
+/* Compute the Jacobian (count, 6, m) of the point by all errors. */
+SIMD_CLONES static void point_jacobian(const ErrorTwists *e, Size m, double *out, Size out_twist,
+                                       Size out_row)
 {
-    double lever[3 * ROWS];
-    for (Size start = 0; start < m; start += ROWS) {
-        const Size n = m - start < ROWS ? m - start : ROWS;
+    double lever[3 * BLOCK_ROWS];
+    for (Size start = 0; start < m; start += BLOCK_ROWS) {
+        const Size n = m - start < BLOCK_ROWS ? m - start : BLOCK_ROWS;
         for (Size j = 0; j < e->count; j++) {
-            const double *frame = e->frames + e->at[j] * e->body + start;
-            if (!j || e->at[j] != e->at[j - 1])
-                reach(lever, e->point + start, e->point_row, frame, e->row, n);
-            velocity(out + j * out_twist + start, out_row, frame, e->row, e->twists + 6 * j, lever, n);
+            const double *frame = e->frames + e->bodies[j] * e->frame_stride + start;
+            if (!j || e->bodies[j] != e->bodies[j - 1])
+                lever_arm(lever, e->point + start, e->point_stride, frame, e->row_stride, n);
+            point_velocity(out + j * out_twist + start, out_row, frame, e->row_stride, e->twists + 6 * j,
+                           lever, n);
         }
     }
 }
 
-/* How rows follow from velocities: each term adds a share (m) of a component, 0 to 5 at the first end, 6 to
-   11 at the second, to a row. Terms of a row are neighbours. */
+/* Sparse observation matrix H of m samples with `count` terms, sorted by row.
+
+   Term q adds coefficients[q, t] times component components[q] of the velocity to row rows[q]. Components 0
+   ... 5 are vx, vy, vz, ωx, ωy, ωz at the first end, 6 ... 11 at the second. */
 typedef struct {
     Size count;
     const Size *rows, *components;
-    const double *shares;
+    const double *coefficients;
     Size stride;
-} Mixture;
+} ObservationMatrix;
 
-/* Whether a row sees what moves, and what turns. */
+/* Whether a row depends on linear and on angular velocities. */
 typedef struct {
-    int moves, turns;
-} Seen;
+    int linear, angular;
+} Sensitivity;
 
-static Seen seen_by(const Mixture *x, Size row)
+static Sensitivity row_sensitivity(const ObservationMatrix *h, Size row)
 {
-    Seen out = {0, 0};
-    for (Size q = 0; q < x->count; q++)
-        if (x->rows[q] == row)
-            *(x->components[q] % 6 < 3 ? &out.moves : &out.turns) = 1;
+    Sensitivity out = {0, 0};
+    for (Size q = 0; q < h->count; q++)
+        if (h->rows[q] == row)
+            *(h->components[q] % 6 < 3 ? &out.linear : &out.angular) = 1;
     return out;
 }
 
-static int is_seen(const Errors *e, Size error, Seen by)
+/* Whether a row with this sensitivity can depend on an error; a rotation moves the point, too. */
+static int is_observed(const ErrorTwists *e, Size error, Sensitivity row)
 {
     const double *twist = e->twists + 6 * error;
-    if (turns(twist))
-        return by.moves || by.turns;
-    return by.moves && (twist[0] != 0 || twist[1] != 0 || twist[2] != 0);
+    if (has_rotation(twist))
+        return row.linear || row.angular;
+    return row.linear && (twist[0] != 0 || twist[1] != 0 || twist[2] != 0);
 }
 
-/* One row of the mixture, from its term q on, of velocities with components at a stride and ends at another;
-   the first term that is no more of that row. */
-static inline __attribute__((always_inline)) Size mix_row(double *restrict out, const Mixture *x, Size q,
-                                                          const double *velocity, Size component, Size end,
-                                                          int is_turning, Size start, Size n)
+/* Compute one row of H·velocity at n samples, starting with term q; return the first term of the next row.
+
+   `component` and `end` are strides of the velocity. Angular terms are skipped unless the error rotates. Up
+   to three terms are added in one pass. */
+static inline __attribute__((always_inline)) Size observation_row(double *restrict out,
+                                                                  const ObservationMatrix *h, Size q,
+                                                                  const double *velocity, Size component,
+                                                                  Size end, int rotates, Size start, Size n)
 {
-    const Size row = x->rows[q];
-    int begun = 0;
-    while (q < x->count && x->rows[q] == row) {
+    const Size row = h->rows[q];
+    int has_value = 0;
+    while (q < h->count && h->rows[q] == row) {
         const double *f[3] = {0}, *v[3] = {0};
-        int some = 0;
-        for (; q < x->count && x->rows[q] == row && some < 3; q++) {
-            const Size which = x->components[q] % 6;
-            if (which > 2 && !is_turning)
+        int n_terms = 0;
+        for (; q < h->count && h->rows[q] == row && n_terms < 3; q++) {
+            const Size axis = h->components[q] % 6;
+            if (axis > 2 && !rotates)
                 continue;
-            f[some] = x->shares + q * x->stride + start;
-            v[some++] = velocity + which * component + x->components[q] / 6 * end;
+            f[n_terms] = h->coefficients + q * h->stride + start;
+            v[n_terms++] = velocity + axis * component + h->components[q] / 6 * end;
         }
         const double *restrict f0 = f[0], *restrict f1 = f[1], *restrict f2 = f[2];
         const double *restrict v0 = v[0], *restrict v1 = v[1], *restrict v2 = v[2];
-        if (some == 3 && begun)
-            EACH (t, n)
+        if (n_terms == 3 && has_value)
+            VECTORIZE (t, n)
                 out[t] += f0[t] * v0[t] + f1[t] * v1[t] + f2[t] * v2[t];
-        else if (some == 3)
-            EACH (t, n)
+        else if (n_terms == 3)
+            VECTORIZE (t, n)
                 out[t] = f0[t] * v0[t] + f1[t] * v1[t] + f2[t] * v2[t];
-        else if (some == 1 && !begun)
-            EACH (t, n)
+        else if (n_terms == 1 && !has_value)
+            VECTORIZE (t, n)
                 out[t] = f0[t] * v0[t];
         else {
-            if (!begun)
+            if (!has_value)
                 memset(out, 0, n * sizeof(double));
-            for (int i = 0; i < some; i++) {
+            for (int i = 0; i < n_terms; i++) {
                 const double *restrict fi = f[i], *restrict vi = v[i];
-                EACH (t, n)
+                VECTORIZE (t, n)
                     out[t] += fi[t] * vi[t];
             }
         }
-        begun = 1;
+        has_value = 1;
     }
     return q;
 }
 
-/* Rows (p, k, m) of velocities (p, 6, ends m). */
-WIDEST static void mix(const Mixture *x, Size p, Size k, Size m, const double *velocities, Size velocity,
-                       Size component, double *out, Size out_error, Size out_row)
+/* Compute the rows (p, k, m) of H times the Jacobian (p, 6, ends·m). */
+SIMD_CLONES static void apply_observation_matrix(const ObservationMatrix *h, Size p, Size k, Size m,
+                                                 const double *jacobian, Size velocity, Size component,
+                                                 double *out, Size out_error, Size out_row)
 {
-    for (Size start = 0; start < m; start += ROWS) {
-        const Size n = m - start < ROWS ? m - start : ROWS;
+    for (Size start = 0; start < m; start += BLOCK_ROWS) {
+        const Size n = m - start < BLOCK_ROWS ? m - start : BLOCK_ROWS;
         for (Size j = 0; j < p; j++)
             for (Size i = 0, q = 0; i < k; i++) {
                 double *to = out + j * out_error + i * out_row + start;
-                if (q < x->count && x->rows[q] == i)
-                    q = mix_row(to, x, q, velocities + j * velocity + start, component, m, 1, start, n);
+                if (q < h->count && h->rows[q] == i)
+                    q = observation_row(to, h, q, jacobian + j * velocity + start, component, m, 1, start, n);
                 else
                     memset(to, 0, n * sizeof(double));
             }
     }
 }
 
-/* Rows by errors at n samples into blocks of c columns ROWS apart, one block a reading, at the columns'
-   places (k, c); `moved` has room for velocities and levers of all ends. */
-WIDEST static void mix_errors(const Errors *e, const Mixture *x, Size start, Size n, Size c,
-                              const Size *places, double *moved, double *blocks)
+/* Compute the whitened Jacobian rows of n samples into blocks (k, c, BLOCK_ROWS), one block per residual.
+
+   positions (k, c) gives the column of each error in the block of each residual, or -1. `velocities` is work
+   memory for 9·n_ends·BLOCK_ROWS doubles: the velocities (6) and lever arms (3) of all ends. */
+SIMD_CLONES static void observed_error_rows(const ErrorTwists *e, const ObservationMatrix *h, Size start,
+                                            Size n, Size c, const Size *positions, double *velocities,
+                                            double *blocks)
 {
-    double *levers = moved + 6 * e->ends * ROWS;
+    double *levers = velocities + 6 * e->n_ends * BLOCK_ROWS;
     for (Size j = 0; j < e->count; j++) {
         const double *twist = e->twists + 6 * j;
-        for (Size end = 0; end < e->ends; end++) {
-            const double *frame = e->frames + e->at[j] * e->body + end * e->apart + start;
-            double *lever = levers + 3 * end * ROWS;
-            if (!j || e->at[j] != e->at[j - 1])
-                reach(lever, e->point + end * e->apart + start, e->point_row, frame, e->row, n);
-            velocity(moved + 6 * end * ROWS, ROWS, frame, e->row, twist, lever, n);
+        for (Size end = 0; end < e->n_ends; end++) {
+            const double *frame = e->frames + e->bodies[j] * e->frame_stride + end * e->end_offset + start;
+            double *lever = levers + 3 * end * BLOCK_ROWS;
+            if (!j || e->bodies[j] != e->bodies[j - 1])
+                lever_arm(lever, e->point + end * e->end_offset + start, e->point_stride, frame,
+                          e->row_stride, n);
+            point_velocity(velocities + 6 * end * BLOCK_ROWS, BLOCK_ROWS, frame, e->row_stride, twist, lever,
+                           n);
         }
-        for (Size q = 0; q < x->count;) {
-            const Size row = x->rows[q], place = places[row * c + j];
-            if (place >= 0)
-                q = mix_row(blocks + (row * c + place) * ROWS, x, q, moved, ROWS, 6 * ROWS, turns(twist),
-                            start, n);
+        for (Size q = 0; q < h->count;) {
+            const Size row = h->rows[q], position = positions[row * c + j];
+            if (position >= 0)
+                q = observation_row(blocks + (row * c + position) * BLOCK_ROWS, h, q, velocities, BLOCK_ROWS,
+                                    6 * BLOCK_ROWS, has_rotation(twist), start, n);
             else
-                while (q < x->count && x->rows[q] == row)
+                while (q < h->count && h->rows[q] == row)
                     q++;
         }
     }

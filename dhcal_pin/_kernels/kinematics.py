@@ -1,4 +1,14 @@
-"""Frames and velocities of a serial arm over many samples, components first: samples are contiguous."""
+"""Frames, Jacobians and rotations of a serial chain over many samples, in NumPy.
+
+Frames along the chain: F_(j+1) = F_j·L_j·M_j(q_j), where L_j is a constant link transform and M_j is a
+rotation about z by q_j (revolute) or a translation along z by q_j (prismatic).
+
+Jacobian of a point p by a unit twist [v, ω] of a body with rotation R and origin o:
+
+    ω' = R·ω,    v' = R·v + ω' × (p - o).
+
+Letters in shapes: m samples, k moving joints, b bodies, p errors. The samples are on the last axis.
+"""
 
 from __future__ import annotations
 
@@ -13,154 +23,202 @@ from .types import JointState, ObservationMatrix
 from .work_arrays import UnbufferedRows, work_array
 
 _IDENTITY = np.eye(4)
-
-
-# So many samples of all bodies stay in a processor's cache.
+# Samples of all bodies that are treated together, so that they stay in the cache.
 BLOCK_SIZE = 2048
-
-
-# Of columns x, y, z, p, the same and y, -x.
+# Maps the columns x, y, z, p to themselves and to y, -x.
 _ROTATION_MIX = np.vstack([np.eye(4), [[0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0]]])
 
 
 def cos_sin(angles: Array) -> tuple[Array, Array]:
-    """Of angles (k, m), rad."""
-    # One tangent of half the angle costs a fifth of a cosine and a sine.
+    """Compute cosines and sines by the half-angle formulas.
+
+    With t = tan(angle/2): cos = (1 - t²)/(1 + t²) and sin = 2t/(1 + t²). One tangent takes a fifth of the
+    time of a cosine and a sine.
+
+    Args:
+        angles: Angles, shape (k, m) [rad].
+
+    Returns:
+        Cosines and sines, each of shape (k, m).
+    """
     half = np.tan(0.5 * angles)
     square = half * half
     return (1 - square) / (1 + square), 2 * half / (1 + square)
 
 
 @UnbufferedRows()
-def propagate_frames(links: Array, prismatic: Array, motion: JointState, frames: Array) -> None:
-    """Fills the columns x, y, z, p of frames (k+2, 7, 3, m), whose first is the base's, to the tool's.
+def propagate_frames(
+    link_transforms: Array, prismatic: Array, joint_state: JointState, frames: Array
+) -> None:
+    """Compute the frames along a chain, from the base to the tool.
 
     Args:
-        links: (k+1, 4, 4) constant transforms between the motions; the last one leads to the tool.
-        prismatic: (k,) True where a joint slides along its z; the others turn about it.
-        motion: of the joints.
-        frames: columns x, y, z, p of each frame, and three that are overwritten.
+        link_transforms: Constant transforms L between the joint motions, shape (k+1, 4, 4). The last one
+            leads to the tool.
+        prismatic: Whether each joint is prismatic, shape (k,).
+        joint_state: Positions of the moving joints.
+        frames: Columns x, y, z, p of each frame and three columns of work memory, shape (k+2, 7, 3, m).
+            Frame 0 is given; the others are filled.
     """
-    # The columns of F·L are the columns of F mixed by L: one small product for all samples. A turn by q
-    # makes of x and y their cos q-fold, and to that adds the sin q-fold of y and -x.
-    mixing, columns = _ROTATION_MIX @ np.swapaxes(links, 1, 2), frames.reshape(*frames.shape[:2], -1)
+    # The columns of F·L are linear combinations of the columns of F: one small matrix product for all
+    # samples. A rotation by q about z maps x to cos q·x + sin q·y and y to cos q·y - sin q·x.
+    mixing, columns = (
+        _ROTATION_MIX @ np.swapaxes(link_transforms, 1, 2),
+        frames.reshape(*frames.shape[:2], -1),
+    )
     steps = zip(mixing, columns[:, :4], columns[1:, :6], frames[1:], prismatic.tolist(), strict=False)
-    for j, (mix, before, mixed, after, slides) in enumerate(steps):
-        if slides:
-            np.matmul(mix[:4], before, out=mixed[:4])
-            np.multiply(after[2], motion.positions[j], out=after[4])
-            after[3] += after[4]
+    for j, (mix, parent, product, child, is_prismatic) in enumerate(steps):
+        if is_prismatic:
+            np.matmul(mix[:4], parent, out=product[:4])
+            np.multiply(child[2], joint_state.positions[j], out=child[4])
+            child[3] += child[4]
         else:
-            np.matmul(mix, before, out=mixed)
-            turned, across = after[:2], after[4:6]
-            turned *= motion.cos[j]
-            across *= motion.sin[j]
-            turned += across
+            np.matmul(mix, parent, out=product)
+            axes, rotated_axes = child[:2], child[4:6]
+            axes *= joint_state.cos[j]
+            rotated_axes *= joint_state.sin[j]
+            axes += rotated_axes
     np.matmul(mixing[-1, :4], columns[-2, :4], out=columns[-1, :4])
 
 
 @UnbufferedRows()
-def point_jacobian(frames: Array, point: Array, at: Array, twists: Array, out: Array) -> None:
-    """Fills in a point's velocity (p, 6, m) per unit of each twist of a body, axes of the measuring frame.
+def point_jacobian(frames: Array, point: Array, bodies: Array, twists: Array, out: Array) -> None:
+    """Compute the Jacobian of a point by unit twists of bodies, in the axes of the measuring frame.
 
     Args:
-        frames: (b, 7, 3, m) columns x, y, z, p of each body's frame, and three that are overwritten.
-        point: (3, m).
-        at: (p,) body numbers, ascending.
-        twists: (p, 6) twists in those bodies' frames.
-        out: (p, 6, m), written in place.
+        frames: Columns x, y, z, p of each body frame and three columns that are overwritten, shape (b, 7, 3,
+            m).
+        point: Point in the measuring frame, shape (3, m) [m].
+        bodies: Body of each twist, ascending, shape (p,).
+        twists: Twists in the body frames, shape (p, 6).
+        out: Velocities [v', ω'] to fill, shape (p, 6, m).
     """
-    # A twist mixes what its body's axes do, one small product for all samples and components.
-    move = np.zeros((len(at), 7))
-    move[:, :3], move[:, 4:] = twists[:, :3], twists[:, 3:]
-    runs = _equal_runs(tuple(np.bincount(at).tolist()))
+    # A velocity is a linear combination of the body's axes and of the velocities that rotations about them
+    # cause: one small matrix product for all samples and components.
+    combination = np.zeros((len(bodies), 7))
+    combination[:, :3], combination[:, 4:] = twists[:, :3], twists[:, 3:]
+    runs = _equal_runs(tuple(np.bincount(bodies).tolist()))
     for start in range(0, point.shape[-1], BLOCK_SIZE):
-        some = np.s_[..., start : start + BLOCK_SIZE]
-        for bodies, rows, count in runs:
-            part = frames[bodies][some]
-            _turn_about_axes(part, point[some])
+        samples = np.s_[..., start : start + BLOCK_SIZE]
+        for run, rows, count in runs:
+            part = frames[run][samples]
+            _fill_rotation_velocities(part, point[samples])
             n, _, _, m = part.shape
             part = part.swapaxes(1, 2)
-            velocity = out[rows][some].reshape(n, count, 6, m).swapaxes(1, 2)
-            np.matmul(move[rows].reshape(n, 1, count, 7), part, out=velocity[:, :3])
-            np.matmul(move[rows, 4:].reshape(n, 1, count, 3), part[:, :, :3], out=velocity[:, 3:])
+            velocity = out[rows][samples].reshape(n, count, 6, m).swapaxes(1, 2)
+            np.matmul(combination[rows].reshape(n, 1, count, 7), part, out=velocity[:, :3])
+            np.matmul(combination[rows, 4:].reshape(n, 1, count, 3), part[:, :, :3], out=velocity[:, 3:])
 
 
 def batch_point_jacobian(
-    frames: Array, point: Array, at: Array, twists: Array, ends: int, out: Array
+    frames: Array, point: Array, bodies: Array, twists: Array, ends: int, out: Array
 ) -> None:
-    """As `point_velocities`, by twists (b, p, 6) of members, whose samples follow each other at each end."""
+    """Compute the Jacobian of a point by unit twists of bodies, for a batch of chains.
+
+    The samples are ordered by configuration of the sample (first or second), then by member of the batch.
+
+    Args:
+        frames: Columns x, y, z, p of each body frame, shape (j, 7, 3, ends·b·m).
+        point: Point in the measuring frame, shape (3, ends·b·m) [m].
+        bodies: Body of each twist, ascending, shape (p,).
+        twists: Twists of each member in its body frames, shape (b, p, 6).
+        ends: Configurations per sample, 1 or 2.
+        out: Velocities [v', ω'] to fill, shape (p, 6, ends·b·m).
+    """
     shape = ends, len(twists), point.shape[1] // max(ends * len(twists), 1)
-    starts = np.searchsorted(at, np.arange(len(frames) + 1)).tolist()
+    starts = np.searchsorted(bodies, np.arange(len(frames) + 1)).tolist()
     for start, end, frame in zip(starts, starts[1:], frames, strict=False):
         if start == end:
             continue
         axes, lever = frame[:3].reshape(3, 3, *shape), (point - frame[3]).reshape(3, *shape)
-        of = twists[:, start:end].transpose(2, 1, 0)[:, :, None, None, :, None]
+        components = twists[:, start:end].transpose(2, 1, 0)[:, :, None, None, :, None]
         block = out[start:end].reshape(end - start, 6, *shape)
         for part, first in ((block[:, :3], 0), (block[:, 3:], 3)):
-            np.multiply(of[first], axes[0], out=part)
-            part += of[first + 1] * axes[1]
-            part += of[first + 2] * axes[2]
+            np.multiply(components[first], axes[0], out=part)
+            part += components[first + 1] * axes[1]
+            part += components[first + 2] * axes[2]
         for i, (u, v) in enumerate(((1, 2), (2, 0), (0, 1))):
             block[:, i] += block[:, 3 + u] * lever[v] - block[:, 3 + v] * lever[u]
 
 
-def apply_observation_matrix(velocities: Array, mixture: ObservationMatrix, out: Array) -> Array:
-    """Fills in what a mixture makes (p, k, m) of velocities (p, 6, c·m)."""
+def apply_observation_matrix(jacobian: Array, observation: ObservationMatrix, out: Array) -> Array:
+    """Multiply an observation matrix by a Jacobian of the tool.
+
+    Args:
+        jacobian: Tool velocities by p errors, shape (p, 6, c·m), with c configurations per sample.
+        observation: Observation matrix of m samples.
+        out: Product to fill, shape (p, r, m).
+
+    Returns:
+        `out`.
+    """
     out[:] = 0.0
     p, _, m = out.shape
-    ends = velocities.reshape(p, 6, velocities.shape[2] // max(m, 1), m)
+    ends = jacobian.reshape(p, 6, jacobian.shape[2] // max(m, 1), m)
     product = work_array("product", p, m)
-    for row, component, share in zip(mixture.rows, mixture.components, mixture.coefficients, strict=True):
-        out[:, row] += np.multiply(ends[:, component % 6, component // 6], share, out=product)
+    terms = zip(observation.rows, observation.components, observation.coefficients, strict=True)
+    for row, component, coefficient in terms:
+        out[:, row] += np.multiply(ends[:, component % 6, component // 6], coefficient, out=product)
     return out
 
 
-def error_frame_poses(body_from_urdf: Array, origins: Array, tool: Array, motions: Array) -> Array:
-    """Each station's frame (2k+4, 4, 4) in its body, before its own motion.
+def error_frame_poses(body_from_urdf: Array, origins: Array, tool: Array, displacements: Array) -> Array:
+    """Compute the pose of each error frame in its body, before its own displacement.
 
     Args:
-        body_from_urdf: (k+1, 4, 4) each body's URDF frame in its body frame.
-        origins: (k+1, 4, 4) of the joints and the tip, without the motions.
-        tool: (4, 4), likewise.
-        motions: (2k+4, 4, 4) of the stations.
+        body_from_urdf: URDF link frame of each body in its body frame, shape (b, 4, 4).
+        origins: Origins of the joints and of the tip without joint motions, shape (b, 4, 4).
+        tool: Tool in the tip frame, shape (4, 4).
+        displacements: Displacements of the error frames, shape (2b+2, 4, 4).
+
+    Returns:
+        Poses of the error frames, shape (2b+2, 4, 4).
     """
-    frames = np.empty(motions.shape)
-    # Body 0 is behind the base's motion.
-    frames[0] = se3.inverse(motions[0])
+    frames = np.empty(displacements.shape)
+    # The frame of body 0 lies behind the displacement of the base.
+    frames[0] = se3.inverse(displacements[0])
     frames[1:-1:2] = body_from_urdf
-    np.matmul(body_from_urdf @ motions[1:-1:2], origins, out=frames[2::2])
-    frames[-1] = frames[-2] @ motions[-2] @ tool
+    np.matmul(body_from_urdf @ displacements[1:-1:2], origins, out=frames[2::2])
+    frames[-1] = frames[-2] @ displacements[-2] @ tool
     return frames
 
 
 def perturb_frames(
     body_from_urdf: Array, origins: Array, tool: Array, error_frames: Array, twists: Array, x: Array
 ) -> tuple[Array, Array]:
-    """Motions of all stations (2k+4, 4, 4) by errors, and the errors' twists (p, 6) as those of bodies.
+    """Displace the error frames of a chain, and express the errors as twists of bodies.
 
-    An error at a station turns with those before it, seen from the station as it was before all of them.
+    The displacement of error frame s is the product of exp(x_i·ξ_i) over the errors i at s, in their order.
+    The derivative of the chain by x_i is the twist Ad(F·E)·ξ_i of the frame's body, where F is the pose of
+    the error frame in the body and E the product over the preceding errors at s.
 
     Args:
-        body_from_urdf: (k+1, 4, 4), as `station_frames` takes it, and so are
-        origins: (k+1, 4, 4), and
-        tool: (4, 4).
-        error_frames: (p,) where the errors are, ascending.
-        twists: (p, 6) in the stations' frames.
-        x: (p,) how far they go.
+        body_from_urdf: URDF link frame of each body in its body frame, shape (b, 4, 4).
+        origins: Origins of the joints and of the tip without joint motions, shape (b, 4, 4).
+        tool: Tool in the tip frame, shape (4, 4).
+        error_frames: Error frame of each error, ascending, shape (p,).
+        twists: Twists in the error frames, shape (p, 6).
+        x: Values of the errors, shape (p,).
+
+    Returns:
+        Displacements of all error frames, shape (2b+2, 4, 4), and twists in body frames, shape (p, 6).
     """
-    motions, before = np.empty((2 * len(body_from_urdf) + 2, 4, 4)), np.empty((len(x), 4, 4))
-    motions[:] = _IDENTITY
-    for i, (station, step) in enumerate(zip(error_frames.tolist(), _exponentials(twists, x), strict=True)):
-        before[i] = motions[station]
-        np.matmul(before[i], step, out=motions[station])
-    frames = error_frame_poses(body_from_urdf, origins, tool, motions)[error_frames] @ before
-    return motions, (se3.adjoint(frames) @ twists[..., None])[..., 0]
+    displacements, preceding = np.empty((2 * len(body_from_urdf) + 2, 4, 4)), np.empty((len(x), 4, 4))
+    displacements[:] = _IDENTITY
+    for i, (frame, step) in enumerate(zip(error_frames.tolist(), _exponentials(twists, x), strict=True)):
+        preceding[i] = displacements[frame]
+        np.matmul(preceding[i], step, out=displacements[frame])
+    frames = error_frame_poses(body_from_urdf, origins, tool, displacements)[error_frames] @ preceding
+    return displacements, (se3.adjoint(frames) @ twists[..., None])[..., 0]
 
 
 def _exponentials(twists: Array, x: Array) -> Array:
-    """Motions (p, 4, 4) of shares x (p,) of twists (p, 6), in a third of the time of `se3.exp6`."""
+    """Compute exp(x·ξ) (p, 4, 4) of values x (p,) and twists ξ (p, 6) in a third of the time of `se3.exp6`.
+
+    With the matrix A of ξ/|ω| and θ = x·|ω|: exp = I + θ·A + (1 - cos θ)·A² + (θ - sin θ)·A³, because A⁴ =
+    -A². The term 1 - cos θ is computed as 2·sin²(θ/2), which does not cancel. For ω = 0 the exponential is I
+    + x·ξ.
+    """
     matrices = np.zeros((len(x), 4, 4))
     matrices[:, :3, :3], matrices[:, :3, 3] = se3.skew(twists[:, 3:]), twists[:, :3]
     size = np.sqrt(np.einsum("ij,ij->i", twists[:, 3:], twists[:, 3:]))
@@ -170,36 +228,50 @@ def _exponentials(twists: Array, x: Array) -> Array:
     return _IDENTITY + first + second + (angle - np.sin(angle))[:, None, None] * (square @ unit)
 
 
-def log_rotations(turns: Array) -> Array:
-    """Rotation vectors (3, m) of rotations (3, 3, m)."""
-    return se3.log3(turns.transpose(2, 0, 1)).T
+def log_rotations(rotations: Array) -> Array:
+    """Compute rotation vectors; see `se3.log3`.
+
+    Args:
+        rotations: Rotation matrices, shape (3, 3, m).
+
+    Returns:
+        Rotation vectors, shape (3, m) [rad].
+    """
+    return se3.log3(rotations.transpose(2, 0, 1)).T
 
 
 def right_jacobian_inverse_batch(rotvecs: Array) -> Array:
-    """Jr⁻¹ (3, 3, m) of rotation vectors (3, m); see `se3.right_jacobian_inverse`."""
+    """Compute inverse right Jacobians of SO(3); see `se3.right_jacobian_inverse`.
+
+    Args:
+        rotvecs: Rotation vectors, shape (3, m) [rad].
+
+    Returns:
+        Matrices Jr⁻¹, shape (3, 3, m).
+    """
     return se3.right_jacobian_inverse(rotvecs.T).transpose(1, 2, 0)
 
 
 @lru_cache(maxsize=64)
 def _equal_runs(counts: tuple[int, ...]) -> list[tuple[slice, slice, int]]:
-    """Neighbouring bodies with as many twists each: which bodies, which twists, how many a body."""
+    """Group adjacent bodies with equal numbers of twists: bodies, twists and number of twists per body."""
     out, body, row = [], 0, 0
-    for count, alike in itertools.groupby(counts):
-        bodies = len(list(alike))
+    for count, run in itertools.groupby(counts):
+        n_bodies = len(list(run))
         if count:
-            out.append((slice(body, body + bodies), slice(row, row + bodies * count), count))
-        body, row = body + bodies, row + bodies * count
+            out.append((slice(body, body + n_bodies), slice(row, row + n_bodies * count), count))
+        body, row = body + n_bodies, row + n_bodies * count
     return out
 
 
-def _turn_about_axes(frames: Array, point: Array) -> None:
-    """Fills the last columns of frames (b, 7, 3, m): how a point (3, m) moves that turns about x, y, z."""
+def _fill_rotation_velocities(frames: Array, point: Array) -> None:
+    """Fill columns 4 to 6 of frames (b, 7, 3, m) with a point's velocity by unit rotations about x, y, z."""
     count, _, _, m = frames.shape
-    axes, turns = frames[:, :3], frames[:, 4:]
+    axes, velocities = frames[:, :3], frames[:, 4:]
     lever, product = work_array("lever", count, 1, 3, m), work_array("product", count, 3, m)
     np.subtract(point, frames[:, 3:4], out=lever)
-    # The cross products of all bodies at once, a component at a time.
+    # Cross products axis × lever of all bodies, one component at a time.
     for x, y, z in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        turned = turns[:, :, x]
-        np.multiply(axes[:, :, y], lever[:, :, z], out=turned)
-        turned -= np.multiply(axes[:, :, z], lever[:, :, y], out=product)
+        component = velocities[:, :, x]
+        np.multiply(axes[:, :, y], lever[:, :, z], out=component)
+        component -= np.multiply(axes[:, :, z], lever[:, :, y], out=product)

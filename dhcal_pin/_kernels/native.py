@@ -1,4 +1,8 @@
-"""The inner loops in C; importing them fails where the installation had no compiler. See `loops`."""
+"""Compiled kernels: the functions of `kinematics.py` and `qr.py` by the module `_native`.
+
+Importing this module raises ImportError if the build had no compiler. Shapes and formulas are documented in
+`kinematics.py` and `qr.py`. Unlike the NumPy implementation, no function overwrites its inputs.
+"""
 
 from __future__ import annotations
 
@@ -11,58 +15,135 @@ from .work_arrays import work_array
 
 
 def cos_sin(angles: Array) -> tuple[Array, Array]:
-    """As `kinematics.cosines_and_sines`."""
+    """Compute cosines and sines; see `kinematics.cos_sin`.
+
+    Args:
+        angles: Angles, shape (k, m) [rad].
+
+    Returns:
+        Cosines and sines, each of shape (k, m).
+    """
     cosines, sines = np.empty_like(angles), np.empty_like(angles)
     _native.cos_sin(angles, cosines, sines)
     return cosines, sines
 
 
-def propagate_frames(links: Array, prismatic: Array, motion: JointState, frames: Array) -> None:
-    """As `kinematics.carry_frames`."""
-    _native.propagate_frames(links, prismatic, motion.positions, motion.cos, motion.sin, frames)
+def propagate_frames(
+    link_transforms: Array, prismatic: Array, joint_state: JointState, frames: Array
+) -> None:
+    """Compute the frames along a chain; see `kinematics.propagate_frames`.
+
+    Args:
+        link_transforms: Constant transforms, shape (k+1, 4, 4).
+        prismatic: Whether each joint is prismatic, shape (k,).
+        joint_state: Positions of the joints.
+        frames: Frames to fill, shape (k+2, 7, 3, m); frame 0 is given.
+    """
+    _native.propagate_frames(
+        link_transforms, prismatic, joint_state.positions, joint_state.cos, joint_state.sin, frames
+    )
 
 
-def point_jacobian(frames: Array, point: Array, at: Array, twists: Array, out: Array) -> None:
-    """As `kinematics.point_velocities`."""
-    _native.point_jacobian(frames, point, at, twists, out)
+def point_jacobian(frames: Array, point: Array, bodies: Array, twists: Array, out: Array) -> None:
+    """Compute the Jacobian of a point by body twists; see `kinematics.point_jacobian`.
+
+    Args:
+        frames: Body frames, shape (b, 7, 3, m).
+        point: Point in the measuring frame, shape (3, m) [m].
+        bodies: Body of each twist, ascending, shape (p,).
+        twists: Twists in body frames, shape (p, 6).
+        out: Jacobian to fill, shape (p, 6, m).
+    """
+    _native.point_jacobian(frames, point, bodies, twists, out)
 
 
-def apply_observation_matrix(velocities: Array, mixture: ObservationMatrix, out: Array) -> Array:
-    """As `kinematics.mix_velocities`."""
-    _native.apply_observation_matrix(velocities, *_contiguous_terms(mixture), out)
+def apply_observation_matrix(jacobian: Array, observation: ObservationMatrix, out: Array) -> Array:
+    """Multiply an observation matrix by a Jacobian; see `kinematics.apply_observation_matrix`.
+
+    Args:
+        jacobian: Tool velocities by p errors, shape (p, 6, c·m).
+        observation: Observation matrix of m samples.
+        out: Product to fill, shape (p, r, m).
+
+    Returns:
+        `out`.
+    """
+    _native.apply_observation_matrix(jacobian, *_contiguous_terms(observation), out)
     return out
 
 
 def perturb_frames(
     body_from_urdf: Array, origins: Array, tool: Array, error_frames: Array, twists: Array, x: Array
 ) -> tuple[Array, Array]:
-    """As `kinematics.move_stations`."""
-    motions, carried = np.empty((2 * len(body_from_urdf) + 2, 4, 4)), np.empty(twists.shape)
-    _native.perturb_frames(body_from_urdf, origins, tool, error_frames, twists, x, motions, carried)
-    return motions, carried
+    """Displace the error frames of a chain; see `kinematics.perturb_frames`.
+
+    Args:
+        body_from_urdf: URDF link frames in body frames, shape (b, 4, 4).
+        origins: Origins of the joints and of the tip, shape (b, 4, 4).
+        tool: Tool in the tip frame, shape (4, 4).
+        error_frames: Error frame of each error, ascending, shape (p,).
+        twists: Twists in the error frames, shape (p, 6).
+        x: Values of the errors, shape (p,).
+
+    Returns:
+        Displacements of all error frames, shape (2b+2, 4, 4), and twists in body frames, shape (p, 6).
+    """
+    displacements = np.empty((2 * len(body_from_urdf) + 2, 4, 4))
+    body_twists = np.empty(twists.shape)
+    _native.perturb_frames(body_from_urdf, origins, tool, error_frames, twists, x, displacements, body_twists)
+    return displacements, body_twists
 
 
-def log_rotations(turns: Array) -> Array:
-    """As `kinematics.log_rotations`."""
-    out = np.empty(turns.shape[1:])
-    # Near a half turn it takes more care.
-    return kinematics.log_rotations(turns) if _native.log_rotations(turns, out) else out
+def log_rotations(rotations: Array) -> Array:
+    """Compute rotation vectors; see `kinematics.log_rotations`.
+
+    Args:
+        rotations: Rotation matrices, shape (3, 3, m).
+
+    Returns:
+        Rotation vectors, shape (3, m) [rad].
+    """
+    out = np.empty(rotations.shape[1:])
+    n_near_half_turn = _native.log_rotations(rotations, out)
+    # Near an angle of π the compiled formula loses digits.
+    return kinematics.log_rotations(rotations) if n_near_half_turn else out
 
 
 def right_jacobian_inverse_batch(rotvecs: Array) -> Array:
-    """As `kinematics.right_jacobian_inverses`."""
+    """Compute inverse right Jacobians of SO(3); see `se3.right_jacobian_inverse`.
+
+    Args:
+        rotvecs: Rotation vectors, shape (3, m) [rad].
+
+    Returns:
+        Matrices Jr⁻¹, shape (3, 3, m).
+    """
     out = np.empty((3, *rotvecs.shape))
     _native.right_jacobian_inverse_batch(rotvecs, out)
     return out
 
 
 def r_factor(rows: Array) -> Array:
-    """As `reduction.triangle_of`; the rows stay."""
+    """Compute the R factor of a matrix; see `qr.r_factor`.
+
+    Args:
+        rows: Matrix of k·m rows, shape (c, k, m).
+
+    Returns:
+        Upper triangular factor, shape (c, c).
+    """
     return r_factors(rows[None])[0]
 
 
 def r_factors(rows: Array) -> Array:
-    """As `reduction.triangles_of`; the rows stay."""
+    """Compute the R factors of a batch of matrices; see `qr.r_factors`.
+
+    Args:
+        rows: Matrices of k·m rows, shape (b, c, k, m).
+
+    Returns:
+        Upper triangular factors, shape (b, c, c).
+    """
     b, c, k, _ = rows.shape
     out = np.empty((b, c, c))
     _native.r_factors(rows, _work_array(c, k, 0), out)
@@ -70,31 +151,52 @@ def r_factors(rows: Array) -> Array:
 
 
 def factor_jacobian(
-    frames: Array, point: Array, at: Array, twists: Array, mixture: ObservationMatrix, given: Array
+    frames: Array, point: Array, bodies: Array, twists: Array, observation: ObservationMatrix, given: Array
 ) -> Array:
-    """As `reduction.error_triangles`; the rows stay."""
+    """Compute R factors of whitened Jacobians without storing the rows; see `qr.factor_jacobian`.
+
+    Args:
+        frames: Body frames, shape (j, 7, 3, c·b·m).
+        point: Tool point, shape (3, c·b·m) [m].
+        bodies: Body of each error, ascending, shape (p,).
+        twists: Twists of each member's errors in body frames, shape (b, p, 6).
+        observation: Observation matrix of r rows at b·m samples.
+        given: Further columns, shape (s, r, b·m).
+
+    Returns:
+        Upper triangular factors, shape (b, p+s, p+s).
+    """
     (s, k, n), (b, p, _) = given.shape, twists.shape
     out = np.empty((b, p + s, p + s))
-    room = _work_array(p + s, k, point.shape[1] // n if n else 1)
-    _native.factor_jacobian(frames, point, at, twists, *_contiguous_terms(mixture), given, room, out)
+    work = _work_array(p + s, k, point.shape[1] // n if n else 1)
+    _native.factor_jacobian(frames, point, bodies, twists, *_contiguous_terms(observation), given, work, out)
     return out
 
 
-def append_diagonal(triangle: Array, diagonal: Array, right: Array) -> Array:
-    """As `reduction.with_diagonal`."""
-    out = np.empty(triangle.shape)
-    _native.append_diagonal(triangle, diagonal, right, _work_array(len(triangle), 1, 0), out)
+def append_diagonal(r: Array, diagonal: Array, target: Array) -> Array:
+    """Append a diagonal block of rows to an R factor; see `qr.append_diagonal`.
+
+    Args:
+        r: R factor with the right-hand side in its last column, shape (p+1, p+1).
+        diagonal: Diagonal of the appended block, shape (p,).
+        target: Right-hand side of the appended rows, shape (p,).
+
+    Returns:
+        Upper triangular factor, shape (p+1, p+1).
+    """
+    out = np.empty(r.shape)
+    _native.append_diagonal(r, diagonal, target, _work_array(len(r), 1, 0), out)
     return out
 
 
-def _contiguous_terms(mixture: ObservationMatrix) -> tuple[Array, Array, Array]:
-    """Rows, components and shares, whatever their strides were."""
-    rows, components, shares = map(
-        np.ascontiguousarray, (mixture.rows, mixture.components, mixture.coefficients)
+def _contiguous_terms(observation: ObservationMatrix) -> tuple[Array, Array, Array]:
+    """Return rows, components and coefficients of an observation matrix as contiguous arrays."""
+    rows, components, coefficients = map(
+        np.ascontiguousarray, (observation.rows, observation.components, observation.coefficients)
     )
-    return rows, components, shares
+    return rows, components, coefficients
 
 
-def _work_array(columns: int, readings: int, ends: int) -> Array:
-    """Memory to reduce rows in; fresh pages for every triangle would cost as much as a part of the work."""
-    return work_array("room", _native.work_size(columns, readings, ends))
+def _work_array(columns: int, residuals: int, ends: int) -> Array:
+    """Return the work memory of a factorization."""
+    return work_array("work", _native.work_size(columns, residuals, ends))

@@ -1,46 +1,74 @@
-/* Triangles of tall rows. */
+/* R factor of a tall matrix: blocked Householder TSQR with paired reflectors.
 
-/* With a column v below `top` as it was before, [above; a] becomes [above - w; a - scale·w·v] with
-   w = tau·(above + scale·v·a) for any other column. */
+   Sequential TSQR (J. Demmel, L. Grigori, M. Hoemmen, J. Langou: Communication-optimal parallel and
+   sequential QR and LU factorizations, SIAM J. Sci. Comput. 34 (2012), A206-A239). The rows of the whitened
+   Jacobian are generated in blocks B of at most BLOCK_ROWS rows that stay in the first-level cache, and each
+   block updates the factor:
+
+       R <- R factor of [R; B].
+
+   R is upper triangular, so reflector j changes row j of R and the block, and no other row of R.
+
+   Reflector of column j (as LAPACK dlarfg), with the diagonal entry α = R[j, j] and the column v of the
+   block:
+
+       β = -sign(α)·sqrt(α² + vᵀv),  τ = (β - α)/β,  s = 1/(α - β),  H = I - τ·[1; s·v]·[1; s·v]ᵀ,
+       H·[α; v] = [β; 0],            H·[h; a] = [h - w; a - s·w·v]  with  w = τ·(h + s·vᵀa).
+
+   Pair of reflectors. Columns j and j + 1 are eliminated together: v is column j, u is column j + 1 after the
+   first reflector. For every later column a with the entries h1 = R[j, .] and h2 = R[j+1, .] above it
+
+       x = τ1·(h1 + s1·vᵀa),                        f = s1·x,
+       y = τ2·(h2 + s2·(uᵀa - f·uᵀv)),              g = s2·y,
+       h1 <- h1 - x,  h2 <- h2 - y,  a <- a - f·v - g·u.
+
+   Both inner products are computed in one pass and both updates in another, so that a is read and written
+   half as often as with single reflectors. The product uᵀv is the same for all columns.
+
+   Each lane of a vector has its own partial sum, and the partial sums are added in a fixed order. Hence no
+   digit depends on the alignment of the data. */
+
+/* τ and s of a Householder reflector. */
 typedef struct {
     double tau, scale;
-} Reflection;
+} Reflector;
 
-/* The reflection that takes what is below `*top`, of which the sum of squares is given, into it. */
-static inline __attribute__((always_inline)) Reflection reflection(double *top, double below)
+/* Compute the reflector of a column with the entry *top and the squared norm vᵀv below it; *top becomes β. */
+static inline __attribute__((always_inline)) Reflector make_reflector(double *top, double squared_norm)
 {
-    const double before = *top;
-    if (below == 0)
-        return (Reflection){0, 0};
-    const double norm = sqrt(before * before + below), beta = before > 0 ? -norm : norm;
+    const double alpha = *top;
+    if (squared_norm == 0)
+        return (Reflector){0, 0};
+    const double norm = sqrt(alpha * alpha + squared_norm), beta = alpha > 0 ? -norm : norm;
     *top = beta;
-    return (Reflection){(beta - before) / beta, 1 / (before - beta)};
+    return (Reflector){(beta - alpha) / beta, 1 / (alpha - beta)};
 }
 
-static inline __attribute__((always_inline)) double sum(const Lanes *a)
+static inline __attribute__((always_inline)) double sum_lanes(const Lanes *a)
 {
     return ((*a)[0] + (*a)[2]) + ((*a)[1] + (*a)[3]);
 }
 
-/* Does two reflections, of columns v and u with the product `both`, to some columns side by side with `first`
-   and `second` above them. */
-static inline __attribute__((always_inline)) void reflect(const int columns, double *restrict first,
-                                                          double *restrict second, Lanes *restrict a,
-                                                          const Lanes *restrict v, const Lanes *restrict u,
-                                                          Size count, Reflection one, Reflection two,
-                                                          double both)
+/* Apply the reflectors `one` of v and `two` of u to adjacent columns a (columns, count) below `first` and
+   `second`.
+
+   `uv` is uᵀv. */
+static inline __attribute__((always_inline)) void
+apply_reflector_pair(const int columns, double *restrict first, double *restrict second, Lanes *restrict a,
+                     const Lanes *restrict v, const Lanes *restrict u, Size count, Reflector one,
+                     Reflector two, double uv)
 {
-    Lanes av[WIDTH] = {{0}}, au[WIDTH] = {{0}};
-    double f[WIDTH], g[WIDTH];
+    Lanes av[MAX_COLUMNS] = {{0}}, au[MAX_COLUMNS] = {{0}};
+    double f[MAX_COLUMNS], g[MAX_COLUMNS];
     for (Size t = 0; t < count; t++)
         for (int k = 0; k < columns; k++) {
             const Lanes at = a[k * count + t];
             av[k] += v[t] * at, au[k] += u[t] * at;
         }
     for (int k = 0; k < columns; k++) {
-        const double x = one.tau * (first[k] + one.scale * sum(&av[k]));
+        const double x = one.tau * (first[k] + one.scale * sum_lanes(&av[k]));
         f[k] = x * one.scale;
-        const double y = two.tau * (second[k] + two.scale * (sum(&au[k]) - f[k] * both));
+        const double y = two.tau * (second[k] + two.scale * (sum_lanes(&au[k]) - f[k] * uv));
         g[k] = y * two.scale;
         first[k] -= x, second[k] -= y;
     }
@@ -49,9 +77,9 @@ static inline __attribute__((always_inline)) void reflect(const int columns, dou
             a[k * count + t] -= f[k] * v[t] + g[k] * u[t];
 }
 
-/* Takes the rows of a block, `count` lanes a column, an even number, into the triangle r (c, c) above them.
-   Two columns are reflected at a time, so that every other one is read and written half as often. */
-WIDEST static void fold(double *restrict r, Lanes *restrict block, Size c, Size count)
+/* Replace r (c, c) by the R factor of [r; block] with `count` lanes per column, an even number; overwrite
+   block. */
+SIMD_CLONES static void update_r_factor(double *restrict r, Lanes *restrict block, Size c, Size count)
 {
     for (Size j = 0; j < c; j += 2) {
         Lanes *v = block + j * count, *u = j + 1 < c ? v + count : v;
@@ -61,213 +89,230 @@ WIDEST static void fold(double *restrict r, Lanes *restrict block, Size c, Size 
             for (int i = 0; i < 2; i++)
                 vv[i] += v[t + i] * v[t + i], vu[i] += v[t + i] * u[t + i];
         vv[0] += vv[1], vu[0] += vu[1];
-        const Reflection one = reflection(first + j, sum(vv));
+        const Reflector one = make_reflector(first + j, sum_lanes(vv));
         if (j + 1 == c)
             break;
-        const double w = one.tau * (first[j + 1] + one.scale * sum(vu)), f = w * one.scale;
+        const double w = one.tau * (first[j + 1] + one.scale * sum_lanes(vu)), f = w * one.scale;
         first[j + 1] -= w;
         vu[0] = vu[1] = uu[0];
         for (Size t = 0; t < count; t += 2)
             for (int i = 0; i < 2; i++) {
-                const Lanes left = u[t + i] - f * v[t + i];
-                uu[i] += left * left, vu[i] += left * v[t + i];
-                u[t + i] = left;
+                const Lanes updated = u[t + i] - f * v[t + i];
+                uu[i] += updated * updated, vu[i] += updated * v[t + i];
+                u[t + i] = updated;
             }
         uu[0] += uu[1], vu[0] += vu[1];
-        const Reflection two = reflection(second + j + 1, sum(uu));
-        const double both = sum(vu);
-        for (Size l = j + 2, left; (left = c - l) > 0;) {
-            /* As evenly as it goes. */
-            const Size parts = (left + WIDTH - 1) / WIDTH, columns = (left + parts - 1) / parts;
-#define REFLECT(n)                                                                                           \
+        const Reflector two = make_reflector(second + j + 1, sum_lanes(uu));
+        const double uv = sum_lanes(vu);
+        for (Size l = j + 2, remaining; (remaining = c - l) > 0;) {
+            /* Groups of nearly equal size, at most MAX_COLUMNS. */
+            const Size groups = (remaining + MAX_COLUMNS - 1) / MAX_COLUMNS;
+            const Size columns = (remaining + groups - 1) / groups;
+#define APPLY_TO(n)                                                                                          \
     case n:                                                                                                  \
-        reflect(n, first + l, second + l, block + l * count, v, u, count, one, two, both);                   \
+        apply_reflector_pair(n, first + l, second + l, block + l * count, v, u, count, one, two, uv);        \
         break;
             switch (columns) {
-                REFLECT(1)
-                REFLECT(2)
-                REFLECT(3)
-                REFLECT(4)
-                REFLECT(5)
-                REFLECT(6)
+                APPLY_TO(1)
+                APPLY_TO(2)
+                APPLY_TO(3)
+                APPLY_TO(4)
+                APPLY_TO(5)
+                APPLY_TO(6)
             }
-#undef REFLECT
+#undef APPLY_TO
             l += columns;
         }
     }
 }
 
-/* Rows on their way into a triangle, gathered to blocks that stay in the nearest cache. */
+/* Buffer that collects rows into blocks before they update an R factor; n_rows rows are filled. */
 typedef struct {
-    double *triangle;
+    double *r;
     Lanes *block;
-    Size columns, held;
-} Fold;
+    Size columns, n_rows;
+} RowBuffer;
 
-static void flush(Fold *f)
+/* Update the R factor with the collected rows and empty the buffer. */
+static void flush_rows(RowBuffer *f)
 {
-    if (!f->held)
+    if (!f->n_rows)
         return;
-    const Size room = (f->held + 2 * LANES - 1) / (2 * LANES) * 2 * LANES;
+    const Size padded = (f->n_rows + 2 * LANES - 1) / (2 * LANES) * 2 * LANES;
     double *block = (double *)f->block;
-    /* Columns lie ROWS apart while they are gathered, and side by side when they are reflected. */
+    /* Columns are BLOCK_ROWS apart in the buffer; `update_r_factor` needs them adjacent and padded with
+       zeros. */
     for (Size j = 0; j < f->columns; j++) {
-        memmove(block + j * room, block + j * ROWS, f->held * sizeof(double));
-        memset(block + j * room + f->held, 0, (room - f->held) * sizeof(double));
+        memmove(block + j * padded, block + j * BLOCK_ROWS, f->n_rows * sizeof(double));
+        memset(block + j * padded + f->n_rows, 0, (padded - f->n_rows) * sizeof(double));
     }
-    fold(f->triangle, f->block, f->columns, room / LANES);
-    f->held = 0;
+    update_r_factor(f->r, f->block, f->columns, padded / LANES);
+    f->n_rows = 0;
 }
 
-/* Adds n rows of columns that lie ROWS apart. */
-static void gather(Fold *f, const double *rows, Size n)
+/* Append n rows whose columns are BLOCK_ROWS apart; update the R factor whenever the buffer is full. */
+static void append_rows(RowBuffer *f, const double *rows, Size n)
 {
     for (Size done = 0; done < n;) {
-        const Size some = n - done < ROWS - f->held ? n - done : ROWS - f->held;
+        const Size count = n - done < BLOCK_ROWS - f->n_rows ? n - done : BLOCK_ROWS - f->n_rows;
         for (Size j = 0; j < f->columns; j++)
-            memcpy((double *)f->block + j * ROWS + f->held, rows + j * ROWS + done, some * sizeof(double));
-        f->held += some, done += some;
-        if (f->held == ROWS)
-            flush(f);
+            memcpy((double *)f->block + j * BLOCK_ROWS + f->n_rows, rows + j * BLOCK_ROWS + done,
+                   count * sizeof(double));
+        f->n_rows += count, done += count;
+        if (f->n_rows == BLOCK_ROWS)
+            flush_rows(f);
     }
 }
 
-static inline __attribute__((always_inline)) int empty(const double *row, Size n)
+/* Whether n doubles are all zero, of either sign. */
+static inline __attribute__((always_inline)) int is_zero(const double *row, Size n)
 {
     const Bits *bits = (const Bits *)row;
-    for (Size start = 0; start < n; start += SAMPLES) {
-        const Size some = n - start < SAMPLES ? n - start : SAMPLES;
+    for (Size start = 0; start < n; start += BLOCK_SAMPLES) {
+        const Size count = n - start < BLOCK_SAMPLES ? n - start : BLOCK_SAMPLES;
         Bits any = 0;
-        for (Size t = 0; t < some; t++)
+        for (Size t = 0; t < count; t++)
             any |= bits[start + t];
-        /* But for the sign. */
+        /* The shift removes the sign bit. */
         if (any << 1)
             return 0;
     }
     return 1;
 }
 
-/* Which of c columns each of k readings has: how many, which, where a column stands among them or -1, and the
-   first reading that has the same. */
-typedef struct {
-    Size *counts, *columns, *places, *alike;
-} Used;
+/* Columns that are not zero in the rows of each of k residuals.
 
-static int list_used(Used *used, const Errors *e, const Mixture *x, const double *given, Size c, Size k,
-                     Size m, Size column, Size reading)
+   counts (k): number of these columns. columns (k, c): their indices. positions (k, c): position of each
+   column in that list, or -1. same_columns_as (k): first residual with an equal list. All are in one
+   allocation, which `counts` points to. */
+typedef struct {
+    Size *counts, *columns, *positions, *same_columns_as;
+} NonzeroColumns;
+
+/* Fill `nonzero`; return 0 if memory is exhausted. */
+static int find_nonzero_columns(NonzeroColumns *nonzero, const ErrorTwists *e, const ObservationMatrix *h,
+                                const double *given, Size c, Size k, Size m, Size column, Size residual)
 {
-    used->counts = calloc(2 * k * (c + 1) + 1, sizeof(Size));
-    if (!used->counts)
+    nonzero->counts = calloc(2 * k * (c + 1) + 1, sizeof(Size));
+    if (!nonzero->counts)
         return 0;
-    used->alike = used->counts + k, used->columns = used->alike + k, used->places = used->columns + k * c;
+    nonzero->same_columns_as = nonzero->counts + k, nonzero->columns = nonzero->same_columns_as + k,
+    nonzero->positions = nonzero->columns + k * c;
     for (Size i = 0; i < k; i++) {
-        Size *mine = used->columns + i * c, *place = used->places + i * c, u = 0;
-        const Seen by = seen_by(x, i);
+        Size *columns = nonzero->columns + i * c, *positions = nonzero->positions + i * c, u = 0;
+        const Sensitivity sensitivity = row_sensitivity(h, i);
         for (Size j = 0; j < c; j++) {
-            const double *rows = given + (j - e->count) * column + i * reading;
-            const int some = j < e->count ? is_seen(e, j, by) : !empty(rows, m);
-            place[j] = some ? u : -1;
-            if (some)
-                mine[u++] = j;
+            const double *rows = given + (j - e->count) * column + i * residual;
+            const int is_nonzero = j < e->count ? is_observed(e, j, sensitivity) : !is_zero(rows, m);
+            positions[j] = is_nonzero ? u : -1;
+            if (is_nonzero)
+                columns[u++] = j;
         }
-        used->counts[i] = u;
+        nonzero->counts[i] = u;
         Size first = 0;
-        while (used->counts[first] != u || memcmp(used->columns + first * c, mine, u * sizeof(Size)))
+        while (nonzero->counts[first] != u || memcmp(nonzero->columns + first * c, columns, u * sizeof(Size)))
             first++;
-        used->alike[i] = first;
+        nonzero->same_columns_as[i] = first;
     }
     return 1;
 }
 
-/* Where lanes may lie. */
-static double *aligned(double *room)
+/* Return the first address in `work` that is aligned to 64 bytes. */
+static double *align_to_lanes(double *work)
 {
-    return room + (64 - (uintptr_t)room % 64) % 64 / sizeof(double);
+    return work + (64 - (uintptr_t)work % 64) % 64 / sizeof(double);
 }
 
-/* Doubles of memory that `reduce` works in. */
-static Size room_for(Size c, Size k, Size ends)
+/* Number of doubles of work memory for c columns, k residuals and n_ends configurations per sample.
+
+   The parts are: k blocks of c columns and one row buffer, velocities and lever arms, k R factors, alignment.
+   */
+static Size work_size(Size c, Size k, Size n_ends)
 {
-    return (k + 1) * c * ROWS + 9 * ends * ROWS + k * c * c + 8;
+    return (k + 1) * c * BLOCK_ROWS + 9 * n_ends * BLOCK_ROWS + k * c * c + 8;
 }
 
-/* The triangle r (c, c) of rows (c, k, m), the first columns by errors and the others given: those of the k
-   readings that are zero in the same columns are reduced without these. Half the errors of an arm are
-   lengths, which turn nothing: a quarter of the work for rows of rotations. */
-static int reduce(const Errors *e, const Mixture *x, const double *given, Size c, Size k, Size m, Size column,
-                  Size reading, double *r, double *room)
+/* Compute the R factor r (c, c) of k·m rows; return 0 if memory is exhausted.
+
+   The first e->count columns are Jacobian columns of errors, the others are `given` (c - e->count, k, m) with
+   the strides `column` and `residual`. Residuals with equal nonzero columns are reduced together without
+   their zero columns, and their R factors are merged at the end. Half the errors of a robot are translations,
+   which do not affect orientation residuals; skipping these columns saves three quarters of the work for such
+   rows. */
+static int factor_rows(const ErrorTwists *e, const ObservationMatrix *h, const double *given, Size c, Size k,
+                       Size m, Size column, Size residual, double *r, double *work)
 {
-    Used used;
-    if (!list_used(&used, e, x, given, c, k, m, column, reading))
+    NonzeroColumns nonzero;
+    if (!find_nonzero_columns(&nonzero, e, h, given, c, k, m, column, residual))
         return 0;
-    /* Of each reading a block of rows, one of rows of several, velocities, and triangles of like readings. */
-    double *blocks = aligned(room);
-    Lanes *spare = (Lanes *)(blocks + k * c * ROWS);
-    double *moved = (double *)spare + c * ROWS, *triangles = moved + 9 * e->ends * ROWS;
+    double *blocks = align_to_lanes(work);
+    Lanes *buffer = (Lanes *)(blocks + k * c * BLOCK_ROWS);
+    double *velocities = (double *)buffer + c * BLOCK_ROWS;
+    double *partial_r = velocities + 9 * e->n_ends * BLOCK_ROWS;
     memset(r, 0, c * c * sizeof(double));
     for (Size i = 0; i < k; i++)
-        if (used.alike[i] == i && used.counts[i] < c)
-            memset(triangles + i * c * c, 0, used.counts[i] * used.counts[i] * sizeof(double));
-    for (Size start = 0; start < m; start += ROWS) {
-        const Size n = m - start < ROWS ? m - start : ROWS;
-        mix_errors(e, x, start, n, c, used.places, moved, blocks);
+        if (nonzero.same_columns_as[i] == i && nonzero.counts[i] < c)
+            memset(partial_r + i * c * c, 0, nonzero.counts[i] * nonzero.counts[i] * sizeof(double));
+    for (Size start = 0; start < m; start += BLOCK_ROWS) {
+        const Size n = m - start < BLOCK_ROWS ? m - start : BLOCK_ROWS;
+        observed_error_rows(e, h, start, n, c, nonzero.positions, velocities, blocks);
         for (Size i = 0; i < k; i++) {
-            const Size u = used.counts[i];
-            if (used.alike[i] != i || !u)
+            const Size u = nonzero.counts[i];
+            if (nonzero.same_columns_as[i] != i || !u)
                 continue;
-            Fold some = {u == c ? r : triangles + i * c * c, spare, u, 0};
+            RowBuffer group = {u == c ? r : partial_r + i * c * c, buffer, u, 0};
             for (Size l = i; l < k; l++) {
-                if (used.alike[l] != i)
+                if (nonzero.same_columns_as[l] != i)
                     continue;
-                double *block = blocks + l * c * ROWS;
-                for (Size j = u; j-- && used.columns[i * c + j] >= e->count;)
-                    memcpy(block + j * ROWS,
-                           given + (used.columns[i * c + j] - e->count) * column + l * reading + start,
+                double *block = blocks + l * c * BLOCK_ROWS;
+                for (Size j = u; j-- && nonzero.columns[i * c + j] >= e->count;)
+                    memcpy(block + j * BLOCK_ROWS,
+                           given + (nonzero.columns[i * c + j] - e->count) * column + l * residual + start,
                            n * sizeof(double));
-                if (n == ROWS)
-                    fold(some.triangle, (Lanes *)block, u, ROWS / LANES);
+                if (n == BLOCK_ROWS)
+                    update_r_factor(group.r, (Lanes *)block, u, BLOCK_ROWS / LANES);
                 else
-                    gather(&some, block, n);
+                    append_rows(&group, block, n);
             }
-            flush(&some);
+            flush_rows(&group);
         }
     }
-    Fold whole = {r, spare, c, 0};
+    /* Merge the partial R factors into r, expanded to all columns. */
+    RowBuffer all = {r, buffer, c, 0};
     for (Size i = 0; i < k; i++) {
-        const Size u = used.counts[i];
-        if (used.alike[i] != i || u == c)
+        const Size u = nonzero.counts[i];
+        if (nonzero.same_columns_as[i] != i || u == c)
             continue;
         for (Size row = 0; row < u; row++) {
-            double *at = (double *)spare + whole.held;
+            double *to = (double *)buffer + all.n_rows;
             for (Size j = 0; j < c; j++) {
-                const Size place = used.places[i * c + j];
-                at[j * ROWS] = place < row ? 0 : triangles[i * c * c + row * u + place];
+                const Size position = nonzero.positions[i * c + j];
+                to[j * BLOCK_ROWS] = position < row ? 0 : partial_r[i * c * c + row * u + position];
             }
-            if (++whole.held == ROWS)
-                flush(&whole);
+            if (++all.n_rows == BLOCK_ROWS)
+                flush_rows(&all);
         }
-        flush(&whole);
+        flush_rows(&all);
     }
-    free(used.counts);
+    free(nonzero.counts);
     return 1;
 }
 
-/* The triangle r (p + 1, p + 1) of another one and of rows below it: a diagonal (p) and what they are to be.
- */
-static void add_diagonal(const double *triangle, Size p, const double *diagonal, const double *right,
-                         double *r, double *room)
+/* Compute the R factor r (p + 1, p + 1) of [r_in; diag(diagonal) | target], for example priors below data. */
+static void append_diagonal(const double *r_in, Size p, const double *diagonal, const double *target,
+                            double *r, double *work)
 {
     const Size c = p + 1;
-    double *block = aligned(room);
-    memcpy(r, triangle, c * c * sizeof(double));
-    for (Size start = 0; start < p; start += ROWS) {
-        const Size n = p - start < ROWS ? p - start : ROWS;
+    double *block = align_to_lanes(work);
+    memcpy(r, r_in, c * c * sizeof(double));
+    for (Size start = 0; start < p; start += BLOCK_ROWS) {
+        const Size n = p - start < BLOCK_ROWS ? p - start : BLOCK_ROWS;
         const Size rows = (n + 2 * LANES - 1) / (2 * LANES) * 2 * LANES;
         memset(block, 0, c * rows * sizeof(double));
         for (Size i = 0; i < n; i++) {
             block[(start + i) * rows + i] = diagonal[start + i];
-            block[p * rows + i] = right[start + i];
+            block[p * rows + i] = target[start + i];
         }
-        fold(r, (Lanes *)block, c, rows / LANES);
+        update_r_factor(r, (Lanes *)block, c, rows / LANES);
     }
 }

@@ -1,4 +1,10 @@
-"""Triangles of tall rows by LAPACK: for installations without a compiler; see `loops`."""
+"""R factors of tall matrices by LAPACK.
+
+A matrix A of k·m rows and c columns is given as an array (c, k, m): k residuals of m samples, columns first.
+Its R factor is the upper triangular matrix with RᵀR = AᵀA; the signs of its rows are arbitrary. The
+orthogonal factor is never formed. The compiled implementation in `qr.h` gives the same factor up to rounding
+and signs.
+"""
 
 from __future__ import annotations
 
@@ -12,96 +18,122 @@ from .kinematics import apply_observation_matrix, batch_point_jacobian, point_ja
 from .types import ObservationMatrix
 from .work_arrays import UnbufferedRows, work_array
 
-# Columns that are reduced at once where that pays.
+# Columns per panel of the blocked factorization (dgeqrt).
 PANEL_WIDTH = 8
-
-
-# OpenBLAS has kernels for narrow products where there is AVX-512: there panels take half the time of LAPACK's
-# plain reduction, elsewhere twice.
+# OpenBLAS has kernels for narrow products on processors with AVX-512. There the blocked factorization takes
+# half the time of dgeqrf, elsewhere twice the time.
 USE_PANELS = not {"AVX512F", "X86_V4"}.isdisjoint(np.show_config(mode="dicts")["SIMD Extensions"]["found"])
-
-
-# From so many rows on, each reading's are reduced apart: below, the calls cost more than the arithmetic.
+# Smallest number of rows for factoring each residual separately; with fewer rows the calls take more time
+# than the arithmetic.
 MIN_TALL_ROWS = 2000
 
 
 def r_factor(rows: Array) -> Array:
-    """Upper triangle R (c, c) of k·m rows A given as (c, k, m), RᵀR = AᵀA; they may be overwritten."""
-    columns, readings, samples = rows.shape
-    if readings == 1 or readings * samples < MIN_TALL_ROWS:
+    """Compute the R factor of a matrix.
+
+    Args:
+        rows: Matrix of k·m rows, shape (c, k, m); it may be overwritten.
+
+    Returns:
+        Upper triangular factor, shape (c, c).
+    """
+    columns, residuals, samples = rows.shape
+    if residuals == 1 or residuals * samples < MIN_TALL_ROWS:
         return _qr(np.ascontiguousarray(rows).reshape(columns, -1))
     parts = [_factor_nonzero_columns(np.ascontiguousarray(part)) for part in rows.swapaxes(0, 1)]
     return _qr(np.concatenate(parts).T.copy())
 
 
 def r_factors(rows: Array) -> Array:
-    """The triangles (b, c, c) of b members' rows (b, c, k, m)."""
+    """Compute the R factors of a batch of matrices.
+
+    Args:
+        rows: Matrices of k·m rows, shape (b, c, k, m).
+
+    Returns:
+        Upper triangular factors, shape (b, c, c).
+    """
     b, c = rows.shape[:2]
     stacked = rows.reshape(b, c, -1)
-    short = c - stacked.shape[2]
-    if short > 0:
-        stacked = np.concatenate([stacked, np.zeros((b, c, short))], 2)
+    n_missing = c - stacked.shape[2]
+    if n_missing > 0:
+        stacked = np.concatenate([stacked, np.zeros((b, c, n_missing))], 2)
     return np.asarray(np.linalg.qr(stacked.swapaxes(1, 2), mode="r"))
 
 
 @UnbufferedRows()
 def factor_jacobian(
-    frames: Array, point: Array, at: Array, twists: Array, mixture: ObservationMatrix, given: Array
+    frames: Array, point: Array, bodies: Array, twists: Array, observation: ObservationMatrix, given: Array
 ) -> Array:
-    """Upper triangles (b, p+s, p+s) of members' rows, of which p columns follow from errors and s are given.
+    """Compute R factors of whitened Jacobians, one per member of a batch.
 
-    The m samples of one member follow those of the one before, and all second configurations all first ones.
+    The first p columns are the Jacobian of the residuals by p errors, the other s columns are given. The
+    samples are ordered by configuration of the sample (first or second), then by member of the batch.
 
     Args:
-        frames: (j, 7, 3, c·b·m), as `kinematics.point_velocities` takes them, and so are
-        point: (3, c·b·m), and
-        at: (p,).
-        twists: (b, p, 6) of each member's errors.
-        mixture: of the point's velocities into k rows at b·m samples.
-        given: (s, k, b·m); they may be overwritten.
+        frames: Columns x, y, z, p of each body frame and three columns that are overwritten, shape
+            (j, 7, 3, c·b·m), with c configurations per sample.
+        point: Tool point in the measuring frame, shape (3, c·b·m) [m].
+        bodies: Body of each error, ascending, shape (p,).
+        twists: Twists of each member's errors in body frames, shape (b, p, 6).
+        observation: Observation matrix of r rows at b·m samples.
+        given: Further columns, shape (s, r, b·m); they may be overwritten.
+
+    Returns:
+        Upper triangular factors, shape (b, p+s, p+s).
     """
     (s, k, n), (b, p, _) = given.shape, twists.shape
     block = work_array("rows", k, p + s, n).swapaxes(0, 1)
-    velocities = work_array("velocities of errors", p, 6, point.shape[1])
+    jacobian = work_array("jacobian", p, 6, point.shape[1])
     if b == 1:
-        point_jacobian(frames, point, at, twists[0], velocities)
+        point_jacobian(frames, point, bodies, twists[0], jacobian)
     else:
-        batch_point_jacobian(frames, point, at, twists, point.shape[1] // max(n, 1), velocities)
-    apply_observation_matrix(velocities, mixture, block[:p])
+        batch_point_jacobian(frames, point, bodies, twists, point.shape[1] // max(n, 1), jacobian)
+    apply_observation_matrix(jacobian, observation, block[:p])
     block[p:] = given
     if b == 1:
         return r_factor(block)[None]
     return r_factors(np.ascontiguousarray(block.reshape(p + s, k, b, -1).transpose(2, 0, 1, 3)))
 
 
-def append_diagonal(triangle: Array, diagonal: Array, right: Array) -> Array:
-    """Triangle (p+1, p+1) of [R | z] and of rows diagonal·δ = right (p,) below it."""
+def append_diagonal(r: Array, diagonal: Array, target: Array) -> Array:
+    """Compute the R factor of [R | z] with rows diag(diagonal)·δ = target below it.
+
+    Args:
+        r: R factor with the right-hand side z in its last column, shape (p+1, p+1).
+        diagonal: Diagonal of the appended block, for example prior weights, shape (p,).
+        target: Right-hand side of the appended rows, shape (p,).
+
+    Returns:
+        Upper triangular factor, shape (p+1, p+1).
+    """
     p = len(diagonal)
     stacked = np.zeros((p + 1, 2 * p + 1))
-    stacked[:, : p + 1] = triangle.T
-    # Entry i of the diagonal stands in column p + 1 + i of line i.
+    stacked[:, : p + 1] = r.T
+    # `stacked` is transposed: entry i of the diagonal is at [i, p + 1 + i].
     stacked.reshape(-1)[p + 1 : 2 * p * (p + 1) : 2 * p + 2] = diagonal
-    stacked[p, p + 1 :] = right
+    stacked[p, p + 1 :] = target
     return _qr(stacked)
 
 
 def _factor_nonzero_columns(rows: Array) -> Array:
-    """Triangle (u, c) of rows (c, m), which are overwritten, by the u columns that are not zero in all.
+    """Compute the R factor (u, c) of rows (c, m) from their u nonzero columns; overwrite the rows.
 
-    Half the errors of an arm are lengths, which turn nothing: a quarter of the work for rows of rotations.
+    Half the errors of a robot are translations, which do not affect orientation residuals. Skipping these
+    columns saves three quarters of the work for such rows.
     """
     columns = len(rows)
-    used, rest = np.flatnonzero(rows[:, 0]), np.flatnonzero(rows[:, 0] == 0)
-    if not rest.size or rows[rest].any():
+    nonzero, zero = np.flatnonzero(rows[:, 0]), np.flatnonzero(rows[:, 0] == 0)
+    if not zero.size or rows[zero].any():
         return _qr(rows)
-    out = np.zeros((len(used), columns))
-    part = work_array("narrow", len(used), rows.shape[1])
-    out[:, used] = _qr(np.take(rows, used, 0, out=part, mode="clip"))
+    out = np.zeros((len(nonzero), columns))
+    part = work_array("nonzero columns", len(nonzero), rows.shape[1])
+    out[:, nonzero] = _qr(np.take(rows, nonzero, 0, out=part, mode="clip"))
     return out
 
 
 def _qr(rows: Array) -> Array:
-    """Upper triangle (c, c) of rows (c, n), a C-order array that LAPACK sees as (n, c) and overwrites."""
+    """Compute the R factor (c, c) of rows (c, n), which LAPACK reads as (n, c) and overwrites."""
     columns, count = rows.shape
     out = np.zeros((columns, columns))
     if not rows.size:
@@ -117,4 +149,5 @@ def _qr(rows: Array) -> Array:
 
 @lru_cache(maxsize=64)
 def _upper(size: int) -> Array:
+    """Return the mask of the upper triangle, shape (size, size)."""
     return np.triu(np.ones((size, size), bool))

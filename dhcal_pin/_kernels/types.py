@@ -1,4 +1,8 @@
-"""Frames and velocities of a serial arm over many samples, components first: samples are contiguous."""
+"""Data structures that the kernels share with the packages above them.
+
+Letters in shapes: m samples, n independent joints, k moving joints, t transmission terms, c configurations
+per sample, r residuals per sample. The samples are on the last axis.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +15,16 @@ from .._typing import Array
 
 @dataclass(frozen=True, eq=False)
 class JointState:
-    """What m configurations ask of a chain's joints; errors do not change it, so one serves a whole search.
+    """Positions of a chain's joints at m configurations.
+
+    Kinematic errors of links and frames do not change it. A fit therefore computes it once, unless it
+    estimates transmission errors.
 
     Attributes:
-        independent: (n, m) values of the independent joints, rad or m.
-        positions: (k, m) of the moving joints, rad or m.
-        cos, sin: (k, m) of the values.
+        independent: Positions of the independent joints, shape (n, m) [rad or m].
+        positions: Positions of the moving joints, shape (k, m) [rad or m].
+        cos: Cosines of `positions`, shape (k, m).
+        sin: Sines of `positions`, shape (k, m).
     """
 
     independent: Array
@@ -27,13 +35,15 @@ class JointState:
 
 @dataclass(frozen=True, eq=False)
 class FrameBatch:
-    """Frames of a chain at m samples, components first so that the samples are contiguous.
+    """Frames of a chain at m samples.
 
     Attributes:
-        columns: (k+1, 7, 3, m) columns x, y, z, p of each body's frame in the measuring frame, and room for
-            how a point moves that turns about x, y and z. A body's frame has its joint's axis along z.
-        tool: (4, 3, m) columns of the tool's frame.
-        terms: (t, n, m) of the independent joints' transmission, where the chain has one.
+        columns: Columns x, y, z, p of the body frames in the measuring frame, then three columns of work
+            memory for `point_jacobian`, shape (k+1, 7, 3, m) [1, m]. The z axis of body frame j is the axis
+            of joint j.
+        tool: Columns x, y, z, p of the tool frame, shape (4, 3, m) [1, m].
+        terms: Transmission terms of the independent joints, shape (t, n, m); None if the chain has no
+            transmission.
     """
 
     columns: Array
@@ -42,11 +52,15 @@ class FrameBatch:
 
     @property
     def bodies(self) -> Array:
-        """Columns x, y, z, p (k+1, 4, 3, m) of each body's frame."""
+        """Columns x, y, z, p of the body frames, shape (k+1, 4, 3, m)."""
         return self.columns[:, :4]
 
     def poses(self) -> Array:
-        """Tool poses (m, 4, 4) in the measuring frame."""
+        """Compute the tool poses in the measuring frame.
+
+        Returns:
+            Homogeneous matrices, shape (m, 4, 4).
+        """
         out = np.zeros((self.tool.shape[-1], 4, 4))
         out[:, :3, :] = self.tool.transpose(2, 1, 0)
         out[:, 3, 3] = 1.0
@@ -55,14 +69,17 @@ class FrameBatch:
 
 @dataclass(frozen=True, eq=False)
 class ObservationMatrix:
-    """How the rows of m samples follow from the tool's velocity at c configurations of each.
+    """Sparse matrix H of a measurement: maps tool velocities to the r residual rows of each of m samples.
 
-    Each of n terms adds a share of one component of the velocity to one row.
+    With the tool velocity y = [vx, vy, vz, ωx, ωy, ωz] of the first configuration, followed by that of the
+    second one for relative measurements, row i of sample t is the sum of coefficients[j, t]·y[components[j]]
+    over the terms j with rows[j] = i. This is the Jacobian of the whitened residual by the tool pose.
 
     Attributes:
-        rows: (n,) ascending.
-        components: (n,) 0 to 5 for vx, vy, vz, ωx, ωy, ωz in the first configuration, 6 to 11 in the second.
-        coefficients: (n, m).
+        rows: Row of each term, ascending, shape (j,).
+        components: Velocity component of each term, 0 to 5 in the first and 6 to 11 in the second
+            configuration, shape (j,).
+        coefficients: Coefficients of the terms, shape (j, m).
     """
 
     rows: Array

@@ -1,4 +1,4 @@
-"""The compiled inner loops do what NumPy and LAPACK do, at every size, and refuse what does not fit them."""
+"""Compiled kernels agree with NumPy and LAPACK at every size and reject unsuitable arrays."""
 
 from __future__ import annotations
 
@@ -18,41 +18,41 @@ from robots import ROOT, random_joints, random_table
 
 from dhcal_pin import se3
 from dhcal_pin._kernels import kinematics, qr, types
-from dhcal_pin.robot.chain import Chain
+from dhcal_pin.robot import Chain
 
 try:
     from dhcal_pin._kernels import _native, native
 except ImportError:
     if os.environ.get("CI"):
         raise
-    pytest.skip("this installation had no compiler", allow_module_level=True)
+    pytest.skip("the compiled kernels are not installed", allow_module_level=True)
 
 SEEDS = st.integers(0, 2**32 - 1)
-# About the sizes of blocks, and far from them.
+# Numbers of samples near the block sizes 64, 128 and 2048, and far from them.
 SAMPLES = st.sampled_from([1, 2, 3, 7, 63, 64, 65, 127, 128, 129, 300, 2049])
 
 
 @given(SEEDS, SAMPLES)
 @settings(max_examples=60, deadline=None)
-def test_frames_and_velocities_are_numpys(seed, m):
-    """Revolute and prismatic joints, any twists on any bodies, written into a part of a larger array."""
+def test_frames_and_jacobians_agree_with_numpy(seed, m):
+    """Revolute and prismatic joints, random twists on random bodies, output into a slice of an array."""
     rng = np.random.default_rng(seed)
     table = random_table(rng)
     chain = Chain.from_dh(table)
     motion = chain.joint_state(random_joints(rng, table, m))
     k, p = len(chain.moving_joints), int(rng.integers(1, 30))
-    theirs, ours = np.empty((2, k + 2, 7, 3, m))
-    theirs[0, :4] = ours[0, :4] = se3.exp6(rng.standard_normal(6))[:3].T[:, :, None]
-    kinematics.propagate_frames(chain.link_transforms, chain.prismatic, motion, theirs)
-    native.propagate_frames(chain.link_transforms, chain.prismatic, motion, ours)
-    np.testing.assert_allclose(ours[:, :4], theirs[:, :4], atol=1e-14)
+    reference, compiled = np.empty((2, k + 2, 7, 3, m))
+    reference[0, :4] = compiled[0, :4] = se3.exp6(rng.standard_normal(6))[:3].T[:, :, None]
+    kinematics.propagate_frames(chain.link_transforms, chain.prismatic, motion, reference)
+    native.propagate_frames(chain.link_transforms, chain.prismatic, motion, compiled)
+    np.testing.assert_allclose(compiled[:, :4], reference[:, :4], atol=1e-14)
     at = np.sort(rng.integers(0, k + 1, p))
     twists = rng.standard_normal((p, 6)) * (rng.random((p, 6)) < 0.4)
     twists[rng.random(p) < 0.3] = np.eye(6)[rng.integers(6)]
     wide = np.full((6, p + 1, m + 5), np.nan)
     out, expected = wide.swapaxes(0, 1)[:p, :, 2 : m + 2], np.empty((p, 6, m))
-    kinematics.point_jacobian(theirs[:-1], theirs[-1, 3], at, twists, expected)
-    native.point_jacobian(ours[:-1], ours[-1, 3], at, twists, out)
+    kinematics.point_jacobian(reference[:-1], reference[-1, 3], at, twists, expected)
+    native.point_jacobian(compiled[:-1], compiled[-1, 3], at, twists, out)
     np.testing.assert_allclose(out, expected, atol=1e-13)
     assert np.isnan(wide[:, p]).all()
     assert np.isnan(wide[..., [0, 1, -3, -2, -1]]).all()
@@ -60,11 +60,11 @@ def test_frames_and_velocities_are_numpys(seed, m):
 
 @given(SEEDS, SAMPLES, st.integers(1, 45), st.integers(1, 6))
 @settings(max_examples=100, deadline=None)
-def test_a_triangle_is_lapacks_but_for_signs(seed, m, columns, readings):
-    """Rows of readings that are zero in columns of their own; the rows are left as they were."""
+def test_r_factor_agrees_with_lapack_up_to_signs(seed, m, columns, residuals):
+    """Residuals with different zero columns; the input rows are not changed."""
     rng = np.random.default_rng(seed)
-    rows = rng.standard_normal((readings, columns, m)).swapaxes(0, 1)
-    rows[rng.random((columns, readings)) < 0.3] = 0.0
+    rows = rng.standard_normal((residuals, columns, m)).swapaxes(0, 1)
+    rows[rng.random((columns, residuals)) < 0.3] = 0.0
     rows *= 10.0 ** rng.uniform(-3, 3, columns)[:, None, None]
     before = rows.copy()
     r = native.r_factor(rows)
@@ -78,52 +78,58 @@ def test_a_triangle_is_lapacks_but_for_signs(seed, m, columns, readings):
     )
 
 
-def test_triangles_of_many_are_each_ones_own():
-    """Members with more rows than columns, and with fewer."""
+def test_batched_r_factors_equal_single_ones():
+    """Batch members with more rows than columns, and with fewer."""
     rng = np.random.default_rng(0)
     for rows in rng.standard_normal((5, 7, 2, 30)), rng.standard_normal((5, 7, 2, 2)):
         many = native.r_factors(rows)
         for member, r in zip(rows, many, strict=True):
             np.testing.assert_array_equal(r, native.r_factor(member))
-        theirs = qr.r_factors(rows)
-        np.testing.assert_allclose(many.swapaxes(1, 2) @ many, theirs.swapaxes(1, 2) @ theirs, atol=1e-12)
+        reference = qr.r_factors(rows)
+        np.testing.assert_allclose(
+            many.swapaxes(1, 2) @ many, reference.swapaxes(1, 2) @ reference, atol=1e-12
+        )
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-100, 1e-12, 1.0, 1e100])
-def test_triangles_of_any_size(size):
+def test_r_factor_of_any_magnitude(size):
     rows = size * np.random.default_rng(0).standard_normal((5, 2, 200))
     wanted = np.abs(np.linalg.qr(rows.reshape(5, -1).T, mode="r"))
     np.testing.assert_allclose(np.abs(native.r_factor(rows)), wanted, rtol=1e-12, atol=1e-12 * size)
 
 
-def random_mixture(rng: np.random.Generator, readings: int, ends: int, m: int) -> types.ObservationMatrix:
-    """Any terms for some of the rows, none for others."""
+def random_observation_matrix(
+    rng: np.random.Generator, residuals: int, ends: int, m: int
+) -> types.ObservationMatrix:
+    """Build an observation matrix with random terms for some rows and none for others."""
     count = int(rng.integers(0, 12))
-    rows = np.sort(rng.integers(0, readings, count))
+    rows = np.sort(rng.integers(0, residuals, count))
     return types.ObservationMatrix(rows, rng.integers(0, 6 * ends, count), rng.standard_normal((count, m)))
 
 
 @given(SEEDS, SAMPLES, st.integers(1, 2), st.integers(1, 6), st.integers(1, 20))
 @settings(max_examples=60, deadline=None)
-def test_mixtures_are_sums_of_products(seed, m, ends, readings, vectors):
+def test_observation_matrix_products_are_sums_of_terms(seed, m, ends, residuals, vectors):
     rng = np.random.default_rng(seed)
-    velocities, mixture = (
+    jacobian, observation = (
         rng.standard_normal((vectors, 6, ends * m)),
-        random_mixture(rng, readings, ends, m),
+        random_observation_matrix(rng, residuals, ends, m),
     )
-    expected = np.zeros((vectors, readings, m))
-    for row, component, share in zip(mixture.rows, mixture.components, mixture.coefficients, strict=True):
+    expected = np.zeros((vectors, residuals, m))
+    for row, component, share in zip(
+        observation.rows, observation.components, observation.coefficients, strict=True
+    ):
         end, which = divmod(component, 6)
-        expected[:, row] += share * velocities[:, which, end * m : (end + 1) * m]
+        expected[:, row] += share * jacobian[:, which, end * m : (end + 1) * m]
     for way in native, kinematics:
-        found = way.apply_observation_matrix(velocities, mixture, np.full(expected.shape, np.nan))
+        found = way.apply_observation_matrix(jacobian, observation, np.full(expected.shape, np.nan))
         np.testing.assert_allclose(found, expected, atol=1e-13)
 
 
 @given(SEEDS, SAMPLES, st.integers(1, 2), st.integers(1, 7), st.integers(0, 4), st.sampled_from([1, 1, 3]))
 @settings(max_examples=100, deadline=None)
-def test_triangles_of_errors_are_those_of_their_rows(seed, m, ends, readings, own, members):
-    """Twists that turn, slide or rest, rows that see some of it, and columns that are given."""
+def test_factored_jacobian_agrees_with_explicit_rows(seed, m, ends, residuals, n_given, members):
+    """Rotations, translations and zero twists; rows that depend on some of them; given columns."""
     rng = np.random.default_rng(seed)
     table = random_table(rng)
     chain, p = Chain.from_dh(table), int(rng.integers(0, 30))
@@ -131,16 +137,16 @@ def test_triangles_of_errors_are_those_of_their_rows(seed, m, ends, readings, ow
     at = np.sort(rng.integers(0, len(chain.moving_joints) + 1, p))
     twists = rng.standard_normal((members, p, 6)) * (rng.random((members, p, 6)) < 0.4)
     twists[rng.random((members, p)) < 0.3, 3:] = 0.0
-    given_ = rng.standard_normal((readings, own + 1, members * m)).swapaxes(0, 1)
-    given_[rng.random((own + 1, readings)) < 0.3] = 0.0
-    mixture = random_mixture(rng, readings, ends, members * m)
-    terms = frames.columns, frames.tool[3], at, twists, mixture, given_
-    before = given_.copy()
-    ours = native.factor_jacobian(*terms)
-    np.testing.assert_array_equal(given_, before)
-    for r, theirs in zip(ours, qr.factor_jacobian(*terms), strict=True):
+    given_columns = rng.standard_normal((residuals, n_given + 1, members * m)).swapaxes(0, 1)
+    given_columns[rng.random((n_given + 1, residuals)) < 0.3] = 0.0
+    observation = random_observation_matrix(rng, residuals, ends, members * m)
+    terms = frames.columns, frames.tool[3], at, twists, observation, given_columns
+    before = given_columns.copy()
+    compiled = native.factor_jacobian(*terms)
+    np.testing.assert_array_equal(given_columns, before)
+    for r, reference in zip(compiled, qr.factor_jacobian(*terms), strict=True):
         np.testing.assert_array_equal(r, np.triu(r))
-        wanted = theirs.T @ theirs
+        wanted = reference.T @ reference
         scale = np.sqrt(np.diag(wanted))
         scale[scale == 0] = 1.0
         np.testing.assert_allclose((r / scale).T @ (r / scale), wanted / np.outer(scale, scale), atol=1e-12)
@@ -148,26 +154,26 @@ def test_triangles_of_errors_are_those_of_their_rows(seed, m, ends, readings, ow
 
 @given(SEEDS, st.integers(0, 30))
 @settings(max_examples=60, deadline=None)
-def test_stations_move_as_numpys(seed, count):
-    """Any twists, several at a station, small and large, at base, joints and tool."""
+def test_perturbed_frames_agree_with_numpy(seed, count):
+    """Random twists, small and large, several per error frame, at base, joints and tool."""
     rng = np.random.default_rng(seed)
     chain = Chain.from_dh(random_table(rng))
-    stations = np.sort(rng.integers(0, chain.tool_frame_index + 1, count))
+    error_frames = np.sort(rng.integers(0, chain.tool_frame_index + 1, count))
     twists = rng.standard_normal((count, 6)) * (rng.random((count, 6)) < 0.4)
     x = rng.standard_normal(count) * 10.0 ** rng.uniform(-9, 0, count)
     tool = se3.exp6(rng.standard_normal(6))
-    terms = chain.body_from_urdf, chain.origins, tool, stations, twists, x
-    theirs, ours = kinematics.perturb_frames(*terms), native.perturb_frames(*terms)
-    for mine, other in zip(ours, theirs, strict=True):
+    terms = chain.body_from_urdf, chain.origins, tool, error_frames, twists, x
+    reference, compiled = kinematics.perturb_frames(*terms), native.perturb_frames(*terms)
+    for mine, other in zip(compiled, reference, strict=True):
         np.testing.assert_allclose(mine, other, atol=1e-13)
-    for station, motion in enumerate(ours[0]):
-        steps = se3.exp6((x[:, None] * twists)[stations == station])
+    for station, motion in enumerate(compiled[0]):
+        steps = se3.exp6((x[:, None] * twists)[error_frames == station])
         np.testing.assert_allclose(motion, functools.reduce(np.matmul, steps, np.eye(4)), atol=1e-13)
 
 
 @pytest.mark.parametrize("size", [1e-9, 0.5, 1.0, 10.0, 1e3, 9.9e4, 1.1e5, 1e12])
 def test_cosines_and_sines_of_any_angle(size):
-    """To the last bit of one, and small ones to their own last bit."""
+    """Relative error of at most 5e-16, also near the zeros of the functions."""
     angles = size * np.random.default_rng(2).uniform(-1, 1, (3, 1001))
     angles[0, :200] = np.round(angles[0, :200] / (np.pi / 4)) * (np.pi / 4)
     angles[1, :2] = 0.0, -0.0
@@ -178,41 +184,43 @@ def test_cosines_and_sines_of_any_angle(size):
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-12, 1e-6, 1e-3, 0.02, 0.05, 1.0, 3.0, np.pi - 1e-9])
-def test_rotations_of_any_angle(size):
-    """Against the general functions, which are tested against Pinocchio's."""
+def test_rotation_vectors_and_jacobians_of_any_angle(size):
+    """Compare with `se3`, which is tested against Pinocchio."""
     rng = np.random.default_rng(1)
     axes = rng.standard_normal((130, 3))
     rotvecs = np.ascontiguousarray(size * (axes / np.linalg.norm(axes, axis=1)[:, None]).T)
-    turns = np.ascontiguousarray(se3.exp3(rotvecs.T).transpose(1, 2, 0))
-    np.testing.assert_allclose(native.log_rotations(turns), se3.log3(turns.transpose(2, 0, 1)).T, atol=2e-15)
+    rotations = np.ascontiguousarray(se3.exp3(rotvecs.T).transpose(1, 2, 0))
+    np.testing.assert_allclose(
+        native.log_rotations(rotations), se3.log3(rotations.transpose(2, 0, 1)).T, atol=2e-15
+    )
     inverses = native.right_jacobian_inverse_batch(rotvecs).transpose(2, 0, 1)
     np.testing.assert_allclose(inverses, se3.right_jacobian_inverse(rotvecs.T), atol=1e-14)
 
 
-def test_digits_depend_neither_on_where_arrays_lie_nor_on_their_neighbours(sim_6dof):
-    """Whole vectors and the rest of a loop round alike: else a report would change from run to run."""
+def test_results_do_not_depend_on_alignment_or_on_other_samples(sim_6dof):
+    """Vectorized loops and their remainders round equally; otherwise reports would differ between runs."""
     q = np.random.default_rng(0).uniform(-3, 3, (300, 6))
     bodies, twists = np.arange(7), np.random.default_rng(1).standard_normal((7, 6))
     frames = sim_6dof.forward_kinematics(q)
-    velocities = sim_6dof.tool_jacobian(frames, bodies, twists)
+    jacobian = sim_6dof.tool_jacobian(frames, bodies, twists)
     for first, count in ((0, 1), (3, 1), (5, 2), (66, 3), (1, 67), (100, 64)):
         part = slice(first, first + count)
         alone = sim_6dof.forward_kinematics(q[part])
         np.testing.assert_array_equal(alone.bodies, frames.bodies[..., part])
         own = sim_6dof.tool_jacobian(alone, bodies, twists)
-        np.testing.assert_array_equal(own, velocities[..., part])
-        turns = np.ascontiguousarray(alone.tool[:3])
+        np.testing.assert_array_equal(own, jacobian[..., part])
+        rotations = np.ascontiguousarray(alone.tool[:3])
         whole = native.log_rotations(np.ascontiguousarray(frames.tool[:3]))
-        np.testing.assert_array_equal(native.log_rotations(turns), whole[:, part])
+        np.testing.assert_array_equal(native.log_rotations(rotations), whole[:, part])
         rotvecs = np.ascontiguousarray(own[0, 3:])
-        inverses = native.right_jacobian_inverse_batch(np.ascontiguousarray(velocities[0, 3:]))
+        inverses = native.right_jacobian_inverse_batch(np.ascontiguousarray(jacobian[0, 3:]))
         np.testing.assert_array_equal(native.right_jacobian_inverse_batch(rotvecs), inverses[..., part])
         rows, components = np.repeat(np.arange(3), 3), np.tile([3, 4, 5], 3)
-        mixture = types.ObservationMatrix(rows, components, inverses.reshape(9, -1))
+        observation = types.ObservationMatrix(rows, components, inverses.reshape(9, -1))
         out, expected = np.empty((7, 3, count)), np.empty((7, 3, 300))
-        native.apply_observation_matrix(velocities, mixture, expected)
+        native.apply_observation_matrix(jacobian, observation, expected)
         native.apply_observation_matrix(
-            own, replace(mixture, coefficients=mixture.coefficients[:, part]), out
+            own, replace(observation, coefficients=observation.coefficients[:, part]), out
         )
         np.testing.assert_array_equal(out, expected[..., part])
         cosines, sines = native.cos_sin(np.ascontiguousarray(q.T))
@@ -236,12 +244,12 @@ def test_digits_depend_neither_on_where_arrays_lie_nor_on_their_neighbours(sim_6
         "rows",
     ],
 )
-def test_arrays_that_do_not_fit_are_refused(rows):
+def test_unsuitable_arrays_are_rejected(rows):
     with pytest.raises((ValueError, TypeError)):
         _native.r_factors(rows, np.empty(10_000), np.zeros((1, 3, 3)))
 
 
-def test_shapes_bodies_and_constants_are_checked(sim_6dof):
+def test_shapes_indices_and_read_only_arrays_are_checked(sim_6dof):
     rows, frozen = np.zeros((1, 3, 2, 4)), np.zeros((1, 3, 3))
     frozen.flags.writeable = False
     for out in (
@@ -256,22 +264,22 @@ def test_shapes_bodies_and_constants_are_checked(sim_6dof):
     with pytest.raises(ValueError, match="shapes"):
         _native.r_factors(rows, np.empty(_native.work_size(3, 2, 0) - 1), np.zeros((1, 3, 3)))
     with pytest.raises(TypeError):
-        _native.r_factors(rows)
+        _native.r_factors(rows)  # pyright: ignore[reportCallIssue]
     frames, out = sim_6dof.forward_kinematics(np.zeros((5, 6))), np.empty((1, 6, 5))
     for body in (-1, len(frames.columns)):
         with pytest.raises(ValueError, match="shapes"):
             native.point_jacobian(frames.columns, frames.tool[3], np.array([body]), np.zeros((1, 6)), out)
     errors = frames.columns, frames.tool[3], np.zeros(1, int), np.ones((1, 1, 6))
     for rows, components in (([0], [6]), ([2], [0]), ([1, 0], [0, 0]), ([0], [-1])):
-        mixture = types.ObservationMatrix(np.array(rows), np.array(components), np.ones((len(rows), 5)))
+        observation = types.ObservationMatrix(np.array(rows), np.array(components), np.ones((len(rows), 5)))
         with pytest.raises(ValueError, match="shapes"):
-            native.apply_observation_matrix(out, mixture, np.empty((1, 2, 5)))
+            native.apply_observation_matrix(out, observation, np.empty((1, 2, 5)))
         with pytest.raises(ValueError, match="shapes"):
-            native.factor_jacobian(*errors, mixture, np.zeros((1, 2, 5)))
-    for stations in ([sim_6dof.tool_frame_index + 1], [-1], [2, 1]):
-        terms = sim_6dof.body_from_urdf, sim_6dof.origins, np.eye(4), np.array(stations)
+            native.factor_jacobian(*errors, observation, np.zeros((1, 2, 5)))
+    for error_frames in ([sim_6dof.tool_frame_index + 1], [-1], [2, 1]):
+        terms = sim_6dof.body_from_urdf, sim_6dof.origins, np.eye(4), np.array(error_frames)
         with pytest.raises(ValueError, match="shapes"):
-            native.perturb_frames(*terms, np.zeros((len(stations), 6)), np.zeros(len(stations)))
+            native.perturb_frames(*terms, np.zeros((len(error_frames), 6)), np.zeros(len(error_frames)))
     with pytest.raises(ValueError, match="shapes"):
         native.propagate_frames(
             sim_6dof.link_transforms[1:],
@@ -298,7 +306,7 @@ print(json.dumps([fit.converged, fit.x.tolist(), fit.std.tolist()]))
 """
 
 
-def test_a_calibration_without_the_compiled_loops_ends_at_the_same_values():
+def test_calibration_without_compiled_kernels_gives_the_same_values():
     places = Path(native.__file__).parents[2], ROOT / "tests"
     environ = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, map(Path.resolve, places)))}
     ends = [
