@@ -51,7 +51,7 @@ def median_radius(points: Array) -> float:
 
 def position_misfit(chain: Chain, q: Array, seen: Array) -> float:
     """The usual distance in m of positions (m, 3) from an arm's at q (m, n), base and tool placed to fit."""
-    begun = candidate_frames(chain, (subsample(Position.from_arrays(q, seen)),), base=True, tool=True)
+    begun = candidate_frames(chain, (subsample(Position(q, seen)),), base=True, tool=True)
     return min(_fit_from(start, q, seen) for start in begun)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -108,16 +108,13 @@ class ObservabilityProbe:
         low, high = np.maximum(chain.lower, -np.pi), np.minimum(chain.upper, np.pi)
         return rng.uniform(low, high, (m, chain.n_joints))
 
-    def _resampled(self, item: Any, joints: Sequence[int], rng: np.random.Generator) -> Any:
+    def _resampled(self, item: Measurement, joints: Sequence[int], rng: np.random.Generator) -> Measurement:
         """The same readings with some joints anywhere; who touches something must stay on it."""
         if item.is_contact:
             return item
-        ends = {}
-        for name in ("q", "q_to"):
-            if hasattr(item, name):
-                ends[name] = getattr(item, name).copy()
-                ends[name][:, joints] = self.draw(rng, len(ends[name]))[:, joints]
-        return replace(item, **ends)
+        q = item.configurations().copy()
+        q[:, joints] = self.draw(rng, len(q))[:, joints]
+        return item.resample(q)
 
     def hypothetical_r_factor(self, joints: Sequence[int], *extra: type[Pose] | type[Position]) -> Array:
         """What the same instruments would see with some joints drawn anew, and with more readings."""
@@ -130,11 +127,7 @@ class ObservabilityProbe:
         q = self.draw(rng, _ROWS_PER_UNKNOWN * p)
         pose = self.chain.poses(q)
         for kind in extra:
-            every.append(
-                Pose.from_arrays(q, pose, 1e-3, 1e-3)
-                if kind is Pose
-                else Position.from_arrays(q, pose[:, :3, 3], 1e-3)
-            )
+            every.append(Pose(q, pose, 1e-3, 1e-3) if kind is Pose else Position(q, pose[:, :3, 3], 1e-3))
         return linearize_and_factor(replace(self.problem, data=tuple(every)), self.x, small_angle=False).r
 
     def unmoved_joints(self) -> list[int]:

@@ -1,7 +1,8 @@
-"""Measurement models: residuals and Jacobians of every supported instrument.
+"""Measurement models: residuals and Jacobians of all supported instruments and contacts.
 
 A measurement kind is one class in a module of this package and one entry of `KINDS`. Files, simulation,
-calibration and planning take the kinds from `KINDS` alone.
+calibration and planning take the kinds from `KINDS`. Units, files and robots are the concern of other
+packages; here lengths are metres, angles radians, and a robot is a `Chain`.
 """
 
 from .base import InstrumentParameter, Measurement, Noise
@@ -10,6 +11,7 @@ from .length import Distance, Wires
 from .pose import Pose, RelativePose
 from .position import MultiTargetPosition, Position, PositionComponents
 
+# Measurement kinds by name.
 KINDS: dict[str, type[Measurement]] = {
     kind.kind: kind
     for kind in (

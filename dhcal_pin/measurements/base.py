@@ -1,44 +1,60 @@
-"""What an instrument reads of the tool, and how that changes with the tool.
+"""Measurement models: the interface of all measurement kinds, and what the kinds share.
 
-A kind of measurement holds joint values and readings in SI. Given a sweep of frames and the values u of
-its own unknowns (an anchor, a touched point) it returns whitened residuals, measured minus modelled over
-sigma, as (k, m). It says how they mix the tool's velocities (p, 6, c·m), of which `derivatives` makes those
-of the whitened model (p, k, m), and gives the derivative (s, k, m) by its s unknowns. Components come first,
-so that samples are contiguous. A step solves derivative·Δx = residual.
+A measurement object holds m samples of one kind: joint positions q, measured values z and their standard
+deviations sigma, in metres and radians. Let h(q, u) be the value that the chain and the s instrument
+parameters u predict, such as the unknown anchor of a wire. With the frames of the chain at q, a kind returns
+
+    r = (z - h) / sigma                     whitened residuals, (k, m)
+    (∂h/∂V) / sigma                         observation matrix; V are the velocities of the tool, (6, c·m)
+    (∂h/∂u) / sigma                         instrument Jacobian, (s, k, m)
+
+With the tool Jacobian J, (p, 6, c·m), of p error parameters x, the Jacobian of the whitened model is the
+product of observation matrix and J, (p, k, m). A least-squares step Δ makes [Jacobian]·Δ ≈ r.
+
+Letters in shapes: m samples, n joints, k residuals per sample, c configurations per sample (1 or 2),
+s instrument parameters, p error parameters. Components come first and samples last, so that the samples of
+one component are contiguous in memory.
+
+A new kind derives from `PointMeasurement`, if it depends on the position of the tool point alone, or from
+`Measurement`. It declares its columns in `COLUMNS`, has a constructor that checks its arguments, and is
+entered in `measurements.KINDS`. Files, simulation, calibration and planning take it from there.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, Protocol, Self, TypeVar
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 
 from .._kernels import apply_observation_matrix
 from .._kernels.types import FrameBatch, ObservationMatrix
 from .._typing import Array
-from ..exceptions import DhcalError
+from ..exceptions import InvalidArgumentError
 from ..robot.chain import Chain
+from .columns import Column, common_text, file_columns, stack_columns, stack_sigmas
 
-# Without a sigma a millimetre weighs as much as a milliradian.
+# Standard deviations [m], [rad] of measurements that state none: a millimetre weighs as much as a
+# milliradian.
 LENGTH_SIGMA, ANGLE_SIGMA = 1e-3, 1e-3
-
-
-# An anchor or a touched point may be anywhere in a hall; a wire's zero within arm's length.
-POINT_PRIOR, ZERO_PRIOR = 10.0, 1.0
+# Prior standard deviation [m] of an anchor or touched point: it may be anywhere in a hall.
+POINT_PRIOR = 10.0
+# Prior standard deviation [m] of the zero of a wire or of a target on the tool: within arm's length.
+OFFSET_PRIOR = 1.0
 
 
 @dataclass(frozen=True)
 class InstrumentParameter:
-    """A scalar that an instrument brings with it.
+    """Unknown scalar of an instrument, which is estimated together with the robot.
 
     Attributes:
-        name: what users call it; measurements share the unknowns that they name alike.
+        name: Name that users see. Measurements share the parameters that have the same name.
         unit: "m" or "rad".
-        nominal: where the search starts.
-        prior: standard deviation about that, in its unit.
-        is_local: whether its value only means something to the very measurement that started it.
+        nominal: Initial value; NaN if another measurement has to provide it.
+        prior: Prior standard deviation of the difference from `nominal`, in `unit`.
+        is_local: Whether the value only has a meaning for the measurement object that initialized it.
     """
 
     name: str
@@ -50,191 +66,349 @@ class InstrumentParameter:
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations an axis: `position` in m, `rotation` in rad."""
+    """Standard deviations of simulated measurement noise.
+
+    Attributes:
+        position: Of each axis of a position, or of a length [m].
+        rotation: Of each component of a rotation vector [rad].
+    """
 
     position: float = 0.0
     rotation: float = 0.0
 
 
-class Measurement(Protocol):
-    """What the solver asks of a kind with m samples, c configurations a sample and s unknowns."""
+@dataclass(frozen=True, eq=False, init=False, repr=False)
+class Measurement(ABC):
+    """Samples of one measurement kind.
 
+    Objects are immutable. Constructors check their arguments; `take`, `replace` and the methods `with_...`
+    return copies without checking again, as solvers call them for each chunk of samples.
+
+    Attributes:
+        q: Joint positions of the first configuration of each sample, (m, n) [rad or m].
+        rows: Row number of each sample in its file, (m,); the first data row is 1.
+        has_stated_sigma: Whether the standard deviations are those of the instrument, not placeholders that
+            are estimated with the fit.
+        instrument_parameters: The s instrument parameters, in the order of u.
+    """
+
+    q: Array
+    rows: Array
+    has_stated_sigma: bool
+    instrument_parameters: tuple[InstrumentParameter, ...]
+
+    # Name of the kind in files, on the command line and in studies.
     kind: ClassVar[str]
-    residual_groups: ClassVar[Mapping[str, slice]]
-    # The kind's columns in a file and what they hold: "length", "angle" or "text"; sigmas included.
+    # Columns of files, except those of the joints.
+    COLUMNS: ClassVar[tuple[Column, ...]]
+    # Quantity of each column of files, standard deviations included: "length", "angle" or "text".
     columns: ClassVar[Mapping[str, str]]
-    # A file is of this kind if it has all columns of one of these.
+    # A file is of this kind if it has all columns of one of these sets.
     required_columns: ClassVar[tuple[frozenset[str], ...]]
-    # Configurations a row: 0, 1, or 2, the second under to:JOINT.
-    configurations_per_row: ClassVar[int]
-    # Fields with an entry a sample.
-    sample_fields: ClassVar[tuple[str, ...]]
-    # Whether the tool must be on something for a sample; if not, any configuration can be measured.
-    is_contact: ClassVar[bool]
-    # Whether a reading holds a length; if not, an arm of any size fits as well.
-    has_length_scale: ClassVar[bool]
+    # Rows of the residual by name.
+    residual_groups: ClassVar[Mapping[str, slice]]
+    # Configurations per row of a file: 0, 1, or 2, the second one in columns `to:JOINT`.
+    configurations_per_row: ClassVar[int] = 1
+    # Attributes with one entry per sample.
+    sample_fields: ClassVar[tuple[str, ...]] = ("q", "rows")
+    # Whether the tool must be in contact with an object; otherwise any configuration can be measured.
+    is_contact: ClassVar[bool] = False
+    # Whether the measured values contain a length; otherwise a scaled robot fits equally well.
+    has_length_scale: ClassVar[bool] = True
 
-    @property
-    def q(self) -> Array:
-        """Joint values (m, n) of the samples' first configurations, rad or m."""
-        ...
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Derive the columns of files from `COLUMNS`."""
+        super().__init_subclass__(**options)
+        if "COLUMNS" in cls.__dict__:
+            cls.columns = file_columns(cls.COLUMNS)
+            if "required_columns" not in cls.__dict__:
+                cls.required_columns = (frozenset(c.name for c in cls.COLUMNS if not c.is_implied),)
 
-    @property
-    def rows(self) -> Array:
-        """Row numbers (m,), the first reading of a file being 1."""
-        ...
+    def _initialize(self, **values: Any) -> None:
+        """Set attributes of an immutable object; for constructors only."""
+        self.__dict__.update(values)
 
-    @property
-    def residual_dim(self) -> int:
-        """Number k of residuals a sample."""
-        ...
+    def __repr__(self) -> str:
+        """Return the kind, the number of samples and the standard deviations."""
+        return f"{type(self).__name__}({', '.join([f'{len(self.rows)} samples', *self._description()])})"
 
-    @property
-    def has_stated_sigma(self) -> bool:
-        """Whether the sigmas are the instrument's own, not a placeholder to be estimated."""
-        ...
+    def _description(self) -> list[str]:
+        """Return what `repr` says besides the number of samples."""
+        return []
 
-    @property
-    def instrument_parameters(self) -> tuple[InstrumentParameter, ...]:
-        """The s unknowns, in the order of u."""
-        ...
+    # ------------------------------------------------------------------------------------------- copies
+    def replace(self, **values: Any) -> Self:
+        """Return a copy with other values of some attributes, which are not checked.
 
-    def configurations(self) -> Array:
-        """Joint values (c·m, n) that a sweep for this measurement has, one configuration after the other."""
-        ...
-
-    def initialized(self, chain: Chain) -> Self:
-        """The same readings with unknowns that start where a chain puts them."""
-        ...
-
-    def residual(self, frames: FrameBatch, u: Array) -> Array:
-        """Whitened residuals (k, m); `groups` names its rows."""
-        ...
-
-    def observation_matrix(self, frames: FrameBatch, u: Array, residual: Array) -> ObservationMatrix:
-        """How the k rows of the whitened model follow from the tool's velocities where residual is."""
-        ...
-
-    def instrument_jacobian(self, frames: FrameBatch, u: Array) -> Array:
-        """Derivatives (s, k, m) of the whitened model by the unknowns."""
-        ...
-
-    def small_angle(self, frames: FrameBatch, u: Array) -> tuple[Array, ObservationMatrix]:
-        """The paper's rows: residual (k, m) by (35) and (36), and what makes its R of velocities."""
-        ...
-
-    def errors(self, frames: FrameBatch, u: Array) -> dict[str, Array]:
-        """Unweighted errors (m, ·): "position" in m, "orientation" in rad, or the kind's own in m."""
-        ...
-
-    def positions(self) -> Array:
-        """Measured positions (m, 3) of the tool point, or (0, 3) where the kind has none."""
-        ...
-
-    def rotations(self) -> Array:
-        """Measured rotations (m, 3, 3) of the tool, or (0, 3, 3) where the kind has none."""
-        ...
-
-    def with_scaled_sigma(self, scales: Mapping[str, float]) -> Self:
-        """The same readings with each group's sigmas multiplied."""
-        ...
-
-    def with_weights(self, weights: Array) -> Self:
-        """The same readings with each sample counting for a weight (m,), by wider sigmas."""
-        ...
+        Args:
+            **values: New values by attribute name.
+        """
+        copy = object.__new__(type(self))
+        known = self.__dict__
+        # Attributes only: cached properties must not be copied.
+        copy.__dict__.update({field.name: known[field.name] for field in fields(self)} | values)
+        return copy
 
     def take(self, index: Array | slice) -> Self:
-        """The samples of an index or mask."""
-        ...
+        """Return the samples of an index, mask or slice.
+
+        Args:
+            index: Indices or mask along the samples.
+        """
+        return self.replace(**{name: getattr(self, name)[index] for name in self.sample_fields})
+
+    def resample(self, q: Array) -> Self:
+        """Return the same measurement at other joint positions, with unchanged measured values.
+
+        Args:
+            q: Joint positions, (c·m, n) as `configurations` returns them [rad or m].
+        """
+        return self.replace(q=q)
+
+    @abstractmethod
+    def with_scaled_sigma(self, scales: Mapping[str, float]) -> Self:
+        """Return a copy whose standard deviations are multiplied by a factor per residual group.
+
+        Args:
+            scales: Factor of each name in `residual_groups`.
+        """
+
+    @abstractmethod
+    def with_weights(self, weights: Array) -> Self:
+        """Return a copy whose standard deviations are divided by the square roots of sample weights.
+
+        Args:
+            weights: Weight of each sample, (m,).
+        """
+
+    # ------------------------------------------------------------------------------------------- model
+    @property
+    @abstractmethod
+    def residual_dim(self) -> int:
+        """Number k of residuals per sample."""
+
+    def configurations(self) -> Array:
+        """Return the joint positions (c·m, n) of all samples, one configuration after the other."""
+        return self.q
+
+    def initialized(self, chain: Chain) -> Self:
+        """Return a copy with initial values of the instrument parameters.
+
+        Args:
+            chain: Robot whose tool poses the initial values are fitted to.
+        """
+        return self
+
+    @abstractmethod
+    def residual(self, frames: FrameBatch, u: Array) -> Array:
+        """Return the whitened residuals (k, m); `residual_groups` names the rows.
+
+        Args:
+            frames: Frames of the chain at `configurations()`.
+            u: Values of the instrument parameters, (s,).
+        """
+
+    @abstractmethod
+    def observation_matrix(self, frames: FrameBatch, u: Array, residual: Array) -> ObservationMatrix:
+        """Return the derivatives of the whitened model with respect to the velocities of the tool.
+
+        Args:
+            frames: Frames of the chain at `configurations()`.
+            u: Values of the instrument parameters, (s,).
+            residual: Whitened residuals at these frames and values, (k, m).
+        """
+
+    @abstractmethod
+    def instrument_jacobian(self, frames: FrameBatch, u: Array) -> Array:
+        """Return the derivatives (s, k, m) of the whitened model with respect to u.
+
+        Args:
+            frames: Frames of the chain at `configurations()`.
+            u: Values of the instrument parameters, (s,).
+        """
+
+    @abstractmethod
+    def small_angle(self, frames: FrameBatch, u: Array) -> tuple[Array, ObservationMatrix]:
+        """Return residuals and observation matrix of the paper, which assume small rotation errors.
+
+        Args:
+            frames: Frames of the chain at `configurations()`.
+            u: Values of the instrument parameters, (s,).
+
+        Returns:
+            Residuals (k, m) by the paper's (35) and (36), and the matching observation matrix.
+        """
+
+    @abstractmethod
+    def errors(self, frames: FrameBatch, u: Array) -> dict[str, Array]:
+        """Return measured minus modelled values, not whitened.
+
+        Args:
+            frames: Frames of the chain at `configurations()`.
+            u: Values of the instrument parameters, (s,).
+
+        Returns:
+            "position" (m, 3) [m], "orientation" (m, 3) [rad], or the kind's own names (m, ·) [m].
+        """
+
+    def positions(self) -> Array:
+        """Return measured positions (m, 3) of the tool point [m]; (0, 3) for kinds without."""
+        return np.empty((0, 3))
+
+    def rotations(self) -> Array:
+        """Return measured rotations (m, 3, 3) of the tool; (0, 3, 3) for kinds without."""
+        return np.empty((0, 3, 3))
 
     @classmethod
+    @abstractmethod
     def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Self:
-        """Readings of a chain with normal noise, the instrument standing somewhere sensible."""
-        ...
+        """Return measurements of a chain with normal noise, by an instrument in a sensible place.
 
+        Args:
+            chain: Robot that is measured.
+            q: Joint positions, (m, n) [rad or m]. Kinds with contact move them onto the touched object.
+            noise: Standard deviations of the noise.
+            rng: Random generator of the noise.
+        """
+
+    # ------------------------------------------------------------------------------------------- files
     @classmethod
     def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> Self:
-        """The readings of a file: joint values (m, n) an end, and its columns (m,) in SI or as text."""
-        ...
+        """Return the measurements of a file.
+
+        Args:
+            q: Joint positions of each configuration, (m, n) [rad or m].
+            values: Columns by name: numbers (m,) in m or rad, or texts.
+        """
+        return cls(*q[: cls.configurations_per_row], **cls._arguments(values))  # pyright: ignore[reportCallIssue]
+
+    @classmethod
+    def _arguments(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the arguments of the constructor that the columns of a file fill."""
+        columns = cls.present_columns(values)
+        out: dict[str, Any] = {}
+        for column in columns:
+            if not column.is_numeric:
+                text = values[column.name]
+                out[column.argument] = common_text(text, column.name) if column.is_common else text
+            elif not column.is_implied and column.argument not in out:
+                names = [other.name for other in columns if other.argument == column.argument]
+                out[column.argument] = stack_columns(values, names)
+        return out | {"sigma": stack_sigmas(values, [column for column in columns if column.is_numeric])}
+
+    @classmethod
+    def present_columns(cls, values: Mapping[str, Any]) -> tuple[Column, ...]:
+        """Return those of `COLUMNS` that a file of this kind uses.
+
+        Args:
+            values: Columns of the file by name.
+        """
+        return tuple(column for column in cls.COLUMNS if column.is_implied or column.name in values)
 
     def to_columns(self) -> dict[str, Any]:
-        """The columns (m,) that a file of these readings has, in SI or as text."""
-        ...
+        """Return the columns (m,) of a file with these measurements: numbers in m or rad, or texts."""
+        values, sigmas = self._columns_and_sigmas()
+        known = values | (sigmas if self.has_stated_sigma else {})
+        return {name: known[name] for name in self.columns if name in known}
+
+    @abstractmethod
+    def _columns_and_sigmas(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return the columns with measured values and texts, and those with standard deviations."""
+
+    @classmethod
+    def plausible_range(cls, name: str, reach: float) -> tuple[float, float] | None:
+        """Return the smallest and largest plausible value of a column [m].
+
+        Args:
+            name: Name of a column.
+            reach: Radius of the sphere that the tip can reach [m].
+
+        Returns:
+            None if the column is not checked by itself.
+        """
+        for column in cls.COLUMNS:
+            if column.name == name and column.plausible_range:
+                return column.plausible_range(reach)
+        return None
 
 
 def whitened_jacobian(
-    item: Measurement, frames: FrameBatch, velocities: Array, u: Array, residual: Array
+    item: Measurement, frames: FrameBatch, tool_jacobian: Array, u: Array, residual: Array
 ) -> Array:
-    """Of the whitened model (p, k, m), from tool velocities (p, 6, c·m) where the residual (k, m) is."""
-    out = np.empty((len(velocities), *residual.shape))
-    return apply_observation_matrix(velocities, item.observation_matrix(frames, u, residual), out)
+    """Compute the Jacobian of the whitened model with respect to the error parameters.
+
+    Args:
+        item: Measurements.
+        frames: Frames of the chain at `item.configurations()`.
+        tool_jacobian: Velocities of the tool per unit of each error parameter, (p, 6, c·m).
+        u: Values of the instrument parameters, (s,).
+        residual: Whitened residuals at these frames and values, (k, m).
+
+    Returns:
+        Shape (p, k, m).
+    """
+    out = np.empty((len(tool_jacobian), *residual.shape))
+    return apply_observation_matrix(tool_jacobian, item.observation_matrix(frames, u, residual), out)
 
 
 _Kind = TypeVar("_Kind", bound=Measurement)
 
 
 def concatenate(items: Sequence[_Kind]) -> _Kind:
-    """The samples of several measurements as one measurement's, in this order.
+    """Join the samples of several measurement objects.
+
+    Args:
+        items: Objects of one kind, which differ in their samples only.
+
+    Returns:
+        One object with all samples in the order of `items`.
 
     Raises:
-        DhcalError: they are of different kinds, or differ in more than their samples.
+        InvalidArgumentError: The objects are of different kinds, or differ in more than their samples.
     """
     first = items[0]
-    common = [f.name for f in fields(first) if f.name not in first.sample_fields]  # pyright: ignore[reportArgumentType]
+    common = [field.name for field in fields(first) if field.name not in first.sample_fields]
     for item in items[1:]:
         if type(item) is not type(first) or not all(
             _is_equal(getattr(item, name), getattr(first, name)) for name in common
         ):
-            raise DhcalError(f"{item.kind}: differs from the first {first.kind} in more than its samples")
-    samples = {name: np.concatenate([getattr(item, name) for item in items]) for name in first.sample_fields}
-    return replace(first, **samples)  # pyright: ignore[reportArgumentType]
+            raise InvalidArgumentError(
+                f"{item.kind}: differs from the first measurements ({first.kind}) in more than its samples; "
+                "expected the same kind, names and instrument"
+            )
+    return first.replace(
+        **{name: np.concatenate([getattr(item, name) for item in items]) for name in first.sample_fields}
+    )
 
 
 def _is_equal(a: Any, b: Any) -> bool:
+    """Return whether two values of an attribute are equal; NaN equals NaN."""
     return np.array_equal(a, b, equal_nan=True) if isinstance(a, np.ndarray) else a == b
 
 
-def columns_together(*names: str) -> frozenset[str]:
-    """Columns that go together."""
-    return frozenset(names)
+def point_parameters(prefix: str, point: Array) -> tuple[InstrumentParameter, ...]:
+    """Return the three coordinates of an unknown point as instrument parameters.
 
-
-def stack_columns(values: Mapping[str, Any], names: Sequence[str]) -> Any:
-    """Columns (m, k), or None where they are not all there."""
-    return np.stack([values[name] for name in names], -1) if all(name in values for name in names) else None
-
-
-def length_columns(*names: str) -> dict[str, str]:
-    """Columns of lengths and their sigmas."""
-    return {**dict.fromkeys(names, "length"), **{f"sigma_{name}": "length" for name in names}}
-
-
-def validated_sigma(value: Any, shape: tuple[int, int], what: str) -> Array:
-    """Sigmas of that shape from one number or as many, positive and finite; or DhcalError."""
-    value = np.asarray(value, float)
-    try:
-        value = np.array(np.broadcast_to(value, shape))
-    except ValueError:
-        raise DhcalError(f"{what} has shape {value.shape}; give one number or {shape}") from None
-    if not (np.isfinite(value).all() and (value > 0).all()):
-        raise DhcalError(f"{what} must be positive and finite")
-    return value
-
-
-def validated_array(value: Any, shape: tuple[int | None, ...], what: str) -> Array:
-    """A finite array of that shape, None being any size; or DhcalError."""
-    value = np.asarray(value, float)
-    fits = value.ndim == len(shape) and all(w in (None, g) for w, g in zip(shape, value.shape, strict=True))
-    if not fits:
-        raise DhcalError(f"{what} has shape {value.shape}, needs {shape}".replace("None", "m"))
-    if not np.isfinite(value).all():
-        raise DhcalError(f"{what}: every value must be finite")
-    return value
-
-
-def point_parameters(prefix: str, at: Array) -> tuple[InstrumentParameter, ...]:
-    """Three unknown coordinates of a point that is at about (3,) m."""
+    Args:
+        prefix: First part of the names; the second is x, y or z.
+        point: Initial position, (3,) [m].
+    """
     return tuple(
         InstrumentParameter(f"{prefix}.{axis}", "m", float(value), POINT_PRIOR)
-        for axis, value in zip("xyz", at, strict=True)
+        for axis, value in zip("xyz", point, strict=True)
     )
+
+
+def format_sigma(*sigmas: tuple[Array, float, str]) -> str:
+    """Return a text with standard deviations for `repr`.
+
+    Args:
+        *sigmas: Standard deviations, factor to the shown unit, and name of that unit.
+    """
+    texts = []
+    for values, factor, unit in sigmas:
+        low, high = (
+            f"{factor * float(value):.3g}" for value in (values.min(initial=np.inf), values.max(initial=0))
+        )
+        texts.append(f"{low} {unit}" if low == high else f"{low} to {high} {unit}")
+    return f"sigma {', '.join(texts)}"

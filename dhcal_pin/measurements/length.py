@@ -1,215 +1,252 @@
-"""Instruments that read lengths: wires from anchors, the three-wire device, bars between two poses."""
+"""Lengths: wires from anchors to the tool point, and distances between two positions of the tool point.
+
+    wire          h = |p - anchor| + offset      anchor and offset may be unknown
+    distance      h = |p_b - p_a|                two configurations a and b
+
+The derivative by p is the unit vector along the wire or from p_a to p_b.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .._typing import Array
-from ..exceptions import DhcalError
+from ..exceptions import InvalidArgumentError
 from ..robot.chain import Chain
-from .base import (
-    LENGTH_SIGMA,
-    ZERO_PRIOR,
-    InstrumentParameter,
-    Noise,
-    columns_together,
-    length_columns,
-    point_parameters,
-    stack_columns,
-    validated_array,
-    validated_sigma,
-)
-from .position import PointReading
-from .trilateration import anchors_of
+from .base import OFFSET_PRIOR, InstrumentParameter, Noise, point_parameters
+from .columns import Column, displacement_range, instrument_range, length_columns
+from .position import PointMeasurement
+from .trilateration import locate_point
+from .validation import validated_array, validated_joint_positions
 
+# Largest number of wires of a device in a file; columns L1 to L9.
 MAX_WIRES = 9
+# Smallest length by which a direction is divided [m]: a wire of length zero has no direction.
+MIN_DIVISOR = 1e-12
 
 
-@dataclass(frozen=True, eq=False)
-class Wires(PointReading):
-    """Lengths (m, w) of w wires from anchors in the measuring frame to the tool point; draw-wire sensors.
+def norm_and_direction(vectors: Array, axis: int) -> tuple[Array, Array]:
+    """Return the norms of vectors and the unit vectors along them.
 
-    One wire is a draw-wire, three are the paper's device with its raw L1, L2, L3 (40). An anchor that is
-    not given has three unknowns; a zero that is not given adds one, the length being |p - anchor| + zero.
-    Anchors and base together can move as one: with both unknown six directions stay unseen. One wire
-    sees distances from its anchor only.
+    Args:
+        vectors: Vectors along one axis [m].
+        axis: Axis of the three components.
+
+    Returns:
+        Norms without that axis, and unit vectors; zero vectors stay zero.
+    """
+    norm = np.linalg.norm(vectors, axis=axis)
+    return norm, vectors / np.expand_dims(np.maximum(norm, MIN_DIVISOR), axis)
+
+
+@dataclass(frozen=True, eq=False, init=False, repr=False)
+class Wires(PointMeasurement):
+    """Lengths of w wires from anchors in the measuring frame to the tool point, by draw-wire sensors.
+
+    One wire is a draw-wire sensor, three are the paper's device with its lengths L1, L2, L3 (40). An unknown
+    anchor i has three instrument parameters `wire<i>.x, .y, .z`, an unknown offset one, `wire<i>.zero`. If
+    anchors and base are all unknown, they can move together: six directions are not observable.
 
     Attributes:
-        anchors: (w, 3) m, NaN where unknown.
-        offsets: (w,) m, NaN where unknown.
+        anchors: Anchors, (w, 3) [m]; NaN if unknown.
+        offsets: Constants that the measured lengths contain, (w,) [m]; NaN if unknown.
     """
 
-    anchors: Array = field(default_factory=lambda: np.empty((0, 3)))
-    offsets: Array = field(default_factory=lambda: np.empty(0))
+    anchors: Array
+    offsets: Array
 
-    kind: ClassVar[str] = "wires"
-    residual_groups: ClassVar[Mapping[str, slice]] = {"length": slice(None)}
-    columns: ClassVar[Mapping[str, str]] = length_columns(
-        "length", *(f"L{i}" for i in range(1, MAX_WIRES + 1))
+    kind = "wires"
+    residual_groups: ClassVar = {"length": slice(None)}
+    COLUMNS = length_columns(
+        "lengths", "length", *(f"L{i}" for i in range(1, MAX_WIRES + 1)), plausible_range=instrument_range
     )
-    required_columns: ClassVar[tuple[frozenset[str], ...]] = (
-        columns_together("length"),
-        columns_together("L1"),
-    )
+    required_columns = (frozenset(["length"]), frozenset(["L1"]))
 
-    @classmethod
-    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> Wires:
-        """`length`, or L1, L2, … in a row, and sigmas; anchors unknown, zeros zero."""
-        names = ["length"] if "length" in values else [n for n in cls.columns if n[0] == "L" and n in values]
-        if names != ["length"] and names != [f"L{i + 1}" for i in range(len(names))]:
-            raise DhcalError(f"wires {', '.join(names)}: number them L1, L2, … without a gap")
-        return cls.from_arrays(
-            q[0], stack_columns(values, names), stack_columns(values, [f"sigma_{name}" for name in names])
-        )
-
-    def value_columns(self) -> tuple[str, ...]:
-        """`length` for one wire, L1, L2, … for more."""
-        count = self.values.shape[1]
-        return ("length",) if count == 1 else tuple(f"L{i + 1}" for i in range(count))
-
-    @classmethod
-    def from_arrays(
-        cls,
+    def __init__(
+        self,
         q: ArrayLike,
-        length: ArrayLike,
+        lengths: ArrayLike,
         sigma: ArrayLike | None = None,
         anchors: ArrayLike | None = None,
-        zeros: ArrayLike | None = 0.0,
-    ) -> Wires:
-        """Checked lengths (m, w) in m at joint values (m, n); anchors (w, 3), None where unknown.
+        offsets: ArrayLike | None = 0.0,
+    ) -> None:
+        """Check and store measured lengths.
 
-        zeros is a number, (w,), or None to have them estimated.
+        Args:
+            q: Joint positions, (m, n) [rad or m].
+            lengths: Measured lengths, (m, w), or (m,) for one wire [m].
+            sigma: Standard deviations, one number or (m, w) [m]; estimated with the fit if None.
+            anchors: Anchors, (w, 3) [m]; estimated with the fit if None.
+            offsets: Constants that the lengths contain, one number or (w,) [m]; estimated if None.
+
+        Raises:
+            InvalidArgumentError: The offsets are neither one number nor one per wire.
         """
-        q = validated_array(q, (None, None), "q")
-        length = validated_array(length, (len(q), None), "length")
-        w = length.shape[1]
-        anchors = np.full((w, 3), np.nan) if anchors is None else validated_array(anchors, (w, 3), "anchors")
-        zeros = np.full(w, np.nan) if zeros is None else np.broadcast_to(np.asarray(zeros, float), w).copy()
-        sigmas = validated_sigma(LENGTH_SIGMA if sigma is None else sigma, length.shape, "sigma")
-        rows = np.arange(1, len(q) + 1)
-        return cls(
-            q,
-            length,
-            sigmas,
-            rows,
-            sigma is not None,
-            _wire_unknowns(anchors, zeros, np.zeros((w, 3))),
-            anchors,
-            zeros,
-        )
+        q = validated_joint_positions(q, "Wires")
+        if np.ndim(lengths) == 1:
+            lengths = np.asarray(lengths)[:, None]
+        lengths = validated_array(lengths, (len(q), None), "Wires: lengths")
+        w = lengths.shape[1]
+        if anchors is None:
+            anchors = np.full((w, 3), np.nan)
+        else:
+            anchors = validated_array(anchors, (w, 3), "Wires: anchors", "anchor", per="wire")
+        offsets = np.asarray(np.nan if offsets is None else offsets, float)
+        if offsets.shape not in ((), (1,), (w,)):
+            raise InvalidArgumentError(
+                f"Wires: offsets has shape {offsets.shape}; expected one number or one per wire, ({w},)"
+            )
+        offsets = np.broadcast_to(offsets, w).copy()
+        super().__init__(q, lengths, sigma, _wire_parameters(anchors, offsets, np.zeros((w, 3))))
+        self._initialize(anchors=anchors, offsets=offsets)
 
-    def _instrument(self, u: Array) -> tuple[Array, Array]:
-        """Anchors (w, 3) and zeros (w,) with the unknowns filled in."""
-        anchors, zeros = self.anchors.copy(), self.offsets.copy()
-        free = np.isnan(anchors[:, 0])
-        count = 3 * int(free.sum())
-        anchors[free] = u[:count].reshape(-1, 3)
-        zeros[np.isnan(zeros)] = u[count:]
-        return anchors, zeros
+    @classmethod
+    def present_columns(cls, values: Mapping[str, Any]) -> tuple[Column, ...]:
+        """Return `length`, or L1, L2, ... as many as the file has.
+
+        Args:
+            values: Columns of the file by name.
+
+        Raises:
+            InvalidArgumentError: The wires are not numbered without a gap.
+        """
+        single, *numbered = cls.COLUMNS
+        if single.name in values:
+            return (single,)
+        present = [column for column in numbered if column.name in values]
+        if present != numbered[: len(present)]:
+            names = ", ".join(column.name for column in present)
+            raise InvalidArgumentError(f"wires: the columns are {names}; expected L1, L2, ... without a gap")
+        return tuple(present)
+
+    def value_columns(self) -> tuple[Column, ...]:
+        """Return `length` for one wire, L1, L2, ... for several."""
+        count = self.values.shape[1]
+        return self.COLUMNS[:1] if count == 1 else self.COLUMNS[1 : count + 1]
+
+    def _description(self) -> list[str]:
+        count = self.values.shape[1]
+        return [f"{count} wire{'s' if count > 1 else ''}", *super()._description()]
+
+    def _instrument_values(self, u: Array) -> tuple[Array, Array]:
+        """Return anchors (w, 3) and offsets (w,) with the unknown ones taken from u."""
+        anchors, offsets = self.anchors.copy(), self.offsets.copy()
+        is_unknown = np.isnan(anchors[:, 0])
+        count = 3 * int(is_unknown.sum())
+        anchors[is_unknown] = u[:count].reshape(-1, 3)
+        offsets[np.isnan(offsets)] = u[count:]
+        return anchors, offsets
 
     def model(self, points: Array, u: Array) -> tuple[Array, Array, Array]:
-        """|p - anchor| + zero of each wire."""
-        anchors, zeros = self._instrument(u)
-        reach = points[0][None] - anchors[:, :, None]
-        length = np.linalg.norm(reach, axis=1)
-        direction = reach / np.maximum(length, 1e-12)[:, None]
+        """Return the lengths |p - anchor| + offset and their derivatives."""
+        anchors, offsets = self._instrument_values(u)
+        length, direction = norm_and_direction(points[0][None] - anchors[:, :, None], 1)
         w, m = length.shape
-        free = np.flatnonzero(np.isnan(self.anchors[:, 0]))
-        loose = np.flatnonzero(np.isnan(self.offsets))
-        own = np.zeros((3 * len(free) + len(loose), w, m))
-        for i, wire in enumerate(free):
-            own[3 * i : 3 * i + 3, wire] = -direction[wire]
-        for i, wire in enumerate(loose):
-            own[3 * len(free) + i, wire] = 1.0
-        return length + zeros[:, None], direction[None], own
+        unknown_anchors = np.flatnonzero(np.isnan(self.anchors[:, 0]))
+        unknown_offsets = np.flatnonzero(np.isnan(self.offsets))
+        jacobian = np.zeros((3 * len(unknown_anchors) + len(unknown_offsets), w, m))
+        for i, wire in enumerate(unknown_anchors):
+            jacobian[3 * i : 3 * i + 3, wire] = -direction[wire]
+        for i, wire in enumerate(unknown_offsets):
+            jacobian[3 * len(unknown_anchors) + i, wire] = 1.0
+        return length + offsets[:, None], direction[None], jacobian
 
     def initialized(self, chain: Chain) -> Self:
-        """Unknown anchors where spheres about the chain's tool points meet best."""
+        """Return a copy whose unknown anchors fit the lengths best at the chain's tool points."""
         points = chain.poses(self.q)[:, :3, 3]
-        found = np.stack([anchors_of(points, length - np.nan_to_num(zero))
-                          for length, zero in zip(self.values.T, self.offsets, strict=True)])  # fmt: skip
-        return replace(self, instrument_parameters=_wire_unknowns(self.anchors, self.offsets, found))
+        anchors = np.stack(
+            [
+                locate_point(points, length - np.nan_to_num(offset))
+                for length, offset in zip(self.values.T, self.offsets, strict=True)
+            ]
+        )
+        return self.replace(instrument_parameters=_wire_parameters(self.anchors, self.offsets, anchors))
 
     @classmethod
     def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Wires:
-        """The three-wire device, an equilateral rig of 300 mm a metre and a half away; raw lengths."""
+        """Return lengths of a three-wire device: a triangle of radius 0.3 m, 1.5 m from the tool points."""
         q = chain.validated_q(q)
         points = chain.forward_kinematics(q).tool[3].T
         anchors = (
             points.mean(0) + [-1.5, 0, 0] + 0.3 * np.array([[0, 0, 1], [0, 0.866, -0.5], [0, -0.866, -0.5]])
         )
-        length = np.linalg.norm(points[:, None] - anchors, axis=2)
-        length += noise.position * rng.standard_normal(length.shape)
-        return cls.from_arrays(q, length, noise.position or None)
+        lengths = np.linalg.norm(points[:, None] - anchors, axis=2)
+        lengths += noise.position * rng.standard_normal(lengths.shape)
+        return cls(q, lengths, noise.position or None)
 
 
-def _wire_unknowns(anchors: Array, zeros: Array, start: Array) -> tuple[InstrumentParameter, ...]:
+def _wire_parameters(anchors: Array, offsets: Array, start: Array) -> tuple[InstrumentParameter, ...]:
+    """Return the parameters of the anchors and offsets that are NaN; anchors start at `start`, (w, 3)."""
     out: list[InstrumentParameter] = []
     for i in np.flatnonzero(np.isnan(anchors[:, 0])):
         out += point_parameters(f"wire{i + 1}", start[i])
-    for i in np.flatnonzero(np.isnan(zeros)):
-        out.append(InstrumentParameter(f"wire{i + 1}.zero", "m", 0.0, ZERO_PRIOR))
+    for i in np.flatnonzero(np.isnan(offsets)):
+        out.append(InstrumentParameter(f"wire{i + 1}.zero", "m", 0.0, OFFSET_PRIOR))
     return tuple(out)
 
 
-@dataclass(frozen=True, eq=False)
-class Distance(PointReading):
-    """Distances (m, 1) of the tool point between two configurations: ballbar, scale bar, interferometer.
+@dataclass(frozen=True, eq=False, init=False, repr=False)
+class Distance(PointMeasurement):
+    """Distances of the tool point between two configurations, by a ballbar, scale bar or interferometer.
 
-    Sees nothing of the base, which moves both ends alike: six directions stay unseen, and so does the
-    tool's rotation.
+    They do not depend on the base, which moves both positions, nor on the rotation of the tool frame: these
+    are not observable.
 
     Attributes:
-        q_to: (m, n) joint values at the other end.
+        q_to: Joint positions of the second configuration, (m, n) [rad or m].
     """
 
-    q_to: Array = field(default_factory=lambda: np.empty((0, 0)))
+    q_to: Array
 
-    kind: ClassVar[str] = "distance"
-    residual_groups: ClassVar[Mapping[str, slice]] = {"length": slice(0, 1)}
-    columns: ClassVar[Mapping[str, str]] = length_columns("distance")
-    required_columns: ClassVar[tuple[frozenset[str], ...]] = (columns_together("distance"),)
-    configurations_per_row: ClassVar[int] = 2
-    sample_fields: ClassVar = (*PointReading.sample_fields, "q_to")
+    kind = "distance"
+    residual_groups: ClassVar = {"length": slice(0, 1)}
+    COLUMNS = length_columns("distances", "distance", plausible_range=displacement_range)
+    configurations_per_row = 2
+    sample_fields = (*PointMeasurement.sample_fields, "q_to")
 
-    @classmethod
-    def from_arrays(
-        cls, q: ArrayLike, q_to: ArrayLike, distance: ArrayLike, sigma: ArrayLike | None = None
-    ) -> Distance:
-        """Checked distances (m,) in m between configurations (m, n) and (m, n)."""
-        q = validated_array(q, (None, None), "q")
-        q_to = validated_array(q_to, q.shape, "q_to")
-        distance = validated_array(distance, (len(q),), "distance")[:, None]
-        sigmas = validated_sigma(LENGTH_SIGMA if sigma is None else sigma, distance.shape, "sigma")
-        return cls(q, distance, sigmas, np.arange(1, len(q) + 1), sigma is not None, (), q_to)
+    def __init__(
+        self, q: ArrayLike, q_to: ArrayLike, distances: ArrayLike, sigma: ArrayLike | None = None
+    ) -> None:
+        """Check and store measured distances.
 
-    @classmethod
-    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> Distance:
-        """`distance` between the configurations JOINT and to:JOINT."""
-        sigma = values.get("sigma_distance")
-        return cls.from_arrays(q[0], q[1], values["distance"], None if sigma is None else sigma[:, None])
+        Args:
+            q: Joint positions of the first configuration, (m, n) [rad or m].
+            q_to: Joint positions of the second configuration, (m, n) [rad or m].
+            distances: Measured distances, (m,) [m].
+            sigma: Standard deviations, one number or (m,) [m]; estimated with the fit if None.
+        """
+        q = validated_joint_positions(q, "Distance")
+        q_to = validated_array(q_to, q.shape, "Distance: q_to", "row of joint positions")
+        values = validated_array(distances, (len(q),), "Distance: distances", "number")[:, None]
+        super().__init__(q, values, sigma)
+        self._initialize(q_to=q_to)
 
     def configurations(self) -> Array:
-        """First ends, then other ends, (2m, n)."""
+        """Return the joint positions (2m, n): first configurations, then second ones."""
         return np.concatenate([self.q, self.q_to])
 
+    def resample(self, q: Array) -> Self:
+        """Return the same measurement at other joint positions (2m, n), first configurations, then second."""
+        first, second = np.split(q, 2)
+        return self.replace(q=first, q_to=second)
+
     def model(self, points: Array, u: Array) -> tuple[Array, Array, Array]:
-        """|p_to - p|."""
-        reach = points[1] - points[0]
-        length = np.linalg.norm(reach, axis=0)
-        direction = (reach / np.maximum(length, 1e-12))[None]
+        """Return the distances |p_b - p_a| and their derivatives."""
+        length, direction = norm_and_direction(points[1] - points[0], 0)
+        direction = direction[None]
         return length[None], np.stack([-direction, direction]), np.empty((0, 1, points.shape[-1]))
 
     @classmethod
     def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Distance:
-        """Distances between each configuration and the next, the last and the first."""
+        """Return distances between each configuration and the next one, and the last and the first."""
         q = chain.validated_q(q)
         points = chain.forward_kinematics(q).tool[3].T
-        other = np.roll(np.arange(len(q)), -1)
-        length = np.linalg.norm(points[other] - points, axis=1) + noise.position * rng.standard_normal(len(q))
-        return cls.from_arrays(q, q[other], length, noise.position or None)
+        following = np.roll(np.arange(len(q)), -1)
+        distances = np.linalg.norm(points[following] - points, axis=1)
+        distances += noise.position * rng.standard_normal(len(q))
+        return cls(q, q[following], distances, noise.position or None)

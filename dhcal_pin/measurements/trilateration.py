@@ -1,4 +1,14 @@
-"""Positions from wire lengths: the paper's three-wire device (40) to (42), and any number of anchors."""
+"""Positions from wire lengths: the paper's three-wire device, and any number of anchors.
+
+A point p at distance L_i from the anchor P_i satisfies |p - P_i|² = L_i². Differences of these equations are
+linear in p. For three anchors the remaining equation is quadratic, (41) of the paper; its two solutions are
+mirror images in the plane of the anchors, which lengths cannot distinguish. As dL = U·dp, where U has the
+rows (p - P_i)/L_i, noise σ of the lengths gives the positions the covariance σ²·(UᵀU)⁻¹.
+
+Two equations of the paper are misprinted: y must be (L3² - L2²)/4b, and z must be
+(L2² + L3² - 2(L1² - a² + b² + c²))/4(a - c). The absolute value under the root of x would hide lengths that
+do not meet.
+"""
 
 from __future__ import annotations
 
@@ -6,99 +16,147 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._typing import Array
-from ..exceptions import DhcalError
+from ..exceptions import InvalidArgumentError
+
+# Anchors closer to one line or plane than this, relative to their extent, are regarded as collinear or
+# coplanar.
+MAX_RELATIVE_FLATNESS = 1e-6
+# The same for the paper's device, relative to its largest dimension.
+MIN_RELATIVE_DIMENSION = 1e-9
+# Relative singular values below this are cut when a point is located.
+POINT_RCOND = 1e-9
+# Gauss-Newton steps for more than three anchors; noise-free lengths need about five.
+N_STEPS = 20
 
 
 def device_anchors(a: float, b: float, c: float) -> Array:
-    """The paper's anchors P1 (0, 0, a), P2 (0, b, c), P3 (0, -b, c) as (3, 3), in m (40)."""
+    """Return the anchors P1 (0, 0, a), P2 (0, b, c) and P3 (0, -b, c) of the paper's device (40).
+
+    Args:
+        a: Coordinate z of P1 [m].
+        b: Coordinate y of P2 [m].
+        c: Coordinate z of P2 and P3 [m].
+
+    Returns:
+        Shape (3, 3) [m].
+    """
     return np.array([[0, 0, a], [0, b, c], [0, -b, c]], float)
 
 
-def three_wires(lengths: ArrayLike, a: float, b: float, c: float, side: int = 1) -> Array:
-    """Positions (m, 3) in the device's frame from L1, L2, L3 (m, 3): the closed form (41), m.
-
-    Errata: y is (L3² - L2²)/4b; z is (L2² + L3² - 2(L1² - a² + b² + c²))/4(a - c); bars under the
-    root of x would hide a negative radicand.
+def trilaterate_three_wires(lengths: ArrayLike, a: float, b: float, c: float, side: int = 1) -> Array:
+    """Compute positions from the lengths of the paper's device in closed form (41).
 
     Args:
-        lengths: L1, L2, L3 of each sample.
-        a: anchor P1 is (0, 0, a), m.
-        b: anchors P2 and P3 are (0, ±b, c), m.
-        c: see b.
-        side: the sign of x. The anchors' plane is a mirror: lengths cannot tell.
+        lengths: L1, L2, L3 of each sample, (m, 3) [m].
+        a: Coordinate z of anchor P1, which is (0, 0, a) [m].
+        b: Coordinate y of anchor P2; P2 and P3 are (0, ±b, c) [m].
+        c: Coordinate z of anchors P2 and P3 [m].
+        side: Sign of x, as the plane of the anchors is a mirror.
+
+    Returns:
+        Positions in the frame of the device, (m, 3) [m].
 
     Raises:
-        DhcalError: anchors on one line (a = c or b = 0), or lengths that do not meet.
+        InvalidArgumentError: The anchors are collinear (a = c or b = 0), or the lengths of a sample do not
+            meet.
     """
     l1, l2, l3 = np.asarray(lengths, float).T
     scale = max(abs(a), abs(b), abs(c))
-    if abs(a - c) <= 1e-9 * scale or abs(b) <= 1e-9 * scale:
-        raise DhcalError(f"three wires: anchors a={a:g}, b={b:g}, c={c:g} lie on one line; move one off it")
+    if min(abs(a - c), abs(b)) <= MIN_RELATIVE_DIMENSION * scale:
+        raise InvalidArgumentError(
+            f"three wires: the anchors a={a:g}, b={b:g}, c={c:g} lie on one line; expected a triangle"
+        )
     y = (l3**2 - l2**2) / (4 * b)
     z = (l2**2 + l3**2 - 2 * (l1**2 - a**2 + b**2 + c**2)) / (4 * (a - c))
-    square = l1**2 - y**2 - (z - a) ** 2
-    bad = np.flatnonzero(square < 0)
-    if bad.size:
-        raise DhcalError(
-            f"three wires: sample {bad[0] + 1} has lengths that do not meet (x² = {square[bad[0]]:.3g} m²); "
-            "check its readings and the anchors, or leave it out"
-        )
-    return np.stack([np.sign(side) * np.sqrt(square), y, z], -1)
+    x_squared = l1**2 - y**2 - (z - a) ** 2
+    _require_meeting(x_squared, "three wires", "x²")
+    return np.stack([np.sign(side) * np.sqrt(x_squared), y, z], -1)
 
 
 def trilaterate(lengths: ArrayLike, anchors: ArrayLike, side: int = 1) -> Array:
-    """Positions (m, 3) from lengths (m, w) to w ≥ 3 anchors (w, 3), all in m.
+    """Compute positions from the lengths of wires to three or more anchors.
 
-    Linear differences give a start; where the anchors lie in a plane, `side` is the sign along its
-    normal (n = (P2 - P1) × (P3 - P1)); then Gauss-Newton on the lengths.
+    The linear differences of the equations give an initial position. If the anchors lie in a plane, the
+    height above it follows from the mean equation. For more than three anchors Gauss-Newton steps minimize
+    the errors of the lengths.
+
+    Args:
+        lengths: Lengths, (m, w) [m].
+        anchors: Anchors, (w, 3), w ≥ 3 [m].
+        side: Sign along the normal (P2 - P1) × (P3 - P1) of anchors that lie in a plane, which is a mirror.
+
+    Returns:
+        Positions, (m, 3) [m].
 
     Raises:
-        DhcalError: fewer than three anchors, anchors on one line, or lengths that do not meet.
+        InvalidArgumentError: There are fewer than three anchors, they are collinear, or the lengths of a
+            sample do not meet.
     """
     lengths, anchors = np.asarray(lengths, float), np.asarray(anchors, float)
     centre = anchors.mean(0)
     arms = anchors - centre
-    if len(anchors) < 3 or (s := np.linalg.svd(arms, compute_uv=False))[1] < 1e-6 * s[0]:
-        raise DhcalError("trilateration needs three anchors that do not lie on one line")
-    # |p-Pi|² = Li² minus its mean over the anchors is linear in p.
+    flat = MAX_RELATIVE_FLATNESS
+    if len(anchors) < 3 or (s := np.linalg.svd(arms, compute_uv=False))[1] < flat * s[0]:
+        raise InvalidArgumentError(
+            f"trilateration: the {len(anchors)} anchors lie on one line; expected three anchors that do not"
+        )
+    # |p - P_i|² = L_i² minus its mean over the anchors is linear in p.
     right = 0.5 * (np.sum(arms**2, 1) - lengths**2)
     right -= right.mean(1, keepdims=True)
-    offset = np.linalg.lstsq(arms, right.T, rcond=1e-6)[0].T
-    if s[2] < 1e-6 * s[0]:
+    offset = np.linalg.lstsq(arms, right.T, rcond=flat)[0].T
+    if s[2] < flat * s[0]:
         normal = np.cross(anchors[1] - anchors[0], anchors[2] - anchors[0])
         normal /= np.linalg.norm(normal)
-        height = np.mean(lengths**2 - np.sum((offset[:, None] - arms) ** 2, 2), 1)
-        bad = np.flatnonzero(height < 0)
-        if bad.size:
-            raise DhcalError(
-                f"trilateration: sample {bad[0] + 1} has lengths that do not meet "
-                f"(height² = {height[bad[0]]:.3g} m²); check its readings and the anchors, or leave it out"
-            )
-        offset = offset + (np.sign(side) * np.sqrt(height))[:, None] * normal
+        height_squared = np.mean(lengths**2 - np.sum((offset[:, None] - arms) ** 2, 2), 1)
+        _require_meeting(height_squared, "trilateration", "height²")
+        offset = offset + (np.sign(side) * np.sqrt(height_squared))[:, None] * normal
     points = centre + offset
-    for _ in range(20 if len(anchors) > 3 else 0):
-        reach = points[:, None] - anchors
-        modelled = np.linalg.norm(reach, axis=2)
-        rows = reach / modelled[..., None]
-        step = np.linalg.pinv(rows) @ (lengths - modelled)[..., None]
+    for _ in range(N_STEPS if len(anchors) > 3 else 0):
+        vectors = points[:, None] - anchors
+        modelled = np.linalg.norm(vectors, axis=2)
+        jacobian = vectors / modelled[..., None]
+        step = np.linalg.pinv(jacobian) @ (lengths - modelled)[..., None]
         points = points + step[..., 0]
     return points
 
 
-def dilution(points: ArrayLike, anchors: ArrayLike) -> Array:
-    """How much a wire's noise grows along x, y, z, (m, 3): roots of the diagonal of (UᵀU)⁻¹.
+def _require_meeting(squares: Array, where: str, name: str) -> None:
+    """Raise InvalidArgumentError if a squared coordinate (m,) [m²] is negative."""
+    bad = np.flatnonzero(squares < 0)
+    if bad.size:
+        raise InvalidArgumentError(
+            f"{where}: the lengths of sample {bad[0] + 1} do not meet ({name} = {squares[bad[0]]:.3g} m²); "
+            "check its lengths and the anchors, or remove the sample"
+        )
 
-    U has rows (p - P_i)/L_i, as dL = U·dp.
+
+def position_dilution(points: ArrayLike, anchors: ArrayLike) -> Array:
+    """Compute how much the noise of the lengths is amplified along x, y and z.
+
+    Args:
+        points: Positions, (m, 3) [m].
+        anchors: Anchors, (w, 3) [m].
+
+    Returns:
+        Standard deviations of the positions divided by that of the lengths, (m, 3).
     """
-    reach = np.asarray(points, float)[:, None] - np.asarray(anchors, float)
-    rows = reach / np.linalg.norm(reach, axis=2, keepdims=True)
+    vectors = np.asarray(points, float)[:, None] - np.asarray(anchors, float)
+    rows = vectors / np.linalg.norm(vectors, axis=2, keepdims=True)
     return np.sqrt(np.diagonal(np.linalg.pinv(rows.swapaxes(1, 2) @ rows), axis1=1, axis2=2))
 
 
-def anchors_of(points: ArrayLike, lengths: ArrayLike) -> Array:
-    """The point (3,) whose distances to points (m, 3) are nearest to lengths (m,): a start for an anchor."""
-    points, lengths = np.asarray(points, float), np.asarray(lengths, float)
+def locate_point(points: ArrayLike, distances: ArrayLike) -> Array:
+    """Locate the point whose distances to given points are known, by linear least squares.
+
+    Args:
+        points: Known points, (m, 3) [m].
+        distances: Distances of the unknown point to them, (m,) [m].
+
+    Returns:
+        The unknown point, (3,) [m]; an initial value for anchors and centres.
+    """
+    points, distances = np.asarray(points, float), np.asarray(distances, float)
     centre = points.mean(0)
     arms = points - centre
-    right = 0.5 * (np.sum(arms**2, 1) - lengths**2)
-    return centre + np.linalg.lstsq(arms, right - right.mean(), rcond=1e-9)[0]
+    right = 0.5 * (np.sum(arms**2, 1) - distances**2)
+    return centre + np.linalg.lstsq(arms, right - right.mean(), rcond=POINT_RCOND)[0]

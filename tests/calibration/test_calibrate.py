@@ -151,7 +151,7 @@ def test_sigmas_that_are_too_small_widen_what_the_data_tell_alone(sim_6dof, sim_
         rng = np.random.default_rng(1)
         q = rng.uniform(-3, 3, (200, 6))
         read = Pose.simulate(placed(sim_6dof_actual, rng), q, Noise(1e-4, 1e-4), rng)
-        data = Pose.from_arrays(q, read.poses, 1e-4 * share, 1e-4 * share)
+        data = Pose(q, read.poses, 1e-4 * share, 1e-4 * share)
         found.append(calibrate(sim_6dof, data, "minimal,base,tool", priors={"*": 1e-2}))
     right, wrong = found
     assert wrong.unit_weight_std == pytest.approx(10, rel=0.1)
@@ -166,9 +166,9 @@ def test_a_single_distance_tells_no_scatter_of_its_own(sim_6dof, sim_6dof_actual
     tip = touches.initialized(sim_6dof_actual)
     places = np.reshape([unknown.nominal for unknown in tip.instrument_parameters], (-1, 3))
     far = np.linalg.norm(places[1] - places[0]) + 1e-3
-    known = PointDistance.from_arrays(6, [touches.names[:2]], [far])
+    known = PointDistance(6, [touches.names[:2]], [far])
     names = [touches.names[i] for i in touches.label]
-    data = PointContact.from_arrays(touches.q, names, 1e-4 if stated else None)
+    data = PointContact(touches.q, names, 1e-4 if stated else None)
     fit = calibrate(sim_6dof, [data, known], "minimal,tool")
     assert fit.problem.data[1].sigma.item() == pytest.approx(expected, rel=0.2)
 
@@ -178,7 +178,7 @@ def test_unstated_sigmas_are_found(sim_6dof, sim_6dof_actual):
     rng = np.random.default_rng(0)
     q = rng.uniform(-3, 3, (300, 6))
     data = Pose.simulate(sim_6dof_actual, q, Noise(2e-2, 5e-5), rng)
-    fit = calibrate(sim_6dof, Pose.from_arrays(q, data.poses), "dh")
+    fit = calibrate(sim_6dof, Pose(q, data.poses), "dh")
     (used,) = fit.problem.data
     assert used.sigma.mean() == pytest.approx(2e-2, rel=0.1)
     assert used.rotation_sigma.mean() == pytest.approx(5e-5, rel=0.1)
@@ -451,7 +451,7 @@ def test_touches_without_a_length_leave_the_size_of_the_arm_to_the_priors(sim_6d
     assert fit.problem.data[0].sigma.mean() == pytest.approx(noise, rel=0.2)
     # One known distance between two of the points, and its size is known.
     first, second = truth.poses(q[:2])[:, :3, 3]
-    known = PointDistance.from_arrays(6, [data.names[:2]], [np.linalg.norm(second - first)], 1e-5)
+    known = PointDistance(6, [data.names[:2]], [np.linalg.norm(second - first)], 1e-5)
     sized = calibrate(sim_6dof, [data, known], "minimal,tool", fix=fixed)
     assert not [text for text in sized.unobservable if "how large" in text]
     assert spread(sized.chain) / spread(truth) == pytest.approx(1, abs=5e-5 + 0.5 * noise)
@@ -497,6 +497,6 @@ def test_a_step_that_damping_makes_small_is_no_end(seed, prismatic, theta, d, a,
     size = np.array([np.deg2rad(2) if p.unit == "rad" else 0.01 for p in errors.parameters])
     truth = errors.at(size * rng.uniform(-1, 1, len(size)))
     q = random_joints(rng, table, 80)
-    fit = calibrate(arm, Pose.from_arrays(q[:40], truth.poses(q[:40])), "dh,base,tool", priors="none")
+    fit = calibrate(arm, Pose(q[:40], truth.poses(q[:40])), "dh,base,tool", priors="none")
     assert fit.converged
     assert np.abs(fit.chain.poses(q[40:]) - truth.poses(q[40:])).max() < 1e-9

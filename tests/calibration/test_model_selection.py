@@ -75,7 +75,7 @@ def test_geometry_alone_gives_no_hint(kind, seeds):
     """One false one in a million by chance, whether or not the instrument states its sigmas."""
     for seed in range(seeds):
         arm, data = simulated("minimal,base,tool", seed, (20, 40, 80)[seed % 3], kind=kind)
-        data = replace(data, has_stated_sigma=bool(seed % 2))
+        data = data.replace(has_stated_sigma=bool(seed % 2))
         assert not family_hint(calibrate(arm, data, "minimal,base,tool"))
 
 
@@ -124,11 +124,11 @@ def test_regions_are_the_ends_of_joint_space():
     q = np.zeros((8, 6))
     q[:, 1] = np.arange(8)
     q[:, 4] = -2 * np.arange(8)
-    data = replace(fitted(m=8).data[0], q=q)
+    data = fitted(m=8).data[0].replace(q=q)
     low, high = sorted(fold[0].nonzero()[0].tolist() for fold in blocked_folds([data]))
     assert (low, high) == ([0, 1], [6, 7])
     with pytest.raises(DhcalError, match="different joint values"):
-        blocked_folds([replace(data, q=np.ones((8, 6)))])
+        blocked_folds([data.replace(q=np.ones((8, 6)))])
 
 
 def test_what_was_touched_is_left_out_as_a_whole():
@@ -137,8 +137,8 @@ def test_what_was_touched_is_left_out_as_a_whole():
     label = np.repeat(np.arange(5), 4)
     arm = Chain.from_dh(paper("sim_6dof"))
     q = 0.4 * label[:, None] + np.random.default_rng(0).uniform(-0.1, 0.1, (20, 6))
-    touches = PointContact.from_arrays(q, names[label].tolist())
-    known = PointDistance.from_arrays(6, [("c", "d"), ("a", "b"), ("a", "i")], [0.1, 0.1, 0.1])
+    touches = PointContact(q, names[label].tolist())
+    known = PointDistance(6, [("c", "d"), ("a", "b"), ("a", "i")], [0.1, 0.1, 0.1])
     problem = calibrate(arm, [touches, known], "dh", max_iterations=1).problem
     places = contact_groups(problem, np.zeros(len(problem.weights)))
     folds = blocked_folds(problem.data, groups=places)
@@ -150,7 +150,7 @@ def test_what_was_touched_is_left_out_as_a_whole():
     left = {tuple(fold[0].tolist()) for fold in folds}
     assert len(left) == len(folds) >= 2
     # One place is no region of its own: there samples are left out one by one.
-    one = PointContact.from_arrays(q, ["a"] * 20)
+    one = PointContact(q, ["a"] * 20)
     alone = [fold[0] for fold in blocked_folds([one], groups=np.zeros(20, int))]
     np.testing.assert_array_equal(alone, [fold[0] for fold in blocked_folds([one])])
 

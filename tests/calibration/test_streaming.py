@@ -55,7 +55,7 @@ def test_sigmas_are_told_by_the_first_part(sim_6dof, sim_6dof_actual):
     """Rotations a hundred times better than the placeholder: weighed as in memory, within their scatter."""
     rng = np.random.default_rng(0)
     data = Pose.simulate(sim_6dof_actual, rng.uniform(-3, 3, (2000, 6)), Noise(2e-3, 1e-5), rng)
-    plain = Pose.from_arrays(data.q, data.poses)
+    plain = Pose(data.q, data.poses)
     parts = [plain.take(np.s_[i : i + 500]) for i in range(0, 2000, 500)]
     found = calibrate_stream(sim_6dof, lambda: parts, "dh", priors="none")
     best = calibrate(sim_6dof, data, "dh", priors="none")

@@ -954,7 +954,7 @@ def test_unknowns_that_cannot_take_up_what_was_measured_are_told(run, tmp_path, 
         step[:, :3, 3] = [a * 1e-3, 0, 0] + step[:, :3, 2] * d * 1e-3
         pose = pose @ step
     point = pose[:, :3, 3] + 0.1 * pose[:, :3, 0] + [3, 1, 0] + rng.normal(0, 1e-4, (40, 3))
-    Path("data.csv").write_text(measurement_text(Position.from_arrays(q, point), arm))
+    Path("data.csv").write_text(measurement_text(Position(q, point), arm))
     for sets, told in (
         ("modified-dh,base,tool", True),
         ("minimal,base,tool", False),

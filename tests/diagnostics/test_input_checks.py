@@ -150,7 +150,7 @@ def test_a_tool_point_that_stays_is_believed(told, ur10):
     data = KINDS["point"].simulate(ur10, joints(ur10), Noise(), np.random.default_rng(0))
     data = data.take(data.label == 0)
     seen = ur10.poses(data.q)[:, :3, 3] + 1e-5 * np.random.default_rng(0).normal(size=(len(data.q), 3))
-    assert told(ur10, measurement_text(Position.from_arrays(data.q, seen), ur10)) == []
+    assert told(ur10, measurement_text(Position(data.q, seen), ur10)) == []
 
 
 @pytest.mark.parametrize(
@@ -325,7 +325,7 @@ def test_two_wires_of_one_name_are_told(tmp_path, monkeypatch, capsys):
     for file, anchor in (("one.csv", [2.0, 1, 0]), ("two.csv", [-1.0, 2, 0.5])):
         q = joints(arm, 60, len(file) + int(anchor[0]))
         length = np.linalg.norm(arm.poses(q)[:, :3, 3] - anchor, axis=1)
-        (tmp_path / file).write_text(measurement_text(Wires.from_arrays(q, length[:, None]), arm))
+        (tmp_path / file).write_text(measurement_text(Wires(q, length[:, None]), arm))
     assert main.main(["calibrate", "arm.dh.toml", "one.csv", "-o", "out.urdf"]) == 0
     assert ": warning: " not in capsys.readouterr().err
     assert main.main(["calibrate", "arm.dh.toml", "one.csv", "two.csv", "-o", "out.urdf"]) == 0

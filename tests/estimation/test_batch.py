@@ -151,7 +151,7 @@ def test_singular_members_leave_the_others_alone(method, sim_6dof, sim_6dof_actu
     errors = select_parameters(sim_6dof, "dh")
     joints = [rng.uniform(-3, 3, (10, 6)), np.zeros((10, 6)), rng.uniform(-3, 3, (10, 6))]
     data = [[Pose.simulate(sim_6dof_actual, q, NOISE, rng)] for q in joints]
-    data.append([Pose.from_arrays(joints[0], sim_6dof.poses(joints[0]), 1e-4, 1e-4)])
+    data.append([Pose(joints[0], sim_6dof.poses(joints[0]), 1e-4, 1e-4)])
     found = solve_batch(BatchProblem.from_models([errors] * 4, data, np.zeros(24)), method)
     assert found.converged.all()
     assert list(found.rank) == [24, 6, 24, 21]

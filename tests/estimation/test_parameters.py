@@ -99,7 +99,7 @@ def test_a_joint_that_mimics_another_has_errors_of_its_own(sets, mimicking):
     errors = select_parameters(mimicking, sets)
     truth = errors.at(5e-3 * rng.normal(size=len(errors.parameters)))
     q = rng.uniform(-np.pi, np.pi, (60, mimicking.n_joints))
-    fit = calibrate(mimicking, Pose.from_arrays(q[:30], truth.poses(q[:30])), sets, priors="none")
+    fit = calibrate(mimicking, Pose(q[:30], truth.poses(q[:30])), sets, priors="none")
     assert np.abs(fit.chain.poses(q[30:]) - truth.poses(q[30:])).max() < 1e-9
 
 
@@ -110,7 +110,7 @@ def missed(arm: str, sets: str, seed: int, priors) -> float:
     size = np.array([np.deg2rad(2) if p.unit == "rad" else 0.01 for p in errors.parameters])
     truth = errors.at(size * rng.uniform(-1, 1, len(size)))
     q = rng.uniform(-np.pi, np.pi, (80, chain.n_joints))
-    fit = calibrate(chain, Pose.from_arrays(q[:40], truth.poses(q[:40])), sets, priors=priors)
+    fit = calibrate(chain, Pose(q[:40], truth.poses(q[:40])), sets, priors=priors)
     return float(np.abs(fit.chain.poses(q[40:]) - truth.poses(q[40:])).max())
 
 

@@ -31,10 +31,10 @@ def spoiled(kind, chain, seed, m=100, share=0.1):
     if kind is Pose:
         poses = data.poses.copy()
         poses[bad, :3, 3] += jump
-        return data, replace(data, poses=poses), np.sort(bad) + 1
+        return data, data.replace(poses=poses), np.sort(bad) + 1
     reading = data.values.copy()
     reading[bad] += jump
-    return data, replace(data, values=reading), np.sort(bad) + 1
+    return data, data.replace(values=reading), np.sort(bad) + 1
 
 
 def trial(kind, loss, sim_6dof, actual, seeds):
@@ -125,9 +125,7 @@ def test_spreads_of_residuals_are_those_of_many_draws(sim_6dof, sim_6dof_actual)
     q = np.random.default_rng(0).uniform(-3, 3, (14, 6))
     exact = Position.simulate(sim_6dof_actual, q, Noise(), np.random.default_rng(0))
     weights = np.where(np.arange(14) == 3, 1e-12, 1.0)
-    fit = calibrate(
-        sim_6dof, Position.from_arrays(q, exact.values, np.full((14, 3), 1e-4)), "dh", priors="none"
-    )
+    fit = calibrate(sim_6dof, Position(q, exact.values, np.full((14, 3), 1e-4)), "dh", priors="none")
     problem = fit.problem.with_data([fit.problem.data[0].with_weights(weights)])
     solution = replace(fit.solution, system=linearize_and_factor(problem, fit.x, small_angle=False))
     expected = residual_covariances(problem, solution, [weights])[0]
@@ -170,7 +168,7 @@ def test_only_the_worst_gross_errors_are_left_aside_unasked(sim_6dof, sim_6dof_a
     data = Pose.simulate(sim_6dof_actual, q, Noise(1e-4, 1e-4), np.random.default_rng(3))
     poses = data.poses.copy()
     poses[[5, 20], :3, 3] += [[9e-4, 0, 0], [0, 4e-2, 0]]
-    fit = calibrate(sim_6dof, replace(data, poses=poses), "dh")
+    fit = calibrate(sim_6dof, data.replace(poses=poses), "dh")
     assert fit.outliers[0].tolist() == [6, 21]
     assert np.flatnonzero(fit.weights[0] < 0.5).tolist() == [20]
 

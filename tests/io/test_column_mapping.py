@@ -189,7 +189,7 @@ def test_a_rotation_by_the_name_of_its_convention(read, how, columns):
 def test_a_second_configuration_and_back(read, arm):
     rng = np.random.default_rng(0)
     q, q_to = rng.uniform(-1, 1, (2, 4, 3))
-    data = RelativePose.from_arrays(q, q_to, se3.inverse(arm.poses(q)) @ arm.poses(q_to))
+    data = RelativePose(q, q_to, se3.inverse(arm.poses(q)) @ arm.poses(q_to))
     text = measurement_text(data, arm)
     how = "".join(
         f'[{key}]\norder = {json.dumps([f"{before}{name}[rad]" for name in JOINTS])}\nunit = "rad"\n'

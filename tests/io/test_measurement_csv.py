@@ -327,7 +327,7 @@ def test_positions_are_written_to_the_last_digit(tmp_path_factory, rows, data):
     folder, rows = tmp_path_factory.mktemp("csv"), np.array(rows)
     chain = scara(folder)
     sigma = data.draw(st.one_of(st.none(), st.floats(1e-9, 1.0)))
-    wrote = Position.from_arrays(rows[:, :2], rows[:, 2:], sigma)
+    wrote = Position(rows[:, :2], rows[:, 2:], sigma)
     again = read_measurements(write(folder, "a.csv", measurement_text(wrote, chain, ["a", "b"])), chain)
     assert isinstance(again, Position)
     assert again.q.tolist() == wrote.q.tolist()
@@ -347,7 +347,7 @@ def test_poses_keep_their_rotation(tmp_path_factory, rows, axis, angle):
     chain = scara(folder)
     turn = se3.exp3(angle * np.array(axis) / np.linalg.norm(axis))
     poses = se3.transform(np.tile(turn, (len(rows), 1, 1)), rows[:, 2:])
-    wrote = Pose.from_arrays(rows[:, :2], poses, 1e-4, 1e-5)
+    wrote = Pose(rows[:, :2], poses, 1e-4, 1e-5)
     again = read_measurements(write(folder, "a.csv", measurement_text(wrote, chain)), chain)
     assert isinstance(again, Pose)
     assert again.q.tolist() == wrote.q.tolist()
@@ -361,7 +361,7 @@ def test_a_joint_named_like_a_reading_is_refused(tmp_path):
     gantry = Chain.from_dh(read_dh(write(tmp_path, "g.dh.toml", SCARA.replace('"lift"', '"x"'))))
     for act in (
         lambda: read_measurement_file(write(tmp_path, "a.csv", HEADER + "0,0,1,2,3\n"), gantry),
-        lambda: measurement_text(Position.from_arrays(np.zeros((1, 2)), np.zeros((1, 3))), gantry),
+        lambda: measurement_text(Position(np.zeros((1, 2)), np.zeros((1, 3))), gantry),
     ):
         with pytest.raises(DhcalError, match="'x' has the name of a reading; rename"):
             act()

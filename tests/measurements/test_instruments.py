@@ -28,7 +28,7 @@ def wires(chain, m, seed=0):
     q = rng.uniform(-2.5, 2.5, (m, 6))
     length = np.linalg.norm(chain.poses(q)[:, None, :3, 3] - anchors, axis=2)
     true = {f"wire{i + 1}.{axis}": float(anchors[i, j]) for i in range(3) for j, axis in enumerate("xyz")}
-    return Wires.from_arrays(q, length), true
+    return Wires(q, length), true
 
 
 def test_surveyed_anchors_are_held_and_fix_the_base(sim_6dof, sim_6dof_actual):
@@ -115,9 +115,7 @@ def test_targets_a_foot_apart_on_the_far_side_of_the_shop_converge(sim_6dof, sim
         base = se3.transform(se3.exp3(rng.normal(0, 1, 3)), rng.normal(0, 3, 3))
         pose = base @ sim_6dof_actual.poses(q)
         seen = pose[:, :3, 3] + np.einsum("mij,mj->mi", pose[:, :3, :3], places[label])
-        data = MultiTargetPosition.from_arrays(
-            q, seen + rng.normal(0, 1e-4, seen.shape), [f"t{i}" for i in label]
-        )
+        data = MultiTargetPosition(q, seen + rng.normal(0, 1e-4, seen.shape), [f"t{i}" for i in label])
         fit = calibrate(sim_6dof, data, "minimal,base,tool")
         assert fit.converged
         assert fit.iterations < 30
@@ -139,8 +137,8 @@ def test_files_that_count_their_targets_differently_are_refused(sim_6dof, tmp_pa
     for held in ([], ["--holdout", "b.csv"]):
         second = [] if held else ["b.csv"]
         assert main(["calibrate", "arm.urdf", "a.csv", *second, *held, "-o", "out.urdf"]) == 2
-        assert "b.csv: begins with target 't2'," in capsys.readouterr().err
+        assert "b.csv: the first target is 't2', " in capsys.readouterr().err
         assert not Path("out.urdf").exists()
     assert main(["calibrate", "arm.urdf", "a.csv", "c.csv", "-o", "out.urdf"]) == 0
     assert main(["validate", "out.urdf", "b.csv"]) == 2
-    assert "b.csv: begins with target 't2'," in capsys.readouterr().err
+    assert "b.csv: the first target is 't2', " in capsys.readouterr().err

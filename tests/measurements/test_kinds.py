@@ -162,7 +162,7 @@ def other_places_are_found(kind, sim_6dof, seeds):
             names = [(touch.names[i], touch.names[j]) for i, j in pairs]
             data = [
                 touch,
-                PointDistance.from_arrays(6, names, [np.linalg.norm(at[i] - at[j]) for i, j in pairs]),
+                PointDistance(6, names, [np.linalg.norm(at[i] - at[j]) for i, j in pairs]),
             ]
         fit = calibrate(sim_6dof, data, "minimal", priors="none")
         assert fit.converged
@@ -214,11 +214,11 @@ def test_paper_rows_are_its_r_and_sine(sim_6dof, sim_6dof_actual):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda q, p: Position.from_arrays(q, p[:3, :3, 3]), "position has shape"),
-        (lambda q, p: Position.from_arrays(q, p[:, :3, 3] * np.nan), "finite"),
-        (lambda q, p: Position.from_arrays(q, p[:, :3, 3], -1e-3), "positive"),
-        (lambda q, p: Pose.from_arrays(q, p * 2), "number 1 is not a rotation"),
-        (lambda q, p: Pose.from_arrays(q, p, 1e-3), "or neither"),
+        (lambda q, p: Position(q, p[:3, :3, 3]), "Position: positions has 3 entries for 5 samples"),
+        (lambda q, p: Position(q, p[:, :3, 3] * np.nan), "finite"),
+        (lambda q, p: Position(q, p[:, :3, 3], -1e-3), "positive"),
+        (lambda q, p: Pose(q, p * 2), "sample 1 is not a rotation"),
+        (lambda q, p: Pose(q, p, 1e-3), "expected both or neither"),
     ],
 )
 def test_wrong_readings_are_refused(make, message, sim_6dof):
@@ -231,7 +231,7 @@ def test_left_handed_rotation_is_refused(sim_6dof):
     poses = sim_6dof.poses(np.zeros((2, 6)))
     poses[:, :3, 0] *= -1
     with pytest.raises(DhcalError, match="not a rotation"):
-        Pose.from_arrays(np.zeros((2, 6)), poses)
+        Pose(np.zeros((2, 6)), poses)
 
 
 def test_small_rotation_noise_is_a_rotation(sim_6dof):

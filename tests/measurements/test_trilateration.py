@@ -11,11 +11,11 @@ from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.length import Wires
 from dhcal_pin.measurements.position import Position
 from dhcal_pin.measurements.trilateration import (
-    anchors_of,
     device_anchors,
-    dilution,
-    three_wires,
+    locate_point,
+    position_dilution,
     trilaterate,
+    trilaterate_three_wires,
 )
 
 A, B, C = 0.3, 0.25, -0.1
@@ -39,7 +39,7 @@ def test_closed_form_is_exact_on_the_side_it_is_told():
     points = somewhere(1000)
     for side in (1, -1):
         mine = points[np.sign(points[:, 0]) == side]
-        found = three_wires(lengths(mine, device_anchors(A, B, C)), A, B, C, side)
+        found = trilaterate_three_wires(lengths(mine, device_anchors(A, B, C)), A, B, C, side)
         np.testing.assert_allclose(found, mine, atol=1e-9)
 
 
@@ -72,9 +72,12 @@ def test_side_is_along_the_anchors_normal():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: three_wires([[1, 1, 1]], 0.3, 0.25, 0.3), "on one line"),
-        (lambda: three_wires([[1, 1, 1]], 0.3, 0.0, 0.1), "on one line"),
-        (lambda: three_wires([[1, 1, 1], [0.1, 1, 1]], A, B, C), "sample 2 has lengths that do not meet"),
+        (lambda: trilaterate_three_wires([[1, 1, 1]], 0.3, 0.25, 0.3), "on one line"),
+        (lambda: trilaterate_three_wires([[1, 1, 1]], 0.3, 0.0, 0.1), "on one line"),
+        (
+            lambda: trilaterate_three_wires([[1, 1, 1], [0.1, 1, 1]], A, B, C),
+            "lengths of sample 2 do not meet",
+        ),
         (lambda: trilaterate([[1, 1, 1]], [[0, 0, 0], [0, 0, 1], [0, 0, 2]]), "one line"),
         (lambda: trilaterate([[1, 1]], [[0, 0, 0], [0, 0, 1]]), "three anchors"),
         (lambda: trilaterate([[0.01, 0.01, 0.01]], RIG), "do not meet"),
@@ -93,7 +96,7 @@ def test_mirror_plane_loses_half_of_all_readings():
     lost = 0
     for row in noisy:
         try:
-            three_wires(row[None], A, B, C)
+            trilaterate_three_wires(row[None], A, B, C)
         except DhcalError:
             lost += 1
     assert lost / 4000 == pytest.approx(0.46, abs=0.05)
@@ -105,7 +108,7 @@ def test_mirror_plane_loses_half_of_all_readings():
 def test_dilution_is_what_noise_does(x, wanted):
     """The verified figures of an equilateral rig, by formula and by noise small enough to be linear."""
     point = np.array([[x, 0.12, -0.08]])
-    found = dilution(point, RIG)[0]
+    found = position_dilution(point, RIG)[0]
     rng = np.random.default_rng(0)
     noisy = lengths(np.tile(point, (20000, 1)), RIG) + 1e-7 * rng.standard_normal((20000, 3))
     side = int(np.sign(np.cross(RIG[1] - RIG[0], RIG[2] - RIG[0])[0] * x))
@@ -116,7 +119,7 @@ def test_dilution_is_what_noise_does(x, wanted):
 
 def test_anchor_from_lengths():
     points = somewhere(20)
-    np.testing.assert_allclose(anchors_of(points, lengths(points, RIG[:1])[:, 0]), RIG[0], atol=1e-12)
+    np.testing.assert_allclose(locate_point(points, lengths(points, RIG[:1])[:, 0]), RIG[0], atol=1e-12)
 
 
 def test_geometry_is_found_with_the_robot(sim_6dof, sim_6dof_actual):
@@ -146,7 +149,7 @@ def test_trilaterated_positions_calibrate_like_positions(sim_6dof, sim_6dof_actu
     side = int(np.sign(np.cross(RIG[1] - RIG[0], RIG[2] - RIG[0])[0]))
     found = trilaterate(lengths(points, anchors), anchors, side)
     np.testing.assert_allclose(found, points, atol=1e-9)
-    fit = calibrate(sim_6dof, Position.from_arrays(q, found), "dh", priors="none")
+    fit = calibrate(sim_6dof, Position(q, found), "dh", priors="none")
     assert (
         np.linalg.norm(fit.chain.poses(-q)[:, :3, 3] - sim_6dof_actual.poses(-q)[:, :3, 3], axis=1).max()
         < 1e-8

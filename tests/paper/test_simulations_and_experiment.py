@@ -144,7 +144,7 @@ def test_noise_is_averaged_out(poses, wanted, sim_6dof, sim_6dof_actual):
         rng = np.random.default_rng(seed)
         q = rng.uniform(-np.pi, np.pi, (poses, 6))
         data = Pose.simulate(sim_6dof_actual, q, Noise(1e-4, np.deg2rad(0.01)), rng)
-        fit = calibrate(sim_6dof, Pose.from_arrays(q, data.poses), "dh", method="gn")
+        fit = calibrate(sim_6dof, Pose(q, data.poses), "dh", method="gn")
         test = Pose.simulate(sim_6dof_actual, rng.uniform(-np.pi, np.pi, (100, 6)), Noise(), rng)
         worst.append(1e3 * fit.validate(test)["position_max_m"])
     assert np.median(worst) == pytest.approx(wanted, rel=0.15)
@@ -244,7 +244,7 @@ def test_an_arm_right_at_its_reference_is_not_impossible_elsewhere(sim_6dof, sim
     measured += (sim_6dof.poses(q[:1]) - sim_6dof_actual.poses(q[:1]))[0, :3, 3]
     commanded = sim_6dof.poses(q)[:, :3, 3]
     commanded[40] += [0.002, 0.0, 0.0]
-    data = Position.from_arrays(q, measured)
+    data = Position(q, measured)
 
     def found(told):
         return [

@@ -90,7 +90,7 @@ def test_a_joint_that_waves_is_seen_in_that_joint_alone():
     wave = np.zeros_like(q)
     wave[:, 2] = 2e-3 * np.sin(q[:, 2])
     data = Pose.simulate(arm, q + wave, Noise(1e-4, 1e-4), rng)
-    found = calibrate(arm, replace(data, q=q), "tool", fix=["tool.y"])
+    found = calibrate(arm, data.replace(q=q), "tool", fix=["tool.y"])
     traces = residuals.joint_offset_profiles(found)
     assert [t.name for t in traces] == list(arm.moving_joints)
     for j, t in enumerate(traces):

@@ -1,0 +1,199 @@
+"""Columns of measurement files.
+
+A measurement kind declares its columns once, in `Measurement.COLUMNS`. Reading, writing and checking of files
+follow from this declaration. Each numeric column `NAME` may be accompanied by a column `sigma_NAME` with its
+standard deviations. Values are in metres and radians; units are the concern of the package `io`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from .._typing import Array
+from ..exceptions import InvalidArgumentError
+
+# Largest plausible distance from the tip to a measured point of the tool [m].
+MAX_TOOL_OFFSET = 1.0
+# Largest plausible distance from the robot to an instrument [m]; a wire may cross a hall.
+MAX_INSTRUMENT_DISTANCE = 50.0
+# Smallest plausible length [m]; nobody sets up shorter ones on purpose.
+MIN_LENGTH = 2e-3
+
+# Map from the reach of a robot [m] to the smallest and largest plausible value [m].
+PlausibleRange = Callable[[float], tuple[float, float]]
+
+
+def displacement_range(reach: float) -> tuple[float, float]:
+    """Return the plausible distances [m] between two positions of the tool point.
+
+    Args:
+        reach: Radius of the sphere that the tip can reach [m].
+    """
+    return 0.0, 2 * (reach + MAX_TOOL_OFFSET)
+
+
+def point_distance_range(reach: float) -> tuple[float, float]:
+    """Return the plausible distances [m] between two points that the tool can touch.
+
+    Args:
+        reach: Radius of the sphere that the tip can reach [m].
+    """
+    return MIN_LENGTH, 2 * (reach + MAX_TOOL_OFFSET)
+
+
+def instrument_range(reach: float) -> tuple[float, float]:
+    """Return the plausible distances [m] between the tool point and a part of an instrument.
+
+    Args:
+        reach: Radius of the sphere that the tip can reach [m].
+    """
+    return MIN_LENGTH, reach + MAX_INSTRUMENT_DISTANCE
+
+
+@dataclass(frozen=True)
+class Column:
+    """Column of a measurement file.
+
+    Attributes:
+        name: Name in the header, without the unit.
+        quantity: "length" [m], "angle" [rad] or "text".
+        argument: Argument of the kind's constructor that the column fills. Several numeric columns with the
+            same argument are stacked, (m, k).
+        is_implied: Whether the value is zero by definition, so that files have only its standard deviation.
+        is_common: Whether all rows of a file must have the same text; the argument is that text.
+        plausible_range: Plausible values of a length; None if it is not checked by itself.
+    """
+
+    name: str
+    quantity: Literal["length", "angle", "text"]
+    argument: str = ""
+    is_implied: bool = False
+    is_common: bool = False
+    plausible_range: PlausibleRange | None = None
+
+    @property
+    def is_numeric(self) -> bool:
+        """Whether the column has numbers, and therefore may have standard deviations."""
+        return self.quantity != "text"
+
+    @property
+    def sigma_name(self) -> str:
+        """Name of the column with the standard deviations."""
+        return f"sigma_{self.name}"
+
+
+def length_columns(
+    argument: str, *names: str, is_implied: bool = False, plausible_range: PlausibleRange | None = None
+) -> tuple[Column, ...]:
+    """Declare columns of lengths that fill one argument of the constructor.
+
+    Args:
+        argument: Name of the constructor's argument.
+        *names: Names of the columns.
+        is_implied: Whether the lengths are zero by definition, so that files have only their sigmas.
+        plausible_range: Plausible values; None if they are not checked by themselves.
+
+    Returns:
+        One column per name.
+    """
+    return tuple(
+        Column(name, "length", argument, is_implied=is_implied, plausible_range=plausible_range)
+        for name in names
+    )
+
+
+def angle_columns(argument: str, *names: str) -> tuple[Column, ...]:
+    """Declare columns of angles that fill one argument of the constructor.
+
+    Args:
+        argument: Name of the constructor's argument.
+        *names: Names of the columns.
+
+    Returns:
+        One column per name.
+    """
+    return tuple(Column(name, "angle", argument) for name in names)
+
+
+def text_column(argument: str, name: str, is_common: bool = False) -> tuple[Column, ...]:
+    """Declare a column of text.
+
+    Args:
+        argument: Name of the constructor's argument.
+        name: Name of the column.
+        is_common: Whether all rows of a file must have the same text.
+
+    Returns:
+        The column, as a tuple that can be added to others.
+    """
+    return (Column(name, "text", argument, is_common=is_common),)
+
+
+def file_columns(columns: Sequence[Column]) -> dict[str, str]:
+    """Return the quantity of each column of a file, in the order in which files are written.
+
+    The columns of standard deviations follow the last numeric column.
+
+    Args:
+        columns: Columns that a measurement kind declares.
+    """
+    sigmas = {column.sigma_name: column.quantity for column in columns if column.is_numeric}
+    last = max((i for i, column in enumerate(columns) if column.is_numeric), default=-1)
+    out: dict[str, str] = {}
+    for i, column in enumerate(columns):
+        if not column.is_implied:
+            out[column.name] = column.quantity
+        if i == last:
+            out |= sigmas
+    return out
+
+
+def stack_columns(values: Mapping[str, Any], names: Iterable[str]) -> Array:
+    """Stack numeric columns of a file.
+
+    Args:
+        values: Columns of a file by name, (m,) each.
+        names: Names of the columns to stack.
+
+    Returns:
+        Shape (m,) for one name, (m, k) for several.
+    """
+    columns = [values[name] for name in names]
+    return columns[0] if len(columns) == 1 else np.stack(columns, -1)
+
+
+def stack_sigmas(values: Mapping[str, Any], columns: Iterable[Column]) -> Array | None:
+    """Stack the standard deviations of some columns of a file.
+
+    Args:
+        values: Columns of a file by name, (m,) each.
+        columns: Numeric columns whose standard deviations are wanted.
+
+    Returns:
+        Shape (m,) for one column, (m, k) for several; None if the file has no standard deviations.
+    """
+    names = [column.sigma_name for column in columns]
+    return stack_columns(values, names) if names and all(name in values for name in names) else None
+
+
+def common_text(texts: Sequence[str], where: str) -> str:
+    """Return the text that all rows of a column have.
+
+    Args:
+        texts: Texts of the rows, (m,).
+        where: Name of the column, for the error message.
+
+    Raises:
+        InvalidArgumentError: The texts differ.
+    """
+    distinct = sorted(set(texts))
+    if len(distinct) != 1:
+        raise InvalidArgumentError(
+            f"column {where!r}: has the names {', '.join(distinct)}; expected one name per file, "
+            "split the file by name"
+        )
+    return distinct[0]
