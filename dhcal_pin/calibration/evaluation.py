@@ -12,7 +12,7 @@ from .._typing import Array
 from ..estimation import robust
 from ..estimation.error_model import ErrorModel
 from ..estimation.problem import Problem, merge_instrument_parameters
-from ..estimation.solver import levenberg_marquardt
+from ..estimation.solver import minimize
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 
@@ -151,7 +151,7 @@ def instrument_values(
     problem = Problem(ErrorModel(chain, ()), tuple(data), weights, given)
     if not len(weights):
         return given
-    return problem.instruments(levenberg_marquardt(problem, np.zeros(len(weights)), 100, None).x)
+    return problem.instruments(minimize(problem).x)
 
 
 def compute_errors(

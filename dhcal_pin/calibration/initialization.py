@@ -11,7 +11,7 @@ from .. import se3
 from .._typing import Array
 from ..estimation.error_model import ErrorModel
 from ..estimation.problem import Problem, merge_instrument_parameters
-from ..estimation.solver import levenberg_marquardt, next_iterate
+from ..estimation.solver import minimize, next_iterate
 from ..measurements.base import Measurement
 from ..robot.chain import BASE_FRAME, Chain
 from ..se3 import nearest_rotation
@@ -110,8 +110,7 @@ def _fit_frames(
     """The chain with the frames that fit the data best, and about the cost that they leave."""
     data = tuple(item.initialized(frames.chain) for item in data)
     problem = make_problem(frames, data, 1 / frames.priors, known)
-    nominal = np.zeros(len(problem.weights))
-    solution = levenberg_marquardt(problem, nominal, max_iterations, None, loose=True)
+    solution = minimize(problem, max_iterations=max_iterations, loose=True)
     cost = solution.system.cost + float(np.sum((problem.weights * solution.x) ** 2))
     return cost, frames.at(next_iterate(problem, solution)[: len(frames.parameters)])
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import fnmatch
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -15,7 +14,7 @@ from ..estimation import robust
 from ..estimation.parameters import select_parameters
 from ..estimation.priors import PriorGroups, Priors, has_default_prior, prior_weights
 from ..estimation.problem import Problem, merge_instrument_parameters
-from ..estimation.solver import METHODS, Progress, levenberg_marquardt
+from ..estimation.solver import METHODS, Progress, minimize
 from ..exceptions import DhcalError
 from ..measurements.base import Measurement
 from ..parallel import SERIAL, TaskExecutor
@@ -164,8 +163,8 @@ def _check_options(
 
 def _solve(problem: Problem, method: Method, max_iterations: int, progress: Progress | None) -> Fit:
     """Solve a problem with unit weights; `reweight` iterates method "lm" to full convergence later."""
-    solve = partial(levenberg_marquardt, loose=True) if method == "lm" else METHODS[method]
-    solution = solve(problem, np.zeros(len(problem.weights)), max_iterations, progress)
+    options = {"loose": True} if method == "lm" else {}
+    solution = minimize(problem, method, None, max_iterations, progress, **options)
     weights = tuple(np.ones(len(item.rows)) for item in problem.data)
     fit = Fit(problem.data, problem, solution, weights)
     errors = problem.errors
@@ -173,7 +172,7 @@ def _solve(problem: Problem, method: Method, max_iterations: int, progress: Prog
         return fit
     # The gravity torques depend on the arm that was found: solve again with those.
     problem = replace(problem, errors=errors.with_current_loads(solution.x[: len(errors.parameters)]))
-    again = solve(problem, solution.x, max_iterations, progress)
+    again = minimize(problem, method, solution.x, max_iterations, progress, **options)
     return replace(fit, problem=problem, solution=again, previous_iterations=solution.iterations)
 
 

@@ -16,7 +16,7 @@ from ..estimation import qr, robust
 from ..estimation.error_model import ErrorModel, ErrorParameter
 from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.qr import TriangularSystem, append_priors, posterior_sqrt_covariance
-from ..estimation.solver import METHODS, SolverResult, bounded_step, levenberg_marquardt
+from ..estimation.solver import SolverResult, bounded_step, minimize
 from ..estimation.uncertainty import UNBOUNDED_TOL, Prediction, Uncertainty
 from ..exceptions import DhcalError
 from ..identifiability import explanations, observability
@@ -333,8 +333,8 @@ class Result:
         nominal = np.zeros_like(self.x)
         if not self.converged:
             with suppress(DhcalError):  # on few samples the paper's loop may run away
-                return METHODS[self.method](problem, nominal, self.iterations, None).x
-        return levenberg_marquardt(problem, nominal, MAX_REFIT_ITERATIONS, None).x
+                return minimize(problem, self.method, nominal, self.iterations).x
+        return minimize(problem, "lm", nominal, MAX_REFIT_ITERATIONS).x
 
     @cached_property
     def estimates(self) -> tuple[Estimate, ...]:

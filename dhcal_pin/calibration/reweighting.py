@@ -22,7 +22,7 @@ from ..estimation import qr, robust
 from ..estimation.priors import PriorGroups, update_prior_scales
 from ..estimation.problem import Problem
 from ..estimation.robust import studentized_residuals
-from ..estimation.solver import Progress, SolverResult, levenberg_marquardt
+from ..estimation.solver import Progress, SolverResult, minimize
 from ..measurements.base import Measurement
 
 # Smallest scale of a standard deviation: a nanometre or a nanoradian for a placeholder of 1 mm or 1 mrad.
@@ -93,7 +93,7 @@ def reweight(fit: Fit, loss: str, groups: PriorGroups, max_iterations: int, prog
     """
     expected = fit.problem.weights
     state = ReweightState(
-        fit, np.ones(sum(len(item.residual_groups) for item in fit.data)), robust.LOSSES[loss]
+        fit, np.ones(sum(len(item.residual_groups) for item in fit.data)), robust.LOSSES[loss].stages
     )
     for rounds_left in reversed(range(MAX_ROUNDS)):
         state = _next_round(state, groups, expected, rounds_left, max_iterations, progress)
@@ -142,8 +142,8 @@ def _next_round(
             fit.iterations,
         )
         state = replace(state, scales=scales)
-    solution = levenberg_marquardt(
-        problem, solution.x, max_iterations, progress, warm_start=before, loose=not is_final
+    solution = minimize(
+        problem, "lm", solution.x, max_iterations, progress, warm_start=before, loose=not is_final
     )
     fit = replace(state.fit, problem=problem, solution=solution, previous_iterations=earlier)
     return replace(state, fit=fit, is_final=is_final)

@@ -14,7 +14,7 @@ from ..estimation import qr
 from ..estimation.priors import Priors
 from ..estimation.problem import Chunk, Problem
 from ..estimation.qr import posterior_sqrt_covariance
-from ..estimation.solver import METHODS, Progress, SolverResult
+from ..estimation.solver import Progress, SolverResult, minimize
 from ..exceptions import DhcalError
 from ..identifiability import explanations
 from ..io.measurement_csv import Part
@@ -158,7 +158,7 @@ def calibrate_stream(
     problem = StreamProblem(
         fit.errors, (head,), fit.problem.weights, known, executor, None, parts, _scales(fit, head)
     )
-    solution = METHODS[method](problem, fit.x, max_iterations, progress)
+    solution = minimize(problem, method, fit.x, max_iterations, progress)
     end = fit.errors.at(solution.x)
     samples, before, after = 0, {}, {}
     for count, squares in problem.map_chunks(partial(_squares, (fit.nominal_refitted, end), known)):

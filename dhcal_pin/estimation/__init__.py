@@ -6,8 +6,8 @@ from .parameters import PARAMETER_SETS, select_parameters
 from .priors import Priors
 from .problem import Problem, linearize_and_factor
 from .qr import TriangularSystem
-from .robust import LOSSES
-from .solver import METHODS, Progress, SolverResult, gauss_newton, levenberg_marquardt
+from .robust import LOSSES, Loss
+from .solver import METHODS, Progress, SolverResult, gauss_newton, levenberg_marquardt, minimize
 from .uncertainty import Prediction, Predictor, Uncertainty
 
 __all__ = [
@@ -18,6 +18,7 @@ __all__ = [
     "BatchResult",
     "ErrorModel",
     "ErrorParameter",
+    "Loss",
     "Prediction",
     "Predictor",
     "Priors",
@@ -29,6 +30,7 @@ __all__ = [
     "gauss_newton",
     "levenberg_marquardt",
     "linearize_and_factor",
+    "minimize",
     "select_parameters",
     "solve_batch",
 ]

@@ -19,10 +19,11 @@ from ..exceptions import DhcalError
 from ..measurements.base import Measurement, concatenate
 from ..parallel import SERIAL, TaskExecutor
 from . import qr
+from . import solver_rules as rules
 from .batch_chains import ChainBatch
-from .batch_qr import TriangularSystems, factor_columns
+from .batch_qr import TriangularSystemBatch
 from .error_model import ErrorModel
-from .solver import DIVERGENCE_LIMIT, N_UNDAMPED_STEPS, UNDAMPED_INTERVAL
+from .solver_rules import step_is_negligible
 
 # Members whose arrays together stay in a core's cache.
 BLOCK_SIZE = 250
@@ -130,7 +131,7 @@ class BatchProblem:
             total += np.sum(residual.reshape(len(residual), len(self), -1) ** 2, (0, 2))
         return total
 
-    def linearize_and_factor(self, x: Array, weights: Array, small_angle: bool) -> TriangularSystems:
+    def linearize_and_factor(self, x: Array, weights: Array, small_angle: bool) -> TriangularSystemBatch:
         """The triangles at x (b, p) of the data and of priors of these weights (p,)."""
         arms, bodies, twists = self.chains.derivative(x)
         b, p = x.shape
@@ -151,8 +152,8 @@ class BatchProblem:
             block[:, :, p] = -(weights * x)[:, held]
             found.append(block)
         if len(found) == 1:
-            return TriangularSystems.from_r_factors(found[0])
-        return factor_columns(np.concatenate(found, 1).swapaxes(1, 2))
+            return TriangularSystemBatch.from_r_factors(found[0])
+        return TriangularSystemBatch.from_columns(np.concatenate(found, 1).swapaxes(1, 2))
 
 
 def _padded(item: Measurement, count: int) -> Measurement:
@@ -181,7 +182,7 @@ class BatchResult:
     converged: Array
 
     @cached_property
-    def systems(self) -> TriangularSystems:
+    def systems(self) -> TriangularSystemBatch:
         """Those of the data alone, at x."""
         return self.batch.linearize_and_factor(self.x, np.zeros(self.x.shape[1]), small_angle=False)
 
@@ -216,100 +217,135 @@ class BatchResult:
 
 
 def _gauss_newton(batch: BatchProblem, x: Array, max_iterations: int) -> tuple[Array, Array, Array]:
-    """`solver.gauss_newton` in step; a member that runs away stops there, not converged."""
-    b, part, live = len(batch), batch, np.arange(len(batch))
+    """Run `solver.gauss_newton` on all problems in lockstep; a diverging problem ends, not converged."""
+    b, active_batch, active = len(batch), batch, np.arange(len(batch))
     x, iterations, converged = x.copy(), np.zeros(b, int), np.zeros(b, bool)
-    for done in range(1, max_iterations + 1):
-        full = part.linearize_and_factor(x[live], batch.weights, small_angle=True)
-        step = full.solve()
-        settled = full.is_step_negligible(np.linalg.norm(full.residual_change(step), axis=1), full.cost)
-        x[live] += step
-        iterations[live], converged[live] = done, settled
-        over = settled | ~(np.abs(x[live]).max(1) < DIVERGENCE_LIMIT)
-        live, part = live[~over], part.take(np.flatnonzero(~over))
-        if not live.size:
+    for iteration in range(1, max_iterations + 1):
+        systems = active_batch.linearize_and_factor(x[active], batch.weights, small_angle=True)
+        step = systems.solve()
+        change = np.linalg.norm(systems.residual_change(step), axis=1)
+        is_negligible = step_is_negligible(change, np.sqrt(systems.cost), np.zeros(1), systems.roundoff)
+        x[active] += step
+        iterations[active], converged[active] = iteration, is_negligible
+        has_ended = is_negligible | rules.has_diverged(x[active])
+        active, active_batch = active[~has_ended], active_batch.take(np.flatnonzero(~has_ended))
+        if not active.size:
             break
     return x, iterations, converged
 
 
 def _undamped_steps(batch: BatchProblem, x: Array, cost: Array) -> tuple[Array, Array]:
-    """`solver`'s leap in step: where plain Gauss-Newton ends, for those whom that takes lower."""
-    far, ends = x.copy(), np.full(len(x), np.inf)
-    live, part = np.arange(len(x)), batch
-    for _ in range(N_UNDAMPED_STEPS):
-        there = far[live] + part.linearize_and_factor(far[live], batch.weights, small_angle=False).solve()
-        near = np.flatnonzero(np.abs(there).max(1) < DIVERGENCE_LIMIT)
-        if not near.size:
+    """Try a series of undamped steps; return their ends and the costs there where those are lower."""
+    end, end_cost = x.copy(), np.full(len(x), np.inf)
+    active, active_batch = np.arange(len(x)), batch
+    for _ in range(rules.N_UNDAMPED_STEPS):
+        systems = active_batch.linearize_and_factor(end[active], batch.weights, small_angle=False)
+        trial = end[active] + systems.solve()
+        bounded = np.flatnonzero(~rules.has_diverged(trial))
+        if not bounded.size:
             break
-        live, part = live[near], part.take(near)
-        far[live], ends[live] = there[near], part.cost(there[near])
-    lower = ends < cost
-    return np.where(lower[:, None], far, x), np.where(lower, ends, cost)
+        active, active_batch = active[bounded], active_batch.take(bounded)
+        end[active], end_cost[active] = trial[bounded], active_batch.cost(trial[bounded])
+    is_lower = end_cost < cost
+    return np.where(is_lower[:, None], end, x), np.where(is_lower, end_cost, cost)
 
 
 def _levenberg_marquardt(batch: BatchProblem, x: Array, max_iterations: int) -> tuple[Array, Array, Array]:
-    """`solver.levenberg_marquardt` in step: who has moved gets a new triangle, all others try again."""
-    b, p, part, live = len(batch), len(batch.weights), batch, np.arange(len(batch))
+    """Run `solver.levenberg_marquardt` on all problems in lockstep.
+
+    In each pass every active problem tries one step. Problems whose step was accepted are linearized again;
+    the others retry with more damping. Arrays without index have one element per problem of the batch, or per
+    active problem where they are computed from `active`.
+    """
+    b, p, active_batch, active = len(batch), len(batch.weights), batch, np.arange(len(batch))
     x, iterations, converged = x.copy(), np.zeros(b, int), np.zeros(b, bool)
-    every, scale = batch.linearize_and_factor(x, batch.weights, small_angle=False), np.zeros((b, p))
-    cost, damping, growth = every.cost, np.full(b, 1e-8), np.full(b, 2.0)
-    fresh, last, leapt = np.ones(b, bool), np.zeros(b), np.zeros(b, int)
-    while live.size and max_iterations:
-        free, before = every.take(live), cost[live]
-        new = live[fresh[live]]
+    systems, scale = batch.linearize_and_factor(x, batch.weights, small_angle=False), np.zeros((b, p))
+    cost, damping, growth = (
+        systems.cost,
+        np.full(b, rules.INITIAL_DAMPING),
+        np.full(b, rules.INITIAL_GROWTH),
+    )
+    # Whether the next trial is the first one of an iteration.
+    is_new, last_change, last_undamped = np.ones(b, bool), np.zeros(b), np.zeros(b, int)
+    while active.size and max_iterations:
+        # Step of each active problem.
+        undamped, start_cost = systems.take(active), cost[active]
+        new = active[is_new[active]]
         iterations[new] += 1
-        scale[new] = np.maximum(scale[new], np.linalg.norm(every.r[new], axis=1))
-        floor = np.where(scale[live] > 0, scale[live], 1.0)
-        least = np.sqrt(damping[live])[:, None] * floor
-        step = free.with_damping(least).solve(least.min(1))
-        moved = free.residual_change(step)
-        change = np.linalg.norm(moved, axis=1)
-        settled = free.is_step_negligible(change, before, last[live])
-        expected = np.sum(free.z**2, -1) - np.sum((moved - free.z) ** 2, -1)
-        rounding, root = free.roundoff(), np.sqrt(before)
-        blur = (10 * rounding) ** 2 + 2 * rounding * root
-        there, trial, ahead = x[live] + step, before - expected, None
-        # A first try mostly holds, and its triangle, which the next step needs, tells its cost too.
-        first = ~settled & fresh[live]
-        tried, others = np.flatnonzero(first), np.flatnonzero(~first & ~(settled & (expected <= blur)))
-        if tried.size:
-            ahead = part.take(tried).linearize_and_factor(there[tried], batch.weights, small_angle=False)
-            trial[tried] = ahead.cost
-        if others.size:
-            trial[others] = part.take(others).cost(there[others])
-        gain = np.where(expected > 0, (before - trial) / np.where(expected > 0, expected, 1.0), 0.0)
-        trusted = (expected <= blur) & (trial <= (root + 10 * rounding) ** 2)
-        accepted = trusted | ((trial <= before) & (gain > 1e-3))
-        stuck = ~accepted & (settled | (damping[live] > 1e16))
-        easier = np.where(trusted | (gain > 0.9), 1e-2, np.maximum(1e-3, 1 - (2 * gain - 1) ** 3))
-        went, retry = live[accepted], live[~accepted]
-        was, x[went], last[went] = last[live], there[accepted], change[accepted]
-        cost[went], growth[went] = trial[accepted], 2.0
-        fresh[live] = accepted
-        damping[went] = np.maximum(damping[went] * easier[accepted], 1e-16)
-        converged[went] = settled[accepted] & (damping[went] < 1e-3)
-        converged[live[stuck]] = settled[stuck]
-        damping[retry], growth[retry] = damping[retry] * growth[retry], growth[retry] * 2
-        # A damped step that is too small to matter is no end where a plain one, not tried yet, is not.
-        creeping = converged[live] & (leapt[live] == 0)
-        creeping[creeping] = ~free.take(creeping).is_converged(before[creeping], was[creeping])
-        converged[live[creeping]], fresh[live[creeping]] = False, True
-        due = creeping | (iterations[live] >= np.maximum(UNDAMPED_INTERVAL, 2 * leapt[live]))
-        leaping = (accepted | stuck) & ~converged[live] & due
-        if leaping.any():
-            who = live[leaping]
-            leapt[who] = iterations[who]
-            x[who], cost[who] = _undamped_steps(part.take(np.flatnonzero(leaping)), x[who], cost[who])
-        over = (stuck & ~creeping) | converged[live] | (fresh[live] & (iterations[live] >= max_iterations))
-        if ahead is not None:
-            every.assign(live[tried][accepted[tried]], ahead.take(accepted[tried]))
-        # Whose step held without a triangle, or who leapt, needs one.
-        lacking = np.flatnonzero(((accepted & ~first) | leaping) & ~over)
-        if lacking.size:
-            every.assign(
-                live[lacking], part.take(lacking).linearize_and_factor(x[live[lacking]], batch.weights, False)
+        scale[new] = np.maximum(scale[new], np.linalg.norm(systems.r[new], axis=1))
+        damping_scale = np.where(scale[active] > 0, scale[active], 1.0)
+        damping_rows = np.sqrt(damping[active])[:, None] * damping_scale
+        step = undamped.with_damping(damping_rows).solve(damping_rows.min(1))
+        row_change = undamped.residual_change(step)
+        change = np.linalg.norm(row_change, axis=1)
+        roundoff, residual_norm = undamped.roundoff, np.sqrt(start_cost)
+        previous_change = last_change[active]
+        is_negligible = step_is_negligible(change, residual_norm, previous_change, roundoff)
+        predicted = undamped.predicted_reduction(row_change)
+
+        # Cost after the step: from the linearization at a first trial, and by prediction within rounding.
+        trial, trial_cost, trial_systems = x[active] + step, start_cost - predicted, None
+        is_first_trial = ~is_negligible & is_new[active]
+        is_predicted = is_negligible & (predicted <= rules.cost_roundoff(residual_norm, roundoff))
+        first, retried = np.flatnonzero(is_first_trial), np.flatnonzero(~is_first_trial & ~is_predicted)
+        if first.size:
+            trial_systems = active_batch.take(first).linearize_and_factor(
+                trial[first], batch.weights, small_angle=False
             )
-        live, part = live[~over], part.take(np.flatnonzero(~over))
+            trial_cost[first] = trial_systems.cost
+        if retried.size:
+            trial_cost[retried] = active_batch.take(retried).cost(trial[retried])
+
+        # Acceptance, damping and termination.
+        gain = rules.gain_ratio(start_cost, trial_cost, predicted)
+        within_roundoff = rules.is_within_roundoff(predicted, trial_cost, residual_norm, roundoff)
+        is_accepted = rules.is_acceptable(start_cost, trial_cost, gain, within_roundoff)
+        is_stuck = ~is_accepted & (is_negligible | (damping[active] > rules.MAX_DAMPING))
+        accepted, rejected = active[is_accepted], active[~is_accepted]
+        x[accepted], last_change[accepted] = trial[is_accepted], change[is_accepted]
+        cost[accepted], growth[accepted] = trial_cost[is_accepted], rules.INITIAL_GROWTH
+        is_new[active] = is_accepted
+        damping[accepted] = rules.damping_after_acceptance(
+            damping[accepted], gain[is_accepted], within_roundoff[is_accepted]
+        )
+        converged[accepted] = is_negligible[is_accepted] & (damping[accepted] < rules.MAX_CONVERGED_DAMPING)
+        converged[active[is_stuck]] = is_negligible[is_stuck]
+        damping[rejected], growth[rejected] = rules.damping_after_rejection(
+            damping[rejected], growth[rejected]
+        )
+
+        # Undamped steps, at once where only the damped step is negligible.
+        is_stalled = converged[active] & (last_undamped[active] == 0)
+        is_stalled[is_stalled] = ~undamped.take(is_stalled).is_stationary(
+            start_cost[is_stalled], previous_change[is_stalled]
+        )
+        converged[active[is_stalled]], is_new[active[is_stalled]] = False, True
+        is_due = is_stalled | rules.undamped_steps_are_due(iterations[active], last_undamped[active])
+        tries_undamped = (is_accepted | is_stuck) & ~converged[active] & is_due
+        if tries_undamped.any():
+            chosen = active[tries_undamped]
+            last_undamped[chosen] = iterations[chosen]
+            x[chosen], cost[chosen] = _undamped_steps(
+                active_batch.take(np.flatnonzero(tries_undamped)), x[chosen], cost[chosen]
+            )
+        has_ended = (
+            (is_stuck & ~is_stalled)
+            | converged[active]
+            | (is_new[active] & (iterations[active] >= max_iterations))
+        )
+
+        # Linearization at the new points that have none yet.
+        if trial_systems is not None:
+            systems.assign(active[first][is_accepted[first]], trial_systems.take(is_accepted[first]))
+        missing = np.flatnonzero(((is_accepted & ~is_first_trial) | tries_undamped) & ~has_ended)
+        if missing.size:
+            systems.assign(
+                active[missing],
+                active_batch.take(missing).linearize_and_factor(
+                    x[active[missing]], batch.weights, small_angle=False
+                ),
+            )
+        active, active_batch = active[~has_ended], active_batch.take(np.flatnonzero(~has_ended))
     return x, iterations, converged
 
 

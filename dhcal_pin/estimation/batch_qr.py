@@ -1,4 +1,11 @@
-"""Stacked triangles: what `solver` and `observability` do with one, for many problems at once."""
+"""Triangular systems of many problems, stacked along a leading axis.
+
+`TriangularSystemBatch` is `qr.TriangularSystem` for b problems: for each of them
+
+    ‖J·δ - r‖² = ‖R·δ - z‖² + min_cost
+
+The formulas are those of `qr`; the decompositions are NumPy's, which loop over the stack in compiled code.
+"""
 
 from __future__ import annotations
 
@@ -9,107 +16,179 @@ import numpy as np
 from .._kernels import r_factors
 from .._typing import Array
 from .qr import RANK_RTOL
-from .solver import EPS_MODEL, STEP_RTOL
+from .solver_rules import EPS_MODEL, step_is_negligible
+
+# Largest estimated condition number at which R is solved without a singular value decomposition. The margin
+# of 1000 to the rank cut covers the error of the estimate.
+MAX_CONDITION = 1e-3 / RANK_RTOL
+# Random unit vectors from which the condition number is estimated.
+N_PROBES = 4
 
 
 @dataclass(frozen=True, eq=False)
-class TriangularSystems:
-    """`solver.Triangle` of b members: r (b, p, p), z (b, p), rest (b,)."""
+class TriangularSystemBatch:
+    """R factors of the whitened rows [J | r] of b problems.
+
+    `qr.TriangularSystem` documents the members that both classes share, and why there are two.
+
+    Attributes:
+        r: R factors of the Jacobians, upper triangular, shape (b, p, p).
+        z: Right-hand sides, shape (b, p).
+        min_cost: Costs that remain after the best steps, shape (b,).
+    """
 
     r: Array
     z: Array
     min_cost: Array
 
     @classmethod
-    def from_r_factors(cls, rows: Array) -> TriangularSystems:
-        """From R, z and the root of the rest (b, p+1, p+1)."""
+    def from_r_factors(cls, rows: Array) -> TriangularSystemBatch:
+        """Split the R factors of [J | r].
+
+        Args:
+            rows: [R z; 0 ρ] of each problem, shape (b, p+1, p+1).
+
+        Returns:
+            Systems of b problems.
+        """
         return cls(rows[:, :-1, :-1], rows[:, :-1, -1], rows[:, -1, -1] ** 2)
+
+    @classmethod
+    def from_columns(cls, columns: Array) -> TriangularSystemBatch:
+        """Factor whitened rows.
+
+        Args:
+            columns: Columns of [J | r] of each problem, k rows each, shape (b, p+1, k).
+
+        Returns:
+            Systems of b problems.
+        """
+        return cls.from_r_factors(r_factors(np.ascontiguousarray(columns)[:, :, None]))
 
     @property
     def cost(self) -> Array:
-        """Sums (b,) of the squared rows that they hold."""
+        """Costs at the current x, shape (b,)."""
         return self.min_cost + np.sum(self.z**2, -1)
 
-    def take(self, members: Array) -> TriangularSystems:
-        """Those of an index (j,)."""
-        return TriangularSystems(self.r[members], self.z[members], self.min_cost[members])
+    @property
+    def roundoff(self) -> Array:
+        """Rounding errors of the rows, EPS_MODEL·‖R‖, shape (b,)."""
+        return EPS_MODEL * _frobenius_norms(self.r)
 
-    def assign(self, members: Array, other: TriangularSystems) -> None:
-        """Writes other ones in their places."""
-        self.r[members], self.z[members], self.min_cost[members] = other.r, other.z, other.min_cost
-
-    def with_damping(self, damping: Array) -> TriangularSystems:
-        """With rows of damping (b, p) below."""
-        b, p = self.z.shape
-        block = np.zeros((b, p + 1, 2 * p))
-        block[:, :p, :p], block[:, p, :p] = self.r.swapaxes(1, 2), self.z
-        block[:, np.arange(p), np.arange(p, 2 * p)] = damping
-        return factor_columns(block)
-
-    def solve(self, min_singular_value: Array | float = 0.0) -> Array:
-        """Shortest least-squares solutions (b, p), singular values cut as in `observability`.
+    def take(self, members: Array) -> TriangularSystemBatch:
+        """Select problems.
 
         Args:
-            min_singular_value: what no singular value is below, (b,), as far as that is known.
+            members: Indices of shape (j,).
+
+        Returns:
+            Copy of the systems of j problems.
+        """
+        return TriangularSystemBatch(self.r[members], self.z[members], self.min_cost[members])
+
+    def assign(self, members: Array, other: TriangularSystemBatch) -> None:
+        """Replace the systems of some problems in place.
+
+        Args:
+            members: Indices of shape (j,).
+            other: Systems of j problems.
+        """
+        self.r[members], self.z[members], self.min_cost[members] = other.r, other.z, other.min_cost
+
+    def with_damping(self, diagonal: Array) -> TriangularSystemBatch:
+        """Append the rows diag(diagonal)·δ = 0.
+
+        Args:
+            diagonal: Coefficients of shape (b, p).
+
+        Returns:
+            Systems with the further rows.
+        """
+        b, p = self.z.shape
+        columns = np.zeros((b, p + 1, 2 * p))
+        columns[:, :p, :p], columns[:, p, :p] = self.r.swapaxes(1, 2), self.z
+        columns[:, np.arange(p), np.arange(p, 2 * p)] = diagonal
+        return TriangularSystemBatch.from_columns(columns)
+
+    def solve(self, min_singular_value: Array | float = 0.0) -> Array:
+        """Compute the minimum-norm least-squares solutions R⁺·z.
+
+        Singular values below RANK_RTOL times the largest count as zero. Only matrices that may have such
+        singular values are decomposed; for the others a solution of a few random right-hand sides bounds the
+        condition number.
+
+        Args:
+            min_singular_value: Known lower bounds of the singular values, shape (b,); zero if unknown.
+
+        Returns:
+            Solutions of shape (b, p).
         """
         p = self.z.shape[1]
-        size, out = _size(self.r), np.empty_like(self.z)
-        # A triangle's singular values go at least as low as its diagonal.
-        plain = np.flatnonzero(np.abs(np.diagonal(self.r, axis1=1, axis2=2)).min(1) > RANK_RTOL * size)
-        # Some directions beside z show how near to singular it is; decompositions are for those that are.
-        probes = np.random.default_rng(0).standard_normal((p, 4))
+        size, out = _frobenius_norms(self.r), np.empty_like(self.z)
+        # The smallest diagonal element of a triangular matrix bounds its smallest singular value from above.
+        diagonal = np.abs(np.diagonal(self.r, axis1=1, axis2=2))
+        candidates = np.flatnonzero(diagonal.min(1) > RANK_RTOL * size)
+        probes = np.random.default_rng(0).standard_normal((p, N_PROBES))
         probes /= np.linalg.norm(probes, axis=0)
-        sides = np.concatenate([self.z[plain, :, None], np.tile(probes, (len(plain), 1, 1))], 2)
-        found = np.linalg.solve(self.r[plain], sides)
-        condition = size[plain] * np.linalg.norm(found[..., 1:], axis=1).max(1)
-        good = (condition < 1e-3 / RANK_RTOL) | (min_singular_value > RANK_RTOL * size)[plain]
-        out[plain[good]] = found[good, :, 0]
-        rest = np.setdiff1d(np.arange(len(out)), plain[good])
-        if rest.size:
-            u, s, vt = np.linalg.svd(self.r[rest])
-            kept = s > RANK_RTOL * s[:, :1]
-            share = np.where(kept, 1 / np.where(kept, s, 1.0), 0.0)
-            along = share[..., None] * (u.swapaxes(1, 2) @ self.z[rest, :, None])
-            out[rest] = (vt.swapaxes(1, 2) @ along)[..., 0]
+        sides = np.concatenate([self.z[candidates, :, None], np.tile(probes, (len(candidates), 1, 1))], 2)
+        solved = np.linalg.solve(self.r[candidates], sides)
+        condition = size[candidates] * np.linalg.norm(solved[..., 1:], axis=1).max(1)
+        is_regular = (condition < MAX_CONDITION) | (min_singular_value > RANK_RTOL * size)[candidates]
+        out[candidates[is_regular]] = solved[is_regular, :, 0]
+        others = np.setdiff1d(np.arange(len(out)), candidates[is_regular])
+        if others.size:
+            u, s, vt = np.linalg.svd(self.r[others])
+            is_nonzero = s > RANK_RTOL * s[:, :1]
+            inverse = np.where(is_nonzero, 1 / np.where(is_nonzero, s, 1.0), 0.0)
+            along = inverse[..., None] * (u.swapaxes(1, 2) @ self.z[others, :, None])
+            out[others] = (vt.swapaxes(1, 2) @ along)[..., 0]
         return out
 
     def residual_change(self, step: Array) -> Array:
-        """R·step (b, p)."""
-        return (self.r @ step[..., None])[..., 0]
-
-    def is_step_negligible(self, change: Array, cost: Array, last: Array | float = 0.0) -> Array:
-        """Whether the rows will not move by anything that matters, (b,), as `solver` has it.
+        """Compute the changes of the rows by steps, up to a rotation.
 
         Args:
-            change: (b,) how far a step moves them.
-            cost: (b,) before it.
-            last: (b,) how far the last step moved them; zero where nothing is known of it.
-        """
-        enough = STEP_RTOL * np.sqrt(cost)
-        shrunk = (change < 1e-2 * last) & (change**2 < 0.1 * enough * last)
-        return (change <= enough) | shrunk | (change <= self.roundoff())
+            step: Steps δ of shape (b, p) [m and rad].
 
-    def is_converged(self, cost: Array, last: Array | float = 0.0) -> Array:
-        """Whether not even a plain step moves the rows by anything that matters, (b,)."""
-        last = np.broadcast_to(last, cost.shape)
-        # No step moves them farther than all that is left.
-        out = self.is_step_negligible(np.linalg.norm(self.z, axis=1), cost, last)
-        rest = np.flatnonzero(~out)
-        if rest.size:
-            left = self.take(rest)
-            change = np.linalg.norm(left.residual_change(left.solve()), axis=1)
-            out[rest] = left.is_step_negligible(change, cost[rest], last[rest])
+        Returns:
+            R·δ of shape (b, p).
+        """
+        return (self.r @ step[..., None])[..., 0]
+
+    def predicted_reduction(self, change: Array) -> Array:
+        """Compute by how much the linear models reduce the costs.
+
+        Args:
+            change: Result of `residual_change`, shape (b, p).
+
+        Returns:
+            ‖z‖² - ‖R·δ - z‖² of shape (b,).
+        """
+        return np.sum(self.z**2, -1) - np.sum((change - self.z) ** 2, -1)
+
+    def is_stationary(self, cost: Array, last_change: Array) -> Array:
+        """Check whether the undamped step of each problem is negligible, too.
+
+        Args:
+            cost: Costs at the current x, shape (b,).
+            last_change: Changes of the rows by the previous steps, shape (b,); zero if unknown.
+
+        Returns:
+            Flags of shape (b,).
+        """
+        residual_norm, roundoff = np.sqrt(cost), self.roundoff
+        # No step changes the rows by more than ‖z‖.
+        out = step_is_negligible(np.linalg.norm(self.z, axis=1), residual_norm, last_change, roundoff)
+        others = np.flatnonzero(~out)
+        if others.size:
+            systems = self.take(others)
+            change = np.linalg.norm(systems.residual_change(systems.solve()), axis=1)
+            out[others] = step_is_negligible(
+                change, residual_norm[others], last_change[others], roundoff[others]
+            )
         return out
 
-    def roundoff(self) -> Array:
-        """What the model's own rounding makes of the rows, (b,)."""
-        return EPS_MODEL * _size(self.r)
 
-
-def factor_columns(columns: Array) -> TriangularSystems:
-    """Of whitened rows [J | r], column by column: (b, p+1, k)."""
-    return TriangularSystems.from_r_factors(r_factors(np.ascontiguousarray(columns)[:, :, None]))
-
-
-def _size(matrices: Array) -> Array:
+def _frobenius_norms(matrices: Array) -> Array:
+    """Compute the norms of stacked matrices, shape (b,)."""
     return np.sqrt(np.einsum("bij,bij->b", matrices, matrices))

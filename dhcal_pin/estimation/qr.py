@@ -1,13 +1,29 @@
-"""What the data see, in numbers: rank, unseen and weakly seen directions, observability indices.
+"""QR factorization of least-squares rows: the triangular system and its analysis.
 
-All of it comes from the triangle of a QR; the words are in `explanations`.
+The whitened rows [J | r] of one linearization, shape (k, p+1) for k rows and p unknowns, enter all further
+computation through the upper triangular factor of their QR decomposition:
 
-The triangle is R of the QR of the whitened Jacobian, metres and radians in its columns. Nothing here
-forms JᵀJ: at condition 1e7 that is wrong in the third digit.
+    Qᵀ·[J | r] = [R z; 0 ρ]        so that        ‖J·δ - r‖² = ‖R·δ - z‖² + ρ²
+
+- Step: δ = R⁺·z by back substitution, or with a rank cut where R is ill-conditioned.
+- Rank, condition and null space: singular values and vectors of R, which are those of J.
+- Covariance: (RᵀR)⁻¹ = S·Sᵀ with S = R⁻¹.
+- More rows: the QR decomposition of the stacked factors [R₁; R₂] is that of all rows. Chunks of samples
+  therefore merge in any number, and prior rows δ/σ = -x/σ are appended in the same way.
+
+This is the square root information filter (Bierman 1977). JᵀJ is never formed: it squares the condition,
+and at condition 1e7 its inverse is wrong in the third digit (Golub & Van Loan 2013, section 5.3).
+
+Columns of J count in metres and radians; the ranks and conditions refer to those units.
+
+References:
+    G. J. Bierman, Factorization Methods for Discrete Sequential Estimation, Academic Press 1977.
+    G. H. Golub and C. F. Van Loan, Matrix Computations, 4th ed., Johns Hopkins 2013, chapter 5.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -16,136 +32,292 @@ from scipy.linalg import lapack
 
 from .._kernels import append_diagonal, r_factor
 from .._typing import Array
+from .solver_rules import EPS_MODEL
 
-# Singular values below this share of the largest are rounding. The paper's arms keep what they see
-# above 1e-4; a cut of 1e-3 or more would already block its loop.
+# Singular values below this fraction of the largest count as zero. On the paper's robots the observable
+# directions lie above 1e-4; a value of 1e-3 or more would stop the paper's iteration from converging.
 RANK_RTOL = 1e-9
+# A triangular matrix whose reciprocal condition number exceeds this value has no singular value near
+# RANK_RTOL: the estimated condition may be wrong by a factor of the matrix size.
+WELL_CONDITIONED = 1e3 * RANK_RTOL
 
 
-def singular_values(triangle: Array) -> Array:
-    """Singular values (p,) of a triangle (p, p), falling."""
-    return np.linalg.svd(triangle, compute_uv=False)
+def singular_values(r: Array) -> Array:
+    """Compute the singular values of R.
+
+    Args:
+        r: Triangular factor of shape (p, p).
+
+    Returns:
+        Singular values of shape (p,), largest first.
+    """
+    return np.linalg.svd(r, compute_uv=False)
 
 
-def row_space(triangle: Array) -> Array:
-    """Orthonormal basis (rank, p) of the directions in parameter space that the data see."""
-    _, s, vt = np.linalg.svd(triangle)
+def row_space(r: Array) -> Array:
+    """Compute an orthonormal basis of the observable directions in parameter space.
+
+    Args:
+        r: Triangular factor of shape (p, p).
+
+    Returns:
+        Basis of shape (rank, p).
+    """
+    _, s, vt = np.linalg.svd(r)
     return vt[: int(np.sum(s > RANK_RTOL * s[0]))] if s.size and s[0] > 0 else vt[:0]
 
 
-def rank(triangle: Array) -> int:
-    """Number of independent directions that the data see."""
-    return len(row_space(triangle))
+def rank(r: Array) -> int:
+    """Count the observable directions in parameter space.
+
+    Args:
+        r: Triangular factor of shape (p, p).
+
+    Returns:
+        Number of singular values above RANK_RTOL times the largest.
+    """
+    return len(row_space(r))
 
 
-def condition(triangle: Array) -> float:
-    """Largest over smallest singular value among the seen directions; 0 if there is none."""
-    s = singular_values(triangle)
-    seen = s[s > RANK_RTOL * s[0]] if s.size else s
-    return float(seen[0] / seen[-1]) if seen.size else 0.0
+def condition(r: Array) -> float:
+    """Compute the condition number within the observable directions.
+
+    Args:
+        r: Triangular factor of shape (p, p).
+
+    Returns:
+        Largest over smallest singular value above the rank cut; 0 if the rank is 0.
+    """
+    s = singular_values(r)
+    nonzero = s[s > RANK_RTOL * s[0]] if s.size else s
+    return float(nonzero[0] / nonzero[-1]) if nonzero.size else 0.0
 
 
-def null_space(triangle: Array) -> Array:
-    """Orthonormal basis (p, d) of the directions in parameter space that the data do not see."""
-    return np.linalg.svd(triangle)[2][rank(triangle) :].T
+def null_space(r: Array) -> Array:
+    """Compute an orthonormal basis of the directions that the data do not determine.
+
+    Args:
+        r: Triangular factor of shape (p, p).
+
+    Returns:
+        Basis of shape (p, d), d = p - rank.
+    """
+    return np.linalg.svd(r)[2][rank(r) :].T
+
+
+def sum_of_squares(a: Array) -> float:
+    """Compute the sum of the squared elements of an array.
+
+    Args:
+        a: Array of any shape.
+
+    Returns:
+        Sum of squares as a Python float.
+    """
+    return float(np.vdot(a, a))
+
+
+def euclidean_norm(a: Array) -> float:
+    """Compute the root of the sum of the squared elements of an array.
+
+    Args:
+        a: Vector, or matrix for its Frobenius norm.
+
+    Returns:
+        Norm as a Python float.
+    """
+    return math.sqrt(sum_of_squares(a))
 
 
 @dataclass(frozen=True, eq=False)
 class TriangularSystem:
-    """QR of the whitened [J | r] at one x: ‖J·δ - r‖² = ‖R·δ - z‖² + rest.
+    """R factor of the whitened rows [J | r] at one x: ‖J·δ - r‖² = ‖R·δ - z‖² + min_cost.
+
+    `batch_qr.TriangularSystemBatch` is the same for b problems. It has the members `r`, `z`, `min_cost`,
+    `cost`, `roundoff`, `residual_change` and `predicted_reduction`, too, with a leading axis b. The classes are
+    separate because a single system is solved by LAPACK's triangular routines, which NumPy does not offer for
+    stacks: a damped step with p = 24 takes seven times as long in a stack of one.
 
     Attributes:
-        rows: (p+1, p+1) upper triangular, R and z with the root of the rest below z.
+        rows: [R z; 0 ρ], upper triangular, shape (p+1, p+1).
     """
 
     rows: Array
 
     @property
     def r(self) -> Array:
-        """(p, p) upper triangular, of the data alone."""
+        """R factor of the Jacobian, upper triangular, shape (p, p)."""
         return self.rows[:-1, :-1]
 
     @property
     def z(self) -> Array:
-        """(p,) right-hand side."""
+        """Right-hand side, shape (p,)."""
         return self.rows[:-1, -1]
 
     @property
     def min_cost(self) -> float:
-        """The part of the cost that no step removes."""
+        """Cost ρ² that remains after the best step."""
         return float(self.rows[-1, -1] ** 2)
 
     @property
     def cost(self) -> float:
-        """Sum of the squared rows, at no step."""
-        return float(np.vdot(self.rows[:, -1], self.rows[:, -1]))
+        """Cost at the current x: sum of the squared rows."""
+        return sum_of_squares(self.rows[:, -1])
+
+    @property
+    def roundoff(self) -> float:
+        """Rounding error of the rows, EPS_MODEL·‖R‖."""
+        return EPS_MODEL * euclidean_norm(self.r)
+
+    def residual_change(self, step: Array) -> Array:
+        """Compute the change of the rows by a step, up to a rotation.
+
+        Args:
+            step: Step δ of shape (p,) [m and rad].
+
+        Returns:
+            R·δ of shape (p,).
+        """
+        return self.r @ step
+
+    def predicted_reduction(self, change: Array) -> float:
+        """Compute by how much the linear model reduces the cost.
+
+        Args:
+            change: Result of `residual_change`, shape (p,).
+
+        Returns:
+            ‖z‖² - ‖R·δ - z‖².
+        """
+        z = self.z
+        return sum_of_squares(z) - sum_of_squares(change - z)
 
     def recentered(self, step: Array) -> TriangularSystem:
-        """As it is seen from a step (p,) ahead, where that is too small to bend the model."""
+        """Build the system at x + step, assuming that the model is linear over the step.
+
+        Args:
+            step: Step δ of shape (p,) [m and rad].
+
+        Returns:
+            System with right-hand side z - R·δ.
+        """
         rows = self.rows.copy()
         rows[:-1, -1] -= self.r @ step
         return TriangularSystem(rows)
 
 
 def merge_r_factors(factors: Sequence[Array]) -> Array:
-    """The triangle (c, c) of the rows of several (u, c), which may come from anywhere."""
+    """Merge R factors of different rows of the same columns.
+
+    Args:
+        factors: Factors or plain rows of shape (u, c), with any number u of rows each.
+
+    Returns:
+        R factor of all rows, shape (c, c).
+    """
     return r_factor(np.concatenate(factors).T[:, None].copy())
 
 
 def combine_r_factors(factors: Iterable[Array], p: int) -> TriangularSystem:
-    """All chunks' triangles (p+1, p+1) in one; memory holds one of them and the one that comes next."""
-    whole = None
-    for triangle in factors:
-        whole = triangle if whole is None else merge_r_factors((whole, triangle))
-    if whole is None:
-        whole = np.zeros((p + 1, p + 1))
-    return TriangularSystem(whole)
+    """Merge the R factors of all chunks of data, one after the other.
+
+    Two factors are in memory at a time.
+
+    Args:
+        factors: R factors of [J | r], shape (p+1, p+1) each.
+        p: Number of unknowns.
+
+    Returns:
+        System of all rows; zero if there are no factors.
+    """
+    merged = None
+    for factor in factors:
+        merged = factor if merged is None else merge_r_factors((merged, factor))
+    if merged is None:
+        merged = np.zeros((p + 1, p + 1))
+    return TriangularSystem(merged)
 
 
-# A triangle with such a reciprocal condition has no singular value near the cut, however large it is.
-WELL_CONDITIONED = 1e3 * RANK_RTOL
+def append_rows(system: TriangularSystem, diagonal: Array, right: Array) -> TriangularSystem:
+    """Append the rows diag(diagonal)·δ = right to a system.
+
+    Args:
+        system: System of p unknowns.
+        diagonal: Coefficients of shape (p,).
+        right: Right-hand sides of shape (p,).
+
+    Returns:
+        System with the further rows; `system` itself if all coefficients are zero.
+    """
+    return TriangularSystem(append_diagonal(system.rows, diagonal, right)) if diagonal.any() else system
 
 
-def append_rows(triangle: TriangularSystem, diagonal: Array, right: Array) -> TriangularSystem:
-    """The triangle with rows diagonal·δ = right (p,) below it."""
-    return TriangularSystem(append_diagonal(triangle.rows, diagonal, right)) if diagonal.any() else triangle
+def append_priors(system: TriangularSystem, weights: Array, x: Array | float) -> TriangularSystem:
+    """Append the prior rows δ/σ = -x/σ to a system.
 
+    Args:
+        system: System of the data at x.
+        weights: Reciprocal prior standard deviations 1/σ of shape (p,); zero without a prior.
+        x: Current values of shape (p,), or 0 [m and rad].
 
-def append_priors(triangle: TriangularSystem, weights: Array, x: Array | float) -> TriangularSystem:
-    """The triangle with prior rows -x/σ below it."""
-    return append_rows(triangle, weights, -(weights * x))
+    Returns:
+        System of data and priors.
+    """
+    return append_rows(system, weights, -(weights * x))
 
 
 def _is_well_conditioned(r: Array) -> bool:
-    """Whether no singular value of a triangle (p, p) can be near the cut."""
+    """Check that no singular value of R can be near the rank cut."""
     return bool(r.size) and lapack.dtrcon(r)[0] > WELL_CONDITIONED
 
 
 def pseudo_inverse(r: Array, z: Array) -> Array:
-    """Shortest least-squares solution of R·δ = z, singular values cut as in `observability`."""
-    # Far from the cut there is one solution, and the triangle gives it a hundred times as fast.
+    """Compute the minimum-norm least-squares solution R⁺·z.
+
+    Singular values below RANK_RTOL times the largest count as zero.
+
+    Args:
+        r: Triangular factor of shape (p, p).
+        z: Right-hand side of shape (p,).
+
+    Returns:
+        Solution of shape (p,).
+    """
+    # Back substitution takes a hundredth of the time of the singular value decomposition.
     if _is_well_conditioned(r):
         return lapack.dtrtrs(r, z)[0]
     return np.linalg.lstsq(r, z, rcond=RANK_RTOL)[0]
 
 
-def posterior_sqrt_covariance(triangle: TriangularSystem, weights: Array) -> tuple[Array, Array]:
-    """A root (p, r) of the covariance with priors of these weights (p,), and a basis (p, p-r) of the rest.
+def posterior_sqrt_covariance(system: TriangularSystem, weights: Array) -> tuple[Array, Array]:
+    """Compute a square root of the covariance of data and priors together.
 
-    The rest are directions that neither data nor a prior tell.
+    The covariance is C = S·Sᵀ = (RᵀR + W²)⁻¹, W = diag(weights), on the directions that data or priors
+    determine. Where [R; W] is ill-conditioned, parameter space is split by the rank of R: in the observable
+    directions data and priors count, in the others the priors alone. Exact data with tiny standard deviations
+    would otherwise hide the information of the priors.
+
+    Args:
+        system: System of the data alone.
+        weights: Reciprocal prior standard deviations 1/σ of shape (p,); zero without a prior.
+
+    Returns:
+        Square root S of the covariance, shape (p, r), and an orthonormal basis of the directions that neither
+        data nor priors determine, shape (p, p-r).
     """
-    full = append_priors(triangle, weights, 0.0).r
+    full = append_priors(system, weights, 0.0).r
     if _is_well_conditioned(full):
         return lapack.dtrtri(full)[0], np.empty((len(weights), 0))
-    # However exact the data are, what they do not see is the priors' to tell: by what is seen and what not.
-    _, s, vt = np.linalg.svd(triangle.r)
-    count = int(np.sum(s > RANK_RTOL * s[0]))
-    seen, unseen = vt[:count].T, vt[count:].T
-    left, t, yt = np.linalg.svd(weights[:, None] * unseen)
-    told = t > RANK_RTOL * weights.max(initial=0.0)
-    left, across = left[:, : len(t)][:, told], unseen @ (yt[told].T / t[told])
-    priors = weights[:, None] * seen
-    rows = np.concatenate([np.diag(s[:count]), priors - left @ (left.T @ priors)])
-    along = lapack.dtrtri(np.linalg.qr(rows)[1])[0]
-    root = np.concatenate([(seen - across @ (left.T @ priors)) @ along, across], 1)
-    return root, unseen @ np.delete(yt, np.flatnonzero(told), 0).T
+    _, s, vt = np.linalg.svd(system.r)
+    n_observable = int(np.sum(s > RANK_RTOL * s[0]))
+    observable, unobservable = vt[:n_observable].T, vt[n_observable:].T
+    # Priors within the unobservable directions: W·unobservable = left·diag(t)·yt.
+    left, t, yt = np.linalg.svd(weights[:, None] * unobservable)
+    has_prior = t > RANK_RTOL * weights.max(initial=0.0)
+    left, prior_root = left[:, : len(t)][:, has_prior], unobservable @ (yt[has_prior].T / t[has_prior])
+    # What the priors add to the observable directions after the unobservable ones are eliminated.
+    priors = weights[:, None] * observable
+    rows = np.concatenate([np.diag(s[:n_observable]), priors - left @ (left.T @ priors)])
+    data_root = lapack.dtrtri(np.linalg.qr(rows)[1])[0]
+    root = np.concatenate([(observable - prior_root @ (left.T @ priors)) @ data_root, prior_root], 1)
+    return root, unobservable @ np.delete(yt, np.flatnonzero(has_prior), 0).T

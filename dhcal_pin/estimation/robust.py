@@ -1,13 +1,39 @@
-"""Robust losses by reweighting whole samples, with a scale that gross errors do not reach.
+"""Robust losses by iteratively reweighted least squares, and outlier detection.
 
-A sample's squared whitened residuals sum to a χ² of as many degrees as it has rows. The median over the
-samples tells the scale, and the cube root (Wilson and Hilferty) makes of each sum a score that is normal
-for a good sample whatever its number of rows, so that one threshold serves every kind.
+A sample i has k whitened residuals r_i. Its mean square, divided by the scale s² of all samples, is χ²_k/k
+distributed if the sample is good. The cube root of that is nearly normal (Wilson & Hilferty 1931):
+
+    t_i = (∛(‖r_i‖²/(k·s²)) - μ) / √(2/(9k)),     μ = 1 - 2/(9k)
+
+so that one threshold serves every kind of measurement, whatever its k. The scale follows from the median,
+which outliers hardly change: median(χ²_k/k) ≈ μ³.
+
+Each round of iteratively reweighted least squares (IRLS) multiplies the rows of sample i by √w(t_i). The
+tuning constants of the weight functions w keep 95 % of the efficiency on normal errors (Holland & Welsch
+1977):
+
+    Huber    w = min(1, 1.345/t)
+    Cauchy   w = 1/(1 + (t/2.385)²)
+    Tukey    w = (1 - (t/4.685)²)²  for t < 4.685, else 0
+
+With few measurements an outlier pulls the fit towards itself and its own residual looks small. The residuals
+are therefore studentized (Cook & Weisberg 1982): instead of r_iᵀ·r_i, the sum of squares is r_iᵀ·C_i⁻¹·r_i
+with the covariance C_i of the residual in a fit of good samples, which depends on the leverage of sample i.
+
+To add a loss: add its weight function to `WEIGHT_FUNCTIONS` and a row to `LOSSES`. The command line takes
+names and help texts from there.
+
+References:
+    E. B. Wilson and M. M. Hilferty, The Distribution of Chi-Square, PNAS 17, 1931.
+    P. J. Huber, Robust Statistics, Wiley 1981.
+    P. W. Holland and R. E. Welsch, Robust Regression Using Iteratively Reweighted Least-Squares, 1977.
+    R. D. Cook and S. Weisberg, Residuals and Influence in Regression, Chapman & Hall 1982.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -19,176 +45,242 @@ from .problem import CHUNK_SIZE, Chunk, Linearization, Problem, chunk_residual, 
 from .qr import posterior_sqrt_covariance
 from .solver import SolverResult
 
-# Scores beyond this are gross: one good sample in three million.
+# Standardized residual above which a sample is an outlier: one good sample in three million exceeds it.
 OUTLIER_THRESHOLD = 5.0
+# Standardized residual above which loss "auto" rejects a sample. Unmodelled errors of good samples in a far
+# corner of the workspace stay below.
+REJECTION_THRESHOLD = 12.0
+
+# Smallest variance of a whitened residual, relative to its noise; below it the fit reproduces the sample.
+MIN_VARIANCE = 1e-3
+# Ratio of successive weight changes above which the weights oscillate.
+OSCILLATION_RATIO = 0.8
+# Weight of a rejected sample; small enough to have no effect, and not zero so that one can divide by it.
+ZERO_WEIGHT = 1e-12
+# Ratio of unknowns to rows below which leverage is negligible and residuals are not studentized.
+NEGLIGIBLE_LEVERAGE = 0.01
 
 
-def _linear(score: Array) -> Array:
-    return np.ones_like(score)
+def _uniform(t: Array) -> Array:
+    """Return unit weights."""
+    return np.ones_like(t)
 
 
-def _huber(score: Array) -> Array:
-    return 1.345 / np.maximum(score, 1.345)
+def _huber(t: Array) -> Array:
+    """Return the weights of Huber's loss."""
+    return 1.345 / np.maximum(t, 1.345)
 
 
-def _cauchy(score: Array) -> Array:
-    return 1 / (1 + (np.maximum(score, 0) / 2.385) ** 2)
+def _cauchy(t: Array) -> Array:
+    """Return the weights of Cauchy's loss."""
+    return 1 / (1 + (np.maximum(t, 0) / 2.385) ** 2)
 
 
-def _tukey(score: Array) -> Array:
-    return np.maximum(1 - (np.clip(score, 0, 4.685) / 4.685) ** 2, 0) ** 2
+def _tukey(t: Array) -> Array:
+    """Return the weights of Tukey's biweight loss."""
+    return np.maximum(1 - (np.clip(t, 0, 4.685) / 4.685) ** 2, 0) ** 2
 
 
-# Weight of a sample by its score, and the score from which it counts for nothing; the constants keep 95 % of
-# the efficiency on normal errors. Of Huber's weights a constant pull would remain, and a tenth of gross
-# errors cost a quarter of the accuracy. What is left aside unasked must be more than a far corner of the
-# workspace that the model does not bend to.
-WEIGHTS: dict[str, tuple[Callable[[Array], Array], float]] = {
-    "uniform": (_linear, np.inf),
+# Weight function of each stage, and the standardized residual above which its weight is zero. Without that
+# limit Huber's weights would leave a constant pull: a tenth of outliers costs a quarter of the accuracy.
+WEIGHT_FUNCTIONS: dict[str, tuple[Callable[[Array], Array], float]] = {
+    "uniform": (_uniform, np.inf),
     "huber_no_cutoff": (_huber, np.inf),
-    "reject": (_linear, 12.0),
+    "reject": (_uniform, REJECTION_THRESHOLD),
     "huber": (_huber, OUTLIER_THRESHOLD),
     "cauchy": (_cauchy, OUTLIER_THRESHOLD),
     "tukey": (_tukey, OUTLIER_THRESHOLD),
 }
 
 
-# The weights that a loss goes through, each until it has settled. The next ones are for gross errors only:
-# good samples then count in full, after a loss that no single one could draw away has told which they are.
-LOSSES: dict[str, tuple[str, ...]] = {
-    "auto": ("uniform", "huber_no_cutoff", "reject"),
-    "linear": ("uniform",),
-    "huber": ("huber",),
-    "cauchy": ("cauchy",),
-    "tukey": ("tukey",),
+@dataclass(frozen=True)
+class Loss:
+    """Robust loss that a user can choose.
+
+    Attributes:
+        stages: Keys of `WEIGHT_FUNCTIONS`, each used until the weights have settled. Stages after "uniform"
+            are skipped if there are no outliers.
+        help: One line for help texts.
+    """
+
+    stages: tuple[str, ...]
+    help: str
+
+
+# "auto" finds the outliers by a fit with Huber's weights, which a single outlier cannot dominate. It then
+# fits the other samples with unit weights.
+LOSSES: dict[str, Loss] = {
+    "auto": Loss(
+        ("uniform", "huber_no_cutoff", "reject"),
+        f"unit weights; only samples beyond {REJECTION_THRESHOLD:g} standard deviations are rejected",
+    ),
+    "linear": Loss(("uniform",), "unit weights for all samples, outliers included"),
+    "huber": Loss(("huber",), "down-weight beyond 1.345 standard deviations, reject outliers"),
+    "cauchy": Loss(("cauchy",), "down-weight smoothly with the size of the residual, reject outliers"),
+    "tukey": Loss(("tukey",), "down-weight smoothly to zero at 4.685 standard deviations"),
 }
 
 
-# Whitened residuals of less variance than this are the fit's own doing.
-MIN_VARIANCE = 1e-3
-
-
-# Weights that change by more than this share of what they did last are not about to settle.
-OSCILLATION_RATIO = 0.8
-
-
-# A weight of this leaves a sample out without leaving a hole in the arithmetic.
-ZERO_WEIGHT = 1e-12
-
-
-def standardized_residuals(residual: Array, spread: Array | None = None) -> Array:
-    """How far each sample (m,) lies from its kind's scatter: standard normal for good ones.
+def standardized_residuals(residual: Array, covariances: Array | None = None) -> Array:
+    """Compute the standardized residual t of each sample of one measurement.
 
     Args:
-        residual: (k, m) whitened.
-        spread: (m, k, k) its covariances up to a scale; unit ones without it.
+        residual: Whitened residuals of shape (k, m).
+        covariances: Covariance of each sample's whitened residual up to a common factor, shape (m, k, k); the
+            identity if None.
+
+    Returns:
+        Standardized residuals of shape (m,), standard normal for good samples.
     """
     k = len(residual)
-    if spread is None:
+    if covariances is None:
         return standardize_mean_squares(np.sum(residual**2, 0) / k, k)
-    # A reading that the fit meets whatever it is tells nothing.
-    freed = spread + MIN_VARIANCE * np.eye(k)
+    # A residual that the fit makes zero for any measured value must not be divided by its variance.
+    regularized = covariances + MIN_VARIANCE * np.eye(k)
     return standardize_mean_squares(
-        np.sum(residual.T * np.linalg.solve(freed, residual.T[..., None])[..., 0], 1) / k, k
+        np.sum(residual.T * np.linalg.solve(regularized, residual.T[..., None])[..., 0], 1) / k, k
     )
 
 
-def standardize_mean_squares(ratio: Array, k: int) -> Array:
-    """Scores (m,) of mean squares (m,) of k residuals each, against their own median."""
-    middle = 1 - 2 / (9 * k)
-    # The median of χ²_k / k is middle³.
-    scale = np.median(ratio) / middle**3 if len(ratio) else 0.0
+def standardize_mean_squares(mean_squares: Array, k: int) -> Array:
+    """Transform mean squares of residuals to standardized residuals t (Wilson & Hilferty).
+
+    Args:
+        mean_squares: Mean square of the k residuals of each sample, shape (m,).
+        k: Number of residuals per sample.
+
+    Returns:
+        Standardized residuals of shape (m,); zero if the median is zero.
+    """
+    mean = 1 - 2 / (9 * k)
+    # The median of χ²_k/k is mean³.
+    scale = np.median(mean_squares) / mean**3 if len(mean_squares) else 0.0
     if scale <= 0:
-        return np.zeros(len(ratio))
-    return (np.cbrt(ratio / scale) - middle) / np.sqrt(2 / (9 * k))
+        return np.zeros(len(mean_squares))
+    return (np.cbrt(mean_squares / scale) - mean) / np.sqrt(2 / (9 * k))
 
 
-def sample_weights(score: Array, stage: str) -> Array:
-    """Weights (m,) of scores (m,)."""
-    weights, gross = WEIGHTS[stage]
-    return np.maximum(np.where(score > gross, 0.0, weights(score)), ZERO_WEIGHT)
+def sample_weights(t: Array, stage: str) -> Array:
+    """Compute the weights of samples.
+
+    Args:
+        t: Standardized residuals of shape (m,).
+        stage: Key of `WEIGHT_FUNCTIONS`.
+
+    Returns:
+        Weights of shape (m,), at least ZERO_WEIGHT.
+    """
+    weight_function, cutoff = WEIGHT_FUNCTIONS[stage]
+    return np.maximum(np.where(t > cutoff, 0.0, weight_function(t)), ZERO_WEIGHT)
 
 
 def update_weights(
-    previous: Sequence[Array], score: Sequence[Array], stage: str, last_change: float
+    previous: Sequence[Array], residuals: Sequence[Array], stage: str, last_change: float
 ) -> tuple[list[Array], float]:
-    """Weights of each item's samples by their scores, and by how much the largest change is.
+    """Compute the weights of the next round of IRLS.
 
-    Where that is hardly less than the `last`, two sets of weights take turns, and what lies between is next.
+    Weights whose change hardly falls alternate between two sets; their mean is used then.
+
+    Args:
+        previous: Weights of each measurement's samples, shape (m,) each.
+        residuals: Standardized residuals of each measurement, shape (m,) each.
+        stage: Key of `WEIGHT_FUNCTIONS`.
+        last_change: Largest change of a weight in the last round.
+
+    Returns:
+        New weights, and the largest change of a weight.
     """
-    weights = [sample_weights(each, stage) for each in score]
-    moved = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(weights, previous, strict=True))
-    if moved > OSCILLATION_RATIO * last_change:
+    weights = [sample_weights(t, stage) for t in residuals]
+    change = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(weights, previous, strict=True))
+    if change > OSCILLATION_RATIO * last_change:
         weights = [0.5 * (a + b) for a, b in zip(weights, previous, strict=True)]
-    return weights, moved
+    return weights, change
 
 
-def has_possible_outliers(score: Array) -> bool:
-    """Whether gross errors, which hide behind each other, may be among samples of scores (m,)."""
-    return bool((score > OUTLIER_THRESHOLD).any())
+def has_possible_outliers(t: Array) -> bool:
+    """Check for samples beyond the outlier threshold; further outliers may hide behind them.
 
+    Args:
+        t: Standardized residuals of shape (m,).
 
-# Where a row takes so small a share of the unknowns, what it draws to itself does not matter.
-NEGLIGIBLE_LEVERAGE = 0.01
+    Returns:
+        Whether any exceeds OUTLIER_THRESHOLD.
+    """
+    return bool((t > OUTLIER_THRESHOLD).any())
 
 
 def studentized_residuals(
     problem: Problem, solution: SolverResult, data: Sequence[Measurement], weights: Sequence[Array]
 ) -> list[Array]:
-    """How far each sample (m,) of each item lies from its kind's scatter; see `standardized_residuals`.
-
-    Zero where no reading is left over: then the scatter tells nothing.
+    """Compute standardized residuals that are corrected for leverage.
 
     Args:
-        problem: as it was fitted.
-        solution: where that ended.
-        data: the fitted measurements with the sigmas of good samples.
-        weights: (m,) of each item's samples in the fit.
+        problem: Problem as it was solved, with robust weights.
+        solution: Its solution.
+        data: Fitted measurements with the standard deviations of good samples, without robust weights.
+        weights: Robust weights of each measurement's samples in the solution, shape (m,) each.
+
+    Returns:
+        Standardized residuals of each measurement, shape (m,) each. They are zero if there are not more rows
+        than observable directions: residuals do not contain information on the noise then.
     """
-    rows = sum(np.count_nonzero(w > 0.5) * item.residual_dim for item, w in zip(data, weights, strict=True))
-    most = len(solution.x)
-    if rows <= most and rows <= qr.rank(solution.system.r):
+    n_rows = sum(np.count_nonzero(w > 0.5) * item.residual_dim for item, w in zip(data, weights, strict=True))
+    n_unknowns = len(solution.x)
+    if n_rows <= n_unknowns and n_rows <= qr.rank(solution.system.r):
         return [np.zeros(len(item.rows)) for item in data]
     chain = problem.errors.at(solution.x[: len(problem.errors.parameters)])
-    found = problem.with_data(data).map_chunks(
+    chunks = problem.with_data(data).map_chunks(
         partial(chunk_residual, chain, problem.instruments(solution.x))
     )
-    residuals = [np.concatenate([np.empty((item.residual_dim, 0)), *_parts(found, item)], 1) for item in data]
-    spread = (
+    residuals = [
+        np.concatenate([np.empty((item.residual_dim, 0)), *_chunks_of(chunks, item)], 1) for item in data
+    ]
+    covariances = (
         residual_covariances(problem, solution, weights)
-        if most >= NEGLIGIBLE_LEVERAGE * rows
+        if n_unknowns >= NEGLIGIBLE_LEVERAGE * n_rows
         else [None] * len(data)
     )
-    return [standardized_residuals(*both) for both in zip(residuals, spread, strict=True)]
+    return [standardized_residuals(*both) for both in zip(residuals, covariances, strict=True)]
 
 
-def _parts(found: Iterator[Array], item: Measurement) -> Iterator[Array]:
-    """What was found in the chunks of one item."""
+def _chunks_of(results: Iterator[Array], item: Measurement) -> Iterator[Array]:
+    """Yield the next results that belong to one measurement."""
     for _ in range(0, len(item.rows), CHUNK_SIZE):
-        yield next(found)
+        yield next(results)
 
 
 def residual_covariances(problem: Problem, solution: SolverResult, weights: Sequence[Array]) -> list[Array]:
-    """Covariances (m, k, k) of each item's whitened residuals in a fit of good readings.
+    """Compute the covariance of each sample's whitened residual in a fit of good samples.
 
-    A sample that takes part lies nearer to the fit than its sigma, by what it draws the fit to itself; one
-    that counts for nothing lies farther, by how little the others know there.
+    With the whitened Jacobian J_i of sample i, its weight w_i, the covariance C of the unknowns and
+    H_i = J_i·C·J_iᵀ, the covariance is I + (1 - 2·w_i)·H_i. A sample of weight 1 has less than unit
+    covariance, I - H_i, as it pulls the fit towards itself. A rejected sample has more, I + H_i, as the fit
+    is uncertain there.
+
+    Args:
+        problem: Problem as it was solved, with robust weights.
+        solution: Its solution.
+        weights: Robust weights of each measurement's samples in the solution, shape (m,) each.
+
+    Returns:
+        Covariances of each measurement, shape (m, k, k) each.
     """
-    # The loop's last triangle is of a step before, where other directions are unseen, which the wide priors
-    # of frames and instruments make far of: its covariance would not go with these rows.
+    # `solution.system` was linearized one step earlier, where other directions may be unobservable. With the
+    # wide priors of frames and instruments its covariance would then not fit these rows.
     root = posterior_sqrt_covariance(
         linearize_and_factor(problem, solution.x, small_angle=False), problem.weights
     )[0]
-    found = problem.map_chunks(partial(_prediction_covariance, problem.linearize(solution.x), root))
+    chunks = problem.map_chunks(partial(_prediction_covariance, problem.linearize(solution.x), root))
     out = []
     for item, weight in zip(problem.data, weights, strict=True):
-        parts = [np.empty((0, item.residual_dim, item.residual_dim)), *_parts(found, item)]
+        parts = [np.empty((0, item.residual_dim, item.residual_dim)), *_chunks_of(chunks, item)]
+        # The rows of the problem are scaled by √w, so that the parts are w·H.
         w = weight[:, None, None]
         out.append(np.eye(item.residual_dim) + (1 - 2 * w) * np.concatenate(parts) / w)
     return out
 
 
-def _prediction_covariance(tangent: Linearization, root: Array, chunk: Chunk) -> Array:
-    """What is not known of a chunk's whitened readings: covariances (m, k, k)."""
-    known = np.tensordot(root, tangent.rows(chunk)[:-1], (0, 0))
-    return np.einsum("rim,rjm->mij", known, known)
+def _prediction_covariance(linearization: Linearization, root: Array, chunk: Chunk) -> Array:
+    """Compute w_i·J_i·C·J_iᵀ of each sample of a chunk, shape (m, k, k), from a square root of C."""
+    rows = np.tensordot(root, linearization.rows(chunk)[:-1], (0, 0))
+    return np.einsum("rim,rjm->mij", rows, rows)

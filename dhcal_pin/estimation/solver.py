@@ -1,6 +1,36 @@
-"""Least squares on one small triangle: the paper's pseudo-inverse loop, and Levenberg-Marquardt.
+"""Nonlinear least squares: Levenberg-Marquardt and Gauss-Newton on a triangular system.
 
-Step, rank and predicted cost come from the triangle of a `problem`.
+Both methods minimize over the p unknowns x the cost
+
+    F(x) = ‖r(x)‖² + ‖W·x‖²
+
+with whitened residuals r and prior weights W = diag(1/σ). At each x all samples are reduced to a triangular
+system (module `qr`) with ‖r(x + δ)‖² ≈ ‖R·δ - z‖² + min_cost; the prior rows δ/σ = -x/σ are appended to it.
+The steps work on this (p+1)×(p+1) matrix only.
+
+**Levenberg-Marquardt** (Nocedal & Wright 2006, chapter 10). A step solves
+
+    min ‖R·δ - z‖² + λ·‖D·δ‖²        low ≤ x + δ ≤ high
+
+where D holds the largest norms so far of the columns of R (Moré 1978), so that the steps do not depend on the
+units. The gain ratio ρ of actual over predicted reduction decides on acceptance and on the next damping λ
+(Nielsen 1999); `solver_rules` states the rules. A rejected step keeps R and costs one evaluation of F. The
+first trial of an iteration is mostly accepted; it is therefore linearized at once, which also yields F.
+
+In a narrow curved valley damped steps downhill become tiny, while undamped Gauss-Newton steps first go
+uphill and then arrive at the minimum. From time to time, and when only damped steps have become negligible,
+a series of undamped steps is tried, and kept if the cost falls.
+
+The iteration has converged if a step changes the rows by less than 1e-8 of their norm, or by less than
+rounding, at small damping.
+
+**Gauss-Newton** is the iteration of the paper, equations (36) to (39): x ← x + R⁺·z with a pseudo-inverse of
+fixed rank cut, without damping.
+
+References:
+    J. Nocedal and S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006.
+    J. J. Moré, The Levenberg-Marquardt Algorithm: Implementation and Theory, Springer LNM 630, 1978.
+    H. B. Nielsen, Damping Parameter in Marquardt's Method, IMM-REP-1999-05, DTU 1999.
 """
 
 from __future__ import annotations
@@ -8,111 +38,61 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from .._typing import Array
-from ..exceptions import DhcalError
+from ..exceptions import ConvergenceError, UnknownNameError
+from . import solver_rules as rules
 from .problem import Problem, linearize_and_factor
-from .qr import TriangularSystem, append_priors, append_rows, pseudo_inverse
+from .qr import (
+    TriangularSystem,
+    append_priors,
+    append_rows,
+    euclidean_norm,
+    pseudo_inverse,
+    sum_of_squares,
+)
+from .solver_rules import has_diverged, step_is_negligible
 
+# Receives the iteration number and the cost.
 Progress = Callable[[int, float], None]
 
-
-# A step is the last one when it changes the rows by less than this share of what they are, or by no more
-# than the rounding of the model, as a share of the Jacobian's size.
-STEP_RTOL, EPS_MODEL = 1e-8, 1e-15
-
-
-# With so small a step ahead sigmas and priors can be told as well as at the end of the loop.
-LOOSE_XTOL = 0.1
-
-
-# After so many damped steps Gauss-Newton tries to get farther in a few, and again after twice as many.
-UNDAMPED_INTERVAL, N_UNDAMPED_STEPS = 8, 6
-
-
-# An error of so many metres or radians is no error any more.
-DIVERGENCE_LIMIT = 1e6
-
-
-def bounded_step(problem: Problem, triangle: TriangularSystem, x: Array) -> Array:
-    """The least-squares step from x (p,) that stays within the problem's bounds."""
-    if problem.bounds is None:
-        return pseudo_inverse(triangle.r, triangle.z)
-    # Loaded where it is needed: it takes longer than most calibrations.
-    from scipy.optimize import lsq_linear
-
-    scale = np.linalg.norm(triangle.r, axis=0)
-    scale[scale == 0] = 1.0
-    low, high = (problem.bounds - x) * scale
-    # Bounds of no width are not allowed there; a step may touch one.
-    found = lsq_linear(triangle.r / scale, triangle.z, (low - 1e-15 * scale, high + 1e-15 * scale), "bvls")
-    return np.clip(found.x, low, high) / scale
-
-
-def _sum_of_squares(a: Array) -> float:
-    """Sum of squares."""
-    return float(np.vdot(a, a))
-
-
-def _norm(a: Array) -> float:
-    """Root of the sum of squares."""
-    return math.sqrt(_sum_of_squares(a))
-
-
-def _residual_change(r: Array, step: Array) -> float:
-    """How far a step moves the whitened rows."""
-    return _norm(r @ step)
-
-
-def _cost(problem: Problem, triangle: TriangularSystem, x: Array) -> float:
-    """Sum of squared whitened residuals and priors at x (p,), given the data's triangle there."""
-    return triangle.cost + _sum_of_squares(problem.weights * x)
-
-
-def _step_is_negligible(
-    r: Array, change: float, cost: float, last_change: float = 0.0, relative: float = STEP_RTOL
-) -> bool:
-    """Whether the rows will not move by anything that matters after a step that moves them by `change`.
-
-    Near the end steps shrink quadratically: where this one is far smaller than the `last` (zero where
-    nothing is known of it), the next one shrinks at least as much.
-    """
-    enough = relative * math.sqrt(cost)
-    shrunk = change < 1e-2 * last_change and change * change < 0.1 * enough * last_change
-    return change <= enough or shrunk or change <= EPS_MODEL * _norm(r)
-
-
-def _is_stationary(
-    problem: Problem,
-    undamped: TriangularSystem,
-    x: Array,
-    cost: float,
-    last: float,
-    relative: float = STEP_RTOL,
-) -> bool:
-    """Whether a plain step from x would not matter either; a damped one may be tiny in a narrow valley."""
-    # No step moves the rows farther than all that is left.
-    if problem.bounds is None and _step_is_negligible(undamped.r, _norm(undamped.z), cost, last, relative):
-        return True
-    return _step_is_negligible(
-        undamped.r, _residual_change(undamped.r, bounded_step(problem, undamped, x)), cost, last, relative
-    )
+# A loose solution ends when a step changes the rows by less than this fraction of their norm. Noise scales
+# and prior widths estimated there agree with those at the minimum.
+LOOSE_RTOL = 0.1
+# Width [m or rad] by which bounds are relaxed: the bounded solver does not accept an interval of zero width.
+BOUND_TOL = 1e-15
 
 
 @dataclass(frozen=True, eq=False)
 class DampingState:
-    """How far a loop trusts a triangle by now: damping, scales (p,), how far the last step moved the rows."""
+    """State of a Levenberg-Marquardt iteration that a continuation starts from.
 
-    damping: float = 1e-8
+    Attributes:
+        damping: Damping λ.
+        scale: Column scales D of shape (p,), the largest norms of the columns of R so far.
+        last_change: Norm of the change of the rows by the last step; zero if unknown.
+    """
+
+    damping: float = rules.INITIAL_DAMPING
     scale: Array | float = 0.0
     last_change: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class SolverResult:
-    """Where a loop ended: x (p,), the data's triangle there, iterations, every x on the way, its trust."""
+    """Result of `minimize`.
+
+    Attributes:
+        x: Solution of shape (p,) [m and rad].
+        system: Triangular system of the data at x, without priors.
+        iterations: Number of iterations.
+        converged: Whether the last step was negligible.
+        iterates: All x from the start to the solution, shape (iterations + 1, p).
+        damping_state: State to continue from (`warm_start`).
+    """
 
     x: Array
     system: TriangularSystem
@@ -122,132 +102,251 @@ class SolverResult:
     damping_state: DampingState = DampingState()
 
 
-def gauss_newton(problem: Problem, x: Array, max_iterations: int, progress: Progress | None) -> SolverResult:
-    """The paper's loop (37) to (39): x ← x + R⁺·DX with a rank-revealing pseudo-inverse.
+def minimize(
+    problem: Problem,
+    method: str = "lm",
+    x: Array | None = None,
+    max_iterations: int = 100,
+    progress: Progress | None = None,
+    **options: Any,
+) -> SolverResult:
+    """Minimize the cost of a problem.
 
-    Rotation errors are (36) and the derivative is R itself, as printed. Priors join only if given.
+    Args:
+        problem: Least-squares problem in p unknowns.
+        method: Key of METHODS: "lm" for `levenberg_marquardt`, "gn" for `gauss_newton`.
+        x: Starting point of shape (p,) [m and rad]; zero, the nominal robot, by default.
+        max_iterations: Largest number of iterations.
+        progress: Called after each iteration with its number and the cost.
+        **options: Further arguments of the method.
+
+    Returns:
+        Solution with the triangular system there.
+
+    Raises:
+        UnknownNameError: If the method is unknown.
     """
-    path, converged, done = [x], False, 0
-    while done < max_iterations and not converged:
-        triangle = linearize_and_factor(problem, x, small_angle=True)
-        full = append_priors(triangle, problem.weights, x)
-        step = pseudo_inverse(full.r, full.z)
-        cost = full.min_cost + float(full.z @ full.z)
-        converged = _step_is_negligible(full.r, _residual_change(full.r, step), cost)
+    if method not in METHODS:
+        raise UnknownNameError(f"unknown method {method!r}; choose from {', '.join(METHODS)}")
+    start = np.zeros(len(problem.weights)) if x is None else x
+    return METHODS[method](problem, start, max_iterations, progress, **options)
+
+
+def bounded_step(problem: Problem, system: TriangularSystem, x: Array) -> Array:
+    """Compute the least-squares step that stays within the bounds of a problem.
+
+    Args:
+        problem: Problem with or without bounds.
+        system: Triangular system at x, with priors and damping.
+        x: Current point of shape (p,) [m and rad].
+
+    Returns:
+        Step δ of shape (p,) [m and rad].
+    """
+    if problem.bounds is None:
+        return pseudo_inverse(system.r, system.z)
+    # lazy import: scipy.optimize takes longer to import than most calibrations take.
+    from scipy.optimize import lsq_linear
+
+    scale = np.linalg.norm(system.r, axis=0)
+    scale[scale == 0] = 1.0
+    low, high = (problem.bounds - x) * scale
+    relaxed = low - BOUND_TOL * scale, high + BOUND_TOL * scale
+    scaled = lsq_linear(system.r / scale, system.z, relaxed, "bvls").x
+    return np.clip(scaled, low, high) / scale
+
+
+def next_iterate(problem: Problem, solution: SolverResult) -> Array:
+    """Compute the point that one undamped step reaches from a loose solution.
+
+    Args:
+        problem: Problem that was solved.
+        solution: Its solution.
+
+    Returns:
+        Point of shape (p,) [m and rad].
+    """
+    system = append_priors(solution.system, problem.weights, solution.x)
+    return solution.x + bounded_step(problem, system, solution.x)
+
+
+def _cost(problem: Problem, system: TriangularSystem, x: Array) -> float:
+    """Compute the cost at x from the triangular system of the data there."""
+    return system.cost + sum_of_squares(problem.weights * x)
+
+
+def _is_stationary(
+    problem: Problem,
+    undamped: TriangularSystem,
+    x: Array,
+    cost: float,
+    last_change: float,
+    roundoff: float,
+    rtol: float = rules.STEP_RTOL,
+) -> bool:
+    """Check that the undamped step from x is negligible, too; damping alone may shorten a step."""
+    residual_norm = math.sqrt(cost)
+    # No step changes the rows by more than ‖z‖.
+    max_change = euclidean_norm(undamped.z)
+    if problem.bounds is None and step_is_negligible(max_change, residual_norm, last_change, roundoff, rtol):
+        return True
+    change = euclidean_norm(undamped.residual_change(bounded_step(problem, undamped, x)))
+    return step_is_negligible(change, residual_norm, last_change, roundoff, rtol)
+
+
+def gauss_newton(
+    problem: Problem, x: Array, max_iterations: int, progress: Progress | None = None
+) -> SolverResult:
+    """Minimize by undamped steps with a pseudo-inverse: the paper's iteration, equations (37) to (39).
+
+    Rotation errors are those of equation (36), and the Jacobian is the paper's matrix as printed.
+
+    Args:
+        problem: Least-squares problem in p unknowns; its bounds are ignored.
+        x: Starting point of shape (p,) [m and rad].
+        max_iterations: Largest number of iterations.
+        progress: Called after each iteration with its number and the cost before it.
+
+    Returns:
+        Solution; its triangular system is that of the exact residuals.
+
+    Raises:
+        ConvergenceError: If the iteration diverges.
+    """
+    iterates, converged, iteration = [x], False, 0
+    while iteration < max_iterations and not converged:
+        data = linearize_and_factor(problem, x, small_angle=True)
+        system = append_priors(data, problem.weights, x)
+        step = pseudo_inverse(system.r, system.z)
+        cost = system.min_cost + float(system.z @ system.z)
+        change = euclidean_norm(system.residual_change(step))
+        converged = step_is_negligible(change, math.sqrt(cost), 0.0, system.roundoff)
         x = x + step
-        path.append(x)
-        done += 1
+        iterates.append(x)
+        iteration += 1
         if progress:
-            progress(done, cost)
-        if not np.abs(x).max() < DIVERGENCE_LIMIT:
-            raise DhcalError("the loop diverged; use --method lm, more poses, or fix parameters")
-    return SolverResult(
-        x, linearize_and_factor(problem, x, small_angle=False), done, converged, np.array(path)
-    )
+            progress(iteration, cost)
+        if has_diverged(x):
+            raise ConvergenceError(
+                "method gn: the iteration diverged; use --method lm, more poses, or fix parameters"
+            )
+    system = linearize_and_factor(problem, x, small_angle=False)
+    return SolverResult(x, system, iteration, converged, np.array(iterates))
 
 
 def _undamped_steps(problem: Problem, x: Array, cost: float) -> tuple[Array, float]:
-    """A few plain Gauss-Newton steps, uphill ones too; where they end if that is lower, else x."""
-    far, ends = x, math.inf
-    for _ in range(N_UNDAMPED_STEPS):
-        triangle = append_priors(linearize_and_factor(problem, far, small_angle=False), problem.weights, far)
-        there = far + bounded_step(problem, triangle, far)
-        if not np.abs(there).max() < DIVERGENCE_LIMIT:
+    """Try a series of undamped steps, also uphill; return its end and the cost there if that is lower."""
+    end, end_cost = x, math.inf
+    for _ in range(rules.N_UNDAMPED_STEPS):
+        data = linearize_and_factor(problem, end, small_angle=False)
+        trial = end + bounded_step(problem, append_priors(data, problem.weights, end), end)
+        if has_diverged(trial):
             break
-        far, ends = there, problem.cost(there)
-    return (far, ends) if ends < cost else (x, cost)
+        end, end_cost = trial, problem.cost(trial)
+    return (end, end_cost) if end_cost < cost else (x, cost)
 
 
 def levenberg_marquardt(
     problem: Problem,
     x: Array,
     max_iterations: int,
-    progress: Progress | None,
+    progress: Progress | None = None,
     warm_start: SolverResult | None = None,
     loose: bool = False,
 ) -> SolverResult:
-    """Levenberg-Marquardt; a retry costs forward kinematics only, the triangle stays.
+    """Minimize by damped steps (see the module docstring).
 
-    Along a narrow valley that bends, damped steps downhill are tiny and Gauss-Newton's, far uphill at
-    first, arrive: now and then it may try, and at once where a damped step is so small that it looks like
-    the end and a plain one is not. A loop on the same data that was `before` goes on. Who needs no more than
-    where it `nearly` ends gets that, unconverged.
+    Args:
+        problem: Least-squares problem in p unknowns.
+        x: Starting point of shape (p,) [m and rad].
+        max_iterations: Largest number of iterations, those of `warm_start` included.
+        progress: Called after each iteration with its number and the cost.
+        warm_start: Solution at x of a problem with the same data, possibly with other priors. Its triangular
+            system and damping are used, and its iterations are continued.
+        loose: Stop as soon as LOOSE_RTOL is met; the result is then reported as not converged.
+
+    Returns:
+        Solution with the triangular system there.
     """
-    trust = warm_start.damping_state if warm_start else DampingState()
-    damping, scale, last = trust.damping, trust.scale, trust.last_change
-    path, done = (list(warm_start.iterates), warm_start.iterations) if warm_start else ([x], 0)
-    growth, converged, leapt = 2.0, False, 0
-    triangle = warm_start.system if warm_start else linearize_and_factor(problem, x, small_angle=False)
-    cost = _cost(problem, triangle, x)
-    while done < max_iterations and not converged and damping <= 1e16:
-        start, reached = x, None
-        free = append_priors(triangle, problem.weights, x)
-        scale = np.maximum(scale, np.sqrt(np.einsum("ij,ij->j", free.r, free.r)))
-        floor = np.where(scale > 0, scale, 1.0)
-        rounding = EPS_MODEL * _norm(free.r)
-        # Where all that is left to gain is rounding, costs tell nothing and the step is to be trusted.
-        blur = (10 * rounding) ** 2 + 2 * rounding * math.sqrt(cost)
-        creeping = False
-        done += 1
+    state = warm_start.damping_state if warm_start else DampingState()
+    damping, scale, last_change = state.damping, state.scale, state.last_change
+    iterates, iteration = (list(warm_start.iterates), warm_start.iterations) if warm_start else ([x], 0)
+    growth, converged, last_undamped = rules.INITIAL_GROWTH, False, 0
+    system = warm_start.system if warm_start else linearize_and_factor(problem, x, small_angle=False)
+    cost = _cost(problem, system, x)
+    while iteration < max_iterations and not converged and damping <= rules.MAX_DAMPING:
+        start, accepted_system = x, None
+        undamped = append_priors(system, problem.weights, x)
+        scale = np.maximum(scale, np.sqrt(np.einsum("ij,ij->j", undamped.r, undamped.r)))
+        damping_scale = np.where(scale > 0, scale, 1.0)
+        roundoff, residual_norm = undamped.roundoff, math.sqrt(cost)
+        # Whether steps have become negligible although the undamped step is not.
+        stalled = False
+        iteration += 1
         while True:
-            damped = append_rows(free, np.sqrt(damping) * floor, np.zeros(len(x)))
+            damped = append_rows(undamped, math.sqrt(damping) * damping_scale, np.zeros(len(x)))
             step = bounded_step(problem, damped, x)
-            change = _residual_change(free.r, step)
-            if loose and damping < 1e-3 and _step_is_negligible(free.r, change, cost, last, LOOSE_XTOL):
-                if _is_stationary(problem, free, x, cost, last, LOOSE_XTOL):
-                    return SolverResult(
-                        x, triangle, done - 1, False, np.array(path), DampingState(damping, scale, last)
-                    )
-                creeping = leapt == 0
-            settled = _step_is_negligible(free.r, change, cost, last)
-            expected = _sum_of_squares(free.z) - _sum_of_squares(free.r @ step - free.z)
-            ahead = None
-            if settled and expected <= blur:
-                trial = max(cost - expected, 0.0)
-            elif not settled and growth == 2.0:
-                # A first try mostly holds, and its triangle, which the next step needs, tells its cost too.
-                ahead = linearize_and_factor(problem, x + step, small_angle=False)
-                trial = _cost(problem, ahead, x + step)
+            row_change = undamped.residual_change(step)
+            change = euclidean_norm(row_change)
+            if (
+                loose
+                and damping < rules.MAX_CONVERGED_DAMPING
+                and step_is_negligible(change, residual_norm, last_change, roundoff, LOOSE_RTOL)
+            ):
+                if _is_stationary(problem, undamped, x, cost, last_change, roundoff, LOOSE_RTOL):
+                    state = DampingState(damping, scale, last_change)
+                    return SolverResult(x, system, iteration - 1, False, np.array(iterates), state)
+                stalled = last_undamped == 0
+            is_negligible = step_is_negligible(change, residual_norm, last_change, roundoff)
+            predicted = undamped.predicted_reduction(row_change)
+            trial_system = None
+            if is_negligible and predicted <= rules.cost_roundoff(residual_norm, roundoff):
+                # Costs cannot verify a reduction below rounding; the linear model is trusted.
+                trial_cost = max(cost - predicted, 0.0)
+            elif not is_negligible and growth == rules.INITIAL_GROWTH:
+                # First trial of the iteration: the next iteration needs its linearization.
+                trial_system = linearize_and_factor(problem, x + step, small_angle=False)
+                trial_cost = _cost(problem, trial_system, x + step)
             else:
-                trial = problem.cost(x + step)
-            gain = (cost - trial) / expected if expected > 0 else 0.0
-            trusted = expected <= blur and trial <= (math.sqrt(cost) + 10 * rounding) ** 2
-            if trusted or (trial <= cost and gain > 1e-3):
-                easier = 1e-2 if trusted or gain > 0.9 else max(1e-3, 1 - (2 * gain - 1) ** 3)
-                damping *= easier
-                damping, growth = max(damping, 1e-16), 2.0
-                x, cost, converged, reached = x + step, trial, settled and damping < 1e-3, ahead
+                trial_cost = problem.cost(x + step)
+            gain = rules.gain_ratio(cost, trial_cost, predicted)
+            within_roundoff = rules.is_within_roundoff(predicted, trial_cost, residual_norm, roundoff)
+            if rules.is_acceptable(cost, trial_cost, gain, within_roundoff):
+                damping = rules.damping_after_acceptance(damping, gain, within_roundoff)
+                growth = rules.INITIAL_GROWTH
+                converged = is_negligible and damping < rules.MAX_CONVERGED_DAMPING
+                x, cost, accepted_system = x + step, trial_cost, trial_system
                 break
-            if settled or damping > 1e16:
-                # Nothing left to gain beyond rounding.
-                converged = settled
+            if is_negligible or damping > rules.MAX_DAMPING:
+                # No reduction beyond rounding is left.
+                converged = is_negligible
                 break
-            damping, growth = damping * growth, growth * 2
-        if converged and leapt == 0 and not _is_stationary(problem, free, start, cost, last):
-            creeping, converged = True, False
-        if not converged and (creeping or done >= max(UNDAMPED_INTERVAL, 2 * leapt)):
-            leapt = done
-            x, cost, reached = *_undamped_steps(problem, x, cost), None
-        # Only whole steps show how fast they shrink.
-        last = change if x is not start and growth == 2.0 else 0.0
-        path.append(x)
+            damping, growth = rules.damping_after_rejection(damping, growth)
+        if (
+            converged
+            and last_undamped == 0
+            and not _is_stationary(problem, undamped, start, cost, last_change, roundoff)
+        ):
+            stalled, converged = True, False
+        if not converged and (stalled or rules.undamped_steps_are_due(iteration, last_undamped)):
+            last_undamped = iteration
+            x, cost = _undamped_steps(problem, x, cost)
+            accepted_system = None
+        # Unknown if x did not move, or only by undamped steps after a rejection.
+        last_change = change if x is not start and growth == rules.INITIAL_GROWTH else 0.0
+        iterates.append(x)
         if progress:
-            progress(done, cost)
+            progress(iteration, cost)
         if converged:
-            # Too small a step to bend the model.
-            triangle = triangle.recentered(x - start)
+            # The model is linear over a negligible step.
+            system = system.recentered(x - start)
         elif x is not start:
-            triangle = reached or linearize_and_factor(problem, x, small_angle=False)
-    return SolverResult(x, triangle, done, converged, np.array(path), DampingState(damping, scale, last))
+            system = accepted_system or linearize_and_factor(problem, x, small_angle=False)
+    state = DampingState(damping, scale, last_change)
+    return SolverResult(x, system, iteration, converged, np.array(iterates), state)
 
 
-def next_iterate(problem: Problem, solution: SolverResult) -> Array:
-    """Where the least-squares step leads (p,) from where a loop nearly ended."""
-    full = append_priors(solution.system, problem.weights, solution.x)
-    return solution.x + bounded_step(problem, full, solution.x)
-
-
-METHODS: dict[str, Callable[[Problem, Array, int, Progress | None], SolverResult]] = {
+METHODS: dict[str, Callable[..., SolverResult]] = {
     "lm": levenberg_marquardt,
     "gn": gauss_newton,
 }

@@ -199,7 +199,7 @@ def test_what_does_not_go_together_is_said(sim_6dof):
         BatchProblem(ChainBatch.from_models([errors] * 2), (pose,), np.zeros(24))
     with pytest.raises(DhcalError, match="arm 2 has other joints or other parameters"):
         ChainBatch.from_models([errors, select_parameters(sim_6dof, "minimal")])
-    with pytest.raises(DhcalError, match="calibrate one by one"):
+    with pytest.raises(DhcalError, match="calibrate such arms one by one"):
         ChainBatch.from_models([select_parameters(sim_6dof, "dh,gain")])
     with pytest.raises(DhcalError, match="choose from lm, gn"):
         solve_batch(BatchProblem(ChainBatch.from_models([errors]), (pose,), np.zeros(24)), "newton")

@@ -1,0 +1,229 @@
+"""Step rules of the solvers: acceptance, damping and termination of a Levenberg-Marquardt iteration.
+
+Both solvers decide by these rules: `solver` for one problem, with Python floats, and `batch` for many
+problems in lockstep, with one array element per problem. Each rule is one expression that serves both.
+
+Notation of one iteration, with the triangular system ‖R·δ - z‖² + min_cost at the current x:
+
+- δ: trial step, minimizes ‖R·δ - z‖² + λ·‖D·δ‖² with damping λ and column scales D,
+- F: cost at x; √F is the norm of all whitened rows,
+- F₊: cost at x + δ,
+- ‖R·δ‖: change of the whitened rows,
+- predicted reduction: ‖z‖² - ‖R·δ - z‖²,
+- gain ratio: ρ = (F - F₊) / predicted reduction,
+- roundoff: ε = EPS_MODEL·‖R‖, the rounding error of the model's rows.
+
+Acceptance: F₊ ≤ F and ρ > MIN_GAIN_RATIO, or both costs agree within rounding.
+
+Damping (Nielsen 1999): after an accepted step λ ← λ·max(MIN_DAMPING_FACTOR, 1 - (2ρ - 1)³), after a
+rejected one λ ← λ·ν and ν ← 2·ν.
+
+Termination: the step is negligible (`step_is_negligible`) and λ < MAX_CONVERGED_DAMPING.
+
+References:
+    J. Nocedal and S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, chapters 4 and 10.
+    H. B. Nielsen, Damping Parameter in Marquardt's Method, IMM-REP-1999-05, DTU 1999.
+"""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+import numpy as np
+
+from .._typing import Array
+
+# A step is negligible if it changes the rows by less than this fraction of their norm.
+STEP_RTOL = 1e-8
+# Rounding error of the model's rows as a fraction of the norm of the Jacobian.
+EPS_MODEL = 1e-15
+# Safety factor on the rounding error where two costs are compared.
+ROUNDOFF_FACTOR = 10
+# A step that is shorter than the previous one by this ratio indicates quadratic convergence.
+MAX_QUADRATIC_RATIO = 1e-2
+
+# Smallest gain ratio of an accepted step.
+MIN_GAIN_RATIO = 1e-3
+# Gain ratio above which the linear model is accurate; the damping then falls by GOOD_STEP_FACTOR.
+GOOD_GAIN_RATIO = 0.9
+GOOD_STEP_FACTOR = 1e-2
+# Smallest factor by which an accepted step changes the damping.
+MIN_DAMPING_FACTOR = 1e-3
+
+# Damping of the first iteration, relative to the squared column norms of R, and its limits.
+INITIAL_DAMPING = 1e-8
+MIN_DAMPING = 1e-16
+MAX_DAMPING = 1e16
+# Largest damping at which a negligible step means convergence; above it damping alone may shorten the step.
+MAX_CONVERGED_DAMPING = 1e-3
+# Factor ν on the damping after the first rejected step; it doubles with each further rejection.
+INITIAL_GROWTH = 2.0
+
+# Iterations before the first series of undamped steps, and number of steps in a series.
+UNDAMPED_INTERVAL = 8
+N_UNDAMPED_STEPS = 6
+
+# Absolute value of a parameter error [m or rad] above which an iteration has diverged.
+DIVERGENCE_LIMIT = 1e6
+
+# A float for one problem, or an array of shape (b,) for b problems.
+_Number = TypeVar("_Number", float, Array)
+
+
+def _select(condition: Any, if_true: Any, if_false: Any) -> Any:
+    """Return one of two values, elementwise if the condition is an array."""
+    # A Python conditional takes 0.1 µs, np.where on floats 2 µs.
+    if isinstance(condition, np.ndarray):
+        return np.where(condition, if_true, if_false)
+    return if_true if condition else if_false
+
+
+def step_is_negligible(
+    change: _Number, residual_norm: _Number, last_change: _Number, roundoff: _Number, rtol: float = STEP_RTOL
+) -> Any:
+    """Decide whether a step changes the whitened rows by a negligible amount.
+
+    Three cases are negligible: the change is below a fraction of the rows' norm, or below the rounding error
+    of the model, or steps shrink quadratically and the next change will be below that fraction.
+
+    Args:
+        change: Change of the rows by the step, ‖R·δ‖.
+        residual_norm: Norm √F of the rows before the step.
+        last_change: Change of the rows by the previous step; zero if unknown.
+        roundoff: Rounding error ε of the rows.
+        rtol: Fraction of `residual_norm` that is negligible.
+
+    Returns:
+        A flag, or an array of flags for arrays.
+    """
+    tolerance = rtol * residual_norm
+    is_quadratic = (change < MAX_QUADRATIC_RATIO * last_change) & (
+        change * change < 0.1 * tolerance * last_change
+    )
+    return (change <= tolerance) | is_quadratic | (change <= roundoff)
+
+
+def cost_roundoff(residual_norm: _Number, roundoff: _Number) -> _Number:
+    """Compute the rounding error of a cost.
+
+    A predicted reduction below this value cannot be verified by comparing costs.
+
+    Args:
+        residual_norm: Norm √F of the rows.
+        roundoff: Rounding error ε of the rows.
+
+    Returns:
+        Rounding error of F.
+    """
+    return (ROUNDOFF_FACTOR * roundoff) ** 2 + 2 * roundoff * residual_norm
+
+
+def is_within_roundoff(
+    predicted_reduction: _Number, trial_cost: _Number, residual_norm: _Number, roundoff: _Number
+) -> Any:
+    """Decide whether the costs before and after a step agree within rounding.
+
+    Args:
+        predicted_reduction: Reduction of the cost that the linear model predicts.
+        trial_cost: Cost F₊ after the step.
+        residual_norm: Norm √F of the rows before the step.
+        roundoff: Rounding error ε of the rows.
+
+    Returns:
+        A flag, or an array of flags for arrays.
+    """
+    max_cost = (residual_norm + ROUNDOFF_FACTOR * roundoff) ** 2
+    return (predicted_reduction <= cost_roundoff(residual_norm, roundoff)) & (trial_cost <= max_cost)
+
+
+def gain_ratio(cost: _Number, trial_cost: _Number, predicted_reduction: _Number) -> _Number:
+    """Compute the actual over the predicted reduction of the cost.
+
+    Args:
+        cost: Cost F before the step.
+        trial_cost: Cost F₊ after the step.
+        predicted_reduction: Reduction that the linear model predicts.
+
+    Returns:
+        Gain ratio ρ; zero if no reduction is predicted.
+    """
+    is_descent = predicted_reduction > 0
+    return _select(is_descent, (cost - trial_cost) / _select(is_descent, predicted_reduction, 1.0), 0.0)
+
+
+def is_acceptable(cost: _Number, trial_cost: _Number, gain: _Number, within_roundoff: Any) -> Any:
+    """Decide whether a step is accepted.
+
+    Args:
+        cost: Cost F before the step.
+        trial_cost: Cost F₊ after the step.
+        gain: Gain ratio ρ of the step.
+        within_roundoff: Result of `is_within_roundoff`.
+
+    Returns:
+        A flag, or an array of flags for arrays.
+    """
+    return within_roundoff | ((trial_cost <= cost) & (gain > MIN_GAIN_RATIO))
+
+
+def damping_after_acceptance(damping: _Number, gain: _Number, within_roundoff: Any) -> _Number:
+    """Compute the damping that follows an accepted step.
+
+    Args:
+        damping: Damping λ of the accepted step.
+        gain: Gain ratio ρ of the step.
+        within_roundoff: Result of `is_within_roundoff`; the gain ratio is then meaningless.
+
+    Returns:
+        Damping of the next step.
+    """
+    # Clipping changes no result, and keeps the cube of a meaningless gain ratio from overflowing.
+    clipped = _select(gain > 1.0, 1.0, _select(gain > 0.0, gain, 0.0))
+    cubic = 1 - (2 * clipped - 1) ** 3
+    factor = _select(
+        within_roundoff | (gain > GOOD_GAIN_RATIO),
+        GOOD_STEP_FACTOR,
+        _select(cubic > MIN_DAMPING_FACTOR, cubic, MIN_DAMPING_FACTOR),
+    )
+    reduced = damping * factor
+    return _select(reduced > MIN_DAMPING, reduced, MIN_DAMPING)
+
+
+def damping_after_rejection(damping: _Number, growth: _Number) -> tuple[_Number, _Number]:
+    """Compute the damping and its growth factor that follow a rejected step.
+
+    Args:
+        damping: Damping λ of the rejected step.
+        growth: Growth factor ν.
+
+    Returns:
+        New damping and new growth factor.
+    """
+    return damping * growth, growth * 2
+
+
+def undamped_steps_are_due(iteration: Any, last_undamped: Any) -> Any:
+    """Decide whether a series of undamped steps is tried after this iteration.
+
+    The first series follows UNDAMPED_INTERVAL iterations, each further one twice as many as the last.
+
+    Args:
+        iteration: Number of iterations so far.
+        last_undamped: Iteration of the last series; zero if there was none.
+
+    Returns:
+        A flag, or an array of flags for arrays.
+    """
+    return (iteration >= UNDAMPED_INTERVAL) & (iteration >= 2 * last_undamped)
+
+
+def has_diverged(x: Array) -> Any:
+    """Decide whether parameter errors are too large to be meaningful, or not finite.
+
+    Args:
+        x: Parameter errors of shape (p,) or (b, p) [m and rad].
+
+    Returns:
+        A flag, or an array of flags of shape (b,).
+    """
+    return ~(np.abs(x).max(-1) < DIVERGENCE_LIMIT)
