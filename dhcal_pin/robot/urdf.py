@@ -1,4 +1,14 @@
-"""The tags of a URDF from its bytes, with the place of each; nothing but plain, bounded XML is let in."""
+"""URDF files: a safe parser that checks everything about the kinematics before any library reads the file.
+
+The parser accepts plain XML in UTF-8 of bounded size and depth. It refuses document types, entities and
+unexpanded xacro, and it records the byte offset of every tag, so that `urdf_edit` can rewrite single
+attributes. Errors name file and line. A `Urdf` is a tree of links and joints without cycles, whose numbers
+are finite.
+
+Lengths are in metres and angles in radians. The origin of a joint is the pose of its frame in the frame of
+its parent link, T = Trans(xyz) · Rz(yaw) · Ry(pitch) · Rx(roll), as in the URDF specification
+(https://wiki.ros.org/urdf/XML/joint).
+"""
 
 from __future__ import annotations
 
@@ -16,154 +26,26 @@ import numpy as np
 
 from .. import se3
 from .._typing import Array
-from ..exceptions import DhcalError
+from ..exceptions import FileFormatError, UnknownNameError
 
-_MAX_JOINTS, _MAX_DEPTH = 20_000, 64
-
-
-_ONCE = ("origin", "axis", "parent", "child", "limit", "mimic")
-
-
-# float() would also take '1_0', 'nan' and the digits of other scripts.
-_NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
-
-
-@dataclass(frozen=True, eq=False)
-class Tag:
-    """A start tag: where it is, what to call it, what it says, its direct children by element name."""
-
-    source: str
-    line: int
-    label: str
-    start: int
-    attributes: dict[str, str]
-    children: dict[str, Tag] = field(default_factory=dict)
-
-    def error(self, text: str) -> DhcalError:
-        """The error that says what is wrong here, with file and line."""
-        return DhcalError(f"{self.source}:{self.line}: {self.label}: {text}")
-
-
-def quote(text: str) -> str:
-    """The text quoted, on one line and not too long for a message."""
-    return repr(text if len(text) <= 60 else text[:57] + "...")
-
-
-def suggest(name: str, known: Iterable[str]) -> str:
-    """A hint at the names that would have been right."""
-    # Matching is quadratic in the length of a name, and names come from a file.
-    short = [other for other in known if len(other) <= 100]
-    close = difflib.get_close_matches(name[:100], short, 3)
-    if close:
-        return f"did you mean {' or '.join(map(quote, close))}?"
-    return f"there are {', '.join(map(quote, short[:12]))}{', ...' if len(short) > 12 else ''}"
-
-
-def numbers(tag: Tag, key: str, count: int) -> list[float]:
-    """The finite numbers of one attribute."""
-    # Expat has made spaces of all blanks but those written as &#9; and the like, which are no separators.
-    words = [word for word in tag.attributes[key].split(" ") if word]
-    if len(words) != count:
-        plural = "number" if len(words) == 1 else "numbers"
-        raise tag.error(f"{key} has {len(words)} {plural}; it needs {count}, with blanks between them")
-    for word in words:
-        if not _NUMBER.fullmatch(word) or not math.isfinite(float(word)):
-            raise tag.error(f"{key} has {quote(word)}; it needs a finite number such as 0.25 or -1e-3")
-    return [float(word) for word in words]
-
-
-def scan(data: bytes, source: str) -> tuple[Tag, dict[str, Tag], dict[str, Tag]]:
-    """The tags of the robot, its links and its joints by name, from well-formed XML without entities."""
-    parser = expat.ParserCreate("utf-8")
-    depth, robot, joint = 0, None, None
-    named: dict[str, dict[str, Tag]] = {"link": {}, "joint": {}}
-
-    def tag(label: str, attributes: dict[str, str]) -> Tag:
-        return Tag(source, parser.CurrentLineNumber, label, parser.CurrentByteIndex, attributes)
-
-    def declaration(_version: str, encoding: str | None, _standalone: int) -> None:
-        name = (encoding or "utf-8").lower()
-        if name not in ("utf-8", "utf8") and not (name in ("us-ascii", "ascii") and data.isascii()):
-            raise tag("<?xml>", {}).error(f"the encoding is {quote(name)}; convert the file to UTF-8")
-
-    def doctype(*_: object) -> None:
-        raise tag("<!DOCTYPE>", {}).error("document types and entities are not accepted; remove it")
-
-    def instruction(target: str, _: str) -> None:
-        if depth > 0:  # before the robot they are common and harmless; inside, Pinocchio fails on them
-            raise tag(f"<?{target[:60]}?>", {}).error("processing instructions are not accepted; remove it")
-
-    def end(_: str) -> None:
-        nonlocal depth
-        depth -= 1
-
-    def start(name: str, attributes: dict[str, str]) -> None:
-        nonlocal depth, robot, joint
-        depth, label = depth + 1, f"<{name[:60]}>"
-        if depth > _MAX_DEPTH:
-            raise tag(label, {}).error(f"nested too deep; at most {_MAX_DEPTH} levels are accepted")
-        if name.startswith("xacro:") or any("${" in text or "$(" in text for text in attributes.values()):
-            raise tag(label, {}).error("unexpanded xacro; expand it first: xacro FILE > out.urdf")
-        if depth == 1:
-            robot = tag(label, attributes)
-            if name != "robot":
-                hint = "this is SDF, not URDF" if name == "sdf" else "this is no URDF"
-                raise robot.error(f"{hint}; the outermost element must be <robot>")
-            if not attributes.get("name"):
-                raise robot.error('no name; it needs name="..."')
-        elif depth == 2:
-            joint = None
-            if name not in named:
-                return
-            called, known = attributes.get("name", ""), named[name]
-            one = tag(f"{name} {quote(called)}", attributes)
-            if not called:
-                raise one.error('no name; it needs name="..."')
-            if called in known:
-                raise one.error(f"the name is taken on line {known[called].line}; give it another")
-            if len(known) > _MAX_JOINTS:
-                raise one.error(f"too many; at most {_MAX_JOINTS} are accepted")
-            known[called] = one
-            joint = one if name == "joint" else None
-        elif depth == 3 and joint is not None:
-            child = tag(f"{joint.label} {label}", attributes)
-            if name in _ONCE and name in joint.children:
-                raise child.error("a second one; keep one")
-            joint.children.setdefault(name, child)
-
-    parser.XmlDeclHandler, parser.StartDoctypeDeclHandler = declaration, doctype
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.ProcessingInstructionHandler = instruction
-    try:
-        parser.Parse(data, True)
-    except expat.ExpatError as error:
-        what = expat.ErrorString(error.code)
-        raise DhcalError(
-            f"{source}:{error.lineno}: broken XML: {what}; export or copy the file again, or mend this line"
-        ) from None
-    assert robot is not None, "expat refuses a document without an element"
-    return robot, named["link"], named["joint"]
-
-
-def xml_attribute(text: str) -> str:
-    """An attribute's value as XML has it, quotes included; `xml.sax.saxutils` would import an HTTP client."""
-    return f'"{html.escape(text)}"'
-
-
-_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
-
-
+# Maximum size of a file [byte], number of links and of joints, and depth of nested elements.
 _MAX_BYTES = 16 << 20
+_MAX_ELEMENTS = 20_000
+_MAX_DEPTH = 64
 
+# Maximum number of joints in a row. Pinocchio recurses along the chain and overflows its stack at thousands.
+_MAX_CHAIN = 500
 
-MAX_ORIGIN = 1e4  # metres or radians: nobody's robot, somebody's typing error
+# Maximum magnitude of an origin's numbers [m or rad]; larger ones are typing errors.
+MAX_ORIGIN = 1e4
 
+_JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 
-_MAX_CHAIN = 500  # Pinocchio recurses along the chain: thousands of joints overflow its stack
+# Elements of which a joint may have one.
+_UNIQUE_ELEMENTS = ("origin", "axis", "parent", "child", "limit", "mimic")
 
-
-# What Pinocchio insists on and would refuse without a line number.
-_NEEDED = {
+# Attributes that Pinocchio requires; it reports a missing one without a line number.
+_REQUIRED_ATTRIBUTES = {
     "axis": ("xyz",),
     "parent": ("link",),
     "child": ("link",),
@@ -172,8 +54,8 @@ _NEEDED = {
     "safety_controller": ("k_velocity",),
 }
 
-
-_NUMBERS = {
+# Attributes that must be one finite number.
+_NUMERIC_ATTRIBUTES = {
     "limit": ("lower", "upper", "effort", "velocity"),
     "mimic": ("multiplier", "offset"),
     "dynamics": ("damping", "friction"),
@@ -181,21 +63,60 @@ _NUMBERS = {
     "safety_controller": ("soft_lower_limit", "soft_upper_limit", "k_position", "k_velocity"),
 }
 
+# float() also accepts '1_0', 'nan' and digits of other scripts.
+_NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfTag:
+    """Start tag of an XML element.
+
+    Attributes:
+        source: Name of the file for messages.
+        line: Line of the tag, from 1.
+        label: Name of the element for messages.
+        start: Byte offset of the tag.
+        attributes: Values of the attributes by name.
+        children: Tags of the direct children by element name.
+    """
+
+    source: str
+    line: int
+    label: str
+    start: int
+    attributes: dict[str, str]
+    children: dict[str, UrdfTag] = field(default_factory=dict)
+
+    def error(self, text: str) -> FileFormatError:
+        """Create an error that names the file, the line and the element.
+
+        Args:
+            text: What is wrong and what is expected.
+
+        Returns:
+            Error to raise.
+        """
+        return FileFormatError(f"{self.source}:{self.line}: {self.label}: {text}")
+
 
 @dataclass(frozen=True, eq=False)
 class UrdfJoint:
-    """One joint of a URDF.
+    """Joint of a URDF.
 
     Attributes:
-        name: unique among the joints.
-        type: revolute, continuous, prismatic, fixed, floating or planar.
-        parent, child: names of the links it connects.
-        origin: (4, 4) pose of the joint frame in the parent link, m; identity if the file has none.
-        axis: (3,) unit axis in the joint frame; (1, 0, 0) if the file has none.
-        lower, upper: limits in rad or m; infinite where the file has none and on a continuous joint.
-        mimic: (joint, multiplier, offset) that this joint follows, or None.
-        line: its line in the file, from 1.
-        start, first_child, origin_start: byte offsets of its tag, its first child and its <origin>.
+        name: Name, unique among the joints.
+        type: "revolute", "continuous", "prismatic", "fixed", "floating" or "planar".
+        parent: Name of the parent link.
+        child: Name of the child link.
+        origin: Pose of the joint frame in the parent link, shape (4, 4) [m]; identity if the file has none.
+        axis: Unit axis in the joint frame, shape (3,); (1, 0, 0) if the file has none.
+        lower: Lower limit [rad or m]; -inf if the file has none and for continuous joints.
+        upper: Upper limit [rad or m]; inf if the file has none and for continuous joints.
+        mimic: Name of the joint that this joint mimics, multiplier and offset; None if it mimics none.
+        line: Line of the tag, from 1.
+        start: Byte offset of the tag.
+        first_child: Byte offset of the first child element.
+        origin_start: Byte offset of the <origin> tag; None if the file has none.
     """
 
     name: str
@@ -215,14 +136,15 @@ class UrdfJoint:
 
 @dataclass(frozen=True, eq=False)
 class Urdf:
-    """A URDF file that passed all checks: its links and joints are one tree.
+    """URDF file that passed all checks: its links and joints form one tree.
 
     Attributes:
-        source: what to call it in messages.
-        data: the exact bytes.
-        name: the robot's name.
-        links, joints: in the order of the file.
-        root: the link without a parent.
+        source: Path of the file, or another name for messages.
+        data: Bytes of the file.
+        name: Name of the robot.
+        links: Names of the links in the order of the file.
+        joints: Joints in the order of the file.
+        root: Name of the link without a parent.
     """
 
     source: str
@@ -233,45 +155,275 @@ class Urdf:
     root: str
 
     @cached_property
-    def _named(self) -> dict[str, UrdfJoint]:
+    def _joints_by_name(self) -> dict[str, UrdfJoint]:
         return {joint.name: joint for joint in self.joints}
 
     @cached_property
-    def _above(self) -> dict[str, UrdfJoint]:
+    def _joints_by_child(self) -> dict[str, UrdfJoint]:
         return {joint.child: joint for joint in self.joints}
 
     def joint(self, name: str) -> UrdfJoint:
-        """The joint of that name.
+        """Return a joint by name.
+
+        Args:
+            name: Name of the joint.
+
+        Returns:
+            Joint of that name.
 
         Raises:
-            DhcalError: there is none; the message names the nearest ones.
+            UnknownNameError: There is no such joint; the message suggests similar names.
         """
-        if name not in self._named:
-            raise DhcalError(f"{self.source}: no joint {quote(name)}; {suggest(name, self._named)}")
-        return self._named[name]
+        if name not in self._joints_by_name:
+            suggestion = suggest_names(name, self._joints_by_name)
+            raise UnknownNameError(f"{self.source}: unknown joint {quote(name)}; {suggestion}")
+        return self._joints_by_name[name]
 
     def leaves(self) -> tuple[str, ...]:
-        """Links without children, in the order of the file."""
-        inner = {joint.parent for joint in self.joints}
-        return tuple(link for link in self.links if link not in inner)
+        """Return the links without children, in the order of the file."""
+        parents = {joint.parent for joint in self.joints}
+        return tuple(link for link in self.links if link not in parents)
 
     def path(self, tip: str) -> tuple[UrdfJoint, ...]:
-        """Joints from the root to the link `tip`, in that order; empty for the root itself.
+        """Return the joints between the root and a link.
+
+        Args:
+            tip: Name of the link.
+
+        Returns:
+            Joints in the order from root to tip; empty for the root.
 
         Raises:
-            DhcalError: there is no such link; the message names the nearest ones.
+            UnknownNameError: There is no such link; the message suggests similar names.
         """
-        if tip != self.root and tip not in self._above:
-            raise DhcalError(f"{self.source}: no link {quote(tip)}; {suggest(tip, self.links)}")
+        if tip != self.root and tip not in self._joints_by_child:
+            raise UnknownNameError(
+                f"{self.source}: unknown link {quote(tip)}; {suggest_names(tip, self.links)}"
+            )
         joints = []
-        while tip in self._above:
-            joints.append(self._above[tip])
+        while tip in self._joints_by_child:
+            joints.append(self._joints_by_child[tip])
             tip = joints[-1].parent
         return tuple(reversed(joints))
 
 
+def read_urdf(path: str | os.PathLike[str]) -> Urdf:
+    """Read and check a URDF file.
+
+    Args:
+        path: Path of the file.
+
+    Returns:
+        Checked file.
+
+    Raises:
+        FileFormatError: The file cannot be read or is not a valid URDF; the message names the line.
+    """
+    source = os.fspath(path)
+    try:
+        with open(source, "rb") as file:
+            data = file.read(_MAX_BYTES + 1)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise FileFormatError(f"{source}: cannot be read: {reason}; give the path of a URDF file") from None
+    return parse_urdf(data, source)
+
+
+def parse_urdf(data: bytes, source: str) -> Urdf:
+    """Parse and check the bytes of a URDF.
+
+    Args:
+        data: Bytes of the file, UTF-8.
+        source: Name of the file for messages.
+
+    Returns:
+        Checked file.
+
+    Raises:
+        FileFormatError: The bytes are not a valid URDF; the message names the line.
+    """
+    if len(data) > _MAX_BYTES:
+        raise FileFormatError(
+            f"{source}: the file is larger than {_MAX_BYTES >> 20} MiB, which no URDF is; check the path"
+        )
+    if not data.strip():
+        raise FileFormatError(f"{source}:1: the file is empty; expected a <robot> element")
+    try:
+        data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise FileFormatError(f"{source}:{line}: not UTF-8; convert the file to UTF-8") from None
+    if b"\0" in data:
+        raise FileFormatError(f"{source}:1: zero bytes as in UTF-16; convert the file to UTF-8")
+    robot, link_tags, joint_tags = scan_tags(data, source)
+    joints = {name: _parse_joint(tag) for name, tag in joint_tags.items()}
+    root = _find_root(robot, link_tags, joints, joint_tags)
+    return Urdf(source, data, robot.attributes["name"], tuple(link_tags), tuple(joints.values()), root)
+
+
+def scan_tags(data: bytes, source: str) -> tuple[UrdfTag, dict[str, UrdfTag], dict[str, UrdfTag]]:
+    """Find the tags of the robot, its links and its joints.
+
+    Errors of the XML and of names are raised as `FileFormatError` with the line.
+
+    Args:
+        data: Bytes of the file, UTF-8.
+        source: Name of the file for messages.
+
+    Returns:
+        Tag of the robot, tags of the links by name, and tags of the joints by name.
+
+    Raises:
+        FileFormatError: The XML is not well-formed.
+    """
+    parser = expat.ParserCreate("utf-8")
+    depth, robot, joint = 0, None, None
+    tags_by_kind: dict[str, dict[str, UrdfTag]] = {"link": {}, "joint": {}}
+
+    def current_tag(label: str, attributes: dict[str, str]) -> UrdfTag:
+        return UrdfTag(source, parser.CurrentLineNumber, label, parser.CurrentByteIndex, attributes)
+
+    def on_declaration(_version: str, encoding: str | None, _standalone: int) -> None:
+        name = (encoding or "utf-8").lower()
+        if name not in ("utf-8", "utf8") and not (name in ("us-ascii", "ascii") and data.isascii()):
+            tag = current_tag("<?xml>", {})
+            raise tag.error(f"the encoding is {quote(name)}; convert the file to UTF-8")
+
+    def on_doctype(*_: object) -> None:
+        raise current_tag("<!DOCTYPE>", {}).error("document types and entities are not accepted; remove it")
+
+    def on_instruction(target: str, _: str) -> None:
+        # Before the robot, instructions are common and harmless; inside, Pinocchio fails on them.
+        if depth > 0:
+            tag = current_tag(f"<?{target[:60]}?>", {})
+            raise tag.error("processing instructions are not accepted; remove it")
+
+    def on_end(_: str) -> None:
+        nonlocal depth
+        depth -= 1
+
+    def on_start(element: str, attributes: dict[str, str]) -> None:
+        nonlocal depth, robot, joint
+        depth, label = depth + 1, f"<{element[:60]}>"
+        if depth > _MAX_DEPTH:
+            raise current_tag(label, {}).error(f"nested too deep; at most {_MAX_DEPTH} levels are accepted")
+        if element.startswith("xacro:") or any("${" in text or "$(" in text for text in attributes.values()):
+            tag = current_tag(label, {})
+            raise tag.error("unexpanded xacro; expand it first: xacro FILE > out.urdf")
+        if depth == 1:
+            robot = current_tag(label, attributes)
+            if element != "robot":
+                format_name = "this is SDF, not URDF" if element == "sdf" else "this is not a URDF"
+                raise robot.error(f"{format_name}; expected <robot> as the outermost element")
+            if not attributes.get("name"):
+                raise robot.error('no name; expected name="..."')
+        elif depth == 2:
+            joint = None
+            if element not in tags_by_kind:
+                return
+            name, siblings = attributes.get("name", ""), tags_by_kind[element]
+            tag = current_tag(f"{element} {quote(name)}", attributes)
+            if not name:
+                raise tag.error('no name; expected name="..."')
+            if name in siblings:
+                raise tag.error(
+                    f"the name is already used on line {siblings[name].line}; give it another one"
+                )
+            if len(siblings) > _MAX_ELEMENTS:
+                raise tag.error(f"too many; at most {_MAX_ELEMENTS} are accepted")
+            siblings[name] = tag
+            joint = tag if element == "joint" else None
+        elif depth == 3 and joint is not None:
+            child = current_tag(f"{joint.label} {label}", attributes)
+            if element in _UNIQUE_ELEMENTS and element in joint.children:
+                raise child.error("a second element of this kind; keep one")
+            joint.children.setdefault(element, child)
+
+    parser.XmlDeclHandler, parser.StartDoctypeDeclHandler = on_declaration, on_doctype
+    parser.StartElementHandler, parser.EndElementHandler = on_start, on_end
+    parser.ProcessingInstructionHandler = on_instruction
+    try:
+        parser.Parse(data, True)
+    except expat.ExpatError as error:
+        reason = expat.ErrorString(error.code)
+        raise FileFormatError(
+            f"{source}:{error.lineno}: broken XML: {reason}; repair this line or export the file again"
+        ) from None
+    assert robot is not None, "expat refuses a document without an element"
+    return robot, tags_by_kind["link"], tags_by_kind["joint"]
+
+
+def parse_numbers(tag: UrdfTag, key: str, count: int) -> list[float]:
+    """Parse the finite numbers of an attribute.
+
+    A wrong number raises a `FileFormatError` with the line.
+
+    Args:
+        tag: Tag that has the attribute.
+        key: Name of the attribute.
+        count: Expected number of numbers.
+
+    Returns:
+        The numbers.
+    """
+    # Expat replaces white space by spaces, except for character references such as &#9;, which do not
+    # separate.
+    words = [word for word in tag.attributes[key].split(" ") if word]
+    if len(words) != count:
+        noun = "number" if len(words) == 1 else "numbers"
+        raise tag.error(f"{key} has {len(words)} {noun}; expected {count}, separated by spaces")
+    for word in words:
+        if not _NUMBER.fullmatch(word) or not math.isfinite(float(word)):
+            raise tag.error(f"{key} has {quote(word)}; expected a finite number such as 0.25 or -1e-3")
+    return [float(word) for word in words]
+
+
+def quote(text: str) -> str:
+    """Quote a text for a message, on one line and shortened to 60 characters.
+
+    Args:
+        text: Text of any length.
+
+    Returns:
+        Quoted text.
+    """
+    return repr(text if len(text) <= 60 else text[:57] + "...")
+
+
+def suggest_names(name: str, known: Iterable[str]) -> str:
+    """Suggest names that are similar to an unknown one, or list the known names.
+
+    Args:
+        name: Unknown name.
+        known: Known names.
+
+    Returns:
+        Part of a sentence for an error message.
+    """
+    # Matching takes quadratic time in the length of a name, and the names come from a file.
+    short = [other for other in known if len(other) <= 100]
+    similar = difflib.get_close_matches(name[:100], short, 3)
+    if similar:
+        return f"did you mean {' or '.join(map(quote, similar))}?"
+    return f"choose from {', '.join(map(quote, short[:12]))}{', ...' if len(short) > 12 else ''}"
+
+
+def xml_attribute(text: str) -> str:
+    """Write the value of an XML attribute, with quotes.
+
+    `xml.sax.saxutils.quoteattr` does the same but imports an HTTP client.
+
+    Args:
+        text: Value of the attribute.
+
+    Returns:
+        Escaped and quoted value.
+    """
+    return f'"{html.escape(text)}"'
+
+
 def _rotation(roll: float, pitch: float, yaw: float) -> Array:
-    """Rz(yaw)·Ry(pitch)·Rx(roll) (3, 3) of angles in radians."""
+    """Compute Rz(yaw)·Ry(pitch)·Rx(roll), shape (3, 3), of angles [rad]."""
     (cr, cp, cy), (sr, sp, sy) = np.cos((roll, pitch, yaw)), np.sin((roll, pitch, yaw))
     return np.array(
         [
@@ -282,172 +434,147 @@ def _rotation(roll: float, pitch: float, yaw: float) -> Array:
     )
 
 
-def _origin(tag: Tag) -> Array:
-    """The pose (4, 4) that an <origin> gives."""
+def _parse_origin(tag: UrdfTag) -> Array:
+    """Parse an <origin> to a pose, shape (4, 4)."""
     if "quat_xyzw" in tag.attributes:
         raise tag.error("quat_xyzw is ignored by most readers of URDF; write the rotation as rpy")
     values = {key: [0.0, 0.0, 0.0] for key in ("xyz", "rpy")}
     for key in [key for key in values if key in tag.attributes]:
-        values[key] = numbers(tag, key, 3)
+        values[key] = parse_numbers(tag, key, 3)
         if max(map(abs, values[key])) > MAX_ORIGIN:
-            raise tag.error(f"{key} is beyond ±{MAX_ORIGIN:g}; it needs metres in xyz and radians in rpy")
+            raise tag.error(f"{key} is beyond ±{MAX_ORIGIN:g}; expected metres in xyz and radians in rpy")
     return se3.transform(_rotation(*values["rpy"]), values["xyz"])
 
 
-def _axis(tag: Tag, moving: bool) -> Array:
-    """The unit axis (3,) that an <axis> gives; x, which has no meaning, where nothing moves."""
-    axis = np.array(numbers(tag, "xyz", 3))
+def _parse_axis(tag: UrdfTag, moving: bool) -> Array:
+    """Parse an <axis> to a unit vector, shape (3,); the axis of a joint that does not move may be zero."""
+    axis = np.array(parse_numbers(tag, "xyz", 3))
     norm = math.hypot(*axis)
     if 1e-6 <= norm <= 1e6:
         return axis / norm
     if moving:
-        raise tag.error(f"its length is {norm:g}; it needs a direction of length 1, such as 0 0 1")
+        raise tag.error(f"the axis has length {norm:g}; expected a direction of length 1, such as 0 0 1")
     return np.array([1.0, 0.0, 0.0])
 
 
-def _joint(tag: Tag) -> UrdfJoint:
-    """A joint from its tag."""
-    kind, inside = tag.attributes.get("type"), tag.children
-    if kind is None:
-        raise tag.error(f"no type; it needs one of {', '.join(_TYPES)}")
-    if kind not in _TYPES:
-        raise tag.error(f"unknown type {quote(kind)}; it needs one of {', '.join(_TYPES)}")
-    for name in ("parent", "child"):
-        if name not in inside:
-            raise tag.error(f'no <{name}>; it needs <{name} link="..."/>')
-    for name, keys in _NEEDED.items():
+def _parse_joint(tag: UrdfTag) -> UrdfJoint:
+    """Parse a joint from its tag."""
+    joint_type, children = tag.attributes.get("type"), tag.children
+    if joint_type is None:
+        raise tag.error(f"no type; expected one of {', '.join(_JOINT_TYPES)}")
+    if joint_type not in _JOINT_TYPES:
+        raise tag.error(f"unknown type {quote(joint_type)}; choose from {', '.join(_JOINT_TYPES)}")
+    for element in ("parent", "child"):
+        if element not in children:
+            raise tag.error(f'no <{element}>; expected <{element} link="..."/>')
+    for element, keys in _REQUIRED_ATTRIBUTES.items():
         for key in keys:
-            if name in inside and key not in inside[name].attributes:
-                raise inside[name].error(f"no {key}; it needs {key}=...")
+            if element in children and key not in children[element].attributes:
+                raise children[element].error(f"no {key}; expected {key}=...")
     values = {
-        (name, key): numbers(inside[name], key, 1)[0]
-        for name, keys in _NUMBERS.items()
+        (element, key): parse_numbers(children[element], key, 1)[0]
+        for element, keys in _NUMERIC_ATTRIBUTES.items()
         for key in keys
-        if name in inside and key in inside[name].attributes
+        if element in children and key in children[element].attributes
     }
-    if "dynamics" in inside and not any(name == "dynamics" for name, _ in values):
-        raise inside["dynamics"].error("neither damping nor friction; add one or remove it")
+    if "dynamics" in children and not any(element == "dynamics" for element, _ in values):
+        raise children["dynamics"].error("neither damping nor friction; add one or remove the element")
     lower, upper = -math.inf, math.inf
-    if kind in ("revolute", "prismatic"):
-        if "limit" not in inside:
-            raise tag.error(f"a {kind} joint has no <limit>; it needs lower, upper, effort and velocity")
+    if joint_type in ("revolute", "prismatic"):
+        if "limit" not in children:
+            raise tag.error(
+                f"a {joint_type} joint has no <limit>; expected lower, upper, effort and velocity"
+            )
         lower, upper = values.get(("limit", "lower"), lower), values.get(("limit", "upper"), upper)
         if lower > upper:
-            raise inside["limit"].error(f"lower {lower:g} is above upper {upper:g}; swap them")
+            raise children["limit"].error(f"lower {lower:g} is above upper {upper:g}; swap them")
     mimic = None
-    if "mimic" in inside:
+    if "mimic" in children:
         factor, offset = values.get(("mimic", "multiplier"), 1.0), values.get(("mimic", "offset"), 0.0)
-        mimic = inside["mimic"].attributes["joint"], factor, offset
-    moving = kind in ("revolute", "continuous", "prismatic")
+        mimic = children["mimic"].attributes["joint"], factor, offset
+    moving = joint_type in ("revolute", "continuous", "prismatic")
     return UrdfJoint(
         name=tag.attributes["name"],
-        type=kind,
-        parent=inside["parent"].attributes["link"],
-        child=inside["child"].attributes["link"],
-        origin=_origin(inside["origin"]) if "origin" in inside else np.eye(4),
-        axis=_axis(inside["axis"], moving) if "axis" in inside else np.array([1.0, 0.0, 0.0]),
+        type=joint_type,
+        parent=children["parent"].attributes["link"],
+        child=children["child"].attributes["link"],
+        origin=_parse_origin(children["origin"]) if "origin" in children else np.eye(4),
+        axis=_parse_axis(children["axis"], moving) if "axis" in children else np.array([1.0, 0.0, 0.0]),
         lower=lower,
         upper=upper,
         mimic=mimic,
         line=tag.line,
         start=tag.start,
-        first_child=next(iter(inside.values())).start,
-        origin_start=inside["origin"].start if "origin" in inside else None,
+        first_child=next(iter(children.values())).start,
+        origin_start=children["origin"].start if "origin" in children else None,
     )
 
 
-def _on_loop(after: Mapping[str, str]) -> str | None:
-    """A name from which following `after` comes back to it, if there is any."""
-    settled: set[str] = set()
-    for name in after:
-        trail: set[str] = set()
-        while name in after and name not in settled and name not in trail:
-            trail.add(name)
-            name = after[name]
-        if name in trail:
+def _find_cycle(successors: Mapping[str, str]) -> str | None:
+    """Return a name on a cycle of a graph with one successor per name, or None."""
+    acyclic: set[str] = set()
+    for name in successors:
+        visited: set[str] = set()
+        while name in successors and name not in acyclic and name not in visited:
+            visited.add(name)
+            name = successors[name]
+        if name in visited:
             return name
-        settled |= trail
+        acyclic |= visited
     return None
 
 
-def _root(robot: Tag, links: dict[str, Tag], joints: dict[str, UrdfJoint], tags: dict[str, Tag]) -> str:
-    """The root link, after checking that links, joints and mimics are a tree."""
-    above: dict[str, UrdfJoint] = {}
+def _find_root(
+    robot: UrdfTag,
+    link_tags: dict[str, UrdfTag],
+    joints: dict[str, UrdfJoint],
+    joint_tags: dict[str, UrdfTag],
+) -> str:
+    """Return the root link after checking that the links form a tree and that mimics have no cycle."""
+    by_child: dict[str, UrdfJoint] = {}
     for joint in joints.values():
-        tag = tags[joint.name]
+        tag = joint_tags[joint.name]
         for role, link in (("parent", joint.parent), ("child", joint.child)):
-            if link not in links:
-                raise tag.children[role].error(f"no link {quote(link)}; {suggest(link, links)}")
-        if joint.child in above:
-            other = above[joint.child].name
+            if link not in link_tags:
+                raise tag.children[role].error(
+                    f"unknown link {quote(link)}; {suggest_names(link, link_tags)}"
+                )
+        if joint.child in by_child:
+            other = by_child[joint.child].name
             raise tag.error(
-                f"its child {quote(joint.child)} already hangs on joint {quote(other)}; "
-                "a link has one parent, so remove one of them"
+                f"its child {quote(joint.child)} is already the child of joint {quote(other)}; "
+                "a link has one parent, so remove one of the joints"
             )
-        above[joint.child] = joint
+        by_child[joint.child] = joint
     mimics = {joint.name: joint.mimic[0] for joint in joints.values() if joint.mimic}
-    if (name := _on_loop(mimics)) is not None:
-        raise tags[name].children["mimic"].error("it mimics itself in a circle; let one joint of it be free")
-    if (link := _on_loop({link: joint.parent for link, joint in above.items()})) is not None:
-        raise tags[above[link].name].error("its child is also above its parent; links must form a tree")
-    roots = [link for link in links if link not in above]
+    if (name := _find_cycle(mimics)) is not None:
+        raise (
+            joint_tags[name]
+            .children["mimic"]
+            .error("the joint mimics itself in a cycle; remove one <mimic> of the cycle")
+        )
+    if (link := _find_cycle({link: joint.parent for link, joint in by_child.items()})) is not None:
+        raise joint_tags[by_child[link].name].error(
+            "the joint closes a loop of links; links must form a tree"
+        )
+    roots = [link for link in link_tags if link not in by_child]
     if not roots:
-        raise robot.error('no links; it needs at least one <link name="..."/>')
+        raise robot.error('no links; expected at least one <link name="..."/>')
     if len(roots) > 1:
-        raise links[roots[1]].error(
-            f"no joint leads here nor to link {quote(roots[0])}; join them: a robot has one root"
+        raise link_tags[roots[1]].error(
+            f"neither this link nor link {quote(roots[0])} is the child of a joint; a robot has one root, so "
+            "connect them by a joint"
         )
     depth = {roots[0]: 0}
-    for link in above:
-        trail = []
+    for link in by_child:
+        ancestors = []
         while link not in depth:
-            trail.append(link)
-            link = above[link].parent
-        for below in reversed(trail):
-            depth[below] = depth[above[below].parent] + 1
-            if depth[below] > _MAX_CHAIN:
-                raise tags[above[below].name].error(f"more than {_MAX_CHAIN} joints in a row; check the file")
+            ancestors.append(link)
+            link = by_child[link].parent
+        for descendant in reversed(ancestors):
+            depth[descendant] = depth[by_child[descendant].parent] + 1
+            if depth[descendant] > _MAX_CHAIN:
+                raise joint_tags[by_child[descendant].name].error(
+                    f"more than {_MAX_CHAIN} joints in a row; check the file"
+                )
     return roots[0]
-
-
-def parse_urdf(data: bytes, source: str) -> Urdf:
-    """A URDF from its bytes, refused unless everything about its kinematics is sound.
-
-    Args:
-        data: the file's bytes, UTF-8.
-        source: what to call it in messages.
-
-    Raises:
-        DhcalError: it is not a sound URDF; the message names the line.
-    """
-    if len(data) > _MAX_BYTES:
-        raise DhcalError(f"{source}: larger than {_MAX_BYTES >> 20} MiB; no URDF is: check the file")
-    if not data.strip():
-        raise DhcalError(f"{source}:1: the file is empty; it needs a <robot> element")
-    try:
-        data.decode("utf-8")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise DhcalError(f"{source}:{line}: not UTF-8; convert the file to UTF-8") from None
-    if b"\0" in data:
-        raise DhcalError(f"{source}:1: zero bytes as in UTF-16; convert the file to UTF-8")
-    robot, links, tags = scan(data, source)
-    joints = {name: _joint(tag) for name, tag in tags.items()}
-    root = _root(robot, links, joints, tags)
-    return Urdf(source, data, robot.attributes["name"], tuple(links), tuple(joints.values()), root)
-
-
-def read_urdf(path: str | os.PathLike[str]) -> Urdf:
-    """A URDF from a file, refused unless everything about its kinematics is sound.
-
-    Raises:
-        DhcalError: the file cannot be read or is not a sound URDF; the message names the line.
-    """
-    source = os.fspath(path)
-    try:
-        with open(source, "rb") as file:
-            data = file.read(_MAX_BYTES + 1)
-    except (OSError, ValueError) as error:
-        what = getattr(error, "strerror", None) or str(error)
-        raise DhcalError(f"{source}: cannot be read: {what}; give the path of a URDF file") from None
-    return parse_urdf(data, source)

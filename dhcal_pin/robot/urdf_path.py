@@ -1,4 +1,13 @@
-"""The path through a URDF: its tip, its independent joints, and the joints' frames as Pinocchio sees them."""
+"""The path through a URDF from the root to a tip: moving joints, independent joints, and joint frames.
+
+The values of the k moving joints follow from those of the n independent joints by the mimic rules of the
+URDF, composed along chains of mimics:
+
+    positions = mimic_matrix @ q + mimic_offset
+
+Joint frames and axes come from Pinocchio's model, which merges fixed joints into the origin of the next
+moving joint.
+"""
 
 from __future__ import annotations
 
@@ -9,100 +18,147 @@ import pinocchio as pin
 
 from .. import se3
 from .._typing import Array
-from ..exceptions import DhcalError
-from .urdf import Urdf, UrdfJoint, quote, suggest
+from ..exceptions import DhcalError, FileFormatError
+from .urdf import Urdf, UrdfJoint, quote, suggest_names
 
-_MAX_MOVING = 64  # what is unknown grows with the path, and work with its cube; no arm comes near
+# Maximum number of moving joints. The work grows with the cube of the number of parameters.
+_MAX_MOVING_JOINTS = 64
 
 
 def build_model(urdf: Urdf) -> pin.Model:
-    """Pinocchio's model of the whole robot; DhcalError where it takes none."""
+    """Build Pinocchio's model of the whole robot.
+
+    Args:
+        urdf: File of the robot.
+
+    Returns:
+        Model without geometry.
+
+    Raises:
+        FileFormatError: Pinocchio does not accept the file.
+    """
     try:
-        # Pinocchio splits numbers at spaces only; XML allows any white space.
+        # Pinocchio separates numbers at spaces only; XML allows any white space.
         return pin.buildModelFromXML(urdf.data.decode("utf-8-sig").translate(dict.fromkeys(b"\t\r\n", " ")))
     except (ValueError, RuntimeError) as error:
-        raise DhcalError(f"{urdf.source}: Pinocchio does not accept this URDF: {error}") from error
+        raise FileFormatError(f"{urdf.source}: Pinocchio does not accept this URDF: {error}") from error
 
 
 def default_tip(urdf: Urdf) -> str:
-    """The leaf behind the most moving joints, then behind the most links; `tool0` breaks a tie."""
-    depth = {leaf: urdf.path(leaf) for leaf in urdf.leaves()}
-    rank = {leaf: (sum(j.type != "fixed" for j in path), len(path)) for leaf, path in depth.items()}
-    best = max(rank.values())
-    deepest = [leaf for leaf, value in rank.items() if value[0] == best[0]]
-    if "tool0" in deepest:
+    """Choose the leaf behind the most moving joints, and of these the one behind the most links.
+
+    `tool0` is preferred among the leaves behind the most moving joints.
+
+    Args:
+        urdf: File of the robot.
+
+    Returns:
+        Name of the tip link.
+
+    Raises:
+        DhcalError: Several leaves are equally deep; the message lists them.
+    """
+    paths = {leaf: urdf.path(leaf) for leaf in urdf.leaves()}
+    depths = {leaf: (sum(j.type != "fixed" for j in path), len(path)) for leaf, path in paths.items()}
+    deepest = max(depths.values())
+    candidates = [leaf for leaf, depth in depths.items() if depth[0] == deepest[0]]
+    if "tool0" in candidates:
         return "tool0"
-    farthest = [leaf for leaf in deepest if rank[leaf] == best]
-    if len(farthest) > 1:
-        shared = set.intersection(*({joint.child for joint in depth[leaf]} for leaf in farthest))
-        common = [joint.child for joint in depth[farthest[0]] if joint.child in shared]
-        also = f" (or {common[-1]}, the last link they share)" if common else ""
+    tied = [leaf for leaf in candidates if depths[leaf] == deepest]
+    if len(tied) > 1:
+        shared = set.intersection(*({joint.child for joint in paths[leaf]} for leaf in tied))
+        common = [joint.child for joint in paths[tied[0]] if joint.child in shared]
+        alternative = f" (or {common[-1]}, the last link they share)" if common else ""
         raise DhcalError(
             f"{urdf.source}: several tips are equally deep; "
-            f"choose the tip, --tip: {', '.join(sorted(deepest))}{also}"
+            f"choose the tip, --tip: {', '.join(sorted(candidates))}{alternative}"
         )
-    return farthest[0]
+    return tied[0]
 
 
 def find_moving_joints(urdf: Urdf, tip: str) -> list[UrdfJoint]:
-    """The joints that move between the root and a tip, in that order.
+    """Find the joints that move between the root and a tip.
+
+    Args:
+        urdf: File of the robot.
+        tip: Name of the tip link.
+
+    Returns:
+        Revolute, continuous and prismatic joints in the order from root to tip.
 
     Raises:
-        DhcalError: there is no such tip, none moves, too many do, or one has more than one freedom.
+        DhcalError: No joint moves, too many do, or one has more than one degree of freedom.
     """
     joints = [joint for joint in urdf.path(tip) if joint.type != "fixed"]
     for joint in joints:
         if joint.type in ("floating", "planar"):
             raise DhcalError(
-                f"{urdf.source}:{joint.line}: joint {joint.name!r} is {joint.type}; "
-                f"the path to {tip!r} may only have revolute, continuous, prismatic and fixed joints: "
-                "make it fixed, as the robot stands while it is measured"
+                f"{urdf.source}:{joint.line}: joint {joint.name!r} is {joint.type}; expected revolute, "
+                f"continuous, prismatic and fixed joints on the path to {tip!r}: make it fixed, at the pose "
+                "that it has during the measurement"
             )
     if not joints:
         raise DhcalError(
             f"{urdf.source}: no moving joint between {urdf.root!r} and {tip!r}; "
-            "choose a tip behind joints that move, --tip"
+            "choose a tip behind moving joints, --tip"
         )
-    if len(joints) > _MAX_MOVING:
+    if len(joints) > _MAX_MOVING_JOINTS:
         raise DhcalError(
             f"{urdf.source}: {len(joints)} moving joints between {urdf.root!r} and {tip!r}; "
-            f"at most {_MAX_MOVING} are accepted: choose a nearer tip, --tip"
+            f"at most {_MAX_MOVING_JOINTS} are accepted: choose a tip closer to the root, --tip"
         )
     return joints
 
 
 def independent_joints(urdf: Urdf, moving: list[str]) -> tuple[list[str], Array, Array]:
-    """Independent joints behind the moving ones, with the (k, n) mixing and (k,) shift of mimics.
+    """Find the independent joints behind the moving joints, and the mimic rules between them.
+
+    Args:
+        urdf: File of the robot.
+        moving: Names of the k moving joints.
+
+    Returns:
+        Names of the n independent joints, mimic matrix (k, n), and mimic offset (k,) [rad or m].
 
     Raises:
-        DhcalError: a joint follows one that is not there or cannot move, or none is left to command.
+        FileFormatError: A joint mimics an unknown or fixed joint, or no independent joint remains.
     """
-    free = [joint.name for joint in urdf.joints if joint.type in ("revolute", "continuous", "prismatic")]
-    entries = []
+    movable = [joint.name for joint in urdf.joints if joint.type in ("revolute", "continuous", "prismatic")]
+    rules = []
     for name in moving:
-        factor, shift = 1.0, 0.0
+        factor, offset = 1.0, 0.0
         while (mimic := urdf.joint(name).mimic) is not None:
-            if mimic[0] not in free:
-                raise DhcalError(
-                    f"{urdf.source}:{urdf.joint(name).line}: joint {quote(name)}: it mimics {quote(mimic[0])}, "
-                    f"which is no joint that moves; {suggest(mimic[0], free)}"
+            if mimic[0] not in movable:
+                raise FileFormatError(
+                    f"{urdf.source}:{urdf.joint(name).line}: joint {quote(name)}: it mimics "
+                    f"{quote(mimic[0])}, which is not a moving joint; {suggest_names(mimic[0], movable)}"
                 )
-            name, shift, factor = mimic[0], shift + factor * mimic[2], factor * mimic[1]
-        entries.append((name, factor, shift))
-    names = list(dict.fromkeys(name for name, factor, _ in entries if factor))
+            name, offset, factor = mimic[0], offset + factor * mimic[2], factor * mimic[1]
+        rules.append((name, factor, offset))
+    names = list(dict.fromkeys(name for name, factor, _ in rules if factor))
     if not names:
-        raise DhcalError(
-            f"{urdf.source}: all joints of the path mimic with multiplier 0; none is left to move"
+        raise FileFormatError(
+            f"{urdf.source}: all joints of the path mimic with multiplier 0; expected a joint that moves"
         )
-    mixing = np.zeros((len(moving), len(names)))
-    for row, (name, factor, _) in enumerate(entries):
+    mimic_matrix = np.zeros((len(moving), len(names)))
+    for row, (name, factor, _) in enumerate(rules):
         if factor:
-            mixing[row, names.index(name)] = factor
-    return names, mixing, np.array([shift for _, _, shift in entries])
+            mimic_matrix[row, names.index(name)] = factor
+    return names, mimic_matrix, np.array([offset for _, _, offset in rules])
 
 
 def placements(model: pin.Model, tip: str, moving: list[str]) -> tuple[Array, Array]:
-    """Origins (k+1, 4, 4) and axes (k, 3) of the path as Pinocchio sees it."""
+    """Return the joint origins and axes of a path in Pinocchio's model.
+
+    Args:
+        model: Model of the whole robot.
+        tip: Name of the tip link.
+        moving: Names of the k moving joints.
+
+    Returns:
+        Pose of each moving joint in the moving joint before it, then the tip, shape (k+1, 4, 4) [m], and unit
+        axes, shape (k, 3).
+    """
     origins, axes = [], []
     for name in moving:
         index = model.getJointId(name)
@@ -119,7 +175,14 @@ def placements(model: pin.Model, tip: str, moving: list[str]) -> tuple[Array, Ar
 
 @lru_cache(maxsize=256)
 def axis_frame(unit: tuple[float, ...]) -> Array:
-    """A rotation (4, 4) that carries z onto a unit axis (3,); a permutation for coordinate axes."""
+    """Return a rotation that turns z onto a unit axis; it is a permutation for a coordinate axis.
+
+    Args:
+        unit: Unit axis, 3 components.
+
+    Returns:
+        Rotation as a homogeneous matrix, shape (4, 4).
+    """
     axis = np.array(unit)
     i = int(np.argmax(np.abs(axis)))
     sign = 1.0 if axis[i] > 0 else -1.0

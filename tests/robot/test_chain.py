@@ -101,7 +101,7 @@ def test_mimic_joint_moves_with_its_source():
 def test_mimic_of_an_unknown_joint_is_refused_on_the_chain_only():
     text = ROBOT.format(mimic='<mimic joint="nobody"/>')
     with pytest.raises(
-        DhcalError, match=r"r.urdf:9: joint 'end': it mimics 'nobody', which is no joint that"
+        DhcalError, match=r"r.urdf:9: joint 'end': it mimics 'nobody', which is not a moving joint"
     ):
         Chain.from_urdf(parse_urdf(text.encode(), "r.urdf"), "end")
     assert Chain.from_urdf(parse_urdf(text.encode(), "r.urdf"), "side").joint_names == ("one", "out")
@@ -109,7 +109,9 @@ def test_mimic_of_an_unknown_joint_is_refused_on_the_chain_only():
 
 def test_mimic_of_a_fixed_joint_is_refused():
     text = ROBOT.format(mimic='<mimic joint="glue"/>')
-    with pytest.raises(DhcalError, match=r"r.urdf:9: joint 'end': it mimics 'glue', which is no joint that"):
+    with pytest.raises(
+        DhcalError, match=r"r.urdf:9: joint 'end': it mimics 'glue', which is not a moving joint"
+    ):
         Chain.from_urdf(parse_urdf(text.encode(), "r.urdf"), "end")
 
 
@@ -127,7 +129,12 @@ def test_mimic_with_multiplier_zero_is_constant():
     ("old", "new", "tip", "message"),
     [
         ('"continuous"', '"floating"', "end", "r.urdf:9: joint 'end' is floating.*: make it fixed"),
-        ('"continuous"', '"fixed"', "base", "no moving joint between 'base' and 'base'; choose a tip behind"),
+        (
+            '"continuous"',
+            '"fixed"',
+            "base",
+            "no moving joint between 'base' and 'base'; choose a tip behind moving",
+        ),
     ],
 )
 def test_unsupported_paths_are_refused_with_a_remedy(old, new, tip, message):

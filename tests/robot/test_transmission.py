@@ -20,7 +20,7 @@ from dhcal_pin.io.measurement_csv import measurement_text
 from dhcal_pin.io.robot import read_robot, write_urdf
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.pose import Pose
-from dhcal_pin.robot.chain import Chain
+from dhcal_pin.robot import Chain
 from dhcal_pin.robot.error_families import COUPLING, FAMILIES
 from dhcal_pin.robot.transmission import TERM_FAMILIES, TERMS, Payload
 from dhcal_pin.robot.urdf import parse_urdf

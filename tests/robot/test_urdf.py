@@ -34,13 +34,13 @@ def test_there_are_69_robots():
 
 
 @pytest.mark.parametrize("name", UNSOUND)
-def test_unsound_robots_are_refused_with_their_line(name):
+def test_invalid_robots_are_refused_with_the_line(name):
     with pytest.raises(DhcalError, match=re.escape(name) + UNSOUND[name]):
         read_urdf(ROBOTS / name)
 
 
 @pytest.mark.parametrize("name", SOUND)
-def test_robots_read_as_pinocchio_reads_them(name):
+def test_robots_agree_with_pinocchio(name):
     urdf = read_urdf(ROBOTS / name)
     assert with_origins(urdf, {one.name: one.origin for one in urdf.joints}) == urdf.data
     assert largest(pinocchio_origins(urdf.data), {one.name: one.origin for one in urdf.joints}) <= 1e-13
@@ -62,7 +62,7 @@ def test_robots_read_as_pinocchio_reads_them(name):
             np.testing.assert_allclose(one.axis, moved.ravel(), atol=1e-15)
 
 
-def test_rotation_of_rpy_is_pinocchios():
+def test_rotation_of_rpy_agrees_with_pinocchio():
     for rpy in np.random.default_rng(2).uniform(-7, 7, (200, 3)):
         text = " ".join(map(repr, rpy.tolist()))
         origin = parse_urdf(robot(LINKS + joint(f'<origin rpy="{text}"/>')), "f").joint("j").origin
@@ -73,12 +73,12 @@ def test_rotation_of_rpy_is_pinocchios():
     "text",
     ["1e-3 +1. -.5", "  1E-3   1.0 -5e-1  ", "1e-3\t1.\r\n-0.5", "&#49;e-3&#32;1&#x20;-.5", "0.001 1 -0.5"],
 )
-def test_odd_but_legal_numbers(text):
+def test_unusual_but_valid_numbers(text):
     urdf = parse_urdf(robot(LINKS + joint(f'<origin xyz="{text}"/>')), "f")
     assert urdf.joint("j").origin[:3, 3].tolist() == [1e-3, 1.0, -0.5]
 
 
-def test_everything_about_a_joint():
+def test_all_fields_of_joints_and_links():
     inside = '<mimic joint="j" multiplier="-2"/><axis xyz="0 3 4"/>'
     third = joint(inside, "k", "prismatic", '<parent link="b"/><child link="c"/>').replace('lower="-1" ', "")
     third = f'<link name="c"/>{third}'
@@ -99,13 +99,13 @@ def test_everything_about_a_joint():
     np.testing.assert_allclose(k.axis, [0, 0.6, 0.8], atol=1e-16)
     assert np.array_equal(k.origin, np.eye(4))
     assert (urdf.root, urdf.leaves(), urdf.path("a"), urdf.path("c")) == ("a", ("c",), (), (j, k))
-    with pytest.raises(DhcalError, match=r"^arm.urdf: no joint 'jj'; did you mean 'j'"):
+    with pytest.raises(DhcalError, match=r"^arm.urdf: unknown joint 'jj'; did you mean 'j'"):
         urdf.joint("jj")
-    with pytest.raises(DhcalError, match=r"^arm.urdf: no link 'tool'; there are 'a', 'b', 'c'$"):
+    with pytest.raises(DhcalError, match=r"^arm.urdf: unknown link 'tool'; choose from 'a', 'b', 'c'$"):
         urdf.path("tool")
 
 
-def test_continuous_joints_have_no_limits_and_ends_need_no_axis():
+def test_continuous_joints_have_no_limits_and_fixed_joints_need_no_axis():
     urdf = parse_urdf(robot(LINKS + joint('<axis xyz="0 0 0"/>', kind="fixed")), "f")
     assert urdf.joint("j").axis.tolist() == [1, 0, 0]
     continuous = parse_urdf(robot(LINKS + joint(kind="continuous")), "f").joint("j")
@@ -149,52 +149,60 @@ REFUSED = [
     (robot(LINKS) + b"<robot/>", 3, "broken XML: junk after document element"),
     (b"name: robot", 1, "broken XML"),
     (b"\n<sdf version='1.6'><model/></sdf>", 2, "<sdf>: this is SDF, not URDF"),
-    (b"<" + b"a" * 10_000 + b"/>", 1, "aaa>: this is no URDF"),
-    (b"<html/>", 1, "<html>: this is no URDF; the outermost element must be <robot>"),
+    (b"<" + b"a" * 10_000 + b"/>", 1, "aaa>: this is not a URDF"),
+    (b"<html/>", 1, "<html>: this is not a URDF; expected <robot> as the outermost element"),
     (b"<robot><link name='a'/></robot>", 1, "<robot>: no name"),
     (robot(""), 1, "<robot>: no links"),
     (robot("<a>" * 64 + "</a>" * 64), 2, "nested too deep; at most 64"),
     (robot("<link/>"), 2, "link '': no name"),
-    (robot(LINKS + "\n<link name='a'/>"), 3, "link 'a': the name is taken on line 2"),
-    (robot(two(joint(), joint())), 4, "joint 'j': the name is taken on line 3"),
+    (robot(LINKS + "\n<link name='a'/>"), 3, "link 'a': the name is already used on line 2"),
+    (robot(two(joint(), joint())), 4, "joint 'j': the name is already used on line 3"),
     (robot(LINKS + joint().replace('name="j"', "")), 2, "joint '': no name"),
     (robot(LINKS + joint().replace('name="j"', 'name=""')), 2, "joint '': no name"),
     (
         robot(LINKS + joint().replace('type="revolute"', "")),
         2,
-        "joint 'j': no type; it needs one of revolute",
+        "joint 'j': no type; expected one of revolute",
     ),
-    (robot(LINKS + joint(kind="ball")), 2, "joint 'j': unknown type 'ball'; it needs one of revolute"),
-    (robot(LINKS + joint(ends='<child link="b"/>')), 2, "joint 'j': no <parent>; it needs"),
-    (robot(LINKS + joint(ends='<parent link="a"/>')), 2, "joint 'j': no <child>; it needs"),
+    (robot(LINKS + joint(kind="ball")), 2, "joint 'j': unknown type 'ball'; choose from revolute"),
+    (robot(LINKS + joint(ends='<child link="b"/>')), 2, "joint 'j': no <parent>; expected"),
+    (robot(LINKS + joint(ends='<parent link="a"/>')), 2, "joint 'j': no <child>; expected"),
     (robot(LINKS + joint(ends='<parent link="a"/>\n<child/>')), 3, "joint 'j' <child>: no link"),
     (
         robot(LINKS + joint(ends='<parent link="a"/>\n<child link="c"/>')),
         3,
-        "<child>: no link 'c'; there are 'a', 'b'",
+        "<child>: unknown link 'c'; choose from 'a', 'b'",
     ),
-    (robot(LINKS + joint(ends='<parent link="aa"/><child link="b"/>')), 2, "no link 'aa'; did you mean 'a'"),
+    (
+        robot(LINKS + joint(ends='<parent link="aa"/><child link="b"/>')),
+        2,
+        "unknown link 'aa'; did you mean 'a'",
+    ),
     (robot(LINKS + '<joint name="j" type="fixed"/>'), 2, "joint 'j': no <parent>"),
     *(
-        (robot(LINKS + joint(element + "\n" + element)), 3, f"joint 'j' <{name}>: a second one; keep one")
+        (
+            robot(LINKS + joint(element + "\n" + element)),
+            3,
+            f"joint 'j' <{name}>: a second element of this kind; keep one",
+        )
         for name, element in (
             ("origin", "<origin/>"),
             ("axis", '<axis xyz="1 0 0"/>'),
             ("mimic", '<mimic joint="j"/>'),
         )
     ),
-    (robot(LINKS + joint('\n<parent link="a"/>')), 3, "joint 'j' <parent>: a second one"),
-    (robot(LINKS + joint('\n<child link="a"/>')), 3, "joint 'j' <child>: a second one"),
-    (robot(LINKS + joint("\n" + LIMIT)), 3, "joint 'j' <limit>: a second one"),
+    (robot(LINKS + joint('\n<parent link="a"/>')), 3, "joint 'j' <parent>: a second element"),
+    (robot(LINKS + joint('\n<child link="a"/>')), 3, "joint 'j' <child>: a second element"),
+    (robot(LINKS + joint("\n" + LIMIT)), 3, "joint 'j' <limit>: a second element"),
     *(
         (robot(LINKS + joint(f'\n<origin {key}="{text}"/>')), 3, f"joint 'j' <origin>: {key} has {what}")
         for key in ("xyz", "rpy")
         for text, what in (
-            ("", "0 numbers; it needs 3"),
-            ("1 2", "2 numbers; it needs 3"),
-            ("1 2 3 4", "4 numbers; it needs 3"),
-            ("1,2,3", "1 number; it needs 3"),
-            ("1 nan 3", "'nan'; it needs a finite number"),
+            ("", "0 numbers; expected 3"),
+            ("1 2", "2 numbers; expected 3"),
+            ("1 2 3 4", "4 numbers; expected 3"),
+            ("1,2,3", "1 number; expected 3"),
+            ("1 nan 3", "'nan'; expected a finite number"),
             ("1 inf 3", "'inf'"),
             ("1 1e999 3", "'1e999'"),
             ("1 0x1 3", "'0x1'"),
@@ -205,14 +213,14 @@ REFUSED = [
             ("1 ١ 3", "'١'"),
         )
     ),
-    (robot(LINKS + joint('<origin xyz="0 0 10001"/>')), 2, "xyz is beyond ±10000; it needs metres"),
+    (robot(LINKS + joint('<origin xyz="0 0 10001"/>')), 2, "xyz is beyond ±10000; expected metres"),
     (robot(LINKS + joint('<origin rpy="0 0 1e22"/>')), 2, "rpy is beyond ±10000"),
     (robot(LINKS + joint('<origin quat_xyzw="0 0 0 1"/>')), 2, "quat_xyzw is ignored by most readers"),
     (robot(LINKS + joint('<origin rpy="0 0 0" quat_xyzw="0 0 0 1"/>')), 2, "write the rotation as rpy"),
-    (robot(LINKS + joint("<axis/>")), 2, "<axis>: no xyz; it needs xyz=..."),
+    (robot(LINKS + joint("<axis/>")), 2, "<axis>: no xyz; expected xyz=..."),
     (robot(LINKS + joint('<axis xyz="0 z 1"/>')), 2, "<axis>: xyz has 'z'"),
     *(
-        (robot(LINKS + joint(f'<axis xyz="{text}"/>', kind=kind)), 2, "it needs a direction of length 1")
+        (robot(LINKS + joint(f'<axis xyz="{text}"/>', kind=kind)), 2, "expected a direction of length 1")
         for kind in ("revolute", "continuous", "prismatic")
         for text in ("0 0 0", "0 1e-200 0", "1e300 1e300 1e300", "-0 0 0")
     ),
@@ -233,7 +241,7 @@ REFUSED = [
     (robot(LINKS + joint("<mimic/>")), 2, "<mimic>: no joint"),
     (robot(LINKS + joint('<mimic joint="j" offset="x"/>')), 2, "<mimic>: offset has 'x'"),
     (robot(LINKS + joint('<mimic joint="j" multiplier="nan"/>')), 2, "<mimic>: multiplier has 'nan'"),
-    (robot(LINKS + joint('\n<mimic joint="j"/>')), 3, "it mimics itself in a circle"),
+    (robot(LINKS + joint('\n<mimic joint="j"/>')), 3, "the joint mimics itself in a cycle"),
     (
         robot(
             two(joint('<mimic joint="k"/>'), joint('<mimic joint="j"/>', "k")).replace(ENDS, ENDS, 1)
@@ -242,15 +250,15 @@ REFUSED = [
             b'<link name="c"/><joint name="k" type="revolute"><parent link="b"/><child link="c"/>',
         ),
         3,
-        "in a circle; let one joint",
+        "in a cycle; remove one <mimic>",
     ),
-    (robot(two(joint(), joint(name="k"))), 4, "joint 'k': its child 'b' already hangs on joint 'j'"),
+    (robot(two(joint(), joint(name="k"))), 4, "joint 'k': its child 'b' is already the child of joint 'j'"),
     (robot(two(joint(), joint(name="k", ends=BACK))), 3, "links must form a tree"),
     (robot(LINKS + "\n" + joint(ends='<parent link="b"/><child link="b"/>')), 3, "links must form a tree"),
     (
         robot('<link name="a"/>\n<link name="b"/>'),
         3,
-        "link 'b': no joint leads here nor to link 'a'; join them",
+        "link 'b': neither this link nor link 'a' is the child of a joint; a robot has one root",
     ),
     (
         robot("".join(f'<link name="{i}"/>\n' for i in range(20_002))),
@@ -261,7 +269,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("data", "line", "fragment"), REFUSED, ids=range(len(REFUSED)))
-def test_refusals_name_the_line(data, line, fragment):
+def test_invalid_files_are_refused_with_the_line(data, line, fragment):
     with pytest.raises(DhcalError) as caught:
         parse_urdf(data, "dir/arm.urdf")
     text = str(caught.value)
@@ -271,7 +279,7 @@ def test_refusals_name_the_line(data, line, fragment):
     assert len(text) < 400
 
 
-def test_what_is_nearly_refused_is_not():
+def test_unusual_but_valid_files_are_accepted():
     for data in (
         robot('<link name="a"><origin/><origin/></link>'),
         b'<?xml version="1.0" encoding="US-ASCII"?>' + robot('<link name="a"/>'),
@@ -296,12 +304,12 @@ def test_unreadable_files(tmp_path):
     path = tmp_path / "huge.urdf"
     with path.open("wb") as file:
         file.truncate((16 << 20) + 1)
-    with pytest.raises(DhcalError, match=r"huge.urdf: larger than 16 MiB"):
+    with pytest.raises(DhcalError, match=r"huge.urdf: the file is larger than 16 MiB"):
         read_urdf(path)
 
 
 def chain(n: int) -> bytes:
-    """A row of n joints; the links stand before them, the last one first."""
+    """Return a chain of n joints whose links come first, in reverse order."""
     links = "".join(f'<link name="l{i}"/>' for i in reversed(range(n + 1)))
     joints = "\n".join(
         joint(name=f"j{i}", ends=f'<parent link="l{i}"/><child link="l{i + 1}"/>') for i in range(n)
@@ -309,7 +317,7 @@ def chain(n: int) -> bytes:
     return robot(f"{links}\n{joints}")
 
 
-def test_long_chains_are_read_up_to_what_pinocchio_can_build():
+def test_chains_are_accepted_up_to_500_joints():
     urdf = parse_urdf(chain(500), "f")
     assert (urdf.root, urdf.leaves()) == ("l0", ("l500",))
     path = urdf.path("l500")
