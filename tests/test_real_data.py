@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from robots import DATA, MAPS, missing, robot_file
 
-from dhcal_pin.calibration.cross_validation import blocked_folds, cross_validate, k_fold
-from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.calibration import blocked_folds, calibrate, cross_validate, k_fold
 from dhcal_pin.cli import main
 from dhcal_pin.io.measurement_csv import read_measurement_file, read_measurements
 from dhcal_pin.io.robot import read_robot

@@ -16,134 +16,22 @@ from scipy.linalg import lstsq
 
 from .._typing import Array
 from ..estimation import qr
-from ..estimation.problem import Problem, linearize_and_factor, merge_instrument_parameters
+from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.qr import TriangularSystem
 from ..exceptions import DhcalError
 from ..measurements.base import Measurement
 from .evaluation import Accuracy, compute_errors
+from .partition import Fold, blocked_folds, contact_groups
 
 if TYPE_CHECKING:
     from .result import Result
-
-# The share of the samples at either end of a principal direction that a fold leaves out.
-BLOCK_FRACTION = 0.25
-
-
-# Directions with less than this share of the widest one's spread are none.
-_MIN_RELATIVE_SPREAD = 1e-6
-
 
 # A fold's fit may cost more than its triangle foretells by this share of one fitted sample's cost.
 _NONLINEARITY_TOL = 1e-3
 
 
-# For each measurement of a fit which of its samples (m,) a fold leaves out.
-Fold = tuple[Array, ...]
-
-
 # Where a fit of a problem ends (p,).
 Refit = Callable[[Problem], Array]
-
-
-def k_fold(data: Sequence[Measurement], count: int, seed: int = 0) -> tuple[Fold, ...]:
-    """Each sample left out in one of `count` folds at random: k-fold.
-
-    Raises:
-        DhcalError: fewer than two folds, or more than samples.
-    """
-    samples = sum(len(item.rows) for item in data)
-    if not 2 <= count <= samples:
-        raise DhcalError(f"{count} folds: choose from 2 to {samples}, the number of samples")
-    labels = np.random.default_rng(seed).permutation(samples) % count
-    return leave_one_group_out(data, labels)
-
-
-def leave_one_group_out(data: Sequence[Measurement], labels: Array) -> tuple[Fold, ...]:
-    """A fold a group: leave one group out.
-
-    Args:
-        data: measurements, m samples in all.
-        labels: (m,) the group of each sample.
-
-    Raises:
-        DhcalError: not one label a sample, or one group only.
-    """
-    labels = np.asarray(labels)
-    if labels.shape != (samples := sum(len(item.rows) for item in data),):
-        raise DhcalError(f"labels have shape {labels.shape}; {samples} samples need ({samples},)")
-    if len(groups := np.unique(labels)) < 2:
-        raise DhcalError("one group: leaving it out leaves nothing to fit")
-    return tuple(_split_mask(data, labels == group) for group in groups)
-
-
-def blocked_folds(
-    data: Sequence[Measurement], share: float = BLOCK_FRACTION, groups: Array | None = None
-) -> tuple[Fold, ...]:
-    """Two folds a principal direction of the joint values: its lowest and its highest share of samples.
-
-    Joint values are scaled to equal spread first. Places are left out as a whole, so that nothing fitted
-    says where a left-out point is or how far it is from another; with one place each sample is its own.
-
-    Args:
-        data: measurements, m samples in all.
-        share: of the samples or places at either end that a fold leaves out.
-        groups: (m,) labels of samples that belong together, as from `touched`; each by itself without it.
-            Readings without joint values go with their place, or are always fitted.
-
-    Raises:
-        DhcalError: all samples have the same joint values.
-    """
-    moving = np.concatenate([np.full(len(item.rows), item.configurations_per_row > 0) for item in data])
-    q = np.concatenate([item.q for item in data])
-    label = np.unique(np.arange(len(q)) if groups is None else groups, return_inverse=True)[1]
-    count = np.bincount(label[moving], minlength=label.max(initial=-1) + 1)
-    if np.count_nonzero(count) == 1:
-        return blocked_folds(data, share)
-    middle = np.stack([np.bincount(label[moving], column, len(count)) for column in q[moving].T], 1)
-    middle = middle[count > 0] / count[count > 0, None]
-    spread = middle.std(0)
-    scaled = (middle - middle.mean(0))[:, spread > 0] / spread[spread > 0]
-    _, size, directions = np.linalg.svd(scaled, full_matrices=False)
-    found: dict[bytes, Fold] = {}
-    for along in (scaled @ directions[size > _MIN_RELATIVE_SPREAD * size.max(initial=0.0)].T).T:
-        low, high = np.quantile(along, [share, 1 - share])
-        for left in (along <= low, along >= high):
-            if not left.all():
-                gone = np.zeros(len(count), bool)
-                gone[count > 0] = left
-                found.setdefault(gone.tobytes(), _split_mask(data, gone[label]))
-    if not found:
-        raise DhcalError("cross-validation by regions needs samples at different joint values")
-    return tuple(found.values())
-
-
-def contact_groups(problem: Problem, x: Array) -> Array:
-    """Labels (m,) of the samples' places: alike where they touch the same thing, or what is known from there.
-
-    Points that a known distance joins are one place; a sample of free space is one by itself.
-    """
-    from scipy.sparse import coo_array  # a part of the start-up, and few fits need it
-    from scipy.sparse.csgraph import connected_components
-
-    chain = problem.errors.at(x[: len(problem.errors.parameters)])
-    place = {unknown.name: i for i, unknown in enumerate(merge_instrument_parameters(problem.data))}
-    first, samples, things = len(place), [], []
-    for item in problem.data:
-        if (item.is_contact or not item.configurations_per_row) and len(item.rows):
-            frames = chain.forward_kinematics(item.configurations())
-            own, sample = np.nonzero(
-                item.instrument_jacobian(frames, problem.instrument_values_of(item, x)).any(1)
-            )
-            samples.append(first + sample)
-            things.append(np.array([place[unknown.name] for unknown in item.instrument_parameters], int)[own])
-        first += len(item.rows)
-    rows, columns = (np.concatenate([*found, np.empty(0, int)]) for found in (samples, things))
-    links = coo_array((np.ones(len(rows)), (rows, columns)), shape=(first, first))
-    return connected_components(links, directed=False)[1][len(place) :]
-
-
-def _split_mask(data: Sequence[Measurement], mask: Array) -> Fold:
-    return tuple(np.split(mask, np.cumsum([len(item.rows) for item in data])[:-1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,7 +193,7 @@ def cross_validate(fit: Result, folds: Sequence[Fold] | None = None) -> CrossVal
 
     Args:
         fit: a calibration; its sigmas, weights and priors are kept.
-        folds: of `random_folds`, `group_folds` or `region_folds`; the last without it.
+        folds: of `k_fold`, `leave_one_group_out` or `blocked_folds`; the last without it.
 
     Raises:
         DhcalError: folds that were not made for the fitted data.

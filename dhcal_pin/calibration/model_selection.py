@@ -28,13 +28,12 @@ from ..robot.error_families import FAMILIES
 from . import procedure
 from .cross_validation import (
     FoldSystems,
-    blocked_folds,
-    contact_groups,
     count_rows,
     factor_folds,
     solve_columns,
     standard_error,
 )
+from .partition import blocked_folds, contact_groups
 from .result import Result
 
 # Widths of a family's priors that are tried, as shares of the default ones.

@@ -47,22 +47,6 @@ def _bounds(problem: Problem, bounds: Mapping[str, tuple[float, float]]) -> Arra
     return out
 
 
-def split(
-    data: Sequence[Measurement], fraction: float, seed: int = 0
-) -> tuple[tuple[Measurement, ...], tuple[Measurement, ...]]:
-    """Fit and hold-out parts of each measurement, at random by seed."""
-    if not 0 <= fraction < 1:
-        raise DhcalError(f"holdout {fraction}: must be a share between 0 and 1")
-    rng = np.random.default_rng(seed)
-    fit, held = [], []
-    for item in data:
-        order = rng.permutation(len(item.rows))
-        count = round(fraction * len(order))
-        held.append(item.take(np.sort(order[:count])))
-        fit.append(item.take(np.sort(order[count:])))
-    return tuple(fit), tuple(item for item in held if len(item.rows))
-
-
 def _validated_known(data: tuple[Measurement, ...], known: Mapping[str, float]) -> Mapping[str, float]:
     """The known values, after checking that each belongs to an unknown of the data."""
     names = [unknown.name for unknown in merge_instrument_parameters(data) if not unknown.is_local]

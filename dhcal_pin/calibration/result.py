@@ -23,7 +23,7 @@ from ..identifiability import explanations, observability
 from ..measurements.base import InstrumentParameter, Measurement
 from ..robot.chain import Chain
 from . import estimates, summary
-from .cross_validation import cross_validate_folds, k_fold
+from .cross_validation import cross_validate_folds
 from .estimates import Estimate
 from .evaluation import (
     Accuracy,
@@ -33,6 +33,7 @@ from .evaluation import (
     remove_outliers,
 )
 from .initialization import fit_frames
+from .partition import configuration_groups, k_fold
 
 # Residuals that are larger than stated by so many standard deviations of chance contradict the sigmas.
 CONTRADICTION_SIGMAS = 3.0
@@ -312,9 +313,10 @@ class Result:
             held = sum(len(item.rows) for item in self.holdout)
             without = Accuracy.from_errors(clean) if gross else Accuracy()
             return (Comparison("held out", held, before, after, 0, gross, without), *found)
-        if count < 2:
+        n_configurations = len(np.unique(configuration_groups(kept)))
+        if n_configurations < 2:
             return found
-        folds = k_fold(kept, min(N_FOLDS, count))
+        folds = k_fold(kept, min(N_FOLDS, n_configurations))
         problem = self.problem.with_data(self._inliers(self.problem.data))
         judged = [
             item

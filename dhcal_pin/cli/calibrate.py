@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from .._typing import PathLike
-from ..calibration import model_selection, procedure, summary
+from ..calibration import model_selection, partition, procedure, summary
 from ..calibration.model_selection import FULL_SET, is_restricted
 from ..calibration.result import Result
 from ..diagnostics.input_checks import find_input_warnings, poorly_fitted_files
@@ -88,7 +88,7 @@ def _read_data(chain: Chain, args: Job, held_file: str | None, known_frames: boo
             fraction = float(args.holdout)
         except ValueError:
             raise DhcalError(f"--holdout {args.holdout}: neither a file nor a share such as 0.3") from None
-        kept, parted = procedure.split(fit, fraction, args.seed)
+        kept, parted = partition.split(fit, fraction, args.seed)
         drawn = [path for path, a, b in zip(args.data, fit, kept, strict=True) if len(b.rows) < len(a.rows)]
         fit, holdout = list(kept), [*holdout, *zip(drawn, parted, strict=True)]
     fitted = {path: item for path, item in zip(args.data, fit, strict=True) if len(item.rows)}

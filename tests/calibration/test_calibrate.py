@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import mpmath
 import numpy as np
 import pytest
@@ -12,9 +10,9 @@ from scipy.linalg import null_space
 
 from dhcal_pin import se3
 from dhcal_pin._kernels import qr as householder
-from dhcal_pin.calibration.cross_validation import k_fold
 from dhcal_pin.calibration.evaluation import accuracy
-from dhcal_pin.calibration.procedure import calibrate, split
+from dhcal_pin.calibration.partition import k_fold
+from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.estimation import problem, qr
 from dhcal_pin.estimation.parameters import select_parameters
 from dhcal_pin.estimation.problem import CHUNK_SIZE, Problem, linearize_and_factor
@@ -314,14 +312,6 @@ def test_mixed_kinds_on_random_arms(seed):
     assert fit.validate(Pose.simulate(truth, draw(50), Noise(), rng))["position_max_m"] < 1e-9
 
 
-def test_split_is_a_partition_by_seed(sim_6dof):
-    data = Position.simulate(sim_6dof, np.zeros((10, 6)), Noise(1e-3), np.random.default_rng(0))
-    fit, held = split([data], 0.3, seed=4)
-    assert sorted([*fit[0].rows, *held[0].rows]) == list(range(1, 11))
-    assert len(held[0].q) == 3
-    np.testing.assert_array_equal(split([data], 0.3, seed=4)[1][0].rows, held[0].rows)
-
-
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
@@ -439,7 +429,7 @@ def test_touches_without_a_length_leave_the_size_of_the_arm_to_the_priors(sim_6d
     errors = select_parameters(sim_6dof, "minimal")
     truth = errors.at(errors.priors * rng.normal(size=len(errors.parameters)))
     q = rng.uniform(-2.5, 2.5, (300, 6))
-    data = replace(PointContact.simulate(truth, q, Noise(noise), rng), has_stated_sigma=False)
+    data = PointContact.simulate(truth, q, Noise(noise), rng).replace(has_stated_sigma=False)
     fixed = ("tool.rx", "tool.ry", "tool.rz")
     fit = calibrate(sim_6dof, data, "minimal,tool", fix=fixed)
     assert [text for text in fit.unobservable if "how large" in text]

@@ -10,16 +10,10 @@ import numpy as np
 import pytest
 from robots import paper, robot_file
 
-from dhcal_pin.calibration.cross_validation import (
-    blocked_folds,
-    contact_groups,
-    cross_validate,
-    k_fold,
-    leave_one_group_out,
-    standard_error,
-)
+from dhcal_pin.calibration.cross_validation import cross_validate, standard_error
 from dhcal_pin.calibration.evaluation import accuracy
 from dhcal_pin.calibration.model_selection import MAX_HINT_SAMPLES, extend, family_hint
+from dhcal_pin.calibration.partition import k_fold
 from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation.parameters import select_parameters
@@ -27,7 +21,7 @@ from dhcal_pin.estimation.solver import levenberg_marquardt
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io.measurement_csv import measurement_text
 from dhcal_pin.measurements.base import Noise
-from dhcal_pin.measurements.contact import PointContact, PointDistance
+from dhcal_pin.measurements.contact import PointContact
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.measurements.position import Position
 from dhcal_pin.robot.chain import Chain
@@ -104,55 +98,9 @@ def test_folds_equal_fits_without_what_they_leave_out():
     assert whole > 1.1 * fit.validate(fit.data)["position_rms_m"]
 
 
-def test_random_folds_and_groups_leave_each_sample_out_once():
-    data = fitted().data
-    for folds in (k_fold(data, 5), leave_one_group_out(data, np.arange(40) // 8)):
-        assert len(folds) == 5
-        np.testing.assert_array_equal(np.sum([fold[0] for fold in folds], 0), np.ones(40))
-    with pytest.raises(DhcalError, match="choose from 2 to 40"):
-        k_fold(data, 41)
-    with pytest.raises(DhcalError, match="40 samples need"):
-        leave_one_group_out(data, np.arange(3))
-    with pytest.raises(DhcalError, match="one group"):
-        leave_one_group_out(data, np.zeros(40))
+def test_folds_of_other_data_are_refused():
     with pytest.raises(DhcalError, match="made for other data"):
-        cross_validate(fitted(m=30), k_fold(data, 5))
-
-
-def test_regions_are_the_ends_of_joint_space():
-    """One joint moves in steps and another with it: one direction, its lowest and highest quarter."""
-    q = np.zeros((8, 6))
-    q[:, 1] = np.arange(8)
-    q[:, 4] = -2 * np.arange(8)
-    data = fitted(m=8).data[0].replace(q=q)
-    low, high = sorted(fold[0].nonzero()[0].tolist() for fold in blocked_folds([data]))
-    assert (low, high) == ([0, 1], [6, 7])
-    with pytest.raises(DhcalError, match="different joint values"):
-        blocked_folds([data.replace(q=np.ones((8, 6)))])
-
-
-def test_what_was_touched_is_left_out_as_a_whole():
-    """Points a, b are joined by a distance, as c, d are; e stands alone and i is never touched."""
-    names = np.array(list("abcde"))
-    label = np.repeat(np.arange(5), 4)
-    arm = Chain.from_dh(paper("sim_6dof"))
-    q = 0.4 * label[:, None] + np.random.default_rng(0).uniform(-0.1, 0.1, (20, 6))
-    touches = PointContact(q, names[label].tolist())
-    known = PointDistance(6, [("c", "d"), ("a", "b"), ("a", "i")], [0.1, 0.1, 0.1])
-    problem = calibrate(arm, [touches, known], "dh", max_iterations=1).problem
-    places = contact_groups(problem, np.zeros(len(problem.weights)))
-    folds = blocked_folds(problem.data, groups=places)
-    for of_touches, of_distances in folds:
-        by_name = {name: set(of_touches[label == i].tolist()) for i, name in enumerate("abcde")}
-        assert all(len(found) == 1 for found in by_name.values())
-        assert by_name["a"] == by_name["b"] == set(of_distances[1:].tolist())
-        assert by_name["c"] == by_name["d"] == set(of_distances[:1].tolist())
-    left = {tuple(fold[0].tolist()) for fold in folds}
-    assert len(left) == len(folds) >= 2
-    # One place is no region of its own: there samples are left out one by one.
-    one = PointContact(q, ["a"] * 20)
-    alone = [fold[0] for fold in blocked_folds([one], groups=np.zeros(20, int))]
-    np.testing.assert_array_equal(alone, [fold[0] for fold in blocked_folds([one])])
+        cross_validate(fitted(m=30), k_fold(fitted().data, 5))
 
 
 def test_few_folds_must_agree_more():

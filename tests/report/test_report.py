@@ -17,7 +17,8 @@ from robots import URDF, missing, paper, robot_file
 
 from dhcal_pin import Provenance, formatting, se3, write_report
 from dhcal_pin.calibration.evaluation import accuracy
-from dhcal_pin.calibration.procedure import calibrate, split
+from dhcal_pin.calibration.partition import split
+from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.calibration.result import Result
 from dhcal_pin.cli import main
 from dhcal_pin.diagnostics import residuals

@@ -1,0 +1,315 @@
+"""Partition of samples into a fitted and a held-out part: one split, or the folds of a cross-validation.
+
+A hold-out error is only valid if the held-out samples are independent of the fitted ones. Two kinds of
+samples depend on each other and therefore always go to the same part:
+
+- Samples of one configuration, for example several targets, corners or repetitions measured while the robot
+  stands still. They share the same joint values and the same error of the robot.
+- In `blocked_folds`, samples that touch the same unknown point, plane or sphere, or points joined by a known
+  distance. A fitted sample would reveal where the held-out one must be.
+
+Random parts measure the error between the measured configurations. A fold of `blocked_folds` holds out one
+end of the measured joint space and so measures the error of an extrapolation.
+
+Shapes: m samples of all measurements in a row, n joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .._typing import Array
+from ..estimation.problem import Problem, merge_instrument_parameters
+from ..exceptions import InvalidArgumentError, NotObservableError
+from ..measurements.base import Measurement
+
+# Joint values that differ by less are the same configuration [rad or m].
+CONFIGURATION_TOL = 1e-6
+# Fraction of the samples that a blocked fold holds out at either end of a principal direction.
+BLOCK_FRACTION = 0.25
+# Principal directions whose spread is below this fraction of the largest one's are ignored.
+_MIN_RELATIVE_SPREAD = 1e-6
+
+# Mask of the held-out samples (m,) of each measurement.
+Fold = tuple[Array, ...]
+
+
+def group_by_configuration(q: Array, tolerance: float = CONFIGURATION_TOL) -> Array:
+    """Label rows of joint values, equal rows by the same label.
+
+    Rows are equal if no joint value differs by more than the tolerance. Equality is transitive: rows that are
+    connected by a chain of equal rows get the same label.
+
+    Args:
+        q: Joint values, shape (m, n) [rad or m].
+        tolerance: Largest difference of equal joint values [rad or m].
+
+    Returns:
+        Labels of shape (m,), counted from 0 in the order of first appearance.
+
+    >>> group_by_configuration(np.array([[0.5, 1.0], [0.0, 1.0], [0.5, 1.0 + 1e-9]]))
+    array([0, 1, 0])
+    """
+    m, n = q.shape
+    # Equal rows are close in their projection on any direction: only neighbours along one are compared. The
+    # direction is irrational, so that rows of a regular grid do not coincide; its weights sum to 1.
+    direction = np.modf(np.arange(1, n + 1) * (1 + np.sqrt(5)) / 2)[0]
+    projection = q @ (direction / direction.sum())
+    order = np.argsort(projection, kind="stable")
+    is_new = np.ones(m, bool)
+    is_new[1:] = np.any(q[order[1:]] != q[order[:-1]], 1)
+    rows, projection = q[order[is_new]], projection[order[is_new]]
+    first, second = [], []
+    for offset in range(1, len(rows)):
+        (near,) = np.nonzero(projection[offset:] - projection[:-offset] <= tolerance * (1 + 1e-6))
+        if not near.size:
+            break
+        near = near[np.abs(rows[near + offset] - rows[near]).max(1) <= tolerance]
+        first.append(near)
+        second.append(near + offset)
+    labels = np.empty(m, int)
+    labels[order] = _connect(len(rows), first, second)[np.cumsum(is_new) - 1]
+    return _by_first_appearance(labels)
+
+
+def _connect(count: int, first: Sequence[Array], second: Sequence[Array]) -> Array:
+    """Label nodes (count,), those that links from `first` to `second` connect by the same label."""
+    ends = [np.concatenate([*nodes, np.empty(0, int)]) for nodes in (first, second)]
+    if not len(ends[0]):
+        return np.arange(count)
+    from scipy.sparse import coo_array  # lazy import: slow, and few data need it
+    from scipy.sparse.csgraph import connected_components
+
+    links = coo_array((np.ones(len(ends[0])), (ends[0], ends[1])), shape=(count, count))
+    return connected_components(links, directed=False)[1]
+
+
+def _by_first_appearance(labels: Array) -> Array:
+    """Number labels (m,) from 0 in the order of their first appearance."""
+    _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[inverse]
+
+
+def _merge_groups(labels: Array, others: Array) -> Array:
+    """Merge groups (m,) that have samples of one group (m,) of the others in common; keep their order."""
+    values, merged = np.unique(labels, return_inverse=True)
+    _, others = np.unique(others, return_inverse=True)
+    while True:
+        lowest = np.full(len(merged), len(values))
+        np.minimum.at(lowest, others, merged)
+        by_group = np.full(len(values), len(values))
+        np.minimum.at(by_group, merged, lowest[others])
+        if np.array_equal(by_group[merged], merged):
+            return values[merged]
+        merged = by_group[merged]
+
+
+def configuration_groups(data: Sequence[Measurement]) -> Array:
+    """Label the samples of measurements, those of the same configuration by the same label.
+
+    A sample with several configurations, such as a relative pose, is compared by all of its joint values. A
+    sample without a configuration, such as a known distance between points, has a label of its own.
+
+    Args:
+        data: Measurements of any kinds, m samples in all.
+
+    Returns:
+        Labels of shape (m,), counted from 0 in the order of first appearance.
+    """
+    counts = [len(item.rows) for item in data]
+    starts = np.cumsum([0, *counts])
+    labels = np.arange(starts[-1])
+    for width in {item.configurations_per_row for item in data} - {0}:
+        chosen = [i for i, item in enumerate(data) if item.configurations_per_row == width and counts[i]]
+        if not chosen:
+            continue
+        # One row of joint values per sample: configurations() lists all first ones, then all second ones.
+        rows = [np.concatenate(np.split(np.asarray(data[i].configurations()), width), axis=1) for i in chosen]
+        samples = np.concatenate([np.arange(starts[i], starts[i + 1]) for i in chosen])
+        # The label of a group is the number of its first sample.
+        groups = group_by_configuration(np.concatenate(rows))
+        labels[samples] = samples[np.unique(groups, return_index=True)[1][groups]]
+    return _by_first_appearance(labels)
+
+
+def split(
+    data: Sequence[Measurement], fraction: float, seed: int = 0
+) -> tuple[tuple[Measurement, ...], tuple[Measurement, ...]]:
+    """Split measurements into a fitted and a held-out part at random.
+
+    The fraction is taken of each measurement, as closely as whole configurations allow.
+
+    Args:
+        data: Measurements of any kinds.
+        fraction: Fraction of the samples to hold out, in [0, 1).
+        seed: Seed of the random numbers.
+
+    Returns:
+        The fitted part of each measurement, and the held-out parts that are not empty.
+
+    Raises:
+        InvalidArgumentError: If the fraction is out of range.
+    """
+    if not 0 <= fraction < 1:
+        raise InvalidArgumentError(f"holdout={fraction}: expected a fraction in [0, 1)")
+    rng = np.random.default_rng(seed)
+    labels = configuration_groups(data)
+    # 1 for a configuration that is held out, 0 for a fitted one, -1 if not yet decided.
+    state = np.full(len(labels), -1)
+    fitted, held_out = [], []
+    for item, label in zip(data, _by_measurement(data, labels), strict=True):
+        order = rng.permutation(len(item.rows))
+        wanted = round(fraction * len(order)) - np.count_nonzero(state[label] == 1)
+        drawn = label[order][state[label[order]] < 0]
+        groups, first, size = np.unique(drawn, return_index=True, return_counts=True)
+        by_draw = np.argsort(first)
+        groups, size = groups[by_draw], size[by_draw]
+        # Hold out configurations in the order drawn, as long as more than half of each is still wanted.
+        state[groups] = np.cumsum(size) - size / 2 <= wanted
+        held = state[label] == 1
+        fitted.append(item.take(np.flatnonzero(~held)))
+        held_out.append(item.take(np.flatnonzero(held)))
+    return tuple(fitted), tuple(item for item in held_out if len(item.rows))
+
+
+def k_fold(data: Sequence[Measurement], count: int, seed: int = 0) -> tuple[Fold, ...]:
+    """Divide configurations into folds at random; each fold holds out one share of them.
+
+    Args:
+        data: Measurements of any kinds.
+        count: Number of folds.
+        seed: Seed of the random numbers.
+
+    Returns:
+        The folds; each sample is held out in exactly one of them.
+
+    Raises:
+        InvalidArgumentError: If there are fewer than two folds, or more folds than configurations.
+    """
+    labels = configuration_groups(data)
+    n_configurations = int(labels.max(initial=-1)) + 1
+    if not 2 <= count <= n_configurations:
+        raise InvalidArgumentError(
+            f"{count} folds: choose from 2 to {n_configurations}, the number of different configurations"
+        )
+    fold_of = np.random.default_rng(seed).permutation(n_configurations) % count
+    return leave_one_group_out(data, fold_of[labels])
+
+
+def leave_one_group_out(data: Sequence[Measurement], labels: Array) -> tuple[Fold, ...]:
+    """Make one fold per group of samples, which holds out that group.
+
+    Groups that have a configuration in common are merged.
+
+    Args:
+        data: Measurements of any kinds, m samples in all.
+        labels: Group of each sample, shape (m,).
+
+    Returns:
+        The folds, in the order of the labels; each sample is held out in exactly one of them.
+
+    Raises:
+        InvalidArgumentError: If there is not one label per sample, or only one group.
+    """
+    labels = np.asarray(labels)
+    if labels.shape != (samples := sum(len(item.rows) for item in data),):
+        raise InvalidArgumentError(f"labels have shape {labels.shape}; expected ({samples},), one per sample")
+    merged = _merge_groups(labels, configuration_groups(data))
+    groups = np.unique(merged)
+    if len(groups) < 2:
+        shared = " (all groups have configurations in common)" if len(np.unique(labels)) > 1 else ""
+        raise InvalidArgumentError(
+            f"one group{shared}: holding it out leaves nothing to fit; expected at least 2"
+        )
+    return tuple(_by_measurement(data, merged == group) for group in groups)
+
+
+def blocked_folds(
+    data: Sequence[Measurement], fraction: float = BLOCK_FRACTION, groups: Array | None = None
+) -> tuple[Fold, ...]:
+    """Make two folds per principal direction of the joint values, which hold out its ends.
+
+    Joint values are scaled to equal standard deviations first. Samples of one group or of one configuration
+    are held out together. If there is only one group, each configuration is its own group.
+
+    Args:
+        data: Measurements of any kinds, m samples in all.
+        fraction: Fraction of the groups that a fold holds out.
+        groups: Labels of samples that belong together, shape (m,), as from `contact_groups`; without it each
+            configuration is its own group. Samples without a configuration go with their group, or are
+            always fitted.
+
+    Returns:
+        The different folds.
+
+    Raises:
+        NotObservableError: If all samples have the same joint values.
+    """
+    has_configuration = np.concatenate(
+        [np.full(len(item.rows), item.configurations_per_row > 0) for item in data]
+    )
+    q = np.concatenate([item.q for item in data])
+    configurations = configuration_groups(data)
+    merged = configurations if groups is None else _merge_groups(groups, configurations)
+    label = np.unique(merged, return_inverse=True)[1]
+    count = np.bincount(label[has_configuration], minlength=label.max(initial=-1) + 1)
+    if groups is not None and np.count_nonzero(count) == 1:
+        return blocked_folds(data, fraction)
+    centre = np.stack(
+        [np.bincount(label[has_configuration], column, len(count)) for column in q[has_configuration].T], 1
+    )
+    centre = centre[count > 0] / count[count > 0, None]
+    std = centre.std(0)
+    scaled = (centre - centre.mean(0))[:, std > 0] / std[std > 0]
+    _, spread, directions = np.linalg.svd(scaled, full_matrices=False)
+    folds: dict[bytes, Fold] = {}
+    for along in (scaled @ directions[spread > _MIN_RELATIVE_SPREAD * spread.max(initial=0.0)].T).T:
+        low, high = np.quantile(along, [fraction, 1 - fraction])
+        for is_end in (along <= low, along >= high):
+            if not is_end.all():
+                held_out = np.zeros(len(count), bool)
+                held_out[count > 0] = is_end
+                folds.setdefault(held_out.tobytes(), _by_measurement(data, held_out[label]))
+    if not folds:
+        raise NotObservableError(
+            "cross-validation by regions: all samples have the same joint values; "
+            "expected samples at different joint values"
+        )
+    return tuple(folds.values())
+
+
+def contact_groups(problem: Problem, x: Array) -> Array:
+    """Label samples that touch the same thing by the same label.
+
+    Points that are joined by a known distance count as the same thing. A sample that touches nothing has a
+    label of its own.
+
+    Args:
+        problem: Problem with the measurements, m samples in all.
+        x: Errors of its parameters, shape (p,) [m or rad].
+
+    Returns:
+        Labels of shape (m,).
+    """
+    chain = problem.errors.at(x[: len(problem.errors.parameters)])
+    node = {parameter.name: i for i, parameter in enumerate(merge_instrument_parameters(problem.data))}
+    # Nodes of the graph: instrument parameters, then samples; a contact links a sample to its parameters.
+    start, samples, parameters = len(node), [], []
+    for item in problem.data:
+        if (item.is_contact or not item.configurations_per_row) and len(item.rows):
+            frames = chain.forward_kinematics(item.configurations())
+            depends, sample = np.nonzero(
+                item.instrument_jacobian(frames, problem.instrument_values_of(item, x)).any(1)
+            )
+            nodes = np.array([node[parameter.name] for parameter in item.instrument_parameters], int)
+            samples.append(start + sample)
+            parameters.append(nodes[depends])
+        start += len(item.rows)
+    return _connect(start, samples, parameters)[len(node) :]
+
+
+def _by_measurement(data: Sequence[Measurement], values: Array) -> Fold:
+    """Cut values (m,) of all samples into one array per measurement."""
+    return tuple(np.split(values, np.cumsum([len(item.rows) for item in data])[:-1]))
