@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import fnmatch
 import os
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -16,7 +17,7 @@ from ..calibration.model_selection import FULL_SET, is_restricted
 from ..calibration.result import Result
 from ..diagnostics.input_checks import find_input_warnings, poorly_fitted_files
 from ..diagnostics.reachability import UnreachableRow, find_unreachable_rows
-from ..estimation.parameters import EXTENSIONS
+from ..estimation.parameters import EXTENSIONS, select_parameters
 from ..estimation.robust import ZERO_WEIGHT
 from ..estimation.solver import Progress
 from ..exceptions import DhcalError
@@ -352,6 +353,10 @@ def improvement_hint(fit: Result, chain: Chain, data: Sequence[Measurement], **o
     group, after = next(iter(now.after.groups.items()))
     if after.rms < EXACT_FIT_RATIO * now.before.groups[group].rms:
         return ""
+    if isinstance(priors := options.get("priors"), Mapping):
+        # The user's priors are for the chosen sets; drop those without a parameter in the full set.
+        names = [p.name for p in select_parameters(chain, FULL_SET).parameters]
+        options["priors"] = {key: std for key, std in priors.items() if fnmatch.filter(names, key)}
     wider = procedure.calibrate(chain, data, FULL_SET, **options)
     then = wider.comparisons[0]
     is_worse = then.after.groups[group].rms > MAX_ERROR_RATIO * after.rms

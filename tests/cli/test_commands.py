@@ -963,3 +963,9 @@ def test_unknowns_that_cannot_take_up_what_was_measured_are_told(run, tmp_path, 
         status, _, err = run("calibrate", "arm.dh.toml", "data.csv", "--parameters", sets, "-o", "out.urdf")
         assert status == 0
         assert ("arm.dh.toml: warning: --parameters minimal,base,tool would leave" in err) == told
+    # Priors of parameters that the wider set does not have are no error of the user.
+    Path("priors.toml").write_text('"theta*" = 0.01\n"base.*" = 2.0\n')
+    sets = ("--parameters", "modified-dh,base,tool", "--priors", "priors.toml")
+    status, _, err = run("calibrate", "arm.dh.toml", "data.csv", *sets, "-o", "out.urdf")
+    assert status == 0, err
+    assert "arm.dh.toml: warning: --parameters minimal,base,tool would leave" in err
