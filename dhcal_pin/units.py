@@ -18,8 +18,8 @@ LENGTHS = {"m": 1.0, "cm": 1e2, "mm": 1e3, "um": 1e6, "\u00b5m": 1e6, "\u03bcm":
 ANGLES = {"rad": 1.0, "mrad": 1e3, "deg": 180.0 / np.pi}
 # Units allowed for each content type of a column.
 UNITS: Mapping[str, Mapping[str, float]] = {"length": LENGTHS, "angle": ANGLES, "number": {}, "text": {}}
-# Largest accepted standard deviation [m or rad]; a larger one has the wrong unit.
-_MAX_STD = 1e6
+# Largest accepted length or angle [m or rad]; a larger value has the wrong unit.
+MAX_SI_VALUE = 1e6
 
 
 def parse_noise(text: str, label: str = "--noise") -> tuple[float, float]:
@@ -55,6 +55,6 @@ def parse_noise(text: str, label: str = "--noise") -> tuple[float, float]:
             raise InvalidArgumentError(
                 f"{where}: {match[1]!r} is not a number; expected for example 0.1"
             ) from None
-        if not 0 <= out[quantity] <= _MAX_STD:
-            raise InvalidArgumentError(f"{where}: standard deviation must lie in [0, {_MAX_STD:g}] m or rad")
+        if not 0 <= out[quantity] <= MAX_SI_VALUE:
+            raise InvalidArgumentError(f"{where}: standard deviation must lie in [0, {MAX_SI_VALUE:g}] m or rad")
     return out.get("length", 0.0), out.get("angle", 0.0)

@@ -24,8 +24,8 @@ from ..exceptions import DhcalError
 from ..io.atomic import write_files
 from ..io.measurement_csv import read_measurement_file
 from ..io.robot import read_robot, urdf_files
-from ..io.settings import read_bounds, read_priors
-from ..io.sidecar import parse_payload, read_instrument, sidecar_path
+from ..io.settings import parse_payload, read_bounds, read_priors
+from ..io.sidecar import read_instrument, sidecar_path
 from ..measurements.base import Measurement
 from ..measurements.position import require_common_reference_target
 from ..parallel import SERIAL, TaskExecutor, open_executor

@@ -12,7 +12,7 @@ from .._typing import Array
 from ..compensation import SINGULAR, Compensation, compensate
 from ..exceptions import DhcalError
 from ..io.atomic import write_files
-from ..io.measurement_columns import QUATERNION, ROTVEC, units_of
+from ..io.measurement_columns import QUATERNION, ROTVEC, joint_units
 from ..io.measurement_csv import TargetPoses, read_targets
 from ..io.robot import has_dh_table, read_robot
 from ..io.tabular import csv_text
@@ -52,7 +52,7 @@ def corrected_text(found: Compensation, chain: Chain, wanted: TargetPoses) -> st
     """
     columns: dict[str, Sequence[str]] = {}
     for name, values in zip(chain.joint_names, found.q.T, strict=True):
-        columns[f"{name}[{'m' if units_of(chain, name) is LENGTHS else 'rad'}]"] = _numbers(values)
+        columns[f"{name}[{'m' if joint_units(chain, name) is LENGTHS else 'rad'}]"] = _numbers(values)
     for i, name in enumerate(("x", "y", "z")):
         unit = wanted.units[name]
         columns[f"{name}[{unit}]"] = _numbers(found.poses[:, i, 3] * LENGTHS[unit])

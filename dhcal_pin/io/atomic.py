@@ -1,4 +1,10 @@
-"""Files written all or none, whatever comes in between."""
+"""Atomic writing: several files are written together, or none of them.
+
+Each content goes to a temporary file in the folder of its target first. Then the temporary files are renamed
+to the targets, one by one; an existing target gets a second name before. If anything fails, the targets that
+were renamed already are restored. A rename is atomic (POSIX), so that a reader sees the old or the new
+content of a file, never a part of it.
+"""
 
 from __future__ import annotations
 
@@ -10,64 +16,72 @@ from collections.abc import Mapping
 from contextlib import suppress
 
 from .._typing import PathLike
-from ..exceptions import DhcalError
+from ..exceptions import FileFormatError, InvalidArgumentError
 
 
 def require_writable(path: PathLike) -> None:
-    """Complains unless a file can stand at a path.
+    """Require that a file can be created at a path.
+
+    Args:
+        path: Path of the file to write.
 
     Raises:
-        DhcalError: its folder is missing, or it is a folder itself.
+        InvalidArgumentError: The folder of the path does not exist, or the path is a folder itself.
     """
     folder = os.path.dirname(path) or os.curdir
     if os.path.isdir(path):
-        raise DhcalError(f"{path}: is a folder; name a file in it")
+        raise InvalidArgumentError(f"{path}: is a folder; name a file in it")
     if not os.path.isdir(folder):
-        raise DhcalError(f"{path}: there is no folder {folder}; make it first, or write elsewhere")
+        raise InvalidArgumentError(f"{path}: there is no folder {folder}; make it first, or write elsewhere")
 
 
 def write_files(contents: Mapping[PathLike, str | bytes]) -> None:
-    """Writes all files or none: each beside its place first, then renamed over.
+    """Write all files or none.
 
-    A link stays a link and what it leads to is written; a file that was there keeps its permissions.
+    A symbolic link stays a link, and its target is written. An existing file keeps its permissions.
+
+    Args:
+        contents: Text, written as UTF-8, or bytes by path.
 
     Raises:
-        DhcalError: a folder is missing or not writable, a disk is full.
+        FileFormatError: A file cannot be written, for example because the disk is full.
     """
-    staged: list[tuple[str, PathLike]] = []
-    placed: list[tuple[str, PathLike]] = []
+    staged: list[tuple[str, PathLike]] = []  # temporary file and target
+    renamed: list[tuple[str, PathLike]] = []
     path: PathLike = ""
     try:
         for path, content in contents.items():
             require_writable(path)
-            real = os.path.realpath(path)
-            handle, name = tempfile.mkstemp(prefix=".dhcal-", dir=os.path.dirname(real))
-            staged.append((name, real))
+            target = os.path.realpath(path)
+            handle, temporary = tempfile.mkstemp(prefix=".dhcal-", dir=os.path.dirname(target))
+            staged.append((temporary, target))
             with os.fdopen(handle, "wb") as file:
                 file.write(content.encode() if isinstance(content, str) else content)
-            os.chmod(name, _permissions(real))
-        for name, path in staged:
-            _make_backup(path, _backup_path(name))
-            os.replace(name, path)
-            placed.append((name, path))
+            os.chmod(temporary, _permissions(target))
+        for temporary, path in staged:
+            _make_backup(path, _backup_path(temporary))
+            os.replace(temporary, path)
+            renamed.append((temporary, path))
     except BaseException as error:
-        for name, done in reversed(placed):
-            if os.path.exists(_backup_path(name)):
-                os.replace(_backup_path(name), done)
+        for temporary, target in reversed(renamed):
+            if os.path.exists(_backup_path(temporary)):
+                os.replace(_backup_path(temporary), target)
             else:
-                os.unlink(done)
+                os.unlink(target)
         if isinstance(error, OSError):
-            raise DhcalError(f"{path}: cannot write there: {error.strerror}; choose another place") from error
+            raise FileFormatError(
+                f"{path}: cannot write there: {error.strerror}; choose another place"
+            ) from error
         raise
     finally:
-        for name, _ in staged:
-            for rest in (name, _backup_path(name)):
+        for temporary, _ in staged:
+            for leftover in (temporary, _backup_path(temporary)):
                 with suppress(FileNotFoundError):
-                    os.unlink(rest)
+                    os.unlink(leftover)
 
 
 def _permissions(path: str) -> int:
-    """Those of the file at a path, or those that a new one gets."""
+    """Return the permissions of an existing file, or those that a new file gets."""
     try:
         return stat.S_IMODE(os.stat(path).st_mode)
     except FileNotFoundError:
@@ -76,15 +90,15 @@ def _permissions(path: str) -> int:
         return 0o666 & ~mask
 
 
-def _backup_path(name: str) -> str:
-    return f"{name}-old"
+def _backup_path(temporary: str) -> str:
+    return f"{temporary}-old"
 
 
 def _make_backup(path: PathLike, backup: str) -> None:
-    """A second name for what stands at a path, if anything does."""
+    """Give the file at a path a second name, if the file exists."""
     try:
         os.link(path, backup)
     except FileNotFoundError:
         pass
     except OSError:
-        shutil.copy2(path, backup)  # a file system without links
+        shutil.copy2(path, backup)  # the file system has no hard links

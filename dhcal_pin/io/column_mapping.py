@@ -1,38 +1,40 @@
-"""Files of other makers, read through a map: a TOML file that says which column is what.
+"""Column maps: read measurement files of other vendors.
 
-Everything in a map but the columns themselves has a default:
+A column map is a TOML file that describes the columns of a vendor's file. Every key except the columns
+themselves has a default:
 
     separator = ";"        # "," (default), ";", "tab", or "space" for any white space
     decimal = ","          # "." (default) or ","
-    skip = 2               # lines before the header, 0 by default
-    header = true          # false: there is none, and columns have numbers from 1
-    comment = "#"          # what a comment line starts with; "" where there are none
+    skip = 2               # number of lines before the header (default 0)
+    header = true          # false: the file has no header; columns are numbers counted from 1
+    comment = "#"          # start of a comment line; "" if there are none
     encoding = "cp1252"    # UTF-8 by default
 
-    [joints]               # the robot's joints from its base to its tip, or those of `names`
-    order = ["A1", "A2"]   # their headers or numbers
-    unit = "deg"           # or one a joint, as ["deg", "mm"]
+    [joints]               # joints of the robot from base to tip, or those in `names`
+    order = ["A1", "A2"]   # header or number of each joint's column
+    unit = "deg"           # or one unit per joint, such as ["deg", "mm"]
     sign = [1, -1]         # optional
-    offset = [0.0, 90.0]   # optional, in that unit: ours = sign * theirs + offset
+    offset = [0.0, 90.0]   # optional, in that unit: joint = sign * column + offset
 
-    [columns]              # our name = theirs
+    [columns]              # project column = vendor column
     x = {from = "X pos", unit = "mm"}
-    sigma_x = {from = 9, unit = "mm", scale = 0.5}    # ours = scale * theirs + offset
+    sigma_x = {from = 9, unit = "mm", scale = 0.5}    # value = scale * column + offset
     point = {from = "socket"}
 
-    [rotation]             # how the target's rotation is written
-    convention = "euler"   # or "rotvec", "quaternion" (order = "wxyz" or "xyzw"), "matrix" (nine, row by row)
-    axes = "ZYX"           # euler: the axes in the order of the columns,
-    frame = "intrinsic"    # about the axes as they have turned; "extrinsic": about fixed ones
+    [rotation]             # how the rotation of the target is written
+    convention = "euler"   # or "rotvec", "quaternion", "matrix" (9 columns, row by row)
+    axes = "ZYX"           # euler: axes in the order of the columns
+    frame = "intrinsic"    # euler: about the rotated axes; "extrinsic": about the fixed axes
+    order = "wxyz"         # quaternion, in place of the keys of euler; or "xyzw"
     columns = ["A", "B", "C"]
     unit = "deg"           # euler and rotvec
 
-    [constant]             # the same for a whole file; {file}, {stem}, {parent} are parts of its path
+    [constant]             # text for the whole file; {file}, {stem}, {parent} are parts of its path
     point = "{parent}/{stem}"
 
-`[to_joints]` is as `[joints]`, for the second configuration of a row. Columns of theirs that the map does
-not name are left alone. A map is used for every file, but for one that lacks its columns and has a header
-of the project's own.
+`[to_joints]` has the keys of `[joints]` and describes the second configuration of a row. Columns of the file
+that the map does not name are ignored. The map applies to every file, except to files with a header of the
+project's own that lack columns of the map.
 """
 
 from __future__ import annotations
@@ -41,7 +43,7 @@ import codecs
 import csv
 import re
 from collections.abc import Mapping, Sequence, Set
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -49,59 +51,51 @@ import numpy as np
 
 from .. import se3
 from .._typing import Array, PathLike
-from ..exceptions import DhcalError
+from ..exceptions import DhcalError, FileFormatError, UnknownNameError
 from ..units import ANGLES, UNITS
 from .measurement_columns import ROTVEC, SECOND_PREFIX
-from .tabular import Column, CsvTable, read_csv_table, read_text, read_toml
+from .tabular import BLANK_CHARACTERS, Column, CsvTable, read_csv_table, read_text
+from .toml_table import TomlTable, is_number
 
-# What stands in braces in a constant.
-PARTS = ("file", "stem", "parent")
-
-
-_SEPARATORS = (",", ";", "tab", "space")
-
-
-_PLAIN = {"separator": str, "decimal": str, "skip": int, "header": bool, "comment": str, "encoding": str}
-
-
-_TABLES = ("joints", "to_joints", "columns", "rotation", "constant")
-
-
-_EXAMPLES = {
-    **{"separator": '";"', "decimal": '","', "skip": "2"},
-    **{"header": "false", "comment": '"#"', "encoding": '"cp1252"'},
-}
-
-
-# How many columns a convention has, and what else it needs.
+# Placeholders in a constant, each written in braces.
+_PATH_PARTS = ("file", "stem", "parent")
+# Separator characters by their names in a map; None for any white space.
+_SEPARATORS: Mapping[str, str | None] = {",": ",", ";": ";", "tab": "\t", "space": None}
+# Number of columns of each convention of rotations, and the other keys that it needs.
 _CONVENTIONS: Mapping[str, tuple[int, tuple[str, ...]]] = {
     "rotvec": (3, ("unit",)),
     "euler": (3, ("unit", "axes", "frame")),
     "quaternion": (4, ("order",)),
     "matrix": (9, ()),
 }
-
-
-_WORDS = {
+# Pattern of the value of each of these keys, and its description.
+_CONVENTION_KEYS = {
     "unit": ("|".join(ANGLES), " or ".join(ANGLES)),
-    "axes": (r"(?i:([xyz])(?!\1)([xyz])(?!\2)[xyz])", 'three axes, as "XYZ" or "ZYZ"'),
-    "frame": ("intrinsic|extrinsic", "intrinsic (axes that turn with it) or extrinsic (fixed axes)"),
+    "axes": (r"(?i:([xyz])(?!\1)([xyz])(?!\2)[xyz])", 'three axes, such as "XYZ" or "ZYZ"'),
+    "frame": ("intrinsic|extrinsic", "intrinsic (rotated axes) or extrinsic (fixed axes)"),
     "order": ("wxyz|xyzw", "wxyz or xyzw"),
 }
-
-
-_MAX_VALUE = 1e300
+# Largest deviation of a matrix' singular values from 1. A larger one is an error, not rounding.
+_MAX_ORTHOGONALITY_ERROR = 1e-3
+# Greatest number of column names that a message lists.
+_MAX_LISTED_NAMES = 30
 
 
 @dataclass(frozen=True)
 class ColumnRule:
-    """A column of ours: its unit, which of theirs, and ours = scale * theirs + offset in that unit.
+    """Rule that makes a column of the project from a column of the vendor: scale * column + offset.
 
-    `what` is "length", "angle", "number" or "text"; "" where the project has no such column.
+    Attributes:
+        name: Name of the project's column.
+        content: "length", "angle", "number" or "text"; empty if the project has no such column.
+        unit: Unit of the vendor's column and of the offset.
+        source_column: Header of the vendor's column, or its number counted from 1.
+        scale: Factor.
+        offset: Summand, in `unit`.
     """
 
     name: str
-    quantity: str
+    content: str
     unit: str
     source_column: str | int
     scale: float = 1.0
@@ -110,9 +104,15 @@ class ColumnRule:
 
 @dataclass(frozen=True)
 class Rotation:
-    """How a rotation is written: "rotvec", "euler", "quaternion" or "matrix", and what goes with it.
+    """Notation of a rotation. Keys that the convention does not need are empty.
 
-    `axes` and `order` are lower-case letters, `frame` is "intrinsic" or "extrinsic"; empty where not needed.
+    Attributes:
+        convention: "rotvec", "euler", "quaternion" or "matrix".
+        columns: Header or number of each of the vendor's columns.
+        unit: Unit of angles.
+        axes: Euler axes in lower case, such as "zyx".
+        frame: "intrinsic" or "extrinsic".
+        order: "wxyz" or "xyzw".
     """
 
     convention: str
@@ -125,360 +125,386 @@ class Rotation:
 
 @dataclass(frozen=True)
 class ColumnMap:
-    """What a map says, checked.
+    """Checked content of a column map.
 
     Attributes:
-        source: the map's file.
-        rules: the columns of ours that are columns of theirs.
-        rotation: how theirs is written, or None.
-        constants: columns of ours that are one text a file.
-        separator, decimal, skip, header, comment, encoding: of their file.
+        source: Name of the map's file.
+        rules: Columns of the project that are columns of the vendor.
+        rotation: Notation of the rotation; None if the file has none.
+        constants: Columns of the project that have one text for the whole file.
+        separator: Name of the separator between cells.
+        decimal: Decimal sign.
+        skip: Number of lines before the header.
+        header: Whether the file has a header.
+        comment: Start of a comment line; empty if there are none.
+        encoding: Encoding of the file.
     """
 
     source: str
     rules: tuple[ColumnRule, ...]
     rotation: Rotation | None
     constants: Mapping[str, str]
-    separator: str = ","
-    decimal: str = "."
-    skip: int = 0
-    header: bool = True
-    comment: str = "#"
-    encoding: str = "utf-8"
+    separator: str
+    decimal: str
+    skip: int
+    header: bool
+    comment: str
+    encoding: str
 
 
-def read_map(path: PathLike, quantities: Mapping[str, str], joints: Sequence[str]) -> ColumnMap:
-    """A map, checked for a robot.
+# --- reading a map ---------------------------------------------------------------------------------
+
+
+def read_map(path: PathLike, contents: Mapping[str, str], joints: Sequence[str]) -> ColumnMap:
+    """Read a column map and check it for a robot.
 
     Args:
-        path: the TOML file.
-        quantities: for each column of ours, "length", "angle", "number" or "text".
-        joints: the robot's joints in order.
+        path: TOML file.
+        contents: "length", "angle", "number" or "text" for each column that the project knows.
+        joints: Names of the robot's joints in order.
+
+    Returns:
+        The map.
 
     Raises:
-        DhcalError: what is wrong in it, and what would be right.
+        FileFormatError: The map is invalid or contradicts itself.
+        UnknownNameError: The encoding is unknown.
     """
-    where, raw = str(path), read_toml(path)
-    _check_keys(raw, (*_PLAIN, *_TABLES), where)
-    entries: list[ColumnRule] = []
-    for key, before in (("joints", ""), ("to_joints", SECOND_PREFIX)):
-        if key in raw:
-            names = [before + name for name in joints]
-            entries += _joints(raw[key], names, quantities, f"{where}: [{key}]")
-    entries += _columns(raw.get("columns", {}), quantities, f"{where}: [columns]")
-    rotation = _rotation(raw["rotation"], f"{where}: [rotation]") if "rotation" in raw else None
-    constants = _constants(raw.get("constant", {}), quantities, f"{where}: [constant]")
-    names = [*(entry.name for entry in entries), *constants, *(ROTVEC if rotation else ())]
-    if twice := [name for i, name in enumerate(names) if name in names[:i]]:
-        raise DhcalError(f"{where}: {twice[0]!r} is given twice; once is enough")
-    out = ColumnMap(where, tuple(entries), rotation, constants)
-    return replace(out, **_settings(raw, out))
-
-
-def _check_keys(raw: Any, allowed: Sequence[str], where: str) -> None:
-    if not isinstance(raw, dict):
-        raise DhcalError(f"{where}: {raw!r} is no table; give {', '.join(allowed)}")
-    if unknown := [key for key in raw if key not in allowed]:
-        raise DhcalError(f"{where}: unknown key {unknown[0]!r}; allowed: {', '.join(allowed)}")
-
-
-def _settings(raw: Mapping[str, Any], default: ColumnMap) -> dict[str, Any]:
-    where = default.source
-    for key, kind in _PLAIN.items():
-        if key in raw and type(raw[key]) is not kind:
-            raise DhcalError(f"{where}: {key} = {raw[key]!r}; write it as in {key} = {_EXAMPLES[key]}")
-    out = {key: raw.get(key, getattr(default, key)) for key in _PLAIN}
-    for key, allowed in (("separator", _SEPARATORS), ("decimal", (".", ","))):
-        if out[key] not in allowed:
-            raise DhcalError(f"{where}: {key} = {out[key]!r}; choose from {', '.join(map(repr, allowed))}")
-    if out["separator"] == out["decimal"]:
-        raise DhcalError(f"{where}: separator and decimal are both ','; one of them must be another")
+    table = TomlTable.read(path)
+    settings: dict[str, Any] = {
+        "separator": table.choice("separator", _SEPARATORS, ","),
+        "decimal": table.choice("decimal", (".", ","), "."),
+        "skip": table.value("skip", int, 0, expected="a number of lines, as in skip = 2"),
+        "header": table.value("header", bool, True),
+        "comment": table.text("comment", "#"),
+        "encoding": table.text("encoding", "utf-8"),
+    }
+    rules: list[ColumnRule] = []
+    for key, prefix in (("joints", ""), ("to_joints", SECOND_PREFIX)):
+        if key in table:
+            rules += _joint_rules(table.table(key), [prefix + name for name in joints], contents)
+    rules += _column_rules(table.table("columns"), contents)
+    rotation = _rotation(table.table("rotation")) if "rotation" in table else None
+    constants = _constants(table.table("constant"), contents)
+    table.finish()
+    if settings["separator"] == settings["decimal"]:
+        raise FileFormatError(f"{table.where}: separator and decimal are both ','; change one of them")
+    if settings["skip"] < 0:
+        raise table.error("skip", "expected the number of lines before the header")
     try:
-        codecs.lookup(out["encoding"])
+        codecs.lookup(settings["encoding"])
     except LookupError:
-        raise DhcalError(f"{where}: encoding = {out['encoding']!r}; write one as utf-8 or cp1252") from None
-    if out["skip"] < 0:
-        raise DhcalError(f"{where}: skip = {out['skip']}; write how many lines stand before the header")
-    return out
+        raise UnknownNameError(
+            f"{table.where}: unknown encoding {settings['encoding']!r}; expected one such as utf-8 or cp1252"
+        ) from None
+    names = [*(rule.name for rule in rules), *constants, *(ROTVEC if rotation else ())]
+    if repeated := [name for i, name in enumerate(names) if name in names[:i]]:
+        raise FileFormatError(f"{table.where}: column {repeated[0]!r} is given twice; remove one")
+    return ColumnMap(table.path, tuple(rules), rotation, constants, **settings)
 
 
-def _rule(
-    name: str, raw: Mapping[str, Any], quantities: Mapping[str, str], source: Any, where: str
-) -> ColumnRule:
-    """A column of ours from `unit`, `scale` and `offset`, and whatever names theirs."""
-    what, unit = quantities.get(name, ""), raw.get("unit", "")
-    units = UNITS.get(what, {})
-    # Whoever knows the readings complains about a name that is none.
-    if what and (units or unit) and unit not in units:
-        names = ", ".join(f'"{unit}"' for unit in units if unit.isascii())
-        fix = f"write unit = one of {names}" if units else "leave the unit out"
-        raise DhcalError(f"{where}: {name}: unit {unit!r}; {fix}")
-    scale, offset = _number(raw.get("scale", 1), where), _number(raw.get("offset", 0), where)
-    if what == "text" and (scale, offset) != (1.0, 0.0):
-        raise DhcalError(f"{where}: {name}: is text; leave scale and offset out")
-    return ColumnRule(name, what, unit, _source_column(source, where), scale, offset)
-
-
-def _columns(raw: Any, quantities: Mapping[str, str], where: str) -> list[ColumnRule]:
-    if not isinstance(raw, dict):
-        raise DhcalError(f'{where}: {raw!r} is no table; write entries such as x = {{from = 1, unit = "mm"}}')
-    out = []
-    for name, entry in raw.items():
-        _check_keys(entry, ("from", "unit", "scale", "offset"), f"{where} {name}")
-        if "from" not in entry:
-            raise DhcalError(f'{where} {name}: has no `from`; write {name} = {{from = "their header"}}')
-        out.append(_rule(name, entry, quantities, entry["from"], f"{where} {name}"))
-    return out
-
-
-def _joints(raw: Any, joints: Sequence[str], quantities: Mapping[str, str], where: str) -> list[ColumnRule]:
-    _check_keys(raw, ("order", "names", "unit", "sign", "offset"), where)
-    order = _column_list(raw.get("order"), None, f"{where} order")
-    names = _column_list(raw.get("names", joints), len(order), f"{where} names")
-    unit = raw.get("unit", "")
-    units = _column_list(unit if isinstance(unit, list) else [unit] * len(order), len(order), f"{where} unit")
-    sign = _column_list(raw.get("sign", [1] * len(order)), len(order), f"{where} sign")
-    offset = _column_list(raw.get("offset", [0] * len(order)), len(order), f"{where} offset")
-    if any(type(value) is bool or value not in (1, -1) for value in sign):
-        raise DhcalError(f"{where} sign: {sign}; write 1 or -1 for each joint")
+def _joint_rules(table: TomlTable, joints: Sequence[str], contents: Mapping[str, str]) -> list[ColumnRule]:
+    order = table.array("order")
+    size = len(order)
+    names = table.array("names", joints, size=size)
+    unit = table.get("unit", "")
+    units = table.array("unit", size=size) if isinstance(unit, list) else [unit] * size
+    signs = table.array("sign", [1] * size, size=size)
+    offsets = table.array("offset", [0] * size, size=size)
+    table.finish()
+    if any(type(sign) is bool or sign not in (1, -1) for sign in signs):
+        raise table.error("sign", "expected 1 or -1 for each joint")
+    for offset in offsets:
+        if not is_number(offset):
+            raise table.error("offset", f"{offset!r} is not a number")
     return [
-        _rule(str(name), {"unit": unit, "scale": s, "offset": o}, quantities, source, where)
-        for name, source, unit, s, o in zip(names, order, units, sign, offset, strict=True)
+        _rule(table, str(name), contents, source, unit, float(sign), float(offset))
+        for name, source, unit, sign, offset in zip(names, order, units, signs, offsets, strict=True)
     ]
 
 
-def _column_list(value: Any, count: int | None, where: str) -> list[Any]:
-    if not isinstance(value, Sequence) or isinstance(value, str) or not value:
-        raise DhcalError(f"{where}: write a list in brackets, one entry a column")
-    if count not in (None, len(value)):
-        raise DhcalError(f"{where}: {len(value)} entries for {count} columns; give as many")
-    return list(value)
+def _column_rules(table: TomlTable, contents: Mapping[str, str]) -> list[ColumnRule]:
+    rules = []
+    for name in table.keys():
+        entry = table.table(name)
+        source = entry.get("from", expected='the header of a column, as in from = "X pos"')
+        unit = entry.get("unit", "")
+        scale, offset = entry.number("scale", 1.0), entry.number("offset", 0.0)
+        entry.finish()
+        rules.append(_rule(entry, name, contents, source, unit, scale, offset))
+    return rules
 
 
-def _source_column(value: Any, where: str) -> str | int:
+def _rule(
+    table: TomlTable,
+    name: str,
+    contents: Mapping[str, str],
+    source: Any,
+    unit: Any,
+    scale: float,
+    offset: float,
+) -> ColumnRule:
+    """Build the rule of a column of the project."""
+    # Unknown column names are reported later, by `measurement_columns.check_columns`.
+    content = contents.get(name, "")
+    units = UNITS.get(content, {})
+    if content and (units or unit) and unit not in units:
+        choices = ", ".join(f'"{choice}"' for choice in units if choice.isascii())
+        remedy = f"write unit = one of {choices}" if units else "leave the unit out"
+        raise UnknownNameError(f"{table.where}: {name}: unit {unit!r}; {remedy}")
+    if content == "text" and (scale, offset) != (1.0, 0.0):
+        raise FileFormatError(f"{table.where}: {name}: is text; leave scale and offset out")
+    return ColumnRule(name, content, unit, _source_column(table, source), scale, offset)
+
+
+def _source_column(table: TomlTable, value: Any) -> str | int:
+    """Check the name of a vendor's column."""
     if type(value) is str or (type(value) is int and value > 0):
         return value
-    raise DhcalError(f"{where}: {value!r} names no column; write its header, or its number from 1")
+    raise FileFormatError(
+        f"{table.where}: {value!r} is not a column; write its header, or its number counted from 1"
+    )
 
 
-def _number(value: Any, where: str) -> float:
-    if type(value) not in (int, float) or not abs(value) < _MAX_VALUE:
-        raise DhcalError(f"{where}: {value!r} is no number for a scale or an offset")
-    return float(value)
+def _rotation(table: TomlTable) -> Rotation:
+    convention = table.choice("convention", _CONVENTIONS)
+    count, needed_keys = _CONVENTIONS[convention]
+    values: dict[str, str] = {}
+    for key, (pattern, description) in _CONVENTION_KEYS.items():
+        if key not in needed_keys:
+            if key in table:
+                raise table.error(key, f"does not go with {convention}; leave it out")
+            continue
+        expected = f"{description} for {convention}"
+        value = table.text(key, expected=expected)
+        if not re.fullmatch(pattern, value):
+            raise table.error(key, f"expected {expected}")
+        values[key] = value if key == "unit" else value.lower()
+    columns = table.array("columns", size=count)
+    table.finish()
+    return Rotation(convention, tuple(_source_column(table, name) for name in columns), **values)
 
 
-def _rotation(raw: Any, where: str) -> Rotation:
-    _check_keys(raw, ("convention", "axes", "frame", "order", "columns", "unit"), where)
-    convention = raw.get("convention")
-    if convention not in _CONVENTIONS:
-        raise DhcalError(f"{where} convention = {convention!r}; choose from {', '.join(_CONVENTIONS)}")
-    count, needs = _CONVENTIONS[convention]
-    for key in ("unit", "axes", "frame", "order"):
-        value, fits = raw.get(key), key in needs
-        if key in raw and not fits:
-            raise DhcalError(f"{where} {key}: does not go with {convention}; leave it out")
-        if fits and key not in raw:
-            raise DhcalError(f"{where}: no {key}; {convention} needs {_WORDS[key][1]}")
-        if fits and not (isinstance(value, str) and re.fullmatch(_WORDS[key][0], value)):
-            raise DhcalError(f"{where} {key} = {value!r}; {convention} needs {_WORDS[key][1]}")
-    columns = _column_list(raw.get("columns"), count, f"{where} columns")
-    rest = {key: raw[key] if key == "unit" else raw[key].lower() for key in needs}
-    return Rotation(convention, tuple(_source_column(name, where) for name in columns), **rest)
+def _constants(table: TomlTable, contents: Mapping[str, str]) -> dict[str, str]:
+    constants: dict[str, str] = {}
+    for name in (name for name, content in contents.items() if content == "text" and name in table):
+        example = f'a text in quotes, as in {name} = "{{stem}}"'
+        constants[name] = table.text(name, expected=example)
+        if not constants[name]:
+            raise table.error(name, f"expected {example}")
+        if unknown := set(re.findall(r"\{([^}]*)\}", constants[name])) - set(_PATH_PARTS):
+            choices = ", ".join(f"{{{part}}}" for part in _PATH_PARTS)
+            raise UnknownNameError(
+                f"{table.where}: {name}: unknown placeholder {{{min(unknown)}}}; choose from {choices}"
+            )
+    table.finish()
+    return constants
 
 
-def _constants(raw: Any, quantities: Mapping[str, str], where: str) -> dict[str, str]:
-    _check_keys(raw, [name for name, what in quantities.items() if what == "text"], where)
-    for name, text in raw.items():
-        if not isinstance(text, str) or not text:
-            raise DhcalError(f'{where} {name} = {text!r}; write a text, as in {name} = "{{stem}}"')
-        if unknown := set(re.findall(r"\{([^}]*)\}", text)) - set(PARTS):
-            parts = ", ".join(f"{{{part}}}" for part in PARTS)
-            raise DhcalError(f"{where} {name}: {{{min(unknown)}}} stands for nothing; there are {parts}")
-    return dict(raw)
-
-
-_DELIMITERS = {",": ",", ";": ";", "tab": "\t"}
-
-
-# A matrix that is less of a rotation than this was not rounded but mistaken.
-_MAX_SKEW = 1e-3
+# --- reading a file through a map ------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class _VendorTable:
-    """Their file: names of its columns, cells by line, the header's line, comments, and how it is written."""
+    """Cells of a vendor's file.
+
+    Attributes:
+        source: Name of the file.
+        column_map: Map that it was read with.
+        names: Headers of its columns, or their numbers.
+        rows: Cells of each row.
+        lines: File line number of each row.
+        header_line: File line number of the header, or of the first row.
+        comments: Text of the comment lines.
+    """
 
     source: str
     column_map: ColumnMap
     names: Sequence[str]
     rows: Sequence[Sequence[str]]
     lines: list[int]
-    header: int
+    header_line: int
     comments: tuple[str, ...]
 
     def column_index(self, name: str | int) -> int | None:
-        """Where a column stands, from 0; None if it is not there."""
+        """Return the index of a column, counted from 0; None if it is absent."""
         if isinstance(name, int):
             return name - 1 if name <= len(self.names) else None
         if self.names.count(name) > 1:
-            raise DhcalError(
-                f"{self.source}:{self.header}: column {name!r} stands twice; give its number in the map"
+            raise FileFormatError(
+                f"{self.source}:{self.header_line}: column {name!r} appears twice; give its number in the map"
             )
         return self.names.index(name) if name in self.names else None
 
     def missing_columns(self) -> list[str | int]:
-        """The columns that the map names and the file does not have."""
+        """Return the columns of the map that the file does not have."""
         rotation = self.column_map.rotation.columns if self.column_map.rotation else ()
-        theirs = [*(entry.source_column for entry in self.column_map.rules), *rotation]
-        return [name for name in theirs if self.column_index(name) is None]
+        names = [*(rule.source_column for rule in self.column_map.rules), *rotation]
+        return [name for name in names if self.column_index(name) is None]
 
     def text(self, name: str | int) -> list[str]:
-        """A column's cells."""
+        """Return the cells of a column."""
         index = self.column_index(name)
         assert index is not None
         return [row[index] for row in self.rows]
 
     def numbers(self, name: str | int) -> tuple[list[str], Array]:
-        """A column's cells with a decimal point, and its numbers (m,)."""
+        """Return the cells of a column with decimal points, and its numbers, shape (m,)."""
         cells, decimal = self.text(name), self.column_map.decimal
         other = "." if decimal == "," else ","
         for cell, line in zip(cells, self.lines, strict=True):
             if other in cell:
-                raise DhcalError(
+                raise FileFormatError(
                     f"{self.source}:{line}: column {name!r}: {cell!r} where the decimal sign is {decimal!r}; "
-                    "write it with that sign, and none for thousands"
+                    "write it with that sign, and without a sign for thousands"
                 )
         cells = [cell.replace(decimal, ".") for cell in cells]
-        sheet = CsvTable(self.source, (), {}, [[cell] for cell in cells], self.lines, self.header)
-        return cells, sheet.numbers(Column(str(name), "", 0))
+        table = CsvTable(self.source, (), {}, [[cell] for cell in cells], self.lines, self.header_line)
+        return cells, table.numbers(Column(str(name), "", 0))
 
 
 def read_mapped_table(path: PathLike, column_map: ColumnMap, known: Set[str]) -> CsvTable:
-    """Another maker's file as a sheet of the project's own.
+    """Read a vendor's file as a table with the project's own columns.
+
+    A file whose header has the project's columns only, and lacks columns of the map, is read as it is.
 
     Args:
-        path: the file.
-        column_map: the map.
-        known: columns that a file of the project's own can have.
+        path: The file.
+        column_map: Map of its columns.
+        known: Columns that a file of the project can have.
+
+    Returns:
+        Table with the columns of the map.
 
     Raises:
-        DhcalError: the file is not as the map says.
+        FileFormatError: A column of the map is missing.
     """
     if _is_native(path, known) and not _matches(path, column_map):
         return read_csv_table(path)
-    raw = _read(path, column_map)
-    if lacking := raw.missing_columns():
-        raise DhcalError(
-            f"{path}:{raw.header}: no column {lacking[0]!r}, which {column_map.source} names; with separator "
-            f"{column_map.separator!r} there are {', '.join(map(repr, raw.names[:30]))}"
+    vendor = _read_vendor_table(path, column_map)
+    if missing := vendor.missing_columns():
+        raise FileFormatError(
+            f"{path}:{vendor.header_line}: no column {missing[0]!r}, which {column_map.source} names; with "
+            f"separator {column_map.separator!r} there are "
+            f"{', '.join(map(repr, vendor.names[:_MAX_LISTED_NAMES]))}"
         )
-    found = {entry.name: (entry.unit, _cells(raw, entry)) for entry in column_map.rules}
-    found |= _rotation_columns(raw, column_map.rotation) if column_map.rotation else {}
-    place = Path(path).absolute()
-    parts: dict[str, str] = dict(zip(PARTS, (place.name, place.stem, place.parent.name), strict=True))
+    # Unit and cells by column.
+    columns = {rule.name: (rule.unit, _apply_rule(vendor, rule)) for rule in column_map.rules}
+    if column_map.rotation:
+        columns |= _rotation_columns(vendor, column_map.rotation)
     for name, text in column_map.constants.items():
-        # No str.format: a path may have braces too.
-        full = re.sub("|".join(f"{{{part}}}" for part in PARTS), lambda hit: parts[hit[0][1:-1]], text)
-        found[name] = "", [full] * len(raw.rows)
+        columns[name] = "", [_fill_placeholders(text, path)] * len(vendor.rows)
     return CsvTable(
-        raw.source,
-        raw.comments,
-        {name: Column(name, unit, i) for i, (name, (unit, _)) in enumerate(found.items())},
-        [list(row) for row in zip(*(cells for _, cells in found.values()), strict=True)],
-        raw.lines,
-        raw.header,
+        vendor.source,
+        vendor.comments,
+        {name: Column(name, unit, i) for i, (name, (unit, _)) in enumerate(columns.items())},
+        [list(row) for row in zip(*(cells for _, cells in columns.values()), strict=True)],
+        vendor.lines,
+        vendor.header_line,
     )
 
 
-def _read(path: PathLike, how: ColumnMap) -> _VendorTable:
-    """Their lines cut into cells."""
+def _fill_placeholders(text: str, path: PathLike) -> str:
+    """Replace {file}, {stem} and {parent}; braces in the path itself stay, other than with str.format."""
+    absolute = Path(path).absolute()
+    values = absolute.name, absolute.stem, absolute.parent.name
+    parts: dict[str, str] = dict(zip(_PATH_PARTS, values, strict=True))
+    pattern = "|".join(f"{{{part}}}" for part in _PATH_PARTS)
+    return re.sub(pattern, lambda match: parts[match[0][1:-1]], text)
+
+
+def _read_vendor_table(path: PathLike, column_map: ColumnMap) -> _VendorTable:
+    """Split the lines of a vendor's file into cells."""
     comments: list[str] = []
-    kept: list[tuple[int, list[str]]] = []
-    for number, line in enumerate(read_text(path, how.encoding).splitlines(), 1):
-        if number <= how.skip or not line.strip(" \t,;"):
+    content: list[tuple[int, list[str]]] = []
+    separator = _SEPARATORS[column_map.separator]
+    for line_number, line in enumerate(read_text(path, column_map.encoding).splitlines(), 1):
+        if line_number <= column_map.skip or not line.strip(BLANK_CHARACTERS):
             continue
-        if how.comment and line.lstrip().startswith(how.comment):
-            comments.append(line.lstrip()[len(how.comment) :].strip())
+        if column_map.comment and line.lstrip().startswith(column_map.comment):
+            comments.append(line.lstrip()[len(column_map.comment) :].strip())
             continue
         try:
-            # Line by line, so that a stray quote stays in its own row.
-            cells = (
-                line.split()
-                if how.separator == "space"
-                else next(csv.reader([line], delimiter=_DELIMITERS[how.separator]))
-            )
+            # Line by line, so that an unbalanced quote does not extend over the following lines.
+            cells = line.split() if separator is None else next(csv.reader([line], delimiter=separator))
         except csv.Error as error:
-            raise DhcalError(f"{path}:{number}: {error}; correct this line") from error
-        kept.append((number, [cell.strip() for cell in cells]))
-    if len(kept) <= how.header:
-        raise DhcalError(f"{path}: no rows with readings; add at least one")
-    first, names = kept[0]
-    if not how.header:
+            raise FileFormatError(f"{path}:{line_number}: {error}; correct this line") from error
+        content.append((line_number, [cell.strip() for cell in cells]))
+    if len(content) <= column_map.header:
+        raise FileFormatError(f"{path}: no rows with measured values; add at least one")
+    header_line, names = content[0]
+    if not column_map.header:
         names = [str(i) for i in range(1, len(names) + 1)]
-    rows = kept[how.header :]
-    for number, cells in rows:
-        # A separator at the end of a line makes no column.
+    rows = content[column_map.header :]
+    for line_number, cells in rows:
+        # Separators at the end of a line do not make a column.
         if len(cells) < len(names) or any(cells[len(names) :]):
-            raise DhcalError(
-                f"{path}:{number}: {len(cells)} values for {len(names)} columns; correct the row, or "
-                f"separator and decimal in {how.source}"
+            raise FileFormatError(
+                f"{path}:{line_number}: {len(cells)} values for {len(names)} columns; correct the row, or "
+                f"separator and decimal in {column_map.source}"
             )
     return _VendorTable(
         str(path),
-        how,
+        column_map,
         names,
         [cells for _, cells in rows],
-        [number for number, _ in rows],
-        first,
+        [line_number for line_number, _ in rows],
+        header_line,
         tuple(comments),
     )
 
 
 def _is_native(path: PathLike, known: Set[str]) -> bool:
-    """Whether a file's header is the project's own."""
+    """Return whether the header of a file is the project's own."""
     try:
         return set(read_csv_table(path).columns) <= known
     except DhcalError:
         return False
 
 
-def _matches(path: PathLike, how: ColumnMap) -> bool:
-    """Whether a file has a header with all the columns of a map."""
+def _matches(path: PathLike, column_map: ColumnMap) -> bool:
+    """Return whether a file has a header with all columns of a map."""
     try:
-        return how.header and not _read(path, how).missing_columns()
+        return column_map.header and not _read_vendor_table(path, column_map).missing_columns()
     except DhcalError:
         return False
 
 
-def _cells(raw: _VendorTable, entry: ColumnRule) -> list[str]:
-    """One column of ours; digits stay as they are where nothing is computed."""
-    if entry.quantity == "text":
-        return raw.text(entry.source_column)
-    cells, values = raw.numbers(entry.source_column)
-    if (entry.scale, entry.offset) == (1.0, 0.0):
+def _apply_rule(vendor: _VendorTable, rule: ColumnRule) -> list[str]:
+    """Return the cells of a column of the project; digits stay as they are if nothing is computed."""
+    if rule.content == "text":
+        return vendor.text(rule.source_column)
+    cells, values = vendor.numbers(rule.source_column)
+    if (rule.scale, rule.offset) == (1.0, 0.0):
         return cells
-    return [repr(value) for value in (entry.scale * values + entry.offset).tolist()]
+    return [repr(value) for value in (rule.scale * values + rule.offset).tolist()]
 
 
-def _rotation_columns(raw: _VendorTable, how: Rotation) -> dict[str, tuple[str, list[str]]]:
-    """The columns of ours for a rotation of theirs, each with its unit."""
-    pairs = [raw.numbers(name) for name in how.columns]
-    if how.convention in ("rotvec", "quaternion"):
-        names = ROTVEC if how.convention == "rotvec" else [f"q{letter}" for letter in how.order]
-        return {name: (how.unit, cells) for name, (cells, _) in zip(names, pairs, strict=True)}
+def _rotation_columns(vendor: _VendorTable, notation: Rotation) -> dict[str, tuple[str, list[str]]]:
+    """Return unit and cells of each column of the project that holds the rotation."""
+    pairs = [vendor.numbers(name) for name in notation.columns]
+    if notation.convention in ("rotvec", "quaternion"):
+        names = ROTVEC if notation.convention == "rotvec" else [f"q{letter}" for letter in notation.order]
+        return {name: (notation.unit, cells) for name, (cells, _) in zip(names, pairs, strict=True)}
     values = np.stack([numbers for _, numbers in pairs], -1)
-    if how.convention == "euler":
-        turns = euler(values / ANGLES[how.unit], how.axes, how.frame)
+    if notation.convention == "euler":
+        rotations = euler_to_matrix(values / ANGLES[notation.unit], notation.axes, notation.frame)
     else:
-        turns = _nearest(values.reshape(-1, 3, 3), raw)
-    vectors = se3.log3(turns).T.tolist()
-    return {name: ("rad", [*map(repr, column)]) for name, column in zip(ROTVEC, vectors, strict=True)}
+        rotations = _orthonormalized(values.reshape(-1, 3, 3), vendor)
+    components = se3.log3(rotations).T.tolist()
+    return {name: ("rad", [*map(repr, column)]) for name, column in zip(ROTVEC, components, strict=True)}
 
 
-def euler(angles: Array, axes: str, frame: str) -> Array:
-    """Rotations (m, 3, 3) of Euler angles (m, 3) in rad about three axes, such as "xyz", in that order.
+def euler_to_matrix(angles: Array, axes: str, frame: str) -> Array:
+    """Convert Euler angles to rotation matrices.
 
-    Intrinsic angles turn about axes as the turns before have left them, extrinsic ones about fixed axes.
+    Args:
+        angles: Angles about the three axes in their order, shape (m, 3) [rad].
+        axes: Three letters such as "xyz".
+        frame: "intrinsic" for rotations about the axes as rotated so far, "extrinsic" for fixed axes.
+
+    Returns:
+        Rotation matrices, shape (m, 3, 3).
     """
     first, second, third = (
         se3.exp3(angles[:, i, None] * np.eye(3)["xyz".index(axis)]) for i, axis in enumerate(axes)
@@ -486,13 +512,14 @@ def euler(angles: Array, axes: str, frame: str) -> Array:
     return first @ second @ third if frame == "intrinsic" else third @ second @ first
 
 
-def _nearest(matrices: Array, raw: _VendorTable) -> Array:
-    """Rotations (m, 3, 3) nearest to matrices, or DhcalError where one is none."""
+def _orthonormalized(matrices: Array, vendor: _VendorTable) -> Array:
+    """Return the rotations nearest to matrices, shape (m, 3, 3)."""
     u, s, vt = np.linalg.svd(matrices)
-    off = np.abs(s - 1).max(-1) + (np.linalg.det(matrices) < 0)
-    if (bad := np.flatnonzero(off > _MAX_SKEW)).size:
-        raise DhcalError(
-            f"{raw.source}:{raw.lines[bad[0]]}: the nine numbers are no rotation, by {off[bad[0]]:.2g}; "
-            "give them row by row, right-handed, within a thousandth"
+    error = np.abs(s - 1).max(-1) + (np.linalg.det(matrices) < 0)
+    if (wrong := np.flatnonzero(error > _MAX_ORTHOGONALITY_ERROR)).size:
+        raise FileFormatError(
+            f"{vendor.source}:{vendor.lines[wrong[0]]}: the nine numbers are not a rotation matrix "
+            f"(error {error[wrong[0]]:.2g}); "
+            "write them row by row, right-handed, with an error below one thousandth"
         )
     return u @ vt

@@ -71,5 +71,13 @@ def origins_text(chain: Chain) -> str:
 
 
 def convert_to_origins(robot: RobotSource, path: PathLike) -> ConvertedRobot:
-    """Convert a robot to a table of joint origins."""
+    """Convert a robot to a table of joint origins.
+
+    Args:
+        robot: Robot to convert.
+        path: Path of the file.
+
+    Returns:
+        Text of the file.
+    """
     return ConvertedRobot(origins_text(robot.chain))

@@ -1,11 +1,17 @@
-"""The columns that a measurement file can have, and the kind of measurement that they make."""
+"""Columns of measurement files: their names, their contents, and the measurement kind that they make.
+
+A column is a joint of the robot, a value column of a measurement kind, or an auxiliary column. The header
+alone selects the kind: of all kinds whose required columns are present, the one with the most required
+columns, and among those the one with the fewest columns in all. A rotation can be given as a quaternion in
+place of a rotation vector.
+"""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Mapping
 
-from ..exceptions import DhcalError
+from ..exceptions import FileFormatError, UnknownNameError
 from ..measurements import KINDS
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
@@ -13,114 +19,148 @@ from ..units import ANGLES, LENGTHS
 from .tabular import CsvTable, require_usable_names
 
 QUATERNION = ("qw", "qx", "qy", "qz")
-
-
 ROTVEC = ("rx", "ry", "rz")
-
-
-# Where a controller was told to go, and where it went with the calibrated model: for screening and for
-# judging a compensation, never fitted.
+# Positions that the controller was commanded to, and positions measured again after a calibration. They serve
+# the reachability check and the judgement of a compensation, and are never fitted.
 COMMANDED = ("commanded_x", "commanded_y", "commanded_z")
-
-
 AFTER = ("after_x", "after_y", "after_z")
-
-
-_AUXILIARY = frozenset(("set", "pose_id", *COMMANDED, *AFTER))
-
-
-# The second configuration of a row stands under the joints' names with this before them.
+# Prefix of a joint's name in the columns of the second configuration of a row.
 SECOND_PREFIX = "to:"
 
-
-_READINGS = frozenset(name for kind in KINDS.values() for name in kind.columns) | frozenset(QUATERNION)
-
-
-_KNOWN = _READINGS | _AUXILIARY
-
-
-# What each column but the joints' holds: "length", "angle", "number" or "text".
-_QUANTITIES: dict[str, str] = {
-    **{name: what for kind in KINDS.values() for name, what in kind.columns.items()},
+_AUXILIARY = frozenset(("set", "pose_id", *COMMANDED, *AFTER))
+_VALUE_COLUMNS = frozenset(name for kind in KINDS.values() for name in kind.columns) | frozenset(QUATERNION)
+_KNOWN = _VALUE_COLUMNS | _AUXILIARY
+# Content of each column other than joints: "length", "angle", "number" or "text".
+_CONTENTS: dict[str, str] = {
+    **{name: content for kind in KINDS.values() for name, content in kind.columns.items()},
     **dict.fromkeys(QUATERNION, "number"),
     **dict.fromkeys(("set", "pose_id"), "text"),
     **dict.fromkeys((*COMMANDED, *AFTER), "length"),
 }
+# Least similarity (0 to 1, `difflib`) of a suggestion to an unknown name.
+_MIN_SIMILARITY = 0.7
+# Longest part of an unknown name that is compared [characters]: the comparison takes quadratic time.
+_MAX_COMPARED = 100
 
 
-def units_of(chain: Chain, name: str) -> Mapping[str, float]:
-    """The units that a joint's column can have."""
+def joint_units(chain: Chain, name: str) -> Mapping[str, float]:
+    """Return the units allowed in the column of a joint.
+
+    Args:
+        chain: Robot with the joint.
+        name: Name of the joint.
+
+    Returns:
+        Divisor to SI units of each unit: lengths for a prismatic joint, otherwise angles.
+    """
     joint = chain.urdf.joint(name)
     return LENGTHS if joint.type == "prismatic" else ANGLES
 
 
-def quantities(chain: Chain) -> dict[str, str]:
-    """What each column that a robot's file can have holds: "length", "angle", "number" or "text"."""
+def column_contents(chain: Chain) -> dict[str, str]:
+    """Return the content of each column that a measurement file of a robot can have.
+
+    Args:
+        chain: The robot.
+
+    Returns:
+        "length", "angle", "number" or "text" by column name.
+    """
     joints = {
-        before + joint.name: "length" if joint.type == "prismatic" else "angle"
+        prefix + joint.name: "length" if joint.type == "prismatic" else "angle"
         for joint in chain.urdf.joints
-        for before in ("", SECOND_PREFIX)
+        for prefix in ("", SECOND_PREFIX)
     }
-    return {**_QUANTITIES, **joints}
+    return {**_CONTENTS, **joints}
 
 
 def check_joint_names(chain: Chain) -> None:
-    """Complains about joints whose names cannot head a column beside the readings."""
+    """Check that the joints of a robot can be columns beside the measured values.
+
+    Args:
+        chain: The robot.
+
+    Raises:
+        FileFormatError: A joint's name cannot be a header, or is the name of another column.
+    """
     require_usable_names(chain.joint_names, chain.urdf.source)
-    if clash := sorted(_KNOWN & set(chain.joint_names)):
-        raise DhcalError(
-            f"{chain.urdf.source}: joint {clash[0]!r} has the name of a reading; rename it there"
+    if clashes := sorted(_KNOWN & set(chain.joint_names)):
+        raise FileFormatError(
+            f"{chain.urdf.source}: joint {clashes[0]!r} has the name of a measurement column; "
+            "rename the joint"
         )
 
 
-def _nearest(name: str, known: Iterable[str]) -> set[str]:
-    """Those known names that a mistyped one is most like, if it is like any."""
-    alike = {other: difflib.SequenceMatcher(None, name[:100], other).ratio() for other in known}
-    return {other for other, ratio in alike.items() if ratio == max(0.7, *alike.values())}
+def check_columns(table: CsvTable, chain: Chain) -> None:
+    """Check that every column is a joint of the robot, a measured value or an auxiliary column.
 
+    Args:
+        table: Table of a measurement file.
+        chain: The robot.
 
-def check_columns(sheet: CsvTable, chain: Chain) -> None:
-    """Complains about a column that is neither a joint nor a reading."""
+    Raises:
+        UnknownNameError: A column is unknown; the message suggests a similar name.
+    """
     names = [joint.name for joint in chain.urdf.joints]
-    joints = {*names, *(SECOND_PREFIX + name for name in names)}
-    for name in sheet.columns:
-        if name not in _KNOWN | joints:
-            near = _nearest(name, _KNOWN | joints)
-            # What is there already was not meant.
-            meant = sorted(near - set(sheet.columns))
-            hint = (
-                f"did you mean {meant[0]!r}?"
-                if meant
-                else f"remove it; the joints are {', '.join(chain.joint_names)}"
-            )
-            raise DhcalError(
-                f"{sheet.source}:{sheet.header}: column {name!r} is neither a joint of this robot "
-                f"nor a known reading; {hint}"
-            )
-
-
-def find_kind(sheet: CsvTable) -> type[Measurement]:
-    """The kind with the most of its columns there, or DhcalError if a column does not go with it."""
-    there = set(sheet.columns) & _READINGS
-    if there & set(QUATERNION):
-        there = there - set(QUATERNION) | set(ROTVEC)
-    fits = [
-        (len(wanted), -len(kind.columns), kind)
-        for kind in KINDS.values()
-        for wanted in kind.required_columns
-        if wanted <= there
-    ]
-    where = f"{sheet.source}:{sheet.header}"
-    if not fits:
-        lone = f"; {', '.join(sorted(there))} alone is not enough" if there else ""
-        raise DhcalError(
-            f"{where}: no readings{lone}; a position needs the columns x[mm],y[mm],z[mm], "
-            "a pose qw,qx,qy,qz beside them"
+    known = _KNOWN | {prefix + name for name in names for prefix in ("", SECOND_PREFIX)}
+    for name in table.columns:
+        if name in known:
+            continue
+        # A column that is present already cannot be the intended one.
+        suggestions = sorted(_most_similar(name, known) - set(table.columns))
+        remedy = (
+            f"did you mean {suggestions[0]!r}?"
+            if suggestions
+            else f"remove it; the joints are {', '.join(chain.joint_names)}"
         )
-    kind = max(fits, key=lambda fit: fit[:2])[2]
-    if odd := sorted(there - set(kind.columns)):
-        raise DhcalError(
-            f"{where}: column {odd[0]!r} does not go with {', '.join(sorted(there & set(kind.columns)))}; "
+        raise UnknownNameError(
+            f"{table.header_location}: column {name!r} is neither a joint of this robot "
+            f"nor a known measurement column; {remedy}"
+        )
+
+
+def _most_similar(name: str, known: Iterable[str]) -> set[str]:
+    """Return the known names that are most similar to a misspelt one."""
+    similarity = {
+        other: difflib.SequenceMatcher(None, name[:_MAX_COMPARED], other).ratio() for other in known
+    }
+    return {
+        other for other, ratio in similarity.items() if ratio == max(_MIN_SIMILARITY, *similarity.values())
+    }
+
+
+def find_kind(table: CsvTable) -> type[Measurement]:
+    """Find the measurement kind of a file from its columns.
+
+    Args:
+        table: Table of a measurement file.
+
+    Returns:
+        Class of the kind.
+
+    Raises:
+        FileFormatError: The columns of no kind are complete, or a column does not belong to the kind.
+    """
+    present = set(table.columns) & _VALUE_COLUMNS
+    if present & set(QUATERNION):
+        present = present - set(QUATERNION) | set(ROTVEC)
+    candidates = [
+        (len(required), -len(kind.columns), kind)
+        for kind in KINDS.values()
+        for required in kind.required_columns
+        if required <= present
+    ]
+    if not candidates:
+        incomplete = f"; {', '.join(sorted(present))} alone is not enough" if present else ""
+        raise FileFormatError(
+            f"{table.header_location}: no measured values{incomplete}; a position needs the columns "
+            "x[mm],y[mm],z[mm], a pose needs qw,qx,qy,qz in addition"
+        )
+    kind = max(candidates, key=lambda candidate: candidate[:2])[2]
+    if unrelated := sorted(present - set(kind.columns)):
+        raise FileFormatError(
+            f"{table.header_location}: column {unrelated[0]!r} does not go with "
+            f"{', '.join(sorted(present & set(kind.columns)))}; "
             f"a {kind.kind} file has {', '.join(kind.columns)}"
         )
     return kind

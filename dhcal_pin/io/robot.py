@@ -1,4 +1,9 @@
-"""Robots in and out: URDF or DH file to a chain, a calibrated chain back to URDF and sidecar."""
+"""Robot files: reading robots of all formats, converting between formats, writing calibrated robots.
+
+`FORMATS` lists the formats; the ending of a file name selects one. Whatever the format, the sidecar beside a
+robot is read with it. A calibrated robot is written as its nominal URDF with changed joint origins, plus a
+sidecar.
+"""
 
 from __future__ import annotations
 
@@ -18,28 +23,28 @@ from ..robot.dh import Convention, DHTable
 from ..robot.urdf import parse_urdf, read_urdf
 from ..robot.urdf_edit import with_origins
 from .atomic import write_files
-from .dh_file import convert_to_dh, read_dh, read_frame
+from .dh_file import convert_to_dh, read_dh
 from .joint_origins import convert_to_origins, joint_origins
 from .robot_format import ConvertedRobot, RobotFormat, RobotSource
-from .sidecar import (
-    existing_sidecar,
-    payload_lines,
-    read_payload,
-    sidecar_path,
-    sidecar_text,
-    transmission_lines,
-    uncertainty_lines,
-    with_transmission,
-)
-from .tabular import read_toml
+from .sidecar import existing_sidecar, sidecar_path, sidecar_text, with_sidecar
 from .ur_kinematics import convert_to_ur_kinematics, read_ur_kinematics
 
-# A written URDF must read back as the same robot to this many metres and radians.
+# Largest difference between the poses of a chain and of its written URDF, relative to the largest entry of
+# the poses or 1.
 READ_BACK_TOL = 1e-12
+# Number of random configurations at which they are compared.
+N_READ_BACK_SAMPLES = 50
 
 
 def robot_name(path: PathLike) -> str:
-    """`dir/arm.dh.toml` → `arm`."""
+    """Return the name of a robot from the path of its file.
+
+    Args:
+        path: Path such as `dir/arm.dh.toml`.
+
+    Returns:
+        File name up to the first dot, such as `arm`.
+    """
     return Path(path).name.split(".")[0] or "arm"
 
 
@@ -142,7 +147,7 @@ def _read(path: PathLike, tip: str | None, sidecar: PathLike | None) -> tuple[Ch
             f"{os.fspath(path)}: a {robot_format.name} cannot be read as a robot; choose from {readable}"
         )
     sidecar = sidecar or existing_sidecar(path)
-    return (chain if sidecar is None else _with_sidecar(chain, sidecar)), table
+    return (chain if sidecar is None else with_sidecar(chain, sidecar)), table
 
 
 def read_robot(path: PathLike, tip: str | None = None, sidecar: PathLike | None = None) -> Chain:
@@ -188,72 +193,52 @@ def convert_robot(
     return robot_format.convert(RobotSource(os.fspath(source), chain, table, convention), target)
 
 
-def _with_sidecar(chain: Chain, path: PathLike) -> Chain:
-    raw = read_toml(path)
-    tip = raw.pop("tip", chain.tip)
-    if unknown := set(raw) - {"base", "tool", "payload", "joint", "instrument", "uncertainty"}:
-        raise DhcalError(
-            f"{os.fspath(path)}: unknown key {min(unknown)!r}; "
-            "allowed: tip, [base], [tool], [payload], [joint.NAME], [instrument], [uncertainty]"
-        )
-    frames = {key: read_frame(raw[key], os.fspath(path), key) for key in ("base", "tool") if key in raw}
-    if tip != chain.tip:
-        # The tool is a place on another link.
-        frames.pop("tool", None)
-    placed = replace(chain, **frames)
-    if "payload" in raw:
-        if tip != chain.tip:
-            raise DhcalError(f"{os.fspath(path)}: [payload] is carried by {tip!r}; name that with --tip")
-        placed = placed.with_payload(read_payload(raw["payload"], os.fspath(path)))
-    return with_transmission(placed, raw["joint"], os.fspath(path)) if "joint" in raw else placed
-
-
 def urdf_files(
     chain: Chain,
     path: PathLike,
     instrument: Mapping[str, float] | None = None,
-    known: Uncertainty | None = None,
+    uncertainty: Uncertainty | None = None,
 ) -> dict[PathLike, str | bytes]:
-    """The calibrated URDF, read back and compared, and its sidecar; by path, not yet written.
+    """Return the contents of a calibrated URDF and its sidecar, without writing them.
 
-    Identity base and tool and ideal joints need no sidecar; one that is there already would be read with
-    the new URDF, and is replaced.
+    The URDF is parsed again and compared with the chain. A sidecar is needed only for a base, a tool, a
+    payload, joint errors, instrument parameters or an uncertainty. One that exists already is always
+    replaced, because it would be read with the new URDF.
 
     Args:
-        chain: the calibrated arm.
-        path: of the URDF.
-        instrument: its values by name, m and rad.
-        known: how well the arm is known.
+        chain: Calibrated robot.
+        path: Path of the URDF.
+        instrument: Instrument parameters by name [m or rad].
+        uncertainty: Uncertainty of the calibrated robot.
+
+    Returns:
+        Contents by path.
 
     Raises:
-        DhcalError: the written text would not be the same robot.
+        DhcalError: The written text would not be the same robot.
     """
     origins, tool = joint_origins(chain)
     data = with_origins(chain.urdf, origins)
-    read = Chain.from_urdf(parse_urdf(data, os.fspath(path)), chain.tip)
-    again = replace(read, base=chain.base, tool=tool, payload=chain.payload)
-    joints, carried = transmission_lines(chain), payload_lines(chain.payload)
+    parsed = Chain.from_urdf(parse_urdf(data, os.fspath(path)), chain.tip)
+    written = replace(parsed, base=chain.base, tool=tool, payload=chain.payload)
     if chain.transmission is not None:
-        # From here on the written masses load the joints.
-        written = replace(chain.transmission, loads=again.loads)
-        chain, again = chain.with_transmission(written), again.with_transmission(written)
-    rng = np.random.default_rng(0)
-    q = rng.uniform(-np.pi, np.pi, (50, chain.n_joints))
-    wanted = chain.poses(q)
-    gap = np.abs(again.poses(q) - wanted).max()
-    if not gap <= READ_BACK_TOL * max(1.0, np.abs(wanted).max()):
+        # The torque of gravity on the joints follows from the masses of the written URDF.
+        transmission = replace(chain.transmission, loads=written.loads)
+        chain, written = chain.with_transmission(transmission), written.with_transmission(transmission)
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (N_READ_BACK_SAMPLES, chain.n_joints))
+    poses = chain.poses(q)
+    difference = np.abs(written.poses(q) - poses).max()
+    if not difference <= READ_BACK_TOL * max(1.0, np.abs(poses).max()):
         raise DhcalError(
-            f"{os.fspath(path)}: not written: read back, the tool is off by {gap:.2g}; please report it"
+            f"{os.fspath(path)}: not written: the tool of the URDF as read back differs by {difference:.2g}; "
+            "please report it"
         )
-    out: dict[PathLike, str | bytes] = {path: data}
-    plain = np.array_equal(chain.base, np.eye(4)) and np.array_equal(tool, np.eye(4))
-    doubt = uncertainty_lines(known) if known else []
-    if not plain or joints or carried or instrument or doubt or existing_sidecar(path):
-        known_values = instrument or {}
-        out[sidecar_path(path)] = sidecar_text(
-            chain.tip, chain.base, tool, known_values, joints, doubt, carried
-        )
-    return out
+    contents: dict[PathLike, str | bytes] = {path: data}
+    is_replaced = existing_sidecar(path) is not None
+    sidecar = sidecar_text(chain, tool, instrument, uncertainty, required=is_replaced)
+    if sidecar is not None:
+        contents[sidecar_path(path)] = sidecar
+    return contents
 
 
 class CalibratedRobot(Protocol):
@@ -276,21 +261,22 @@ class CalibratedRobot(Protocol):
 
 
 def write_urdf(fit: CalibratedRobot | Chain, path: PathLike) -> None:
-    """Writes the calibrated URDF, and its sidecar where base or tool need one or an old one lies there.
+    """Write a calibrated URDF and its sidecar.
 
-    Only the origins of joints that moved change; every other byte is the nominal file's.
+    Only the origins of joints that moved change; every other byte is that of the nominal file. `urdf_files`
+    says when a sidecar is written.
+
+    Args:
+        fit: Result of a calibration, or a chain alone.
+        path: Path of the URDF to write.
 
     Raises:
-        DhcalError: the path cannot be written, or is the nominal file.
+        InvalidArgumentError: The path is the nominal robot itself.
     """
-    chain = fit if isinstance(fit, Chain) else fit.chain
-    if (
-        os.path.exists(path)
-        and os.path.exists(chain.urdf.source)
-        and os.path.samefile(path, chain.urdf.source)
-    ):
-        raise DhcalError(f"{os.fspath(path)}: is the nominal robot itself; write to another file")
-    instrument, known = (
-        (None, None) if isinstance(fit, Chain) else (fit.transferable_instruments, fit.uncertainty)
-    )
-    write_files(urdf_files(chain, path, instrument, known))
+    is_chain = isinstance(fit, Chain)
+    chain = fit if is_chain else fit.chain
+    nominal = chain.urdf.source
+    if os.path.exists(path) and os.path.exists(nominal) and os.path.samefile(path, nominal):
+        raise InvalidArgumentError(f"{os.fspath(path)}: is the nominal robot itself; write to another file")
+    instrument, uncertainty = (None, None) if is_chain else (fit.transferable_instruments, fit.uncertainty)
+    write_files(urdf_files(chain, path, instrument, uncertainty))

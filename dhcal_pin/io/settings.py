@@ -1,50 +1,103 @@
-"""Robots in and out: URDF or DH file to a chain, a calibrated chain back to URDF and sidecar."""
+"""Settings that command-line options and TOML files give to a calibration: bounds, priors, payload."""
 
 from __future__ import annotations
 
 import os
+import re
 
 from .._typing import PathLike
 from ..estimation.priors import Priors
-from ..exceptions import DhcalError
-from .tabular import read_toml
+from ..exceptions import InvalidArgumentError
+from ..robot.transmission import Payload
+from .sidecar import MAX_PAYLOAD_DISTANCE_M, MAX_PAYLOAD_KG
+from .toml_table import TomlTable, is_number
 
-_MAX_VALUE = 1e300
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_PAYLOAD = re.compile(rf"({_NUMBER})kg(?:@({_NUMBER}),({_NUMBER}),({_NUMBER})(mm|cm|m))?")
+# Metres per unit of the centre of a payload.
+_METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 
 
 def read_bounds(path: PathLike | None) -> dict[str, tuple[float, float]]:
-    """A TOML file of least and largest values in m and rad by parameter name or pattern; none without it.
+    """Read the bounds of parameters.
+
+    Args:
+        path: TOML file of the least and the largest value by parameter name or pattern; None for no bounds.
+
+    Returns:
+        Least and largest value by name or pattern [m or rad]; either may be infinite.
 
     Raises:
-        DhcalError: a value is not a pair of numbers in order.
+        FileFormatError: A value is not a pair of numbers in ascending order.
     """
-    raw = read_toml(path) if path else {}
-    for name, value in raw.items():
+    if not path:
+        return {}
+    table = TomlTable.read(path)
+    bounds: dict[str, tuple[float, float]] = {}
+    for name in table.keys():
+        value = table.get(name)
         pair = value if isinstance(value, list) and len(value) == 2 else []
-        numbers = [v for v in pair if isinstance(v, int | float) and not isinstance(v, bool)]
+        # Unlike other numbers, a bound may be infinite.
+        numbers = [float(v) for v in pair if isinstance(v, float) or is_number(v)]
         if len(numbers) != 2 or not numbers[0] < numbers[1]:
-            raise DhcalError(
-                f"{path}: {name} = {value!r} are no bounds; write the least and the largest value "
-                'in m or rad, such as "d2" = [0.12, 0.13]'
+            raise table.error(
+                name, 'expected the least and the largest value in m or rad, such as "d2" = [0.12, 0.13]'
             )
-    return {name: (float(low), float(high)) for name, (low, high) in raw.items()}
+        bounds[name] = numbers[0], numbers[1]
+    return bounds
 
 
 def read_priors(choice: str | None) -> Priors | None:
-    """`default`, `none`, or a TOML file of sigmas in m and rad by parameter name or pattern.
+    """Read the prior standard deviations of parameters.
+
+    Args:
+        choice: "default", "none", or a TOML file of standard deviations [m or rad] by parameter name or
+            pattern.
+
+    Returns:
+        The choice itself, or the standard deviations by name or pattern.
 
     Raises:
-        DhcalError: neither, or a sigma is not a positive number.
+        InvalidArgumentError: The choice is neither a name nor a file.
     """
-    if choice is None or choice in ("default", "none"):
-        return choice  # pyright: ignore[reportReturnType]
+    if choice is None or choice == "default" or choice == "none":
+        return choice
     if not os.path.exists(choice):
-        raise DhcalError(f"--priors {choice}: neither default, none, nor a file of sigmas by parameter")
-    raw = read_toml(choice)
-    for name, value in raw.items():
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= _MAX_VALUE:
-            raise DhcalError(
-                f"{choice}: {name} = {value!r} is not a sigma; write a positive number in m or rad, "
-                'such as "theta*" = 0.01'
-            )
-    return {name: float(value) for name, value in raw.items()}
+        raise InvalidArgumentError(
+            f"--priors {choice}: unknown choice; expected default, none, or a file of standard deviations"
+        )
+    table = TomlTable.read(choice)
+    expected = 'a positive standard deviation in m or rad, such as "theta*" = 0.01'
+    return {name: table.number(name, above=0, expected=expected) for name in table.keys()}
+
+
+def parse_payload(text: str, label: str = "--payload") -> Payload:
+    """Parse a mass and its centre in the tip frame.
+
+    Args:
+        text: Text such as `5kg` or `5kg@0,0,80mm`.
+        label: Name of the option, for messages.
+
+    Returns:
+        The payload.
+
+    Raises:
+        InvalidArgumentError: The text has another form, or a value is out of range.
+    """
+    match = _PAYLOAD.fullmatch(text.replace(" ", ""))
+    if not match:
+        raise InvalidArgumentError(
+            f"{label} {text}: write the mass and, in the tip frame, its centre, as 5kg or 5kg@0,0,80mm"
+        )
+    mass, *position, unit = match.groups()
+    x, y, z = (_METRES[unit or "m"] * float(value or 0) for value in position)
+    if not 0 < float(mass) <= MAX_PAYLOAD_KG:
+        raise InvalidArgumentError(
+            f"{label} {text}: the mass must be positive and at most {MAX_PAYLOAD_KG:g} kg"
+        )
+    if not max(abs(x), abs(y), abs(z)) <= MAX_PAYLOAD_DISTANCE_M:
+        raise InvalidArgumentError(
+            f"{label} {text}: the centre must be within {MAX_PAYLOAD_DISTANCE_M:g} m of the tip; "
+            "write its position in the tip frame"
+        )
+    return Payload(float(mass), (x, y, z))

@@ -1,16 +1,30 @@
-"""Robots in and out: URDF or DH file to a chain, a calibrated chain back to URDF and sidecar."""
+"""Files that ship with the package: the paper's robots and data, and example studies.
+
+They are in the folder `urdf` of the source tree, which is installed as the package `dhcal_pin.data`.
+"""
 
 from __future__ import annotations
 
+from importlib import resources
 from pathlib import Path
 
-from ..exceptions import DhcalError
+from ..exceptions import UnknownNameError
 
 
 def shipped_file(name: str) -> Path:
-    """A file that ships with the package, such as the paper's tables, installed or in the source tree."""
-    package = Path(__file__).resolve().parent.parent
+    """Find a file that ships with the package.
+
+    Args:
+        name: Name of the file, such as `sim_6dof.dh.toml`.
+
+    Returns:
+        Path of the file, in the installed package or in the source tree.
+
+    Raises:
+        UnknownNameError: No such file ships with the package.
+    """
+    package = Path(str(resources.files("dhcal_pin")))
     for folder in (package / "data", package.parent / "urdf"):
-        if (folder / name).exists():
+        if (folder / name).is_file():
             return folder / name
-    raise DhcalError(f"{name}: no such file, nor one that ships with dhcal-pin; check its name")
+    raise UnknownNameError(f"{name}: no such file, and none that ships with dhcal-pin; check its name")

@@ -1,4 +1,9 @@
-"""Text files read and tables written: units, and sheets with a header."""
+"""Text files: UTF-8 text, TOML, and CSV tables whose header names a unit for each column.
+
+A CSV table has `#` comments, one header row of cells `name` or `name[unit]`, and one row per sample.
+`CsvTable` converts columns to SI units and names the file, the line and the column in every error. Line
+numbers count all lines of the file from 1, as text editors do.
+"""
 
 from __future__ import annotations
 
@@ -17,74 +22,127 @@ from typing import Any
 import numpy as np
 
 from .._typing import Array, PathLike
-from ..exceptions import DhcalError
+from ..exceptions import FileFormatError, UnknownNameError
+from ..units import MAX_SI_VALUE
 
-# Metres or radians: no reading, but a wrong unit or a typing error.
-_MAX_VALUE = 1e6
-
-
-# Joint names are column names, and one stands in every line of a table.
-_NOT_IN_NAMES = frozenset(",;[]#\"'")
+# Characters with a meaning in a header, which the names of joints and columns cannot have.
+_RESERVED_CHARACTERS = frozenset(",;[]#\"'")
+# Characters of a line without content: spreadsheets write empty rows as separators only.
+BLANK_CHARACTERS = " \t,;"
+# Longest header cell that a message quotes in full [characters].
+_MAX_QUOTED_CELL = 60
 
 
 def read_text(path: PathLike, encoding: str = "utf-8") -> str:
-    """A text file, in UTF-8 if nothing else is said, or DhcalError."""
+    """Read a text file.
+
+    Args:
+        path: Path of the file.
+        encoding: Name of the encoding.
+
+    Returns:
+        Content of the file, without a byte order mark.
+
+    Raises:
+        FileFormatError: The file cannot be read, or has bytes that the encoding does not allow.
+    """
     try:
         return Path(path).read_bytes().decode(encoding).removeprefix("\ufeff")
     except OSError as error:
-        raise DhcalError(f"{path}: cannot read it: {error.strerror}; give the path of a file") from error
+        raise FileFormatError(f"{path}: cannot read it: {error.strerror}; give the path of a file") from error
     except UnicodeDecodeError as error:
         name = encoding.upper()
-        raise DhcalError(f"{path}: byte {error.start} is not {name}; save the file as {name}") from error
+        raise FileFormatError(f"{path}: byte {error.start} is not {name}; save the file as {name}") from error
 
 
-def read_toml(path: PathLike) -> dict:
-    """A TOML file, or DhcalError."""
+def read_toml(path: PathLike) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Args:
+        path: Path of the file.
+
+    Returns:
+        Its top-level table.
+
+    Raises:
+        FileFormatError: The file cannot be read or is not TOML.
+    """
     text = read_text(path)
     try:
         return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # more than TOMLDecodeError: endless numbers and brackets
-        raise DhcalError(f"{path}: not TOML: {error}; correct that line") from error
+    # Integers with too many digits raise ValueError; brackets nested too deeply raise RecursionError.
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f"{path}: not TOML: {error}; correct that line") from error
 
 
 def require_usable_names(names: Sequence[str], source: str) -> None:
-    """Complains about joint names that a table or a measurement file cannot carry.
+    """Require names that can be the header of a CSV column.
+
+    Args:
+        names: Names of joints.
+        source: File of the robot, for messages.
 
     Raises:
-        DhcalError: a name is empty, not printable, or has a sign that means something in a header.
+        FileFormatError: A name is empty, is not printable, or has a character with a meaning in a header.
     """
     for name in names:
-        if not name or name != name.strip() or not name.isprintable() or _NOT_IN_NAMES & set(name):
-            raise DhcalError(
+        if not name or name != name.strip() or not name.isprintable() or _RESERVED_CHARACTERS & set(name):
+            raise FileFormatError(
                 f"{source}: joint name {name!r}: a name that heads a column must be printable, "
-                f"without {' '.join(sorted(_NOT_IN_NAMES))}; rename the joint"
+                f"without {' '.join(sorted(_RESERVED_CHARACTERS))}; rename the joint"
             )
 
 
 @dataclass(frozen=True)
 class Column:
-    """A header entry `name[unit]`; unit is empty where the header gives none."""
+    """Header entry `name[unit]`.
+
+    Attributes:
+        name: Name of the column.
+        unit: Unit in brackets; empty if the header has none.
+        index: Position in the header, counted from 0.
+    """
 
     name: str
     unit: str
     index: int
 
-    def scale(self, units: Mapping[str, float], where: str) -> float:
-        """The divisor to SI, or DhcalError when the unit is missing or of another quantity."""
+    def divisor(self, units: Mapping[str, float], where: str) -> float:
+        """Return the divisor that converts the column to SI units.
+
+        Args:
+            units: Divisor of each allowed unit.
+            where: File and line of the header, for messages.
+
+        Returns:
+            Divisor of the column's unit.
+
+        Raises:
+            FileFormatError: The column has no unit.
+            UnknownNameError: The unit is unknown or belongs to another quantity.
+        """
         if self.unit in units:
             return units[self.unit]
-        found = f"has unit {self.unit!r}" if self.unit else "has no unit"
-        raise DhcalError(
-            f"{where}: column {self.name!r} {found}; write one of "
-            f"{', '.join(f'{self.name}[{unit}]' for unit in units if unit.isascii())}"
+        choices = ", ".join(f"{self.name}[{unit}]" for unit in units if unit.isascii())
+        if not self.unit:
+            raise FileFormatError(f"{where}: column {self.name!r} has no unit; write one of {choices}")
+        raise UnknownNameError(
+            f"{where}: column {self.name!r} has unit {self.unit!r}; write one of {choices}"
         )
 
 
 @dataclass(frozen=True)
 class CsvTable:
-    """A CSV file: comments, columns, and cells with the line each row stands on.
+    """CSV table, or a part of one.
 
-    `parsed` has the numbers (m,) of columns, by index, that a quick parser understood as a whole.
+    Attributes:
+        source: Name of the file.
+        comments: Text of the comment lines, without `#`.
+        columns: Columns by name.
+        cells: Cells of each row, m rows.
+        lines: File line number of each row, counted from 1.
+        header_line: File line number of the header.
+        parsed: Numbers, shape (m,), of those columns that could be parsed as a whole, by column index.
     """
 
     source: str
@@ -92,104 +150,179 @@ class CsvTable:
     columns: dict[str, Column]
     cells: Sequence[list[str]]
     lines: list[int]
-    header: int
+    header_line: int
     parsed: Mapping[int, Array] = field(default_factory=dict)
 
+    @property
+    def header_location(self) -> str:
+        """File and line of the header, for messages."""
+        return f"{self.source}:{self.header_line}"
+
+    def cell_location(self, row: int, column: str) -> str:
+        """Return file, line and column of a cell, for messages.
+
+        Args:
+            row: Index of the row, counted from 0.
+            column: Name of the column.
+
+        Returns:
+            Text such as `data.csv:7: column 'x'`.
+        """
+        return f"{self.source}:{self.lines[row]}: column {column!r}"
+
     def to_si(self, column: Column, units: Mapping[str, float]) -> Array:
-        """A column's numbers (m,) in metres or radians, or DhcalError naming line and column."""
-        out = self.numbers(column) / column.scale(units, f"{self.source}:{self.header}")
-        bad = np.flatnonzero(np.abs(out) > _MAX_VALUE)
-        if bad.size:
-            text = self.cells[bad[0]][column.index].strip()
-            raise DhcalError(
-                f"{self.source}:{self.lines[bad[0]]}: column {column.name!r}: {text} {column.unit} is beyond "
-                f"{_MAX_VALUE:g} {next(iter(units))}; correct the number or the unit"
+        """Return the numbers of a column in SI units.
+
+        Args:
+            column: Column of this table.
+            units: Divisor of each allowed unit.
+
+        Returns:
+            Values, shape (m,) [m or rad].
+
+        Raises:
+            FileFormatError: A number is too large. A cell that is not a number and a unit that is missing or
+                unknown raise the errors of `numbers` and `Column.divisor`.
+        """
+        values = self.numbers(column) / column.divisor(units, self.header_location)
+        too_large = np.flatnonzero(np.abs(values) > MAX_SI_VALUE)
+        if too_large.size:
+            row = int(too_large[0])
+            text = self.cells[row][column.index].strip()
+            raise FileFormatError(
+                f"{self.cell_location(row, column.name)}: {text} {column.unit} is beyond "
+                f"{MAX_SI_VALUE:g} {next(iter(units))}; correct the number or the unit"
             )
-        return out
+        return values
 
     def numbers(self, column: Column) -> Array:
-        """A column's finite numbers (m,), or DhcalError naming line and column."""
+        """Return the numbers of a column, in the column's own unit.
+
+        Args:
+            column: Column of this table.
+
+        Returns:
+            Finite numbers, shape (m,).
+
+        Raises:
+            FileFormatError: A cell is not a finite number.
+        """
         with suppress(ValueError):
-            out = self.parsed.get(column.index)
-            if out is None:
-                out = np.array([number(row[column.index]) for row in self.cells])
-            if np.isfinite(out).all():
-                return out
-        for row, line in zip(self.cells, self.lines, strict=True):
-            text = row[column.index].strip()
-            if not _is_number(text):
-                what = f"{text!r} is not a finite number" if text else "is empty"
-                raise DhcalError(
-                    f"{self.source}:{line}: column {column.name!r}: {what}; correct or remove the row"
-                )
-        raise AssertionError("unreachable")
+            values = self.parsed.get(column.index)
+            if values is None:
+                values = np.array([parse_number(row[column.index]) for row in self.cells])
+            if np.isfinite(values).all():
+                return values
+        row, text = next(
+            (row, cells[column.index].strip())
+            for row, cells in enumerate(self.cells)
+            if not _is_finite_number(cells[column.index])
+        )
+        problem = f"{text!r} is not a finite number" if text else "is empty"
+        raise FileFormatError(f"{self.cell_location(row, column.name)}: {problem}; correct or remove the row")
 
     def text(self, column: Column) -> list[str]:
-        """A column's cells as text (m,)."""
+        """Return the cells of a column as text.
+
+        Args:
+            column: Column of this table.
+
+        Returns:
+            One text per row, without surrounding white space.
+        """
         return [row[column.index].strip() for row in self.cells]
 
 
-def number(text: str) -> float:
-    """The number that a cell holds, or ValueError; 1_000, which Python would read, is none."""
+def parse_number(text: str) -> float:
+    """Parse the number in a cell.
+
+    Args:
+        text: Text of the cell.
+
+    Returns:
+        The number, possibly infinite or not a number.
+
+    Raises:
+        ValueError: The text is not a number. Underscores such as in 1_000 are refused, although Python reads
+            them.
+    """
     if "_" in text:
         raise ValueError(text)
     return float(text)
 
 
 def read_csv_table(path: PathLike) -> CsvTable:
-    """A comma-separated UTF-8 file with `#` comments and one header line.
+    """Read a comma-separated UTF-8 file with `#` comments and one header row.
 
-    Raises:
-        DhcalError: it is empty, its header is none, or a row is too short or too long.
+    Args:
+        path: Path of the file.
+
+    Returns:
+        The table; `parse_csv_table` names the possible errors.
     """
     return parse_csv_table(os.fspath(path), enumerate(read_text(path).splitlines(), 1))
 
 
 def parse_csv_table(source: str, numbered: Iterable[tuple[int, str]]) -> CsvTable:
-    """The sheet of numbered lines, which need not be all of a file; as `read_sheet`."""
-    comments, kept = [], []
-    for number, line in numbered:
+    """Parse numbered lines of a CSV file, possibly of a part of it.
+
+    Args:
+        source: Name of the file, for messages.
+        numbered: File line number and text of each line; the first one with content is the header.
+
+    Returns:
+        The table.
+
+    Raises:
+        FileFormatError: There is no row, the header is invalid, or a row has too few or too many cells.
+    """
+    comments: list[str] = []
+    content: list[tuple[int, str]] = []
+    for line_number, line in numbered:
         if line.lstrip().startswith("#"):
             comments.append(line.lstrip()[1:].strip())
-        elif line.strip(" \t,;"):
-            kept.append((number, line))
-    if not kept:
-        raise DhcalError(
+        elif line.strip(BLANK_CHARACTERS):
+            content.append((line_number, line))
+    if not content:
+        raise FileFormatError(
             f"{source}: is empty; the first line must be a header such as joint_1[deg],…,x[mm],y[mm],z[mm]"
         )
-    first, head = kept[0]
-    columns = _columns(_cells(head, f"{source}:{first}"), f"{source}:{first}")
-    lines = [number for number, _ in kept[1:]]
-    cells = _Rows(source, kept[1:])
-    for i, (line, text) in enumerate(kept[1:]):
+    (header, header_text), rows = content[0], content[1:]
+    where = f"{source}:{header}"
+    columns = _parse_header(_split_cells(header_text, where), where)
+    cells = _LazyRows(source, rows)
+    for i, (line_number, text) in enumerate(rows):
         count = len(cells[i]) if '"' in text else text.count(",") + 1
         if count != len(columns):
-            raise DhcalError(
-                f"{source}:{line}: {count} values under a header of {len(columns)} columns; "
-                "give every row one value a column (decimal point, comma between)"
+            raise FileFormatError(
+                f"{source}:{line_number}: {count} values under a header of {len(columns)} columns; "
+                "write one value per column in every row, with decimal points and commas between values"
             )
-    if not lines:
-        raise DhcalError(f"{source}: no rows under the header in line {first}; add at least one row")
-    return CsvTable(source, tuple(comments), columns, cells, lines, first, cells.numbers())
+    if not rows:
+        raise FileFormatError(f"{source}: no rows under the header in line {header}; add at least one row")
+    lines = [line_number for line_number, _ in rows]
+    return CsvTable(source, tuple(comments), columns, cells, lines, header, cells.parse_numbers())
 
 
-class _Rows(Sequence[list[str]]):
-    """Rows of comma-separated text, split when they are asked for: numbers mostly need no cells."""
+class _LazyRows(Sequence[list[str]]):
+    """Rows of comma-separated text, split on access: numeric columns are parsed without splitting."""
 
-    def __init__(self, source: str, kept: Sequence[tuple[int, str]]):
-        self.source, self.kept = source, kept
+    def __init__(self, source: str, rows: Sequence[tuple[int, str]]):
+        self._source, self._rows = source, rows
 
     def __len__(self) -> int:
-        return len(self.kept)
+        return len(self._rows)
 
     def __getitem__(self, index: Any) -> Any:
-        number, line = self.kept[index]
-        # Line by line, so that a stray quote stays in its own row.
-        return _cells(line, f"{self.source}:{number}")
+        line_number, line = self._rows[index]
+        return _split_cells(line, f"{self._source}:{line_number}")
 
-    def numbers(self) -> dict[int, Array]:
-        """All columns of numbers (m,) by index; none if a cell of them is something else, or quoted."""
-        if any('"' in line for _, line in self.kept):
+    def parse_numbers(self) -> dict[int, Array]:
+        """Parse all columns that are numeric in the first row, shape (m,) each, by column index.
+
+        Returns an empty dict if a cell is quoted, or if a cell of such a column is not a number.
+        """
+        if any('"' in line for _, line in self._rows):
             return {}
         numeric = []
         for i, cell in enumerate(self[0]):
@@ -198,46 +331,58 @@ class _Rows(Sequence[list[str]]):
                 numeric.append(i)
         try:
             table = np.loadtxt(
-                (line for _, line in self.kept), delimiter=",", comments=None, usecols=numeric, ndmin=2
+                (line for _, line in self._rows), delimiter=",", comments=None, usecols=numeric, ndmin=2
             )
         except ValueError:
             return {}
         return dict(zip(numeric, np.ascontiguousarray(table.T), strict=True))
 
 
-def _cells(line: str, where: str) -> list[str]:
+def _split_cells(line: str, where: str) -> list[str]:
+    """Split one line, so that an unbalanced quote does not extend over the following lines."""
     try:
         return next(csv.reader([line]))
     except csv.Error as error:
-        raise DhcalError(f"{where}: not comma-separated text: {error}; correct this line") from error
+        raise FileFormatError(f"{where}: not comma-separated text: {error}; correct this line") from error
 
 
-def _columns(header: Sequence[str], where: str) -> dict[str, Column]:
+def _parse_header(header: Sequence[str], where: str) -> dict[str, Column]:
     columns: dict[str, Column] = {}
     for index, cell in enumerate(header):
         match = re.fullmatch(r"\s*([^\[\]]+?)\s*(?:\[\s*([^\[\]]*?)\s*\])?\s*", cell)
         if not match:
-            shown = cell if len(cell) <= 60 else cell[:57] + "..."
-            raise DhcalError(f"{where}: header {shown!r}: write name or name[unit], with commas between them")
+            quoted = cell if len(cell) <= _MAX_QUOTED_CELL else cell[: _MAX_QUOTED_CELL - 3] + "..."
+            raise FileFormatError(
+                f"{where}: header {quoted!r}: write name or name[unit], with commas between them"
+            )
         name, unit = match[1], match[2] or ""
         if name in columns:
-            raise DhcalError(f"{where}: column {name!r} stands twice; remove one")
+            raise FileFormatError(f"{where}: column {name!r} appears twice; remove one")
         columns[name] = Column(name, unit, index)
-    if all(map(_is_number, columns)):
-        raise DhcalError(
+    if all(map(_is_finite_number, columns)):
+        raise FileFormatError(
             f"{where}: numbers where the header must be; write one such as joint_1[deg],…,x[mm],y[mm],z[mm]"
         )
     return columns
 
 
-def _is_number(text: str) -> bool:
+def _is_finite_number(text: str) -> bool:
     with suppress(ValueError):
-        return math.isfinite(number(text))
+        return math.isfinite(parse_number(text))
     return False
 
 
 def csv_text(columns: Mapping[str, Iterable[Any]], comments: Iterable[str] = ()) -> str:
-    """Comments and columns of equal length as CSV; numbers to the last digit, None as an empty cell."""
+    """Return the text of a CSV file.
+
+    Args:
+        columns: Values by header, all of one length m. Numbers are written with all digits, None as an empty
+            cell.
+        comments: Lines that precede the header, each after `# `.
+
+    Returns:
+        Comment lines, header and m rows.
+    """
     out = io.StringIO()
     out.writelines(f"# {comment}\n" for comment in comments)
     writer = csv.writer(out, lineterminator="\n")

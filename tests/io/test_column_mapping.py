@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from dhcal_pin import se3
 from dhcal_pin.cli import main
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io.column_mapping import euler
+from dhcal_pin.io.column_mapping import euler_to_matrix
 from dhcal_pin.io.measurement_csv import measurement_text, read_measurement_file, read_measurements
 from dhcal_pin.measurements.pose import Pose, RelativePose
 from dhcal_pin.measurements.position import Position
@@ -145,7 +145,7 @@ def test_all_euler_conventions_are_scipys(frame):
     assert len(every) == 12
     for axes in map("".join, every):
         wanted = Rotation.from_euler(axes.upper() if frame == "intrinsic" else axes, angles).as_matrix()
-        np.testing.assert_allclose(euler(angles, axes, frame), wanted, atol=5e-15)
+        np.testing.assert_allclose(euler_to_matrix(angles, axes, frame), wanted, atol=5e-15)
 
 
 @pytest.mark.parametrize(
@@ -220,37 +220,40 @@ ROTATION = '[rotation]\nconvention = "euler"\naxes = "XYZ"\nframe = "intrinsic"\
     ("how", "words"),
     [
         ("a =", ["map.toml", "not TOML"]),
-        ("seperator = ';'\n" + MAP, ["unknown key 'seperator'", "allowed: separator"]),
-        (swap('separator = ";"', 'separator = "|"'), ["separator = '|'", "'tab'"]),
+        ("seperator = ';'\n" + MAP, ["unknown key 'seperator'", "choose from separator"]),
+        (swap('separator = ";"', 'separator = "|"'), ["separator = '|'", '"tab"']),
         (swap("skip = 2", 'skip = "two"'), ["skip = 'two'", "skip = 2"]),
         (swap("skip = 2", "skip = -1"), ["skip = -1"]),
         (swap('separator = ";"', ""), ["separator and decimal are both ','"]),
         ('encoding = "klingon"\n' + MAP, ["'klingon'", "utf-8"]),
         (swap('unit = "deg"', 'unit = "mm"'), ["[joints]: joint_1: unit 'mm'", '"rad"']),
         (swap('unit = "deg"', ""), ["[joints]: joint_1: unit ''", '"deg"']),
-        (swap('"A1", "A2", "A3"', '"A1", "A2"'), ["names: 3 entries for 2 columns"]),
+        (swap('"A1", "A2", "A3"', '"A1", "A2"'), ["names has 3 entries; expected 2"]),
         (swap('unit = "deg"', 'unit = "deg"\nsign = [1, 2, 1]'), ["sign", "1 or -1"]),
-        (swap('unit = "deg"', 'unit = ["deg", "mm"]'), ["unit", "2 entries for 3"]),
+        (swap('unit = "deg"', 'unit = ["deg", "mm"]'), ["unit has 2 entries; expected 3"]),
         (swap('unit = "deg"', 'unit = ["deg", "deg", "mm"]'), ["joint_3", "'mm'", '"deg"']),
-        (swap('unit = "deg"', 'unit = "deg"\noffset = ["a", 0, 0]'), ["'a' is no number"]),
+        (swap('unit = "deg"', 'unit = "deg"\noffset = ["a", 0, 0]'), ["'a' is not a number"]),
         (swap('"A1"', '"A9"'), ["theirs.csv:3", "no column 'A9'", "map.toml", "'A1'", "separator ';'"]),
         (swap('"A1"', "99"), ["no column 99"]),
-        (swap('"A1"', "0"), ["0 names no column"]),
-        (swap('x = {from = "X pos", unit = "mm"}', 'x = {unit = "mm"}'), ["x: has no `from`"]),
-        (swap('x = {from = "X pos", unit = "mm"}', 'x = "X pos"'), ["'X pos' is no table"]),
+        (swap('"A1"', "0"), ["0 is not a column"]),
+        (
+            swap('x = {from = "X pos", unit = "mm"}', 'x = {unit = "mm"}'),
+            ["[columns.x]: from is missing", "header"],
+        ),
+        (swap('x = {from = "X pos", unit = "mm"}', 'x = "X pos"'), ["[columns.x]: 'X pos' is not a table"]),
         (swap('{from = "X pos", unit = "mm"}', '{from = "X pos", unit = "deg"}'), ["x: unit 'deg'", '"mm"']),
         (swap("x = {from", "x_pos = {from"), ["column 'x_pos' is neither a joint"]),
         (MAP + 'set = {from = "Nr", scale = 2}', ["set", "is text"]),
         (MAP + '[constant]\njoint_1 = "0"', ["[constant]: unknown key 'joint_1'", "point"]),
-        (MAP + '[constant]\npoint = "{name}"', ["{name} stands for nothing", "{stem}"]),
+        (MAP + '[constant]\npoint = "{name}"', ["unknown placeholder {name}", "{stem}"]),
         (MAP + "[constant]\npoint = 3", ["point = 3", "{stem}"]),
         (MAP + '[to_joints]\norder = [1]\nnames = ["joint_1"]\nunit="deg"', ["'joint_1' is given twice"]),
-        (MAP + ROTATION + "columns = [1, 2]", ["columns: 2 entries for 3 columns"]),
+        (MAP + ROTATION + "columns = [1, 2]", ["columns has 2 entries; expected 3"]),
         (MAP + ROTATION.replace("XYZ", "XXZ") + "columns = [1, 2, 3]", ["axes = 'XXZ'", "ZYZ"]),
         (MAP + ROTATION.replace("intrinsic", "moving") + "columns = [1, 2, 3]", ["frame = 'moving'"]),
         (
             MAP + ROTATION.replace('frame = "intrinsic"\n', "") + "columns = [1, 2, 3]",
-            ["no frame", "extrinsic"],
+            ["frame is missing", "extrinsic"],
         ),
         (MAP + ROTATION.replace("euler", "rpy") + "columns = [1, 2, 3]", ["convention = 'rpy'", "euler"]),
         (MAP + ROTATION + 'order = "wxyz"\ncolumns = [1, 2, 3]', ["order", "does not go with euler"]),
@@ -270,8 +273,8 @@ def test_a_wrong_map_is_refused(read, how, words):
         (FILE.replace("10,5", "ten"), ["theirs.csv:5", "column 'Z pos'", "'ten' is not a finite number"]),
         (FILE.replace("2;11,5;", "2;"), ["theirs.csv:6", "6 values for 7 columns"]),
         (FILE.replace("-8", "-8;9"), ["theirs.csv:6", "8 values for 7 columns"]),
-        (FILE.replace("A1;A2", "A1;A1"), ["theirs.csv:3", "'A1' stands twice", "number"]),
-        ("one\ntwo\nthree\n", ["no rows with readings"]),
+        (FILE.replace("A1;A2", "A1;A1"), ["theirs.csv:3", "'A1' appears twice", "number"]),
+        ("one\ntwo\nthree\n", ["no rows with measured values"]),
         (FILE.replace("100,25", "1e10"), ["theirs.csv:5", "beyond"]),
     ],
 )
@@ -287,7 +290,7 @@ def test_nine_numbers_that_are_no_rotation(read, cells):
     how = 'header = false\njoints = {order = [1, 2, 3], unit = "rad"}\n[columns]\n'
     how += "".join(f'{axis} = {{from = 1, unit = "m"}}\n' for axis in "xyz")
     how += '[rotation]\nconvention = "matrix"\ncolumns = [4, 5, 6, 7, 8, 9, 10, 11, 12]'
-    with pytest.raises(DhcalError, match=r"theirs.csv:1: the nine numbers are no rotation"):
+    with pytest.raises(DhcalError, match=r"theirs.csv:1: the nine numbers are not a rotation matrix"):
         read(f"0.1,0.2,0.3,{cells}\n", how)
 
 

@@ -159,14 +159,14 @@ def change(old, new):
 @pytest.mark.parametrize(
     ("edit", "words"),
     [
-        (change('convention = "standard"', ""), ["states no convention", 'convention = "standard"']),
-        (change('"standard"', '"classic"'), ["'classic' is unknown", 'convention = "standard"']),
-        (change('"standard"', "[1]"), ["[1] is unknown"]),
-        (change('length = "mm"', ""), ["[units] must state length", "mm"]),
-        (change('length = "mm"', 'length = "inch"'), ["[units] must state length", "mm"]),
-        (change('length = "mm"', 'length = ["mm"]'), ["[units] must state length"]),
-        (change('angle = "deg"', ""), ["[units] must state angle", "deg"]),
-        (change("a = 325.0", "r = 325.0"), ["'shoulder'", "unknown key 'r'", "alpha"]),
+        (change('convention = "standard"', ""), ["convention is missing", '"standard"']),
+        (change('"standard"', '"classic"'), ["convention = 'classic'", '"standard"']),
+        (change('"standard"', "[1]"), ["convention = [1]"]),
+        (change('length = "mm"', ""), ["[units]: length", "mm"]),
+        (change('length = "mm"', 'length = "inch"'), ["[units]: length", "mm"]),
+        (change('length = "mm"', 'length = ["mm"]'), ["[units]: length = ['mm']"]),
+        (change('angle = "deg"', ""), ["[units]: angle is missing", "deg"]),
+        (change("a = 325.0", "r = 325.0"), ["'shoulder'", "a is missing", "theta, d, r, alpha"]),
         (change("[units]", "[unit]"), ["unknown key 'unit'", "units"]),
         (change("a = 325.0", ""), ["'shoulder'", "a is missing", "a = 0.0"]),
         (change("a = 325.0", "a = nan"), ["'shoulder'", "a = nan", "finite"]),
@@ -177,15 +177,15 @@ def change(old, new):
         (change("a = 325.0", "a = 3.25e9"), ["'shoulder'", "a is 3.25e+06 m", "unit"]),
         (change("upper = 0.0", "upper = nan"), ["'lift'", "upper = nan", "finite"]),
         (change("upper = 0.0", "upper = -300.0"), ["'lift'", "lower is above upper", "swap"]),
-        (change('"prismatic"', '"linear"'), ["'lift'", "'linear'", "revolute or prismatic"]),
+        (change('"prismatic"', '"linear"'), ["'lift'", "'linear'", '"revolute", "prismatic"']),
         (change('name = "lift"', 'name = "shoulder"'), ["must differ", "shoulder"]),
         (change('name = "lift"', "name = 3"), ["3", "quotes"]),
         (change('name = "lift"', 'name = "a,b"'), ["'a,b'", "rename"]),
         (change("[units]", "[units"), ["not TOML", "line 2"]),
-        (change("[units]", "base = 3\n[units]"), ["[base]", "xyz_m"]),
+        (change("[units]", "base = 3\n[units]"), ["[base]: 3 is not a table"]),
         (change("[units]", 'base = {xyz_m = ["1", "2", "3"]}\n[units]'), ["[base]", "xyz_m"]),
         (change("[units]", "tool = {xyz_m = [0, 0, nan]}\n[units]"), ["[tool]", "xyz_m"]),
-        (change("[units]", "tool = {xyz = [0, 0, 1]}\n[units]"), ["[tool]", "xyz_m"]),
+        (change("[units]", "tool = {xyz = [0, 0, 1]}\n[units]"), ["[tool]", "unknown key 'xyz'", "xyz_m"]),
         (change(SCARA[SCARA.index("[[joint]]") :], ""), ["no [[joint]]"]),
         (change(SCARA[SCARA.index("[[joint]]") :], "[joint]\n"), ["no [[joint]]"]),
     ],
@@ -204,7 +204,7 @@ def test_a_wrong_dh_toml_is_refused_in_words(tmp_path, edit, words):
     ("edit", "line", "words"),
     [
         (change("# convention: standard", "# an arm"), None, ["no convention", "# convention: standard"]),
-        (change(": standard", ": Craig"), None, ["'Craig' is unknown", "# convention: standard"]),
+        (change(": standard", ": Craig"), None, ["unknown convention 'Craig'", "# convention: standard"]),
         (change("d[mm]", "d"), 2, ["'d' has no unit", "d[mm]"]),
         (change("d[mm]", "d[deg]"), 2, ["'d' has unit 'deg'", "d[mm]"]),
         (change("d[mm]", "offset[mm]"), 2, ["unknown column 'offset'", "theta"]),
@@ -214,13 +214,13 @@ def test_a_wrong_dh_toml_is_refused_in_words(tmp_path, edit, words):
         (change("606.8", "6e7"), None, ["'shoulder'", "d is 60000 m", "unit"]),
         (change("lift", "shoulder"), None, ["must differ"]),
         (change("lift", ""), None, ["joint name ''"]),
-        (change("prismatic", "slide"), None, ["'lift'", "'slide'", "revolute or prismatic"]),
-        (change("lower[deg|mm]", "lower[deg]"), 2, ["'lower'", "sliding", "lower[deg|mm]"]),
-        (change("lower[deg|mm]", "lower[mm]"), 2, ["'lower'", "turning", "lower[deg|mm]"]),
+        (change("prismatic", "slide"), 4, ["'lift'", "'slide'", "revolute, prismatic"]),
+        (change("lower[deg|mm]", "lower[deg]"), 2, ["'lower'", "prismatic", "lower[deg|mm]"]),
+        (change("lower[deg|mm]", "lower[mm]"), 2, ["'lower'", "revolute", "lower[deg|mm]"]),
         (change("-130.0", "none"), 3, ["'lower'", "'none'", "empty"]),
         (change("\nshoulder", "\n# base: 0 0 1\nshoulder"), None, ["'# base:' needs six numbers"]),
         (change("\nshoulder", "\n# tool: 0 0 1 0 0 x\nshoulder"), None, ["'# tool:' needs six numbers"]),
-        (change("\nshoulder", "\n# tool: 0 0 1 0 0 nan\nshoulder"), None, ["[tool]", "three numbers"]),
+        (change("\nshoulder", "\n# tool: 0 0 1 0 0 nan\nshoulder"), None, ["[tool]", "3 numbers"]),
     ],
     ids=lambda value: str(value)[:40],
 )
@@ -363,7 +363,7 @@ def test_a_joint_named_like_a_reading_is_refused(tmp_path):
         lambda: read_measurement_file(write(tmp_path, "a.csv", HEADER + "0,0,1,2,3\n"), gantry),
         lambda: measurement_text(Position(np.zeros((1, 2)), np.zeros((1, 3))), gantry),
     ):
-        with pytest.raises(DhcalError, match="'x' has the name of a reading; rename"):
+        with pytest.raises(DhcalError, match="'x' has the name of a measurement column; rename"):
             act()
 
 
@@ -534,7 +534,7 @@ def test_an_old_sidecar_does_not_outlive_its_robot(tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "words"),
-    [("[gripper]\n", "gripper"), ("base = 1\n", "xyz_m"), ("[tool]\nxyz_m = [1, 2]\n", "three numbers")],
+    [("[gripper]\n", "gripper"), ("base = 1\n", "is not a table"), ("[tool]\nxyz_m = [1, 2]\n", "3 numbers")],
 )
 def test_a_wrong_sidecar_is_refused(tmp_path, text, words):
     write_urdf(scara(tmp_path), tmp_path / "arm.urdf")
@@ -544,5 +544,7 @@ def test_a_wrong_sidecar_is_refused(tmp_path, text, words):
     assert str(path) in str(caught.value)
 
 
-def test_sidecar_text_is_toml():
-    assert set(tomllib.loads(sidecar_text('a "b"', np.eye(4), np.eye(4), {}))) == {"tip", "base", "tool"}
+def test_sidecar_text_is_toml(tmp_path):
+    text = sidecar_text(replace(scara(tmp_path), tip='a "b"'), np.eye(4), required=True)
+    assert text is not None
+    assert set(tomllib.loads(text)) == {"tip", "base", "tool"}
