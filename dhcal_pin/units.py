@@ -56,5 +56,7 @@ def parse_noise(text: str, label: str = "--noise") -> tuple[float, float]:
                 f"{where}: {match[1]!r} is not a number; expected for example 0.1"
             ) from None
         if not 0 <= out[quantity] <= MAX_SI_VALUE:
-            raise InvalidArgumentError(f"{where}: standard deviation must lie in [0, {MAX_SI_VALUE:g}] m or rad")
+            raise InvalidArgumentError(
+                f"{where}: standard deviation must lie in [0, {MAX_SI_VALUE:g}] m or rad"
+            )
     return out.get("length", 0.0), out.get("angle", 0.0)

@@ -222,8 +222,10 @@ def read_uncertainty(path: PathLike, chain: Chain) -> Uncertainty | None:
     if "uncertainty" not in document:
         return None
     table = document.table("uncertainty")
-    joints, terms = table.get("joints"), table.get("terms")
-    texts = {key: table.get(key) for key in ("sqrt_covariance", "unbounded_directions")}
+    joints, terms = (table.get(key, expected="a list of names") for key in ("joints", "terms"))
+    texts = {
+        key: table.get(key, expected="base64 text") for key in ("sqrt_covariance", "unbounded_directions")
+    }
     table.finish()
     if joints != list(chain.moving_joints):
         raise table.error("joints", f"expected the joints of this robot: {', '.join(chain.moving_joints)}")

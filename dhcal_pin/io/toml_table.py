@@ -237,7 +237,8 @@ class TomlTable:
         Returns:
             The numbers; an absent key or another list is an error.
         """
-        expected = f"{size} numbers such as {[0.0] * size}"
+        limit = f" up to ±{at_most:g}" if at_most < _MAX_NUMBER else ""
+        expected = f"{size} numbers{limit}, such as {[0.0] * size}"
         value = self.get(key, default, expected=expected)
         if (
             isinstance(value, str)

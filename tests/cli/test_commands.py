@@ -165,7 +165,7 @@ DATA = {
     "broken header": (edited("x[mm]", "x[mm"), ["data.csv:1:", "'x[mm'", "name[unit]"]),
     "semicolons": (csv(4).replace(",", ";"), ["data.csv:1:", "commas"]),
     "comma at the end": (csv(4).replace("\n", ",\n"), ["data.csv:1:", "header ''"]),
-    "same column twice": (edited("y[mm]", "x[m]"), ["data.csv:1:", "'x' stands twice", "remove one"]),
+    "same column twice": (edited("y[mm]", "x[m]"), ["data.csv:1:", "'x' appears twice", "remove one"]),
     "joint missing": (
         "\n".join(line[line.index(",") + 1 :] for line in LINES),
         ["data.csv:1:", "'joint_1'", "[deg]"],

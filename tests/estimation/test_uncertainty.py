@@ -158,11 +158,11 @@ def test_a_map_as_a_page_and_what_is_refused(calibrated, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ('sqrt_covariance = """', 'sqrt_covariance = """!', "no base64"),
-        ('sqrt_covariance = """', 'sqrt_covariance = """\nAAAA', "no base64 of"),
-        ('"joint_1"', '"shoulder"', "is of joints"),
+        ('sqrt_covariance = """', 'sqrt_covariance = """!', "is not base64 text"),
+        ('sqrt_covariance = """', 'sqrt_covariance = """\nAAAA', "does not hold 42 rows"),
+        ('"joint_1"', '"shoulder"', "expected the joints of this robot"),
         ("terms = []", 'terms = ["elbow.play"]', "elbow.play"),
-        ("terms = []", "", "must be a table of"),
+        ("terms = []", "", "terms is missing"),
     ],
 )
 def test_a_wrong_table_is_refused(calibrated, tmp_path, old, new, words):
