@@ -6,10 +6,14 @@ decimals are shown (rounding rule of the Particle Data Group).
 
 from __future__ import annotations
 
-import html
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import jinja2
 
 # SI unit -> (factor, text of the shown unit).
 RATE_UNITS = {"rad/Nm": (1e6, " µrad/Nm"), "rad/rad": (1e3, " mrad/rad"), "rad/m": (1e3, " mrad/m")}
@@ -97,42 +101,37 @@ class Table:
     caption: str = ""
 
 
-def html_table(table: Table, drawings: Mapping[str, Sequence[str]] | None = None) -> str:
+@cache
+def html_templates() -> jinja2.Environment:
+    """Return the HTML templates of the package, named by their paths in it.
+
+    Returns:
+        Environment that escapes all inserted texts and refuses undefined names.
+    """
+    # Lazy import: only reports and notebooks need it.
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("dhcal_pin", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.globals["MAX_UNBROKEN_CHARS"] = MAX_UNBROKEN_CHARS
+    return environment
+
+
+def html_table(table: Table) -> str:
     """Render a table as HTML.
 
     Args:
         table: Table to render; its texts are escaped.
-        drawings: Additional columns by title, each with one SVG per row; they are not escaped.
 
     Returns:
         HTML element `table`.
     """
-    drawn = drawings or {}
-
-    def cell(tag: str, i: int, text: str) -> str:
-        css_class = (
-            ' class="number"'
-            if i >= table.n_text_columns
-            else ' class="long"'
-            if len(text) > MAX_UNBROKEN_CHARS
-            else ""
-        )
-        scope = ' scope="row"' if tag == "th" else ""
-        content = html.escape(text).replace("-", "−") if i >= table.n_text_columns else html.escape(text)
-        return f"<{tag}{scope}{css_class}>{content}</{tag}>"
-
-    head = "".join(
-        f'<th scope="col"{" class=number" if i >= table.n_text_columns else ""}>{html.escape(name)}</th>'
-        for i, name in enumerate(table.header)
-    )
-    head += "".join(f'<th scope="col">{html.escape(name)}</th>' for name in drawn)
-    body = []
-    for number, row in enumerate(table.rows):
-        cells = "".join(cell("td" if i else "th", i, text) for i, text in enumerate(row))
-        cells += "".join(f"<td>{column[number]}</td>" for column in drawn.values())
-        body.append(f"<tr>{cells}</tr>")
-    caption = f"<caption>{html.escape(table.caption)}</caption>" if table.caption else ""
-    return f"<table>{caption}<thead><tr>{head}</tr></thead>\n<tbody>{chr(10).join(body)}</tbody></table>"
+    return str(html_templates().get_template("table.html").make_module().render_table(table))  # pyright: ignore
 
 
 def markdown_table(table: Table) -> str:

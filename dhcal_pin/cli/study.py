@@ -20,7 +20,7 @@ from ..io.tabular import csv_text, read_text
 from ..parallel import open_executor
 from ..studies.grid import Setting, StudyGrid, read_study
 from ..studies.runner import run, table
-from ..visualization.study_plot import plot
+from ..visualization.plots import study_svg
 from . import console
 from .options import require_writable_outputs, sidecars
 
@@ -55,7 +55,7 @@ def study(args: Namespace) -> int:
         console.print_lines(f"dhcal: interrupted; {kept}")
         return 130
     header, rows = table(wanted, blocks)
-    drawn = plot(wanted.title or "study", len(fields(Setting)), header, rows)
+    drawn = study_svg(wanted.title or "study", header, rows, len(fields(Setting)))
     columns = dict(zip(header, zip(*rows, strict=True), strict=True))
     contents = {args.output: csv_text(columns)} | ({picture: drawn} if drawn else {})
     write_files(contents)

@@ -1,261 +1,413 @@
-"""The report's figures: errors before and after, by sample and by joint, and singular values."""
+"""Figures of the report: which plots of `visualization.plots` go into which section.
+
+A section names one function of this module. The function gets the `ReportContext` and returns the groups of
+figures of the section in their order on the page.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
 
 import numpy as np
 
+from .. import se3
 from .._typing import Array
 from ..calibration.evaluation import GROUP_UNITS, compute_errors, error_norms
 from ..calibration.summary import GROUP_LABELS
-from ..diagnostics.residuals import JointProfile
+from ..diagnostics.residuals import JointProfile, Workspace
 from ..estimation import qr
-from ..formatting import SMALL_UNITS
-from ..visualization import figures
-from ..visualization.figures import Axis, Mark, axes, axis_over, symmetric
-from .sections import ReportContext
+from ..formatting import format_quantity
+from ..robot.chain import Chain
+from ..visualization import plots, scene
+from ..visualization.plots import SQUARE_PANEL, WIDE_PANEL, SvgPanels
+from .context import ReportContext
 
-HISTOGRAM = 28
-
-
-MAX_DOTS = 1500
-
-
-# Fewer dots than this are drawn large.
-MAX_SEPARATE_DOTS = 100
-
-
-# What is so many times larger than the rest would flatten it, were they to share a scale.
-MAX_PANELS = 4
+# A joint whose errors are larger than this multiple of the joints' median gets a scale of its own. Errors
+# before the calibration are left out if they are larger than this multiple of those after it.
+MAX_SCALE_RATIO = 4.0
+# Displacement of the drawn robot relative to its size that the magnified errors should have, and the largest
+# magnification.
+DRAWN_DISPLACEMENT, MAX_MAGNIFICATION = 0.05, 500.0
 
 
-def _unit(group: str) -> tuple[float, str]:
-    factor, name = SMALL_UNITS[GROUP_UNITS[group]]
-    return factor, name.strip()
+@dataclass(frozen=True)
+class Panel:
+    """One figure with its caption.
+
+    Attributes:
+        caption: Text above the figure.
+        svg: SVG element.
+    """
+
+    caption: str
+    svg: str
 
 
-def _bins(before: Array, after: Array, title: str, count: int) -> tuple[Axis, Array]:
-    """Axis and edges of a histogram of sizes; logarithmic where one of both would else be a single bar."""
-    every = np.concatenate([before, after])
-    high = float(every.max())
-    medians = sorted((float(np.median(before)), float(np.median(after))))
-    if medians[1] <= MAX_PANELS * medians[0]:
-        axis = axis_over(every, title, zero=True)
-        return axis, np.linspace(axis.low, axis.high, count + 1)
-    low = max(float(np.quantile(every, 0.01)), 1e-6 * high)
-    return Axis(low, high, title, log=True), np.geomspace(low, high, count + 1)
+@dataclass(frozen=True)
+class LegendEntry:
+    """Meaning of a colour.
+
+    Attributes:
+        text: What is drawn in this way.
+        color: Name of the colour in `plots.COLORS`.
+        mark: Shape of the sample: "area", "cell", "dashes", "dots" or "line".
+    """
+
+    text: str
+    color: str
+    mark: str
 
 
-def histograms(study: ReportContext) -> list[str]:
-    """Sizes of errors before and after, a panel a group, held out first."""
-    fit, out = study.fit, []
-    for title, data in (("held out", fit.holdout), ("fitted", fit.inliers)):
+@dataclass(frozen=True)
+class FigureGroup:
+    """Figures that belong together and share a legend.
+
+    Attributes:
+        panels: The figures.
+        title: Heading of the group; may be empty.
+        legend: Meaning of the colours.
+        layout: Columns of panels on a wide page: "narrow" (three) or "wide" (two).
+        scene: HTML page of a 3-D scene, shown on screens; the panels then appear in print only.
+    """
+
+    panels: Sequence[Panel]
+    title: str = ""
+    legend: Sequence[LegendEntry] = ()
+    layout: str = "narrow"
+    scene: str = ""
+
+
+def accuracy_figures(context: ReportContext) -> list[FigureGroup]:
+    """Draw histograms of the errors before and after, for hold-out and fitted samples and each error group.
+
+    Args:
+        context: Result and diagnostics.
+
+    Returns:
+        One group of figures.
+    """
+    fit, svg, panels = context.fit, SvgPanels(), []
+    for role, data in (("hold-out", fit.holdout), ("fitted", fit.inliers)):
         if not data:
             continue
         before = error_norms(compute_errors(fit.nominal_refitted, data))
         after = error_norms(compute_errors(fit.chain, data, fit.instruments))
-        for group, size in after.items():
-            factor, unit = _unit(group)
-            bins = min(HISTOGRAM, max(8, len(size) // 3))
-            pair = [factor * before[group], factor * size]
-            x, edges = _bins(pair[0], pair[1], f"{GROUP_LABELS[group]}, {unit}", bins)
-            counts = [np.histogram(np.clip(v, edges[0], edges[-1]), edges)[0] for v in pair]
-            marks = [
-                figures.histogram(edges, n, look) for n, look in zip(counts, ("before", "after"), strict=True)
-            ]
-            rms = [float(np.sqrt(np.mean(v**2))) for v in pair]
+        for group, errors in after.items():
+            quantity, unit = GROUP_LABELS[group], GROUP_UNITS[group]
+            caption = f"{_capitalized(quantity)}, {len(errors)} {role} samples"
+            rms = [_shown(float(np.sqrt(np.mean(norms**2))), unit) for norms in (before[group], errors)]
             text = (
-                f"Histogram of the {GROUP_LABELS[group]} of {len(size)} samples {title}: RMS {rms[0]:.3g} {unit} "
-                f"before, {rms[1]:.3g} {unit} after."
+                f"Histogram of the {quantity} of {len(errors)} {role} samples: RMS {rms[0]} before, "
+                f"{rms[1]} after."
             )
-            y = axis_over([5, *np.concatenate(counts)], "samples", zero=True)
-            name = f"{GROUP_LABELS[group][0].upper()}{GROUP_LABELS[group][1:]}, {len(size)} {title}"
-            out.append(axes(f"h-{title.replace(' ', '')}-{group}", name, text, x, y, marks))
-    return out
+            plot = partial(plots.plot_error_histogram, before[group], errors, quantity=quantity, unit=unit)
+            key = f"histogram-{role}-{group}"
+            panels.append(Panel(caption, svg.draw(plot, key, caption, text, WIDE_PANEL)))
+    legend = [LegendEntry(state, state, "area") for state in ("before", "after")]
+    return [FigureGroup(panels, legend=legend, layout="wide")]
 
 
-def _places(study: ReportContext) -> list[tuple[str, Array, dict[str, Array], Array]]:
-    """By item: "fitted" or "held out", sample numbers over all files, sizes by group, gross or not."""
-    fit = study.fit
-    starts: dict[str, int] = {}
-    last: dict[str, int] = {}
-    named = [*zip(study.names, fit.data, strict=True), *zip(study.holdout_names, fit.holdout, strict=True)]
-    for name, item in named:
-        last[name] = max(last.get(name, 0), int(item.rows.max()))
-    for name in last:
-        starts[name] = sum(last[other] for other in starts)
+def residual_figures(context: ReportContext) -> list[FigureGroup]:
+    """Draw the residual error of each joint, and the errors over the joint positions and over the samples.
+
+    Args:
+        context: Result and diagnostics.
+
+    Returns:
+        Groups of figures.
+    """
+    svg = SvgPanels()
+    groups = [
+        _joint_offset_group(context, svg),
+        _joint_error_group(context, svg),
+        _sample_group(context, svg),
+    ]
+    return [group for group in groups if group.panels]
+
+
+def _joint_offset_group(context: ReportContext, svg: SvgPanels) -> FigureGroup:
+    profiles = [profile for profile in context.joint_profiles if len(profile.centres)]
+    offsets = {
+        p.name: {"before": (p.before, p.before_std), "after": (p.after, p.after_std)} for p in profiles
+    }
+    largest = {
+        state: max((_largest_offset(*offsets[p.name][state]) for p in profiles), default=0.0)
+        for state in ("before", "after")
+    }
+    states = ["before", "after"] if largest["before"] <= MAX_SCALE_RATIO * largest["after"] else ["after"]
+    panels = []
+    for i, profile in enumerate(profiles):
+        shown = {state: offsets[profile.name][state] for state in states}
+        worst = _shown(float(np.nanmax(np.abs(profile.after))), _offset_unit(profile))
+        text = (
+            f"Residual error of {profile.name} over its position, with two standard errors; at most "
+            f"{worst} after calibration."
+        )
+        plot = partial(
+            plots.plot_joint_offsets,
+            profile.centres,
+            shown,
+            joint=profile.name,
+            is_prismatic=profile.is_prismatic,
+            limit=_offset_limit(profile, profiles, states, offsets),
+        )
+        panels.append(Panel(profile.name, svg.draw(plot, f"offset-{i}", profile.name, text)))
+    marks = {"before": "dashes", "after": "line"}
+    return FigureGroup(
+        panels,
+        "Residual joint-angle error over joint angle",
+        [LegendEntry(state, state, marks[state]) for state in states],
+    )
+
+
+def _largest_offset(value: Array, std: Array) -> float:
+    """Return the largest distance from zero, two standard errors included."""
+    return float(np.nanmax(np.abs(value) + 2 * std, initial=0.0))
+
+
+def _offset_limit(
+    profile: JointProfile,
+    profiles: Sequence[JointProfile],
+    states: Sequence[str],
+    offsets: dict[str, dict[str, tuple[Array, Array]]],
+) -> float:
+    """Return the common scale of the joints of one type; a joint with much larger errors gets its own."""
+    largest = {
+        p.name: max(_largest_offset(*offsets[p.name][state]) for state in states)
+        for p in profiles
+        if p.is_prismatic == profile.is_prismatic
+    }
+    typical = MAX_SCALE_RATIO * float(np.median(list(largest.values())))
+    return max(largest[profile.name], *(value for value in largest.values() if value <= typical))
+
+
+def _offset_unit(profile: JointProfile) -> str:
+    return "m" if profile.is_prismatic else "rad"
+
+
+def _joint_error_group(context: ReportContext, svg: SvgPanels) -> FigureGroup:
+    group = next(iter(context.fit.comparisons[0].after.groups))
+    quantity, panels = GROUP_LABELS[group], []
+    for i, profile in enumerate(context.joint_profiles):
+        text = (
+            f"{_capitalized(quantity)} of the samples after calibration over the position of {profile.name}."
+        )
+        plot = partial(
+            plots.plot_errors_over_joint,
+            profile.values,
+            profile.sizes,
+            joint=profile.name,
+            is_prismatic=profile.is_prismatic,
+            quantity=quantity,
+            unit=GROUP_UNITS[group],
+        )
+        panels.append(Panel(profile.name, svg.draw(plot, f"joint-{i}", profile.name, text)))
+    legend = [LegendEntry("sample", "sample", "dots"), LegendEntry("median", "after", "line")]
+    return FigureGroup(panels, f"{_capitalized(quantity)} over joint position, after calibration", legend)
+
+
+def _sample_group(context: ReportContext, svg: SvgPanels) -> FigureGroup:
+    samples, panels = _errors_by_sample(context), []
+    for group, roles in samples.items():
+        quantity, unit = GROUP_LABELS[group], GROUP_UNITS[group]
+        errors = np.concatenate([errors for _, errors in roles.values()])
+        caption = f"{_capitalized(quantity)} by sample"
+        largest = _shown(float(errors.max()), unit)
+        text = f"{_capitalized(quantity)} of {len(errors)} samples after calibration; at most {largest}."
+        plot = partial(plots.plot_errors_by_sample, roles, quantity=quantity, unit=unit)
+        panel = svg.draw(plot, f"sample-{group}", caption, text, WIDE_PANEL)
+        panels.append(Panel(caption, panel))
+    roles = dict.fromkeys(role for group in samples.values() for role in group)
+    legend = [LegendEntry(role, plots.sample_color(role, "hold-out" in roles), "dots") for role in roles]
+    return FigureGroup(panels, "Errors in the order of the files, after calibration", legend, "wide")
+
+
+def _errors_by_sample(context: ReportContext) -> dict[str, dict[str, tuple[Array, Array]]]:
+    """Return numbers and error norms of the samples by error group and role; rows continue over the files."""
+    fit = context.fit
+    data = [*fit.data, *fit.holdout]
+    names = [*context.data_names, *context.holdout_names]
+    last_rows: dict[str, int] = {}
+    for name, item in zip(names, data, strict=True):
+        last_rows[name] = max(last_rows.get(name, 0), int(item.rows.max()))
+    starts = dict(zip(last_rows, np.cumsum([0, *last_rows.values()]).tolist(), strict=False))
+    outliers = {(outlier.item, outlier.row) for outlier in context.outliers}
     errors = [
         *compute_errors(fit.chain, fit.data, fit.instruments),
         *compute_errors(fit.chain, fit.holdout, fit.instruments),
     ]
-    gross = {(o.item, o.row) for o in study.outliers}
-    out = []
-    for i, ((name, item), error) in enumerate(zip(named, errors, strict=True)):
-        bad = np.array([(i, int(row)) in gross for row in item.rows])
-        title = "fitted" if i < len(fit.data) else "held out"
-        out.append((title, starts[name] + item.rows, error_norms([error]), bad))
-    return out
-
-
-def sample_looks(study: ReportContext) -> tuple[str, ...]:
-    """How dots of the fitted samples look, and of those held out if there are any."""
-    size = " large" if study.fit.n_samples < MAX_SEPARATE_DOTS else ""
-    return (f"faint{size}", f"after{size}") if study.fit.holdout else (f"after{size}",)
-
-
-def by_sample(study: ReportContext) -> list[str]:
-    """Errors after calibration over the samples' order, a panel a group."""
-    found, out = _places(study), []
-    several = len(set(study.names) | set(study.holdout_names)) > 1
-    for group in GROUP_UNITS:
-        mine = [(title, rows, size[group], bad) for title, rows, size, bad in found if group in size]
-        if not mine:
-            continue
-        factor, unit = _unit(group)
-        every = np.concatenate([rows for _, rows, _, _ in mine])
-        most = factor * np.concatenate([size for _, _, size, _ in mine])
-        x = axis_over(
-            every, "sample, all files in a row" if several else "row of the file", zero=True, round_up=False
-        )
-        y = axis_over(most, f"{GROUP_LABELS[group]}, {unit}", zero=True)
-        marks: list[Mark] = []
-        for look, wanted in zip(sample_looks(study), ("fitted", "held out"), strict=False):
-            for title, rows, size, bad in mine:
-                if title == wanted:
-                    thin = np.flatnonzero(~bad)[figures.subsample_indices(int(np.sum(~bad)), 2 * MAX_DOTS)]
-                    marks.append(figures.dots(rows[thin], factor * size[thin], look))
-                    marks += [figures.dots(rows[bad], factor * size[bad], "gross")] if bad.any() else []
-        text = f"{GROUP_LABELS[group]} after calibration of {len(every)} samples; at most {most.max():.3g} {unit}."
-        title = f"{GROUP_LABELS[group][0].upper()}{GROUP_LABELS[group][1:]} by sample"
-        out.append(axes(f"s-{group}", title, text, x, y, marks, figures.WIDE))
-    return out
-
-
-def _label(trace: JointProfile) -> tuple[float, str, float, str]:
-    """Factor and unit of a joint's value, and of its error."""
-    return (1e3, "mm", 1e3, "mm") if trace.is_prismatic else (180 / np.pi, "°", 1e3, "mrad")
-
-
-def by_joint(study: ReportContext) -> list[str]:
-    """Errors after calibration over each joint's value, with the median of each part."""
-    traces = study.joint_profiles
-    if not traces:
-        return []
-    name = next(iter(study.fit.comparisons[0].after.groups))
-    factor, unit = _unit(name)
-    out = []
-    y = axis_over(
-        factor * np.concatenate([t.sizes for t in traces]), f"{GROUP_LABELS[name]}, {unit}", zero=True
-    )
-    for i, t in enumerate(traces):
-        scale, angle, _, _ = _label(t)
-        x = axis_over(scale * t.values, f"{t.name}, {angle}", round_up=False)
-        thin = figures.subsample_indices(len(t.values), MAX_DOTS)
-        size = " large" if len(thin) < MAX_SEPARATE_DOTS else ""
-        marks = [figures.dots(scale * t.values[thin], factor * t.sizes[thin], f"faint{size}")]
-        if len(t.centres) > 1:
-            half = 0.5 * float(np.min(np.diff(t.centres)))
-            middle = [np.median(t.sizes[np.abs(t.values - c) <= half * 1.001]) for c in t.centres]
-            marks.append(figures.line(scale * t.centres, factor * np.array(middle), "after"))
-        text = f"{GROUP_LABELS[name]} after calibration over the value of {t.name}, with each part's median."
-        out.append(axes(f"j-{i}", t.name, text, x, y, marks))
-    return out
-
-
-def _reach(value: Array, std: Array) -> float:
-    """How far from zero values go, two standard errors included."""
-    return float(np.max(np.abs(value) + 2 * std, initial=0.0))
-
-
-def visible_states(study: ReportContext) -> list[str]:
-    """What the panels of `asked` show: "before" only where it leaves room to see what is left after."""
-    pairs = [
-        max((_reach(v, s) for v, s in rows), default=0.0)
-        for rows in (
-            [(t.before, t.before_std) for t in study.joint_profiles],
-            [(t.after, t.after_std) for t in study.joint_profiles],
-        )
-    ]
-    return ["before", "after"] if pairs[0] <= MAX_PANELS * pairs[1] else ["after"]
-
-
-def plot_joint_offset_profile(study: ReportContext) -> list[str]:
-    """The error of each joint alone that each part of its range asks for, before and after."""
-    out, looks = [], visible_states(study)
-
-    def drawn(t: JointProfile) -> list[tuple[Array, Array]]:
-        every = {"before": (t.before, t.before_std), "after": (t.after, t.after_std)}
-        return [every[look] for look in looks]
-
-    for i, t in enumerate(study.joint_profiles):
-        if not len(t.centres):
-            continue
-        scale, angle, factor, unit = _label(t)
-        # Joints share a scale, but for one that is asked for much more than the others.
-        reach = {o.name: max(_reach(v, s) for v, s in drawn(o)) for o in study.joint_profiles if o.is_prismatic == t.is_prismatic
-                 and len(o.centres)}  # fmt: skip
-        shared = max(r for r in reach.values() if r <= MAX_PANELS * np.median(list(reach.values())))
-        x = axis_over(scale * t.values, f"{t.name}, {angle}", round_up=False)
-        marks = [figures.hline(0.0, "zero")]
-        for (value, std), look in zip(drawn(t), looks, strict=True):
-            at, v, s = scale * t.centres, factor * value, factor * std
-            marks += [
-                figures.error_bars(at, v - 2 * s, v + 2 * s, look),
-                figures.line(at, v, look),
-                figures.dots(at, v, look),
-            ]
-        worst = factor * float(np.nanmax(np.abs(t.after)))
-        text = (
-            f"Error of {t.name} alone that would explain the readings in each part of its range, with two "
-            f"standard errors; at most {worst:.3g} {unit} after calibration."
-        )
-        y = symmetric([factor * max(shared, reach[t.name])], f"joint error asked for, {unit}")
-        out.append(axes(f"a-{i}", t.name, text, x, y, marks))
-    return out
-
-
-def spectrum(study: ReportContext) -> list[str]:
-    """Singular values of the whitened Jacobian, those below the cut apart."""
-    s = qr.singular_values(study.fit.solution.system.r)
-    if not (s.size and s[0] > 0):
-        return []
-    share = np.maximum(s / s[0], 1e-18)
-    number = np.arange(1, len(s) + 1)
-    seen = np.arange(len(s)) < study.fit.rank
-    low = 10.0 ** np.floor(np.log10(min(float(share.min()), 0.1)))
-    y = Axis(low, 2.0, "share of the largest", log=True)
-    x = Axis(0.0, len(s) + 1.0, "direction")
-    marks: list[Mark] = [figures.dots(number[seen], share[seen], "after large")]
-    if not seen.all():
-        marks += [
-            figures.hline(qr.RANK_RTOL, "cut"),
-            figures.dots(number[~seen], share[~seen], "gross large"),
-        ]
-    text = (
-        f"{len(s)} singular values, {study.fit.rank} of them seen; the smallest seen is "
-        f"{share[seen][-1]:.2g} of the largest."
-    )
-    return [axes("sv", "Singular values", text, x, y, marks)]
-
-
-def estimate_bars(study: ReportContext, names: Sequence[str]) -> dict[str, list[str]]:
-    """Drawings for the rows of a parameter table: change with two standard deviations, and observability."""
-    rows = {e.name: e for e in study.fit.estimates}
-    chosen = [rows[name] for name in names]
-    most = {}
-    for e in chosen:
-        if np.isfinite(e.change):
-            spread = e.std if np.isfinite(e.std) else 0.0
-            most[e.unit] = max(
-                most.get(e.unit, 0.0), abs(e.change) + 2 * min(spread, 3 * abs(e.change) + 1e-12)
+    parts: dict[str, dict[str, list[tuple[Array, Array]]]] = {}
+    for i, (name, item, item_errors) in enumerate(zip(names, data, errors, strict=True)):
+        role = "fitted" if i < len(fit.data) else "hold-out"
+        is_outlier = np.array([(i, int(row)) in outliers for row in item.rows], bool)
+        for group, norms in error_norms([item_errors]).items():
+            by_role = parts.setdefault(group, {})
+            for key, chosen in ((role, ~is_outlier), ("outlier", is_outlier)):
+                if chosen.any():
+                    by_role.setdefault(key, []).append((starts[name] + item.rows[chosen], norms[chosen]))
+    return {
+        group: {
+            role: (
+                np.concatenate([numbers for numbers, _ in parts[group][role]]),
+                np.concatenate([norms for _, norms in parts[group][role]]),
             )
-    out: dict[str, list[str]] = {}
-    if most:
-        out["change ± 2 std"] = [
-            "" if e.fixed or not np.isfinite(e.change) or not np.isfinite(e.std)
-            else figures.interval_bar(e.change - 2 * e.std, e.change, e.change + 2 * e.std, most[e.unit])
-            for e in chosen
-        ]  # fmt: skip
-    out["seen"] = ["" if e.fixed else figures.share_bar(e.observability) for e in chosen]
-    return out
+            for role in ("fitted", "hold-out", "outlier")
+            if role in parts[group]
+        }
+        for group in GROUP_UNITS
+        if group in parts
+    }
+
+
+def workspace_figures(context: ReportContext) -> list[FigureGroup]:
+    """Draw maps of the predicted standard deviation of the tool position.
+
+    Args:
+        context: Result and diagnostics.
+
+    Returns:
+        One group of figures; none if nothing can be predicted.
+    """
+    return workspace_maps(context.workspace)
+
+
+def workspace_maps(workspace: Workspace) -> list[FigureGroup]:
+    """Draw maps of the predicted standard deviation of the tool position from above and from the side.
+
+    Args:
+        workspace: Predictions over the workspace, and measured samples.
+
+    Returns:
+        One group of figures; none if nothing can be predicted.
+    """
+    finite = workspace.std[np.isfinite(workspace.std)]
+    if not finite.size:
+        return []
+    svg, panels = SvgPanels(), []
+    median, p95 = (_shown(float(np.quantile(finite, q)), "m") for q in (0.5, 0.95))
+    for plane, caption in (("xy", "Seen from above"), ("xz", "Seen from the side")):
+        text = (
+            f"Map of the predicted standard deviation of the tool position over {plane[0]} and {plane[1]}: "
+            f"median {median}, 95th percentile {p95}."
+        )
+        plot = partial(
+            plots.plot_position_std_map,
+            workspace.points,
+            workspace.std,
+            plane=plane,
+            measured=workspace.measured,
+        )
+        panel = svg.draw(plot, f"map-{plane}", caption, text, SQUARE_PANEL)
+        panels.append(Panel(caption, panel))
+    edges = 1e3 * plots.std_levels(workspace.std)
+    decimals = max(0, 1 - math.floor(math.log10(edges[1])))
+    texts = [f"{low:.{decimals}f}–{high:.{decimals}f} mm" for low, high in pairwise(edges)]
+    texts[-1] = f"above {edges[-2]:.{decimals}f} mm"
+    legend = [LegendEntry(text, f"level-{k}", "cell") for k, text in enumerate(texts)]
+    if len(finite) < len(workspace.std):
+        legend.append(LegendEntry("not predictable", "unknown", "cell"))
+    if len(workspace.measured):
+        legend.append(LegendEntry("measured samples", "measured", "dots"))
+    return [FigureGroup(panels, legend=legend, layout="wide")]
+
+
+def scene_figures(context: ReportContext) -> list[FigureGroup]:
+    """Draw the robot before and after calibration: a 3-D scene on screens, two drawings in print.
+
+    Args:
+        context: Result and diagnostics.
+
+    Returns:
+        One group of figures.
+    """
+    fit, magnification = context.fit, scene_magnification(context)
+    base = se3.inverse(fit.chain.base)
+    nominal, calibrated = (
+        points @ base[:3, :3].T + base[:3, 3]
+        for points in (_arm_points(chain, context) for chain in (fit.nominal_refitted, fit.chain))
+    )
+    arms = {"before": nominal, "after": nominal + magnification * (calibrated - nominal)}
+    scale = f"errors {magnification:g} times larger" if magnification > 1 else "true to scale"
+    svg, panels = SvgPanels(), []
+    for plane, side in (("xz", "From the side"), ("xy", "From above")):
+        caption = f"{side}, {scale}"
+        text = f"Joints of the robot before and after calibration over {plane[0]} and {plane[1]}."
+        plot = partial(plots.plot_arms, arms, plane=plane, samples=context.workspace.measured)
+        panel = svg.draw(plot, f"arm-{plane}", caption, text, SQUARE_PANEL)
+        panels.append(Panel(caption, panel))
+    legend = [
+        LegendEntry("nominal", "before", "dashes"),
+        LegendEntry("calibrated", "after", "line"),
+        LegendEntry("fitted samples", "sample", "dots"),
+    ]
+    page = scene.scene_html(fit.nominal_refitted, fit, title=context.robot_name, magnification=magnification)
+    return [FigureGroup(panels, legend=legend, layout="wide", scene=page)]
+
+
+def scene_magnification(context: ReportContext) -> float:
+    """Choose how many times larger than true the errors of the robot are drawn.
+
+    Args:
+        context: Result and diagnostics.
+
+    Returns:
+        Magnification: 1, 2 or 5 times a power of ten, from 1 to `MAX_MAGNIFICATION`.
+    """
+    nominal, calibrated = (
+        _arm_points(chain, context)[:-1] for chain in (context.fit.nominal_refitted, context.fit.chain)
+    )
+    displacement = float(np.linalg.norm(calibrated - nominal, axis=1).max())
+    wanted = DRAWN_DISPLACEMENT * float(np.ptp(nominal, axis=0).max()) / max(displacement, 1e-12)
+    return min(max(_round_up_125(max(wanted, 1e-3) / 2), 1.0), MAX_MAGNIFICATION)
+
+
+def _arm_points(chain: Chain, context: ReportContext) -> Array:
+    """Return the origins of the bodies and the tool (k, 3) at the sample nearest to the middle of all [m]."""
+    used = [item.configurations() for item in context.fit.data if item.configurations_per_row > 0]
+    q = np.zeros((1, chain.n_joints))
+    if used:
+        points = context.workspace.measured
+        nearest = int(np.argmin(np.linalg.norm(points - points.mean(0), axis=1)))
+        q = np.concatenate(used)[nearest : nearest + 1]
+    frames = chain.forward_kinematics(q)
+    return np.array([*(body[3, :, 0] for body in frames.bodies), frames.tool[3, :, 0]])
+
+
+def _round_up_125(value: float) -> float:
+    """Return the smallest of 1, 2 and 5 times a power of ten that is at least `value`."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return next(k * power for k in (1, 2, 5, 10) if k * power >= value * (1 - 1e-9))
+
+
+def observability_figures(context: ReportContext) -> list[FigureGroup]:
+    """Draw the singular values of the whitened Jacobian.
+
+    Args:
+        context: Result and diagnostics.
+
+    Returns:
+        One group of figures; none if all singular values are zero.
+    """
+    values, rank = qr.singular_values(context.fit.solution.system.r), context.fit.rank
+    if not (values.size and values[0] > 0):
+        return []
+    smallest = values[rank - 1] / values[0]
+    text = (
+        f"{len(values)} singular values, {rank} of them above the limit of the rank; the smallest of these "
+        f"is {smallest:.2g} of the largest."
+    )
+    plot = partial(plots.plot_singular_values, values, rank)
+    svg = SvgPanels().draw(plot, "singular-values", "Singular values", text)
+    return [FigureGroup([Panel("Singular values", svg)])]
+
+
+def _capitalized(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _shown(value: float, unit: str) -> str:
+    return format_quantity(value, unit, value / 10, small=True)

@@ -1,347 +1,448 @@
-"""The report as a person reads it: sections of sentences and tables, and their Markdown."""
+"""Sections of the report: sentences and tables, and the figures that belong to them.
+
+A new section is a function in this module that returns a `Section` and is listed in `report_sections`. If it
+has figures, a function in `figures.py` draws them. The HTML page shows all of it. Markdown has no figures and
+no bars.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from .. import formatting
 from ..calibration import summary
-from ..calibration.evaluation import Comparison
+from ..calibration.estimates import Estimate
 from ..calibration.model_selection import trial_table
-from ..calibration.result import Result
-from ..diagnostics.residuals import (
-    JointProfile,
-    Outlier,
-    Workspace,
-    joint_offset_profiles,
-    outliers,
-    sigmas,
-    workspace,
-)
+from ..diagnostics.residuals import sigmas
 from ..estimation import robust
 from ..formatting import Table, format_fixed, format_quantity
 from ..robot.chain import BASE_FRAME
-from .document import Provenance, short_names, versions
+from . import figures
+from .context import ReportContext
+from .document import short_names, versions
+from .figures import FigureGroup
 
-# A longer list of outliers is cut: its file is to be looked at, not its rows.
+# A longer list of outliers is cut: the file as a whole is then more likely wrong than single rows.
 MAX_OUTLIERS = 40
 
 
-@dataclass(frozen=True, eq=False)
-class ReportContext:
-    """A result and everything that is computed for its report, once."""
+@dataclass(frozen=True)
+class ShareBar:
+    """Bar of a fraction.
 
-    fit: Result
-    source: Provenance
-    outliers: Sequence[Outlier]
-    joint_profiles: Sequence[JointProfile]
-    workspace: Workspace
+    Attributes:
+        share: Length of the bar, from 0 to 1.
+    """
 
-    @property
-    def names(self) -> list[str]:
-        """What each item of the fitted data is called."""
-        return _names(self.source.names, [item.kind for item in self.fit.data])
-
-    @property
-    def holdout_names(self) -> list[str]:
-        """What each item held out is called."""
-        return _names(self.source.holdout_names, [item.kind for item in self.fit.holdout])
-
-    @property
-    def comparisons(self) -> tuple[Comparison, ...]:
-        """Accuracy before and after, the most honest first."""
-        judged, own = self.source.comparison, self.fit.comparisons
-        return (judged, *(c for c in own if c.title == "fitted")) if judged and not self.fit.holdout else own
-
-    @property
-    def robot(self) -> str:
-        """The robot's own name."""
-        return self.fit.chain.model.name or "robot"
+    share: float
 
 
-def _names(given: Sequence[str], kinds: Sequence[str]) -> list[str]:
-    if len(given) == len(kinds):
-        short = short_names(given)
-        return [short[name] for name in given]
-    return [f"{kind} measurements {i}" for i, kind in enumerate(kinds, 1)]
+@dataclass(frozen=True)
+class IntervalBar:
+    """Mark with an interval around it, on a scale from -1 to 1.
+
+    Attributes:
+        low: Lower end of the interval.
+        middle: Position of the mark.
+        high: Upper end of the interval.
+    """
+
+    low: float
+    middle: float
+    high: float
 
 
-def report_context(fit: Result, source: Provenance) -> ReportContext:
-    """Everything that the report of a result needs."""
-    return ReportContext(fit, source, outliers(fit), joint_offset_profiles(fit), workspace(fit, fit.data))
+@dataclass(frozen=True)
+class BarColumn:
+    """Column of bars beside the numbers of a table.
+
+    Attributes:
+        title: Title of the column.
+        bars: One bar per row; None leaves the cell empty.
+    """
+
+    title: str
+    bars: Sequence[ShareBar | IntervalBar | None]
+
+
+@dataclass(frozen=True)
+class BarTable(Table):
+    """Table with additional columns of bars, which only the HTML page shows.
+
+    Attributes:
+        bars: The additional columns.
+    """
+
+    bars: Sequence[BarColumn] = ()
 
 
 @dataclass(frozen=True)
 class Section:
-    """A heading with sentences, a list and tables; `key` says where a page puts which figures."""
+    """Section of the report.
+
+    Attributes:
+        key: Identifier of the section on the page.
+        title: Heading.
+        sentences: Paragraphs.
+        items: List below the paragraphs.
+        tables: Tables below the list.
+        figures: Draws the figures, at the end of the section; called for HTML only.
+    """
 
     key: str
     title: str
     sentences: Sequence[str] = ()
     items: Sequence[str] = ()
     tables: Sequence[Table] = ()
+    figures: Callable[[ReportContext], Sequence[FigureGroup]] | None = None
 
 
-def sections(found: ReportContext) -> list[Section]:
-    """The whole report below its headline."""
+def report_sections(context: ReportContext) -> list[Section]:
+    """Return all sections of the report below its headline.
+
+    Args:
+        context: Result and diagnostics.
+
+    Returns:
+        Sections in their order; a section without content is left out of the report.
+    """
     return [
-        _accuracy(found),
-        _residual_section(found),
-        _extension(found),
-        _workspace(found),
-        Section("scene", "The arm"),
-        _parameters(found),
-        _observability_section(found),
-        _rows(found),
-        _provenance_section(found),
+        _accuracy_section(context),
+        _residual_section(context),
+        _transmission_section(context),
+        _workspace_section(context),
+        Section("scene", "Nominal and calibrated robot", figures=figures.scene_figures),
+        _parameter_section(context),
+        _observability_section(context),
+        _outlier_section(context),
+        _provenance_section(context),
     ]
 
 
-def warnings(found: ReportContext) -> list[str]:
-    """What a reader must know before believing the figures."""
-    fit, out = found.fit, []
+def warnings(context: ReportContext) -> list[str]:
+    """Return what a reader must know before relying on the report.
+
+    Args:
+        context: Result and diagnostics.
+
+    Returns:
+        Sentences.
+    """
+    fit, texts = context.fit, []
     if not fit.converged:
-        out.append("The loop did not converge: the figures are of its last step.")
-    out += summary.regressions(found.comparisons)
+        texts.append("The iteration did not converge; all values are those of its last step.")
+    texts += summary.regressions(context.comparisons)
     if not np.isfinite(fit.unit_weight_std):
-        out.append(
-            f"{fit.n_samples} samples stand against {fit.rank} directions that they see: no reading is left "
-            "over to tell how uncertain the parameters are."
+        texts.append(
+            f"{fit.n_samples} samples determine {fit.rank} directions in parameter space and leave no "
+            "redundancy; the measurement noise and the parameter uncertainties cannot be estimated."
         )
-    if found.outliers:
-        many = f"{len(found.outliers)} gross errors are" if len(found.outliers) > 1 else "One gross error is"
-        aside = max(c.n_rejected for c in fit.comparisons)
-        out.append(f"{many} among the samples, {aside or 'none'} left aside; see below.")
-    return out
+    if context.outliers:
+        count, n_rejected = len(context.outliers), max(c.n_rejected for c in fit.comparisons)
+        texts.append(
+            f"{count} {'outlier' if count == 1 else 'outliers'} among the samples, {n_rejected or 'none'} "
+            "rejected; see the section on outliers."
+        )
+    return texts
 
 
-def _accuracy(found: ReportContext) -> Section:
-    frames = {e.name.split(".")[0] for e in found.fit.estimates if e.category == "frame" and not e.fixed}
-    same = f", its {' and '.join(sorted(frames))} where they fit best" if frames else ""
+def _accuracy_section(context: ReportContext) -> Section:
+    frames = {e.name.split(".")[0] for e in context.fit.estimates if e.category == "frame" and not e.fixed}
+    fitted = f" with its {' and '.join(sorted(frames))} fitted to the same measurements" if frames else ""
     return Section(
         "accuracy",
         "Accuracy",
-        [f"Before is the nominal arm{same}: what differs between before and after is the robot alone."],
-        tables=[summary.accuracy_table(found.comparisons)],
+        [
+            f"“Before” is the nominal robot{fitted}. The difference between before and after is therefore "
+            "due to the robot parameters alone."
+        ],
+        tables=[summary.accuracy_table(context.comparisons)],
+        figures=figures.accuracy_figures,
     )
 
 
-def _residual_section(found: ReportContext) -> Section:
-    title, key = "What the model leaves unexplained", "left"
-    if not found.joint_profiles:
-        return Section(key, title)
-    which = "held out" if found.fit.holdout else "fitted"
+def _residual_section(context: ReportContext) -> Section:
+    key, title = "residuals", "Residual errors"
+    profiles = context.joint_profiles
+    if not profiles:
+        return Section(key, title, figures=figures.residual_figures)
     rows = []
-    for t in found.joint_profiles:
-        unit = "m" if t.is_prismatic else "rad"
-        if len(t.centres):
-            worst = int(np.nanargmax(np.abs(t.after)))
-            std, at = float(t.after_std[worst]), float(t.centres[worst])
-            figures = (float(np.nanmax(np.abs(t.before))), float(t.after[worst]), std)
-            place = f"{1e3 * at:.0f} mm" if t.is_prismatic else f"{np.degrees(at):.0f}°"
-            rows.append(
-                [t.name, *(format_quantity(figure, unit, std, small=True) for figure in figures), place]
-            )
-    text = (
-        "In each part of a joint's range, the error of that joint alone that would explain the samples "
-        f"{which} best. Scatter about zero is noise; a wave points to an error that the model lacks: an "
-        "eccentric gear, elasticity, backlash."
-    )
-    table = Table(["joint", "largest before", "largest after", "std", "at"], rows)
-    if silent := [t.name for t in found.joint_profiles if not len(t.centres)]:
-        text += f" Nothing is said of {', '.join(silent)}: too few samples, or it hardly moves the point."
+    for profile in profiles:
+        if not len(profile.centres):
+            continue
+        unit = "m" if profile.is_prismatic else "rad"
+        worst = int(np.nanargmax(np.abs(profile.after)))
+        std, centre = float(profile.after_std[worst]), float(profile.centres[worst])
+        values = (float(np.nanmax(np.abs(profile.before))), float(profile.after[worst]), std)
+        position = f"{1e3 * centre:.0f} mm" if profile.is_prismatic else f"{np.degrees(centre):.0f}°"
+        rows.append(
+            [profile.name, *(format_quantity(value, unit, std, small=True) for value in values), position]
+        )
     if not rows:
-        return Section(key, title, ["There are too few samples to see how each joint errs over its range."])
-    return Section(key, title, [text], tables=[table])
-
-
-def _extension(found: ReportContext) -> Section:
-    title, trials = "Errors of the joints' drives", found.source.trials
-    if not trials:
-        hint = found.source.hint
-        return Section("extension", title, [f"{hint[0].upper()}{hint[1:]}."] if hint else [])
-    kept = [trial.family for trial in trials if trial.is_selected]
-    said = f"Added to the geometry: {', '.join(kept)}." if kept else "None was added to the geometry."
+        sentences = ["There are too few samples to estimate joint errors over the range of the joints."]
+        return Section(key, title, sentences, figures=figures.residual_figures)
+    role = "hold-out" if context.fit.holdout else "fitted"
     text = (
-        "Errors are those on regions of joint space that were left out of the fit, in standard deviations "
-        "of a reading, without the family and with it, each on top of those added before. A family is added "
-        "where the error falls by more than its standard error and where chance would hardly bring as much."
+        "For each part of a joint's range, the table shows the error of that joint alone that best "
+        f"explains the residuals of the {role} samples. Scatter around zero is noise. A periodic pattern "
+        "indicates an unmodelled error such as gear eccentricity, joint elasticity or backlash."
     )
-    return Section("extension", title, [said, text], tables=[trial_table(trials)])
+    if unknown := [profile.name for profile in profiles if not len(profile.centres)]:
+        text += f" No estimate for {', '.join(unknown)}: too few samples, or the joint hardly moves the tool."
+    table = Table(["joint", "largest before", "largest after", "std", "at"], rows)
+    return Section(key, title, [text], tables=[table], figures=figures.residual_figures)
 
 
-def _workspace(found: ReportContext) -> Section:
-    w = found.workspace
-    known = np.isfinite(w.std)
+def _transmission_section(context: ReportContext) -> Section:
+    key, title, trials = "transmission", "Transmission errors", context.source.trials
+    if not trials:
+        hint = context.source.hint
+        return Section(key, title, [f"{hint[0].upper()}{hint[1:]}."] if hint else [])
+    selected = [trial.family for trial in trials if trial.is_selected]
+    conclusion = (
+        f"Added to the geometry: {', '.join(selected)}."
+        if selected
+        else "No family was added to the geometry."
+    )
+    text = (
+        "Errors are cross-validated over regions of joint space, in standard deviations of a measurement, "
+        "without and with the family. Each family is tried in addition to those added before. It is added "
+        "if the error falls by more than its standard error and the improvement is unlikely to be due to "
+        "chance."
+    )
+    return Section(key, title, [conclusion, text], tables=[trial_table(trials)])
+
+
+def _workspace_section(context: ReportContext) -> Section:
+    workspace = context.workspace
+    is_known = np.isfinite(workspace.std)
     rows = []
     for title, std in (
-        ("everywhere within the joints' limits", w.std),
-        ("at the fitted samples", w.measured_std),
+        ("everywhere within the joint limits", workspace.std),
+        ("at the fitted samples", workspace.measured_std),
     ):
         if len(std):
-            good = std[np.isfinite(std)]
+            finite = std[np.isfinite(std)]
             cells = [
-                format_fixed(1e3 * float(np.quantile(good, at)), 3) if good.size else "–"
-                for at in (0.05, 0.5, 0.95, 1)
+                format_fixed(1e3 * float(np.quantile(finite, fraction)), 3) if finite.size else "–"
+                for fraction in (0.05, 0.5, 0.95, 1)
             ]
-            rows.append([title, *cells, f"{100 * (1 - good.size / len(std)):.0f} %"])
+            rows.append([title, *cells, f"{100 * (1 - finite.size / len(std)):.0f} %"])
     sentences = [
-        "The standard deviation of the tool's position that follows from the parameters' own uncertainty, "
-        "for configurations drawn over the joints' limits (a joint turns at most half a turn each way). "
-        "It grows away from what was measured. What the model lacks comes on top of it: see "
-        "the error on samples that were not fitted."
+        "Standard deviation of the tool position that follows from the uncertainty of the parameters, for "
+        "configurations drawn within the joint limits (revolute joints at most half a turn each way). It "
+        "grows with the distance from the measured samples. Unmodelled errors come in addition; the error "
+        "on hold-out or cross-validated samples includes them."
     ]
-    if not known.any():
+    if not is_known.any():
         sentences = [
-            "No accuracy can be predicted anywhere: the data leave the tool's place undetermined and no "
-            "prior holds it, or no reading is left over to tell the noise by."
+            "The accuracy cannot be predicted: the measurements do not determine the tool position and no "
+            "prior limits it, or there are too few measurements to estimate their noise."
         ]
-    elif not known.all():
-        sentences.append("Where the data leave the tool's place undetermined it cannot be predicted at all.")
-    header = ["predicted position std, mm", "best 5 % below", "half below", "95 % below", "worst", "unknown"]
-    return Section(
-        "workspace", "Where the calibrated arm can be trusted", sentences, tables=[Table(header, rows)]
-    )
-
-
-def _parameters(found: ReportContext) -> Section:
-    titles = {
-        "robot": "Robot",
-        "frame": "Where the robot stands and where the target sits",
-        "instrument": "Instruments",
-    }
-    every = [
-        (title, [e for e in found.fit.estimates if e.category == place]) for place, title in titles.items()
-    ]
-    out = []
-    for title, rows in every:
-        if rows:
-            table = summary.estimate_table(rows)
-            # A frame's nominal place says nothing, and only joints have a prior that matters.
-            drop = (1, 3, 5) if title == titles["frame"] else (5,) if title == titles["instrument"] else ()
-            header = [*table.header, "prior std", "observability"]
-            full = [
-                [
-                    *row,
-                    format_quantity(e.prior, e.unit, e.prior, True) if not e.fixed else "",
-                    "" if e.fixed else f"{e.observability:.2f}",
-                ]
-                for row, e in zip(table.rows, rows, strict=True)
-            ]
-            header, *cells = [
-                [text for i, text in enumerate(row) if i not in drop] for row in [header, *full]
-            ]
-            out.append(Table(header, cells, caption=title))
-    text = (
-        "Observability is how far the data alone see a parameter, from 0 (not at all) to 1 (fully). A "
-        "parameter with less than 1 shares what it does with others; the prior decides how the sum is parted."
-    )
-    return Section("parameters", "Parameters", [text], tables=out)
-
-
-def _observability_section(found: ReportContext) -> Section:
-    fit = found.fit
-    text = (
-        f"The data see {fit.rank} of {len(fit.parameters)} directions of the parameters; the largest "
-        f"singular value seen is {fit.condition:.3g} times the smallest."
-    )
-    also = "Nothing is hidden: every parameter can be told from the others."
-    if fit.unobservable:
-        also = "These cannot be told apart: their single values mean little, what they do together is known."
-    sentences = [text, also]
-    if held := [e.name for e in fit.estimates if e.fixed]:
-        sentences.append(f"Held at nominal, and so not judged: {', '.join(held)}.")
-    items = [
-        *(f"held back: {text}" for text in fit.shrinkage_notes),
-        *fit.unobservable,
-        *(f"weakly seen: {text}" for text in fit.weakly_observable),
-    ]
-    return Section("seen", "What could not be told apart", sentences, items)
-
-
-def _rows(found: ReportContext) -> Section:
-    names, rows = found.names, []
-    for o in found.outliers[:MAX_OUTLIERS]:
-        size = ", ".join(
-            format_quantity(v, "rad" if g == "orientation" else "m", v / 10, True) for g, v in o.sizes.items()
+    elif not is_known.all():
+        sentences.append(
+            "At some configurations it cannot be predicted, because the measurements do not determine the "
+            "tool position there."
         )
-        rows.append([names[o.item], str(o.row), size, f"{o.score:.0f}"])
-    sentences = [
-        f"No fitted sample scores beyond {robust.OUTLIER_THRESHOLD:g} against the scatter of the others."
+    header = [
+        "predicted position std, mm",
+        "5th percentile",
+        "median",
+        "95th percentile",
+        "largest",
+        "not predictable",
     ]
-    if rows:
-        more = len(found.outliers) - len(rows)
-        sentences = [
-            f"Fitted samples that score beyond {robust.OUTLIER_THRESHOLD:g} against the scatter of the others; a good "
-            "sample does that once in three million." + (f" {more} more are not listed." if more else "")
+    return Section(
+        "workspace",
+        "Predicted accuracy in the workspace",
+        sentences,
+        tables=[Table(header, rows)],
+        figures=figures.workspace_figures,
+    )
+
+
+def _parameter_section(context: ReportContext) -> Section:
+    tables = []
+    # Columns of a frame or instrument that mean nothing: nominal value and change of a frame, priors of both.
+    for category, title, hidden in (
+        ("robot", "Robot", ()),
+        ("frame", "Robot base and tool", (1, 3, 5)),
+        ("instrument", "Instruments", (5,)),
+    ):
+        if not (estimates := [e for e in context.fit.estimates if e.category == category]):
+            continue
+        table = summary.estimate_table(estimates)
+        header = [*table.header, "prior std", "observability"]
+        rows = [
+            [
+                *row,
+                "" if e.fixed else format_quantity(e.prior, e.unit, e.prior, small=True),
+                "" if e.fixed else f"{e.observability:.2f}",
+            ]
+            for row, e in zip(table.rows, estimates, strict=True)
         ]
+        header, *rows = [[text for i, text in enumerate(row) if i not in hidden] for row in [header, *rows]]
+        tables.append(BarTable(header, rows, caption=title, bars=_estimate_bars(estimates)))
+    text = (
+        "Observability is the fraction of a parameter that the measurements alone determine, from 0 "
+        "(nothing) to 1 (all). Below 1, other parameters have partly the same effect on the measurements; "
+        "the priors then decide how the effect is shared between them."
+    )
+    return Section("parameters", "Parameters", [text], tables=tables)
+
+
+def _estimate_bars(estimates: Sequence[Estimate]) -> list[BarColumn]:
+    """Return bars of the change with two standard deviations (one scale per unit) and of observability."""
+    scale: dict[str, float] = {}
+    for e in estimates:
+        if math.isfinite(e.change):
+            # A parameter that is known much worse than it changed does not set the scale.
+            spread = 2 * min(e.std if math.isfinite(e.std) else 0.0, 3 * abs(e.change) + 1e-12)
+            scale[e.unit] = max(scale.get(e.unit, 0.0), abs(e.change) + spread)
+
+    def interval(e: Estimate) -> IntervalBar | None:
+        if e.fixed or not math.isfinite(e.change) or not math.isfinite(e.std):
+            return None
+        ends = (e.change - 2 * e.std, e.change, e.change + 2 * e.std)
+        relative = (value / scale[e.unit] if scale[e.unit] > 0 else 0.0 for value in ends)
+        return IntervalBar(*(max(-1.0, min(1.0, value)) for value in relative))
+
+    columns = [BarColumn("change ± 2 std", [interval(e) for e in estimates])] if scale else []
+    shares = [None if e.fixed else ShareBar(e.observability) for e in estimates]
+    return [*columns, BarColumn("0 to 1", shares)]
+
+
+def _observability_section(context: ReportContext) -> Section:
+    fit = context.fit
+    sentences = [
+        f"The measurements determine {fit.rank} of {len(fit.parameters)} directions in parameter space. "
+        f"The condition number of these directions is {fit.condition:.3g}.",
+        "Some parameters are determined only in combination; their single values depend on the priors."
+        if fit.unobservable
+        else "All parameters are observable.",
+    ]
+    if fixed := [e.name for e in fit.estimates if e.fixed]:
+        sentences.append(f"Fixed at their nominal values and not assessed: {', '.join(fixed)}.")
     items = [
-        f"{name}, row {row}, is left out: {reason}"
-        for name, reasons in found.source.excluded_rows.items()
+        *fit.shrinkage_notes,
+        *(f"not observable: {text}" for text in fit.unobservable),
+        *(f"poorly identified: {text}" for text in fit.weakly_observable),
+    ]
+    return Section("observability", "Observability", sentences, items, figures=figures.observability_figures)
+
+
+def _outlier_section(context: ReportContext) -> Section:
+    names, rows = context.data_names, []
+    for outlier in context.outliers[:MAX_OUTLIERS]:
+        errors = ", ".join(
+            format_quantity(value, "rad" if group == "orientation" else "m", value / 10, small=True)
+            for group, value in outlier.sizes.items()
+        )
+        rows.append([names[outlier.item], str(outlier.row), errors, f"{outlier.score:.0f}"])
+    threshold = f"{robust.OUTLIER_THRESHOLD:g}"
+    if rows:
+        n_hidden = len(context.outliers) - len(rows)
+        text = (
+            f"Fitted samples whose standardized residual exceeds {threshold}; a normally distributed one "
+            "does so once in three million." + (f" {n_hidden} more are not listed." if n_hidden else "")
+        )
+    else:
+        text = f"No fitted sample has a standardized residual above {threshold}."
+    items = [
+        f"{name}, row {row}: not used, {reason}"
+        for name, reasons in context.source.excluded_rows.items()
         for row, reason in reasons.items()
     ]
-    items += [f"{name}: warning: {text}" for name, texts in found.source.warnings.items() for text in texts]
-    return Section(
-        "rows", "Outliers", sentences, items, [Table(["file", "row", "error", "score"], rows)] if rows else []
-    )
+    items += [f"{name}: warning: {text}" for name, texts in context.source.warnings.items() for text in texts]
+    table = Table(["file", "row", "error", "score"], rows)
+    return Section("outliers", "Outliers", [text], items, [table] if rows else [])
 
 
-def _provenance_section(found: ReportContext) -> Section:
-    fit, source = found.fit, found.source
-    facts = [["robot", f"{found.robot}, tip {fit.chain.tip}, joints {', '.join(fit.chain.joint_names)}"]]
-    if source.command:
-        facts.append(["command", source.command])
-    free = {e.name for e in fit.estimates if not e.fixed}
-    for what, station in (("base", BASE_FRAME), ("tool", fit.chain.tool_frame_index)):
-        count = sum(p.error_frame == station and p.name in free for p in fit.errors.parameters)
-        facts.append(
-            [what, f"{count} of 6 components found from the data" if count else "as given, not changed"]
-        )
-    held = [e.name for e in fit.estimates if e.fixed]
-    facts += [["held", ", ".join(held)]] if held else []
-    facts.append(
-        ["method", {"lm": "Levenberg-Marquardt", "gn": "Gauss-Newton, the paper's loop"}[fit.method]]
-    )
-    facts.append(
-        ["state", f"{'converged' if fit.converged else 'not converged'} after {fit.iterations} iterations"]
-    )
-    priors = bool(np.any(fit.problem.weights))
-    near = "normal about nominal, standard deviations in the tables above; frames and instruments wide"
-    facts.append(["priors", near if priors else "none"])
-    facts += [[name, text] for name, text in source.settings.items()]
-    rows = []
-    held_out = dict.fromkeys(found.names, 0)
-    for name, item in zip(found.holdout_names, fit.holdout, strict=True):
-        held_out[name] = held_out.get(name, 0) + len(item.rows)
-    for name, item, sigma in zip(found.names, fit.data, sigmas(fit), strict=True):
-        how = "stated" if item.has_stated_sigma else ("estimated" if fit.method == "lm" else "assumed")
-        each = ", ".join(
-            f"{group} {format_quantity(v, 'rad' if group == 'orientation' else 'm', v, small=True)}"
-            for group, v in sigma.items()
-        )
-        rows.append([name, item.kind, f"{each}, {how}", str(len(item.rows)), str(held_out.pop(name, 0))])
-    rows += [[name, "", "", "0", str(count)] for name, count in held_out.items()]
-    short = short_names(list(source.inputs))
-    hashes = [[short[path], digest] for path, digest in source.inputs.items()]
-    out = [
-        Table(
-            ["data", "kind", "standard deviation of an axis", "fitted", "held out"], rows, n_text_columns=3
-        ),
-        Table(["choice", "value"], facts, n_text_columns=2),
-        Table(["file", "SHA-256"], hashes, n_text_columns=2),
-        Table(["software", "version"], list(map(list, versions().items())), n_text_columns=2),
+def _provenance_section(context: ReportContext) -> Section:
+    tables = [
+        _data_table(context),
+        Table(["choice", "value"], _choices(context), n_text_columns=2),
+        _hash_table(context),
+        Table(["software", "version"], [list(pair) for pair in versions().items()], n_text_columns=2),
     ]
-    return Section("done", "How this was made", tables=[table for table in out if table.rows])
+    return Section("provenance", "Provenance", tables=[table for table in tables if table.rows])
 
 
-def markdown(found: ReportContext) -> str:
-    """The report without its figures."""
-    head = summary.headline(found.comparisons)
-    parts = [f"# Calibration of {found.robot}", f"**{head.text}**", *found.source.remarks, *warnings(found)]
-    for section in sections(found):
+def _data_table(context: ReportContext) -> Table:
+    fit = context.fit
+    n_holdout = dict.fromkeys(context.data_names, 0)
+    for name, item in zip(context.holdout_names, fit.holdout, strict=True):
+        n_holdout[name] = n_holdout.get(name, 0) + len(item.rows)
+    rows = []
+    for name, item, sigma in zip(context.data_names, fit.data, sigmas(fit), strict=True):
+        origin = "stated" if item.has_stated_sigma else ("estimated" if fit.method == "lm" else "assumed")
+        values = ", ".join(
+            f"{group} {format_quantity(value, 'rad' if group == 'orientation' else 'm', value, small=True)}"
+            for group, value in sigma.items()
+        )
+        rows.append(
+            [name, item.kind, f"{values}, {origin}", str(len(item.rows)), str(n_holdout.pop(name, 0))]
+        )
+    rows += [[name, "", "", "0", str(count)] for name, count in n_holdout.items()]
+    return Table(
+        ["data", "kind", "standard deviation per axis", "fitted", "hold-out"], rows, n_text_columns=3
+    )
+
+
+def _choices(context: ReportContext) -> list[list[str]]:
+    """Return names and values of the choices that led to the result."""
+    fit, source = context.fit, context.source
+    choices = [
+        ["robot", f"{context.robot_name}, tip {fit.chain.tip}, joints {', '.join(fit.chain.joint_names)}"]
+    ]
+    if source.command:
+        choices.append(["command", source.command])
+    free = {e.name for e in fit.estimates if not e.fixed}
+    for name, error_frame in (("base", BASE_FRAME), ("tool", fit.chain.tool_frame_index)):
+        count = sum(p.error_frame == error_frame and p.name in free for p in fit.errors.parameters)
+        choices.append([name, f"{count} of 6 components estimated" if count else "as given"])
+    if fixed := [e.name for e in fit.estimates if e.fixed]:
+        choices.append(["fixed", ", ".join(fixed)])
+    state = "converged" if fit.converged else "not converged"
+    priors = (
+        "normal with nominal mean, standard deviations in the tables above; wide for frames and instruments"
+    )
+    return [
+        *choices,
+        ["method", {"lm": "Levenberg-Marquardt", "gn": "Gauss-Newton as in the paper"}[fit.method]],
+        ["state", f"{state} after {fit.iterations} iterations"],
+        ["priors", priors if np.any(fit.problem.weights) else "none"],
+        *([name, text] for name, text in source.settings.items()),
+    ]
+
+
+def _hash_table(context: ReportContext) -> Table:
+    short = short_names(list(context.source.inputs))
+    rows = [[short[path], digest] for path, digest in context.source.inputs.items()]
+    return Table(["file", "SHA-256"], rows, n_text_columns=2)
+
+
+def markdown(context: ReportContext) -> str:
+    """Render the report as Markdown, without figures.
+
+    Args:
+        context: Result and diagnostics.
+
+    Returns:
+        Text of the Markdown file.
+    """
+    head = summary.headline(context.comparisons)
+    parts = [
+        f"# Calibration of {context.robot_name}",
+        f"**{head.text}**",
+        *context.source.remarks,
+        *warnings(context),
+    ]
+    for section in report_sections(context):
         blocks = [*section.sentences]
         if section.items:
             blocks.append("\n".join(f"- {item}" for item in section.items))

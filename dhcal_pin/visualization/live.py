@@ -25,12 +25,12 @@ import umsgpack
 import zmq
 
 from .. import se3
-from .._typing import Array
+from .._typing import Array, PathLike
 from ..calibration.result import Result
 from ..exceptions import DhcalError
 from ..robot.chain import Chain
 from .meshes import Visuals, visuals_of
-from .scene import MAX_TRIANGLES, PathLike, kinematic_tree, with_shared_frames
+from .scene import MAX_TRIANGLES, kinematic_tree, with_shared_frames
 
 TIMEOUT_MS = 2000  # ms that the server may take for one command
 

@@ -19,12 +19,9 @@ import numpy as np
 import pinocchio as pin
 
 from .. import se3
-from .._typing import Array
+from .._typing import Array, PathLike
 from ..robot.chain import Chain
 from ..robot.dh_urdf import MATERIALS
-
-PathLike = str | os.PathLike[str]
-
 
 GRID = 8000  # mesh corners sit on a grid of this many steps along the longest side, 0.1 mm on most links
 

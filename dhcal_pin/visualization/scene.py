@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import html
 import json
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -26,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from .. import se3
-from .._typing import Array
+from .._typing import Array, PathLike
 from ..calibration.result import Result
 from ..estimation.uncertainty import Predictor
 from ..exceptions import DhcalError
@@ -34,9 +33,7 @@ from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from ..robot.transmission import TERMS, GravityLoads
 from .meshes import rows, visuals_of
-
-PathLike = str | os.PathLike[str]
-
+from .subsampling import evenly_spaced_indices
 
 MAX_POINTS = 2000  # more are thinned out evenly: the page keeps moving smoothly
 
@@ -115,7 +112,7 @@ def scene_html(
     )
     poses = np.concatenate([np.empty((0, nominal.n_joints)), *map(nominal.validated_q, played)])
     samples, points, residuals = _points(arm, measurements, known or {})
-    thinned = _subsample_indices(len(samples), MAX_POINTS)
+    thinned = evenly_spaced_indices(len(samples), MAX_POINTS)
     notes = [drawn.note]
     if len(thinned) < len(samples):
         notes.append(f"{len(thinned)} of {len(samples)} measured points are drawn.")
@@ -128,7 +125,7 @@ def scene_html(
         "compared": calibrated is not None,
         "magnification": magnification,
         "joints": _joints(nominal, np.concatenate([poses, samples])),
-        "poses": poses[_subsample_indices(len(poses), MAX_POINTS)].tolist(),
+        "poses": poses[evenly_spaced_indices(len(poses), MAX_POINTS)].tolist(),
         "samples": samples[thinned].tolist(),
         "points": np.round((points[thinned] - arm.base[:3, 3]) @ arm.base[:3, :3], 9).tolist(),
         "residuals": np.round(residuals[thinned] @ arm.base[:3, :3], 9).tolist(),
@@ -325,11 +322,6 @@ def _points(
     return np.concatenate(q), np.concatenate(points), np.concatenate(residuals)
 
 
-def _subsample_indices(count: int, most: int) -> Array:
-    """At most so many indices, evenly spread over `count`."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
-
-
 def _ellipsoids(model: Predictor, poses: Array) -> list[dict[str, Any]]:
     """How well the calibrated tool's place is known at some of the poses (m, n).
 
@@ -337,7 +329,7 @@ def _ellipsoids(model: Predictor, poses: Array) -> list[dict[str, Any]]:
     axes of one standard deviation, m, in axes of the calibrated base link. Poses at which a direction
     is not known at all have none.
     """
-    poses = poses[_subsample_indices(len(poses), MAX_ELLIPSOIDS)]
+    poses = poses[evenly_spaced_indices(len(poses), MAX_ELLIPSOIDS)]
     covariance = model.predict(poses).covariance[:, :3, :3]
     told = np.isfinite(covariance).all((1, 2))
     squares, axes = np.linalg.eigh(covariance[told])

@@ -16,9 +16,9 @@ from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.length import Wires
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.measurements.position import Position
+from dhcal_pin.report.context import ReportContext
 from dhcal_pin.report.document import Provenance
-from dhcal_pin.report.figures import histograms
-from dhcal_pin.report.sections import report_context
+from dhcal_pin.report.figures import accuracy_figures
 
 
 def spoiled(kind, chain, seed, m=100, share=0.1):
@@ -155,7 +155,8 @@ def test_what_is_told_of_a_fit_is_of_the_samples_that_count(sim_6dof, sim_6dof_a
     assert (told.n_samples, told.n_rejected) == (57, 3)
     assert told.after["position_rms_m"] < 1.3 * expected.after["position_rms_m"]
     assert "3 gross errors left aside." in headline(fit.comparisons).text
-    assert f"Position error, {57} fitted" in "".join(histograms(report_context(fit, Provenance())))
+    figures = accuracy_figures(ReportContext.from_result(fit, Provenance()))[0]
+    assert [panel.caption for panel in figures.panels][0] == "Position error, 57 fitted samples"
     held = calibrate(sim_6dof, clean, "dh", holdout=[dirty]).comparisons[0]
     assert (held.n_samples, held.n_outliers) == (60, 3)
     assert held.after["position_rms_m"] > 10 * held.after_without_outliers["position_rms_m"]

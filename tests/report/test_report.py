@@ -8,7 +8,6 @@ from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
@@ -28,10 +27,9 @@ from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.measurements.position import Position
 from dhcal_pin.report import document, html
-from dhcal_pin.report.sections import markdown, report_context
+from dhcal_pin.report.context import ReportContext
+from dhcal_pin.report.sections import markdown
 from dhcal_pin.robot.chain import Chain
-from dhcal_pin.visualization import figures
-from dhcal_pin.visualization.figures import Axis
 
 AXE = Path(sys.prefix) / "node_modules" / "axe-core" / "axe.min.js"
 # The text of an A4 page between its margins of 14 mm, CSS pixels.
@@ -117,51 +115,6 @@ def test_the_workspace_is_in_the_base_frame(quick):
     assert np.median(found.std) > np.median(found.measured_std)
 
 
-# --- figures ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "labels"),
-    [
-        (0, 1, ["0.0", "0.2", "0.4", "0.6", "0.8", "1.0"]),
-        (-3, 7, ["−2", "0", "2", "4", "6"]),
-        (0, 0.03, ["0.00", "0.01", "0.02", "0.03"]),
-        (120, 1180, ["500", "1000"]),
-    ],
-)
-def test_ticks_are_round(low, high, labels):
-    assert [label for _, label in Axis(low, high, "x").ticks()] == labels
-
-
-def test_ticks_of_a_logarithm_are_powers():
-    axis = Axis(1e-4, 2.0, "x", log=True)
-    assert [label for _, label in axis.ticks()] == ["10⁻⁴", "10⁻³", "10⁻²", "10⁻¹", "1"]
-    assert axis.share([1e-4, 2.0]) == pytest.approx([0, 1])
-
-
-def test_a_dot_is_where_its_axes_say():
-    x, y = Axis(0, 10, "x"), Axis(0, 1, "y")
-    svg = figures.axes("k", "A & B", "What <it> shows", x, y, [figures.dots([5.0], [0.5], "after")])
-    root = ElementTree.fromstring(svg)
-    assert [root.find("title").text, root.find("desc").text] == ["A & B", "What <it> shows"]
-    assert root.attrib["aria-labelledby"].split() == [
-        root.find("title").attrib["id"],
-        root.find("desc").attrib["id"],
-    ]
-    grid = re.findall(r"M([\d.]+) ([\d.]+)([HV])([\d.]+)", root.find("path[@class='grid']").attrib["d"])
-    across = [float(a) for a, _, way, _ in grid if way == "V"]
-    down = [float(b) for _, b, way, _ in grid if way == "H"]
-    at = re.fullmatch(r"M([\d.]+) ([\d.]+)h0", root.find("path[@class='dots after']").attrib["d"])
-    # Halfway between the first and the last line of the grid.
-    assert float(at[1]) == pytest.approx((across[0] + across[-1]) / 2, abs=0.1)
-    assert float(at[2]) == pytest.approx((down[0] + down[-1]) / 2, abs=0.1)
-
-
-def test_levels_of_a_map():
-    found = figures.level_of([0.5, 1.0, 1.99, 3.5, np.inf], [1.0, 2.0, 3.0])
-    assert found.tolist() == [0, 0, 0, 1, -1]
-
-
 # --- words -----------------------------------------------------------------------------------------
 
 
@@ -196,11 +149,11 @@ class Texts(HTMLParser):
 
 def test_the_headline_is_the_error_on_what_was_not_fitted(fit, quick):
     held = accuracy(fit.chain, fit.holdout)["position_rms_m"]
-    page = Texts(html.page(report_context(fit, Provenance())))
+    page = Texts(html.html_page(ReportContext.from_result(fit, Provenance())))
     assert page.texts["h1"] == ["Position error on 12 samples that were not fitted"]
     first = page.texts["dd"]
     assert float(first[1].split()[0]) == pytest.approx(1e3 * held, abs=0.051)
-    assert f"{first[0]} before, {first[1]} after." in markdown(report_context(fit, Provenance()))
+    assert f"{first[0]} before, {first[1]} after." in markdown(ReportContext.from_result(fit, Provenance()))
     assert len(page.ids) == len(set(page.ids))
     assert "12 held out" in fit._repr_html_()
     assert "not fitted" in fit._repr_html_()
@@ -208,8 +161,8 @@ def test_the_headline_is_the_error_on_what_was_not_fitted(fit, quick):
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_few_held_out_or_none_is_said(count, quick):
-    found = report_context(fitted(held=count / 40), Provenance())
-    page, text = Texts(html.page(found)), markdown(found)
+    found = ReportContext.from_result(fitted(held=count / 40), Provenance())
+    page, text = Texts(html.html_page(found)), markdown(found)
     if count:
         assert page.texts["h1"] == ["Position error on 1 sample that was not fitted"]
         assert "So few samples say little." in text
@@ -226,10 +179,10 @@ def test_every_kind_and_few_data_have_a_report(kind, quick):
     actual = Chain.from_dh(paper("sim_6dof_actual"))
     for count, noise, priors in ((30, Noise(1e-4, 1e-4), "default"), (3, Noise(), "none")):
         data = KINDS[kind].simulate(actual, rng.uniform(-1, 1, (count, 6)), noise, rng)
-        found = report_context(
+        found = ReportContext.from_result(
             calibrate(nominal, data, "minimal,base,tool", priors=priors, max_iterations=5), Provenance()
         )
-        page, text = html.page(found), markdown(found)
+        page, text = html.html_page(found), markdown(found)
         Texts(page)
         for words in (page.split("<iframe")[0], text):
             assert not re.search(r"\b(nan|inf)\b", words), words
@@ -280,10 +233,10 @@ def test_gross_errors_are_listed_with_file_row_and_size(quick):
     data = Position.simulate(nominal, rng.uniform(-1.5, 1.5, (60, 3)), Noise(1e-4), rng)
     data.values[16] += [0.0, 0.03, 0.04]
     source = Provenance(names=["in/laser.csv"], excluded_rows={"laser.csv": {3: "because"}})
-    text = markdown(report_context(calibrate(nominal, data, "dh", loss="tukey"), source))
+    text = markdown(ReportContext.from_result(calibrate(nominal, data, "dh", loss="tukey"), source))
     row = next(line for line in text.splitlines() if line.startswith("| laser.csv | 17 |"))
     assert float(row.split("|")[3].split()[0]) == pytest.approx(50, abs=1)
-    assert "laser.csv, row 3, is left out: because" in text
+    assert "laser.csv, row 3: not used, because" in text
 
 
 # --- the page in a browser -------------------------------------------------------------------------

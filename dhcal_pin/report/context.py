@@ -1,0 +1,81 @@
+"""What a report is about: a result, where it comes from, and the diagnostics that are computed once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from ..calibration.evaluation import Comparison
+from ..calibration.result import Result
+from ..diagnostics.residuals import (
+    JointProfile,
+    Outlier,
+    Workspace,
+    joint_offset_profiles,
+    outliers,
+    workspace,
+)
+from .document import Provenance, short_names
+
+
+@dataclass(frozen=True, eq=False)
+class ReportContext:
+    """A result with everything that the sections and figures of its report need.
+
+    Attributes:
+        fit: Result of the calibration.
+        source: Files, settings and other facts that the result does not contain.
+        outliers: Outliers among the fitted samples.
+        joint_profiles: Residual joint errors over the range of each moving joint.
+        workspace: Predicted accuracy over the workspace.
+    """
+
+    fit: Result
+    source: Provenance
+    outliers: Sequence[Outlier]
+    joint_profiles: Sequence[JointProfile]
+    workspace: Workspace
+
+    @classmethod
+    def from_result(cls, fit: Result, source: Provenance) -> ReportContext:
+        """Compute what the report of a result needs.
+
+        Args:
+            fit: Result of the calibration.
+            source: Files, settings and other facts that the result does not contain.
+
+        Returns:
+            The context.
+        """
+        return cls(fit, source, outliers(fit), joint_offset_profiles(fit), workspace(fit, fit.data))
+
+    @property
+    def data_names(self) -> list[str]:
+        """Name of each measurement of the fitted data."""
+        return _data_names(self.source.names, [item.kind for item in self.fit.data])
+
+    @property
+    def holdout_names(self) -> list[str]:
+        """Name of each measurement of the hold-out data."""
+        return _data_names(self.source.holdout_names, [item.kind for item in self.fit.holdout])
+
+    @property
+    def comparisons(self) -> tuple[Comparison, ...]:
+        """Accuracy before and after, beginning with the samples that say most about other measurements."""
+        cross_validated, own = self.source.comparison, self.fit.comparisons
+        if cross_validated is None or self.fit.holdout:
+            return own
+        return (cross_validated, *(c for c in own if c.title == "fitted"))
+
+    @property
+    def robot_name(self) -> str:
+        """Name of the robot."""
+        return self.fit.chain.model.name or "robot"
+
+
+def _data_names(paths: Sequence[str], kinds: Sequence[str]) -> list[str]:
+    """Return the short names of files, or numbered kinds for data that do not come from files."""
+    if len(paths) == len(kinds):
+        short = short_names(paths)
+        return [short[path] for path in paths]
+    return [f"{kind} measurements {i}" for i, kind in enumerate(kinds, 1)]

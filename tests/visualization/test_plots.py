@@ -1,0 +1,172 @@
+"""Plots: what is drawn where, the same SVG for the same data, and no import of matplotlib before a plot."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from functools import partial
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from dhcal_pin.visualization import plots
+from dhcal_pin.visualization.plots import COLORS, SvgPanels
+
+HEADER = ["noise", "poses", "position_rms[m]", "orientation_rms[rad]", "length_error[m]", "angle_error[rad]"]
+ROWS = [
+    [noise, poses, scale * 1e-3 / poses, None, None, None]
+    for noise, scale in (("0.1mm", 1.0), ("1mm", 10.0))
+    for poses in (10, 20, 40, 100)
+]
+
+
+def parse(svg: str) -> ElementTree.Element:
+    return ElementTree.fromstring(svg)
+
+
+def dots_of(svg: str, color: str) -> np.ndarray:
+    """Return the pixels (m, 2) of the dots of a colour."""
+    paths = [e for e in parse(svg).iter("path") if f"stroke: var(--{color})" in e.get("style", "")]
+    outline = next(e.get("d", "") for e in paths if "h0" in e.get("d", ""))
+    return np.array([pair.split() for pair in outline.strip("M").replace("h0", "").split("M")], float)
+
+
+@pytest.mark.parametrize(
+    "plot",
+    [
+        partial(plots.plot_error_histogram, np.array([1.0, 2.0, 3.0]), np.array([0.1, 0.2, 0.3])),
+        partial(plots.plot_errors_by_sample, {"fitted": (np.arange(3), np.ones(3))}),
+        partial(plots.plot_errors_over_joint, np.linspace(-1, 1, 200), np.ones(200)),
+        partial(plots.plot_joint_offsets, np.arange(3.0), {"after": (np.zeros(3), np.ones(3))}),
+        partial(plots.plot_singular_values, np.array([1.0, 0.5, 1e-17]), 2),
+        partial(plots.plot_position_std_map, np.random.default_rng(0).normal(size=(50, 3)), np.ones(50)),
+        partial(plots.plot_arms, {"before": np.eye(3), "after": 2 * np.eye(3)}),
+        partial(plots.plot_study, HEADER, ROWS, 2, "position_rms[m]"),
+    ],
+    ids=lambda plot: plot.func.__name__,
+)
+def test_every_plot_uses_the_given_axes_or_new_ones(plot):
+    ax = plot()
+    assert ax.figure.axes == [ax]
+    assert ax.get_xlabel()
+    assert ax.get_ylabel()
+    assert ax.has_data()
+    assert plot(ax=ax) is ax
+
+
+def test_plots_are_in_shown_units():
+    ax = plots.plot_errors_by_sample(
+        {"fitted": (np.array([1, 2]), np.array([1e-3, 2e-3])), "hold-out": (np.array([3]), np.array([5e-3]))}
+    )
+    assert ax.get_ylabel() == "position error, mm"
+    assert [line.get_ydata().tolist() for line in ax.lines] == [[1.0, 2.0], [5.0]]
+    ax = plots.plot_joint_offsets(np.array([0.0, np.pi]), {"after": (np.array([1e-3, 2e-3]), np.zeros(2))})
+    assert ax.get_xlabel() == "joint position, °"
+    assert ax.lines[-1].get_xdata().tolist() == [0.0, 180.0]
+    assert ax.lines[-1].get_ydata().tolist() == [1.0, 2.0]
+
+
+def test_a_histogram_counts_every_sample():
+    before, after = np.random.default_rng(0).uniform(0, [[1e-3], [1e-4]], (2, 300))
+    ax = plots.plot_error_histogram(before, after)
+    assert [int(patch.get_data().values.sum()) for patch in ax.patches] == [300, 300]
+    assert ax.get_xscale() == "log"
+    assert plots.plot_error_histogram(before, 0.5 * before).get_xscale() == "linear"
+
+
+def test_a_dot_is_where_its_axes_say():
+    plot = partial(
+        plots.plot_errors_by_sample,
+        {
+            "fitted": (np.array([0, 10, 5]), np.array([0.0, 1e-3, 0.5e-3])),
+            "hold-out": (np.array([5]), np.zeros(1)),
+        },
+    )
+    svg = SvgPanels().draw(plot, "k", "A & B", "What <it> shows")
+    root = parse(svg)
+    assert [root.findtext("title"), root.findtext("desc")] == ["A & B", "What <it> shows"]
+    assert root.attrib["aria-labelledby"].split() == [
+        e.attrib["id"] for tag in ("title", "desc") for e in root.iter(tag)
+    ]
+    low, high, middle = dots_of(svg, "sample")
+    assert middle == pytest.approx((low + high) / 2, abs=0.1)
+    assert dots_of(svg, "after")[0] == pytest.approx([middle[0], low[1]], abs=0.1)
+
+
+def test_panels_do_not_depend_on_the_panels_before():
+    first = partial(plots.plot_singular_values, np.array([1.0, 0.5, 1e-17]), 2)
+    second = partial(plots.plot_errors_over_joint, np.linspace(-1, 1, 200), np.linspace(0, 1e-3, 200))
+    panels = SvgPanels()
+    drawn = [panels.draw(plot, key, key, "") for key, plot in (("a", first), ("b", second), ("c", first))]
+    assert drawn[1] == SvgPanels().draw(second, "b", "b", "")
+    assert drawn[2] == SvgPanels().draw(first, "c", "c", "")
+
+
+def test_the_same_data_give_the_same_bytes_whatever_the_users_settings():
+    import matplotlib
+
+    plot = partial(plots.plot_errors_by_sample, {"fitted": (np.arange(50), np.linspace(0, 1e-3, 50))})
+    wanted = SvgPanels().draw(plot, "k", "t", "d")
+    with matplotlib.rc_context({"font.size": 30, "axes.facecolor": "red", "lines.marker": "x"}):
+        assert SvgPanels().draw(plot, "k", "t", "d") == wanted
+        assert matplotlib.rcParams["font.size"] == 30
+    assert "<metadata" not in wanted
+    assert "<style" not in wanted
+
+
+def test_colours_are_css_variables():
+    plot = partial(plots.plot_singular_values, np.array([1.0, 0.5, 1e-17]), 2)
+    svg = SvgPanels().draw(plot, "k", "t", "d")
+    assert {f"var(--{name})" for name in ("text", "grid", "after", "outlier")} <= set(
+        style.split(": ")[1] for e in parse(svg).iter() for style in e.get("style", "").split("; ") if style
+    )
+    assert not [color for color in COLORS.values() if color in svg]
+    assert len(set(COLORS.values())) == len(COLORS)
+
+
+def test_names_with_dollars_and_foreign_letters_are_plain_text():
+    plot = partial(plots.plot_errors_over_joint, np.linspace(-1, 1, 20), np.ones(20), joint="$a_b$ 関節")
+    assert "$a_b$ 関節, °" in [e.text for e in parse(SvgPanels().draw(plot, "k", "t", "d")).iter("text")]
+
+
+def test_levels_of_a_map():
+    std = np.concatenate([np.full(90, 0.10), np.full(10, 0.55), [np.inf]])
+    edges = plots.std_levels(std)
+    assert edges == pytest.approx(0.092 * np.arange(7))
+    # Equal values get a colour in the middle of the scale.
+    assert np.searchsorted(plots.std_levels(np.ones(5)), 1.0, side="right") - 1 in (2, 3)
+
+
+def test_a_line_for_each_setting_at_the_numbers_of_the_table():
+    ax = plots.plot_study(HEADER, ROWS, 2, "position_rms[m]")
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
+    assert [line.get_label() for line in ax.lines] == ["noise 0.1mm", "noise 1mm"]
+    for line, scale in zip(ax.lines, (1.0, 10.0), strict=True):
+        assert line.get_xdata().tolist() == [10, 20, 40, 100]
+        assert line.get_ydata() == pytest.approx(scale / np.array([10, 20, 40, 100]))
+
+
+def test_a_study_is_one_file_and_the_same_for_the_same_table():
+    svg = plots.study_svg("how many?", HEADER, ROWS, 2)
+    assert svg == plots.study_svg("how many?", HEADER, ROWS, 2)
+    words = {e.text for e in ElementTree.fromstring(svg).iter() if e.tag.endswith("text")}
+    assert {"noise 0.1mm", "noise 1mm", "poses", "how many?", "position error, RMS [mm]"} <= words
+    assert "orientation error, RMS [°]" not in words
+    assert plots.study_svg("a", HEADER, ROWS[:1], 2) == ""
+
+
+def test_matplotlib_is_imported_for_plots_only():
+    """Commands without a plot must not wait for the import."""
+    modules = (
+        "dhcal_pin.cli.main",
+        "dhcal_pin.cli.calibrate",
+        "dhcal_pin.cli.study",
+        "dhcal_pin.report.html",
+    )
+    script = (
+        f"import sys, dhcal_pin, {', '.join(modules)}\n"
+        "dhcal_pin.calibrate, dhcal_pin.show, dhcal_pin.write_report\n"
+        "sys.exit(any(name.split('.')[0] in ('matplotlib', 'jinja2') for name in sys.modules))"
+    )
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
