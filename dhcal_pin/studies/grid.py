@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from functools import partial
 from itertools import product
@@ -21,7 +21,7 @@ from ..estimation.solver import METHODS
 from ..exceptions import DhcalError
 from ..io.robot import read_robot
 from ..io.shipped_files import shipped_file
-from ..io.tabular import read_toml
+from ..io.toml_table import TomlTable
 from ..measurements import KINDS
 from ..measurements.base import Noise
 from ..planning.planner import plan
@@ -31,6 +31,8 @@ from ..units import parse_noise
 
 # Calibrations a task: some tenths of a second.
 BLOCK_SIZE = 100
+# Largest number of calibrations of a setting.
+MAX_SEEDS = 10**6
 
 
 @dataclass(frozen=True)
@@ -153,21 +155,23 @@ class StudyGrid:
 
 
 def read_study(path: PathLike) -> StudyGrid:
-    """A study's TOML file: `title`, `seeds`, and `[settings]` with `Setting`'s entries or lists of them.
+    """Read a study and the robots that it names.
 
-    Raises:
-        DhcalError: an unknown key, a value that does not fit, a robot that cannot be read.
+    Args:
+        path: TOML file with `title`, `seeds`, and `[settings]` with entries of `Setting` or lists of them.
+
+    Returns:
+        The grid of all combinations of settings.
     """
-    document = read_toml(path)
-    where = os.fspath(path)
-    if odd := sorted(set(document) - {"title", "seeds", "settings"}):
-        raise DhcalError(f"{where}: {odd[0]!r} is not known; a study has title, seeds and [settings]")
-    seeds, table = document.get("seeds", 100), document.get("settings")
-    if isinstance(seeds, bool) or not isinstance(seeds, int) or not 1 <= seeds <= 10**6:
-        raise DhcalError(f"{where}: seeds = {seeds!r}: must be a whole number from 1 to 1000000")
-    if not isinstance(table, dict) or "robot" not in table:
-        raise DhcalError(f'{where}: no robot; write [settings] with robot = "arm.urdf" in it')
-    settings = [_validated(setting, where) for setting in _grid(table, where)]
+    document = TomlTable.read(path)
+    where = document.path
+    title = str(document.get("title", ""))
+    seeds = document.value("seeds", int, 100, expected="a whole number from 1 to 1000000")
+    if not 1 <= seeds <= MAX_SEEDS:
+        raise document.error("seeds", "expected a whole number from 1 to 1000000")
+    table = document.table("settings", required=True)
+    document.finish()
+    settings = [_validated(setting, where) for setting in _grid(table)]
     arms = {(name, s.tip) for s in settings for name in (s.robot, s.truth) if name}
     files = {name: os.fspath(_find_robot_file(name, path)) for name in sorted({name for name, _ in arms})}
     chains = {(name, tip): read_robot(files[name], tip or None) for name, tip in sorted(arms)}
@@ -182,25 +186,27 @@ def read_study(path: PathLike) -> StudyGrid:
     digest = hashlib.sha256(repr((seeds, settings)).encode())
     for chain in chains.values():
         digest.update(chain.urdf.data + chain.origins.tobytes())
-    title, robots = str(document.get("title", "")), tuple(files.values())
-    return StudyGrid(title, seeds, tuple(cases), digest.hexdigest(), robots)
+    return StudyGrid(title, seeds, tuple(cases), digest.hexdigest(), tuple(files.values()))
 
 
-def _grid(table: Mapping[str, Any], where: str) -> Iterator[Setting]:
-    types = {field.name: field.type for field in fields(Setting)}
-    lists = {}
-    for key, value in table.items():
-        if key not in types:
-            raise DhcalError(f"{where}: setting {key!r} is not known; there are {', '.join(types)}")
-        lists[key] = value if isinstance(value, list) else [value]
-        for entry in lists[key]:
-            if type(entry).__name__ != types[key]:
-                kind = {"str": "a text", "int": "a whole number", "bool": "true or false"}[str(types[key])]
-                raise DhcalError(f"{where}: setting {key} = {entry!r}: must be {kind}, or a list of such")
-        if not lists[key]:
-            raise DhcalError(f"{where}: setting {key} = []: give at least one value")
-    for values in product(*lists.values()):
-        yield Setting(**dict(zip(lists, values, strict=True)))
+def _grid(table: TomlTable) -> Iterator[Setting]:
+    """Build all combinations of the entries of [settings]; the last list varies fastest."""
+    types = {"str": "a text", "int": "a whole number", "bool": "true or false"}
+    known = {field.name: types[str(field.type)] for field in fields(Setting)}
+    values: dict[str, list[Any]] = {}
+    table.get("robot", expected='a robot, as in robot = "arm.urdf"')
+    present = [name for name in known if name in table]
+    table.finish()
+    for key in sorted(present, key=table.keys().index):
+        value = table.get(key)
+        values[key] = value if isinstance(value, list) else [value]
+        if not values[key]:
+            raise table.error(key, "expected at least one value")
+        for entry in values[key]:
+            if types.get(type(entry).__name__) != known[key]:
+                raise table.error(key, f"expected {known[key]}, or a list of such values")
+    for combination in product(*values.values()):
+        yield Setting(**dict(zip(values, combination, strict=True)))
 
 
 def _validated(setting: Setting, where: str) -> Setting:

@@ -174,12 +174,12 @@ def test_journal_of_another_study_is_left_alone(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("poses = 12", "pose = 12"), "setting 'pose' is not known; there are robot, tip, truth"),
-        (("poses = 12", "poses = 'many'"), "setting poses = 'many': must be a whole number"),
-        (("poses = 12", "poses = []"), "give at least one value"),
+        (("poses = 12", "pose = 12"), "unknown key 'pose'; choose from robot, tip, truth"),
+        (("poses = 12", "poses = 'many'"), "poses = 'many'; expected a whole number"),
+        (("poses = 12", "poses = []"), "expected at least one value"),
         (("poses = 12", "poses = 0"), "must be from 1"),
-        (("seeds = 120", "seeds = -1"), "seeds = -1: must be a whole number"),
-        (("seeds = 120", "sedes = 120"), "'sedes' is not known"),
+        (("seeds = 120", "seeds = -1"), "seeds = -1; expected a whole number"),
+        (("seeds = 120", "sedes = 120"), "unknown key 'sedes'"),
         (('"pose", "position"', '"gps"'), "kind = 'gps': choose from pose, position"),
         (
             ("poses = 12", "pose_selection = 'best'"),
@@ -195,7 +195,7 @@ def test_journal_of_another_study_is_left_alone(tmp_path, capsys):
         (("sim_6dof.dh.toml", "none.urdf"), "none.urdf: no such file"),
         (("poses = 12", "truth = 'sim_3dof.dh.toml'"), "arm 2 has other joints"),
         (("poses = 12", "parameters = 'dh,tol'"), "unknown parameter set 'tol'"),
-        (('robot = "sim_6dof.dh.toml"', ""), "no robot"),
+        (('robot = "sim_6dof.dh.toml"', ""), "robot is missing"),
     ],
 )
 def test_wrong_studies_are_named(tmp_path, change, message):
