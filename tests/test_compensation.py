@@ -122,19 +122,19 @@ def check_landing(name: str, m: int, seed: int):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_the_true_robot_lands_where_asked(name):
+def test_true_robot_reaches_the_targets(name):
     check_landing(name, 60, 1)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2, 5))
 @pytest.mark.parametrize("name", ROBOTS)
-def test_a_thousand_targets_land(name, seed):
+def test_true_robot_reaches_a_thousand_targets(name, seed):
     check_landing(name, 1100, seed)
 
 
 @pytest.mark.parametrize("name", ["ur5", "panda", "sim_6dof"])
-def test_positions_alone_land(name):
+def test_true_robot_reaches_positions(name):
     _, nominal, true, targets, beyond = landing(name, 100, 7)
     found = compensate(nominal, true, targets[:, :3, 3])
     assert found.reached.tolist() == (~beyond).tolist()
@@ -160,19 +160,19 @@ def noisy(m: int, seeds: range) -> tuple[list[float], list[float]]:
     return misses, expected
 
 
-def test_with_a_calibrated_model_it_lands_within_the_predicted_spread():
+def test_calibrated_model_reaches_targets_within_the_predicted_uncertainty():
     misses, expected = noisy(20, range(8))
     assert 0.6 <= np.sqrt(np.mean(misses) / np.mean(expected)) <= 1.5
     assert np.mean(np.array(misses) <= 9 * np.array(expected)) >= 0.97
 
 
 @pytest.mark.slow
-def test_the_predicted_spread_is_right_over_many_seeds():
+def test_predicted_uncertainty_over_many_seeds():
     misses, expected = noisy(20, range(60))
     assert 0.9 <= np.sqrt(np.mean(misses) / np.mean(expected)) <= 1.1
 
 
-def test_the_paper_s_eight_objects():
+def test_eight_objects_of_the_paper():
     """Rows 1-6 of Table 5 give the joint values that the paper sent; row 8 is beyond the arm."""
     nominal = Chain.from_dh(paper("experiment"))
     wanted = read_targets(URDF / "experiment_targets.csv", nominal)
@@ -188,7 +188,7 @@ def test_the_paper_s_eight_objects():
     assert ideal.residual_error[7, 0] == pytest.approx(1.3058 - 0.745, abs=1e-4)
 
 
-def test_at_a_singularity_it_says_so():
+def test_singular_targets_are_marked():
     """UR5's wrist with axes 4 and 6 parallel."""
     arm = ROBOTS["ur5"]()
     q = draw(arm, 20, np.random.default_rng(0))
@@ -201,7 +201,7 @@ def test_at_a_singularity_it_says_so():
     assert found.status[10:].count("ok") >= 9
 
 
-def test_beyond_limits_is_not_beyond_reach():
+def test_status_distinguishes_limits_from_reach():
     table = replace(paper("experiment"), lower=np.deg2rad([-90, -90, -150]), upper=np.deg2rad([90, 90, -5]))
     arm = Chain.from_dh(table)
     behind = replace(arm, lower=arm.lower - 10, upper=arm.upper + 10).poses(np.array([[np.pi, 0.3, -1.0]]))
@@ -210,7 +210,7 @@ def test_beyond_limits_is_not_beyond_reach():
     assert np.isnan(found.q).all()
 
 
-def test_of_several_solutions_the_nearest_to_what_is_asked():
+def test_nearest_of_several_solutions_is_chosen():
     rng = np.random.default_rng(3)
     arm = ROBOTS["ur10"]()
     true = wrong(arm, rng)
@@ -224,7 +224,7 @@ def test_of_several_solutions_the_nearest_to_what_is_asked():
     assert np.abs(found.q - q)[clear].max() <= 1e-6
 
 
-def test_targets_are_where_the_calibrated_arm_was_measured():
+def test_targets_are_in_the_measuring_frame():
     rng = np.random.default_rng(5)
     nominal = ROBOTS["z1"]()
     base, tool = se3.exp6(rng.normal(size=(2, 6)) * 0.3)
@@ -239,7 +239,7 @@ def test_targets_are_where_the_calibrated_arm_was_measured():
 @pytest.mark.parametrize(
     "targets", [np.zeros((3, 2)), np.full((1, 3), np.nan), np.zeros((0, 3)), 2 * np.eye(4)[None]]
 )
-def test_wrong_targets(targets):
+def test_invalid_targets_are_refused(targets):
     arm = Chain.from_dh(paper("experiment"))
     with pytest.raises(DhcalError, match="targets"):
         compensate(arm, arm, targets)
@@ -271,7 +271,7 @@ def rows():
 
 
 @pytest.mark.parametrize("rotation", ["", "qw,qx,qy,qz", "rx[deg],ry[deg],rz[deg]"])
-def test_the_command_writes_what_lands(place, capsys, rotation):
+def test_command_writes_joint_positions_and_corrected_targets(place, capsys, rotation):
     nominal, true = place
     joints = draw(nominal, 20, np.random.default_rng(1))
     poses = true.poses(joints)
@@ -306,7 +306,7 @@ def test_the_command_writes_what_lands(place, capsys, rotation):
     assert np.abs(nominal.poses(q)[:, :3, :3] - matrix).max() <= 1e-12
 
 
-def test_joint_columns_choose_the_branch(place):
+def test_joint_columns_choose_the_solution(place):
     nominal, true = place
     q = draw(nominal, 30, np.random.default_rng(2))
     poses = true.poses(q)
@@ -339,7 +339,7 @@ def test_joint_columns_choose_the_branch(place):
         ("x[mm],y[mm],z[mm],target\n1,2,3,a\n", ["targets.csv:1", "targets"]),
     ],
 )
-def test_wrong_target_files(place, capsys, text, words):
+def test_invalid_target_files_are_refused(place, capsys, text, words):
     Path("targets.csv").write_text(text)
     assert main.main(COMMAND) == 2
     said = capsys.readouterr().err
@@ -350,7 +350,7 @@ def test_wrong_target_files(place, capsys, text, words):
     assert not Path("out.csv").exists()
 
 
-def test_robots_that_do_not_go_together(place, capsys):
+def test_chains_with_different_joints_are_refused(place, capsys):
     Path("targets.csv").write_text("x[mm],y[mm],z[mm]\n1,2,3\n")
     Path("other.urdf").write_bytes((URDF / "experiment.urdf").read_bytes())
     for second, tips, words in (

@@ -1,12 +1,15 @@
-"""Denavit-Hartenberg tables, standard and modified, revolute and prismatic.
+"""Denavit-Hartenberg tables: standard and modified, with revolute and prismatic joints.
 
-Lengths in metres, angles in radians. With q_i the joint value, row i is
+With the joint position q_i, row i of a table with n joints is the link transform
 
-* standard: Rz(θ+q)·Tz(d)·Tx(a)·Rx(α)·Ry(β), which joint i moves about z_{i-1} (equation 1);
-* modified: Tx(a)·Rx(α)·Ry(β)·Tz(d)·Rz(θ+q), with a and α those of the link before the joint.
+* standard: A_i = Rz(θ_i + q_i) · Tz(d_i) · Tx(a_i) · Rx(α_i) · Ry(β_i); joint i moves about z_{i-1};
+* modified: A_i = Tx(a_i) · Rx(α_i) · Ry(β_i) · Tz(d_i) · Rz(θ_i + q_i); a_i and α_i belong to the link before
+  the joint.
 
-A prismatic joint's value is added to d instead. β is Hayati's angle for (nearly) parallel axes and
-zero in a plain table.
+The position of a prismatic joint is added to d_i instead of θ_i. β is Hayati's angle for nearly parallel axes
+(Hayati & Mirmirani 1985) and zero in a plain table. The tool pose is base · A_1 · … · A_n · tool.
+
+Lengths are in metres and angles in radians. Shapes: m samples, n joints.
 """
 
 from __future__ import annotations
@@ -18,18 +21,24 @@ import numpy as np
 
 from .. import se3
 from .._typing import Array
-from ..exceptions import DhcalError
+from ..exceptions import InvalidArgumentError
 
 Convention = Literal["standard", "modified"]
-
 
 CONVENTIONS = ("standard", "modified")
 
 
 def axis_rotation(axis: int, angle: Array) -> Array:
-    """Rotations (..., 4, 4) about coordinate axis 0, 1 or 2 by angle (...,) in radians.
+    """Compute rotations about a coordinate axis.
 
-    Quarter turns are exact: cos 90° is 0, not 6e-17, so a table's right angles stay right.
+    Quarter turns are exact: the cosine of 90° is 0, not 6e-17.
+
+    Args:
+        axis: 0, 1 or 2 for x, y or z.
+        angle: Angles, shape (...,) [rad].
+
+    Returns:
+        Homogeneous matrices, shape (..., 4, 4).
     """
     c, s = np.cos(angle), np.sin(angle)
     c, s = np.where(np.abs(c) < 1e-16, 0.0, c), np.where(np.abs(s) < 1e-16, 0.0, s)
@@ -41,27 +50,35 @@ def axis_rotation(axis: int, angle: Array) -> Array:
 
 
 def axis_translation(axis: int, length: Array) -> Array:
-    """Translations (..., 4, 4) along coordinate axis 0, 1 or 2 by length (...,) in metres."""
+    """Compute translations along a coordinate axis.
+
+    Args:
+        axis: 0, 1 or 2 for x, y or z.
+        length: Distances, shape (...,) [m].
+
+    Returns:
+        Homogeneous matrices, shape (..., 4, 4).
+    """
     return se3.translation(np.asarray(length)[..., None] * np.eye(3)[axis])
-
-
-def _identity() -> Array:
-    return np.eye(4)
 
 
 @dataclass(frozen=True)
 class DHTable:
-    """A serial arm as a DH table of n joints.
+    """Denavit-Hartenberg table of a serial arm with n joints.
 
     Attributes:
         convention: "standard" or "modified".
-        names: the n joints' names.
-        prismatic: (n,) True where the joint slides.
-        theta, d, a, alpha: (n,) rad, m, m, rad.
-        beta: (n,) rad, Hayati's angle about y; zero in a plain table.
-        lower, upper: (n,) joint limits, rad or m; infinite where there is none.
-        base: (4, 4) pose of the table's frame 0 in the robot's base frame.
-        tool: (4, 4) pose of the tool in the table's last frame.
+        names: Names of the n joints.
+        prismatic: True for prismatic joints, shape (n,).
+        theta: Joint angles, shape (n,) [rad].
+        d: Link offsets, shape (n,) [m].
+        a: Link lengths, shape (n,) [m].
+        alpha: Link twists, shape (n,) [rad].
+        beta: Hayati's angles about y, shape (n,) [rad]; zero in a plain table.
+        lower: Lower joint limits, shape (n,) [rad or m]; -inf if there is none.
+        upper: Upper joint limits, shape (n,) [rad or m]; inf if there is none.
+        base: Pose of frame 0 of the table in the base frame of the robot, shape (4, 4) [m].
+        tool: Pose of the tool in the last frame of the table, shape (4, 4) [m].
     """
 
     convention: Convention
@@ -74,23 +91,29 @@ class DHTable:
     beta: Array
     lower: Array
     upper: Array
-    base: Array = field(default_factory=_identity)
-    tool: Array = field(default_factory=_identity)
+    base: Array = field(default_factory=lambda: np.eye(4))
+    tool: Array = field(default_factory=lambda: np.eye(4))
 
     def __post_init__(self) -> None:
         n = len(self.names)
         if self.convention not in CONVENTIONS:
-            raise DhcalError(f"convention {self.convention!r}: must be 'standard' or 'modified'")
+            raise InvalidArgumentError(
+                f"unknown convention {self.convention!r}; choose from {', '.join(CONVENTIONS)}"
+            )
         if n == 0:
-            raise DhcalError("a DH table needs at least one joint")
+            raise InvalidArgumentError("the DH table is empty; expected at least one joint")
         if len(set(self.names)) != n:
-            raise DhcalError(f"joint names must differ: {', '.join(self.names)}")
+            raise InvalidArgumentError(
+                f"a joint name occurs twice in {', '.join(self.names)}; expected unique names"
+            )
         for key in ("theta", "d", "a", "alpha", "beta", "lower", "upper", "prismatic"):
             value = np.asarray(getattr(self, key), bool if key == "prismatic" else float)
             if value.shape != (n,):
-                raise DhcalError(f"DH column {key!r}: {value.size} values for {n} joints")
+                raise InvalidArgumentError(f"DH column {key!r} has shape {value.shape}; expected ({n},)")
             if key in ("theta", "d", "a", "alpha", "beta") and not np.isfinite(value).all():
-                raise DhcalError(f"DH column {key!r}: every value must be finite")
+                raise InvalidArgumentError(
+                    f"DH column {key!r} has a value that is not finite; expected finite numbers"
+                )
             object.__setattr__(self, key, value)
 
     @property
@@ -99,19 +122,36 @@ class DHTable:
         return len(self.names)
 
     def rows(self, q: Array) -> Array:
-        """Link transforms A_i (m, n, 4, 4) at joint values q (m, n) in rad or m (equation 1)."""
-        q = np.atleast_2d(np.asarray(q, float))
-        if q.shape[1] != self.n_joints:
-            raise DhcalError(f"q has {q.shape[1]} columns, the table has {self.n_joints} joints")
-        spin = axis_rotation(2, self.theta + np.where(self.prismatic, 0.0, q))
-        slide = axis_translation(2, self.d + np.where(self.prismatic, q, 0.0))
+        """Compute the link transforms A_i (equation 1 of the paper).
+
+        Args:
+            q: Joint positions, shape (m, n) [rad or m].
+
+        Returns:
+            Link transforms, shape (m, n, 4, 4).
+
+        Raises:
+            InvalidArgumentError: The joint positions have another shape.
+        """
+        q = np.asarray(q, float)
+        if q.ndim != 2 or q.shape[1] != self.n_joints:
+            raise InvalidArgumentError(f"q has shape {q.shape}; expected shape (m, {self.n_joints})")
+        rotation = axis_rotation(2, self.theta + np.where(self.prismatic, 0.0, q))
+        offset = axis_translation(2, self.d + np.where(self.prismatic, q, 0.0))
         link = axis_translation(0, self.a) @ axis_rotation(0, self.alpha) @ axis_rotation(1, self.beta)
         if self.convention == "standard":
-            return spin @ slide @ link
-        return link @ slide @ spin
+            return rotation @ offset @ link
+        return link @ offset @ rotation
 
     def poses(self, q: Array) -> Array:
-        """Tool poses (m, 4, 4) in the robot's base frame, the plain product (equation 2)."""
+        """Compute tool poses as the product of the link transforms (equation 2 of the paper).
+
+        Args:
+            q: Joint positions, shape (m, n) [rad or m].
+
+        Returns:
+            Poses of the tool in the base frame of the robot, shape (m, 4, 4) [m].
+        """
         rows = self.rows(q)
         out = np.broadcast_to(self.base, (len(rows), 4, 4))
         for i in range(self.n_joints):
@@ -119,11 +159,14 @@ class DHTable:
         return out @ self.tool
 
     def origins(self) -> Array:
-        """Joint origins and tool (n+1, 4, 4) of the same arm written as a URDF.
+        """Compute the joint origins and the tool of the equivalent URDF.
 
-        Each joint turns about (or slides along) its own z. Standard: joint 1's origin is the base,
-        joint i+1's is row i, the tool carries row n. Modified: joint i's origin is row i. Every
-        change of a table entry is exactly a change of one origin.
+        Each joint moves about or along its own z axis. In the standard convention, the origin of joint 1 is
+        the base, the origin of joint i+1 is row i, and the tool contains row n. In the modified convention,
+        the origin of joint i is row i. Each entry of the table thus changes exactly one origin.
+
+        Returns:
+            Poses of joints 1 to n and of the tool, each in the frame before it, shape (n+1, 4, 4) [m].
         """
         rows = self.rows(np.zeros((1, self.n_joints)))[0]
         if self.convention == "standard":

@@ -126,7 +126,7 @@ def perturb(origins, rng):
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("hayati", [False, True])
-def test_random_chains(convention, hayati):
+def test_tables_of_random_chains_give_their_poses(convention, hayati):
     rng = np.random.default_rng(1)
     errors = []
     for _ in range(500):
@@ -138,7 +138,7 @@ def test_random_chains(convention, hayati):
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_nearly_parallel_chains(convention):
+def test_tables_of_nearly_parallel_chains_give_their_poses(convention):
     """Tilts from rounding up to degrees, at every size, through every branch."""
     rng = np.random.default_rng(2)
     errors = []
@@ -157,7 +157,7 @@ def test_nearly_parallel_chains(convention):
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("hayati", [False, True])
-def test_a_table_comes_back(convention, hayati):
+def test_extraction_inverts_the_conversion_of_a_table(convention, hayati):
     rng = np.random.default_rng(3)
     for _ in range(500):
         table = random_table(rng, convention)
@@ -170,7 +170,7 @@ def test_a_table_comes_back(convention, hayati):
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_a_table_with_beta_comes_back(convention):
+def test_extraction_inverts_the_conversion_of_a_table_with_beta(convention):
     rng = np.random.default_rng(4)
     n = 6
     z = np.zeros(n)
@@ -195,7 +195,7 @@ def test_a_table_with_beta_comes_back(convention):
         assert len(found.notes) == n
 
 
-def test_negative_entries_come_back():
+def test_negative_entries_are_preserved():
     """The two ways of writing a row differ in the signs of a and α; the table's own is found."""
     z = np.zeros(2)
     alpha, a = np.array([-np.pi / 2, np.pi / 2]), np.array([-1.0, -0.5])
@@ -208,7 +208,7 @@ def test_negative_entries_come_back():
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("source", ["table", "chain", "nearly parallel"])
-def test_frames_carry_the_changes_of_a_row(convention, source):
+def test_frames_transform_changes_of_a_row(convention, source):
     """Finite changes, not derivatives: both sides are products of exact motions."""
     rng = np.random.default_rng(6)
     for _ in range(30):
@@ -242,7 +242,7 @@ def test_frames_carry_the_changes_of_a_row(convention, source):
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("robot", UR)
-def test_ur_arms(robot, convention):
+def test_ur_arms_have_plain_rows_under_small_errors(robot, convention):
     origins, names, q, poses = read_robot(*UR[robot])
     np.testing.assert_allclose(product(origins, np.zeros(6, bool), q), poses, atol=1e-14)
     reach = np.linalg.norm(origins[:, :3, 3], axis=1).sum()
@@ -275,7 +275,7 @@ def test_ur_arms(robot, convention):
         ("ur10", 0.1273, 0.612, 0.5723, 0.163941, 0.1157, 0.0922),
     ],
 )
-def test_ur_lengths_are_the_published_ones(robot, d1, a2, a3, d4, d5, d6):
+def test_ur_lengths_agree_with_the_published_ones(robot, d1, a2, a3, d4, d5, d6):
     table = extract(read_robot(*UR[robot])[0]).table
     np.testing.assert_allclose(np.abs(table.a), [0, a2, a3, 0, 0, 0], atol=1e-8)
     # The maker gives one length along the three parallel axes; the URDF spreads it over brackets.
@@ -283,7 +283,7 @@ def test_ur_lengths_are_the_published_ones(robot, d1, a2, a3, d4, d5, d6):
     np.testing.assert_allclose(found, [d1, d4, d5, d6], atol=1e-4)
 
 
-def test_panda_is_the_published_modified_table():
+def test_panda_agrees_with_the_published_modified_table():
     origins, _, q, poses = read_robot(*PANDA)
     table = extract(origins, convention="modified").table
     np.testing.assert_allclose(table.poses(q), poses, atol=1e-14)
@@ -296,20 +296,20 @@ def test_panda_is_the_published_modified_table():
     np.testing.assert_allclose(table.tool, se3.translation([0, 0, 0.107]), atol=1e-15)
 
 
-def test_a_note_names_the_joints_the_tilt_and_the_offset():
+def test_note_names_joints_tilt_and_offset():
     """1 mrad between axes 0.4 m apart: the common normal is 0.4 m / 1 mrad = 400 m away."""
     tilted = se3.exp6([0.4, 0, 0, 0, 0, 0]) @ se3.exp6([0, 0, 0, 0, 1e-3, 0])
     end = se3.exp6([0, 0.1, 0, 0.5, 0, 0])
     found = extract(np.array([np.eye(4), tilted, end]))
     assert found.notes == (
         "the axis of j1 and the axis of j2 are 1 mrad from parallel: the row between them has "
-        "Hayati's beta, as a plain one would need an offset of 400 m",
+        "Hayati's beta, because a row without beta would need an offset of 400 m",
     )
     np.testing.assert_allclose([found.table.a[0], found.table.beta[0]], [0.4, 1e-3], atol=1e-15)
     assert found.table.d[0] == 0.0
 
 
-def test_hayati_widens_the_window():
+def test_hayati_raises_the_tilt_up_to_which_beta_is_used():
     """3° is a plain row's business unless β is asked for, or unless the plain row would leave the robot."""
     tilted = se3.exp6([0.02, 0.01, 0, 0, 0, 0]) @ se3.exp6([0, 0, 0, 0.0, np.radians(3), 0])
     far = se3.exp6([0, 0, 1.0, 0.5, 0, 0])
@@ -319,9 +319,9 @@ def test_hayati_widens_the_window():
     assert extract(np.array([np.eye(4), tilted, near])).table.beta[0] != 0
 
 
-def test_wrong_input_is_named():
+def test_wrong_arguments_are_refused():
     one = np.array([np.eye(4)] * 2)
-    with pytest.raises(DhcalError, match=r"origins of shape \(2, 4, 4\): 2 joints need \(3, 4, 4\)"):
+    with pytest.raises(DhcalError, match=r"origins have shape \(2, 4, 4\); expected \(3, 4, 4\)"):
         extract_dh(one, ("a", "b"), [False] * 2, [0, 0], [1, 1])
     with pytest.raises(DhcalError, match="convention 'craig'"):
         extract(one, convention="craig")
@@ -330,7 +330,7 @@ def test_wrong_input_is_named():
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_a_mounted_arm_keeps_its_lengths(convention):
+def test_mounting_pose_does_not_change_the_other_rows(convention):
     """Wherever the base stands, rows 2 and on are the same, and row 1 has no length of the room in it."""
     origins = read_robot(*UR["ur5"])[0]
     table = extract(origins, convention=convention).table

@@ -79,7 +79,7 @@ def pinocchio_poses(text, q):
     return np.array(poses)
 
 
-def test_pinocchio_reads_the_table_back():
+def test_pinocchio_gives_the_poses_of_the_table():
     rng = np.random.default_rng(0)
     worst = 0.0
     for _ in range(200):
@@ -91,7 +91,7 @@ def test_pinocchio_reads_the_table_back():
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_mujoco_reads_the_same_arm(convention):
+def test_mujoco_gives_the_poses_of_the_table(convention):
     """No compiler setting is needed to load it; fusestatic keeps the tool's frame apart."""
     table = arm(
         (90, 0, 0, -90, 0, 90),
@@ -110,7 +110,7 @@ def test_mujoco_reads_the_same_arm(convention):
         data.qpos[:] = q
         mujoco.mj_kinematics(model, data)
         tool = data.body("tool0")
-        pose = table.poses(q)[0]
+        pose = table.poses(q[None])[0]
         np.testing.assert_allclose(tool.xpos, pose[:3, 3], atol=1e-14)
         np.testing.assert_allclose(tool.xmat.reshape(3, 3), pose[:3, :3], atol=1e-14)
 
@@ -131,14 +131,14 @@ def test_links_joints_and_limits():
     assert model.nq == model.nv == 4
 
 
-def test_one_sided_limits_stay_in_order():
+def test_one_sided_limits_are_completed_in_order():
     table = arm((0, 0), (100, 100), (0, 0), lower=[8.0, -np.inf], upper=[np.inf, -8.0])
     model = pin.buildModelFromXML(dh_to_urdf(table, "arm"))
     assert np.all(model.lowerPositionLimit < model.upperPositionLimit)
     assert (model.lowerPositionLimit[0], model.upperPositionLimit[1]) == (8.0, -8.0)
 
 
-def test_numbers_are_clean():
+def test_numbers_have_no_rounding_errors_or_negative_zeros():
     """Right angles and zeros as people write them, and every origin a row of the table."""
     found = ORIGINS.findall(dh_to_urdf(paper_arm(), "arm"))
     quarter = "1.5707963267948966"
@@ -154,7 +154,7 @@ def test_numbers_are_clean():
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_quarter_turns_stay_quarter_turns(convention):
+def test_quarter_turns_are_exact(convention):
     """All combinations of right angles, pitch ±90° among them, read back to rounding and are never -0.0."""
     turns = np.array([(t, a) for t in (-90, 0, 90, 180) for a in (-90, 0, 90, 180)])
     table = arm(turns[:, 1], [100] * 16, [50] * 16, convention, theta=turns[:, 0])
@@ -166,7 +166,7 @@ def test_quarter_turns_stay_quarter_turns(convention):
     np.testing.assert_allclose(pinocchio_poses(text, q), table.poses(q), atol=1e-14)
 
 
-def test_near_the_lock_nothing_is_lost():
+def test_pitch_near_a_quarter_turn_loses_no_digits():
     """Modified rows put θ behind α: pitch is ±90° to within any small angle."""
     for angle in (1e-3, 1e-6, 1e-8, 1e-12):
         near = 90 - np.degrees(angle)
@@ -175,7 +175,7 @@ def test_near_the_lock_nothing_is_lost():
         np.testing.assert_allclose(pinocchio_poses(dh_to_urdf(table, "arm"), q), table.poses(q), atol=2e-15)
 
 
-def test_names_are_escaped_and_kept_apart():
+def test_names_are_escaped_and_unique():
     """A joint called tool, one called like a link, and characters that XML reserves."""
     names = ("tool", "link_1", 'a<b>&"c"')
     plain = arm((90, 0, 0), (0, 400, 345), (433, 0, 0))
@@ -228,7 +228,7 @@ def test_drawing_follows_the_rows():
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_a_slide_keeps_its_sleeve_on_the_link_before(convention):
+def test_prismatic_joint_is_drawn_on_the_link_before_it(convention):
     slide = [False, True, False]
     limits = {"lower": [-1, 0, -1], "upper": [1, 0.3, 1]}
     table = arm((0, 180, 0), (300, 200, 0), (400, 0, 50), convention, prismatic=slide, **limits)
@@ -242,6 +242,6 @@ def test_a_slide_keeps_its_sleeve_on_the_link_before(convention):
     assert links["link_2"].count("along_d") == 1 + (convention == "modified")
 
 
-def test_an_arm_of_no_length_still_loads():
+def test_table_of_zeros_can_be_loaded():
     model = pin.buildModelFromXML(dh_to_urdf(arm((0, 90), (0, 0), (0, 0)), "point"))
     assert model.nq == 2

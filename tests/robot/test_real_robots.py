@@ -79,14 +79,14 @@ def pinocchio_poses(chain: Chain, q):
 
 
 @ARM
-def test_poses_equal_pinocchio(arm):
+def test_poses_agree_with_pinocchio(arm):
     chain = load(arm)
     q = draw(chain, 200)
     assert np.abs(chain.poses(q) - pinocchio_poses(chain, q)).max() <= 1e-12
 
 
 @ARM
-def test_poses_equal_mujoco(arm):
+def test_poses_agree_with_mujoco(arm):
     import mujoco
 
     chain = load(arm)
@@ -108,7 +108,7 @@ def test_poses_equal_mujoco(arm):
 
 
 @ARM
-def test_poses_equal_kinpy(arm):
+def test_poses_agree_with_kinpy(arm):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what it imports
         import kinpy
@@ -123,7 +123,7 @@ def test_poses_equal_kinpy(arm):
 
 
 @ARM
-def test_jacobian_equals_pinocchios_regressor(arm):
+def test_jacobian_agrees_with_the_regressor_of_pinocchio(arm):
     chain = load(arm)
     errors = select_parameters(chain, "placement")
     q = draw(chain, 50)
@@ -131,7 +131,7 @@ def test_jacobian_equals_pinocchios_regressor(arm):
 
 
 @ARM
-def test_perturbed_model_equals_the_chain(arm):
+def test_model_of_a_perturbed_chain_has_its_poses(arm):
     chain = load(arm)
     rng = np.random.default_rng(1)
     moved = chain.perturbed_at(
@@ -142,7 +142,7 @@ def test_perturbed_model_equals_the_chain(arm):
 
 
 @ARM
-def test_written_back_it_is_the_same_robot_and_no_other_line_changes(arm, tmp_path):
+def test_written_urdf_is_the_same_robot_and_changes_only_origins(arm, tmp_path):
     chain = load(arm)
     rng = np.random.default_rng(2)
     moved = chain.perturbed_at(
@@ -169,7 +169,7 @@ def test_factors_agree_through_the_extracted_table(arm):
 
 @pytest.mark.parametrize("convention", ["standard", "modified"])
 @ARM
-def test_to_dh_and_back(arm, convention):
+def test_extracted_dh_table_has_the_same_poses(arm, convention):
     chain = load(arm)
     table = extract_dh_table(chain, convention).table
     q = draw(chain, 100)
@@ -217,7 +217,7 @@ EVERY_SET = [*PARAMETER_SETS, *WITH_FRAMES]
 
 @pytest.mark.parametrize("sets", EVERY_SET)
 @ARM
-def test_every_set_finds_a_noise_free_arm(arm, sets):
+def test_every_set_recovers_a_noise_free_arm(arm, sets):
     chain = load(arm)
     for seed in range(2):
         assert recovered(chain, sets, seed) < 1e-9
@@ -226,13 +226,13 @@ def test_every_set_finds_a_noise_free_arm(arm, sets):
 @pytest.mark.slow
 @pytest.mark.parametrize("sets", EVERY_SET)
 @ARM
-def test_every_set_finds_a_noise_free_arm_in_every_seed(arm, sets):
+def test_every_set_recovers_a_noise_free_arm_for_all_seeds(arm, sets):
     chain = load(arm)
     worst = max(recovered(chain, sets, seed) for seed in range(100))
     assert worst < 1e-9
 
 
-def test_ur10_has_the_makers_lengths():
+def test_ur10_agrees_with_the_published_lengths():
     table = extract_dh_table(load("ur10"), "standard").table
     np.testing.assert_allclose(np.sort(np.abs(table.a))[-2:], [0.5723, 0.612], atol=1e-9)
     np.testing.assert_allclose(
@@ -241,7 +241,7 @@ def test_ur10_has_the_makers_lengths():
     assert abs(np.sum(table.d[1:4])) == pytest.approx(0.163941, abs=1e-6)
 
 
-def test_shaken_ur_arms_stay_readable():
+def test_tables_of_perturbed_ur_arms_have_no_large_offsets():
     for arm in ("ur3", "ur5", "ur10"):
         chain = load(arm)
         length = np.linalg.norm(chain.origins[:, :3, 3], axis=1).sum()
@@ -256,7 +256,7 @@ def test_shaken_ur_arms_stay_readable():
                 np.testing.assert_allclose(table.poses(q), moved.poses(q), atol=1e-12)
 
 
-def test_ambiguous_tips_are_listed_with_what_they_share():
+def test_ambiguous_tips_are_listed_with_their_last_shared_link():
     with pytest.raises(DhcalError, match=r"--tip: panda_leftfinger, panda_rightfinger .*panda_hand"):
         Chain.from_urdf(robot_file(ARMS["panda"][0]))
 
@@ -266,14 +266,14 @@ def test_default_tips():
     assert Chain.from_urdf(robot_file(ARMS["xarm7"][0])).tip == "link_eef"
 
 
-def test_joints_off_the_path_stay_neutral():
+def test_joints_that_are_not_on_the_path_stay_neutral():
     chain = load("tiago")
     assert chain.joint_names[0] == "torso_lift_joint"
     assert chain.prismatic.tolist() == [True] + [False] * 7
     assert chain.n_joints < chain.model.nv
 
 
-def test_frames_of_an_instrument_do_not_enter_the_robot(tmp_path):
+def test_base_and_tool_are_not_written_to_the_urdf(tmp_path):
     chain = load("ur10")
     base = se3.exp6([1.0, 2, 3, 0.4, 0.5, 0.6])
     placed = replace(chain, base=base, tool=se3.exp6([0.1, 0, 0.2, 0, 0.3, 0]))

@@ -37,7 +37,7 @@ def drawn(chain: Chain, sets: str, rng: np.random.Generator):
     return errors.at(x).with_current_loads(), dict(zip([p.name for p in errors.parameters], x, strict=True))
 
 
-def test_effective_value_is_the_formula():
+def test_actual_positions_follow_the_formula():
     """By a fresh Pinocchio model and plain arithmetic, a joint at a time."""
     rng = np.random.default_rng(0)
     plain = ur10()
@@ -84,7 +84,7 @@ MIMIC = """<robot name="r"><link name="base"/><link name="a"/><link name="b"/>
     <mimic joint="lead" multiplier="-2" offset="0.1"/></joint></robot>"""
 
 
-def test_a_mimic_joint_follows_what_its_leader_really_does():
+def test_mimic_joint_follows_the_actual_position_of_its_source():
     arm = Chain.from_urdf(parse_urdf(MIMIC.encode(), "mimic.urdf"))
     errors = select_parameters(arm, "gain")
     assert [p.name for p in errors.parameters] == ["lead.gain"]
@@ -98,7 +98,7 @@ def test_a_mimic_joint_follows_what_its_leader_really_does():
     np.testing.assert_allclose(velocity, change / (2 * step), atol=1e-9)
 
 
-def test_torques_of_a_mimic_joint_load_its_leader():
+def test_gravity_on_a_mimic_joint_loads_its_source():
     """By the work of gravity: the generalised force is the slope of the potential energy."""
     arm = with_masses(Chain.from_urdf(parse_urdf(MIMIC.encode(), "mimic.urdf")), np.random.default_rng(3))
     q, h = np.array([[0.3, -0.7]]), 1e-6
@@ -111,7 +111,7 @@ def test_torques_of_a_mimic_joint_load_its_leader():
     np.testing.assert_allclose(arm.loads.torques(q)[0], slope, atol=1e-8)
 
 
-def test_sets_that_a_robot_cannot_have(sim_6dof):
+def test_empty_sets_are_refused_with_their_requirement(sim_6dof):
     with pytest.raises(DhcalError, match=r"set 'compliance'.*masses"):
         select_parameters(sim_6dof, "base,compliance")
     slides = replace(random_table(np.random.default_rng(0), size=2), prismatic=np.array([True, True]))
@@ -123,7 +123,7 @@ def test_sets_that_a_robot_cannot_have(sim_6dof):
     ]
 
 
-def test_many_arms_at_once_have_ideal_joints():
+def test_batches_refuse_transmission_errors():
     arm = ur10()
     driven, _ = drawn(arm, "gain", np.random.default_rng(0))
     for errors in (select_parameters(arm, "base,gain"), select_parameters(driven, "base")):
@@ -134,7 +134,7 @@ def test_many_arms_at_once_have_ideal_joints():
 # --- the sidecar -----------------------------------------------------------------------------------
 
 
-def test_written_and_read_back_it_is_the_same_robot(tmp_path):
+def test_sidecar_preserves_the_robot(tmp_path):
     rng = np.random.default_rng(1)
     arm, x = drawn(ur10(), "minimal,base,tool,gain,harmonics,compliance,coupling", rng)
     write_urdf(arm, tmp_path / "out.urdf")
@@ -165,7 +165,7 @@ def test_written_and_read_back_it_is_the_same_robot(tmp_path):
         ("[joint.elbow_joint]\ncoupling = 0.1", r"coupling\]: 0.1 is not a table"),
     ],
 )
-def test_a_wrong_joint_table_is_refused(tmp_path, text, words):
+def test_invalid_joint_table_is_refused(tmp_path, text, words):
     write_urdf(ur10(), tmp_path / "arm.urdf")
     (tmp_path / "arm.calibration.toml").write_text(text)
     with pytest.raises(DhcalError, match=words) as caught:
@@ -173,7 +173,7 @@ def test_a_wrong_joint_table_is_refused(tmp_path, text, words):
     assert "arm.calibration.toml" in str(caught.value)
 
 
-def test_a_sliding_joint_has_a_gain_alone(tmp_path):
+def test_prismatic_joint_has_only_a_gain(tmp_path):
     table = replace(random_table(np.random.default_rng(0), size=2), prismatic=np.array([True, False]))
     write_urdf(Chain.from_dh(table), tmp_path / "arm.urdf")
     (tmp_path / "arm.calibration.toml").write_text("[joint.j1]\nsin_rad = 0.1")
@@ -181,7 +181,7 @@ def test_a_sliding_joint_has_a_gain_alone(tmp_path):
         read_robot(tmp_path / "arm.urdf")
 
 
-def test_commands_read_what_calibrate_wrote(tmp_path, monkeypatch, capsys):
+def test_commands_read_the_sidecar_of_calibrate(tmp_path, monkeypatch, capsys):
     """A drooping arm: calibrated, validated, calibrated again; its root stays where gravity counts on it."""
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(2)
@@ -220,7 +220,7 @@ def test_commands_read_what_calibrate_wrote(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("family", EXTENSIONS)
-def test_a_family_is_found_again(family):
+def test_simulated_family_is_recovered(family):
     """All coefficients within 3 σ but for the one that chance may put beyond, and their spread as claimed."""
     off, arm = [], ur10()
     for seed in range(2):
@@ -237,7 +237,7 @@ def test_a_family_is_found_again(family):
     assert 0.6 < np.sqrt(np.mean(np.square(off))) < 1.4
 
 
-def test_the_nominal_of_a_calibrated_robot_is_what_it_had(tmp_path):
+def test_nominal_values_are_those_of_the_given_robot(tmp_path):
     rng = np.random.default_rng(5)
     arm = Chain.from_dh(paper("sim_6dof"))
     had, x = drawn(arm, "gain", rng)
@@ -260,7 +260,7 @@ def carried_in_the_file() -> bytes:
     return text.replace("</robot>", more).encode()
 
 
-def test_a_payload_weighs_as_much_as_a_link_of_the_file():
+def test_payload_has_the_torques_of_a_link_in_the_file():
     q = np.random.default_rng(0).uniform(-2, 2, (6, 20))
     wanted = Chain.from_urdf(parse_urdf(carried_in_the_file(), "held.urdf"), "tool0").loads.torques(q)
     bare, carrying = ur10(), ur10().with_payload(CARRIED)
@@ -269,7 +269,7 @@ def test_a_payload_weighs_as_much_as_a_link_of_the_file():
     np.testing.assert_array_equal(carrying.poses(q.T), bare.poses(q.T))
 
 
-def test_what_a_carrying_arm_gives_is_found_and_kept(tmp_path, monkeypatch, capsys):
+def test_compliance_under_a_payload_is_recovered_and_saved(tmp_path, monkeypatch, capsys):
     """Told of the payload, calibrate finds the compliance that the truth has, and the sidecar says so."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "arm.urdf").write_bytes(robot_file("ur_description/urdf/ur10_robot.urdf").read_bytes())
@@ -317,7 +317,7 @@ def test_what_a_carrying_arm_gives_is_found_and_kept(tmp_path, monkeypatch, caps
         ("mass_kg = 2\nmass = 2", "unknown key 'mass'; choose from mass_kg"),
     ],
 )
-def test_a_wrong_payload_is_refused(tmp_path, table, words):
+def test_invalid_payload_is_refused(tmp_path, table, words):
     (tmp_path / "arm.urdf").write_bytes(robot_file("ur_description/urdf/ur10_robot.urdf").read_bytes())
     (tmp_path / "arm.calibration.toml").write_text(f"[payload]\n{table}\n")
     with pytest.raises(DhcalError, match=words):

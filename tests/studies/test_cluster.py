@@ -34,7 +34,7 @@ def cluster():
             yield cluster
 
 
-def test_a_cluster_gives_the_same_table(cluster, tmp_path):
+def test_cluster_gives_the_same_table(cluster, tmp_path):
     there = table_of(tmp_path, "there", "--scheduler", cluster.scheduler_address)
     assert there == table_of(tmp_path, "here")
 
@@ -46,7 +46,7 @@ def test_ten_thousand_calibrations_on_a_cluster(cluster, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_worker_lost_in_the_middle_changes_nothing(cluster, tmp_path):
+def test_lost_worker_does_not_change_the_results(cluster, tmp_path):
     (tmp_path / "s.study.toml").write_text(SMALL_STUDY.replace("seeds = 120", "seeds = 400"))
     study = read_study(tmp_path / "s.study.toml")
     here = list(run(study))
@@ -62,7 +62,7 @@ def test_a_worker_lost_in_the_middle_changes_nothing(cluster, tmp_path):
     assert next(iter(victim.values())) not in survivors.values()
 
 
-def test_a_stream_gives_the_same_digits_with_a_worker_lost(cluster, tmp_path, sim_6dof, sim_6dof_actual):
+def test_lost_worker_does_not_change_a_streamed_calibration(cluster, tmp_path, sim_6dof, sim_6dof_actual):
     """Parts of a file that both workers see; one worker dies after the first few triangles."""
     rng = np.random.default_rng(0)
     data = Position.simulate(sim_6dof_actual, rng.uniform(-3, 3, (1200, 6)), Noise(1e-4), rng)
@@ -89,7 +89,7 @@ def test_a_stream_gives_the_same_digits_with_a_worker_lost(cluster, tmp_path, si
     assert killed[0] not in survivors.values()
 
 
-def test_no_scheduler_is_said():
+def test_unreachable_scheduler_is_refused():
     with (
         pytest.raises(DhcalError, match="no Dask scheduler found"),
         open_executor(scheduler="tcp://127.0.0.1:1"),

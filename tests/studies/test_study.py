@@ -46,7 +46,7 @@ def results(folder, text: str) -> list[dict]:
     return [dict(zip(header, row, strict=True)) for row in rows]
 
 
-def test_six_dof_medians_by_iteration(tmp_path):
+def test_medians_of_the_6_dof_arm_by_iteration(tmp_path):
     """Two kept sets fit and stay wrong; ten find every parameter: degrees, mm, as verified by hand."""
     rows = results(tmp_path, SIX + "poses = [2, 10]\niterations = [0, 1, 2, 3, 10]\n")
     wanted = {
@@ -64,7 +64,7 @@ def test_six_dof_medians_by_iteration(tmp_path):
     assert 1e3 * rows[-1]["length_error[m]"] < 1e-9
 
 
-def test_more_sets_converge_faster_where_they_are_drawn_anew(tmp_path):
+def test_more_poses_converge_faster_if_resampled(tmp_path):
     """The paper's first claim, under the condition that makes it true."""
     text = SIX + "poses = [2, 10]\nresample_each_iteration = true\niterations = [1, 2, 3, 4, 5, 10]\n"
     rows = results(tmp_path, text)
@@ -75,7 +75,7 @@ def test_more_sets_converge_faster_where_they_are_drawn_anew(tmp_path):
     assert ten[3] < 1e-9
 
 
-def test_positions_alone_leave_parameters_elsewhere_and_the_tool_right(tmp_path):
+def test_positions_of_the_3_dof_arm_determine_the_tool_but_not_the_parameters(tmp_path):
     """The paper's second claim: 3-DOF arm; kept sets of three miss by 2.59 mm, drawn anew by 5 µm."""
     kept, anew = (
         results(tmp_path, THREE + f"poses = 3\niterations = 10\nresample_each_iteration = {word}\n")[0]
@@ -89,7 +89,7 @@ def test_positions_alone_leave_parameters_elsewhere_and_the_tool_right(tmp_path)
     assert 1e3 * ten[1]["position_max[m]"] == pytest.approx(0.00168, rel=0.2)
 
 
-def test_noise_is_averaged_out(tmp_path):
+def test_noise_is_averaged_over_poses(tmp_path):
     """0.1 mm and 0.01° an axis: worst of 100 test poses in mm."""
     text = SIX.replace("0mm", "0.1mm,0.01deg").replace("seeds = 50", "seeds = 30")
     rows = results(tmp_path, text + "poses = [10, 30, 100]\n")
@@ -111,7 +111,7 @@ poses = 16
 """
 
 
-def test_planned_poses_are_worth_what_the_plan_says(tmp_path):
+def test_planned_poses_have_the_predicted_error(tmp_path):
     """The same arms with poses at random and with those of `plan`, however the work is shared out."""
     one = table_of(tmp_path, "one", text=PLANNED)
     assert one == table_of(tmp_path, "two", "--jobs", "2", text=PLANNED)
@@ -125,7 +125,7 @@ def test_planned_poses_are_worth_what_the_plan_says(tmp_path):
     assert planned < 0.85 * random
 
 
-def test_a_cut_journal_is_taken_up(tmp_path, capsys):
+def test_incomplete_journal_is_continued(tmp_path, capsys):
     """As a kill leaves it: whole lines and a piece of one."""
     whole = table_of(tmp_path, "whole")
     study = read_study(tmp_path / "s.study.toml")
@@ -150,7 +150,7 @@ def killed_and_resumed(folder, text: str, lines: int, *options: str) -> str:
     return out.read_text()
 
 
-def test_a_killed_run_continues_to_the_same_table(tmp_path):
+def test_killed_run_is_continued_to_the_same_table(tmp_path):
     text = SMALL_STUDY.replace("120", "300")
     assert killed_and_resumed(tmp_path, text, 2) == table_of(tmp_path, "whole", text=text)
 
@@ -163,7 +163,7 @@ def test_ten_thousand_calibrations(tmp_path):
     assert sum(int(row["calibrations"]) for row in csv.DictReader(one.splitlines())) == 10_000
 
 
-def test_journal_of_another_study_is_left_alone(tmp_path, capsys):
+def test_journal_of_another_study_is_refused(tmp_path, capsys):
     (tmp_path / "s.study.toml").write_text(SMALL_STUDY)
     (tmp_path / "r.csv.part").write_text("0000\n")
     assert main.main(["study", str(tmp_path / "s.study.toml"), "-o", str(tmp_path / "r.csv")]) == 2
@@ -198,7 +198,7 @@ def test_journal_of_another_study_is_left_alone(tmp_path, capsys):
         (('robot = "sim_6dof.dh.toml"', ""), "robot is missing"),
     ],
 )
-def test_wrong_studies_are_named(tmp_path, change, message):
+def test_invalid_studies_are_refused(tmp_path, change, message):
     path = tmp_path / "s.study.toml"
     path.write_text(SMALL_STUDY.replace(*change))
     with pytest.raises(DhcalError, match=message):
@@ -215,7 +215,7 @@ FORK = """<robot name="fork"><link name="base"/><link name="left"/><link name="r
 </robot>"""
 
 
-def test_a_study_of_an_arm_with_two_hands(tmp_path):
+def test_tip_can_be_a_list(tmp_path):
     """Its tip is a setting as any other."""
     (tmp_path / "fork.urdf").write_text(FORK)
     text = 'seeds = 3\n[settings]\nrobot = "fork.urdf"\nposes = 20\n'
@@ -227,7 +227,7 @@ def test_a_study_of_an_arm_with_two_hands(tmp_path):
     assert alone == rows[1:]
 
 
-def test_a_studys_robot_is_no_output(tmp_path, capsys):
+def test_output_must_not_be_the_robot_file(tmp_path, capsys):
     path, robot = tmp_path / "s.study.toml", tmp_path / "sim_6dof.dh.toml"
     path.write_text(SMALL_STUDY)
     robot.write_bytes((URDF / robot.name).read_bytes())
