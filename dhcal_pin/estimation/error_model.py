@@ -1,10 +1,21 @@
-"""A chain's unknown errors: each is a twist at a station, some scaled by what the joint does.
+"""Error model: a nominal chain and its unknown kinematic errors.
 
-Changes at one station act in the order of the list, M ← M·exp(x₁ξ₁)·exp(x₂ξ₂)…, so a parameter's value
-is always its whole error from the nominal chain, DH's changes are exact (its rotations and translations
-about one axis commute), and the derivative at any value is a twist again. A scaled one, such as a gain or
-a compliance, is an entry of the chain's transmission: its twist is the joint's own, times a term of the
-joint's value and load.
+Every error is a scalar x_i that scales a constant twist ξ_i = [v, ω] at one error frame of the chain. Errors
+at the same frame act in the order of the list, as right perturbations:
+
+    M ← M·exp(x_1·ξ_1)·exp(x_2·ξ_2)·…
+
+- Twist convention: v are the three linear and ω the three angular components, in axes of the error frame.
+  A twist with unit v is a translation in metres per unit of x, one with unit ω a rotation in radians.
+- Error frames (see `robot.chain`): 0 is the base, 2j the origin of joint j before its motion, 2j+1 link j
+  after the motion of joint j, 2k+2 the tip and 2k+3 the tool, for j = 1 … k.
+- Values: x is the whole error from the nominal chain, in metres or radians. Since rotations and translations
+  about one axis commute, x of a DH parameter is exactly the difference of its table entry.
+- Derivative: at any x, the derivative of the chain by x_i is a twist of one body again (`derivative`).
+
+Errors of the joint transmission, such as a gear ratio error or joint elasticity, scale the joint's own twist
+by a function of joint position and load. They are entries of the chain's transmission coefficients instead of
+constant twists, and come last in the list.
 """
 
 from __future__ import annotations
@@ -23,16 +34,18 @@ from ..robot.transmission import Transmission
 
 @dataclass(frozen=True)
 class ErrorParameter:
-    """One scalar error.
+    """Scalar kinematic error.
 
     Attributes:
-        name: what users call it, as `d2` or `elbow_joint.rx`.
-        unit: "m" or "rad"; of a scaled one "1", "rad", "rad/Nm", "rad/rad", "rad/m".
-        nominal: the value that a drawing would show; zero for a pure error.
-        error_frame: where it acts (see `chain`).
-        twist: (6,) [v, ω] in the station's frame.
-        prior: standard deviation expected before any measurement, in its unit.
-        coefficient_index: of a scaled one, where its coefficient stands in the transmission's flat coefficients.
+        name: Name for users, such as `d2` or `elbow_joint.rx`.
+        unit: Unit of the value: "m" or "rad" for a geometric error; "1", "rad", "rad/Nm", "rad/rad" or
+            "rad/m" for a transmission coefficient.
+        nominal: Nominal value in that unit: the DH table entry or the transmission coefficient; zero for
+            errors that are differences.
+        error_frame: Index of the error frame: 0 base, 2j joint j, 2j+1 link j, 2k+2 tip, 2k+3 tool.
+        twist: Twist [v, ω] per unit of the error, in axes of the error frame.
+        prior: Standard deviation expected before any measurement, in the unit of the value.
+        coefficient_index: Index into the flattened transmission coefficients; None for a geometric error.
     """
 
     name: str
@@ -46,12 +59,12 @@ class ErrorParameter:
 
 @dataclass(frozen=True, eq=False)
 class ErrorModel:
-    """A nominal chain and p unknown errors, sorted by station.
+    """Nominal chain and p unknown errors.
 
     Attributes:
-        chain: nominal.
-        parameters: (p,) the unknowns.
-        fixed: parameters of the same sets that are held at nominal.
+        chain: Nominal chain.
+        parameters: Unknown errors, length p, sorted by error frame; transmission coefficients last.
+        fixed: Parameters of the same sets that are held at their nominal values.
     """
 
     chain: Chain
@@ -60,41 +73,45 @@ class ErrorModel:
 
     @cached_property
     def _n_geometric(self) -> int:
-        """How many parameters, the first ones, are plain twists."""
+        """Number of geometric errors; they precede the transmission coefficients."""
         return sum(parameter.coefficient_index is None for parameter in self.parameters)
 
     @cached_property
     def _coefficient_indices(self) -> Array:
+        """Indices of the unknown transmission coefficients, shape (e,)."""
         return np.array(
             [p.coefficient_index for p in self.parameters if p.coefficient_index is not None], int
         )
 
     @property
     def has_transmission(self) -> bool:
-        """Whether its joints may miss their values."""
+        """Whether the joints have transmission errors, known or unknown."""
         return bool(self._coefficient_indices.size) or self.chain.transmission is not None
 
     @cached_property
     def _twists(self) -> Array:
+        """Twists of the geometric errors in their error frames, shape (p-e, 6)."""
         return np.array([parameter.twist for parameter in self.parameters]).reshape(-1, 6)[
             : self._n_geometric
         ]
 
     @cached_property
     def _error_frames(self) -> Array:
+        """Error frames of the geometric errors, shape (p-e,)."""
         return np.array([parameter.error_frame for parameter in self.parameters], int)[: self._n_geometric]
 
     @cached_property
     def _bodies(self) -> Array:
+        """Bodies that the geometric errors move, shape (p-e,)."""
         return bodies_of_frames(self.chain, self._error_frames)
 
     @property
     def priors(self) -> Array:
-        """Prior standard deviations (p,), each in its parameter's unit."""
+        """Prior standard deviations of shape (p,), each in the unit of its parameter."""
         return np.array([parameter.prior for parameter in self.parameters])
 
-    def _frame_motions(self, x: Array) -> tuple[Array, Array]:
-        """Motions of all stations (2k+4, 4, 4), and the plain twists (p, 6) as those of bodies."""
+    def _perturb_frames(self, x: Array) -> tuple[Array, Array]:
+        """Compute the displacements of all error frames (2k+4, 4, 4) and the body twists (p-e, 6) at x."""
         chain = self.chain
         return perturb_frames(
             chain.body_from_urdf,
@@ -106,49 +123,85 @@ class ErrorModel:
         )
 
     def at(self, x: Array) -> Chain:
-        """The chain with errors x (p,) in SI; its joints yield to the nominal arm's masses."""
+        """Build the chain with given errors.
+
+        The gravity torques remain those of the nominal chain; see `with_current_loads`.
+
+        Args:
+            x: Errors of shape (p,), each in the unit of its parameter.
+
+        Returns:
+            Chain with the errors.
+        """
         x = np.ascontiguousarray(x, float)
-        return self._with_transmission(self.chain.perturbed(self._frame_motions(x)[0]), x)
+        return self._with_transmission(self.chain.perturbed(self._perturb_frames(x)[0]), x)
 
     def _with_transmission(self, chain: Chain, x: Array) -> Chain:
-        """A chain with the transmission at x (p,)."""
+        """Return a chain with the transmission coefficients at x (p,)."""
         if not self._coefficient_indices.size:
             return chain
-        held = self._transmission.with_coefficients_added(self._coefficient_indices, x[self._n_geometric :])
-        return chain.with_transmission(held)
+        transmission = self._transmission.with_coefficients_added(
+            self._coefficient_indices, x[self._n_geometric :]
+        )
+        return chain.with_transmission(transmission)
 
     @cached_property
     def _transmission(self) -> Transmission:
+        """Transmission of the nominal chain; zero if it has none."""
         return self.chain.transmission or Transmission.zero(self.chain.loads)
 
     def with_current_loads(self, x: Array) -> ErrorModel:
-        """The same unknowns, with joints that yield to the masses as they are placed at x."""
-        held = replace(self._transmission, loads=self.at(x).loads)
-        return replace(self, chain=self.chain.with_transmission(held))
+        """Return the model with the gravity torques of the chain at x.
+
+        Args:
+            x: Errors of shape (p,), each in the unit of its parameter.
+
+        Returns:
+            Model with the same unknowns.
+        """
+        transmission = replace(self._transmission, loads=self.at(x).loads)
+        return replace(self, chain=self.chain.with_transmission(transmission))
 
     def derivative(self, x: Array) -> tuple[Chain, Array, Array]:
-        """The chain at x, and for each parameter the body (p,) and twist (p, 6) it moves there.
+        """Compute the chain at x and its derivative by each error.
 
-        Entries of the transmission come last, numbered behind the bodies (see `Chain.tool_velocities`).
+        Args:
+            x: Errors of shape (p,), each in the unit of its parameter.
+
+        Returns:
+            Chain at x, and for each error the body that it moves, shape (p,), and the twist of that body in
+            its own frame, shape (p, 6), as `Chain.tool_jacobian` takes them. Transmission coefficients have
+            numbers above those of the bodies.
         """
         x = np.ascontiguousarray(x, float)
-        motions, twists = self._frame_motions(x)
-        chain, bodies = self._with_transmission(self.chain.perturbed(motions), x), self._bodies
+        displacements, twists = self._perturb_frames(x)
+        chain, bodies = self._with_transmission(self.chain.perturbed(displacements), x), self._bodies
         if not self._coefficient_indices.size:
             return chain, bodies, twists
         entries = len(chain.moving_joints) + 1 + self._coefficient_indices
         return chain, np.concatenate([bodies, entries]), np.pad(twists, ((0, len(entries)), (0, 0)))
 
     def with_parameters(self, parameters: Iterable[ErrorParameter]) -> ErrorModel:
-        """With more unknowns, each where it belongs: by station, entries of the transmission last."""
-        both = (*self.parameters, *parameters)
+        """Return the model with further unknowns, sorted by error frame.
+
+        Args:
+            parameters: Unknowns to add.
+
+        Returns:
+            Model with all unknowns; transmission coefficients last.
+        """
         ordered = sorted(
-            both, key=lambda p: (-1 if p.coefficient_index is None else p.coefficient_index, p.error_frame)
+            (*self.parameters, *parameters),
+            key=lambda p: (-1 if p.coefficient_index is None else p.coefficient_index, p.error_frame),
         )
         return replace(self, parameters=tuple(ordered))
 
     def only_frames(self) -> ErrorModel | None:
-        """Base and tool alone, if any of them is unknown."""
+        """Return the model with the unknowns of base and tool alone.
+
+        Returns:
+            Model of base and tool; None if neither is unknown.
+        """
         outside = (BASE_FRAME, self.chain.tool_frame_index)
-        kept = tuple(p for p in self.parameters if p.error_frame in outside)
-        return replace(self, parameters=kept) if kept else None
+        frame_parameters = tuple(p for p in self.parameters if p.error_frame in outside)
+        return replace(self, parameters=frame_parameters) if frame_parameters else None

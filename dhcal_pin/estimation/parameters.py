@@ -1,115 +1,167 @@
-"""Sets of error parameters, each a function from a chain to its parameters, and the choice among them."""
+"""Parameter sets: which errors of a robot are unknown.
+
+A parameter set is a function from a chain to its `ErrorParameter`s. Sets are combined by name, as in
+`--parameters minimal,base,tool`; parameters of the same name count once. `PARAMETER_SETS` lists all sets with
+one line of description each. To add a set: write such a function and add a row there.
+
+Geometric sets, for R revolute and P prismatic joints:
+
+- `dh`, `modified_dh`, `hayati`: the entries θ, d, a, α (and β) of Denavit-Hartenberg tables. Each is a twist
+  along or about an axis of the row, carried into the frames of the URDF by the adjoint.
+- `minimal`: 4R + 2P parameters. With `base` and `tool` this set is complete and free of redundancy: it has
+  the 4R + 2P + 6 independent directions of a serial robot (Mooring, Roth & Driels 1991).
+- `placement`: 6 parameters for each joint origin; complete, and redundant along and about the joint axes.
+- `base`, `tool`: 6 parameters each, outside the robot.
+- `offset`: the zero position of each joint.
+
+Sets of the transmission: one set for each of `robot.error_families.FAMILIES`.
+
+Redundant sets are allowed. The priors, or the rank cut, hold the directions that no data can determine.
+
+References:
+    B. W. Mooring, Z. S. Roth and M. R. Driels, Fundamentals of Manipulator Calibration, Wiley 1991.
+    S. A. Hayati, Robot Arm Geometric Link Parameter Estimation, CDC 1983.
+"""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from .. import se3
-from ..exceptions import DhcalError
+from ..exceptions import DhcalError, InvalidArgumentError, UnknownNameError
 from ..robot.chain import BASE_FRAME, Chain, extract_dh_table, joint_frame, link_frame, without_mimics
 from ..robot.dh import Convention
 from ..robot.error_families import COUPLING, FAMILIES
 from ..robot.transmission import COUPLING_PRIOR, COUPLING_TERM, TERM_FAMILIES, TERMS, Transmission
 from .error_model import ErrorModel, ErrorParameter
 
-# Standard deviations that manufacturing and assembly lead one to expect, and frames anywhere in a room.
-LENGTH_PRIOR, ANGLE_PRIOR, OFFSET_PRIOR = 1e-3, 5e-3, np.deg2rad(2.0)
+# Prior standard deviations of manufacturing and assembly errors: lengths [m], angles and joint offsets [rad].
+LENGTH_PRIOR = 1e-3
+ANGLE_PRIOR = 5e-3
+OFFSET_PRIOR = np.deg2rad(2.0)
+# Prior standard deviations of base and tool [m, rad]: anywhere in a room.
+FRAME_LENGTH_PRIOR = 10.0
+FRAME_ANGLE_PRIOR = 10.0
 
-
-FRAME_LENGTH_PRIOR, FRAME_ANGLE_PRIOR = 10.0, 10.0
-
-
-# A term of the transmission that nowhere exceeds this is none, rad or N·m: token masses load no joint.
+# Smallest maximum [rad or N·m] of a transmission term. A term that stays below is omitted: some URDFs have
+# links with token masses.
 MIN_TERM = 0.1
-
-
-# A joint's axis whose largest component is as near to one as this lies along an axis of its frame.
+# Difference to 1 of an axis' largest component below which the axis counts as an axis of its frame.
 AXIS_ALIGNMENT_TOL = 1e-5
+# Angle [rad] between joint axes below which `hayati` replaces d by β.
+MAX_PARALLEL_ANGLE = np.deg2rad(5.0)
 
-
-_AXES = np.eye(6)
+_FRAME_NAMES = ("x", "y", "z", "rx", "ry", "rz")
+_FRAME_UNITS = ("m", "m", "m", "rad", "rad", "rad")
+_FRAME_TWISTS = np.eye(6)
+_ZERO = (0.0, 0.0, 0.0)
 
 
 @functools.lru_cache(maxsize=16)
-def _dh_rows(chain: Chain, convention: Convention, hayati: bool) -> tuple[ErrorParameter, ...]:
-    found = extract_dh_table(without_mimics(chain), convention, hayati)
-    table = found.table
+def _dh_parameters(chain: Chain, convention: Convention, hayati: bool) -> tuple[ErrorParameter, ...]:
+    """Build the parameters of all rows of a chain's DH table."""
+    extraction = extract_dh_table(without_mimics(chain), convention, hayati)
+    table = extraction.table
     out = []
     k = len(chain.moving_joints)
-    # DH frames are given where the joint's axis is z; carry their twists into the URDF's own frame.
-    frames = np.concatenate([chain.axis_frames, np.eye(4)[None]])
+    # In DH frames the joint axis is z; the twists are carried into the frames of the URDF.
+    axis_frames = np.concatenate([chain.axis_frames, np.eye(4)[None]])
     for i in range(k):
-        along = chain.axes[i]
-        spin = (0.0, 0.0, 0.0, *map(float, along))
-        slide = (*map(float, along), 0.0, 0.0, 0.0)
+        axis = tuple(map(float, chain.axes[i]))
         if convention == "standard":
             axial, lateral = link_frame(i + 1), joint_frame(i + 2)
-            carry = frames[i + 2] @ found.frames[i]
+            carry = axis_frames[i + 2] @ extraction.frames[i]
         else:
             axial = lateral = joint_frame(i + 1)
-            carry = frames[i + 1] @ found.frames[i]
-        sideways = se3.adjoint(carry)
-        label = i + 1
-        rows = [
-            ErrorParameter(f"theta{label}", "rad", float(table.theta[i]), axial, spin, OFFSET_PRIOR),
-            ErrorParameter(f"d{label}", "m", float(table.d[i]), axial, slide, LENGTH_PRIOR),
-            ErrorParameter(f"a{label}", "m", float(table.a[i]), lateral, tuple(sideways[:, 0]), LENGTH_PRIOR),
-            ErrorParameter(
-                f"alpha{label}", "rad", float(table.alpha[i]), lateral, tuple(sideways[:, 3]), ANGLE_PRIOR
-            ),
+            carry = axis_frames[i + 1] @ extraction.frames[i]
+        # Columns: twists along and about the axes x, y, z of the DH frame.
+        twists = se3.adjoint(carry)
+        row = i + 1
+        theta, d = float(table.theta[i]), float(table.d[i])
+        a, alpha, beta = float(table.a[i]), float(table.alpha[i]), float(table.beta[i])
+        parameters = [
+            ErrorParameter(f"theta{row}", "rad", theta, axial, _ZERO + axis, OFFSET_PRIOR),
+            ErrorParameter(f"d{row}", "m", d, axial, axis + _ZERO, LENGTH_PRIOR),
+            ErrorParameter(f"a{row}", "m", a, lateral, tuple(twists[:, 0]), LENGTH_PRIOR),
+            ErrorParameter(f"alpha{row}", "rad", alpha, lateral, tuple(twists[:, 3]), ANGLE_PRIOR),
         ]
         if hayati and _is_nearly_parallel(chain, i, convention):
-            rows.append(
-                ErrorParameter(
-                    f"beta{label}", "rad", float(table.beta[i]), lateral, tuple(sideways[:, 4]), ANGLE_PRIOR
-                )
+            parameters.append(
+                ErrorParameter(f"beta{row}", "rad", beta, lateral, tuple(twists[:, 4]), ANGLE_PRIOR)
             )
-        out += rows if convention == "standard" else rows[2:] + rows[:2]
+        out += parameters if convention == "standard" else parameters[2:] + parameters[:2]
     return tuple(out)
 
 
 def _is_nearly_parallel(chain: Chain, i: int, convention: Convention) -> bool:
-    """Whether row i (from 0) stands between two axes within 5° of parallel."""
+    """Check whether the link of row i, counted from 0, joins two nearly parallel axes."""
     link = i + 1 if convention == "standard" else i
-    return 0 < link < len(chain.moving_joints) and abs(chain.link_transforms[link][2, 2]) > np.cos(
-        np.deg2rad(5.0)
-    )
+    if not 0 < link < len(chain.moving_joints):
+        return False
+    return abs(chain.link_transforms[link][2, 2]) > np.cos(MAX_PARALLEL_ANGLE)
 
 
 def dh(chain: Chain) -> list[ErrorParameter]:
-    """Standard DH, 4 a joint: θ, d, a, α of every row; the columns of the paper's R."""
-    return list(_dh_rows(chain, "standard", hayati=False))
+    """Build the entries θ, d, a, α of all rows of the standard DH table: the columns of the paper's R.
+
+    Args:
+        chain: Nominal chain.
+
+    Returns:
+        4 parameters per joint.
+    """
+    return list(_dh_parameters(chain, "standard", hayati=False))
 
 
 def modified_dh(chain: Chain) -> list[ErrorParameter]:
-    """Modified DH, 4 a joint: a, α of the link before each joint, then d, θ."""
-    return list(_dh_rows(chain, "modified", hayati=False))
+    """Build the entries a, α, d, θ of all rows of the modified DH table.
+
+    Args:
+        chain: Nominal chain.
+
+    Returns:
+        4 parameters per joint; a and α belong to the link before the joint.
+    """
+    return list(_dh_parameters(chain, "modified", hayati=False))
 
 
 def hayati(chain: Chain) -> list[ErrorParameter]:
-    """Standard DH with β in place of d between (nearly) parallel axes."""
-    rows = _dh_rows(chain, "standard", hayati=True)
-    swapped = {f"d{row.name[4:]}" for row in rows if row.name.startswith("beta")}
-    return [row for row in rows if row.name not in swapped]
+    """Build the entries of the standard DH table, with β in place of d between nearly parallel axes.
+
+    Args:
+        chain: Nominal chain.
+
+    Returns:
+        4 parameters per joint.
+    """
+    rows = _dh_parameters(chain, "standard", hayati=True)
+    replaced = {f"d{row.name[4:]}" for row in rows if row.name.startswith("beta")}
+    return [row for row in rows if row.name not in replaced]
 
 
-_NAMES = ("x", "y", "z", "rx", "ry", "rz")
-
-
-def _frame_parameters(prefix: str, station: int, length: float, angle: float) -> list[ErrorParameter]:
+def _frame_parameters(prefix: str, error_frame: int, length: float, angle: float) -> list[ErrorParameter]:
+    """Build three translations and three rotations of a frame, with prior standard deviations [m, rad]."""
     return [
-        ErrorParameter(f"{prefix}.{name}", unit, 0.0, station, tuple(axis), prior)
-        for name, unit, axis, prior in zip(
-            _NAMES, ("m",) * 3 + ("rad",) * 3, _AXES, (length,) * 3 + (angle,) * 3, strict=True
+        ErrorParameter(f"{prefix}.{name}", unit, 0.0, error_frame, tuple(twist), prior)
+        for name, unit, twist, prior in zip(
+            _FRAME_NAMES, _FRAME_UNITS, _FRAME_TWISTS, (length,) * 3 + (angle,) * 3, strict=True
         )
     ]
 
 
 def placement(chain: Chain) -> list[ErrorParameter]:
-    """Six a joint: every joint origin moves freely in its own frame."""
+    """Build three translations and three rotations of each joint origin, in its own frame.
+
+    Args:
+        chain: Nominal chain.
+
+    Returns:
+        6 parameters per joint.
+    """
     return [
         parameter
         for j, name in enumerate(chain.moving_joints)
@@ -118,99 +170,139 @@ def placement(chain: Chain) -> list[ErrorParameter]:
 
 
 def minimal(chain: Chain) -> list[ErrorParameter]:
-    """The axis line's own freedom: 4 a revolute joint, 2 a prismatic one.
+    """Build the independent errors of each joint's axis.
 
-    A joint origin moves in all directions but along and about its axis, which commute with the motion
-    and so pass on to the next joint, and at last to the tool. With `base` and `tool` the set is complete
-    and has no singular arm: 4R + 2P + 6 directions for R revolute and P prismatic joints.
+    A joint origin moves in all directions but along and about its axis. Those two commute with the joint's
+    motion; they pass on to the next joint, and from the last joint to the tool. A translation of a prismatic
+    joint's axis passes on in the same way.
+
+    Args:
+        chain: Nominal chain.
+
+    Returns:
+        4 parameters per revolute joint, 2 per prismatic joint.
     """
     out = []
-    for j, (name, axis, slides) in enumerate(
+    for j, (name, axis, is_prismatic) in enumerate(
         zip(chain.moving_joints, chain.axes, chain.prismatic, strict=True)
     ):
-        parts = [abs(part) for part in axis.tolist()]
-        if abs(max(parts) - 1) < AXIS_ALIGNMENT_TOL:
-            skip = parts.index(max(parts))
-            kept = [
+        components = [abs(component) for component in axis.tolist()]
+        error_frame = joint_frame(j + 1)
+        if abs(max(components) - 1) < AXIS_ALIGNMENT_TOL:
+            along = components.index(max(components))
+            parameters = [
                 p
-                for i, p in enumerate(_frame_parameters(name, joint_frame(j + 1), LENGTH_PRIOR, ANGLE_PRIOR))
-                if i % 3 != skip
+                for i, p in enumerate(_frame_parameters(name, error_frame, LENGTH_PRIOR, ANGLE_PRIOR))
+                if i % 3 != along
             ]
         else:
-            turn = chain.axis_frames[j + 1][:3, :3]
-            zero = (0.0, 0.0, 0.0)
-            u, v = (tuple(map(float, turn[:, i])) for i in (0, 1))
-            kept = [
-                ErrorParameter(f"{name}.u", "m", 0.0, joint_frame(j + 1), u + zero, LENGTH_PRIOR),
-                ErrorParameter(f"{name}.v", "m", 0.0, joint_frame(j + 1), v + zero, LENGTH_PRIOR),
-                ErrorParameter(f"{name}.ru", "rad", 0.0, joint_frame(j + 1), zero + u, ANGLE_PRIOR),
-                ErrorParameter(f"{name}.rv", "rad", 0.0, joint_frame(j + 1), zero + v, ANGLE_PRIOR),
+            # Two directions u, v across an axis that is not an axis of its frame.
+            rotation = chain.axis_frames[j + 1][:3, :3]
+            u, v = (tuple(map(float, rotation[:, i])) for i in (0, 1))
+            parameters = [
+                ErrorParameter(f"{name}.u", "m", 0.0, error_frame, u + _ZERO, LENGTH_PRIOR),
+                ErrorParameter(f"{name}.v", "m", 0.0, error_frame, v + _ZERO, LENGTH_PRIOR),
+                ErrorParameter(f"{name}.ru", "rad", 0.0, error_frame, _ZERO + u, ANGLE_PRIOR),
+                ErrorParameter(f"{name}.rv", "rad", 0.0, error_frame, _ZERO + v, ANGLE_PRIOR),
             ]
-        out += [parameter for parameter in kept if not (slides and parameter.unit == "m")]
+        out += [parameter for parameter in parameters if not (is_prismatic and parameter.unit == "m")]
     return out
 
 
 def offset(chain: Chain) -> list[ErrorParameter]:
-    """The zero of each moving joint, rad or m."""
+    """Build the offset of each moving joint's zero position.
+
+    Args:
+        chain: Nominal chain.
+
+    Returns:
+        1 parameter per joint [rad, or m if prismatic].
+    """
     out = []
-    for j, (name, axis, slides) in enumerate(
+    for j, (name, axis, is_prismatic) in enumerate(
         zip(chain.moving_joints, chain.axes, chain.prismatic, strict=True)
     ):
-        direction = tuple(map(float, axis))
-        zero = (0.0, 0.0, 0.0)
-        twist = direction + zero if slides else zero + direction
-        out.append(
-            ErrorParameter(
-                f"{name}.offset",
-                "m" if slides else "rad",
-                0.0,
-                joint_frame(j + 1),
-                twist,
-                LENGTH_PRIOR if slides else OFFSET_PRIOR,
-            )
-        )
+        unit, prior = ("m", LENGTH_PRIOR) if is_prismatic else ("rad", OFFSET_PRIOR)
+        twist = _joint_twist(axis.tolist(), is_prismatic)
+        out.append(ErrorParameter(f"{name}.offset", unit, 0.0, joint_frame(j + 1), twist, prior))
     return out
 
 
+def _joint_twist(axis: Sequence[float], is_prismatic: bool) -> tuple[float, ...]:
+    """Return the twist [v, ω] of a joint's own motion."""
+    return (*axis, *_ZERO) if is_prismatic else (*_ZERO, *axis)
+
+
 def base(chain: Chain) -> list[ErrorParameter]:
-    """Where the robot stands in the measuring frame, six."""
+    """Build the pose of the robot's base in the measuring frame.
+
+    Args:
+        chain: Nominal chain.
+
+    Returns:
+        6 parameters.
+    """
     return _frame_parameters("base", BASE_FRAME, FRAME_LENGTH_PRIOR, FRAME_ANGLE_PRIOR)
 
 
 def tool(chain: Chain) -> list[ErrorParameter]:
-    """Where the measured point sits on the tip, six."""
+    """Build the pose of the measured point in the tip frame.
+
+    Args:
+        chain: Nominal chain.
+
+    Returns:
+        6 parameters.
+    """
     return _frame_parameters("tool", chain.tool_frame_index, FRAME_LENGTH_PRIOR, FRAME_ANGLE_PRIOR)
 
 
 def _transmission_parameter(
     chain: Chain, coefficient: tuple[int, int, int], name: str, unit: str, prior: float
 ) -> ErrorParameter:
-    """A coefficient of the transmission, at the first joint on the path that the independent one moves."""
-    first = int(np.flatnonzero(chain.mimic_matrix[:, coefficient[1]])[0])
-    axis, zero = tuple(map(float, chain.axes[first])), (0.0, 0.0, 0.0)
-    twist = axis + zero if chain.prismatic[first] else zero + axis
-    held = 0.0 if chain.transmission is None else float(chain.transmission.coefficients[coefficient])
-    entry = int(np.ravel_multi_index(coefficient, (len(TERMS), chain.n_joints, chain.n_joints)))
-    return ErrorParameter(name, unit, held, link_frame(first + 1), twist, prior, entry)
+    """Build the parameter of one coefficient (term, joint, source joint) of the transmission."""
+    # The error acts at the first moving joint that the independent joint drives.
+    moving_joint = int(np.flatnonzero(chain.mimic_matrix[:, coefficient[1]])[0])
+    twist = _joint_twist(chain.axes[moving_joint].tolist(), chain.prismatic[moving_joint])
+    nominal = 0.0 if chain.transmission is None else float(chain.transmission.coefficients[coefficient])
+    index = int(np.ravel_multi_index(coefficient, (len(TERMS), chain.n_joints, chain.n_joints)))
+    return ErrorParameter(name, unit, nominal, link_frame(moving_joint + 1), twist, prior, index)
 
 
 def family(chain: Chain, name: str) -> list[ErrorParameter]:
-    """All terms of a family of `transmission.TERMS` at each joint that has them.
+    """Build the coefficients of all terms of a family of joint errors.
 
-    A term that is next to nothing wherever the arm stands, such as a vertical axis' load, is left out.
+    Terms that are negligible in all configurations are omitted, such as the gravity torque about a vertical
+    axis.
+
+    Args:
+        chain: Nominal chain.
+        name: One of `transmission.TERM_FAMILIES`.
+
+    Returns:
+        1 parameter for each term and joint that the family applies to.
     """
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (chain.n_joints, 64))
-    felt = np.abs(Transmission.zero(chain.loads).terms(q)).max(-1) > MIN_TERM
+    is_effective = np.abs(Transmission.zero(chain.loads).terms(q)).max(-1) > MIN_TERM
     return [
         _transmission_parameter(chain, (t, i, i), f"{joint}.{term.name}", term.unit, term.prior)
         for i, joint in enumerate(chain.joint_names)
         for t, term in enumerate(TERMS)
-        if term.family == name and felt[t, i] and (term.applies_to_prismatic or not chain.is_prismatic[i])
+        if term.family == name
+        and is_effective[t, i]
+        and (term.applies_to_prismatic or not chain.is_prismatic[i])
     ]
 
 
 def coupling(chain: Chain) -> list[ErrorParameter]:
-    """How far each revolute joint turns per unit of every other joint's value."""
+    """Build the rotation of each revolute joint per unit of every other joint's position.
+
+    Args:
+        chain: Nominal chain.
+
+    Returns:
+        1 parameter for each pair of a revolute joint and another joint [rad/rad or rad/m].
+    """
     return [
         _transmission_parameter(
             chain,
@@ -225,69 +317,116 @@ def coupling(chain: Chain) -> list[ErrorParameter]:
     ]
 
 
-PARAMETER_SETS: dict[str, Callable[[Chain], list[ErrorParameter]]] = {
-    "dh": dh,
-    "modified-dh": modified_dh,
-    "hayati": hayati,
-    "minimal": minimal,
-    "placement": placement,
-    "base": base,
-    "tool": tool,
-    "offset": offset,
-    **{name: functools.partial(family, name=name) for name in TERM_FAMILIES},
-    COUPLING: coupling,
+@dataclass(frozen=True)
+class ParameterSet:
+    """Parameter set that users select by name; calling it returns its parameters.
+
+    Attributes:
+        build: Function from a chain to the parameters of the set.
+        help: One line for help texts.
+    """
+
+    build: Callable[[Chain], list[ErrorParameter]]
+    help: str
+
+    def __call__(self, chain: Chain) -> list[ErrorParameter]:
+        """Build the parameters of the set.
+
+        Args:
+            chain: Nominal chain.
+
+        Returns:
+            Parameters of the set; empty if no joint has such errors.
+        """
+        return self.build(chain)
+
+
+PARAMETER_SETS: dict[str, ParameterSet] = {
+    "dh": ParameterSet(dh, "theta, d, a, alpha of the standard DH table"),
+    "modified-dh": ParameterSet(modified_dh, "a, alpha, d, theta of the modified DH table"),
+    "hayati": ParameterSet(hayati, "standard DH table, with beta in place of d between nearly parallel axes"),
+    "minimal": ParameterSet(minimal, "position and direction of each joint axis, without redundancy"),
+    "placement": ParameterSet(placement, "position and orientation of each joint origin, six per joint"),
+    "base": ParameterSet(base, "pose of the robot's base in the measuring frame"),
+    "tool": ParameterSet(tool, "pose of the measured point in the tip frame"),
+    "offset": ParameterSet(offset, "zero position of each joint"),
+    **{
+        name: ParameterSet(functools.partial(family, name=name), FAMILIES[name].description)
+        for name in TERM_FAMILIES
+    },
+    COUPLING: ParameterSet(coupling, FAMILIES[COUPLING].description),
 }
 
-
+# Sets that model selection may add.
 EXTENSIONS = tuple(FAMILIES)
 
 
 def select_parameters(
     chain: Chain, sets: str | Iterable[str], fix: Sequence[str] = (), free: Sequence[str] = ()
 ) -> ErrorModel:
-    """The union of named sets on a chain.
+    """Build the error model of a chain from named parameter sets.
 
     Args:
-        chain: the nominal chain.
-        sets: names, as a comma-separated text or one by one.
-        fix: parameters or whole sets held at nominal.
-        free: parameters of any set added one by one.
+        chain: Nominal chain.
+        sets: Keys of PARAMETER_SETS, comma-separated or one by one.
+        fix: Parameters or whole sets that are held at their nominal values.
+        free: Single parameters of any set that are added.
+
+    Returns:
+        Error model with the union of the sets.
 
     Raises:
-        DhcalError: an unknown set or parameter, one both fixed and freed, or nothing left to identify.
+        DhcalError: If a set has no parameters on this chain.
+        InvalidArgumentError: If a parameter is both fixed and freed, or no parameter is left.
+        UnknownNameError: If a set or parameter is unknown.
     """
     names = [s.strip() for s in sets.split(",")] if isinstance(sets, str) else list(sets)
-    unknown = [name for name in names if name not in PARAMETER_SETS]
-    if unknown:
-        raise DhcalError(f"unknown parameter set {unknown[0]!r}; choose from {', '.join(PARAMETER_SETS)}")
+    if unknown := [name for name in names if name not in PARAMETER_SETS]:
+        raise UnknownNameError(
+            f"unknown parameter set {unknown[0]!r}; choose from {', '.join(PARAMETER_SETS)}"
+        )
     if both := sorted({*fix} & {*free}):
-        raise DhcalError(f"{both[0]!r} is both fixed and freed; leave out one of the two")
-    found = {name: PARAMETER_SETS[name](chain) for name in names}
-    if empty := [name for name, parameters in found.items() if not parameters]:
+        raise InvalidArgumentError(f"{both[0]!r} is both fixed and freed; leave out one of the two")
+    parameters_by_set = {name: PARAMETER_SETS[name](chain) for name in names}
+    if empty := [name for name, parameters in parameters_by_set.items() if not parameters]:
         raise DhcalError(
             f"{chain.urdf.source}: no joint has parameters of the set {empty[0]!r}; "
             f"the set needs {FAMILIES[empty[0]].requirement}"
         )
-    pool = {p.name: p for parameters in found.values() for p in parameters}
-    fixed = set[str]()
-    for name in fix:
-        members = {p.name for p in PARAMETER_SETS[name](chain)} if name in PARAMETER_SETS else {name}
-        if not members & set(pool):
-            what = (
-                "none of its parameters is unknown here" if name in PARAMETER_SETS else "not a parameter here"
-            )
-            raise DhcalError(f"cannot fix {name!r}: {what}; there are {', '.join(pool)}")
-        fixed |= members
-    if missing := [name for name in free if name not in pool]:
-        every = {p.name: p for build in PARAMETER_SETS.values() for p in build(chain)}
-        for name in missing:
-            if name in PARAMETER_SETS:
-                raise DhcalError(f"cannot free {name!r}: it is a whole set; add it to the parameters")
-            if name not in every:
-                raise DhcalError(f"cannot free {name!r}: there are {', '.join(every)}")
-            pool[name] = every[name]
+    pool = {p.name: p for parameters in parameters_by_set.values() for p in parameters}
+    fixed = _fixed_names(chain, fix, pool)
+    pool |= _freed_parameters(chain, [name for name in free if name not in pool])
     fixed -= set(free)
-    chosen = [p for p in pool.values() if p.name not in fixed]
-    if not chosen:
-        raise DhcalError("no parameter is left to identify; fix fewer of them")
-    return ErrorModel(chain, (), tuple(p for p in pool.values() if p.name in fixed)).with_parameters(chosen)
+    free_parameters = [p for p in pool.values() if p.name not in fixed]
+    if not free_parameters:
+        raise InvalidArgumentError("no parameter is left to identify; fix fewer of them")
+    fixed_parameters = tuple(p for p in pool.values() if p.name in fixed)
+    return ErrorModel(chain, (), fixed_parameters).with_parameters(free_parameters)
+
+
+def _fixed_names(chain: Chain, fix: Sequence[str], pool: dict[str, ErrorParameter]) -> set[str]:
+    """Return the names of all fixed parameters; fixed sets are expanded."""
+    out = set[str]()
+    for name in fix:
+        is_set = name in PARAMETER_SETS
+        members = {p.name for p in PARAMETER_SETS[name](chain)} if is_set else {name}
+        if not members & set(pool):
+            problem = "none of its parameters is unknown" if is_set else "no such parameter"
+            raise UnknownNameError(f"cannot fix {name!r}: {problem}; choose from {', '.join(pool)}")
+        out |= members
+    return out
+
+
+def _freed_parameters(chain: Chain, names: Sequence[str]) -> dict[str, ErrorParameter]:
+    """Find single parameters among all sets."""
+    if not names:
+        return {}
+    parameters = {p.name: p for build in PARAMETER_SETS.values() for p in build(chain)}
+    for name in names:
+        if name in PARAMETER_SETS:
+            raise UnknownNameError(f"cannot free {name!r}: it is a whole set; add it to the parameters")
+        if name not in parameters:
+            raise UnknownNameError(
+                f"cannot free {name!r}: no such parameter; choose from {', '.join(parameters)}"
+            )
+    return {name: parameters[name] for name in names}

@@ -1,4 +1,22 @@
-"""How large errors are expected to be, before any measurement and after a fit."""
+"""Prior standard deviations of the errors, and their estimation from the data.
+
+Each parameter error x_i has a normal prior of mean zero and standard deviation σ_i. The prior enters the
+least-squares problem as one more row x_i/σ_i; its weight is 1/σ_i.
+
+Default priors state the order of magnitude only. `update_prior_scales` therefore estimates one factor per
+group of parameters by the evidence procedure (MacKay 1992). With the posterior variance s_i² of parameter i,
+the data determine the fraction γ_i = 1 - s_i²/σ_i² of it. The prior standard deviation of greatest evidence
+satisfies, in units of the expected one,
+
+    σ² = Σ x_i² / Σ γ_i
+
+and is iterated together with x. The expected value σ = 1 counts as EXPECTATION_COUNT further parameters,
+where the errors are smaller than expected. No prior becomes narrower than the narrowest expected one of its
+unit.
+
+References:
+    D. J. C. MacKay, Bayesian Interpolation, Neural Computation 4, 1992.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +28,7 @@ from typing import Literal
 import numpy as np
 
 from .._typing import Array
-from ..exceptions import DhcalError
+from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..robot.chain import BASE_FRAME
 from .error_model import ErrorModel
 from .problem import Problem
@@ -19,35 +37,57 @@ from .solver import SolverResult
 
 Priors = Literal["default", "none"] | Mapping[str, float]
 
-
-# Against narrower priors the expected size counts as much as so many errors that were found.
+# Number of determined parameters that the expected standard deviation counts for against smaller errors.
 EXPECTATION_COUNT = 0.5
 
 
 def prior_weights(errors: ErrorModel, priors: Priors) -> Array:
-    """One over each prior's sigma (p,), zero where there is none.
+    """Compute the reciprocal prior standard deviation of each parameter.
+
+    Args:
+        errors: Error model of p parameters.
+        priors: "default", "none", or standard deviations by parameter name or pattern that replace the
+            default ones, each in the unit of its parameter.
+
+    Returns:
+        Weights 1/σ of shape (p,); zero without a prior.
 
     Raises:
-        DhcalError: an unknown choice or name, or a sigma that is not positive.
+        InvalidArgumentError: If a standard deviation is not positive.
+        UnknownNameError: If the choice is unknown, or no parameter matches a name.
     """
     if isinstance(priors, str):
         if priors not in ("default", "none"):
-            raise DhcalError(f"priors {priors!r}: choose default, none, or sigmas by name")
+            raise UnknownNameError(
+                f"unknown priors {priors!r}; choose default, none, or standard deviations by name"
+            )
         return 1 / errors.priors if priors == "default" else np.zeros(len(errors.parameters))
     sigma = errors.priors.copy()
     names = [p.name for p in errors.parameters]
     for pattern, value in priors.items():
-        hit = [i for i, name in enumerate(names) if fnmatch.fnmatchcase(name, pattern)]
-        if not hit:
-            raise DhcalError(f"prior for {pattern!r}: no such parameter; there are {', '.join(names)}")
+        matches = [i for i, name in enumerate(names) if fnmatch.fnmatchcase(name, pattern)]
+        if not matches:
+            raise UnknownNameError(
+                f"prior for {pattern!r}: no such parameter; choose from {', '.join(names)}"
+            )
         if not value > 0:
-            raise DhcalError(f"prior for {pattern!r}: {value} must be positive, in its parameter's unit")
-        sigma[hit] = value
+            raise InvalidArgumentError(
+                f"prior for {pattern!r}: {value} must be positive, in the unit of the parameter"
+            )
+        sigma[matches] = value
     return 1 / sigma
 
 
 def has_default_prior(errors: ErrorModel, priors: Priors) -> Array:
-    """Which parameters (p,) have default priors."""
+    """Find the parameters that have default priors.
+
+    Args:
+        errors: Error model of p parameters.
+        priors: Choice of priors as for `prior_weights`.
+
+    Returns:
+        Flags of shape (p,).
+    """
     if isinstance(priors, str):
         return np.full(len(errors.parameters), priors == "default")
     return np.array([not any(fnmatch.fnmatchcase(p.name, key) for key in priors) for p in errors.parameters])
@@ -55,13 +95,13 @@ def has_default_prior(errors: ErrorModel, priors: Priors) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class PriorGroups:
-    """Parameters whose default priors share one scale: those of one unit and one expected size.
+    """Groups of parameters whose default priors share one scale: those of one unit and one expected size.
 
     Attributes:
-        members: (n,) the parameters.
-        group_index: (n,) which family each is of.
-        expected_weights: (f,) one over the size that a family's errors are expected to have.
-        max_weights: (f,) the largest of those in its unit.
+        members: Indices of the parameters in any group, shape (n,).
+        group_index: Group of each of them, shape (n,).
+        expected_weights: Reciprocal expected standard deviation of each group, shape (g,).
+        max_weights: Largest expected weight among the groups of the same unit, shape (g,).
     """
 
     members: Array
@@ -71,47 +111,63 @@ class PriorGroups:
 
     @classmethod
     def from_expected(cls, errors: ErrorModel, expected: Array, default: Array) -> PriorGroups:
-        """Of parameters (p,) with such expected weights that have default priors."""
+        """Group the parameters of the robot that have default priors; base and tool are left out.
+
+        Args:
+            errors: Error model of p parameters.
+            expected: Expected weights 1/σ of shape (p,) or longer.
+            default: Flags of the parameters with default priors, shape (p,).
+
+        Returns:
+            Groups in order of their first parameters.
+        """
         outside = (BASE_FRAME, errors.chain.tool_frame_index)
         inside = [i for i, p in enumerate(errors.parameters) if default[i] and p.error_frame not in outside]
+        # Angles of the geometry and of the transmission count as different units.
         units = [(errors.parameters[i].unit, errors.parameters[i].coefficient_index is None) for i in inside]
-        sizes = list(zip(units, expected[inside].tolist(), strict=True))
-        families = list(dict.fromkeys(sizes))
-        narrowest = [max(weight for unit, weight in families if unit == mine) for mine, _ in families]
+        keys = list(zip(units, expected[inside].tolist(), strict=True))
+        distinct = list(dict.fromkeys(keys))
+        max_weights = [max(weight for unit, weight in distinct if unit == own) for own, _ in distinct]
         return cls(
             np.array(inside, int),
-            np.array([families.index(size) for size in sizes], int),
-            np.array([weight for _, weight in families]),
-            np.array(narrowest),
+            np.array([distinct.index(key) for key in keys], int),
+            np.array([weight for _, weight in distinct]),
+            np.array(max_weights),
         )
 
     def groups(self) -> list[tuple[list[int], float]]:
-        """The members of each and its expected weight."""
+        """List the groups.
+
+        Returns:
+            Parameter indices and expected weight of each group.
+        """
         return [
-            (self.members[self.group_index == i].tolist(), w)
-            for i, w in enumerate(self.expected_weights.tolist())
+            (self.members[self.group_index == i].tolist(), weight)
+            for i, weight in enumerate(self.expected_weights.tolist())
         ]
 
 
-def update_prior_scales(problem: Problem, solution: SolverResult, families: PriorGroups) -> Array:
-    """The weights (p+s,) of priors as wide as the errors that were found.
+def update_prior_scales(problem: Problem, solution: SolverResult, groups: PriorGroups) -> Array:
+    """Estimate the scale of each group's priors from the errors in a solution (evidence procedure).
 
-    Default priors of one unit and one expected size have one scale, the one of greatest evidence
-    (MacKay 1992): the mean square of the errors over as many as the data and not the prior determine.
-    None gets narrower than the narrowest expectation of its unit, as offsets of no more than tilts' size.
-    Priors that are not default stay.
+    Args:
+        problem: Problem that was solved, in p robot errors and s instrument parameters.
+        solution: Its solution.
+        groups: Parameters whose priors are updated.
+
+    Returns:
+        New prior weights of shape (p+s,); priors outside the groups keep their weights.
     """
-    weights, members, family = problem.weights.copy(), families.members, families.group_index
+    weights, members, group_index = problem.weights.copy(), groups.members, groups.group_index
     if not len(members):
         return weights
-    expected, root = (
-        families.expected_weights,
-        posterior_sqrt_covariance(solution.system, problem.weights)[0][members],
-    )
-    told = 1 - np.einsum("ij,ij->i", root, root) * problem.weights[members] ** 2
-    found = np.bincount(family, solution.x[members] ** 2) * expected**2
-    count = np.bincount(family, told)
-    share = np.where(found <= count, EXPECTATION_COUNT, 0.0)
-    scaled = np.fmin(expected * np.sqrt((count + share) / (found + share)), families.max_weights)
-    weights[members] = scaled[family]
+    expected = groups.expected_weights
+    root = posterior_sqrt_covariance(solution.system, problem.weights)[0][members]
+    # γ: fraction of each parameter that the data determine.
+    determined = 1 - np.einsum("ij,ij->i", root, root) * problem.weights[members] ** 2
+    squares = np.bincount(group_index, solution.x[members] ** 2) * expected**2
+    count = np.bincount(group_index, determined)
+    extra = np.where(squares <= count, EXPECTATION_COUNT, 0.0)
+    updated = np.fmin(expected * np.sqrt((count + extra) / (squares + extra)), groups.max_weights)
+    weights[members] = updated[group_index]
     return weights

@@ -134,9 +134,9 @@ class TriangularSystem:
     """R factor of the whitened rows [J | r] at one x: ‖J·δ - r‖² = ‖R·δ - z‖² + min_cost.
 
     `batch_qr.TriangularSystemBatch` is the same for b problems. It has the members `r`, `z`, `min_cost`,
-    `cost`, `roundoff`, `residual_change` and `predicted_reduction`, too, with a leading axis b. The classes are
-    separate because a single system is solved by LAPACK's triangular routines, which NumPy does not offer for
-    stacks: a damped step with p = 24 takes seven times as long in a stack of one.
+    `cost`, `roundoff`, `residual_change` and `predicted_reduction`, too, with a leading axis b. The classes
+    are separate because a single system is solved by LAPACK's triangular routines, which NumPy does not offer
+    for stacks: a damped step with p = 24 takes seven times as long in a stack of one.
 
     Attributes:
         rows: [R z; 0 ρ], upper triangular, shape (p+1, p+1).

@@ -1,10 +1,30 @@
-"""What touching says nothing of: the size of the arm, and which way it is turned.
+"""Gauge of scale and orientation for measurements without a length.
 
-A tool that touches one thing again and again misses it by less the smaller the arm is modelled, so least
-squares would shrink the arm by some tenths of a percent, and by all of it where the sigmas are found with
-the fit. And as misses turn with the arm, they look as if they told how it is turned. They are therefore
-counted in the arm's size and along axes that turn with it: both are then left to whatever else was read, or
-to the priors.
+Contact measurements state that the tool touches the same unknown point, plane or sphere several times. Their
+residuals e (misses [m]) determine neither the size of the robot nor its orientation in the measuring frame:
+these are gauge freedoms (Triggs et al. 2000, section 9). Plain least squares would nevertheless use them,
+because all misses shrink with the size s of the modelled robot: the estimate would be too small by some
+tenths of a percent, or would collapse where the standard deviations are estimated, too.
+
+The residuals are therefore made invariant: they are divided by the size, and counted along axes that rotate
+with the robot,
+
+    e' = Rᵀ·e / s
+
+with the size s and the mean rotation R relative to the nominal robot. For an error x_i that makes the robot
+grow at the rate a_i and rotate at the rate w_i, the derivative of the whitened model is, at R = 1,
+
+    J'_i = (J_i + (a_i/s)·e + w_i × e) / s       with the sign convention J = -∂e/∂x of the rows [J | e].
+
+Size and orientation then have no effect on the cost, and remain to other measurements or to the priors.
+
+- Size: RMS distance of the tool from its mean position over c configurations, s = ρ/ρ_nominal.
+- Growth: a = Σ v·d / (c·ρ·ρ_nominal), with the tool velocity v per unit of the error and the distance d from
+  the mean position.
+- Rotation: w = K⁺·Σ d×v, the mean angular velocity, with the inertia K = Σ (|d|²·1 - d·dᵀ).
+
+References:
+    B. Triggs, P. McLauchlan, R. Hartley and A. Fitzgibbon, Bundle Adjustment - A Modern Synthesis, 2000.
 """
 
 from __future__ import annotations
@@ -16,17 +36,17 @@ import numpy as np
 from .._typing import Array
 from ..robot.chain import Chain
 
-# Configurations that tell how far an arm reaches.
-_SAMPLES = 100
+# Number of configurations at which size and rotation are evaluated.
+_N_SAMPLES = 100
 
 
 @dataclass(frozen=True, eq=False)
 class ScaleGauge:
-    """Measures an arm's size: how far the tool spreads about its middle, RMS, in units of the nominal arm's.
+    """Size of a robot and its rates of growth and rotation.
 
     Attributes:
-        q: joint values (c, n).
-        nominal: the nominal spread, m.
+        q: Joint positions of shape (c, n) [rad or m].
+        nominal: RMS distance of the nominal tool from its mean position [m].
     """
 
     q: Array
@@ -34,60 +54,81 @@ class ScaleGauge:
 
     @classmethod
     def from_configurations(cls, chain: Chain, q: Array) -> ScaleGauge:
-        """For readings at joint values (m, n), which are shuffled joint by joint."""
+        """Choose configurations by drawing each joint from the measured ones.
+
+        Args:
+            chain: Nominal chain.
+            q: Measured joint positions of shape (m, n) [rad or m].
+
+        Returns:
+            Gauge in which the nominal chain has size 1.
+        """
         rng = np.random.default_rng(0)
-        drawn = np.stack([rng.choice(column, _SAMPLES) for column in q.T], 1)
+        drawn = np.stack([rng.choice(column, _N_SAMPLES) for column in q.T], 1)
         return cls(drawn, _rms_radius(_centered(chain.forward_kinematics(drawn).tool[3])))
 
     def size(self, chain: Chain) -> float:
-        """Of an arm, the nominal one's being 1."""
-        return (
-            _rms_radius(_centered(chain.forward_kinematics(self.q).tool[3])) / self.nominal
-            if self.nominal
-            else 1.0
-        )
-
-    def rates(self, chain: Chain, bodies: Array, twists: Array) -> Array:
-        """How fast an arm grows, and turns on average in the measuring frame, with each of e errors (e, 4).
+        """Compute the size of a chain.
 
         Args:
-            chain: the arm.
-            bodies: (e,) what each error moves, as `Chain.tool_velocities` takes it.
-            twists: (e, 6) how.
+            chain: Chain with the joints of the nominal one.
+
+        Returns:
+            Size s; 1 for the nominal chain, and for a tool that does not move.
+        """
+        if not self.nominal:
+            return 1.0
+        return _rms_radius(_centered(chain.forward_kinematics(self.q).tool[3])) / self.nominal
+
+    def rates(self, chain: Chain, bodies: Array, twists: Array) -> Array:
+        """Compute the rates of growth and rotation per unit of each error.
+
+        Args:
+            chain: Chain at the current errors.
+            bodies: Body that each of e errors moves, shape (e,); see `Chain.tool_jacobian`.
+            twists: Twists of those bodies, shape (e, 6).
+
+        Returns:
+            Growth rate and mean angular velocity in the measuring frame, shape (e, 4).
         """
         rates = np.zeros((len(bodies), 4))
         if self.nominal:
             frames = chain.forward_kinematics(self.q)
-            out = _centered(frames.tool[3])
-            moved = chain.tool_jacobian(frames, bodies, twists)[:, :3]
-            rates[:, 0] = np.tensordot(moved, out) / (_SAMPLES * _rms_radius(out) * self.nominal)
-            inertia = np.vdot(out, out) * np.eye(3) - out @ out.T
-            rates[:, 1:] = np.cross(out[None], moved, axis=1).sum(-1) @ np.linalg.pinv(
+            offsets = _centered(frames.tool[3])
+            velocities = chain.tool_jacobian(frames, bodies, twists)[:, :3]
+            rates[:, 0] = np.tensordot(velocities, offsets) / (
+                _N_SAMPLES * _rms_radius(offsets) * self.nominal
+            )
+            inertia = np.vdot(offsets, offsets) * np.eye(3) - offsets @ offsets.T
+            rates[:, 1:] = np.cross(offsets[None], velocities, axis=1).sum(-1) @ np.linalg.pinv(
                 inertia, hermitian=True
             )
         return rates
 
 
 def _centered(points: Array) -> Array:
+    """Return the offsets of points (3, c) from their mean."""
     return points - points.mean(1, keepdims=True)
 
 
-def _rms_radius(out: Array) -> float:
-    return float(np.sqrt(np.vdot(out, out) / _SAMPLES))
+def _rms_radius(offsets: Array) -> float:
+    """Return the RMS length of offsets (3, c)."""
+    return float(np.sqrt(np.vdot(offsets, offsets) / _N_SAMPLES))
 
 
 def normalize_by_scale(block: Array, size: float, rates: Array, vectors: slice | None) -> None:
-    """Counts whitened misses and their derivatives in the arm's size and along axes that turn with it.
+    """Make whitened rows invariant to the size and the orientation of the robot.
 
     Args:
-        block: (p+1, k, m) derivatives of the whitened model, those by the robot's e errors first, and the
-            residual; changed in place.
-        size: of the arm.
-        rates: (e, 4) of `Ruler.rates`.
-        vectors: which of the k rows are a vector's, along the measuring frame's axes.
+        block: Rows [J | e] of shape (p+1, k, m), the derivatives by the robot errors first; changed in
+            place.
+        size: Size s of the chain.
+        rates: Result of `ScaleGauge.rates`, shape (e, 4).
+        vectors: Which of the k rows are components of a vector along the axes of the measuring frame; None if
+            there are none.
     """
     block /= size
-    missed = block[-1]
-    block[: len(rates)] += (rates[:, 0] / size)[:, None, None] * missed
+    residual = block[-1]
+    block[: len(rates)] += (rates[:, 0] / size)[:, None, None] * residual
     if vectors is not None:
-        block[: len(rates), vectors] += np.cross(rates[:, 1:, None], missed[None, vectors], axis=1)
+        block[: len(rates), vectors] += np.cross(rates[:, 1:, None], residual[None, vectors], axis=1)

@@ -1,8 +1,20 @@
-"""How well a calibrated arm is known, apart from the fit that told: predictions anywhere, also of a file.
+"""Uncertainty of a calibrated robot: the predicted covariance of its tool poses.
 
-Whatever was identified, all that an error does to the tool is to move the bodies of the path, or to change a
-coefficient of the transmission. So the errors' covariance is kept as one of such motions, which needs neither
-the parameter set nor the data.
+Every identified error moves one body of the chain by a twist, or changes one transmission coefficient. The
+covariance of the parameters is therefore stored as a covariance of body twists and coefficients, which
+depends neither on the parameter set nor on the data, and can be kept in a file. With the parameters'
+covariance S·Sᵀ and the matrix A from parameters to body twists and coefficients, the stored square root is
+A·S.
+
+At joint positions q with the tool Jacobian J(q) of those twists and coefficients, the covariance of the tool
+twist [v, ω] is, to first order,
+
+    C(q) = (J·A·S)·(J·A·S)ᵀ
+
+Noise of future measurements is not included. Directions that neither data nor priors determine are stored
+separately; a tool component that depends on them has infinite variance.
+
+Shapes: m samples, k moving joints, e uncertain transmission coefficients, r columns of the square root.
 """
 
 from __future__ import annotations
@@ -19,22 +31,22 @@ from ..robot.chain import Chain, link_frame, twists_in_bodies
 from .error_model import ErrorModel
 from .qr import RANK_RTOL
 
-# A parameter, or a metre and a radian of the tool, with more than this share of itself unseen is unknown.
+# Largest squared component in undetermined directions for which a variance counts as determined: of a
+# parameter, or of the tool [m² or rad²] per unit of those directions.
 UNBOUNDED_TOL = 1e-6
 
-
-# Configurations at which the motions of two sets of errors are compared.
+# Number of configurations at which the effects of two parameter sets are compared.
 N_MATCHING_SAMPLES = 200
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Tool poses of a calibrated arm, and how well they are known.
+    """Tool poses of a calibrated robot and their covariance.
 
     Attributes:
-        poses: (m, 4, 4) in the measuring frame.
-        covariance: (m, 6, 6) of the tool point's displacement [v, ω], m and rad, in axes of the
-            measuring frame; infinite on the diagonal where neither data nor a prior tell.
+        poses: Tool poses in the measuring frame, shape (m, 4, 4).
+        covariance: Covariance of the displacement [v, ω] of the tool point in axes of the measuring frame,
+            shape (m, 6, 6) [m and rad]; infinite on the diagonal where neither data nor priors determine it.
     """
 
     poses: Array
@@ -42,38 +54,45 @@ class Prediction:
 
     @property
     def position_std(self) -> Array:
-        """Root of the position's total variance (m,), m: the RMS distance to expect."""
+        """Expected RMS distance from the true position, shape (m,) [m]."""
         return np.sqrt(np.trace(self.covariance[:, :3, :3], axis1=1, axis2=2))
 
     @property
     def orientation_std(self) -> Array:
-        """Root of the rotation vector's total variance (m,), rad: the RMS angle to expect."""
+        """Expected RMS angle from the true orientation, shape (m,) [rad]."""
         return np.sqrt(np.trace(self.covariance[:, 3:, 3:], axis1=1, axis2=2))
 
 
 class Predictor(Protocol):
-    """What knows a calibrated arm and how well it is known: a `Result`, or what a file has kept of it."""
+    """Calibrated robot with uncertainty: a `Result`, or an `Uncertainty` from a file."""
 
     @property
     def chain(self) -> Chain:
-        """The calibrated arm."""
+        """Calibrated chain."""
         ...
 
     def predict(self, q: Array) -> Prediction:
-        """Its tool poses at joint values q (m, n), rad or m, and how well they are known."""
+        """Predict tool poses and their covariance.
+
+        Args:
+            q: Joint positions of shape (m, n) [rad or m].
+        """
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """A calibrated arm and the covariance of its errors.
+    """Calibrated chain and the covariance of its errors.
+
+    The rows of the square root are the twists [v, ω] of bodies 0 to k, then the e uncertain transmission
+    coefficients. Body 0, the base link, counts in axes of the measuring frame; the other bodies count in
+    their own link frames.
 
     Attributes:
-        chain: calibrated.
-        entries: (e,) of the transmission's flat coefficients that are uncertain.
-        sqrt_covariance: (6(k+1)+e, r) root of the covariance: of twists [v, ω] of the bodies' frames, the base link's
-            in the measuring frame and the others' in their own link's, then of the entries.
-        unbounded_directions: (6(k+1)+e, h) of the directions that neither data nor a prior tell.
+        chain: Calibrated chain.
+        entries: Indices of the uncertain coefficients in the flattened transmission, shape (e,).
+        sqrt_covariance: Square root of the covariance, shape (6(k+1)+e, r).
+        unbounded_directions: Directions that neither data nor priors determine, shape (6(k+1)+e, h).
     """
 
     chain: Chain
@@ -85,72 +104,84 @@ class Uncertainty:
     def from_errors(
         cls, errors: ErrorModel, x: Array, chain: Chain, sqrt_covariance: Array, unbounded_directions: Array
     ) -> Uncertainty:
-        """The uncertainty of identified errors.
+        """Transform the covariance of identified parameters.
 
         Args:
-            errors: the unknowns.
-            x: (p,) their values.
-            chain: the calibrated arm.
-            sqrt_covariance: (p, r) of the unknowns' covariance.
-            unbounded_directions: (p, h) of the directions of them that nothing tells.
+            errors: Error model of p parameters.
+            x: Identified values of shape (p,).
+            chain: Calibrated chain.
+            sqrt_covariance: Square root of the parameters' covariance, shape (p, r).
+            unbounded_directions: Undetermined directions of the parameters, shape (p, h).
+
+        Returns:
+            Uncertainty of the calibrated chain.
         """
         _, bodies, twists = errors.derivative(x)
-        count = len(chain.moving_joints) + 1
-        entries = bodies[bodies >= count] - count
-        plain = len(bodies) - len(entries)
-        # From the bodies' frames, whose z are the joints' axes, to the links' own and the measuring frame.
-        into = se3.adjoint(np.concatenate([chain.base[None], chain.axis_frames[1:]]))
-        motions = np.zeros((count, 6, len(bodies)))
-        motions[bodies[:plain], :, np.arange(plain)] = np.einsum(
-            "pij,pj->pi", into[bodies[:plain]], twists[:plain]
+        n_bodies = len(chain.moving_joints) + 1
+        entries = bodies[bodies >= n_bodies] - n_bodies
+        n_geometric = len(bodies) - len(entries)
+        # From body frames, whose z axes are the joint axes, to link frames and the measuring frame.
+        link_from_body = se3.adjoint(np.concatenate([chain.base[None], chain.axis_frames[1:]]))
+        body_twists = np.zeros((n_bodies, 6, len(bodies)))
+        body_twists[bodies[:n_geometric], :, np.arange(n_geometric)] = np.einsum(
+            "pij,pj->pi", link_from_body[bodies[:n_geometric]], twists[:n_geometric]
         )
-        rows = np.concatenate([motions.reshape(6 * count, -1), np.eye(len(bodies))[plain:]])
+        rows = np.concatenate([body_twists.reshape(6 * n_bodies, -1), np.eye(len(bodies))[n_geometric:]])
         return cls(chain, entries, rows @ sqrt_covariance, rows @ unbounded_directions)
 
     def of_parameters(self, errors: ErrorModel, scale: Array) -> tuple[Array, Array]:
-        """Root (p, r) of the covariance of this arm's p further errors, and what of them is hidden (p, h).
+        """Compute the covariance of further parameters of the calibrated chain.
 
-        They are told by what they do to the tool; what several of them do alike is shared out by their scale,
-        and what none of them does goes to those that come nearest.
+        Parameters are matched by their effect on the tool (least squares). Effects shared by several
+        parameters are distributed in proportion to `scale`; effects outside the parameters' span are
+        projected onto it.
 
         Args:
-            errors: unknowns of the calibrated arm.
-            scale: (p,) units to count them in, such as their priors' sigmas.
+            errors: Error model of p parameters on the calibrated chain.
+            scale: Units of the parameters, such as prior standard deviations, shape (p,).
+
+        Returns:
+            Square root of the covariance of x/scale, shape (p, r), and undetermined directions, shape (p, h).
         """
         q = np.random.default_rng(0).uniform(-np.pi, np.pi, (N_MATCHING_SAMPLES, self.chain.n_joints))
         chain, bodies, twists = errors.derivative(np.zeros(len(scale)))
-        moved = chain.tool_jacobian(chain.forward_kinematics(q), bodies, twists) * scale[:, None, None]
-        inverse = np.linalg.pinv(moved.reshape(len(scale), -1).T, rcond=RANK_RTOL)
-        carried = self._tool_jacobian(self.chain.forward_kinematics(q)).reshape(len(self.sqrt_covariance), -1)
-        told = inverse @ carried.T
-        return told @ self.sqrt_covariance, told @ self.unbounded_directions
+        effects = chain.tool_jacobian(chain.forward_kinematics(q), bodies, twists) * scale[:, None, None]
+        inverse = np.linalg.pinv(effects.reshape(len(scale), -1).T, rcond=RANK_RTOL)
+        own_effects = self._tool_jacobian(self.chain.forward_kinematics(q))
+        parameters_from_own = inverse @ own_effects.reshape(len(self.sqrt_covariance), -1).T
+        return parameters_from_own @ self.sqrt_covariance, parameters_from_own @ self.unbounded_directions
 
     def _tool_jacobian(self, frames: FrameBatch) -> Array:
-        """Of the tool (6(k+1)+e, 6, m) by each of the motions and entries, as `Chain.tool_velocities`."""
-        chain, count = self.chain, len(self.chain.moving_joints) + 1
-        carry = np.tile(np.eye(4), (count, 1, 1))
+        """Compute the tool twist per unit of each body twist and coefficient, shape (6(k+1)+e, 6, m)."""
+        chain, n_bodies = self.chain, len(self.chain.moving_joints) + 1
+        carry = np.tile(np.eye(4), (n_bodies, 1, 1))
         carry[0] = se3.inverse(chain.base)
-        stations = np.repeat([link_frame(j) for j in range(count)], 6)
-        bodies, twists = twists_in_bodies(chain, stations, np.tile(np.eye(6), (count, 1)), carry.repeat(6, 0))
+        error_frames = np.repeat([link_frame(j) for j in range(n_bodies)], 6)
+        bodies, twists = twists_in_bodies(
+            chain, error_frames, np.tile(np.eye(6), (n_bodies, 1)), carry.repeat(6, 0)
+        )
         return chain.tool_jacobian(
             frames,
-            np.concatenate([bodies, count + self.entries]),
+            np.concatenate([bodies, n_bodies + self.entries]),
             np.pad(twists, ((0, len(self.entries)), (0, 0))),
         )
 
     def predict(self, q: Array) -> Prediction:
-        """The calibrated tool poses at joint values q (m, n), rad or m, and how well they are known.
+        """Predict tool poses and their covariance.
 
-        The covariance is that of the identified errors carried to the tool to first order; noise of a
-        future measurement is not in it.
+        Args:
+            q: Joint positions of shape (m, n) [rad or m].
+
+        Returns:
+            Calibrated tool poses with the covariance of the identified errors.
         """
         frames = self.chain.forward_kinematics(q)
-        velocities = self._tool_jacobian(frames)
-        carried, lost = (
-            np.einsum("pim,pr->mir", velocities, part)
+        jacobian = self._tool_jacobian(frames)
+        root, undetermined = (
+            np.einsum("pim,pr->mir", jacobian, part)
             for part in (self.sqrt_covariance, self.unbounded_directions)
         )
-        covariance = carried @ np.swapaxes(carried, 1, 2)
-        rows, axes = np.nonzero(np.sum(lost**2, -1) > UNBOUNDED_TOL)
-        covariance[rows, axes, axes] = np.inf
+        covariance = root @ np.swapaxes(root, 1, 2)
+        samples, components = np.nonzero(np.sum(undetermined**2, -1) > UNBOUNDED_TOL)
+        covariance[samples, components, components] = np.inf
         return Prediction(frames.poses(), covariance)

@@ -20,7 +20,7 @@ from dhcal_pin.measurements.position import Position
 from dhcal_pin.robot.chain import Chain
 
 
-def rank(chain: Chain, sets: str, kind=Pose, m: int = 60) -> int:
+def rank(chain: Chain, sets: str, kind: type = Pose, m: int = 60) -> int:
     errors = select_parameters(chain, sets)
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (m, chain.n_joints))
     zero = np.zeros(len(errors.parameters))
