@@ -1,13 +1,13 @@
 """Public names of dhcal_pin; `__init__.py` loads each on first use."""
 
-from .calibration.partition import blocked_folds as blocked_folds
 from .calibration.cross_validation import cross_validate as cross_validate
-from .calibration.partition import k_fold as k_fold
-from .calibration.partition import leave_one_group_out as leave_one_group_out
 from .calibration.evaluation import accuracy as accuracy
 from .calibration.model_selection import extend as extend
-from .calibration.procedure import calibrate as calibrate
+from .calibration.partition import blocked_folds as blocked_folds
+from .calibration.partition import k_fold as k_fold
+from .calibration.partition import leave_one_group_out as leave_one_group_out
 from .calibration.partition import split as split
+from .calibration.procedure import calibrate as calibrate
 from .calibration.result import Result as Result
 from .calibration.streaming import calibrate_stream as calibrate_stream
 from .compensation import Compensation as Compensation

@@ -1,7 +1,9 @@
-"""Readings that are probably not what they say: a wrong unit, a row twice, a joint beyond its limits.
+"""Checks of measurement files before a fit, and of the errors of each file after it.
 
-These are doubts, not errors: nothing is changed or left out. They are told before anything is fitted, from
-the robot's nominal geometry, and hold wherever instrument and target are.
+The checks find values that are probably not what their header says: a wrong unit, a repeated row, a joint
+beyond its limits, mixed-up columns. They return warnings; nothing is changed or rejected. Before the fit they
+only use the nominal geometry of the robot and quantities that do not depend on where instrument and target
+are, such as the spread of positions or the angles between rotations.
 """
 
 from __future__ import annotations
@@ -16,258 +18,289 @@ from ..calibration.initialization import align
 from ..io.measurement_columns import ROTVEC, SECOND_PREFIX
 from ..io.measurement_csv import MeasurementFile
 from ..measurements.base import Measurement
+from ..measurements.columns import MAX_TOOL_OFFSET
 from ..robot.chain import Chain
 from ..units import ANGLES, LENGTHS
 from .column_mixups import diagnose_mixups, median_radius, orientation_misfit
 from .reachability import reach_sphere
 
-# Revolute joints do not turn more than this, rad, nor slides slide more than this, m.
+# Larger joint positions mean a wrong unit: no revolute joint turns further [rad], no prismatic joint slides
+# further [m].
 _MAX_TURN_RAD, _MAX_STROKE_M = 4 * np.pi, 20.0
-
-
-# How far beyond its limits a joint is read without a remark, rad or m.
+# Revolute joints in degrees whose positions lie all in this range are probably in radians [deg]: below, the
+# robot does not move; above, no joint limit in radians would allow it.
+_MIN_RADIANS_AS_DEG, _MAX_RADIANS_AS_DEG = 1.0, 2 * np.pi
+# In that case the measured positions spread by more than this factor farther than the modelled ones.
+_MIN_SPREAD_RATIO = 5.0
+# A joint may exceed its limits by this much without a warning [rad or m]; controllers round.
 _LIMIT_SLACK = 1e-3
-
-
-# How far a target may sit from the tip, and an instrument from the arm, m.
-_MAX_TOOL_OFFSET_M, _MAX_INSTRUMENT_DISTANCE_M = 1.0, 50.0
-
-
-# Lengths that no one sets up on purpose, m; sigmas that no instrument has, m and rad.
-_MIN_LENGTH_M, _MAX_SIGMA = 2e-3, {"length": 0.05, "angle": 0.2}
-
-
-# Half of the rotations differ by more than this from what the joints say, rad: another convention.
+# Larger standard deviations mean a wrong unit: no instrument is so coarse [m], [rad].
+_MAX_SIGMA = {"length": 0.05, "angle": 0.2}
+# Positions that spread farther than this factor times the reach mean a wrong unit.
+_MAX_SPREAD_RATIO = 3.0
+# Positions that spread this many times less than the modelled ones are probably in metres instead of
+# millimetres, if they fit the modelled ones after scaling with a smaller error than the second factor times
+# their spread.
+_MIN_SCALE, _MAX_SCALED_MISFIT = 50.0, 0.5
+# A rotation vector need not be longer than a turn; this much is left for rounding [rad].
+_ROTVEC_SLACK_RAD = 0.1
+# Half of the rotations differ by more than this from the robot's in another rotation convention [rad].
 _MAX_ORIENTATION_MISFIT_RAD = 0.35
-
-
-# A calibrated arm usually is nearer to its readings than this share of its reach, or angle in rad.
+# A calibrated robot usually has smaller errors than this share of its reach, and smaller ones than this angle
+# [rad].
 _MAX_RELATIVE_MISFIT, _MAX_MISFIT_RAD = 0.02, 0.1
-
-
-# Rows that the tests of geometry look at, at most.
+# Fewer positions or rotations than this cannot be compared.
+_MIN_SAMPLES = 3
+# Largest number of rows that the geometric checks use.
 _MAX_ROWS = 2000
+# Row numbers that a warning lists before it says how many more there are.
+_MAX_LISTED_ROWS = 5
 
 
 def find_input_warnings(chain: Chain, readings: MeasurementFile) -> list[str]:
-    """What is hard to believe in a file, a sentence each; an empty list for most files."""
-    joints = _joint_units(chain, readings)
-    out = [*joints.values(), *_small_joints(chain, readings)]
-    sizes = _sizes(chain, readings)
-    # With joint values in doubt, how they move and turn the tool says nothing about the readings.
-    moves = [] if out or sizes else diagnose_mixups(chain, readings.data)
-    turns = [] if out or moves else _turns(chain, readings)
-    out += [*sizes, *moves, *turns, *_outside(chain, readings, joints)]
-    return [*out, *_repeated(readings)]
+    """Find implausible values in a measurement file.
+
+    Args:
+        chain: Nominal robot.
+        readings: Measurement file.
+
+    Returns:
+        One sentence per warning; an empty list for most files.
+    """
+    joint_units = _check_joint_units(chain, readings)
+    joints = [*joint_units.values(), *_check_small_joints(chain, readings)]
+    lengths = _check_lengths(chain, readings)
+    # With implausible joint positions, the modelled motion says nothing about the measured values.
+    mixups = [] if joints or lengths else diagnose_mixups(chain, readings.data)
+    rotations = [] if joints or mixups else _check_rotations(chain, readings)
+    limits = _check_limits(chain, readings, joint_units)
+    return [*joints, *lengths, *mixups, *rotations, *limits, *_check_repeated_rows(readings)]
 
 
 def poorly_fitted_files(
     chain: Chain, data: Mapping[str, Measurement], known: Mapping[str, float]
 ) -> dict[str, list[str]]:
-    """Readings that stay far from the arm that was fitted to them and others, sentences by file.
+    """Find files whose errors remain large after a fit to them and others.
 
     Args:
-        chain: calibrated.
-        data: the fitted readings by file.
-        known: values of the instruments' unknowns by name, as found.
+        chain: Calibrated robot.
+        data: Fitted measurements by file.
+        known: Estimated values of the instrument parameters by name.
+
+    Returns:
+        Warnings by file, one sentence each; empty lists for well fitted files.
     """
-    _, radius = reach_sphere(chain)
-    bounds = {"orientation": _MAX_MISFIT_RAD}
+    _, reach = reach_sphere(chain)
+    limits = {"orientation": _MAX_MISFIT_RAD}
     out: dict[str, list[str]] = {path: [] for path in data}
-    for (path, item), found in zip(
+    for (path, item), all_errors in zip(
         data.items(), compute_errors(chain, list(data.values()), known), strict=True
     ):
         names = {unknown.name for unknown in item.instrument_parameters if not unknown.is_local}
-        shared = [
+        sharing = [
             other
             for other in data
-            if other != path and names & {u.name for u in data[other].instrument_parameters}
+            if other != path and names & {unknown.name for unknown in data[other].instrument_parameters}
         ]
-        for what, errors in found.items():
-            usual = float(np.median(np.linalg.norm(errors, axis=1)))
-            if usual <= bounds.get(what, _MAX_RELATIVE_MISFIT * radius):
+        for group, errors in all_errors.items():
+            median = float(np.median(np.linalg.norm(errors, axis=1)))
+            if median <= limits.get(group, _MAX_RELATIVE_MISFIT * reach):
                 continue
-            text = f"after the fit, {what} is usually {_size(usual, what)} off; check robot, tip and columns"
-            if shared:
-                text += f", and whether its {min(names).split('.')[0]} is that of {' and '.join(shared)}"
+            size = f"{np.rad2deg(median):.3g} deg" if group == "orientation" else f"{1e3 * median:.3g} mm"
+            text = (
+                f"after the fit, the median {group} error is {size}; check the robot, the tip and the columns"
+            )
+            if sharing:
+                instrument = min(names).split(".")[0]
+                text += f", and whether {instrument} is the same one as in {' and '.join(sharing)}"
             out[path].append(text)
     return out
 
 
-def _size(value: float, what: str) -> str:
-    return f"{np.rad2deg(value):.3g} deg" if what == "orientation" else f"{1e3 * value:.3g} mm"
-
-
-def _configurations_per_row(readings: MeasurementFile) -> list[Array]:
-    """Joint values (m, n) of each configuration of a row."""
+def _joint_positions_by_configuration(readings: MeasurementFile) -> list[Array]:
+    """Return the joint positions (m, n) of each configuration of a row."""
     data = readings.data
     return np.split(data.configurations(), data.configurations_per_row) if data.configurations_per_row else []
 
 
 def _subsample(count: int) -> Array:
+    """Return indices of at most _MAX_ROWS rows, evenly spaced."""
     return np.unique(np.linspace(0, count - 1, min(count, _MAX_ROWS)).astype(int))
 
 
 def _format_as_written(value: float, unit: str) -> str:
-    """A value in SI as it stood in the file."""
+    """Return a value in m or rad as it is written in a file with another unit."""
     factor = {**LENGTHS, **ANGLES}.get(unit, 1.0)
     return f"{value * factor:.4g} {unit}".rstrip()
 
 
-def _rows(readings: MeasurementFile, mask: Array) -> str:
-    """`row 3` or `rows 3, 5, 8 and 4 more`."""
+def _format_rows(readings: MeasurementFile, mask: Array) -> str:
+    """Return a text such as `row 3` or `rows 3, 5, 8, 9, 12 and 4 more`."""
     rows = [str(row) for row in readings.data.rows[mask]]
-    more = f" and {len(rows) - 5} more" if len(rows) > 5 else ""
-    return f"row{'s' if len(rows) > 1 else ''} {', '.join(rows[:5])}{more}"
+    listed, more = rows[:_MAX_LISTED_ROWS], len(rows) - _MAX_LISTED_ROWS
+    return f"row{'s' if len(rows) > 1 else ''} {', '.join(listed)}" + (
+        f" and {more} more" if more > 0 else ""
+    )
 
 
-def _joint_units(chain: Chain, readings: MeasurementFile) -> dict[str, str]:
-    """Joints that cannot have moved as far as their column says, by the column's name."""
+def _check_joint_units(chain: Chain, readings: MeasurementFile) -> dict[str, str]:
+    """Return warnings about joints that cannot move as far as their columns say, by column name."""
     out: dict[str, str] = {}
-    for before, q in zip(("", SECOND_PREFIX), _configurations_per_row(readings), strict=False):
+    for prefix, q in zip(("", SECOND_PREFIX), _joint_positions_by_configuration(readings), strict=False):
         for j, name in enumerate(chain.joint_names):
-            slides = chain.urdf.joint(name).type == "prismatic"
-            most, unit = float(np.max(np.abs(q[:, j]), initial=0.0)), readings.units[before + name]
-            if most > (_MAX_STROKE_M if slides else _MAX_TURN_RAD):
-                far = "far for a slide" if slides else f"{most / (2 * np.pi):.1f} turns"
-                out[before + name] = (
-                    f"joint {before + name} goes to {_format_as_written(most, unit)}, {far}; "
-                    f"if these are {'mm' if slides else 'degrees'}, say so in its unit"
+            is_prismatic = chain.urdf.joint(name).type == "prismatic"
+            largest, unit = float(np.max(np.abs(q[:, j]), initial=0.0)), readings.units[prefix + name]
+            if largest > (_MAX_STROKE_M if is_prismatic else _MAX_TURN_RAD):
+                problem = (
+                    "too far for a prismatic joint" if is_prismatic else f"{largest / (2 * np.pi):.1f} turns"
+                )
+                true_unit, short = ("millimetres", "mm") if is_prismatic else ("degrees", "deg")
+                out[prefix + name] = (
+                    f"joint {prefix + name} reaches {_format_as_written(largest, unit)}, {problem}; "
+                    f"if the values are {true_unit}, write [{short}] in the header"
                 )
     return out
 
 
-def _small_joints(chain: Chain, readings: MeasurementFile) -> list[str]:
-    """Radians in columns of degrees: no joint moves, but the tool does."""
-    ends = _configurations_per_row(readings)
-    turning = [
+def _check_small_joints(chain: Chain, readings: MeasurementFile) -> list[str]:
+    """Return a warning if columns in degrees hold radians: no joint moves, but the tool does."""
+    configurations = _joint_positions_by_configuration(readings)
+    revolute = [
         j
         for j, name in enumerate(chain.joint_names)
         if chain.urdf.joint(name).type != "prismatic" and readings.units.get(name) == "deg"
     ]
-    if not ends or not turning:
+    if not configurations or not revolute:
         return []
-    most = float(np.max(np.abs(np.concatenate(ends)[:, turning]), initial=0.0)) * ANGLES["deg"]
-    if not 1.0 < most <= 2 * np.pi:
+    largest = float(np.max(np.abs(np.concatenate(configurations)[:, revolute]), initial=0.0)) * ANGLES["deg"]
+    if not _MIN_RADIANS_AS_DEG < largest <= _MAX_RADIANS_AS_DEG:
         return []
-    seen, index = readings.data.positions(), _subsample(len(ends[0]))
-    if len(seen) and median_radius(seen[index]) < 5 * median_radius(chain.poses(ends[0][index])[:, :3, 3]):
-        return []
+    positions, index = readings.data.positions(), _subsample(len(configurations[0]))
+    if len(positions):
+        modelled = chain.poses(configurations[0][index])[:, :3, 3]
+        if median_radius(positions[index]) < _MIN_SPREAD_RATIO * median_radius(modelled):
+            return []
     return [
-        f"no joint goes further than {most:.3g} deg, so the arm hardly moves; "
-        "if these are radians, write [rad] for [deg]"
+        f"no joint moves beyond {largest:.3g} deg, so the robot hardly moves; "
+        "if the values are radians, write [rad] instead of [deg] in the header"
     ]
 
 
-def _sizes(chain: Chain, readings: MeasurementFile) -> list[str]:
-    """Lengths that are far too long or far too short for this arm."""
-    _, radius = reach_sphere(chain)
-    out = _position_sizes(chain, readings, radius)
-    for name, what in readings.data.columns.items():
-        if name not in readings.values or what == "text" or name in ("x", "y", "z", *ROTVEC):
+def _check_lengths(chain: Chain, readings: MeasurementFile) -> list[str]:
+    """Return warnings about lengths that are too long or too short for the robot, and about large sigmas."""
+    _, reach = reach_sphere(chain)
+    out = _check_position_spread(chain, readings, reach)
+    data = readings.data
+    for name, quantity in data.columns.items():
+        if name not in readings.values or quantity == "text":
             continue
-        size, unit = np.abs(readings.values[name]), readings.units.get(name, "")
-        usual, most = float(np.median(size)), float(size.max())
-        if "sigma" in name:
-            if usual > _MAX_SIGMA[what]:
+        values, unit = np.abs(readings.values[name]), readings.units.get(name, "")
+        median, largest = float(np.median(values)), float(values.max())
+        if name.startswith("sigma_"):
+            if median > _MAX_SIGMA[quantity]:
                 out.append(
-                    f"{name} is {_format_as_written(usual, unit)}: no instrument is that coarse; check its unit"
+                    f"{name} is {_format_as_written(median, unit)}, more than that of any instrument; "
+                    "check its unit"
                 )
-        elif what == "length":
-            # Ends of a known distance are both within reach; a wire may come from across the hall.
-            limit = (
-                2 * (radius + _MAX_TOOL_OFFSET_M) if name[0] == "d" else radius + _MAX_INSTRUMENT_DISTANCE_M
-            )
-            if usual > limit:
+        elif (limits := data.plausible_range(name, reach)) is not None:
+            smallest_plausible, largest_plausible = limits
+            if median > largest_plausible:
                 out.append(
-                    f"{name} is {_format_as_written(usual, unit)}, and the arm reaches {radius:.2g} m; "
-                    "if these are mm, say so in its unit"
+                    f"{name} is {_format_as_written(median, unit)}, but the robot reaches {reach:.2g} m; "
+                    f"if the values are millimetres, write {name}[mm]"
                 )
-            elif 0 < most < _MIN_LENGTH_M and readings.data.configurations_per_row < 2:
+            elif 0 < largest < smallest_plausible:
                 out.append(
-                    f"{name} is {_format_as_written(most, unit)} at most; if these are metres, write {name}[m]"
+                    f"{name} is at most {_format_as_written(largest, unit)}; "
+                    f"if the values are metres, write {name}[m]"
                 )
     return out
 
 
-def _position_sizes(chain: Chain, readings: MeasurementFile, radius: float) -> list[str]:
-    """Positions spread wider than the arm reaches, or as the arm moves but a hundred times smaller."""
-    seen = readings.data.positions()
-    if len(seen) < 3:
+def _check_position_spread(chain: Chain, readings: MeasurementFile, reach: float) -> list[str]:
+    """Return a warning if positions spread farther than the robot reaches, or too little by a unit."""
+    positions = readings.data.positions()
+    if len(positions) < _MIN_SAMPLES:
         return []
-    index = _subsample(len(seen))
-    seen, unit = seen[index], readings.units.get("x", "")
-    moved, extent = chain.poses(readings.data.q[index])[:, :3, 3], median_radius(seen)
-    if extent > 3 * (radius + _MAX_TOOL_OFFSET_M):
+    index = _subsample(len(positions))
+    positions, unit = positions[index], readings.units.get("x", "")
+    modelled, spread = chain.poses(readings.data.q[index])[:, :3, 3], median_radius(positions)
+    if spread > _MAX_SPREAD_RATIO * (reach + MAX_TOOL_OFFSET):
         return [
-            f"the positions lie {_format_as_written(extent, unit)} around their middle, and the arm reaches "
-            f"{radius:.2g} m; if they are mm, write x[mm],y[mm],z[mm]"
+            f"the positions spread {_format_as_written(spread, unit)} around their centre, but the robot "
+            f"reaches {reach:.2g} m; if they are millimetres, write x[mm],y[mm],z[mm]"
         ]
-    wanted = median_radius(moved)
-    if 0 < extent < wanted / 50 and align(seen * (wanted / extent), moved)[1] < 0.5 * wanted:
+    modelled_spread = median_radius(modelled)
+    if not 0 < spread < modelled_spread / _MIN_SCALE:
+        return []
+    scaled_misfit = align(positions * (modelled_spread / spread), modelled)[1]
+    if scaled_misfit < _MAX_SCALED_MISFIT * modelled_spread:
         return [
-            f"the positions lie {_format_as_written(extent, unit)} around their middle where the arm moves its tip by "
-            f"{_format_as_written(wanted, unit)}; if they are metres, write x[m],y[m],z[m]"
+            f"the positions spread {_format_as_written(spread, unit)} around their centre, but the robot "
+            f"moves its tip by {_format_as_written(modelled_spread, unit)}; if they are metres, write "
+            "x[m],y[m],z[m]"
         ]
     return []
 
 
-def _turns(chain: Chain, readings: MeasurementFile) -> list[str]:
-    """Rotation vectors longer than a turn, and rotations that do not turn as the joints do."""
+def _check_rotations(chain: Chain, readings: MeasurementFile) -> list[str]:
+    """Return a warning about rotation vectors longer than a turn, or rotations that do not fit the joints."""
     vectors = [readings.values[name] for name in ROTVEC if name in readings.values]
     unit = readings.units.get("rx", "")
-    if len(vectors) == 3 and unit and (longest := np.linalg.norm(vectors, axis=0).max()) > 2 * np.pi + 0.1:
-        return [
-            f"a rotation vector rx,ry,rz is {_format_as_written(longest, unit)} long, more than a turn; "
-            "if these are degrees write [deg], and Euler angles need a map (--columns)"
-        ]
-    turned = readings.data.rotations()
-    if len(turned) < 3:
+    if len(vectors) == 3 and unit:
+        longest = np.linalg.norm(vectors, axis=0).max()
+        if longest > 2 * np.pi + _ROTVEC_SLACK_RAD:
+            return [
+                f"a rotation vector rx,ry,rz has the length {_format_as_written(longest, unit)}, more than a "
+                "turn; if the values are degrees, write [deg]; Euler angles need a column map (--columns)"
+            ]
+    measured = readings.data.rotations()
+    if len(measured) < _MIN_SAMPLES:
         return []
-    index = _subsample(len(turned))
-    modelled = chain.poses(readings.data.q[index])[:, :3, :3]
-    off = orientation_misfit(modelled, turned[index])
-    if off <= _MAX_ORIENTATION_MISFIT_RAD:
+    index = _subsample(len(measured))
+    misfit = orientation_misfit(chain.poses(readings.data.q[index])[:, :3, :3], measured[index])
+    if misfit <= _MAX_ORIENTATION_MISFIT_RAD:
         return []
     return [
-        f"the measured rotations are usually {np.rad2deg(off):.0f} deg off this arm's wherever instrument "
-        "and target are; check unit, order of a quaternion, axes and frame of Euler angles, "
-        "rows of a matrix, and the tip"
+        f"the measured rotations differ from this robot by {np.rad2deg(misfit):.0f} deg (median, with the "
+        "best base and target); check the unit, the order of a quaternion, the axes and frame of Euler "
+        "angles, the rows of a matrix, and the tip"
     ]
 
 
-def _outside(chain: Chain, readings: MeasurementFile, known: Container[str]) -> list[str]:
-    """Joint values beyond the robot's limits, but for columns whose unit is in doubt anyhow."""
+def _check_limits(chain: Chain, readings: MeasurementFile, reported: Container[str]) -> list[str]:
+    """Return warnings about joints beyond their limits, except for columns that are reported already."""
     out = []
-    for before, q in zip(("", SECOND_PREFIX), _configurations_per_row(readings), strict=False):
+    for prefix, q in zip(("", SECOND_PREFIX), _joint_positions_by_configuration(readings), strict=False):
         for j, name in enumerate(chain.joint_names):
-            low, high = chain.lower[j], chain.upper[j]
-            beyond = (q[:, j] < low - _LIMIT_SLACK) | (q[:, j] > high + _LIMIT_SLACK)
-            if beyond.any() and before + name not in known:
-                unit = readings.units[before + name]
+            lower, upper = chain.lower[j], chain.upper[j]
+            is_beyond = (q[:, j] < lower - _LIMIT_SLACK) | (q[:, j] > upper + _LIMIT_SLACK)
+            if is_beyond.any() and prefix + name not in reported:
+                unit = readings.units[prefix + name]
                 out.append(
-                    f"joint {before + name} is beyond its limits, {_format_as_written(low, unit)} to "
-                    f"{_format_as_written(high, unit)}, in {_rows(readings, beyond)}; check sign, offset and unit"
+                    f"joint {prefix + name} is beyond its limits, {_format_as_written(lower, unit)} to "
+                    f"{_format_as_written(upper, unit)}, in {_format_rows(readings, is_beyond)}; "
+                    "check its sign, zero and unit"
                 )
     return out
 
 
-def _repeated(readings: MeasurementFile) -> list[str]:
-    """Rows with the same joint values and the same readings."""
-    columns: list[Array] = [column for q in _configurations_per_row(readings) for column in q.T]
+def _check_repeated_rows(readings: MeasurementFile) -> list[str]:
+    """Return a warning about rows with the same joint positions and the same measured values."""
+    columns: list[Array] = [column for q in _joint_positions_by_configuration(readings) for column in q.T]
     columns += [np.asarray(values) for values in readings.values.values()]
     if not columns or not len(columns[0]):
         return []
-    # Texts and numbers alike by their place in the sorted column.
+    # Ranks, as columns of texts and of numbers cannot be stacked.
     keys = np.stack([np.unique(column, return_inverse=True)[1] for column in columns], -1)
     first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)[1:]
-    again = np.ones(len(keys), bool)
-    again[first] = False
-    if not again.any():
+    is_repeated = np.ones(len(keys), bool)
+    is_repeated[first] = False
+    if not is_repeated.any():
         return []
-    example = int(np.flatnonzero(again)[0])
-    source = int(readings.data.rows[first[inverse[example]]])
+    example = int(np.flatnonzero(is_repeated)[0])
+    original = int(readings.data.rows[first[inverse[example]]])
     return [
-        f"{_rows(readings, again)}: the same as others to the last digit (row "
-        f"{readings.data.rows[example]} as row {source}); a copied reading counts twice"
+        f"{_format_rows(readings, is_repeated)}: identical to other rows in every digit (row "
+        f"{readings.data.rows[example]} to row {original}); a copied measurement counts twice, remove it"
     ]

@@ -1,4 +1,13 @@
-"""Rows that cannot be: found from the robot's own geometry before anything is fitted."""
+"""Rows of a measurement file that are impossible for the robot's geometry, found before anything is fitted.
+
+For a robot whose base and tool are known, the joint positions of a row give the position p of the tool point.
+A row is impossible if a measured or commanded position z is much farther from p than in typical rows:
+
+    |z - p| > max(20·median|z - p|, share·R),     R: largest distance of the tool point from the shoulder
+
+The reason that is reported says whether the position is out of reach, or with which joint positions the robot
+would reach it.
+"""
 
 from __future__ import annotations
 
@@ -12,25 +21,50 @@ from ..io.measurement_csv import MeasurementFile
 from ..robot.chain import Chain
 from ..robot.inverse_kinematics import position_task, solve_ik, without_rotary_limits
 
-# A row is impossible only if it is this many times as far off as the typical row, and by more than a share
-# of the tool's distance from the shoulder: so far no controller strays, and no arm is wrong.
-MAX_TYPICAL_RATIO, MAX_COMMANDED_OFFSET, MAX_MEASURED_OFFSET = 20.0, 0.01, 0.05
+# An impossible row is this many times as far off as the typical row.
+MAX_TYPICAL_RATIO = 20.0
+# It is also farther off than these shares of R: no controller deviates by 1 % from its command, and the
+# geometry of no robot is wrong by 5 %.
+MAX_COMMANDED_OFFSET, MAX_MEASURED_OFFSET = 0.01, 0.05
+# Rounding of a position that equals the modelled one [m].
+EXACT_POSITION_TOL = 1e-6
+# Joint positions that agree to this many decimals [rad or m] are one pose, at which measurements were
+# repeated.
+POSE_DECIMALS = 3
+# Two axes with a smaller sine between them, or a distance [m] smaller than this, are regarded as meeting.
+AXIS_TOL = 1e-9
+# Initial joint positions of a solution: the typical ones, and this many random ones within ±1.5 rad or m.
+N_RANDOM_STARTS, START_RANGE = 63, 1.5
+# Largest remaining position error of a solution [m].
+SOLUTION_TOL = 1e-6
 
 
 @dataclass(frozen=True)
 class UnreachableRow:
-    """A row that cannot be: its number (from 1), by how much (m), and why in words."""
+    """Row of a file that is impossible.
+
+    Attributes:
+        row: Row number in the file, from 1.
+        error: Distance between the position and the one at the row's joint positions [m].
+        reason: Explanation for users, without a full stop.
+    """
 
     row: int
-    size: float
+    error: float
     reason: str
 
 
 def reach_sphere(chain: Chain) -> tuple[Array, float]:
-    """A fixed point (3,) in the measuring frame and how far from it the tool can get, m.
+    """Return the centre and radius of a sphere that the tool point cannot leave.
 
-    The point moves up the chain as long as the next origin lies on the axis just passed: for most arms
-    it is the shoulder. Sliding joints add their longest stroke, and an endless one an infinite reach.
+    The centre moves up the chain as long as the next origin lies on the axis just passed. For most robots it
+    is the shoulder. Prismatic joints add their longest stroke; one without limits makes the radius infinite.
+
+    Args:
+        chain: Robot, base and tool included.
+
+    Returns:
+        Centre in the measuring frame, (3,) [m], and radius [m].
     """
     origins = np.concatenate([chain.origins[:-1], (chain.origins[-1] @ chain.tool)[None]])
     frame = chain.base @ origins[0]
@@ -38,65 +72,86 @@ def reach_sphere(chain: Chain) -> tuple[Array, float]:
     for j in range(1, len(chain.moving_joints)):
         step = origins[j][:3, 3]
         off_axis = step - (step @ chain.axes[j - 1]) * chain.axes[j - 1]
-        if chain.prismatic[j - 1] or np.linalg.norm(off_axis) > 1e-9:
+        if chain.prismatic[j - 1] or np.linalg.norm(off_axis) > AXIS_TOL:
             break
-        # Turning about the axis leaves points on it where they are.
+        # A rotation about the axis does not move points on the axis.
         frame = frame @ se3.translation(step)
         first = j + 1
-        if np.linalg.norm(np.cross(chain.axes[j - 1], _next_axis(chain, j))) > 1e-9:
+        next_axis = chain.origins[j][:3, :3] @ chain.axes[j]
+        if np.linalg.norm(np.cross(chain.axes[j - 1], next_axis)) > AXIS_TOL:
             break
-    stroke = np.max(np.abs(np.stack([chain.lower, chain.upper])), 0)
-    # Not infinite, as other joints' zeros in the mixing would make it NaN.
-    moving = np.abs(chain.mimic_matrix) @ np.where(np.isfinite(stroke), stroke, np.inf).clip(max=1e300)
-    slides = float(np.sum(moving[chain.prismatic]))
-    return frame[:3, 3], float(np.linalg.norm(origins[first:, :3, 3], axis=1).sum()) + slides
-
-
-def _next_axis(chain: Chain, j: int) -> Array:
-    return chain.origins[j][:3, :3] @ chain.axes[j]
+    limits = np.max(np.abs(np.stack([chain.lower, chain.upper])), 0)
+    # Large instead of infinite, as zeros of the mimic matrix times infinity would be NaN.
+    strokes = np.abs(chain.mimic_matrix) @ np.where(np.isfinite(limits), limits, np.inf).clip(max=1e300)
+    stroke = float(np.sum(strokes[chain.prismatic]))
+    return frame[:3, 3], float(np.linalg.norm(origins[first:, :3, 3], axis=1).sum()) + stroke
 
 
 def solve_position(chain: Chain, target: Array, near: Array) -> Array | None:
-    """Joint values (n,) that put the tool point at target (3,), nearest to `near` (n,), or None."""
+    """Find joint positions that move the tool point to a position.
+
+    Args:
+        chain: Robot, base and tool included.
+        target: Position in the measuring frame, (3,) [m].
+        near: Joint positions, (n,) [rad or m]; the nearest of the solutions found is returned.
+
+    Returns:
+        Joint positions, (n,) [rad or m], or None if no solution is found.
+    """
     rng = np.random.default_rng(0)
-    start = np.concatenate([near[None], rng.uniform(-1.5, 1.5, (63, chain.n_joints))])
-    q, left = solve_ik(without_rotary_limits(chain), position_task(np.broadcast_to(target, (64, 3))), start)
+    starts = rng.uniform(-START_RANGE, START_RANGE, (N_RANDOM_STARTS, chain.n_joints))
+    targets = np.broadcast_to(target, (N_RANDOM_STARTS + 1, 3))
+    starts = np.concatenate([near[None], starts])
+    q, errors = solve_ik(without_rotary_limits(chain), position_task(targets), starts)
     q = np.where(chain.is_prismatic, q, (q + np.pi) % (2 * np.pi) - np.pi)
-    good = np.flatnonzero(left < 1e-6)
+    good = np.flatnonzero(errors < SOLUTION_TOL)
     return q[good[np.argmin(np.abs(q[good] - near).sum(1))]] if good.size else None
 
 
 def find_unreachable_rows(chain: Chain, readings: MeasurementFile) -> list[UnreachableRow]:
-    """Impossible rows of a file, for a chain whose base and tool are known, in row order."""
+    """Find the impossible rows of a file.
+
+    Args:
+        chain: Robot whose base and tool are known.
+        readings: Measurement file, with positions or with commanded positions.
+
+    Returns:
+        The impossible rows in the order of the file.
+    """
     found: dict[int, UnreachableRow] = {}
     centre, radius = reach_sphere(chain)
-    typical = np.median(readings.data.q, 0)
-    modelled = chain.poses(readings.data.q)[:, :3, 3]
-    size = np.linalg.norm(modelled - centre, axis=1).max(initial=0.0)
-    # Readings repeated at one pose are typical of that pose only.
-    distinct = np.unique(np.round(readings.data.q, 3), axis=0, return_index=True)[1]
-    places = [("measured", readings.data.positions(), MAX_MEASURED_OFFSET)]
+    q = readings.data.q
+    modelled = chain.poses(q)[:, :3, 3]
+    extent = np.linalg.norm(modelled - centre, axis=1).max(initial=0.0)
+    # One row of each pose: measurements repeated at one pose are typical of that pose only.
+    distinct = np.unique(np.round(q, POSE_DECIMALS), axis=0, return_index=True)[1]
+    checks = [("measured", readings.data.positions(), MAX_MEASURED_OFFSET)]
     if readings.commanded is not None:
-        places.insert(0, ("commanded", readings.commanded, MAX_COMMANDED_OFFSET))
-    for what, position, share in places:
-        if not len(position):
+        checks.insert(0, ("commanded", readings.commanded, MAX_COMMANDED_OFFSET))
+    for what, positions, share in checks:
+        if not len(positions):
             continue
-        off = np.linalg.norm(position - modelled, axis=1)
-        far = np.linalg.norm(position - centre, axis=1)
-        for i in np.flatnonzero(off > max(MAX_TYPICAL_RATIO * float(np.median(off[distinct])), share * size)):
-            if i + 1 in found or off[i] < 1e-6:
+        errors = np.linalg.norm(positions - modelled, axis=1)
+        limit = max(MAX_TYPICAL_RATIO * float(np.median(errors[distinct])), share * extent)
+        for i in np.flatnonzero(errors > limit):
+            if i + 1 in found or errors[i] < EXACT_POSITION_TOL:
                 continue
-            reason = f"its joint values lead {1e3 * off[i]:.0f} mm away from the {what} position"
-            if far[i] > radius:
+            reason = f"its joint positions lead {1e3 * errors[i]:.0f} mm away from the {what} position"
+            distance = np.linalg.norm(positions[i] - centre)
+            if distance > radius:
                 reason += (
-                    f", which lies {1e3 * far[i]:.1f} mm from the shoulder of an arm that reaches "
+                    f", which is {1e3 * distance:.1f} mm from the shoulder although the robot reaches "
                     f"{1e3 * radius:.1f} mm"
                 )
-            elif (solved := solve_position(chain, position[i], typical)) is not None:
-                values = ", ".join(
-                    f"{1e3 * v:.2f} mm" if slides else f"{np.rad2deg(v):.2f}°"
-                    for v, slides in zip(solved, chain.is_prismatic, strict=True)
-                )
-                reason += f", which the arm reaches with ({values})"
-            found[int(i) + 1] = UnreachableRow(int(i) + 1, float(off[i]), reason)
+            elif (solution := solve_position(chain, positions[i], np.median(q, 0))) is not None:
+                reason += f", which the robot reaches with ({_format_joints(chain, solution)})"
+            found[int(i) + 1] = UnreachableRow(int(i) + 1, float(errors[i]), reason)
     return [found[row] for row in sorted(found)]
+
+
+def _format_joints(chain: Chain, q: Array) -> str:
+    """Return joint positions (n,) as a text in degrees and millimetres."""
+    return ", ".join(
+        f"{1e3 * value:.2f} mm" if is_prismatic else f"{np.rad2deg(value):.2f}°"
+        for value, is_prismatic in zip(q, chain.is_prismatic, strict=True)
+    )

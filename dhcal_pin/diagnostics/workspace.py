@@ -1,4 +1,14 @@
-"""How far to trust a calibrated arm over its workspace: position uncertainty and errors, cell by cell."""
+"""Predicted accuracy of a calibrated robot over its workspace, beside measured errors.
+
+The covariance of the estimated parameters predicts the standard deviation of the tool position in any
+configuration. `predict_workspace` returns it for single configurations, `workspace_map` by cells of the
+workspace:
+
+    std = √(mean of std_i² over the configurations i whose tool point lies in the cell)
+
+A position is reached in many configurations, and not equally well in all of them. Errors that the model lacks
+come on top of the prediction; the measured errors of a cell contain them.
+"""
 
 from __future__ import annotations
 
@@ -7,31 +17,79 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .. import se3
 from .._typing import Array
 from ..calibration.evaluation import position_errors
 from ..estimation.uncertainty import Predictor
 from ..measurements.base import Measurement
-from ..robot.sampling import ConfigurationSampler, WorkspaceConstraints
+from ..robot.sampling import ConfigurationSampler, WorkspaceConstraints, joint_range
 
-# Configurations that a map is made of, and predictions made at once.
-SAMPLES, CHUNK = 20_000, 2000
+# Configurations of a prediction by configurations, and of a map by cells.
+N_PREDICTED_CONFIGURATIONS, N_MAP_CONFIGURATIONS = 16_000, 20_000
+# Predictions that are computed at once; more need more memory and are not faster.
+CHUNK_SIZE = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class WorkspacePrediction:
+    """Predicted accuracy in single configurations.
+
+    Attributes:
+        points: Tool points in the base frame of s configurations all over the joint ranges, (s, 3) [m].
+        std: Predicted standard deviations of their positions, (s,) [m]; infinite if not determined.
+        measured: Tool points of the measured samples in the base frame, (m, 3) [m].
+        measured_std: Predicted standard deviations of their positions, (m,) [m].
+    """
+
+    points: Array
+    std: Array
+    measured: Array
+    measured_std: Array
+
+
+def predict_workspace(model: Predictor, data: Sequence[Measurement]) -> WorkspacePrediction:
+    """Predict the accuracy in configurations all over the joint ranges, and in the measured ones.
+
+    Args:
+        model: Calibration, or what its sidecar file contains of it.
+        data: Measurements.
+
+    Returns:
+        Tool points and their standard deviations.
+    """
+    n = model.chain.n_joints
+    drawn = np.random.default_rng(0).uniform(*joint_range(model.chain), (N_PREDICTED_CONFIGURATIONS, n))
+    measured = [item.configurations() for item in data if item.configurations_per_row > 0]
+    base_from_measuring = se3.inverse(model.chain.base)
+
+    def predict(q: Array) -> tuple[Array, Array]:
+        if not len(q):
+            return np.empty((0, 3)), np.empty(0)
+        predictions = [model.predict(part) for part in np.array_split(q, -(-len(q) // CHUNK_SIZE))]
+        points = np.concatenate([one.poses[:, :3, 3] for one in predictions])
+        points = points @ base_from_measuring[:3, :3].T + base_from_measuring[:3, 3]
+        return points, np.concatenate([one.position_std for one in predictions])
+
+    return WorkspacePrediction(
+        *predict(drawn), *predict(np.concatenate(measured) if measured else np.empty((0, n)))
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class WorkspaceMap:
-    """Predicted position uncertainty by cells of the workspace.
+    """Predicted and measured accuracy by cells of the workspace.
 
     Attributes:
-        centre: (c, 3) middles of the cells that the tool reaches, m, in the measuring frame.
-        size: the cells' side, m.
-        std: (c,) RMS distance to expect between the tool and where the model has it, over the configurations
-            that reach the cell, m; infinite where it cannot be told.
-        worst: (c,) the largest of them, m.
-        count: (c,) configurations that were looked at.
-        readings: (c,) positions that were measured there.
-        measured: (c,) RMS distance between these and where the model has them, m; NaN where there is none.
-        expected: (c,) predicted RMS distance at these very configurations, m; NaN where there is none. The
-            instrument's noise comes on top.
+        centre: Centres of the c cells that the tool reaches, in the measuring frame, (c, 3) [m].
+        size: Side of the cells [m].
+        std: Predicted RMS distance between tool and model over the configurations that reach the cell, (c,)
+            [m]; infinite if it is not determined.
+        worst: Largest predicted distance of these configurations, (c,) [m].
+        count: Number of configurations, (c,).
+        readings: Number of measured positions, (c,).
+        measured: RMS distance between measured and modelled positions, (c,) [m]; NaN without measurements.
+        expected: Predicted RMS distance in the measured configurations, without the noise of the instrument,
+            (c,) [m]; NaN without measurements.
     """
 
     centre: Array
@@ -49,52 +107,53 @@ def workspace_map(
     data: Sequence[Measurement] = (),
     known: Mapping[str, float] | None = None,
     cell: float = 0.1,
-    samples: int = SAMPLES,
+    samples: int = N_MAP_CONFIGURATIONS,
     seed: int = 0,
 ) -> WorkspaceMap:
-    """The predicted position uncertainty of a calibrated arm wherever its tool can be.
-
-    The same place is reached in many ways, and not equally well: each cell's figures are over configurations
-    drawn evenly from the joints' range.
+    """Predict the position uncertainty of a calibrated robot by cells of its workspace.
 
     Args:
-        model: a calibration, or what a file has kept of it.
-        data: measurements to judge it by; those that are no positions are passed over.
-        known: values of their instruments' unknowns; others are fitted to the data.
-        cell: side of a cell, m.
-        samples: how many configurations.
-        seed: of their choice.
+        model: Calibration, or what its sidecar file contains of it.
+        data: Measurements to compare with; kinds without positions are ignored.
+        known: Values of their instrument parameters by name; others are fitted to the data.
+        cell: Side of a cell [m].
+        samples: Number of configurations, drawn evenly from the joint ranges.
+        seed: Seed of the draw.
+
+    Returns:
+        The cells that the tool reaches.
     """
-    room = ConfigurationSampler.from_chain(model.chain, WorkspaceConstraints(), 0.0, 0.0)
-    points, square = _predicted(model, room.draw(samples, np.random.default_rng(seed)))
+    sampler = ConfigurationSampler.from_chain(model.chain, WorkspaceConstraints(), 0.0, 0.0)
+    points, variances = _predict_positions(model, sampler.draw(samples, np.random.default_rng(seed)))
     q, errors = position_errors(model.chain, data, known)
-    there, expected = _predicted(model, q)
-    every = np.floor(np.concatenate([points, there]) / cell).astype(int)
-    cells, which = np.unique(every, axis=0, return_inverse=True)
-    which = which.reshape(-1)
+    measured_points, measured_variances = _predict_positions(model, q)
+    keys = np.floor(np.concatenate([points, measured_points]) / cell).astype(int)
+    cells, index = np.unique(keys, axis=0, return_inverse=True)
+    index = index.reshape(-1)
+    measured_index = index[len(points) :]
+    all_variances = np.concatenate([variances, measured_variances])
     worst = np.zeros(len(cells))
-    np.maximum.at(worst, which, np.sqrt(np.concatenate([square, expected])))
-    seen = which[len(points) :]
+    np.maximum.at(worst, index, np.sqrt(all_variances))
     return WorkspaceMap(
         centre=(cells + 0.5) * cell,
         size=cell,
-        std=_rms(which, np.concatenate([square, expected]), len(cells)),
+        std=_root_mean(index, all_variances, len(cells)),
         worst=worst,
-        count=np.bincount(which),
-        readings=np.bincount(seen, minlength=len(cells)),
-        measured=_rms(seen, errors**2, len(cells)),
-        expected=_rms(seen, expected, len(cells)),
+        count=np.bincount(index),
+        readings=np.bincount(measured_index, minlength=len(cells)),
+        measured=_root_mean(measured_index, errors**2, len(cells)),
+        expected=_root_mean(measured_index, measured_variances, len(cells)),
     )
 
 
-def _predicted(model: Predictor, q: Array) -> tuple[Array, Array]:
-    """Tool points (m, 3) and the predicted square distances (m,) at joint values (m, n)."""
-    found = [model.predict(part) for part in np.array_split(q, len(q) // CHUNK + 1)]
-    points = np.concatenate([one.poses[:, :3, 3] for one in found])
-    return points, np.concatenate([one.position_std for one in found]) ** 2
+def _predict_positions(model: Predictor, q: Array) -> tuple[Array, Array]:
+    """Return tool points (m, 3) [m] and the variances (m,) [m²] of their positions."""
+    predictions = [model.predict(part) for part in np.array_split(q, len(q) // CHUNK_SIZE + 1)]
+    points = np.concatenate([one.poses[:, :3, 3] for one in predictions])
+    return points, np.concatenate([one.position_std for one in predictions]) ** 2
 
 
-def _rms(which: Array, square: Array, count: int) -> Array:
-    """Root of the mean square by cell (c,); NaN where there is none."""
+def _root_mean(index: Array, squares: Array, count: int) -> Array:
+    """Return the root of the mean of squares (m,) by cell, (count,); NaN for cells without any."""
     with np.errstate(invalid="ignore"):
-        return np.sqrt(np.bincount(which, square, count) / np.bincount(which, minlength=count))
+        return np.sqrt(np.bincount(index, squares, count) / np.bincount(index, minlength=count))

@@ -7,14 +7,8 @@ from dataclasses import dataclass
 
 from ..calibration.evaluation import Comparison
 from ..calibration.result import Result
-from ..diagnostics.residuals import (
-    JointProfile,
-    Outlier,
-    Workspace,
-    joint_offset_profiles,
-    outliers,
-    workspace,
-)
+from ..diagnostics.residuals import JointProfile, Outlier, find_outliers, joint_offset_profiles
+from ..diagnostics.workspace import WorkspacePrediction, predict_workspace
 from .document import Provenance, short_names
 
 
@@ -34,7 +28,7 @@ class ReportContext:
     source: Provenance
     outliers: Sequence[Outlier]
     joint_profiles: Sequence[JointProfile]
-    workspace: Workspace
+    workspace: WorkspacePrediction
 
     @classmethod
     def from_result(cls, fit: Result, source: Provenance) -> ReportContext:
@@ -47,7 +41,8 @@ class ReportContext:
         Returns:
             The context.
         """
-        return cls(fit, source, outliers(fit), joint_offset_profiles(fit), workspace(fit, fit.data))
+        workspace = predict_workspace(fit, fit.data)
+        return cls(fit, source, find_outliers(fit), joint_offset_profiles(fit), workspace)
 
     @property
     def data_names(self) -> list[str]:

@@ -18,7 +18,8 @@ from .. import se3
 from .._typing import Array
 from ..calibration.evaluation import GROUP_UNITS, compute_errors, error_norms
 from ..calibration.summary import GROUP_LABELS
-from ..diagnostics.residuals import JointProfile, Workspace
+from ..diagnostics.residuals import JointProfile
+from ..diagnostics.workspace import WorkspacePrediction
 from ..estimation import qr
 from ..formatting import format_quantity
 from ..robot.chain import Chain
@@ -199,7 +200,7 @@ def _joint_error_group(context: ReportContext, svg: SvgPanels) -> FigureGroup:
         plot = partial(
             plots.plot_errors_over_joint,
             profile.values,
-            profile.sizes,
+            profile.error_norms,
             joint=profile.name,
             is_prismatic=profile.is_prismatic,
             quantity=quantity,
@@ -275,7 +276,7 @@ def workspace_figures(context: ReportContext) -> list[FigureGroup]:
     return workspace_maps(context.workspace)
 
 
-def workspace_maps(workspace: Workspace) -> list[FigureGroup]:
+def workspace_maps(workspace: WorkspacePrediction) -> list[FigureGroup]:
     """Draw maps of the predicted standard deviation of the tool position from above and from the side.
 
     Args:

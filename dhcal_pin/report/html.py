@@ -16,7 +16,7 @@ from ..calibration import summary
 from ..calibration.evaluation import Comparison
 from ..calibration.result import Result
 from ..calibration.summary import GROUP_LABELS, STATISTIC_LABELS
-from ..diagnostics.residuals import Workspace
+from ..diagnostics.workspace import WorkspacePrediction
 from ..exceptions import InvalidArgumentError
 from ..formatting import format_quantity
 from ..io.atomic import write_files
@@ -91,7 +91,7 @@ def html_page(context: ReportContext) -> str:
     return _render(f"Calibration of {context.robot_name}", shown, _header(context))
 
 
-def map_page(title: str, workspace: Workspace, sentences: Sequence[str]) -> str:
+def map_page(title: str, workspace: WorkspacePrediction, sentences: Sequence[str]) -> str:
     """Render a page with maps of the predicted accuracy.
 
     Args:

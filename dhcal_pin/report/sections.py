@@ -17,7 +17,7 @@ from .. import formatting
 from ..calibration import summary
 from ..calibration.estimates import Estimate
 from ..calibration.model_selection import trial_table
-from ..diagnostics.residuals import sigmas
+from ..diagnostics.residuals import median_sigmas
 from ..estimation import robust
 from ..formatting import Table, format_fixed, format_quantity
 from ..robot.chain import BASE_FRAME
@@ -340,7 +340,7 @@ def _outlier_section(context: ReportContext) -> Section:
     for outlier in context.outliers[:MAX_OUTLIERS]:
         errors = ", ".join(
             format_quantity(value, "rad" if group == "orientation" else "m", value / 10, small=True)
-            for group, value in outlier.sizes.items()
+            for group, value in outlier.error_norms.items()
         )
         rows.append([names[outlier.item], str(outlier.row), errors, f"{outlier.score:.0f}"])
     threshold = f"{robust.OUTLIER_THRESHOLD:g}"
@@ -378,7 +378,7 @@ def _data_table(context: ReportContext) -> Table:
     for name, item in zip(context.holdout_names, fit.holdout, strict=True):
         n_holdout[name] = n_holdout.get(name, 0) + len(item.rows)
     rows = []
-    for name, item, sigma in zip(context.data_names, fit.data, sigmas(fit), strict=True):
+    for name, item, sigma in zip(context.data_names, fit.data, median_sigmas(fit), strict=True):
         origin = "stated" if item.has_stated_sigma else ("estimated" if fit.method == "lm" else "assumed")
         values = ", ".join(
             f"{group} {format_quantity(value, 'rad' if group == 'orientation' else 'm', value, small=True)}"

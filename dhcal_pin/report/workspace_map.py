@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ..calibration.evaluation import position_errors
-from ..diagnostics import residuals
-from ..diagnostics.workspace import WorkspaceMap, workspace_map
+from ..diagnostics.workspace import WorkspaceMap, predict_workspace, workspace_map
 from ..estimation.uncertainty import Predictor
 from ..exceptions import DhcalError
 from ..io.tabular import csv_text
@@ -50,7 +49,7 @@ def map_content(
             + (f"included; {rms[1]} are predicted without it." if len(rms) > 1 else "included.")
         )
     title = f"Where {model.chain.model.name or 'the robot'} can be trusted"
-    return map_page(title, residuals.workspace(model, data), sentences)
+    return map_page(title, predict_workspace(model, data), sentences)
 
 
 def map_text(found: WorkspaceMap) -> str:

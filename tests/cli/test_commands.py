@@ -614,7 +614,7 @@ def test_validate_names_impossible_rows_and_counts_them(run, place):
     assert (status, found["samples"]) == (0, 8)
     assert found["after"]["position_rms_m"] == pytest.approx(np.sqrt(np.mean(off**2)), rel=1e-9)
     assert [text.split(": ")[1] for text in found["warnings"]] == ["row 7", "row 8"]
-    assert "warning: row 7: its joint values lead 1095 mm away" in err
+    assert "warning: row 7: its joint positions lead 1095 mm away" in err
     assert run("validate", URDF / "experiment.dh.toml", table, "--fit-frames")[2].count("warning: row") == 0
 
 

@@ -142,7 +142,7 @@ def test_what_is_hard_to_believe_of_a_robot_is_told(place, capsys):
     said = capsys.readouterr().err.splitlines()
     (line,) = [line for line in said if "warning:" in line]
     assert "warning: wrong.csv: " in line
-    assert "joint joint_3 moving the other way" in line
+    assert "the opposite sign of joint joint_3" in line
     first, second = csv.DictReader(Path("summary.csv").read_text().splitlines())
     assert first["message"] == ""
     assert "joint_3" in second["message"]

@@ -72,9 +72,9 @@ def test_right_units_bring_up_nothing(told, ur10, kind, joint, length):
 @pytest.mark.parametrize(
     ("units", "word"),
     [
-        ({"joint": ("rad", "deg")}, "if these are degrees, say so"),
-        ({"joint": ("deg", "rad")}, "if these are radians, write [rad]"),
-        ({"length": ("m", "mm")}, "if they are mm, write x[mm]"),
+        ({"joint": ("rad", "deg")}, "if the values are degrees, write [deg]"),
+        ({"joint": ("deg", "rad")}, "if the values are radians, write [rad]"),
+        ({"length": ("m", "mm")}, "if they are millimetres, write x[mm]"),
         ({"length": ("mm", "m")}, "if they are metres, write x[m]"),
     ],
 )
@@ -83,11 +83,12 @@ def test_a_wrong_unit_is_told_once(told, ur10, kind, units, word):
     wrong = {name: pair[1] for name, pair in units.items()}
     found = told(ur10, sheet(ur10, joints(ur10), kind=kind, wrong=wrong, **said))
     assert len([text for text in found if word in text]) == len(found) > 0
-    assert len(found) <= (6 if word.startswith("if these are degrees") else 1)
+    assert len(found) <= (6 if word.startswith("if the values are degrees") else 1)
 
 
 @pytest.mark.parametrize(
-    ("said", "true", "word"), [("rad", "deg", "more than a turn"), ("deg", "rad", "deg off")]
+    ("said", "true", "word"),
+    [("rad", "deg", "more than a turn"), ("deg", "rad", "rotations differ from this robot by")],
 )
 def test_rotation_vectors_in_the_wrong_unit(told, ur10, said, true, word):
     (text,) = told(ur10, sheet(ur10, joints(ur10), angle=said, wrong={"angle": true}))
@@ -204,12 +205,12 @@ def flipped(j):
 
 
 MISTAKES = [
-    *((flipped(j), f"joint {name}_joint moving the other way") for j, name in enumerate(
+    *((flipped(j), f"the opposite sign of joint {name}_joint") for j, name in enumerate(
         ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"))),
     (off(1, 90), "with -90 deg added to joint shoulder_lift_joint; check its zero"),
     (off(4, -90), "with 90 deg added to joint wrist_2_joint; check its zero"),
-    (swapped(0, 2), "shoulder_pan_joint and elbow_joint in each other's place; check the joints' order"),
-    (swapped(3, 4), "joints wrist_1_joint and wrist_2_joint in each other's place"),
+    (swapped(0, 2), "joints shoulder_pan_joint and elbow_joint swapped; check the order of the joint"),
+    (swapped(3, 4), "joints wrist_1_joint and wrist_2_joint swapped"),
 ]  # fmt: skip
 
 
@@ -242,7 +243,7 @@ def test_a_mirrored_frame_is_named(told, ur10, swap):
     a, b = (f"{axis}[mm]" for axis in swap)
     head = head.replace(a, "?").replace(b, a).replace("?", b)
     (said,) = told(ur10, f"{head}\n{body}")
-    assert "with the frame mirrored; check the order and the signs of x, y and z" in said
+    assert "with the measuring frame mirrored; check the order and the signs of x, y and z" in said
 
 
 def test_readings_of_another_row_are_named(told, ur10):
@@ -250,13 +251,16 @@ def test_readings_of_another_row_are_named(told, ur10):
     pairs = pairwise(lines[1:])
     rows = [",".join((*q.split(",")[:6], *reading.split(",")[6:])) for q, reading in pairs]
     (said,) = told(ur10, "\n".join([lines[0], *rows]))
-    assert "with the readings of the row before; check how rows were put together" in said
+    assert (
+        "with the measured values of the previous row; check how joint and measured columns were joined"
+        in said
+    )
 
 
 def test_another_robot_is_told_but_nothing_guessed(told, ur10):
     other = Chain.from_urdf(robot_file("ur_description/urdf/ur3_robot.urdf"), "tool0")
     (said,) = told(ur10, sheet(other, joints(ur10, 60), kind="position"))
-    assert said.endswith("check robot and tip, units, and the joints' order, signs and zeros")
+    assert said.endswith("check the robot and tip, the units, and the order, signs and zeros of the joints")
 
 
 def test_gross_errors_are_no_mistaken_column(told, ur10):
@@ -273,7 +277,7 @@ def test_gross_errors_are_no_mistaken_column(told, ur10):
 def test_rows_given_twice(told, ur10):
     lines = sheet(ur10, joints(ur10)).splitlines()
     (text,) = told(ur10, "\n".join([*lines, lines[3], lines[3], lines[9]]))
-    assert text.startswith("rows 31, 32, 33: the same as others to the last digit (row 31 as row 3)")
+    assert text.startswith("rows 31, 32, 33: identical to other rows in every digit (row 31 to row 3)")
 
 
 def test_the_same_configuration_read_again_is_believed(told, ur10):
@@ -314,7 +318,7 @@ def test_the_command_line_says_so(tmp_path, monkeypatch, capsys, command):
     assert main.main([command, "arm.dh.toml", "data.csv", *more]) == 0
     found = [line for line in capsys.readouterr().err.splitlines() if "warning:" in line]
     assert len(found) == 1
-    assert found[0].startswith("data.csv: warning: row 13: the same as others")
+    assert found[0].startswith("data.csv: warning: row 13: identical to other rows")
 
 
 def test_two_wires_of_one_name_are_told(tmp_path, monkeypatch, capsys):
@@ -332,5 +336,5 @@ def test_two_wires_of_one_name_are_told(tmp_path, monkeypatch, capsys):
     found = [line for line in capsys.readouterr().err.splitlines() if "warning:" in line]
     assert found
     assert all(
-        "after the fit, length is usually" in line and "whether its wire1 is" in line for line in found
+        "after the fit, the median length error is" in line and "whether wire1 is" in line for line in found
     )

@@ -190,8 +190,8 @@ def test_a_result_alone_says_the_same_of_points_left_out(experiment, options, fi
 def test_impossible_rows_are_found_with_their_reasons(experiment):
     assert [finding.row for finding in experiment.findings] == [7, 8]
     seven, eight = experiment.findings
-    assert 1e3 * seven.size == pytest.approx(1095, abs=0.5)
-    assert 1e3 * eight.size == pytest.approx(767, abs=0.5)
+    assert 1e3 * seven.error == pytest.approx(1095, abs=0.5)
+    assert 1e3 * eight.error == pytest.approx(767, abs=0.5)
     assert "(29.95°, 29.69°, -29.39°)" in seven.reason
     assert "1305.8 mm" in eight.reason
     assert "745.0 mm" in eight.reason

@@ -20,7 +20,7 @@ from dhcal_pin.calibration.partition import split
 from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.calibration.result import Result
 from dhcal_pin.cli import main
-from dhcal_pin.diagnostics import residuals
+from dhcal_pin.diagnostics import predict_workspace, residuals, workspace
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.measurements import KINDS
 from dhcal_pin.measurements.base import Noise
@@ -53,7 +53,7 @@ def fit() -> Result:
 @pytest.fixture
 def quick(monkeypatch):
     """Fewer configurations over the workspace."""
-    monkeypatch.setattr(residuals, "N_SAMPLES", 300)
+    monkeypatch.setattr(workspace, "N_PREDICTED_CONFIGURATIONS", 300)
 
 
 # --- numbers ---------------------------------------------------------------------------------------
@@ -105,7 +105,7 @@ def test_the_workspace_is_in_the_base_frame(quick):
     truth = replace(actual, base=se3.exp6(np.array([3.0, -2.0, 1.0, 0.3, 0.2, 2.0])))
     rng = np.random.default_rng(0)
     data = Pose.simulate(truth, rng.uniform(-1.5, 1.5, (40, 6)), Noise(1e-4, 1e-4), rng)
-    found = residuals.workspace(calibrate(nominal, data, "dh,base"), [data])
+    found = predict_workspace(calibrate(nominal, data, "dh,base"), [data])
     model, state = actual.model, actual.model.createData()
     for q, point in zip(data.q, found.measured, strict=True):
         pin.framesForwardKinematics(model, state, actual.configurations(q[None])[0])
