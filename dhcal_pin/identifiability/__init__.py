@@ -1,10 +1,15 @@
-"""Identifiability: which parameters the measurements determine, and why not the others."""
+"""Identifiability: which parameters the measurements determine, and why not the others.
 
-from .explanations import explain_unobservable, explain_weakly_observable
-from .observability import clusters, correlation, observability_indices, observable_fraction
+Numbers (rank, observability indices, directions) are in `observability`, the causes of unobservable
+directions in `null_space`, their geometry in `propagation`, and the sentences for users in `explanations`.
+All of them analyze a linearized problem; what solves problems belongs to `estimation`.
+"""
+
+from .explanations import EXPECTED, explain_unobservable, explain_weakly_observable
+from .observability import correlation, observability_indices, observable_fraction
 
 __all__ = [
-    "clusters",
+    "EXPECTED",
     "correlation",
     "explain_unobservable",
     "explain_weakly_observable",

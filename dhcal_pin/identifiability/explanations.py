@@ -1,8 +1,13 @@
-"""What the data cannot tell apart, in words: which parameters, why, and what would tell them.
+"""Explanations of unobservable and poorly identified parameters, as sentences for users.
 
-A reason is printed only after it was checked on the arm at hand: a combination is carried along the
-chain, and where it passes a joint it must be a motion that this joint's own motion leaves as it is (see
-`passage`). Where a check fails the plain fact remains. What would help is computed, too.
+Each sentence names the parameters, the reason, what is identifiable, and what to measure. A reason is
+stated only if it was verified on the robot at hand: a combination of errors is propagated along the chain,
+and each joint that it passes must leave it unchanged (see `propagation`). If no reason can be verified,
+only the parameters are named. An advice is given only if the hypothetical measurement makes the
+parameters observable (see `null_space`).
+
+Redundancies of the model, such as base pose and origin of joint 1, exist for every instrument. Their
+sentences start with `EXPECTED`, and users can ignore them.
 """
 
 from __future__ import annotations
@@ -33,113 +38,119 @@ from .propagation import (
     propagate_along_chain,
 )
 
-# Axes within this of parallel are nearly so.
-_NEARLY_PARALLEL_RAD = np.deg2rad(5.0)
-
-
-# More names than these make no sentence.
-_MAX_NAMES = 12
-
-
-# Entries that count of the projector on what is weakly seen, each parameter in its expected spread.
-_MIN_CORRELATION = 0.1
-
-
-# What data without a length leave open.
-SCALE_UNKNOWN = "the readings do not tell how large the robot is"
-
-
+# Start of the sentences on redundancies that no measurement can resolve.
+EXPECTED = "Expected, no action needed: "
+# Reason for an undetermined size of the robot.
+SCALE_UNKNOWN = "the measurements do not determine the size of the robot"
 SCALE = (
-    f"all lengths together: {SCALE_UNKNOWN}; priors alone do; a known distance of touched points would tell"
+    f"all lengths together: {SCALE_UNKNOWN}, only the priors do; add a known distance between contact points"
 )
+# Largest angle of axes that a sentence calls parallel to within an angle [rad].
+_NEARLY_PARALLEL_RAD = np.deg2rad(5.0)
+# Largest number of names in a sentence.
+_MAX_NAMES = 12
+# Entries of the projector on weakly observable directions, in units of the priors, that connect two
+# parameters.
+_MIN_CORRELATION = 0.1
+# Smallest singular value, relative to the norm of R, of an observable direction.
+_OBSERVABLE_RTOL = 1e-8
+# Weights of a sum that are this close to 1 are not written; a sum with weights below the second value is not
+# written.
+_UNIT_WEIGHT_TOL, _ZERO_WEIGHT = 1e-4, 1e-6
+# Configurations for the test whether a combination scales the robot.
+_N_SCALING_SAMPLES = 30
 
 
 def join_names(names: Sequence[str]) -> str:
-    """Names as in a sentence."""
+    """Join names with commas and "and"; summarize the last ones if there are too many.
+
+    Args:
+        names: At least one name.
+
+    Returns:
+        Text such as "a, b and c".
+    """
     if len(names) > _MAX_NAMES:
         names = [*names[: _MAX_NAMES - 1], f"{len(names) - _MAX_NAMES + 1} more"]
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
 def _numbered(word: str, plural: str, numbers: Sequence[int], chain: Chain) -> str:
-    """Joints or axes by their place from 1, with the joints' names where these do not tell it."""
+    """Name joints or axes by their numbers from 1, and by joint names that do not contain the number."""
     names = [chain.moving_joints[j - 1] for j in numbers]
     text = f"{word if len(numbers) == 1 else plural} {join_names([str(j) for j in numbers])}"
-    told = all(str(j) in name for j, name in zip(numbers, names, strict=True))
-    return text if told else f"{text} ({', '.join(names)})"
+    is_clear = all(str(j) in name for j, name in zip(numbers, names, strict=True))
+    return text if is_clear else f"{text} ({', '.join(names)})"
 
 
 def _axes(numbers: Sequence[int], chain: Chain) -> str:
+    """Name joint axes, such as "axes 2 and 3"."""
     return _numbered("axis", "axes", numbers, chain)
 
 
-def _sum(names: Sequence[str], weights: Array) -> str:
-    """A weighted sum, as `d2 + d3 - 0.5 a4`."""
+def _weighted_sum(names: Sequence[str], weights: Array) -> str:
+    """Format a weighted sum, such as "d2 + d3 - 0.5 a4"."""
     text = names[0]
     for name, weight in zip(names[1:], weights[1:] / weights[0], strict=True):
         size = abs(weight)
-        factor = "" if abs(size - 1) < 1e-4 else f"{size:.3g} "
+        factor = "" if abs(size - 1) < _UNIT_WEIGHT_TOL else f"{size:.3g} "
         text += f" {'+' if weight > 0 else '-'} {factor}{name}"
     return text
 
 
-def _describe_frame(chain: Chain, station: int) -> str:
-    if station == BASE_FRAME:
-        return "the base"
-    if station >= chain.tip_frame:
-        return "the tool" if station == chain.tool_frame_index else "the tip"
-    number = _numbered("joint", "joints", [station // 2], chain)
-    return f"the origin of {number}" if station % 2 == 0 else f"the link behind {number}"
+def _describe_frame(chain: Chain, frame: int) -> str:
+    """Name an error frame."""
+    if frame == BASE_FRAME:
+        return "base pose"
+    if frame >= chain.tip_frame:
+        return "the tool" if frame == chain.tool_frame_index else "the tip"
+    number = _numbered("joint", "joints", [frame // 2], chain)
+    return f"the origin of {number}" if frame % 2 == 0 else f"the link behind {number}"
 
 
 def _parallel(axes: Sequence[int], angle: float, chain: Chain) -> str:
-    """That axes are parallel, exactly or to within an angle in rad."""
-    within = "" if angle < PARALLEL_TOL else f" to within {np.rad2deg(angle):.2g}°"
-    return f"{_axes(axes, chain)} are parallel{within}"
+    """State that axes are parallel, exactly or to within an angle [rad]."""
+    tolerance = "" if angle < PARALLEL_TOL else f" to within {np.rad2deg(angle):.2g}°"
+    return f"{_axes(axes, chain)} are parallel{tolerance}"
 
 
 def _explain_propagation(chain: Chain, way: Propagation, parameters: Sequence[ErrorParameter]) -> str:
-    """The geometric reason why a combination of parameters leaves the whole tool where it is."""
-    if not (way.translation_joints or way.rotation_joints or way.crossed_prismatic_joints):
-        stations = [p.error_frame for p in parameters]
-        first, last = _describe_frame(chain, min(stations)), _describe_frame(chain, max(stations))
-        return f"no joint moves between {first} and {last}" if first != last else f"they all act at {first}"
+    """Explain why a combination of parameters that passes joints does not move the tool."""
     axes = sorted(axes_acted_on(chain, parameters) | {*way.translation_joints, *way.rotation_joints})
     if not way.crossed_prismatic_joints and len(axes) == axes[-1] - axes[0] + 1 > 1:
-        tilts = [axis_angle_and_distance(chain, i, j) for i, j in pairwise(axes)]
-        if all(max(one) < PARALLEL_TOL for one in tilts):
+        relations = [axis_angle_and_distance(chain, i, j) for i, j in pairwise(axes)]
+        if all(max(relation) < PARALLEL_TOL for relation in relations):
             return f"{_axes(axes, chain)} lie on one line"
-        worst = max(angle for angle, _ in tilts)
-        if not way.rotation_joints and worst < NEGLIGIBLE:
-            return _parallel(axes, worst, chain)
+        largest_angle = max(angle for angle, _ in relations)
+        if not way.rotation_joints and largest_angle < NEGLIGIBLE:
+            return _parallel(axes, largest_angle, chain)
     motions = []
     if way.rotation_joints and way.rotation_joints == way.translation_joints:
-        motions.append(f"a turn about and a shift along {_axes(way.rotation_joints, chain)}")
+        motions.append(f"a rotation about and a translation along {_axes(way.rotation_joints, chain)}")
     else:
-        motions += [f"a turn about {_axes(way.rotation_joints, chain)}"] if way.rotation_joints else []
-        motions += [f"a shift along {_axes(way.translation_joints, chain)}"] if way.translation_joints else []
+        if way.rotation_joints:
+            motions.append(f"a rotation about {_axes(way.rotation_joints, chain)}")
+        if way.translation_joints:
+            motions.append(f"a translation along {_axes(way.translation_joints, chain)}")
     if way.crossed_prismatic_joints:
-        motions.append(
-            f"a shift across {_axes(way.crossed_prismatic_joints, chain)} of a joint that only slides"
-        )
-    joints = (
-        "that joint"
-        if len({*way.rotation_joints, *way.translation_joints, *way.crossed_prismatic_joints}) == 1
-        else "those joints"
+        motions.append(f"a translation across prismatic {_axes(way.crossed_prismatic_joints, chain)}")
+    n_joints = len({*way.rotation_joints, *way.translation_joints, *way.crossed_prismatic_joints})
+    is_single = len(motions) == 1 and not (way.rotation_joints and way.translation_joints)
+    return (
+        f"{' and '.join(motions)} {'has' if is_single else 'have'} the same effect before and behind "
+        f"{'that joint' if n_joints == 1 else 'those joints'}"
     )
-    look = "looks" if len(motions) == 1 and not (way.rotation_joints and way.translation_joints) else "look"
-    return f"{' and '.join(motions)} {look} the same before and behind {joints}"
 
 
 @dataclass(frozen=True, eq=False)
 class Explainer:
-    """Sentences on the unseen directions of one experiment.
+    """Sentences on the unobservable directions of one problem.
 
     Attributes:
-        probe: the problem, and where its Jacobian is taken.
-        layers: of `Experiment.layers`.
-        names: (p,).
-        plain_errors: the robot's plain parameters, first among the names.
+        probe: Problem, and values at which its Jacobian is taken.
+        layers: Null space by cause, from `ObservabilityProbe.null_space_layers`.
+        names: Names of the unknowns, length p.
+        plain_errors: Geometric errors of the robot, the first of the unknowns.
     """
 
     probe: ObservabilityProbe
@@ -148,44 +159,90 @@ class Explainer:
     plain_errors: PlainErrors
 
     def sentence(self, group: UnobservableGroup) -> str:
-        """What a group's parameters have to do with each other, why, what is seen, what would help."""
-        say = {"arm": self._arm, "instrument": self._instrument, "still": self._still, "poses": self._poses}
-        reason, advice = say[group.cause](group)
-        names = [self.names[i] for i in group.members]
-        seen = self._describe_observable(group, names)
-        if reason and all(name in seen for name in names):
-            return f"{reason}: {seen}; {advice}"
-        # Of too many names those that move most.
-        order = np.argsort(-np.abs(group.vectors[group.members]).max(1), kind="stable")
-        main = sorted(order[: _MAX_NAMES - 1]) + sorted(order[_MAX_NAMES - 1 :])
-        return f"{join_names([names[i] for i in main])}: {reason + '; ' if reason else ''}{seen}; {advice}"
+        """Explain one group of unobservable directions.
 
-    def _describe_observable(self, group: UnobservableGroup, names: list[str]) -> str:
-        """How much of the members can be seen, counted against all that cannot be for the same cause."""
+        Args:
+            group: Group of directions.
+
+        Returns:
+            Sentence with names, reason, identifiable combinations and advice.
+        """
+        names = [self.names[i] for i in group.members]
+        if group.cause == "structure" and group.members[-1] < len(self.probe.problem.errors.parameters):
+            return EXPECTED + self._explain_redundancy(group, names)
+        explain = {
+            "structure": self._explain_structure,
+            "instrument": self._explain_instrument,
+            "poses": self._explain_poses,
+            "unmoved": self._explain_unmoved,
+        }
+        reason, advice = explain[group.cause](group)
+        extent = self._describe_observable(group, names)
+        return f"{self._listed(group, names)}: {reason + '; ' if reason else ''}{extent}; {advice}"
+
+    def _listed(self, group: UnobservableGroup, names: list[str]) -> str:
+        """List the names of a group; of too many names, those with the largest entries."""
+        order = np.argsort(-np.abs(group.vectors[group.members]).max(1), kind="stable")
+        selected = sorted(order[: _MAX_NAMES - 1]) + sorted(order[_MAX_NAMES - 1 :])
+        return join_names([names[i] for i in selected])
+
+    def _explain_redundancy(self, group: UnobservableGroup, names: list[str]) -> str:
+        """Explain parameters of the robot that no instrument can separate."""
+        listed = self._listed(group, names)
+        subject = f"{listed} {'is' if len(names) == 1 else 'are'} redundant"
+        extent = self._describe_observable(group, names, by=" by any measurement")
+        members, way = self._robot_part(group)
+        if way is None or np.abs(way.tool_twists).max() > NEGLIGIBLE:
+            return f"{subject}; {extent}"
+        chain = self.plain_errors.chain
+        if way.translation_joints or way.rotation_joints or way.crossed_prismatic_joints:
+            reason = _explain_propagation(chain, way, members)
+            if all(name in extent for name in names):
+                return f"{reason}, so {extent}"
+            return f"{subject}, because {reason}; {extent}"
+        frames = [p.error_frame for p in members]
+        first, last = _describe_frame(chain, min(frames)), _describe_frame(chain, max(frames))
+        if first == last:
+            return f"{subject}, because all act at {first}; {extent}"
+        extent = self._describe_observable(group, names, listed, by=" by any measurement")
+        return f"{first} and {last} are redundant, because no joint moves between them; {extent}"
+
+    def _describe_observable(
+        self, group: UnobservableGroup, names: list[str], listed: str = "", by: str = ""
+    ) -> str:
+        """Describe which combinations of the members are identifiable.
+
+        The count refers to the null space of the group's cause, because other groups may share its members.
+        With `listed`, the text names the members, otherwise it refers to names that precede it.
+        """
         members, r = group.members, group.vectors.shape[1]
         _, s, vt = np.linalg.svd(self.layers[group.cause][members].T)
-        lost = int(np.sum(s > NEGLIGIBLE))
-        now = int(np.linalg.matrix_rank(self.layers["still"][members], NEGLIGIBLE))
-        verb = "is" if now == lost else "can be"
+        n_lost = int(np.sum(s > NEGLIGIBLE))
+        n_lost_now = int(np.linalg.matrix_rank(self.layers["unmoved"][members], NEGLIGIBLE))
+        one, several = "can be identified", "can be identified"
+        if n_lost_now == n_lost:
+            one, several = "is identifiable", "are identifiable"
         if r == len(members):
-            return "the readings do not depend on it" if r == 1 else "the readings depend on none of them"
-        if lost != r:
-            return "what one changes the others undo" if r == 1 else f"{r} combinations of them stay unseen"
+            return f"the measurements do not depend on {'it' if r == 1 else 'any of them'}"
+        if n_lost != r:
+            number, verb = ("one combination", "is") if r == 1 else (f"{r} combinations", "are")
+            return f"{number} of {listed or 'them'} {verb} not identifiable{by}"
+        whole = listed or f"the {len(members)}"
         if len(members) > r + 1:
-            return (
-                f"only {len(members) - r} combinations of the {len(members)} {verb.replace('is', 'are')} seen"
-            )
+            return f"only {len(members) - r} combinations of {whole} {several}{by}"
         weights = vt[-1]
-        if len({self._unit(i) for i in members}) > 1 or np.abs(weights).min() < 1e-6:
-            return f"only one combination of the {len(members)} {verb} seen"
-        return f"only {_sum(names, weights)} {verb} seen"
+        has_mixed_units = len({self._unit(i) for i in members}) > 1
+        if has_mixed_units or np.abs(weights).min() < _ZERO_WEIGHT:
+            return f"only one combination of {whole} {one}{by}"
+        return f"only {_weighted_sum(names, weights)} {one}{by}"
 
     def _unit(self, i: int) -> str:
+        """Return the unit of an unknown."""
         problem = self.probe.problem
         return (*problem.errors.parameters, *problem.instrument_parameters)[i].unit
 
     def _robot_part(self, group: UnobservableGroup) -> tuple[list[ErrorParameter], Propagation | None]:
-        """The plain parameters of a group, and how it passes along the chain if these are all of it."""
+        """Return the geometric errors of a group, and their propagation if the group has no other members."""
         count = len(self.plain_errors.parameters)
         members = [i for i in group.members if i < count]
         way = (
@@ -195,138 +252,148 @@ class Explainer:
         )
         return [self.plain_errors.parameters[i] for i in members], way
 
-    def _arm(self, group: UnobservableGroup) -> tuple[str, str]:
-        members, way = self._robot_part(group)
-        robot = len(self.probe.problem.errors.parameters)
-        if all(i < robot for i in group.members):
-            advice = "no measurement of this arm tells more"
-        else:
-            advice = "more readings that depend on them may tell"
-        if way is None or np.abs(way.tool_twists).max() > NEGLIGIBLE:
-            return "", advice
-        return _explain_propagation(self.plain_errors.chain, way, members), advice
+    def _explain_structure(self, group: UnobservableGroup) -> tuple[str, str]:
+        """Explain a redundancy in which instrument parameters take part."""
+        return "", "add measurements that depend on them"
 
-    def _instrument(self, group: UnobservableGroup) -> tuple[str, str]:
+    def _explain_instrument(self, group: UnobservableGroup) -> tuple[str, str]:
+        """Explain directions that the instruments at hand cannot observe at any pose."""
         members, way = self._robot_part(group)
         chain = self.plain_errors.chain
-        outside = len(group.members) > len(members)
+        has_other_members = len(group.members) > len(members)
         if members and all(p.error_frame == BASE_FRAME for p in members):
-            if outside:
-                return "the robot and the instrument can move as one", self._suggest_reading(group)
-            return "the readings stay the same when the whole robot moves so", self._suggest_reading(group)
+            if has_other_members:
+                reason = "the robot and the instrument can move together without changing a measurement"
+            else:
+                reason = "the measurements do not change when the whole robot moves in this way"
+            return reason, self._suggest_measurement(group)
         if way is not None and np.abs(way.tool_twists[:, :3]).max() < NEGLIGIBLE:
-            return (
-                "the tool only turns about the measured point, and that is not read",
-                self._suggest_reading(group),
-            )
+            reason = "only the orientation of the tool depends on this, and the orientation is not measured"
+            return reason, self._suggest_measurement(group)
         last = len(chain.moving_joints)
         point = (chain.link_transforms[-1] @ chain.tool)[:2, 3]
-        behind = all(
+        is_behind_last_joint = all(
             self.plain_errors.bodies[i] >= last - 1
             for i in group.members
             if i < len(self.plain_errors.bodies)
         )
-        if not outside and behind and not chain.prismatic[-1] and np.linalg.norm(point) < PARALLEL_TOL:
-            reason = f"the measured point lies on {_axes([last], chain)} and does not move with it"
-            aside = self.probe.with_offset_point().hypothetical_r_factor(range(chain.n_joints))
-            other = "a point beside that axis or " if self._is_determined_by(aside, group) else ""
-            return reason, other + self._suggest_reading(group)
+        is_point_on_axis = not chain.prismatic[-1] and np.linalg.norm(point) < PARALLEL_TOL
+        if not has_other_members and is_behind_last_joint and is_point_on_axis:
+            reason = f"the measured point lies on {_axes([last], chain)} and does not move with that joint"
+            offset = self.probe.with_offset_point().hypothetical_r_factor(range(chain.n_joints))
+            suggestion = self._suggest_measurement(group)
+            if self._is_determined_by(offset, group):
+                suggestion = f"measure a point beside that axis, or {suggestion}"
+            return reason, suggestion
         if self._is_scaling(group):
-            return SCALE_UNKNOWN, self._suggest_reading(group)
-        return "the readings stay the same", self._suggest_reading(group)
+            return SCALE_UNKNOWN, self._suggest_measurement(group)
+        return "the measurements do not change", self._suggest_measurement(group)
 
     def _is_scaling(self, group: UnobservableGroup) -> bool:
-        """Whether a group makes the whole robot larger about some point, and does no more than that."""
+        """Decide whether a group scales the robot about some point and has no other effect."""
         if group.vectors.shape[1] != 1 or len(group.members) < 2:
             return False
-        path, count = self.plain_errors, len(self.plain_errors.parameters)
+        errors, count = self.plain_errors, len(self.plain_errors.parameters)
         robot = [i for i in group.members if i < len(self.probe.problem.errors.parameters)]
         if not robot or robot[-1] >= count:
             return False
-        frames = path.chain.forward_kinematics(self.probe.draw(np.random.default_rng(0), 30))
-        velocities = path.chain.tool_jacobian(frames, path.bodies, path.twists)[:, :3]
-        moved = np.tensordot(group.vectors[:count, 0], velocities, 1)
+        q = self.probe.draw_configurations(np.random.default_rng(0), _N_SCALING_SAMPLES)
+        frames = errors.chain.forward_kinematics(q)
+        velocities = errors.chain.tool_jacobian(frames, errors.bodies, errors.twists)[:, :3]
+        displacement = np.tensordot(group.vectors[:count, 0], velocities, 1)
+        # Displacement = scale·point + translation + rotation × point, fitted to all samples.
         point = frames.tool[3]
         motions = [*(np.eye(3)[i][:, None] * np.ones_like(point) for i in range(3))]
         motions += [np.cross(np.eye(3)[i], point.T).T for i in range(3)]
         rows = np.array([point, *motions]).reshape(7, -1).T
-        found, *_ = np.linalg.lstsq(rows, moved.ravel(), rcond=None)
-        return bool(np.abs(rows @ found - moved.ravel()).max() < NEGLIGIBLE and abs(found[0]) > NEGLIGIBLE)
+        solution, *_ = np.linalg.lstsq(rows, displacement.ravel(), rcond=None)
+        largest_misfit = np.abs(rows @ solution - displacement.ravel()).max()
+        return bool(largest_misfit < NEGLIGIBLE and abs(solution[0]) > NEGLIGIBLE)
 
-    def _is_determined_by(self, triangle: Array, group: UnobservableGroup) -> bool:
-        """Whether a triangle sees all of a group's directions."""
-        s = np.linalg.svd(triangle @ group.vectors, compute_uv=False)
-        return bool(s.min() > 1e-8 * np.linalg.norm(triangle))
+    def _is_determined_by(self, r: Array, group: UnobservableGroup) -> bool:
+        """Decide whether measurements with an R factor observe all directions of a group."""
+        s = np.linalg.svd(r @ group.vectors, compute_uv=False)
+        return bool(s.min() > _OBSERVABLE_RTOL * np.linalg.norm(r))
 
-    def _suggest_reading(self, group: UnobservableGroup) -> str:
-        """The least reading besides those at hand that would tell a group's directions."""
-        position = any(len(item.positions()) for item in self.probe.problem.data)
+    def _suggest_measurement(self, group: UnobservableGroup) -> str:
+        """Suggest the simplest additional measurement that makes a group observable."""
+        has_positions = any(len(item.positions()) for item in self.probe.problem.data)
         joints = range(self.plain_errors.chain.n_joints)
         if self._is_determined_by(self.probe.hypothetical_r_factor(joints, Position), group):
-            return "the tool's position in a fixed frame would tell"
+            return "measure the position of the tool in a fixed frame"
         if self._is_determined_by(self.probe.hypothetical_r_factor(joints, Pose), group):
-            return f"the tool's {'orientation' if position else 'pose in a fixed frame'} would tell"
-        return "other poses or readings may tell"
+            return f"measure the {'orientation' if has_positions else 'pose'} of the tool in a fixed frame"
+        return "add other poses or measurements"
 
-    def _still(self, group: UnobservableGroup) -> tuple[str, str]:
+    def _explain_unmoved(self, group: UnobservableGroup) -> tuple[str, str]:
+        """Explain directions that joints which never moved would make observable."""
         names = [self.plain_errors.chain.joint_names[j] for j in self.probe.unmoved_joints()]
         return (
             f"{join_names(names)} never moved",
-            f"moving {'it' if len(names) == 1 else 'them'} would tell more",
+            f"move {'this joint' if len(names) == 1 else 'these joints'}",
         )
 
-    def _poses(self, group: UnobservableGroup) -> tuple[str, str]:
+    def _explain_poses(self, group: UnobservableGroup) -> tuple[str, str]:
+        """Explain directions that more or other poses would make observable."""
         problem, r = self.probe.problem, group.vectors.shape[1]
         samples = sum(len(item.rows) for item in problem.data)
-        rows = self.probe.count_rows()
-        if len(self.names) - self.layers["still"].shape[1] == rows:
-            more = -(-r * samples // rows)
-            return f"{rows} readings for {len(self.names)} unknowns", (
-                f"at least {more} more {'pose is' if more == 1 else 'poses are'} needed"
+        n_equations = self.probe.n_equations
+        if len(self.names) - self.layers["unmoved"].shape[1] == n_equations:
+            n_missing = -(-r * samples // n_equations)
+            return f"{n_equations} equations for {len(self.names)} parameters", (
+                f"measure at least {n_missing} more {'pose' if n_missing == 1 else 'poses'}"
             )
-        free = [
+        chain = self.plain_errors.chain
+        decisive = [
             j
-            for j in range(self.plain_errors.chain.n_joints)
+            for j in range(chain.n_joints)
             if self._is_determined_by(self.probe.hypothetical_r_factor([j]), group)
         ]
-        where = join_names([self.plain_errors.chain.joint_names[j] for j in free]) if free else "the joints"
-        return "the poses are too much alike", f"poses all over the range of {where} would tell"
+        joints = join_names([chain.joint_names[j] for j in decisive]) if decisive else "the joints"
+        return "the poses are too similar", f"measure poses over the full range of {joints}"
 
 
-def explain_unobservable(problem: Problem, x: Array, triangle: TriangularSystem) -> list[str]:
-    """What the data cannot tell apart, why, and what would tell it; every unseen direction in one sentence.
+def explain_unobservable(problem: Problem, x: Array, system: TriangularSystem) -> list[str]:
+    """Explain which parameters are not identifiable, why, and what to measure.
 
     Args:
-        problem: the unknowns and the data.
-        x: (p,) the unknowns' values.
-        triangle: of the data alone, at x or where the last step came from.
+        problem: Unknowns and measurements.
+        x: Values of the unknowns, shape (p,) [m or rad].
+        system: Triangular system of the measurements without priors, at x or at the start of the last step.
 
     Returns:
-        Sentences; none where all is seen.
+        Sentences that together cover every unobservable direction; empty if all are observable. Sentences on
+        redundancies of the model start with `EXPECTED`.
     """
-    if qr.rank(triangle.r) == len(x):
+    if qr.rank(system.r) == len(x):
         return []
-    experiment = ObservabilityProbe(problem, x)
-    # The last step, small as it is, turns unseen directions by more than other readings may: taken anew.
-    here = linearize_and_factor(problem, x, small_angle=False).r
-    layers = experiment.layers(here)
-    path = PlainErrors.from_model(problem.errors, x[: len(problem.errors.parameters)])
+    probe = ObservabilityProbe(problem, x)
+    # Even a small last step rotates the null space by more than the tolerance, so take the Jacobian at x.
+    r = linearize_and_factor(problem, x, small_angle=False).r
+    layers = probe.null_space_layers(r)
+    plain_errors = PlainErrors.from_model(problem.errors, x[: len(problem.errors.parameters)])
     names = [p.name for p in (*problem.errors.parameters, *problem.instrument_parameters)]
-    explainer = Explainer(experiment, dict(layers), names, path)
-    found = [explainer.sentence(group) for group in _joined(group_directions(layers, path.error_frames))]
-    untold = experiment.is_scale_unobservable(here) and not any(SCALE_UNKNOWN in text for text in found)
-    return [SCALE, *found] if untold else found
+    explainer = Explainer(probe, dict(layers), names, plain_errors)
+    groups = _merge_groups(group_directions(layers, plain_errors.error_frames))
+    sentences = [explainer.sentence(group) for group in groups]
+    is_scale_unexplained = probe.is_scale_unobservable(r) and not any(
+        SCALE_UNKNOWN in text for text in sentences
+    )
+    return [SCALE, *sentences] if is_scale_unexplained else sentences
 
 
-def _joined(found: list[UnobservableGroup]) -> list[UnobservableGroup]:
-    """Groups of which one combination each is seen, put together where they share a parameter."""
+def _merge_groups(groups: list[UnobservableGroup]) -> list[UnobservableGroup]:
+    """Merge groups of one cause if their union has one identifiable combination.
+
+    Groups of the causes "poses" and "unmoved" are always merged.
+    """
     out: list[UnobservableGroup] = []
-    for group in found:
+    for group in groups:
         for i, other in enumerate(out):
-            both = UnobservableGroup(group.cause, np.concatenate([other.vectors, group.vectors], 1))
-            chained = len(both.members) == both.vectors.shape[1] + 1
-            if other.cause == group.cause and (chained or group.cause in ("poses", "still")):
-                out[i] = both
+            union = UnobservableGroup(group.cause, np.concatenate([other.vectors, group.vectors], 1))
+            has_one_combination = len(union.members) == union.vectors.shape[1] + 1
+            if other.cause == group.cause and (has_one_combination or group.cause in ("poses", "unmoved")):
+                out[i] = union
                 break
         else:
             out.append(group)
@@ -334,65 +401,68 @@ def _joined(found: list[UnobservableGroup]) -> list[UnobservableGroup]:
 
 
 def explain_weakly_observable(
-    problem: Problem, x: Array, triangle: TriangularSystem, expected: Array, noise: float
+    problem: Problem, x: Array, system: TriangularSystem, prior_std: Array, noise: float
 ) -> list[str]:
-    """What counts in the rank but is hardly better known than before the measurement, and why.
+    """Explain which parameters are observable but hardly better known than before the measurement.
 
     Args:
-        problem: the unknowns and the data.
-        x: (p,) where the triangle was taken.
-        triangle: of the data alone.
-        expected: (p,) standard deviations before any measurement, m and rad.
-        noise: standard deviation of the whitened residuals; NaN where nothing tells it.
+        problem: Unknowns and measurements.
+        x: Values at which `system` was computed, shape (p,) [m or rad].
+        system: Triangular system of the measurements without priors.
+        prior_std: Prior standard deviations, shape (p,) [m or rad].
+        noise: Standard deviation of the whitened residuals; NaN if it cannot be estimated.
 
     Returns:
-        A sentence for each set of parameters that share such directions.
+        One sentence per set of parameters that share weakly observable directions.
     """
     if np.isnan(noise):
         return [
-            "no reading is left over to tell the noise, so nothing tells how far to believe what was found: "
-            "state the instrument's sigmas or measure more poses"
+            "the accuracy of all parameters is unknown, because there are no redundant measurements to "
+            "estimate the noise from; state the standard deviations of the instrument or measure more poses"
         ]
-    directions, left = observability.weakly_observable(triangle.r, expected, noise)
-    if not len(left):
+    directions, std_ratios = observability.weakly_observable(system.r, prior_std, noise)
+    if not len(std_ratios):
         return []
     names = [p.name for p in (*problem.errors.parameters, *problem.instrument_parameters)]
-    path = PlainErrors.from_model(problem.errors, x[: len(problem.errors.parameters)])
-    experiment = ObservabilityProbe(problem, x)
-    elsewhere = experiment.hypothetical_r_factor(range(path.chain.n_joints)) / np.sqrt(
-        experiment.n_repetitions
+    plain_errors = PlainErrors.from_model(problem.errors, x[: len(problem.errors.parameters)])
+    probe = ObservabilityProbe(problem, x)
+    # R factor of as many poses over the full range of the joints.
+    full_range = probe.hypothetical_r_factor(range(plain_errors.chain.n_joints)) / np.sqrt(
+        probe.n_repetitions
     )
-    scaled = directions / expected[:, None]
-    variance = (scaled * left**2) @ scaled.T
+    scaled = directions / prior_std[:, None]
+    variance = (scaled * std_ratios**2) @ scaled.T
     out = []
-    for members in observability.clusters(np.abs(scaled @ scaled.T) > _MIN_CORRELATION):
-        mine = np.ix_(members, members)
-        count = max(1, round(float(np.trace((scaled @ scaled.T)[mine]))))
-        share, main = (part[..., -count:] for part in np.linalg.eigh(variance[mine]))
+    for members in observability.connected_components(np.abs(scaled @ scaled.T) > _MIN_CORRELATION):
+        block = np.ix_(members, members)
+        count = max(1, round(float(np.trace((scaled @ scaled.T)[block]))))
+        ratio_squared, main = (part[..., -count:] for part in np.linalg.eigh(variance[block]))
         what = (
-            "" if len(members) == 1 else "a combination is " if count == 1 else f"{count} combinations are "
+            "" if len(members) == 1 else " of one combination" if count == 1 else f" of {count} combinations"
         )
-        text = f"{join_names([names[i] for i in members])}: {what}hardly better known than before the measurement, "
-        text += f"{100 * np.sqrt(share[0]):.0f} %{' or more' * (count > 1)} of the expected spread is left"
-        if near := _nearly_parallel_axes(
-            path, [path.parameters[i] for i in members if i < len(path.parameters)]
-        ):
-            text += f"; {near}"
-        told = np.linalg.norm(elsewhere[:, members] @ (expected[list(members), None] * main), axis=0) / noise
-        if np.all(1 / np.hypot(1.0, told) < observability.MAX_KNOWN_STD_RATIO):
-            text += "; as many poses all over the joints' range would tell more"
+        text = (
+            f"{join_names([names[i] for i in members])}: standard deviation{what} still "
+            f"{100 * np.sqrt(ratio_squared[0]):.0f} %{' or more' * (count > 1)} of the prior"
+        )
+        geometric = [plain_errors.parameters[i] for i in members if i < len(plain_errors.parameters)]
+        if relation := _nearly_parallel_axes(plain_errors, geometric):
+            text += f"; {relation}"
+        change = full_range[:, members] @ (prior_std[list(members), None] * main)
+        s = np.linalg.norm(change, axis=0) / noise
+        if np.all(1 / np.hypot(1.0, s) < observability.MAX_KNOWN_STD_RATIO):
+            text += "; measure over the full range of the joints"
         out.append(text)
     return out
 
 
-def _nearly_parallel_axes(path: PlainErrors, parameters: Sequence[ErrorParameter]) -> str:
-    """Which neighbouring axes, along which parameters act, are parallel but for a small angle."""
-    axes = axes_acted_on(path.chain, parameters)
-    near = {j: axis_angle_and_distance(path.chain, j, j + 1)[0] for j in axes if j + 1 in axes}
-    linked = np.zeros((len(path.chain.moving_joints) + 2,) * 2)
-    for j in (j for j, angle in near.items() if angle < _NEARLY_PARALLEL_RAD):
-        linked[j : j + 2, j : j + 2] = 1
-    said = []
-    for run in observability.clusters(linked):
-        said.append(_parallel(run, max(near[j] for j in run[:-1]), path.chain))
-    return " and ".join(said)
+def _nearly_parallel_axes(errors: PlainErrors, parameters: Sequence[ErrorParameter]) -> str:
+    """Name adjacent axes that parameters act along and that are parallel to within a small angle."""
+    axes = axes_acted_on(errors.chain, parameters)
+    angles = {j: axis_angle_and_distance(errors.chain, j, j + 1)[0] for j in axes if j + 1 in axes}
+    adjacency = np.zeros((len(errors.chain.moving_joints) + 2,) * 2)
+    for j in (j for j, angle in angles.items() if angle < _NEARLY_PARALLEL_RAD):
+        adjacency[j : j + 2, j : j + 2] = 1
+    relations = []
+    for run in observability.connected_components(adjacency):
+        relations.append(_parallel(run, max(angles[j] for j in run[:-1]), errors.chain))
+    return " and ".join(relations)

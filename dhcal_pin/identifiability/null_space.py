@@ -1,9 +1,23 @@
-"""Why directions stay unseen: what would show them, and short combinations that span them.
+"""Causes of unobservable directions, and sparse combinations that span the null space.
 
-The unseen directions of a data set are peeled in four layers by asking what the same model would see
-otherwise, with Jacobians that are really computed: at other joint values, and with the tool's whole pose
-read. What nothing shows lies in the arm; what poses would show lies in the instrument; what other joint
-values would show lies in the poses, and some of that in joints that never moved.
+Let N(D) be the null space of the whitened Jacobian of data D. The null space of the measurements is split by
+computing Jacobians of hypothetical measurements, at joint positions drawn at random within the limits:
+
+    N_structure ⊆ N_instrument ⊆ N_poses ⊆ N_data
+
+* N_data: null space of the measurements themselves.
+* N_poses: its part that stays unobservable if the joints that never moved do move. The rest has the cause
+"unmoved".
+* N_instrument: the part that stays unobservable with the instruments at other poses. The rest has the cause
+"poses".
+* N_structure: the part that stays unobservable even if the tool poses are measured. The rest has the cause
+"instrument",
+  and N_structure has the cause "structure": the parameters are redundant for every instrument.
+
+Each layer is then spanned by combinations with few parameters on short parts of the chain, by Gaussian
+elimination with different column orders. References: Khalil & Dombre, Modeling, Identification and Control of
+Robots, 2002, chapter 11 (identifiable parameters); Hollerbach, Khalil & Gautier, Model Identification,
+Springer Handbook of Robotics, 2016.
 """
 
 from __future__ import annotations
@@ -24,24 +38,27 @@ from ..measurements.position import Position
 from ..robot.chain import Chain
 from .propagation import NEGLIGIBLE
 
-Cause = Literal["arm", "instrument", "poses", "still"]
-
-
-# Joint values drawn to see what other poses would show: this many rows an unknown.
+Cause = Literal["structure", "instrument", "poses", "unmoved"]
+# Rows of hypothetical measurements per unknown.
 _ROWS_PER_UNKNOWN = 6
-
-
-# A direction that other readings show stands out from their rounding by far more than this.
+# Singular values below this fraction of the norm of R count as zero.
 _RTOL = 1e-8
+# Joint positions with a smaller range never moved [rad or m].
+_MIN_JOINT_RANGE = 1e-9
+# Standard deviations of hypothetical poses and positions [m, rad].
+_PROBE_SIGMA = 1e-3
+# Displacement of the measured point in `ObservabilityProbe.with_offset_point` [m].
+_POINT_OFFSET = (0.11, 0.07, 0.05)
 
 
 @dataclass(frozen=True, eq=False)
 class UnobservableGroup:
-    """Unseen directions that share a cause and a part of the arm.
+    """Unobservable directions with the same cause and on the same part of the chain.
 
     Attributes:
-        cause: who would have to change for them to be seen.
-        vectors: (p, r) changes of the unknowns that the data do not see, the largest entry of each 1.
+        cause: What has to change to make the directions observable; "structure" if nothing can.
+        vectors: Combinations of the unknowns without effect on the measurements, shape (p, r) [m or rad]. The
+            largest entry of each is 1.
     """
 
     cause: Cause
@@ -49,32 +66,32 @@ class UnobservableGroup:
 
     @property
     def members(self) -> list[int]:
-        """The unknowns that take part."""
+        """Indices of the unknowns that take part."""
         return np.flatnonzero(np.abs(self.vectors).max(1) > NEGLIGIBLE).tolist()
 
 
 def _vanishing_combinations(rows: Array) -> Array:
-    """Orthonormal basis of the combinations of columns that vanish in rows of an orthonormal basis."""
+    """Return a basis of the combinations of columns that vanish in these rows of an orthonormal basis."""
     _, s, vt = np.linalg.svd(rows)
     return vt[int(np.sum(s > NEGLIGIBLE)) :].T
 
 
-def _unseen_part(space: Array, triangle: Array) -> Array:
-    """Basis of the part of a space (p, d) that a triangle does not see either."""
-    size = np.linalg.norm(triangle, 2) if triangle.size else 0.0
-    if not space.shape[1] or size == 0:
+def _unobservable_part(space: Array, r: Array) -> Array:
+    """Return a basis of the part of a space (p, d) that lies in the null space of an R factor."""
+    norm = np.linalg.norm(r, 2) if r.size else 0.0
+    if not space.shape[1] or norm == 0:
         return space
-    _, s, vt = np.linalg.svd(triangle @ space)
-    return space @ vt[int(np.sum(s > _RTOL * size)) :].T
+    _, s, vt = np.linalg.svd(r @ space)
+    return space @ vt[int(np.sum(s > _RTOL * norm)) :].T
 
 
 @dataclass(frozen=True, eq=False)
 class ObservabilityProbe:
-    """What was measured, and what could be measured instead.
+    """Problem with its measurements, and Jacobians of hypothetical measurements.
 
     Attributes:
-        problem: the unknowns and the data.
-        x: (p,) where the Jacobian is taken.
+        problem: Unknowns and measurements.
+        x: Values of the unknowns for all Jacobians, shape (p,) [m or rad].
     """
 
     problem: Problem
@@ -82,143 +99,200 @@ class ObservabilityProbe:
 
     @property
     def chain(self) -> Chain:
-        """The chain at x."""
+        """Chain at x."""
         return self.problem.errors.at(self.x[: len(self.problem.errors.parameters)])
 
     @property
     def n_repetitions(self) -> int:
-        """How many times the data's samples are drawn anew, so that there are enough of them."""
+        """Number of hypothetical samples per measured sample, so that there are enough rows."""
         return 1 + _ROWS_PER_UNKNOWN * len(self.x) // sum(len(item.rows) for item in self.problem.data)
 
-    def count_rows(self) -> int:
-        """How many numbers were read."""
+    @property
+    def n_equations(self) -> int:
+        """Number of residual rows of the measurements."""
         return sum(item.residual_dim * len(item.rows) for item in self.problem.data)
 
     def with_offset_point(self) -> ObservabilityProbe:
-        """The same with the measured point some way off."""
+        """Return a copy whose measured point is displaced in the tool frame.
+
+        Returns:
+            Probe with another tool.
+        """
         errors = self.problem.errors
-        off = {errors.chain.tool_frame_index: se3.translation([0.11, 0.07, 0.05])}
+        offset = {errors.chain.tool_frame_index: se3.translation(_POINT_OFFSET)}
         return ObservabilityProbe(
-            replace(self.problem, errors=replace(errors, chain=errors.chain.perturbed_at(off))), self.x
+            replace(self.problem, errors=replace(errors, chain=errors.chain.perturbed_at(offset))), self.x
         )
 
-    def draw(self, rng: np.random.Generator, m: int) -> Array:
-        """Joint values (m, n) anywhere within the limits and within half a turn or π metres each way."""
+    def draw_configurations(self, rng: np.random.Generator, m: int) -> Array:
+        """Draw joint positions within the limits and within ±π rad or ±π m.
+
+        Args:
+            rng: Random generator.
+            m: Number of configurations.
+
+        Returns:
+            Joint positions, shape (m, n) [rad or m].
+        """
         chain = self.chain
         low, high = np.maximum(chain.lower, -np.pi), np.minimum(chain.upper, np.pi)
         return rng.uniform(low, high, (m, chain.n_joints))
 
     def _resampled(self, item: Measurement, joints: Sequence[int], rng: np.random.Generator) -> Measurement:
-        """The same readings with some joints anywhere; who touches something must stay on it."""
+        """Return a measurement with some joints drawn anew; contacts are returned unchanged."""
         if item.is_contact:
             return item
         q = item.configurations().copy()
-        q[:, joints] = self.draw(rng, len(q))[:, joints]
+        q[:, joints] = self.draw_configurations(rng, len(q))[:, joints]
         return item.resample(q)
 
     def hypothetical_r_factor(self, joints: Sequence[int], *extra: type[Pose] | type[Position]) -> Array:
-        """What the same instruments would see with some joints drawn anew, and with more readings."""
+        """Compute the R factor of hypothetical measurements with the same instruments.
+
+        Args:
+            joints: Joints to draw anew, from 0; the others keep their measured positions.
+            *extra: Kinds of additional measurements in the measuring frame.
+
+        Returns:
+            R factor of the whitened Jacobian, shape (p, p).
+        """
         rng = np.random.default_rng(0)
-        data = self.problem.data
+        measured = self.problem.data
         p = len(self.x)
-        every: list[Measurement] = [
-            self._resampled(item, joints, rng) for _ in range(self.n_repetitions) for item in data
+        data: list[Measurement] = [
+            self._resampled(item, joints, rng) for _ in range(self.n_repetitions) for item in measured
         ]
-        q = self.draw(rng, _ROWS_PER_UNKNOWN * p)
-        pose = self.chain.poses(q)
+        q = self.draw_configurations(rng, _ROWS_PER_UNKNOWN * p)
+        poses = self.chain.poses(q)
         for kind in extra:
-            every.append(Pose(q, pose, 1e-3, 1e-3) if kind is Pose else Position(q, pose[:, :3, 3], 1e-3))
-        return linearize_and_factor(replace(self.problem, data=tuple(every)), self.x, small_angle=False).r
+            data.append(
+                Pose(q, poses, _PROBE_SIGMA, _PROBE_SIGMA)
+                if kind is Pose
+                else Position(q, poses[:, :3, 3], _PROBE_SIGMA)
+            )
+        return linearize_and_factor(replace(self.problem, data=tuple(data)), self.x, small_angle=False).r
 
     def unmoved_joints(self) -> list[int]:
-        """Independent joints, from 0, that have one value in all the data."""
-        moved = [item.configurations() for item in self.problem.data if item.configurations_per_row]
-        return np.flatnonzero(np.ptp(np.concatenate(moved), axis=0) < 1e-9).tolist() if moved else []
+        """Find the independent joints that have the same position in all measurements.
 
-    def is_scale_unobservable(self, triangle: Array) -> bool:
-        """Whether a direction that a triangle does not see makes the arm larger."""
+        Returns:
+            Indices of the joints, from 0.
+        """
+        q = [item.configurations() for item in self.problem.data if item.configurations_per_row]
+        if not q:
+            return []
+        return np.flatnonzero(np.ptp(np.concatenate(q), axis=0) < _MIN_JOINT_RANGE).tolist()
+
+    def is_scale_unobservable(self, r: Array) -> bool:
+        """Decide whether a direction of the null space changes the size of the robot.
+
+        Args:
+            r: R factor of the whitened Jacobian, shape (p, p).
+
+        Returns:
+            False for problems without scale gauge.
+        """
         if self.problem.scale_gauge is None:
             return False
-        robot = len(self.problem.errors.parameters)
-        growth = self.problem.scale_gauge.rates(*self.problem.errors.derivative(self.x[:robot]))[:, 0]
-        return bool(np.abs(growth @ qr.null_space(triangle)[:robot]).max(initial=0.0) > NEGLIGIBLE)
+        n_robot = len(self.problem.errors.parameters)
+        growth = self.problem.scale_gauge.rates(*self.problem.errors.derivative(self.x[:n_robot]))[:, 0]
+        return bool(np.abs(growth @ qr.null_space(r)[:n_robot]).max(initial=0.0) > NEGLIGIBLE)
 
-    def layers(self, triangle: Array) -> list[tuple[Cause, Array]]:
-        """Bases (p, ·) of what stays unseen, each within the next: by the arm, and by all that was done."""
-        joints = list(range(self.chain.n_joints))
-        data = qr.null_space(triangle)
-        still = self.unmoved_joints()
-        poses = _unseen_part(data, self.hypothetical_r_factor(still)) if still else data
-        instrument = _unseen_part(poses, self.hypothetical_r_factor(joints))
-        arm = _unseen_part(instrument, self.hypothetical_r_factor(joints, Pose))
-        return [("arm", arm), ("instrument", instrument), ("poses", poses), ("still", data)]
+    def null_space_layers(self, r: Array) -> list[tuple[Cause, Array]]:
+        """Split the null space by cause.
+
+        Args:
+            r: R factor of the measurements at x, shape (p, p).
+
+        Returns:
+            Causes with orthonormal bases, each of shape (p, ·); each space contains the preceding one.
+        """
+        all_joints = list(range(self.chain.n_joints))
+        data = qr.null_space(r)
+        unmoved = self.unmoved_joints()
+        poses = _unobservable_part(data, self.hypothetical_r_factor(unmoved)) if unmoved else data
+        instrument = _unobservable_part(poses, self.hypothetical_r_factor(all_joints))
+        structure = _unobservable_part(instrument, self.hypothetical_r_factor(all_joints, Pose))
+        return [("structure", structure), ("instrument", instrument), ("poses", poses), ("unmoved", data)]
 
 
-def _echelon(space: Array, order: Array) -> Iterator[Array]:
-    """Combinations that span a space (p, d), each the only one with an entry at its pivot."""
+def _row_echelon_combinations(space: Array, order: Array) -> Iterator[Array]:
+    """Yield combinations that span a space (p, d), from elimination of the columns in this order."""
     rows = space.T.copy()
-    done = 0
+    n_pivots = 0
     for column in order:
-        if done == len(rows):
+        if n_pivots == len(rows):
             break
-        pivot = done + int(np.argmax(np.abs(rows[done:, column])))
+        pivot = n_pivots + int(np.argmax(np.abs(rows[n_pivots:, column])))
         if abs(rows[pivot, column]) < NEGLIGIBLE:
             continue
-        rows[[done, pivot]] = rows[[pivot, done]]
-        rows[done] /= rows[done, column]
-        others = np.arange(len(rows)) != done
-        rows[others] -= np.outer(rows[others, column], rows[done])
-        done += 1
+        rows[[n_pivots, pivot]] = rows[[pivot, n_pivots]]
+        rows[n_pivots] /= rows[n_pivots, column]
+        others = np.arange(len(rows)) != n_pivots
+        rows[others] -= np.outer(rows[others, column], rows[n_pivots])
+        n_pivots += 1
     for row in rows:
         yield row / row[np.argmax(np.abs(row))]
 
 
-def _orthogonal_part(known: Array, vector: Array) -> Array:
-    """What of a unit vector (p,), or of several (p, k), lies outside an orthonormal basis (p, d)."""
-    return vector - known @ (known.T @ vector)
+def _orthogonal_part(basis: Array, vector: Array) -> Array:
+    """Return the part of a vector (p,), or of several (p, k), that is orthogonal to a basis (p, d)."""
+    return vector - basis @ (basis.T @ vector)
 
 
 def _sort_key(row: Array) -> tuple[int, int, int]:
-    """Short combinations of neighbours come first."""
-    taking = np.flatnonzero(np.abs(row) > NEGLIGIBLE)
-    return len(taking), int(taking[-1] - taking[0]), int(taking[0])
+    """Sort combinations by number of parameters, then by extent, then by position."""
+    members = np.flatnonzero(np.abs(row) > NEGLIGIBLE)
+    return len(members), int(members[-1] - members[0]), int(members[0])
 
 
 def group_directions(layers: Sequence[tuple[Cause, Array]], error_frames: Array) -> list[UnobservableGroup]:
-    """Every unseen direction once: short combinations, each on as short a piece of the arm as it can be.
+    """Group the unobservable directions by cause and by part of the chain.
+
+    Every direction belongs to one group. A group has sparse combinations on the shortest possible part of the
+    chain.
 
     Args:
-        layers: of `Experiment.layers`.
-        error_frames: (r,) where each of the robot's plain errors acts; they are the first of the unknowns.
+        layers: Result of `ObservabilityProbe.null_space_layers`.
+        error_frames: Error frame of each geometric error, shape (r,). The geometric errors are the first
+            unknowns.
+
+    Returns:
+        Groups that together span the null space.
     """
     p = layers[-1][1].shape[0]
-    at = np.unique(error_frames)
-    spans = sorted(((i, j) for i in at for j in at if i <= j), key=lambda span: (span[1] - span[0], span[0]))
+    frames = np.unique(error_frames)
+    spans = sorted(
+        ((i, j) for i in frames for j in frames if i <= j), key=lambda span: (span[1] - span[0], span[0])
+    )
     parts = []
-    for with_others in (False, True)[: 1 + (len(error_frames) < p)]:
-        for first, end in spans:
-            inside = np.full(p, with_others)
-            inside[: len(error_frames)] = (error_frames >= first) & (error_frames <= end)
+    for with_other_unknowns in (False, True)[: 1 + (len(error_frames) < p)]:
+        for first, last in spans:
+            inside = np.full(p, with_other_unknowns)
+            inside[: len(error_frames)] = (error_frames >= first) & (error_frames <= last)
             parts.append(inside)
-    known = np.empty((p, 0))
+    # Orthonormal basis of the directions that already belong to a group.
+    basis = np.empty((p, 0))
     out = []
     for cause, space in layers:
         for inside in parts:
-            if known.shape[1] == space.shape[1]:
+            if basis.shape[1] == space.shape[1]:
                 break
             local = space @ _vanishing_combinations(space[~inside]) if (~inside).any() else space
-            if np.abs(_orthogonal_part(known, local)).max(initial=0) < 10 * NEGLIGIBLE:
+            if np.abs(_orthogonal_part(basis, local)).max(initial=0) < 10 * NEGLIGIBLE:
                 continue
             members = np.flatnonzero(inside)
-            found = [row for order in (members, members[::-1]) for row in _echelon(local, order)]
-            found.sort(key=_sort_key)
+            combinations = [
+                row for order in (members, members[::-1]) for row in _row_echelon_combinations(local, order)
+            ]
+            combinations.sort(key=_sort_key)
             new = []
-            for row in found:
-                rest = _orthogonal_part(known, row / np.linalg.norm(row))
+            for row in combinations:
+                rest = _orthogonal_part(basis, row / np.linalg.norm(row))
                 if np.linalg.norm(rest) > 10 * NEGLIGIBLE:
                     new.append(row)
-                    rest = _orthogonal_part(known, rest / np.linalg.norm(rest))
-                    known = np.concatenate([known, rest[:, None] / np.linalg.norm(rest)], 1)
+                    rest = _orthogonal_part(basis, rest / np.linalg.norm(rest))
+                    basis = np.concatenate([basis, rest[:, None] / np.linalg.norm(rest)], 1)
             if new:
                 out.append(UnobservableGroup(cause, np.array(new).T))
     return out

@@ -1,9 +1,24 @@
-"""What the data see, in numbers: rank, unseen and weakly seen directions, observability indices.
+"""Observability in numbers: indices, observable fractions, weakly observable directions.
 
-All of it comes from the triangle of a QR; the words are in `explanations`.
+All functions take the R factor of the whitened Jacobian J (unknowns in m and rad, rows in units of their
+standard deviations). J and R have the same singular values σ₁ ≥ … ≥ σ_p and right singular vectors v_i. JᵀJ
+is never formed: at a condition of 1e7 its inverse is wrong in the third digit.
 
-The triangle is R of the QR of the whitened Jacobian, metres and radians in its columns. Nothing here
-forms JᵀJ: at condition 1e7 that is wrong in the third digit.
+* Rank L: number of σ_i above `estimation.qr.RANK_RTOL` times σ₁.
+* Observable subspace: span of v₁ … v_L; its projector is P = V_L·V_Lᵀ. Null space: the orthogonal complement.
+* Observability indices O1 to O5, functions of σ₁ … σ_L; see `observability_indices`.
+
+References:
+    J.-H. Borm and C.-H. Menq, Determination of optimal measurement configurations for robot calibration based
+    on observability measure, Int. J. Robotics Research 10 (1991), 51-63: O1.
+    M. R. Driels and U. S. Pathre, Significance of observation strategy on the design of robot calibration
+    experiments, J. Robotic Systems 7 (1990), 197-223: O2.
+    A. Nahvi, J. M. Hollerbach and V. Hayward, Calibration of a parallel robot using multiple kinematic closed
+    loops, IEEE ICRA 1994, 407-412: O3.
+    A. Nahvi and J. M. Hollerbach, The noise amplification index for optimal pose selection in robot
+    calibration, IEEE ICRA 1996, 647-654: O4.
+    Y. Sun and J. M. Hollerbach, Observability index selection for robot calibration, IEEE ICRA 2008, 831-836:
+    O5.
 """
 
 from __future__ import annotations
@@ -13,45 +28,68 @@ import numpy as np
 from .._typing import Array
 from ..estimation.qr import rank, row_space, singular_values
 
-# A direction is known by the data if they leave less than this share of what was expected before them.
+# A direction is known if its posterior standard deviation is below this fraction of the prior one.
 MAX_KNOWN_STD_RATIO = 0.5
+# Entries of the null-space projector above this value connect two parameters.
+_MIN_PROJECTOR_ENTRY = 1e-6
 
 
-def observable_fraction(triangle: Array) -> Array:
-    """How far each parameter lies in what the data see, (p,) between 0 (not at all) and 1 (fully)."""
-    return np.clip(np.sum(row_space(triangle) ** 2, 0), 0.0, 1.0)
+def observable_fraction(r: Array) -> Array:
+    """Compute how much of each parameter lies in the observable subspace.
 
-
-def observability_indices(triangle: Array, samples: int) -> dict[str, float]:
-    """Observability indices O1 to O5 over the directions seen; the larger, the better; 0 if there is none.
-
-    With σ₁ ≥ … ≥ σ_L the singular values of the whitened Jacobian (metres and radians) and m samples:
-
-    * O1 = (σ₁…σ_L)^(1/L)/√m: Borm and Menq, Int. J. Robotics Research 10 (1991);
-    * O2 = σ_L/σ₁, the inverse condition: Driels and Pathre, J. Robotic Systems 7 (1990);
-    * O3 = σ_L: Nahvi, Hollerbach and Hayward, ICRA 1994;
-    * O4 = σ_L²/σ₁, noise amplification: Nahvi and Hollerbach, ICRA 1996;
-    * O5 = 1/(1/σ₁ + … + 1/σ_L): Sun and Hollerbach, ICRA 2008.
+    The fraction is the diagonal of the projector P: 1 for an identifiable parameter, 0 for one without effect
+        on
+    the measurements, and between them for a parameter that is identifiable only in combination with others.
 
     Args:
-        triangle: (p, p).
-        samples: m.
+        r: R factor of the whitened Jacobian, shape (p, p).
+
+    Returns:
+        Fractions in [0, 1], shape (p,).
     """
-    s = singular_values(triangle)[: rank(triangle)]
+    return np.clip(np.sum(row_space(r) ** 2, 0), 0.0, 1.0)
+
+
+def observability_indices(r: Array, samples: int) -> dict[str, float]:
+    """Compute the observability indices O1 to O5 over the observable directions; larger is better.
+
+    With the singular values σ₁ ≥ … ≥ σ_L of the whitened Jacobian and m samples:
+
+    * O1 = (σ₁·…·σ_L)^(1/L)/√m: Borm and Menq (1991);
+    * O2 = σ_L/σ₁, the inverse condition number: Driels and Pathre (1990);
+    * O3 = σ_L: Nahvi, Hollerbach and Hayward (1994);
+    * O4 = σ_L²/σ₁, the noise amplification index: Nahvi and Hollerbach (1996);
+    * O5 = 1/(1/σ₁ + … + 1/σ_L): Sun and Hollerbach (2008).
+
+    Args:
+        r: R factor of the whitened Jacobian, shape (p, p).
+        samples: Number m of samples.
+
+    Returns:
+        Indices by name; all are 0 if no direction is observable.
+    """
+    s = singular_values(r)[: rank(r)]
     if not s.size:
         return dict.fromkeys(("O1", "O2", "O3", "O4", "O5"), 0.0)
-    found = (
+    indices = (
         np.exp(np.mean(np.log(s))) / np.sqrt(samples),
         s[-1] / s[0],
         s[-1],
         s[-1] ** 2 / s[0],
         1 / np.sum(1 / s),
     )
-    return {f"O{i + 1}": float(value) for i, value in enumerate(found)}
+    return {f"O{i + 1}": float(value) for i, value in enumerate(indices)}
 
 
 def correlation(covariance: Array) -> Array:
-    """Correlations (p, p) of a covariance; NaN off the diagonal where a variance is not finite."""
+    """Compute correlation coefficients from a covariance matrix.
+
+    Args:
+        covariance: Covariance matrix, shape (p, p).
+
+    Returns:
+        Correlations in [-1, 1], shape (p, p); NaN off the diagonal where a variance is not finite.
+    """
     std = np.sqrt(np.diag(covariance))
     with np.errstate(invalid="ignore", divide="ignore"):
         out = np.clip(covariance / np.outer(std, std), -1.0, 1.0)
@@ -59,48 +97,63 @@ def correlation(covariance: Array) -> Array:
     return out
 
 
-def weakly_observable(triangle: Array, expected: Array, noise: float) -> tuple[Array, Array]:
-    """Directions that count in the rank but of which the data tell next to nothing.
+def weakly_observable(r: Array, prior_std: Array, noise: float) -> tuple[Array, Array]:
+    """Find directions that count in the rank but are hardly better known than before the measurement.
 
-    Each column of the triangle is scaled by what was expected of its parameter, so that metres and radians
-    compare. Of a direction with singular value s there, data of that noise leave 1/√(1 + (s/noise)²) of
-    what was expected before; `KNOWN_SHARE` of it or more is not knowledge. Directions not seen at all
-    are left out.
+    The columns of R are scaled by the prior standard deviations, which makes metres and radians comparable.
+    For a direction with singular value s of the scaled factor, measurements with this noise reduce the
+    standard deviation to the fraction 1/√(1 + (s/noise)²) of the prior one. Directions with
+    `MAX_KNOWN_STD_RATIO` or more are weakly observable. Directions in the null space are not included.
 
     Args:
-        triangle: (p, p).
-        expected: (p,) standard deviations before any measurement, m and rad.
-        noise: standard deviation of the whitened residuals.
+        r: R factor of the whitened Jacobian, shape (p, p).
+        prior_std: Prior standard deviations, shape (p,) [m or rad].
+        noise: Standard deviation of the whitened residuals.
 
     Returns:
-        The directions (p, w), each one expected standard deviation long, and the shares (w,) left.
+        Weakly observable directions, each one prior standard deviation long, shape (p, w), and their ratios
+        of posterior to prior standard deviation, shape (w,).
     """
-    _, s, vt = np.linalg.svd(triangle * expected)
-    s = s[: rank(triangle)]
-    left = noise / np.hypot(noise, s)
-    weak = np.flatnonzero(left >= MAX_KNOWN_STD_RATIO)
-    return expected[:, None] * vt[weak].T, left[weak]
+    _, s, vt = np.linalg.svd(r * prior_std)
+    s = s[: rank(r)]
+    std_ratios = noise / np.hypot(noise, s)
+    weak = np.flatnonzero(std_ratios >= MAX_KNOWN_STD_RATIO)
+    return prior_std[:, None] * vt[weak].T, std_ratios[weak]
 
 
-def clusters(linked: Array) -> list[tuple[int, ...]]:
-    """Those of p that link to themselves in a symmetric (p, p) table, put together where it links them."""
+def connected_components(adjacency: Array) -> list[tuple[int, ...]]:
+    """Find the connected components of an undirected graph.
+
+    Args:
+        adjacency: Symmetric table of edges, shape (p, p). Nodes with a zero on the diagonal are ignored.
+
+    Returns:
+        Nodes of each component, ascending.
+    """
     out: list[tuple[int, ...]] = []
-    todo = set(np.flatnonzero(np.diag(linked)).tolist())
-    while todo:
-        group, edge = set[int](), {min(todo)}
-        while edge:
-            group |= edge
-            edge = {int(j) for i in edge for j in np.flatnonzero(linked[i])} - group
-        todo -= group
-        out.append(tuple(sorted(group)))
+    remaining = set(np.flatnonzero(np.diag(adjacency)).tolist())
+    while remaining:
+        component, frontier = set[int](), {min(remaining)}
+        while frontier:
+            component |= frontier
+            frontier = {int(j) for i in frontier for j in np.flatnonzero(adjacency[i])} - component
+        remaining -= component
+        out.append(tuple(sorted(component)))
     return out
 
 
-def unobservable_groups(triangle: Array) -> list[tuple[tuple[int, ...], int]]:
-    """Groups of parameters that cannot be told apart, each with its number of unseen directions."""
-    basis = row_space(triangle)
-    hidden = np.eye(triangle.shape[1]) - basis.T @ basis
+def unobservable_groups(r: Array) -> list[tuple[tuple[int, ...], int]]:
+    """Group the parameters that are identifiable only in combination.
+
+    Args:
+        r: R factor of the whitened Jacobian, shape (p, p).
+
+    Returns:
+        Parameters of each group and the number of its unobservable directions.
+    """
+    basis = row_space(r)
+    projector = np.eye(r.shape[1]) - basis.T @ basis
     return [
-        (members, round(float(np.trace(hidden[np.ix_(members, members)]))))
-        for members in clusters(np.abs(hidden) > 1e-6)
+        (members, round(float(np.trace(projector[np.ix_(members, members)]))))
+        for members in connected_components(np.abs(projector) > _MIN_PROJECTOR_ENTRY)
     ]

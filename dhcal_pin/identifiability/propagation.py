@@ -1,4 +1,16 @@
-"""How small errors at one place of an arm pass along it, joint by joint, and what its axes have in common."""
+"""Propagation of error twists along a chain, and relations between its joint axes.
+
+A combination of errors is unobservable for every instrument if its effect can be moved along the chain to a
+place where it vanishes. The twist ξ of the combination passes a joint unchanged, for all joint positions, if
+it commutes with the joint motion (Khalil & Dombre, Modeling, Identification and Control of Robots, 2002,
+chapter 11: grouping of parameters):
+
+* revolute joint about z: rotation about z and translation along z;
+* prismatic joint along z: rotation about z and every translation.
+
+From body to body, the twist transforms by the adjoint of the link transform: ξ_(j+1) = Ad(L_j⁻¹)·ξ_j + own
+errors.
+"""
 
 from __future__ import annotations
 
@@ -12,22 +24,23 @@ from .._typing import Array
 from ..estimation.error_model import ErrorModel, ErrorParameter
 from ..robot.chain import Chain, joint_frame, link_frame
 
-# Axes within this of each other, rad and m, are parallel, or the same line.
+# Two axes are parallel if their angle [rad], and coincident if also their distance [m], is below this value.
 PARALLEL_TOL = 1e-6
-
-
-# Entries of a combination, the largest 1 in m and rad, below which a parameter has no part worth a word.
+# Entries of a combination, whose largest entry is 1 [m or rad], below this value count as zero.
 NEGLIGIBLE = 1e-3
+# Cross products of unit vectors below this value mean that a twist acts along or about an axis.
+_ALONG_AXIS_TOL = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class PlainErrors:
-    """A chain and the errors that are plain twists in it, those that no joint's value scales.
+    """Chain with its geometric errors, which are constant twists (no transmission errors).
 
     Attributes:
-        chain: at the values of the unknowns.
-        parameters: (r,).
-        bodies, twists: (r,), (r, 6) what they move there, see `stations.twists_at`.
+        chain: Chain at the current values of the parameters.
+        parameters: Geometric error parameters, shape (r,).
+        bodies: Body that each error moves, shape (r,).
+        twists: Twist of each error in its body frame, shape (r, 6).
     """
 
     chain: Chain
@@ -37,12 +50,20 @@ class PlainErrors:
 
     @property
     def error_frames(self) -> Array:
-        """Where they act (r,)."""
+        """Error frame of each error, shape (r,)."""
         return np.array([p.error_frame for p in self.parameters], int)
 
     @classmethod
     def from_model(cls, errors: ErrorModel, x: Array) -> PlainErrors:
-        """The plain errors of a model at x (p,); they come first in it."""
+        """Select the geometric errors of a model; they are its first parameters.
+
+        Args:
+            errors: Error model.
+            x: Values of its parameters, shape (p,) [m or rad].
+
+        Returns:
+            Geometric errors at x.
+        """
         chain, bodies, twists = errors.derivative(x)
         count = int(np.sum(bodies <= len(chain.moving_joints)))
         return cls(chain, errors.parameters[:count], bodies[:count], twists[:count])
@@ -50,12 +71,13 @@ class PlainErrors:
 
 @dataclass(frozen=True, eq=False)
 class Propagation:
-    """How a combination of errors passes along the chain without a joint taking notice.
+    """Joints that a combination of errors passes unchanged, and its effect on the tool.
 
     Attributes:
-        translation_joints, rotation_joints: the joints, from 1, along and about whose axes it passes.
-        crossed_prismatic_joints: the prismatic joints that it passes across their axis.
-        tool_twists: (r, 6) what is left at the measured point; zero if the whole tool stays where it is.
+        translation_joints: Joints, from 1, that it passes as a translation along their axis.
+        rotation_joints: Joints, from 1, that it passes as a rotation about their axis.
+        crossed_prismatic_joints: Prismatic joints, from 1, that it passes as a translation across their axis.
+        tool_twists: Twists of the tool at the measured point, shape (c, 6); zero if the tool does not move.
     """
 
     translation_joints: list[int]
@@ -64,52 +86,73 @@ class Propagation:
     tool_twists: Array
 
 
-def propagate_along_chain(path: PlainErrors, vectors: Array) -> Propagation | None:
-    """How combinations (r, c) of a path's errors pass along it; None if a joint changes them.
+def propagate_along_chain(errors: PlainErrors, vectors: Array) -> Propagation | None:
+    """Propagate combinations of errors along the chain.
 
-    A motion passes a joint unchanged if it commutes with the joint's own: a turn about and a shift along a
-    revolute joint's axis, a turn about a prismatic joint's axis and any shift.
+    Args:
+        errors: Geometric errors of the chain.
+        vectors: Combinations, shape (r, c).
+
+    Returns:
+        Joints that the combinations pass; None if a joint motion changes their effect.
     """
-    chain = path.chain
-    shifts, turns, slides = set[int](), set[int](), set[int]()
-    carried = np.zeros((6, vectors.shape[1]))
+    chain = errors.chain
+    translations, rotations, crossings = set[int](), set[int](), set[int]()
+    propagated = np.zeros((6, vectors.shape[1]))
     for body, link in enumerate(chain.link_transforms):
-        mine = path.bodies == body
-        carried = carried + path.twists[mine].T @ vectors[mine]
-        last = body == len(chain.moving_joints)
-        carried = se3.adjoint(se3.inverse(link @ chain.tool if last else link)) @ carried
-        if last:
+        at_body = errors.bodies == body
+        propagated = propagated + errors.twists[at_body].T @ vectors[at_body]
+        is_last = body == len(chain.moving_joints)
+        propagated = se3.adjoint(se3.inverse(link @ chain.tool if is_last else link)) @ propagated
+        if is_last:
             break
-        size = np.abs(carried).max(1) > NEGLIGIBLE
-        if size[3:5].any() or (size[:2].any() and not chain.prismatic[body]):
+        is_nonzero = np.abs(propagated).max(1) > NEGLIGIBLE
+        if is_nonzero[3:5].any() or (is_nonzero[:2].any() and not chain.prismatic[body]):
             return None
-        shifts |= {body + 1} if size[2] else set()
-        turns |= {body + 1} if size[5] else set()
-        slides |= {body + 1} if size[:2].any() else set()
-    return Propagation(sorted(shifts), sorted(turns), sorted(slides), carried.T)
+        translations |= {body + 1} if is_nonzero[2] else set()
+        rotations |= {body + 1} if is_nonzero[5] else set()
+        crossings |= {body + 1} if is_nonzero[:2].any() else set()
+    return Propagation(sorted(translations), sorted(rotations), sorted(crossings), propagated.T)
 
 
 def axis_angle_and_distance(chain: Chain, first: int, second: int) -> tuple[float, float]:
-    """Angle in rad between two axes, from 1, and distance in m of the second's origin from the first.
+    """Compute the angle and the distance of two joint axes.
 
-    The joints between them are at zero; for parallel and for coincident axes that does not matter.
+    The distance is that of the second joint's origin from the first axis. The joints between them are at
+    zero; for parallel and coincident axes the result does not depend on that.
+
+    Args:
+        chain: Chain.
+        first: Number of the first joint, from 1.
+        second: Number of the second joint, greater than `first`.
+
+    Returns:
+        Angle in [0, π/2] [rad] and distance [m].
     """
-    between = np.eye(4)
+    transform = np.eye(4)
     for j in range(first, second):
-        between = between @ chain.link_transforms[j]
-    sine = np.linalg.norm(between[:2, 2])
-    return float(np.arctan2(sine, abs(between[2, 2]))), float(np.linalg.norm(between[:2, 3]))
+        transform = transform @ chain.link_transforms[j]
+    sine = np.linalg.norm(transform[:2, 2])
+    return float(np.arctan2(sine, abs(transform[2, 2]))), float(np.linalg.norm(transform[:2, 3]))
 
 
 def axes_acted_on(chain: Chain, parameters: Sequence[ErrorParameter]) -> set[int]:
-    """Joints, from 1, along or about whose own axes parameters act."""
+    """Find the joints whose own axes parameters translate along or rotate about.
+
+    Args:
+        chain: Chain.
+        parameters: Geometric error parameters.
+
+    Returns:
+        Numbers of the joints, from 1.
+    """
     out = set()
     for p in parameters:
         twist = np.array(p.twist).reshape(2, 3)
         for j, axis in enumerate(chain.axes, start=1):
             if (
                 p.error_frame in (joint_frame(j), link_frame(j))
-                and np.abs(np.cross(twist, axis)).max() < 1e-9
+                and np.abs(np.cross(twist, axis)).max() < _ALONG_AXIS_TOL
             ):
                 out.add(j)
     return out

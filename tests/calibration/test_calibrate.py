@@ -432,7 +432,7 @@ def test_touches_without_a_length_leave_the_size_of_the_arm_to_the_priors(sim_6d
     data = PointContact.simulate(truth, q, Noise(noise), rng).replace(has_stated_sigma=False)
     fixed = ("tool.rx", "tool.ry", "tool.rz")
     fit = calibrate(sim_6dof, data, "minimal,tool", fix=fixed)
-    assert [text for text in fit.unobservable if "how large" in text]
+    assert [text for text in fit.unobservable if "the size of the robot" in text]
     assert fit.converged
     assert fit.iterations < 40
     # Joints 1 with the points 4, a shift and a turn behind joint 1, and the size; the rest is seen.
@@ -443,7 +443,7 @@ def test_touches_without_a_length_leave_the_size_of_the_arm_to_the_priors(sim_6d
     first, second = truth.poses(q[:2])[:, :3, 3]
     known = PointDistance(6, [data.names[:2]], [np.linalg.norm(second - first)], 1e-5)
     sized = calibrate(sim_6dof, [data, known], "minimal,tool", fix=fixed)
-    assert not [text for text in sized.unobservable if "how large" in text]
+    assert not [text for text in sized.unobservable if "the size of the robot" in text]
     assert spread(sized.chain) / spread(truth) == pytest.approx(1, abs=5e-5 + 0.5 * noise)
 
 
@@ -458,7 +458,7 @@ def test_lengths_that_are_held_tell_how_large_an_arm_is_that_touches(sim_6dof):
     data = PointContact.simulate(sim_6dof, rng.uniform(-2.5, 2.5, (300, 6)), Noise(1e-4), rng)
     said = calibrate(sim_6dof, data, "offset,tool").unobservable
     assert said
-    assert not [text for text in said if "how large" in text]
+    assert not [text for text in said if "the size of the robot" in text]
 
 
 @pytest.mark.parametrize(

@@ -91,8 +91,8 @@ def test_unseen_directions_are_named(sim_6dof, sim_6dof_actual):
     at_nominal = Pose.simulate(sim_6dof, q, Noise(), np.random.default_rng(0))
     said = calibrate(sim_6dof, at_nominal, "dh", method="gn", max_iterations=1).unobservable
     assert len(said) == 2
-    assert "only d2 + d3 + d4 is seen" in said[0]
-    assert "only d5 + d6 is seen" in said[1]
+    assert "only d2 + d3 + d4 is identifiable" in said[0]
+    assert "only d5 + d6 is identifiable" in said[1]
     at_actual = Pose.simulate(sim_6dof_actual, q, Noise(), np.random.default_rng(0))
     assert calibrate(sim_6dof_actual, at_actual, "dh", method="gn", max_iterations=1).unobservable == []
 
