@@ -1,24 +1,44 @@
-"""What the small commands of `dhcal` do, once the command line is read.
-
-Wrong input is found before anything is written or shown; JSON goes to stdout, all else to stderr.
-"""
+"""`dhcal check`: compare the Jacobian of the robot with the paper, Pinocchio and finite differences."""
 
 from __future__ import annotations
 
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
 
-from ..io.robot import read_robot
-from ..paper.jacobian_check import crosscheck
-from . import console
-from .options import require_writable_outputs, write_json
+from .options import JSON, ROBOT, TIP
+
+EXAMPLE = "dhcal check arm.dh.toml"
 
 
-def check(args: Namespace) -> int:
-    """All routes to the Jacobian side by side; 1 where they disagree."""
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the arguments of `dhcal check`.
+
+    Args:
+        parser: Parser of the command.
+    """
+    parser.add_argument("robot", **ROBOT)
+    parser.add_argument("--tip", **TIP)
+    parser.add_argument("--json", **JSON)
+
+
+def run(args: Namespace) -> int:
+    """Compute the Jacobian in several ways and show the differences.
+
+    Args:
+        args: Parsed arguments.
+
+    Returns:
+        Exit status: 0 if all agree, else 1.
+    """
+    from ..io import read_robot  # lazy import, as the following: they load Pinocchio
+    from ..paper.jacobian_check import crosscheck
+    from . import console
+    from .outputs import require_writable_outputs, write_outputs
+
     require_writable_outputs([args.json], [args.robot])
     rows = crosscheck(read_robot(args.robot, args.tip))
-    agree = all(row.agrees for row in rows)
-    write_json(args.json, {"agree": agree, "routes": [asdict(row) | {"agrees": row.agrees} for row in rows]})
+    all_agree = all(row.agrees for row in rows)
+    routes = [asdict(row) | {"agrees": row.agrees} for row in rows]
+    write_outputs({}, args.json, {"agree": all_agree, "routes": routes})
     console.print_crosscheck(args.robot, rows)
-    return 0 if agree else 1
+    return 0 if all_agree else 1

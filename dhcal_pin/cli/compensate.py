@@ -1,109 +1,120 @@
-"""`dhcal compensate`: targets in, joint values and corrected targets out."""
+"""`dhcal compensate`: compute joint values and targets that correct the errors of a calibrated robot."""
 
 from __future__ import annotations
 
-from argparse import Namespace
+import math
+from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-import numpy as np
+from ..exceptions import InvalidArgumentError
+from .options import TIP
 
-from .. import se3
-from .._typing import Array
-from ..compensation import SINGULAR, Compensation, compensate
-from ..exceptions import DhcalError
-from ..io.atomic import write_files
-from ..io.measurement_columns import QUATERNION, ROTVEC, joint_units
-from ..io.measurement_csv import TargetPoses, read_targets
-from ..io.robot import has_dh_table, read_robot
-from ..io.tabular import csv_text
-from ..robot.chain import Chain
-from ..units import ANGLES, LENGTHS
-from . import console
-from .options import require_writable_outputs, sidecars
+if TYPE_CHECKING:
+    from .._typing import Array
+    from ..compensation import Compensation
+    from ..io import TargetPoses
+    from ..robot import Chain
 
-# Rows named on stderr; all of them are in the file.
-_SHOWN = 12
+EXAMPLE = "dhcal compensate ur10.urdf ur10_calibrated.urdf targets.csv --tip tool0 -o corrected.csv"
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the arguments of `dhcal compensate`.
+
+    Args:
+        parser: Parser of the command.
+    """
+    parser.add_argument("nominal", metavar="NOMINAL.urdf", help="robot model of the controller")
+    parser.add_argument("calibrated", metavar="CALIBRATED.urdf", help="the same robot, calibrated")
+    parser.add_argument("targets", metavar="targets.csv", help="positions or poses of the tool")
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="corrected.csv",
+        required=True,
+        help="joint values and corrected targets to write, one row per target",
+    )
+    parser.add_argument("--tip", **TIP)
 
 
 def run(args: Namespace) -> int:
-    """Reads both robots with their sidecars and the targets, writes the corrected ones, names the others."""
-    given = [args.nominal, args.calibrated]
-    require_writable_outputs([args.output], [*given, *sidecars(given), args.targets])
-    nominal, calibrated = (read_robot(path, None if has_dh_table(path) else args.tip) for path in given)
+    """Correct targets, write them, and show which could not be reached.
+
+    Args:
+        args: Parsed arguments.
+
+    Returns:
+        Exit status 0.
+
+    Raises:
+        InvalidArgumentError: The two robots have different tips.
+    """
+    from ..compensation import compensate  # lazy import, as the following: they load Pinocchio
+    from ..io import read_robot, read_targets
+    from ..io.robot import has_dh_table
+    from . import console
+    from .outputs import existing_sidecars, require_writable_outputs, write_outputs
+
+    robots = [args.nominal, args.calibrated]
+    require_writable_outputs([args.output], [*robots, *existing_sidecars(robots), args.targets])
+    nominal, calibrated = (read_robot(path, None if has_dh_table(path) else args.tip) for path in robots)
     if nominal.tip != calibrated.tip and args.tip is None:
-        raise DhcalError(
-            f"{args.calibrated}: its tip is {calibrated.tip!r}, that of {args.nominal} is {nominal.tip!r}; "
-            "name one with --tip"
+        raise InvalidArgumentError(
+            f"{args.calibrated}: its tip is {calibrated.tip!r}, but the tip of {args.nominal} is "
+            f"{nominal.tip!r}; choose one with --tip"
         )
-    wanted = read_targets(args.targets, calibrated)
-    with console.progress_bar("compensating", len(wanted.values)) as progress:
-        found = compensate(nominal, calibrated, wanted.values, wanted.near, progress)
-    write_files({args.output: corrected_text(found, calibrated, wanted)})
-    _show(found, calibrated, wanted)
+    targets = read_targets(args.targets, calibrated)
+    with console.progress_bar("compensating", len(targets.values)) as progress:
+        result = compensate(nominal, calibrated, targets.values, targets.near, progress)
+    write_outputs({args.output: corrected_text(result, calibrated, targets)})
+    console.print_compensation(result, calibrated, targets)
     console.print_lines(f"wrote {args.output}")
     return 0
 
 
-def corrected_text(found: Compensation, chain: Chain, wanted: TargetPoses) -> str:
-    """The CSV of a compensation, a row a target, in the units of the targets; empty where not reached.
+def corrected_text(result: Compensation, chain: Chain, targets: TargetPoses) -> str:
+    """Format corrected targets.
 
-    Columns: the joints' values, the corrected target, how far the calibrated tool stays from what was
-    asked for, and the status.
+    Args:
+        result: Corrected targets.
+        chain: Calibrated robot.
+        targets: Targets as read, with their units.
+
+    Returns:
+        CSV text with one row per target: joint values, corrected target in the units of the input, remaining
+        error of the calibrated tool, and status. Cells of targets that are not reached are empty.
     """
+    import numpy as np  # lazy import, as the following: they are slow to load
+
+    from .. import se3
+    from ..io.measurement_columns import QUATERNION, ROTVEC, joint_units
+    from ..io.tabular import csv_text
+    from ..units import ANGLES, LENGTHS
+
     columns: dict[str, Sequence[str]] = {}
-    for name, values in zip(chain.joint_names, found.q.T, strict=True):
-        columns[f"{name}[{'m' if joint_units(chain, name) is LENGTHS else 'rad'}]"] = _numbers(values)
+    for name, values in zip(chain.joint_names, result.q.T, strict=True):
+        columns[f"{name}[{'m' if joint_units(chain, name) is LENGTHS else 'rad'}]"] = _cells(values)
     for i, name in enumerate(("x", "y", "z")):
-        unit = wanted.units[name]
-        columns[f"{name}[{unit}]"] = _numbers(found.poses[:, i, 3] * LENGTHS[unit])
-    turn = np.full((len(found.q), 3), np.nan)
-    turn[found.reached] = se3.log3(found.poses[found.reached, :3, :3])
-    if ROTVEC[0] in wanted.units:
-        for name, values in zip(ROTVEC, turn.T, strict=True):
-            unit = wanted.units[name]
-            columns[f"{name}[{unit}]"] = _numbers(values * ANGLES[unit])
+        unit = targets.units[name]
+        columns[f"{name}[{unit}]"] = _cells(result.poses[:, i, 3] * LENGTHS[unit])
+    rotvec = np.full((len(result.q), 3), np.nan)
+    rotvec[result.reached] = se3.log3(result.poses[result.reached, :3, :3])
+    if ROTVEC[0] in targets.units:
+        for name, values in zip(ROTVEC, rotvec.T, strict=True):
+            unit = targets.units[name]
+            columns[f"{name}[{unit}]"] = _cells(values * ANGLES[unit])
     else:
-        half = np.linalg.norm(turn, axis=1) / 2
-        vector = turn * np.sinc(half / np.pi)[:, None] / 2
-        columns |= dict(zip(QUATERNION, map(_numbers, [np.cos(half), *vector.T]), strict=True))
-    unit = wanted.units["x"]
-    columns[f"miss_position[{unit}]"] = _numbers(found.residual_error[:, 0] * LENGTHS[unit])
-    if wanted.values.ndim == 3:
-        columns["miss_rotation[deg]"] = _numbers(found.residual_error[:, 1] * ANGLES["deg"])
-    return csv_text(columns | {"status": found.status})
+        half_angle = np.linalg.norm(rotvec, axis=1) / 2
+        vector = rotvec * np.sinc(half_angle / np.pi)[:, None] / 2
+        columns |= dict(zip(QUATERNION, map(_cells, [np.cos(half_angle), *vector.T]), strict=True))
+    unit = targets.units["x"]
+    columns[f"miss_position[{unit}]"] = _cells(result.residual_error[:, 0] * LENGTHS[unit])
+    if targets.values.ndim == 3:
+        columns["miss_rotation[deg]"] = _cells(result.residual_error[:, 1] * ANGLES["deg"])
+    return csv_text(columns | {"status": result.status})
 
 
-def _numbers(values: Array) -> list[str]:
-    return ["" if np.isnan(value) else repr(value) for value in values.tolist()]
-
-
-def _show(found: Compensation, chain: Chain, wanted: TargetPoses) -> None:
-    """How many targets came out how, and which are not reached or delicate."""
-    for status in dict.fromkeys(found.status):
-        rows = [row for row, other in enumerate(found.status, 1) if other == status]
-        text = f"{wanted.source}: {len(rows)} of {len(found.status)} {status}"
-        if status != "ok":
-            named = [
-                f"row {row}"
-                if status == SINGULAR
-                else f"row {row} ({_size(found.residual_error[row - 1])} away)"
-                for row in rows[:_SHOWN]
-            ]
-            text += f": {', '.join(named)}" + (
-                f" and {len(rows) - _SHOWN} more" if len(rows) > _SHOWN else ""
-            )
-        console.print_lines(text, style="" if status == "ok" else "yellow")
-    if chain.n_joints > 6:
-        console.print_lines(
-            f"note: with {chain.n_joints} joints a controller may reach a corrected target in other ways, which "
-            "are not corrected; send the joint values"
-        )
-    elif chain.n_joints < 6 and wanted.values.ndim == 3 and not found.reached.all():
-        console.print_lines(
-            f"note: {chain.n_joints} joints cannot turn the tool as one likes; leave the rotation out of targets"
-        )
-
-
-def _size(miss: Array) -> str:
-    turn = np.rad2deg(miss[1])
-    return f"{1e3 * miss[0]:.3g} mm" + (f", {turn:.3g}°" if turn > 0 else "")
+def _cells(values: Array) -> list[str]:
+    """Format numbers exactly; NaN as an empty cell."""
+    return ["" if math.isnan(value) else repr(value) for value in values.tolist()]

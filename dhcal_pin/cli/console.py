@@ -1,16 +1,22 @@
-"""What the command line shows a person: tables and progress on stderr, plain where it is no terminal."""
+"""Console output of the commands: tables, sentences and progress on stderr.
+
+Output has colours and progress bars on a terminal, and is plain text in files and pipes. This is the only
+module that uses rich.
+"""
 
 from __future__ import annotations
 
 import webbrowser
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from rich.console import Console
-from rich.progress import Progress as Bar
-from rich.table import Table as Grid
+from rich.progress import Progress as ProgressBar
+from rich.table import Table as ConsoleTable
 from rich.text import Text
 
 from ..calibration.evaluation import GROUP_UNITS, Accuracy
@@ -29,41 +35,109 @@ from ..estimation.solver import Progress
 from ..formatting import Table, format_quantity
 
 if TYPE_CHECKING:
+    from .._typing import Array
+    from ..compensation import Compensation
+    from ..io import TargetPoses
     from ..paper.jacobian_check import Agreement
+    from ..planning import Plan
+    from ..robot import Chain
+    from ..studies import StudyGrid
+
+# Longest list of rows in a sentence; the files that are written contain all of them.
+MAX_LISTED_ROWS = 12
+
+# Width of tables in files and pipes, in characters: wide enough not to fold them.
+_FILE_WIDTH = 140
+
+
+# --- basic output ----------------------------------------------------------------------------------
 
 
 def _console() -> Console:
+    """Create a console on stderr."""
     console = Console(stderr=True, highlight=False)
     if not console.is_terminal:
-        # A file or a pipe has no width of its own: never fold a table there.
-        console.width = 140
+        console.width = _FILE_WIDTH
     return console
 
 
 def print_table(title: str, content: Table) -> None:
-    """A table under its title."""
+    """Print a table under its title.
+
+    Args:
+        title: Title.
+        content: Table.
+    """
     console = _console()
-    out = Grid(header_style="bold", box=None, pad_edge=False)
+    table = ConsoleTable(header_style="bold", box=None, pad_edge=False)
     for i, name in enumerate(content.header):
-        out.add_column(name, justify="left" if i < content.n_text_columns else "right")
+        table.add_column(name, justify="left" if i < content.n_text_columns else "right")
     for row in content.rows:
-        out.add_row(*map(Text, row))
+        table.add_row(*map(Text, row))
     console.print()
-    # Not the table's own title, which would be folded to the table's width.
+    # The title of a rich table would be folded to the width of the table.
     console.print(Text(title, style="bold"), soft_wrap=True)
-    console.print(out)
+    console.print(table)
 
 
 def print_lines(*texts: str, style: str = "") -> None:
-    """Plain sentences."""
+    """Print sentences, one per line.
+
+    Args:
+        *texts: Sentences.
+        style: Style of rich, such as "yellow" or "bold".
+    """
     console = _console()
     for text in texts:
         console.print(Text(text, style=style), soft_wrap=True)
 
 
+def print_notes(texts: Sequence[str]) -> None:
+    """Print notes on a result.
+
+    Args:
+        texts: Notes.
+    """
+    print_lines(*(f"note: {text}" for text in texts))
+
+
+def print_warnings(path: str, texts: Sequence[str]) -> None:
+    """Print warnings about a file, one line each.
+
+    Args:
+        path: Path of the file.
+        texts: Warnings.
+    """
+    for text in texts:
+        print_lines(f"{path}: warning: {text}", style="yellow")
+
+
+def print_hint(text: str) -> None:
+    """Print a suggestion.
+
+    Args:
+        text: Suggestion; nothing is printed if it is empty.
+    """
+    if text:
+        print_lines(f"hint: {text}", style="yellow")
+
+
+def _listed(items: Sequence[object]) -> str:
+    """Join the first items of a list and count the others."""
+    text = ", ".join(map(str, items[:MAX_LISTED_ROWS]))
+    return text + (f" and {len(items) - MAX_LISTED_ROWS} more" if len(items) > MAX_LISTED_ROWS else "")
+
+
 @contextmanager
 def show_progress(title: str) -> Iterator[Progress | None]:
-    """A status line while a loop runs; nothing where stderr is not a terminal."""
+    """Show the progress of a solver in a status line.
+
+    Args:
+        title: Description of the work.
+
+    Yields:
+        Callback with iteration and cost; None if stderr is not a terminal.
+    """
     console = _console()
     if not console.is_terminal:
         yield None
@@ -73,63 +147,99 @@ def show_progress(title: str) -> Iterator[Progress | None]:
 
 
 @contextmanager
-def progress_bar(title: str, total: int, done: int = 0) -> Iterator[Callable[[int], None]]:
-    """A bar for so many pieces of work, told how many are done; nothing where it is no terminal."""
+def progress_bar(title: str, total: int, n_done: int = 0) -> Iterator[Callable[[int], None]]:
+    """Show a progress bar; nothing is shown if stderr is not a terminal.
+
+    Args:
+        title: Description of the work.
+        total: Number of tasks.
+        n_done: Number of tasks that are already done.
+
+    Yields:
+        Callback with the number of tasks done.
+    """
     console = _console()
-    with Bar(console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task(title, total=total, completed=done)
+    with ProgressBar(console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task(title, total=total, completed=n_done)
         yield lambda count: bar.update(task, completed=count)
 
 
-def print_unreachable_rows(path: str, found: Sequence[UnreachableRow]) -> None:
-    """Impossible rows, one line each."""
-    for finding in found:
-        print_lines(f"{path}: row {finding.row} is left out: {finding.reason}", style="yellow")
+def open_page(path: str) -> None:
+    """Open a page in the browser; without a browser print its address.
+
+    Args:
+        path: Path of the page.
+    """
+    open_url(Path(path).resolve().as_uri())
 
 
-def print_warnings(path: str, texts: Sequence[str]) -> None:
-    """What is hard to believe in a file, one line each."""
-    for text in texts:
-        print_lines(f"{path}: warning: {text}", style="yellow")
+def open_url(url: str) -> None:
+    """Open an address in the browser; without a browser print it.
+
+    Args:
+        url: Address.
+    """
+    if not webbrowser.open(url):
+        print_lines(f"no browser found; open {url}")
 
 
-def print_outliers(path: str, rows: Sequence[int], aside: Sequence[int]) -> None:
-    """Gross errors, on a line those that take no part in the fit, on another those that do."""
-    left, others = [row for row in rows if row in aside], [row for row in rows if row not in aside]
-    for some, hint in (
-        (left, "no part in the fit"),
-        (others, "part in the fit; --loss tukey would leave out such"),
-    ):
-        listed = ", ".join(map(str, some[:12])) + (f" and {len(some) - 12} more" if len(some) > 12 else "")
-        if len(some) == 1:
-            print_lines(f"{path}: a gross error, row {listed}: takes {hint}", style="yellow")
-        elif some:
-            print_lines(f"{path}: {len(some)} gross errors, rows {listed}: take {hint}", style="yellow")
+# --- calibrate, validate ---------------------------------------------------------------------------
 
 
-def print_notes(texts: Sequence[str]) -> None:
-    """Remarks on a conversion."""
-    print_lines(*(f"note: {text}" for text in texts))
+def print_unreachable_rows(path: str, unreachable: Sequence[UnreachableRow]) -> None:
+    """Print the rows that are excluded because the robot cannot reach them.
+
+    Args:
+        path: Path of the measurement file.
+        unreachable: Rows with the reason.
+    """
+    for item in unreachable:
+        print_lines(f"{path}: row {item.row} is excluded: {item.reason}", style="yellow")
 
 
-def print_crosscheck(robot: str, rows: Sequence[Agreement]) -> None:
-    """The routes of `dhcal check` against the paper's factors."""
-    cells = [
-        [
-            row.route,
-            str(row.columns) if row.columns else "",
-            f"{row.difference:.1e}",
-            f"{row.tolerance:.0e}",
-            "agrees" if row.agrees else "DISAGREES",
-        ]
-        for row in rows
-    ]
-    header = ["route", "columns", "difference", "allowed", "verdict"]
-    print_table(f"{robot}: largest difference from the paper's factors (m, rad)", Table(header, cells))
+def print_outliers(path: str, rows: Sequence[int], rejected: Sequence[int]) -> None:
+    """Print the outliers of a file: one line for those excluded from the fit, one for the others.
+
+    Args:
+        path: Path of the measurement file.
+        rows: Row numbers of the outliers.
+        rejected: Row numbers with zero weight in the fit.
+    """
+    excluded = [row for row in rows if row in rejected]
+    included = [row for row in rows if row not in rejected]
+    if excluded:
+        print_lines(f"{path}: {_count_outliers(excluded)} excluded from the fit", style="yellow")
+    if included:
+        text = f"{path}: {_count_outliers(included)} kept in the fit; use --loss tukey to down-weight them"
+        print_lines(text, style="yellow")
+
+
+def _count_outliers(rows: Sequence[int]) -> str:
+    """Count outliers and name their rows."""
+    plural = "s" if len(rows) > 1 else ""
+    return f"{len(rows)} outlier{plural} (row{plural} {_listed(rows)})"
+
+
+def print_trials(trials: Sequence[FamilyTrial]) -> None:
+    """Print the effect of each joint error family.
+
+    Args:
+        trials: Families that were tried; nothing is printed if there are none.
+    """
+    if trials:
+        title = (
+            "joint error families: cross-validated error over regions of joint space, in standard deviations"
+        )
+        print_table(title, trial_table(trials))
 
 
 def print_summary(fit: Result, files: Mapping[str, str]) -> None:
-    """Parameters, accuracy, what could not be seen, and where it all is."""
+    """Print parameters, accuracy, limits of the identification, and the files written.
+
+    Args:
+        fit: Result of a calibration.
+        files: Paths of the files, by what they are.
+    """
     print_table("parameters", estimate_table(fit.estimates))
     print_table("accuracy", accuracy_table(fit.comparisons))
     state = "converged" if fit.converged else "NOT converged"
@@ -138,55 +248,162 @@ def print_summary(fit: Result, files: Mapping[str, str]) -> None:
         f"{state} after {fit.iterations} iterations; {fit.n_samples} samples; "
         f"rank {fit.rank} of {len(fit.parameters)}; condition {fit.condition:.3g}",
     )
-    for text in fit.shrinkage_notes:
-        print_lines(f"held back: {text}", style="yellow")
-    for text in fit.unobservable:
-        print_lines(f"not observable: {text}", style="yellow")
-    for text in fit.weakly_observable:
-        print_lines(f"weakly seen: {text}", style="yellow")
-    for name, path in files.items():
-        print_lines(f"wrote {name}: {path}")
+    for label, texts in (
+        ("correction reduced", fit.shrinkage_notes),
+        ("not observable", fit.unobservable),
+        ("poorly identified", fit.weakly_observable),
+    ):
+        print_lines(*(f"{label}: {text}" for text in texts), style="yellow")
+    print_lines(*(f"wrote {name}: {path}" for name, path in files.items()))
 
 
-def print_verdict(fit: Result) -> None:
-    """The headline: last, where the eye is."""
+def print_headline(fit: Result) -> None:
+    """Print the accuracy in one sentence; called last, so that it stays visible in the terminal.
+
+    Args:
+        fit: Result of a calibration.
+    """
     print_lines(*regressions(fit.comparisons), style="yellow")
     print_lines("", headline(fit.comparisons).text, style="bold")
 
 
-def print_trials(found: Sequence[FamilyTrial]) -> None:
-    """What each family of joints' transmission errors brought, or would bring."""
-    if not found:
-        return
-    title = "extensions: error on left-out regions of joint space, in standard deviations"
-    print_table(title, trial_table(found))
+def print_validation(title: str, accuracies: Mapping[str, Accuracy]) -> None:
+    """Print the accuracy of a model.
 
-
-def print_hint(text: str) -> None:
-    """What one might try next, if anything."""
-    if text:
-        print_lines(f"hint: {text}", style="yellow")
-
-
-def open_page(path: str) -> None:
-    """Shows a page in the browser, or says where it lies."""
-    open_url(Path(path).resolve().as_uri())
-
-
-def open_url(url: str) -> None:
-    """Shows an address in the browser, or says it."""
-    if not webbrowser.open(url):
-        print_lines(f"no browser here; open {url}")
-
-
-def print_validation(title: str, found: Mapping[str, Accuracy]) -> None:
-    """Accuracies of a model on data, by what was done before."""
+    Args:
+        title: Title.
+        accuracies: Accuracy by the column that shows it.
+    """
     rows = []
     for group in GROUP_UNITS:
-        measured = [one.groups[group] for one in found.values() if group in one.groups]
-        for key, word in STATISTIC_LABELS.items():
+        columns = [accuracy.groups[group] for accuracy in accuracies.values() if group in accuracy.groups]
+        for key, label in STATISTIC_LABELS.items():
             cells = [
-                format_quantity(getattr(one, key), one.unit, one.rms_std, small=True) for one in measured
+                format_quantity(getattr(column, key), column.unit, column.rms_std, small=True)
+                for column in columns
             ]
-            rows += [[f"{GROUP_LABELS[group]}, {word}", *cells]] if cells else []
-    print_table(title, Table(["error", *found], rows))
+            rows += [[f"{GROUP_LABELS[group]}, {label}", *cells]] if cells else []
+    print_table(title, Table(["error", *accuracies], rows))
+
+
+# --- check, plan, compensate, study ----------------------------------------------------------------
+
+
+def print_crosscheck(robot: str, agreements: Sequence[Agreement]) -> None:
+    """Print how well other computations agree with the error factors of the paper.
+
+    Args:
+        robot: Path of the robot.
+        agreements: One comparison per computation.
+    """
+    rows = [
+        [
+            agreement.route,
+            str(agreement.columns) if agreement.columns else "",
+            f"{agreement.difference:.1e}",
+            f"{agreement.tolerance:.0e}",
+            "agrees" if agreement.agrees else "DISAGREES",
+        ]
+        for agreement in agreements
+    ]
+    header = ["computation", "columns", "difference", "tolerance", "verdict"]
+    print_table(
+        f"{robot}: largest difference from the error factors of the paper [m, rad]", Table(header, rows)
+    )
+
+
+def print_plan(plan: Plan) -> None:
+    """Print the predicted error over the number of poses, and how a plan compares with random poses.
+
+    Args:
+        plan: Plan.
+    """
+    sizes, count = plan.sizes.tolist(), len(plan.q)
+    random_errors = dict(zip(plan.random_sizes.tolist(), plan.random_errors.tolist(), strict=True))
+    selected = {*random_errors, count, sizes[-1]}
+    selected |= {plan.recommended_size} if plan.recommended_size else set()
+    rows = [
+        [
+            str(size),
+            f"{1e3 * error:.4f}",
+            f"{1e3 * random_errors[size]:.4f}" if size in random_errors else "",
+        ]
+        for size, error in zip(sizes, plan.errors.tolist(), strict=True)
+        if size in selected
+    ]
+    table = Table(["poses", "planned, mm", "random, mm"], rows, n_text_columns=0)
+    print_table("predicted RMS position error over the task", table)
+    percent = round(100 * (1 - plan.relative_error))
+    change = f"{abs(percent)} % {'lower' if percent > 0 else 'higher'}" if percent else "About the same"
+    print_lines("", f"{change} predicted error {'than' if percent else 'as'} {count} random poses.")
+    if plan.recommended_size:
+        print_lines(f"Diminishing returns beyond {plan.recommended_size} poses (less than 1 % per ten).")
+    else:
+        print_lines(f"No diminishing returns up to {sizes[-1]} poses (still at least 1 % per ten).")
+    print_notes(plan.notes)
+
+
+def print_compensation(result: Compensation, chain: Chain, targets: TargetPoses) -> None:
+    """Print how many targets have which status, and the rows of those that are not corrected exactly.
+
+    Args:
+        result: Corrected targets.
+        chain: Calibrated robot.
+        targets: Targets as read.
+    """
+    from ..compensation import SINGULAR  # lazy import: only this command needs it
+
+    for status in dict.fromkeys(result.status):
+        rows = [row for row, other in enumerate(result.status, 1) if other == status]
+        text = f"{targets.source}: {len(rows)} of {len(result.status)} {status}"
+        if status == "ok":
+            print_lines(text)
+            continue
+        items = [
+            f"row {row}"
+            if status == SINGULAR
+            else f"row {row} ({_distance(result.residual_error[row - 1])} away)"
+            for row in rows
+        ]
+        print_lines(f"{text}: {_listed(items)}", style="yellow")
+    if chain.n_joints > 6:
+        print_notes(
+            [
+                f"{chain.n_joints} joints reach a target in many ways, and the corrected targets hold only "
+                "for these joint values; send the joint values to the controller"
+            ]
+        )
+    elif chain.n_joints < 6 and targets.values.ndim == 3 and not result.reached.all():
+        print_notes(
+            [f"{chain.n_joints} joints cannot reach every orientation; omit the orientation from the targets"]
+        )
+
+
+def _distance(error: Array) -> str:
+    """Format a position and an orientation error, shape (2,) [m, rad]."""
+    angle = np.rad2deg(error[1])
+    return f"{1e3 * error[0]:.3g} mm" + (f", {angle:.3g}°" if angle > 0 else "")
+
+
+def print_study(study: StudyGrid, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """Print the results of a study in mm and degrees, with the settings that differ.
+
+    Args:
+        study: Study.
+        header: Names of the columns, the settings first.
+        rows: Values of the columns, one row per setting.
+    """
+    from ..studies import Setting  # lazy import: only this command needs it
+
+    n_settings = len(fields(Setting))
+    varied = [i for i in range(n_settings) if len({row[i] for row in rows}) > 1]
+    # The column behind the settings is the number of calibrations, which is in the title.
+    known = [i for i in range(n_settings + 1, len(header)) if any(row[i] is not None for row in rows)]
+    names = [name.replace("[m]", ", mm").replace("[rad]", ", °").replace("_", " ") for name in header]
+    scales = [1e3 if "[m]" in name else np.rad2deg(1.0) if "[rad]" in name else 1.0 for name in header]
+    cells = [
+        [str(row[i]) for i in varied] + ["" if row[i] is None else f"{row[i] * scales[i]:.3g}" for i in known]
+        for row in rows
+    ]
+    title = f"{study.title or 'study'}: medians over {study.seeds} calibrations per setting"
+    print_table(title, Table([names[i] for i in (*varied, *known)], cells, n_text_columns=len(varied)))

@@ -1,128 +1,193 @@
-"""What the small commands of `dhcal` do, once the command line is read.
+"""`dhcal demo`: reproduce the experiment and the simulations of the paper.
 
-Wrong input is found before anything is written or shown; JSON goes to stdout, all else to stderr.
+The experiment is the 3-joint robot of the paper with the positions of its Table 5. The files of a calibration
+and a summary in Markdown are written into a folder.
 """
 
 from __future__ import annotations
 
 import os
-from argparse import Namespace
-from typing import Any
+from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from .. import formatting
-from .._typing import PathLike
-from ..calibration import summary
-from ..exceptions import DhcalError
-from ..io.atomic import write_files
-from ..io.robot import urdf_files
-from ..io.shipped_files import shipped_file
-from ..paper.experiment import PaperExperiment, run_experiment
-from ..paper.simulations import (
-    SEEDS,
-    SIMULATION_HEADER,
-    SIMULATION_REMARKS,
-    TESTS,
-    simulation_rows,
-)
-from ..report import html
-from ..report.document import Provenance, file_digests, json_text, result_to_dict
-from ..visualization.scene import scene_html
-from . import console
-from .options import require_writable_outputs, write_json
+from ..exceptions import InvalidArgumentError
+from .options import JSON
+
+if TYPE_CHECKING:
+    from .._typing import PathLike
+    from ..formatting import Table
+    from ..paper import PaperExperiment
+
+EXAMPLE = "dhcal demo --out demo"
 
 
-def demo(args: Namespace) -> int:
-    """The paper's arm, end to end."""
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the arguments of `dhcal demo`.
+
+    Args:
+        parser: Parser of the command.
+    """
+    parser.add_argument(
+        "--out", default="demo", metavar="DIR", help="folder for the results (default: %(default)s)"
+    )
+    parser.add_argument("--open", action="store_true", help="open the report in the browser")
+    parser.add_argument("--json", **JSON)
+
+
+def run(args: Namespace) -> int:
+    """Run experiment and simulations.
+
+    Args:
+        args: Parsed arguments.
+
+    Returns:
+        Exit status 0.
+    """
+    from . import console  # lazy import, as the following: they load Pinocchio
+    from .outputs import require_writable_outputs, write_outputs
+
     require_writable_outputs([args.json], [])
-    document = run(args.out)
-    write_json(args.json, document)
+    document = run_demo(args.out)
+    write_outputs({}, args.json, document)
     if args.open:
         console.open_page(document["files"]["report"])
     return 0
 
 
-# --- the command -----------------------------------------------------------------------------------
-def _verdict(found: PaperExperiment) -> list[str]:
-    mm = {key: f"{1e3 * value:.1f} mm" for key, value in found.figures.items()}
-    count, unknown = 3 * len(found.data.q), len(found.fit.parameters)
-    missed = mm["published_parameters"]
-    return [
-        f"{len(found.data.q)} points do not determine the parameters: {count} readings stand against "
-        f"{unknown} unknowns, and a point that was left out is missed by {mm['least_squares_left_out']} "
-        f"where fitted ones are missed by {mm['least_squares']}.",
-        f"{' and '.join(found.fixed)} cannot be seen from these positions at the nominal arm, and were held.",
-        "The published parameters (Table 4) do not reproduce the measurements of Table 5: with them the "
-        f"model misses the measured points by {missed} RMS, the nominal one by {mm['before']}. "
-        "Nothing here was adjusted to match them.",
-    ]
+def run_demo(folder: PathLike) -> dict[str, Any]:
+    """Run experiment and simulations, show the results and write all files.
 
+    Args:
+        folder: Folder for the files; created if it does not exist.
 
-def run(out: PathLike) -> dict[str, Any]:
-    """Runs everything, shows it, and writes URDFs, JSON and a Markdown summary into a folder."""
-    folder = os.fspath(out)
+    Returns:
+        JSON document of the experiment.
+
+    Raises:
+        InvalidArgumentError: The folder cannot be created.
+    """
+    from ..calibration.summary import estimate_table  # lazy import, as the following: they load Pinocchio
+    from ..formatting import Table
+    from ..paper import simulations
+    from ..paper.experiment import run_experiment
+    from . import console
+
+    folder = os.fspath(folder)
     try:
         os.makedirs(folder, exist_ok=True)
     except OSError as error:
-        raise DhcalError(f"{folder}: cannot make this folder: {error.strerror}") from error
-    found = run_experiment()
-    console.print_unreachable_rows("Table 5", found.findings)
-    header = ["position RMS in mm", "fitted", "left one out"]
-    title = f"The experiment, {len(found.data.q)} of {len(found.readings.data.q)} rows"
-    verdict = formatting.Table(header, found.rows)
-    console.print_table(title, verdict)
-    parameters = summary.estimate_table(found.fit.estimates)
-    console.print_table("Parameters, least squares", parameters)
-    console.print_lines("", *_verdict(found))
-    rows = simulation_rows()
-    simulation_title = (
-        f"The simulations: worst of {TESTS} test poses in mm by iteration, median of {SEEDS} seeds; how many "
-        "end with an exact fit, and how many with the true parameters"
+        raise InvalidArgumentError(f"{folder}: cannot create this folder: {error.strerror}") from error
+    experiment = run_experiment()
+    console.print_unreachable_rows("Table 5", experiment.findings)
+    header = ["position RMS in mm", "fitted", "leave-one-out"]
+    sections = [
+        _Section(
+            f"The experiment, {len(experiment.data.q)} of {len(experiment.readings.data.q)} rows",
+            Table(header, experiment.rows),
+            experiment_remarks(experiment),
+        ),
+        _Section("Parameters, least squares", estimate_table(experiment.fit.estimates)),
+    ]
+    for section in sections:
+        _print_section(section)
+    sections.append(
+        _Section(
+            f"The simulations: largest error of {simulations.TESTS} test poses in mm by iteration, median of "
+            f"{simulations.SEEDS} seeds; runs with an exact fit and runs with the true parameters",
+            Table(simulations.SIMULATION_HEADER, simulations.simulation_rows()),
+            simulations.SIMULATION_REMARKS,
+        )
     )
-    simulations = formatting.Table(SIMULATION_HEADER, rows)
-    console.print_table(simulation_title, simulations)
-    console.print_lines(*SIMULATION_REMARKS)
-    urdf = os.path.join(folder, "experiment_calibrated.urdf")
-    nominal = os.path.join(folder, "experiment.urdf")
-    contents = urdf_files(found.fit.chain, urdf) | {nominal: found.chain.urdf.data}
-    files = {
-        "urdf": urdf,
-        "nominal": nominal,
-        "json": os.path.join(folder, "result.json"),
-        "summary": os.path.join(folder, "summary.md"),
-        "scene": os.path.join(folder, "scene.html"),
-        "report": os.path.join(folder, "report.html"),
+    _print_section(sections[-1])
+    document = _write_results(experiment, folder, sections)
+    console.print_lines("", *(f"wrote {path}" for path in document["files"].values()))
+    return document
+
+
+class _Section(NamedTuple):
+    """Table of the demo with its title and remarks."""
+
+    title: str
+    table: Table
+    remarks: Sequence[str] = ()
+
+
+def _print_section(section: _Section) -> None:
+    """Print a table and its remarks."""
+    from . import console  # lazy import: loads Pinocchio
+
+    console.print_table(section.title, section.table)
+    console.print_lines(*section.remarks)
+
+
+def experiment_remarks(experiment: PaperExperiment) -> list[str]:
+    """Say in sentences what the experiment shows.
+
+    Args:
+        experiment: Experiment of the paper.
+
+    Returns:
+        Sentences.
+    """
+    mm = {key: f"{1e3 * value:.1f} mm" for key, value in experiment.figures.items()}
+    n_points, n_parameters = len(experiment.data.q), len(experiment.fit.parameters)
+    return [
+        f"{3 * n_points} equations for {n_parameters} parameters leave little redundancy: leave-one-out "
+        f"{mm['least_squares_left_out']}, fit {mm['least_squares']}.",
+        f"{' and '.join(experiment.fixed)} are not observable from these positions and stay at their nominal "
+        "values.",
+        "The published parameters (Table 4) do not reproduce the measurements of Table 5: their error is "
+        f"{mm['published_parameters']} RMS, that of the nominal parameters {mm['before']}. No value was "
+        "adjusted to agree with them.",
+    ]
+
+
+def _write_results(experiment: PaperExperiment, folder: str, sections: Sequence[_Section]) -> dict[str, Any]:
+    """Write URDFs, JSON, summary, scene and report; return the JSON document."""
+    from ..formatting import markdown_table  # lazy import, as the following: they load Pinocchio
+    from ..io import shipped_file, urdf_files
+    from ..report import html
+    from ..report.document import Provenance, file_digests, json_text, result_to_dict
+    from ..visualization import scene_html
+    from .outputs import write_outputs
+
+    names = {
+        "urdf": "experiment_calibrated.urdf",
+        "nominal": "experiment.urdf",
+        "json": "result.json",
+        "summary": "summary.md",
+        "scene": "scene.html",
+        "report": "report.html",
     }
+    files = {key: os.path.join(folder, name) for key, name in names.items()}
     inputs = [shipped_file("experiment.dh.toml"), shipped_file("experiment_table5.csv")]
     digests = zip(inputs, file_digests(inputs).values(), strict=True)
+    excluded = {item.row: item.reason for item in experiment.findings}
     source = Provenance(
         command="dhcal demo",
         inputs={path.name: digest for path, digest in digests},
         names=[inputs[1].name],
         settings={"parameters": "dh"},
-        excluded_rows={inputs[1].name: {f.row: f.reason for f in found.findings}},
-        remarks=_verdict(found),
-        comparison=found.comparison,
+        excluded_rows={inputs[1].name: excluded},
+        remarks=experiment_remarks(experiment),
+        comparison=experiment.comparison,
     )
-    rejected = [finding.row for finding in found.findings]
-    document = result_to_dict(found.fit, files, source.inputs, rejected) | {"experiment_m": found.figures}
-    contents |= html.report_files(found.fit, [files["report"]], source)
-    contents[files["scene"]] = scene_html(found.chain, found.fit, title="The paper's robot, before and after")
-    contents[files["json"]] = json_text(document)
-    contents[files["summary"]] = "\n\n".join(
-        [
-            "# The paper's robot, calibrated",
-            *(f"Row {f.row} of Table 5 is left out: {f.reason}." for f in found.findings),
-            f"## {title}",
-            formatting.markdown_table(verdict),
-            *_verdict(found),
-            "## Parameters, least squares",
-            formatting.markdown_table(parameters),
-            f"## {simulation_title}",
-            formatting.markdown_table(simulations),
-            *SIMULATION_REMARKS,
-            "",
-        ]
-    )
-    write_files(contents)
-    console.print_lines("", *(f"wrote {path}" for path in files.values()))
+    document = result_to_dict(experiment.fit, files, source.inputs, list(excluded))
+    document |= {"experiment_m": experiment.figures}
+    summary = ["# The paper's robot, calibrated"]
+    summary += [f"Row {row} of Table 5 is excluded: {reason}." for row, reason in excluded.items()]
+    for section in sections:
+        summary += [f"## {section.title}", markdown_table(section.table), *section.remarks]
+    contents: dict[PathLike, str | bytes] = {
+        **urdf_files(experiment.fit.chain, files["urdf"]),
+        files["nominal"]: experiment.chain.urdf.data,
+        **html.report_files(experiment.fit, [files["report"]], source),
+        files["scene"]: scene_html(
+            experiment.chain, experiment.fit, title="The paper's robot, before and after"
+        ),
+        files["json"]: json_text(document),
+        files["summary"]: "\n\n".join([*summary, ""]),
+    }
+    write_outputs(contents)
     return document

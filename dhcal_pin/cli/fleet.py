@@ -1,17 +1,19 @@
-"""Many robots to calibrate: a manifest, read before anything runs, and its jobs in parallel processes.
+"""Calibration of many robots: a manifest of jobs, run in parallel processes, and their summary.
 
 A manifest is a TOML file whose name ends with `.fleet.toml`. Its keys are the names of the options of
-`dhcal calibrate`; at its top they hold for every robot. Paths are relative to the manifest:
+`dhcal calibrate`. Keys at the top apply to every job. Paths are relative to the manifest:
 
     parameters = "minimal,base,tool"
     holdout = 0.3
 
     [[job]]
-    name = "cell 1"                     # optional; the robot's file without it
+    name = "cell 1"                     # optional; default: the name of the robot file
     robot = "cell1/ur10.urdf"
     data = ["cell1/monday.csv", "cell1/friday.csv"]
     output = "cell1/ur10_calibrated.urdf"
     tip = "tool0"
+
+The whole manifest is checked before the first job runs. A job that fails does not stop the others.
 """
 
 from __future__ import annotations
@@ -23,27 +25,31 @@ from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import MISSING, dataclass, field, fields
-from typing import Any, get_args
+from dataclasses import Field, dataclass, field, fields
+from typing import Any
 
 from .._typing import PathLike
-from ..calibration.procedure import Method
-from ..exceptions import DhcalError
-from ..io.atomic import write_files
+from ..exceptions import DhcalError, FileFormatError, InvalidArgumentError, UnknownNameError
 from ..io.robot import robot_name
 from ..io.sidecar import sidecar_path
 from ..io.tabular import csv_text, read_toml
-from ..report.document import json_text
 from . import console
-from .job import Job
-from .options import STDOUT, require_writable_outputs, write_json
+from .job import Job, option_flags
+from .options import STDOUT, IntegerType
+from .outputs import require_writable_outputs, write_outputs
+from .run_job import run_job
 
 OK, NOT_CONVERGED, FAILED = "ok", "not converged", "failed"
 
 
 @dataclass(frozen=True)
 class FleetJob:
-    """One robot of a fleet: what it is called, and its job with paths relative to the manifest."""
+    """One job of a manifest.
+
+    Attributes:
+        name: Name shown for the robot.
+        job: Its options, with paths relative to the manifest.
+    """
 
     name: str
     job: Job
@@ -51,12 +57,12 @@ class FleetJob:
 
 @dataclass(frozen=True)
 class FleetJobOutcome:
-    """How a robot of a fleet came out.
+    """Outcome of one job of a manifest.
 
     Attributes:
-        status: "ok", "not converged" (its files are written all the same) or "failed".
-        message: why it failed, or what of its data is hard to believe.
-        document: as the JSON of `dhcal calibrate`; empty where it failed.
+        status: "ok", "not converged" (its files are written nevertheless) or "failed".
+        message: Reason of the failure, or warnings about the input.
+        document: JSON document as of `dhcal calibrate`; empty if the job failed.
     """
 
     status: str
@@ -64,250 +70,309 @@ class FleetJobOutcome:
     document: Mapping[str, Any] = field(default_factory=dict)
 
 
-# Calibrates one robot, writes its files, and returns its document.
-Run = Callable[[Job], Mapping[str, Any]]
+# Function that calibrates one robot, writes its files and returns its JSON document.
+JobRunner = Callable[[Job], Mapping[str, Any]]
+
+
+# --- manifest --------------------------------------------------------------------------------------
 
 
 def read_fleet(path: PathLike) -> list[FleetJob]:
-    """The robots of a manifest.
+    """Read and check a manifest.
+
+    Args:
+        path: Path of the manifest.
+
+    Returns:
+        Its jobs.
 
     Raises:
-        DhcalError: it is not a manifest, an option is unknown or of the wrong type, or two jobs would
-            get into each other's way.
+        FileFormatError: The file is not a manifest, a key or a value is invalid, or two jobs use one file.
     """
-    raw = read_toml(path)
-    tables = raw.pop("job", [])
+    shared = read_toml(path)
+    tables = shared.pop("job", [])
     if not isinstance(tables, list) or not tables or not all(isinstance(table, dict) for table in tables):
-        raise DhcalError(f"{path}: no robots; write a [[job]] table with robot, data and output for each")
+        raise FileFormatError(
+            f"{path}: no jobs; expected a [[job]] table with robot, data and output for each robot"
+        )
     entries = []
     for number, table in enumerate(tables, 1):
-        where = f"{path}: job {number}"
-        given = {key.replace("-", "_"): value for key, value in (raw | table).items()}
-        name = given.pop("name", None)
-        options = {key: _option(key, value, where) for key, value in given.items()}
+        location = f"{path}: job {number}"
+        values = {key.replace("-", "_"): value for key, value in (shared | table).items()}
+        name = values.pop("name", None)
+        options = {key: _option_value(key, value, location) for key, value in values.items()}
         for key in ("robot", "data", "output"):
             if not options.get(key):
-                raise DhcalError(f"{where}: no {key}; every [[job]] needs robot, data and output")
+                raise FileFormatError(
+                    f"{location}: {key} is missing; every [[job]] needs robot, data and output"
+                )
         job = Job(**options)
         entries.append(FleetJob(str(name or robot_name(job.robot)), job))
     _require_distinct_files(entries, path)
     return entries
 
 
-def _option(key: str, value: Any, where: str) -> Any:
-    """An option's value as the command line would have it."""
-    known = {option.name: option for option in fields(Job)}
-    if key not in known:
-        raise DhcalError(f"{where}: unknown key {key!r}; allowed: name, {', '.join(known)}")
-    default = () if key == "data" else known[key].default
-    wanted = str if default in (None, MISSING) else type(default)
-    if wanted is tuple:
-        value = (value,) if isinstance(value, str) else tuple(value) if isinstance(value, list) else value
-        good = isinstance(value, tuple) and all(isinstance(item, str) for item in value)
-        text = "a path, or a list of paths"
-    elif wanted is str:
-        # 0.3 may stand without quotes.
-        value = str(value) if isinstance(value, int | float) and not isinstance(value, bool) else value
-        good, text = isinstance(value, str) and value != "", "a text in quotes"
-    else:
-        good, text = type(value) is wanted, {bool: "true or false", int: "a whole number"}[wanted]
-    if key == "method":
-        good, text = value in get_args(Method), " or ".join(get_args(Method))
-    if key == "json" and value == STDOUT:
-        good, text = False, "a file"
-    if not good:
-        raise DhcalError(f"{where}: {key} = {value!r}: write {text}")
-    return value
+def _option_value(key: str, value: Any, location: str) -> Any:
+    """Check the value of an option and return it in the type of its field."""
+    options = {option.name: option for option in fields(Job)}
+    if key not in options:
+        raise UnknownNameError(f"{location}: unknown key {key!r}; choose from name, {', '.join(options)}")
+    converted, expected = _converted(options[key], value)
+    if converted is None or (key == "json" and converted == STDOUT):
+        raise FileFormatError(f"{location}: {key} = {value!r}; expected {expected}")
+    return converted
+
+
+def _converted(option: Field[Any], value: Any) -> tuple[Any, str]:
+    """Return a value in the type of its field, or None, and a description of the values that are expected."""
+    default = () if option.name == "data" else option.default
+    if isinstance(default, bool):
+        return (value if isinstance(value, bool) else None), "true or false"
+    if isinstance(default, int):
+        integer: IntegerType = option.metadata["type"]
+        is_valid = isinstance(value, int) and not isinstance(value, bool) and value >= integer.minimum
+        return (value if is_valid else None), integer.description
+    if isinstance(default, tuple):
+        paths = [value] if isinstance(value, str) else value if isinstance(value, list) else [None]
+        return (
+            tuple(paths) if all(isinstance(item, str) for item in paths) else None
+        ), "a path or a list of paths"
+    if choices := option.metadata.get("choices"):
+        return (value if value in choices else None), " or ".join(choices)
+    # A number such as the fraction 0.3 may be written without quotes.
+    text = str(value) if isinstance(value, int | float) and not isinstance(value, bool) else value
+    expected = "the path of a file" if option.name == "json" else "a text in quotes"
+    return (text if isinstance(text, str) and text else None), expected
 
 
 def _require_distinct_files(entries: Sequence[FleetJob], path: PathLike) -> None:
-    """Complains about a file that one job writes and another one writes or reads."""
+    """Require that no job writes a file that another job reads or writes."""
     folder = os.path.dirname(os.path.abspath(path))
-    jobs = [entry.job for entry in entries]
-    written = [(i, p) for i, job in enumerate(jobs, 1) for p in _output_paths(job)]
-    read = [(i, p) for i, job in enumerate(jobs, 1) for p in (job.robot, *job.data)]
-    writer: dict[str, int] = {}
+    writers: dict[str, int] = {}
 
-    def check(number: int, place: str, owner: int) -> None:
-        if owner != number:
-            raise DhcalError(
-                f"{path}: job {number} writes or reads {place}, which job {owner} writes; "
-                "give every robot an output of its own"
+    def require(is_free: bool, number: int, file: str, writer: int) -> None:
+        if not is_free:
+            raise FileFormatError(
+                f"{path}: job {number} uses {file}, which job {writer} writes; every job needs its own output"
             )
 
-    for number, place in written:
-        check(number, place, writer.setdefault(_absolute(folder, place), number))
-    for number, place in read:
-        check(number, place, writer.get(_absolute(folder, place), number))
+    for number, entry in enumerate(entries, 1):
+        for file in _output_paths(entry.job):
+            writer = writers.setdefault(_real_path(folder, file), number)
+            require(writer == number, number, file, writer)
+    for number, entry in enumerate(entries, 1):
+        for file in (entry.job.robot, *entry.job.data):
+            writer = writers.get(_real_path(folder, file), number)
+            require(writer == number, number, file, writer)
 
 
-def _absolute(folder: str, place: str) -> str:
-    return os.path.realpath(os.path.join(folder, place))
+def _real_path(folder: str, path: str) -> str:
+    """Return the absolute path of a file of a manifest in `folder`, links resolved."""
+    return os.path.realpath(os.path.join(folder, path))
 
 
 def _output_paths(job: Job) -> list[str]:
-    kept = (job.output, sidecar_path(job.output), job.map, job.json, *job.report)
-    return [place for place in kept if place]
+    """List the files that a job writes."""
+    paths = (job.output, sidecar_path(job.output), job.map, job.json, *job.report)
+    return [path for path in paths if path]
 
 
 def file_paths(entries: Sequence[FleetJob], path: PathLike) -> list[str]:
-    """Paths of the files that a fleet reads or writes, seen from here."""
+    """List the files that the jobs of a manifest read or write.
+
+    Args:
+        entries: Jobs of the manifest.
+        path: Path of the manifest.
+
+    Returns:
+        Paths relative to the current folder.
+    """
     folder = os.path.dirname(os.fspath(path))
-    every = [place for e in entries for place in (e.job.robot, *e.job.data, *_output_paths(e.job))]
-    return [os.path.join(folder, place) for place in every]
+    files = [file for e in entries for file in (e.job.robot, *e.job.data, *_output_paths(e.job))]
+    return [os.path.join(folder, file) for file in files]
+
+
+# --- processes -------------------------------------------------------------------------------------
 
 
 def run_fleet(
     entries: Sequence[FleetJob],
     path: PathLike,
-    run: Run,
-    workers: int,
-    done: Callable[[int, FleetJobOutcome], None],
+    runner: JobRunner,
+    n_processes: int,
+    on_done: Callable[[int, FleetJobOutcome], None],
 ) -> list[FleetJobOutcome]:
-    """Calibrates every robot, in processes that work in the manifest's folder; one failure stops no other.
+    """Run every job in processes that work in the folder of the manifest.
 
     Args:
-        entries: the robots.
-        path: the manifest.
-        run: a function that other processes can import.
-        workers: how many processes at a time.
-        done: called with a robot's number and outcome as soon as it is known.
+        entries: Jobs.
+        path: Path of the manifest.
+        runner: Function that runs one job; other processes must be able to import it.
+        n_processes: Number of processes at a time.
+        on_done: Called with the index of a job and its outcome as soon as the job has ended.
+
+    Returns:
+        Outcome of each job, in the order of `entries`.
     """
     folder = os.path.dirname(os.path.abspath(path))
-    out: dict[int, FleetJobOutcome] = {}
+    outcomes: dict[int, FleetJobOutcome] = {}
 
-    def gather(numbers: Sequence[int], count: int) -> list[int]:
-        """Runs some robots; returns those whose process died, or that waited for one that did."""
+    def run_in_pool(indices: Sequence[int], count: int) -> list[int]:
+        # Returns the jobs without an outcome, because a process of their pool died.
         lost = []
-        # A fresh interpreter each: forking a process with threads can hang.
+        # Spawn instead of fork: forking a process that has threads can block forever.
         context = multiprocessing.get_context("spawn")
         pool = ProcessPoolExecutor(count, context, initializer=_initialize_process, initargs=(folder,))
         try:
-            futures = {pool.submit(_work, run, entries[number].job): number for number in numbers}
+            futures = {pool.submit(_run_in_process, runner, entries[index].job): index for index in indices}
             for future in as_completed(futures):
-                number = futures[future]
+                index = futures[future]
                 try:
-                    out[number] = future.result()
+                    outcomes[index] = future.result()
                 except BrokenProcessPool:
-                    lost.append(number)
+                    lost.append(index)
                 else:
-                    done(number, out[number])
+                    on_done(index, outcomes[index])
         finally:
             pool.shutdown(cancel_futures=True)
         return lost
 
-    for number in sorted(gather(range(len(entries)), min(workers, len(entries)))):
-        # One of them brought its process down; alone, it cannot harm the others.
-        if gather([number], 1):
-            out[number] = FleetJobOutcome(FAILED, "its process was killed, perhaps for want of memory")
-            done(number, out[number])
-    return [out[number] for number in range(len(entries))]
+    for index in sorted(run_in_pool(range(len(entries)), min(n_processes, len(entries)))):
+        # One of these jobs killed its process and the pool with it. Run each of them in its own pool.
+        if run_in_pool([index], 1):
+            outcomes[index] = FleetJobOutcome(FAILED, "the process was killed; it may have run out of memory")
+            on_done(index, outcomes[index])
+    return [outcomes[index] for index in range(len(entries))]
 
 
 def _initialize_process(folder: str) -> None:
-    """Readies a process: paths are relative to the manifest, and an interrupt only ends a job."""
+    """Change to the folder of the manifest; between jobs the process ignores interrupts."""
     os.chdir(folder)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _work(run: Run, job: Job) -> FleetJobOutcome:
-    """One job in its process."""
+def _run_in_process(runner: JobRunner, job: Job) -> FleetJobOutcome:
+    """Run one job and convert its errors to an outcome; an interrupt ends only this job."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        document = run(job)
-        doubts = [f"warning: {text}" for text in document.get("warnings", [])]
-        return FleetJobOutcome(OK if document["converged"] else NOT_CONVERGED, "; ".join(doubts), document)
+        document = runner(job)
+        warnings = "; ".join(f"warning: {text}" for text in document.get("warnings", []))
+        return FleetJobOutcome(OK if document["converged"] else NOT_CONVERGED, warnings, document)
     except DhcalError as error:
         return FleetJobOutcome(FAILED, " ".join(str(error).split()))
     except KeyboardInterrupt:
         return FleetJobOutcome(FAILED, "interrupted; nothing written")
-    except Exception as error:  # A defect in one robot's run must not lose the others'.
-        return FleetJobOutcome(
-            FAILED, f"{type(error).__name__}: {' '.join(str(error).split())}; please report it"
-        )
+    except Exception as error:  # A defect that one job reveals must not lose the results of the others.
+        text = " ".join(str(error).split())
+        return FleetJobOutcome(FAILED, f"{type(error).__name__}: {text}; please report this error")
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
+def _job_document(job: Job) -> Mapping[str, Any]:
+    """Run one job; return its JSON document."""
+    return run_job(job).document
+
+
+# --- command ---------------------------------------------------------------------------------------
+
 _STAGES = ("before", "after", "holdout_before", "holdout_after")
 
-
-# Columns of the summary: a key of the accuracy, its name there, and the factor from SI.
+# Columns of the summary: key of the accuracy, name of the column with its unit, and factor from SI.
 _ERRORS = (
     ("position_rms_m", "position_rms[mm]", 1e3),
     ("orientation_rms_rad", "orientation_rms[mrad]", 1e3),
     ("residual_rms", "residual_rms[mm]", 1e3),
 )
 
-
+# Numbers of a document that the summary repeats.
 _FIGURES = ("iterations", "samples", "samples_holdout", "rank", "parameters_total")
 
 
-def run(args: Namespace, calibrate: Run) -> int:
-    """Calibrates the robots of a manifest; 0 all done, 1 some failed. `calibrate` does one of them."""
-    plain = Job(args.robot, (), args.output, json=args.json)
-    told = Job.from_args(args)
-    if args.data:
-        raise DhcalError(f"{args.data[0]}: beside a manifest; the data stand in its [[job]] tables")
-    for option in fields(Job):
-        if getattr(told, option.name) != getattr(plain, option.name):
-            raise DhcalError(
-                f"--{option.name.replace('_', '-')}: beside a manifest; write it at the top of {args.robot}, "
-                "for all robots, or into a [[job]]"
-            )
-    if not args.output.lower().endswith(".csv"):
-        raise DhcalError(f"{args.output}: the summary of a fleet is a table; name a .csv file")
+def run_manifest(args: Namespace) -> int:
+    """Calibrate the robots of a manifest and write their summary.
+
+    Args:
+        args: Parsed arguments of `dhcal calibrate`.
+
+    Returns:
+        Exit status: 0 all jobs done, 1 a job failed, 130 interrupted.
+    """
+    _require_manifest_arguments(args)
     entries = read_fleet(args.robot)
     require_writable_outputs([args.output, args.json], [args.robot, *file_paths(entries, args.robot)])
     width = max(len(entry.name) for entry in entries)
-    total, count = len(entries), 0
+    total, n_done = len(entries), 0
 
-    def done(number: int, outcome: FleetJobOutcome) -> None:
-        nonlocal count
-        count += 1
-        style = "" if outcome.status == "ok" else "red" if outcome.status == FAILED else "yellow"
-        line = f"{count:{len(str(total))}} of {total}  {entries[number].name:{width}}  {_line(outcome)}"
+    def show(index: int, outcome: FleetJobOutcome) -> None:
+        nonlocal n_done
+        n_done += 1
+        style = {OK: "", FAILED: "red"}.get(outcome.status, "yellow")
+        counter = f"{n_done:{len(str(total))}} of {total}"
+        line = f"{counter}  {entries[index].name:{width}}  {_outcome_text(outcome)}"
         console.print_lines(line, style=style)
         if outcome.status != FAILED and outcome.message:
             console.print_lines(f"        {outcome.message}", style="yellow")
 
     try:
-        found = run_fleet(entries, args.robot, calibrate, args.jobs or os.cpu_count() or 1, done)
+        outcomes = run_fleet(entries, args.robot, _job_document, args.jobs or os.cpu_count() or 1, show)
     except KeyboardInterrupt:
-        console.print_lines(f"dhcal: interrupted; {count} of {total} robots are done; no summary written")
+        console.print_lines(f"dhcal: interrupted; {n_done} of {total} robots are done; no summary written")
         return 130
-    contents: dict[PathLike, str | bytes] = {args.output: summary_text(entries, found)}
-    document = _document(entries, found)
-    if args.json and args.json != STDOUT:
-        contents[args.json] = json_text(document)
-    write_files(contents)
-    if args.json == STDOUT:
-        write_json(args.json, document)
-    failed = sum(outcome.status == FAILED for outcome in found)
-    console.print_lines(f"{total - failed} of {total} robots calibrated", f"wrote {args.output}")
-    return 1 if failed else 0
+    contents: dict[PathLike, str | bytes] = {args.output: summary_text(entries, outcomes)}
+    write_outputs(contents, args.json, _fleet_document(entries, outcomes))
+    n_failed = sum(outcome.status == FAILED for outcome in outcomes)
+    console.print_lines(f"{total - n_failed} of {total} robots calibrated", f"wrote {args.output}")
+    return 1 if n_failed else 0
 
 
-def _line(outcome: FleetJobOutcome) -> str:
-    """A robot's outcome for people: the error held out, or that of the fit where nothing is."""
+def _require_manifest_arguments(args: Namespace) -> None:
+    """Raise an error if the command line has options that belong into the manifest."""
+    if args.data:
+        raise InvalidArgumentError(
+            f"{args.data[0]}: not allowed beside a manifest; name the data in its [[job]] tables"
+        )
+    given, allowed = Job.from_args(args), Job(args.robot, (), args.output, json=args.json)
+    for option in fields(Job):
+        if getattr(given, option.name) != getattr(allowed, option.name):
+            raise InvalidArgumentError(
+                f"{option_flags(option)[-1]}: not allowed beside a manifest; write it into {args.robot}, at "
+                "the top for all robots or into a [[job]]"
+            )
+    if not args.output.lower().endswith(".csv"):
+        raise InvalidArgumentError(
+            f"{args.output}: the summary of a manifest is a table; expected a .csv file"
+        )
+
+
+def _outcome_text(outcome: FleetJobOutcome) -> str:
+    """Describe an outcome by its hold-out errors, or by those of the fit if nothing is held out."""
     if outcome.status == FAILED:
         return f"failed: {outcome.message}"
     document = outcome.document
-    held = bool(document["holdout_after"])
-    stages = _STAGES[2:] if held else _STAGES[:2]
+    has_holdout = bool(document["holdout_after"])
     parts = []
-    for key, name, factor in _ERRORS:
-        before, after = (document[stage].get(key) for stage in stages)
+    for key, column, factor in _ERRORS:
+        before, after = (document[stage].get(key) for stage in (_STAGES[2:] if has_holdout else _STAGES[:2]))
         if after is not None:
-            what, unit = name.rstrip("]").split("[")
-            parts.append(f"{what.replace('_', ' ')} {factor * before:.3g} → {factor * after:.3g} {unit}")
-    return f"{', '.join(parts)} {'held out' if held else 'as fitted'}; {outcome.status}"
+            name, unit = column.rstrip("]").split("[")
+            label = name.replace("_rms", " RMS")
+            parts.append(f"{label} {factor * before:.3g} → {factor * after:.3g} {unit}")
+    return f"{', '.join(parts)} ({'hold-out' if has_holdout else 'fitted'}); {outcome.status}"
 
 
-def summary_text(entries: Sequence[FleetJob], found: Sequence[FleetJobOutcome]) -> str:
-    """The CSV of a fleet, a row a robot; empty where a robot failed or has no such figure."""
+def summary_text(entries: Sequence[FleetJob], outcomes: Sequence[FleetJobOutcome]) -> str:
+    """Format the summary of a manifest.
+
+    Args:
+        entries: Jobs.
+        outcomes: Their outcomes.
+
+    Returns:
+        CSV text with one row per job; cells are empty if a job failed or has no such value.
+    """
     rows = []
-    for entry, outcome in zip(entries, found, strict=True):
+    for entry, outcome in zip(entries, outcomes, strict=True):
         row: dict[str, Any] = {"name": entry.name, "robot": entry.job.robot, "output": entry.job.output}
         row |= {"status": outcome.status, "converged": str(outcome.document.get("converged", "")).lower()}
         row |= {key: outcome.document.get(key, "") for key in _FIGURES}
@@ -319,11 +384,11 @@ def summary_text(entries: Sequence[FleetJob], found: Sequence[FleetJobOutcome]) 
     return csv_text({name: [row[name] for row in rows] for name in rows[0]})
 
 
-def _document(entries: Sequence[FleetJob], found: Sequence[FleetJobOutcome]) -> dict[str, Any]:
-    """The fleet as JSON: every robot's document, or why it failed."""
+def _fleet_document(entries: Sequence[FleetJob], outcomes: Sequence[FleetJobOutcome]) -> dict[str, Any]:
+    """Create the JSON document of a manifest."""
     jobs = [
         {"name": entry.name, "robot": entry.job.robot, "output": entry.job.output}
         | {"status": outcome.status, "message": outcome.message, "result": outcome.document or None}
-        for entry, outcome in zip(entries, found, strict=True)
+        for entry, outcome in zip(entries, outcomes, strict=True)
     ]
     return {"robots": len(jobs), "failed": sum(job["status"] == FAILED for job in jobs), "jobs": jobs}

@@ -1,64 +1,186 @@
-"""One robot to calibrate: what `dhcal calibrate` is told, so that any process can do it."""
+"""Calibration job: the options of `dhcal calibrate` for one robot.
+
+The fields of `Job` declare these options once. The arguments of the command, the keys of a manifest of
+several robots and the command line that a report shows are built from them. The metadata of a field are
+keyword arguments of `argparse.ArgumentParser.add_argument`, and in addition
+
+- `flags`: names on the command line; `--name` by default;
+- `is_output`: whether the option only says where results are written.
+
+A job contains text and numbers only, so it can be sent to another process.
+"""
 
 from __future__ import annotations
 
 import shlex
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import Field, dataclass, field, fields
+from typing import TYPE_CHECKING, Any
 
-from ..calibration.procedure import Method
+from .options import (
+    COLUMNS,
+    DATA,
+    FIX,
+    FREE,
+    INSTRUMENT,
+    JSON,
+    NON_NEGATIVE_INTEGER,
+    PARAMETERS,
+    POSITIVE_INTEGER,
+    ROBOT,
+    TIP,
+)
 
-# A manifest of many jobs.
-MANIFEST = ".fleet.toml"
+if TYPE_CHECKING:
+    from ..calibration import Method
 
-
-# Where a job writes, which changes nothing about what it finds.
-_OUTPUTS = ("output", "in_place", "report", "json", "map")
+# File extension of a manifest of several jobs.
+MANIFEST_ENDING = ".fleet.toml"
 
 
 @dataclass(frozen=True)
 class Job:
-    """The options of `dhcal calibrate`, under the names that they have on the command line.
+    """Options of `dhcal calibrate` for one robot, explained by `dhcal calibrate --help`."""
 
-    Attributes:
-        robot: path of a URDF or a DH file.
-        data: paths of measurement files.
-        output: path of the corrected URDF.
-        tip, columns, parameters, extend, fix, free, holdout, method, loss, priors, bounds, instrument,
-            payload, max_iterations, seed, in_place, world_joint, tool_frame, report, json, map: as in
-            `dhcal calibrate --help`.
-    """
-
-    robot: str
-    data: tuple[str, ...]
-    output: str
-    tip: str | None = None
-    columns: str | None = None
-    parameters: str | None = None
-    extend: str = "none"
-    fix: str = ""
-    free: str = ""
-    holdout: str | None = None
-    method: Method = "lm"
-    loss: str = "auto"
-    priors: str | None = None
-    bounds: str | None = None
-    instrument: str | None = None
-    payload: str | None = None
-    max_iterations: int = 100
-    seed: int = 0
-    in_place: bool = False
-    world_joint: bool = False
-    tool_frame: str | None = None
-    report: tuple[str, ...] = ()
-    json: str | None = None
-    map: str | None = None
+    robot: str = field(
+        metadata={
+            "flags": ("robot",),
+            "metavar": "ROBOT",
+            "help": f"{ROBOT['help']}; or a manifest of several robots, NAME{MANIFEST_ENDING}",
+        }
+    )
+    data: tuple[str, ...] = field(
+        metadata={
+            "flags": ("data",),
+            "metavar": "DATA",
+            "nargs": "*",
+            "help": f"{DATA['help']}; none with a manifest",
+        }
+    )
+    output: str = field(
+        metadata={
+            "flags": ("-o", "--output"),
+            "metavar": "OUT.urdf",
+            "required": True,
+            "help": "corrected URDF; with a manifest, a summary of all robots (.csv)",
+            "is_output": True,
+        }
+    )
+    tip: str | None = field(default=None, metadata=TIP)
+    columns: str | None = field(default=None, metadata=COLUMNS)
+    parameters: str | None = field(default=None, metadata=PARAMETERS)
+    extend: str = field(
+        default="none",
+        metadata={
+            "metavar": "auto|none|FAMILY[,FAMILY]",
+            "help": "joint error families to add if they reduce the cross-validated error: auto (try all), "
+            "none (default), or some of {error_families}",
+        },
+    )
+    fix: str = field(default="", metadata=FIX)
+    free: str = field(default="", metadata=FREE)
+    holdout: str | None = field(
+        default=None,
+        metadata={
+            "metavar": "FRACTION|FILE",
+            "help": "hold-out data, excluded from the fit to measure the accuracy: a fraction such as 0.3, "
+            "or a measurement file",
+        },
+    )
+    method: Method = field(
+        default="lm",
+        metadata={
+            "choices": ("lm", "gn"),
+            "help": "lm: Levenberg-Marquardt (default); gn: Gauss-Newton iteration of the paper",
+        },
+    )
+    loss: str = field(
+        default="auto",
+        metadata={"metavar": "LOSS", "help": "weights of outliers: {losses} (default: %(default)s)"},
+    )
+    priors: str | None = field(
+        default=None,
+        metadata={
+            "metavar": "default|none|FILE",
+            "help": "prior standard deviations: default (if method is lm), none (if method is gn), or a TOML "
+            "file by parameter name",
+        },
+    )
+    bounds: str | None = field(
+        default=None,
+        metadata={
+            "metavar": "FILE.toml",
+            "help": "lower and upper bounds by parameter name",
+        },
+    )
+    instrument: str | None = field(default=None, metadata=INSTRUMENT)
+    payload: str | None = field(
+        default=None,
+        metadata={
+            "metavar": "KG[@X,Y,Z]",
+            "help": "mass at the tip and its centre in the tip frame, for joint compliance: 5kg or "
+            "5kg@0,0,80mm",
+        },
+    )
+    max_iterations: int = field(
+        default=100,
+        metadata={
+            "metavar": "N",
+            "type": POSITIVE_INTEGER,
+            "help": "maximum number of iterations (default: %(default)s)",
+        },
+    )
+    seed: int = field(
+        default=0,
+        metadata={
+            "metavar": "N",
+            "type": NON_NEGATIVE_INTEGER,
+            "help": "random seed of the hold-out selection (default: %(default)s)",
+        },
+    )
+    in_place: bool = field(
+        default=False, metadata={"help": "allow OUT.urdf to replace ROBOT", "is_output": True}
+    )
+    world_joint: bool = field(
+        default=False, metadata={"help": "write the base pose into the URDF, as a joint from link `world`"}
+    )
+    tool_frame: str | None = field(
+        default=None,
+        metadata={
+            "metavar": "NAME",
+            "help": "write the tool pose into the URDF, as a link of this name fixed to the tip",
+        },
+    )
+    report: tuple[str, ...] = field(
+        default=(),
+        metadata={
+            "metavar": "R.html",
+            "help": "write a report (.html or .md); may be repeated",
+            "is_output": True,
+        },
+    )
+    json: str | None = field(default=None, metadata={**JSON, "is_output": True})
+    map: str | None = field(
+        default=None,
+        metadata={
+            "metavar": "MAP",
+            "help": "write the predicted position uncertainty and the hold-out errors over the workspace "
+            "(.csv or .html)",
+            "is_output": True,
+        },
+    )
 
     @classmethod
     def from_args(cls, args: Namespace) -> Job:
-        """The job that a command line asks for."""
+        """Create the job that a command line describes.
+
+        Args:
+            args: Parsed arguments, among them those of `add_job_arguments`.
+
+        Returns:
+            Job with these options.
+        """
         values: dict[str, Any] = {}
         for option in fields(cls):
             value = getattr(args, option.name)
@@ -66,7 +188,13 @@ class Job:
         return cls(**values)
 
     def command(self, names: Mapping[str, str]) -> str:
-        """The command line of this job, without where it writes, and files under other names.
+        """Format the command line of this job without the options that only name outputs.
+
+        Args:
+            names: Other names for files, by path.
+
+        Returns:
+            Command line for a shell.
 
         >>> Job("in/arm.urdf", ("in/a.csv",), "out.urdf", seed=3).command({"in/arm.urdf": "arm.urdf"})
         'dhcal calibrate arm.urdf in/a.csv --seed 3'
@@ -74,12 +202,49 @@ class Job:
         words = ["dhcal", "calibrate", *(names.get(path, path) for path in (self.robot, *self.data))]
         for option in fields(self):
             value = getattr(self, option.name)
-            if option.name not in (*_OUTPUTS, "robot", "data") and value != option.default:
-                flag = f"--{option.name.replace('_', '-')}"
+            flag = option_flags(option)[-1]
+            if flag.startswith("-") and not option.metadata.get("is_output") and value != option.default:
                 words += [flag] if value is True else [flag, names.get(str(value), str(value))]
         return shlex.join(words)
 
 
+def option_flags(option: Field[Any]) -> tuple[str, ...]:
+    """Return the names of an option on the command line.
+
+    Args:
+        option: Field of `Job`.
+
+    Returns:
+        Flags such as `("-o", "--output")`, or the name of a positional argument.
+    """
+    return option.metadata.get("flags", (f"--{option.name.replace('_', '-')}",))
+
+
+def add_job_arguments(parser: ArgumentParser) -> None:
+    """Declare the options of a job.
+
+    Args:
+        parser: Parser of a command.
+    """
+    for option in fields(Job):
+        keywords = {key: v for key, v in option.metadata.items() if key not in ("flags", "is_output")}
+        flags = option_flags(option)
+        if option.default is False:
+            keywords["action"] = "store_true"
+        elif option.default == ():
+            keywords |= {"action": "append", "default": []}
+        elif flags[0].startswith("-") and not keywords.get("required"):
+            keywords["default"] = option.default
+        parser.add_argument(*flags, **keywords)
+
+
 def is_manifest(path: str) -> bool:
-    """Whether a path names a manifest of many robots in a robot's place."""
-    return path.lower().endswith(MANIFEST)
+    """Tell a manifest of several jobs from a robot file by its name.
+
+    Args:
+        path: Path of a robot or a manifest.
+
+    Returns:
+        Whether the path names a manifest.
+    """
+    return path.lower().endswith(MANIFEST_ENDING)

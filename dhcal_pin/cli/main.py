@@ -1,49 +1,131 @@
-"""The `dhcal` command: no heavy import before a command needs it."""
+"""Entry point of the `dhcal` command: table of commands, parser and exit status."""
 
 from __future__ import annotations
 
+import argparse
 import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from typing import Any, NamedTuple, NoReturn
 
 from ..exceptions import DhcalError
-from .arguments import parser
+from .options import CommandParser, HelpFormatter
 
-# Where each command lives: module and function, imported when it is asked for and not before.
-COMMANDS = {
-    "demo": "demo:demo",
-    "calibrate": "calibrate:calibrate",
-    "validate": "validate:validate",
-    "convert": "convert:convert",
-    "view": "view:view",
-    "check": "check:check",
-    "plan": "plan:run",
-    "simulate": "simulate:simulate",
-    "compensate": "compensate:run",
-    "study": "study:study",
-}
+
+class Command(NamedTuple):
+    """One command of `dhcal`.
+
+    Attributes:
+        name: Word on the command line.
+        module: Module of this package with `EXAMPLE`, `add_arguments(parser)` and `run(args) -> int`.
+        help: One line for `dhcal --help`.
+    """
+
+    name: str
+    module: str
+    help: str
+
+
+COMMANDS = (
+    Command("demo", "demo", "reproduce the experiment and the simulations of the paper"),
+    Command("calibrate", "calibrate", "estimate the errors of a robot and write the corrected URDF"),
+    Command("validate", "validate", "compute the accuracy of a robot model on measurements"),
+    Command("convert", "convert", "convert a robot file to another format"),
+    Command("view", "view", "show the nominal and the calibrated robot on one offline web page"),
+    Command("check", "check", "compare the Jacobian with the paper, Pinocchio and finite differences"),
+    Command("plan", "plan", "choose the poses to measure and predict the resulting accuracy"),
+    Command("simulate", "simulate", "simulate measurements of a robot with known errors"),
+    Command("compensate", "compensate", "compute joint values and targets that correct the errors"),
+    Command("study", "study", "simulate calibrations over a grid of settings"),
+)
+
+
+class _LazyCommandParser(CommandParser):
+    """Parser of one command that imports the command's module on first use."""
+
+    def __init__(self, *, module: str, **options: Any):
+        super().__init__(**options)
+        self._module = module
+        self._has_arguments = False
+
+    def parse_known_args(self, *args: Any, **options: Any) -> Any:
+        """Declare the arguments of the command, then parse.
+
+        Args:
+            *args: Positional arguments of the method of `argparse.ArgumentParser`.
+            **options: Its keyword arguments.
+
+        Returns:
+            Namespace, and words that no argument takes.
+        """
+        if not self._has_arguments:
+            self._has_arguments = True
+            module = import_module(f".{self._module}", __package__)
+            self.epilog = f"example:\n  {module.EXAMPLE}"
+            module.add_arguments(self)
+            self.set_defaults(run=module.run)
+        return super().parse_known_args(*args, **options)
+
+
+class _VersionAction(argparse.Action):
+    """Print the version, which is looked up only when it is asked for."""
+
+    def __call__(self, *_: object) -> NoReturn:
+        from importlib.metadata import version  # lazy import: reads the installed metadata
+
+        print(f"dhcal {version('dhcal-pin')}")
+        sys.exit(0)
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Build the parser of all commands.
+
+    Returns:
+        Parser whose namespace has `command` and `run`, the function that executes the command.
+    """
+    parser = CommandParser(
+        prog="dhcal",
+        description="Robot kinematic calibration: estimate the errors of a robot and correct its URDF.",
+        epilog="ROBOT is a URDF or a DH file. `dhcal COMMAND --help` shows the options and an example.",
+        formatter_class=HelpFormatter,
+    )
+    parser.add_argument("--version", action=_VersionAction, nargs=0, help="show the version and exit")
+    commands = parser.add_subparsers(
+        dest="command", metavar="COMMAND", required=True, parser_class=_LazyCommandParser
+    )
+    for command in COMMANDS:
+        commands.add_parser(
+            command.name,
+            module=command.module,
+            help=command.help,
+            description=f"{command.help[0].upper()}{command.help[1:]}.",
+            formatter_class=HelpFormatter,
+        )
+    return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs one command; 0 done, 1 a check that failed, 2 wrong input, 130 interrupted."""
-    args = parser().parse_args(argv)
-    # Small and narrow matrices: further threads of a BLAS, which asks when NumPy loads, would only wait.
+    """Run one command.
+
+    Args:
+        argv: Words of the command line; those of this process by default.
+
+    Returns:
+        Exit status: 0 done, 1 a check or a robot of a manifest failed, 2 invalid input, 130 interrupted.
+    """
+    args = build_parser().parse_args(argv)
+    # The matrices are small and narrow: more BLAS threads only wait. BLAS reads these when NumPy is loaded.
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     try:
-        module, _, function = COMMANDS[args.command].partition(":")
-        return getattr(import_module(f".{module}", __package__), function)(args)
+        return args.run(args)
     except DhcalError as error:
         print(f"dhcal: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except MemoryError:
-        print("dhcal: there is not enough memory for this; ask for fewer samples", file=sys.stderr)
+        print("dhcal: not enough memory; use fewer samples", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("dhcal: interrupted; nothing written", file=sys.stderr)
         return 130
-
-
-if __name__ == "__main__":
-    sys.exit(main())

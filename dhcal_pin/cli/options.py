@@ -1,56 +1,238 @@
-"""Where a command's files go: places checked before any work, JSON to a file or to stdout."""
+"""Parser classes, shared options and help texts of the commands.
+
+Shared options are dictionaries of keyword arguments of `argparse.ArgumentParser.add_argument`:
+
+    parser.add_argument("--tip", **TIP)
+
+Help texts may contain placeholders such as `{losses}`. When the help is printed they are replaced by names
+and descriptions from the modules that define them. A new loss or measurement kind therefore appears without
+an edit in this package. This module imports nothing heavy when it is loaded.
+"""
 
 from __future__ import annotations
 
-import os
+import argparse
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NoReturn
 
-from ..exceptions import DhcalError
-from ..io.atomic import require_writable, write_files
-from ..io.sidecar import existing_sidecar
-from ..report import document
+if TYPE_CHECKING:
+    from ..io.robot_format import RobotFormat
 
+# File name that stands for standard output.
 STDOUT = "-"
 
 
 def split_commas(text: str) -> list[str]:
-    """The entries of a comma-separated option."""
+    """Split the entries of a comma-separated option.
+
+    Args:
+        text: Value of the option.
+
+    Returns:
+        Entries without surrounding spaces; empty ones are dropped.
+    """
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
-def is_same_file(a: str, b: str) -> bool:
-    """Whether two paths are one file, there or not."""
-    if os.path.exists(a) and os.path.exists(b):
-        return os.path.samefile(a, b)
-    return os.path.realpath(a) == os.path.realpath(b)
+# --- parsers ---------------------------------------------------------------------------------------
 
 
-def require_writable_outputs(outputs: Sequence[str | None], inputs: Sequence[str]) -> None:
-    """Complains about an output that cannot be written, or would write over an input or another output."""
-    paths = [path for path in outputs if path and path != STDOUT]
-    for number, path in enumerate(paths):
-        if any(is_same_file(path, other) for other in inputs):
-            raise DhcalError(f"{path}: is an input; name another output")
-        if any(is_same_file(path, other) for other in paths[:number]):
-            raise DhcalError(f"{path}: is another output already; name a second file")
-        require_writable(path)
+class CommandParser(argparse.ArgumentParser):
+    """Argument parser that reports an error in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print one line to stderr and exit with status 2.
+
+        Args:
+            message: Description of the error.
+        """
+        print(f"{self.prog}: {' '.join(message.split())}; see {self.prog} --help", file=sys.stderr)
+        sys.exit(2)
 
 
-def require_urdf_ending(path: str) -> None:
-    """Raise DhcalError unless the path of a URDF to write ends with .urdf."""
-    if not path.lower().endswith(".urdf"):
-        raise DhcalError(f"{path}: unknown ending; write a URDF as .urdf")
+class HelpFormatter(argparse.RawDescriptionHelpFormatter):
+    """Help formatter with wide columns that replaces placeholders of help texts."""
+
+    def __init__(self, prog: str, **options: Any):
+        super().__init__(prog, max_help_position=30, **options)
+
+    def add_argument(self, action: argparse.Action) -> None:
+        """Add an option to the help.
+
+        Args:
+            action: Option; the placeholders of its help text are replaced.
+        """
+        if action.help:
+            action.help = expand_placeholders(action.help)
+        super().add_argument(action)
 
 
-def write_json(target: str | None, content: object) -> None:
-    """JSON to a file, or alone on stdout for `-`."""
-    if target == STDOUT:
-        sys.stdout.write(document.json_text(content))
-    elif target:
-        write_files({target: document.json_text(content)})
+@dataclass(frozen=True)
+class IntegerType:
+    """Type of an integer option, for argparse and manifests.
+
+    Attributes:
+        minimum: Smallest value.
+    """
+
+    minimum: int
+
+    @property
+    def description(self) -> str:
+        """Description of the values."""
+        return f"an integer of at least {self.minimum}"
+
+    def __call__(self, text: str) -> int:
+        """Parse a value.
+
+        Args:
+            text: Word of the command line.
+
+        Returns:
+            Value from `minimum` to the largest of 64 bits.
+
+        Raises:
+            ArgumentTypeError: The text is not such a number.
+        """
+        try:
+            value = int(text)
+        except ValueError:
+            value = None
+        if value is None or not self.minimum <= value < 2**63:
+            raise argparse.ArgumentTypeError(f"{text!r} is invalid; expected {self.description}")
+        return value
 
 
-def sidecars(robots: Sequence[str]) -> list[str]:
-    """The sidecars that lie beside robots' files."""
-    return [path for path in map(existing_sidecar, robots) if path]
+POSITIVE_INTEGER = IntegerType(1)
+NON_NEGATIVE_INTEGER = IntegerType(0)
+
+
+# --- shared options --------------------------------------------------------------------------------
+
+ROBOT: dict[str, Any] = {"metavar": "ROBOT", "help": "robot: {robot_formats}"}
+DATA: dict[str, Any] = {"metavar": "DATA", "nargs": "+", "help": "measurement CSV files"}
+TIP: dict[str, Any] = {"metavar": "LINK", "help": "tip link of a URDF (default: the deepest leaf link)"}
+COLUMNS: dict[str, Any] = {"metavar": "MAP.toml", "help": "column map of files in another layout"}
+JSON: dict[str, Any] = {"metavar": "FILE", "help": "write the result as JSON; - for stdout"}
+PARAMETERS: dict[str, Any] = {
+    "metavar": "SET[,SET]",
+    "help": "parameter sets to estimate (default: minimal,base,tool for a URDF, dh for a DH file): "
+    "{parameter_sets}",
+}
+FIX: dict[str, Any] = {
+    "metavar": "NAME[,NAME]",
+    "help": "parameters or sets to keep at their nominal values",
+}
+FREE: dict[str, Any] = {"metavar": "NAME[,NAME]", "help": "single parameters to estimate in addition"}
+KIND: dict[str, Any] = {
+    "metavar": "KIND",
+    "default": "pose",
+    "help": "kind of measurement: {kinds} (default: %(default)s)",
+}
+INSTRUMENT: dict[str, Any] = {
+    "metavar": "FILE.toml",
+    "help": "known values of the instrument, such as wire1.x, in a table [instrument]",
+}
+SCHEDULER: dict[str, Any] = {
+    "metavar": "ADDRESS",
+    "help": "run on the Dask cluster of this scheduler, such as tcp://host:8786",
+}
+
+
+def add_execution_options(parser: argparse.ArgumentParser, jobs_help: str, jobs: int | None) -> None:
+    """Add --jobs and --scheduler, which exclude each other.
+
+    Args:
+        parser: Parser of a command.
+        jobs_help: Help text of --jobs.
+        jobs: Default number of processes; None if it depends on the command line.
+    """
+    group = parser.add_mutually_exclusive_group()
+    group.add_argument("--jobs", metavar="N", type=POSITIVE_INTEGER, default=jobs, help=jobs_help)
+    group.add_argument("--scheduler", **SCHEDULER)
+
+
+# --- help texts from the domain --------------------------------------------------------------------
+
+
+def _parameter_sets() -> str:
+    from ..estimation.parameters import PARAMETER_SETS  # lazy import: loads Pinocchio
+
+    return ", ".join(PARAMETER_SETS)
+
+
+def _error_families() -> str:
+    from ..robot.error_families import FAMILIES  # lazy import: only for help
+
+    return "; ".join(f"{family.name} ({family.description})" for family in FAMILIES.values())
+
+
+def _losses() -> str:
+    from ..estimation.robust import LOSSES  # lazy import: loads Pinocchio
+
+    return ", ".join(LOSSES)
+
+
+def _criteria() -> str:
+    from ..planning.planner import CRITERIA  # lazy import: loads Pinocchio
+
+    return ", ".join(CRITERIA)
+
+
+def _kinds() -> str:
+    from ..measurements import KINDS  # lazy import: loads Pinocchio
+
+    return ", ".join(KINDS)
+
+
+def _robot_formats() -> str:
+    from ..io.robot import FORMATS  # lazy import: loads Pinocchio
+
+    return _format_list(robot_format for robot_format in FORMATS if robot_format.is_readable)
+
+
+def _written_formats() -> str:
+    from ..io.robot import FORMATS  # lazy import: loads Pinocchio
+
+    return _format_list(FORMATS)
+
+
+def _format_list(formats: Iterable[RobotFormat]) -> str:
+    """List file formats with their endings."""
+    return ", ".join(f"{item.name} ({', '.join(item.endings)})" for item in formats)
+
+
+def _shipped_studies() -> str:
+    from ..io.shipped_files import shipped_file  # lazy import: loads Pinocchio
+
+    ending = ".study.toml"
+    names = sorted(path.name for path in shipped_file("").iterdir() if path.name.endswith(ending))
+    return ", ".join(name.removesuffix(ending) for name in names)
+
+
+# Text of each placeholder; called only when a help page is printed.
+PLACEHOLDERS: dict[str, Callable[[], str]] = {
+    "criteria": _criteria,
+    "error_families": _error_families,
+    "kinds": _kinds,
+    "losses": _losses,
+    "parameter_sets": _parameter_sets,
+    "robot_formats": _robot_formats,
+    "shipped_studies": _shipped_studies,
+    "written_formats": _written_formats,
+}
+
+
+def expand_placeholders(text: str) -> str:
+    """Replace the placeholders of a help text.
+
+    Args:
+        text: Help text in the syntax of argparse, with placeholders such as `{losses}`.
+
+    Returns:
+        The text with names and descriptions from the modules that define them.
+    """
+    return re.sub(r"\{(\w+)\}", lambda match: PLACEHOLDERS[match[1]]().replace("%", "%%"), text)

@@ -1,65 +1,169 @@
-"""`dhcal plan`: which poses to measure."""
+"""`dhcal plan`: choose the poses to measure and predict the resulting accuracy."""
 
 from __future__ import annotations
 
 import re
-from argparse import Namespace
-from typing import Any
+from argparse import ArgumentParser, Namespace
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from .._typing import Array, PathLike
-from ..compensation import compensate
-from ..exceptions import DhcalError
-from ..formatting import Table
-from ..io.atomic import write_files
-from ..io.measurement_csv import (
-    configurations_text,
-    read_configurations,
-    read_measurement_file,
-    read_targets,
+from ..exceptions import InvalidArgumentError
+from .options import (
+    COLUMNS,
+    FIX,
+    FREE,
+    INSTRUMENT,
+    JSON,
+    KIND,
+    NON_NEGATIVE_INTEGER,
+    PARAMETERS,
+    POSITIVE_INTEGER,
+    ROBOT,
+    TIP,
+    split_commas,
 )
-from ..io.robot import read_robot
-from ..io.settings import read_priors
-from ..io.sidecar import existing_sidecar, read_instrument, read_uncertainty
-from ..io.tabular import read_csv_table
-from ..measurements.base import Noise
-from ..planning.planner import Plan, plan
-from ..report.document import file_digests, json_text, versions
-from ..robot.chain import Chain
-from ..robot.sampling import WorkspaceConstraints
-from ..units import ANGLES, LENGTHS, parse_noise
-from . import console
-from .options import STDOUT, require_writable_outputs, sidecars, split_commas, write_json
+
+if TYPE_CHECKING:
+    from .._typing import Array, PathLike
+    from ..planning import Plan
+    from ..robot import Chain, WorkspaceConstraints
+
+EXAMPLE = "dhcal plan ur10.urdf -n 40 --tip tool0 --sigma 0.1mm,0.01deg -o poses.csv"
+
+# Standard deviation of a laser tracker and a precise robot, used without --sigma and --data.
+_DEFAULT_SIGMA = "0.1mm,0.01deg"
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 
 
-# A laser tracker and a good arm's repeatability, where neither --sigma nor --data tell.
-_SIGMA = "0.1mm,0.01deg"
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the arguments of `dhcal plan`.
+
+    Args:
+        parser: Parser of the command.
+    """
+    parser.add_argument("robot", **ROBOT)
+    parser.add_argument(
+        "-n", "--count", type=POSITIVE_INTEGER, required=True, metavar="N", help="number of poses"
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="poses.csv",
+        required=True,
+        help="joint values to write, ordered as a short tour",
+    )
+    parser.add_argument("--tip", **TIP)
+    parser.add_argument("--kind", **KIND)
+    parser.add_argument(
+        "--sigma",
+        metavar="LENGTH[,ANGLE]",
+        help="standard deviation per axis of instrument and robot repeatability (default: as in --data, else "
+        f"{_DEFAULT_SIGMA})",
+    )
+    parser.add_argument(
+        "--criterion",
+        metavar="C",
+        default="D",
+        help="optimality criterion: {criteria} (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--task",
+        metavar="FILE",
+        help="configurations where the accuracy matters: joint values, or tool positions x[mm],y[mm],z[mm]",
+    )
+    parser.add_argument("--parameters", **PARAMETERS)
+    parser.add_argument("--fix", default="", **FIX)
+    parser.add_argument("--free", default="", **FREE)
+    parser.add_argument(
+        "--priors",
+        metavar="default|FILE",
+        help="prior standard deviations, as in calibrate (default: the uncertainty in the sidecar of a "
+        "calibrated robot, else default)",
+    )
+    parser.add_argument("--instrument", **INSTRUMENT)
+    parser.add_argument(
+        "--data", metavar="DATA", nargs="+", help="existing measurements to complement, as CSV files"
+    )
+    parser.add_argument("--columns", **COLUMNS)
+    parser.add_argument(
+        "--candidates",
+        type=POSITIVE_INTEGER,
+        default=5000,
+        metavar="N",
+        help="number of random candidates (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--from", dest="candidates_from", metavar="FILE", help="choose from the joint values in a file"
+    )
+    parser.add_argument(
+        "--box", metavar="X,Y,Z:X,Y,ZUNIT", help="allowed box of the tool in the measuring frame"
+    )
+    parser.add_argument(
+        "--visible-from",
+        metavar="X,Y,ZUNIT",
+        help="position of the instrument; its line of sight to the tool must be free",
+    )
+    parser.add_argument(
+        "--cone",
+        metavar="ANGLE",
+        help="largest angle between the z axis of the tool and the direction to the instrument, as 30deg",
+    )
+    parser.add_argument(
+        "--margin",
+        default="5mm,2deg",
+        metavar="LENGTH,ANGLE",
+        help="distance to the joint limits (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--seed",
+        metavar="N",
+        type=NON_NEGATIVE_INTEGER,
+        default=0,
+        help="random seed of the candidates (default: %(default)s)",
+    )
+    parser.add_argument("--json", **JSON)
 
 
 def run(args: Namespace) -> int:
-    """Chooses poses and writes them, with what to expect of them."""
-    given = [
+    """Choose poses, write them and show the predicted accuracy.
+
+    Args:
+        args: Parsed arguments.
+
+    Returns:
+        Exit status 0.
+    """
+    import numpy as np  # lazy import, as the following: they are slow to load
+
+    from ..io import read_measurement_file, read_priors, read_robot
+    from ..io.measurement_csv import configurations_text, read_configurations
+    from ..io.sidecar import existing_sidecar, read_instrument, read_uncertainty
+    from ..measurements import Noise
+    from ..planning import plan
+    from ..report.document import file_digests, versions
+    from ..units import parse_noise
+    from . import console
+    from .outputs import existing_sidecars, require_writable_outputs, write_outputs
+
+    files = [
         *(args.data or []),
         *filter(None, (args.candidates_from, args.task, args.columns, args.instrument)),
     ]
     priors = [args.priors] if args.priors not in (None, "default") else []
-    inputs = [args.robot, *sidecars([args.robot]), *given, *priors]
+    inputs = [args.robot, *existing_sidecars([args.robot]), *files, *priors]
     require_writable_outputs([args.output, args.json], inputs)
     chain = read_robot(args.robot, args.tip)
-    space = _space(args)
+    space = _workspace_constraints(args)
     candidates: int | Array = args.candidates
     if args.candidates_from:
         candidates = read_configurations(args.candidates_from, chain, args.columns)
     data = [read_measurement_file(path, chain, args.columns).data for path in args.data or []]
-    # Readings given tell themselves what they tell, and priors asked for stand alone.
+    # The uncertainty of an earlier calibration would count twice beside its data, and replaces the priors.
     sidecar = None if args.data or args.priors else existing_sidecar(args.robot)
-    learnt = read_uncertainty(sidecar, chain) if sidecar else None
-    sigma = args.sigma or (None if any(item.kind == args.kind for item in data) else _SIGMA)
+    prior_uncertainty = read_uncertainty(sidecar, chain) if sidecar else None
+    sigma = args.sigma or (None if any(item.kind == args.kind for item in data) else _DEFAULT_SIGMA)
     with console.show_progress(f"choosing {args.count} poses"):
-        found = plan(
+        result = plan(
             chain,
             args.count,
             kind=args.kind,
@@ -71,131 +175,131 @@ def run(args: Namespace) -> int:
             criterion=args.criterion,
             data=data,
             known=read_instrument(args.instrument) if args.instrument else None,
-            prior_uncertainty=learnt,
+            prior_uncertainty=prior_uncertainty,
             task=read_task(args.task, chain) if args.task else None,
             candidates=candidates,
             space=space,
             margin=Noise(*parse_noise(args.margin, "--margin")),
             seed=args.seed,
         )
-    noise = found.information.noise
-    document = _document(found, args)
-    document |= {"inputs": file_digests(inputs), "versions": versions()}
+    noise = result.information.noise
     comments = [
-        f"{args.count} poses to measure ({args.kind}, criterion {found.criterion}), as a short tour",
-        f"predicted position error {1e3 * found.error:.4g} mm RMS with sigma "
+        f"{args.count} poses to measure ({args.kind}, criterion {result.criterion}), as a short tour",
+        f"predicted position error {1e3 * result.error:.4g} mm RMS with standard deviation "
         f"{1e3 * noise.position:.4g} mm, {np.degrees(noise.rotation):.4g} deg",
     ]
-    contents: dict[PathLike, str | bytes] = {args.output: configurations_text(found.q, chain, comments)}
-    if args.json and args.json != STDOUT:
-        contents[args.json] = json_text(document)
-    write_files(contents)
-    if args.json == STDOUT:
-        write_json(args.json, document)
-    _say(found, args)
+    document = _plan_document(result, args)
+    document |= {"inputs": file_digests(inputs), "versions": versions()}
+    write_outputs({args.output: configurations_text(result.q, chain, comments)}, args.json, document)
+    console.print_plan(result)
+    console.print_lines(f"wrote {args.output}")
     return 0
 
 
-def _space(args: Namespace) -> WorkspaceConstraints:
-    """Where the tool may be, as the command line says it."""
-    box = _places(args.box, "--box", "200,-400,100:900,400,800mm", 2) if args.box else None
-    eye = _places(args.visible_from, "--visible-from", "3000,0,1200mm", 1)[0] if args.visible_from else None
+def _workspace_constraints(args: Namespace) -> WorkspaceConstraints:
+    """Create the constraints of the tool from --box, --visible-from and --cone."""
+    import numpy as np  # lazy import, as the following: they are slow to load
+
+    from ..robot import WorkspaceConstraints
+    from ..units import ANGLES
+
+    box = _parse_points(args.box, "--box", "200,-400,100:900,400,800mm", 2) if args.box else None
     if box is not None and not np.all(box[0] < box[1]):
-        raise DhcalError(f"--box {args.box}: the first corner must be below the second in x, y and z")
-    if args.cone and eye is None:
-        raise DhcalError("--cone needs --visible-from: where the instrument stands")
+        raise InvalidArgumentError(
+            f"--box {args.box}: the first corner must be below the second in x, y and z"
+        )
+    instrument = None
+    if args.visible_from:
+        instrument = _parse_points(args.visible_from, "--visible-from", "3000,0,1200mm", 1)[0]
+    if args.cone and instrument is None:
+        raise InvalidArgumentError("--cone: needs --visible-from, the position of the instrument")
     cone = np.pi
     if args.cone:
         match = re.fullmatch(rf"\s*({_NUMBER})\s*(rad|deg)\s*", args.cone)
         cone = float(match[1]) / ANGLES[match[2]] if match else 0.0
         if not 0 < cone <= np.pi:
-            raise DhcalError(f"--cone {args.cone}: write a half angle up to 180deg, as 30deg")
-    return WorkspaceConstraints(box, eye, cone)
+            raise InvalidArgumentError(
+                f"--cone {args.cone}: invalid half angle; expected at most 180deg, such as 30deg"
+            )
+    return WorkspaceConstraints(box, instrument, cone)
 
 
-def _places(text: str, option: str, example: str, count: int) -> Array:
-    """Places (count, 3) in m from coordinates with a unit at the end."""
-    place = rf"\s*{_NUMBER}\s*,\s*{_NUMBER}\s*,\s*{_NUMBER}\s*"
-    match = re.fullmatch(rf"({place}(?::{place}){{{count - 1}}})([a-zµμ]+)\s*", text)
+def _parse_points(text: str, option: str, example: str, count: int) -> Array:
+    """Parse points, shape (count, 3) [m], from coordinates with one unit at the end."""
+    import numpy as np  # lazy import, as the following: they are slow to load
+
+    from ..units import LENGTHS
+
+    point = rf"\s*{_NUMBER}\s*,\s*{_NUMBER}\s*,\s*{_NUMBER}\s*"
+    match = re.fullmatch(rf"({point}(?::{point}){{{count - 1}}})([a-zµμ]+)\s*", text)
     if not match or match[2] not in LENGTHS:
-        raise DhcalError(f"{option} {text}: write x,y,z with a unit at the end, as {example}")
+        raise InvalidArgumentError(
+            f"{option} {text}: invalid coordinates; expected x,y,z with a unit at the end, such as {example}"
+        )
     return np.array(re.findall(_NUMBER, match[1]), float).reshape(count, 3) / LENGTHS[match[2]]
 
 
-def _document(found: Plan, args: Namespace) -> dict[str, Any]:
-    """What was chosen and what to expect, SI."""
-    noise = found.information.noise
-    return {
-        "poses": len(found.q),
-        "kind": args.kind,
-        "criterion": found.criterion,
-        "sigma_position_m": noise.position,
-        "sigma_orientation_rad": noise.rotation,
-        "rows": None if found.index is None else (found.index + 1).tolist(),
-        "log_det": found.log_det,
-        "predicted_position_rms_m": found.error,
-        "random_position_rms_m": found.random_error,
-        "relative_error": found.relative_error,
-        "recommended_size": found.recommended_size,
-        "curve": [
-            {"poses": int(size), "predicted_position_rms_m": float(error)}
-            for size, error in zip(found.sizes, found.errors, strict=True)
-        ],
-        "random_curve": [
-            {"poses": int(size), "predicted_position_rms_m": float(error)}
-            for size, error in zip(found.random_sizes, found.random_errors, strict=True)
-        ],
-        "notes": list(found.notes),
-        "files": {"poses": args.output} | ({"json": args.json} if args.json not in (None, STDOUT) else {}),
-    }
-
-
-def _say(found: Plan, args: Namespace) -> None:
-    """The table and the sentences."""
-    random = dict(zip(found.random_sizes.tolist(), found.random_errors.tolist(), strict=True))
-    sizes = found.sizes.tolist()
-    last = {len(found.q), sizes[-1]} | ({found.recommended_size} if found.recommended_size else set())
-    shown = sorted(size for size in {*random, *last} if size in sizes)
-    rows = [
-        [
-            str(size),
-            f"{1e3 * found.errors[sizes.index(size)]:.4f}",
-            f"{1e3 * random[size]:.4f}" if size in random else "",
-        ]
-        for size in shown
-    ]
-    content = Table(["poses", "planned mm", "random mm"], rows, n_text_columns=0)
-    console.print_table("predicted position error, RMS over the task", content)
-    console.print_lines("")
-    console.print_lines(
-        f"{len(found.q)} planned poses leave {found.relative_error:.2f} of the error that as many at random leave"
-    )
-    if found.recommended_size:
-        console.print_lines(
-            f"more poses stop paying at {found.recommended_size}: ten more would lower what a check shows by under 1 %"
-        )
-    else:
-        console.print_lines(f"more poses still pay at {sizes[-1]}")
-    console.print_notes(found.notes)
-    console.print_lines(f"wrote {args.output}")
-
-
 def read_task(path: PathLike, chain: Chain) -> Array:
-    """Joint values (m, n) of a task: as the file has them, or such that the tool is on its targets.
+    """Read the configurations where the accuracy matters.
 
-    Targets are places or poses of the chain's tool in the measuring frame.
+    Args:
+        path: CSV file with joint values, or with positions or poses of the tool in the measuring frame.
+        chain: Nominal robot.
+
+    Returns:
+        Joint values, shape (m, n) [rad or m]; for tool positions and poses those of the inverse kinematics.
 
     Raises:
-        DhcalError: what is wrong, or a target that is out of reach.
+        InvalidArgumentError: A target is out of reach.
     """
+    import numpy as np  # lazy import, as the following: they are slow to load
+
+    from ..compensation import compensate
+    from ..io import read_targets
+    from ..io.measurement_csv import read_configurations
+    from ..io.tabular import read_csv_table
+
     columns = read_csv_table(path).columns
     if any(name in columns for name in chain.joint_names):
         return read_configurations(path, chain)
     targets = read_targets(path, chain)
-    found = compensate(chain, chain, targets.values)
-    if (lost := np.flatnonzero(~found.reached)).size:
-        raise DhcalError(
-            f"{targets.source}: target {lost[0] + 1} is out of reach ({found.status[lost[0]]}); "
+    result = compensate(chain, chain, targets.values)
+    if (failed := np.flatnonzero(~result.reached)).size:
+        raise InvalidArgumentError(
+            f"{targets.source}: target {failed[0] + 1} is out of reach ({result.status[failed[0]]}); "
             "correct or remove it"
         )
-    return found.q
+    return result.q
+
+
+def _plan_document(result: Plan, args: Namespace) -> dict[str, Any]:
+    """Create the JSON document of a plan, in SI units."""
+    from .outputs import json_path  # lazy import: loads Pinocchio
+
+    noise = result.information.noise
+    path = json_path(args.json)
+    return {
+        "poses": len(result.q),
+        "kind": args.kind,
+        "criterion": result.criterion,
+        "sigma_position_m": noise.position,
+        "sigma_orientation_rad": noise.rotation,
+        "rows": None if result.index is None else (result.index + 1).tolist(),
+        "log_det": result.log_det,
+        "predicted_position_rms_m": result.error,
+        "random_position_rms_m": result.random_error,
+        "relative_error": result.relative_error,
+        "recommended_size": result.recommended_size,
+        "curve": _curve(result.sizes, result.errors),
+        "random_curve": _curve(result.random_sizes, result.random_errors),
+        "notes": list(result.notes),
+        "files": {"poses": args.output} | ({"json": path} if path else {}),
+    }
+
+
+def _curve(sizes: Array, errors: Array) -> list[dict[str, float]]:
+    """Convert a curve of errors over the number of poses to JSON."""
+    return [
+        {"poses": int(size), "predicted_position_rms_m": float(error)}
+        for size, error in zip(sizes, errors, strict=True)
+    ]

@@ -1,45 +1,86 @@
-"""What the small commands of `dhcal` do, once the command line is read.
-
-Wrong input is found before anything is written or shown; JSON goes to stdout, all else to stderr.
-"""
+"""`dhcal simulate`: simulate measurements of a robot with known errors."""
 
 from __future__ import annotations
 
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
 
-import numpy as np
+from ..exceptions import InvalidArgumentError, UnknownNameError
+from .options import KIND, NON_NEGATIVE_INTEGER, POSITIVE_INTEGER, ROBOT, TIP
 
-from ..exceptions import DhcalError
-from ..io.atomic import write_files
-from ..io.measurement_csv import measurement_text
-from ..io.robot import has_dh_table, read_robot
-from ..measurements import KINDS
-from ..measurements.base import Noise
-from ..robot.sampling import joint_range
-from ..units import parse_noise
-from . import console
-from .options import require_writable_outputs, sidecars
+EXAMPLE = "dhcal simulate arm.dh.toml --truth actual.dh.toml -m 50 --noise 0.1mm,0.01deg -o data.csv"
 
 
-def simulate(args: Namespace) -> int:
-    """Measurements of a robot that is known to be wrong."""
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the arguments of `dhcal simulate`.
+
+    Args:
+        parser: Parser of the command.
+    """
+    parser.add_argument("robot", metavar="ROBOT", help=f"nominal {ROBOT['help']}")
+    parser.add_argument(
+        "-m", "--samples", type=POSITIVE_INTEGER, required=True, metavar="M", help="number of samples"
+    )
+    parser.add_argument(
+        "--noise",
+        default="0mm",
+        metavar="LENGTH[,ANGLE]",
+        help="standard deviation per axis, such as 0.1mm,0.01deg (default: %(default)s)",
+    )
+    parser.add_argument(
+        "-o", "--output", metavar="data.csv", required=True, help="measurement CSV file to write"
+    )
+    parser.add_argument("--truth", metavar="T.urdf", help="robot with errors (default: ROBOT)")
+    parser.add_argument("--kind", **KIND)
+    parser.add_argument("--tip", **TIP)
+    parser.add_argument(
+        "--seed",
+        metavar="N",
+        type=NON_NEGATIVE_INTEGER,
+        default=0,
+        help="random seed of joint values and noise (default: %(default)s)",
+    )
+
+
+def run(args: Namespace) -> int:
+    """Simulate measurements and write them.
+
+    Args:
+        args: Parsed arguments.
+
+    Returns:
+        Exit status 0.
+
+    Raises:
+        UnknownNameError: There is no such kind of measurement.
+        InvalidArgumentError: The two robots have different joints.
+    """
+    import numpy as np  # lazy import, as the following: they are slow to load
+
+    from ..io import measurement_text, read_robot
+    from ..io.robot import has_dh_table
+    from ..measurements import KINDS, Noise
+    from ..robot.sampling import joint_range
+    from ..units import parse_noise
+    from . import console
+    from .outputs import existing_sidecars, require_writable_outputs, write_outputs
+
     robots = [args.robot, *([args.truth] if args.truth else [])]
-    require_writable_outputs([args.output], [*robots, *sidecars(robots)])
+    require_writable_outputs([args.output], [*robots, *existing_sidecars(robots)])
     noise = Noise(*parse_noise(args.noise))
     if args.kind not in KINDS:
-        raise DhcalError(f"--kind {args.kind}: choose from {', '.join(KINDS)}")
-    chain = truth = read_robot(args.robot, args.tip)
+        raise UnknownNameError(f"--kind: unknown kind {args.kind!r}; choose from {', '.join(KINDS)}")
+    nominal = truth = read_robot(args.robot, args.tip)
     if args.truth:
         truth = read_robot(args.truth, None if has_dh_table(args.truth) else args.tip)
-        if truth.joint_names != chain.joint_names:
-            raise DhcalError(
+        if truth.joint_names != nominal.joint_names:
+            raise InvalidArgumentError(
                 f"{args.truth}: its joints are {', '.join(truth.joint_names)}; "
-                f"they must be those of {args.robot}: {', '.join(chain.joint_names)}"
+                f"expected those of {args.robot}: {', '.join(nominal.joint_names)}"
             )
     rng = np.random.default_rng(args.seed)
-    q = rng.uniform(*joint_range(chain), (args.samples, chain.n_joints))
+    q = rng.uniform(*joint_range(nominal), (args.samples, nominal.n_joints))
     data = KINDS[args.kind].simulate(truth, q, noise, rng)
-    comments = [f"simulated {args.kind} of {args.truth or args.robot}, noise {args.noise}, seed {args.seed}"]
-    write_files({args.output: measurement_text(data, chain, comments)})
+    comment = f"simulated {args.kind} of {args.truth or args.robot}, noise {args.noise}, seed {args.seed}"
+    write_outputs({args.output: measurement_text(data, nominal, [comment])})
     console.print_lines(f"wrote {args.output}")
     return 0

@@ -1,103 +1,127 @@
-"""`dhcal study`: a grid of simulated calibrations, shared out, resumed after a kill, as CSV and plot."""
+"""`dhcal study`: simulate calibrations over a grid of settings; write medians as CSV and plot.
+
+A study runs in blocks of calibrations. Each finished block is appended to a journal `OUT.part`, whose first
+line identifies the study. After an interruption the same command resumes with the next block.
+"""
 
 from __future__ import annotations
 
 import json
 import os
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import fields
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, TextIO
 
-import numpy as np
+from ..exceptions import FileFormatError
+from .options import add_execution_options
 
-from ..exceptions import DhcalError
-from ..formatting import Table
-from ..io.atomic import write_files
-from ..io.shipped_files import shipped_file
-from ..io.tabular import csv_text, read_text
-from ..parallel import open_executor
-from ..studies.grid import Setting, StudyGrid, read_study
-from ..studies.runner import run, table
-from ..visualization.plots import study_svg
-from . import console
-from .options import require_writable_outputs, sidecars
+if TYPE_CHECKING:
+    from ..studies import StudyGrid
+
+EXAMPLE = "dhcal study ur10_poses --jobs 2 -o results.csv"
 
 
-def study(args: Namespace) -> int:
-    """Runs a study, or what is left of it."""
-    given = os.path.exists(args.study) or args.study.endswith(".toml")
-    path = args.study if given else shipped_file(f"{args.study}.study.toml")
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the arguments of `dhcal study`.
+
+    Args:
+        parser: Parser of the command.
+    """
+    parser.add_argument(
+        "study",
+        metavar="STUDY.toml",
+        help="grid of settings, or the name of a study that is part of the package: {shipped_studies}",
+    )
+    parser.add_argument(
+        "-o", "--output", metavar="results.csv", required=True, help="table to write, one row per setting"
+    )
+    add_execution_options(parser, "processes on this computer (default: %(default)s)", jobs=1)
+
+
+def run(args: Namespace) -> int:
+    """Run a study, or the blocks that an interrupted run has left.
+
+    Args:
+        args: Parsed arguments.
+
+    Returns:
+        Exit status: 0 done, 130 interrupted.
+    """
+    from dataclasses import fields  # lazy import, as the following: they load Pinocchio
+
+    from .. import studies
+    from ..io import shipped_file
+    from ..io.tabular import csv_text
+    from ..parallel import open_executor
+    from ..studies.runner import table
+    from ..visualization.plots import study_svg
+    from . import console
+    from .outputs import existing_sidecars, require_writable_outputs, write_outputs
+
+    is_file = os.path.exists(args.study) or args.study.endswith(".toml")
+    path = args.study if is_file else shipped_file(f"{args.study}.study.toml")
     journal = f"{args.output}.part"
-    picture = f"{os.path.splitext(args.output)[0]}.svg"
-    wanted = read_study(path)
-    inputs = [os.fspath(path), *wanted.robots, *sidecars(wanted.robots)]
-    require_writable_outputs([args.output, journal, picture], inputs)
-    blocks = _resumed(journal, wanted)
-    total = len(wanted.tasks())
+    figure = f"{os.path.splitext(args.output)[0]}.svg"
+    study = studies.read_study(path)
+    inputs = [os.fspath(path), *study.robots, *existing_sidecars(study.robots)]
+    require_writable_outputs([args.output, journal, figure], inputs)
+    blocks = _read_journal(journal, study)
+    total = len(study.tasks())
     if blocks:
-        console.print_lines(f"{journal}: goes on after {len(blocks)} of {total} blocks")
+        console.print_lines(f"{journal}: resuming after {len(blocks)} of {total} blocks")
     try:
         with (
-            open_executor(args.jobs, args.scheduler) as where,
-            console.progress_bar(wanted.title or "study", total, len(blocks)) as progress,
-            _opened(journal, wanted, blocks) as file,
+            open_executor(args.jobs, args.scheduler) as executor,
+            console.progress_bar(study.title or "study", total, len(blocks)) as progress,
+            _open_journal(journal, study, blocks) as file,
         ):
-            for block in run(wanted, len(blocks), where):
-                # One line a block and each at once, so that a kill costs no more than the blocks under way.
+            for block in studies.run(study, len(blocks), executor):
+                # Flush each line at once: if the process is killed, only unfinished blocks are lost.
                 file.write(json.dumps(block) + "\n")
                 file.flush()
                 blocks.append(block)
                 progress(len(blocks))
     except KeyboardInterrupt:
-        kept = f"{journal} keeps {len(blocks)} of {total} blocks, and the same command goes on from there"
-        console.print_lines(f"dhcal: interrupted; {kept}")
+        console.print_lines(
+            f"dhcal: interrupted; {journal} contains {len(blocks)} of {total} blocks; run the same command "
+            "to resume"
+        )
         return 130
-    header, rows = table(wanted, blocks)
-    drawn = study_svg(wanted.title or "study", header, rows, len(fields(Setting)))
+    header, rows = table(study, blocks)
+    drawing = study_svg(study.title or "study", header, rows, len(fields(studies.Setting)))
     columns = dict(zip(header, zip(*rows, strict=True), strict=True))
-    contents = {args.output: csv_text(columns)} | ({picture: drawn} if drawn else {})
-    write_files(contents)
+    contents = {args.output: csv_text(columns)} | ({figure: drawing} if drawing else {})
+    write_outputs(contents)
     os.unlink(journal)
-    _shown(wanted, header, rows)
+    console.print_study(study, header, rows)
     console.print_lines(*(f"wrote {path}" for path in contents))
     return 0
 
 
-def _resumed(journal: str, wanted: StudyGrid) -> list[list[list[float]]]:
-    """The blocks that a run before this one finished."""
+def _read_journal(journal: str, study: StudyGrid) -> list[list[list[float]]]:
+    """Read the blocks that an interrupted run of this study has finished."""
+    from ..io.tabular import read_text  # lazy import: loads Pinocchio
+
     if not os.path.exists(journal):
         return []
-    head, *lines = read_text(journal).split("\n")
-    if head != wanted.digest:
-        raise DhcalError(
-            f"{journal}: belongs to another study, or to other robots; finish that one, or remove the file"
+    digest, *lines = read_text(journal).split("\n")
+    if digest != study.digest:
+        raise FileFormatError(
+            f"{journal}: belongs to another study or to other robots; finish that study, or remove the file"
         )
     blocks = []
-    # The last line is empty, or was cut by the kill.
+    # The last line is empty, or incomplete if the process was killed.
     with suppress(ValueError):
         for line in lines[:-1]:
             blocks.append(json.loads(line))
     return blocks
 
 
-def _opened(journal: str, wanted: StudyGrid, blocks: Sequence[list[list[float]]]) -> TextIO:
-    """The journal with its whole lines, to be written on."""
-    write_files({journal: "".join(f"{line}\n" for line in (wanted.digest, *map(json.dumps, blocks)))})
+def _open_journal(journal: str, study: StudyGrid, blocks: Sequence[list[list[float]]]) -> TextIO:
+    """Write the journal with its complete lines only, and open it to append more."""
+    from .outputs import write_outputs  # lazy import: loads Pinocchio
+
+    lines = (study.digest, *map(json.dumps, blocks))
+    write_outputs({journal: "".join(f"{line}\n" for line in lines)})
     return open(journal, "a", encoding="utf-8")
-
-
-def _shown(wanted: StudyGrid, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """The settings that differ, and the figures, in mm and degrees."""
-    count = len(fields(Setting))
-    varied = [i for i in range(count) if len({row[i] for row in rows}) > 1]
-    names = [name.replace("[m]", " mm").replace("[rad]", " °").replace("_", " ") for name in header]
-    scale = [1e3 if "[m]" in name else np.rad2deg(1.0) if "[rad]" in name else 1.0 for name in header]
-    told = [i for i in range(count + 1, len(header)) if any(row[i] is not None for row in rows)]
-    lines = [
-        [str(row[i]) for i in varied] + ["" if row[i] is None else f"{row[i] * scale[i]:.3g}" for i in told]
-        for row in rows
-    ]
-    title = f"{wanted.title or 'study'}: medians of {wanted.seeds} calibrations a line"
-    console.print_table(title, Table([names[i] for i in (*varied, *told)], lines, n_text_columns=len(varied)))

@@ -1,91 +1,129 @@
-"""What the small commands of `dhcal` do, once the command line is read.
-
-Wrong input is found before anything is written or shown; JSON goes to stdout, all else to stderr.
-"""
+"""`dhcal validate`: compute the accuracy of a robot model on measurements."""
 
 from __future__ import annotations
 
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
+from typing import TYPE_CHECKING
 
-from ..calibration import procedure
-from ..calibration.evaluation import Accuracy, accuracy
-from ..diagnostics.input_checks import find_input_warnings
-from ..diagnostics.reachability import find_unreachable_rows
-from ..estimation.uncertainty import Predictor
-from ..exceptions import DhcalError
-from ..io.atomic import write_files
-from ..io.measurement_csv import MeasurementFile, read_measurement_file
-from ..io.robot import read_robot
-from ..io.sidecar import existing_sidecar, read_instrument, read_uncertainty
-from ..measurements.position import require_common_reference_target
-from ..report.document import (
-    file_digests,
-    main_statistics,
-    result_to_dict,
-    validation_to_dict,
-)
-from ..report.workspace_map import check_map_ending, map_content
-from ..robot.chain import Chain
-from . import console
-from .options import STDOUT, require_writable_outputs, write_json
+from ..exceptions import InvalidArgumentError
+from .options import COLUMNS, DATA, JSON, ROBOT, TIP
+
+if TYPE_CHECKING:
+    from ..estimation.uncertainty import Predictor
+    from ..io import MeasurementFile
+    from ..robot import Chain
+
+EXAMPLE = "dhcal validate ur10_calibrated.urdf other.csv --tip tool0 --fit-frames"
 
 
-def validate(args: Namespace) -> int:
-    """The accuracy of a model on measurements."""
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the arguments of `dhcal validate`.
+
+    Args:
+        parser: Parser of the command.
+    """
+    parser.add_argument("robot", **ROBOT)
+    parser.add_argument("data", **DATA)
+    parser.add_argument("--tip", **TIP)
+    parser.add_argument("--columns", **COLUMNS)
+    parser.add_argument(
+        "--sidecar",
+        metavar="S.toml",
+        help="file with base, tool and joint errors (default: NAME.calibration.toml beside ROBOT)",
+    )
+    parser.add_argument(
+        "--fit-frames", action="store_true", help="fit base and tool to the measurements first"
+    )
+    parser.add_argument(
+        "--map",
+        metavar="MAP",
+        help="write the predicted position uncertainty and the measured errors over the workspace (.csv or "
+        ".html)",
+    )
+    parser.add_argument("--json", **JSON)
+
+
+def run(args: Namespace) -> int:
+    """Compute the accuracy of a model, write it and show it.
+
+    Args:
+        args: Parsed arguments.
+
+    Returns:
+        Exit status 0.
+    """
+    from ..calibration import accuracy, calibrate  # lazy import, as the following: they load Pinocchio
+    from ..io import read_measurement_file, read_robot
+    from ..io.sidecar import existing_sidecar, read_instrument
+    from ..measurements.position import require_common_reference_target
+    from ..report.document import file_digests, main_statistics, result_to_dict, validation_to_dict
+    from ..report.workspace_map import map_content
+    from . import console
+    from .outputs import json_path, require_writable_outputs, write_outputs
+
     sidecar = args.sidecar or existing_sidecar(args.robot)
     inputs = [args.robot, *args.data, *filter(None, (sidecar, args.columns))]
     require_writable_outputs([args.json, args.map], inputs)
     chain = read_robot(args.robot, args.tip, sidecar)
-    model = _trusted(chain, sidecar, args) if args.map else None
-    readings = [read_measurement_file(path, chain, args.columns) for path in args.data]
-    data = [item.data for item in readings]
-    surveyed = read_instrument(sidecar) if sidecar else {}
-    there = {unknown.name for item in data for unknown in item.instrument_parameters}
-    require_common_reference_target(dict(zip(args.data, data, strict=True)), surveyed)
-    known = {name: value for name, value in surveyed.items() if name in there}
-    given = accuracy(chain, data, known)
-    found: dict[str, Accuracy] = {"base and tool as given": given}
+    predictor = _predictor(chain, sidecar, args) if args.map else None
+    files = [read_measurement_file(path, chain, args.columns) for path in args.data]
+    data = [file.data for file in files]
+    instrument = read_instrument(sidecar) if sidecar else {}
+    used = {parameter.name for item in data for parameter in item.instrument_parameters}
+    require_common_reference_target(dict(zip(args.data, data, strict=True)), instrument)
+    known = {name: value for name, value in instrument.items() if name in used}
+    nominal = accuracy(chain, data, known)
+    accuracies = {"base and tool as given": nominal}
     if args.fit_frames:
-        # Whatever is judged counts.
-        fit = procedure.calibrate(chain, data, "base,tool", known=known, loss="linear")
-        found["fitted"] = fit.comparisons[-1].after
+        # The loss is linear: validation includes all samples, outliers too.
+        fit = calibrate(chain, data, "base,tool", known=known, loss="linear")
+        accuracies["base and tool fitted"] = fit.comparisons[-1].after
         document = result_to_dict(fit, {}, file_digests(inputs))
     else:
         document = validation_to_dict(chain, data, file_digests(inputs), known)
-    document["before"] = main_statistics(given)
-    doubtful = {item.source: _input_warnings(chain, item, args.fit_frames) for item in readings}
-    document["warnings"] = [f"{path}: {text}" for path, texts in doubtful.items() for text in texts]
-    document["files"] = {"json": args.json} if args.json and args.json != STDOUT else {}
-    if model:
+    document["before"] = main_statistics(nominal)
+    warnings = {file.source: _input_warnings(chain, file, args.fit_frames) for file in files}
+    document["warnings"] = [f"{path}: {text}" for path, texts in warnings.items() for text in texts]
+    path = json_path(args.json)
+    document["files"] = {"json": path} if path else {}
+    contents = {}
+    if predictor:
         document["files"]["map"] = args.map
-        write_files({args.map: map_content(args.map, model, data, known)})
-    write_json(args.json, document)
-    for path, texts in doubtful.items():
+        contents[args.map] = map_content(args.map, predictor, data, known)
+    write_outputs(contents, args.json, document)
+    for path, texts in warnings.items():
         console.print_warnings(path, texts)
-    console.print_validation(f"{args.robot}: accuracy on {document['samples']} samples", found)
-    if model:
-        console.print_lines(f"wrote map: {args.map}")
+    console.print_validation(f"{args.robot}: accuracy on {document['samples']} samples", accuracies)
+    console.print_lines(*(f"wrote map: {path}" for path in contents))
     return 0
 
 
-def _input_warnings(chain: Chain, readings: MeasurementFile, frames_unknown: bool) -> list[str]:
-    """What is hard to believe in a file, impossible rows too; a model that is judged has to bear them all."""
-    found = [] if frames_unknown else find_unreachable_rows(chain, readings)
+def _input_warnings(chain: Chain, file: MeasurementFile, has_unknown_frames: bool) -> list[str]:
+    """List the warnings about a file, rows that the robot cannot reach included; no row is excluded."""
+    from ..diagnostics.input_checks import find_input_warnings  # lazy import: loads Pinocchio
+    from ..diagnostics.reachability import find_unreachable_rows
+
+    unreachable = [] if has_unknown_frames else find_unreachable_rows(chain, file)
     return [
-        *find_input_warnings(chain, readings),
-        *(f"row {finding.row}: {finding.reason}" for finding in found),
+        *find_input_warnings(chain, file),
+        *(f"row {item.row}: {item.reason}" for item in unreachable),
     ]
 
 
-def _trusted(chain: Chain, sidecar: str | None, args: Namespace) -> Predictor:
-    """How well the arm is known, as its calibration has left it beside the robot."""
+def _predictor(chain: Chain, sidecar: str | None, args: Namespace) -> Predictor:
+    """Read the uncertainty that the calibration has written beside the robot."""
+    from ..io.sidecar import read_uncertainty  # lazy import: loads Pinocchio
+    from ..report.workspace_map import check_map_ending
+
     check_map_ending(args.map)
     if args.fit_frames:
-        raise DhcalError("--map is of base and tool as calibrated; leave out --fit-frames")
-    known = read_uncertainty(sidecar, chain) if sidecar else None
-    if known is None:
-        raise DhcalError(
-            f"{sidecar or args.robot}: holds no [uncertainty] of a calibration to draw --map from; "
-            "`dhcal calibrate` writes one beside the new robot where samples are left over to tell it"
+        raise InvalidArgumentError(
+            "--map: not available with --fit-frames; the uncertainty holds for base and tool as calibrated"
         )
-    return known
+    uncertainty = read_uncertainty(sidecar, chain) if sidecar else None
+    if uncertainty is None:
+        raise InvalidArgumentError(
+            f"{sidecar or args.robot}: --map needs the table [uncertainty] of a calibration; `dhcal "
+            "calibrate` writes it beside the corrected robot if there are more measurements than parameters"
+        )
+    return uncertainty

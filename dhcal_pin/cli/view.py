@@ -1,66 +1,120 @@
-"""`dhcal view`: the offline page of an arm, or a live scene of it until it is interrupted."""
+"""`dhcal view`: show a robot on an offline web page, or as a live scene until it is interrupted."""
 
 from __future__ import annotations
 
 import os
 import tempfile
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-import numpy as np
+from ..exceptions import InvalidArgumentError
+from .options import POSITIVE_INTEGER, ROBOT, TIP
 
-from ..exceptions import DhcalError
-from ..io.atomic import write_files
-from ..io.measurement_csv import read_measurements
-from ..io.robot import has_dh_table, read_robot, robot_name
-from ..io.sidecar import existing_sidecar, read_instrument, read_uncertainty
-from ..measurements.base import Measurement
-from ..robot.chain import Chain
-from ..visualization import scene
-from . import console
-from .options import require_writable_outputs, sidecars
+if TYPE_CHECKING:
+    from ..measurements import Measurement
+    from ..robot import Chain
+
+EXAMPLE = "dhcal view ur10.urdf ur10_calibrated.urdf --tip tool0 --data laser.csv --html scene.html"
 
 
-def view(args: Namespace) -> int:
-    """Writes the page, opens it where asked for or where no file is named."""
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the arguments of `dhcal view`.
+
+    Args:
+        parser: Parser of the command.
+    """
+    parser.add_argument("nominal", metavar="NOMINAL.urdf", help=ROBOT["help"])
+    parser.add_argument("calibrated", metavar="CALIBRATED.urdf", nargs="?", help="the same robot, calibrated")
+    parser.add_argument(
+        "--data", metavar="DATA", nargs="+", default=[], help="measurement CSV files to draw and play"
+    )
+    parser.add_argument(
+        "--html", metavar="FILE", help="page to write (default: a temporary file, opened in the browser)"
+    )
+    parser.add_argument("--open", action="store_true", help="open the page in the browser")
+    parser.add_argument(
+        "--magnification",
+        metavar="S",
+        type=float,
+        default=1.0,
+        help="initial magnification of the errors, 1 to 500 (default: 1)",
+    )
+    parser.add_argument(
+        "--simplify",
+        metavar="N",
+        type=POSITIVE_INTEGER,
+        nargs="?",
+        default=60_000,
+        const=15_000,
+        help="maximum number of mesh triangles; fewer give a smaller page (default: "
+        "%(default)s; %(const)s without N)",
+    )
+    parser.add_argument(
+        "--live", action="store_true", help="serve a moving scene on this computer until Ctrl-C, no page"
+    )
+    parser.add_argument("--tip", **TIP)
+
+
+def run(args: Namespace) -> int:
+    """Write the page of a robot, or serve a live scene.
+
+    Args:
+        args: Parsed arguments.
+
+    Returns:
+        Exit status 0.
+
+    Raises:
+        InvalidArgumentError: --live is combined with options of the page.
+    """
+    from ..io import read_measurements, read_robot  # lazy import, as the following: they load Pinocchio
+    from ..io.robot import has_dh_table, robot_name
+    from ..io.sidecar import existing_sidecar, read_instrument, read_uncertainty
+    from ..visualization import scene
+    from . import console
+    from .outputs import existing_sidecars, require_writable_outputs, write_outputs
+
     if args.live and (args.html or args.open):
-        raise DhcalError("--live writes no page; leave out --html and --open")
-    given = [args.nominal, *([args.calibrated] if args.calibrated else [])]
-    beside = sidecars(given)
+        raise InvalidArgumentError("--live writes no page; omit --html and --open")
+    robots = [args.nominal, *([args.calibrated] if args.calibrated else [])]
+    sidecars = existing_sidecars(robots)
     page = args.html or os.path.join(tempfile.mkdtemp(prefix="dhcal-"), f"{robot_name(args.nominal)}.html")
-    require_writable_outputs([page], [*given, *beside, *args.data])
-    arms = [read_robot(path, None if has_dh_table(path) else args.tip) for path in given]
-    data = [read_measurements(path, arms[0]) for path in args.data]
+    require_writable_outputs([page], [*robots, *sidecars, *args.data])
+    chains = [read_robot(path, None if has_dh_table(path) else args.tip) for path in robots]
+    data = [read_measurements(path, chains[0]) for path in args.data]
     if args.live:
-        return _live(arms, data, args)
-    sidecar = existing_sidecar(given[-1])
+        return _serve_live(chains, data, args)
+    sidecar = existing_sidecar(robots[-1])
     text = scene.scene_html(
-        *arms,
+        *chains,
         measurements=data,
         known=read_instrument(sidecar) if sidecar else None,
-        predictor=read_uncertainty(sidecar, arms[-1]) if sidecar and len(arms) > 1 else None,
-        title=" and ".join(robot_name(path) for path in given),
+        predictor=read_uncertainty(sidecar, chains[-1]) if sidecar and len(chains) > 1 else None,
+        title=" and ".join(robot_name(path) for path in robots),
         magnification=args.magnification,
         triangles=args.simplify,
     )
-    write_files({page: text})
+    write_outputs({page: text})
     console.print_lines(f"wrote {page}")
     if args.open or not args.html:
         console.open_page(page)
     return 0
 
 
-def _live(arms: list[Chain], data: list[Measurement], args: Namespace) -> int:
-    """Plays the measured poses over and over."""
-    from ..visualization import (
-        live,  # MeshCat's Python side takes half a second to import
-    )
+def _serve_live(chains: Sequence[Chain], data: Sequence[Measurement], args: Namespace) -> int:
+    """Play the measured poses repeatedly in a live scene."""
+    import numpy as np  # lazy import, as the following: they are slow to load
 
-    poses = np.concatenate([item.configurations() for item in data] or [np.zeros((1, arms[0].n_joints))])
-    with live.serve(*arms, magnification=args.magnification, triangles=args.simplify) as scene:
-        console.print_lines(f"live at {scene.url}; end with Ctrl-C")
-        console.open_url(scene.url)
+    from ..visualization import live
+    from . import console
+
+    q = np.concatenate([item.configurations() for item in data] or [np.zeros((1, chains[0].n_joints))])
+    with live.serve(*chains, magnification=args.magnification, triangles=args.simplify) as server:
+        console.print_lines(f"live at {server.url}; end with Ctrl-C")
+        console.open_url(server.url)
         try:
             while True:
-                scene.play(poses)
+                server.play(q)
         except KeyboardInterrupt:
             return 0

@@ -212,8 +212,8 @@ def test_rows_are_found_wherever_they_stand(experiment, tmp_path):
 
 def test_held_parameters_are_those_that_cannot_be_seen(experiment):
     assert experiment.fixed == ["alpha3", "d3"]
-    assert "do not determine" in demo._verdict(experiment)[0]
-    assert "51.6 mm" in demo._verdict(experiment)[2]
+    assert "little redundancy" in demo.experiment_remarks(experiment)[0]
+    assert "51.6 mm" in demo.experiment_remarks(experiment)[2]
 
 
 def test_good_rows_are_not_called_impossible(sim_6dof, sim_6dof_actual):

@@ -132,7 +132,7 @@ def test_incomplete_journal_is_continued(tmp_path, capsys):
     blocks = [json.dumps(block) for block in run(study)]
     (tmp_path / "cut.csv.part").write_text(f"{study.digest}\n{blocks[0]}\n{blocks[1][:77]}")
     assert table_of(tmp_path, "cut") == whole
-    assert "goes on after 1 of 4 blocks" in capsys.readouterr().err
+    assert "resuming after 1 of 4 blocks" in capsys.readouterr().err
 
 
 def killed_and_resumed(folder, text: str, lines: int, *options: str) -> str:

@@ -1,0 +1,389 @@
+"""Work of one calibration job: read files, calibrate, write files; used for one robot and for many.
+
+A job runs in these steps. Invalid input is found before anything is written.
+
+1. Check that all outputs can be written and overwrite no input.
+2. Read the robot and the measurements. Rows that the robot cannot reach are excluded if base and tool are
+   known; the rest is split into data to fit and hold-out data.
+3. Calibrate, with additional joint error families if requested.
+4. Collect warnings about the data and the choice of parameters, and a hint on error families.
+5. Write URDF, sidecar, report, map and JSON, all or none.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from .._typing import PathLike
+from ..calibration import model_selection, partition, procedure, summary
+from ..calibration.model_selection import FULL_SET, is_restricted
+from ..calibration.result import Result
+from ..diagnostics.input_checks import find_input_warnings, poorly_fitted_files
+from ..diagnostics.reachability import UnreachableRow, find_unreachable_rows
+from ..estimation.parameters import EXTENSIONS, select_parameters
+from ..estimation.robust import ZERO_WEIGHT
+from ..estimation.solver import Progress
+from ..exceptions import InvalidArgumentError
+from ..io.measurement_csv import read_measurement_file
+from ..io.robot import read_robot, urdf_files
+from ..io.settings import parse_payload, read_bounds, read_priors
+from ..io.sidecar import read_instrument, sidecar_path
+from ..measurements.base import Measurement
+from ..measurements.position import require_common_reference_target
+from ..parallel import SERIAL, TaskExecutor
+from ..report.document import Provenance, file_digests, result_to_dict, short_names
+from ..robot import urdf_edit
+from ..robot.chain import Chain
+from .job import Job
+from .options import split_commas
+from .outputs import (
+    existing_sidecars,
+    is_same_file,
+    json_path,
+    require_urdf_ending,
+    require_writable_outputs,
+    write_outputs,
+)
+
+# More parameters are suggested if they reduce the error at least to this fraction.
+MAX_ERROR_RATIO = 0.8
+
+# They are not suggested if the calibrated error is below this fraction of the nominal one: exact data.
+EXACT_FIT_RATIO = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationOutcome:
+    """Result of a calibration job whose files are written.
+
+    Attributes:
+        fit: Result of the calibration.
+        document: The same as a JSON document.
+        files: Paths of the files written, by what they are.
+        unreachable: Rows that the robot cannot reach, by measurement file; excluded from everything.
+        outliers: Row numbers of outliers, by measurement file.
+        rejected: Row numbers with zero weight in the fit, by measurement file.
+        warnings: Warnings about the input, by file.
+        trials: Effect of each error family of --extend.
+        hint: Suggestion to use --extend; empty if there is none.
+    """
+
+    fit: Result
+    document: dict[str, Any]
+    files: dict[str, str]
+    unreachable: dict[str, list[UnreachableRow]]
+    outliers: dict[str, list[int]]
+    rejected: dict[str, list[int]]
+    warnings: dict[str, list[str]]
+    trials: tuple[model_selection.FamilyTrial, ...]
+    hint: str
+
+
+def run_job(
+    job: Job, progress: Progress | None = None, executor: TaskExecutor = SERIAL
+) -> CalibrationOutcome:
+    """Calibrate one robot and write its files, in this process or another; nothing is shown.
+
+    Args:
+        job: Options of the calibration.
+        progress: Callback of the solver, with iteration and cost.
+        executor: Where the samples are processed.
+
+    Returns:
+        The result and what was written. If the input is invalid or a file cannot be written, an error is
+        raised and no file is written.
+    """
+    inputs = _checked_inputs(job)
+    chain = read_robot(job.robot, job.tip)
+    if job.payload:
+        chain = chain.with_payload(parse_payload(job.payload))
+    sets = chain.parameters if job.parameters is None else job.parameters
+    data = _read_data(chain, job, has_known_frames=not {"base", "tool"} & set(split_commas(sets)))
+    restrictions: dict[str, Any] = {
+        "bounds": read_bounds(job.bounds),
+        "fix": split_commas(job.fix),
+        "free": split_commas(job.free),
+    }
+    options: dict[str, Any] = {
+        "priors": read_priors(job.priors),
+        "holdout": [item for _, item in data.holdout],
+        "known": read_instrument(job.instrument) if job.instrument else None,
+        "loss": job.loss,
+        "max_iterations": job.max_iterations,
+        "progress": progress,
+        "executor": executor,
+    }
+    measurements = list(data.fit.values())
+    fit, trials = model_selection.extend(
+        chain, measurements, sets, _families(job.extend), method=job.method, **restrictions, **options
+    )
+    # More parameters are not suggested if the choice was deliberate, or if the columns may be mixed up.
+    is_deliberate = job.method != "lm" or any(restrictions.values())
+    if not is_deliberate and not any(data.warnings.values()) and is_restricted(split_commas(sets)):
+        suggestion = improvement_hint(fit, chain, measurements, **options)
+        data.warnings[job.robot] = [suggestion] if suggestion else []
+    for path, texts in poorly_fitted_files(fit.chain, data.fit, fit.instruments).items():
+        # A warning about the columns of a file already explains a poor fit.
+        data.warnings[path] += texts if not data.warnings[path] else []
+    hint = _family_hint(fit, data, sets, job)
+
+    contents = _robot_files(fit, job)
+    files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
+    if job.map:
+        from ..report import workspace_map  # lazy import: only for maps
+
+        contents[job.map] = workspace_map.map_content(job.map, fit, fit.holdout, fit.instruments)
+        files["map"] = job.map
+    if path := json_path(job.json):
+        files["json"] = path
+    files |= {
+        "report" if number == 1 else f"report_{number}": path for number, path in enumerate(job.report, 1)
+    }
+    source = _provenance(job, sets, data, inputs, trials, hint)
+    if job.report:
+        from ..report import html  # lazy import: only for reports
+
+        contents |= html.report_files(fit, job.report, source)
+    outliers = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))
+    zero_weight = (
+        item.rows[weight <= ZERO_WEIGHT] for item, weight in zip(fit.data, fit.weights, strict=True)
+    )
+    rejected = dict(zip(data.fit, (rows.tolist() for rows in zero_weight), strict=True))
+    document = _job_document(fit, data, outliers, files, source)
+    write_outputs(contents, json_path(job.json), document)
+    return CalibrationOutcome(
+        fit, document, files, data.unreachable, outliers, rejected, data.warnings, trials, hint
+    )
+
+
+# --- input -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _JobData:
+    """Measurements of a job, and what was found when they were read.
+
+    Attributes:
+        fit: Measurements to fit, by file.
+        holdout: Hold-out measurements with their file.
+        unreachable: Rows that the robot cannot reach, by file; in neither of the two.
+        warnings: Warnings about the input, by file.
+    """
+
+    fit: dict[str, Measurement]
+    holdout: list[tuple[str, Measurement]]
+    unreachable: dict[str, list[UnreachableRow]]
+    warnings: dict[str, list[str]]
+
+
+def _holdout_file(job: Job) -> str | None:
+    """Return the measurement file that --holdout names, if it names one."""
+    return job.holdout if job.holdout is not None and os.path.exists(job.holdout) else None
+
+
+def _checked_inputs(job: Job) -> list[str]:
+    """Check the paths of a job; return those of its input files."""
+    measured = [*job.data, *filter(None, [_holdout_file(job)])]
+    for number, path in enumerate(measured):
+        if any(is_same_file(path, other) for other in measured[:number]):
+            raise InvalidArgumentError(
+                f"{path}: is given twice; name each measurement file once, to fit or as hold-out"
+            )
+    settings = [job.priors] if job.priors not in (None, "default", "none") else []
+    settings += [path for path in (job.bounds, job.instrument, job.columns) if path]
+    inputs = [job.robot, *existing_sidecars([job.robot]), *measured, *settings]
+    require_urdf_ending(job.output)
+    require_writable_outputs([job.json, *job.report], inputs)
+    protected = [*measured, *settings] if job.in_place else inputs
+    outputs = [job.output, sidecar_path(job.output), job.map, job.json, *job.report]
+    require_writable_outputs(outputs, protected)
+    if job.report:
+        from ..report import html  # lazy import: only for reports
+
+        for path in job.report:
+            html.check_ending(path)
+    if job.map:
+        from ..report import workspace_map  # lazy import: only for maps
+
+        workspace_map.check_map_ending(job.map)
+    return inputs
+
+
+def _without(data: Measurement, unreachable: Sequence[UnreachableRow]) -> Measurement:
+    """Return the measurement without some rows."""
+    return data.take(~np.isin(data.rows, [item.row for item in unreachable]))
+
+
+def _read_data(chain: Chain, job: Job, has_known_frames: bool) -> _JobData:
+    """Read all measurements and split them by their `set` columns and by --holdout."""
+    holdout_file = _holdout_file(job)
+    fit: list[Measurement] = []
+    holdout: list[tuple[str, Measurement]] = []
+    unreachable: dict[str, list[UnreachableRow]] = {}
+    warnings: dict[str, list[str]] = {}
+    by_file: dict[str, Measurement] = {}
+    for path in [*job.data, *filter(None, [holdout_file])]:
+        measured = read_measurement_file(path, chain, job.columns)
+        by_file[path] = measured.data
+        warnings[path] = find_input_warnings(chain, measured)
+        # Without base and tool it is not known where the robot can place the measured point.
+        unreachable[path] = find_unreachable_rows(chain, measured) if has_known_frames else []
+        if path == holdout_file:
+            holdout.append((path, _without(measured.data, unreachable[path])))
+        else:
+            fit.append(_without(measured.fit, unreachable[path]))
+            holdout.append((path, _without(measured.holdout, unreachable[path])))
+    require_common_reference_target(by_file)
+    if job.holdout is not None and not holdout_file:
+        try:
+            fraction = float(job.holdout)
+        except ValueError:
+            raise InvalidArgumentError(
+                f"--holdout {job.holdout}: neither a file nor a number; expected a measurement file or a "
+                "fraction such as 0.3"
+            ) from None
+        remaining, drawn = partition.split(fit, fraction, job.seed)
+        split_files = [
+            path for path, a, b in zip(job.data, fit, remaining, strict=True) if len(b.rows) < len(a.rows)
+        ]
+        fit, holdout = list(remaining), [*holdout, *zip(split_files, drawn, strict=True)]
+    fitted = {path: item for path, item in zip(job.data, fit, strict=True) if len(item.rows)}
+    if not fitted:
+        raise InvalidArgumentError(
+            f"{', '.join(job.data)}: every row is held out; leave some rows for the fit"
+        )
+    return _JobData(fitted, [(path, item) for path, item in holdout if len(item.rows)], unreachable, warnings)
+
+
+# --- calibration -----------------------------------------------------------------------------------
+
+
+def _families(extend: str) -> tuple[str, ...]:
+    """Return the error families that --extend allows."""
+    return {"none": (), "auto": EXTENSIONS}.get(extend, tuple(split_commas(extend)))
+
+
+def _family_hint(fit: Result, data: _JobData, sets: str, job: Job) -> str:
+    """Suggest --extend only if there are no warnings and parameters of the robot itself are estimated."""
+    is_default = job.method == "lm" and job.priors != "none" and job.extend == "none"
+    if not is_default or any(data.warnings.values()) or set(split_commas(sets)) <= {"base", "tool"}:
+        return ""
+    return model_selection.family_hint(fit)
+
+
+def improvement_hint(fit: Result, chain: Chain, data: Sequence[Measurement], **options: Any) -> str:
+    """Suggest the full parameter set if it considerably reduces the error on samples that are not fitted.
+
+    Args:
+        fit: Calibration with fewer parameters.
+        chain: Nominal robot.
+        data: Fitted measurements.
+        **options: Options of `calibrate`, as for the fit.
+
+    Returns:
+        A sentence, or an empty text if the reduction is small or unknown.
+    """
+    current = fit.comparisons[0]
+    group, after = next(iter(current.after.groups.items()))
+    if current.title == "fitted" or after.rms < EXACT_FIT_RATIO * current.before.groups[group].rms:
+        return ""
+    if isinstance(priors := options.get("priors"), Mapping):
+        # The user's priors are for the chosen sets; drop those without a parameter in the full set.
+        names = [p.name for p in select_parameters(chain, FULL_SET).parameters]
+        options["priors"] = {key: std for key, std in priors.items() if fnmatch.filter(names, key)}
+    full_fit = procedure.calibrate(chain, data, FULL_SET, **options)
+    full = full_fit.comparisons[0]
+    if not full_fit.converged or full.after.groups[group].rms > MAX_ERROR_RATIO * after.rms:
+        return ""
+    with_full_set, with_this_set = summary.headline([full]).after, summary.headline([current]).after
+    return (
+        f"--parameters {FULL_SET} reduces the RMS {summary.GROUP_LABELS[group]} on samples that are not "
+        f"fitted from {with_this_set} to {with_full_set}: the chosen parameters cannot represent the errors"
+    )
+
+
+# --- output ----------------------------------------------------------------------------------------
+
+
+def _robot_files(fit: Result, job: Job) -> dict[PathLike, str | bytes]:
+    """Return the calibrated URDF and its sidecar; base and tool are moved into the URDF on request."""
+    chain = fit.chain
+    # A base in the URDF must not be applied a second time by the sidecar.
+    written = replace(chain, base=np.eye(4)) if job.world_joint else chain
+    contents = urdf_files(written, job.output, fit.transferable_instruments, fit.uncertainty)
+    data = contents[job.output]
+    assert isinstance(data, bytes)
+    if job.world_joint and chain.transmission is not None and chain.transmission.has_compliance:
+        raise InvalidArgumentError(
+            "--world-joint: not available with joint compliance, whose gravity torques assume that z of the "
+            "robot's root link points up; omit it"
+        )
+    if job.world_joint:
+        data = urdf_edit.with_world(data, chain.base)
+    if job.tool_frame:
+        data = urdf_edit.with_tool_frame(data, chain.tip, job.tool_frame, chain.tool)
+    return contents | {job.output: data}
+
+
+def _provenance(
+    job: Job,
+    sets: str,
+    data: _JobData,
+    inputs: Sequence[str],
+    trials: Sequence[model_selection.FamilyTrial],
+    hint: str,
+) -> Provenance:
+    """Describe files, command and settings for the report."""
+    names = short_names(inputs)
+    settings = {"parameters": sets, "loss": job.loss, "seed": str(job.seed)}
+    if job.payload:
+        settings["payload"] = job.payload
+    if job.holdout is not None:
+        settings["hold-out"] = names.get(
+            job.holdout, f"fraction {job.holdout} of each file, drawn with the seed"
+        )
+    return Provenance(
+        command=job.command(names),
+        inputs=file_digests(inputs),
+        names=list(data.fit),
+        holdout_names=[path for path, _ in data.holdout],
+        settings=settings,
+        excluded_rows={
+            names[path]: {item.row: item.reason for item in rows} for path, rows in data.unreachable.items()
+        },
+        warnings={names[path]: texts for path, texts in data.warnings.items()},
+        trials=trials,
+        hint=hint,
+    )
+
+
+def _job_document(
+    fit: Result,
+    data: _JobData,
+    outliers: Mapping[str, Sequence[int]],
+    files: Mapping[str, str],
+    source: Provenance,
+) -> dict[str, Any]:
+    """Create the JSON document of a job."""
+    rows = {
+        path: sorted([*(item.row for item in unreachable), *outliers.get(path, [])])
+        for path, unreachable in data.unreachable.items()
+    }
+    rows = {path: numbers for path, numbers in rows.items() if numbers}
+    document = result_to_dict(
+        fit, files, source.inputs, [row for numbers in rows.values() for row in numbers]
+    )
+    return document | {
+        "outliers_by_file": rows,
+        "warnings": [f"{path}: {text}" for path, texts in data.warnings.items() for text in texts],
+        "command": source.command,
+        "settings": source.settings,
+        "extension": [asdict(trial) for trial in source.trials],
+        "hint": source.hint,
+    }
