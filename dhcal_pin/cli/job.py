@@ -97,7 +97,10 @@ class Job:
     )
     loss: str = field(
         default="auto",
-        metadata={"metavar": "LOSS", "help": "weights of outliers: {losses} (default: %(default)s)"},
+        metadata={
+            "metavar": "LOSS",
+            "help": "weights of the samples in the fit (default: %(default)s): {losses}",
+        },
     )
     priors: str | None = field(
         default=None,

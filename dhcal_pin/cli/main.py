@@ -92,7 +92,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action=_VersionAction, nargs=0, help="show the version and exit")
     commands = parser.add_subparsers(
-        dest="command", metavar="COMMAND", required=True, parser_class=_LazyCommandParser
+        title="commands", dest="command", metavar="COMMAND", required=True, parser_class=_LazyCommandParser
     )
     for command in COMMANDS:
         commands.add_parser(

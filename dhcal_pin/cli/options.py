@@ -130,7 +130,7 @@ FREE: dict[str, Any] = {"metavar": "NAME[,NAME]", "help": "single parameters to 
 KIND: dict[str, Any] = {
     "metavar": "KIND",
     "default": "pose",
-    "help": "kind of measurement: {kinds} (default: %(default)s)",
+    "help": "kind of measurement (default: %(default)s): {kinds}",
 }
 INSTRUMENT: dict[str, Any] = {
     "metavar": "FILE.toml",
@@ -173,7 +173,7 @@ def _error_families() -> str:
 def _losses() -> str:
     from ..estimation.robust import LOSSES  # lazy import: loads Pinocchio
 
-    return ", ".join(LOSSES)
+    return "; ".join(f"{name} ({loss.help})" for name, loss in LOSSES.items())
 
 
 def _criteria() -> str:

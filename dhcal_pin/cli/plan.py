@@ -64,7 +64,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--criterion",
         metavar="C",
         default="D",
-        help="optimality criterion: {criteria} (default: %(default)s)",
+        help="optimality criterion (default: %(default)s): {criteria}",
     )
     parser.add_argument(
         "--task",

@@ -810,8 +810,8 @@ def test_a_convention_that_is_there_already_changes_nothing(run, place):
 
 def test_a_sidecar_beside_the_new_urdf_is_pointed_out(run, place):
     Path("new.calibration.toml").write_text("[base]\nxyz_m = [1.0, 0.0, 0.0]\n")
-    assert "new.calibration.toml exists beside it" in run("convert", "arm.dh.toml", "new.urdf")[2]
-    assert "new.calibration.toml are not part of the DH file" in run("convert", "new.urdf", "new.dh.csv")[2]
+    assert "note: new.calibration.toml" in run("convert", "arm.dh.toml", "new.urdf")[2]
+    assert re.search(r"note: .*new\.calibration\.toml", run("convert", "new.urdf", "new.dh.csv")[2])
 
 
 # --- check, demo -----------------------------------------------------------------------------------
