@@ -206,11 +206,9 @@ def _format_list(formats: Iterable[RobotFormat]) -> str:
 
 
 def _shipped_studies() -> str:
-    from ..io.shipped_files import shipped_file  # lazy import: loads Pinocchio
+    from ..io.shipped_files import shipped_names  # lazy import: loads Pinocchio
 
-    ending = ".study.toml"
-    names = sorted(path.name for path in shipped_file("").iterdir() if path.name.endswith(ending))
-    return ", ".join(name.removesuffix(ending) for name in names)
+    return ", ".join(shipped_names(".study.toml"))
 
 
 # Text of each placeholder; called only when a help page is printed.

@@ -11,6 +11,12 @@ from pathlib import Path
 from ..exceptions import UnknownNameError
 
 
+def _folders() -> tuple[Path, Path]:
+    """Return the folder in the installed package and the one in the source tree."""
+    package = Path(str(resources.files("dhcal_pin")))
+    return package / "data", package.parent / "urdf"
+
+
 def shipped_file(name: str) -> Path:
     """Find a file that ships with the package.
 
@@ -23,8 +29,20 @@ def shipped_file(name: str) -> Path:
     Raises:
         UnknownNameError: No such file ships with the package.
     """
-    package = Path(str(resources.files("dhcal_pin")))
-    for folder in (package / "data", package.parent / "urdf"):
+    for folder in _folders():
         if (folder / name).is_file():
             return folder / name
     raise UnknownNameError(f"{name}: no such file, and none that ships with dhcal-pin; check its name")
+
+
+def shipped_names(ending: str) -> list[str]:
+    """List the files of one type that ship with the package.
+
+    Args:
+        ending: End of the file names, such as `.study.toml`.
+
+    Returns:
+        Sorted names without the ending.
+    """
+    paths = (path for folder in _folders() for path in folder.glob(f"*{ending}"))
+    return sorted({path.name.removesuffix(ending) for path in paths})
