@@ -1,4 +1,10 @@
-"""Whether a robot meets itself, or stands in the way of an instrument: Coal, through Pinocchio."""
+"""Self-collision and line of sight, by Pinocchio and Coal.
+
+The collision geometry of the URDF is checked pair by pair. Pairs of shapes on one link or on neighbouring
+links are not checked. Pairs that collide both at the neutral configuration and in the middle of the joint
+limits are not checked either: their shapes overlap in the robot description. A line of sight is a thin
+capsule between instrument and tool.
+"""
 
 from __future__ import annotations
 
@@ -17,18 +23,18 @@ import pinocchio as pin
 from .._typing import Array
 from .chain import Chain
 
-# A line of sight is as thick as a pencil.
+# Diameter of a line of sight [m].
 SIGHT_DIAMETER = 5e-3
 
 
 @dataclass(frozen=True, eq=False)
 class CollisionChecker:
-    """A robot's collision geometry.
+    """Collision checks of a robot.
 
     Attributes:
-        chain: the robot.
-        geometry: its collision shapes and the pairs that are looked at; None without shapes.
-        note: what is not looked at and why, or nothing.
+        chain: Kinematic chain of the robot.
+        geometry: Pinocchio's collision shapes and the pairs to check; None if the robot has no usable shapes.
+        note: What is not checked and why, or an empty text.
     """
 
     chain: Chain
@@ -39,14 +45,14 @@ class CollisionChecker:
     def from_chain(
         cls, chain: Chain, package_dirs: Sequence[str | os.PathLike[str]] | None = None
     ) -> CollisionChecker:
-        """The collision geometry of a chain's URDF.
-
-        Pairs on one link or on neighbours are left out, and those that meet both at neutral and in the middle
-        of the joints' limits: their shapes overlap.
+        """Load the collision geometry of a chain's URDF.
 
         Args:
-            chain: the robot.
-            package_dirs: where to look for meshes; the folders above the URDF without it.
+            chain: Kinematic chain of the robot.
+            package_dirs: Folders with the packages of the meshes; the folders above the URDF by default.
+
+        Returns:
+            Checker; without geometry if a mesh is missing or the URDF has no collision shapes.
         """
         if package_dirs is None:
             package_dirs = list(Path(chain.urdf.source).absolute().parents)
@@ -69,20 +75,21 @@ class CollisionChecker:
             for first, a in enumerate(joints[:second]):
                 if a != b and parents[a] != b and parents[b] != a:
                     geometry.addCollisionPair(pin.CollisionPair(first, second))
-        out = cls(chain, geometry)
+        checker = cls(chain, geometry)
         low, high = (np.clip(limit, -np.pi, np.pi) for limit in (chain.lower, chain.upper))
         middle = chain.configurations((low + high)[None] / 2)[0]
         neutral = pin.neutral(chain.model)
-        for pair in out._colliding_pairs(neutral) & out._colliding_pairs(middle):
+        for pair in checker._colliding_pairs(neutral) & checker._colliding_pairs(middle):
             geometry.removeCollisionPair(pin.CollisionPair(*pair))
-        return out
+        return checker
 
     @cached_property
     def _data(self) -> tuple[pin.Data, pin.GeometryData]:
+        """Work data of the model and of the geometry."""
         return self.chain.model.createData(), pin.GeometryData(self.geometry)
 
     def _colliding_pairs(self, configuration: Array) -> set[tuple[int, int]]:
-        """Pairs of shapes that meet."""
+        """Return the indices of the pairs of shapes that collide."""
         data = pin.GeometryData(self.geometry)
         model = self.chain.model
         pin.computeCollisions(model, model.createData(), self.geometry, data, configuration, False)
@@ -93,7 +100,14 @@ class CollisionChecker:
         }
 
     def is_collision_free(self, q: Array) -> bool:
-        """Whether no two shapes meet at joint values q (n,); True where there are no shapes."""
+        """Return whether no two shapes collide; True if the robot has no geometry.
+
+        Args:
+            q: Joint positions, shape (n,) [rad or m].
+
+        Returns:
+            Whether the configuration is free of collisions.
+        """
         if self.geometry is None:
             return True
         data, shapes = self._data
@@ -101,12 +115,17 @@ class CollisionChecker:
         return not pin.computeCollisions(self.chain.model, data, self.geometry, shapes, configuration, True)
 
     def has_line_of_sight(self, q: Array, eye: Array, point: Array) -> bool:
-        """Whether nothing of the robot but its last link stands between two points at joint values q (n,).
+        """Return whether the robot leaves the line between two points free.
+
+        The links behind the last moving joint are ignored, because the measured point is on them.
 
         Args:
-            q: (n,) rad or m.
-            eye: (3,) the instrument, m, in the frame of the base link.
-            point: (3,) what it looks at.
+            q: Joint positions, shape (n,) [rad or m].
+            eye: Position of the instrument in the frame of the base link, shape (3,) [m].
+            point: Position of the measured point in the frame of the base link, shape (3,) [m].
+
+        Returns:
+            Whether the line is free; True if the robot has no geometry.
         """
         if self.geometry is None:
             return True
@@ -115,21 +134,21 @@ class CollisionChecker:
         pin.updateGeometryPlacements(
             model, data, self.geometry, shapes, self.chain.configurations(q[None])[0]
         )
-        last = model.getJointId(self.chain.moving_joints[-1])
-        away = point - eye
-        length = float(np.linalg.norm(away))
-        turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), away / length).matrix()
+        last_joint = model.getJointId(self.chain.moving_joints[-1])
+        direction = point - eye
+        length = float(np.linalg.norm(direction))
+        rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), direction / length).matrix()
         line = coal.Capsule(SIGHT_DIAMETER / 2, length)
-        place = coal.Transform3s(turn, (eye + point) / 2)
+        line_pose = coal.Transform3s(rotation, (eye + point) / 2)
         return not any(
             coal.collide(
                 line,
-                place,
+                line_pose,
                 item.geometry,
                 coal.Transform3s(shapes.oMg[i].rotation, shapes.oMg[i].translation),
                 coal.CollisionRequest(),
                 coal.CollisionResult(),
             )
             for i, item in enumerate(self.geometry.geometryObjects)
-            if item.parentJoint < last
+            if item.parentJoint < last_joint
         )

@@ -1,4 +1,17 @@
-"""Joint values that put the tool where it is asked for, within the joints' limits, many samples at once."""
+"""Inverse kinematics within joint limits, vectorized over many samples.
+
+For each sample the solver minimizes the norm of a task error e(q) with the Jacobian J = ∂e/∂q by damped
+least-squares steps
+
+    Δq = −Jᵀ (J Jᵀ + λ I)⁻¹ e,    λ = λ_min + μ |e|²
+
+The damping shrinks with the error, so that the last steps are Newton steps (Sugihara, IEEE T-RO 27, 2011). μ
+is decreased after a step that reduces the error and increased after a rejected one. A joint at a limit that
+would leave it is held, and the other joints take its part. If no start reaches the target, the result is a
+local minimum of the error.
+
+Shapes: m samples, r active samples, n joints, k components of the task error.
+"""
 
 from __future__ import annotations
 
@@ -9,193 +22,245 @@ import numpy as np
 
 from .. import se3
 from .._typing import Array
-from ..exceptions import DhcalError
+from ..exceptions import ConvergenceError
 from .chain import Chain
 
-# From tool poses (r, 4, 4) of the samples numbered (r,) to gaps (r, k) in m, and their derivatives (r, k, 6)
-# by the tool's twist [v, ω] in axes of the measuring frame, or (r, k, 3) where v alone matters.
+# Function from tool poses, shape (r, 4, 4), and sample numbers, shape (r,), to task errors, shape (r, k) [m],
+# and their derivatives by the tool twist [v, ω] in axes of the measuring frame, shape (r, k, 6), or by v, (r,
+# k, 3).
 TaskError = Callable[[Array, Array], tuple[Array, Array]]
 
-
-# Damping is this share of the squared gap at first, and never less than what a singularity needs (m²).
+# Initial damping factor μ, and the minimum damping λ_min near singularities [m²].
 _DAMPING, _MIN_DAMPING = 0.1, 1e-9
 
-
-# It eases where a step closed the gap by something, and brakes where it did not and is taken back.
+# Factors of μ after an accepted and after a rejected step.
 _DAMPING_DECREASE, _DAMPING_INCREASE = 0.5, 8.0
 
-
-# No joint moves further at once, rad or m.
+# Maximum change of a joint position in one step [rad or m].
 _MAX_STEP = 1.0
 
+# A sample is finished when the norm of its task error is below this value [m].
+_ERROR_TOL = 1e-14
 
-_GAP_TOL = 1e-14
-
-
-# A wrist alone has no size to speak of, m.
+# Minimum characteristic length, for chains without links such as a wrist [m].
 _MIN_LENGTH = 0.05
 
-
-# A gap that has not shrunk to this share within so many steps stays as it is.
+# A sample is abandoned if its error has not shrunk to this ratio within this number of steps.
 _MAX_STALLED_STEPS, _MIN_PROGRESS_RATIO = 10, 0.99
 
+# A target counts as reached below this error [m and rad].
+REACHED_TOL = 1e-9
 
-REACHED_TOL = 1e-9  # m, and rad
+# Number of random restarts before `solve_within_limits` gives up, and steps of each.
+_MAX_RESTARTS, _STEPS_PER_START = 100, 60
 
 
 def tool_pose_and_jacobian(chain: Chain, q: Array) -> tuple[Array, Array]:
-    """Tool poses (m, 4, 4), and the tool's twists (m, 6, n) per unit of the independent joints, at q (m, n).
+    """Compute tool poses and geometric Jacobians.
 
-    A twist is [v, ω] of the tool point, in axes of the measuring frame.
+    Args:
+        chain: Kinematic chain.
+        q: Joint positions, shape (m, n) [rad or m].
+
+    Returns:
+        Poses, shape (m, 4, 4), and Jacobians, shape (m, 6, n): twists [v, ω] of the tool point in axes of the
+        measuring frame per unit of each joint.
     """
     frames = chain.forward_kinematics(q)
     return frames.poses(), chain.joint_jacobian(frames).transpose(2, 1, 0)
 
 
 def characteristic_length(chain: Chain) -> float:
-    """A length typical of the arm, m: a radian about a joint moves the tool by about that much."""
+    """Return a length typical of the arm, by which rotations are compared with translations.
+
+    It is a third of the total length of links and prismatic strokes (at most 1 m each): a rotation of a joint
+    by one radian moves the tool by about that distance.
+
+    Args:
+        chain: Kinematic chain.
+
+    Returns:
+        Characteristic length [m].
+    """
     links = np.concatenate([chain.origins[1:-1], (chain.origins[-1] @ chain.tool)[None]])
     strokes = np.minimum(chain.upper - chain.lower, 1.0)[chain.is_prismatic]
     return max(float(np.linalg.norm(links[:, :3, 3], axis=1).sum() + strokes.sum()) / 3, _MIN_LENGTH)
 
 
 def without_rotary_limits(chain: Chain) -> Chain:
-    """The same arm with joints that turn without end; those that slide keep their limits."""
-    turning = ~chain.is_prismatic
+    """Return a copy of a chain without limits of revolute joints; prismatic joints keep theirs.
+
+    Args:
+        chain: Kinematic chain.
+
+    Returns:
+        Copy of the chain.
+    """
+    is_revolute = ~chain.is_prismatic
     return replace(
         chain,
-        lower=np.where(turning, -np.inf, chain.lower),
-        upper=np.where(turning, np.inf, chain.upper),
+        lower=np.where(is_revolute, -np.inf, chain.lower),
+        upper=np.where(is_revolute, np.inf, chain.upper),
     )
 
 
 def solve_ik(
     chain: Chain, task_error: TaskError, start: Array, steps: int = 200, samples: Array | None = None
 ) -> tuple[Array, Array]:
-    """Joint values (m, n) within limits that close gaps, and how wide they stay (m,), m; damped steps.
-
-    The damping shrinks with the gap (Sugihara, T-RO 2011), so that the end is Newton's; a step that widens
-    the gap is taken back. A joint that would leave its limits is held there while the others take its part.
-    Where no start closes a gap, the end is where it is narrowest nearby.
+    """Minimize task errors within the joint limits, starting from given joint positions.
 
     Args:
-        chain: base and tool included.
-        task_error: of the samples.
-        start: (m, n) joint values.
-        steps: most of them.
-        samples: (m,) the numbers by which `gap` knows the rows of `start`; 0 to m-1 without.
+        chain: Kinematic chain with base and tool.
+        task_error: Task errors of the samples.
+        start: Initial joint positions, shape (m, n) [rad or m].
+        steps: Maximum number of steps.
+        samples: Numbers by which `task_error` identifies the rows of `start`, shape (m,); 0 to m-1 by
+            default.
+
+    Returns:
+        Joint positions, shape (m, n) [rad or m], and norms of the task errors, shape (m,) [m].
     """
     samples = np.arange(len(start)) if samples is None else samples
     q = np.clip(chain.validated_q(start), chain.lower, chain.upper)
-    wide, rows = _gaps(chain, task_error, q, samples)
-    width = np.linalg.norm(wide, axis=1)
-    damping, marked = np.full(len(q), _DAMPING), np.full(len(q), np.inf)
-    left = np.arange(len(q))
+    errors, jacobians = _errors_and_jacobians(chain, task_error, q, samples)
+    norms = np.linalg.norm(errors, axis=1)
+    damping, earlier_norms = np.full(len(q), _DAMPING), np.full(len(q), np.inf)
+    active = np.arange(len(q))
     for count in range(steps):
-        go = width[left] > _GAP_TOL
+        unfinished = norms[active] > _ERROR_TOL
         if count % _MAX_STALLED_STEPS == 0:
-            go &= width[left] < _MIN_PROGRESS_RATIO * marked[left]
-            marked[left] = width[left]
-        left = left[go]
-        if not left.size:
+            unfinished &= norms[active] < _MIN_PROGRESS_RATIO * earlier_norms[active]
+            earlier_norms[active] = norms[active]
+        active = active[unfinished]
+        if not active.size:
             break
-        at, slope = q[left], rows[left]
-        amount = _MIN_DAMPING + damping[left] * width[left] ** 2
-        step = _damped(slope, wide[left], amount)
-        held = ((at <= chain.lower) & (step < 0)) | ((at >= chain.upper) & (step > 0))
-        if held.any():
-            step = _damped(np.where(held[:, None], 0.0, slope), wide[left], amount)
+        trial, jacobian = q[active], jacobians[active]
+        total_damping = _MIN_DAMPING + damping[active] * norms[active] ** 2
+        step = _damped_step(jacobian, errors[active], total_damping)
+        at_limit = ((trial <= chain.lower) & (step < 0)) | ((trial >= chain.upper) & (step > 0))
+        if at_limit.any():
+            step = _damped_step(np.where(at_limit[:, None], 0.0, jacobian), errors[active], total_damping)
         step /= np.maximum(1.0, np.abs(step).max(1, keepdims=True) / _MAX_STEP)
-        at = np.clip(at + step, chain.lower, chain.upper)
-        new_wide, new_rows = _gaps(chain, task_error, at, samples[left])
-        new_width = np.linalg.norm(new_wide, axis=1)
-        closer = new_width < width[left]
-        damping[left] *= np.where(closer, _DAMPING_DECREASE, _DAMPING_INCREASE)
-        taken = left[closer]
-        q[taken], width[taken] = at[closer], new_width[closer]
-        wide[taken], rows[taken] = new_wide[closer], new_rows[closer]
-    return q, width
+        trial = np.clip(trial + step, chain.lower, chain.upper)
+        trial_errors, trial_jacobians = _errors_and_jacobians(chain, task_error, trial, samples[active])
+        trial_norms = np.linalg.norm(trial_errors, axis=1)
+        improved = trial_norms < norms[active]
+        damping[active] *= np.where(improved, _DAMPING_DECREASE, _DAMPING_INCREASE)
+        accepted = active[improved]
+        q[accepted], norms[accepted] = trial[improved], trial_norms[improved]
+        errors[accepted], jacobians[accepted] = trial_errors[improved], trial_jacobians[improved]
+    return q, norms
 
 
-def _gaps(chain: Chain, gap: TaskError, q: Array, samples: Array) -> tuple[Array, Array]:
-    """Gaps (r, k) at q (r, n), and their derivatives (r, k, n) by the joints."""
-    poses, twists = tool_pose_and_jacobian(chain, q)
-    wide, by_twist = gap(poses, samples)
-    return wide, by_twist @ twists[:, : by_twist.shape[-1]]
+def _errors_and_jacobians(
+    chain: Chain, task_error: TaskError, q: Array, samples: Array
+) -> tuple[Array, Array]:
+    """Compute task errors, shape (r, k), and their Jacobians, shape (r, k, n), at q, shape (r, n)."""
+    poses, tool_jacobians = tool_pose_and_jacobian(chain, q)
+    errors, by_twist = task_error(poses, samples)
+    return errors, by_twist @ tool_jacobians[:, : by_twist.shape[-1]]
 
 
-def _damped(rows: Array, wide: Array, damping: Array) -> Array:
-    """Steps (r, n) that close gaps (r, k) to first order, their derivatives by the joints being (r, k, n)."""
-    across = np.swapaxes(rows, 1, 2)
-    damped = rows @ across + damping[:, None, None] * np.eye(wide.shape[1])
-    return -(across @ np.linalg.solve(damped, wide[..., None]))[..., 0]
+def _damped_step(jacobians: Array, errors: Array, damping: Array) -> Array:
+    """Solve the damped least-squares problem of the module docstring; steps of shape (r, n)."""
+    transposed = np.swapaxes(jacobians, 1, 2)
+    damped = jacobians @ transposed + damping[:, None, None] * np.eye(errors.shape[1])
+    return -(transposed @ np.linalg.solve(damped, errors[..., None]))[..., 0]
 
 
 def position_task(targets: Array) -> TaskError:
-    """The gap to positions (m, 3)."""
-    return lambda poses, which: (
-        poses[:, :3, 3] - targets[which],
+    """Create the task error of target positions.
+
+    Args:
+        targets: Positions of the tool, shape (m, 3) [m].
+
+    Returns:
+        Task error with 3 components.
+    """
+    return lambda poses, samples: (
+        poses[:, :3, 3] - targets[samples],
         np.broadcast_to(np.eye(3), (len(poses), 3, 3)),
     )
 
 
 def pose_task(targets: Array, length: float) -> TaskError:
-    """The gap to poses (m, 4, 4), a radian of rotation counting for `length` metres."""
+    """Create the task error of target poses.
+
+    Args:
+        targets: Poses of the tool, shape (m, 4, 4) [m].
+        length: Weight of rotations: one radian counts as much as this distance [m].
+
+    Returns:
+        Task error with 6 components [m].
+    """
     scale = np.diag([1.0, 1.0, 1.0, length, length, length])
 
-    def gap(poses: Array, which: Array) -> tuple[Array, Array]:
-        wanted = targets[which]
-        turn = se3.log3(poses[:, :3, :3] @ np.swapaxes(wanted[:, :3, :3], 1, 2))
-        wide = np.concatenate([poses[:, :3, 3] - wanted[:, :3, 3], length * turn], 1)
-        # The rotation's own derivative is the identity at the target, and has no bound half a turn away.
-        return wide, np.broadcast_to(scale, (len(poses), 6, 6))
+    def task_error(poses: Array, samples: Array) -> tuple[Array, Array]:
+        goals = targets[samples]
+        rotation = se3.log3(poses[:, :3, :3] @ np.swapaxes(goals[:, :3, :3], 1, 2))
+        errors = np.concatenate([poses[:, :3, 3] - goals[:, :3, 3], length * rotation], 1)
+        # The exact derivative of the logarithm is the identity at the target and unbounded at half a turn.
+        return errors, np.broadcast_to(scale, (len(poses), 6, 6))
 
-    return gap
+    return task_error
 
 
 def wrap_into_limits(chain: Chain, q: Array, near: Array | float = 0.0) -> tuple[Array, Array]:
-    """The same configurations (..., n) less whole turns, and which of them (...) keep the joints' limits.
+    """Remove whole turns from joint positions, so that they are within the limits if possible.
 
     Args:
-        chain: the arm.
-        q: (..., n) joint values.
-        near: (..., n) what turning joints come within half a turn of, where their limits let them.
+        chain: Kinematic chain.
+        q: Joint positions, shape (..., n) [rad or m].
+        near: Positions that revolute joints come within half a turn of, if their limits allow it, shape (...,
+            n).
+
+    Returns:
+        Joint positions of the same tool poses, shape (..., n), and whether they are within the limits, shape
+        (...,).
     """
-    turning = ~chain.is_prismatic & np.all(chain.mimic_matrix % 1 == 0, 0)
-    home = near + (q - near + np.pi) % (2 * np.pi) - np.pi
-    home = home + 2 * np.pi * ((home < chain.lower).astype(float) - (home > chain.upper))
-    q = np.where(turning, home, q)
+    # A whole turn of an independent joint must be whole turns of its mimics.
+    is_periodic = ~chain.is_prismatic & np.all(chain.mimic_matrix % 1 == 0, 0)
+    wrapped = near + (q - near + np.pi) % (2 * np.pi) - np.pi
+    wrapped = wrapped + 2 * np.pi * ((wrapped < chain.lower).astype(float) - (wrapped > chain.upper))
+    q = np.where(is_periodic, wrapped, q)
     return q, np.all((q >= chain.lower) & (q <= chain.upper), -1)
 
 
 def solve_within_limits(chain: Chain, task_error: TaskError, start: Array, rng: np.random.Generator) -> Array:
-    """Joint values (m, n) that close every gap, within the joints' limits where such are found.
+    """Find joint positions that bring every task error to zero, within the joint limits if possible.
 
     Args:
-        chain: base and tool included.
-        task_error: of the samples, which are the rows of `start`.
-        start: (m, n) joint values.
-        rng: draws the other starts, for gaps that stay open and joints beyond their limits.
+        chain: Kinematic chain with base and tool.
+        task_error: Task errors of the samples, which are the rows of `start`.
+        start: Initial joint positions, shape (m, n) [rad or m].
+        rng: Random generator for further starts of samples that are not solved within the limits.
+
+    Returns:
+        Joint positions, shape (m, n) [rad or m].
 
     Raises:
-        DhcalError: a gap stays open.
+        ConvergenceError: The task error of a sample remains.
     """
-    free = without_rotary_limits(chain)
-    out, closed, kept = start.copy(), np.zeros(len(start), bool), np.zeros(len(start), bool)
-    again, left = start, np.arange(len(start))
-    for _ in range(100):
-        q, wide = solve_ik(free, task_error, again, 60, left)
-        q, allowed = wrap_into_limits(chain, q)
-        good = (wide <= REACHED_TOL) & (allowed | ~closed[left])
-        out[left[good]] = q[good]
-        closed[left] |= good
-        kept[left] |= good & allowed
-        left = np.flatnonzero(~kept)
-        if not left.size:
+    unlimited = without_rotary_limits(chain)
+    out, solved, within_limits = start.copy(), np.zeros(len(start), bool), np.zeros(len(start), bool)
+    starts, remaining = start, np.arange(len(start))
+    for _ in range(_MAX_RESTARTS):
+        q, norms = solve_ik(unlimited, task_error, starts, _STEPS_PER_START, remaining)
+        q, is_allowed = wrap_into_limits(chain, q)
+        # A solution beyond the limits is kept only as long as there is no other one.
+        improved = (norms <= REACHED_TOL) & (is_allowed | ~solved[remaining])
+        out[remaining[improved]] = q[improved]
+        solved[remaining] |= improved
+        within_limits[remaining] |= improved & is_allowed
+        remaining = np.flatnonzero(~within_limits)
+        if not remaining.size:
             break
-        again = start[rng.integers(0, len(start), len(left))] + rng.uniform(
-            -1, 1, (len(left), chain.n_joints)
+        starts = start[rng.integers(0, len(start), len(remaining))] + rng.uniform(
+            -1, 1, (len(remaining), chain.n_joints)
         )
-    if not closed.all():
-        raise DhcalError("the simulated instrument is out of this arm's reach; try other joint values")
+    if not solved.all():
+        raise ConvergenceError(
+            f"{np.sum(~solved)} of {len(start)} targets are out of reach of this arm; "
+            "choose other joint positions"
+        )
     return out

@@ -1,4 +1,11 @@
-"""A robot's joint space: where it may stand, drawn at random, and an order to go through."""
+"""Random configurations within joint limits and workspace constraints, and a short tour through them.
+
+Configurations are drawn uniformly in joint space. They are rejected if the tool leaves the workspace, if the
+robot collides with itself, or if it hides the tool from the instrument. `shortest_tour` orders configurations
+by 2-opt (Croes 1958), so that a robot moves little from one to the next.
+
+Shapes: m samples, n joints.
+"""
 
 from __future__ import annotations
 
@@ -8,26 +15,34 @@ import numpy as np
 
 from .. import se3
 from .._typing import Array
-from ..exceptions import DhcalError
+from ..exceptions import InvalidArgumentError
 from .chain import Chain
 from .collision import CollisionChecker
 
-# Draws for each configuration before the space is called too narrow.
+# Number of draws per requested configuration before the workspace is considered too narrow.
 MAX_DRAWS_PER_SAMPLE = 200
 
-
-# Half a metre of a slide is as much of the arm's motion as half a turn.
+# Distances of prismatic joints are compared with angles by this factor [rad/m]: half a metre counts as half a
+# turn.
 RAD_PER_METRE = 2 * np.pi
+
+# Range of a joint with wider or without limits, each way from zero [rad and m].
+_MAX_ANGLE, _MAX_STROKE = np.pi, 0.5
+
+# A change of the tour must shorten it by more than this (rounding).
+_MIN_TOUR_GAIN = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class WorkspaceConstraints:
-    """Where the tool may be; places in the measuring frame, which is the base link's own if nobody said more.
+    """Constraints of the tool pose, in the measuring frame (by default the frame of the base link).
 
     Attributes:
-        box: (2, 3) least and most x, y, z of the tool point, m; None for anywhere.
-        instrument_position: (3,) the instrument, m, which must see the tool point past the robot; None for anywhere.
-        max_view_angle: half angle about the tool's z axis in which the instrument must stand, rad; π for any.
+        box: Lowest and highest x, y, z of the tool point, shape (2, 3) [m]; None for any position.
+        instrument_position: Position of an instrument that must see the tool point, shape (3,) [m]; None if
+            visibility does not matter.
+        max_view_angle: Maximum angle between the z axis of the tool and the direction to the instrument
+            [rad].
     """
 
     box: Array | None = None
@@ -35,29 +50,39 @@ class WorkspaceConstraints:
     max_view_angle: float = np.pi
 
     def contains(self, poses: Array) -> Array:
-        """Which tool poses (m, 4, 4) are inside the box and look at the instrument, (m,)."""
-        point = poses[:, :3, 3]
-        good = np.ones(len(poses), bool)
+        """Return which tool poses are inside the box and face the instrument.
+
+        Args:
+            poses: Tool poses, shape (m, 4, 4) [m].
+
+        Returns:
+            Whether each pose satisfies the constraints, shape (m,).
+        """
+        points = poses[:, :3, 3]
+        inside = np.ones(len(poses), bool)
         if self.box is not None:
-            good &= np.all((point >= self.box[0]) & (point <= self.box[1]), 1)
+            inside &= np.all((points >= self.box[0]) & (points <= self.box[1]), 1)
         if self.instrument_position is not None:
-            away = self.instrument_position - point
-            towards = np.einsum("mi,mi->m", poses[:, :3, 2], away)
-            good &= towards >= np.cos(self.max_view_angle) * np.linalg.norm(away, axis=1)
-        return good
+            direction = self.instrument_position - points
+            along_z = np.einsum("mi,mi->m", poses[:, :3, 2], direction)
+            inside &= along_z >= np.cos(self.max_view_angle) * np.linalg.norm(direction, axis=1)
+        return inside
 
 
 def joint_range(chain: Chain, angle: float = 0.0, length: float = 0.0) -> tuple[Array, Array]:
-    """Lowest and highest values (n,) inside the limits, and inside a turn or half a metre each way.
+    """Return the range of joint positions within the limits and within half a turn or half a metre each way.
 
     Args:
-        chain: the robot.
-        angle: margin to the limits of joints that turn, rad.
-        length: margin to the limits of joints that slide, m.
+        chain: Kinematic chain.
+        angle: Margin to the limits of revolute joints [rad].
+        length: Margin to the limits of prismatic joints [m].
+
+    Returns:
+        Lowest and highest joint positions, each of shape (n,) [rad or m].
     """
-    slides = np.array([chain.urdf.joint(name).type == "prismatic" for name in chain.joint_names])
-    span, margin = np.where(slides, 0.5, np.pi), np.where(slides, length, angle)
-    # A margin that leaves a joint nothing is cut to a quarter of its way.
+    is_prismatic = _is_prismatic(chain)
+    span, margin = np.where(is_prismatic, _MAX_STROKE, _MAX_ANGLE), np.where(is_prismatic, length, angle)
+    # The margin is at most a quarter of the range, so that half of it remains.
     margin = np.minimum(margin, (chain.upper - chain.lower) / 4)
     low, high = chain.lower + margin, chain.upper - margin
     return (
@@ -66,15 +91,21 @@ def joint_range(chain: Chain, angle: float = 0.0, length: float = 0.0) -> tuple[
     )
 
 
+def _is_prismatic(chain: Chain) -> Array:
+    """Return whether each independent joint is prismatic in the URDF, shape (n,)."""
+    return np.array([chain.urdf.joint(name).type == "prismatic" for name in chain.joint_names])
+
+
 @dataclass(frozen=True, eq=False)
 class ConfigurationSampler:
-    """Where a robot may stand.
+    """Sampler of configurations that a robot can take.
 
     Attributes:
-        chain: the robot; base and tool as far as they are known.
-        workspace: where its tool may be.
-        low, high: (n,) its joints' range, rad or m.
-        collision: its collision geometry.
+        chain: Kinematic chain with base and tool as far as they are known.
+        workspace: Constraints of the tool pose.
+        low: Lowest joint positions, shape (n,) [rad or m].
+        high: Highest joint positions, shape (n,) [rad or m].
+        collision: Collision checks of the robot.
     """
 
     chain: Chain
@@ -85,16 +116,33 @@ class ConfigurationSampler:
 
     @classmethod
     def from_chain(
-        cls, chain: Chain, space: WorkspaceConstraints, angle: float, length: float
+        cls, chain: Chain, workspace: WorkspaceConstraints, angle: float, length: float
     ) -> ConfigurationSampler:
-        """A chain's room with margins to its limits, rad and m."""
-        return cls(chain, space, *joint_range(chain, angle, length), CollisionChecker.from_chain(chain))
+        """Create a sampler with margins to the joint limits.
+
+        Args:
+            chain: Kinematic chain with base and tool.
+            workspace: Constraints of the tool pose.
+            angle: Margin to the limits of revolute joints [rad].
+            length: Margin to the limits of prismatic joints [m].
+
+        Returns:
+            Sampler with the collision geometry of the URDF.
+        """
+        return cls(chain, workspace, *joint_range(chain, angle, length), CollisionChecker.from_chain(chain))
 
     def draw(self, count: int, rng: np.random.Generator) -> Array:
-        """Uniform joint values (count, n) whose tool the space holds.
+        """Draw uniform joint positions whose tool poses are in the workspace; collisions are not checked.
+
+        Args:
+            count: Number of configurations.
+            rng: Random generator.
+
+        Returns:
+            Joint positions, shape (count, n) [rad or m].
 
         Raises:
-            DhcalError: there are next to none.
+            InvalidArgumentError: Too few configurations are in the workspace.
         """
         out = np.empty((0, self.chain.n_joints))
         for _ in range(MAX_DRAWS_PER_SAMPLE):
@@ -102,52 +150,89 @@ class ConfigurationSampler:
             out = np.concatenate([out, q[self.workspace.contains(self.chain.poses(q))]])
             if len(out) >= count:
                 return out[:count]
-        raise DhcalError(
-            f"the tool is in the space asked for in {len(out)} of {MAX_DRAWS_PER_SAMPLE * count} configurations; "
-            "widen the box or the cone, or ask for fewer candidates"
+        raise InvalidArgumentError(
+            f"only {len(out)} of {MAX_DRAWS_PER_SAMPLE * count} random configurations have the tool in the "
+            "workspace; widen the box or the view angle, or reduce the number of candidates"
         )
 
     def perturb(self, q: Array, step: float, count: int, rng: np.random.Generator) -> Array:
-        """Configurations (m·count, n) about each of q (m, n), a step being a share of the joints' range."""
+        """Draw configurations around given ones, clipped to the joint range.
+
+        Args:
+            q: Joint positions, shape (m, n) [rad or m].
+            step: Standard deviation as a fraction of the joint range.
+            count: Number of configurations around each of q.
+            rng: Random generator.
+
+        Returns:
+            Joint positions, shape (m·count, n) [rad or m].
+        """
         moves = rng.standard_normal((len(q), count, self.chain.n_joints)) * step * (self.high - self.low)
         return np.clip(q[:, None] + moves, self.low, self.high).reshape(-1, self.chain.n_joints)
 
     def is_feasible(self, q: Array) -> bool:
-        """Whether the robot can stand at q (n,), and the instrument sees the tool if it must."""
+        """Return whether a configuration has no collision and a free line of sight if one is required.
+
+        Args:
+            q: Joint positions, shape (n,) [rad or m].
+
+        Returns:
+            Whether the robot can be measured in this configuration.
+        """
         if not self.collision.is_collision_free(q):
             return False
         if self.workspace.instrument_position is None:
             return True
-        into = se3.inverse(self.chain.base)
+        base_from_measuring = se3.inverse(self.chain.base)
         point = self.chain.poses(q[None])[0, :3, 3]
-        eye, point = (into[:3, :3] @ at + into[:3, 3] for at in (self.workspace.instrument_position, point))
+        eye, point = (
+            base_from_measuring[:3, :3] @ position + base_from_measuring[:3, 3]
+            for position in (self.workspace.instrument_position, point)
+        )
         return self.collision.has_line_of_sight(q, eye, point)
 
 
 def scale_joint_units(chain: Chain, q: Array) -> Array:
-    """Joint values (m, n) in which a step of any joint counts alike, a slide's metres as radians."""
-    slides = np.array([chain.urdf.joint(name).type == "prismatic" for name in chain.joint_names])
-    return q * np.where(slides, RAD_PER_METRE, 1.0)
+    """Convert positions of prismatic joints to radians by `RAD_PER_METRE`, so that distances can be compared.
+
+    Args:
+        chain: Kinematic chain.
+        q: Joint positions, shape (m, n) [rad or m].
+
+    Returns:
+        Joint positions, shape (m, n) [rad].
+    """
+    return q * np.where(_is_prismatic(chain), RAD_PER_METRE, 1.0)
 
 
 def shortest_tour(q: Array) -> Array:
-    """An order (n,) of configurations (n, dof) with little motion from each to the next, by 2-opt."""
+    """Find an order of configurations with little motion between successive ones, by 2-opt.
+
+    The tour starts from the nearest-neighbour tour. It is a local minimum, not always the shortest tour.
+
+    Args:
+        q: Configurations in comparable units, shape (m, n).
+
+    Returns:
+        Order of the configurations, shape (m,).
+    """
     count = len(q)
-    way = np.zeros((count + 1, count + 1))
-    # The last one is nowhere, as near to all: a closed tour through it is an open one.
-    way[:count, :count] = np.linalg.norm(q[:, None] - q[None], axis=2)
-    order, left = [count], set(range(count))
-    at = int(np.argmin(np.linalg.norm(q - q.mean(0), axis=1)))
-    while left:
-        left.remove(at)
-        order.append(at)
-        at = min(left, key=lambda other: way[order[-1], other], default=0)
-    path = np.array(order)
+    distances = np.zeros((count + 1, count + 1))
+    # An additional point at distance 0 from all others turns the closed tour of 2-opt into an open one.
+    distances[:count, :count] = np.linalg.norm(q[:, None] - q[None], axis=2)
+    order, unvisited = [count], set(range(count))
+    current = int(np.argmin(np.linalg.norm(q - q.mean(0), axis=1)))
+    while unvisited:
+        unvisited.remove(current)
+        order.append(current)
+        current = min(unvisited, key=lambda other: distances[order[-1], other], default=0)
+    tour = np.array(order)
     while True:
-        first, after = way[path[:, None], path], np.roll(path, -1)
-        steps = way[path, after]
-        gain = steps[:, None] + steps[None] - first - way[after[:, None], after]
+        # Gain of reversing the part of the tour from i+1 to j.
+        between, successors = distances[tour[:, None], tour], np.roll(tour, -1)
+        steps = distances[tour, successors]
+        gain = steps[:, None] + steps[None] - between - distances[successors[:, None], successors]
         i, j = np.unravel_index(np.argmax(np.triu(gain, 1)), gain.shape)
-        if gain[i, j] <= 1e-9 or i >= j:
-            return np.roll(path, -int(np.flatnonzero(path == count)[0]))[1:]
-        path[i + 1 : j + 1] = path[i + 1 : j + 1][::-1].copy()
+        if gain[i, j] <= _MIN_TOUR_GAIN or i >= j:
+            return np.roll(tour, -int(np.flatnonzero(tour == count)[0]))[1:]
+        tour[i + 1 : j + 1] = tour[i + 1 : j + 1][::-1].copy()
