@@ -1,7 +1,19 @@
-"""Many arms of one structure at once: their kinematics and derivatives as stacked arrays.
+"""Chains of one structure as stacked arrays: kinematics and derivatives of many robots at once.
 
-Samples lie in one row, arm after arm and as many for each, so that a measurement of b·m samples reads a
-sweep over b arms as it reads that of one.
+All chains share joints, error frames and error parameters; base, links, tool and twists may differ. The
+kernels take samples in one row: the samples of chain 1, then those of chain 2, and so on, with the same
+number for each chain. A measurement of b·m samples therefore evaluates the frames of b chains like those of
+one.
+
+Errors are applied as in `error_model`: M ← M·exp(x_1·ξ_1)·exp(x_2·ξ_2)·… at each error frame. With the 4×4
+matrix A of a twist of angular rate ω = |w|, A⁴ = -ω²·A², so that the exponential is a cubic polynomial in A:
+
+    exp(x·A) = 1 + x·A + (1 - cos ωx)/ω²·A² + (ωx - sin ωx)/ω³·A³
+
+The powers of A are computed once per batch.
+
+Shapes: b chains, p error parameters, k moving joints, n independent joints, m samples per chain, c
+configurations per sample.
 """
 
 from __future__ import annotations
@@ -17,7 +29,7 @@ from .. import se3
 from .._kernels import cos_sin
 from .._kernels.types import FrameBatch
 from .._typing import Array
-from ..exceptions import DhcalError
+from ..exceptions import InvalidArgumentError
 from ..robot.chain import BASE_FRAME, Chain
 from ..robot.error_families import FAMILIES
 from .error_model import ErrorModel
@@ -25,17 +37,17 @@ from .error_model import ErrorModel
 
 @dataclass(frozen=True, eq=False)
 class ChainBatch:
-    """b arms that have the joints and the p error parameters of one model, each with geometry of its own.
+    """b chains with the joints and the p error parameters of one model.
 
-    What all arms share is held once, with an axis of length 1 in place of b.
+    Arrays that are equal for all chains have an axis of length 1 in place of b.
 
     Attributes:
-        model: whose joints, limits and parameters' names and stations all share.
-        n_chains: b.
-        base: (b, 4, 4).
-        link_transforms: (b, k+1, 4, 4) as in `chain.Chain`: between the motions, every joint turning about its z.
-        tool: (b, 4, 4).
-        twists: (b, p, 6) of the parameters, [v, ω], in the frames that `links` join.
+        model: Error model whose joints, limits, parameter names and error frames all chains share.
+        n_chains: Number b of chains.
+        base: Poses of the base links in the measuring frame, shape (b, 4, 4).
+        link_transforms: Transforms between the joint motions, with joint axes along z, shape (b, k+1, 4, 4).
+        tool: Poses of the measured points in the tip frames, shape (b, 4, 4).
+        twists: Twists [v, ω] of the parameters in frames with joint axes along z, shape (b, p, 6).
     """
 
     model: ErrorModel
@@ -47,29 +59,26 @@ class ChainBatch:
 
     @classmethod
     def from_models(cls, models: Sequence[ErrorModel]) -> ChainBatch:
-        """The arms of several error models.
+        """Stack the chains of several error models.
+
+        Args:
+            models: Error models with the same joints and parameters.
+
+        Returns:
+            Batch of their nominal chains.
 
         Raises:
-            DhcalError: they differ in joints or in parameters, or have gains or other errors of the joints'
-                transmission.
+            InvalidArgumentError: If the models differ in joints or parameters, or have transmission errors.
         """
         first = models[0]
-        if first.chain.transmission is not None or any(
-            p.coefficient_index is not None for p in first.parameters
-        ):
-            raise DhcalError(
-                f"arm 1 has joint transmission errors ({', '.join(FAMILIES)}); calibrate such arms one by one"
-            )
         for number, model in enumerate(models, 1):
-            if model.chain.transmission is not None or any(
-                p.coefficient_index is not None for p in model.parameters
-            ):
-                raise DhcalError(
+            if model.has_transmission:
+                raise InvalidArgumentError(
                     f"arm {number} has joint transmission errors ({', '.join(FAMILIES)}); "
-                    "calibrate it by itself"
+                    "calibrate such arms one by one"
                 )
             if model is not first and _structure(model) != _structure(first):
-                raise DhcalError(
+                raise InvalidArgumentError(
                     f"arm {number} has other joints or other parameters than arm 1; calibrate it by itself"
                 )
         distinct = models if any(model is not first for model in models) else models[:1]
@@ -83,22 +92,37 @@ class ChainBatch:
         )
 
     def __len__(self) -> int:
+        """Number of chains."""
         return self.n_chains
 
     def take(self, index: Array) -> ChainBatch:
-        """The arms of an index (j,)."""
-        parts = {name: getattr(self, name) for name in ("base", "link_transforms", "tool", "twists")}
+        """Select chains.
+
+        Args:
+            index: Indices of shape (j,).
+
+        Returns:
+            Batch of j chains.
+        """
+        arrays = {name: getattr(self, name) for name in ("base", "link_transforms", "tool", "twists")}
         return replace(
             self,
             n_chains=len(index),
-            **{name: part[index] if len(part) > 1 else part for name, part in parts.items()},
+            **{name: array[index] if len(array) > 1 else array for name, array in arrays.items()},
         )
 
     def chain(self, number: int) -> Chain:
-        """One of them, from 0."""
+        """Build one of the chains.
+
+        Args:
+            number: Index of the chain, from 0.
+
+        Returns:
+            Single chain.
+        """
         chain = self.model.chain
         base, links, tool = (
-            part[number % len(part)] for part in (self.base, self.link_transforms, self.tool)
+            array[number % len(array)] for array in (self.base, self.link_transforms, self.tool)
         )
         origins = chain.axis_frames @ links
         origins[:-1] = origins[:-1] @ se3.inverse(chain.axis_frames[1:])
@@ -106,7 +130,7 @@ class ChainBatch:
 
     @cached_property
     def _powers(self) -> tuple[Array, Array]:
-        """I, A, A², A³ of the twists' matrices A, (p, b, 4, 16), and their turning rates (p, b)."""
+        """Powers 1, A, A², A³ of the twists' matrices (p, b, 4, 16), and their rates ω (p, b)."""
         twists = self.twists.swapaxes(0, 1)
         first = np.zeros((*twists.shape[:2], 4, 4))
         first[..., :3, :3], first[..., :3, 3] = se3.skew(twists[..., 3:]), twists[..., :3]
@@ -114,71 +138,94 @@ class ChainBatch:
         powers = np.stack([np.broadcast_to(np.eye(4), first.shape), first, second, first @ second], 2)
         return powers.reshape(*powers.shape[:3], 16), np.linalg.norm(twists[..., 3:], axis=-1)
 
-    def _factors(self, x: Array) -> Array:
-        """Each parameter's motion exp(x·A) (p, b, 4, 4) at x (b, p); A³ ends it, as A⁴ = -rate²·A²."""
+    def _exponentials(self, x: Array) -> Array:
+        """Compute exp(x·A) of each parameter, shape (p, b, 4, 4), at x (b, p)."""
         powers, rate = self._powers
         x = x.T
         _, two, three = se3.exp_coefficients(x * rate)
-        terms = np.stack([np.ones_like(x), x, x**2 * two, x**3 * three], -1)
-        return (terms[..., None, :] @ powers).reshape(*x.shape, 4, 4)
+        coefficients = np.stack([np.ones_like(x), x, x**2 * two, x**3 * three], -1)
+        return (coefficients[..., None, :] @ powers).reshape(*x.shape, 4, 4)
 
     def _propagate(self, x: Array) -> tuple[ChainBatch, Array]:
-        """The arms at x (b, p), and where each parameter acts, (p, b, 4, 4) in its body's frame."""
-        factors = self._factors(x)
-        places = np.empty_like(factors)
-        stations = [parameter.error_frame for parameter in self.model.parameters]
+        """Compute the chains at x (b, p), and the frame of each error in its body, shape (p, b, 4, 4)."""
+        exponentials = self._exponentials(x)
+        frames = np.empty_like(exponentials)
+        error_frames = [parameter.error_frame for parameter in self.model.parameters]
 
-        def through(station: int, frame: Array) -> Array:
-            for i in range(bisect_left(stations, station), bisect_right(stations, station)):
-                places[i] = frame
-                frame = frame @ factors[i]
+        def apply_errors(error_frame: int, frame: Array) -> Array:
+            """Multiply a frame by all errors at one error frame, and store the frame before each of them."""
+            first, end = bisect_left(error_frames, error_frame), bisect_right(error_frames, error_frame)
+            for i in range(first, end):
+                frames[i] = frame
+                frame = frame @ exponentials[i]
             return frame
 
-        moved = through(BASE_FRAME, np.eye(4))
-        outside = bisect_right(stations, BASE_FRAME)
-        # Body 0 is behind the base's own errors.
-        places[:outside] = se3.inverse(moved) @ places[:outside]
+        base_error = apply_errors(BASE_FRAME, np.eye(4))
+        n_base = bisect_right(error_frames, BASE_FRAME)
+        # Body 0 follows the errors of the base.
+        frames[:n_base] = se3.inverse(base_error) @ frames[:n_base]
         links = np.empty((self.n_chains, *self.link_transforms.shape[1:]))
         for j, link in enumerate(self.link_transforms.swapaxes(0, 1)):
-            links[:, j] = through(2 * j + 2, through(2 * j + 1, np.eye(4)) @ link)
-        end = through(self.model.chain.tool_frame_index, links[:, -1] @ self.tool)
+            # Errors of link j, then those of joint j + 1 or of the tip.
+            links[:, j] = apply_errors(2 * j + 2, apply_errors(2 * j + 1, np.eye(4)) @ link)
+        end = apply_errors(self.model.chain.tool_frame_index, links[:, -1] @ self.tool)
         tool = se3.inverse(links[:, -1]) @ end
-        return replace(self, base=self.base @ moved, link_transforms=links, tool=tool), places
+        return replace(self, base=self.base @ base_error, link_transforms=links, tool=tool), frames
 
     def at(self, x: Array) -> ChainBatch:
-        """The arms with errors x (b, p) in m and rad."""
+        """Build the chains with given errors.
+
+        Args:
+            x: Errors of shape (b, p) [m and rad].
+
+        Returns:
+            Batch of b chains.
+        """
         return self._propagate(x)[0]
 
     def derivative(self, x: Array) -> tuple[ChainBatch, Array, Array]:
-        """The arms at x (b, p), and each parameter's body (p,) and twist (p, b, 6) there.
+        """Compute the chains at x and their derivatives by each error, as `ErrorModel.derivative`.
 
-        As `parameters.ErrorModel.derivative`, for all arms in one walk along the chain.
+        Args:
+            x: Errors of shape (b, p) [m and rad].
+
+        Returns:
+            Chains at x, the body that each error moves, shape (p,), and the twist of that body in its own
+            frame, shape (p, b, 6).
         """
-        arms, places = self._propagate(x)
-        stations = np.array([parameter.error_frame for parameter in self.model.parameters], int)
+        chains, frames = self._propagate(x)
+        error_frames = np.array([parameter.error_frame for parameter in self.model.parameters], int)
         twists = self.twists.swapaxes(0, 1)[..., None]
-        turn = places[..., :3, :3]
-        spin = (turn @ twists[..., 3:, :])[..., 0]
-        slide = (turn @ twists[..., :3, :])[..., 0] + np.cross(places[..., :3, 3], spin)
-        bodies = np.clip((stations - 1) // 2, 0, self.link_transforms.shape[1] - 1)
-        return arms, bodies, np.concatenate([slide, spin], -1)
+        # The adjoint of the frames, applied to [v, ω].
+        rotation = frames[..., :3, :3]
+        angular = (rotation @ twists[..., 3:, :])[..., 0]
+        linear = (rotation @ twists[..., :3, :])[..., 0] + np.cross(frames[..., :3, 3], angular)
+        bodies = np.clip((error_frames - 1) // 2, 0, self.link_transforms.shape[1] - 1)
+        return chains, bodies, np.concatenate([linear, angular], -1)
 
     def forward_kinematics(self, q: Array) -> FrameBatch:
-        """All frames at joint values q (c, b, m, n), the samples in a row (c·b·m)."""
+        """Compute all frames.
+
+        Args:
+            q: Joint positions of shape (c, b, m, n) [rad or m].
+
+        Returns:
+            Frames at c·b·m samples.
+        """
         chain = self.model.chain
-        values = np.moveaxis(q @ chain.mimic_matrix.T + chain.mimic_offset, -1, 0).copy()
-        shape = values.shape[1:]
-        cos, sin = (each.reshape(values.shape) for each in cos_sin(values.reshape(len(values), -1)))
+        positions = np.moveaxis(q @ chain.mimic_matrix.T + chain.mimic_offset, -1, 0).copy()
+        shape = positions.shape[1:]
+        cos, sin = (part.reshape(positions.shape) for part in cos_sin(positions.reshape(len(positions), -1)))
         bodies = np.empty((len(chain.moving_joints) + 1, 7, 3, *shape))
         bodies[0, :4] = self.base[:, :3].transpose(2, 1, 0)[:, :, None, :, None]
         for j in range(len(chain.moving_joints)):
-            after = _multiply_columns(bodies[j], self.link_transforms[:, j], bodies[j + 1])
+            frame = _multiply_columns(bodies[j], self.link_transforms[:, j], bodies[j + 1])
             if chain.prismatic[j]:
-                after[3] += after[2] * values[j]
+                frame[3] += frame[2] * positions[j]
             else:
-                x, y = after[0].copy(), after[1].copy()
-                after[0] = x * cos[j] + y * sin[j]
-                after[1] = y * cos[j] - x * sin[j]
+                x, y = frame[0].copy(), frame[1].copy()
+                frame[0] = x * cos[j] + y * sin[j]
+                frame[1] = y * cos[j] - x * sin[j]
         tool = _multiply_columns(
             bodies[-1], self.link_transforms[:, -1] @ self.tool, np.empty((4, 3, *shape))
         )
@@ -186,29 +233,30 @@ class ChainBatch:
 
 
 def _structure(model: ErrorModel) -> tuple[object, ...]:
+    """Return what all models of a batch must have in common."""
     chain = model.chain
     arrays = (chain.axes, chain.prismatic, chain.mimic_matrix, chain.mimic_offset)
-    names = [(parameter.name, parameter.error_frame) for parameter in model.parameters]
-    return (chain.joint_names, chain.moving_joints, names, *(array.tolist() for array in arrays))
+    parameters = [(parameter.name, parameter.error_frame) for parameter in model.parameters]
+    return (chain.joint_names, chain.moving_joints, parameters, *(array.tolist() for array in arrays))
 
 
 def _twists(model: ErrorModel) -> Array:
-    """The parameters' twists (p, 6) in frames whose joint axis is z."""
+    """Return the parameters' twists (p, 6) in frames whose joint axis is z."""
     chain, out = model.chain, np.array([parameter.twist for parameter in model.parameters]).reshape(-1, 6)
-    into = se3.adjoint(se3.inverse(chain.axis_frames))
+    body_from_urdf = se3.adjoint(se3.inverse(chain.axis_frames))
     for i, parameter in enumerate(model.parameters):
         body = parameter.error_frame // 2
-        if body < len(into) and parameter.error_frame != BASE_FRAME:
-            out[i] = into[body] @ out[i]
+        if body < len(body_from_urdf) and parameter.error_frame != BASE_FRAME:
+            out[i] = body_from_urdf[body] @ out[i]
     return out
 
 
 def _multiply_columns(frames: Array, links: Array, out: Array) -> Array:
-    """Columns of F·L (4, 3, …, b, m) of frames F (4, 3, …, b, m) and each arm's link L (b, 4, 4)."""
+    """Multiply frames (4, 3, …, b, m), stored by columns, by one link (b, 4, 4) per chain."""
     for column in range(4):
-        mix = links[:, :, column].T[:, :, None]
-        np.multiply(frames[0], mix[0], out=out[column])
-        out[column] += frames[1] * mix[1]
-        out[column] += frames[2] * mix[2]
+        coefficients = links[:, :, column].T[:, :, None]
+        np.multiply(frames[0], coefficients[0], out=out[column])
+        out[column] += frames[1] * coefficients[1]
+        out[column] += frames[2] * coefficients[2]
     out[3] += frames[3]
     return out

@@ -1,7 +1,22 @@
-"""Least squares problems as chunks of whitened rows [J | r], reduced to one small triangle.
+"""Least-squares problem: error model, measurements and priors.
 
-A chunk's rows become their triangle by QR wherever the chunk is, and triangles merge in any order, so
-memory does not grow with the samples. Nothing here knows a kind of measurement or a set by name.
+The unknowns x are the p errors of the robot, followed by the s instrument parameters as differences from
+their initial values. The cost is
+
+    F(x) = Σ_i ‖r_i(x)‖² + ‖W·x‖²
+
+with the whitened residuals r_i of sample i and the prior weights W = diag(1/σ).
+
+The samples are processed in chunks. `Linearization` holds everything that a chunk needs at one x, and no
+data; it is sent to whatever process works on the chunk. There the whitened rows [J | r] are reduced by QR to
+one R factor of shape (p+s+1, p+s+1), and the R factors of all chunks are merged (module `qr`). Memory
+therefore does not grow with the number of samples, and every executor yields the same digits, as the order of
+merging is fixed.
+
+Nothing here depends on the kind of a measurement or on a parameter set.
+
+Shapes: m samples of k residuals each, p robot errors, s instrument parameters. Arrays over samples have the
+samples as their last axis.
 """
 
 from __future__ import annotations
@@ -22,30 +37,30 @@ from ..measurements.base import InstrumentParameter, Measurement
 from ..parallel import SERIAL, TaskExecutor
 from ..robot.chain import Chain
 from .error_model import ErrorModel
-from .qr import TriangularSystem, combine_r_factors
+from .qr import TriangularSystem, combine_r_factors, sum_of_squares
 from .scale_gauge import ScaleGauge, normalize_by_scale
 
-# Samples a chunk.
+# Largest number of samples in a chunk.
 CHUNK_SIZE = 2000
+# Distance [m or rad] to a bound below which the bound is active.
+ACTIVE_BOUND_TOL = 1e-12
 
-
-_Found = TypeVar("_Found")
+_Output = TypeVar("_Output")
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What is unknown and what was measured.
+    """Least-squares problem in p robot errors and s instrument parameters.
 
-    The unknowns x are the p errors of the robot, then the s unknowns of the instruments as differences
-    from where they start; instruments share what they name alike.
+    Measurements share the instrument parameters that have the same name.
 
     Attributes:
-        errors: the nominal chain and its p errors.
-        data: measurements, any mixture of kinds.
-        weights: (p+s,) one over the prior's sigma; zero where there is none.
-        known: values of instruments' unknowns, by name, that are no unknowns here.
-        executor: what the chunks are shared out to; their order, and so every digit, stays.
-        bounds: (2, p+s) least and largest x; None where nothing is bounded.
+        errors: Nominal chain and its p errors.
+        data: Measurements of any kinds.
+        weights: Reciprocal prior standard deviations of shape (p+s,); zero without a prior.
+        known: Values of instrument parameters that are not estimated, by name [m or rad].
+        executor: Executes the work on the chunks. The result does not depend on it.
+        bounds: Smallest and largest x, shape (2, p+s) [m and rad]; None if nothing is bounded.
     """
 
     errors: ErrorModel
@@ -57,43 +72,74 @@ class Problem:
 
     @cached_property
     def instrument_parameters(self) -> tuple[InstrumentParameter, ...]:
-        """The instruments' s unknowns, each once."""
+        """Unknown instrument parameters, each once, length s."""
         return tuple(u for u in merge_instrument_parameters(self.data) if u.name not in self.known)
 
     def instruments(self, x: Array) -> dict[str, float]:
-        """The values of all the instruments' unknowns at x, by name."""
-        found = x[len(self.errors.parameters) :]
+        """Compute the values of all instrument parameters, known and unknown.
+
+        Args:
+            x: Unknowns of shape (p+s,).
+
+        Returns:
+            Values by name [m or rad].
+        """
+        differences = x[len(self.errors.parameters) :]
         return {
-            u.name: u.nominal + float(v) for u, v in zip(self.instrument_parameters, found, strict=True)
+            u.name: u.nominal + float(v) for u, v in zip(self.instrument_parameters, differences, strict=True)
         } | dict(self.known)
 
     def instrument_values_of(self, item: Measurement, x: Array) -> Array:
-        """The values u of a measurement's unknowns at x."""
-        every = self.instruments(x)
-        return np.array([every[unknown.name] for unknown in item.instrument_parameters])
+        """Compute the instrument parameters of one measurement.
+
+        Args:
+            item: Measurement of this problem.
+            x: Unknowns of shape (p+s,).
+
+        Returns:
+            Values in the order of `item.instrument_parameters` [m or rad].
+        """
+        values = self.instruments(x)
+        return np.array([values[parameter.name] for parameter in item.instrument_parameters])
 
     def linearize(self, x: Array) -> Linearization:
-        """The model at x (p+s,), ready for any chunk of data."""
-        robot = len(self.errors.parameters)
-        places = {unknown.name: robot + i for i, unknown in enumerate(self.instrument_parameters)}
-        model = self.errors.derivative(x[:robot])
-        size, rates = 1.0, np.zeros((robot, 4))
+        """Linearize the model.
+
+        Args:
+            x: Unknowns of shape (p+s,).
+
+        Returns:
+            Linearization at x for any chunk of data.
+        """
+        n_robot = len(self.errors.parameters)
+        columns = {parameter.name: n_robot + i for i, parameter in enumerate(self.instrument_parameters)}
+        model = self.errors.derivative(x[:n_robot])
+        size, rates = 1.0, np.zeros((n_robot, 4))
         if self.scale_gauge:
             size, rates = self.scale_gauge.size(model[0]), self.scale_gauge.rates(*model)
-        return Linearization(*model, self.instruments(x), places, size, rates)
+        return Linearization(*model, self.instruments(x), columns, size, rates)
 
     @cached_property
     def scale_gauge(self) -> ScaleGauge | None:
-        """What tells the arm's size, which readings without a length are counted in, if there are any."""
-        plain = [item for item in self.data if not item.has_length_scale and len(item.rows)]
-        if not plain or any(
-            unknown.name in self.known for item in plain for unknown in item.instrument_parameters
+        """Gauge of the measurements without a length; None if there are none, or their objects are known."""
+        scale_free = [item for item in self.data if not item.has_length_scale and len(item.rows)]
+        if not scale_free or any(
+            parameter.name in self.known for item in scale_free for parameter in item.instrument_parameters
         ):
             return None
-        return ScaleGauge.from_configurations(self.errors.chain, np.concatenate([item.q for item in plain]))
+        return ScaleGauge.from_configurations(
+            self.errors.chain, np.concatenate([item.q for item in scale_free])
+        )
 
     def with_data(self, data: Sequence[Measurement]) -> Problem:
-        """The same problem with some or other samples of the same measurements, or with other sigmas."""
+        """Return the problem with other samples or standard deviations of the same measurements.
+
+        Args:
+            data: Measurements in the order of `self.data`.
+
+        Returns:
+            Problem with the scale gauge of this one; chunks and joint states are reused where possible.
+        """
         out = replace(self, data=tuple(data))
         vars(out)["scale_gauge"] = self.scale_gauge
         if "chunks" not in vars(self) or len(data) != len(self.data):
@@ -108,7 +154,7 @@ class Problem:
 
     @cached_property
     def chunks(self) -> tuple[Chunk, ...]:
-        """The data in pieces of at most CHUNK samples."""
+        """Data in pieces of at most CHUNK_SIZE samples, each of one measurement."""
         return tuple(
             Chunk(item.take(np.s_[start : start + CHUNK_SIZE]), self.errors.chain)
             for item in self.data
@@ -116,36 +162,64 @@ class Problem:
         )
 
     def with_prior_weights(self, weights: Array) -> Problem:
-        """The same data with other priors."""
+        """Return the problem with other priors.
+
+        Args:
+            weights: Reciprocal prior standard deviations of shape (p+s,).
+
+        Returns:
+            Problem with the same data and chunks.
+        """
         out = replace(self, weights=weights)
         vars(out).update(chunks=self.chunks, scale_gauge=self.scale_gauge)
         return out
 
     def is_interior(self, x: Array) -> Array:
-        """Which unknowns (p+s,) are not pressed against a bound at x."""
+        """Find the unknowns whose bounds are not active.
+
+        Args:
+            x: Unknowns of shape (p+s,).
+
+        Returns:
+            Flags of shape (p+s,).
+        """
         if self.bounds is None:
             return np.ones(len(x), bool)
-        return ~np.any(np.abs(self.bounds - x) <= 1e-12, 0)
+        return ~np.any(np.abs(self.bounds - x) <= ACTIVE_BOUND_TOL, 0)
 
     def cost(self, x: Array) -> float:
-        """Sum of squared whitened residuals and priors at x (p,)."""
+        """Compute the sum of squared whitened residuals and priors.
+
+        Args:
+            x: Unknowns of shape (p+s,).
+
+        Returns:
+            Cost F(x).
+        """
         chain = self.errors.at(x[: len(self.errors.parameters)])
         size = self.scale_gauge.size(chain) if self.scale_gauge else 1.0
-        costs = self.map_chunks(partial(_cost, chain, self.instruments(x), size))
+        costs = self.map_chunks(partial(_chunk_cost, chain, self.instruments(x), size))
         return sum(costs, float(np.sum((self.weights * x) ** 2)))
 
-    def map_chunks(self, function: Callable[[Chunk], _Found]) -> Iterator[_Found]:
-        """What a function finds in each chunk, in order."""
+    def map_chunks(self, function: Callable[[Chunk], _Output]) -> Iterator[_Output]:
+        """Apply a function to each chunk.
+
+        Args:
+            function: Function that the executor can send to another process.
+
+        Returns:
+            Iterator over the results in the order of the chunks.
+        """
         return self.executor.map(function, self.chunks)
 
 
 @dataclass(frozen=True, eq=False)
 class Chunk:
-    """Some samples of one measurement, and their joints' motion, which every x shares.
+    """Some samples of one measurement, with the joint state that is the same at every x.
 
     Attributes:
-        data: the samples.
-        nominal: the chain that they belong to; errors of it do not matter here.
+        data: Samples.
+        nominal: Nominal chain; its geometric errors do not affect the joint state.
     """
 
     data: Measurement
@@ -153,34 +227,54 @@ class Chunk:
 
     @cached_property
     def joint_state(self) -> JointState:
-        """Of the samples' configurations."""
+        """Joint state at the configurations of the samples."""
         return self.nominal.joint_state(self.data.configurations())
 
     def reuse_joint_state(self, other: Chunk) -> None:
-        """Takes over the motion of a chunk at the same joint values, if that is known there."""
+        """Take over the joint state of a chunk, if it has been computed.
+
+        Args:
+            other: Chunk at the same configurations.
+        """
         if "joint_state" in vars(other):
             vars(self)["joint_state"] = other.joint_state
 
     def frames(self, chain: Chain) -> FrameBatch:
-        """A chain's frames at the samples, in memory that the next chunk's overwrite."""
+        """Compute the frames of a chain at the samples.
+
+        Args:
+            chain: Chain with the joints of the nominal one.
+
+        Returns:
+            Frames in a work array, valid until the next call.
+        """
         k, m = self.joint_state.positions.shape
-        return chain.forward_kinematics(self.joint_state, work_array("sweep", k + 2, 7, 3, m))
+        return chain.forward_kinematics(self.joint_state, work_array("frames", k + 2, 7, 3, m))
 
     def instrument_values(self, instruments: Mapping[str, float]) -> Array:
-        """The values u of the measurement's unknowns among all the instruments'."""
-        return np.array([instruments[unknown.name] for unknown in self.data.instrument_parameters])
+        """Select the instrument parameters of the measurement.
+
+        Args:
+            instruments: Values of all instrument parameters by name [m or rad].
+
+        Returns:
+            Values in the order of `data.instrument_parameters`.
+        """
+        return np.array([instruments[parameter.name] for parameter in self.data.instrument_parameters])
 
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """A problem's model at one x. It holds no data, so it goes to wherever a chunk of them is.
+    """Model of a problem at one x, without data, so that it can be sent to the process that holds a chunk.
 
     Attributes:
-        chain: with its errors at x.
-        bodies, twists: (e,), (e, 6): what each of the e errors moves, as `Chain.tool_velocities` takes it.
-        instruments: values of all the instruments' unknowns by name.
-        instrument_columns: where those of them that are unknown here stand in x.
-        arm_scale, gauge_rates: of the arm, and how fast it grows and turns with each error (e, 4); see `scale`.
+        chain: Chain with the errors at x.
+        bodies: Body that each of the p robot errors moves, shape (p,); see `Chain.tool_jacobian`.
+        twists: Twists of those bodies, shape (p, 6).
+        instruments: Values of all instrument parameters by name [m or rad].
+        instrument_columns: Column of each unknown instrument parameter in J, by name.
+        arm_scale: Size of the chain; see `scale_gauge`.
+        gauge_rates: Rates of growth and rotation per unit of each robot error, shape (p, 4).
     """
 
     chain: Chain
@@ -192,80 +286,127 @@ class Linearization:
     gauge_rates: Array
 
     def r_factor(self, chunk: Chunk, small_angle: bool) -> Array:
-        """Triangle (p+1, p+1) of a chunk's whitened rows [J | r]; exact or by the paper's rows."""
+        """Compute the R factor of a chunk's whitened rows [J | r].
+
+        Args:
+            chunk: Samples.
+            small_angle: Whether to use the paper's residuals and Jacobian, equation (36), instead of the
+                exact ones.
+
+        Returns:
+            R factor of shape (p+s+1, p+s+1).
+        """
         data, frames = chunk.data, chunk.frames(self.chain)
-        # Rows by twists are worked out on their way into the triangle, unless they are changed before.
-        plain = int(np.searchsorted(self.bodies, len(frames.columns))) if data.has_length_scale else 0
-        given = work_array("given", data.residual_dim, self._columns - plain, len(data.rows)).swapaxes(0, 1)
-        mixture = self._fill(given, chunk, frames, small_angle)
-        twists = self.twists[None, :plain]
-        return factor_jacobian(frames.columns, frames.tool[3], self.bodies[:plain], twists, mixture, given)[0]
+        # The kernel computes the columns of geometric errors while it factors them; they are never stored.
+        # All other columns, and all columns of measurements that are normalized by scale, are filled before.
+        n_geometric = int(np.searchsorted(self.bodies, len(frames.columns))) if data.has_length_scale else 0
+        filled = work_array(
+            "filled columns", data.residual_dim, self._n_columns - n_geometric, len(data.rows)
+        ).swapaxes(0, 1)
+        observation = self._fill(filled, chunk, frames, small_angle)
+        bodies, twists = self.bodies[:n_geometric], self.twists[None, :n_geometric]
+        return factor_jacobian(frames.columns, frames.tool[3], bodies, twists, observation, filled)[0]
 
     def rows(self, chunk: Chunk) -> Array:
-        """A chunk's whitened rows [J | r] (p+1, k, m)."""
-        out = np.empty((self._columns, chunk.data.residual_dim, len(chunk.data.rows)))
+        """Compute the whitened rows [J | r] of a chunk.
+
+        Args:
+            chunk: Samples.
+
+        Returns:
+            Rows of shape (p+s+1, k, m).
+        """
+        out = np.empty((self._n_columns, chunk.data.residual_dim, len(chunk.data.rows)))
         self._fill(out, chunk, chunk.frames(self.chain), False)
         return out
 
     @property
-    def _columns(self) -> int:
+    def _n_columns(self) -> int:
+        """Number of columns of [J | r]."""
         return len(self.bodies) + len(self.instrument_columns) + 1
 
     @UnbufferedRows()
     def _fill(self, block: Array, chunk: Chunk, frames: FrameBatch, small_angle: bool) -> ObservationMatrix:
-        """Fills in the last columns of the rows, as many as the block has; tells what makes the others."""
+        """Fill a block (c, k, m) with the last c columns of [J | r]; return the observation matrix."""
         data, u = chunk.data, chunk.instrument_values(self.instruments)
         if small_angle:
-            block[-1], mixture = data.small_angle(frames, u)
+            block[-1], observation = data.small_angle(frames, u)
         else:
             block[-1] = data.residual(frames, u)
-            mixture = data.observation_matrix(frames, u, block[-1])
-        first = self._columns - len(block)
-        errors = len(self.bodies) - first
-        if errors:
-            velocities = work_array("velocities", errors, 6, frames.tool.shape[-1])
-            self.chain.tool_jacobian(frames, self.bodies[first:], self.twists[first:], velocities)
-            apply_observation_matrix(velocities, mixture, block[:errors])
-        block[errors:-1] = 0.0
-        own = data.instrument_jacobian(frames, u) if data.instrument_parameters else ()
-        for unknown, rows in zip(data.instrument_parameters, own, strict=True):
-            if unknown.name in self.instrument_columns:
-                block[self.instrument_columns[unknown.name] - first] = rows
+            observation = data.observation_matrix(frames, u, block[-1])
+        first = self._n_columns - len(block)
+        n_errors = len(self.bodies) - first
+        if n_errors:
+            jacobian = work_array("filled jacobian", n_errors, 6, frames.tool.shape[-1])
+            self.chain.tool_jacobian(frames, self.bodies[first:], self.twists[first:], jacobian)
+            apply_observation_matrix(jacobian, observation, block[:n_errors])
+        block[n_errors:-1] = 0.0
+        instrument_rows = data.instrument_jacobian(frames, u) if data.instrument_parameters else ()
+        for parameter, rows in zip(data.instrument_parameters, instrument_rows, strict=True):
+            if parameter.name in self.instrument_columns:
+                block[self.instrument_columns[parameter.name] - first] = rows
         if not data.has_length_scale:
             normalize_by_scale(block, self.arm_scale, self.gauge_rates, data.residual_groups.get("position"))
-        return mixture
+        return observation
 
 
 def chunk_residual(chain: Chain, instruments: Mapping[str, float], chunk: Chunk) -> Array:
-    """A chunk's whitened residuals (k, m) for a chain and values of all the instruments' unknowns."""
+    """Compute the whitened residuals of a chunk.
+
+    Args:
+        chain: Chain with errors.
+        instruments: Values of all instrument parameters by name [m or rad].
+        chunk: Samples.
+
+    Returns:
+        Residuals of shape (k, m).
+    """
     return chunk.data.residual(chunk.frames(chain), chunk.instrument_values(instruments))
 
 
-def _cost(chain: Chain, instruments: Mapping[str, float], size: float, chunk: Chunk) -> float:
-    residual = chunk_residual(chain, instruments, chunk)
-    square = float(np.vdot(residual, residual))
-    return square if chunk.data.has_length_scale else square / size**2
+def _chunk_cost(chain: Chain, instruments: Mapping[str, float], size: float, chunk: Chunk) -> float:
+    """Compute the sum of squared whitened residuals of a chunk, for a chain of a given size."""
+    cost = sum_of_squares(chunk_residual(chain, instruments, chunk))
+    return cost if chunk.data.has_length_scale else cost / size**2
 
 
-def _chunk_r_factor(tangent: Linearization, small_angle: bool, chunk: Chunk) -> Array:
-    return tangent.r_factor(chunk, small_angle)
+def _chunk_r_factor(linearization: Linearization, small_angle: bool, chunk: Chunk) -> Array:
+    """Compute the R factor of a chunk; a module-level function can be sent to another process."""
+    return linearization.r_factor(chunk, small_angle)
 
 
 def merge_instrument_parameters(data: Sequence[Measurement]) -> tuple[InstrumentParameter, ...]:
-    """The unknowns of several measurements, each once; a start that is NaN gives way to one that is not."""
-    found: dict[str, InstrumentParameter] = {}
+    """Collect the instrument parameters of several measurements.
+
+    Args:
+        data: Measurements; parameters of the same name are the same.
+
+    Returns:
+        Parameters, each once. The initial value is the first one that is not NaN, or zero.
+    """
+    merged: dict[str, InstrumentParameter] = {}
     for item in data:
-        for unknown in item.instrument_parameters:
-            if unknown.name not in found or math.isnan(found[unknown.name].nominal):
-                found[unknown.name] = unknown
+        for parameter in item.instrument_parameters:
+            if parameter.name not in merged or math.isnan(merged[parameter.name].nominal):
+                merged[parameter.name] = parameter
     return tuple(
-        replace(unknown, nominal=0.0) if math.isnan(unknown.nominal) else unknown
-        for unknown in found.values()
+        replace(parameter, nominal=0.0) if math.isnan(parameter.nominal) else parameter
+        for parameter in merged.values()
     )
 
 
 def linearize_and_factor(problem: Problem, x: Array, small_angle: bool) -> TriangularSystem:
-    """The data's triangle at x (p,), without the priors; exact or by the paper's rows."""
+    """Compute the triangular system of all data, without priors.
+
+    Args:
+        problem: Problem in p robot errors and s instrument parameters.
+        x: Unknowns of shape (p+s,).
+        small_angle: Whether to use the paper's residuals and Jacobian, equation (36), instead of the exact
+        ones.
+
+    Returns:
+        System at x.
+    """
     return combine_r_factors(
         problem.map_chunks(partial(_chunk_r_factor, problem.linearize(x), small_angle)), len(x)
     )

@@ -195,7 +195,7 @@ def test_what_does_not_go_together_is_said(sim_6dof):
     with pytest.raises(DhcalError, match="more than its samples"):
         concatenate([pose, position])
     errors = select_parameters(sim_6dof, "dh")
-    with pytest.raises(DhcalError, match="do not share out among 2"):
+    with pytest.raises(DhcalError, match="cannot be divided among 2"):
         BatchProblem(ChainBatch.from_models([errors] * 2), (pose,), np.zeros(24))
     with pytest.raises(DhcalError, match="arm 2 has other joints or other parameters"):
         ChainBatch.from_models([errors, select_parameters(sim_6dof, "minimal")])
