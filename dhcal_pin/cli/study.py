@@ -54,7 +54,6 @@ def run(args: Namespace) -> int:
     from ..io import shipped_file
     from ..io.tabular import csv_text
     from ..parallel import open_executor
-    from ..studies.runner import table
     from ..visualization.plots import study_svg
     from . import console
     from .outputs import existing_sidecars, require_writable_outputs, write_outputs
@@ -88,7 +87,7 @@ def run(args: Namespace) -> int:
             "to resume"
         )
         return 130
-    header, rows = table(study, blocks)
+    header, rows = studies.result_table(study, blocks)
     drawing = study_svg(study.title or "study", header, rows, len(fields(studies.Setting)))
     columns = dict(zip(header, zip(*rows, strict=True), strict=True))
     contents = {args.output: csv_text(columns)} | ({figure: drawing} if drawing else {})

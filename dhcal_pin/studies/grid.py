@@ -1,4 +1,9 @@
-"""The grid of a study: settings, their robots, how poses are chosen, and the file that names them."""
+"""Study grids: the settings of simulated calibrations, their robots, and the TOML file that describes them.
+
+A study file lists values of `Setting`; the grid contains every combination. Each setting becomes a `Case`
+with its robots. A study is checked completely before it starts, including one small simulated calibration
+problem of each kind of setting.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +23,7 @@ from ..estimation.batch import BatchProblem
 from ..estimation.batch_chains import ChainBatch
 from ..estimation.parameters import select_parameters
 from ..estimation.solver import METHODS
-from ..exceptions import DhcalError
+from ..exceptions import DhcalError, FileFormatError
 from ..io.robot import read_robot
 from ..io.shipped_files import shipped_file
 from ..io.toml_table import TomlTable
@@ -29,31 +34,42 @@ from ..robot.chain import Chain
 from ..robot.sampling import joint_range
 from ..units import parse_noise
 
-# Calibrations a task: some tenths of a second.
+# Number of calibrations of a task, which takes some tenths of a second.
 BLOCK_SIZE = 100
-# Largest number of calibrations of a setting.
+
+# Maximum number of calibrations of a setting, and maximum of its numbers of poses and of iterations.
 MAX_SEEDS = 10**6
+_MAX_COUNT = 10**5
+
+# Number of configurations of the problem that checks a setting.
+_N_CHECK_POSES = 8
+
+# Number of candidates from which poses are planned.
+_N_CANDIDATES = 5000
+
+# Value of `pose_selection` for poses that are planned once for the nominal robot of a setting.
+PLANNED = "planned"
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One point of the grid; every entry can be a list in the file.
+    """One combination of the grid; every entry can be a list in the file.
 
     Attributes:
-        robot: the nominal robot's file, beside the study or shipped.
-        tip: the tip link of URDFs; the deepest leaf without it.
-        truth: the true robot's file; without it the truth is the nominal robot with errors drawn.
-        error_std: standard deviations of the true robot's parameters, length and angle.
-        error_parameters: the sets that these errors are in.
-        parameters: the sets that are identified.
-        kind: of measurement, one without unknowns of its own.
-        noise: its standard deviations an axis.
-        poses: how many are measured.
-        pose_selection: how they are chosen, of `CHOICES`.
-        resample_each_iteration: whether the poses are drawn anew at each iteration; planned ones cannot be.
+        robot: File of the nominal robot, in the folder of the study or part of the package.
+        tip: Tip link of URDFs; by default the deepest leaf.
+        truth: File of the true robot; by default true robots are nominal robots with random errors.
+        error_std: Standard deviations of the random errors, length and angle.
+        error_parameters: Parameter sets of the random errors.
+        parameters: Parameter sets that are estimated.
+        kind: Measurement kind without instrument parameters.
+        noise: Standard deviations of the measurement noise per axis, length and angle.
+        poses: Number of measured poses.
+        pose_selection: Selection of the poses, one of `POSE_SELECTIONS`.
+        resample_each_iteration: Whether new poses are drawn for each iteration; not for planned poses.
         method: "lm" or "gn".
         priors: "default" or "none".
-        iterations: most steps.
+        iterations: Maximum number of iterations.
     """
 
     robot: str
@@ -72,35 +88,40 @@ class Setting:
     iterations: int = 100
 
 
-def configurations(chain: Chain, count: int, rng: np.random.Generator, share: float = 1.0) -> Array:
-    """Uniform joint values (count, n) in the lower `share` of each joint's range."""
+def draw_configurations(chain: Chain, count: int, rng: np.random.Generator, fraction: float = 1.0) -> Array:
+    """Draw uniform joint positions from the lower part of the joint ranges.
+
+    Args:
+        chain: Kinematic chain.
+        count: Number of configurations.
+        rng: Random generator.
+        fraction: Part of each joint range that is used, from its lower end.
+
+    Returns:
+        Joint positions, shape (count, n) [rad or m].
+    """
     low, high = joint_range(chain)
-    return rng.uniform(low, low + share * (high - low), (count, chain.n_joints))
+    return rng.uniform(low, low + fraction * (high - low), (count, chain.n_joints))
 
 
-# How each arm's poses are drawn: all over the joints' ranges, or in their lowest quarter alone.
+# Poses that are drawn for each robot: from the whole joint ranges, or from their lowest quarter.
 SAMPLERS: dict[str, Callable[[Chain, int, np.random.Generator], Array]] = {
-    "random": configurations,
-    "corner": partial(configurations, share=0.25),
+    "random": draw_configurations,
+    "corner": partial(draw_configurations, fraction=0.25),
 }
-
-
-# Or all arms of a setting take those that `planning` chooses for the nominal one.
-PLANNED = "planned"
-
 
 POSE_SELECTIONS = (*SAMPLERS, PLANNED)
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A setting with its robots.
+    """Setting with its robots.
 
     Attributes:
-        setting: what is simulated.
-        nominal: what the robots are thought to be.
-        truth: what they are; None where each draws its own errors.
-        poses: (poses, n) joint values that all of them take; None where each draws its own.
+        setting: Setting to simulate.
+        nominal: Nominal robot.
+        truth: True robot; None if the errors of each robot are random.
+        poses: Joint positions that all robots take, shape (poses, n) [rad or m]; None if each draws its own.
     """
 
     setting: Setting
@@ -108,8 +129,16 @@ class Case:
     truth: Chain | None
     poses: Array | None = None
 
-    def planned(self, count: int, candidates: int = 5000) -> Array:
-        """Joint values (count, n) planned for the nominal robot, its kind, noise and parameters."""
+    def plan_poses(self, count: int, candidates: int = _N_CANDIDATES) -> Array:
+        """Plan poses for the nominal robot with the kind, noise and parameters of the setting.
+
+        Args:
+            count: Number of poses.
+            candidates: Number of random configurations to choose from.
+
+        Returns:
+            Joint positions, shape (count, n) [rad or m].
+        """
         setting = self.setting
         return plan(
             self.nominal,
@@ -120,23 +149,34 @@ class Case:
             candidates=max(candidates, count),
         ).q
 
-    def drawn(self, rng: np.random.Generator) -> Array:
-        """One arm's joint values (poses, n)."""
+    def draw_poses(self, rng: np.random.Generator) -> Array:
+        """Return the measured joint positions of one robot.
+
+        Args:
+            rng: Random generator of the robot.
+
+        Returns:
+            Joint positions, shape (poses, n) [rad or m].
+        """
         if self.poses is not None:
             return self.poses
         return SAMPLERS[self.setting.pose_selection](self.nominal, self.setting.poses, rng)
 
 
+# Block of calibrations: case, first seed, and number of seeds.
+Task = tuple[Case, int, int]
+
+
 @dataclass(frozen=True, eq=False)
 class StudyGrid:
-    """A grid of settings.
+    """Grid of settings with the number of calibrations of each.
 
     Attributes:
-        title: what it asks.
-        seeds: calibrations a setting, seeded 0, 1, ….
-        cases: the settings, in the order of the file's lists, the last one fastest.
-        digest: of everything that the result depends on.
-        robots: the files that the settings' robots were read from.
+        title: Question that the study answers.
+        seeds: Number of calibrations of each setting, with the seeds 0, 1, ….
+        cases: Settings in the order of the lists in the file; the last list varies fastest.
+        digest: Hash of everything that determines the result.
+        robots: Paths of the robot files.
     """
 
     title: str
@@ -145,8 +185,8 @@ class StudyGrid:
     digest: str
     robots: tuple[str, ...]
 
-    def tasks(self) -> list[tuple[Case, int, int]]:
-        """Blocks of calibrations: case, first seed, and how many."""
+    def tasks(self) -> list[Task]:
+        """Return the blocks of calibrations, in the order of the cases."""
         return [
             (case, first, min(BLOCK_SIZE, self.seeds - first))
             for case in self.cases
@@ -161,7 +201,7 @@ def read_study(path: PathLike) -> StudyGrid:
         path: TOML file with `title`, `seeds`, and `[settings]` with entries of `Setting` or lists of them.
 
     Returns:
-        The grid of all combinations of settings.
+        Grid of all combinations of settings.
     """
     document = TomlTable.read(path)
     where = document.path
@@ -172,16 +212,17 @@ def read_study(path: PathLike) -> StudyGrid:
     table = document.table("settings", required=True)
     document.finish()
     settings = [_validated(setting, where) for setting in _grid(table)]
-    arms = {(name, s.tip) for s in settings for name in (s.robot, s.truth) if name}
-    files = {name: os.fspath(_find_robot_file(name, path)) for name in sorted({name for name, _ in arms})}
-    chains = {(name, tip): read_robot(files[name], tip or None) for name, tip in sorted(arms)}
+    robots = {(name, s.tip) for s in settings for name in (s.robot, s.truth) if name}
+    files = {name: os.fspath(_find_robot_file(name, path)) for name in sorted({name for name, _ in robots})}
+    chains = {(name, tip): read_robot(files[name], tip or None) for name, tip in sorted(robots)}
     cases = [Case(s, chains[s.robot, s.tip], chains.get((s.truth, s.tip))) for s in settings]
-    different = {
+    # Settings that differ in other values only need one check.
+    distinct = {
         (s.robot, s.tip, s.truth, s.kind, s.parameters, s.error_parameters, s.pose_selection, s.noise): case
         for case in cases
         if (s := case.setting)
     }
-    for case in different.values():
+    for case in distinct.values():
         _require_runnable(case, where)
     digest = hashlib.sha256(repr((seeds, settings)).encode())
     for chain in chains.values():
@@ -210,6 +251,7 @@ def _grid(table: TomlTable) -> Iterator[Setting]:
 
 
 def _validated(setting: Setting, where: str) -> Setting:
+    """Return a setting after checking its values."""
     for key, known in (
         ("kind", KINDS),
         ("pose_selection", POSE_SELECTIONS),
@@ -217,13 +259,17 @@ def _validated(setting: Setting, where: str) -> Setting:
         ("priors", ("default", "none")),
     ):
         if getattr(setting, key) not in known:
-            raise DhcalError(f"{where}: {key} = {getattr(setting, key)!r}: choose from {', '.join(known)}")
-    for key, least in (("poses", 1), ("iterations", 0)):
-        if not least <= getattr(setting, key) <= 10**5:
-            raise DhcalError(f"{where}: {key} = {getattr(setting, key)}: must be from {least} to 100000")
+            raise FileFormatError(
+                f"{where}: unknown {key} {getattr(setting, key)!r}; choose from {', '.join(known)}"
+            )
+    for key, minimum in (("poses", 1), ("iterations", 0)):
+        if not minimum <= getattr(setting, key) <= _MAX_COUNT:
+            raise FileFormatError(
+                f"{where}: {key} = {getattr(setting, key)}; expected a number from {minimum} to {_MAX_COUNT}"
+            )
     if setting.resample_each_iteration and setting.pose_selection == PLANNED:
-        raise DhcalError(
-            f"{where}: resample_each_iteration = true: planned poses are not drawn anew; set it to false"
+        raise FileFormatError(
+            f"{where}: resample_each_iteration = true; planned poses are not resampled, so set it to false"
         )
     for key in ("noise", "error_std"):
         parse_noise(getattr(setting, key), f"{where}: {key}")
@@ -231,23 +277,23 @@ def _validated(setting: Setting, where: str) -> Setting:
 
 
 def _find_robot_file(name: str, path: PathLike) -> Path:
-    """A robot's file beside the study, or one of those shipped."""
-    near = Path(path).resolve().parent / name
-    return near if near.exists() else shipped_file(name)
+    """Return the path of a robot file in the folder of the study, or of one that is part of the package."""
+    in_folder = Path(path).resolve().parent / name
+    return in_folder if in_folder.exists() else shipped_file(name)
 
 
 def _require_runnable(case: Case, where: str) -> None:
-    """Complains about what would only fail in the middle of the work."""
+    """Set up a small problem of a case, so that invalid settings are reported before the study starts."""
     setting, nominal = case.setting, case.nominal
     errors = select_parameters(nominal, setting.parameters)
     select_parameters(nominal, setting.error_parameters)
     if case.truth is not None:
         ChainBatch.from_models([errors, select_parameters(case.truth, setting.parameters)])
-    q = configurations(nominal, 8, np.random.default_rng(0))
+    q = draw_configurations(nominal, _N_CHECK_POSES, np.random.default_rng(0))
     data = KINDS[setting.kind].simulate(nominal, q, Noise(), np.random.default_rng(0))
     try:
         BatchProblem(ChainBatch.from_models([errors]), (data,), np.zeros(len(errors.parameters)))
         if setting.pose_selection == PLANNED:
-            case.planned(1, candidates=8)
+            case.plan_poses(1, candidates=_N_CHECK_POSES)
     except DhcalError as error:
-        raise DhcalError(f"{where}: kind = {setting.kind!r}: {error}") from None
+        raise FileFormatError(f"{where}: kind = {setting.kind!r}: {error}") from None

@@ -1,8 +1,11 @@
-"""How well a calibration can do: simulated over a grid of settings, many seeds each.
+"""Run of a study: many simulated calibrations of each setting, and statistics of their errors.
 
-A setting is one line of the result. For each of its seeds a true arm, joint sets, readings and test poses are
-drawn from that seed alone, so settings differ by what is set and by nothing else, and any way of sharing
-out the work gives the same digits. Planned poses are chosen once a setting, by whoever shares out the work.
+For each seed a true robot, measured poses, measurements and test poses are drawn from that seed alone.
+Settings therefore differ by their entries only, and the results do not depend on the distribution of tasks to
+processes or on interruptions. Planned poses are chosen once per setting by the process that distributes the
+tasks.
+
+Calibrations of a block are solved together as a batch. Shapes: b robots of a block, p parameters.
 """
 
 from __future__ import annotations
@@ -23,21 +26,22 @@ from ..measurements import KINDS
 from ..measurements.base import Noise, concatenate
 from ..parallel import SERIAL, TaskExecutor
 from ..units import parse_noise
-from .grid import PLANNED, Case, Setting, StudyGrid, configurations
+from .grid import MAX_SEEDS, PLANNED, Case, Setting, StudyGrid, Task, draw_configurations
 
-# Configurations at which each calibrated arm is compared with its true one.
+# Number of test poses at which each calibrated robot is compared with its true robot.
 N_TEST_POSES = 100
 
+# First seed of the test poses; the seeds of the measurements are below it.
+_TEST_SEED = MAX_SEEDS + 1
 
-# Their seeds lie apart from those of what is measured.
-_TEST_SEED = 10**6 + 1
+# Parameter sets whose nominal values are table entries, so that the true errors are differences of two
+# tables.
+_TABLE_SETS = frozenset(("dh", "modified-dh"))
 
+# Quantile of the position error in the last column of the table.
+_UPPER_QUANTILE = 0.9
 
-# Sets whose nominal values are those of a table, so that two robots' can be compared.
-_TABLES = frozenset(("dh", "modified-dh"))
-
-
-# What is kept of each calibration, and its unit.
+# Results of each calibration, and their units.
 MEASURE_UNITS = {
     "converged": "",
     "steps": "",
@@ -52,100 +56,133 @@ MEASURE_UNITS = {
 }
 
 
-def _true_chains(case: Case, seeds: range) -> tuple[ChainBatch, Array]:
-    """The true arms, and their errors (b, p) in what is identified; NaN where that cannot express them."""
-    setting, b = case.setting, len(seeds)
-    identified = select_parameters(case.nominal, setting.parameters)
-    unknown = np.full((b, len(identified.parameters)), np.nan)
-    if case.truth is not None:
-        true = select_parameters(case.truth, setting.parameters)
-        off = [t.nominal - n.nominal for t, n in zip(true.parameters, identified.parameters, strict=True)]
-        known = set(setting.parameters.split(",")) <= _TABLES
-        return ChainBatch.from_models([true] * b), np.tile(off, (b, 1)) if known else unknown
-    wrong = select_parameters(case.nominal, setting.error_parameters)
-    length, angle = parse_noise(setting.error_std)
-    sizes = np.array([length if parameter.unit == "m" else angle for parameter in wrong.parameters])
-    # Apart from what is drawn for the measurement, so that more poses do not mean another robot.
-    x = np.array([sizes * np.random.default_rng([seed, 1]).standard_normal(len(sizes)) for seed in seeds])
-    same = [p.name for p in wrong.parameters] == [p.name for p in identified.parameters]
-    return ChainBatch.from_models([wrong] * b).at(x), x if same else unknown
+def run(study: StudyGrid, done: int = 0, executor: TaskExecutor = SERIAL) -> Iterator[list[list[float]]]:
+    """Run the tasks of a study in order.
+
+    Args:
+        study: Study to run.
+        done: Number of tasks that are already done, from the first one on.
+        executor: Executor of the tasks.
+
+    Returns:
+        Iterator over the results of the remaining tasks, each as of `run_block`.
+    """
+    return executor.map(run_block, _with_planned_poses(study.tasks()[done:]))
 
 
-def calibrations(task: tuple[Case, int, int]) -> list[list[float]]:
-    """A block of calibrations: a row of `MEASURES` for each seed."""
+def run_block(task: Task) -> list[list[float]]:
+    """Simulate and calibrate the robots of a block.
+
+    Args:
+        task: Case, first seed and number of seeds.
+
+    Returns:
+        One row per seed with the columns of `MEASURE_UNITS`.
+    """
     case, first, count = task
     setting, nominal, seeds = case.setting, case.nominal, range(first, first + count)
     errors = select_parameters(nominal, setting.parameters)
-    truths, true = _true_chains(case, seeds)
-    chains = [truths.chain(i) for i in range(count)]
+    true_chains, true_x = _draw_true_chains(case, seeds)
+    chains = [true_chains.chain(i) for i in range(count)]
     rngs = [np.random.default_rng(seed) for seed in seeds]
     noise, kind = Noise(*parse_noise(setting.noise)), KINDS[setting.kind]
     weights = np.zeros(len(errors.parameters)) if setting.priors == "none" else 1 / errors.priors
 
-    def measured() -> BatchProblem:
+    def simulate() -> BatchProblem:
         items = [
-            kind.simulate(chain, case.drawn(rng), noise, rng) for chain, rng in zip(chains, rngs, strict=True)
+            kind.simulate(chain, case.draw_poses(rng), noise, rng)
+            for chain, rng in zip(chains, rngs, strict=True)
         ]
         return BatchProblem(ChainBatch.from_models([errors] * count), (concatenate(items),), weights)
 
-    batch = measured()
-    most = min(setting.iterations, 1) if setting.resample_each_iteration else setting.iterations
-    found = solve_batch(batch, setting.method, most)
-    for _ in range(most, setting.iterations if setting.resample_each_iteration else most):
-        batch = measured()
-        found = solve_batch(batch, setting.method, 1, start=found.x)
-    checks = [np.random.default_rng(_TEST_SEED + seed) for seed in seeds]
-    tests = np.array([configurations(nominal, N_TEST_POSES, rng) for rng in checks])
-    goal, start, end = (
-        arms.forward_kinematics(tests[None]).tool.reshape(4, 3, count, N_TEST_POSES)
-        for arms in (truths, batch.chains, batch.chains.at(found.x))
+    batch = simulate()
+    if setting.resample_each_iteration:
+        result = solve_batch(batch, setting.method, min(setting.iterations, 1))
+        for _ in range(1, setting.iterations):
+            batch = simulate()
+            result = solve_batch(batch, setting.method, 1, start=result.x)
+        iterations = np.full(count, setting.iterations)
+    else:
+        result = solve_batch(batch, setting.method, setting.iterations)
+        iterations = result.iterations
+    test_rngs = [np.random.default_rng(_TEST_SEED + seed) for seed in seeds]
+    test_q = np.array([draw_configurations(nominal, N_TEST_POSES, rng) for rng in test_rngs])
+    true, before, after = (
+        chains_at.forward_kinematics(test_q[None]).tool.reshape(4, 3, count, N_TEST_POSES)
+        for chains_at in (true_chains, batch.chains, batch.chains.at(result.x))
     )
-    before, off = (np.linalg.norm(frames[3] - goal[3], axis=0) for frames in (start, end))
-    turn = np.linalg.norm(se3.log3(np.einsum("cibt,cjbt->btij", goal[:3], end[:3])), axis=-1)
-    gap = np.abs(found.x - true)
-    angles = np.array([parameter.unit == "rad" for parameter in errors.parameters])
-    rows = [
-        found.converged,
-        found.iterations if not setting.resample_each_iteration else np.full(count, setting.iterations),
-        found.rank,
-        np.sqrt(found.cost / batch.count_rows()),
-        np.sqrt(np.mean(before**2, 1)),
-        np.sqrt(np.mean(off**2, 1)),
-        off.max(1),
-        np.sqrt(np.mean(turn**2, 1)),
-        gap[:, ~angles].max(1, initial=0.0),
-        gap[:, angles].max(1, initial=0.0),
+    error_before, error_after = (np.linalg.norm(frames[3] - true[3], axis=0) for frames in (before, after))
+    rotation = np.linalg.norm(se3.log3(np.einsum("cibt,cjbt->btij", true[:3], after[:3])), axis=-1)
+    parameter_errors = np.abs(result.x - true_x)
+    is_angle = np.array([parameter.unit == "rad" for parameter in errors.parameters])
+    columns = [
+        result.converged,
+        iterations,
+        result.rank,
+        np.sqrt(result.cost / batch.count_rows()),
+        np.sqrt(np.mean(error_before**2, 1)),
+        np.sqrt(np.mean(error_after**2, 1)),
+        error_after.max(1),
+        np.sqrt(np.mean(rotation**2, 1)),
+        parameter_errors[:, ~is_angle].max(1, initial=0.0),
+        parameter_errors[:, is_angle].max(1, initial=0.0),
     ]
-    return np.stack(rows, 1).astype(float).tolist()
+    return np.stack(columns, 1).astype(float).tolist()
 
 
-def run(study: StudyGrid, done: int = 0, executor: TaskExecutor = SERIAL) -> Iterator[list[list[float]]]:
-    """The blocks of `Study.tasks`, in order, after those that are done."""
-    return executor.map(calibrations, _ready(study.tasks()[done:]))
+def result_table(study: StudyGrid, blocks: Sequence[list[list[float]]]) -> tuple[list[str], list[list[Any]]]:
+    """Summarize the results of a study, one row per setting.
 
+    The columns are the entries of the setting, the number of calibrations, the fraction that converged, the
+    medians of the other results, and the 90 % quantile of the position error. Values that are not defined for
+    a setting are None.
 
-def _ready(tasks: Sequence[tuple[Case, int, int]]) -> Iterator[tuple[Case, int, int]]:
-    """The tasks with the poses that are planned, each plan made here and once, when its turn has come."""
-    for case, blocks in groupby(tasks, lambda task: task[0]):
-        if case.setting.pose_selection == PLANNED:
-            case = replace(case, poses=case.planned(case.setting.poses))
-        yield from ((case, first, count) for _, first, count in blocks)
+    Args:
+        study: Study that was run.
+        blocks: Results of all tasks in order.
 
-
-def table(study: StudyGrid, blocks: Sequence[list[list[float]]]) -> tuple[list[str], list[list[Any]]]:
-    """Header and a row a setting: the setting, the share that converged, medians, and a 90 % quantile.
-
-    What a setting cannot tell is None.
+    Returns:
+        Names of the columns, and the rows.
     """
     names = [field.name for field in fields(Setting)]
-    shown = {name: f"{name}[{unit}]" if unit else name for name, unit in MEASURE_UNITS.items()}
-    header = [*names, "calibrations", *shown.values(), "position_rms_p90[m]"]
-    every = np.array([row for block in blocks for row in block]).reshape(len(study.cases), study.seeds, -1)
+    measures = [f"{name}[{unit}]" if unit else name for name, unit in MEASURE_UNITS.items()]
+    header = [*names, "calibrations", *measures, "position_rms_p90[m]"]
+    results = np.array([row for block in blocks for row in block]).reshape(len(study.cases), study.seeds, -1)
     rows = []
-    for case, part in zip(study.cases, every, strict=True):
-        middle = np.median(part, 0)
-        middle[0] = np.mean(part[:, 0])
-        most = np.quantile(part[:, list(MEASURE_UNITS).index("position_rms")], 0.9)
-        figures = [float(value) if np.isfinite(value) else None for value in (*middle, most)]
-        rows.append([*astuple(case.setting), study.seeds, *figures])
+    for case, values in zip(study.cases, results, strict=True):
+        statistics = np.median(values, 0)
+        statistics[0] = np.mean(values[:, 0])
+        quantile = np.quantile(values[:, list(MEASURE_UNITS).index("position_rms")], _UPPER_QUANTILE)
+        finite = [float(value) if np.isfinite(value) else None for value in (*statistics, quantile)]
+        rows.append([*astuple(case.setting), study.seeds, *finite])
     return header, rows
+
+
+def _draw_true_chains(case: Case, seeds: range) -> tuple[ChainBatch, Array]:
+    """Draw the true robots and their errors in the estimated parameters, shape (b, p).
+
+    The errors are NaN if the estimated parameters cannot express them.
+    """
+    setting, b = case.setting, len(seeds)
+    estimated = select_parameters(case.nominal, setting.parameters)
+    undefined = np.full((b, len(estimated.parameters)), np.nan)
+    if case.truth is not None:
+        true = select_parameters(case.truth, setting.parameters)
+        x = [t.nominal - n.nominal for t, n in zip(true.parameters, estimated.parameters, strict=True)]
+        is_table = set(setting.parameters.split(",")) <= _TABLE_SETS
+        return ChainBatch.from_models([true] * b), np.tile(x, (b, 1)) if is_table else undefined
+    errors = select_parameters(case.nominal, setting.error_parameters)
+    length, angle = parse_noise(setting.error_std)
+    std = np.array([length if parameter.unit == "m" else angle for parameter in errors.parameters])
+    # A separate generator, so that the robot of a seed does not depend on the number of poses.
+    x = np.array([std * np.random.default_rng([seed, 1]).standard_normal(len(std)) for seed in seeds])
+    is_same_set = [p.name for p in errors.parameters] == [p.name for p in estimated.parameters]
+    return ChainBatch.from_models([errors] * b).at(x), x if is_same_set else undefined
+
+
+def _with_planned_poses(tasks: Sequence[Task]) -> Iterator[Task]:
+    """Generate the tasks, with the poses of each planned case computed once before its first task."""
+    for case, blocks in groupby(tasks, lambda task: task[0]):
+        if case.setting.pose_selection == PLANNED:
+            case = replace(case, poses=case.plan_poses(case.setting.poses))
+        yield from ((case, first, count) for _, first, count in blocks)

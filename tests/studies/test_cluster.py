@@ -17,8 +17,7 @@ from dhcal_pin.io.measurement_csv import iter_measurements, measurement_text
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.position import Position
 from dhcal_pin.parallel import open_executor
-from dhcal_pin.studies.grid import read_study
-from dhcal_pin.studies.runner import run
+from dhcal_pin.studies import read_study, run
 
 distributed = pytest.importorskip("distributed")
 

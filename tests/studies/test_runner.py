@@ -20,8 +20,7 @@ from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io.robot import read_robot
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.planning.planner import plan
-from dhcal_pin.studies.grid import read_study
-from dhcal_pin.studies.runner import run, table
+from dhcal_pin.studies import read_study, result_table, run
 
 SIX = """
 seeds = 50
@@ -42,7 +41,7 @@ def results(folder, text: str) -> list[dict]:
     path = folder / "s.study.toml"
     path.write_text(text)
     study = read_study(path)
-    header, rows = table(study, list(run(study)))
+    header, rows = result_table(study, list(run(study)))
     return [dict(zip(header, row, strict=True)) for row in rows]
 
 
@@ -171,40 +170,6 @@ def test_journal_of_another_study_is_refused(tmp_path, capsys):
     assert (tmp_path / "r.csv.part").read_text() == "0000\n"
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (("poses = 12", "pose = 12"), "unknown key 'pose'; choose from robot, tip, truth"),
-        (("poses = 12", "poses = 'many'"), "poses = 'many'; expected a whole number"),
-        (("poses = 12", "poses = []"), "expected at least one value"),
-        (("poses = 12", "poses = 0"), "must be from 1"),
-        (("seeds = 120", "seeds = -1"), "seeds = -1; expected a whole number"),
-        (("seeds = 120", "sedes = 120"), "unknown key 'sedes'"),
-        (('"pose", "position"', '"gps"'), "kind = 'gps': choose from pose, position"),
-        (
-            ("poses = 12", "pose_selection = 'best'"),
-            "pose_selection = 'best': choose from random, corner, planned",
-        ),
-        (
-            ("poses = 12", "pose_selection = 'planned'\nresample_each_iteration = true"),
-            "planned poses are not drawn anew",
-        ),
-        (("poses = 12", "pose_selection = 'planned'\nnoise = '0mm'"), "a pose needs sigmas above zero"),
-        (('"pose", "position"', '"wires"'), r"kind = 'wires': wires: wire1.x is unknown"),
-        (("0.5mm,0.1deg", "0.5"), "error_std '0.5': not a number with a unit"),
-        (("sim_6dof.dh.toml", "none.urdf"), "none.urdf: no such file"),
-        (("poses = 12", "truth = 'sim_3dof.dh.toml'"), "arm 2 has other joints"),
-        (("poses = 12", "parameters = 'dh,tol'"), "unknown parameter set 'tol'"),
-        (('robot = "sim_6dof.dh.toml"', ""), "robot is missing"),
-    ],
-)
-def test_invalid_studies_are_refused(tmp_path, change, message):
-    path = tmp_path / "s.study.toml"
-    path.write_text(SMALL_STUDY.replace(*change))
-    with pytest.raises(DhcalError, match=message):
-        read_study(path)
-
-
 FORK = """<robot name="fork"><link name="base"/><link name="left"/><link name="right"/>
   <joint name="j" type="revolute"><parent link="base"/><child link="middle"/><axis xyz="0 0 1"/>
     <limit lower="-2" upper="2" effort="1" velocity="1"/></joint><link name="middle"/>
@@ -237,8 +202,3 @@ def test_output_must_not_be_the_robot_file(tmp_path, capsys):
     assert robot.read_bytes() == before
     assert main.main(["study", str(tmp_path / "none.toml"), "-o", str(tmp_path / "r.csv")]) == 2
     assert "none.toml: cannot read it" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("path", sorted(URDF.glob("*.study.toml")), ids=lambda path: path.name)
-def test_shipped_studies_can_be_read(path):
-    assert read_study(path).title
