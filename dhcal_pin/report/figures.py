@@ -7,10 +7,11 @@ figures of the section in their order on the page.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,8 +25,11 @@ from ..estimation import qr
 from ..formatting import format_quantity
 from ..robot.chain import Chain
 from ..visualization import plots, scene
-from ..visualization.plots import SQUARE_PANEL, WIDE_PANEL, SvgPanels
+from ..visualization.plots import SQUARE_PANEL, WIDE_PANEL
 from .context import ReportContext
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 # A joint whose errors are larger than this multiple of the joints' median gets a scale of its own. Errors
 # before the calibration are left out if they are larger than this multiple of those after it.
@@ -37,15 +41,21 @@ DRAWN_DISPLACEMENT, MAX_MAGNIFICATION = 0.05, 500.0
 
 @dataclass(frozen=True)
 class Panel:
-    """One figure with its caption.
+    """One figure, which is drawn when the page is written.
 
     Attributes:
+        key: Prefix of its identifiers, unique in the report.
         caption: Text above the figure.
-        svg: SVG element.
+        description: What the figure shows, in words, for screen readers.
+        plot: Function of `plots` with all its arguments except `ax`.
+        size: Width and height [px].
     """
 
+    key: str
     caption: str
-    svg: str
+    description: str
+    plot: Callable[..., Axes]
+    size: tuple[float, float] = plots.PANEL
 
 
 @dataclass(frozen=True)
@@ -91,7 +101,7 @@ def accuracy_figures(context: ReportContext) -> list[FigureGroup]:
     Returns:
         One group of figures.
     """
-    fit, svg, panels = context.fit, SvgPanels(), []
+    fit, panels = context.fit, []
     for role, data in (("hold-out", fit.holdout), ("fitted", fit.inliers)):
         if not data:
             continue
@@ -107,7 +117,7 @@ def accuracy_figures(context: ReportContext) -> list[FigureGroup]:
             )
             plot = partial(plots.plot_error_histogram, before[group], errors, quantity=quantity, unit=unit)
             key = f"histogram-{role}-{group}"
-            panels.append(Panel(caption, svg.draw(plot, key, caption, text, WIDE_PANEL)))
+            panels.append(Panel(key, caption, text, plot, WIDE_PANEL))
     legend = [LegendEntry(state, state, "area") for state in ("before", "after")]
     return [FigureGroup(panels, legend=legend, layout="wide")]
 
@@ -121,16 +131,11 @@ def residual_figures(context: ReportContext) -> list[FigureGroup]:
     Returns:
         Groups of figures.
     """
-    svg = SvgPanels()
-    groups = [
-        _joint_offset_group(context, svg),
-        _joint_error_group(context, svg),
-        _sample_group(context, svg),
-    ]
+    groups = [_joint_offset_group(context), _joint_error_group(context), _sample_group(context)]
     return [group for group in groups if group.panels]
 
 
-def _joint_offset_group(context: ReportContext, svg: SvgPanels) -> FigureGroup:
+def _joint_offset_group(context: ReportContext) -> FigureGroup:
     profiles = [profile for profile in context.joint_profiles if len(profile.centres)]
     offsets = {
         p.name: {"before": (p.before, p.before_std), "after": (p.after, p.after_std)} for p in profiles
@@ -156,7 +161,7 @@ def _joint_offset_group(context: ReportContext, svg: SvgPanels) -> FigureGroup:
             is_prismatic=profile.is_prismatic,
             limit=_offset_limit(profile, profiles, states, offsets),
         )
-        panels.append(Panel(profile.name, svg.draw(plot, f"offset-{i}", profile.name, text)))
+        panels.append(Panel(f"offset-{i}", profile.name, text, plot))
     marks = {"before": "dashes", "after": "line"}
     return FigureGroup(
         panels,
@@ -190,7 +195,7 @@ def _offset_unit(profile: JointProfile) -> str:
     return "m" if profile.is_prismatic else "rad"
 
 
-def _joint_error_group(context: ReportContext, svg: SvgPanels) -> FigureGroup:
+def _joint_error_group(context: ReportContext) -> FigureGroup:
     group = next(iter(context.fit.comparisons[0].after.groups))
     quantity, panels = GROUP_LABELS[group], []
     for i, profile in enumerate(context.joint_profiles):
@@ -206,12 +211,12 @@ def _joint_error_group(context: ReportContext, svg: SvgPanels) -> FigureGroup:
             quantity=quantity,
             unit=GROUP_UNITS[group],
         )
-        panels.append(Panel(profile.name, svg.draw(plot, f"joint-{i}", profile.name, text)))
+        panels.append(Panel(f"joint-{i}", profile.name, text, plot))
     legend = [LegendEntry("sample", "sample", "dots"), LegendEntry("median", "after", "line")]
     return FigureGroup(panels, f"{_capitalized(quantity)} over joint position, after calibration", legend)
 
 
-def _sample_group(context: ReportContext, svg: SvgPanels) -> FigureGroup:
+def _sample_group(context: ReportContext) -> FigureGroup:
     samples, panels = _errors_by_sample(context), []
     for group, roles in samples.items():
         quantity, unit = GROUP_LABELS[group], GROUP_UNITS[group]
@@ -220,8 +225,7 @@ def _sample_group(context: ReportContext, svg: SvgPanels) -> FigureGroup:
         largest = _shown(float(errors.max()), unit)
         text = f"{_capitalized(quantity)} of {len(errors)} samples after calibration; at most {largest}."
         plot = partial(plots.plot_errors_by_sample, roles, quantity=quantity, unit=unit)
-        panel = svg.draw(plot, f"sample-{group}", caption, text, WIDE_PANEL)
-        panels.append(Panel(caption, panel))
+        panels.append(Panel(f"sample-{group}", caption, text, plot, WIDE_PANEL))
     roles = dict.fromkeys(role for group in samples.values() for role in group)
     legend = [LegendEntry(role, plots.sample_color(role, "hold-out" in roles), "dots") for role in roles]
     return FigureGroup(panels, "Errors in the order of the files, after calibration", legend, "wide")
@@ -288,7 +292,7 @@ def workspace_maps(workspace: WorkspacePrediction) -> list[FigureGroup]:
     finite = workspace.std[np.isfinite(workspace.std)]
     if not finite.size:
         return []
-    svg, panels = SvgPanels(), []
+    panels = []
     median, p95 = (_shown(float(np.quantile(finite, q)), "m") for q in (0.5, 0.95))
     for plane, caption in (("xy", "Seen from above"), ("xz", "Seen from the side")):
         text = (
@@ -302,8 +306,7 @@ def workspace_maps(workspace: WorkspacePrediction) -> list[FigureGroup]:
             plane=plane,
             measured=workspace.measured,
         )
-        panel = svg.draw(plot, f"map-{plane}", caption, text, SQUARE_PANEL)
-        panels.append(Panel(caption, panel))
+        panels.append(Panel(f"map-{plane}", caption, text, plot, SQUARE_PANEL))
     edges = 1e3 * plots.std_levels(workspace.std)
     decimals = max(0, 1 - math.floor(math.log10(edges[1])))
     texts = [f"{low:.{decimals}f}–{high:.{decimals}f} mm" for low, high in pairwise(edges)]
@@ -333,13 +336,12 @@ def scene_figures(context: ReportContext) -> list[FigureGroup]:
     )
     arms = {"before": nominal, "after": nominal + magnification * (calibrated - nominal)}
     scale = f"errors {magnification:g} times larger" if magnification > 1 else "true to scale"
-    svg, panels = SvgPanels(), []
+    panels = []
     for plane, side in (("xz", "From the side"), ("xy", "From above")):
         caption = f"{side}, {scale}"
         text = f"Joints of the robot before and after calibration over {plane[0]} and {plane[1]}."
         plot = partial(plots.plot_arms, arms, plane=plane, samples=context.workspace.measured)
-        panel = svg.draw(plot, f"arm-{plane}", caption, text, SQUARE_PANEL)
-        panels.append(Panel(caption, panel))
+        panels.append(Panel(f"arm-{plane}", caption, text, plot, SQUARE_PANEL))
     legend = [
         LegendEntry("nominal", "before", "dashes"),
         LegendEntry("calibrated", "after", "line"),
@@ -402,8 +404,7 @@ def observability_figures(context: ReportContext) -> list[FigureGroup]:
         f"is {smallest:.2g} of the largest."
     )
     plot = partial(plots.plot_singular_values, values, rank)
-    svg = SvgPanels().draw(plot, "singular-values", "Singular values", text)
-    return [FigureGroup([Panel("Singular values", svg)])]
+    return [FigureGroup([Panel("singular-values", "Singular values", text, plot)])]
 
 
 def _capitalized(text: str) -> str:

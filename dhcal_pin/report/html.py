@@ -1,7 +1,7 @@
 """Report as one HTML page with figures, tables and the 3-D scene, which needs no network.
 
-`report.html` is the Jinja template of the page. All texts are escaped when they are inserted; only the SVG
-elements of `figures.py` are inserted unchanged.
+`report.html` is the Jinja template of the page. All texts are escaped when they are inserted; only the
+figures are inserted unchanged.
 """
 
 from __future__ import annotations
@@ -20,9 +20,11 @@ from ..diagnostics.workspace import WorkspacePrediction
 from ..exceptions import InvalidArgumentError
 from ..formatting import format_quantity
 from ..io.atomic import write_files
+from ..visualization.plots import svg_panels
 from . import figures, sections
 from .context import ReportContext
 from .document import Provenance
+from .figures import FigureGroup, Panel
 from .sections import Section
 
 
@@ -107,11 +109,16 @@ def map_page(title: str, workspace: WorkspacePrediction, sentences: Sequence[str
 
 def _render(
     title: str,
-    shown: Sequence[tuple[Section, Sequence[figures.FigureGroup]]],
+    shown: Sequence[tuple[Section, Sequence[FigureGroup]]],
     header: dict[str, Any] | None = None,
 ) -> str:
     template = formatting.html_templates().get_template("report/report.html")
-    return template.render(title=title, sections=shown, header=header)
+    with svg_panels() as svg:
+
+        def draw(panel: Panel) -> str:
+            return svg.draw(panel.plot, panel.key, panel.caption, panel.description, panel.size)
+
+        return template.render(title=title, sections=shown, header=header, draw=draw)
 
 
 def _header(context: ReportContext) -> dict[str, Any]:

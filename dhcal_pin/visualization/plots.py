@@ -9,7 +9,7 @@ Arguments are in SI units; the axes show mm, mrad and degrees. No function uses 
 do not depend on a display or on figures of the caller. This is the only module that imports matplotlib. The
 imports are inside functions, because they take about 0.4 s and most commands draw nothing.
 
-`SvgPanels` draws plots for a web page. The SVG is the same for the same data on every machine: identifiers
+`svg_panels` draws plots for a web page. The SVG is the same for the same data on every machine: identifiers
 are hashed with a fixed salt, no date is written, and the layout is computed with the font that is part of
 matplotlib. The colours in `COLORS` become CSS variables of the same names, so the light, dark and print
 styles of the page apply.
@@ -435,7 +435,8 @@ def _fill_cells(ax: Axes, corners: Array, size: float, color: str) -> None:
     outline = size * np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])
     vertices = (corners[:, None] + outline).reshape(-1, 2)
     codes = np.tile([Path.MOVETO, Path.LINETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY], len(corners))
-    ax.add_patch(PathPatch(Path(vertices, codes), facecolor=color, edgecolor="none", antialiased=False))
+    # `add_patch` would compute the limits of the axes from every vertex, which takes most of the time.
+    ax.add_artist(PathPatch(Path(vertices, codes), facecolor=color, edgecolor="none", antialiased=False))
 
 
 def plot_arms(
@@ -585,7 +586,7 @@ def study_svg(title: str, header: Sequence[str], rows: Sequence[Sequence[Any]], 
     if _study_abscissa(rows, n_settings) is None:
         return ""
     columns = [name for name in STUDY_COLUMNS if any(row[header.index(name)] is not None for row in rows)]
-    with _svg_style(title):
+    with _svg_style():
         from matplotlib.figure import Figure
 
         n_across = min(2, len(columns))
@@ -619,16 +620,28 @@ def study_svg(title: str, header: Sequence[str], rows: Sequence[Sequence[Any]], 
             ncols=n_label_columns,
             frameon=False,
         )
-        root = _svg_tree(figure)
+        root = _svg_tree(figure, "study")
     root.set("xmlns", "http://www.w3.org/2000/svg")
     return ElementTree.tostring(root, "unicode") + "\n"
 
 
 # --- SVG --------------------------------------------------------------------------------------------
-class SvgPanels:
-    """Series of plots as SVG elements of one web page.
+@contextmanager
+def svg_panels() -> Iterator[SvgPanels]:
+    """Draw plots as SVG elements of a web page.
 
-        svg = SvgPanels().draw(partial(plot_singular_values, values, rank), "sv", "Singular values", "...")
+        with svg_panels() as svg:
+            element = svg.draw(partial(plot_singular_values, values, rank), "sv", "Singular values", "...")
+
+    Yields:
+        Object that draws one plot after the other.
+    """
+    with _svg_style():
+        yield SvgPanels()
+
+
+class SvgPanels:
+    """Series of plots as SVG elements of one web page; `svg_panels` provides it.
 
     The axes are reused from panel to panel, because creating axes takes longer than drawing into them.
     """
@@ -656,10 +669,9 @@ class SvgPanels:
         Returns:
             SVG element with the role of an image; its colours are CSS variables.
         """
-        with _svg_style(key):
-            figure = self._empty_figure(size)
-            plot(ax=figure.axes[0])
-            root = _svg_tree(figure)
+        figure = self._empty_figure(size)
+        plot(ax=figure.axes[0])
+        root = _svg_tree(figure, key)
         variables = {color: f"var(--{name})" for name, color in COLORS.items()}
         for element in root.iter():
             if style := element.get("style"):
@@ -705,27 +717,50 @@ class SvgPanels:
 
 
 @contextmanager
-def _svg_style(salt: str) -> Iterator[None]:
-    """Replace the matplotlib settings of the caller, and hash identifiers with `salt`."""
+def _svg_style() -> Iterator[None]:
+    """Replace the matplotlib settings of the caller by those of the project."""
     import matplotlib
 
     with matplotlib.rc_context(), warnings.catch_warnings():
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_RC_PARAMS)
-        matplotlib.rcParams["svg.hashsalt"] = salt
         # The font measures text only; the browser has the letters that it lacks.
         warnings.filterwarnings("ignore", r"Glyph .* missing from", UserWarning)
         yield
 
 
-def _svg_tree(figure: Figure) -> ElementTree.Element:
-    """Draw a figure as a compact SVG tree without namespaces, metadata and style sheet."""
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
+def _svg_tree(figure: Figure, key: str) -> ElementTree.Element:
+    """Draw a figure as a compact SVG tree whose identifiers are hashed with `key`."""
+    import matplotlib
+    from matplotlib.backends.backend_svg import RendererSVG
+    from matplotlib.path import Path
 
+    class Renderer(RendererSVG):
+        """Renderer that writes all dots of a series as one path; one element each is slow and large."""
+
+        def draw_markers(
+            self, gc: Any, marker_path: Any, marker_trans: Any, path: Any, trans: Any, rgbFace: Any = None
+        ) -> None:
+            if marker_path is not Path.unit_circle():
+                super().draw_markers(gc, marker_path, marker_trans, path, trans, rgbFace)
+                return
+            # A line of length zero with round ends is a dot.
+            dots = Path(np.repeat(path.vertices, 2, axis=0), [Path.MOVETO, Path.LINETO] * len(path.vertices))
+            pen = self.new_gc()
+            pen.copy_properties(gc)
+            pen.set_foreground(rgbFace)
+            pen.set_linewidth(marker_path.get_extents(marker_trans).width)
+            pen.set_capstyle("round")
+            self.draw_path(pen, dots, trans)
+
+    matplotlib.rcParams["svg.hashsalt"] = key
     buffer = io.StringIO()
-    FigureCanvasSVG(figure).print_svg(
-        buffer, metadata={"Date": None, "Creator": None, "Format": None, "Type": None}
-    )
+    figure.set_dpi(72)
+    width, height = figure.get_size_inches() * 72
+    metadata = {"Date": None, "Creator": None, "Format": None, "Type": None}
+    renderer = Renderer(width, height, buffer, metadata=metadata)
+    figure.draw(renderer)
+    renderer.finalize()
     root = ElementTree.fromstring(buffer.getvalue())
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
@@ -735,7 +770,8 @@ def _svg_tree(figure: Figure) -> ElementTree.Element:
             element.attrib.pop("id", None)
         if outline := element.get("d"):
             # A hundredth of a pixel is enough.
-            element.set("d", re.sub(r"(\.\d\d)\d+", r"\1", " ".join(outline.split())))
+            outline = re.sub(r"(?<=\.\d\d)\d+", "", " ".join(outline.split()))
+            element.set("d", re.sub(r"M (\S+ \S+) L \1 ?(?=M|$)", r"M\1h0", outline))
         if "rotate(-0 " in element.get("transform", ""):
             del element.attrib["transform"]
         for name in [name for name in element.attrib if name.startswith("{")]:
@@ -744,32 +780,7 @@ def _svg_tree(figure: Figure) -> ElementTree.Element:
         # The style sheet would apply to the whole page; `_RC_PARAMS` and the page set what it sets.
         if child.tag == "metadata" or (child.tag == "defs" and child.find("style") is not None):
             root.remove(child)
-    _merge_dots(root)
     return root
-
-
-def _merge_dots(root: ElementTree.Element) -> None:
-    """Replace each series of round markers by one path of round dots.
-
-    matplotlib writes one element per marker. A page with ten thousand of them is large and slow.
-    """
-    radii: dict[str, float] = {}
-    for group in list(root.iter("g")):
-        for definition in group.findall("defs/path"):
-            if circle := re.match(r"M 0 ([\d.]+) C", definition.get("d", "")):
-                radii[f"#{definition.get('id')}"] = float(circle[1])
-        markers = group.findall("use")
-        if not markers or markers[0].get("href") not in radii:
-            continue
-        fill = dict(item.split(": ") for item in markers[0].get("style", "").split("; "))
-        radius = radii[markers[0].get("href", "")]
-        places = (f"M{float(m.get('x', 0)):.1f} {float(m.get('y', 0)):.1f}h0" for m in markers)
-        style = f"fill: none; stroke: {fill['fill']}; stroke-width: {2 * radius:g}; stroke-linecap: round"
-        if "fill-opacity" in fill:
-            style += f"; stroke-opacity: {fill['fill-opacity']}"
-        for marker in markers:
-            group.remove(marker)
-        group.append(ElementTree.Element("path", d="".join(places), style=style))
 
 
 # --- shared by the plots ----------------------------------------------------------------------------

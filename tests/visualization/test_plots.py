@@ -5,13 +5,14 @@ from __future__ import annotations
 import subprocess
 import sys
 from functools import partial
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 from dhcal_pin.visualization import plots
-from dhcal_pin.visualization.plots import COLORS, SvgPanels
+from dhcal_pin.visualization.plots import COLORS, svg_panels
 
 HEADER = ["noise", "poses", "position_rms[m]", "orientation_rms[rad]", "length_error[m]", "angle_error[rad]"]
 ROWS = [
@@ -19,6 +20,12 @@ ROWS = [
     for noise, scale in (("0.1mm", 1.0), ("1mm", 10.0))
     for poses in (10, 20, 40, 100)
 ]
+
+
+def draw(plot: partial[Any], key: str = "k", title: str = "t", description: str = "d") -> str:
+    """Draw a plot as the only one of a page."""
+    with svg_panels() as svg:
+        return svg.draw(plot, key, title, description)
 
 
 def parse(svg: str) -> ElementTree.Element:
@@ -83,7 +90,7 @@ def test_a_dot_is_where_its_axes_say():
             "hold-out": (np.array([5]), np.zeros(1)),
         },
     )
-    svg = SvgPanels().draw(plot, "k", "A & B", "What <it> shows")
+    svg = draw(plot, "k", "A & B", "What <it> shows")
     root = parse(svg)
     assert [root.findtext("title"), root.findtext("desc")] == ["A & B", "What <it> shows"]
     assert root.attrib["aria-labelledby"].split() == [
@@ -97,19 +104,19 @@ def test_a_dot_is_where_its_axes_say():
 def test_panels_do_not_depend_on_the_panels_before():
     first = partial(plots.plot_singular_values, np.array([1.0, 0.5, 1e-17]), 2)
     second = partial(plots.plot_errors_over_joint, np.linspace(-1, 1, 200), np.linspace(0, 1e-3, 200))
-    panels = SvgPanels()
-    drawn = [panels.draw(plot, key, key, "") for key, plot in (("a", first), ("b", second), ("c", first))]
-    assert drawn[1] == SvgPanels().draw(second, "b", "b", "")
-    assert drawn[2] == SvgPanels().draw(first, "c", "c", "")
+    with svg_panels() as svg:
+        drawn = [svg.draw(plot, key, key, "") for key, plot in (("a", first), ("b", second), ("c", first))]
+    assert drawn[1] == draw(second, "b", "b", "")
+    assert drawn[2] == draw(first, "c", "c", "")
 
 
 def test_the_same_data_give_the_same_bytes_whatever_the_users_settings():
     import matplotlib
 
     plot = partial(plots.plot_errors_by_sample, {"fitted": (np.arange(50), np.linspace(0, 1e-3, 50))})
-    wanted = SvgPanels().draw(plot, "k", "t", "d")
+    wanted = draw(plot)
     with matplotlib.rc_context({"font.size": 30, "axes.facecolor": "red", "lines.marker": "x"}):
-        assert SvgPanels().draw(plot, "k", "t", "d") == wanted
+        assert draw(plot) == wanted
         assert matplotlib.rcParams["font.size"] == 30
     assert "<metadata" not in wanted
     assert "<style" not in wanted
@@ -117,7 +124,7 @@ def test_the_same_data_give_the_same_bytes_whatever_the_users_settings():
 
 def test_colours_are_css_variables():
     plot = partial(plots.plot_singular_values, np.array([1.0, 0.5, 1e-17]), 2)
-    svg = SvgPanels().draw(plot, "k", "t", "d")
+    svg = draw(plot)
     assert {f"var(--{name})" for name in ("text", "grid", "after", "outlier")} <= set(
         style.split(": ")[1] for e in parse(svg).iter() for style in e.get("style", "").split("; ") if style
     )
@@ -127,7 +134,7 @@ def test_colours_are_css_variables():
 
 def test_names_with_dollars_and_foreign_letters_are_plain_text():
     plot = partial(plots.plot_errors_over_joint, np.linspace(-1, 1, 20), np.ones(20), joint="$a_b$ 関節")
-    assert "$a_b$ 関節, °" in [e.text for e in parse(SvgPanels().draw(plot, "k", "t", "d")).iter("text")]
+    assert "$a_b$ 関節, °" in [e.text for e in parse(draw(plot)).iter("text")]
 
 
 def test_levels_of_a_map():
