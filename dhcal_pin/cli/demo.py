@@ -79,11 +79,11 @@ def run_demo(folder: PathLike) -> dict[str, Any]:
     except OSError as error:
         raise InvalidArgumentError(f"{folder}: cannot create this folder: {error.strerror}") from error
     experiment = run_experiment()
-    console.print_unreachable_rows("Table 5", experiment.findings)
+    console.print_unreachable_rows("Table 5", experiment.unreachable_rows)
     header = ["position RMS in mm", "fitted", "leave-one-out"]
     sections = [
         _Section(
-            f"The experiment, {len(experiment.data.q)} of {len(experiment.readings.data.q)} rows",
+            f"The experiment, {len(experiment.data.q)} of {len(experiment.measurements.data.q)} rows",
             Table(header, experiment.rows),
             experiment_remarks(experiment),
         ),
@@ -163,7 +163,7 @@ def _write_results(experiment: PaperExperiment, folder: str, sections: Sequence[
     files = {key: os.path.join(folder, name) for key, name in names.items()}
     inputs = [shipped_file("experiment.dh.toml"), shipped_file("experiment_table5.csv")]
     digests = zip(inputs, file_digests(inputs).values(), strict=True)
-    excluded = {item.row: item.reason for item in experiment.findings}
+    excluded = {item.row: item.reason for item in experiment.unreachable_rows}
     source = Provenance(
         command="dhcal demo",
         inputs={path.name: digest for path, digest in digests},

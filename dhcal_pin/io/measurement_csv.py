@@ -157,9 +157,6 @@ def parse_measurements(table: CsvTable, chain: Chain) -> MeasurementFile:
 
     Returns:
         Content of the table.
-
-    Raises:
-        FileFormatError: The columns are incomplete, or a value is invalid.
     """
     check_columns(table, chain)
     kind = find_kind(table)

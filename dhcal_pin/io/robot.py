@@ -159,10 +159,8 @@ def read_robot(path: PathLike, tip: str | None = None, sidecar: PathLike | None 
         sidecar: Sidecar to read in place of the one beside the robot.
 
     Returns:
-        The chain from the base link to the tip.
-
-    Raises:
-        DhcalError: A file is missing or invalid, or a tip is given for a DH table.
+        The chain from the base link to the tip. A file that is missing or invalid, and a tip given for a DH
+        table, raise a `DhcalError`.
     """
     return _read(path, tip, sidecar)[0]
 
@@ -182,7 +180,7 @@ def convert_robot(
         Text of the target file, and notes on what it could not hold.
 
     Raises:
-        DhcalError: A file is missing or invalid, or the target's format cannot hold the robot.
+        InvalidArgumentError: No format has the ending of the target.
     """
     robot_format = find_format(target)
     if robot_format is None:

@@ -26,9 +26,6 @@ def read_bounds(path: PathLike | None) -> dict[str, tuple[float, float]]:
 
     Returns:
         Least and largest value by name or pattern [m or rad]; either may be infinite.
-
-    Raises:
-        FileFormatError: A value is not a pair of numbers in ascending order.
     """
     if not path:
         return {}

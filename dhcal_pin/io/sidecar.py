@@ -215,7 +215,6 @@ def read_uncertainty(path: PathLike, chain: Chain) -> Uncertainty | None:
         Uncertainty of the robot; None without the table.
 
     Raises:
-        FileFormatError: The table belongs to a robot with other joints.
         UnknownNameError: A term is unknown.
     """
     document = TomlTable.read(path)

@@ -1,4 +1,10 @@
-"""The paper's arms, and the robot it measured, calibrated on its own table with an honest verdict."""
+"""The paper's experiment: the measured robot (Tables 3 to 5), calibrated and judged by leave-one-out.
+
+Table 5 is screened first: rows that the robot cannot reach are left out. The remaining rows are fitted in
+three ways: the paper's single pseudo-inverse step (37) to (39), least squares with the parameters held that
+the positions cannot determine, and the published parameters of Table 4. The error that counts is that of a
+row under the fit to all other rows.
+"""
 
 from __future__ import annotations
 
@@ -15,61 +21,85 @@ from ..diagnostics.reachability import UnreachableRow, find_unreachable_rows
 from ..estimation.parameters import select_parameters
 from ..estimation.problem import Problem, linearize_and_factor
 from ..identifiability import observability
-from ..io.dh_file import read_dh
-from ..io.measurement_csv import MeasurementFile, read_measurement_file
-from ..io.shipped_files import shipped_file
+from ..io import MeasurementFile, read_dh, read_measurement_file, shipped_file
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 
 
 def paper_arm(name: str) -> Chain:
-    """One of the paper's arms by the name of its DH file, such as `sim_6dof`."""
+    """Read one of the paper's arms.
+
+    Args:
+        name: Name of its DH file without ending: `sim_6dof` (Table 2), `sim_6dof_actual` (Table 1),
+            `sim_3dof` and `sim_3dof_actual` (their first three links), `experiment` (Table 3),
+            `experiment_published` (Table 4).
+
+    Returns:
+        The arm.
+    """
     return Chain.from_dh(read_dh(shipped_file(f"{name}.dh.toml")), name)
 
 
 def parameters_to_fix(chain: Chain, data: Sequence[Measurement]) -> list[str]:
-    """Parameters to hold so that no direction is unseen at the nominal arm: the last of each group."""
+    """Find DH parameters that have to be held so that the others are observable.
+
+    Args:
+        chain: Nominal arm.
+        data: Measurements of it.
+
+    Returns:
+        Names, sorted: of each group of parameters with k unobservable combinations, the last k.
+    """
     errors = select_parameters(chain, "dh")
     zero = np.zeros(len(errors.parameters))
-    triangle = linearize_and_factor(Problem(errors, tuple(data), zero), zero, small_angle=False)
-    held = [
+    system = linearize_and_factor(Problem(errors, tuple(data), zero), zero, small_angle=False)
+    names = [
         errors.parameters[i].name
-        for members, unseen in observability.unobservable_groups(triangle.r)
-        for i in members[len(members) - unseen :]
+        for members, n_unobservable in observability.unobservable_groups(system.r)
+        for i in members[len(members) - n_unobservable :]
     ]
-    return sorted(held)
+    return sorted(names)
 
 
 def leave_one_out(fit: Callable[[Measurement], Result], data: Measurement) -> Accuracy:
-    """Accuracy, as from `accuracy`, on each sample under the fit to all the others."""
+    """Compute the accuracy of each sample under the fit to all other samples.
+
+    Args:
+        fit: Function that calibrates on some of the samples.
+        data: All m samples.
+
+    Returns:
+        Error statistics over the m fits.
+    """
     rows = np.arange(len(data.q))
-    found = [compute_errors(fit(data.take(rows != row)).chain, [data.take(rows == row)])[0] for row in rows]
-    return Accuracy.from_errors(found)
+    errors = [compute_errors(fit(data.take(rows != row)).chain, [data.take(rows == row)])[0] for row in rows]
+    return Accuracy.from_errors(errors)
 
 
-def _rms(difference: Array) -> float:
-    return float(np.sqrt(np.mean(np.sum(difference**2, 1))))
+def _rms(differences: Array) -> float:
+    """Return the root mean square of the norms of vectors, shape (m, 3)."""
+    return float(np.sqrt(np.mean(np.sum(differences**2, 1))))
 
 
 @dataclass(frozen=True, eq=False)
 class PaperExperiment:
-    """The paper's measured robot.
+    """Result of the paper's experiment.
 
     Attributes:
-        chain: as designed (Table 3).
-        readings: Table 5 as printed.
-        findings: its impossible rows.
-        data: the rows that remain.
-        fixed: parameters that these poses cannot see.
-        fit: least squares on the rest.
-        comparison: its accuracy on each sample left out of the fit to the others.
-        rows: the comparison for people, numbers in mm.
-        figures: the same numbers in m.
+        chain: Robot as designed (Table 3).
+        measurements: Table 5 as printed.
+        unreachable_rows: Its rows that the robot cannot reach.
+        data: Samples of the other rows.
+        fixed: Parameters that these positions cannot determine, and that are held.
+        fit: Least-squares calibration with these parameters held.
+        comparison: Its accuracy on each sample under the fit to all others, before and after.
+        rows: Description, RMS of the fitted samples and leave-one-out RMS of each variant [mm], as text.
+        figures: RMS position error of each variant by name [m].
     """
 
     chain: Chain
-    readings: MeasurementFile
-    findings: list[UnreachableRow]
+    measurements: MeasurementFile
+    unreachable_rows: list[UnreachableRow]
     data: Measurement
     fixed: list[str]
     fit: Result
@@ -79,36 +109,40 @@ class PaperExperiment:
 
 
 def run_experiment() -> PaperExperiment:
-    """Screens Table 5, calibrates Table 3 on what is left, and compares with what the paper printed."""
+    """Screen Table 5, calibrate the robot of Table 3 on its good rows, and compare with the paper's figures.
+
+    Returns:
+        The robot, the data, the calibration and its accuracy.
+    """
     chain = paper_arm("experiment")
-    readings = read_measurement_file(shipped_file("experiment_table5.csv"), chain)
-    findings = find_unreachable_rows(chain, readings)
-    good = ~np.isin(readings.data.rows, [finding.row for finding in findings])
-    data = readings.data.take(good)
-    held = parameters_to_fix(chain, [data])
-    commanded, after = readings.commanded, readings.measured_after
+    measurements = read_measurement_file(shipped_file("experiment_table5.csv"), chain)
+    unreachable_rows = find_unreachable_rows(chain, measurements)
+    is_reachable = ~np.isin(measurements.data.rows, [unreachable.row for unreachable in unreachable_rows])
+    data = measurements.data.take(is_reachable)
+    fixed = parameters_to_fix(chain, [data])
+    commanded, after = measurements.commanded, measurements.measured_after
     assert commanded is not None
     assert after is not None
 
-    def one_step(part: Measurement) -> Result:
-        return calibrate(chain, part, "dh", method="gn", max_iterations=1)
+    def one_step(samples: Measurement) -> Result:
+        return calibrate(chain, samples, "dh", method="gn", max_iterations=1)
 
-    def least_squares(part: Measurement) -> Result:
-        return calibrate(chain, part, "dh", priors="none", fix=held)
+    def least_squares(samples: Measurement) -> Result:
+        return calibrate(chain, samples, "dh", priors="none", fix=fixed)
 
     fit = least_squares(data)
-    left_out = leave_one_out(least_squares, data)
-    step = one_step(data)
-    measured = readings.data.positions()
+    nominal_accuracy = accuracy(chain, [data])
+    cross_validated = leave_one_out(least_squares, data)
+    measured = measurements.data.positions()
     figures = {
-        "before": accuracy(chain, [data])["position_rms_m"],
-        "one_step": accuracy(step.chain, [data])["position_rms_m"],
+        "before": nominal_accuracy["position_rms_m"],
+        "one_step": accuracy(one_step(data).chain, [data])["position_rms_m"],
         "one_step_left_out": leave_one_out(one_step, data)["position_rms_m"],
         "least_squares": accuracy(fit.chain, [data])["position_rms_m"],
-        "least_squares_left_out": left_out["position_rms_m"],
+        "least_squares_left_out": cross_validated["position_rms_m"],
         "published_parameters": accuracy(paper_arm("experiment_published"), [data])["position_rms_m"],
-        "paper_before": _rms((measured - commanded)[good]),
-        "paper_after": _rms((after - commanded)[good]),
+        "paper_before": _rms((measured - commanded)[is_reachable]),
+        "paper_after": _rms((after - commanded)[is_reachable]),
         "paper_before_all": _rms(measured - commanded),
         "paper_after_all": _rms(after - commanded),
     }
@@ -116,10 +150,10 @@ def run_experiment() -> PaperExperiment:
     rows = [
         ["as designed (Table 3)", mm["before"], ""],
         ["one pseudo-inverse step, (37) to (39)", mm["one_step"], mm["one_step_left_out"]],
-        [f"least squares, {' and '.join(held)} held", mm["least_squares"], mm["least_squares_left_out"]],
+        [f"least squares, {' and '.join(fixed)} held", mm["least_squares"], mm["least_squares_left_out"]],
         ["parameters as published (Table 4)", mm["published_parameters"], ""],
         ["the paper's own distance from the object, before", mm["paper_before"], ""],
         ["the paper's own distance from the object, after", mm["paper_after"], ""],
     ]
-    judged = Comparison("cross-validated", len(data.q), accuracy(chain, [data]), left_out)
-    return PaperExperiment(chain, readings, findings, data, held, fit, judged, rows, figures)
+    comparison = Comparison("cross-validated", len(data.q), nominal_accuracy, cross_validated)
+    return PaperExperiment(chain, measurements, unreachable_rows, data, fixed, fit, comparison, rows, figures)

@@ -1,15 +1,25 @@
-"""The paper's error factors, equation by equation: an independent check of the fast kernel.
+"""Error factors of the paper, equation by equation: an independent check of the fast kernels.
 
-Cho, Ha, Lee and Park, "Positioning Accuracy Improvement of Robots by Link Parameter Calibration".
-Numbers in parentheses are the paper's equations. Where its print is wrong the derivation stands and
-the text says "erratum". Twists are [v, ω] in the tool frame, lengths in metres, angles in radians.
+Cho, Ha, Lee and Park, "Positioning Accuracy Improvement of Robots by Link Parameter Calibration". Numbers in
+parentheses are the paper's equations. "Erratum" marks those that differ from its print; the derivation
+counts. Twists are [v, ω] in the tool frame, lengths in metres, angles in radians.
 
-A link's matrix changes by dA_i = A_i·δA_i (3, 4, 6), with δA_i the cross-product form (5) of a small
-displacement d_i and rotation δ_i. The partial derivatives (7, 8) are written A_i·Q (9) with the
-constant matrices Q (10) of `q_matrices`; their sum (11) is δA_i (12), whose entries (13, 14) are
-d_i = k1·Δθ + k2·Δd + k3·Δa and δ_i = k2·Δθ + k3·Δα with the vectors (15) of `link_vectors`. The
-products (16) are linearised (17), gathered behind T_N (18) with the tail matrices U (19) of
-`tail_matrices`, and give the tool's own small motion (20, 21).
+    A_i   = Rz(θ_i + q_i) Tz(d_i) Tx(a_i) Rx(α_i)                        (1)   link matrix
+    T_N   = A_1 A_2 … A_N                                                (2)   tool pose
+    dA_i  = A_i δA_i                                                     (3), (4), (6)
+    δA_i  = [δ_i× d_i; 0 0]                                              (5)   small displacement and rotation
+    ∂A/∂x = A Q_x   for x = θ, d, a, α                                   (7) to (10)
+    δA_i  = Q_θ Δθ_i + Q_d Δd_i + Q_a Δa_i + Q_α Δα_i                    (11), (12)
+    d_i   = k1_i Δθ_i + k2_i Δd_i + k3_i Δa_i                            (13), (15)
+    δ_i   = k2_i Δθ_i + k3_i Δα_i                                        (14), (15)
+    dT_N  = Σ_i A_1 … A_i δA_i A_{i+1} … A_N                             (16), (17)
+    δT_N  = Σ_i U_{i+1}⁻¹ δA_i U_{i+1}   with dT_N = T_N δT_N            (18), (20)
+    U_i   = A_i A_{i+1} … A_N = [n o a p; 0 0 0 1]                       (19)
+    DX    = [dx dy dz δx δy δz] from δT_N                                (21)
+    DX    = Σ_i THF_i Δθ_i + LDF_i Δd_i + LAF_i Δa_i + ALPF_i Δα_i       (22) to (27)
+    DX    = R ΔPAR                                                       (28), (29)
+
+Shapes: m configurations, n joints (the paper's N).
 """
 
 from __future__ import annotations
@@ -20,48 +30,73 @@ import numpy as np
 
 from .. import se3
 from .._typing import Array
-from ..exceptions import DhcalError
+from ..exceptions import InvalidArgumentError
 from ..robot.dh import DHTable
 
 
 def q_matrices(table: DHTable) -> Array:
-    """Q_θ, Q_d, Q_a, Q_α (4, n, 4, 4): ∂A_i/∂x = A_i·Q_x, equations (9) and (10).
+    """Return the derivative matrices Q, equations (9) and (10).
 
-    Erratum, probably of the transcription: Q_α has -1 at row 2, column 3.
+    They satisfy ∂A_i/∂x = A_i·Q_x. Erratum, probably of the transcription: Q_α has -1 at row 2, column 3.
+
+    Args:
+        table: Standard DH table.
+
+    Returns:
+        Q_θ, Q_d, Q_a and Q_α of each link, shape (4, n, 4, 4).
     """
     s, c = np.sin(table.alpha), np.cos(table.alpha)
     out = np.zeros((4, table.n_joints, 4, 4))
+    # Q_θ
     out[0, :, 0, 1], out[0, :, 0, 2] = -c, s
     out[0, :, 1, 0], out[0, :, 1, 3] = c, table.a * c
     out[0, :, 2, 0], out[0, :, 2, 3] = -s, -table.a * s
+    # Q_d
     out[1, :, 1, 3], out[1, :, 2, 3] = s, c
+    # Q_a
     out[2, :, 0, 3] = 1.0
+    # Q_α
     out[3, :, 1, 2], out[3, :, 2, 1] = -1.0, 1.0
     return out
 
 
 def link_vectors(table: DHTable) -> tuple[Array, Array, Array]:
-    """k1, k2, k3, each (n, 3), of equations (13) to (15); k1 in metres, the others directions.
+    """Return the vectors k1, k2 and k3, equations (13) to (15).
 
-    Erratum: (15) prints k1 = [0, a·sα, -a·cα], which contradicts (13). Right is [0, a·cα, -a·sα].
-    A row with Hayati's β ends in Ry(β), so its vectors are seen in a frame turned by β.
+        k1 = [0, a·cα, -a·sα],  k2 = [0, sα, cα],  k3 = [1, 0, 0]
+
+    Erratum: (15) prints k1 = [0, a·sα, -a·cα], which contradicts (13). A row with Hayati's angle β ends with
+    Ry(β), so its vectors are expressed in a frame rotated by β.
+
+    Args:
+        table: Standard DH table.
+
+    Returns:
+        k1 [m], k2 and k3 (directions), shape (n, 3) each.
     """
     s, c, zero = np.sin(table.alpha), np.cos(table.alpha), np.zeros(table.n_joints)
     k1 = np.stack([zero, table.a * c, -table.a * s], -1)
     k2 = np.stack([zero, s, c], -1)
     k3 = np.tile([1.0, 0.0, 0.0], (table.n_joints, 1))
-    turn = se3.exp3(-table.beta[:, None] * np.array([0.0, 1.0, 0.0]))
+    rotation = se3.exp3(-table.beta[:, None] * np.array([0.0, 1.0, 0.0]))
     return (
-        np.einsum("nij,nj->ni", turn, k1),
-        np.einsum("nij,nj->ni", turn, k2),
-        np.einsum("nij,nj->ni", turn, k3),
+        np.einsum("nij,nj->ni", rotation, k1),
+        np.einsum("nij,nj->ni", rotation, k2),
+        np.einsum("nij,nj->ni", rotation, k3),
     )
 
 
 def tail_matrices(table: DHTable, q: Array) -> Array:
-    """U_2 … U_{N+1} (m, n, 4, 4) at q (m, n): U_i = A_i·…·A_N·tool, equation (19).
+    """Return the tail matrices U_i = A_i·…·A_N·tool, equation (19).
 
-    Entry i of the second axis is U_{i+2}, the tail behind link i+1. The paper's tool is the identity.
+    Entry i of the second axis is U_{i+2}, the tail after link i+1. In the paper the tool is the identity.
+
+    Args:
+        table: Standard DH table.
+        q: Joint positions, shape (m, n) [rad or m].
+
+    Returns:
+        U_2 … U_{N+1}, shape (m, n, 4, 4).
     """
     rows = table.rows(q)
     out = np.empty_like(rows)
@@ -72,51 +107,103 @@ def tail_matrices(table: DHTable, q: Array) -> Array:
     return out
 
 
-def _turned(u: Array, k: Array) -> Array:
-    """The dot products n·k, o·k, a·k (..., 3) with the columns of U (..., 4, 4)."""
+def _dot_axes(u: Array, k: Array) -> Array:
+    """Return the dot products n·k, o·k, a·k, shape (..., 3), with the columns of U, shape (..., 4, 4)."""
     return np.einsum("...ij,...i->...j", u[..., :3, :3], k)
 
 
-def _levered(u: Array, k: Array) -> Array:
-    """The dot products (p×n)·k, (p×o)·k, (p×a)·k (..., 3)."""
-    return _turned(u, np.cross(k, u[..., :3, 3]))
+def _dot_lever_arms(u: Array, k: Array) -> Array:
+    """Return the triple products (p×n)·k, (p×o)·k, (p×a)·k, shape (..., 3)."""
+    return _dot_axes(u, np.cross(k, u[..., :3, 3]))
 
 
 def thf(u: Array, k1: Array, k2: Array) -> Array:
-    """THF1 … THF6 (..., 6): the tool's motion per Δθ; equations (22) to (27)."""
-    return np.concatenate([_turned(u, k1) + _levered(u, k2), _turned(u, k2)], -1)
+    """Return THF1 … THF6, the motion of the tool per Δθ.
+
+        THF1 = n·k1 + (p×n)·k2   (22)        THF4 = n·k2   (25)
+        THF2 = o·k1 + (p×o)·k2   (23)        THF5 = o·k2   (26)
+        THF3 = a·k1 + (p×a)·k2   (24)        THF6 = a·k2   (27)
+
+    Args:
+        u: Tail matrices U_{i+1} = [n o a p; 0 0 0 1], shape (..., 4, 4).
+        k1: Vectors of (15), shape (..., 3) [m].
+        k2: Vectors of (15), shape (..., 3).
+
+    Returns:
+        Twists, shape (..., 6) [m/rad, rad/rad].
+    """
+    return np.concatenate([_dot_axes(u, k1) + _dot_lever_arms(u, k2), _dot_axes(u, k2)], -1)
 
 
 def ldf(u: Array, k2: Array) -> Array:
-    """LDF1 … LDF6 (..., 6): the tool's motion per Δd; the last three vanish (22 to 24, 28)."""
-    turned = _turned(u, k2)
-    return np.concatenate([turned, np.zeros_like(turned)], -1)
+    """Return LDF1 … LDF6, the motion of the tool per Δd.
+
+        LDF1 = n·k2 (22),  LDF2 = o·k2 (23),  LDF3 = a·k2 (24),  LDF4 = LDF5 = LDF6 = 0 (28)
+
+    Args:
+        u: Tail matrices U_{i+1} = [n o a p; 0 0 0 1], shape (..., 4, 4).
+        k2: Vectors of (15), shape (..., 3).
+
+    Returns:
+        Twists, shape (..., 6) [m/m, rad/m].
+    """
+    linear = _dot_axes(u, k2)
+    return np.concatenate([linear, np.zeros_like(linear)], -1)
 
 
 def laf(u: Array, k3: Array) -> Array:
-    """LAF1 … LAF6 (..., 6): the tool's motion per Δa; the last three vanish (22 to 24, 28)."""
-    turned = _turned(u, k3)
-    return np.concatenate([turned, np.zeros_like(turned)], -1)
+    """Return LAF1 … LAF6, the motion of the tool per Δa.
+
+        LAF1 = n·k3 (22),  LAF2 = o·k3 (23),  LAF3 = a·k3 (24),  LAF4 = LAF5 = LAF6 = 0 (28)
+
+    Args:
+        u: Tail matrices U_{i+1} = [n o a p; 0 0 0 1], shape (..., 4, 4).
+        k3: Vectors of (15), shape (..., 3).
+
+    Returns:
+        Twists, shape (..., 6) [m/m, rad/m].
+    """
+    linear = _dot_axes(u, k3)
+    return np.concatenate([linear, np.zeros_like(linear)], -1)
 
 
 def alpf(u: Array, k3: Array) -> Array:
-    """ALPF1 … ALPF6 (..., 6): the tool's motion per Δα; equations (22) to (27).
+    """Return ALPF1 … ALPF6, the motion of the tool per Δα.
 
-    Erratum, probably of the transcription: (24) has lost its Δα term.
+        ALPF1 = (p×n)·k3   (22)        ALPF4 = n·k3   (25)
+        ALPF2 = (p×o)·k3   (23)        ALPF5 = o·k3   (26)
+        ALPF3 = (p×a)·k3   (24)        ALPF6 = a·k3   (27)
+
+    Erratum, probably of the transcription: (24) lacks the term of Δα.
+
+    Args:
+        u: Tail matrices U_{i+1} = [n o a p; 0 0 0 1], shape (..., 4, 4).
+        k3: Vectors of (15), shape (..., 3).
+
+    Returns:
+        Twists, shape (..., 6) [m/rad, rad/rad].
     """
-    return np.concatenate([_levered(u, k3), _turned(u, k3)], -1)
+    return np.concatenate([_dot_lever_arms(u, k3), _dot_axes(u, k3)], -1)
 
 
 def error_factors(table: DHTable, q: Array) -> Array:
-    """The paper's R (m, 6, 4n) at q (m, n): DX = R·ΔPAR, equations (28) and (29).
+    """Compute the matrix R of DX = R·ΔPAR, equations (28) and (29).
 
-    Columns are Δθ_1…Δθ_n, Δd…, Δa…, Δα…; rows are dx dy dz (m) and δx δy δz (rad) in the tool frame.
+    Args:
+        table: Standard DH table.
+        q: Joint positions, shape (m, n) [rad or m].
+
+    Returns:
+        R, shape (m, 6, 4n). Rows are dx, dy, dz [m] and δx, δy, δz [rad] in the tool frame. Columns are
+        Δθ_1 … Δθ_n, Δd_1 … Δd_n, Δa_1 … Δa_n, Δα_1 … Δα_n.
 
     Raises:
-        DhcalError: for a modified table, whose factors the paper does not give.
+        InvalidArgumentError: The table has modified DH parameters, for which the paper gives no factors.
     """
     if table.convention != "standard":
-        raise DhcalError("the paper's factors belong to standard DH; convert the table first")
+        raise InvalidArgumentError(
+            "the paper's error factors need standard DH parameters; convert the table first"
+        )
     u = tail_matrices(table, q)
     k1, k2, k3 = link_vectors(table)
     blocks = [thf(u, k1, k2), ldf(u, k2), laf(u, k3), alpf(u, k3)]
@@ -124,9 +211,22 @@ def error_factors(table: DHTable, q: Array) -> Array:
 
 
 def differential_motion(change: Array, pose: Array) -> Array:
-    """dn, do, da, dp as columns (..., 3, 4) of dT_N, from DX (..., 6) and T_N (..., 4, 4).
+    """Compute the differential of the tool pose, equations (30) to (34).
 
-    Equations (30) to (34). Erratum, probably of the transcription: (31) is dn = o·δz - a·δy.
+        dT_N = T_N·δT_N = [dn do da dp; 0 0 0 0]     (30)
+        dn   =  o·δz - a·δy                          (31)
+        do   = -n·δz + a·δx                          (32)
+        da   =  n·δy - o·δx                          (33)
+        dp   =  n·dx + o·dy + a·dz                   (34)
+
+    Erratum, probably of the transcription: (31) prints a·δz in place of o·δz.
+
+    Args:
+        change: DX, shape (..., 6) [m, rad].
+        pose: Tool poses T_N = [n o a p; 0 0 0 1], shape (..., 4, 4).
+
+    Returns:
+        dn, do, da, dp as columns, shape (..., 3, 4).
     """
     n, o, a = pose[..., :3, 0], pose[..., :3, 1], pose[..., :3, 2]
     dx, dy, dz, rx, ry, rz = (change[..., i, None] for i in range(6))
@@ -134,34 +234,64 @@ def differential_motion(change: Array, pose: Array) -> Array:
 
 
 def tool_error(measured: Array, model: Array) -> Array:
-    """DX (..., 6) in the tool frame from measured and modelled poses (..., 4, 4): (35) and (36).
+    """Compute the tool error DX of measured poses, equations (35) and (36).
 
-    dT = measured - model. With NORᵀ·NOR = 2I, (36) is half the vee of RᵀRc - RcᵀR, that is sin(φ)·u:
-    right for small angles, and useless beyond 90°. Errata: (35) takes dp as a direction, so
-    d = Rᵀ·dp; (36) lacks the factor [dn; do; da].
+        [dx dy dz] = Rᵀ·dp                                        (35)
+        [δx δy δz] = (NORᵀ·NOR)⁻¹ NORᵀ·[dn; do; da]               (36)
+
+    with dT = measured - model. NORᵀ·NOR = 2I, so (36) is half the vee of RᵀR_c - R_cᵀR, where R_c is the
+    measured rotation. That is sin(φ)·u for an error of angle φ about the axis u: accurate for small angles,
+    and ambiguous beyond 90°. Errata: (35) multiplies dp as a point, but it is a direction; (36) lacks the
+    factor [dn; do; da].
+
+    Args:
+        measured: Measured poses, shape (..., 4, 4).
+        model: Poses of the model, shape (..., 4, 4).
+
+    Returns:
+        DX in the tool frame of the model, shape (..., 6) [m, rad].
     """
     rotation = model[..., :3, :3]
-    change = measured[..., :3, :] - model[..., :3, :]
+    difference = measured[..., :3, :] - model[..., :3, :]
     n, o, a = rotation[..., 0], rotation[..., 1], rotation[..., 2]
-    dn, do, da = change[..., 0], change[..., 1], change[..., 2]
-    dot = lambda x, y: np.sum(x * y, -1)  # noqa: E731
-    # NORᵀ times the stacked vector, row by row.
-    small = 0.5 * np.stack([dot(a, do) - dot(o, da), dot(n, da) - dot(a, dn), dot(o, dn) - dot(n, do)], -1)
-    return np.concatenate([_turned(model, change[..., 3]), small], -1)
+    dn, do, da, dp = (difference[..., i] for i in range(4))
+
+    def dot(x: Array, y: Array) -> Array:
+        return np.sum(x * y, -1)
+
+    # Rows of NORᵀ times the stacked vector.
+    angular = 0.5 * np.stack([dot(a, do) - dot(o, da), dot(n, da) - dot(a, dn), dot(o, dn) - dot(n, do)], -1)
+    return np.concatenate([_dot_axes(model, dp), angular], -1)
 
 
-def pseudo_inverse_step(factors: Array, error: Array, cut: float = 1e-9) -> Array:
-    """ΔPAR (p,) of equations (37) and (38) from R (m, k, p) and DX (m, k).
+def pseudo_inverse_step(factors: Array, error: Array, rtol: float = 1e-9) -> Array:
+    """Compute the parameter correction ΔPAR, equations (37) and (38).
 
-    Erratum: (38) inverts ReLᵀ·ReL, which is singular for nominally parallel axes at every number of
-    poses. The pseudo-inverse by singular values, cut relative to the largest, is what it stands for.
-    (39) then is PAR' = PAR + ΔPAR.
+    (37) stacks DX_i = R_i·ΔPAR over all configurations to D = ReL·ΔPAR. Erratum: (38) inverts ReLᵀ·ReL, which
+    is singular for nominally parallel axes, however many configurations there are. The pseudo-inverse by
+    singular values takes its place.
+
+    Args:
+        factors: R of each configuration, shape (m, k, p).
+        error: DX of each configuration, shape (m, k) [m, rad].
+        rtol: Singular values below this fraction of the largest one count as zero.
+
+    Returns:
+        ΔPAR, shape (p,) [rad, m].
     """
     stacked = factors.reshape(-1, factors.shape[-1])
-    return np.linalg.lstsq(stacked, error.reshape(-1), rcond=cut)[0]
+    return np.linalg.lstsq(stacked, error.reshape(-1), rcond=rtol)[0]
 
 
-def moved(table: DHTable, change: Array) -> DHTable:
-    """The table with PAR' = PAR + ΔPAR, equation (39); change (4n,) in the order of R's columns."""
+def apply_correction(table: DHTable, change: Array) -> DHTable:
+    """Return the table with PAR' = PAR + ΔPAR, equation (39).
+
+    Args:
+        table: DH table.
+        change: ΔPAR in the order of the columns of R, shape (4n,) [rad, m].
+
+    Returns:
+        Corrected table.
+    """
     theta, d, a, alpha = np.asarray(change, float).reshape(4, table.n_joints)
     return replace(table, theta=table.theta + theta, d=table.d + d, a=table.a + a, alpha=table.alpha + alpha)

@@ -1,4 +1,16 @@
-"""The same derivative by six routes: the paper, the fast kernel, Pinocchio three times, differences."""
+"""Cross-check of the Jacobian: the same derivative by six independent routes.
+
+The paper's matrix R (see `factors`) is compared with
+
+1. the DH product itself, whose poses must be Pinocchio's poses,
+2. the Jacobian of the compiled kernels that calibrate,
+3. Pinocchio's frame Jacobian, whose columns are those of Δθ, or of Δd for a prismatic joint,
+4. Pinocchio's Jacobian of a chain with four virtual joints Rz, Tz, Tx, Rx per link,
+5. Pinocchio's kinematic regressor: derivatives with respect to a right perturbation of every joint placement,
+6. central differences of the DH product.
+
+Shapes: m configurations, n joints, p parameters. Jacobians are (m, 6, p), twists [v, ω] in the tool frame.
+"""
 
 from __future__ import annotations
 
@@ -15,15 +27,24 @@ from ..robot.chain import Chain, extract_dh_table, link_frame, without_mimics
 from ..robot.dh import DHTable
 from .factors import error_factors
 
-ALGEBRAIC, NUMERICAL = 1e-12, 1e-7
-
-
+# Largest allowed difference [m or rad]: of exact derivatives, and of central differences.
+EXACT_TOL, NUMERICAL_TOL = 1e-12, 1e-7
+# Step of the central differences [rad or m].
 _STEP = 1e-5
+# Columns of the paper's R: the parameters of all joints, one kind after the other.
+_KINDS = ("theta", "d", "a", "alpha")
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """One route's largest difference from the paper's R, m and rad, and what is allowed."""
+    """Agreement of one route with the paper's R.
+
+    Attributes:
+        route: Name of the route.
+        columns: Number of columns of R that were compared; 0 for a comparison of poses.
+        difference: Largest absolute difference [m or rad].
+        tolerance: Largest allowed difference [m or rad].
+    """
 
     route: str
     columns: int
@@ -32,51 +53,77 @@ class Agreement:
 
     @property
     def agrees(self) -> bool:
-        """Whether the route agrees."""
+        """Whether the difference is allowed."""
         return self.difference <= self.tolerance
 
 
-def _order(errors: ErrorModel, n: int) -> Array:
-    """Where the paper's columns Δθ… Δd… Δa… Δα… stand in the model's order."""
-    place = {p.name: i for i, p in enumerate(errors.parameters)}
-    return np.array([place[f"{kind}{i + 1}"] for kind in ("theta", "d", "a", "alpha") for i in range(n)])
+def _paper_order(errors: ErrorModel, n_joints: int) -> Array:
+    """Return the index in the error model of each column Δθ…, Δd…, Δa…, Δα…, shape (4n,)."""
+    index = {parameter.name: i for i, parameter in enumerate(errors.parameters)}
+    return np.array([index[f"{kind}{i + 1}"] for kind in _KINDS for i in range(n_joints)])
 
 
-def vectorised(chain: Chain, errors: ErrorModel, q: Array) -> Array:
-    """The kernel's Jacobian (m, 6, p) in the tool frame."""
+def kernel_jacobian(chain: Chain, errors: ErrorModel, q: Array) -> Array:
+    """Compute the Jacobian with the kernels that calibrate.
+
+    Args:
+        chain: Robot without base and tool.
+        errors: Error model of the robot.
+        q: Joint positions, shape (m, n) [rad or m].
+
+    Returns:
+        Jacobian in the tool frame, shape (m, 6, p).
+    """
     _, bodies, twists = errors.derivative(np.zeros(len(errors.parameters)))
     frames = chain.forward_kinematics(q)
-    velocities = chain.tool_jacobian(frames, bodies, twists)
+    jacobian = chain.tool_jacobian(frames, bodies, twists)
     rotation = frames.tool[:3]  # columns, components, samples
-    linear = np.einsum("crm,prm->mcp", rotation, velocities[:, :3])
-    angular = np.einsum("crm,prm->mcp", rotation, velocities[:, 3:])
+    linear = np.einsum("crm,prm->mcp", rotation, jacobian[:, :3])
+    angular = np.einsum("crm,prm->mcp", rotation, jacobian[:, 3:])
     return np.concatenate([linear, angular], 1)
 
 
 def frame_jacobian(chain: Chain, q: Array) -> Array:
-    """Pinocchio's LOCAL frame Jacobian (m, 6, n) at the tip, moving joints in path order."""
+    """Compute Pinocchio's LOCAL frame Jacobian at the tip.
+
+    Args:
+        chain: Robot without mimic joints.
+        q: Joint positions, shape (m, n) [rad or m].
+
+    Returns:
+        Jacobian with respect to the joint positions in path order, shape (m, 6, n).
+    """
     model, frame = chain.model, chain.frame_id
     data = model.createData()
     columns = [model.joints[model.getJointId(name)].idx_v for name in chain.moving_joints]
-    found = [
+    jacobians = [
         pin.computeFrameJacobian(model, data, configuration, frame, pin.ReferenceFrame.LOCAL)
         for configuration in chain.configurations(q)
     ]
-    # Of a single joint Pinocchio gives a vector.
-    return np.array(found).reshape(len(q), 6, model.nv)[:, :, columns]
+    # Pinocchio returns a vector for a single joint.
+    return np.array(jacobians).reshape(len(q), 6, model.nv)[:, :, columns]
 
 
 def augmented_jacobian(table: DHTable, q: Array) -> Array:
-    """Pinocchio's Jacobian (m, 6, 4n) of a chain that has a virtual joint for every DH entry."""
+    """Compute Pinocchio's Jacobian of a chain with one virtual joint for each DH parameter.
+
+    Args:
+        table: Standard DH table.
+        q: Joint positions, shape (m, n) [rad or m].
+
+    Returns:
+        Jacobian with respect to Δθ…, Δd…, Δa…, Δα…, shape (m, 6, 4n).
+    """
     model = pin.Model()
-    parent, place = 0, pin.SE3(table.base)
+    parent, placement = 0, pin.SE3(table.base)
     for i in range(table.n_joints):
         joints = [pin.JointModelRZ(), pin.JointModelPZ(), pin.JointModelPX(), pin.JointModelRX()]
-        for joint, name in zip(joints, ("theta", "d", "a", "alpha"), strict=True):
-            parent = model.addJoint(parent, joint, place, f"{name}{i + 1}")
-            place = pin.SE3.Identity()
-        place = pin.SE3(se3.exp6([0, 0, 0, 0, table.beta[i], 0]))
-    frame = model.addFrame(pin.Frame("tool", parent, place * pin.SE3(table.tool), pin.FrameType.OP_FRAME))
+        for joint, kind in zip(joints, _KINDS, strict=True):
+            parent = model.addJoint(parent, joint, placement, f"{kind}{i + 1}")
+            placement = pin.SE3.Identity()
+        placement = pin.SE3(se3.exp6([0, 0, 0, 0, table.beta[i], 0]))
+    tool = pin.Frame("tool", parent, placement * pin.SE3(table.tool), pin.FrameType.OP_FRAME)
+    frame = model.addFrame(tool)
     data = model.createData()
     values = np.tile(np.stack([table.theta, table.d, table.a, table.alpha], -1), (len(q), 1, 1))
     values[:, :, 0] += np.where(table.prismatic, 0.0, q)
@@ -90,85 +137,111 @@ def augmented_jacobian(table: DHTable, q: Array) -> Array:
     )
 
 
-def regressor(chain: Chain, errors: ErrorModel, q: Array) -> Array:
-    """Pinocchio's kinematic regressor times K (m, 6, p): placements' right perturbations to errors."""
+def regressor_jacobian(chain: Chain, errors: ErrorModel, q: Array) -> Array:
+    """Compute the Jacobian from Pinocchio's kinematic regressor.
+
+    The regressor is the derivative of the tip frame with respect to a right perturbation of each joint
+    placement. It is multiplied by the matrix K from errors to perturbations.
+
+    Args:
+        chain: Robot without base and tool.
+        errors: Error model of the robot.
+        q: Joint positions, shape (m, n) [rad or m].
+
+    Returns:
+        Jacobian in the tool frame, shape (m, 6, p).
+    """
     model, frame = chain.model, chain.frame_id
     data = model.createData()
-    k = len(chain.moving_joints)
-    mixing = np.zeros((6 * k + 6, len(errors.parameters)))
+    n_moving = len(chain.moving_joints)
+    perturbations = np.zeros((6 * n_moving + 6, len(errors.parameters)))
     for column, parameter in enumerate(errors.parameters):
         twist = np.array(parameter.twist)
-        # Placement j stands between station link j and station joint j+1; the last one is the tip.
+        # Placement j lies between the error frames of link j and joint j+1; the last one is that of the tip.
         j = (parameter.error_frame - 1) // 2
         if parameter.error_frame == link_frame(j):
             twist = se3.adjoint(se3.inverse(chain.origins[j])) @ twist
-        mixing[6 * j : 6 * j + 6, column] = twist
-    blocks = np.concatenate([np.arange(6) + 6 * (model.getJointId(name) - 1) for name in chain.moving_joints])
+        perturbations[6 * j : 6 * j + 6, column] = twist
+    columns = np.concatenate(
+        [np.arange(6) + 6 * (model.getJointId(name) - 1) for name in chain.moving_joints]
+    )
     out = np.empty((len(q), 6, len(errors.parameters)))
     for i, configuration in enumerate(chain.configurations(q)):
         pin.forwardKinematics(model, data, configuration)
         pin.updateFramePlacements(model, data)
-        full = pin.computeFrameKinematicRegressor(model, data, frame, pin.ReferenceFrame.LOCAL)
-        out[i] = np.concatenate([full[:, blocks], np.eye(6)], 1) @ mixing
+        regressor = pin.computeFrameKinematicRegressor(model, data, frame, pin.ReferenceFrame.LOCAL)
+        out[i] = np.concatenate([regressor[:, columns], np.eye(6)], 1) @ perturbations
     return out
 
 
-def differences(table: DHTable, q: Array) -> Array:
-    """Central differences (m, 6, 4n) of the plain DH product in every table entry."""
+def numerical_jacobian(table: DHTable, q: Array) -> Array:
+    """Compute central differences of the DH product.
+
+    Args:
+        table: DH table.
+        q: Joint positions, shape (m, n) [rad or m].
+
+    Returns:
+        Jacobian with respect to Δθ…, Δd…, Δa…, Δα…, shape (m, 6, 4n).
+    """
     columns = []
-    for key in ("theta", "d", "a", "alpha"):
+    for kind in _KINDS:
         for i in range(table.n_joints):
             shift = np.eye(table.n_joints)[i] * _STEP
             up, down = (
-                replace(table, **{key: getattr(table, key) + sign * shift}).poses(q) for sign in (1.0, -1.0)
+                replace(table, **{kind: getattr(table, kind) + sign * shift}).poses(q) for sign in (1.0, -1.0)
             )
             columns.append(se3.log6(se3.inverse(down) @ up) / (2 * _STEP))
     return np.stack(columns, -1)
 
 
 def crosscheck(chain: Chain, samples: int = 100, seed: int = 0) -> list[Agreement]:
-    """All routes against the paper's R at random joint values; base, tool and joints' errors left out.
+    """Compare all routes with the paper's R at random joint positions.
 
-    A joint that mimics another is a row of the table like any other, and moves by itself here.
+    Base, tool and joint errors are left out. A joint that mimics another one is a row of the DH table like
+    any other, and moves independently here.
+
+    Args:
+        chain: Robot to check.
+        samples: Number of random configurations.
+        seed: Seed of the configurations.
+
+    Returns:
+        Agreement of each route.
     """
     chain = without_mimics(replace(chain, base=np.eye(4), tool=np.eye(4), transmission=None))
-    found = extract_dh_table(chain)
-    table, n = found.table, found.table.n_joints
+    table = extract_dh_table(chain).table
+    n = table.n_joints
     q = np.random.default_rng(seed).uniform(-np.pi, np.pi, (samples, n))
     paper = error_factors(table, q)
     errors = select_parameters(chain, "dh")
-    order = _order(errors, n)
-    motion = np.where(table.prismatic, np.arange(n) + n, np.arange(n))
-    kernel = vectorised(chain, errors, q)[:, :, order]
+    order = _paper_order(errors, n)
+    # Columns of R that are the derivative with respect to the joint positions.
+    joint_columns = np.where(table.prismatic, np.arange(n) + n, np.arange(n))
 
-    def gap(other: Array, mine: Array = paper) -> float:
-        return float(np.abs(other - mine).max())
+    def compare(
+        route: str, columns: int, actual: Array, expected: Array = paper, tolerance: float = EXACT_TOL
+    ) -> Agreement:
+        return Agreement(route, columns, float(np.abs(actual - expected).max()), tolerance)
 
+    kernel = kernel_jacobian(chain, errors, q)[:, :, order]
+    regressor = regressor_jacobian(chain, errors, q)[:, :, order]
     return [
-        Agreement("DH product = Pinocchio's poses", 0, gap(table.poses(q), _poses(chain, q)), ALGEBRAIC),
-        Agreement("vectorised Jacobian", 4 * n, gap(kernel), ALGEBRAIC),
-        Agreement(
-            "Pinocchio, LOCAL frame Jacobian",
-            n,
-            gap(frame_jacobian(chain, q), paper[:, :, motion]),
-            ALGEBRAIC,
-        ),
-        Agreement("Pinocchio, augmented chain", 4 * n, gap(augmented_jacobian(table, q)), ALGEBRAIC),
-        Agreement(
-            "Pinocchio, kinematic regressor times K",
-            4 * n,
-            gap(regressor(chain, errors, q)[:, :, order]),
-            ALGEBRAIC,
-        ),
-        Agreement("central differences", 4 * n, gap(differences(table, q)), NUMERICAL),
+        compare("DH product = Pinocchio's poses", 0, table.poses(q), _pinocchio_poses(chain, q)),
+        compare("vectorised Jacobian", 4 * n, kernel),
+        compare("Pinocchio, LOCAL frame Jacobian", n, frame_jacobian(chain, q), paper[:, :, joint_columns]),
+        compare("Pinocchio, augmented chain", 4 * n, augmented_jacobian(table, q)),
+        compare("Pinocchio, kinematic regressor times K", 4 * n, regressor),
+        compare("central differences", 4 * n, numerical_jacobian(table, q), tolerance=NUMERICAL_TOL),
     ]
 
 
-def _poses(chain: Chain, q: Array) -> Array:
+def _pinocchio_poses(chain: Chain, q: Array) -> Array:
+    """Return Pinocchio's poses of the tip, shape (m, 4, 4)."""
     model, frame = chain.model, chain.frame_id
     data = model.createData()
-    out = []
+    poses = []
     for configuration in chain.configurations(q):
         pin.framesForwardKinematics(model, data, configuration)
-        out.append(data.oMf[frame].homogeneous)
-    return np.array(out)
+        poses.append(data.oMf[frame].homogeneous)
+    return np.array(poses)

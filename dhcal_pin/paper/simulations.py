@@ -1,4 +1,10 @@
-"""The paper end to end on its own robots: the experiment with an honest verdict, and both simulations."""
+"""The paper's simulations: its Gauss-Newton loop from a nominal arm to an actual arm, without noise.
+
+The loop repeats (37) to (39) on the joint sets of Tables 1 and 2 (6-DOF arm, poses) or on the first three
+links (3-DOF arm, positions). Each run draws its joint sets with a seed of its own. The joint sets stay the
+same in all iterations, or are drawn again in each. The error that counts is the tool error at random test
+poses, because several sets of parameters can fit the same joint sets.
+"""
 
 from __future__ import annotations
 
@@ -19,24 +25,60 @@ from ..measurements.base import Measurement, Noise
 from ..robot.chain import Chain
 from .experiment import paper_arm
 
+# Number of runs, and number of test poses of each run.
 SEEDS, TESTS = 50, 100
+# First seed of the test poses, beyond the seeds of the runs; the seed before it draws `_N_PROBES` joint sets
+# at which a parameter must be observable.
+_FIRST_TEST_SEED = 10**6 + 1
+_N_PROBES = 500
+# A parameter whose observable fraction is smaller by more than this is not observable.
+_UNOBSERVABLE_TOL = 1e-6
+# A run has an exact fit if no whitened residual exceeds the first value, and has found the true parameters if
+# no error exceeds the others [rad, m].
+_EXACT_FIT_TOL = 1e-9
+_TRUE_ANGLE_TOL, _TRUE_LENGTH_TOL = np.deg2rad(1e-6), 1e-9
+# Iterations that the table shows.
+_SHOWN_ITERATIONS = (0, 1, 2, 3, 5, 10)
+
+# Rows of the table: title, arm, measurement kind, joint sets per iteration, and whether they are drawn again.
+SETTINGS = (
+    ("6-DOF, pose, 2 kept", "sim_6dof", "pose", 2, False),
+    ("6-DOF, pose, 10 kept", "sim_6dof", "pose", 10, False),
+    ("6-DOF, pose, 2 anew", "sim_6dof", "pose", 2, True),
+    ("3-DOF, position, 3 kept", "sim_3dof", "position", 3, False),
+    ("3-DOF, position, 10 kept", "sim_3dof", "position", 10, False),
+    ("3-DOF, position, 3 anew", "sim_3dof", "position", 3, True),
+)
+SIMULATION_HEADER = [
+    "joint sets",
+    "rank",
+    *(f"it {iteration}" for iteration in _SHOWN_ITERATIONS),
+    "exact fit",
+    "true",
+]
+SIMULATION_REMARKS = (
+    "Two joint sets are fitted exactly, but the parameters are wrong. Ten joint sets determine the true "
+    "parameters, except alpha3 of the 3-DOF arm, which only rotates the tool about the measured point.",
+    "Kept sets are the same in each iteration. With sets that are drawn anew, more sets converge faster.",
+    "Ranks are those of the nominal arm, whose axes 2, 3 and 4, and 5 and 6, are parallel, and of the arm "
+    "that was found.",
+)
 
 
-_STEPS = (0, 1, 2, 3, 5, 10)
-
-
-# --- the simulations -------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """Many runs of the paper's loop on a simulated arm.
+    """Runs of the paper's loop on a simulated arm.
+
+    Parameters that no measurement of the actual arm determines do not count in the parameter errors.
 
     Attributes:
-        angle, length: (seeds, steps+1) largest parameter error by iteration, rad and m.
-        test: (seeds, steps+1) largest tool error over random test poses by iteration, m.
-        residual: (seeds,) largest whitened row left at the end, over the sigma of 1 mm or 1 mrad.
-        rank: of the stacked factors at the nominal arm, first seed.
-        rank_found: the same at the arm where the loop ends.
-        null_space: (p,) parameters that no pose sees at the true arm.
+        angle: Largest angle error of the parameters by run and iteration, shape (seeds, steps+1) [rad].
+        length: Largest length error of the parameters by run and iteration, shape (seeds, steps+1) [m].
+        test: Largest position error over random test poses by run and iteration, shape (seeds, steps+1) [m].
+        residual: Largest whitened residual after the last iteration, shape (seeds,) [1 mm or 1 mrad].
+        rank: Rank of the stacked error factors at the nominal arm, first run.
+        rank_found: Rank at the arm that the first run ends with.
+        null_space: Whether no measurement of the actual arm determines a parameter, shape (p,).
     """
 
     angle: Array
@@ -51,60 +93,68 @@ class Simulation:
 def simulate(
     arm: str, kind: str, poses: int, resample_each_iteration: bool, steps: int = 10, seeds: int = SEEDS
 ) -> Simulation:
-    """The paper's loop from an arm's nominal table to its actual one, noise-free.
+    """Run the paper's loop from an arm's nominal table to its actual one, without noise.
 
     Args:
         arm: `sim_6dof` or `sim_3dof`.
-        kind: of measurement, `pose` or `position`.
-        poses: joint sets an iteration.
-        resample_each_iteration: draw the joint sets anew at each iteration, or keep them.
-        steps: iterations.
-        seeds: runs, seeded 0, 1, …; a run that diverges keeps its last error.
+        kind: Measurement kind, `pose` or `position`.
+        poses: Number of joint sets per iteration.
+        resample_each_iteration: Whether the joint sets are drawn again in each iteration.
+        steps: Number of iterations.
+        seeds: Number of runs, seeded 0, 1, …. A run that diverges keeps its last parameters.
+
+    Returns:
+        Errors of all runs by iteration.
     """
     nominal, actual = paper_arm(arm), paper_arm(f"{arm}_actual")
-    errors = select_parameters(nominal, "dh")
-    truth = _errors_between(errors, select_parameters(actual, "dh"))
-    angles = np.array([p.unit == "rad" for p in errors.parameters])
+    errors, actual_errors = select_parameters(nominal, "dh"), select_parameters(actual, "dh")
+    truth = _parameter_differences(errors, actual_errors)
+    is_angle = np.array([parameter.unit == "rad" for parameter in errors.parameters])
     weights = np.zeros(len(truth))
-    many = _draw(np.random.default_rng(10**6), 500, nominal.n_joints)
-    seen = linearize_and_factor(
-        Problem(select_parameters(actual, "dh"), (_exact(actual, kind, many),), weights),
-        0 * truth,
-        small_angle=False,
+    probes = _draw(np.random.default_rng(_FIRST_TEST_SEED - 1), _N_PROBES, nominal.n_joints)
+    system = linearize_and_factor(
+        Problem(actual_errors, (_measure(actual, kind, probes),), weights), 0 * truth, small_angle=False
     )
-    hidden = observability.observable_fraction(seen.r) < 1 - 1e-6
-    out = np.zeros((3, seeds, steps + 1))
+    is_unobservable = observability.observable_fraction(system.r) < 1 - _UNOBSERVABLE_TOL
+    angle, length, test = np.zeros((3, seeds, steps + 1))
     residual = np.zeros(seeds)
     ranks = (0, 0)
     for seed in range(seeds):
         rng = np.random.default_rng(seed)
-        data = _exact(actual, kind, _draw(rng, poses, nominal.n_joints))
-        test = _draw(np.random.default_rng(10**6 + 1 + seed), TESTS, nominal.n_joints)
-        goal = actual.poses(test)[:, :3, 3]
-        start = Problem(errors, (data,), weights)
-        path = _loop(start, steps)
+        data = _measure(actual, kind, _draw(rng, poses, nominal.n_joints))
+        test_q = _draw(np.random.default_rng(_FIRST_TEST_SEED + seed), TESTS, nominal.n_joints)
+        test_positions = actual.poses(test_q)[:, :3, 3]
+        first_problem = Problem(errors, (data,), weights)
+        iterates = _iterate(first_problem, steps)
         if resample_each_iteration:
-            path = path[:2]
-            while len(path) <= steps:
-                data = _exact(actual, kind, _draw(rng, poses, nominal.n_joints))
-                path = np.concatenate([path, _loop(Problem(errors, (data,), weights), 1, path[-1])[1:]])
+            iterates = iterates[:2]
+            while len(iterates) <= steps:
+                data = _measure(actual, kind, _draw(rng, poses, nominal.n_joints))
+                problem = Problem(errors, (data,), weights)
+                iterates = np.concatenate([iterates, _iterate(problem, 1, iterates[-1])[1:]])
         for step in range(steps + 1):
-            x = path[min(step, len(path) - 1)]
-            gap = np.where(hidden, 0.0, np.abs(x - truth))
-            off = np.linalg.norm(errors.at(x).poses(test)[:, :3, 3] - goal, axis=1)
-            out[:, seed, step] = gap[angles].max(), gap[~angles].max(), off.max()
-        chain = errors.at(path[-1])
-        residual[seed] = np.abs(data.residual(chain.forward_kinematics(data.q), np.array([]))).max()
+            x = iterates[min(step, len(iterates) - 1)]
+            parameter_error = np.where(is_unobservable, 0.0, np.abs(x - truth))
+            angle[seed, step] = parameter_error[is_angle].max()
+            length[seed, step] = parameter_error[~is_angle].max()
+            positions = errors.at(x).poses(test_q)[:, :3, 3]
+            test[seed, step] = np.linalg.norm(positions - test_positions, axis=1).max()
+        found = errors.at(iterates[-1])
+        residual[seed] = np.abs(data.residual(found.forward_kinematics(data.q), np.array([]))).max()
         if seed == 0:
             first, last = (
-                qr.rank(linearize_and_factor(start, x, small_angle=False).r) for x in (0 * truth, path[-1])
+                qr.rank(linearize_and_factor(first_problem, x, small_angle=False).r)
+                for x in (0 * truth, iterates[-1])
             )
             ranks = first, last
-    return Simulation(out[0], out[1], out[2], residual, ranks[0], ranks[1], hidden)
+    return Simulation(angle, length, test, residual, ranks[0], ranks[1], is_unobservable)
 
 
-def _loop(problem: Problem, steps: int, x: Array | None = None) -> Array:
-    """Every x on the paper's loop, (steps+1, p) or fewer where it settles; it stays put where it diverges."""
+def _iterate(problem: Problem, steps: int, x: Array | None = None) -> Array:
+    """Return all iterates of the paper's loop, shape (steps+1, p), or fewer if it converges earlier.
+
+    If the loop diverges, the start is returned twice.
+    """
     x = np.zeros(len(problem.weights)) if x is None else x
     try:
         return gauss_newton(problem, x, steps, None).iterates
@@ -112,63 +162,40 @@ def _loop(problem: Problem, steps: int, x: Array | None = None) -> Array:
         return np.stack([x, x])
 
 
-def _draw(rng: np.random.Generator, count: int, size: int) -> Array:
-    return rng.uniform(-np.pi, np.pi, (count, size))
+def _draw(rng: np.random.Generator, count: int, n_joints: int) -> Array:
+    """Draw joint positions, shape (count, n) [rad]."""
+    return rng.uniform(-np.pi, np.pi, (count, n_joints))
 
 
-def _exact(chain: Chain, kind: str, q: Array) -> Measurement:
+def _measure(chain: Chain, kind: str, q: Array) -> Measurement:
+    """Measure an arm without noise."""
     return KINDS[kind].simulate(chain, q, Noise(), np.random.default_rng(0))
 
 
-def _errors_between(nominal: ErrorModel, actual: ErrorModel) -> Array:
-    return np.array(
-        [b.nominal - a.nominal for a, b in zip(nominal.parameters, actual.parameters, strict=True)]
-    )
-
-
-SETTINGS = (
-    ("6-DOF, pose, 2 kept", "sim_6dof", "pose", 2, False),
-    ("6-DOF, pose, 10 kept", "sim_6dof", "pose", 10, False),
-    ("6-DOF, pose, 2 anew", "sim_6dof", "pose", 2, True),
-    ("3-DOF, position, 3 kept", "sim_3dof", "position", 3, False),
-    ("3-DOF, position, 10 kept", "sim_3dof", "position", 10, False),
-    ("3-DOF, position, 3 anew", "sim_3dof", "position", 3, True),
-)
-
-
-SIMULATION_HEADER = [
-    "joint sets",
-    "rank",
-    *(f"it {step}" for step in _STEPS),
-    "exact fit",
-    "true",
-]
+def _parameter_differences(nominal: ErrorModel, actual: ErrorModel) -> Array:
+    """Return actual minus nominal value of each parameter, shape (p,) [rad, m]."""
+    pairs = zip(nominal.parameters, actual.parameters, strict=True)
+    return np.array([b.nominal - a.nominal for a, b in pairs])
 
 
 def simulation_rows(seeds: int = SEEDS) -> list[list[str]]:
-    """A line a setting: median over the seeds of the worst test pose's error in mm by iteration."""
+    """Run all settings and format their results.
+
+    Args:
+        seeds: Number of runs of each setting.
+
+    Returns:
+        One row per setting under `SIMULATION_HEADER`: ranks, the median over the runs of the largest test
+        error [mm] by iteration, and the numbers of runs with an exact fit and with the true parameters.
+    """
     rows = []
-    for title, arm, kind, poses, redrawn in SETTINGS:
-        run = simulate(arm, kind, poses, redrawn, seeds=seeds)
-        total = 4 * paper_arm(arm).n_joints
-        medians = [f"{1e3 * np.median(run.test[:, step]):.2g}" for step in _STEPS]
-        zero = int(np.sum(run.residual < 1e-9))
-        true = int(np.sum((run.angle[:, -1] < np.deg2rad(1e-6)) & (run.length[:, -1] < 1e-9)))
-        rows.append(
-            [
-                title,
-                f"{run.rank}→{run.rank_found}/{total}",
-                *medians,
-                f"{zero}/{seeds}",
-                f"{true}/{seeds}",
-            ]
-        )
+    for title, arm, kind, poses, resample_each_iteration in SETTINGS:
+        run = simulate(arm, kind, poses, resample_each_iteration, seeds=seeds)
+        n_parameters = 4 * paper_arm(arm).n_joints
+        medians = [f"{1e3 * np.median(run.test[:, iteration]):.2g}" for iteration in _SHOWN_ITERATIONS]
+        n_exact = int(np.sum(run.residual < _EXACT_FIT_TOL))
+        is_true = (run.angle[:, -1] < _TRUE_ANGLE_TOL) & (run.length[:, -1] < _TRUE_LENGTH_TOL)
+        n_true = int(np.sum(is_true))
+        ranks = f"{run.rank}→{run.rank_found}/{n_parameters}"
+        rows.append([title, ranks, *medians, f"{n_exact}/{seeds}", f"{n_true}/{seeds}"])
     return rows
-
-
-SIMULATION_REMARKS = (
-    "Two joint sets fit without a rest and still leave the parameters wrong; ten find the true ones, all but "
-    "alpha3 of the 3-DOF arm, which only turns the tool about the point that is measured.",
-    "Kept sets are the same at each iteration. More sets converge faster where they are drawn anew.",
-    "Ranks are those of the arm as designed, whose axes 2, 3 and 4, and 5 and 6, are parallel, and as found.",
-)

@@ -13,19 +13,19 @@ from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io.robot import read_robot
 from dhcal_pin.paper.factors import (
     alpf,
+    apply_correction,
     differential_motion,
     error_factors,
     laf,
     ldf,
     link_vectors,
-    moved,
     pseudo_inverse_step,
     q_matrices,
     tail_matrices,
     thf,
     tool_error,
 )
-from dhcal_pin.paper.jacobian_check import crosscheck, differences
+from dhcal_pin.paper.jacobian_check import crosscheck, numerical_jacobian
 from dhcal_pin.robot.chain import Chain
 from dhcal_pin.robot.dh import DHTable
 
@@ -81,7 +81,7 @@ def test_small_motion_of_a_link_is_the_sum_of_its_vectors():
 def test_factors_are_the_derivative(arm):
     table = paper(arm)
     q = joints(table)
-    np.testing.assert_allclose(error_factors(table, q), differences(table, q), atol=1e-9)
+    np.testing.assert_allclose(error_factors(table, q), numerical_jacobian(table, q), atol=1e-9)
 
 
 def test_factors_of_random_arms_with_sliding_joints():
@@ -90,7 +90,7 @@ def test_factors_of_random_arms_with_sliding_joints():
         table = random_table(rng)
         table = replace(table, beta=rng.uniform(-0.1, 0.1, table.n_joints), tool=se3.exp6(rng.normal(size=6)))
         q = joints(table, 5)
-        np.testing.assert_allclose(error_factors(table, q), differences(table, q), atol=1e-8)
+        np.testing.assert_allclose(error_factors(table, q), numerical_jacobian(table, q), atol=1e-8)
 
 
 def test_printed_vector_15_is_wrong():
@@ -99,7 +99,7 @@ def test_printed_vector_15_is_wrong():
     q = joints(table, 100)
     k1, k2, k3 = link_vectors(table)
     printed = np.stack([0 * table.a, table.a * np.sin(table.alpha), -table.a * np.cos(table.alpha)], -1)
-    u, numeric = tail_matrices(table, q), differences(table, q)
+    u, numeric = tail_matrices(table, q), numerical_jacobian(table, q)
 
     def gap(first):
         blocks = [thf(u, first, k2), ldf(u, k2), laf(u, k3), alpf(u, k3)]
@@ -120,7 +120,7 @@ def test_a_loop_with_the_printed_vector_still_converges():
         u = tail_matrices(table, q)
         blocks = [thf(u, printed, k2), ldf(u, k2), laf(u, k3), alpf(u, k3)]
         factors = np.concatenate([np.swapaxes(b, 1, 2) for b in blocks], -1)
-        table = moved(table, pseudo_inverse_step(factors, tool_error(goal, table.poses(q))))
+        table = apply_correction(table, pseudo_inverse_step(factors, tool_error(goal, table.poses(q))))
     np.testing.assert_allclose(table.d, actual.d, atol=1e-9)
 
 

@@ -188,8 +188,8 @@ def test_a_result_alone_says_the_same_of_points_left_out(experiment, options, fi
 
 
 def test_impossible_rows_are_found_with_their_reasons(experiment):
-    assert [finding.row for finding in experiment.findings] == [7, 8]
-    seven, eight = experiment.findings
+    assert [finding.row for finding in experiment.unreachable_rows] == [7, 8]
+    seven, eight = experiment.unreachable_rows
     assert 1e3 * seven.error == pytest.approx(1095, abs=0.5)
     assert 1e3 * eight.error == pytest.approx(767, abs=0.5)
     assert "(29.95°, 29.69°, -29.39°)" in seven.reason
@@ -202,7 +202,7 @@ def test_rows_are_found_wherever_they_stand(experiment, tmp_path):
     from dhcal_pin.diagnostics.reachability import find_unreachable_rows
     from dhcal_pin.io.measurement_csv import measurement_text, read_measurement_file
 
-    data = experiment.readings.data.take(np.array([7, 0, 1, 6, 2, 3, 4, 5]))
+    data = experiment.measurements.data.take(np.array([7, 0, 1, 6, 2, 3, 4, 5]))
     path = tmp_path / "t.csv"
     path.write_text(measurement_text(data, experiment.chain))
     assert [

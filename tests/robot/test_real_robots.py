@@ -20,7 +20,7 @@ from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io.robot import read_robot, write_urdf
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.pose import Pose
-from dhcal_pin.paper.jacobian_check import crosscheck, regressor, vectorised
+from dhcal_pin.paper.jacobian_check import crosscheck, kernel_jacobian, regressor_jacobian
 from dhcal_pin.robot.chain import Chain, extract_dh_table
 from dhcal_pin.robot.urdf import read_urdf
 
@@ -127,7 +127,7 @@ def test_jacobian_agrees_with_the_regressor_of_pinocchio(arm):
     chain = load(arm)
     errors = select_parameters(chain, "placement")
     q = draw(chain, 50)
-    assert np.abs(vectorised(chain, errors, q) - regressor(chain, errors, q)).max() <= 1e-11
+    assert np.abs(kernel_jacobian(chain, errors, q) - regressor_jacobian(chain, errors, q)).max() <= 1e-11
 
 
 @ARM
