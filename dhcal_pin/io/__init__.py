@@ -9,7 +9,6 @@ To add a robot file format, add a module with its functions, and one row to `rob
 
 from .atomic import require_writable, write_files
 from .dh_file import dh_text, read_dh
-from .joint_origins import joint_origins, origins_text
 from .measurement_csv import (
     MeasurementFile,
     TargetPoses,
@@ -21,10 +20,11 @@ from .measurement_csv import (
     read_measurements,
     read_targets,
 )
+from .origins_file import joint_origins, origins_text
 from .robot import FORMATS, convert_robot, read_robot, robot_name, urdf_files, write_urdf
 from .robot_format import ConvertedRobot, RobotFormat, RobotSource
 from .settings import parse_payload, read_bounds, read_priors
-from .shipped_files import shipped_file
+from .shipped_files import shipped_file, shipped_names
 from .sidecar import existing_sidecar, read_instrument, read_uncertainty, sidecar_path
 from .tabular import csv_text, read_csv_table, read_text, read_toml
 from .toml_table import TomlTable
@@ -63,6 +63,7 @@ __all__ = [
     "require_writable",
     "robot_name",
     "shipped_file",
+    "shipped_names",
     "sidecar_path",
     "urdf_files",
     "write_files",

@@ -24,7 +24,7 @@ from ..robot.urdf import parse_urdf, read_urdf
 from ..robot.urdf_edit import with_origins
 from .atomic import write_files
 from .dh_file import convert_to_dh, read_dh
-from .joint_origins import convert_to_origins, joint_origins
+from .origins_file import convert_to_origins, joint_origins
 from .robot_format import ConvertedRobot, RobotFormat, RobotSource
 from .sidecar import existing_sidecar, sidecar_path, sidecar_text, with_sidecar
 from .ur_kinematics import convert_to_ur_kinematics, read_ur_kinematics
@@ -102,17 +102,6 @@ def find_format(path: PathLike) -> RobotFormat | None:
         if name.endswith(ending)
     }
     return by_ending[max(by_ending, key=len)] if by_ending else None
-
-
-def formats_help() -> str:
-    """Return one line per robot file format, for help texts."""
-    width = max(len(robot_format.name) for robot_format in FORMATS)
-    lines = []
-    for robot_format in FORMATS:
-        endings = ", ".join((*robot_format.endings, *robot_format.other_endings))
-        note = "" if robot_format.is_readable else "; only written"
-        lines.append(f"  {robot_format.name:{width}}  {endings}{note}")
-    return "\n".join(["file formats of robots:", *lines])
 
 
 def has_dh_table(path: PathLike) -> bool:

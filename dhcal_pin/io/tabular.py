@@ -318,9 +318,11 @@ class _LazyRows(Sequence[list[str]]):
         return _split_cells(line, f"{self._source}:{line_number}")
 
     def parse_numbers(self) -> dict[int, Array]:
-        """Parse all columns that are numeric in the first row, shape (m,) each, by column index.
+        """Parse all columns that are numeric in the first row.
 
-        Returns an empty dict if a cell is quoted, or if a cell of such a column is not a number.
+        Returns:
+            Numbers, shape (m,) each, by column index; empty if a cell is quoted, or if a cell of such a
+            column is not a number.
         """
         if any('"' in line for _, line in self._rows):
             return {}

@@ -20,7 +20,7 @@ from ..exceptions import FileFormatError, InvalidArgumentError
 from ..robot.chain import Chain, extract_dh_table
 from ..robot.dh import DHTable
 from ..robot.dh_extraction import extract_dh
-from .joint_origins import ORIGIN_KEYS
+from .origins_file import ORIGIN_KEYS
 from .robot_format import ConvertedRobot, RobotSource
 from .tabular import read_text
 

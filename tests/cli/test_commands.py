@@ -876,7 +876,7 @@ def test_demo(run, place, monkeypatch):
     assert "Row 7 of Table 5 is excluded" in summary
     assert f"{1e3 * found['after']['position_rms_m']:.3f}" in summary
     assert "21→24/24" in summary
-    assert "all but alpha3" in summary
+    assert "except alpha3" in summary
     left_out, other = found["comparisons"][0]["after"], found["experiment_m"]["least_squares_left_out"]
     assert left_out["position_rms_m"] == pytest.approx(other, rel=1e-3)
     poses_agree("shown/experiment.urdf", URDF / "experiment.dh.toml")

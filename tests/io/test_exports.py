@@ -15,8 +15,8 @@ from dhcal_pin import se3
 from dhcal_pin.cli.main import main
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io.dh_file import dh_text
-from dhcal_pin.io.joint_origins import origins_text
 from dhcal_pin.io.measurement_csv import measurement_text
+from dhcal_pin.io.origins_file import origins_text
 from dhcal_pin.io.robot import read_robot
 from dhcal_pin.io.ur_kinematics import read_ur_kinematics, ur_kinematics, ur_kinematics_text
 from dhcal_pin.measurements.base import Noise
