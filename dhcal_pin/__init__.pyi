@@ -25,10 +25,17 @@ from .io.measurement_csv import read_targets as read_targets
 from .io.robot import read_robot as read_robot
 from .io.robot import write_urdf as write_urdf
 from .measurements.base import Noise as Noise
+from .measurements.contact import PlaneContact as PlaneContact
 from .measurements.contact import PointContact as PointContact
 from .measurements.contact import PointDistance as PointDistance
+from .measurements.contact import SphereContact as SphereContact
+from .measurements.length import Distance as Distance
+from .measurements.length import Wires as Wires
 from .measurements.pose import Pose as Pose
+from .measurements.pose import RelativePose as RelativePose
+from .measurements.position import MultiTargetPosition as MultiTargetPosition
 from .measurements.position import Position as Position
+from .measurements.position import PositionComponents as PositionComponents
 from .paper.factors import error_factors as error_factors
 from .paper.jacobian_check import crosscheck as crosscheck
 from .planning.planner import Plan as Plan

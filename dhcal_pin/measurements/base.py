@@ -130,7 +130,9 @@ class Measurement(ABC):
 
     def __repr__(self) -> str:
         """Return the kind, the number of samples and the standard deviations."""
-        return f"{type(self).__name__}({', '.join([f'{len(self.rows)} samples', *self._description()])})"
+        count = len(self.rows)
+        parts = [f"{count} sample{'' if count == 1 else 's'}", *self._description()]
+        return f"{type(self).__name__}({', '.join(parts)})"
 
     def _description(self) -> list[str]:
         """Return what `repr` says besides the number of samples."""
@@ -407,8 +409,8 @@ def format_sigma(*sigmas: tuple[Array, float, str]) -> str:
     """
     texts = []
     for values, factor, unit in sigmas:
-        low, high = (
-            f"{factor * float(value):.3g}" for value in (values.min(initial=np.inf), values.max(initial=0))
-        )
-        texts.append(f"{low} {unit}" if low == high else f"{low} to {high} {unit}")
-    return f"sigma {', '.join(texts)}"
+        extremes = (values.min(), values.max()) if values.size else ()
+        # One number if both are written alike.
+        numbers = dict.fromkeys(f"{factor * value:.3g}" for value in extremes)
+        texts += [f"{' to '.join(numbers)} {unit}"] if numbers else []
+    return " ".join(["sigma", ", ".join(texts)]) if texts else "sigma stated"

@@ -18,21 +18,19 @@ MAX_ROTATION_DEVIATION = 1e-6
 
 
 def _as_numbers(value: Any, where: str, expected: str) -> Array:
+    """Return a value as an array of floats of any shape."""
     try:
         return np.asarray(value, float)
     except (TypeError, ValueError):
-        what = f"of type {type(value).__name__}"
-        raise InvalidArgumentError(
-            f"{where} {what} is not an array of numbers; expected {expected}"
-        ) from None
+        problem = f"{where} of type {type(value).__name__} is not an array of numbers"
+        raise InvalidArgumentError(f"{problem}; expected {expected}") from None
 
 
 def _require_finite(value: Array, where: str) -> None:
-    if not (good := np.isfinite(value)).all():
-        row = int(np.argwhere(~good)[0][0]) + 1
-        raise InvalidArgumentError(
-            f"{where} has a value that is not finite in row {row}; expected finite values"
-        )
+    """Raise an error that names the first row with a value that is not finite."""
+    if not (is_finite := np.isfinite(value)).all():
+        row = int(np.argwhere(~is_finite)[0][0]) + 1
+        raise InvalidArgumentError(f"{where} is not finite in row {row}; expected finite numbers")
 
 
 def validated_joint_positions(value: Any, kind: str, what: str = "q") -> Array:

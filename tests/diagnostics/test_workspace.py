@@ -1,22 +1,21 @@
-"""Maps of the predicted uncertainty against the errors of many simulated robots."""
+"""Workspace maps: predicted uncertainty against the errors of simulated robots."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from dhcal_pin.calibration.procedure import calibrate
-from dhcal_pin.diagnostics.workspace import workspace_map
-from dhcal_pin.estimation.parameters import select_parameters
-from dhcal_pin.measurements.base import Noise
-from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.calibration import calibrate
+from dhcal_pin.diagnostics import workspace_map
+from dhcal_pin.estimation import select_parameters
+from dhcal_pin.measurements import Noise, Pose
 from dhcal_pin.robot.sampling import ConfigurationSampler, WorkspaceConstraints
 
 NOISE = Noise(1e-4, np.deg2rad(0.01))
 
 
-def test_cells_hold_the_errors_that_calibrated_robots_have(sim_6dof):
-    """Poses of one corner calibrate well there and badly elsewhere, and the map says how badly."""
+def test_predicted_uncertainty_equals_the_errors_of_calibrated_robots(sim_6dof):
+    """Poses in one corner of joint space give small errors there and larger ones elsewhere."""
     errors = select_parameters(sim_6dof, "minimal,base,tool")
     prior = np.where(errors.priors < 1, errors.priors, 1e-3)
     rng = np.random.default_rng(0)
@@ -28,20 +27,20 @@ def test_cells_hold_the_errors_that_calibrated_robots_have(sim_6dof):
         fit = calibrate(sim_6dof, Pose.simulate(truth, taken, NOISE, rng), "minimal,base,tool")
         found = workspace_map(fit, cell=0.5, samples=1500)
         points = fit.chain.poses(q)[:, :3, 3]
-        gap = np.sum((points - truth.poses(q)[:, :3, 3]) ** 2, 1)
+        squared_errors = np.sum((points - truth.poses(q)[:, :3, 3]) ** 2, 1)
         cells = {tuple(cell): i for i, cell in enumerate(np.floor(found.centre / 0.5).astype(int))}
         at = np.array([cells.get(tuple(cell), -1) for cell in np.floor(points / 0.5).astype(int)])
-        squares.append(gap[at >= 0])
+        squares.append(squared_errors[at >= 0])
         expected.append(found.std[at[at >= 0]] ** 2)
     squares, expected = np.concatenate(squares), np.concatenate(expected)
     for low, high in ((0, 25), (25, 50), (50, 75), (75, 100)):
         part = (expected >= np.percentile(expected, low)) & (expected <= np.percentile(expected, high))
-        # Six robots with some thirty directions each.
+        # The sample is small: six robots with about thirty determined directions each.
         assert np.sqrt(squares[part].mean()) == pytest.approx(np.sqrt(expected[part].mean()), rel=0.25)
     assert np.percentile(expected, 90) > 1.3 * np.percentile(expected, 10)
 
 
-def test_every_configuration_has_its_cell(sim_6dof):
+def test_every_configuration_is_counted_in_its_cell(sim_6dof):
     rng = np.random.default_rng(1)
     fit = calibrate(sim_6dof, Pose.simulate(sim_6dof, rng.uniform(-2, 2, (20, 6)), NOISE, rng))
     found = workspace_map(fit, cell=0.25, samples=3000, seed=5)

@@ -1,4 +1,4 @@
-"""Conformance of every kind of measurement: it walks the list, a new kind needs no edit here."""
+"""Conformance of all measurement kinds: it walks `KINDS`, so a new kind is tested without an edit here."""
 
 from __future__ import annotations
 
@@ -9,26 +9,20 @@ import numpy as np
 import pytest
 from robots import URDF
 
-from dhcal_pin import se3
-from dhcal_pin._kernels import apply_observation_matrix
+from dhcal_pin.calibration import calibrate
 from dhcal_pin.calibration.evaluation import instrument_values
-from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.cli.main import main
-from dhcal_pin.estimation.parameters import select_parameters
-from dhcal_pin.estimation.problem import Problem, linearize_and_factor
-from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.estimation import Problem, select_parameters
+from dhcal_pin.estimation.problem import linearize_and_factor
 from dhcal_pin.io.measurement_csv import measurement_text, read_measurements
-from dhcal_pin.measurements import KINDS
-from dhcal_pin.measurements.base import Noise, whitened_jacobian
-from dhcal_pin.measurements.contact import PlaneContact, PointContact, PointDistance
-from dhcal_pin.measurements.pose import Pose
-from dhcal_pin.measurements.position import Position
+from dhcal_pin.measurements import KINDS, Noise, PlaneContact, PointContact, PointDistance, Pose
+from dhcal_pin.measurements.base import concatenate, whitened_jacobian
 
 KIND = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 
 
 def setting(chain, kind, seed=0, m=8):
-    """Readings of an arm that is a little off, noisy, and the errors and unknowns to differentiate by."""
+    """Return noisy measurements of a disturbed robot, and values to differentiate at."""
     rng = np.random.default_rng(seed)
     q = rng.uniform(-np.pi, np.pi, (m, chain.n_joints))
     errors = select_parameters(chain, "dh,base,tool")
@@ -40,7 +34,7 @@ def setting(chain, kind, seed=0, m=8):
     return data, errors, x, u, rng
 
 
-def derivatives_hold(kind, sim_6dof_actual, seeds):
+def check_derivatives(kind, sim_6dof_actual, seeds):
     h = 1e-6
     for seed in seeds:
         data, errors, x, u, rng = setting(sim_6dof_actual, kind, seed)
@@ -69,8 +63,8 @@ def derivatives_hold(kind, sim_6dof_actual, seeds):
 
 
 @KIND
-def test_the_triangle_keeps_what_the_rows_tell(kind, sim_6dof_actual):
-    """Rows are reduced on the way and in one piece; 300 samples are more than are taken at a time."""
+def test_r_factor_equals_that_of_all_rows(kind, sim_6dof_actual):
+    """300 samples are more than one chunk: the R factor is updated chunk by chunk."""
     data, errors, x, u, _ = setting(sim_6dof_actual, kind, m=300)
     problem = Problem(errors, (data,), np.zeros(len(x) + len(u)))
     at = np.concatenate([x, u - [unknown.nominal for unknown in problem.instrument_parameters]])
@@ -86,18 +80,18 @@ def test_the_triangle_keeps_what_the_rows_tell(kind, sim_6dof_actual):
 
 
 @KIND
-def test_derivative_equals_central_differences(kind, sim_6dof_actual):
-    derivatives_hold(kind, sim_6dof_actual, range(10))
+def test_derivatives_equal_central_differences(kind, sim_6dof_actual):
+    check_derivatives(kind, sim_6dof_actual, range(10))
 
 
 @pytest.mark.slow
 @KIND
-def test_derivative_in_200_states(kind, sim_6dof_actual):
-    derivatives_hold(kind, sim_6dof_actual, range(200))
+def test_derivatives_in_200_states(kind, sim_6dof_actual):
+    check_derivatives(kind, sim_6dof_actual, range(200))
 
 
 def truth_of(kind, chain, m, noise=None, seed=0):
-    """Simulated readings and the unknowns that were simulated, as near as a fit of them alone tells."""
+    """Return simulated measurements and their instrument parameters, fitted with the robot fixed."""
     rng = np.random.default_rng(seed)
     q = rng.uniform(-2.5, 2.5, (m, chain.n_joints))
     data = kind.simulate(chain, q, noise or Noise(), rng).initialized(chain)
@@ -105,20 +99,20 @@ def truth_of(kind, chain, m, noise=None, seed=0):
     return data, np.array([names[unknown.name] for unknown in data.instrument_parameters])
 
 
-# Distances between points alone do not say where the points are.
-PLACED = pytest.mark.parametrize(
+# Distances between points do not determine where the points are.
+LOCATED = pytest.mark.parametrize(
     "kind", [kind for kind in KINDS.values() if kind is not PointDistance], ids=lambda kind: kind.kind
 )
 
 
-@PLACED
-def test_truth_leaves_no_residual(kind, sim_6dof_actual):
+@LOCATED
+def test_true_values_leave_no_residual(kind, sim_6dof_actual):
     data, u = truth_of(kind, sim_6dof_actual, 12)
-    # In sigmas of a millimetre; wide priors pull at the unknowns by less.
+    # In units of sigma, 1 mm; the wide priors shift the parameters by less.
     assert np.abs(data.residual(sim_6dof_actual.forward_kinematics(data.configurations()), u)).max() < 1e-4
 
 
-@PLACED
+@LOCATED
 def test_noise_whitens_to_one(kind, sim_6dof_actual):
     data, u = truth_of(kind, sim_6dof_actual, 600, Noise(2e-4, 3e-4))
     assert data.has_stated_sigma
@@ -129,7 +123,7 @@ def test_noise_whitens_to_one(kind, sim_6dof_actual):
 
 
 @KIND
-def test_slices_are_slices(kind, sim_6dof_actual):
+def test_take_selects_samples(kind, sim_6dof_actual):
     data, _, _, u, _ = setting(sim_6dof_actual, kind)
     part = data.take(np.array([1, 4]))
     whole = data.residual(sim_6dof_actual.forward_kinematics(data.configurations()), u)
@@ -139,15 +133,15 @@ def test_slices_are_slices(kind, sim_6dof_actual):
 
 
 @KIND
-def test_sigmas_divide(kind, sim_6dof_actual):
+def test_residuals_are_divided_by_sigma(kind, sim_6dof_actual):
     data, _, _, u, _ = setting(sim_6dof_actual, kind)
     frames = sim_6dof_actual.forward_kinematics(data.configurations())
     scaled = data.with_scaled_sigma(dict.fromkeys(data.residual_groups, 4.0))
     np.testing.assert_allclose(scaled.residual(frames, u) * 4, data.residual(frames, u), rtol=1e-14)
 
 
-def other_places_are_found(kind, sim_6dof, seeds):
-    """Distances between held-out tool points, which no gauge of base or instrument touches."""
+def check_calibration(kind, sim_6dof, seeds):
+    """Compare distances between held-out tool points, which do not depend on base and instrument."""
     for seed in seeds:
         rng = np.random.default_rng(seed)
         errors = select_parameters(sim_6dof, "minimal")
@@ -156,12 +150,12 @@ def other_places_are_found(kind, sim_6dof, seeds):
         q = rng.uniform(-2.5, 2.5, (120, 6))
         data = [kind.simulate(truth, q, Noise(), rng)]
         if kind is PointDistance:
-            touch = PointContact.simulate(truth, q, Noise(), rng)
-            at = truth.poses(touch.q[:4])[:, :3, 3]
+            contacts = PointContact.simulate(truth, q, Noise(), rng)
+            at = truth.poses(contacts.q[:4])[:, :3, 3]
             pairs = [(i, j) for i in range(4) for j in range(i)]
-            names = [(touch.names[i], touch.names[j]) for i, j in pairs]
+            names = [(contacts.names[i], contacts.names[j]) for i, j in pairs]
             data = [
-                touch,
+                contacts,
                 PointDistance(6, names, [np.linalg.norm(at[i] - at[j]) for i, j in pairs]),
             ]
         fit = calibrate(sim_6dof, data, "minimal", priors="none")
@@ -169,80 +163,62 @@ def other_places_are_found(kind, sim_6dof, seeds):
         other = rng.uniform(-2.5, 2.5, (50, 6))
         found, wanted = (chain.poses(other)[:, :3, 3] for chain in (fit.chain, truth))
         lengths = [np.linalg.norm(points[1:] - points[0], axis=1) for points in (found, wanted)]
-        # Plane and points alone do not see the scale.
+        # Contacts with a plane or with points do not determine the scale.
         scale = np.sum(lengths[0]) / np.sum(lengths[1]) if kind in (PlaneContact, PointContact) else 1.0
         assert scale == pytest.approx(1, abs=0.2)
         assert np.abs(lengths[0] / scale - lengths[1]).max() < 1e-9
 
 
 @KIND
-def test_noise_free_calibration_finds_other_places(kind, sim_6dof):
-    other_places_are_found(kind, sim_6dof, range(2))
+def test_noise_free_calibration_is_exact_elsewhere(kind, sim_6dof):
+    check_calibration(kind, sim_6dof, range(2))
 
 
 @pytest.mark.slow
 @KIND
 def test_noise_free_calibration_in_50_seeds(kind, sim_6dof):
-    other_places_are_found(kind, sim_6dof, range(50))
+    check_calibration(kind, sim_6dof, range(50))
 
 
-def test_paper_rows_are_its_r_and_sine(sim_6dof, sim_6dof_actual):
-    """Seen in the tool frame, the small-angle rows are R and (35), (36)."""
-    from robots import paper
-
-    from dhcal_pin.paper.factors import error_factors, tool_error
-
-    q = np.random.default_rng(3).uniform(-3, 3, (11, 6))
-    data = Pose.simulate(sim_6dof_actual, q, Noise(), np.random.default_rng(0))
-    errors = select_parameters(sim_6dof, "dh")
-    chain, bodies, twists = errors.derivative(np.zeros(24))
-    frames = chain.forward_kinematics(q)
-    residual, mixture = data.small_angle(frames, np.array([]))
-    velocities = chain.tool_jacobian(frames, bodies, twists)
-    rows = apply_observation_matrix(velocities, mixture, np.empty((24, *residual.shape)))
-    rotation = chain.poses(q)[:, :3, :3]
-    into_tool = np.zeros((11, 6, 6))
-    into_tool[:, :3, :3] = into_tool[:, 3:, 3:] = np.swapaxes(rotation, 1, 2)
-    seen = np.einsum("mij,jm->mi", into_tool, residual) * 1e-3
-    np.testing.assert_allclose(seen, tool_error(data.poses, chain.poses(q)), atol=1e-15)
-    order = [next(i for i, p in enumerate(errors.parameters) if p.name == f"{key}{j}")
-             for key in ("theta", "d", "a", "alpha") for j in range(1, 7)]  # fmt: skip
-    mine = np.einsum("mij,pjm->mip", into_tool, rows)[:, :, order] * 1e-3
-    np.testing.assert_allclose(mine, error_factors(paper("sim_6dof"), q), atol=1e-14)
+@KIND
+def test_resample_replaces_the_configurations_only(kind, sim_6dof):
+    data, _, _, _, rng = setting(sim_6dof, kind)
+    q = rng.uniform(-1, 1, data.configurations().shape)
+    other = data.resample(q)
+    np.testing.assert_array_equal(other.configurations(), q)
+    assert other.to_columns().keys() == data.to_columns().keys()
+    np.testing.assert_array_equal(other.rows, data.rows)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda q, p: Position(q, p[:3, :3, 3]), "Position: positions has 3 entries for 5 samples"),
-        (lambda q, p: Position(q, p[:, :3, 3] * np.nan), "finite"),
-        (lambda q, p: Position(q, p[:, :3, 3], -1e-3), "positive"),
-        (lambda q, p: Pose(q, p * 2), "sample 1 is not a rotation"),
-        (lambda q, p: Pose(q, p, 1e-3), "expected both or neither"),
-    ],
-)
-def test_wrong_readings_are_refused(make, message, sim_6dof):
-    q = np.zeros((5, 6))
-    with pytest.raises(DhcalError, match=message):
-        make(q, sim_6dof.poses(q))
+@KIND
+def test_concatenate_is_the_inverse_of_take(kind, sim_6dof):
+    data, _, _, _, _ = setting(sim_6dof, kind)
+    parts = [data.take(slice(0, 3)), data.take(slice(3, None))]
+    joined = concatenate(parts)
+    for name in data.sample_fields:
+        np.testing.assert_array_equal(getattr(joined, name), getattr(data, name))
 
 
-def test_left_handed_rotation_is_refused(sim_6dof):
-    poses = sim_6dof.poses(np.zeros((2, 6)))
-    poses[:, :3, 0] *= -1
-    with pytest.raises(DhcalError, match="not a rotation"):
-        Pose(np.zeros((2, 6)), poses)
+@KIND
+def test_repr_is_short_and_names_kind_and_samples(kind, sim_6dof):
+    for noise in (Noise(), Noise(1e-4, 2e-4)):
+        data = kind.simulate(sim_6dof, np.zeros((5, 6)) + 0.3, noise, np.random.default_rng(0))
+        text = repr(data)
+        assert text.startswith(f"{kind.__name__}({len(data.rows)} samples, ")
+        assert ("sigma 0.1 mm" in text) == data.has_stated_sigma
+        assert len(text) < 80
 
 
-def test_small_rotation_noise_is_a_rotation(sim_6dof):
-    data = Pose.simulate(sim_6dof, np.zeros((50, 6)), Noise(0, 0.2), np.random.default_rng(0))
-    spread = se3.log3(data.poses[:, :3, :3] @ np.swapaxes(sim_6dof.poses(np.zeros((50, 6)))[:, :3, :3], 1, 2))
-    assert np.std(spread) == pytest.approx(0.2, rel=0.15)
+@KIND
+def test_measurements_are_immutable(kind, sim_6dof):
+    data, _, _, _, _ = setting(sim_6dof, kind)
+    with pytest.raises(AttributeError):
+        data.q = np.zeros((1, 6))
 
 
 @KIND
 def test_file_round_trip_is_exact(kind, sim_6dof_actual, tmp_path):
-    """Every column's every digit, sigmas included; rotations to rounding."""
+    """All columns agree in every digit, sigmas included; rotation vectors up to rounding."""
     for noise in (Noise(), Noise(1e-4, 2e-4)):
         q = np.random.default_rng(1).uniform(-2.5, 2.5, (9, 6))
         data = kind.simulate(sim_6dof_actual, q, noise, np.random.default_rng(0))
@@ -275,7 +251,7 @@ def test_simulated_file_calibrates(kind, tmp_path, monkeypatch):
             assert result["after"][key] < 1e-3
 
 
-def test_a_mixture_of_five_kinds_converges(sim_6dof, sim_6dof_actual):
+def test_five_kinds_are_calibrated_together(sim_6dof, sim_6dof_actual):
     rng = np.random.default_rng(0)
     kinds = [KINDS[name] for name in ("pose", "wires", "plane", "distance", "relative")]
     draw = lambda m: rng.uniform(-2.5, 2.5, (m, 6))  # noqa: E731

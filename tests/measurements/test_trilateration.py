@@ -1,15 +1,13 @@
-"""The three-wire device: its closed form, its mirror, its dilution, and its geometry found with the robot."""
+"""Trilateration: closed form, mirror image, noise amplification, and calibration with unknown anchors."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.calibration import calibrate
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.measurements.base import Noise
-from dhcal_pin.measurements.length import Wires
-from dhcal_pin.measurements.position import Position
+from dhcal_pin.measurements import Noise, Position, Wires
 from dhcal_pin.measurements.trilateration import (
     device_anchors,
     locate_point,
@@ -27,41 +25,41 @@ def lengths(points, anchors):
     return np.linalg.norm(points[:, None] - anchors, axis=2)
 
 
-def somewhere(m, seed=0):
-    """Points more than 10 mm off the anchors' plane."""
+def random_points(m, seed=0):
+    """Return points more than 10 mm off the plane of the anchors."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-1, 1, (m, 3))
     points[:, 0] = np.sign(points[:, 0]) * (0.01 + np.abs(points[:, 0]))
     return points
 
 
-def test_closed_form_is_exact_on_the_side_it_is_told():
-    points = somewhere(1000)
+def test_closed_form_is_exact_on_the_given_side():
+    points = random_points(1000)
     for side in (1, -1):
         mine = points[np.sign(points[:, 0]) == side]
         found = trilaterate_three_wires(lengths(mine, device_anchors(A, B, C)), A, B, C, side)
         np.testing.assert_allclose(found, mine, atol=1e-9)
 
 
-def test_printed_equations_are_wrong():
-    """(41) as printed turns y about, and its z is right only where a² = b² + c²."""
-    points = somewhere(5)
+def test_equations_as_printed_are_wrong():
+    """(41) as printed has the wrong sign of y, and a z that is correct only if a² = b² + c²."""
+    points = random_points(5)
     l1, l2, l3 = lengths(points, device_anchors(A, B, C)).T
     np.testing.assert_allclose((l2**2 - l3**2) / (4 * B), -points[:, 1], atol=1e-12)
     printed = (l2**2 + l3**2 - 2 * (l1**2 + A**2 - B**2 - C**2)) / (4 * (A - C))
     assert np.abs(printed - points[:, 2]).min() > 1e-3
 
 
-def test_any_number_of_anchors():
+def test_trilateration_is_exact_for_any_number_of_anchors():
     rng = np.random.default_rng(1)
-    points = somewhere(200)
+    points = random_points(200)
     np.testing.assert_allclose(trilaterate(lengths(points, RIG), RIG, 1)[:, 1:], points[:, 1:], atol=1e-9)
     for count in (4, 6):
         anchors = rng.uniform(-1, 1, (count, 3))
         np.testing.assert_allclose(trilaterate(lengths(points, anchors), anchors), points, atol=1e-9)
 
 
-def test_side_is_along_the_anchors_normal():
+def test_side_is_the_sign_along_the_normal_of_the_anchors():
     normal = np.cross(RIG[1] - RIG[0], RIG[2] - RIG[0])
     point = np.array([[0.7, 0.1, -0.2]])
     side = int(np.sign(normal[0]))
@@ -83,12 +81,12 @@ def test_side_is_along_the_anchors_normal():
         (lambda: trilaterate([[0.01, 0.01, 0.01]], RIG), "do not meet"),
     ],
 )
-def test_what_cannot_be_is_said(call, message):
+def test_impossible_anchors_and_lengths_are_refused(call, message):
     with pytest.raises(DhcalError, match=message):
         call()
 
 
-def test_mirror_plane_loses_half_of_all_readings():
+def test_noise_near_the_mirror_plane_makes_lengths_that_do_not_meet():
     """At x = 2 mm and 0.1 mm of wire noise 46 % of the radicands are negative."""
     rng = np.random.default_rng(0)
     point = np.tile([0.002, 0.1, 0.05], (4000, 1))
@@ -105,8 +103,8 @@ def test_mirror_plane_loses_half_of_all_readings():
 @pytest.mark.parametrize(
     ("x", "wanted"), [(1.0, (0.71, 2.84, 2.90)), (0.3, (0.84, 1.14, 1.29)), (0.01, (14.1, 0.80, 1.00))]
 )
-def test_dilution_is_what_noise_does(x, wanted):
-    """The verified figures of an equilateral rig, by formula and by noise small enough to be linear."""
+def test_position_dilution_equals_that_of_simulated_noise(x, wanted):
+    """Verified figures of an equilateral device, by the formula and by small noise."""
     point = np.array([[x, 0.12, -0.08]])
     found = position_dilution(point, RIG)[0]
     rng = np.random.default_rng(0)
@@ -117,19 +115,19 @@ def test_dilution_is_what_noise_does(x, wanted):
     np.testing.assert_allclose(found, wanted, rtol=0.01)
 
 
-def test_anchor_from_lengths():
-    points = somewhere(20)
+def test_locate_point_is_exact():
+    points = random_points(20)
     np.testing.assert_allclose(locate_point(points, lengths(points, RIG[:1])[:, 0]), RIG[0], atol=1e-12)
 
 
-def test_geometry_is_found_with_the_robot(sim_6dof, sim_6dof_actual):
+def test_unknown_anchors_are_estimated_with_the_robot(sim_6dof, sim_6dof_actual):
     """Raw lengths, nine unknown anchor coordinates, and all the arm's errors, noise-free."""
     rng = np.random.default_rng(0)
     q = rng.uniform(-np.pi, np.pi, (60, 6))
     data = Wires.simulate(sim_6dof_actual, q, Noise(), rng)
     fit = calibrate(sim_6dof, data, "dh", priors="none", fix=["theta1", "d1"])
     anchors = np.array([fit.instruments[u.name] for u in data.instrument_parameters]).reshape(3, 3)
-    # The base is not known to the wires: compare what does not move with it.
+    # Anchors and base can move together: compare the distances between the anchors.
     truth = np.array([[np.linalg.norm(a - b) for a in RIG] for b in RIG])
     found = np.array([[np.linalg.norm(a - b) for a in anchors] for b in anchors])
     np.testing.assert_allclose(found, truth, rtol=1e-3)

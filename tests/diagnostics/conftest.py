@@ -1,0 +1,30 @@
+"""Fixtures for the tests of diagnostics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from robots import robot_file
+
+from dhcal_pin.diagnostics import find_input_warnings
+from dhcal_pin.io.measurement_csv import read_measurement_file
+from dhcal_pin.robot import Chain
+
+
+@pytest.fixture(scope="module")
+def ur10() -> Chain:
+    return Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+
+
+@pytest.fixture
+def warnings_of(tmp_path: Path) -> Callable[[Chain, str], list[str]]:
+    """Return a function from a robot and the text of a file to the warnings."""
+
+    def find(chain: Chain, text: str) -> list[str]:
+        path = tmp_path / "data.csv"
+        path.write_text(text)
+        return find_input_warnings(chain, read_measurement_file(path, chain))
+
+    return find
