@@ -29,10 +29,11 @@ from dataclasses import Field, dataclass, field, fields
 from typing import Any
 
 from .._typing import PathLike
-from ..exceptions import DhcalError, FileFormatError, InvalidArgumentError, UnknownNameError
+from ..exceptions import DhcalError, FileFormatError, InvalidArgumentError
 from ..io.robot import robot_name
 from ..io.sidecar import sidecar_path
-from ..io.tabular import csv_text, read_toml
+from ..io.tabular import csv_text
+from ..io.toml_table import TomlTable
 from . import console
 from .job import Job, option_flags
 from .options import STDOUT, IntegerType
@@ -89,22 +90,27 @@ def read_fleet(path: PathLike) -> list[FleetJob]:
     Raises:
         FileFormatError: The file is not a manifest, a key or a value is invalid, or two jobs use one file.
     """
-    shared = read_toml(path)
-    tables = shared.pop("job", [])
-    if not isinstance(tables, list) or not tables or not all(isinstance(table, dict) for table in tables):
-        raise FileFormatError(
-            f"{path}: no jobs; expected a [[job]] table with robot, data and output for each robot"
-        )
+    document = TomlTable.read(path)
+    tables = document.tables("job", expected="one for each robot, with robot, data and output")
+    shared = {key: document.get(key) for key in document.keys() if key != "job"}
     entries = []
-    for number, table in enumerate(tables, 1):
-        location = f"{path}: job {number}"
-        values = {key.replace("-", "_"): value for key, value in (shared | table).items()}
-        name = values.pop("name", None)
-        options = {key: _option_value(key, value, location) for key, value in values.items()}
+    for table in tables:
+        values = shared | {key: table.get(key) for key in table.keys()}
+        # The keys may be written as on the command line, with hyphens.
+        job_table = TomlTable(
+            path, {key.replace("-", "_"): value for key, value in values.items()}, table.name
+        )
+        name = job_table.get("name", "")
+        options = {
+            option.name: _option_value(job_table, option)
+            for option in fields(Job)
+            if option.name in job_table
+        }
+        job_table.finish()
         for key in ("robot", "data", "output"):
             if not options.get(key):
                 raise FileFormatError(
-                    f"{location}: {key} is missing; every [[job]] needs robot, data and output"
+                    f"{job_table.where}: {key} is missing; every [[job]] needs robot, data and output"
                 )
         job = Job(**options)
         entries.append(FleetJob(str(name or robot_name(job.robot)), job))
@@ -112,15 +118,12 @@ def read_fleet(path: PathLike) -> list[FleetJob]:
     return entries
 
 
-def _option_value(key: str, value: Any, location: str) -> Any:
+def _option_value(table: TomlTable, option: Field[Any]) -> Any:
     """Check the value of an option and return it in the type of its field."""
-    options = {option.name: option for option in fields(Job)}
-    if key not in options:
-        raise UnknownNameError(f"{location}: unknown key {key!r}; choose from name, {', '.join(options)}")
-    converted, expected = _converted(options[key], value)
-    if converted is None or (key == "json" and converted == STDOUT):
-        raise FileFormatError(f"{location}: {key} = {value!r}; expected {expected}")
-    return converted
+    value, expected = _converted(option, table.get(option.name))
+    if value is None or (option.name == "json" and value == STDOUT):
+        raise table.error(option.name, f"expected {expected}")
+    return value
 
 
 def _converted(option: Field[Any], value: Any) -> tuple[Any, str]:
