@@ -57,24 +57,24 @@ _MAX_ROWS = 2000
 _MAX_LISTED_ROWS = 5
 
 
-def find_input_warnings(chain: Chain, readings: MeasurementFile) -> list[str]:
+def find_input_warnings(chain: Chain, file: MeasurementFile) -> list[str]:
     """Find implausible values in a measurement file.
 
     Args:
         chain: Nominal robot.
-        readings: Measurement file.
+        file: Measurement file.
 
     Returns:
         One sentence per warning; an empty list for most files.
     """
-    joint_units = _check_joint_units(chain, readings)
-    joints = [*joint_units.values(), *_check_small_joints(chain, readings)]
-    lengths = _check_lengths(chain, readings)
+    joint_units = _check_joint_units(chain, file)
+    joints = [*joint_units.values(), *_check_small_joints(chain, file)]
+    lengths = _check_lengths(chain, file)
     # With implausible joint positions, the modelled motion says nothing about the measured values.
-    mixups = [] if joints or lengths else diagnose_mixups(chain, readings.data)
-    rotations = [] if joints or mixups else _check_rotations(chain, readings)
-    limits = _check_limits(chain, readings, joint_units)
-    return [*joints, *lengths, *mixups, *rotations, *limits, *_check_repeated_rows(readings)]
+    mixups = [] if joints or lengths else diagnose_mixups(chain, file.data)
+    rotations = [] if joints or mixups else _check_rotations(chain, file)
+    limits = _check_limits(chain, file, joint_units)
+    return [*joints, *lengths, *mixups, *rotations, *limits, *_check_repeated_rows(file)]
 
 
 def poorly_fitted_files(
@@ -96,11 +96,11 @@ def poorly_fitted_files(
     for (path, item), all_errors in zip(
         data.items(), compute_errors(chain, list(data.values()), known), strict=True
     ):
-        names = {unknown.name for unknown in item.instrument_parameters if not unknown.is_local}
+        names = {parameter.name for parameter in item.instrument_parameters if not parameter.is_local}
         sharing = [
             other
             for other in data
-            if other != path and names & {unknown.name for unknown in data[other].instrument_parameters}
+            if other != path and names & {parameter.name for parameter in data[other].instrument_parameters}
         ]
         for group, errors in all_errors.items():
             median = float(np.median(np.linalg.norm(errors, axis=1)))
@@ -117,9 +117,9 @@ def poorly_fitted_files(
     return out
 
 
-def _joint_positions_by_configuration(readings: MeasurementFile) -> list[Array]:
+def _joint_positions_by_configuration(file: MeasurementFile) -> list[Array]:
     """Return the joint positions (m, n) of each configuration of a row."""
-    data = readings.data
+    data = file.data
     return np.split(data.configurations(), data.configurations_per_row) if data.configurations_per_row else []
 
 
@@ -134,22 +134,22 @@ def _format_as_written(value: float, unit: str) -> str:
     return f"{value * factor:.4g} {unit}".rstrip()
 
 
-def _format_rows(readings: MeasurementFile, mask: Array) -> str:
+def _format_rows(file: MeasurementFile, mask: Array) -> str:
     """Return a text such as `row 3` or `rows 3, 5, 8, 9, 12 and 4 more`."""
-    rows = [str(row) for row in readings.data.rows[mask]]
+    rows = [str(row) for row in file.data.rows[mask]]
     listed, more = rows[:_MAX_LISTED_ROWS], len(rows) - _MAX_LISTED_ROWS
     return f"row{'s' if len(rows) > 1 else ''} {', '.join(listed)}" + (
         f" and {more} more" if more > 0 else ""
     )
 
 
-def _check_joint_units(chain: Chain, readings: MeasurementFile) -> dict[str, str]:
+def _check_joint_units(chain: Chain, file: MeasurementFile) -> dict[str, str]:
     """Return warnings about joints that cannot move as far as their columns say, by column name."""
     out: dict[str, str] = {}
-    for prefix, q in zip(("", SECOND_PREFIX), _joint_positions_by_configuration(readings), strict=False):
+    for prefix, q in zip(("", SECOND_PREFIX), _joint_positions_by_configuration(file), strict=False):
         for j, name in enumerate(chain.joint_names):
             is_prismatic = chain.urdf.joint(name).type == "prismatic"
-            largest, unit = float(np.max(np.abs(q[:, j]), initial=0.0)), readings.units[prefix + name]
+            largest, unit = float(np.max(np.abs(q[:, j]), initial=0.0)), file.units[prefix + name]
             if largest > (_MAX_STROKE_M if is_prismatic else _MAX_TURN_RAD):
                 problem = (
                     "too far for a prismatic joint" if is_prismatic else f"{largest / (2 * np.pi):.1f} turns"
@@ -162,20 +162,20 @@ def _check_joint_units(chain: Chain, readings: MeasurementFile) -> dict[str, str
     return out
 
 
-def _check_small_joints(chain: Chain, readings: MeasurementFile) -> list[str]:
+def _check_small_joints(chain: Chain, file: MeasurementFile) -> list[str]:
     """Return a warning if columns in degrees hold radians: no joint moves, but the tool does."""
-    configurations = _joint_positions_by_configuration(readings)
+    configurations = _joint_positions_by_configuration(file)
     revolute = [
         j
         for j, name in enumerate(chain.joint_names)
-        if chain.urdf.joint(name).type != "prismatic" and readings.units.get(name) == "deg"
+        if chain.urdf.joint(name).type != "prismatic" and file.units.get(name) == "deg"
     ]
     if not configurations or not revolute:
         return []
     largest = float(np.max(np.abs(np.concatenate(configurations)[:, revolute]), initial=0.0)) * ANGLES["deg"]
     if not _MIN_RADIANS_AS_DEG < largest <= _MAX_RADIANS_AS_DEG:
         return []
-    positions, index = readings.data.positions(), _subsample(len(configurations[0]))
+    positions, index = file.data.positions(), _subsample(len(configurations[0]))
     if len(positions):
         modelled = chain.poses(configurations[0][index])[:, :3, 3]
         if median_radius(positions[index]) < _MIN_SPREAD_RATIO * median_radius(modelled):
@@ -186,15 +186,15 @@ def _check_small_joints(chain: Chain, readings: MeasurementFile) -> list[str]:
     ]
 
 
-def _check_lengths(chain: Chain, readings: MeasurementFile) -> list[str]:
+def _check_lengths(chain: Chain, file: MeasurementFile) -> list[str]:
     """Return warnings about lengths that are too long or too short for the robot, and about large sigmas."""
     _, reach = reach_sphere(chain)
-    out = _check_position_spread(chain, readings, reach)
-    data = readings.data
+    out = _check_position_spread(chain, file, reach)
+    data = file.data
     for name, quantity in data.columns.items():
-        if name not in readings.values or quantity == "text":
+        if name not in file.values or quantity == "text":
             continue
-        values, unit = np.abs(readings.values[name]), readings.units.get(name, "")
+        values, unit = np.abs(file.values[name]), file.units.get(name, "")
         median, largest = float(np.median(values)), float(values.max())
         if name.startswith("sigma_"):
             if median > _MAX_SIGMA[quantity]:
@@ -217,14 +217,14 @@ def _check_lengths(chain: Chain, readings: MeasurementFile) -> list[str]:
     return out
 
 
-def _check_position_spread(chain: Chain, readings: MeasurementFile, reach: float) -> list[str]:
+def _check_position_spread(chain: Chain, file: MeasurementFile, reach: float) -> list[str]:
     """Return a warning if positions spread farther than the robot reaches, or too little by a unit."""
-    positions = readings.data.positions()
+    positions = file.data.positions()
     if len(positions) < _MIN_SAMPLES:
         return []
     index = _subsample(len(positions))
-    positions, unit = positions[index], readings.units.get("x", "")
-    modelled, spread = chain.poses(readings.data.q[index])[:, :3, 3], median_radius(positions)
+    positions, unit = positions[index], file.units.get("x", "")
+    modelled, spread = chain.poses(file.data.q[index])[:, :3, 3], median_radius(positions)
     if spread > _MAX_SPREAD_RATIO * (reach + MAX_TOOL_OFFSET):
         return [
             f"the positions spread {_format_as_written(spread, unit)} around their centre, but the robot "
@@ -243,10 +243,10 @@ def _check_position_spread(chain: Chain, readings: MeasurementFile, reach: float
     return []
 
 
-def _check_rotations(chain: Chain, readings: MeasurementFile) -> list[str]:
+def _check_rotations(chain: Chain, file: MeasurementFile) -> list[str]:
     """Return a warning about rotation vectors longer than a turn, or rotations that do not fit the joints."""
-    vectors = [readings.values[name] for name in ROTVEC if name in readings.values]
-    unit = readings.units.get("rx", "")
+    vectors = [file.values[name] for name in ROTVEC if name in file.values]
+    unit = file.units.get("rx", "")
     if len(vectors) == 3 and unit:
         longest = np.linalg.norm(vectors, axis=0).max()
         if longest > 2 * np.pi + _ROTVEC_SLACK_RAD:
@@ -254,11 +254,11 @@ def _check_rotations(chain: Chain, readings: MeasurementFile) -> list[str]:
                 f"a rotation vector rx,ry,rz has the length {_format_as_written(longest, unit)}, more than a "
                 "turn; if the values are degrees, write [deg]; Euler angles need a column map (--columns)"
             ]
-    measured = readings.data.rotations()
+    measured = file.data.rotations()
     if len(measured) < _MIN_SAMPLES:
         return []
     index = _subsample(len(measured))
-    misfit = orientation_misfit(chain.poses(readings.data.q[index])[:, :3, :3], measured[index])
+    misfit = orientation_misfit(chain.poses(file.data.q[index])[:, :3, :3], measured[index])
     if misfit <= _MAX_ORIENTATION_MISFIT_RAD:
         return []
     return [
@@ -268,27 +268,27 @@ def _check_rotations(chain: Chain, readings: MeasurementFile) -> list[str]:
     ]
 
 
-def _check_limits(chain: Chain, readings: MeasurementFile, reported: Container[str]) -> list[str]:
+def _check_limits(chain: Chain, file: MeasurementFile, reported: Container[str]) -> list[str]:
     """Return warnings about joints beyond their limits, except for columns that are reported already."""
     out = []
-    for prefix, q in zip(("", SECOND_PREFIX), _joint_positions_by_configuration(readings), strict=False):
+    for prefix, q in zip(("", SECOND_PREFIX), _joint_positions_by_configuration(file), strict=False):
         for j, name in enumerate(chain.joint_names):
             lower, upper = chain.lower[j], chain.upper[j]
             is_beyond = (q[:, j] < lower - _LIMIT_SLACK) | (q[:, j] > upper + _LIMIT_SLACK)
             if is_beyond.any() and prefix + name not in reported:
-                unit = readings.units[prefix + name]
+                unit = file.units[prefix + name]
                 out.append(
                     f"joint {prefix + name} is beyond its limits, {_format_as_written(lower, unit)} to "
-                    f"{_format_as_written(upper, unit)}, in {_format_rows(readings, is_beyond)}; "
+                    f"{_format_as_written(upper, unit)}, in {_format_rows(file, is_beyond)}; "
                     "check its sign, zero and unit"
                 )
     return out
 
 
-def _check_repeated_rows(readings: MeasurementFile) -> list[str]:
+def _check_repeated_rows(file: MeasurementFile) -> list[str]:
     """Return a warning about rows with the same joint positions and the same measured values."""
-    columns: list[Array] = [column for q in _joint_positions_by_configuration(readings) for column in q.T]
-    columns += [np.asarray(values) for values in readings.values.values()]
+    columns: list[Array] = [column for q in _joint_positions_by_configuration(file) for column in q.T]
+    columns += [np.asarray(values) for values in file.values.values()]
     if not columns or not len(columns[0]):
         return []
     # Ranks, as columns of texts and of numbers cannot be stacked.
@@ -299,8 +299,8 @@ def _check_repeated_rows(readings: MeasurementFile) -> list[str]:
     if not is_repeated.any():
         return []
     example = int(np.flatnonzero(is_repeated)[0])
-    original = int(readings.data.rows[first[inverse[example]]])
+    original = int(file.data.rows[first[inverse[example]]])
     return [
-        f"{_format_rows(readings, is_repeated)}: identical to other rows in every digit (row "
-        f"{readings.data.rows[example]} to row {original}); a copied measurement counts twice, remove it"
+        f"{_format_rows(file, is_repeated)}: identical to other rows in every digit (row "
+        f"{file.data.rows[example]} to row {original}); a copied measurement counts twice, remove it"
     ]

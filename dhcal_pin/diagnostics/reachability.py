@@ -108,33 +108,33 @@ def solve_position(chain: Chain, target: Array, near: Array) -> Array | None:
     return q[good[np.argmin(np.abs(q[good] - near).sum(1))]] if good.size else None
 
 
-def find_unreachable_rows(chain: Chain, readings: MeasurementFile) -> list[UnreachableRow]:
+def find_unreachable_rows(chain: Chain, file: MeasurementFile) -> list[UnreachableRow]:
     """Find the impossible rows of a file.
 
     Args:
         chain: Robot whose base and tool are known.
-        readings: Measurement file, with positions or with commanded positions.
+        file: Measurement file, with positions or with commanded positions.
 
     Returns:
         The impossible rows in the order of the file.
     """
-    found: dict[int, UnreachableRow] = {}
+    impossible: dict[int, UnreachableRow] = {}
     centre, radius = reach_sphere(chain)
-    q = readings.data.q
+    q = file.data.q
     modelled = chain.poses(q)[:, :3, 3]
     extent = np.linalg.norm(modelled - centre, axis=1).max(initial=0.0)
     # One row of each pose: measurements repeated at one pose are typical of that pose only.
     distinct = np.unique(np.round(q, POSE_DECIMALS), axis=0, return_index=True)[1]
-    checks = [("measured", readings.data.positions(), MAX_MEASURED_OFFSET)]
-    if readings.commanded is not None:
-        checks.insert(0, ("commanded", readings.commanded, MAX_COMMANDED_OFFSET))
+    checks = [("measured", file.data.positions(), MAX_MEASURED_OFFSET)]
+    if file.commanded is not None:
+        checks.insert(0, ("commanded", file.commanded, MAX_COMMANDED_OFFSET))
     for what, positions, share in checks:
         if not len(positions):
             continue
         errors = np.linalg.norm(positions - modelled, axis=1)
         limit = max(MAX_TYPICAL_RATIO * float(np.median(errors[distinct])), share * extent)
         for i in np.flatnonzero(errors > limit):
-            if i + 1 in found or errors[i] < EXACT_POSITION_TOL:
+            if i + 1 in impossible or errors[i] < EXACT_POSITION_TOL:
                 continue
             reason = f"its joint positions lead {1e3 * errors[i]:.0f} mm away from the {what} position"
             distance = np.linalg.norm(positions[i] - centre)
@@ -145,8 +145,8 @@ def find_unreachable_rows(chain: Chain, readings: MeasurementFile) -> list[Unrea
                 )
             elif (solution := solve_position(chain, positions[i], np.median(q, 0))) is not None:
                 reason += f", which the robot reaches with ({_format_joints(chain, solution)})"
-            found[int(i) + 1] = UnreachableRow(int(i) + 1, float(errors[i]), reason)
-    return [found[row] for row in sorted(found)]
+            impossible[int(i) + 1] = UnreachableRow(int(i) + 1, float(errors[i]), reason)
+    return [impossible[row] for row in sorted(impossible)]
 
 
 def _format_joints(chain: Chain, q: Array) -> str:

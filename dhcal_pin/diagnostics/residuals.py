@@ -163,7 +163,7 @@ def _offset_equations(chain: Chain, data: Sequence[Measurement], fit: Result) ->
     _, bodies, twists = errors.derivative(np.zeros(len(errors.parameters)))
     ar, aa = [], []
     for item in data:
-        u = np.array([known[unknown.name] for unknown in item.instrument_parameters])
+        u = np.array([known[parameter.name] for parameter in item.instrument_parameters])
         frames = chain.forward_kinematics(item.configurations())
         residual = item.residual(frames, u)
         a = whitened_jacobian(item, frames, chain.tool_jacobian(frames, bodies, twists), u, residual)
