@@ -102,7 +102,7 @@ class TriangularSystemBatch:
             diagonal: Coefficients of shape (b, p).
 
         Returns:
-            Systems with the further rows.
+            Systems for `solve`; their `min_cost` does not include that of `self`.
         """
         b, p = self.z.shape
         columns = np.zeros((b, p + 1, 2 * p))

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import mpmath
 import numpy as np
 import pytest
 from robots import paper, random_joints, random_table
 from scipy.linalg import null_space
 
 from dhcal_pin import se3
-from dhcal_pin._kernels import qr as householder
 from dhcal_pin.calibration.evaluation import accuracy
 from dhcal_pin.calibration.partition import k_fold
 from dhcal_pin.calibration.procedure import calibrate
-from dhcal_pin.estimation import problem, qr
 from dhcal_pin.estimation.parameters import select_parameters
-from dhcal_pin.estimation.problem import CHUNK_SIZE, Problem, linearize_and_factor
-from dhcal_pin.estimation.qr import append_priors, pseudo_inverse
-from dhcal_pin.estimation.solver import levenberg_marquardt
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.measurements.base import Noise, whitened_jacobian
+from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.contact import PointContact, PointDistance
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.measurements.position import Position
@@ -228,74 +222,6 @@ def test_result_is_the_minimum_that_scipy_finds(sim_6dof, sim_6dof_actual):
     assert np.sum(residual(fit.x) ** 2) <= 2 * other.cost * (1 + 1e-9)
 
 
-def test_chunks_do_not_change_the_answer(sim_6dof_actual):
-    """The triangle of many chunks equals the QR of all rows at once."""
-    rng = np.random.default_rng(0)
-    q = rng.uniform(-3, 3, (2 * CHUNK_SIZE + 17, 6))
-    data = Pose.simulate(sim_6dof_actual, q, Noise(1e-4, 1e-4), rng)
-    errors = select_parameters(sim_6dof_actual, "dh")
-    zero = np.zeros(24)
-    found = linearize_and_factor(Problem(errors, (data,), zero), zero, False)
-    chain, bodies, twists = errors.derivative(zero)
-    frames = chain.forward_kinematics(q)
-    velocities = chain.tool_jacobian(frames, bodies, twists)
-    rows = whitened_jacobian(data, frames, velocities, NONE, data.residual(frames, NONE)).reshape(24, -1)
-    r = np.linalg.qr(rows.T, mode="r")
-    np.testing.assert_allclose(np.abs(found.r), np.abs(r), atol=1e-9 * np.abs(r).max())
-    assert found.min_cost + found.z @ found.z == pytest.approx(
-        np.sum(data.residual(frames, NONE) ** 2), rel=1e-12
-    )
-
-
-@pytest.mark.parametrize("way", ["compiled", "panels", "plain"])
-@pytest.mark.parametrize("samples", [50, 700])
-def test_each_way_of_reduction_keeps_what_the_rows_tell(way, samples, sim_6dof, monkeypatch):
-    """Whole or a row of readings at a time, by panels or not, with columns that are zero in some rows."""
-    if way != "compiled":
-        monkeypatch.setattr(householder, "USE_PANELS", way == "panels")
-        monkeypatch.setattr(problem, "factor_jacobian", householder.factor_jacobian)
-    errors, rng = select_parameters(sim_6dof, "dh"), np.random.default_rng(0)
-    data = Pose.simulate(sim_6dof, rng.uniform(-3, 3, (samples, 6)), Noise(1e-4, 1e-4), rng)
-    found = linearize_and_factor(Problem(errors, (data,), np.zeros(24)), np.zeros(24), False)
-    chain, bodies, twists = errors.derivative(np.zeros(24))
-    frames = chain.forward_kinematics(data.q)
-    residual = data.residual(frames, NONE)
-    rows = whitened_jacobian(data, frames, chain.tool_jacobian(frames, bodies, twists), NONE, residual)
-    whole = np.concatenate([rows, residual[None]]).reshape(25, -1)
-    whole /= np.linalg.norm(whole, axis=1)[:, None]
-    packed = np.zeros((25, 25))
-    packed[:24, :24], packed[:24, 24], packed[24, 24] = found.r, found.z, np.sqrt(found.min_cost)
-    assert np.array_equal(packed, np.triu(packed))
-    packed /= np.linalg.norm(packed, axis=0)
-    np.testing.assert_allclose(packed.T @ packed, whole @ whole.T, atol=1e-13)
-
-
-@pytest.mark.parametrize("sets", ["dh", "minimal,base,tool"])
-def test_a_loop_that_stopped_near_its_end_goes_on_as_if_it_had_not(sets, sim_6dof, sim_6dof_actual):
-    rng = np.random.default_rng(0)
-    data = Position.simulate(sim_6dof_actual, rng.uniform(-3, 3, (20, 6)), Noise(1e-4), rng)
-    errors = select_parameters(sim_6dof, sets)
-    case, zero = Problem(errors, (data,), 1 / errors.priors), np.zeros(len(errors.parameters))
-    whole = levenberg_marquardt(case, zero, 100, None)
-    near = levenberg_marquardt(case, zero, 100, None, loose=True)
-    after = levenberg_marquardt(case, near.x, 100, None, warm_start=near)
-    assert whole.converged
-    assert after.converged
-    assert not near.converged
-    assert near.iterations < whole.iterations
-    np.testing.assert_array_equal(after.iterates, whole.iterates)
-
-
-def test_rank_is_not_taken_from_a_square():
-    """At condition 1e8 the triangle still tells full rank; JᵀJ would not."""
-    rng = np.random.default_rng(0)
-    u, _ = np.linalg.qr(rng.normal(size=(50, 6)))
-    v, _ = np.linalg.qr(rng.normal(size=(6, 6)))
-    triangle = np.linalg.qr(u * np.logspace(0, -8, 6) @ v, mode="r")
-    assert qr.rank(triangle) == 6
-    assert qr.condition(triangle) == pytest.approx(1e8, rel=1e-6)
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_mixed_kinds_on_random_arms(seed):
     rng = np.random.default_rng(seed)
@@ -365,33 +291,6 @@ def test_samples_that_are_met_exactly_do_not_foretell_the_others(sim_6dof, sim_6
     wanted = np.sqrt(np.mean([found["position_rms_m"] ** 2 for found in alone]))
     assert left_out.after["position_rms_m"] == pytest.approx(wanted, rel=0.05)
     assert wanted > 5e-3
-
-
-def test_the_step_is_exact_at_condition_1e8():
-    """Nearly parallel axes: the same rows solved with fifty digits give the same step."""
-    nominal = Chain.from_dh(paper("sim_6dof"))
-    errors = select_parameters(nominal, "dh")
-    tilts = [i for i, p in enumerate(errors.parameters) if p.name in ("alpha2", "alpha3", "alpha5")]
-    x = np.zeros(24)
-    x[tilts] = 1e-4, -2e-4, 1e-4
-    rng = np.random.default_rng(2)
-    q = rng.uniform(-3, 3, (12, 6))
-    data = Pose.simulate(errors.at(x + 1e-4 * rng.normal(size=24)), q, Noise(1e-4, 1e-4), rng)
-    problem = Problem(errors, (data,), np.zeros(24))
-    full = append_priors(linearize_and_factor(problem, x, False), problem.weights, x)
-    assert qr.rank(full.r) == 24
-    assert 3e7 < qr.condition(full.r) < 3e8
-    chain, bodies, twists = errors.derivative(x)
-    frames = chain.forward_kinematics(q)
-    residual = data.residual(frames, NONE)
-    velocities = chain.tool_jacobian(frames, bodies, twists)
-    rows = whitened_jacobian(data, frames, velocities, NONE, residual).reshape(24, -1).T
-    with mpmath.workdps(50):
-        # Fifty digits can afford the normal equations.
-        wanted = mpmath.lu_solve(mpmath.matrix(rows.tolist()), mpmath.matrix(residual.ravel().tolist()))
-        wanted = np.array([float(value) for value in wanted])
-    step = pseudo_inverse(full.r, full.z)
-    assert np.linalg.norm(step - wanted) <= 1e-6 * np.linalg.norm(wanted)
 
 
 def test_bounds_hold_and_the_rest_is_least_squares(sim_6dof, sim_6dof_actual):

@@ -156,7 +156,7 @@ def test_what_is_told_of_a_fit_is_of_the_samples_that_count(sim_6dof, sim_6dof_a
     assert told.after["position_rms_m"] < 1.3 * expected.after["position_rms_m"]
     assert "3 gross errors left aside." in headline(fit.comparisons).text
     figures = accuracy_figures(ReportContext.from_result(fit, Provenance()))[0]
-    assert [panel.caption for panel in figures.panels][0] == "Position error, 57 fitted samples"
+    assert figures.panels[0].caption == "Position error, 57 fitted samples"
     held = calibrate(sim_6dof, clean, "dh", holdout=[dirty]).comparisons[0]
     assert (held.n_samples, held.n_outliers) == (60, 3)
     assert held.after["position_rms_m"] > 10 * held.after_without_outliers["position_rms_m"]

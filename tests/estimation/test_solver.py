@@ -1,0 +1,115 @@
+"""Solvers: loose and continued iterations, dispatch by method, and the step rules for floats and arrays."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dhcal_pin.estimation import (
+    METHODS,
+    Problem,
+    gauss_newton,
+    levenberg_marquardt,
+    minimize,
+    select_parameters,
+)
+from dhcal_pin.estimation import solver_rules as rules
+from dhcal_pin.exceptions import ConvergenceError, UnknownNameError
+from dhcal_pin.measurements import Noise, Position
+
+
+def case(sim_6dof, sim_6dof_actual, sets="dh", m=20):
+    rng = np.random.default_rng(0)
+    data = Position.simulate(sim_6dof_actual, rng.uniform(-3, 3, (m, 6)), Noise(1e-4), rng)
+    errors = select_parameters(sim_6dof, sets)
+    return Problem(errors, (data,), 1 / errors.priors)
+
+
+@pytest.mark.parametrize("sets", ["dh", "minimal,base,tool"])
+def test_a_warm_start_continues_a_loose_solution_exactly(sets, sim_6dof, sim_6dof_actual):
+    problem = case(sim_6dof, sim_6dof_actual, sets)
+    zero = np.zeros(len(problem.weights))
+    full = levenberg_marquardt(problem, zero, 100)
+    loose = levenberg_marquardt(problem, zero, 100, loose=True)
+    continued = levenberg_marquardt(problem, loose.x, 100, warm_start=loose)
+    assert full.converged
+    assert continued.converged
+    assert not loose.converged
+    assert loose.iterations < full.iterations
+    np.testing.assert_array_equal(continued.iterates, full.iterates)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_minimize_calls_the_method_and_reports_progress(method, sim_6dof, sim_6dof_actual):
+    problem, seen = case(sim_6dof, sim_6dof_actual), []
+    result = minimize(problem, method, progress=lambda i, cost: seen.append((i, cost)))
+    alone = METHODS[method](problem, np.zeros(24), 100)
+    np.testing.assert_array_equal(result.iterates, alone.iterates)
+    assert [i for i, _ in seen] == list(range(1, result.iterations + 1))
+    assert len(result.iterates) == result.iterations + 1
+
+
+def test_minimize_names_an_unknown_method(sim_6dof, sim_6dof_actual):
+    with pytest.raises(UnknownNameError, match="unknown method 'newton'; choose from lm, gn"):
+        minimize(case(sim_6dof, sim_6dof_actual), "newton")
+
+
+def test_gauss_newton_stops_when_it_diverges(sim_6dof, sim_6dof_actual):
+    with pytest.raises(ConvergenceError, match=r"method gn.*--method lm"):
+        gauss_newton(case(sim_6dof, sim_6dof_actual), np.full(24, 1e7), 100)
+
+
+def test_step_rules_agree_for_floats_and_arrays():
+    """Over the ranges that occur, zeros included; the cubes of Python and NumPy differ in the last digit."""
+    rng = np.random.default_rng(0)
+    n = 2000
+    cost, predicted = 10.0 ** rng.uniform(-20, 8, n), 10.0 ** rng.uniform(-30, 8, n)
+    trial = cost - predicted * rng.uniform(-2, 2, n)
+    roundoff, last = 10.0 ** rng.uniform(-16, -8, n), 10.0 ** rng.uniform(-14, 2, n)
+    predicted[:50], last[50:100] = 0.0, 0.0
+    change = np.sqrt(cost) * 10.0 ** rng.uniform(-12, 1, n)
+    damping, norm = 10.0 ** rng.uniform(-18, 18, n), np.sqrt(cost)
+
+    def decide(cost, trial, predicted, roundoff, last, change, damping, norm):
+        gain = rules.gain_ratio(cost, trial, predicted)
+        within = rules.is_within_roundoff(predicted, trial, norm, roundoff)
+        return (
+            gain,
+            rules.cost_roundoff(norm, roundoff),
+            within,
+            rules.is_acceptable(cost, trial, gain, within),
+            rules.damping_after_acceptance(damping, gain, within),
+            *rules.damping_after_rejection(damping, rules.INITIAL_GROWTH),
+            rules.step_is_negligible(change, norm, last, roundoff),
+        )
+
+    columns = (cost, trial, predicted, roundoff, last, change, damping, norm)
+    together = decide(*columns)
+    single = [decide(*values) for values in zip(*(column.tolist() for column in columns), strict=True)]
+    for one, many in zip(zip(*single, strict=True), together, strict=True):
+        np.testing.assert_allclose(np.broadcast_to(many, n).astype(float), one, rtol=1e-15, atol=0)
+    # All branches occur.
+    assert 0 < together[2].sum() < n
+    assert 0 < together[3].sum() < n
+    assert 0 < together[7].sum() < n
+
+
+@pytest.mark.parametrize(
+    ("gain", "factor"), [(1.0, 1e-2), (0.91, 1e-2), (0.9, 1 - 0.8**3), (0.5, 1.0), (0.25, 1.125)]
+)
+def test_damping_follows_the_gain_ratio(gain, factor):
+    assert rules.damping_after_acceptance(1.0, gain, False) == pytest.approx(factor)
+
+
+def test_undamped_steps_become_rarer():
+    due, last = [], 0
+    for iteration in range(1, 100):
+        if rules.undamped_steps_are_due(iteration, last):
+            due.append(iteration)
+            last = iteration
+    assert due == [8, 16, 32, 64]
+
+
+def test_divergence_includes_what_is_not_finite():
+    x = np.array([[0.0, 1.0], [0.0, 2e6], [np.nan, 0.0], [np.inf, 0.0]])
+    assert rules.has_diverged(x).tolist() == [False, True, True, True]
