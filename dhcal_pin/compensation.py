@@ -1,9 +1,16 @@
-"""Where to send a robot so that its tool, by its calibrated model, lands on what was asked for.
+"""Compensation: joint positions and corrected targets that bring a calibrated tool to its targets.
 
-Two ways to use it: send the joint values, or, to a controller that keeps its nominal model, the corrected
-target, which is where that model puts the tool at those joint values. The second is as good as the first
-where the controller's own inverse solution is the same: a controller that folds the arm another way, or a
-redundant one that picks another elbow, meets other errors there.
+With the nominal kinematics f_0 of the controller and the calibrated kinematics f, each target T is solved for
+q with f(q) = T within the joint limits. There are two ways to use the result: send q, or send the corrected
+target f_0(q) to a controller that keeps its nominal model. Both are equivalent if the inverse solution of the
+controller is q. A controller that chooses another configuration of the arm, or another elbow of a redundant
+arm, has other errors.
+
+The solver starts from the given joint positions and from the nearest of a fixed random set of configurations,
+found by a k-d tree of their tool poses. Unsolved targets are tried again with more starts. Among several
+solutions the one nearest to the given joint positions is chosen.
+
+Shapes: m targets, n joints, c starts of a target.
 """
 
 from __future__ import annotations
@@ -15,11 +22,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
 from . import se3
 from ._typing import Array
-from .exceptions import DhcalError
+from .exceptions import InvalidArgumentError
 from .robot.chain import Chain
 from .robot.inverse_kinematics import (
     REACHED_TOL,
@@ -34,41 +39,43 @@ from .robot.inverse_kinematics import (
 )
 from .se3 import nearest_rotation
 
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+# Values of `Compensation.status`.
 OK, SINGULAR, LIMITS, OUT = "ok", "near singular", "joint limits", "out of reach"
 
-
-# A motion of the tool, by a thousandth of the arm's size or of a radian, that takes the joints 0.2 rad.
+# A target is near a singularity if a joint rate of 1 rad moves the tool by less than this, as a fraction of
+# the characteristic length per radian [1] or as an angle [rad/rad].
 _NEAR_SINGULAR_TOL = 5e-3
 
-
-# Configurations known beforehand, and how many of the best are taken along from round to round.
+# Number of random configurations, and of the best solutions of a round that are starts of the next one.
 _N_CONFIGURATIONS, _N_BEST = 8192, 4
 
-
-# Round after round for targets that are not reached: from how many of the known ones with how many steps, if
-# the tool came within this share of the arm's size.
+# Rounds for targets that are not solved yet: number of starts, number of steps, and the largest position
+# error so far, as a multiple of the characteristic length, with which a target takes part.
 _ROUNDS = ((8, 60, np.inf), (64, 60, np.inf), (512, 300, 0.3))
 
+# Number of targets that are solved together, which bounds the memory.
+_CHUNK_SIZE = 512
 
-# Targets at a time, so that memory does not grow with them.
-_CHUNK = 512
-
-
+# Maximum deviation of the elements of a target's rotation from those of the nearest rotation.
 _ROTATION_TOL = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Compensation:
-    """Joint values and corrected targets for m targets; NaN in rows that are not reached.
+    """Joint positions and corrected targets for m targets; NaN for targets that are not reached.
 
     Attributes:
-        q: (m, n) joint values, rad or m, that put the calibrated tool on the targets, within the limits.
-        poses: (m, 4, 4) corrected targets for a controller with the nominal model: where that model,
-            with its own base and tool, has the tool at `q`.
-        status: (m,) "ok", "near singular" (reached, but little of the tool takes much of the joints),
-            "joint limits" (reached only beyond them) or "out of reach".
-        residual_error: (m, 2) how far the calibrated tool stays from the targets, m and rad; the nearest that was
-            found where they are not reached. The second is 0 for targets without a rotation.
+        q: Joint positions within the limits that bring the calibrated tool to the targets, shape (m, n)
+            [rad or m].
+        poses: Corrected targets for a controller with the nominal model, shape (m, 4, 4) [m]: the poses of
+            its tool, with its own base and tool frame, at `q`.
+        status: "ok", "near singular" (reached, but small motions of the tool need large motions of the
+            joints), "joint limits" (reached only beyond the limits) or "out of reach", for each target.
+        residual_error: Distance and angle between the calibrated tool and the target, shape (m, 2) [m, rad];
+            of the nearest solution if the target is not reached. The angle is 0 for position targets.
     """
 
     q: Array
@@ -78,7 +85,7 @@ class Compensation:
 
     @property
     def reached(self) -> Array:
-        """Which targets (m,) have joint values: those that are "ok" or "near singular"."""
+        """Whether each target is reached, that is "ok" or "near singular", shape (m,)."""
         return np.isin(self.status, (OK, SINGULAR))
 
 
@@ -89,81 +96,87 @@ def compensate(
     near: ArrayLike | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Compensation:
-    """Joint values that put the calibrated arm on targets, and the corrected targets for the nominal one.
+    """Solve targets on the calibrated robot and correct them for a controller with the nominal model.
 
-    Every target is solved on the calibrated arm from many starts; what is kept is checked by forward
-    kinematics to 1e-9 m and 1e-9 rad. Where the nominal inverse solution, followed from the target to the
-    corrected one, ends elsewhere, the row is "near singular"; that is not asked of redundant arms.
+    Each solution is checked by forward kinematics to 1e-9 m and 1e-9 rad. A target is also "near singular" if
+    the inverse solution of the nominal model, continued from the target to the corrected target, ends in
+    another configuration. This check is omitted for redundant arms.
 
     Args:
-        nominal: what the controller believes, with its base and tool.
-        calibrated: the same robot's true geometry, with its base and tool.
-        targets: (m, 3) positions in m or (m, 4, 4) poses of the calibrated arm's tool, in its measuring
-            frame.
-        near: (n,) or (m, n) joint values; of several solutions the nearest is taken. Without it, the middle
-            of the limits, or zero where there are none.
-        progress: called with the number of targets done.
+        nominal: Model of the controller with its base and tool.
+        calibrated: Calibrated model of the same robot with its base and tool.
+        targets: Positions, shape (m, 3) [m], or poses, shape (m, 4, 4) [m], of the calibrated tool in the
+            measuring frame of the calibrated model.
+        near: Joint positions near which solutions are preferred, shape (n,) or (m, n) [rad or m]; by default
+            the middle of the limits, or zero without limits.
+        progress: Function that is called with the number of targets done.
+
+    Returns:
+        Joint positions, corrected targets and status of each target.
 
     Raises:
-        DhcalError: the chains are of different joints, or the targets are neither positions nor poses.
+        InvalidArgumentError: The two models have different joints, or `near` has a wrong shape.
     """
     if nominal.joint_names != calibrated.joint_names:
-        raise DhcalError(
-            f"{calibrated.urdf.source}: its joints are {', '.join(calibrated.joint_names)}; "
-            f"they must be those of {nominal.urdf.source}: {', '.join(nominal.joint_names)}"
+        raise InvalidArgumentError(
+            f"{calibrated.urdf.source}: the joints are {', '.join(calibrated.joint_names)}; expected those "
+            f"of {nominal.urdf.source}: {', '.join(nominal.joint_names)}"
         )
-    targets = _checked(targets)
+    targets = _validated_targets(targets)
     near = calibrated.validated_q(np.atleast_2d(_mid_range(calibrated) if near is None else near))
     if len(near) not in (1, len(targets)):
-        raise DhcalError(f"near has {len(near)} rows; give one, or one a target ({len(targets)})")
+        raise InvalidArgumentError(f"near has {len(near)} rows; expected 1 or {len(targets)}, one per target")
     near = np.broadcast_to(near, (len(targets), calibrated.n_joints))
     search = _Search.from_chain(calibrated, targets.ndim == 3)
-    parts = []
-    for first in range(0, len(targets), _CHUNK):
-        chunk = slice(first, first + _CHUNK)
-        parts.append(search.find(targets[chunk], near[chunk]))
+    chunks = []
+    for first in range(0, len(targets), _CHUNK_SIZE):
+        chunk = slice(first, first + _CHUNK_SIZE)
+        chunks.append(search.find(targets[chunk], near[chunk]))
         if progress is not None:
-            progress(min(first + _CHUNK, len(targets)))
-    q, status, miss = (np.concatenate(part) for part in zip(*parts, strict=True))
+            progress(min(first + _CHUNK_SIZE, len(targets)))
+    q, status, residual_error = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
     reached = np.flatnonzero(status == OK)
     poses = np.full((len(q), 4, 4), np.nan)
     poses[reached] = nominal.poses(q[reached])
-    delicate = _is_near_singular(nominal, calibrated, targets[reached], q[reached])
-    status[reached[delicate]] = SINGULAR
-    return Compensation(q, poses, tuple(status.tolist()), miss)
+    is_singular = _is_near_singular(nominal, calibrated, targets[reached], q[reached])
+    status[reached[is_singular]] = SINGULAR
+    return Compensation(q, poses, tuple(status.tolist()), residual_error)
 
 
-def _checked(targets: ArrayLike) -> Array:
-    """Targets as finite (m, 3) or (m, 4, 4), rotations exact, or DhcalError."""
+def _validated_targets(targets: ArrayLike) -> Array:
+    """Return targets as floats, shape (m, 3) or (m, 4, 4), with exact rotations, after checking them."""
     out = np.array(targets, float)
     if out.shape[1:] not in ((3,), (4, 4)) or not len(out) or not np.isfinite(out).all():
-        raise DhcalError(
-            f"targets: finite positions (m, 3) or poses (m, 4, 4) are wanted, not shape {out.shape}"
+        raise InvalidArgumentError(
+            f"targets have shape {out.shape} or a value that is not finite; expected finite positions "
+            "(m, 3) or poses (m, 4, 4)"
         )
     if out.ndim == 3:
-        turns = nearest_rotation(out[:, :3, :3])
-        if np.abs(turns - out[:, :3, :3]).max() > _ROTATION_TOL or np.any(out[:, 3] != (0, 0, 0, 1)):
-            raise DhcalError("targets: a pose is a rotation and a position over a last row 0 0 0 1")
-        out[:, :3, :3] = turns
+        rotations = nearest_rotation(out[:, :3, :3])
+        if np.abs(rotations - out[:, :3, :3]).max() > _ROTATION_TOL or np.any(out[:, 3] != (0, 0, 0, 1)):
+            raise InvalidArgumentError(
+                "targets: a pose is not a rigid motion; expected a rotation, a position and last row 0 0 0 1"
+            )
+        out[:, :3, :3] = rotations
     return out
 
 
 def _mid_range(chain: Chain) -> Array:
-    """The middle (n,) of each joint's limits, or what is nearest to zero where there is one or none."""
-    both = np.isfinite(chain.lower) & np.isfinite(chain.upper)
+    """Return the middle of the joint limits, or the value nearest to zero without both limits, shape (n,)."""
+    has_both = np.isfinite(chain.lower) & np.isfinite(chain.upper)
     with np.errstate(invalid="ignore"):
-        return np.where(both, (chain.lower + chain.upper) / 2, np.clip(0.0, chain.lower, chain.upper))
+        return np.where(has_both, (chain.lower + chain.upper) / 2, np.clip(0.0, chain.lower, chain.upper))
 
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """An arm, and configurations of it found by where they bring the tool.
+    """Search for joint positions that bring the tool of a chain to targets.
 
     Attributes:
-        chain: base and tool included.
-        q: (c, n) joint values within the limits.
-        tree: of their tools.
-        with_rotations: whether rotations matter.
+        chain: Chain with base and tool.
+        q: Random configurations within the limits.
+        tree: Nearest-neighbour search of their tool poses.
+        with_rotations: Whether targets are poses.
     """
 
     chain: Chain
@@ -172,110 +185,116 @@ class _Search:
     with_rotations: bool
 
     @classmethod
-    def from_chain(cls, chain: Chain, turned: bool) -> _Search:
-        """Always the same configurations."""
+    def from_chain(cls, chain: Chain, with_rotations: bool) -> _Search:
+        """Create a search with a fixed random set of configurations."""
         span = np.where(chain.is_prismatic, characteristic_length(chain), np.pi)
         middle = _mid_range(chain)
         low, high = np.maximum(chain.lower, middle - span), np.minimum(chain.upper, middle + span)
         q = np.random.default_rng(0).uniform(low, high, (_N_CONFIGURATIONS, chain.n_joints))
-        # A heavy import that no other command needs.
-        from scipy.spatial import cKDTree
+        from scipy.spatial import cKDTree  # lazy import: scipy.spatial is slow to import
 
-        return cls(
-            chain, q, cKDTree(_search_points(chain.poses(q), turned, characteristic_length(chain))), turned
-        )
+        points = _search_points(chain.poses(q), with_rotations, characteristic_length(chain))
+        return cls(chain, q, cKDTree(points), with_rotations)
 
     def starts(self, targets: Array, count: int) -> Array:
-        """Joint values (m, count, n) that bring the tool near targets."""
-        places = (
+        """Return configurations whose tools are nearest to the targets, shape (m, count, n)."""
+        points = (
             _search_points(targets, True, characteristic_length(self.chain))
             if self.with_rotations
             else targets
         )
-        return self.q[self.tree.query(places, range(1, count + 1))[1]]
+        return self.q[self.tree.query(points, range(1, count + 1))[1]]
 
     def solve(self, chain: Chain, targets: Array, starts: Array, steps: int) -> tuple[Array, Array]:
-        """Joint values (m, c, n) of a chain from starts, and how far (m, c) they miss the targets, m."""
+        """Solve targets from several starts; return q, shape (m, c, n), and error norms, shape (m, c)."""
         m, count, n = starts.shape
-        q, wide = solve_ik(
-            chain, _task_error(chain, targets), starts.reshape(-1, n), steps, np.repeat(np.arange(m), count)
-        )
-        return q.reshape(m, count, n), wide.reshape(m, count)
+        samples = np.repeat(np.arange(m), count)
+        q, norms = solve_ik(chain, _task_error(chain, targets), starts.reshape(-1, n), steps, samples)
+        return q.reshape(m, count, n), norms.reshape(m, count)
 
     def find(self, targets: Array, near: Array) -> tuple[Array, Array, Array]:
-        """Joint values (m, n), status (m,) and miss (m, 2) of targets, nearest to `near` (m, n)."""
+        """Return q, shape (m, n), status, shape (m,), and residual errors, shape (m, 2), of targets."""
         m, n = near.shape
-        q, status, miss = np.full((m, n), np.nan), np.full(m, OUT, dtype=object), np.full((m, 2), np.nan)
-        scale = np.where(self.chain.is_prismatic, characteristic_length(self.chain), 1.0)
-        best, missed = np.repeat(near[:, None], _N_BEST, 1), np.zeros(m)
-        for count, steps, share in _ROUNDS:
-            left = np.flatnonzero((status == OUT) & (missed <= share * characteristic_length(self.chain)))
-            if not left.size:
+        length = characteristic_length(self.chain)
+        q, status = np.full((m, n), np.nan), np.full(m, OUT, dtype=object)
+        residual_error = np.full((m, 2), np.nan)
+        scale = np.where(self.chain.is_prismatic, length, 1.0)
+        best, best_norm = np.repeat(near[:, None], _N_BEST, 1), np.zeros(m)
+        for count, steps, max_error in _ROUNDS:
+            open_targets = np.flatnonzero((status == OUT) & (best_norm <= max_error * length))
+            if not open_targets.size:
                 continue
-            starts = np.concatenate([best[left], self.starts(targets[left], count)], 1)
-            tried, _ = self.solve(self.chain, targets[left], starts, steps)
-            # Whole turns less; an arm's errors need not repeat with them.
-            tried, _ = wrap_into_limits(self.chain, tried, near[left, None])
-            tried, wide = self.solve(self.chain, targets[left], tried, steps)
-            away = np.linalg.norm((tried - near[left, None]) / scale, axis=2)
-            # Those that are there first, the nearest before others; then those that miss least.
-            order = np.lexsort([np.where(wide <= REACHED_TOL, away, wide), wide > REACHED_TOL])[:, :_N_BEST]
-            best[left] = np.take_along_axis(tried, order[..., None], 1)
-            missed[left] = wide.min(1)
-            chosen = best[left, 0]
-            miss[left] = _tool_error(self.chain, chosen, targets[left])
-            inside = np.all((chosen >= self.chain.lower) & (chosen <= self.chain.upper), 1)
-            good = np.all(miss[left] <= REACHED_TOL, 1) & inside
-            q[left[good]], status[left[good]] = chosen[good], OK
-        left = np.flatnonzero(status == OUT)
-        _, wide = self.solve(without_rotary_limits(self.chain), targets[left], best[left], _ROUNDS[-1][1])
-        status[left[np.any(wide <= REACHED_TOL, 1)]] = LIMITS
-        return q, status, miss
+            goals = targets[open_targets]
+            starts = np.concatenate([best[open_targets], self.starts(goals, count)], 1)
+            tried, _ = self.solve(self.chain, goals, starts, steps)
+            # A calibrated arm need not be periodic, so it is solved again after removing whole turns.
+            tried, _ = wrap_into_limits(self.chain, tried, near[open_targets, None])
+            tried, norms = self.solve(self.chain, goals, tried, steps)
+            distance = np.linalg.norm((tried - near[open_targets, None]) / scale, axis=2)
+            # Solutions come first, ordered by distance; then the others, ordered by error.
+            is_open = norms > REACHED_TOL
+            order = np.lexsort([np.where(is_open, norms, distance), is_open])[:, :_N_BEST]
+            best[open_targets] = np.take_along_axis(tried, order[..., None], 1)
+            best_norm[open_targets] = norms.min(1)
+            chosen = best[open_targets, 0]
+            residual_error[open_targets] = _tool_error(self.chain, chosen, goals)
+            within_limits = np.all((chosen >= self.chain.lower) & (chosen <= self.chain.upper), 1)
+            accepted = np.all(residual_error[open_targets] <= REACHED_TOL, 1) & within_limits
+            q[open_targets[accepted]], status[open_targets[accepted]] = chosen[accepted], OK
+        open_targets = np.flatnonzero(status == OUT)
+        unlimited = without_rotary_limits(self.chain)
+        _, norms = self.solve(unlimited, targets[open_targets], best[open_targets], _ROUNDS[-1][1])
+        status[open_targets[np.any(norms <= REACHED_TOL, 1)]] = LIMITS
+        return q, status, residual_error
 
 
 def _task_error(chain: Chain, targets: Array) -> TaskError:
+    """Return the task error of positions or poses."""
     return position_task(targets) if targets.ndim == 2 else pose_task(targets, characteristic_length(chain))
 
 
-def _search_points(poses: Array, turned: bool, length: float) -> Array:
-    """Points (m, 3), or (m, 12) with rotations in them, that are near to each other where poses are."""
-    if not turned:
+def _search_points(poses: Array, with_rotations: bool, length: float) -> Array:
+    """Return points whose distances approximate those of poses, shape (m, 3), or (m, 12) with rotations."""
+    if not with_rotations:
         return poses[:, :3, 3]
-    # A small turn by an angle changes a rotation matrix by √2 of it.
+    # A small rotation by an angle changes a rotation matrix by √2 times the angle (Frobenius norm).
     return np.concatenate([poses[:, :3, 3], poses[:, :3, :3].reshape(-1, 9) * length / np.sqrt(2)], 1)
 
 
 def _tool_error(chain: Chain, q: Array, targets: Array) -> Array:
-    """Distance in m and angle in rad (m, 2) of the tool from targets; no angle where they have none."""
+    """Return distances [m] and angles [rad] between tool and targets, shape (m, 2)."""
     poses = chain.poses(q)
     if targets.ndim == 2:
         return np.stack([np.linalg.norm(poses[:, :3, 3] - targets, axis=1), np.zeros(len(q))], 1)
-    turn = se3.log3(poses[:, :3, :3] @ np.swapaxes(targets[:, :3, :3], 1, 2))
+    rotation = se3.log3(poses[:, :3, :3] @ np.swapaxes(targets[:, :3, :3], 1, 2))
     return np.stack(
-        [np.linalg.norm(poses[:, :3, 3] - targets[:, :3, 3], axis=1), np.linalg.norm(turn, axis=1)], 1
+        [np.linalg.norm(poses[:, :3, 3] - targets[:, :3, 3], axis=1), np.linalg.norm(rotation, axis=1)], 1
     )
 
 
 def _is_near_singular(nominal: Chain, calibrated: Chain, targets: Array, q: Array) -> Array:
-    """Which solutions (m,) stand at a singularity, or so near that the correction leads across it."""
-    # A controller is told a pose in any case.
-    asked = slice(6 if targets.ndim == 3 else 3)
+    """Return whether solutions are at a singularity, or whether the correction crosses one, shape (m,)."""
+    # The corrected target of the controller is always a pose.
+    components = slice(6 if targets.ndim == 3 else 3)
     out = (
-        np.minimum(_min_singular_value(nominal, q, slice(6)), _min_singular_value(calibrated, q, asked))
+        np.minimum(_min_singular_value(nominal, q, slice(6)), _min_singular_value(calibrated, q, components))
         < _NEAR_SINGULAR_TOL
     )
     if nominal.n_joints > 6:
-        return out  # A redundant arm's controller is free in any case.
-    # A controller that comes from the uncorrected target must end in the same joint values.
-    told = replace(nominal, base=calibrated.base, tool=calibrated.tool)
-    before, _ = solve_ik(told, _task_error(told, targets), q)
+        return out  # The controller of a redundant arm may choose other joint positions in any case.
+    # A controller that moves from the uncorrected target must end in the same joint positions.
+    uncorrected = replace(nominal, base=calibrated.base, tool=calibrated.tool)
+    before, _ = solve_ik(uncorrected, _task_error(uncorrected, targets), q)
     commanded, _ = solve_ik(nominal, pose_task(nominal.poses(q), characteristic_length(nominal)), before)
     return out | np.any(_tool_error(calibrated, commanded, targets) > REACHED_TOL, 1)
 
 
-def _min_singular_value(chain: Chain, q: Array, rows: slice) -> Array:
-    """The smallest motion (m,) of the tool, lengths in sizes of the arm, that a unit of the joints makes."""
-    twists = tool_pose_and_jacobian(chain, q)[1]
-    twists[:, :3] /= characteristic_length(chain)
-    twists[:, :, chain.is_prismatic] *= characteristic_length(chain)
-    return np.linalg.svd(twists[:, rows], compute_uv=False)[:, -1]
+def _min_singular_value(chain: Chain, q: Array, components: slice) -> Array:
+    """Return the smallest singular value of the scaled Jacobian, shape (m,).
+
+    Lengths are divided by the characteristic length, in the rows as well as in the columns.
+    """
+    jacobian = tool_pose_and_jacobian(chain, q)[1]
+    jacobian[:, :3] /= characteristic_length(chain)
+    jacobian[:, :, chain.is_prismatic] *= characteristic_length(chain)
+    return np.linalg.svd(jacobian[:, components], compute_uv=False)[:, -1]

@@ -13,16 +13,13 @@ from robots import URDF, paper, robot_file
 from scipy.spatial.transform import Rotation
 
 from dhcal_pin import se3
-from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.calibration import calibrate
 from dhcal_pin.cli import main
 from dhcal_pin.compensation import compensate
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io.measurement_csv import read_targets
-from dhcal_pin.io.robot import write_urdf
-from dhcal_pin.measurements.base import Noise
-from dhcal_pin.measurements.pose import Pose
-from dhcal_pin.robot.chain import Chain
-from dhcal_pin.robot.dh import DHTable
+from dhcal_pin.io import read_targets, write_urdf
+from dhcal_pin.measurements import Noise, Pose
+from dhcal_pin.robot import Chain, DHTable
 
 ERROR = np.array([5e-3] * 3 + [np.deg2rad(1.0)] * 3)
 

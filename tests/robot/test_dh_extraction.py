@@ -11,8 +11,8 @@ import pytest
 
 from dhcal_pin import se3
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.robot.dh import CONVENTIONS, DHTable
-from dhcal_pin.robot.dh_extraction import Extraction, extract_dh
+from dhcal_pin.robot import DHTable, Extraction, extract_dh
+from dhcal_pin.robot.dh import CONVENTIONS
 
 ROBOTS = Path(
     str(distribution("example-robot-data").locate_file("cmeel.prefix/share/example-robot-data/robots"))

@@ -11,8 +11,8 @@ import pinocchio as pin
 import pytest
 
 from dhcal_pin import se3
-from dhcal_pin.robot.dh import CONVENTIONS, DHTable
-from dhcal_pin.robot.dh_urdf import dh_to_urdf
+from dhcal_pin.robot import DHTable, dh_to_urdf
+from dhcal_pin.robot.dh import CONVENTIONS
 
 ORIGINS = re.compile(r'<joint name="[^"]*" type="[a-z]+">\n +<origin xyz="([^"]*)" rpy="([^"]*)"/>')
 

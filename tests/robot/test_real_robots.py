@@ -12,17 +12,14 @@ import pytest
 from robots import robot_file
 
 from dhcal_pin import se3
-from dhcal_pin.calibration.procedure import calibrate
-from dhcal_pin.estimation import qr
-from dhcal_pin.estimation.parameters import PARAMETER_SETS, select_parameters
-from dhcal_pin.estimation.problem import Problem, linearize_and_factor
+from dhcal_pin.calibration import calibrate
+from dhcal_pin.estimation import PARAMETER_SETS, Problem, linearize_and_factor, qr, select_parameters
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io.robot import read_robot, write_urdf
-from dhcal_pin.measurements.base import Noise
-from dhcal_pin.measurements.pose import Pose
-from dhcal_pin.paper.jacobian_check import crosscheck, kernel_jacobian, regressor_jacobian
-from dhcal_pin.robot.chain import Chain, extract_dh_table
-from dhcal_pin.robot.urdf import read_urdf
+from dhcal_pin.io import read_robot, write_urdf
+from dhcal_pin.measurements import Noise, Pose
+from dhcal_pin.paper import crosscheck
+from dhcal_pin.paper.jacobian_check import kernel_jacobian, regressor_jacobian
+from dhcal_pin.robot import Chain, extract_dh_table, read_urdf
 
 ARMS = {
     "ur3": ("ur_description/urdf/ur3_robot.urdf", "tool0"),

@@ -11,19 +11,17 @@ import pinocchio as pin
 import pytest
 from robots import paper, random_table, robot_file, with_masses
 
-from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.calibration import calibrate
 from dhcal_pin.cli.main import main
+from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.batch_chains import ChainBatch
-from dhcal_pin.estimation.parameters import EXTENSIONS, select_parameters
+from dhcal_pin.estimation.parameters import EXTENSIONS
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io.measurement_csv import measurement_text
-from dhcal_pin.io.robot import read_robot, write_urdf
-from dhcal_pin.measurements.base import Noise
-from dhcal_pin.measurements.pose import Pose
-from dhcal_pin.robot import Chain
-from dhcal_pin.robot.error_families import COUPLING, FAMILIES
-from dhcal_pin.robot.transmission import TERM_FAMILIES, TERMS, Payload
-from dhcal_pin.robot.urdf import parse_urdf
+from dhcal_pin.io import measurement_text, read_robot, write_urdf
+from dhcal_pin.measurements import Noise, Pose
+from dhcal_pin.robot import FAMILIES, Chain, Payload, parse_urdf
+from dhcal_pin.robot.error_families import COUPLING
+from dhcal_pin.robot.transmission import TERM_FAMILIES, TERMS
 
 
 def ur10() -> Chain:
@@ -161,7 +159,10 @@ def test_sidecar_preserves_the_robot(tmp_path):
         ("[joint.elbow_joint]\nsin_rad = nan", "sin_rad = nan; expected a finite number"),
         ("[joint.elbow_joint]\ngain = [1.0]", "expected a finite number"),
         ("[joint]\nelbow_joint = 1", "1 is not a table"),
-        ("[joint.elbow_joint.coupling]\nelbow_joint = 0.1", "is not another joint; choose from shoulder_pan_joint"),
+        (
+            "[joint.elbow_joint.coupling]\nelbow_joint = 0.1",
+            "is not another joint; choose from shoulder_pan_joint",
+        ),
         ("[joint.elbow_joint]\ncoupling = 0.1", r"coupling\]: 0.1 is not a table"),
     ],
 )

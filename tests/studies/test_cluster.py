@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 from study_runs import LARGE_STUDY, SMALL_STUDY, table_of
 
-from dhcal_pin.calibration.streaming import calibrate_stream
+from dhcal_pin.calibration import calibrate_stream
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io.measurement_csv import iter_measurements, measurement_text
-from dhcal_pin.measurements.base import Noise
-from dhcal_pin.measurements.position import Position
+from dhcal_pin.io import iter_measurements, measurement_text
+from dhcal_pin.measurements import Noise, Position
 from dhcal_pin.parallel import open_executor
 from dhcal_pin.studies import read_study, run
 

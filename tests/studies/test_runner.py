@@ -17,9 +17,9 @@ from study_runs import LARGE_STUDY, SMALL_STUDY, table_of
 
 from dhcal_pin.cli import main
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io.robot import read_robot
-from dhcal_pin.measurements.base import Noise
-from dhcal_pin.planning.planner import plan
+from dhcal_pin.io import read_robot
+from dhcal_pin.measurements import Noise
+from dhcal_pin.planning import plan
 from dhcal_pin.studies import read_study, result_table, run
 
 SIX = """
