@@ -172,6 +172,9 @@ def _log3_near_half_turn(r: Array) -> Array:
 
     Each row of 4·q·qᵀ with q = [w, x, y, z] is proportional to q. The row of the largest vector component
     is used because it has the smallest rounding error.
+
+    Returns:
+        Rotation vectors, shape (m, 3) [rad].
     """
     m, trace = len(r), np.trace(r, axis1=1, axis2=2)
     rows = np.empty((m, 3, 4))

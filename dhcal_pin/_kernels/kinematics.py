@@ -218,6 +218,9 @@ def _exponentials(twists: Array, x: Array) -> Array:
     With the matrix A of ξ/|ω| and θ = x·|ω|: exp = I + θ·A + (1 - cos θ)·A² + (θ - sin θ)·A³, because A⁴ =
     -A². The term 1 - cos θ is computed as 2·sin²(θ/2), which does not cancel. For ω = 0 the exponential is I
     + x·ξ.
+
+    Returns:
+        Transforms, shape (p, 4, 4).
     """
     matrices = np.zeros((len(x), 4, 4))
     matrices[:, :3, :3], matrices[:, :3, 3] = se3.skew(twists[:, 3:]), twists[:, :3]

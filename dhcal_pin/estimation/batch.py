@@ -310,6 +310,9 @@ def _levenberg_marquardt(batch: BatchProblem, x: Array, max_iterations: int) -> 
     In each pass every active problem tries one step. Problems whose step was accepted are linearized again;
     the others retry with more damping. Arrays without index have one element per problem of the batch, or per
     active problem where they are computed from `active`.
+
+    Returns:
+        Parameters, shape (b, p); numbers of iterations and flags of convergence, shape (b,).
     """
     b, p, active_batch, active = len(batch), len(batch.weights), batch, np.arange(len(batch))
     x, iterations, converged = x.copy(), np.zeros(b, int), np.zeros(b, bool)

@@ -242,6 +242,9 @@ def _base_transform(
 
     The base can contain any motion, so it takes everything except the offset along an upright axis 1. Only an
     origin that already is a modified row goes to the table.
+
+    Returns:
+        Base transform and remaining parameters.
     """
     row = _split_origin(origin, 0.0, arm_length, max_tilt, offset_first=False)
     if not standard and row.t1 == 0 and row.d1 == 0:
@@ -257,6 +260,9 @@ def _split_origin(
 
     `previous_t2` is the rotation that the joint before the origin already has. For a row with β, the free
     offset goes to d1 if `offset_first`, else to d2.
+
+    Returns:
+        The seven parameters.
     """
     tilt = _tilt(origin)
     t1, d2 = _common_normal(origin) if tilt > QUARTER_TURN_TOL else (0.0, 0.0)

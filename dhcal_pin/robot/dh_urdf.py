@@ -179,6 +179,9 @@ def _skeletons(table: DHTable) -> list[_Skeleton]:
 
     In the standard convention, row i belongs to link i, d before a. In the modified convention, row i belongs
     to link i-1, a before d.
+
+    Returns:
+        One skeleton per link.
     """
     row = table.rows(np.zeros((1, table.n_joints)))[0]
     start, zero = table.base[:3, 3], np.zeros(3)

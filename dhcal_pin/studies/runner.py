@@ -162,6 +162,9 @@ def _draw_true_chains(case: Case, seeds: range) -> tuple[ChainBatch, Array]:
     """Draw the true robots and their errors in the estimated parameters, shape (b, p).
 
     The errors are NaN if the estimated parameters cannot express them.
+
+    Returns:
+        True chains and their errors.
     """
     setting, b = case.setting, len(seeds)
     estimated = select_parameters(case.nominal, setting.parameters)
