@@ -34,9 +34,8 @@ if TYPE_CHECKING:
 # A joint whose errors are larger than this multiple of the joints' median gets a scale of its own. Errors
 # before the calibration are left out if they are larger than this multiple of those after it.
 MAX_SCALE_RATIO = 4.0
-# Displacement of the drawn robot relative to its size that the magnified errors should have, and the largest
-# magnification.
-DRAWN_DISPLACEMENT, MAX_MAGNIFICATION = 0.05, 500.0
+# Displacement that the magnified errors should cause, relative to the size of the robot.
+DRAWN_DISPLACEMENT = 0.05
 
 
 @dataclass(frozen=True)
@@ -358,14 +357,14 @@ def scene_magnification(context: ReportContext) -> float:
         context: Result and diagnostics.
 
     Returns:
-        Magnification: 1, 2 or 5 times a power of ten, from 1 to `MAX_MAGNIFICATION`.
+        Magnification: 1, 2 or 5 times a power of ten, from 1 to `scene.MAX_MAGNIFICATION`.
     """
     nominal, calibrated = (
         _arm_points(chain, context)[:-1] for chain in (context.fit.nominal_refitted, context.fit.chain)
     )
     displacement = float(np.linalg.norm(calibrated - nominal, axis=1).max())
     wanted = DRAWN_DISPLACEMENT * float(np.ptp(nominal, axis=0).max()) / max(displacement, 1e-12)
-    return min(max(_round_up_125(max(wanted, 1e-3) / 2), 1.0), MAX_MAGNIFICATION)
+    return min(max(_round_up_125(max(wanted, 1e-3) / 2), 1.0), scene.MAX_MAGNIFICATION)
 
 
 def _arm_points(chain: Chain, context: ReportContext) -> Array:

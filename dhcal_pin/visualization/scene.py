@@ -1,14 +1,16 @@
-"""The robot before and after calibration in one offline web page: MeshCat with sliders and switches.
+"""3-D scene of the robot before and after calibration, as one web page that needs no network.
 
-The page holds everything it needs: MeshCat's own script, the meshes, the kinematics. It opens from
-disk, inside a notebook and inside a report; it starts no server and asks no host for anything. Python
-sends it a tree of *bodies*, each with its place in its parent as built on paper, the twist that leads
-from there to the calibrated place, and the joint that moves it; `viewer.html` draws that. Errors are
-magnified by stretching these twists, so that at 1 × the page shows the calibrated arm itself.
+The page contains everything that it shows: the script of MeshCat, the meshes and the kinematics. It opens
+from disk, in notebooks and in reports.
 
-Everything is drawn in the frame of the calibrated arm's base link; the tips that the page states are
-in the measuring frame. A nominal arm without base or tool of its own borrows the calibrated one's:
-these say where the instrument stands and what it looks at, not how the robot was made.
+Python describes the robot as a tree of bodies (`kinematic_tree`), which `viewer.html` draws. Each body has
+its nominal placement in its parent, T, the twist ξ = log(T⁻¹ T_calibrated) of its calibrated placement, and
+the joint that moves it. Errors are magnified by the factor s as T exp(s ξ), so that s = 1 shows the
+calibrated robot itself.
+
+Everything is drawn in the frame of the calibrated robot's base link. The page states tool positions in the
+measuring frame. A nominal robot without base or tool takes those of the calibrated robot, because they
+describe the set-up of the measurement and not the robot.
 """
 
 from __future__ import annotations
@@ -28,27 +30,25 @@ from .. import se3
 from .._typing import Array, PathLike
 from ..calibration.result import Result
 from ..estimation.uncertainty import Predictor
-from ..exceptions import DhcalError
+from ..exceptions import InvalidArgumentError
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from ..robot.transmission import TERMS, GravityLoads
 from .meshes import rows, visuals_of
 from .subsampling import evenly_spaced_indices
 
-MAX_POINTS = 2000  # more are thinned out evenly: the page keeps moving smoothly
-
-
-MAX_ELLIPSOIDS = 400  # more would hide each other
-
-
-MAX_TRIANGLES = 60_000  # that the meshes keep: with more the page would hardly turn, and be large
-
-
+# Largest number of measured points and of configurations to play; more would make the page slow.
+MAX_POINTS = 2000
+# Largest number of ellipsoids; more would hide each other.
+MAX_ELLIPSOIDS = 400
+# Largest number of triangles of all meshes; more would make the page large and slow.
+MAX_TRIANGLES = 60_000
+# Fewer triangles cannot show a robot.
 MIN_TRIANGLES = 100
-
-
-DEFAULT_STROKE_M = 0.5  # m each way for a sliding joint without limits
-
+# Largest magnification of errors.
+MAX_MAGNIFICATION = 500
+# Range of a slider in each direction for a prismatic joint without limits [m].
+DEFAULT_STROKE_M = 0.5
 
 PAGE = Path(__file__).with_name("viewer.html")
 
@@ -66,33 +66,35 @@ def scene_html(
     magnification: float = 1.0,
     triangles: int = MAX_TRIANGLES,
 ) -> str:
-    """One offline HTML page of an arm, or of an arm before and after its calibration.
+    """Build the page of a robot, or of a robot before and after its calibration.
 
     Args:
-        nominal: the arm as it was thought to be; a ghost beside the calibrated one, solid if alone.
-        calibrated: the same arm with other origins, base and tool; or the result that found it: then the
-            nominal arm stands where it was fitted to the same data, those data are shown, and ellipsoids
-            of one standard deviation say how well the calibrated tool's place is known.
-        q: (m, n) poses to play, rad or m; those of the measurements without it.
-        measurements: those that are positions are drawn, with arrows from where the arm puts them.
-        known: values of the instruments' unknowns, as in `Result.instruments`; without it where their
-            search starts.
-        predictor: how well the calibrated tool's place is known; the result itself without it.
-        title: the page's heading.
-        package_dirs: where to look for the URDF's meshes; the folders above the URDF without it.
-        magnification: how many times larger than true the errors are drawn at first, 1 to 500.
-        triangles: most of them that the meshes keep all together; 15,000 still show what each link is.
+        nominal: Nominal robot; transparent beside the calibrated one, solid if alone.
+        calibrated: Calibrated robot with the same joints, or the result of the calibration. With a result,
+            the nominal robot has the base and tool that fit the same measurements, these measurements are
+            shown, and ellipsoids show one standard deviation of the tool position.
+        q: Joint positions to play, shape (m, n) [rad or m]; by default those of the measurements.
+        measurements: Measurements; positions among them are drawn with arrows from the modelled positions.
+        known: Values of instrument parameters by name, as in `Result.instruments`; by default their initial
+            values.
+        predictor: Source of the uncertainty of the tool position; by default the result.
+        title: Heading of the page.
+        package_dirs: Folders that contain the meshes of the URDF; by default the folders above the URDF.
+        magnification: Initial magnification of errors, from 1 to `MAX_MAGNIFICATION`.
+        triangles: Largest number of triangles of all meshes; 15,000 still show the form of each link.
 
     Returns:
-        The page; the same bytes for the same input.
+        Text of the page; the same for the same input.
 
     Raises:
-        DhcalError: the two arms have different joints, or q does not fit them.
+        InvalidArgumentError: The two robots have different joints, or an argument has a wrong shape or value.
     """
-    if not 1 <= magnification <= 500:
-        raise DhcalError(f"magnification {magnification:g}: must be between 1 and 500")
+    if not 1 <= magnification <= MAX_MAGNIFICATION:
+        raise InvalidArgumentError(
+            f"magnification {magnification:g}: expected a number from 1 to {MAX_MAGNIFICATION}"
+        )
     if triangles < MIN_TRIANGLES:
-        raise DhcalError(f"{triangles} triangles draw no robot: allow {MIN_TRIANGLES} at least")
+        raise InvalidArgumentError(f"{triangles} triangles: expected at least {MIN_TRIANGLES}")
     if isinstance(calibrated, Result):
         predictor = predictor or calibrated
         measurements = calibrated.data if measurements is None else measurements
@@ -102,60 +104,61 @@ def scene_html(
         )
         calibrated = calibrated.chain
     measurements = measurements or ()
-    arm = nominal if calibrated is None else calibrated
-    arms = kinematic_tree(nominal, arm)
-    drawn = visuals_of(nominal, arms["bodies"], package_dirs, triangles)
-    played = (
-        [q]
-        if q is not None
-        else [item.configurations() for item in measurements if item.configurations_per_row]
-    )
-    poses = np.concatenate([np.empty((0, nominal.n_joints)), *map(nominal.validated_q, played)])
-    samples, points, residuals = _points(arm, measurements, known or {})
-    thinned = evenly_spaced_indices(len(samples), MAX_POINTS)
-    notes = [drawn.note]
-    if len(thinned) < len(samples):
-        notes.append(f"{len(thinned)} of {len(samples)} measured points are drawn.")
-    ellipsoids = _ellipsoids(predictor, poses) if predictor else []
-    if predictor and len(poses) and not ellipsoids:
-        notes.append("No ellipsoids: the data do not tell how well the tool's place is known.")
+    shown = nominal if calibrated is None else calibrated
+    tree = kinematic_tree(nominal, shown)
+    visuals = visuals_of(nominal, tree["bodies"], package_dirs, triangles)
+    parts = [item.configurations() for item in measurements if item.configurations_per_row]
+    played = [q] if q is not None else parts
+    configurations = np.concatenate([np.empty((0, nominal.n_joints)), *map(nominal.validated_q, played)])
+    samples, points, residuals = _measured_points(shown, measurements, known or {})
+    drawn = evenly_spaced_indices(len(samples), MAX_POINTS)
+    notes = [visuals.note]
+    if len(drawn) < len(samples):
+        notes.append(f"{len(drawn)} of {len(samples)} measured points are drawn.")
+    ellipsoids = _ellipsoids(predictor, configurations) if predictor else []
+    if predictor and len(configurations) and not ellipsoids:
+        notes.append("No ellipsoids: the measurements do not determine the uncertainty of the tool position.")
+    base = shown.base
     scene = {
         "title": title,
         "note": " ".join(filter(None, notes)),
-        "compared": calibrated is not None,
+        "has_calibrated": calibrated is not None,
         "magnification": magnification,
-        "joints": _joints(nominal, np.concatenate([poses, samples])),
-        "poses": poses[evenly_spaced_indices(len(poses), MAX_POINTS)].tolist(),
-        "samples": samples[thinned].tolist(),
-        "points": np.round((points[thinned] - arm.base[:3, 3]) @ arm.base[:3, :3], 9).tolist(),
-        "residuals": np.round(residuals[thinned] @ arm.base[:3, :3], 9).tolist(),
+        "max_magnification": MAX_MAGNIFICATION,
+        "joints": _sliders(nominal, np.concatenate([configurations, samples])),
+        "configurations": configurations[evenly_spaced_indices(len(configurations), MAX_POINTS)].tolist(),
+        "samples": samples[drawn].tolist(),
+        "points": np.round((points[drawn] - base[:3, 3]) @ base[:3, :3], 9).tolist(),
+        "residuals": np.round(residuals[drawn] @ base[:3, :3], 9).tolist(),
         "ellipsoids": ellipsoids,
-        "shapes": drawn.shapes,
-        "meshes": [mesh.encoded() for mesh in drawn.meshes],
-        **arms,
+        "shapes": visuals.shapes,
+        "meshes": [mesh.encoded() for mesh in visuals.meshes],
+        **tree,
     }
     data = json.dumps(scene, separators=(",", ":"), ensure_ascii=False).replace("<", "\\u003c")
     terms = ", ".join(f"{term.name}: (q, torque) => {term.javascript}" for term in TERMS)
-    parts = {
+    replacements = {
         "@TITLE@": html.escape(title),
         "/*@MESHCAT@*/": _meshcat(),
         # Script text, not data of the scene: the page's security policy forbids evaluating strings.
         "/*@TERMS@*/": terms,
         "@SCENE@": data,
     }
-    return re.sub("|".join(map(re.escape, parts)), lambda mark: parts[mark[0]], PAGE.read_text("utf-8"))
+    marks = "|".join(map(re.escape, replacements))
+    return re.sub(marks, lambda mark: replacements[mark[0]], PAGE.read_text("utf-8"))
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A page that notebooks show inline.
+    """Page that notebooks show inline.
 
     Attributes:
-        html: the page.
-        height: of the frame in the notebook, pixels.
+        html: Text of the page.
+        height: Height of the frame in the notebook [px].
     """
 
-    html: str = field(repr=False)  # a notebook keeps the repr too
+    # Notebooks save the repr as well, so it must be short.
+    html: str = field(repr=False)
     height: int
 
     def _repr_html_(self) -> str:
@@ -167,19 +170,22 @@ class Scene:
 def show(
     nominal: Chain, calibrated: Chain | Result | None = None, *, height: int = 620, **options: Any
 ) -> Scene:
-    """The page inline in a notebook, also in a saved one.
+    """Show the robot in a notebook; the scene is part of the saved notebook.
 
     Args:
-        nominal: the arm as it was thought to be.
-        calibrated: the calibrated arm, or the result that found it.
-        height: of the frame in the notebook, pixels.
-        options: as for `scene_html`.
+        nominal: Nominal robot.
+        calibrated: Calibrated robot, or the result of the calibration.
+        height: Height of the frame in the notebook [px].
+        options: Further arguments of `scene_html`.
+
+    Returns:
+        Page that the notebook shows.
     """
     return Scene(scene_html(nominal, calibrated, **options), height)
 
 
 def _meshcat() -> str:
-    """MeshCat's script with its licences, without importing the package and its server."""
+    """Return the script of MeshCat with its licences, without importing the package and its server."""
     package = metadata.distribution("meshcat")
     viewer = Path(str(package.locate_file("meshcat/viewer")))
     parts = ["/*!", (viewer / "LICENSE").read_text(encoding="utf-8"), "*/"]
@@ -190,154 +196,193 @@ def _meshcat() -> str:
     return "\n".join(parts).replace("</script", "<\\/script")
 
 
-def with_shared_frames(nominal: Chain, arm: Chain) -> Chain:
-    """The nominal arm as drawn and compared: with the other's base and tool where it has none of its own."""
-    same = np.eye(4)
+def with_shared_frames(nominal: Chain, calibrated: Chain) -> Chain:
+    """Give a nominal robot without base or tool those of the calibrated robot.
+
+    Args:
+        nominal: Nominal robot.
+        calibrated: Calibrated robot.
+
+    Returns:
+        Nominal robot for drawing and comparison.
+    """
+    identity = np.eye(4)
     return replace(
         nominal,
-        base=arm.base if np.array_equal(nominal.base, same) else nominal.base,
-        tool=arm.tool if np.array_equal(nominal.tool, same) else nominal.tool,
+        base=calibrated.base if np.array_equal(nominal.base, identity) else nominal.base,
+        tool=calibrated.tool if np.array_equal(nominal.tool, identity) else nominal.tool,
     )
 
 
-def kinematic_tree(nominal: Chain, arm: Chain) -> dict[str, Any]:
-    """The tree of bodies and the two arms' frames.
+def kinematic_tree(nominal: Chain, calibrated: Chain) -> dict[str, Any]:
+    """Describe the bodies and joints of both robots for the page.
 
-    Body 0 is the base link, body i the model's joint i, and the last two are tip and tool; each has
-    `parent`, `placement` in it, `twist` (6) to the calibrated placement, and where it moves `axes` of
-    both arms, `slides`, `mixing` (n,) and `shift`. The measuring frame sees a drawn tool D at `stands`·D.
-    Of each of `arms`, `terms` say how its joints miss their values, and where they yield to weights
-    `loads` are the bodies that these pull at.
+    Body 0 is the base link, body i the link after joint i of the Pinocchio model, and the last two are tip
+    and tool. A body has these keys:
+
+    - `parent`: number of its parent; -1 for the base link.
+    - `placement`: nominal pose in the parent (upper three rows).
+    - `twist`: twist from the nominal to the calibrated placement.
+    - `axes`, if a joint moves it: joint axis of the nominal and of the calibrated robot; further the keys of
+      `_joint_input`.
+
+    Args:
+        nominal: Nominal robot.
+        calibrated: Calibrated robot with the same joints; the nominal one if there is no other.
+
+    Returns:
+        `bodies`; `base_in_measuring_frame`, the pose of the calibrated base link; and `transmissions` of the
+        nominal and the calibrated robot, see `_transmission`.
+
+    Raises:
+        InvalidArgumentError: The robots have different joints.
     """
-    if (arm.joint_names, arm.moving_joints) != (nominal.joint_names, nominal.moving_joints):
-        raise DhcalError(
-            f"the arms differ: one moves {', '.join(nominal.moving_joints)}, the other {', '.join(arm.moving_joints)}; "
-            "give both the same tip"
+    if (calibrated.joint_names, calibrated.moving_joints) != (nominal.joint_names, nominal.moving_joints):
+        first, second = (", ".join(chain.moving_joints) for chain in (nominal, calibrated))
+        raise InvalidArgumentError(
+            f"the robots differ: one moves {first}, the other {second}; give both the same tip"
         )
-    drawn = with_shared_frames(nominal, arm)
-    model, k = nominal.model, len(nominal.moving_joints)
-    index = [model.getJointId(name) for name in nominal.moving_joints]
-    bodies = [_body(-1, se3.inverse(arm.base) @ drawn.base, np.eye(4))]
+    drawn = with_shared_frames(nominal, calibrated)
+    model, n_moving = nominal.model, len(nominal.moving_joints)
+    joint_ids = [model.getJointId(name) for name in nominal.moving_joints]
+    bodies = [_body(-1, se3.inverse(calibrated.base) @ drawn.base, np.eye(4))]
     bodies += [
         _body(parent, placement.homogeneous, placement.homogeneous)
         for parent, placement in zip(list(model.parents)[1:], list(model.jointPlacements)[1:], strict=True)
     ]
-    for j, i in enumerate(index):
-        bodies[i] = _body(int(model.parents[i]), nominal.origins[j], arm.origins[j]) | {
-            "axes": [nominal.axes[j].tolist(), arm.axes[j].tolist()],
+    for j, i in enumerate(joint_ids):
+        bodies[i] = _body(int(model.parents[i]), nominal.origins[j], calibrated.origins[j]) | {
+            "axes": [nominal.axes[j].tolist(), calibrated.axes[j].tolist()],
             **_joint_input(nominal, j),
         }
-    bodies.append(_body(index[-1], nominal.origins[k], arm.origins[k]))
-    bodies.append(_body(len(bodies) - 1, drawn.tool, arm.tool))
+    bodies.append(_body(joint_ids[-1], nominal.origins[n_moving], calibrated.origins[n_moving]))
+    bodies.append(_body(len(bodies) - 1, drawn.tool, calibrated.tool))
     return {
         "bodies": bodies,
-        "base_in_measuring_frame": rows(arm.base),
-        "arms": [_transmission_terms(nominal), _transmission_terms(arm)],
+        "base_in_measuring_frame": rows(calibrated.base),
+        "transmissions": [_transmission(nominal), _transmission(calibrated)],
     }
 
 
 def _body(parent: int, placement: Array, calibrated: Array) -> dict[str, Any]:
-    same = np.array_equal(placement, calibrated)
-    twist = np.zeros(6) if same else se3.log6(se3.inverse(placement) @ calibrated)
+    is_same = np.array_equal(placement, calibrated)
+    twist = np.zeros(6) if is_same else se3.log6(se3.inverse(placement) @ calibrated)
     return {"parent": int(parent), "placement": rows(placement), "twist": twist.tolist()}
 
 
-def _transmission_terms(chain: Chain) -> dict[str, Any]:
-    """An arm's transmission, term by term: which joint by what of which joint, and its coefficient."""
+def _joint_input(chain: Chain, j: int) -> dict[str, Any]:
+    """Return the type of moving joint j and how its position follows from the independent joints."""
+    return {
+        "is_prismatic": bool(chain.prismatic[j]),
+        "mimic_multipliers": chain.mimic_matrix[j].tolist(),
+        "mimic_offset": float(chain.mimic_offset[j]),
+    }
+
+
+def _transmission(chain: Chain) -> dict[str, Any]:
+    """Return the transmission errors of a robot.
+
+    Each of `terms` adds `coefficient` times the term `name`, evaluated at the joint `input_joint`, to the
+    position of the joint `joint`. `gravity_bodies` exist if a joint is elastic; see `_gravity_bodies`.
+
+    Args:
+        chain: The robot.
+
+    Returns:
+        `terms` and `gravity_bodies`.
+    """
     if chain.transmission is None:
         return {"terms": []}
-    held = chain.transmission.coefficients
+    coefficients = chain.transmission.coefficients
     terms = [
-        {"name": TERMS[t].name, "joint": int(i), "of": int(j), "value": float(held[t, i, j])}
-        for t, i, j in np.argwhere(held)
+        {
+            "name": TERMS[t].name,
+            "joint": int(i),
+            "input_joint": int(j),
+            "coefficient": float(coefficients[t, i, j]),
+        }
+        for t, i, j in np.argwhere(coefficients)
     ]
-    return {"terms": terms} | (
-        {"loads": _gravity_bodies(chain, chain.transmission.loads)}
-        if chain.transmission.has_compliance
-        else {}
-    )
+    if not chain.transmission.has_compliance:
+        return {"terms": terms}
+    return {"terms": terms, "gravity_bodies": _gravity_bodies(chain, chain.transmission.loads)}
 
 
 def _gravity_bodies(chain: Chain, loads: GravityLoads) -> list[dict[str, Any]]:
-    """The tree of what loads a chain's joints: each body's weight, N, its centre, and what moves it."""
+    """Return the bodies whose weight loads the joints: weight [N], centre of mass and joint of each."""
     model = loads.model
-    moved = {model.getJointId(name): j for j, name in enumerate(chain.moving_joints)}
-    out = []
+    moving = {model.getJointId(name): j for j, name in enumerate(chain.moving_joints)}
+    bodies = []
     for i, inertia in enumerate(model.inertias):
         body = {
             "parent": int(model.parents[i]),
             "placement": rows(model.jointPlacements[i].homogeneous),
             "weight": -float(inertia.mass * model.gravity.linear[2]),
-            "centre": inertia.lever.tolist(),
+            "centre_of_mass": inertia.lever.tolist(),
         }
-        out.append(
-            body
-            | ({"axis": chain.axes[moved[i]].tolist()} | _joint_input(chain, moved[i]) if i in moved else {})
-        )
-    return out
+        if i in moving:
+            body |= {"axis": chain.axes[moving[i]].tolist(), **_joint_input(chain, moving[i])}
+        bodies.append(body)
+    return bodies
 
 
-def _joint_input(chain: Chain, j: int) -> dict[str, Any]:
-    """What moves the moving joint j by how much."""
-    return {
-        "slides": bool(chain.prismatic[j]),
-        "mixing": chain.mimic_matrix[j].tolist(),
-        "shift": float(chain.mimic_offset[j]),
-    }
-
-
-def _joints(chain: Chain, poses: Array) -> list[dict[str, Any]]:
-    """Sliders: range, wide enough for all poses (m, n), and where they start, rad or m."""
-    slides = [
+def _sliders(chain: Chain, configurations: Array) -> list[dict[str, Any]]:
+    """Return range and initial value of each joint's slider; the range contains all configurations (m, n)."""
+    is_prismatic = [
         bool(chain.prismatic[np.flatnonzero(chain.mimic_matrix[:, i])[0]]) for i in range(chain.n_joints)
     ]
-    wide = np.where(slides, DEFAULT_STROKE_M, np.pi)
-    lower = np.where(np.isfinite(chain.lower), chain.lower, np.minimum(chain.upper, wide) - 2 * wide)
-    lower = np.where(np.isfinite(lower), lower, -wide)
-    upper = np.where(np.isfinite(chain.upper), chain.upper, np.maximum(lower, -wide) + 2 * wide)
+    half_range = np.where(is_prismatic, DEFAULT_STROKE_M, np.pi)
+    lower = np.where(
+        np.isfinite(chain.lower), chain.lower, np.minimum(chain.upper, half_range) - 2 * half_range
+    )
+    lower = np.where(np.isfinite(lower), lower, -half_range)
+    upper = np.where(np.isfinite(chain.upper), chain.upper, np.maximum(lower, -half_range) + 2 * half_range)
     start = np.where((lower <= 0) & (upper >= 0), 0.0, 0.5 * (lower + upper))
-    if len(poses):
-        lower, upper = np.minimum(lower, poses.min(0)), np.maximum(upper, poses.max(0))
-        start = poses[0]
-    return [
-        {"name": name, "slides": slide, "lower": low, "upper": high, "start": value}
-        for name, slide, low, high, value in zip(
-            chain.joint_names, slides, lower.tolist(), upper.tolist(), start.tolist(), strict=True
-        )
-    ]
+    if len(configurations):
+        lower, upper = np.minimum(lower, configurations.min(0)), np.maximum(upper, configurations.max(0))
+        start = configurations[0]
+    columns = (chain.joint_names, is_prismatic, lower.tolist(), upper.tolist(), start.tolist())
+    keys = ("name", "is_prismatic", "lower", "upper", "start")
+    return [dict(zip(keys, values, strict=True)) for values in zip(*columns, strict=True)]
 
 
-def _points(
+def _measured_points(
     chain: Chain, measurements: Sequence[Measurement], known: Mapping[str, float]
 ) -> tuple[Array, Array, Array]:
-    """Joint values (m, n), measured positions and residuals (m, 3) in the measuring frame, m."""
+    """Return joint positions (m, n), measured positions and residuals (m, 3) in the measuring frame."""
     q, points, residuals = [np.empty((0, chain.n_joints))], [np.empty((0, 3))], [np.empty((0, 3))]
     for item in measurements:
         if len(item.positions()):
-            unknowns = item.initialized(chain).instrument_parameters
-            u = np.array([known.get(unknown.name, unknown.nominal) for unknown in unknowns])
+            parameters = item.initialized(chain).instrument_parameters
+            values = np.array([known.get(parameter.name, parameter.nominal) for parameter in parameters])
             q.append(chain.validated_q(item.q))
             points.append(item.positions())
-            residuals.append(item.errors(chain.forward_kinematics(item.q), u)["position"])
+            residuals.append(item.errors(chain.forward_kinematics(item.q), values)["position"])
     return np.concatenate(q), np.concatenate(points), np.concatenate(residuals)
 
 
-def _ellipsoids(model: Predictor, poses: Array) -> list[dict[str, Any]]:
-    """How well the calibrated tool's place is known at some of the poses (m, n).
+def _ellipsoids(model: Predictor, configurations: Array) -> list[dict[str, Any]]:
+    """Return the ellipsoids of one standard deviation of the calibrated tool position.
 
-    Each has its joint values `q` (n,) and `axes` (9), rows of the matrix whose columns are the half
-    axes of one standard deviation, m, in axes of the calibrated base link. Poses at which a direction
-    is not known at all have none.
+    Configurations with an undetermined direction of the tool position have none.
+
+    Args:
+        model: Source of the covariance.
+        configurations: Joint positions, shape (m, n) [rad or m].
+
+    Returns:
+        Joint positions `q` and `axes` of each: the 3 x 3 matrix, row by row, whose columns are the half axes
+        [m] in the frame of the calibrated base link.
     """
-    poses = poses[evenly_spaced_indices(len(poses), MAX_ELLIPSOIDS)]
-    covariance = model.predict(poses).covariance[:, :3, :3]
-    told = np.isfinite(covariance).all((1, 2))
-    squares, axes = np.linalg.eigh(covariance[told])
-    # A flat ellipsoid would have no outside to be lit.
-    half = np.sqrt(np.maximum(squares, 1e-6 * squares[:, -1:] + 1e-18))
+    configurations = configurations[evenly_spaced_indices(len(configurations), MAX_ELLIPSOIDS)]
+    covariance = model.predict(configurations).covariance[:, :3, :3]
+    is_finite = np.isfinite(covariance).all((1, 2))
+    variances, axes = np.linalg.eigh(covariance[is_finite])
+    # A flat ellipsoid has no surface normals and would be black.
+    lengths = np.sqrt(np.maximum(variances, 1e-6 * variances[:, -1:] + 1e-18))
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
-    axes = model.chain.base[:3, :3].T @ axes * half[:, None]
+    axes = model.chain.base[:3, :3].T @ axes * lengths[:, None]
     return [
         {"q": q, "axes": np.round(matrix, 12).ravel().tolist()}
-        for q, matrix in zip(poses[told].tolist(), axes, strict=True)
+        for q, matrix in zip(configurations[is_finite].tolist(), axes, strict=True)
     ]

@@ -276,7 +276,7 @@ def test_reflectors_beside_the_tool_and_lengths_are_no_residuals(window, tmp_pat
     }
     html = scene_html(sim_6dof, measurements=data, known=known)
     window.open(tmp_path / "scene.html", html)
-    assert window.page.evaluate("dhcal.scene.poses.length") == 27
+    assert window.page.evaluate("dhcal.scene.configurations.length") == 27
     assert window.page.evaluate("dhcal.scene.points.length") == 9
     assert window.page.evaluate("largest") < 1e-8
     assert window.look()["points"] > 15
@@ -330,7 +330,7 @@ def test_a_tool_of_which_nothing_tells_the_place_has_no_ellipsoid(sim_6dof):
 
 
 def test_what_does_not_fit_together_is_said(sim_6dof):
-    with pytest.raises(DhcalError, match="the arms differ"):
+    with pytest.raises(DhcalError, match="the robots differ"):
         scene_html(sim_6dof, Chain.from_dh(paper("sim_3dof")))
     with pytest.raises(DhcalError, match="q has shape"):
         scene_html(sim_6dof, q=np.zeros((2, 3)))
