@@ -238,13 +238,13 @@ def normalize_offsets(table: DHTable) -> DHTable:
 def _base_transform(
     origin: Array, arm_length: float, max_tilt: float, standard: bool
 ) -> tuple[Array, _OriginParameters]:
-    """Split the origin of joint 1 into the base, shape (4, 4), and the parameters that remain for row 1.
+    """Split the origin of joint 1 between base and row 1.
 
     The base can contain any motion, so it takes everything except the offset along an upright axis 1. Only an
     origin that already is a modified row goes to the table.
 
     Returns:
-        Base transform and remaining parameters.
+        Base, shape (4, 4), and the parameters that remain for row 1.
     """
     row = _split_origin(origin, 0.0, arm_length, max_tilt, offset_first=False)
     if not standard and row.t1 == 0 and row.d1 == 0:
@@ -262,7 +262,7 @@ def _split_origin(
     offset goes to d1 if `offset_first`, else to d2.
 
     Returns:
-        The seven parameters.
+        Parameters of the preferred form of the row.
     """
     tilt = _tilt(origin)
     t1, d2 = _common_normal(origin) if tilt > QUARTER_TURN_TOL else (0.0, 0.0)

@@ -175,13 +175,13 @@ def _inertial() -> list[str]:
 
 
 def _skeletons(table: DHTable) -> list[_Skeleton]:
-    """Compute the skeletons of base_link, link_1 … link_n, which lead from frame to frame along d and a.
+    """Compute line segments that lead from frame to frame along d and a.
 
     In the standard convention, row i belongs to link i, d before a. In the modified convention, row i belongs
     to link i-1, a before d.
 
     Returns:
-        One skeleton per link.
+        Skeletons of base_link, link_1 … link_n.
     """
     row = table.rows(np.zeros((1, table.n_joints)))[0]
     start, zero = table.base[:3, 3], np.zeros(3)

@@ -247,7 +247,7 @@ def solve_within_limits(chain: Chain, task_error: TaskError, start: Array, rng: 
     for _ in range(_MAX_RESTARTS):
         q, norms = solve_ik(unlimited, task_error, starts, _STEPS_PER_START, remaining)
         q, is_allowed = wrap_into_limits(chain, q)
-        # A solution beyond the limits is kept only as long as there is no other one.
+        # A solution beyond the limits is replaced by a later one within the limits.
         improved = (norms <= REACHED_TOL) & (is_allowed | ~solved[remaining])
         out[remaining[improved]] = q[improved]
         solved[remaining] |= improved

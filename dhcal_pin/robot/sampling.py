@@ -208,7 +208,7 @@ def scale_joint_units(chain: Chain, q: Array) -> Array:
 def shortest_tour(q: Array) -> Array:
     """Find an order of configurations with little motion between successive ones, by 2-opt.
 
-    The tour starts from the nearest-neighbour tour. It is a local minimum, not always the shortest tour.
+    The search starts from the nearest-neighbour tour. The result is a local minimum.
 
     Args:
         q: Configurations in comparable units, shape (m, n).
@@ -226,13 +226,13 @@ def shortest_tour(q: Array) -> Array:
         unvisited.remove(current)
         order.append(current)
         current = min(unvisited, key=lambda other: distances[order[-1], other], default=0)
-    tour = np.array(order)
+    path = np.array(order)
     while True:
-        # Gain of reversing the part of the tour from i+1 to j.
-        between, successors = distances[tour[:, None], tour], np.roll(tour, -1)
-        steps = distances[tour, successors]
+        # Gain of reversing the part of the path from i+1 to j.
+        between, successors = distances[path[:, None], path], np.roll(path, -1)
+        steps = distances[path, successors]
         gain = steps[:, None] + steps[None] - between - distances[successors[:, None], successors]
         i, j = np.unravel_index(np.argmax(np.triu(gain, 1)), gain.shape)
         if gain[i, j] <= _MIN_TOUR_GAIN or i >= j:
-            return np.roll(tour, -int(np.flatnonzero(tour == count)[0]))[1:]
-        tour[i + 1 : j + 1] = tour[i + 1 : j + 1][::-1].copy()
+            return np.roll(path, -int(np.flatnonzero(path == count)[0]))[1:]
+        path[i + 1 : j + 1] = path[i + 1 : j + 1][::-1].copy()

@@ -159,12 +159,10 @@ def result_table(study: StudyGrid, blocks: Sequence[list[list[float]]]) -> tuple
 
 
 def _draw_true_chains(case: Case, seeds: range) -> tuple[ChainBatch, Array]:
-    """Draw the true robots and their errors in the estimated parameters, shape (b, p).
-
-    The errors are NaN if the estimated parameters cannot express them.
+    """Draw the true robots of a block.
 
     Returns:
-        True chains and their errors.
+        Robots, and their errors in the estimated parameters, shape (b, p); NaN if these cannot express them.
     """
     setting, b = case.setting, len(seeds)
     estimated = select_parameters(case.nominal, setting.parameters)
