@@ -40,7 +40,7 @@ class Outlier:
         item: Index of the measurement object in the fitted data.
         row: Row number in its file.
         error_norms: Error by group, "position" [m], "orientation" [rad] or "residual" [m].
-        score: Studentized residual; standard normal for a sample that is no outlier.
+        score: Studentized residual; standard normal for a sample that is not an outlier.
     """
 
     item: int

@@ -1,4 +1,7 @@
-"""Maps of the workspace as files: predicted position uncertainty beside measured errors."""
+"""Workspace maps as files: predicted position uncertainty beside measured errors.
+
+A map is written as CSV, one row per cell of the workspace, or as an HTML page with drawings.
+"""
 
 from __future__ import annotations
 
@@ -16,27 +19,30 @@ from .html import map_page
 
 
 def check_map_ending(path: str) -> None:
-    """Complains about a map's path that is neither a table nor a page."""
+    """Raise DhcalError if a path ends neither in .csv nor in .html."""
     if not path.lower().endswith((".csv", ".html")):
-        raise DhcalError(f"{path}: unknown ending; write a map as .csv or .html")
+        raise DhcalError(f"{path}: unknown ending; expected .csv or .html")
 
 
 def map_content(
     path: str, model: Predictor, data: Sequence[Measurement], known: Mapping[str, float] | None = None
 ) -> str:
-    """The text of a map, a table or a page as its path ends.
+    """Compute a workspace map as CSV or HTML.
 
     Args:
-        path: where it will be written.
-        model: a calibration, or what a file has kept of it.
-        data: measurements to judge it by.
-        known: values of their instruments' unknowns; others are fitted to the data.
+        path: Path of the file; its ending selects the format.
+        model: Calibrated robot with its uncertainty.
+        data: Measurements to compare with.
+        known: Known instrument parameters by name [m or rad]; the others are fitted to the data.
+
+    Returns:
+        Text of the file.
     """
     if path.lower().endswith(".csv"):
         return map_text(workspace_map(model, data, known))
     sentences = [
-        "The predicted standard deviation of the tool's position, for configurations drawn over the joints' "
-        "limits: what follows from the parameters' own uncertainty. What the model lacks comes on top of it."
+        "Predicted standard deviation of the tool position for random configurations within the joint limits. "
+        "It follows from the uncertainty of the parameters. Unmodelled errors are not included."
     ]
     q, errors = position_errors(model.chain, data, known)
     if len(errors):
@@ -45,15 +51,15 @@ def map_content(
             f"{1e3 * np.sqrt(np.mean(part**2)):.3g} mm" for part in (errors, std) if np.isfinite(part).all()
         ]
         sentences.append(
-            f"At the {len(errors)} measured positions the RMS error is {rms[0]}, the instrument's noise "
-            + (f"included; {rms[1]} are predicted without it." if len(rms) > 1 else "included.")
+            f"At the {len(errors)} measured positions the RMS error is {rms[0]} including the noise of the "
+            + (f"instrument; the prediction without it is {rms[1]}." if len(rms) > 1 else "instrument.")
         )
-    title = f"Where {model.chain.model.name or 'the robot'} can be trusted"
+    title = f"Predicted accuracy of {model.chain.model.name or 'the robot'} over the workspace"
     return map_page(title, predict_workspace(model, data), sentences)
 
 
 def map_text(found: WorkspaceMap) -> str:
-    """The CSV text of a map: a row a cell, millimetres; columns of readings only where there are any."""
+    """Return the CSV text of a map: one row per cell, in millimetres."""
     names = ("x[mm]", "y[mm]", "z[mm]")
     columns = {name: (1e3 * found.centre[:, i]).round(6).tolist() for i, name in enumerate(names)}
     columns |= {"position_std[mm]": (1e3 * found.std).tolist(), "worst[mm]": (1e3 * found.worst).tolist()}
@@ -62,4 +68,4 @@ def map_text(found: WorkspaceMap) -> str:
         columns["readings"] = found.readings.tolist()
         for name, part in (("measured_rms[mm]", found.measured), ("predicted_there[mm]", found.expected)):
             columns[name] = ["" if np.isnan(value) else value for value in (1e3 * part).tolist()]
-    return csv_text(columns, ["predicted position uncertainty by cells of the workspace, measuring frame"])
+    return csv_text(columns, ["predicted position uncertainty by cell of the workspace, measuring frame"])

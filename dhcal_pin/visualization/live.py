@@ -1,8 +1,8 @@
-"""A live MeshCat scene of an arm, on this computer only and only on request.
+"""Live MeshCat scene of a robot on the loopback address of this computer.
 
-The offline page of `viewer` needs no server. This is for programs that move the arm while one looks on:
-a server process on the loopback address that ends with the program, and that answers within a time
-limit or is given up.
+The offline page of `scene` needs no server. The live scene is for programs that move the robot. A server
+process listens on the loopback address and ends with the program. If it does not answer within
+`TIMEOUT_MS`, a DhcalError is raised; MeshCat itself would wait without limit.
 """
 
 from __future__ import annotations
@@ -32,15 +32,13 @@ from ..robot.chain import Chain
 from .meshes import Visuals, visuals_of
 from .scene import MAX_TRIANGLES, kinematic_tree, with_shared_frames
 
-TIMEOUT_MS = 2000  # ms that the server may take for one command
-
-
-START_TIMEOUT_S = 30.0  # s that it may take to start, imports from a slow disk included
-
-
-FRAMES_PER_SECOND = 30  # a second, while poses are played
-
-
+# Largest duration of one command [ms].
+TIMEOUT_MS = 2000
+# Largest duration of the start, including imports from a slow disk [s].
+START_TIMEOUT_S = 30.0
+# Frames per second of `Live.play`.
+FRAMES_PER_SECOND = 30
+# Colour and opacity of each layer.
 STYLES = {"nominal": (0x0072B2, 0.35), "calibrated": (0xE69F00, 1.0), "arm": (0x0072B2, 1.0)}
 
 
@@ -52,20 +50,20 @@ def serve(
     magnification: float = 1.0,
     triangles: int = MAX_TRIANGLES,
 ) -> Live:
-    """Starts a live scene of an arm, or of an arm before and after its calibration.
+    """Start a live scene of one robot, or of a nominal and a calibrated robot.
 
     Args:
-        nominal: the arm as it was thought to be; a ghost beside the calibrated one, solid if alone.
-        calibrated: the same arm, or the result that found it.
-        package_dirs: where to look for the URDF's meshes; the folders above the URDF without it.
-        magnification: how many times larger than true the errors are drawn.
-        triangles: most of them that the meshes keep all together.
+        nominal: Nominal robot; transparent beside the calibrated one, opaque if alone.
+        calibrated: Calibrated robot, or calibration result.
+        package_dirs: Folders to search for meshes. Default: the folders above the URDF.
+        magnification: Factor by which the errors are magnified.
+        triangles: Largest number of triangles of all meshes together.
 
     Returns:
-        The scene, in the pose of zeros; close it, or use it in a `with` statement.
+        Scene with all joints at zero. Close it, or use it in a `with` statement.
 
     Raises:
-        DhcalError: the two arms have different joints, or the server does not start.
+        DhcalError: The robots have different joints, or the server does not start.
     """
     if isinstance(calibrated, Result):
         nominal = replace(
@@ -98,11 +96,11 @@ def serve(
 
 @dataclass(frozen=True, eq=False)
 class Live:
-    """A running scene.
+    """Running live scene.
 
     Attributes:
-        url: of its page, for a browser on this computer.
-        arms: what is drawn, by layer.
+        url: Address of the page for a browser on this computer.
+        arms: Robots by layer.
     """
 
     url: str
@@ -110,20 +108,24 @@ class Live:
     _window: _Window
 
     def show(self, q: Array) -> None:
-        """Puts the arms where joint values q (n,) say, rad or m.
+        """Show the robots at joint positions q, shape (n,) [rad or m].
 
         Raises:
-            DhcalError: q does not fit, or the server is gone, within 3 s.
+            DhcalError: The shape is wrong, or the server does not answer.
         """
         for name, chain in self.arms.items():
             for number, pose in enumerate(_body_poses(chain, q)):
                 meshcat.Visualizer(window=self._window)[f"{name}/{number}"].set_transform(pose)
 
     def play(self, q: Array, seconds: float = 1.0) -> None:
-        """Moves through poses q (m, n), so long from one to the next.
+        """Move the robots through configurations.
+
+        Args:
+            q: Joint positions, shape (m, n) [rad or m].
+            seconds: Duration of the motion from one configuration to the next [s].
 
         Raises:
-            DhcalError: as `show`.
+            DhcalError: The shape is wrong, or the server does not answer.
         """
         q = next(iter(self.arms.values())).validated_q(q)
         steps = max(1, round(seconds * FRAMES_PER_SECOND))
@@ -133,7 +135,7 @@ class Live:
                 time.sleep(1 / FRAMES_PER_SECOND)
 
     def close(self) -> None:
-        """Ends the server."""
+        """Stop the server."""
         self._window.close()
 
     def __enter__(self) -> Live:
@@ -144,46 +146,45 @@ class Live:
 
 
 def _body_poses(chain: Chain, q: Array) -> list[Array]:
-    """Poses (4, 4) of the bodies that `viewer.tree` lists, as Pinocchio has them, in the measuring frame."""
+    """Compute the poses, shape (4, 4), of the bodies of `kinematic_tree` in the measuring frame."""
     model, data = chain.model, chain.model.createData()
     pin.framesForwardKinematics(model, data, chain.configurations(np.atleast_2d(q))[0])
-    placed = [*data.oMi, data.oMf[chain.frame_id]]
-    poses = [chain.base @ pose.homogeneous for pose in placed]
+    poses = [chain.base @ pose.homogeneous for pose in (*data.oMi, data.oMf[chain.frame_id])]
     return [*poses, poses[-1] @ chain.tool]
 
 
-def _draw(view: meshcat.Visualizer, look: tuple[int, float], drawn: Visuals, tool: int) -> None:
-    """Sends an arm's shapes, each under its body's number, and a triad for the tool."""
-    color, opacity = look
+def _draw(view: meshcat.Visualizer, style: tuple[int, float], visuals: Visuals, tool: int) -> None:
+    """Send the shapes of a robot, each under the number of its body, and a triad for the tool."""
+    color, opacity = style
     material = g.MeshPhongMaterial(color=color, opacity=opacity, transparent=opacity < 1)
-    for number, shape in enumerate(drawn.shapes):
-        turn = np.eye(4)
+    for number, shape in enumerate(visuals.shapes):
+        rotation = np.eye(4)
         if "box" in shape:
             geometry = g.Box(shape["box"])
         elif "sphere" in shape:
             geometry = g.Sphere(shape["sphere"])
         elif "cylinder" in shape:
             radius, length = shape["cylinder"]
-            # MeshCat's cylinders stand along y, URDF's along z.
-            geometry, turn = g.Cylinder(length, radius), se3.exp6(np.array([0, 0, 0, np.pi / 2, 0, 0]))
+            # The axis of a cylinder is y in MeshCat and z in URDF.
+            geometry, rotation = g.Cylinder(length, radius), se3.exp6(np.array([0, 0, 0, np.pi / 2, 0, 0]))
         else:
-            mesh = drawn.meshes[shape["mesh"]]
+            mesh = visuals.meshes[shape["mesh"]]
             geometry = g.TriangularMeshGeometry(mesh.vertices, mesh.triangles)
-        place = np.concatenate([np.reshape(shape["placement"], (3, 4)), [[0, 0, 0, 1]]])
+        placement = np.concatenate([np.reshape(shape["placement"], (3, 4)), [[0, 0, 0, 1]]])
         view[f"{shape['body']}/{number}"].set_object(geometry, material)
-        view[f"{shape['body']}/{number}"].set_transform(place @ turn)
+        view[f"{shape['body']}/{number}"].set_transform(placement @ rotation)
     view[f"{tool}/frame"].set_object(g.triad(0.2))
 
 
 @dataclass(frozen=True, eq=False)
 class _Window:
-    """What `meshcat.Visualizer` sends its commands to; MeshCat's own waits for ever for an answer.
+    """Connection of `meshcat.Visualizer` to a server, with a time limit for each answer.
 
     Attributes:
-        process: the server.
-        socket: to it.
-        folder: of the socket file.
-        web_url: of the server's page.
+        process: Server process.
+        socket: Socket that is connected to the server.
+        folder: Folder of the socket file.
+        web_url: Address of the page.
     """
 
     process: subprocess.Popen[str]
@@ -193,7 +194,7 @@ class _Window:
 
     @classmethod
     def start(cls) -> _Window:
-        """With a server of its own."""
+        """Start a server process and connect to it."""
         folder = TemporaryDirectory(prefix="dhcal-")
         address = f"ipc://{folder.name}/commands"
         process = subprocess.Popen(
@@ -202,7 +203,7 @@ class _Window:
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
-            # The same modules as here; and an interrupt of a notebook's cell is not one of the server.
+            # The server imports the same modules. It ignores the interrupt of a notebook cell.
             env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
             start_new_session=True,
         )
@@ -221,7 +222,7 @@ class _Window:
         return window
 
     def send(self, command: Any) -> None:
-        """One command of MeshCat, answered within the time limit."""
+        """Send one MeshCat command and wait for its answer."""
         data = command.lower()
         try:
             if self.process.poll() is None:
@@ -233,10 +234,10 @@ class _Window:
         except zmq.ZMQError:
             pass
         self.close()
-        raise DhcalError(f"the MeshCat server at {self.web_url} is gone; start another one")
+        raise DhcalError(f"the MeshCat server at {self.web_url} does not answer; start a new scene")
 
     def close(self) -> None:
-        """Ends the server and removes its socket file."""
+        """Stop the server and remove the socket file."""
         self.socket.close()
         self.process.kill()
         self.process.communicate()

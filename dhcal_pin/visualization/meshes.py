@@ -1,7 +1,9 @@
-"""What a robot's links look like: the visual geometry of its URDF, or rods and drums in its place.
+"""Visual geometry of a robot: the meshes and primitives of its URDF, or a skeleton of cylinders.
 
-A shape is a dictionary for the page: the `body` it moves with, its `placement` there (12 numbers, upper
-rows, m), and `box`, `sphere`, `cylinder` with sizes in metres or `mesh`, a number in the list of meshes.
+A shape is a dictionary for the page. It has the number of the `body` that it moves with, its `placement` on
+that body (upper three rows of the pose, 12 numbers [m]), and one of `box`, `sphere`, `cylinder` with sizes
+[m], or `mesh` with the number of a mesh. Meshes are rounded to a grid, equal meshes are stored once, and
+large meshes are simplified by edge collapse (fast-simplification).
 """
 
 from __future__ import annotations
@@ -23,26 +25,24 @@ from .._typing import Array, PathLike
 from ..robot.chain import Chain
 from ..robot.dh_urdf import MATERIALS
 
-GRID = 8000  # mesh corners sit on a grid of this many steps along the longest side, 0.1 mm on most links
-
-
-COARSER_GRIDS = (400, 200, 100, 50, 25, 12, 6)  # grids for meshes that are simplified, one after the other
-
-
-MAX_NAMED = 3  # lost meshes that a note lists
-
-
+# Steps of the grid along the longest side of a mesh: about 0.1 mm on most links.
+GRID = 8000
+# Grids for meshes that are simplified, tried in this order.
+COARSER_GRIDS = (400, 200, 100, 50, 25, 12, 6)
+# Number of missing meshes that the note names.
+MAX_NAMED = 3
+# Colours of the axes that the URDF of a DH table draws.
 TRIAD = [MATERIALS[f"{axis}_axis"] for axis in "xyz"]
 
 
 @dataclass(frozen=True, eq=False)
 class Visuals:
-    """How an arm is drawn.
+    """Shapes and meshes of a robot.
 
     Attributes:
-        shapes: of all bodies.
-        meshes: that the shapes refer to by number.
-        note: what is drawn in another way than the URDF says, for people; empty if nothing is.
+        shapes: Shapes of all bodies.
+        meshes: Meshes that the shapes refer to by number.
+        note: Sentence about parts that are not drawn as the URDF describes them; empty if there are none.
     """
 
     shapes: list[dict[str, Any]]
@@ -53,13 +53,17 @@ class Visuals:
 def visuals_of(
     chain: Chain, bodies: Sequence[dict[str, Any]], package_dirs: Sequence[PathLike] | None, triangles: int
 ) -> Visuals:
-    """What to draw for each body of an arm.
+    """Collect the shapes of all bodies of a robot.
 
     Args:
-        chain: the arm.
-        bodies: its tree, for the rods: each with `parent`, `placement` (12) and where it moves `axes`.
-        package_dirs: where to look for meshes; the folders above the URDF without it.
-        triangles: most of them that all meshes together keep.
+        chain: Robot.
+        bodies: Bodies of the kinematic tree, for the skeleton: each with `parent`, `placement` (12 numbers)
+            and, if it moves, `axes`.
+        package_dirs: Folders to search for meshes. Default: the folders above the URDF.
+        triangles: Largest number of triangles of all meshes together.
+
+    Returns:
+        Shapes, meshes and a note.
     """
     if package_dirs is None:
         package_dirs = list(Path(chain.urdf.source).absolute().parents)
@@ -96,7 +100,7 @@ def visuals_of(
 
 
 def rows(pose: Array) -> list[float]:
-    """The upper three rows of a pose (4, 4), in full."""
+    """Return the upper three rows of a pose, shape (4, 4), as a list of 12 numbers."""
     return (np.asarray(pose, float)[:3] + 0.0).ravel().tolist()
 
 
@@ -104,10 +108,10 @@ def rows(pose: Array) -> list[float]:
 def _visuals(
     model: pin.Model, text: str, folders: Sequence[str]
 ) -> tuple[Sequence[pin.GeometryObject], dict[str, list[str]]]:
-    """What Pinocchio can draw, and by link the names of the meshes that are missing or unreadable."""
+    """Return the visual geometry that Pinocchio can load, and the missing or unreadable meshes by link."""
     if (found := _loaded(model, text, folders)) is not None:
         return found, {}
-    # One lost mesh makes Pinocchio refuse all: each is tried alone, in a robot that has nothing else.
+    # Pinocchio rejects the whole URDF if one mesh is missing: load each mesh in a robot with one link.
     robot = ElementTree.fromstring(text)
     lost: dict[str, list[str]] = {}
     for link in robot.findall("link"):
@@ -123,7 +127,7 @@ def _visuals(
 
 
 def _loaded(model: pin.Model, text: str, folders: Sequence[str]) -> Sequence[pin.GeometryObject] | None:
-    """All visual geometry, or None where a mesh of it cannot be had."""
+    """Load the visual geometry of a URDF; return None if one of its meshes cannot be loaded."""
     try:
         found = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.VISUAL, package_dirs=[*folders])
     except (ValueError, RuntimeError):
@@ -140,9 +144,18 @@ def _missing_meshes_note(lost: dict[str, list[str]]) -> str:
 
 
 def _parent_body(model: pin.Model, chain: Chain, frame: int, placement: pin.SE3) -> tuple[int, Array]:
-    """The body that a thing on a link's frame belongs to and its pose (4, 4) there.
+    """Return the body that carries a geometry, and the pose of the geometry on this body.
 
-    What is fixed to the tip moves with the tip. `placement` is the thing's in its moving joint.
+    A geometry that is fixed to the tip moves with the tip.
+
+    Args:
+        model: Pinocchio model of the whole URDF.
+        chain: Robot.
+        frame: Index of the frame of the link that has the geometry.
+        placement: Pose of the geometry relative to its moving joint.
+
+    Returns:
+        Index of the body, and the pose, shape (4, 4).
     """
     tip, joint = chain.frame_id, int(model.frames[frame].parentJoint)
     while frame != tip and model.frames[frame].type != pin.FrameType.JOINT and frame > 0:
@@ -153,7 +166,7 @@ def _parent_body(model: pin.Model, chain: Chain, frame: int, placement: pin.SE3)
 
 
 def _primitive(geometry: Any) -> dict[str, Any] | None:
-    """A box, sphere or cylinder with its sizes in metres; None for a mesh."""
+    """Return a box, sphere or cylinder with its sizes [m], or None for a mesh."""
     kind = type(geometry).__name__
     if kind == "Box":
         return {"box": (2 * geometry.halfSide).tolist()}
@@ -167,7 +180,14 @@ def _primitive(geometry: Any) -> dict[str, Any] | None:
 # --- meshes ----------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles (t, 3) between corners (v, 3) that are `origin` + `step` · whole numbers, m."""
+    """Triangle mesh on a grid.
+
+    Attributes:
+        origin: Origin of the grid, shape (3,) [m].
+        step: Step of the grid [m].
+        corners: Grid coordinates of the corners, integers, shape (v, 3).
+        triangles: Numbers of the corners of each triangle, shape (t, 3).
+    """
 
     origin: Array
     step: float
@@ -176,17 +196,26 @@ class Mesh:
 
     @classmethod
     def from_geometry(cls, geometry: Any) -> Mesh:
-        """What coal read from a file."""
+        """Convert a mesh that coal has read from a file."""
         faces = [(t[0], t[1], t[2]) for t in map(geometry.tri_indices, range(geometry.num_tris))]
         return cls.on_grid(np.asarray(geometry.vertices(), float), np.array(faces, int).reshape(-1, 3))
 
     @classmethod
     def on_grid(cls, corners: Array, triangles: Array, grid: int = GRID) -> Mesh:
-        """Corners that fall together are one; triangles that vanish or come twice are left out."""
+        """Round a mesh to a grid; merge equal corners, and remove degenerate and duplicate triangles.
+
+        Args:
+            corners: Corners, shape (v, 3) [m].
+            triangles: Numbers of the corners of each triangle, shape (t, 3).
+            grid: Number of steps along the longest side.
+
+        Returns:
+            Mesh on the grid.
+        """
         origin, size = corners.min(0), np.ptp(corners, axis=0).max()
         step = size / grid or 1.0
         x, y, z = np.round((corners - origin) / step).astype(np.int64).T
-        # One whole number a corner is found again faster than three.
+        # np.unique is faster on one integer per corner than on three.
         kept, place = np.unique((x << 32) + (y << 16) + z, return_inverse=True)
         cells = np.stack([kept >> 32, kept >> 16 & 0xFFFF, kept & 0xFFFF], -1).astype("<u2")
         triangles = place[triangles]
@@ -198,21 +227,21 @@ class Mesh:
 
     @property
     def vertices(self) -> Array:
-        """The corners (v, 3), m."""
+        """Corners, shape (v, 3) [m]."""
         return self.origin + self.step * self.corners
 
     @property
     def key(self) -> tuple[bytes, ...]:
-        """The same for equal meshes."""
+        """Key that is equal for equal meshes."""
         return self.origin.tobytes(), self.corners.tobytes(), self.triangles.tobytes()
 
     def simplify(self, most: int) -> Mesh:
-        """With at most so many triangles, by collapsing the edges that change its form least."""
+        """Return a mesh with at most `most` triangles, simplified by edge collapse."""
         mesh = self
         for grid in COARSER_GRIDS:
             if len(mesh.triangles) <= most:
                 break
-            # Slivers between the teeth of a thread keep edges from collapsing: a coarser grid takes them.
+            # Very thin triangles prevent edge collapse. A coarser grid removes them.
             mesh = Mesh.on_grid(mesh.vertices, mesh.triangles, grid)
             if len(mesh.triangles) > most:
                 corners, triangles = fast_simplification.simplify(
@@ -222,7 +251,7 @@ class Mesh:
         return mesh
 
     def encoded(self) -> dict[str, Any]:
-        """For the page: base64 of little-endian integers, the triangles' of `bytes` bytes each."""
+        """Encode for the page: base64 of little-endian integers; indices of triangles have `bytes` bytes."""
         width = 2 if len(self.corners) <= 1 << 16 else 4
         return {
             "origin": self.origin.tolist(),
@@ -234,10 +263,16 @@ class Mesh:
 
 
 def allocate_triangles(counts: Sequence[int], total: int) -> list[int]:
-    """How many of its triangles each mesh keeps, all together at most `total`.
+    """Distribute a number of triangles over meshes in proportion to the square root of their sizes.
 
-    A mesh of four times as many as another keeps twice as many, so that both lose detail alike; small
-    ones stay whole.
+    No mesh gets more triangles than it has.
+
+    Args:
+        counts: Number of triangles of each mesh.
+        total: Largest sum of the result.
+
+    Returns:
+        Number of triangles that each mesh keeps.
     """
     left, roots = float(total), np.sqrt(counts)
     rate = np.inf
@@ -251,7 +286,7 @@ def allocate_triangles(counts: Sequence[int], total: int) -> list[int]:
 
 # --- rods and drums --------------------------------------------------------------------------------
 def _skeleton(bodies: Sequence[dict[str, Any]], bare: set[int]) -> list[dict[str, Any]]:
-    """For bare bodies, a drum on the moving joint and rods from it to all the joints behind."""
+    """Return cylinders for bodies without geometry: one on the joint, and rods to the next joints."""
     ends = [np.reshape(body["placement"], (3, 4))[:, 3] for body in bodies]
     radius = 0.02 * (sum(float(np.linalg.norm(end)) for end in ends[1:]) or 1.0)
     return [
@@ -264,7 +299,7 @@ def _skeleton(bodies: Sequence[dict[str, Any]], bare: set[int]) -> list[dict[str
 def _rods(
     bodies: Sequence[dict[str, Any]], ends: Sequence[Array], radius: float
 ) -> Iterator[tuple[int, Array, list[float]]]:
-    """Body, pose (4, 4) there, and radius and length in m of every rod and drum."""
+    """Yield body, pose on it, shape (4, 4), and radius and length [m] of each cylinder."""
     yield 0, *_rod(np.zeros(3), np.array([0.0, 0.0, -0.6 * radius]), 4 * radius)
     for i, (body, end) in enumerate(zip(bodies, ends, strict=True)):
         if i and np.linalg.norm(end) > 1e-6:
@@ -275,7 +310,7 @@ def _rods(
 
 
 def _rod(start: Array, end: Array, radius: float) -> tuple[Array, list[float]]:
-    """A cylinder between two points (3,): its pose (4, 4), radius and length, m."""
+    """Return pose, shape (4, 4), and radius and length [m] of a cylinder between two points, shape (3,)."""
     z = (end - start) / np.linalg.norm(end - start)
     x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
     x /= np.linalg.norm(x)

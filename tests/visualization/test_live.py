@@ -1,4 +1,4 @@
-"""The live scene listens on this computer only, shows Pinocchio's poses, and says when its server is gone."""
+"""The live scene listens on this computer only, shows Pinocchio's poses, and reports a server that does not answer."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_a_server_that_is_gone_is_named_in_time(scene, end):
     for process in processes(scene):
         process.send_signal(end)
     for _ in range(2):
-        with pytest.raises(DhcalError, match=r"127\.0\.0\.1:\d+/static/ is gone; start another one"):
+        with pytest.raises(DhcalError, match=r"127\.0\.0\.1:\d+/static/ does not answer; start a new scene"):
             scene.show(np.zeros(6))
 
 
