@@ -22,6 +22,37 @@ MAPS = ROOT / "tests" / "maps"
 DATA = ROOT.parent / "shared" / "data"
 
 
+# A revolute and a prismatic joint, as a DH file in millimetres and degrees.
+SCARA = """convention = "standard"
+[units]
+length = "mm"
+angle = "deg"
+[[joint]]
+name = "shoulder"
+theta = 0
+d = 606.8
+a = 325.0
+alpha = 0.0
+lower = -130.0
+[[joint]]
+name = "lift"
+type = "prismatic"
+theta = 30.0
+d = 12.5
+a = 0.25
+alpha = 180.0
+lower = -210.0
+upper = 0.0
+"""
+
+
+def write(folder: Path, name: str, content: str | bytes) -> Path:
+    """Write a file into a folder and return its path."""
+    path = folder / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
 def missing(what: str) -> NoReturn:
     """Skip a test, or fail it if DHCAL_REQUIRE_DATA=1."""
     if os.environ.get("DHCAL_REQUIRE_DATA") == "1":

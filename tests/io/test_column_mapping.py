@@ -1,4 +1,4 @@
-"""Files of other makers through a map: every key, every convention, and what is refused."""
+"""Column maps: every key, every convention of rotations, and errors that name the problem."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ columns = {{point = {{from = 4}}}}
     assert data.to_columns()["point"] == ["socket-1", "socket-2"]
 
 
-def test_a_constant_takes_parts_of_the_path(tmp_path, arm):
+def test_constants_contain_parts_of_the_path(tmp_path, arm):
     folder = tmp_path / "front {stem}"
     folder.mkdir()
     (folder / "hole_0.csv").write_text("0.1,0.2,0.3\n")
@@ -109,19 +109,19 @@ def test_a_constant_takes_parts_of_the_path(tmp_path, arm):
     assert data.to_columns()["point"] == ["p-front {stem}/hole_0"]
 
 
-def test_another_encoding_and_separators_at_the_ends_of_lines(read):
+def test_encodings_and_separators_at_the_end_of_lines(read):
     text = FILE.replace("Nr", "Temperatur °C").replace("-7", "-7;;").encode("cp1252")
     assert read(text, 'encoding = "cp1252"\n' + MAP).data.q.shape == (2, 3)
     with pytest.raises(DhcalError, match="is not UTF-8; save the file as UTF-8"):
         read(text)
 
 
-def test_a_file_of_the_own_form_beside_is_read_as_it_is(read, arm):
+def test_a_file_of_the_own_format_is_read_without_the_map(read, arm):
     own = "point_a,point_b,distance[mm]\np,q,50\n"
     assert read(own).data.kind == "point_distance"
     bare = 'header = false\njoints = {order = [1, 2, 3], unit = "rad"}\nconstant = {point = "p"}'
     assert read(own, bare).data.kind == "point_distance"
-    # What the map fits, the map reads: here the second joint's sign is turned.
+    # A file with all columns of the map is read through the map: here the second joint's sign is reversed.
     both = "joint_1[deg],joint_2[deg],joint_3[deg],x[mm],y[mm],z[mm]\n1,2,3,4,5,6\n"
     how = """[joints]
 order = ["joint_1[deg]", "joint_2[deg]", "joint_3[deg]"]
@@ -139,7 +139,7 @@ z = {from = "z[mm]", unit = "mm"}
 
 
 @pytest.mark.parametrize("frame", ["intrinsic", "extrinsic"])
-def test_all_euler_conventions_are_scipys(frame):
+def test_euler_conventions_are_those_of_scipy(frame):
     angles = np.random.default_rng(0).uniform(-7, 7, (40, 3))
     every = [axes for axes in itertools.product("xyz", repeat=3) if axes[0] != axes[1] != axes[2]]
     assert len(every) == 12
@@ -169,8 +169,8 @@ def test_all_euler_conventions_are_scipys(frame):
         ),
     ],
 )
-def test_a_rotation_by_the_name_of_its_convention(read, how, columns):
-    turns = Rotation.random(20, random_state=1)
+def test_rotations_in_every_convention(read, how, columns):
+    turns = Rotation.random(20, 1)
     values = columns(turns)
     names = [f"r{i}" for i in range(values.shape[1])]
     lines = [",".join(["a", "b", "c", "x", "y", "z", *names])]
@@ -186,7 +186,7 @@ def test_a_rotation_by_the_name_of_its_convention(read, how, columns):
     np.testing.assert_allclose(data.rotations(), turns.as_matrix(), atol=5e-15)
 
 
-def test_a_second_configuration_and_back(read, arm):
+def test_a_second_configuration_is_read_back(read, arm):
     rng = np.random.default_rng(0)
     q, q_to = rng.uniform(-1, 1, (2, 4, 3))
     data = RelativePose(q, q_to, se3.inverse(arm.poses(q)) @ arm.poses(q_to))
@@ -205,10 +205,11 @@ def test_a_second_configuration_and_back(read, arm):
     np.testing.assert_allclose(again.poses, data.poses, atol=1e-14)
 
 
-# --- what is refused -------------------------------------------------------------------------------
+# --- errors -------------------------------------------------------------------------------
 
 
-def swap(old, new):
+def swap(old: str, new: str) -> str:
+    """Return the map with one replacement."""
     assert old in MAP
     return MAP.replace(old, new)
 
@@ -259,7 +260,7 @@ ROTATION = '[rotation]\nconvention = "euler"\naxes = "XYZ"\nframe = "intrinsic"\
         (MAP + ROTATION + 'order = "wxyz"\ncolumns = [1, 2, 3]', ["order", "does not go with euler"]),
     ],
 )
-def test_a_wrong_map_is_refused(read, how, words):
+def test_an_invalid_map_is_an_error(read, how, words):
     with pytest.raises(DhcalError) as caught:
         read(how=how)
     for word in words:
@@ -278,7 +279,7 @@ def test_a_wrong_map_is_refused(read, how, words):
         (FILE.replace("100,25", "1e10"), ["theirs.csv:5", "beyond"]),
     ],
 )
-def test_a_file_that_is_not_as_its_map_says(read, text, words):
+def test_a_file_that_contradicts_its_map_is_an_error(read, text, words):
     with pytest.raises(DhcalError) as caught:
         read(text)
     for word in words:
@@ -286,7 +287,7 @@ def test_a_file_that_is_not_as_its_map_says(read, text, words):
 
 
 @pytest.mark.parametrize("cells", ["1,0,0,0,1,0,0,0,1.1", "1,0,0,0,1,0,0,0,-1"])
-def test_nine_numbers_that_are_no_rotation(read, cells):
+def test_a_matrix_that_is_not_a_rotation_is_an_error(read, cells):
     how = 'header = false\njoints = {order = [1, 2, 3], unit = "rad"}\n[columns]\n'
     how += "".join(f'{axis} = {{from = 1, unit = "m"}}\n' for axis in "xyz")
     how += '[rotation]\nconvention = "matrix"\ncolumns = [4, 5, 6, 7, 8, 9, 10, 11, 12]'
@@ -294,7 +295,7 @@ def test_nine_numbers_that_are_no_rotation(read, cells):
         read(f"0.1,0.2,0.3,{cells}\n", how)
 
 
-def test_the_map_on_the_command_line(tmp_path, arm, monkeypatch, capsys):
+def test_maps_on_the_command_line(tmp_path, arm, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     q = np.random.default_rng(0).uniform(-80, 80, (12, 3))
     seen = 1e3 * arm.poses(np.deg2rad(q))[:, :3, 3]

@@ -1,4 +1,4 @@
-"""World joint, tool frame, UR's YAML and the plain table: each read back by somebody else."""
+"""Kinematics files of Universal Robots, and DH tables with the factory deltas of a UR arm."""
 
 from __future__ import annotations
 
@@ -14,17 +14,9 @@ from robots import DATA, paper, robot_file
 from dhcal_pin import se3
 from dhcal_pin.cli.main import main
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io.dh_file import dh_text
-from dhcal_pin.io.measurement_csv import measurement_text
-from dhcal_pin.io.origins_file import origins_text
-from dhcal_pin.io.robot import read_robot
+from dhcal_pin.io import dh_text, read_robot
 from dhcal_pin.io.ur_kinematics import read_ur_kinematics, ur_kinematics, ur_kinematics_text
-from dhcal_pin.measurements.base import Noise
-from dhcal_pin.measurements.pose import Pose
-from dhcal_pin.robot.chain import Chain
-from dhcal_pin.robot.dh import DHTable
-from dhcal_pin.robot.urdf import parse_urdf
-from dhcal_pin.robot.urdf_edit import with_tool_frame, with_world
+from dhcal_pin.robot import Chain, DHTable
 
 FACTORY = DATA / "ur_factory/ur10_delta_dh.csv"
 JOINTS = (
@@ -75,7 +67,7 @@ def link_places(chain: Chain):
 
 
 @pytest.mark.parametrize("deltas", [factory(), LIKE_FACTORY], ids=["shipped", "alike"])
-def test_factory_deltas_become_a_sane_urdf(deltas):
+def test_factory_deltas_become_a_urdf_with_nearly_nominal_links(deltas):
     """Link origins within 5 cm of nominal, and the tool where the plain DH product has it."""
     nominal, actual = Chain.from_dh(ur10()), Chain.from_dh(ur10(deltas))
     assert np.linalg.norm(link_places(actual) - link_places(nominal), axis=1).max() < 0.05
@@ -84,14 +76,14 @@ def test_factory_deltas_become_a_sane_urdf(deltas):
     np.testing.assert_allclose(actual.poses(q), ur10(deltas).poses(q), atol=1e-9)
 
 
-def test_tables_without_cancelling_offsets_stay_rows():
+def test_tables_without_cancelling_offsets_keep_one_row_per_origin():
     """The paper's arms keep one DH row an origin, nearly parallel axes and all."""
     for name in ("sim_6dof_actual", "experiment_published", "sim_6dof"):
         table = paper(name)
         np.testing.assert_allclose(Chain.from_dh(table).origins, table.origins(), atol=1e-15)
 
 
-def test_ur_yaml_is_urs_own():
+def test_a_nominal_ur10_has_the_numbers_of_urs_description():
     """The numbers that UR's description ships for a nominal UR10."""
     found = ur_kinematics(Chain.from_dh(ur10()))
     wanted = {
@@ -113,7 +105,7 @@ def test_ur_yaml_is_urs_own():
     )
 
 
-def test_ur_yaml_is_accepted_back(tmp_path):
+def test_written_files_are_read_back(tmp_path):
     table = ur10(factory())
     path = tmp_path / "kinematics.yaml"
     path.write_text(ur_kinematics_text(Chain.from_dh(table)))
@@ -124,7 +116,7 @@ def test_ur_yaml_is_accepted_back(tmp_path):
     np.testing.assert_allclose(read_ur_kinematics(path).poses(q), table.poses(q), atol=1e-12)
 
 
-def test_ur_yaml_of_a_ros_urdf_keeps_the_tool():
+def test_the_flange_of_a_ros_urdf_stays():
     """Axes along y in the old description; the flange is where its tool0 is."""
     chain = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
     pose = np.eye(4)
@@ -135,13 +127,13 @@ def test_ur_yaml_of_a_ros_urdf_keeps_the_tool():
     np.testing.assert_allclose(pose, chain.poses(q[None])[0], atol=1e-12)
 
 
-def test_ur_yaml_refuses_others(sim_6dof):
+def test_other_robots_are_an_error(sim_6dof):
     with pytest.raises(DhcalError, match="need the joints shoulder_pan_joint"):
         ur_kinematics(sim_6dof)
 
 
 @pytest.mark.parametrize("text", ["a: [", "kinematics: 3", "kinematics:\n  shoulder: {x: 1}", "[]", ""])
-def test_wrong_yaml_is_one_line(text, tmp_path):
+def test_invalid_files_are_an_error_of_one_line(text, tmp_path):
     path = tmp_path / "k.yaml"
     path.write_text(text)
     with pytest.raises(DhcalError, match=r"k\.yaml: ") as caught:
@@ -149,92 +141,10 @@ def test_wrong_yaml_is_one_line(text, tmp_path):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("mark", ["\n", "\r\n"])
-def test_world_and_tool_stand_where_they_were_found(mark, sim_6dof):
-    rng = np.random.default_rng(0)
-    base, tool = se3.exp6(rng.normal(size=6)), se3.exp6(rng.normal(size=6))
-    data = sim_6dof.urdf.data.replace(b"\n", mark.encode())
-    with_both = with_tool_frame(with_world(data, base), "tool0", "reflector", tool)
-    model = pin.buildModelFromXML(with_both.decode())
-    pin_data = model.createData()
-    q = rng.uniform(-3, 3, (10, 6))
-    for row, pose in zip(q, base @ sim_6dof.poses(q) @ tool, strict=True):
-        pin.framesForwardKinematics(model, pin_data, row)
-        found = pin_data.oMf[model.getFrameId("reflector", pin.FrameType.BODY)].homogeneous
-        np.testing.assert_allclose(found, pose, atol=1e-14)
-    assert parse_urdf(with_both, "x").root == "world"
-    assert with_both.count(mark.encode()) == with_both.count(b"\n")
-    assert with_both.startswith(data[: data.rindex(b"</robot>")])
-
-
-def test_a_world_that_is_there_takes_up_the_base():
-    chain = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
-    base = se3.exp6([1.0, 2, 3, 0.1, 0.2, 0.3])
-    placed = Chain.from_urdf(parse_urdf(with_world(chain.urdf.data, base), "x"), "tool0")
-    q = np.zeros((1, 6))
-    np.testing.assert_allclose(placed.poses(q), base @ chain.poses(q), atol=1e-14)
-
-
-def test_taken_names_are_refused(sim_6dof):
-    with pytest.raises(DhcalError, match="--tool-frame link_3"):
-        with_tool_frame(sim_6dof.urdf.data, "tool0", "link_3", np.eye(4))
-
-
-def test_table_of_origins_is_what_pinocchio_reads(sim_6dof_actual):
-    rows = list(csv.DictReader(origins_text(sim_6dof_actual).splitlines()))
-    assert [row["joint"] for row in rows] == [*sim_6dof_actual.moving_joints, "tool"]
-    for row, origin in zip(rows, sim_6dof_actual.origins, strict=True):
-        rotation = pin.rpy.rpyToMatrix(*(float(row[f"{k}[rad]"]) for k in ("roll", "pitch", "yaw")))
-        np.testing.assert_allclose(rotation, origin[:3, :3], atol=1e-14)
-        np.testing.assert_allclose([float(row[f"{k}[m]"]) for k in "xyz"], origin[:3, 3], atol=0)
-
-
-# --- through the commands --------------------------------------------------------------------------
-
-
-@pytest.fixture
-def measured(tmp_path):
-    """A UR10 somewhere in a hall, with a reflector somewhere on its flange, and its file of poses."""
-    robot = tmp_path / "ur10.urdf"
-    robot.write_bytes(robot_file("ur_description/urdf/ur10_robot.urdf").read_bytes())
-    chain = Chain.from_urdf(robot, "tool0")
-    rng = np.random.default_rng(0)
-    truth = chain.perturbed_at(
-        {0: se3.exp6([1, 2, 0.5, 0.1, 0.2, 2.0]), chain.tool_frame_index: se3.exp6([0.1, 0, 0.05, 0.3, 0, 0])}
-        | {2 * j: se3.exp6(1e-3 * rng.normal(size=6)) for j in range(1, 7)}
-    )
-    q = rng.uniform(-2, 2, (40, 6))
-    data = tmp_path / "laser.csv"
-    data.write_text(measurement_text(Pose.simulate(truth, q, Noise(), rng), chain))
-    return robot, data, truth
-
-
-def test_calibrate_can_put_both_frames_into_the_urdf(measured, tmp_path):
-    robot, data, truth = measured
-    out = tmp_path / "out.urdf"
-    options = ["--tip", "tool0", "--priors", "none", "--world-joint", "--tool-frame", "reflector"]
-    assert main(["calibrate", str(robot), str(data), "-o", str(out), *options]) == 0
-    q = np.random.default_rng(1).uniform(-2, 2, (30, 6))
-    for tip in ("reflector", "tool0"):
-        np.testing.assert_allclose(read_robot(out, tip).poses(q), truth.poses(q), atol=1e-9)
-    lines = out.read_bytes().splitlines()
-    assert set(robot.read_bytes().splitlines()) - set(lines) <= {
-        line for line in robot.read_bytes().splitlines() if b"<origin" in line
-    }
-
-
-def test_convert_writes_and_reads_urs_yaml(tmp_path):
+def test_convert_writes_and_reads_ur_kinematics(tmp_path):
     table, yaml_file, urdf = (str(tmp_path / name) for name in ("a.dh.toml", "k.yaml", "b.urdf"))
     Path(table).write_text(dh_text(ur10(factory()), table))
     assert main(["convert", table, yaml_file]) == 0
     assert main(["convert", yaml_file, urdf]) == 0
     q = np.random.default_rng(1).uniform(-2, 2, (30, 6))
     np.testing.assert_allclose(read_robot(urdf).poses(q), ur10(factory()).poses(q), atol=1e-9)
-
-
-def test_convert_writes_a_table_of_origins(tmp_path):
-    out = tmp_path / "ur10.origins.csv"
-    source = robot_file("ur_description/urdf/ur10_robot.urdf")
-    assert main(["convert", str(source), str(out), "--tip", "tool0"]) == 0
-    rows = {row["joint"]: row for row in csv.DictReader(out.read_text().splitlines())}
-    assert float(rows["shoulder_pan_joint"]["z[m]"]) == 0.1273

@@ -1,0 +1,72 @@
+"""Robot files: formats by ending, reading and converting."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from robots import URDF, write
+
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io import FORMATS, convert_robot, read_robot, robot_name
+from dhcal_pin.io.robot import find_format, has_dh_table
+
+TABLE, ROBOT = URDF / "ur10.dh.toml", URDF / "sim_6dof.urdf"
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("arm.urdf", "URDF"),
+        ("ARM.URDF", "URDF"),
+        ("arm.toml", "DH table"),
+        ("arm.dh.csv", "DH table"),
+        ("arm.origins.csv", "table of joint origins"),
+        ("arm.yml", "kinematics of Universal Robots"),
+    ],
+)
+def test_the_longest_ending_selects_the_format(name, expected):
+    robot_format = find_format(name)
+    assert robot_format is not None
+    assert robot_format.name == expected
+
+
+def test_endings_are_unique():
+    endings = [e for robot_format in FORMATS for e in (*robot_format.endings, *robot_format.other_endings)]
+    assert len(set(endings)) == len(endings)
+    assert find_format("arm.png") is None
+
+
+def test_only_files_with_a_dh_table_have_a_fixed_tip():
+    assert has_dh_table("arm.dh.toml")
+    assert has_dh_table("arm.yaml")
+    assert not has_dh_table("arm.urdf")
+    assert not has_dh_table("arm.xml")
+    with pytest.raises(DhcalError, match="a DH table has one tip; leave out --tip"):
+        read_robot(TABLE, "tool0")
+
+
+@pytest.mark.parametrize("robot_format", [f for f in FORMATS if f.is_readable], ids=lambda f: f.name)
+def test_a_converted_robot_has_the_same_poses(tmp_path, robot_format):
+    for ending in robot_format.endings:
+        path = write(tmp_path, f"arm{ending}", convert_robot(TABLE, f"arm{ending}").text)
+        arm, again = read_robot(TABLE), read_robot(path)
+        q = np.random.default_rng(0).uniform(-3, 3, (20, arm.n_joints))
+        np.testing.assert_allclose(again.poses(q), arm.poses(q), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("source", "target", "words"),
+    [
+        (TABLE, "arm.png", r"arm\.png: unknown ending; choose from \.urdf, \.dh\.toml, \.dh\.csv, \.yaml"),
+        (ROBOT, "arm.urdf", r"is already a URDF; choose from \.dh\.toml"),
+        ("arm.origins.csv", "arm.urdf", "a table of joint origins cannot be read as a robot; choose from"),
+    ],
+)
+def test_what_cannot_be_converted_is_an_error(source, target, words):
+    with pytest.raises(DhcalError, match=words):
+        convert_robot(source, target)
+
+
+def test_a_robot_has_the_name_of_its_file():
+    assert robot_name("dir/arm.dh.toml") == "arm"
+    assert robot_name(".urdf") == "arm"

@@ -1,0 +1,79 @@
+"""Sidecars: written, read back, replaced, and refused if invalid."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from robots import write
+
+from dhcal_pin import se3
+from dhcal_pin.estimation import Uncertainty
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io import read_instrument, read_robot, read_uncertainty, urdf_files, write_urdf
+from dhcal_pin.io.sidecar import sidecar_text
+
+
+def test_base_and_tool_are_read_back_from_the_sidecar(tmp_path, scara):
+    rng = np.random.default_rng(0)
+    placed = replace(scara, base=se3.exp6(rng.normal(size=6)), tool=se3.exp6(rng.normal(size=6)))
+    write_urdf(placed, tmp_path / "out.urdf")
+    q = rng.uniform(-1, 1, (20, 2))
+    np.testing.assert_allclose(read_robot(tmp_path / "out.urdf").poses(q), placed.poses(q), atol=1e-12)
+
+
+def test_an_old_sidecar_is_replaced_with_its_robot(tmp_path, scara):
+    assert list(urdf_files(scara, tmp_path / "out.urdf")) == [tmp_path / "out.urdf"]
+    base = np.eye(4)
+    base[:3, 3] = 1.0, 2.0, 3.0
+    write_urdf(replace(scara, base=base), tmp_path / "out.urdf")
+    side = tmp_path / "out.calibration.toml"
+    assert tomllib.loads(side.read_text())["base"]["xyz_m"] == [1.0, 2.0, 3.0]
+    write_urdf(scara, tmp_path / "out.urdf")
+    assert tomllib.loads(side.read_text())["base"]["xyz_m"] == [0.0, 0.0, 0.0]
+    np.testing.assert_array_equal(read_robot(tmp_path / "out.urdf").base, np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("[gripper]\n", "gripper"), ("base = 1\n", "is not a table"), ("[tool]\nxyz_m = [1, 2]\n", "3 numbers")],
+)
+def test_an_invalid_sidecar_is_an_error(tmp_path, text, words, scara):
+    write_urdf(scara, tmp_path / "arm.urdf")
+    path = write(tmp_path, "arm.calibration.toml", text)
+    with pytest.raises(DhcalError, match=words) as caught:
+        read_robot(tmp_path / "arm.urdf")
+    assert str(path) in str(caught.value)
+
+
+def test_sidecar_text_is_toml(scara):
+    text = sidecar_text(replace(scara, tip='a "b"'), np.eye(4), required=True)
+    assert text is not None
+    assert set(tomllib.loads(text)) == {"tip", "base", "tool"}
+
+
+def test_numbers_are_read_back_bit_identical(tmp_path, scara):
+    values = {
+        "wire1.x": 0.1 + 0.2,
+        'a "b"': -0.0,
+        "plane.d": 5e-324,
+        "é [x]": 1.7976931348623157e308,
+        "n": -1e-7,
+    }
+    n_rows = 6 * (len(scara.moving_joints) + 1)
+    rows = np.random.default_rng(0).normal(size=(2, n_rows, 3))
+    known = Uncertainty(scara, np.array([], int), rows[0], rows[1])
+    for path, content in urdf_files(scara, tmp_path / "out.urdf", values, known).items():
+        write(tmp_path, str(path), content)
+    side = tmp_path / "out.calibration.toml"
+    assert {name: value.hex() for name, value in read_instrument(side).items()} == {
+        name: value.hex() for name, value in values.items()
+    }
+    again = read_uncertainty(side, scara)
+    assert again is not None
+    np.testing.assert_array_equal(again.sqrt_covariance, rows[0])
+    np.testing.assert_array_equal(again.unbounded_directions, rows[1])
+    assert side.read_text().startswith("# ")
+    assert 'sqrt_covariance = """\n' in side.read_text()
