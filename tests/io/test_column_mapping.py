@@ -170,7 +170,7 @@ def test_euler_conventions_are_those_of_scipy(frame):
     ],
 )
 def test_rotations_in_every_convention(read, how, columns):
-    turns = Rotation.random(20, 1)
+    turns = Rotation.random(20, np.random.default_rng(1))
     values = columns(turns)
     names = [f"r{i}" for i in range(values.shape[1])]
     lines = [",".join(["a", "b", "c", "x", "y", "z", *names])]
