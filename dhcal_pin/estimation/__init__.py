@@ -1,8 +1,33 @@
-"""Least-squares estimation: error parameters, problem, QR factorization, solvers, robust weights, batches."""
+"""Least-squares estimation: error models, problems, solvers, robust weights, priors and uncertainty.
+
+A `Problem` joins an error model, measurements and priors. `minimize` solves it by one of `METHODS` and
+returns a `SolverResult`:
+
+    >>> import numpy as np
+    >>> from dhcal_pin.estimation import Problem, minimize, select_parameters
+    >>> from dhcal_pin.io import read_dh, shipped_file
+    >>> from dhcal_pin.measurements import Noise, Position
+    >>> from dhcal_pin.robot import Chain
+    >>> nominal = Chain.from_dh(read_dh(shipped_file("sim_6dof.dh.toml")))
+    >>> actual = Chain.from_dh(read_dh(shipped_file("sim_6dof_actual.dh.toml")))
+    >>> rng = np.random.default_rng(0)
+    >>> data = Position.simulate(actual, rng.uniform(-3, 3, (30, 6)), Noise(position=1e-4), rng)
+    >>> errors = select_parameters(nominal, "dh")
+    >>> result = minimize(Problem(errors, (data,), weights=1 / errors.priors))
+    >>> result.converged
+    True
+    >>> calibrated = errors.at(result.x)
+
+`solve_batch` does the same for many small problems at once. Everything here follows from the triangular
+system of one linearization (`TriangularSystem`).
+
+The choice of initial frames, noise scales and hold-out data belongs to `calibration`. Reports on parameters
+that the data do not determine belong to `identifiability`.
+"""
 
 from .batch import BatchProblem, BatchResult, solve_batch
 from .error_model import ErrorModel, ErrorParameter
-from .parameters import PARAMETER_SETS, select_parameters
+from .parameters import PARAMETER_SETS, ParameterSet, select_parameters
 from .priors import Priors
 from .problem import Problem, linearize_and_factor
 from .qr import TriangularSystem
@@ -19,6 +44,7 @@ __all__ = [
     "ErrorModel",
     "ErrorParameter",
     "Loss",
+    "ParameterSet",
     "Prediction",
     "Predictor",
     "Priors",

@@ -74,14 +74,14 @@ def test_the_rank_is_full_at_condition_1e8():
     rng = np.random.default_rng(0)
     u, _ = np.linalg.qr(rng.normal(size=(50, 6)))
     v, _ = np.linalg.qr(rng.normal(size=(6, 6)))
-    r = np.linalg.qr(u * np.logspace(0, -8, 6) @ v, mode="r")
+    r = np.asarray(np.linalg.qr(u * np.logspace(0, -8, 6) @ v, mode="r"))
     assert qr.rank(r) == 6
     assert qr.condition(r) == pytest.approx(1e8, rel=1e-6)
 
 
 def test_row_space_and_null_space_are_complements():
     rng = np.random.default_rng(0)
-    r = np.linalg.qr(rng.normal(size=(50, 4)) @ rng.normal(size=(4, 6)), mode="r")
+    r = np.asarray(np.linalg.qr(rng.normal(size=(50, 4)) @ rng.normal(size=(4, 6)), mode="r"))
     observable, unobservable = qr.row_space(r), qr.null_space(r)
     assert observable.shape == (4, 6)
     assert unobservable.shape == (6, 2)
