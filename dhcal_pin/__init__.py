@@ -3,15 +3,20 @@
 Lengths are metres and angles radians everywhere. Joint positions q have shape (m, n), one row per sample;
 poses have shape (m, 4, 4); twists are [v, ω]; T_ab is the pose of frame b in frame a.
 
-The public names are listed in `__init__.pyi`. Each is loaded on first use, so that `import dhcal_pin` and
-`dhcal --help` are fast.
+The public names are listed in `__init__.pyi`. The list is read, and each name is loaded, on first use, so
+that `import dhcal_pin` and `dhcal --help` are fast.
 """
 
+from functools import cache
 from typing import Any
 
-import lazy_loader
 
-_load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+@cache
+def _public() -> tuple[Any, Any, list[str]]:
+    """Return the module functions __getattr__ and __dir__, and __all__, as the stub file declares them."""
+    import lazy_loader
+
+    return lazy_loader.attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str) -> Any:
@@ -19,4 +24,9 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         return version("dhcal-pin")
-    return _load(name)
+    load, _, names = _public()
+    return names if name == "__all__" else load(name)
+
+
+def __dir__() -> list[str]:
+    return _public()[1]()
