@@ -12,31 +12,20 @@ from robots import paper, robot_file
 
 from dhcal_pin import se3
 from dhcal_pin.calibration import calibrate
-from dhcal_pin.estimation import qr
-from dhcal_pin.estimation.parameters import select_parameters
-from dhcal_pin.estimation.problem import Problem, linearize_and_factor
+from dhcal_pin.estimation import Problem, linearize_and_factor, qr, select_parameters
 from dhcal_pin.identifiability import EXPECTED, explanations
 from dhcal_pin.identifiability.null_space import ObservabilityProbe, UnobservableGroup, group_directions
 from dhcal_pin.identifiability.propagation import PlainErrors
-from dhcal_pin.measurements import KINDS
-from dhcal_pin.measurements.base import Measurement, Noise
-from dhcal_pin.measurements.pose import Pose
-from dhcal_pin.measurements.position import Position
-from dhcal_pin.robot.chain import Chain
-from dhcal_pin.robot.dh import DHTable
+from dhcal_pin.measurements import KINDS, Measurement, Noise, Pose, Position
+from dhcal_pin.robot import Chain, DHTable
 
 
 def table(theta, d, a, alpha, prismatic=()):
     zero = np.zeros(len(theta))
-    return DHTable(
-        "standard",
-        tuple(f"j{i + 1}" for i in range(len(theta))),
-        np.isin(np.arange(len(theta)), prismatic),
-        *(np.array(column, float) for column in (theta, d, a, alpha)),
-        zero,
-        zero - np.inf,
-        zero + np.inf,
-    )
+    theta, d, a, alpha = (np.array(column, float) for column in (theta, d, a, alpha))
+    names = tuple(f"j{i + 1}" for i in range(len(theta)))
+    is_prismatic = np.isin(np.arange(len(theta)), prismatic)
+    return DHTable("standard", names, is_prismatic, theta, d, a, alpha, zero, zero - np.inf, zero + np.inf)
 
 
 RIGHT = np.pi / 2

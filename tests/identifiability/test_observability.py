@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from dhcal_pin.calibration import calibrate
-from dhcal_pin.estimation.parameters import select_parameters
+from dhcal_pin.estimation import select_parameters
 from dhcal_pin.identifiability import observability
-from dhcal_pin.measurements.base import Noise
-from dhcal_pin.measurements.pose import Pose
-from dhcal_pin.measurements.position import Position
-from dhcal_pin.robot.chain import Chain
+from dhcal_pin.measurements import Noise, Pose, Position
+from dhcal_pin.robot import Chain
 
 NOISE = Noise(1e-4, np.deg2rad(0.01))
 

@@ -9,20 +9,16 @@ import pinocchio as pin
 import pytest
 from robots import paper, robot_file
 
-from dhcal_pin.calibration.procedure import calibrate
-from dhcal_pin.estimation.parameters import select_parameters
-from dhcal_pin.estimation.problem import Problem, linearize_and_factor
+from dhcal_pin.calibration import calibrate
+from dhcal_pin.estimation import Problem, linearize_and_factor, select_parameters
 from dhcal_pin.estimation.qr import append_priors
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io.robot import read_robot, write_urdf
-from dhcal_pin.io.sidecar import read_uncertainty
-from dhcal_pin.measurements import KINDS
-from dhcal_pin.measurements.base import Noise
+from dhcal_pin.io import read_robot, read_uncertainty, write_urdf
+from dhcal_pin.measurements import KINDS, Noise
+from dhcal_pin.planning import Information, plan
 from dhcal_pin.planning.criteria import DOptimality
 from dhcal_pin.planning.exchange import CandidateSet, exchange, greedy, sqrt_covariance
-from dhcal_pin.planning.information import Information
-from dhcal_pin.planning.planner import plan
-from dhcal_pin.robot.chain import Chain
+from dhcal_pin.robot import Chain
 from dhcal_pin.robot.sampling import ConfigurationSampler, WorkspaceConstraints, shortest_tour
 from dhcal_pin.robot.urdf import parse_urdf
 
