@@ -214,6 +214,9 @@ class Explainer:
 
         The count refers to the null space of the group's cause, because other groups may share its members.
         With `listed`, the text names the members, otherwise it refers to names that precede it.
+
+        Returns:
+            Clause without a full stop.
         """
         members, r = group.members, group.vectors.shape[1]
         _, s, vt = np.linalg.svd(self.layers[group.cause][members].T)
@@ -386,6 +389,9 @@ def _merge_groups(groups: list[UnobservableGroup]) -> list[UnobservableGroup]:
     """Merge groups of one cause if their union has one identifiable combination.
 
     Groups of the causes "poses" and "unmoved" are always merged.
+
+    Returns:
+        Merged groups.
     """
     out: list[UnobservableGroup] = []
     for group in groups:

@@ -1,4 +1,8 @@
-"""Planning: which poses to measure, and which accuracy to expect of them."""
+"""Planning of measurements: which poses to measure, and which accuracy to expect.
+
+Optimality criteria, knowledge before a measurement, and the search for good poses belong here. Random
+configurations, workspace constraints and collision checks belong to `robot`.
+"""
 
 from .information import Information
 from .planner import CRITERIA, Plan, plan

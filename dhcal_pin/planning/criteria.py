@@ -1,8 +1,28 @@
-"""What a design of experiments is chosen for, weighed by a root of the unknowns' covariance.
+"""Criteria of optimal experimental design, computed from a square root of the covariance.
 
-Smaller is better, a hundredth less is one per cent better. Candidates are as in `design`: a pool of m of
-them is (p, k, m), whitened rows by p unknowns in units of their priors. Of their covariance C there is only
-a root, C = H·Hᵀ: squaring would lose half the digits.
+Notation: p unknowns in units of their prior standard deviations, M = RᵀR the information matrix of priors and
+measurements, and C = M⁻¹ = H·Hᵀ the covariance with H = R⁻¹. A candidate is a block A (k, p) of k whitened
+Jacobian rows; measuring it changes M to M + AᵀA. Every criterion is minimized:
+
+* D: det(C)^(1/p), the geometric mean of the variances along the principal axes. Gain: log det(I + A·C·Aᵀ).
+* A: tr(Wᵀ·C·W) with orthonormal observable directions W, the sum of variances.
+  Gain: tr((I + A·C·Aᵀ)⁻¹·A·C·W·Wᵀ·C·Aᵀ) (Woodbury identity).
+* I, or task: the same with W such that tr(Wᵀ·C·W) is the mean squared position error over a task.
+* E: largest eigenvalue of V·C·Vᵀ over the observable directions V.
+* Bias and variance: √(tr(Wᵀ·C·W)·‖Wᵀ·B - G‖²), where B is the bias of the fitted unknowns by omitted ones;
+see
+  `BiasVarianceCriterion`.
+
+`value` returns the logarithm of the criterion: a difference of 0.01 is one per cent. `gains` ranks candidates
+and uses k×k determinants in place of p×p ones. C is never formed from M: that would lose half the digits.
+
+References:
+    A. C. Atkinson, A. N. Donev and R. D. Tobias, Optimum Experimental Designs, with SAS, Oxford 2007,
+    chapters 10 and 11: D, A, E and I optimality. F. Pukelsheim, Optimal Design of Experiments, SIAM 2006,
+    chapters 5 and 6: information functions. G. E. P. Box and N. R. Draper, A basis for the selection of a
+    response surface design, J. American Statistical Association 54 (1959), 622-654: bias by omitted terms,
+    the alias matrix. E. Läuter, Experimental design in a class of models, Math. Operationsforschung und
+    Statistik 5 (1974), 379-398: compound criteria.
 """
 
 from __future__ import annotations
@@ -14,27 +34,45 @@ import numpy as np
 
 from .._typing import Array
 
+# Exponent that makes the weighted sum of variances in the gains of `EOptimality` follow the largest one.
+_E_WEIGHT_POWER = 6
+
 
 class Criterion(Protocol):
-    """What a design is chosen for."""
+    """Optimality criterion of a design; smaller values are better."""
 
-    def value(self, root: Array) -> float:
-        """Log of what is to be small, of a root (p, p) of the covariance."""
+    def value(self, sqrt_covariance: Array) -> float:
+        """Compute the logarithm of the criterion.
+
+        Args:
+            sqrt_covariance: Square root H of the covariance C = H·Hᵀ, shape (p, p).
+
+        Returns:
+            Logarithm; a difference of 0.01 is one per cent.
+        """
         ...
 
-    def gains(self, rows: Array, root: Array) -> Array:
-        """How much each candidate (m,) of a pool (p, k, m) would help, by a measure that ranks them."""
+    def gains(self, rows: Array, sqrt_covariance: Array) -> Array:
+        """Rate candidates by the improvement that each would bring alone.
+
+        Args:
+            rows: Whitened rows of m candidates, shape (p, k, m).
+            sqrt_covariance: Square root of the covariance before, shape (p, p).
+
+        Returns:
+            Gains, larger is better, shape (m,).
+        """
         ...
 
 
-def _transform_rows(rows: Array, by: Array) -> Array:
-    """Rows (p, k, m) in coordinates by (p, w): (w, k, m)."""
+def _transform_rows(rows: Array, basis: Array) -> Array:
+    """Return the products (w, k, m) of rows (p, k, m) with the columns of a basis (p, w)."""
     p, k, m = rows.shape
-    return (by.T @ rows.reshape(p, k * m)).reshape(-1, k, m)
+    return (basis.T @ rows.reshape(p, k * m)).reshape(-1, k, m)
 
 
 def _factor(rows: Array) -> Array:
-    """Cholesky factors (k, k, m), lower, of I + rowsᵀ·rows for rows (p, k, m), all candidates at once."""
+    """Return the lower Cholesky factors (k, k, m) of I + A·Aᵀ for m candidates with rows A (p, k, m)."""
     k, m = rows.shape[1:]
     out = np.empty((k, k, m))
     for i in range(k):
@@ -50,7 +88,7 @@ def _factor(rows: Array) -> Array:
 
 
 def _solve_factor(rows: Array, factor: Array) -> Array:
-    """Rows (w, k, m) times the inverse transposes of lower factors (k, k, m), in place."""
+    """Multiply rows (w, k, m) by the inverse transposes of lower factors (k, k, m), in place."""
     for j in range(rows.shape[1]):
         for i in range(j):
             rows[:, j] -= factor[j, i] * rows[:, i]
@@ -60,107 +98,185 @@ def _solve_factor(rows: Array, factor: Array) -> Array:
 
 @dataclass(frozen=True)
 class DOptimality:
-    """D: the volume of the unknowns' uncertainty, as the geometric mean of p standard deviations, squared."""
+    """D-optimality: volume of the confidence ellipsoid of all unknowns."""
 
-    def value(self, root: Array) -> float:
-        """Log of det(C)^(1/p)."""
-        return 2 * float(np.mean(np.log(np.abs(np.diag(root)))))
+    def value(self, sqrt_covariance: Array) -> float:
+        """Compute log det(C)^(1/p); see `Criterion.value`.
 
-    def gains(self, rows: Array, root: Array) -> Array:
-        """By how much log det of the information grows: det(I + A·C·Aᵀ)."""
-        factor = _factor(_transform_rows(rows, root))
+        Args:
+            sqrt_covariance: Upper triangular square root of the covariance, shape (p, p).
+
+        Returns:
+            Logarithm of the criterion.
+        """
+        return 2 * float(np.mean(np.log(np.abs(np.diag(sqrt_covariance)))))
+
+    def gains(self, rows: Array, sqrt_covariance: Array) -> Array:
+        """Compute log det(I + A·C·Aᵀ); see `Criterion.gains`.
+
+        Args:
+            rows: Whitened rows of m candidates, shape (p, k, m).
+            sqrt_covariance: Square root of the covariance before, shape (p, p).
+
+        Returns:
+            Gains, shape (m,).
+        """
+        factor = _factor(_transform_rows(rows, sqrt_covariance))
         return 2 * np.log(np.einsum("iim->im", factor)).sum(0)
 
 
 @dataclass(frozen=True, eq=False)
 class AOptimality:
-    """A and task: the sum of the variances of some combinations of the unknowns.
+    """A- or I-optimality: sum of the variances of combinations of the unknowns.
 
     Attributes:
-        combinations: (p, w).
+        combinations: Combinations W, shape (p, w). Observable directions give A-optimality, the combinations
+            of `Information.task_combinations` I-optimality over a task.
     """
 
     combinations: Array
 
-    def value(self, root: Array) -> float:
-        """Log of the sum."""
-        return float(np.log(np.sum((self.combinations.T @ root) ** 2)))
+    def value(self, sqrt_covariance: Array) -> float:
+        """Compute log tr(Wᵀ·C·W); see `Criterion.value`.
 
-    def gains(self, rows: Array, root: Array) -> Array:
-        """By how much the sum falls: tr((I + A·C·Aᵀ)⁻¹·A·C·W·C·Aᵀ)."""
-        turned = _transform_rows(rows, root)
-        factor = _factor(turned)
-        left = _solve_factor(_transform_rows(turned, root.T @ self.combinations), factor)
-        return np.einsum("wkm,wkm->m", left, left)
+        Args:
+            sqrt_covariance: Square root of the covariance, shape (p, p).
+
+        Returns:
+            Logarithm of the criterion.
+        """
+        return float(np.log(np.sum((self.combinations.T @ sqrt_covariance) ** 2)))
+
+    def gains(self, rows: Array, sqrt_covariance: Array) -> Array:
+        """Compute the decrease of the sum, tr((I + A·C·Aᵀ)⁻¹·A·C·W·Wᵀ·C·Aᵀ); see `Criterion.gains`.
+
+        Args:
+            rows: Whitened rows of m candidates, shape (p, k, m).
+            sqrt_covariance: Square root of the covariance before, shape (p, p).
+
+        Returns:
+            Gains, shape (m,).
+        """
+        scaled = _transform_rows(rows, sqrt_covariance)
+        factor = _factor(scaled)
+        change = _solve_factor(_transform_rows(scaled, sqrt_covariance.T @ self.combinations), factor)
+        return np.einsum("wkm,wkm->m", change, change)
 
 
 @dataclass(frozen=True, eq=False)
 class EOptimality:
-    """E: the variance of the worst known among the combinations that can be known at all.
+    """E-optimality: largest variance of any observable direction.
 
     Attributes:
-        observable: (r, p) orthonormal directions that the candidates see.
+        observable: Orthonormal observable directions V, shape (r, p).
     """
 
     observable: Array
 
-    def value(self, root: Array) -> float:
-        """Log of the largest variance."""
-        return 2 * float(np.log(np.linalg.norm(self.observable @ root, 2)))
+    def value(self, sqrt_covariance: Array) -> float:
+        """Compute the logarithm of the largest eigenvalue of V·C·Vᵀ; see `Criterion.value`.
 
-    def gains(self, rows: Array, root: Array) -> Array:
-        """By how much a sum of variances falls in which the worst ones count nearly alone."""
-        directions, size, _ = np.linalg.svd(self.observable @ root, full_matrices=False)
-        return AOptimality(self.observable.T @ directions * (size / size[0]) ** 6).gains(rows, root)
+        Args:
+            sqrt_covariance: Square root of the covariance, shape (p, p).
+
+        Returns:
+            Logarithm of the criterion.
+        """
+        return 2 * float(np.log(np.linalg.norm(self.observable @ sqrt_covariance, 2)))
+
+    def gains(self, rows: Array, sqrt_covariance: Array) -> Array:
+        """Compute the decrease of a smooth substitute; see `Criterion.gains`.
+
+        The substitute is the sum of the variances of the principal axes of V·C·Vᵀ, weighted by a high power
+        of their standard deviations, so that the largest ones dominate.
+
+        Args:
+            rows: Whitened rows of m candidates, shape (p, k, m).
+            sqrt_covariance: Square root of the covariance before, shape (p, p).
+
+        Returns:
+            Gains, shape (m,).
+        """
+        directions, std, _ = np.linalg.svd(self.observable @ sqrt_covariance, full_matrices=False)
+        weighted = self.observable.T @ directions * (std / std[0]) ** _E_WEIGHT_POWER
+        return AOptimality(weighted).gains(rows, sqrt_covariance)
 
 
 @dataclass(frozen=True, eq=False)
 class BiasVarianceCriterion:
-    """Robust: the error of some combinations by noise and by what the fit's model leaves out, both alike.
+    """Robust design: variance, and bias by unknowns that the fit omits, in equal parts.
 
-    A fit that takes f of the unknowns for zero while they are not puts them down to the others: with rows A
-    of those that it finds and Φ of those left out, C·Aᵀ·Φ of them (the alias matrix of Box and Draper 1959).
-    What that adds to the mean squared error, beyond what a fit to the task itself would suffer, counts as
-    much as the variance, whatever the ratio of their sizes, which nobody knows before measuring: what is
-    small is the geometric mean of the two (compound designs, Läuter 1974).
+    The unknowns are split into fitted ones with rows A and omitted ones with rows Φ, which the fit takes as
+    zero. The fitted ones then absorb the effect of the omitted ones: their bias is B = C_f·Aᵀ·Φ per unit of
+    the omitted ones (the alias matrix of Box and Draper), with the covariance C_f of the fit. A fit to the
+    task itself would have the bias G in the combinations W. The criterion is the geometric mean of variance
+    and squared additional bias,
+
+        √(tr(Wᵀ·C_f·W)·‖Wᵀ·B - G‖²).
+
+    The geometric mean (a compound criterion, Läuter) weighs relative changes of both equally. Hence no
+    assumption on the ratio of noise to omitted effects is needed.
 
     Attributes:
-        fitted: (p+f,) which unknowns a fit finds.
-        combinations: (p, w) of these, orthogonal ones over the task.
-        wanted: (w, f) what of those left out a fit to the task itself would show in the combinations.
+        fitted: Whether the fit estimates each unknown, shape (p+f,).
+        combinations: Combinations W of the fitted unknowns, orthogonal over the task, shape (p, w).
+        target_bias: Bias G of a fit to the task itself, shape (w, f).
     """
 
     fitted: Array
     combinations: Array
-    wanted: Array
+    target_bias: Array
 
-    def _known(self, root: Array) -> tuple[Array, Array]:
-        """With those left out held at zero: root (p, p) of the others' covariance, and their bias (p, f)."""
-        own, lost = root[self.fitted], root[~self.fitted]
-        q, triangle = np.linalg.qr(lost.T)
-        shared = own @ q
-        held = np.linalg.qr((own - shared @ q.T).T, mode="r").T
-        return held, -np.linalg.solve(triangle, shared.T).T
+    def _fit_covariance_and_bias(self, sqrt_covariance: Array) -> tuple[Array, Array]:
+        """Compute the square root (p, p) of the covariance C_f of the fit, and the bias B (p, f).
 
-    def value(self, root: Array) -> float:
-        """Log of the geometric mean of variance and squared bias."""
-        held, bias = self._known(root)
-        variance = np.sum((self.combinations.T @ held) ** 2)
-        return float(np.log(variance * np.sum((self.combinations.T @ bias - self.wanted) ** 2)) / 2)
+        Both follow from the joint covariance C of all unknowns: C_f is the conditional covariance of the
+            fitted ones for
+        known omitted ones, and -B is the regression matrix of the fitted on the omitted ones.
 
-    def gains(self, rows: Array, root: Array) -> Array:
-        """By how much the mean of both falls, up to what is the same for all candidates."""
-        held, bias = self._known(root)
-        own, lost = rows[self.fitted], rows[~self.fitted]
-        turned = _transform_rows(own, held)
-        factor = _factor(turned)
-        seen = _solve_factor(_transform_rows(turned, held.T @ self.combinations), factor)
-        news = _solve_factor(lost - _transform_rows(own, bias), factor)
-        off = self.combinations.T @ bias - self.wanted
-        variance = np.sum((self.combinations.T @ held) ** 2) - np.einsum("wkm,wkm->m", seen, seen)
-        square = np.sum(off**2) + 2 * np.einsum("fkm,fkm->m", _transform_rows(seen, off), news)
+        Returns:
+            Square root of C_f, and B.
+        """
+        fitted, omitted = sqrt_covariance[self.fitted], sqrt_covariance[~self.fitted]
+        q, r = np.linalg.qr(omitted.T)
+        shared = fitted @ q
+        conditional = np.linalg.qr((fitted - shared @ q.T).T, mode="r").T
+        return conditional, -np.linalg.solve(r, shared.T).T
+
+    def value(self, sqrt_covariance: Array) -> float:
+        """Compute the logarithm of the geometric mean of variance and squared bias; see `Criterion.value`.
+
+        Args:
+            sqrt_covariance: Square root of the covariance of all unknowns, shape (p+f, p+f).
+
+        Returns:
+            Logarithm of the criterion.
+        """
+        conditional, bias = self._fit_covariance_and_bias(sqrt_covariance)
+        variance = np.sum((self.combinations.T @ conditional) ** 2)
+        return float(np.log(variance * np.sum((self.combinations.T @ bias - self.target_bias) ** 2)) / 2)
+
+    def gains(self, rows: Array, sqrt_covariance: Array) -> Array:
+        """Compute the negative logarithm of the criterion after each candidate; see `Criterion.gains`.
+
+        Args:
+            rows: Whitened rows of m candidates, shape (p+f, k, m).
+            sqrt_covariance: Square root of the covariance before, shape (p+f, p+f).
+
+        Returns:
+            Gains up to a constant, shape (m,).
+        """
+        conditional, bias = self._fit_covariance_and_bias(sqrt_covariance)
+        fitted, omitted = rows[self.fitted], rows[~self.fitted]
+        scaled = _transform_rows(fitted, conditional)
+        factor = _factor(scaled)
+        change = _solve_factor(_transform_rows(scaled, conditional.T @ self.combinations), factor)
+        innovation = _solve_factor(omitted - _transform_rows(fitted, bias), factor)
+        excess = self.combinations.T @ bias - self.target_bias
+        variance = np.sum((self.combinations.T @ conditional) ** 2) - np.einsum("wkm,wkm->m", change, change)
+        square = np.sum(excess**2) + 2 * np.einsum("fkm,fkm->m", _transform_rows(change, excess), innovation)
         for i in range(rows.shape[1]):
             for j in range(rows.shape[1]):
-                both = np.einsum("wm,wm->m", seen[:, i], seen[:, j])
-                square += both * np.einsum("fm,fm->m", news[:, i], news[:, j])
+                product = np.einsum("wm,wm->m", change[:, i], change[:, j])
+                square += product * np.einsum("fm,fm->m", innovation[:, i], innovation[:, j])
         return -np.log(variance * square) / 2

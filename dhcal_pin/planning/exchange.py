@@ -1,11 +1,21 @@
-"""Optimal design of experiments: which of many candidates' readings tell most about p unknowns.
+"""Selection of candidates: greedy choice, then exchange of single candidates.
 
-A candidate is k whitened rows of a Jacobian by the unknowns, each in units of its prior's sigma; a pool of m
-of them is (p, k, m), components first. What is known beforehand, priors included, is a triangle R, and
-C = R⁻¹R⁻ᵀ the covariance. A criterion weighs C: smaller is better, a hundredth less is one per cent better.
+A candidate is a block of k whitened Jacobian rows by p unknowns in units of their prior standard deviations;
+m candidates are an array (p, k, m). Prior knowledge is the R factor R₀ of priors and existing measurements. A
+selection S has the covariance C = (R₀ᵀR₀ + Σ_S AᵢᵀAᵢ)⁻¹, of which only the square root R⁻¹ is computed, with
+R the R factor of [R₀; A_S].
 
-Greedy choice, then exchange (Fedorov 1972; Cook and Nachtsheim 1980), with each candidate's k×k determinant
-in place of a p×p one. C never appears, only its root: squaring would lose half the digits.
+* Greedy: add the feasible candidate of the largest gain, n times.
+* Exchange: for each selected candidate in turn, remove it and add the best one of the others, if that lowers
+the
+  criterion; repeat until a pass gains less than `MIN_PASS_GAIN`.
+
+References:
+    V. V. Fedorov, Theory of Optimal Experiments, Academic Press 1972: exchange.
+    T. J. Mitchell, An algorithm for the construction of D-optimal experimental designs, Technometrics 16
+    (1974), 203-210: removal and addition of one candidate at a time (DETMAX). R. D. Cook and C. J.
+    Nachtsheim, A comparison of algorithms for constructing exact D-optimal designs, Technometrics 22 (1980),
+    315-324: exchange of one selected candidate after the other.
 """
 
 from __future__ import annotations
@@ -19,149 +29,200 @@ from scipy.linalg import lapack
 from .._typing import Array
 from .criteria import Criterion
 
-# A pass of exchanges that gains less than this is the last one: a thousandth of efficiency.
+# A pass of exchanges that lowers the logarithm of the criterion by less is the last one.
 MIN_PASS_GAIN = 1e-3
-
-
+# Largest number of passes.
 MAX_PASSES = 20
-
-
-# Exchange looks at so many candidates, those which would add most to the design as it is.
+# Number of candidates that a pass considers: those of the largest gain for the design as it is.
 MAX_EXCHANGE_CANDIDATES = 600
 
 
-def sqrt_covariance(prior_factor: Array, rows: Array) -> Array:
-    """R⁻¹ (p, p) of the QR of a triangle (p, p) and rows (n, k, p) below it: a root of the covariance."""
+def compute_sqrt_covariance(prior_factor: Array, rows: Array) -> Array:
+    """Compute a square root of the covariance after measurements.
+
+    Args:
+        prior_factor: R factor of the knowledge before, shape (p, p).
+        rows: Whitened rows of n measurements, shape (n, k, p).
+
+    Returns:
+        R⁻¹ for the R factor of both, upper triangular, shape (p, p).
+    """
     p = prior_factor.shape[1]
-    triangle = np.linalg.qr(np.concatenate([prior_factor, rows.reshape(-1, p)]), mode="r")
-    return lapack.dtrtri(triangle)[0]
+    r = np.linalg.qr(np.concatenate([prior_factor, rows.reshape(-1, p)]), mode="r")
+    return lapack.dtrtri(r)[0]
 
 
-def _always(_: int) -> bool:
+def _always_feasible(_: int) -> bool:
+    """Accept every candidate."""
     return True
 
 
 @dataclass(frozen=True, eq=False)
 class CandidateSet:
-    """Candidates to choose from.
+    """Candidates of a design.
 
     Attributes:
-        rows: (p, k, m) whitened, the unknowns in units of their priors.
-        coordinates: (m, d) where they stand. What no model holds is alike for neighbours, so two of them tell less
-            than their rows say.
-        min_distance: the distance that two chosen ones keep.
-        is_feasible: tells of a candidate whether it can be measured at all; asked only of those that are wanted.
-        infeasible: (m,) candidates known to be impossible; grows as they are asked about.
+        rows: Whitened rows, with the unknowns in units of their prior standard deviations, shape (p, k, m).
+        coordinates: Coordinates of the candidates for their distances, shape (m, d). Effects that no model
+            describes are similar for neighbours, so two neighbours contain less information than their rows
+            say.
+        min_distance: Smallest distance of two selected candidates.
+        is_feasible: Expensive test of a candidate by its index; called only for candidates that are about to
+            be selected.
+        infeasible: Candidates that failed the test so far, shape (m,); updated in place.
     """
 
     rows: Array
     coordinates: Array
     min_distance: float = 0.0
-    is_feasible: Callable[[int], bool] = _always
+    is_feasible: Callable[[int], bool] = _always_feasible
     infeasible: Array = field(default_factory=lambda: np.zeros(0, bool))
 
     @classmethod
     def from_rows(
-        cls, rows: Array, places: Array, apart: float = 0.0, possible: Callable[[int], bool] = _always
+        cls,
+        rows: Array,
+        coordinates: Array,
+        min_distance: float = 0.0,
+        is_feasible: Callable[[int], bool] = _always_feasible,
     ) -> CandidateSet:
-        """Candidates none of which is known to be impossible."""
-        return cls(rows, places, apart, possible, np.zeros(rows.shape[2], bool))
-
-    def at(self, chosen: Array) -> Array:
-        """The chosen ones' rows (n, k, p)."""
-        return np.ascontiguousarray(self.rows[:, :, chosen].transpose(2, 1, 0))
-
-    def best(self, gains: Array, among: Array, others: Array) -> int | None:
-        """The possible one of the largest gain (w,), or None.
+        """Create a set of candidates of which none is known to be infeasible.
 
         Args:
-            gains: (w,), -inf for what is out of the question.
-            among: (w,) their numbers.
-            others: (n, d) places to keep away from.
+            rows: Whitened rows, shape (p, k, m).
+            coordinates: Coordinates, shape (m, d).
+            min_distance: Smallest distance of two selected candidates.
+            is_feasible: Test of a candidate by its index.
+
+        Returns:
+            Candidates.
         """
-        gains = np.where(self.infeasible[among] | self._is_too_close(among, others), -np.inf, gains)
+        return cls(rows, coordinates, min_distance, is_feasible, np.zeros(rows.shape[2], bool))
+
+    def rows_of(self, selected: Array) -> Array:
+        """Return the rows of selected candidates.
+
+        Args:
+            selected: Indices, shape (n,).
+
+        Returns:
+            Rows, shape (n, k, p).
+        """
+        return np.ascontiguousarray(self.rows[:, :, selected].transpose(2, 1, 0))
+
+    def best_candidate(self, gains: Array, indices: Array, occupied: Array) -> int | None:
+        """Find the feasible candidate of the largest gain.
+
+        Args:
+            gains: Gains, -inf for candidates that must not be selected, shape (w,).
+            indices: Indices of these candidates, shape (w,).
+            occupied: Coordinates to which `min_distance` must be kept, shape (n, d).
+
+        Returns:
+            Index of the candidate; None if none is feasible.
+        """
+        is_excluded = self.infeasible[indices] | self._is_too_close(indices, occupied)
+        gains = np.where(is_excluded, -np.inf, gains)
         while gains.size:
-            at = int(np.argmax(gains))
-            if gains[at] == -np.inf:
+            best = int(np.argmax(gains))
+            if gains[best] == -np.inf:
                 break
-            if self.is_feasible(int(among[at])):
-                return int(among[at])
-            self.infeasible[among[at]] = True
-            gains[at] = -np.inf
+            if self.is_feasible(int(indices[best])):
+                return int(indices[best])
+            self.infeasible[indices[best]] = True
+            gains[best] = -np.inf
         return None
 
-    def _is_too_close(self, among: Array, others: Array) -> Array:
-        """Which of the candidates (w,) stand too near to other places (n, d)."""
+    def _is_too_close(self, indices: Array, occupied: Array) -> Array:
+        """Return whether candidates (w,) are closer than `min_distance` to any of the coordinates (n, d)."""
         if not self.min_distance:
-            return np.zeros(len(among), bool)
-        here = self.coordinates[among]
-        squares = np.sum(here**2, 1)[:, None] + np.sum(others**2, 1) - 2 * here @ others.T
+            return np.zeros(len(indices), bool)
+        own = self.coordinates[indices]
+        squares = np.sum(own**2, 1)[:, None] + np.sum(occupied**2, 1) - 2 * own @ occupied.T
         return np.any(squares < self.min_distance**2, 1)
 
 
-def greedy(
-    pool: CandidateSet, prior_factor: Array, count: int, criterion: Criterion, chosen: Array, existing: Array
+def select_greedily(
+    candidates: CandidateSet,
+    prior_factor: Array,
+    count: int,
+    criterion: Criterion,
+    selected: Array,
+    existing: Array,
 ) -> Array:
-    """Numbers of the chosen ones and of `count` more, each the best to add; fewer if no more are possible.
+    """Add candidates to a selection, each the best one to add next.
 
     Args:
-        pool: candidates.
-        prior_factor: (p, p) triangle of what is known.
-        count: how many to add.
-        criterion: what for.
-        chosen: (c,) numbers.
-        existing: (n, d) further places to keep away from.
+        candidates: Candidates.
+        prior_factor: R factor of the knowledge before, shape (p, p).
+        count: Number of candidates to add.
+        criterion: Optimality criterion.
+        selected: Indices of candidates already selected, shape (c,).
+        existing: Coordinates of existing measurements, to which the distance is kept, shape (n, d).
+
+    Returns:
+        Indices of the selection; fewer than c + count if no more are feasible.
     """
-    every = np.arange(pool.rows.shape[2])
-    out = list(map(int, chosen))
+    every = np.arange(candidates.rows.shape[2])
+    out = list(map(int, selected))
     for _ in range(count):
-        gains = criterion.gains(pool.rows, sqrt_covariance(prior_factor, pool.at(np.array(out, int))))
+        rows = candidates.rows_of(np.array(out, int))
+        gains = criterion.gains(candidates.rows, compute_sqrt_covariance(prior_factor, rows))
         gains[out] = -np.inf
-        found = pool.best(gains, every, np.concatenate([existing, pool.coordinates[out]]))
-        if found is None:
+        occupied = np.concatenate([existing, candidates.coordinates[out]])
+        best = candidates.best_candidate(gains, every, occupied)
+        if best is None:
             break
-        out.append(found)
+        out.append(best)
     return np.array(out, int)
 
 
-def exchange(
-    pool: CandidateSet,
+def improve_by_exchange(
+    candidates: CandidateSet,
     prior_factor: Array,
-    chosen: Array,
+    selected: Array,
     criterion: Criterion,
     existing: Array,
-    passes: int = MAX_PASSES,
+    max_passes: int = MAX_PASSES,
 ) -> Array:
-    """The chosen ones (n,) after exchanging each for the best in its place, until that gains next to nothing.
+    """Exchange selected candidates one at a time for better ones, until a pass gains too little.
 
     Args:
-        pool: candidates.
-        prior_factor: (p, p) triangle of what is known.
-        chosen: (n,) numbers.
-        criterion: what for.
-        existing: (c, d) further places to keep away from.
-        passes: the most of them.
+        candidates: Candidates.
+        prior_factor: R factor of the knowledge before, shape (p, p).
+        selected: Indices of the selection to start with, shape (n,).
+        criterion: Optimality criterion.
+        existing: Coordinates of existing measurements, to which the distance is kept, shape (c, d).
+        max_passes: Largest number of passes over the selection.
+
+    Returns:
+        Indices of the improved selection, shape (n,).
     """
-    chosen = chosen.copy()
-    value = criterion.value(sqrt_covariance(prior_factor, pool.at(chosen)))
-    for _ in range(passes):
-        before = value
-        gains = criterion.gains(pool.rows, sqrt_covariance(prior_factor, pool.at(chosen)))
-        gains[chosen] = np.inf
-        near = np.argsort(-gains)[: max(MAX_EXCHANGE_CANDIDATES, 2 * len(chosen))]
-        rows = np.ascontiguousarray(pool.rows[:, :, near])
-        for slot in range(len(chosen)):
-            others = np.delete(chosen, slot)
-            gains = criterion.gains(rows, sqrt_covariance(prior_factor, pool.at(others)))
-            gains[np.isin(near, others)] = -np.inf
-            found = pool.best(gains, near, np.concatenate([existing, pool.coordinates[others]]))
-            if found is None or found == chosen[slot]:
+    selected = selected.copy()
+
+    def sqrt_covariance(indices: Array) -> Array:
+        return compute_sqrt_covariance(prior_factor, candidates.rows_of(indices))
+
+    value = criterion.value(sqrt_covariance(selected))
+    for _ in range(max_passes):
+        value_before = value
+        gains = criterion.gains(candidates.rows, sqrt_covariance(selected))
+        gains[selected] = np.inf
+        promising = np.argsort(-gains)[: max(MAX_EXCHANGE_CANDIDATES, 2 * len(selected))]
+        rows = np.ascontiguousarray(candidates.rows[:, :, promising])
+        for slot in range(len(selected)):
+            others = np.delete(selected, slot)
+            gains = criterion.gains(rows, sqrt_covariance(others))
+            gains[np.isin(promising, others)] = -np.inf
+            occupied = np.concatenate([existing, candidates.coordinates[others]])
+            best = candidates.best_candidate(gains, promising, occupied)
+            if best is None or best == selected[slot]:
                 continue
-            trial = chosen.copy()
-            trial[slot] = found
-            reached = criterion.value(sqrt_covariance(prior_factor, pool.at(trial)))
-            if reached < value:
-                chosen, value = trial, reached
-        if before - value < MIN_PASS_GAIN:
+            trial = selected.copy()
+            trial[slot] = best
+            trial_value = criterion.value(sqrt_covariance(trial))
+            if trial_value < value:
+                selected, value = trial, trial_value
+        if value_before - value < MIN_PASS_GAIN:
             break
-    return chosen
+    return selected

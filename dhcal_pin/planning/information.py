@@ -1,4 +1,15 @@
-"""What measuring would tell: the information of readings not yet taken, and the errors that remain."""
+"""Fisher information of measurements before they are taken, and the position errors that remain.
+
+The unknowns are p kinematic errors of the robot and s' parameters of the instrument, scaled by their prior
+standard deviations. To first order, knowledge is an R factor: [I] for the priors, the scaled R factor of
+existing measurements, or the inverse square root of the covariance of an earlier calibration. Measuring at
+joint positions q appends the whitened Jacobian rows A(q), which do not depend on the measured values:
+
+    C = (R₀ᵀR₀ + Σ A(q_i)ᵀA(q_i))⁻¹.
+
+The mean squared position error over a task with tool Jacobians J_t (linear part) is tr(Wᵀ·C·W), where Wᵀ is
+the R factor of all J_t, divided by the square root of their number.
+"""
 
 from __future__ import annotations
 
@@ -16,41 +27,40 @@ from ..estimation.parameters import PARAMETER_SETS, select_parameters
 from ..estimation.priors import Priors, prior_weights
 from ..estimation.problem import linearize_and_factor
 from ..estimation.uncertainty import Uncertainty
-from ..exceptions import DhcalError
+from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..measurements import KINDS
 from ..measurements.base import Measurement, Noise, whitened_jacobian
 from ..robot.chain import Chain
-from .exchange import sqrt_covariance
+from .exchange import compute_sqrt_covariance
 
-# The unknowns of an instrument are placed as if it were to read so many configurations.
+# Configurations at which initial values of instrument parameters are computed.
 _N_PLACEMENT_SAMPLES = 200
-
-
-# What no model holds of a joint, from pose to pose: a gear of an arcminute, and as little on a slide.
+# Standard deviation of joint positions from pose to pose that no model describes: one arcminute of a gear,
+# and a comparable length of a linear axis [m, rad].
 JOINT_SCATTER = Noise(5e-5, np.deg2rad(1 / 60))
-
-
-# A share of the largest standard deviation that is none, but rounding.
+# Standard deviations below this fraction of the largest one are zero up to rounding.
 ZERO_STD_RTOL = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """What would be known after measuring at any configurations, to first order about the model at hand.
+    """Knowledge before a measurement, and the information of measurements at any configurations.
 
-    The unknowns are the p errors of the robot, then those of instruments, each in units of its prior's sigma.
+    Shapes: p robot parameters, s instrument parameters of the kind, s' further unknowns of instruments. The
+        unknowns are
+    the robot parameters, then the instrument parameters, in units of their prior standard deviations.
 
     Attributes:
-        errors: the robot's unknowns.
-        x: (p,) their values so far.
-        kind: of measurement.
-        noise: its sigmas.
-        instrument_values: (s,) values of the kind's unknowns.
-        instrument_columns: (s,) where those stand among all unknowns; -1 for one that is known.
-        prior_sigma: (p+s',) sigmas of the priors, m and rad.
-        prior_factor: (p+s', p+s') triangle of priors and data so far.
-        data_factor: (p+s', p+s') or (0, p+s') triangle of the data alone.
-        fitted: (p+s',) which unknowns a fit will find; it takes the others for zero.
+        errors: Error model of the robot.
+        x: Present values of the robot parameters, shape (p,) [m or rad].
+        kind: Kind of measurement.
+        noise: Standard deviations of a measurement [m, rad].
+        instrument_values: Values of the kind's instrument parameters, shape (s,).
+        instrument_columns: Column of each of them among the unknowns, -1 if it is known, shape (s,).
+        prior_sigma: Prior standard deviations of the unknowns, shape (p+s',) [m or rad].
+        prior_factor: R factor of priors and existing measurements, shape (p+s', p+s').
+        data_factor: R factor of the existing measurements alone, shape (p+s', p+s') or (0, p+s').
+        fitted: Whether the fit estimates each unknown, shape (p+s',). It takes the others as zero.
     """
 
     errors: ErrorModel
@@ -66,60 +76,98 @@ class Information:
 
     @cached_property
     def _derivative(self) -> tuple[Chain, Array, Array]:
+        """Chain at x, bodies and twists of its errors."""
         return self.errors.derivative(self.x)
 
     @property
     def chain(self) -> Chain:
-        """The robot as far as it is known."""
+        """Robot at the present values of its parameters."""
         return self._derivative[0]
 
     def rows(self, q: Array) -> Array:
-        """Whitened rows (p+s', k, m) of readings at joint values q (m, n)."""
+        """Compute the whitened Jacobian rows of measurements.
+
+        Args:
+            q: Joint positions, shape (m, n) [rad or m].
+
+        Returns:
+            Rows of k residuals, shape (p+s', k, m).
+        """
         chain, bodies, twists = self._derivative
         data = self.kind.simulate(chain, q, self.noise, np.random.default_rng(0))
         frames = chain.forward_kinematics(q)
-        velocities = chain.tool_jacobian(frames, bodies, twists)
+        jacobian = chain.tool_jacobian(frames, bodies, twists)
         whitened = whitened_jacobian(
-            data, frames, velocities, self.instrument_values, data.residual(frames, self.instrument_values)
+            data, frames, jacobian, self.instrument_values, data.residual(frames, self.instrument_values)
         )
         out = np.zeros((len(self.prior_sigma), *whitened.shape[1:]))
         out[: len(whitened)] = whitened
-        free = self.instrument_columns >= 0
-        out[self.instrument_columns[free]] = data.instrument_jacobian(frames, self.instrument_values)[free]
+        is_unknown = self.instrument_columns >= 0
+        instrument_jacobian = data.instrument_jacobian(frames, self.instrument_values)
+        out[self.instrument_columns[is_unknown]] = instrument_jacobian[is_unknown]
         return out * self.prior_sigma[:, None, None]
 
-    def task(self, q: Array) -> Array:
-        """Combinations (p+s', w) whose variances add up to the mean squared position error at q, m²."""
+    def task_combinations(self, q: Array) -> Array:
+        """Compute combinations of the unknowns whose variances sum to the mean squared position error.
+
+        Args:
+            q: Joint positions of the task, shape (m, n) [rad or m].
+
+        Returns:
+            Combinations W, shape (p+s', w) [m].
+        """
         chain, bodies, twists = self._derivative
-        velocities = chain.tool_jacobian(chain.forward_kinematics(q), bodies, twists)[:, :3]
+        jacobian = chain.tool_jacobian(chain.forward_kinematics(q), bodies, twists)[:, :3]
         out = np.zeros((len(self.prior_sigma), 3 * len(q)))
-        out[: len(velocities)] = velocities.reshape(len(velocities), -1)
+        out[: len(jacobian)] = jacobian.reshape(len(jacobian), -1)
         return np.asarray(np.linalg.qr((out * self.prior_sigma[:, None]).T / np.sqrt(len(q)), mode="r")).T
 
     def without_omitted(self) -> Information:
-        """The same without what a fit will leave out."""
-        kept, robot = self.fitted, len(self.x)
-        found = [p for p, fitted in zip(self.errors.parameters, kept[:robot], strict=True) if fitted]
-        places = np.where(self.instrument_columns < 0, -1, np.cumsum(kept)[self.instrument_columns] - 1)
+        """Return the knowledge about the fitted unknowns alone, as if the omitted ones were zero.
+
+        Returns:
+            Information whose unknowns are all fitted.
+        """
+        fitted, n_robot = self.fitted, len(self.x)
+        parameters = [
+            p for p, is_fitted in zip(self.errors.parameters, fitted[:n_robot], strict=True) if is_fitted
+        ]
+        columns = np.where(self.instrument_columns < 0, -1, np.cumsum(fitted)[self.instrument_columns] - 1)
         return replace(
             self,
-            errors=replace(self.errors, parameters=tuple(found)),
-            x=self.x[kept[:robot]],
-            instrument_columns=places,
-            prior_sigma=self.prior_sigma[kept],
-            prior_factor=np.asarray(np.linalg.qr(self.prior_factor[:, kept], mode="r")),
-            data_factor=self.data_factor[:, kept],
-            fitted=kept[kept],
+            errors=replace(self.errors, parameters=tuple(parameters)),
+            x=self.x[fitted[:n_robot]],
+            instrument_columns=columns,
+            prior_sigma=self.prior_sigma[fitted],
+            prior_factor=np.asarray(np.linalg.qr(self.prior_factor[:, fitted], mode="r")),
+            data_factor=self.data_factor[:, fitted],
+            fitted=fitted[fitted],
         )
 
     def observable_directions(self, rows: Array) -> Array:
-        """Orthonormal directions (r, p+s') that data so far and further rows (n, k, p+s') see."""
-        every = np.concatenate([self.data_factor, rows.reshape(-1, len(self.prior_sigma))])
-        return qr.row_space(np.asarray(np.linalg.qr(every, mode="r")))
+        """Compute the directions that existing and further measurements observe.
 
-    def error(self, rows: Array, task: Array) -> float:
-        """Predicted RMS position error in m over a `task`, after readings of rows (n, k, p+s')."""
-        return float(np.sqrt(np.sum((task.T @ sqrt_covariance(self.prior_factor, rows)) ** 2)))
+        Args:
+            rows: Whitened rows of further measurements, shape (n, k, p+s').
+
+        Returns:
+            Orthonormal directions, shape (r, p+s').
+        """
+        stacked = np.concatenate([self.data_factor, rows.reshape(-1, len(self.prior_sigma))])
+        return qr.row_space(np.asarray(np.linalg.qr(stacked, mode="r")))
+
+    def predict_error(self, rows: Array, combinations: Array) -> float:
+        """Predict the RMS position error over a task after measurements.
+
+        Args:
+            rows: Whitened rows of the measurements, shape (n, k, p+s').
+            combinations: Result of `task_combinations`, shape (p+s', w).
+
+        Returns:
+            RMS position error [m].
+        """
+        sqrt_covariance = compute_sqrt_covariance(self.prior_factor, rows)
+        return float(np.sqrt(np.sum((combinations.T @ sqrt_covariance) ** 2)))
 
     @classmethod
     def from_prior(
@@ -137,29 +185,35 @@ class Information:
         omitted_sets: Sequence[str] = (),
         prior_uncertainty: Uncertainty | None = None,
     ) -> Information:
-        """What is known before measuring: the priors, and what data already taken or a calibration tell.
+        """Collect the knowledge before measuring from priors, existing measurements or a calibration.
 
         Args:
-            chain: the nominal robot.
-            q: (m, n) joint values of the kind that will be measured.
-            kind: of `KINDS`.
-            noise: its sigmas; None for those that the data show.
-            parameters: what is unknown, as in `calibrate`.
-            priors: as in `calibrate`.
-            fix: as in `calibrate`.
-            free: as in `calibrate`.
-            data: readings already taken.
-            known: values of instruments' unknowns, as in `calibrate`.
-            omitted_sets: sets whose parameters the robot has and a fit will take for zero, as far as it does not
-                find them.
-            prior_uncertainty: of the calibration that made the chain; it takes the priors' place for what it found.
+            chain: Nominal robot.
+            q: Joint positions similar to those that will be measured, shape (m, n) [rad or m].
+            kind: Name in `KINDS`.
+            noise: Standard deviations of a measurement [m, rad]; None for those of the existing measurements.
+            parameters: Parameter sets, as in `calibrate`.
+            priors: Prior standard deviations, as in `calibrate`.
+            fix: Parameters to fix, as in `calibrate`.
+            free: Parameters to free, as in `calibrate`.
+            data: Existing measurements.
+            known: Values of known instrument parameters, as in `calibrate`.
+            omitted_sets: Sets whose parameters the robot has, and which the fit takes as zero unless they are
+                in `parameters`.
+            prior_uncertainty: Uncertainty of the calibration that made the chain. It replaces the priors of
+                the parameters that the calibration estimated.
+
+        Returns:
+            Knowledge about all unknowns.
 
         Raises:
-            DhcalError: the kind's readings hang together, a sigma or a prior is missing.
+            InvalidArgumentError: Priors or standard deviations are missing.
         """
         maker = _plannable_kind(kind)
         if priors == "none":
-            raise DhcalError("a plan needs priors; choose default, or sigmas by name")
+            raise InvalidArgumentError(
+                "priors 'none': a plan needs priors; choose default, or standard deviations by name"
+            )
         errors = select_parameters(
             chain, parameters if parameters is not None else chain.parameters, fix, free
         )
@@ -171,113 +225,144 @@ class Information:
             sigma, values = 1 / fit.problem.weights, values | fit.instruments
             noise = noise or _sigma_of(fit.problem.data, kind)
         if noise is None:
-            raise DhcalError(f"no sigma is known of a {kind}; give one, as 0.1mm,0.01deg")
-        errors, x, sigma, fitted = _with_sets(errors, x, sigma, omitted_sets)
-        there, triangle = {}, np.zeros((0, len(sigma)))
+            raise InvalidArgumentError(
+                f"kind {kind!r}: the standard deviation is unknown; give one, for example 0.1mm,0.01deg"
+            )
+        errors, x, sigma, fitted = _add_parameter_sets(errors, x, sigma, omitted_sets)
+        # Column of each instrument parameter by name, and R factor of the existing measurements.
+        columns, r = {}, np.zeros((0, len(sigma)))
         if fit is not None:
-            there = {unknown.name: len(x) + i for i, unknown in enumerate(fit.problem.instrument_parameters)}
-            every = np.concatenate([x, fit.x[len(fit.x) - len(there) :]])
-            triangle = linearize_and_factor(replace(fit.problem, errors=errors), every, small_angle=False).r
+            instrument_parameters = fit.problem.instrument_parameters
+            columns = {parameter.name: len(x) + i for i, parameter in enumerate(instrument_parameters)}
+            x_all = np.concatenate([x, fit.x[len(fit.x) - len(columns) :]])
+            r = linearize_and_factor(replace(fit.problem, errors=errors), x_all, small_angle=False).r
         model = errors.at(x)
         template = maker.simulate(
             model, q[:_N_PLACEMENT_SAMPLES], noise, np.random.default_rng(0)
         ).initialized(model)
         if not template.has_stated_sigma:
-            needs = "0.1mm,0.01deg" if "orientation" in maker.residual_groups else "0.1mm"
-            raise DhcalError(f"a {kind} needs sigmas above zero, as {needs}")
-        places = []
-        for unknown in template.instrument_parameters:
-            if unknown.name not in values:
-                there[unknown.name] = len(sigma)
-                sigma, fitted = np.append(sigma, unknown.prior), np.append(fitted, True)
-            places.append(there.get(unknown.name, -1))
-        taken = np.zeros((len(triangle), len(sigma)))
-        taken[:, : triangle.shape[1]] = triangle * sigma[: triangle.shape[1]]
-        start = np.concatenate([taken, np.eye(len(sigma))])
+            example = "0.1mm,0.01deg" if "orientation" in maker.residual_groups else "0.1mm"
+            raise InvalidArgumentError(
+                f"kind {kind!r}: standard deviations must be above zero; give them, for example {example}"
+            )
+        instrument_columns = []
+        for parameter in template.instrument_parameters:
+            if parameter.name not in values:
+                columns[parameter.name] = len(sigma)
+                sigma, fitted = np.append(sigma, parameter.prior), np.append(fitted, True)
+            instrument_columns.append(columns.get(parameter.name, -1))
+        data_factor = np.zeros((len(r), len(sigma)))
+        data_factor[:, : r.shape[1]] = r * sigma[: r.shape[1]]
+        stacked = np.concatenate([data_factor, np.eye(len(sigma))])
         if prior_uncertainty is not None:
-            start[len(taken) :, : len(x)] = 0.0
-            told = _rows(*prior_uncertainty.of_parameters(errors, sigma[: len(x)]))
-            start[len(taken) : len(taken) + len(x), : len(x)] = told
+            # Replace the prior rows of the robot parameters.
+            rows = _information_rows(*prior_uncertainty.of_parameters(errors, sigma[: len(x)]))
+            stacked[len(data_factor) :, : len(x)] = 0.0
+            stacked[len(data_factor) : len(data_factor) + len(x), : len(x)] = rows
         return cls(
             errors=errors,
             x=x,
             kind=maker,
             noise=noise,
             instrument_values=np.array(
-                [values.get(unknown.name, unknown.nominal) for unknown in template.instrument_parameters]
+                [
+                    values.get(parameter.name, parameter.nominal)
+                    for parameter in template.instrument_parameters
+                ]
             ),
-            instrument_columns=np.array(places, int),
+            instrument_columns=np.array(instrument_columns, int),
             prior_sigma=sigma,
-            prior_factor=np.asarray(np.linalg.qr(start, mode="r")),
-            data_factor=taken,
+            prior_factor=np.asarray(np.linalg.qr(stacked, mode="r")),
+            data_factor=data_factor,
             fitted=fitted,
         )
 
 
-def _rows(sqrt_covariance: Array, unbounded_directions: Array) -> Array:
-    """Rows (p, p) whose information is that of a covariance's root (p, r), in units of the priors.
+def _information_rows(sqrt_covariance: Array, unbounded_directions: Array) -> Array:
+    """Compute rows (p, p) with the information of a covariance, in units of the priors.
 
-    Unknowns and directions that a calibration did not look for have no covariance: they keep their prior.
+    Unknowns and directions that the calibration did not estimate have no covariance and keep their prior.
 
     Args:
-        sqrt_covariance: (p, r).
-        unbounded_directions: (p, h) directions that nothing told, whose variance is without bounds.
+        sqrt_covariance: Square root of the covariance, shape (p, r).
+        unbounded_directions: Directions without any information, shape (p, h).
+
+    Returns:
+        Rows whose R factor is the knowledge, shape (p, p).
     """
-    ways, size, _ = np.linalg.svd(
-        np.pad(sqrt_covariance, ((0, 0), (0, max(0, len(sqrt_covariance) - sqrt_covariance.shape[1]))))
-    )
-    known = size > ZERO_STD_RTOL * size[0]
-    rows = ways.T[known] / size[known, None]
-    lost = np.linalg.svd(rows @ unbounded_directions, full_matrices=False)
-    away = lost[0][:, lost[1] > ZERO_STD_RTOL * np.linalg.norm(rows)]
-    return np.concatenate([rows - away @ (away.T @ rows), ways.T[~known]])
+    n_missing = max(0, len(sqrt_covariance) - sqrt_covariance.shape[1])
+    axes, std, _ = np.linalg.svd(np.pad(sqrt_covariance, ((0, 0), (0, n_missing))))
+    has_covariance = std > ZERO_STD_RTOL * std[0]
+    rows = axes.T[has_covariance] / std[has_covariance, None]
+    # Remove the part of the rows that depends on the unbounded directions.
+    u, s, _ = np.linalg.svd(rows @ unbounded_directions, full_matrices=False)
+    unbounded = u[:, s > ZERO_STD_RTOL * np.linalg.norm(rows)]
+    return np.concatenate([rows - unbounded @ (unbounded.T @ rows), axes.T[~has_covariance]])
 
 
-def _with_sets(
+def _add_parameter_sets(
     errors: ErrorModel, x: Array, sigma: Array, sets: Sequence[str]
 ) -> tuple[ErrorModel, Array, Array, Array]:
-    """With further sets' parameters among the errors: values and sigmas of all unknowns, and which are old.
+    """Add the parameters of further sets to an error model.
 
     Args:
-        errors: p unknowns.
-        x: (p,) their values.
-        sigma: (p+s,) theirs and instruments'.
-        sets: names.
+        errors: Error model with p parameters.
+        x: Their values, shape (p,) [m or rad].
+        sigma: Prior standard deviations of these and of instrument parameters, shape (p+s,).
+        sets: Names of the sets.
+
+    Returns:
+        Error model, values, prior standard deviations, and which unknowns were there before.
     """
-    own = {parameter.name: i for i, parameter in enumerate(errors.parameters)}
-    more = [p for name in sets for p in PARAMETER_SETS[name](errors.chain) if p.name not in own]
-    wide = errors.with_parameters(more)
-    at = np.array([own.get(parameter.name, -1) for parameter in wide.parameters])
-    priors = np.where(at < 0, wide.priors, sigma[at])
-    fitted = np.concatenate([at >= 0, np.full(len(sigma) - len(x), True)])
-    return wide, np.where(at < 0, 0.0, x[at]), np.concatenate([priors, sigma[len(x) :]]), fitted
+    indices = {parameter.name: i for i, parameter in enumerate(errors.parameters)}
+    new = [p for name in sets for p in PARAMETER_SETS[name](errors.chain) if p.name not in indices]
+    extended = errors.with_parameters(new)
+    old_index = np.array([indices.get(parameter.name, -1) for parameter in extended.parameters])
+    is_new = old_index < 0
+    priors = np.where(is_new, extended.priors, sigma[old_index])
+    fitted = np.concatenate([~is_new, np.full(len(sigma) - len(x), True)])
+    all_priors = np.concatenate([priors, sigma[len(x) :]])
+    return extended, np.where(is_new, 0.0, x[old_index]), all_priors, fitted
 
 
-def with_joint_scatter(chain: Chain, q: Array, noise: Noise) -> Noise:
-    """Sigmas of readings at joint values q (m, n) by arms whose joints scatter by `JOINTS`, too."""
+def add_joint_scatter(chain: Chain, q: Array, noise: Noise) -> Noise:
+    """Add the effect of scattering joint positions on the tool to the noise of an instrument.
+
+    Args:
+        chain: Robot.
+        q: Joint positions over which the effect is averaged, shape (m, n) [rad or m].
+        noise: Standard deviations of the instrument [m, rad].
+
+    Returns:
+        Standard deviations of instrument and `JOINT_SCATTER` together [m, rad].
+    """
     errors = select_parameters(chain, "offset")
     model, bodies, twists = errors.derivative(np.zeros(len(errors.parameters)))
-    turns = np.array([parameter.unit == "rad" for parameter in errors.parameters])
-    sizes = np.where(turns, JOINT_SCATTER.rotation, JOINT_SCATTER.position)
-    moved = model.tool_jacobian(model.forward_kinematics(q), bodies, twists) * sizes[:, None, None]
-    place, turn = np.sqrt(np.sum(moved**2, 0).reshape(2, 3, -1).mean((1, 2)))
-    return Noise(float(np.hypot(noise.position, place)), float(np.hypot(noise.rotation, turn)))
+    is_angle = np.array([parameter.unit == "rad" for parameter in errors.parameters])
+    std = np.where(is_angle, JOINT_SCATTER.rotation, JOINT_SCATTER.position)
+    effects = model.tool_jacobian(model.forward_kinematics(q), bodies, twists) * std[:, None, None]
+    position, rotation = np.sqrt(np.sum(effects**2, 0).reshape(2, 3, -1).mean((1, 2)))
+    return Noise(float(np.hypot(noise.position, position)), float(np.hypot(noise.rotation, rotation)))
 
 
 def _plannable_kind(kind: str) -> type[Measurement]:
-    """The kind, if its readings stand alone: one configuration each, and no name that ties rows together."""
-    alone = [
+    """Return a kind whose measurements are independent: one configuration each, and no names that link rows.
+
+    Raises:
+        UnknownNameError: The kind is unknown or cannot be planned.
+    """
+    plannable = [
         name
-        for name, kept in KINDS.items()
-        if kept.configurations_per_row == 1 and "text" not in kept.columns.values()
+        for name, measurement in KINDS.items()
+        if measurement.configurations_per_row == 1 and "text" not in measurement.columns.values()
     ]
-    if kind not in alone:
-        raise DhcalError(f"kind {kind!r}: no plan for it; choose from {', '.join(alone)}")
+    if kind not in plannable:
+        raise UnknownNameError(f"kind {kind!r} cannot be planned; choose from {', '.join(plannable)}")
     return KINDS[kind]
 
 
 def _sigma_of(data: Sequence[Measurement], kind: str) -> Noise | None:
-    """The sigmas of data of that kind, as stated or as the fit found them."""
+    """Return the RMS standard deviations of the first measurement of a kind; None if there is none."""
     for item in data:
         if item.kind == kind:
             sigmas = [getattr(item, name, np.zeros(1)) for name in ("sigma", "rotation_sigma")]

@@ -1,4 +1,15 @@
-"""Which poses to measure: the choice that tells most about a robot's errors with the instrument at hand."""
+"""Planning of measurements: which poses to measure, and which accuracy to expect.
+
+Steps of `plan`:
+
+1. Draw candidates within the joint limits and the workspace, or take the given ones.
+2. Collect the knowledge before measuring (`information`), and the whitened Jacobian rows of all candidates.
+3. Select poses greedily, improve the selection by exchange (`exchange`), and move the poses to better ones
+between
+   the candidates (`refinement`), all for one criterion (`criteria`).
+4. Predict the error over the number of poses, for the plan and for random poses.
+5. Order the poses as a short tour.
+"""
 
 from __future__ import annotations
 
@@ -12,61 +23,58 @@ from .._typing import Array
 from ..estimation import qr
 from ..estimation.priors import Priors
 from ..estimation.uncertainty import Uncertainty
-from ..exceptions import DhcalError
+from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..measurements.base import Measurement, Noise
 from ..robot.chain import Chain
 from ..robot.sampling import ConfigurationSampler, WorkspaceConstraints, scale_joint_units, shortest_tour
 from ..robot.transmission import TERM_FAMILIES
 from .criteria import AOptimality, BiasVarianceCriterion, Criterion, DOptimality, EOptimality
-from .exchange import MAX_EXCHANGE_CANDIDATES, CandidateSet, exchange, greedy, sqrt_covariance
-from .information import Information, with_joint_scatter
+from .exchange import (
+    MAX_EXCHANGE_CANDIDATES,
+    CandidateSet,
+    compute_sqrt_covariance,
+    improve_by_exchange,
+    select_greedily,
+)
+from .information import Information, add_joint_scatter
 from .refinement import DesignGoal, refine
 
-# Joints stay this far from their limits.
+# Margins to the joint limits [rad] and [m].
 MARGIN_ANGLE, MARGIN_LENGTH = np.deg2rad(2.0), 5e-3
-
-
-# Predicted errors are averaged over so many configurations where no task is given.
+# Configurations over which predicted errors are averaged if no task is given.
 N_TASK_SAMPLES = 300
-
-
-# Random choices that a plan is compared with, at so many numbers of poses, out of so many poses at least.
+# Random plans per number of poses, numbers of poses, and smallest number of poses that they are drawn from.
 N_RANDOM_PLANS, N_RANDOM_SIZES, MIN_RANDOM_POSES = 200, 6, 600
-
-
-# Candidates drawn at the most: with more of them memory ends before the plan gains.
+# Largest number of candidates; more need too much memory and do not improve the plan.
 MAX_CANDIDATES = 10**6
-
-
-# Poses nearer than this are as one to a real robot, whose errors no model holds in full: they repeat there.
-# Where poses at random would stand nearer than that, their distance.
+# Smallest distance of two poses, in the units of `scale_joint_units`: the effects that no model describes are
+# similar at closer poses. If random poses are closer, their median distance is used.
 MIN_DISTANCE_RAD = np.deg2rad(20.0)
-
-
-# A share of the task that is unseen and no rounding.
+# Part of the task, relative to its norm, that may be unobservable without a note.
 UNOBSERVABLE_RTOL = 1e-6
-
-
-# More poses stop paying where ten more lower what a check would show by less than a hundredth.
+# Diminishing returns: this many more poses lower the error that a check shows by less than this fraction.
 EXTRA_POSES, MIN_EXTRA_GAIN = 10, 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Configurations to measure, and what to expect of them.
+    """Configurations to measure, and the accuracy to expect.
 
     Attributes:
-        q: (n, dof) joint values in the order of a short tour, rad or m.
-        index: (n,) their numbers among given candidates; None where candidates were drawn and refined.
-        criterion: what they were chosen for.
-        information: what is known before, and what any configurations would tell.
-        task: combinations whose variances are the mean squared position error over the task.
-        sizes: (c,) numbers of poses, beyond n as if more were added to the plan.
-        errors: (c,) predicted RMS position error over the task after a plan of so many, m.
-        random_sizes, random_errors: the same for poses at random, the median of several draws.
-        recommended_size: number of poses from which on ten more lower what a check with this instrument would show by
-            less than a hundredth; None if that is beyond the sizes.
-        notes: what was not looked at.
+        q: Joint positions in the order of a short tour, shape (n, dof) [rad or m].
+        index: Indices of the poses among given candidates, shape (n,); None if candidates were drawn and
+            refined.
+        criterion: Name of the criterion.
+        information: Knowledge before the measurement.
+        task: Combinations of the unknowns whose variances sum to the mean squared position error over the
+            task, shape (p, w) [m].
+        sizes: Numbers of poses, shape (c,); numbers above n add poses to the plan.
+        errors: Predicted RMS position error over the task for each number of poses, shape (c,) [m].
+        random_sizes: Numbers of random poses, shape (d,).
+        random_errors: Predicted error of random poses, median of several draws, shape (d,) [m].
+        recommended_size: Number of poses with diminishing returns: ten more lower the error that a check with
+            this instrument shows by less than 1 %. None if it is larger than all sizes.
+        notes: Sentences on what was not considered.
     """
 
     q: Array
@@ -83,30 +91,36 @@ class Plan:
 
     @cached_property
     def log_det(self) -> float:
-        """Log det of the information, the unknowns in units of their priors."""
+        """Logarithm of the determinant of the information matrix, with unknowns in units of their priors."""
         rows = self.information.rows(self.q).transpose(2, 1, 0)
-        return -2 * float(
-            np.sum(np.log(np.abs(np.diag(sqrt_covariance(self.information.prior_factor, rows)))))
-        )
+        sqrt_covariance = compute_sqrt_covariance(self.information.prior_factor, rows)
+        return -2 * float(np.sum(np.log(np.abs(np.diag(sqrt_covariance)))))
 
     @property
     def error(self) -> float:
-        """Predicted RMS position error over the task after these poses, m."""
+        """Predicted RMS position error over the task after these poses [m]."""
         return self.expected_error(self.q)
 
     @property
     def random_error(self) -> float:
-        """Predicted error of as many poses at random, the median of several draws, m."""
+        """Predicted error of as many random poses, median of several draws [m]."""
         return float(self.random_errors[-1])
 
     @property
     def relative_error(self) -> float:
-        """Predicted error over that of as many poses at random."""
+        """Predicted error divided by that of as many random poses."""
         return self.error / self.random_error
 
     def expected_error(self, q: Array) -> float:
-        """Predicted RMS position error in m over the plan's task, after measuring at any q (m, dof)."""
-        return self.information.error(self.information.rows(q).transpose(2, 1, 0), self.task)
+        """Predict the RMS position error over the task after measuring at other configurations.
+
+        Args:
+            q: Joint positions, shape (m, dof) [rad or m].
+
+        Returns:
+            RMS position error [m].
+        """
+        return self.information.predict_error(self.information.rows(q).transpose(2, 1, 0), self.task)
 
 
 def plan(
@@ -129,98 +143,133 @@ def plan(
     margin: Noise | None = None,
     seed: int = 0,
 ) -> Plan:
-    """Chooses configurations to measure.
+    """Select configurations to measure.
 
-    Drawn candidates keep the joints' limits, the space asked for, and do not collide; the chosen ones are
-    then moved on between them. Given candidates are chosen from as they are.
+    Drawn candidates are within the joint limits and the workspace and free of collisions; the selected poses
+    are then moved to better ones between the candidates. Given candidates are not moved.
 
     Args:
-        chain: the nominal robot; base and tool as far as they are known.
-        count: how many.
-        kind: of measurement; readings of one configuration each that hang together by nothing.
-        noise: sigmas of instrument and robot together, m and rad; without it, those that the data show.
-        parameters: what is unknown, as in `calibrate`.
-        priors: as in `calibrate`.
-        fix: as in `calibrate`.
-        free: as in `calibrate`.
-        criterion: "D" volume of the unknowns' uncertainty, "A" mean variance, "E" worst variance, each in
-            units of the priors; "task" predicted position error over the task; "robust" this and, as much,
-            the error over the task by what the model leaves out of gains, harmonics and compliance, of an arm
-            whose joints scatter by an arcminute beside the noise given.
-        data: readings already taken, to be added to.
-        known: values of instruments' unknowns, as in `calibrate`.
-        prior_uncertainty: what the calibration that made the chain left uncertain; it takes the priors' place.
-        task: (m, n) joint values where the tool is to be right; anywhere without it, or where
-            the given candidates are.
-        candidates: how many to draw, or joint values (m, n) to choose from.
-        space: where the tool may be.
-        margin: distance to the joints' limits: `rotation` in rad, `position` in m.
-        seed: of all draws.
+        chain: Nominal robot with base and tool as far as they are known.
+        count: Number of poses.
+        kind: Kind of measurement with one configuration per sample.
+        noise: Standard deviations of instrument and robot together [m, rad]; None for those of `data`.
+        parameters: Parameter sets to identify, as in `calibrate`.
+        priors: Prior standard deviations, as in `calibrate`.
+        fix: Parameters to fix, as in `calibrate`.
+        free: Parameters to free, as in `calibrate`.
+        criterion: "D" volume of the uncertainty, "A" mean variance, "E" largest variance, all in units of the
+            priors; "task" predicted position error over the task; "robust" this and, in equal parts, the
+            error by joint gains, harmonics and compliance that the fit omits, with an additional joint
+            scatter of one arcminute.
+        data: Existing measurements to complement.
+        known: Values of known instrument parameters, as in `calibrate`.
+        prior_uncertainty: Uncertainty of the calibration that made the chain; it replaces the priors.
+        task: Joint positions where the tool must be accurate, shape (m, n) [rad or m]; None for the given
+            candidates, or for the whole joint space.
+        candidates: Number of candidates to draw, or joint positions to choose from, shape (m, n) [rad or m].
+        space: Constraints of the tool pose for drawn candidates.
+        margin: Margins to the joint limits: `rotation` [rad], `position` [m].
+        seed: Seed of all random draws.
+
+    Returns:
+        Poses and predicted errors.
 
     Raises:
-        DhcalError: an unknown name, no room for the tool, or too few candidates.
+        UnknownNameError: The criterion is unknown.
+        InvalidArgumentError: The number of poses or candidates is out of range, or too few candidates are
+            feasible.
     """
     if criterion not in CRITERIA:
-        raise DhcalError(f"criterion {criterion!r}: choose from {', '.join(CRITERIA)}")
+        raise UnknownNameError(f"unknown criterion {criterion!r}; choose from {', '.join(CRITERIA)}")
     if count < 1:
-        raise DhcalError(f"{count} poses: plan at least one")
+        raise InvalidArgumentError(f"{count} poses: expected at least 1")
     if isinstance(candidates, int) and not count <= candidates <= MAX_CANDIDATES:
-        raise DhcalError(f"{candidates} candidates for {count} poses: draw from {count} to {MAX_CANDIDATES}")
+        raise InvalidArgumentError(
+            f"{candidates} candidates for {count} poses: expected from {count} to {MAX_CANDIDATES}"
+        )
     rng = np.random.default_rng(seed)
     margin = margin or Noise(MARGIN_LENGTH, MARGIN_ANGLE)
-    room, notes = None, []
+    sampler, notes = None, []
     if isinstance(candidates, int):
-        room = ConfigurationSampler.from_chain(
+        sampler = ConfigurationSampler.from_chain(
             chain, space or WorkspaceConstraints(), margin.rotation, margin.position
         )
-        q = room.draw(candidates, rng)
-        notes += [room.collision.note] if room.collision.note else []
-        where = (
-            replace(room, workspace=WorkspaceConstraints()).draw(N_TASK_SAMPLES, rng)
+        q = sampler.draw(candidates, rng)
+        notes += [sampler.collision.note] if sampler.collision.note else []
+        task_q = (
+            replace(sampler, workspace=WorkspaceConstraints()).draw(N_TASK_SAMPLES, rng)
             if task is None
             else chain.validated_q(task)
         )
     else:
         q = chain.validated_q(candidates)
-        where = q if task is None else chain.validated_q(task)
-    left_out = ()
+        task_q = q if task is None else chain.validated_q(task)
+    omitted_sets = ()
     if criterion == "robust":
-        left_out, noise = TERM_FAMILIES, noise and with_joint_scatter(chain, q, noise)
-    wide = Information.from_prior(
-        chain, q, kind, noise, parameters, priors, fix, free, data, known, left_out, prior_uncertainty
+        omitted_sets, noise = TERM_FAMILIES, noise and add_joint_scatter(chain, q, noise)
+    full_information = Information.from_prior(
+        chain, q, kind, noise, parameters, priors, fix, free, data, known, omitted_sets, prior_uncertainty
     )
-    information = wide.without_omitted()
-    stands = scale_joint_units(chain, q)
-    kept = np.concatenate(
-        [stands[:0], *(scale_joint_units(chain, item.q) for item in data if item.configurations_per_row == 1)]
+    information = full_information.without_omitted()
+    coordinates = scale_joint_units(chain, q)
+    existing = np.concatenate(
+        [
+            coordinates[:0],
+            *(scale_joint_units(chain, item.q) for item in data if item.configurations_per_row == 1),
+        ]
     )
-    possible = _always if room is None else lambda i: room.is_feasible(q[i])
-    pool = CandidateSet.from_rows(wide.rows(q), stands, _min_distance(stands, count, rng), possible)
-    seen = information.observable_directions(
-        pool.at(np.arange(0, len(q), max(1, len(q) // N_TASK_SAMPLES)))[..., wide.fitted]
+    candidate_set = CandidateSet.from_rows(
+        full_information.rows(q),
+        coordinates,
+        _min_distance(coordinates, count, rng),
+        _always_feasible if sampler is None else lambda i: sampler.is_feasible(q[i]),
     )
-    every = information.task(where)
-    # What the instrument cannot see, as where the base is beside wires of unknown anchors, no choice mends.
-    combinations = seen.T @ (seen @ every)
-    if np.linalg.norm(every - combinations) > UNOBSERVABLE_RTOL * np.linalg.norm(combinations):
-        notes.append(f"where the base stands is not counted, as {kind} readings cannot tell")
-    goal = CRITERIA[criterion](seen, combinations, wide, where)
-    aim = DesignGoal(information, wide, goal, combinations, len(seen), kept, room)
-    first = greedy(pool, wide.prior_factor, count, aim.criterion, np.zeros(0, int), kept)
-    if len(first) < count:
-        # They do not stand so far apart.
-        pool = replace(pool, min_distance=0.0)
-        first = greedy(pool, wide.prior_factor, count - len(first), aim.criterion, first, kept)
-    if len(first) < count:
-        raise DhcalError(f"only {len(first)} of {len(q)} candidates are possible, {count} are asked for")
-    chosen = exchange(pool, wide.prior_factor, first, aim.criterion, kept)
-    best = q[chosen] if room is None else refine(aim, q[chosen], room, pool.min_distance, rng)
-    sizes, errors = _error_curve(aim, pool, q, first, chosen, best, rng)
-    random_sizes, random_errors = _random_errors(aim, pool, sizes[sizes <= count], rng)
-    order = shortest_tour(scale_joint_units(chain, best))
+    every_nth = np.arange(0, len(q), max(1, len(q) // N_TASK_SAMPLES))
+    observable = information.observable_directions(
+        candidate_set.rows_of(every_nth)[..., full_information.fitted]
+    )
+    all_combinations = information.task_combinations(task_q)
+    # Parts of the task error that no measurement of this kind determines, such as the base pose with wires of
+    # unknown anchors, do not depend on the selection.
+    combinations = observable.T @ (observable @ all_combinations)
+    unobservable = np.linalg.norm(all_combinations - combinations)
+    if unobservable > UNOBSERVABLE_RTOL * np.linalg.norm(combinations):
+        notes.append(
+            f"the predicted error does not contain the base pose, which {kind} measurements do not determine"
+        )
+    goal = DesignGoal(
+        information=information,
+        full_information=full_information,
+        criterion=CRITERIA[criterion](observable, combinations, full_information, task_q),
+        task=combinations,
+        n_observable=len(observable),
+        existing=existing,
+        sampler=sampler,
+    )
+    prior_factor = full_information.prior_factor
+    greedy = select_greedily(candidate_set, prior_factor, count, goal.criterion, np.zeros(0, int), existing)
+    if len(greedy) < count:
+        # Not enough candidates have the minimum distance, so select the others without it.
+        candidate_set = replace(candidate_set, min_distance=0.0)
+        greedy = select_greedily(
+            candidate_set, prior_factor, count - len(greedy), goal.criterion, greedy, existing
+        )
+    if len(greedy) < count:
+        raise InvalidArgumentError(
+            f"only {len(greedy)} of {len(q)} candidates are feasible; expected at least {count}: "
+            "relax the constraints or use more candidates"
+        )
+    selected = improve_by_exchange(candidate_set, prior_factor, greedy, goal.criterion, existing)
+    if sampler is None:
+        refined = q[selected]
+    else:
+        refined = refine(goal, q[selected], sampler, candidate_set.min_distance, rng)
+    sizes, errors = _error_curve(goal, candidate_set, q, greedy, selected, refined, rng)
+    random_sizes, random_errors = _random_errors(goal, candidate_set, sizes[sizes <= count], rng)
+    order = shortest_tour(scale_joint_units(chain, refined))
     return Plan(
-        q=best[order],
-        index=None if room else chosen[order],
+        q=refined[order],
+        index=selected[order] if sampler is None else None,
         criterion=criterion,
         information=information,
         task=combinations,
@@ -233,120 +282,166 @@ def plan(
     )
 
 
-def _robust(seen: Array, task: Array, wide: Information, where: Array) -> Criterion:
-    """The compromise over a task at joint values (m, n), if anything is left out at all."""
-    kept = wide.fitted
-    if kept.all():
-        return AOptimality(task)
-    every = wide.task(where)
-    # Of the displacements over the task, those that a fit can make: what it should put there, and its share.
-    ways, size, _ = np.linalg.svd((seen.T @ (seen @ every[kept])).T, full_matrices=False)
-    ways = ways[:, size > UNOBSERVABLE_RTOL * size[0]]
-    return BiasVarianceCriterion(kept, seen.T @ (seen @ every[kept]) @ ways, ways.T @ every[~kept].T)
+def _robust_criterion(
+    observable: Array, combinations: Array, full_information: Information, task_q: Array
+) -> Criterion:
+    """Create the criterion of bias and variance over a task; without omitted unknowns, that of the variance.
+
+    Args:
+        observable: Observable directions of the fitted unknowns, shape (r, p).
+        combinations: Observable combinations of the task, shape (p, w).
+        full_information: Knowledge about fitted and omitted unknowns.
+        task_q: Joint positions of the task, shape (m, n).
+
+    Returns:
+        Criterion on all unknowns.
+    """
+    fitted = full_information.fitted
+    if fitted.all():
+        return AOptimality(combinations)
+    all_combinations = full_information.task_combinations(task_q)
+    fitted_combinations = observable.T @ (observable @ all_combinations[fitted])
+    # Displacements over the task that a fit can produce, and their share of the effect of the omitted
+    # unknowns.
+    displacements, std, _ = np.linalg.svd(fitted_combinations.T, full_matrices=False)
+    displacements = displacements[:, std > UNOBSERVABLE_RTOL * std[0]]
+    return BiasVarianceCriterion(
+        fitted, fitted_combinations @ displacements, displacements.T @ all_combinations[~fitted].T
+    )
 
 
+# Criteria by name, each from observable directions, task combinations, knowledge and joint positions of the
+# task.
 CRITERIA: dict[str, Callable[[Array, Array, Information, Array], Criterion]] = {
-    "D": lambda seen, task, wide, where: DOptimality(),
-    "A": lambda seen, task, wide, where: AOptimality(seen.T),
-    "E": lambda seen, task, wide, where: EOptimality(seen),
-    "task": lambda seen, task, wide, where: AOptimality(task),
-    "robust": _robust,
+    "D": lambda observable, combinations, full_information, task_q: DOptimality(),
+    "A": lambda observable, combinations, full_information, task_q: AOptimality(observable.T),
+    "E": lambda observable, combinations, full_information, task_q: EOptimality(observable),
+    "task": lambda observable, combinations, full_information, task_q: AOptimality(combinations),
+    "robust": _robust_criterion,
 }
 
 
-def _always(_: int) -> bool:
+def _always_feasible(_: int) -> bool:
+    """Accept every candidate."""
     return True
 
 
-def _min_distance(places: Array, count: int, rng: np.random.Generator) -> float:
-    """How far apart `count` of the places (m, n) are to stand."""
-    some = places[rng.permutation(len(places))[:count]]
-    if len(some) < 2:
+def _min_distance(coordinates: Array, count: int, rng: np.random.Generator) -> float:
+    """Choose the smallest distance of `count` poses among coordinates (m, n)."""
+    sample = coordinates[rng.permutation(len(coordinates))[:count]]
+    if len(sample) < 2:
         return 0.0
-    between = np.linalg.norm(some[:, None] - some[None], axis=2) + np.diag(np.full(len(some), np.inf))
-    return min(MIN_DISTANCE_RAD, float(np.median(between.min(1))))
+    distances = np.linalg.norm(sample[:, None] - sample[None], axis=2)
+    distances += np.diag(np.full(len(sample), np.inf))
+    return min(MIN_DISTANCE_RAD, float(np.median(distances.min(1))))
 
 
 def _error_curve(
-    aim: DesignGoal,
-    pool: CandidateSet,
+    goal: DesignGoal,
+    candidates: CandidateSet,
     q: Array,
-    first: Array,
-    chosen: Array,
-    best: Array,
+    greedy: Array,
+    selected: Array,
+    refined: Array,
     rng: np.random.Generator,
 ) -> tuple[Array, Array]:
-    """Numbers of poses and predicted errors in m: of smaller plans, of the plan, then with candidates added.
+    """Predict the error of smaller plans, of the plan, and of the plan with more poses.
 
     Args:
-        aim: what for.
-        pool: all candidates.
-        q: (m, dof) their joint values.
-        first: (n,) the greedy choice in its order, from which smaller plans start.
-        chosen: (n,) the exchanged choice.
-        best: (n, dof) the refined one.
-        rng: for refinement.
+        goal: What to optimize.
+        candidates: All candidates.
+        q: Their joint positions, shape (m, dof) [rad or m].
+        greedy: Greedy selection in its order, from which smaller plans start, shape (n,).
+        selected: Selection after exchange, shape (n,).
+        refined: Joint positions after refinement, shape (n, dof) [rad or m].
+        rng: Random generator for the refinement of smaller plans.
+
+    Returns:
+        Numbers of poses and predicted RMS errors [m].
     """
-    wide, start = aim.full_information, aim.full_information.prior_factor
-    own, count = wide.rows(best), len(best)
-    known = qr.rank(aim.information.data_factor)
-    least = min(count, max(1, -(-(aim.n_observable - known) // own.shape[1])))
-    sizes = np.unique(np.rint([least, 1.4 * least, 2 * least, np.sqrt(2 * least * count)]).astype(int))
+    information, prior_factor = goal.full_information, goal.full_information.prior_factor
+    plan_rows, count = information.rows(refined), len(refined)
+    n_known = qr.rank(goal.information.data_factor)
+    smallest = min(count, max(1, -(-(goal.n_observable - n_known) // plan_rows.shape[1])))
+    sizes = np.unique(
+        np.rint([smallest, 1.4 * smallest, 2 * smallest, np.sqrt(2 * smallest * count)]).astype(int)
+    )
     sizes = sizes[sizes < count]
     smaller = []
     for size in sizes:
-        some = exchange(pool, start, first[:size], aim.criterion, aim.existing, passes=1)
-        if aim.sampler is not None and size <= 2 * least:
-            # Near the fewest that tell all, refinement counts for much.
-            better = refine(aim, q[some], aim.sampler, pool.min_distance, rng)
-            smaller.append(wide.rows(better).transpose(2, 1, 0))
+        selection = improve_by_exchange(
+            candidates, prior_factor, greedy[:size], goal.criterion, goal.existing, max_passes=1
+        )
+        if goal.sampler is not None and size <= 2 * smallest:
+            # With few redundant measurements, refinement lowers the error considerably.
+            better = refine(goal, q[selection], goal.sampler, candidates.min_distance, rng)
+            smaller.append(information.rows(better).transpose(2, 1, 0))
         else:
-            smaller.append(pool.at(some))
-    gains = aim.criterion.gains(
-        pool.rows, sqrt_covariance(start, np.ascontiguousarray(own.transpose(2, 1, 0)))
+            smaller.append(candidates.rows_of(selection))
+    sqrt_covariance = compute_sqrt_covariance(
+        prior_factor, np.ascontiguousarray(plan_rows.transpose(2, 1, 0))
     )
-    gains[pool.infeasible] = -np.inf
-    gains[chosen] = -np.inf
-    left = np.argsort(-gains)[: min(MAX_EXCHANGE_CANDIDATES, int(np.isfinite(gains).sum()))]
-    both = CandidateSet.from_rows(
-        np.concatenate([own, pool.rows[:, :, left]], 2),
-        np.concatenate([scale_joint_units(wide.chain, best), pool.coordinates[left]]),
-        pool.min_distance,
-        lambda i: i < count or pool.is_feasible(int(left[i - count])),
+    gains = goal.criterion.gains(candidates.rows, sqrt_covariance)
+    gains[candidates.infeasible] = -np.inf
+    gains[selected] = -np.inf
+    promising = np.argsort(-gains)[: min(MAX_EXCHANGE_CANDIDATES, int(np.isfinite(gains).sum()))]
+    # The plan's poses come first and are feasible.
+    extended = CandidateSet.from_rows(
+        np.concatenate([plan_rows, candidates.rows[:, :, promising]], 2),
+        np.concatenate([scale_joint_units(information.chain, refined), candidates.coordinates[promising]]),
+        candidates.min_distance,
+        lambda i: i < count or candidates.is_feasible(int(promising[i - count])),
     )
-    order = greedy(both, start, max(count, EXTRA_POSES), aim.criterion, np.arange(count), aim.existing)
-    larger = np.arange(count, len(order) + 1)
-    rows = [*smaller, *(both.at(order[:size]) for size in larger)]
-    errors = [aim.information.error(one[..., wide.fitted], aim.task) for one in rows]
-    every = np.arange(least, len(order) + 1)
-    between = np.interp(np.log(every), np.log([*sizes, *larger]), np.log(errors))
-    return every, np.exp(between)
+    order = select_greedily(
+        extended, prior_factor, max(count, EXTRA_POSES), goal.criterion, np.arange(count), goal.existing
+    )
+    larger_sizes = np.arange(count, len(order) + 1)
+    rows = [*smaller, *(extended.rows_of(order[:size]) for size in larger_sizes)]
+    errors = [goal.information.predict_error(r[..., information.fitted], goal.task) for r in rows]
+    all_sizes = np.arange(smallest, len(order) + 1)
+    log_errors = np.interp(np.log(all_sizes), np.log([*sizes, *larger_sizes]), np.log(errors))
+    return all_sizes, np.exp(log_errors)
 
 
 def _random_errors(
-    aim: DesignGoal, pool: CandidateSet, sizes: Array, rng: np.random.Generator
+    goal: DesignGoal, candidates: CandidateSet, sizes: Array, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Some of the sizes, and the predicted error in m after as many poses at random, the median of draws."""
+    """Predict the error of random poses for some numbers of poses.
+
+    Args:
+        goal: What to optimize.
+        candidates: All candidates.
+        sizes: Numbers of poses to choose from.
+        rng: Random generator.
+
+    Returns:
+        Numbers of poses and predicted errors, medians of random plans [m].
+    """
     if not sizes.size:
         return sizes, np.empty(0)
-    order = rng.permutation(pool.rows.shape[2])
-    wanted = max(4 * int(sizes[-1]), MIN_RANDOM_POSES)
-    open_ones = [i for i in order[: 4 * wanted] if not pool.infeasible[i] and pool.is_feasible(int(i))][
-        :wanted
-    ]
-    rows = pool.at(np.array(open_ones, int))[..., aim.full_information.fitted]
-    some = np.unique(np.linspace(0, len(sizes) - 1, N_RANDOM_SIZES).round().astype(int))
-    out = [
-        np.median([
-            aim.information.error(rows[rng.permutation(len(rows))[:size]], aim.task) for _ in range(N_RANDOM_PLANS)
-        ])
-        for size in sizes[some]
-    ]  # fmt: skip
-    return sizes[some], np.array(out)
+    order = rng.permutation(candidates.rows.shape[2])
+    n_poses = max(4 * int(sizes[-1]), MIN_RANDOM_POSES)
+    feasible = [
+        i for i in order[: 4 * n_poses] if not candidates.infeasible[i] and candidates.is_feasible(int(i))
+    ][:n_poses]
+    rows = candidates.rows_of(np.array(feasible, int))[..., goal.full_information.fitted]
+    selected_sizes = sizes[np.unique(np.linspace(0, len(sizes) - 1, N_RANDOM_SIZES).round().astype(int))]
+
+    def random_error(size: int) -> float:
+        selection = rng.permutation(len(rows))[:size]
+        return goal.information.predict_error(rows[selection], goal.task)
+
+    errors = [np.median([random_error(size) for _ in range(N_RANDOM_PLANS)]) for size in selected_sizes]
+    return selected_sizes, np.array(errors)
 
 
 def _recommended_size(sizes: Array, errors: Array, sigma: float) -> int | None:
-    """The number of poses from which on MORE lower what a check shows, its own noise included, by < WORTH."""
+    """Find the number of poses with diminishing returns for an instrument of this standard deviation.
+
+    Returns:
+        First size at which `EXTRA_POSES` more lower the error that a check shows, with the noise of the
+        instrument included, by less than `MIN_EXTRA_GAIN`; None if there is none.
+    """
     shown = np.sqrt(errors**2 + 3 * sigma**2)
-    little = np.flatnonzero(shown[EXTRA_POSES:] > (1 - MIN_EXTRA_GAIN) * shown[:-EXTRA_POSES])
-    return int(sizes[little[0]]) if little.size else None
+    is_diminishing = np.flatnonzero(shown[EXTRA_POSES:] > (1 - MIN_EXTRA_GAIN) * shown[:-EXTRA_POSES])
+    return int(sizes[is_diminishing[0]]) if is_diminishing.size else None

@@ -1,4 +1,8 @@
-"""Chosen configurations moved to better ones about them, which no list of candidates holds."""
+"""Refinement: move selected configurations to better ones nearby that no list of candidates contains.
+
+Random local search: in each round, every configuration gets random neighbours, and the best feasible one
+replaces it if that lowers the criterion. The neighbourhood shrinks from round to round.
+"""
 
 from __future__ import annotations
 
@@ -9,18 +13,29 @@ import numpy as np
 from .._typing import Array
 from ..robot.sampling import ConfigurationSampler, scale_joint_units
 from .criteria import Criterion
-from .exchange import CandidateSet, sqrt_covariance
+from .exchange import CandidateSet, compute_sqrt_covariance
 from .information import Information
 
-# Refinement: rounds, each with so many neighbours a pose, nearer from round to round.
-ROUNDS, NEIGHBOURS, STEP, SHRINK = 8, 24, 0.15, 0.65
+# Number of rounds.
+N_ROUNDS = 8
+# Random neighbours per configuration and round.
+N_NEIGHBOURS = 24
+# Size of the first round's neighbourhood, as a fraction of the joint range, and its factor per round.
+STEP, SHRINK_FACTOR = 0.15, 0.65
 
 
 @dataclass(frozen=True, eq=False)
 class DesignGoal:
-    """What is known before, with what a fit will leave out, too, and what is to be known.
+    """Knowledge before the measurements, and what to optimize.
 
-    How much of it can be seen at all; places to keep away from; where the robot may stand.
+    Attributes:
+        information: Knowledge about the unknowns that the fit estimates.
+        full_information: Knowledge about these and about the unknowns that the fit omits.
+        criterion: Optimality criterion on all unknowns.
+        task: Combinations whose variances sum to the mean squared position error over the task, shape (p, w).
+        n_observable: Number of observable directions.
+        existing: Coordinates of existing measurements, shape (n, d).
+        sampler: Feasible configurations; None if the candidates are given.
     """
 
     information: Information
@@ -33,33 +48,46 @@ class DesignGoal:
 
 
 def refine(
-    aim: DesignGoal, q: Array, sampler: ConfigurationSampler, min_distance: float, rng: np.random.Generator
+    goal: DesignGoal, q: Array, sampler: ConfigurationSampler, min_distance: float, rng: np.random.Generator
 ) -> Array:
-    """The configurations (n, dof) moved to better ones about them, by smaller and smaller steps."""
-    information, criterion = aim.full_information, aim.criterion
+    """Move configurations to better ones nearby, with decreasing steps.
+
+    Args:
+        goal: What to optimize.
+        q: Joint positions, shape (n, dof) [rad or m].
+        sampler: Feasible configurations.
+        min_distance: Smallest distance of two configurations, in the units of `scale_joint_units`.
+        rng: Random generator.
+
+    Returns:
+        Improved joint positions, shape (n, dof) [rad or m].
+    """
+    information, criterion = goal.full_information, goal.criterion
+    prior_factor = information.prior_factor
     q = q.copy()
     rows = np.ascontiguousarray(information.rows(q).transpose(2, 1, 0))
-    value = criterion.value(sqrt_covariance(information.prior_factor, rows))
-    for turn in range(ROUNDS):
-        near = sampler.perturb(q, STEP * SHRINK**turn, NEIGHBOURS, rng)
-        possible = lambda i, near=near: sampler.is_feasible(near[i])  # noqa: E731
-        pool = CandidateSet.from_rows(
-            information.rows(near), scale_joint_units(sampler.chain, near), min_distance, possible
+    value = criterion.value(compute_sqrt_covariance(prior_factor, rows))
+    for round_number in range(N_ROUNDS):
+        nearby = sampler.perturb(q, STEP * SHRINK_FACTOR**round_number, N_NEIGHBOURS, rng)
+        is_feasible = lambda i, nearby=nearby: sampler.is_feasible(nearby[i])  # noqa: E731
+        candidates = CandidateSet.from_rows(
+            information.rows(nearby), scale_joint_units(sampler.chain, nearby), min_distance, is_feasible
         )
-        pool.infeasible[:] = ~sampler.workspace.contains(sampler.chain.poses(near))
+        candidates.infeasible[:] = ~sampler.workspace.contains(sampler.chain.poses(nearby))
         for slot in range(len(q)):
-            block = np.arange(slot * NEIGHBOURS, (slot + 1) * NEIGHBOURS)
-            rest = sqrt_covariance(information.prior_factor, np.delete(rows, slot, 0))
-            here = np.concatenate([pool.rows[:, :, block], rows[slot].T[:, :, None]], 2)
-            gains = criterion.gains(here, rest)
+            block = np.arange(slot * N_NEIGHBOURS, (slot + 1) * N_NEIGHBOURS)
+            rest = compute_sqrt_covariance(prior_factor, np.delete(rows, slot, 0))
+            block_rows = np.concatenate([candidates.rows[:, :, block], rows[slot].T[:, :, None]], 2)
+            gains = criterion.gains(block_rows, rest)
+            # The last gain is that of the present configuration.
             better = np.where(gains[:-1] > gains[-1], gains[:-1], -np.inf)
-            others = np.concatenate([aim.existing, scale_joint_units(sampler.chain, np.delete(q, slot, 0))])
-            found = pool.best(better, block, others)
-            if found is None:
+            others = scale_joint_units(sampler.chain, np.delete(q, slot, 0))
+            best = candidates.best_candidate(better, block, np.concatenate([goal.existing, others]))
+            if best is None:
                 continue
             trial = rows.copy()
-            trial[slot] = pool.rows[:, :, found].T
-            reached = criterion.value(sqrt_covariance(information.prior_factor, trial))
-            if reached < value:
-                rows, value, q[slot] = trial, reached, near[found]
+            trial[slot] = candidates.rows[:, :, best].T
+            trial_value = criterion.value(compute_sqrt_covariance(prior_factor, trial))
+            if trial_value < value:
+                rows, value, q[slot] = trial, trial_value, nearby[best]
     return q

@@ -1,4 +1,4 @@
-"""Plans against random sets, calibrations of simulated robots, and an independent look at collisions."""
+"""Plans against random sets, calibrations of simulated robots, and collision checks by Pinocchio."""
 
 from __future__ import annotations
 
@@ -17,7 +17,12 @@ from dhcal_pin.io import read_robot, read_uncertainty, write_urdf
 from dhcal_pin.measurements import KINDS, Noise
 from dhcal_pin.planning import Information, plan
 from dhcal_pin.planning.criteria import DOptimality
-from dhcal_pin.planning.exchange import CandidateSet, exchange, greedy, sqrt_covariance
+from dhcal_pin.planning.exchange import (
+    CandidateSet,
+    compute_sqrt_covariance,
+    improve_by_exchange,
+    select_greedily,
+)
 from dhcal_pin.robot import Chain
 from dhcal_pin.robot.sampling import ConfigurationSampler, WorkspaceConstraints, shortest_tour
 from dhcal_pin.robot.urdf import parse_urdf
@@ -38,7 +43,7 @@ def arm(name: str) -> Chain:
 
 
 def log_det(chain: Chain, kind: str, q) -> float:
-    """Log det of the information by the solver's own triangle, unknowns in units of their priors."""
+    """Compute log det of the information from the solver's R factor, in units of the priors."""
     errors = select_parameters(chain, SETS)
     weights = 1 / errors.priors
     zero = np.zeros(len(weights))
@@ -48,84 +53,93 @@ def log_det(chain: Chain, kind: str, q) -> float:
     return float(2 * np.sum(np.log(np.abs(np.diag(full)))) + 2 * np.sum(np.log(errors.priors)))
 
 
-def free(chain: Chain, q) -> np.ndarray:
-    """Which configurations (m,) are free of self-collision, by Pinocchio's own reading of the file.
+def is_collision_free(chain: Chain, q) -> np.ndarray:
+    """Check configurations (m,) for self-collisions, with the geometry that Pinocchio reads from the file.
 
-    Neighbours and what meets at neutral are left out.
+    Neighbouring links and pairs that collide at the neutral configuration are ignored.
+
+    Returns:
+        Whether each configuration is free of self-collisions, shape (m,).
     """
     folders = [str(path) for path in robot_file("").parents]
     shapes = pin.buildGeomFromUrdf(chain.model, chain.urdf.source, pin.GeometryType.COLLISION, None, folders)
     shapes.addAllCollisionPairs()
     data, joints = chain.model.createData(), [item.parentJoint for item in shapes.geometryObjects]
-    there = pin.GeometryData(shapes)
-    pin.computeCollisions(chain.model, data, shapes, there, pin.neutral(chain.model), False)
-    neutral = [result.isCollision() for result in there.collisionResults]
-    kept = []
+    geometry_data = pin.GeometryData(shapes)
+    pin.computeCollisions(chain.model, data, shapes, geometry_data, pin.neutral(chain.model), False)
+    neutral = [result.isCollision() for result in geometry_data.collisionResults]
+    is_checked_pair = []
     for i, pair in enumerate(shapes.collisionPairs):
         a, b = joints[pair.first], joints[pair.second]
         near = a == b or chain.model.parents[a] == b or chain.model.parents[b] == a
-        kept.append(not near and not neutral[i])
+        is_checked_pair.append(not near and not neutral[i])
     out = []
     for configuration in chain.configurations(q):
-        pin.computeCollisions(chain.model, data, shapes, there, configuration, False)
-        met = [result.isCollision() for result in there.collisionResults]
-        out.append(not np.any(np.array(met) & np.array(kept)))
+        pin.computeCollisions(chain.model, data, shapes, geometry_data, configuration, False)
+        met = [result.isCollision() for result in geometry_data.collisionResults]
+        out.append(not np.any(np.array(met) & np.array(is_checked_pair)))
     return np.array(out)
 
 
-def random_ones(chain: Chain, count: int, seed: int) -> np.ndarray:
-    """Configurations within the limits and free of collision."""
-    room = ConfigurationSampler.from_chain(chain, WorkspaceConstraints(), 0.0, 0.0)
-    q = room.draw(2 * count + 20, np.random.default_rng(seed))
-    return np.array([one for one in q if room.is_feasible(one)])[:count]
+def random_configurations(chain: Chain, count: int, seed: int) -> np.ndarray:
+    """Draw configurations within the limits and free of collisions."""
+    sampler = ConfigurationSampler.from_chain(chain, WorkspaceConstraints(), 0.0, 0.0)
+    q = sampler.draw(2 * count + 20, np.random.default_rng(seed))
+    return np.array([one for one in q if sampler.is_feasible(one)])[:count]
 
 
-def compared(name: str, kind: str, candidates: int, draws: int) -> None:
+def check_plan_is_better(name: str, kind: str, candidates: int, draws: int) -> None:
     chain = arm(name)
     found = plan(chain, 20, kind=kind, noise=NOISE, parameters=SETS, candidates=candidates, seed=3)
     assert found.q.shape == (20, chain.n_joints)
     assert ((found.q > chain.lower) & (found.q < chain.upper)).all()
     if name != "sim_6dof":
-        assert free(chain, found.q).all()
+        assert is_collision_free(chain, found.q).all()
     reached = log_det(chain, kind, found.q)
     assert found.log_det == pytest.approx(reached, abs=0.01)
     information = found.information
-    q = random_ones(chain, candidates, 4)
-    pool = CandidateSet.from_rows(information.rows(q), q)
+    q = random_configurations(chain, candidates, 4)
+    candidate_set = CandidateSet.from_rows(information.rows(q), q)
     scores = []
     rng = np.random.default_rng(5)
     for _ in range(draws):
-        rows = pool.at(rng.choice(len(q), 20, replace=False))
-        scores.append(-2 * np.sum(np.log(np.abs(np.diag(sqrt_covariance(information.prior_factor, rows))))))
+        rows = candidate_set.rows_of(rng.choice(len(q), 20, replace=False))
+        scores.append(
+            -2 * np.sum(np.log(np.abs(np.diag(compute_sqrt_covariance(information.prior_factor, rows)))))
+        )
     assert reached >= max(scores)
-    # A choice among these candidates, exchanged one against any other until nothing is gained.
-    best = greedy(pool, information.prior_factor, 20, DOptimality(), np.zeros(0, int), q[:0])
+    # Selection among these candidates, exchanged until no exchange improves it.
+    best = select_greedily(
+        candidate_set, information.prior_factor, 20, DOptimality(), np.zeros(0, int), q[:0]
+    )
     value = np.inf
     while (
-        now := DOptimality().value(sqrt_covariance(information.prior_factor, pool.at(best)))
+        now := DOptimality().value(
+            compute_sqrt_covariance(information.prior_factor, candidate_set.rows_of(best))
+        )
     ) < value - 1e-12:
         value = now
-        best = exchange(pool, information.prior_factor, best, DOptimality(), q[:0])
+        best = improve_by_exchange(candidate_set, information.prior_factor, best, DOptimality(), q[:0])
     assert np.exp((reached - log_det(chain, kind, q[best])) / len(information.prior_sigma)) >= 0.99
 
 
 @pytest.mark.parametrize(("name", "kind"), [("ur10", "position"), ("panda", "pose")])
-def test_a_plan_beats_random_sets_and_an_exchange(name, kind):
-    compared(name, kind, 800, 500)
+def test_plan_is_better_than_random_sets_and_exchange(name, kind):
+    check_plan_is_better(name, kind, 800, 500)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["pose", "position"])
 @pytest.mark.parametrize("name", ["ur10", "panda", "sim_6dof"])
-def test_a_plan_beats_ten_thousand_random_sets_and_an_exchange(name, kind):
-    compared(name, kind, 5000, 10_000)
+def test_plan_is_better_than_ten_thousand_random_sets_and_exchange(name, kind):
+    check_plan_is_better(name, kind, 5000, 10_000)
 
 
 def simulated(chain: Chain, kind: str, choices, seed: int) -> list[float]:
-    """RMS position errors in m, anywhere, of calibrations with each choice of poses, for one random robot."""
+    """Return RMS position errors [m] of one random robot, calibrated with each selection of poses."""
     rng = np.random.default_rng(seed)
     errors = select_parameters(chain, SETS)
-    # The base stands anywhere; the tool is known to some millimetres.
+    # The base pose is arbitrary; the tool is known to some millimetres.
     frames = [0.3 if parameter.error_frame == 0 else 2e-3 for parameter in errors.parameters]
     prior = np.where(errors.priors < 1, errors.priors, frames)
     truth = errors.at(prior * rng.standard_normal(len(prior)))
@@ -133,77 +147,84 @@ def simulated(chain: Chain, kind: str, choices, seed: int) -> list[float]:
     out = []
     for q in choices(seed):
         fit = calibrate(chain, KINDS[kind].simulate(truth, q, NOISE, rng), SETS)
-        gap = fit.chain.poses(held)[:, :3, 3] - truth.poses(held)[:, :3, 3]
-        out.append(float(np.sqrt(np.mean(np.sum(gap**2, 1)))))
+        difference = fit.chain.poses(held)[:, :3, 3] - truth.poses(held)[:, :3, 3]
+        out.append(float(np.sqrt(np.mean(np.sum(difference**2, 1)))))
     return out
 
 
 def ratios(name: str, kind: str, seeds: int) -> tuple[float, float]:
-    """Held-out error of planned over random poses: simulated, and as the plan predicts it."""
+    """Return the error of planned over that of random poses: simulated, and predicted by the plan."""
     chain = arm(name)
     found = plan(chain, 20, kind=kind, noise=NOISE, parameters=SETS, criterion="task")
     pairs = [
-        simulated(chain, kind, lambda seed: (found.q, random_ones(chain, 20, seed)), seed)
+        simulated(chain, kind, lambda seed: (found.q, random_configurations(chain, 20, seed)), seed)
         for seed in range(seeds)
     ]
     return float(np.median([planned / random for planned, random in pairs])), found.relative_error
 
 
-def test_planned_poses_leave_less_error_than_random_ones():
+def test_planned_poses_give_smaller_errors_than_random_ones():
     reached, predicted = ratios("ur10", "position", 12)
     assert reached <= 0.9
-    # Ratios of about 0.78 scatter by 15 %, and their median by 5 %.
+    # The ratios of about 0.78 have a standard deviation of 15 %, their median one of 5 %.
     assert predicted == pytest.approx(reached, rel=0.15)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["pose", "position"])
 @pytest.mark.parametrize("name", ["ur10", "panda", "sim_6dof"])
-def test_planned_poses_leave_less_error_than_random_ones_over_many_robots(name, kind):
-    # A hundred robots' median scatters by 3 %, four hundred's by half of that.
+def test_planned_poses_give_smaller_errors_than_random_ones_for_many_robots(name, kind):
+    # The standard deviation of the median is 3 % for 100 robots and 1.5 % for 400.
     reached, predicted = ratios(name, kind, 400)
     assert reached <= 0.9
     assert predicted == pytest.approx(reached, rel=0.05)
 
 
-def misfits(name: str, kind: str, seeds: int) -> np.ndarray:
-    """Errors anywhere (seeds, 3) of 20 poses out of 400, robust, "D" and at random, over that of all 400.
+def relative_errors(name: str, kind: str, seeds: int) -> np.ndarray:
+    """Return errors (seeds, 3) of 20 poses out of 400, relative to those of all 400 poses.
 
-    The arms have gains, harmonics and compliance of a tenth of their priors, which no fit looks for.
+    The poses are selected by the criteria "robust" and "D" and at random. The robots have gains, harmonics
+    and compliance of a tenth of their priors, which the fit does not estimate.
+
+    Returns:
+        Errors of the three selections.
     """
     chain = arm(name)
     space = ConfigurationSampler.from_chain(chain, WorkspaceConstraints(), 0.0, 0.0)
-    pool, held = space.draw(400, np.random.default_rng(77)), space.draw(150, np.random.default_rng(5))
+    candidate_set, held = (
+        space.draw(400, np.random.default_rng(77)),
+        space.draw(150, np.random.default_rng(5)),
+    )
     sizes = {
         p.name: 0.3 if p.error_frame == 0 else min(p.prior, 2e-3)
         for p in select_parameters(chain, SETS).parameters
     }
     errors = select_parameters(chain, f"{SETS},gain,harmonics,compliance")
     size = np.array([sizes.get(p.name, 0.1 * p.prior) for p in errors.parameters])
-    options = {"kind": kind, "noise": NOISE, "parameters": SETS, "candidates": pool}
+    options = {"kind": kind, "noise": NOISE, "parameters": SETS, "candidates": candidate_set}
     robust, plain = (plan(chain, 20, criterion=name, **options) for name in ("robust", "D"))
     out = []
     for seed in range(seeds):
         rng = np.random.default_rng(seed)
         truth = errors.at(size * rng.standard_normal(len(size)))
-        missed = []
-        for q in (robust.q, plain.q, pool[rng.choice(400, 20, replace=False)], pool):
+        errors_of_robot = []
+        for q in (robust.q, plain.q, candidate_set[rng.choice(400, 20, replace=False)], candidate_set):
             fit = calibrate(chain, KINDS[kind].simulate(truth, q, NOISE, rng), SETS)
-            gap = fit.chain.poses(held)[:, :3, 3] - truth.poses(held)[:, :3, 3]
-            missed.append(np.sqrt(np.mean(np.sum(gap**2, 1))))
-        out.append(np.array(missed[:3]) / missed[3])
+            difference = fit.chain.poses(held)[:, :3, 3] - truth.poses(held)[:, :3, 3]
+            errors_of_robot.append(np.sqrt(np.mean(np.sum(difference**2, 1))))
+        out.append(np.array(errors_of_robot[:3]) / errors_of_robot[3])
     return np.array(out)
 
 
-def test_a_robust_plan_minds_what_the_model_leaves_out():
-    robust, plain, random = np.median(misfits("panda", "pose", 8), 0)
+def test_robust_plan_limits_the_bias_by_unmodelled_effects():
+    robust, plain, random = np.median(relative_errors("panda", "pose", 8), 0)
     assert robust < min(plain, random)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "kind"), [("panda", "pose"), ("ur10", "pose"), ("ur10", "position")])
-def test_robust_plans_mind_what_the_model_leaves_out_on_many_robots(name, kind):
-    errors = misfits(name, kind, 60)
+def test_robust_plans_limit_the_bias_by_unmodelled_effects_for_many_robots(name, kind):
+    errors = relative_errors(name, kind, 60)
     robust, plain, random = np.median(errors, 0)
     assert robust <= 1.15
     assert robust < plain < random
@@ -211,34 +232,34 @@ def test_robust_plans_mind_what_the_model_leaves_out_on_many_robots(name, kind):
 
 
 def curve(sizes, seeds: int) -> list[tuple[float, float]]:
-    """RMS errors of plans of several sizes as the largest plan predicts them, and simulated."""
+    """Return pairs of predicted and simulated RMS errors for plans of several sizes."""
     chain = arm("ur10")
-    most = plan(chain, max(sizes), noise=NOISE, parameters=SETS)
+    largest = plan(chain, max(sizes), noise=NOISE, parameters=SETS)
     plans = [plan(chain, size, noise=NOISE, parameters=SETS).q for size in sizes]
     found = np.array([simulated(chain, "pose", lambda _: plans, seed) for seed in range(seeds)])
-    predicted = [float(most.errors[most.sizes == size][0]) for size in sizes]
+    predicted = [float(largest.errors[largest.sizes == size][0]) for size in sizes]
     return list(zip(predicted, np.sqrt(np.mean(found**2, 0)).tolist(), strict=True))
 
 
-def test_the_predicted_error_by_number_of_poses_is_the_simulated_one():
+def test_predicted_errors_agree_with_simulation():
     for predicted, reached in curve((10, 24), 10):
-        # Ten robots with thirty directions each: their RMS is known to 4 %.
+        # The RMS of ten robots with thirty directions each has a standard deviation of 4 %.
         assert predicted == pytest.approx(reached, rel=0.15)
 
 
 @pytest.mark.slow
-def test_the_predicted_error_by_number_of_poses_is_the_simulated_one_over_many_robots():
+def test_predicted_errors_agree_with_simulation_of_many_robots():
     for predicted, reached in curve((8, 12, 16, 24, 40), 100):
         assert predicted == pytest.approx(reached, rel=0.10)
 
 
-def test_readings_already_taken_count():
-    """Ten more: what a plan expects of them is what the fit to all of them then says of itself."""
+def test_existing_measurements_are_complemented():
+    """The predicted error of ten more poses is the standard deviation of the fit to all measurements."""
     chain = arm("ur10")
     rng = np.random.default_rng(2)
     errors = select_parameters(chain, SETS)
     truth = errors.at(np.where(errors.priors < 1, errors.priors, 0.3) * rng.standard_normal(36))
-    # A corner of the space: what is left to learn is elsewhere.
+    # The existing poses are in one corner of the joint space.
     taken = rng.uniform(0.2, 0.8, (25, 6))
     old = KINDS["pose"].simulate(truth, taken, NOISE, rng)
     task = ConfigurationSampler.from_chain(chain, WorkspaceConstraints(), 0.0, 0.0).draw(200, rng)
@@ -253,48 +274,55 @@ def test_readings_already_taken_count():
     assert found.error < alone.error
 
 
-def test_a_calibration_says_itself_what_is_left_to_learn(tmp_path):
-    """What a calibrated robot's file keeps counts as the readings themselves do, whatever sets come next."""
+def test_uncertainty_of_a_calibrated_robot_replaces_its_measurements(tmp_path):
+    """The uncertainty in the sidecar gives the same plan as the measurements, for all parameter sets."""
     chain = arm("ur10")
     rng = np.random.default_rng(2)
     errors = select_parameters(chain, SETS)
     truth = errors.at(np.where(errors.priors < 1, errors.priors, 0.3) * rng.standard_normal(36))
     old = KINDS["pose"].simulate(truth, rng.uniform(0.2, 0.8, (25, 6)), NOISE, rng)
     write_urdf(calibrate(chain, old, SETS), tmp_path / "arm.urdf")
-    sidecar, there = tmp_path / "arm.calibration.toml", read_robot(tmp_path / "arm.urdf", "tool0")
-    learnt = read_uncertainty(sidecar, there)
+    sidecar, calibrated = tmp_path / "arm.calibration.toml", read_robot(tmp_path / "arm.urdf", "tool0")
+    prior_uncertainty = read_uncertainty(sidecar, calibrated)
     task = ConfigurationSampler.from_chain(chain, WorkspaceConstraints(), 0.0, 0.0).draw(200, rng)
     options = {"noise": NOISE, "criterion": "task", "task": task, "candidates": 800}
     beside = plan(chain, 10, parameters=SETS, data=[old], **options)
-    found = plan(there, 10, parameters=SETS, prior_uncertainty=learnt, **options)
+    found = plan(calibrated, 10, parameters=SETS, prior_uncertainty=prior_uncertainty, **options)
     assert found.error == pytest.approx(beside.error, rel=0.03)
-    none = Information.from_prior(there, task, "pose", NOISE, SETS, prior_uncertainty=learnt)
+    none = Information.from_prior(calibrated, task, "pose", NOISE, SETS, prior_uncertainty=prior_uncertainty)
     before = np.sqrt(np.mean(calibrate(chain, old, SETS).predict(task).position_std ** 2))
     empty = np.zeros((0, 6, len(none.prior_sigma)))
-    assert none.error(empty, none.task(task)) == pytest.approx(before, rel=1e-6)
+    assert none.predict_error(empty, none.task_combinations(task)) == pytest.approx(before, rel=1e-6)
     assert found.error < 0.5 * before
-    # Six a joint say the same with more unknowns; what was not looked for keeps its prior.
-    wide = Information.from_prior(there, task, "pose", NOISE, "placement,base,tool", prior_uncertainty=learnt)
+    # Six parameters per joint give the same error; parameters that were not estimated keep their prior.
+    wide = Information.from_prior(
+        calibrated, task, "pose", NOISE, "placement,base,tool", prior_uncertainty=prior_uncertainty
+    )
     empty = np.zeros((0, 6, len(wide.prior_sigma)))
-    assert wide.error(empty, wide.task(task)) == pytest.approx(before, rel=1e-6)
-    gain = Information.from_prior(there, task, "pose", NOISE, f"{SETS},gain", prior_uncertainty=learnt)
+    assert wide.predict_error(empty, wide.task_combinations(task)) == pytest.approx(before, rel=1e-6)
+    gain = Information.from_prior(
+        calibrated, task, "pose", NOISE, f"{SETS},gain", prior_uncertainty=prior_uncertainty
+    )
     empty = np.zeros((0, 6, len(gain.prior_sigma)))
-    prior = Information.from_prior(there, task, "pose", NOISE, "gain")
-    alone = prior.error(np.zeros((0, 6, 6)), prior.task(task))
-    assert gain.error(empty, gain.task(task)) == pytest.approx(np.hypot(before, alone), rel=0.01)
+    prior = Information.from_prior(calibrated, task, "pose", NOISE, "gain")
+    alone = prior.predict_error(np.zeros((0, 6, 6)), prior.task_combinations(task))
+    assert gain.predict_error(empty, gain.task_combinations(task)) == pytest.approx(
+        np.hypot(before, alone), rel=0.01
+    )
 
 
-def test_the_tool_stays_in_the_box_and_in_sight():
+def test_tool_is_in_the_box_and_visible():
     chain = arm("ur10")
     eye = np.array([2.5, 0.0, 1.0])
     space = WorkspaceConstraints(np.array([[0.0, -0.8, 0.1], [1.2, 0.8, 1.0]]), eye, np.deg2rad(40.0))
     found = plan(chain, 12, kind="position", noise=NOISE, candidates=1000, space=space)
+    assert space.box is not None
     poses = chain.poses(found.q)
     assert ((poses[:, :3, 3] >= space.box[0]) & (poses[:, :3, 3] <= space.box[1])).all()
     away = eye - poses[:, :3, 3]
     cosine = np.sum(poses[:, :3, 2] * away, 1) / np.linalg.norm(away, axis=1)
     assert (cosine >= np.cos(np.deg2rad(40.0))).all()
-    assert free(chain, found.q).all()
+    assert is_collision_free(chain, found.q).all()
 
 
 PILLAR = """<robot name="r"><link name="l0"><collision><origin xyz="1 0 0"/><geometry><box size="0.2 0.2 4"/>
@@ -305,33 +333,34 @@ PILLAR = """<robot name="r"><link name="l0"><collision><origin xyz="1 0 0"/><geo
 </robot>"""
 
 
-def test_a_pillar_hides_the_tool():
-    """The instrument at x = 3 m looks past a pillar at x = 1 m to a tool that goes round at half a metre."""
+def test_obstacle_hides_the_tool():
+    """A pillar at x = 1 m between the instrument at x = 3 m and a tool on a circle of radius 0.5 m."""
     chain = Chain.from_urdf(parse_urdf(PILLAR.encode(), "r.urdf"), "l2")
-    room = ConfigurationSampler.from_chain(
+    sampler = ConfigurationSampler.from_chain(
         chain, WorkspaceConstraints(instrument_position=np.array([3.0, 0, 0])), 0.0, 0.0
     )
-    turn = np.linspace(-np.pi, np.pi, 181)
-    tool = 0.5 * np.stack([np.cos(turn), np.sin(turn)], -1)
-    # Where the line from the instrument crosses the pillar's two faces across it.
+    angles = np.linspace(-np.pi, np.pi, 181)
+    tool = 0.5 * np.stack([np.cos(angles), np.sin(angles)], -1)
+    # The line of sight crosses the front or the back face of the pillar.
     slope = tool[:, 1] / (3.0 - tool[:, 0])
     hidden = (np.abs(slope) * 2.1 < 0.1) | (np.abs(slope) * 1.9 < 0.1)
     clear = np.abs(np.abs(slope) * 1.9 - 0.1) > 0.02
-    seen = np.array([room.is_feasible(np.array([angle, 0.0])) for angle in turn])
-    assert np.array_equal(seen[clear], ~hidden[clear])
+    is_visible = np.array([sampler.is_feasible(np.array([angle, 0.0])) for angle in angles])
+    assert np.array_equal(is_visible[clear], ~hidden[clear])
     assert 10 < hidden.sum() < 100
 
 
-def test_given_candidates_are_chosen_as_they_are():
+def test_given_candidates_are_not_moved():
     chain = arm("sim_6dof")
     q = np.random.default_rng(0).uniform(-2, 2, (60, 6))
     found = plan(chain, 15, noise=NOISE, candidates=q)
+    assert found.index is not None
     assert np.array_equal(found.q, q[found.index])
     assert len(set(found.index)) == 15
     assert len(plan(chain, 60, noise=NOISE, candidates=q).q) == 60
 
 
-def test_a_plan_is_the_same_every_time():
+def test_plans_are_reproducible():
     chain = arm("sim_6dof")
     one, two = (plan(chain, 6, noise=NOISE, candidates=300, seed=8).q for _ in range(2))
     assert np.array_equal(one, two)
@@ -345,7 +374,7 @@ def test_other_instruments(kind):
     assert (np.diff(found.errors) <= 1e-12).all()
 
 
-def test_a_tour_is_short():
+def test_tour_is_short():
     rng = np.random.default_rng(0)
     q = rng.uniform(-2, 2, (40, 6))
     order = shortest_tour(q)
@@ -364,22 +393,22 @@ def test_a_tour_is_short():
     ("options", "words"),
     [
         ({"criterion": "G"}, "choose from D, A, E, task"),
-        ({"kind": "distance"}, "no plan for it"),
-        ({"kind": "touch"}, "no plan for it"),
-        ({"noise": None}, "no sigma is known"),
+        ({"kind": "distance"}, "cannot be planned"),
+        ({"kind": "touch"}, "cannot be planned"),
+        ({"noise": None}, "the standard deviation is unknown"),
         ({"noise": Noise(1e-4, 0.0)}, "0.1mm,0.01deg"),
         ({"priors": "none"}, "needs priors"),
         ({"space": WorkspaceConstraints(np.array([[5.0, 5, 5], [6.0, 6, 6]]))}, "widen the box"),
         ({"candidates": np.zeros((3, 6))}, "only 3 of 3"),
     ],
 )
-def test_what_cannot_be_planned_is_said(options, words):
+def test_invalid_arguments_are_rejected(options, words):
     given = {"noise": NOISE, "candidates": 100} | options
     with pytest.raises(DhcalError, match=words):
         plan(arm("sim_6dof"), 10, **given)
 
 
-def test_without_shapes_it_says_so():
+def test_missing_collision_geometry_is_noted():
     found = plan(arm("sim_6dof"), 6, noise=NOISE, candidates=100)
     assert "no collision geometry" in found.notes[0]
     chain = arm("ur10")

@@ -28,7 +28,10 @@ from dhcal_pin.studies import read_study
             ("poses = 12", "pose_selection = 'planned'\nresample_each_iteration = true"),
             "planned poses are not resampled",
         ),
-        (("poses = 12", "pose_selection = 'planned'\nnoise = '0mm'"), "a pose needs sigmas above zero"),
+        (
+            ("poses = 12", "pose_selection = 'planned'\nnoise = '0mm'"),
+            "standard deviations must be above zero",
+        ),
         (('"pose", "position"', '"wires"'), r"kind = 'wires': wires: wire1.x is unknown"),
         (("0.5mm,0.1deg", "0.5"), "error_std '0.5': not a number with a unit"),
         (("sim_6dof.dh.toml", "none.urdf"), "none.urdf: no such file"),
