@@ -1,8 +1,18 @@
-"""Samples left out of a fit, and what the fit to the others says of them.
+"""Cross-validation: errors of held-out samples under a fit of the other samples.
 
-The model is nearly linear around a fit, so a fold is solved from two triangles: that of its fitted rows and
-that of its left-out rows. Where few samples make a fold's fit quite another one, its cost tells, and it is
-fitted again.
+The model is nearly linear around a solution x. A fold is therefore solved from two triangular systems at x
+instead of a new iteration: one of its fitted rows, [R_f | z_f], and one of its held-out rows, [R_h | z_h].
+With prior weights W, the step of the fold's fit and its held-out error are
+
+    δ = argmin ‖R_f·δ - z_f‖² + ‖W·(x + δ)‖²,        error² = (‖R_h·δ - z_h‖² + ρ_h²) / m_h,
+
+with ρ_h² the part of the held-out cost that no δ changes and m_h the number of held-out rows. If the true
+cost at x + δ exceeds the cost that the linear model predicts, the model is not linear enough over δ, and
+the fold is fitted by iteration.
+
+Unknowns that only held-out samples depend on, such as a contact point, are fitted to the held-out samples.
+
+Shapes: p unknowns, c columns (unknowns that are free), m samples of a measurement, k folds.
 """
 
 from __future__ import annotations
@@ -18,7 +28,7 @@ from .._typing import Array
 from ..estimation import qr
 from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.qr import TriangularSystem
-from ..exceptions import DhcalError
+from ..exceptions import InvalidArgumentError
 from ..measurements.base import Measurement
 from .evaluation import Accuracy, compute_errors
 from .partition import Fold, blocked_folds, contact_groups
@@ -26,100 +36,132 @@ from .partition import Fold, blocked_folds, contact_groups
 if TYPE_CHECKING:
     from .result import Result
 
-# A fold's fit may cost more than its triangle foretells by this share of one fitted sample's cost.
+# A fold is fitted by iteration if its cost exceeds that of the linear model by more than this fraction of the
+# mean cost of a fitted sample.
 _NONLINEARITY_TOL = 1e-3
 
-
-# Where a fit of a problem ends (p,).
+# Function that returns the solution x (p,) of a problem with some of the samples.
 Refit = Callable[[Problem], Array]
 
 
 @dataclass(frozen=True, eq=False)
 class FoldSystems:
-    """A fold's triangles around one x: of what it fits and of what it leaves out, and the latter's rows."""
+    """Triangular systems of the fitted and of the held-out samples of a fold, at one x.
+
+    Attributes:
+        fitted: System of the fitted rows.
+        held_out: System of the held-out rows.
+        n_rows: Number of held-out rows.
+    """
 
     fitted: TriangularSystem
     held_out: TriangularSystem
     n_rows: int
 
     @property
-    def unobserved(self) -> Array:
-        """Columns (p,) that the fitted rows do not depend on, such as a point that was touched elsewhere."""
+    def is_unobserved(self) -> Array:
+        """Unknowns that no fitted row depends on, such as a point that only held-out samples touch, (p,)."""
         return np.logical_not(self.fitted.r.any(0))
 
     def error(self, weights: Array, x: Array, columns: Array) -> float:
-        """RMS of the left-out whitened rows after a fit of some columns (p,) with priors of weights about 0.
+        """Compute the RMS of the held-out whitened rows under the fit of the other rows.
 
-        What only the left-out rows depend on is fitted to them.
+        Unknowns that only the held-out rows depend on are fitted to these.
+
+        Args:
+            weights: One over the prior standard deviations of the unknowns, (p,).
+            x: Point of the linearization, (p,).
+            columns: Mask of the unknowns that are fitted, (p,).
+
+        Returns:
+            The RMS in standard deviations.
         """
         step, _ = solve_columns(self.fitted, weights, x, columns)
-        own = self.held_out.r[:, columns]
-        rest = self.held_out.z - own @ step
-        alone = self.unobserved[columns] & own.any(0)
-        if alone.any():
-            basis = np.linalg.qr(own[:, alone])[0]
-            rest = rest - basis @ (basis.T @ rest)
-        return float(np.sqrt((rest @ rest + self.held_out.min_cost) / self.n_rows))
+        held_out = self.held_out.r[:, columns]
+        residual = self.held_out.z - held_out @ step
+        own = self.is_unobserved[columns] & held_out.any(0)
+        if own.any():
+            basis = np.linalg.qr(held_out[:, own])[0]
+            residual = residual - basis @ (basis.T @ residual)
+        return float(np.sqrt((residual @ residual + self.held_out.min_cost) / self.n_rows))
 
 
-def solve_columns(
-    triangle: TriangularSystem, weights: Array, x: Array, columns: Array
-) -> tuple[Array, float]:
-    """The step (c,) of the columns that count (p,) with priors of weights (p,) about 0, and its cost.
+def solve_columns(system: TriangularSystem, weights: Array, x: Array, columns: Array) -> tuple[Array, float]:
+    """Solve a triangular system with priors for some of the unknowns.
 
-    What neither rows nor priors tell goes back to 0, as x may have it from rows that are left out.
+    Directions that neither rows nor priors determine return to 0, as x may contain information on them from
+    held-out rows.
+
+    Args:
+        system: System at x.
+        weights: One over the prior standard deviations of the unknowns, (p,); 0 without a prior.
+        x: Point of the linearization, (p,).
+        columns: Mask of the c unknowns that are fitted, (p,).
+
+    Returns:
+        The step, (c,), and the cost of rows and priors after it.
     """
-    held = weights[columns]
-    a = np.concatenate([triangle.r[:, columns], np.diag(held)])
-    b = np.concatenate([triangle.z, -held * x[columns]])
-    found = lstsq(a, b, lapack_driver="gelsy", check_finite=False)
-    assert found is not None
-    step = found[0]
-    if not held.all():
+    prior = weights[columns]
+    a = np.concatenate([system.r[:, columns], np.diag(prior)])
+    b = np.concatenate([system.z, -prior * x[columns]])
+    solution = lstsq(a, b, lapack_driver="gelsy", check_finite=False)
+    assert solution is not None
+    step = solution[0]
+    if not prior.all():
         _, s, vt = np.linalg.svd(a)
-        untold = vt[s <= qr.RANK_RTOL * s[0]]
-        step = step - untold.T @ (untold @ (x[columns] + step))
-    return step, triangle.min_cost + float(np.sum((a @ step - b) ** 2))
+        null_space = vt[s <= qr.RANK_RTOL * s[0]]
+        step = step - null_space.T @ (null_space @ (x[columns] + step))
+    return step, system.min_cost + float(np.sum((a @ step - b) ** 2))
 
 
 def count_rows(problem: Problem) -> int:
-    """Number of whitened rows."""
+    """Return the number of whitened rows of a problem."""
     return sum(item.residual_dim * len(item.rows) for item in problem.data)
 
 
 def factor_folds(
     problem: Problem, x: Array, folds: Sequence[Fold], progress: Callable[[int, float], None] | None = None
 ) -> tuple[FoldSystems, ...]:
-    """Each fold's triangles around x (p,)."""
-    found = []
+    """Compute the triangular systems of each fold.
+
+    Args:
+        problem: Problem with the samples of all folds.
+        x: Point of the linearization, (p,).
+        folds: Folds of its measurements.
+        progress: Called after each fold with the number of folds done and the fold's cost.
+
+    Returns:
+        The systems of each fold.
+    """
+    systems = []
     for fold in folds:
-        found.append(_split(problem, x, fold)[1])
+        systems.append(_divide(problem, x, fold)[1])
         if progress:
-            progress(len(found), found[-1].fitted.min_cost)
-    return tuple(found)
+            progress(len(systems), systems[-1].fitted.min_cost)
+    return tuple(systems)
 
 
-def _split(problem: Problem, x: Array, fold: Fold) -> tuple[Problem, FoldSystems]:
-    """The problem of what a fold fits, and the fold's triangles around x (p,)."""
-    kept, left = (
-        problem.with_data([item.take(side) for item, side in zip(problem.data, sides, strict=True)])
-        for sides in ([~mask for mask in fold], fold)
+def _divide(problem: Problem, x: Array, fold: Fold) -> tuple[Problem, FoldSystems]:
+    """Return the problem of the fitted samples of a fold, and the fold's systems at x (p,)."""
+    fitted, held_out = (
+        problem.with_data([item.take(mask) for item, mask in zip(problem.data, masks, strict=True)])
+        for masks in ([~mask for mask in fold], fold)
     )
-    inside = linearize_and_factor(kept, x, small_angle=False)
-    return kept, FoldSystems(inside, linearize_and_factor(left, x, small_angle=False), count_rows(left))
+    fitted_system = linearize_and_factor(fitted, x, small_angle=False)
+    held_out_system = linearize_and_factor(held_out, x, small_angle=False)
+    return fitted, FoldSystems(fitted_system, held_out_system, count_rows(held_out))
 
 
-def _refit_estimate(kept: Problem, part: FoldSystems, x: Array, columns: Array, refit: Refit) -> Array:
-    """Where the fit of what a fold keeps ends (p,), from the fit of all at x with its free columns."""
-    moved = x.copy()
-    step, cost = solve_columns(part.fitted, kept.weights, x, columns)
-    moved[columns] += step
-    cost += float(np.sum((kept.weights * x)[~columns] ** 2))
-    samples = sum(len(item.rows) for item in kept.data)
-    # One step is all where the model is as straight as its triangle.
-    if kept.cost(moved) <= cost + _NONLINEARITY_TOL * cost / max(1, samples):
-        return moved
-    return refit(kept)
+def _solve_fold(fitted: Problem, systems: FoldSystems, x: Array, columns: Array, refit: Refit) -> Array:
+    """Solve a fold by one step from x (p,) in the free columns, or by iteration if that is not enough."""
+    candidate = x.copy()
+    step, cost = solve_columns(systems.fitted, fitted.weights, x, columns)
+    candidate[columns] += step
+    cost += float(np.sum((fitted.weights * x)[~columns] ** 2))
+    n_samples = sum(len(item.rows) for item in fitted.data)
+    if fitted.cost(candidate) <= cost + _NONLINEARITY_TOL * cost / max(1, n_samples):
+        return candidate
+    return refit(fitted)
 
 
 def cross_validate_folds(
@@ -130,45 +172,53 @@ def cross_validate_folds(
     refit: Refit,
     shrinkage_factor: float = 1.0,
 ) -> Iterator[tuple[list[dict[str, Array]], float]]:
-    """For each fold the deviations of its left-out samples, and their RMS in standard deviations.
+    """Generate the errors of the held-out samples of each fold.
 
     Args:
-        problem: as it was fitted.
-        x: (p,) where it ended.
-        data: the fitted measurements, whose samples are judged.
-        folds: made for them.
-        refit: the same fit of some of its samples, where one step from x does not reach it.
-        shrinkage_factor: of each fold's x that its samples are judged by.
+        problem: Problem that was solved.
+        x: Its solution, (p,).
+        data: Fitted measurements without robust weights, whose errors are computed.
+        folds: Folds of these measurements.
+        refit: Fit of a part of the samples, for folds that one step from x does not solve.
+        shrinkage_factor: Factor to the solution of each fold.
+
+    Yields:
+        Errors of the held-out samples of each measurement, as from `compute_errors`, and their RMS in
+        standard deviations.
 
     Raises:
-        DhcalError: folds that were made for other data.
+        InvalidArgumentError: If the folds were made for other data.
     """
     sizes = [len(item.rows) for item in data]
     if any([len(mask) for mask in fold] != sizes for fold in folds):
-        raise DhcalError(f"folds were made for other data; {len(sizes)} measurements have {sizes} samples")
+        raise InvalidArgumentError(
+            f"folds were made for other data; expected masks of {', '.join(map(str, sizes))} samples"
+        )
     columns, robot = problem.is_interior(x), len(problem.errors.parameters)
     for fold in folds:
-        kept, part = _split(problem, x, fold)
-        moved = shrinkage_factor * _refit_estimate(kept, part, x, columns, refit)
-        unseen = {
-            u.name
-            for u, alone in zip(problem.instrument_parameters, part.unobserved[robot:], strict=True)
-            if alone
+        fitted, systems = _divide(problem, x, fold)
+        solution = shrinkage_factor * _solve_fold(fitted, systems, x, columns, refit)
+        unobserved = {
+            parameter.name
+            for parameter, is_unobserved in zip(
+                problem.instrument_parameters, systems.is_unobserved[robot:], strict=True
+            )
+            if is_unobserved
         }
-        known = {name: value for name, value in problem.instruments(moved).items() if name not in unseen}
-        left = [item.take(mask) for item, mask in zip(data, fold, strict=True) if mask.any()]
-        found = compute_errors(problem.errors.at(moved[:robot]), left, known)
-        yield found, part.error(problem.weights, x, columns)
+        known = {name: v for name, v in problem.instruments(solution).items() if name not in unobserved}
+        held_out = [item.take(mask) for item, mask in zip(data, fold, strict=True) if mask.any()]
+        errors = compute_errors(problem.errors.at(solution[:robot]), held_out, known)
+        yield errors, systems.error(problem.weights, x, columns)
 
 
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
-    """Errors on what was left out.
+    """Errors of held-out samples.
 
     Attributes:
-        folds: of each fold what `accuracy` says of its left-out samples, m and rad.
-        errors: (k,) RMS of each fold's left-out rows in standard deviations as the fit used them.
-        accuracy: the same as a fold's, of all folds' samples together.
+        folds: Accuracy of the held-out samples of each fold.
+        errors: RMS of the held-out rows of each fold in standard deviations, (k,).
+        accuracy: Accuracy of the held-out samples of all folds together.
     """
 
     folds: tuple[Accuracy, ...]
@@ -177,33 +227,40 @@ class CrossValidation:
 
 
 def standard_error(values: Array) -> float:
-    """Standard error of the mean of values (k,), as wide as Student's t makes few; infinite for one."""
+    """Compute the standard error of a mean, widened for few values by Student's t distribution.
+
+    Args:
+        values: Values, (k,).
+
+    Returns:
+        Half width of the interval that contains the mean as often as one standard deviation of a normal
+        distribution; infinite for one value.
+    """
     if len(values) < 2:
         return np.inf
-    from scipy.special import (  # a good part of the start-up, and few fits need it
-        ndtr,
-        stdtrit,
-    )
+    from scipy.special import ndtr, stdtrit  # lazy import: slow, and few calibrations need it
 
     return float(stdtrit(len(values) - 1, ndtr(1.0)) * values.std(ddof=1) / np.sqrt(len(values)))
 
 
 def cross_validate(fit: Result, folds: Sequence[Fold] | None = None) -> CrossValidation:
-    """How well a result's model predicts what it is not fitted to.
+    """Measure how well the model of a calibration predicts samples that it is not fitted to.
+
+    Standard deviations, weights and priors are those of the calibration.
 
     Args:
-        fit: a calibration; its sigmas, weights and priors are kept.
-        folds: of `k_fold`, `leave_one_group_out` or `blocked_folds`; the last without it.
+        fit: Result of a calibration.
+        folds: Folds of `fit.data` from `k_fold`, `leave_one_group_out` or `blocked_folds`; the last one
+            with the contacts of the measurements if not given.
 
-    Raises:
-        DhcalError: folds that were not made for the fitted data.
+    Returns:
+        Errors of the held-out samples.
     """
     if folds is None:
         folds = blocked_folds(fit.data, groups=contact_groups(fit.problem, fit.x))
-    judged = list(cross_validate_folds(fit.problem, fit.solution.x, fit.data, folds, fit.refit))
-    every = [item for found, _ in judged for item in found]
+    results = list(cross_validate_folds(fit.problem, fit.solution.x, fit.data, folds, fit.refit))
     return CrossValidation(
-        tuple(Accuracy.from_errors(found) for found, _ in judged),
-        np.array([error for _, error in judged]),
-        Accuracy.from_errors(every),
+        tuple(Accuracy.from_errors(errors) for errors, _ in results),
+        np.array([error for _, error in results]),
+        Accuracy.from_errors([item for errors, _ in results for item in errors]),
     )

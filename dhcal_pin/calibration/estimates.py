@@ -1,4 +1,9 @@
-"""Numbers and tables as people read them: millimetres, degrees, digits as far as they are known."""
+"""Estimates: nominal and identified value of each parameter with its uncertainty.
+
+A parameter of the robot is identified as an error x of its nominal value, so its value is nominal + x. The
+components of base and tool are those of a pose: position and rotation vector of the calibrated base or tool.
+Their nominal value is only the start of the fit and not an expectation, so they have no change.
+"""
 
 from __future__ import annotations
 
@@ -18,16 +23,18 @@ from ..robot.chain import BASE_FRAME, Chain
 
 @dataclass(frozen=True)
 class Estimate:
-    """What was found of one parameter, m and rad.
+    """Estimate of one parameter, in its unit (m, rad, or a rate).
 
     Attributes:
-        name, unit: of the parameter.
-        nominal, value: before and after.
-        std: standard deviation, infinite where nothing tells.
-        prior: standard deviation expected before any measurement, infinite without a prior.
-        observability: how far the data see it, 0 to 1.
-        posterior_to_prior_std: the share that std is of what was expected before the measurement.
-        fixed: whether it was held.
+        name: Name of the parameter.
+        unit: Unit of the parameter.
+        nominal: Value before the calibration.
+        value: Value after the calibration.
+        std: Standard deviation of the value; infinite if neither measurements nor a prior determine it.
+        prior: Standard deviation of its prior; infinite without a prior.
+        observability: Fraction of the parameter that the measurements determine, 0 to 1.
+        posterior_to_prior_std: Ratio of `std` to the standard deviation expected before the measurement.
+        fixed: Whether the parameter was held at its nominal value.
         category: "robot", "frame" (base and tool) or "instrument".
     """
 
@@ -44,44 +51,51 @@ class Estimate:
 
     @property
     def change(self) -> float:
-        """Value minus nominal; NaN for a frame, whose nominal place means nothing."""
+        """Value minus nominal value; NaN for a component of base or tool."""
         return math.nan if self.category == "frame" else self.value - self.nominal
 
     @property
     def certainty(self) -> str:
-        """The standard deviation in words."""
+        """Standard deviation with its unit, "fixed" or "not observable"."""
         if self.fixed:
             return "fixed"
-        return (
-            "not seen" if math.isinf(self.std) else format_quantity(self.std, self.unit, self.std, small=True)
-        )
+        if math.isinf(self.std):
+            return "not observable"
+        return format_quantity(self.std, self.unit, self.std, small=True)
 
 
-def estimates(
+def make_estimates(
     chain: Chain,
     parameters: Sequence[ErrorParameter | InstrumentParameter],
     figures: Array,
     fixed: Sequence[ErrorParameter],
 ) -> tuple[Estimate, ...]:
-    """What was found of each unknown, then the parameters that were held.
+    """Make the estimates of all identified parameters, then those of the fixed ones.
 
     Args:
-        chain: calibrated; base and tool are given by component of their place, others as nominal plus error.
-        parameters: of the robot and the instruments, p of them.
-        figures: (p, 5) found error, standard deviation, prior, observability and share remaining of each.
-        fixed: parameters that were held.
+        chain: Calibrated chain.
+        parameters: The p identified parameters of the robot and the instruments.
+        figures: Identified error, standard deviation, standard deviation of the prior, observability and
+            ratio of posterior to prior standard deviation of each parameter, shape (p, 5).
+        fixed: Parameters that were held at their nominal values.
+
+    Returns:
+        The estimates.
     """
     frames = {BASE_FRAME: chain.base, chain.tool_frame_index: chain.tool}
-    sixes = {at: np.append(pose[:3, 3], se3.log3(pose[:3, :3])) for at, pose in frames.items()}
+    # Position and rotation vector of base and tool, shape (6,).
+    components = {frame: np.append(pose[:3, 3], se3.log3(pose[:3, :3])) for frame, pose in frames.items()}
     rows = [(p, row, False) for p, row in zip(parameters, figures.tolist(), strict=True)]
     rows += [(p, [0.0] * 5, True) for p in fixed]
-    out = []
-    for p, (x, std, prior, seen, left), held in rows:
-        nominal, value, place = p.nominal, p.nominal + x, "instrument"
+    estimates = []
+    for p, (x, std, prior, observability, ratio), is_fixed in rows:
+        nominal, value, category = p.nominal, p.nominal + x, "instrument"
         if isinstance(p, ErrorParameter):
-            place = "frame" if p.error_frame in frames else "robot"
-        if isinstance(p, ErrorParameter) and place == "frame":
-            value = float(sixes[p.error_frame] @ np.array(p.twist))
-            nominal = value if held else nominal
-        out.append(Estimate(p.name, p.unit, nominal, value, std, prior, seen, left, held, place))
-    return tuple(out)
+            category = "frame" if p.error_frame in frames else "robot"
+        if isinstance(p, ErrorParameter) and category == "frame":
+            value = float(components[p.error_frame] @ np.array(p.twist))
+            nominal = value if is_fixed else nominal
+        estimates.append(
+            Estimate(p.name, p.unit, nominal, value, std, prior, observability, ratio, is_fixed, category)
+        )
+    return tuple(estimates)

@@ -1,10 +1,23 @@
-"""How far measurements lie from what a chain says, and what that says of its accuracy."""
+"""Errors of a chain on measurements and their statistics.
+
+The error of a sample is the measured minus the modelled value: a vector of components along the axes of the
+measuring frame [m] for positions, a rotation vector [rad] for orientations, one or more lengths [m] for other
+instruments. Statistics are taken of the Euclidean norms e_i of these errors:
+
+    RMS = sqrt(mean(e_i²)),    standard error of the RMS = std(e_i²) / (2 · RMS · sqrt(m)).
+
+The standard error follows from the variance of the mean of e_i² by the delta method. It assumes independent
+samples, but no distribution.
+
+Instrument parameters that are not given, such as a contact point that only these samples touch, are fitted to
+the measurements before the errors are computed.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,6 +28,7 @@ from ..estimation.problem import Problem, merge_instrument_parameters
 from ..estimation.solver import minimize
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
+from .arguments import as_measurements, require_chain
 
 # Unit of each group of errors, in the order of importance.
 GROUP_UNITS = {"position": "m", "orientation": "rad", "residual": "m"}
@@ -132,22 +146,34 @@ class Accuracy(Mapping[str, Any]):
         return out
 
     def __getitem__(self, key: str) -> Any:
+        """Return the value of a key of the JSON document."""
         return self.to_dict()[key]
 
     def __iter__(self) -> Iterator[str]:
+        """Iterate over the keys of the JSON document."""
         return iter(self.to_dict())
 
     def __len__(self) -> int:
+        """Return the number of keys of the JSON document."""
         return len(self.to_dict())
 
 
-def instrument_values(
+def fit_instrument_parameters(
     chain: Chain, data: Sequence[Measurement], known: Mapping[str, float]
 ) -> dict[str, float]:
-    """Values of started data's unknowns by name, those that are not known fitted to the data alone."""
-    every = merge_instrument_parameters(data)
-    given = {u.name: known[u.name] for u in every if u.name in known and not u.is_local}
-    weights = np.array([1 / u.prior for u in every if u.name not in given])
+    """Fit the instrument parameters that are not known to measurements of a given chain.
+
+    Args:
+        chain: Chain with base and tool.
+        data: Measurements whose instrument parameters are initialized.
+        known: Values of instrument parameters by name [m or rad].
+
+    Returns:
+        Values of all instrument parameters of the measurements by name [m or rad].
+    """
+    parameters = merge_instrument_parameters(data)
+    given = {p.name: known[p.name] for p in parameters if p.name in known and not p.is_local}
+    weights = np.array([1 / p.prior for p in parameters if p.name not in given])
     problem = Problem(ErrorModel(chain, ()), tuple(data), weights, given)
     if not len(weights):
         return given
@@ -157,20 +183,23 @@ def instrument_values(
 def compute_errors(
     chain: Chain, data: Sequence[Measurement], known: Mapping[str, float] | None = None
 ) -> list[dict[str, Array]]:
-    """Measured minus modelled: for each item its unweighted errors (m, ·) by name, m or rad.
+    """Compute the errors of all samples, measured minus modelled, without weights.
 
     Args:
-        chain: base and tool included.
-        data: measurements of any kinds.
-        known: values of instruments' unknowns; others (a point that only these data touch) are fitted
-            to the data first.
+        chain: Chain with base and tool.
+        data: Measurements of any kinds.
+        known: Values of instrument parameters by name [m or rad]; the others, such as a point that only
+            these samples touch, are fitted to the data first.
+
+    Returns:
+        Errors of each measurement by the name that its kind gives them, arrays of shape (m, ·) [m or rad].
     """
     data = [item.initialized(chain) for item in data]
-    values = instrument_values(chain, data, known or {})
+    values = fit_instrument_parameters(chain, data, known or {})
     return [
         item.errors(
             chain.forward_kinematics(item.configurations()),
-            np.array([values[unknown.name] for unknown in item.instrument_parameters]),
+            np.array([values[parameter.name] for parameter in item.instrument_parameters]),
         )
         for item in data
     ]
@@ -179,13 +208,22 @@ def compute_errors(
 def position_errors(
     chain: Chain, data: Sequence[Measurement], known: Mapping[str, float] | None = None
 ) -> tuple[Array, Array]:
-    """Joint values (m, n) of all measured positions, and how far the chain is from each (m,), m."""
-    q, sizes = [np.empty((0, chain.n_joints))], [np.empty(0)]
-    placed = [item for item in data if len(item.positions())]
-    for item, errors in zip(placed, compute_errors(chain, placed, known), strict=True):
+    """Compute the position errors of all measurements that contain positions.
+
+    Args:
+        chain: Chain with base and tool.
+        data: Measurements of any kinds, with m positions in all.
+        known: Values of instrument parameters by name [m or rad]; the others are fitted to the data first.
+
+    Returns:
+        Joint values, shape (m, n) [rad or m], and norms of the position errors, shape (m,) [m].
+    """
+    q, norms = [np.empty((0, chain.n_joints))], [np.empty(0)]
+    with_positions = [item for item in data if len(item.positions())]
+    for item, errors in zip(with_positions, compute_errors(chain, with_positions, known), strict=True):
         q.append(item.configurations())
-        sizes.append(np.linalg.norm(errors["position"], axis=1))
-    return np.concatenate(q), np.concatenate(sizes)
+        norms.append(np.linalg.norm(errors["position"], axis=1))
+    return np.concatenate(q), np.concatenate(norms)
 
 
 def error_norms(errors: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
@@ -204,35 +242,44 @@ def error_norms(errors: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
     return {group: np.concatenate(out[group]) for group in GROUP_UNITS if group in out}
 
 
-def accuracy(chain: Chain, data: Sequence[Measurement], known: Mapping[str, float] | None = None) -> Accuracy:
-    """Compute the errors of a chain on measurements.
+def accuracy(
+    chain: Chain, data: Measurement | Sequence[Measurement], known: Mapping[str, float] | None = None
+) -> Accuracy:
+    """Compute the error statistics of a chain on measurements.
 
     Args:
         chain: Chain with base and tool.
-        data: Measurements of any kinds.
-        known: Values of instrument parameters by name; the others are fitted to the data first.
+        data: One measurement or several of any kinds.
+        known: Values of instrument parameters by name [m or rad]; the others are fitted to the data first.
 
     Returns:
         Number of samples, RMS with its standard error, mean, 95th percentile, maximum and RMS along each
-        axis, for each group of errors.
+        axis, for each group of errors. It can also be indexed by the keys of the JSON document, such as
+        "position_rms_m".
     """
-    return Accuracy.from_errors(compute_errors(chain, data, known))
+    require_chain(chain)
+    return Accuracy.from_errors(compute_errors(chain, as_measurements(data), known))
 
 
-def remove_outliers(found: Sequence[Mapping[str, Array]]) -> tuple[list[dict[str, Array]], int]:
-    """Deviations without the samples that stand out of all others, and how many those are.
+def remove_outliers(errors: Sequence[Mapping[str, Array]]) -> tuple[list[dict[str, Array]], int]:
+    """Remove the samples whose errors are outliers among those of their measurement.
 
-    Of several groups the first, the position, tells.
+    Only the first group of errors of a measurement is tested: of a pose, the position.
+
+    Args:
+        errors: Errors by name of each measurement, arrays of shape (m, ·) [m or rad].
+
+    Returns:
+        Errors of the other samples, and the number of outliers.
     """
-    clean, gross = [], 0
-    for item in found:
-        first = next(iter(item.values()))
-        good = (
-            robust.standardize_mean_squares(np.mean(first**2, 1), first.shape[1]) <= robust.OUTLIER_THRESHOLD
-        )
-        gross += int(np.sum(~good))
-        clean.append({name: error[good] for name, error in item.items()})
-    return clean, gross
+    inliers, n_outliers = [], 0
+    for item in errors:
+        tested = next(iter(item.values()))
+        scores = robust.standardize_mean_squares(np.mean(tested**2, 1), tested.shape[1])
+        is_inlier = scores <= robust.OUTLIER_THRESHOLD
+        n_outliers += int(np.sum(~is_inlier))
+        inliers.append({name: error[is_inlier] for name, error in item.items()})
+    return inliers, n_outliers
 
 
 @dataclass(frozen=True)
@@ -240,15 +287,16 @@ class Comparison:
     """Accuracy before and after a calibration on the same samples.
 
     Attributes:
-        title: "held out", "cross-validated" (each sample of a fit without it) or "fitted".
-        n_samples: how many.
-        before, after: as from `accuracy`.
-        n_rejected: gross errors among the samples of a fit that they take no part in; not in the figures.
-        n_outliers: gross errors that are in the figures.
-        after_without_outliers: `after` without those, where there are any.
+        title: "hold-out", "cross-validated" (each sample is judged by a fit without it) or "fitted".
+        n_samples: Number of samples.
+        before: Accuracy of the nominal robot, base and tool fitted.
+        after: Accuracy of the calibrated robot.
+        n_rejected: Number of fitted samples with zero weight; they are not in the figures.
+        n_outliers: Number of outliers among hold-out samples; they are in the figures.
+        after_without_outliers: `after` without these; empty if there are none.
     """
 
-    title: str
+    title: Literal["hold-out", "cross-validated", "fitted"]
     n_samples: int
     before: Accuracy
     after: Accuracy
@@ -257,8 +305,8 @@ class Comparison:
     after_without_outliers: Accuracy = field(default_factory=Accuracy)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields for the JSON document, the accuracies by their flat keys."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        """Return the attributes for the JSON document, the accuracies by their flat keys."""
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
         return {
             name: value.to_dict() if isinstance(value, Accuracy) else value for name, value in values.items()
         }

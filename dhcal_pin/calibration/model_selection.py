@@ -1,9 +1,30 @@
-"""Which families of joints' transmission errors the data ask for: forward selection by cross-validation.
+"""Model selection: which families of joint errors the measurements support.
 
-A family is added where two things hold: the error on left-out regions of joint space falls by more than its
-standard error and by a share that is worth it, and an F-test on all data says that chance would hardly do
-it. Cross-validation also chooses how wide the family's priors are, as a term that runs away under wide ones
-may serve under narrow ones: as narrow as does no harm.
+Forward selection by cross-validation. A family is a set of parameters that describe one physical cause,
+such as `harmonics` for gear eccentricity. In each round every remaining family is tried on top of those
+selected before. The family with the lowest cross-validated error is added if
+
+1. the error of held-out regions of joint space, e_k for fold k, falls by more than the standard error of
+   its mean change and by more than 1 %;
+2. an F-test on all data rejects that the family has no effect:
+
+       F = ((C_0 - C_1)/q) / (C_1/(m - p - q)),    P(F_{q, m-p-q} > F) < 0.01,
+
+   with C_0, C_1 the costs without and with the q parameters of the family, m rows and p other parameters.
+
+Cross-validation also selects the width of the family's priors: the narrowest one whose error is within one
+standard error of the lowest (the "one standard error rule"). A family that extrapolates badly under wide
+priors may be useful under narrow ones.
+
+All trials use one linearization of the model around the fit without extensions, with columns for all
+families. The selected families are then identified together with the geometry, as both share directions of
+parameter space.
+
+Shapes: p unknowns of the robot with all families and of the instruments, k folds.
+
+References:
+    L. Breiman, J. Friedman, R. Olshen and C. Stone, Classification and Regression Trees, Wadsworth 1984.
+    B. Laurent and P. Massart, Adaptive Estimation of a Quadratic Functional, Annals of Statistics 28, 2000.
 """
 
 from __future__ import annotations
@@ -20,12 +41,12 @@ from ..estimation.parameters import EXTENSIONS, PARAMETER_SETS
 from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.qr import TriangularSystem
 from ..estimation.solver import Progress
-from ..exceptions import DhcalError
+from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..formatting import Table, format_fixed
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from ..robot.error_families import FAMILIES
-from . import procedure
+from .arguments import require_chain
 from .cross_validation import (
     FoldSystems,
     count_rows,
@@ -34,40 +55,42 @@ from .cross_validation import (
     standard_error,
 )
 from .partition import blocked_folds, contact_groups
+from .procedure import calibrate
 from .result import Result
 
-# Widths of a family's priors that are tried, as shares of the default ones.
+# Widths of a family's priors that are tried, as fractions of the default ones.
 PRIOR_WIDTHS = (1.0, 0.3, 0.1, 0.03)
-
-
-# A family that lowers the error by a smaller share is not worth its unknowns.
+# Smallest relative improvement of the cross-validated error for which a family is added.
 MIN_IMPROVEMENT = 0.01
-
-
-# A family that chance alone would make look so good more often than this is not added.
+# Largest p-value of the F-test for which a family is added.
 MAX_P_VALUE = 0.01
-
-
-# A hint is given of one that leaves less than this share of the error, with so many rows left over for each
-# of its unknowns; so many samples tell.
-MAX_HINT_RATIO, MIN_ROWS_PER_PARAMETER, MAX_HINT_SAMPLES = 0.9, 5, 500
-
-
-# Smaller chances differ by nothing that one could believe.
+# Largest ratio of the errors with and without a family for which a hint is given.
+MAX_HINT_RATIO = 0.9
+# Smallest number of rows that must remain per parameter of a family for a hint.
+MIN_ROWS_PER_PARAMETER = 5
+# Largest number of samples of each measurement that a hint is computed from.
+MAX_HINT_SAMPLES = 500
+# Negative logarithm of the largest p-value for which a hint is given: one in a million.
+HINT_LOG_P = 14
+# Smaller p-values are shown as "< 1e-06".
 MIN_SHOWN_P_VALUE = 1e-6
+
+# All parameters that positions and poses can determine, wherever instrument and target are.
+FULL_SET = "minimal,base,tool"
 
 
 @dataclass(frozen=True)
 class FamilyTrial:
-    """What a family would bring on top of those kept before it.
+    """Effect of a family on top of those selected before it.
 
     Attributes:
-        family: a set of `parameters.EXTENSIONS`.
-        cv_before, cv_after: cross-validated error without and with it, in standard deviations.
-        standard_error: of the difference.
-        p_value: how often chance alone would lower the fit's own cost as much.
-        prior_width: its priors, as a share of the default ones.
-        is_selected: whether it was added.
+        family: Name of the family, one of `estimation.EXTENSIONS`.
+        cv_before: Cross-validated error without the family, in standard deviations.
+        cv_after: Cross-validated error with it, in standard deviations.
+        standard_error: Standard error of the difference.
+        p_value: Probability that chance alone lowers the cost of all data as much.
+        prior_width: Width of its priors as a fraction of the default one.
+        is_selected: Whether it was added.
     """
 
     family: str
@@ -80,42 +103,50 @@ class FamilyTrial:
 
     @property
     def is_significant(self) -> bool:
-        """Whether the data ask for it."""
-        gained = self.cv_before - self.cv_after
+        """Whether the measurements support the family."""
+        reduction = self.cv_before - self.cv_after
         return (
-            gained > max(self.standard_error, MIN_IMPROVEMENT * self.cv_before) and self.p_value < MAX_P_VALUE
+            reduction > max(self.standard_error, MIN_IMPROVEMENT * self.cv_before)
+            and self.p_value < MAX_P_VALUE
         )
 
 
-def trial_table(found: Sequence[FamilyTrial]) -> Table:
-    """What each family brought, or would bring on top of those added before it."""
+def trial_table(trials: Sequence[FamilyTrial]) -> Table:
+    """Make a table of the effect of each family on the cross-validated error.
+
+    Args:
+        trials: Trials of a selection.
+
+    Returns:
+        Table with one row per family.
+    """
     header = ["family", "verdict", "before", "after"]
-    header += ["standard error of the change", "by chance", "prior width"]
+    header += ["standard error of the change", "p-value", "prior width"]
     rows = [
         [
-            one.family,
-            "added" if one.is_selected else "not selected",
-            format_fixed(one.cv_before, 3),
-            format_fixed(one.cv_after, 3),
-            format_fixed(one.standard_error, 3),
-            f"{one.p_value:.1g}" if one.p_value > MIN_SHOWN_P_VALUE else f"< {MIN_SHOWN_P_VALUE:g}",
-            f"{one.prior_width:g} of default",
+            trial.family,
+            "added" if trial.is_selected else "not selected",
+            format_fixed(trial.cv_before, 3),
+            format_fixed(trial.cv_after, 3),
+            format_fixed(trial.standard_error, 3),
+            f"{trial.p_value:.1g}" if trial.p_value > MIN_SHOWN_P_VALUE else f"< {MIN_SHOWN_P_VALUE:g}",
+            f"{trial.prior_width:g} of default",
         ]
-        for one in found
+        for trial in trials
     ]
     return Table(header, rows, n_text_columns=2)
 
 
 @dataclass(frozen=True, eq=False)
 class _LinearizedFit:
-    """Everything around the fit without extensions: linear, and columns for all families at once.
+    """Linear model around a fit without extensions, with columns for all families.
 
     Attributes:
-        problem: with all families, and default priors of theirs.
-        system: triangle of all its data.
-        x: (p,) where it is linear.
-        family: (p,) the family of each column, or "".
-        folds: triangles of every fold.
+        problem: Problem with the parameters and default priors of all families.
+        system: Triangular system of all its data.
+        x: Point of the linearization, (p,).
+        family: Name of the family of each unknown, "" for the unknowns of the fit, (p,).
+        folds: Triangular systems of the folds.
     """
 
     problem: Problem
@@ -124,142 +155,151 @@ class _LinearizedFit:
     family: Array
     folds: tuple[FoldSystems, ...] = ()
 
-    def with_prior_widths(self, kept: dict[str, float]) -> tuple[Array, Array]:
-        """Weights (p,) with the priors of some families narrowed, and which columns (p,) count."""
-        width = np.array([kept.get(name, 1.0) for name in self.family])
-        return self.problem.weights / width, (self.family == "") | np.isin(self.family, list(kept))
+    def weights_and_columns(self, selected: dict[str, float]) -> tuple[Array, Array]:
+        """Return prior weights (p,) and mask of the columns (p,) with families of these prior widths."""
+        width = np.array([selected.get(name, 1.0) for name in self.family])
+        return self.problem.weights / width, (self.family == "") | np.isin(self.family, list(selected))
 
-    def errors(self, kept: dict[str, float]) -> Array:
-        """Each fold's error (k,) with some families at prior widths."""
-        weights, columns = self.with_prior_widths(kept)
-        return np.array([part.error(weights, self.x, columns) for part in self.folds])
+    def errors(self, selected: dict[str, float]) -> Array:
+        """Compute the held-out error of each fold, (k,), with families of these prior widths."""
+        weights, columns = self.weights_and_columns(selected)
+        return np.array([fold.error(weights, self.x, columns) for fold in self.folds])
 
-    def cost(self, kept: dict[str, float]) -> float:
-        """The least cost of all data and priors."""
-        weights, columns = self.with_prior_widths(kept)
+    def cost(self, selected: dict[str, float]) -> float:
+        """Compute the lowest cost of all data and priors with families of these prior widths."""
+        weights, columns = self.weights_and_columns(selected)
         return solve_columns(self.system, weights, self.x, columns)[1]
 
-    def degrees_of_freedom(self, name: str, kept: dict[str, float]) -> tuple[int, int]:
-        """How many unknowns a family adds to those that are kept, and how many rows are left over then."""
-        more = int(np.sum(self.family == name))
-        return more, count_rows(self.problem) - int(np.sum(self.with_prior_widths(kept)[1])) - more
+    def degrees_of_freedom(self, name: str, selected: dict[str, float]) -> tuple[int, int]:
+        """Return the number of parameters that a family adds, and the number of rows that remain."""
+        added = int(np.sum(self.family == name))
+        return added, count_rows(self.problem) - int(np.sum(self.weights_and_columns(selected)[1])) - added
 
-    def trial(self, name: str, kept: dict[str, float]) -> FamilyTrial:
-        """A family at the narrowest width that is no more than a standard error worse than the best one."""
-        before = self.errors(kept)
-        tried = [(self.errors(kept | {name: width}), width) for width in PRIOR_WIDTHS]
+    def trial(self, name: str, selected: dict[str, float]) -> FamilyTrial:
+        """Try a family on top of the selected ones."""
+        before = self.errors(selected)
+        tried = [(self.errors(selected | {name: width}), width) for width in PRIOR_WIDTHS]
         best = min((errors for errors, _ in tried), key=np.mean)
+        # One standard error rule, from the narrowest width on.
         after, width = next(
             (errors, width)
             for errors, width in reversed(tried)
             if np.mean(errors - best) <= standard_error(errors - best)
         )
-        more, left = self.degrees_of_freedom(name, kept)
-        without, with_it = self.cost(kept), self.cost(kept | {name: 1.0})
-        chance = 1.0
-        if left > 0 and with_it > 0:
-            from scipy.special import (
-                fdtrc,  # a good part of the start-up, and few fits are extended
-            )
+        added, remaining = self.degrees_of_freedom(name, selected)
+        cost_before, cost_after = self.cost(selected), self.cost(selected | {name: 1.0})
+        p_value = 1.0
+        if remaining > 0 and cost_after > 0:
+            from scipy.special import fdtrc  # lazy import: slow, and few calibrations need it
 
-            chance = float(fdtrc(more, left, (without - with_it) / more / (with_it / left)))
+            f = (cost_before - cost_after) / added / (cost_after / remaining)
+            p_value = float(fdtrc(added, remaining, f))
         error = standard_error(before - after)
-        return FamilyTrial(name, float(before.mean()), float(after.mean()), error, chance, width)
+        return FamilyTrial(name, float(before.mean()), float(after.mean()), error, p_value, width)
 
 
 def _missing_parameters(fit: Result, families: Sequence[str]) -> dict[str, list[ErrorParameter]]:
-    """The parameters of families that have some which the fit does not."""
-    there = {p.name for p in fit.errors.parameters}
-    found = {name: PARAMETER_SETS[name](fit.errors.chain) for name in families}
-    return {name: ps for name, ps in found.items() if any(p.name not in there for p in ps)}
+    """Return the parameters of each family that has some which the fit does not have."""
+    identified = {p.name for p in fit.errors.parameters}
+    by_family = {name: PARAMETER_SETS[name](fit.errors.chain) for name in families}
+    return {name: ps for name, ps in by_family.items() if any(p.name not in identified for p in ps)}
 
 
 def _linearize_fit(
     fit: Result, data: Sequence[Measurement], families: dict[str, list[ErrorParameter]]
 ) -> _LinearizedFit:
-    """The stage of a fit and some of its data, which nothing has parted yet."""
-    names = {p.name for p in fit.errors.parameters}
-    new = [p for parameters in families.values() for p in parameters if p.name not in names]
-    errors = fit.errors.with_parameters(new)
+    """Linearize a fit on some of its data with the parameters of families, without folds."""
+    identified = {p.name for p in fit.errors.parameters}
+    added = [p for parameters in families.values() for p in parameters if p.name not in identified]
+    errors = fit.errors.with_parameters(added)
     robot = len(fit.errors.parameters)
-    at = dict(
-        zip(
-            (p.name for p in fit.errors.parameters),
-            zip(fit.x, fit.problem.weights, strict=False),
-            strict=False,
-        )
-    )
-    start = [at.get(p.name, (0.0, 1 / p.prior)) for p in errors.parameters]
-    x = np.array([*(value for value, _ in start), *fit.x[robot:]])
-    weights = np.array([*(weight for _, weight in start), *fit.problem.weights[robot:]])
-    home = {p.name: name for name, parameters in families.items() for p in parameters if p.name not in names}
+    names = [p.name for p in fit.errors.parameters]
+    # x and prior weight of each identified parameter; the others start from 0 with their default priors.
+    start = dict(zip(names, zip(fit.x[:robot], fit.problem.weights[:robot], strict=True), strict=True))
+    values = [start.get(p.name, (0.0, 1 / p.prior)) for p in errors.parameters]
+    x = np.array([*(value for value, _ in values), *fit.x[robot:]])
+    weights = np.array([*(weight for _, weight in values), *fit.problem.weights[robot:]])
+    family_of = {
+        p.name: name for name, parameters in families.items() for p in parameters if p.name not in identified
+    }
     problem = replace(fit.problem, errors=errors, weights=weights, data=tuple(data))
     return _LinearizedFit(
         problem,
         linearize_and_factor(problem, x, small_angle=False),
         x,
-        np.array([home.get(p.name, "") for p in errors.parameters] + [""] * len(fit.x[robot:])),
+        np.array([family_of.get(p.name, "") for p in errors.parameters] + [""] * len(fit.x[robot:])),
     )
 
 
 def select_error_families(
     fit: Result, families: Sequence[str] = EXTENSIONS, progress: Progress | None = None
 ) -> tuple[FamilyTrial, ...]:
-    """Tries families on top of a fit and keeps the best that helps, until none does.
+    """Select the families of joint errors that lower the cross-validated error, one after the other.
 
     Args:
-        fit: a calibration without them, by method lm and with priors.
-        families: of `parameters.EXTENSIONS`; one without a parameter on this robot is passed over.
-        progress: called with the number of folds done.
+        fit: Calibration without them, by method "lm" and with priors.
+        families: Names of `estimation.EXTENSIONS` to try; those without a parameter on this robot are
+            skipped.
+        progress: Called after each fold with the number of folds done and the cost.
 
     Returns:
-        The kept ones in the order they were added, then the others as they would come on top of those.
+        Trials of the selected families in the order of selection, then trials of the others on top of those.
 
     Raises:
-        DhcalError: an unknown family.
+        UnknownNameError: If a family is unknown.
     """
     if unknown := [name for name in families if name not in EXTENSIONS]:
-        raise DhcalError(f"no extension {unknown[0]!r}: choose from {', '.join(EXTENSIONS)}, or auto or none")
-    found = _missing_parameters(fit, families)
-    if not found:
+        raise UnknownNameError(
+            f"unknown extension {unknown[0]!r}; choose from {', '.join(EXTENSIONS)}, or auto or none"
+        )
+    candidates = _missing_parameters(fit, families)
+    if not candidates:
         return ()
-    stage = _linearize_fit(fit, fit.problem.data, found)
-    folds = blocked_folds(stage.problem.data, groups=contact_groups(stage.problem, stage.x))
-    stage = replace(stage, folds=factor_folds(stage.problem, stage.x, folds, progress))
-    kept: dict[str, float] = {}
-    out: list[FamilyTrial] = []
+    model = _linearize_fit(fit, fit.problem.data, candidates)
+    folds = blocked_folds(model.problem.data, groups=contact_groups(model.problem, model.x))
+    model = replace(model, folds=factor_folds(model.problem, model.x, folds, progress))
+    selected: dict[str, float] = {}
+    selected_trials: list[FamilyTrial] = []
     while True:
-        trials = [stage.trial(name, kept) for name in found if name not in kept]
-        helping = [trial for trial in trials if trial.is_significant]
-        if not helping:
-            return (*out, *trials)
-        best = min(helping, key=lambda trial: trial.cv_after)
-        kept[best.family] = best.prior_width
-        out.append(replace(best, is_selected=True))
+        trials = [model.trial(name, selected) for name in candidates if name not in selected]
+        significant = [trial for trial in trials if trial.is_significant]
+        if not significant:
+            return (*selected_trials, *trials)
+        best = min(significant, key=lambda trial: trial.cv_after)
+        selected[best.family] = best.prior_width
+        selected_trials.append(replace(best, is_selected=True))
 
 
 def family_hint(fit: Result) -> str:
-    """A sentence on the family that would take up most of what a fit leaves; "" if little, or by chance.
+    """Suggest an extension if one family explains a significant part of the residuals.
 
-    Around the fit, without another one, and from `MOST` samples of each measurement at most.
+    The hint is computed from a linearization around the fit and at most `MAX_HINT_SAMPLES` samples of each
+    measurement. It requires a change of the cost that chance causes less than once in a million fits, by
+    the bound P(χ²_q > q + 2·sqrt(q·t) + 2·t) <= exp(-t) of Laurent and Massart (2000).
+
+    Args:
+        fit: Calibration by method "lm" and with priors.
+
+    Returns:
+        One sentence; empty without a significant family.
     """
-    some = [item.take(np.s_[:: max(1, -(-len(item.rows) // MAX_HINT_SAMPLES))]) for item in fit.problem.data]
-    found = _missing_parameters(fit, EXTENSIONS)
-    stage = _linearize_fit(fit, some, found)
-    now, best = stage.cost({}), (MAX_HINT_RATIO, "")
-    for name in found:
-        more, left = stage.degrees_of_freedom(name, {})
-        then = stage.cost({name: 1.0})
-        if left < MIN_ROWS_PER_PARAMETER * more or not then > 0:
+    data = [item.take(np.s_[:: max(1, -(-len(item.rows) // MAX_HINT_SAMPLES))]) for item in fit.problem.data]
+    candidates = _missing_parameters(fit, EXTENSIONS)
+    model = _linearize_fit(fit, data, candidates)
+    cost_before, best = model.cost({}), (MAX_HINT_RATIO, "")
+    for name in candidates:
+        added, remaining = model.degrees_of_freedom(name, {})
+        cost_after = model.cost({name: 1.0})
+        if remaining < MIN_ROWS_PER_PARAMETER * added or not cost_after > 0:
             continue
-        # Beyond this, a χ² of so many degrees is once in a million times (Laurent and Massart 2000).
-        chance = more + 2 * np.sqrt(14 * more) + 28
-        if (now - then) / (then / left) > chance:
-            best = min(best, (float(np.sqrt(then / left / (now / (left + more)))), name))
-    share, name = best
+        threshold = added + 2 * np.sqrt(HINT_LOG_P * added) + 2 * HINT_LOG_P
+        if (cost_before - cost_after) / (cost_after / remaining) > threshold:
+            ratio = float(np.sqrt(cost_after / remaining / (cost_before / (remaining + added))))
+            best = min(best, (ratio, name))
+    ratio, name = best
     return name and (
-        f"what is left goes with the joints' values as {FAMILIES[name].description} would; "
-        f"--extend auto may leave about {100 * share:.0f} % of it"
+        f"residuals vary with the joint values ({FAMILIES[name].description}?); "
+        f"--extend auto may reduce them by about {100 * (1 - ratio):.0f} %"
     )
 
 
@@ -270,27 +310,29 @@ def extend(
     families: Sequence[str] = EXTENSIONS,
     **options: Any,
 ) -> tuple[Result, tuple[FamilyTrial, ...]]:
-    """`calibrate`, with those families of joints' transmission errors added that the data ask for.
-
-    All unknowns are solved together in the end, as an extension shares directions with the geometry.
+    """Calibrate with those families of joint errors that the measurements support.
 
     Args:
-        chain: the nominal robot.
-        data: one measurement or several of any kinds.
-        parameters: sets of `parameters.SETS`; the chain's own default without it.
-        families: those that may be added.
-        options: of `calibrate`; method lm and priors are needed.
+        chain: Nominal robot.
+        data: One measurement or several of any kinds.
+        parameters: Names of parameter sets, separated by commas; the chain's own default set if not given.
+        families: Names of `estimation.EXTENSIONS` that may be added.
+        **options: Keyword arguments of `calibrate`; method "lm" and priors are required.
+
+    Returns:
+        Result with the selected families, and the trials of all families.
 
     Raises:
-        DhcalError: as `calibrate`, or an unknown family, no priors, or another method than lm.
+        InvalidArgumentError: If the method is not "lm" or there are no priors.
     """
+    require_chain(chain)
     priors = options.get("priors") or "default"
     if families and (options.get("method", "lm") != "lm" or priors == "none"):
-        raise DhcalError(
-            "an extension is chosen by method lm with priors: leave out --method gn, --priors none"
+        raise InvalidArgumentError(
+            "an extension requires method lm and priors; leave out --method gn and --priors none"
         )
     parameters = chain.parameters if parameters is None else parameters
-    fit = procedure.calibrate(chain, data, parameters, **options)
+    fit = calibrate(chain, data, parameters, **options)
     trials = select_error_families(fit, families, options.get("progress"))
     widths = {trial.family: trial.prior_width for trial in trials if trial.is_selected}
     if not widths:
@@ -298,17 +340,20 @@ def extend(
     narrowed = {
         p.name: p.prior * width for name, width in widths.items() for p in PARAMETER_SETS[name](chain)
     }
-    own = {} if isinstance(priors, str) else dict(priors)
-    options["priors"] = narrowed | own
-    return procedure.calibrate(chain, data, ",".join([parameters, *widths]), **options), trials
-
-
-# All that positions and poses can tell of any arm, wherever instrument and target are.
-FULL_SET = "minimal,base,tool"
+    stated = {} if isinstance(priors, str) else dict(priors)
+    options["priors"] = narrowed | stated
+    return calibrate(chain, data, ",".join([parameters, *widths]), **options), trials
 
 
 def is_restricted(sets: Sequence[str]) -> bool:
-    """Whether sets are of the robot, and fewer than EVERYTHING."""
+    """Check whether parameter sets describe the robot, but fewer of its errors than `FULL_SET`.
+
+    Args:
+        sets: Names of parameter sets.
+
+    Returns:
+        Whether the full set has parameters that these sets lack.
+    """
     frames = {"base", "tool"}
-    full = frames <= set(sets) and {"minimal", "placement"} & set(sets)
-    return not full and not set(sets) <= frames
+    is_full = frames <= set(sets) and {"minimal", "placement"} & set(sets)
+    return not is_full and not set(sets) <= frames

@@ -24,6 +24,7 @@ from .._typing import Array
 from ..estimation.problem import Problem, merge_instrument_parameters
 from ..exceptions import InvalidArgumentError, NotObservableError
 from ..measurements.base import Measurement
+from .arguments import as_measurements
 
 # Joint values that differ by less are the same configuration [rad or m].
 CONFIGURATION_TOL = 1e-6
@@ -135,14 +136,14 @@ def configuration_groups(data: Sequence[Measurement]) -> Array:
 
 
 def split(
-    data: Sequence[Measurement], fraction: float, seed: int = 0
+    data: Measurement | Sequence[Measurement], fraction: float, seed: int = 0
 ) -> tuple[tuple[Measurement, ...], tuple[Measurement, ...]]:
     """Split measurements into a fitted and a held-out part at random.
 
     The fraction is taken of each measurement, as closely as whole configurations allow.
 
     Args:
-        data: Measurements of any kinds.
+        data: One measurement or several of any kinds.
         fraction: Fraction of the samples to hold out, in [0, 1).
         seed: Seed of the random numbers.
 
@@ -152,6 +153,7 @@ def split(
     Raises:
         InvalidArgumentError: If the fraction is out of range.
     """
+    data = as_measurements(data)
     if not 0 <= fraction < 1:
         raise InvalidArgumentError(f"holdout={fraction}: expected a fraction in [0, 1)")
     rng = np.random.default_rng(seed)
@@ -174,11 +176,11 @@ def split(
     return tuple(fitted), tuple(item for item in held_out if len(item.rows))
 
 
-def k_fold(data: Sequence[Measurement], count: int, seed: int = 0) -> tuple[Fold, ...]:
+def k_fold(data: Measurement | Sequence[Measurement], count: int, seed: int = 0) -> tuple[Fold, ...]:
     """Divide configurations into folds at random; each fold holds out one share of them.
 
     Args:
-        data: Measurements of any kinds.
+        data: One measurement or several of any kinds.
         count: Number of folds.
         seed: Seed of the random numbers.
 
@@ -186,8 +188,9 @@ def k_fold(data: Sequence[Measurement], count: int, seed: int = 0) -> tuple[Fold
         The folds; each sample is held out in exactly one of them.
 
     Raises:
-        InvalidArgumentError: If there are fewer than two folds, or more folds than configurations.
+        InvalidArgumentError: If there are fewer than two folds or more folds than configurations.
     """
+    data = as_measurements(data)
     labels = configuration_groups(data)
     n_configurations = int(labels.max(initial=-1)) + 1
     if not 2 <= count <= n_configurations:
@@ -198,13 +201,13 @@ def k_fold(data: Sequence[Measurement], count: int, seed: int = 0) -> tuple[Fold
     return leave_one_group_out(data, fold_of[labels])
 
 
-def leave_one_group_out(data: Sequence[Measurement], labels: Array) -> tuple[Fold, ...]:
+def leave_one_group_out(data: Measurement | Sequence[Measurement], labels: Array) -> tuple[Fold, ...]:
     """Make one fold per group of samples, which holds out that group.
 
     Groups that have a configuration in common are merged.
 
     Args:
-        data: Measurements of any kinds, m samples in all.
+        data: One measurement or several of any kinds, m samples in all.
         labels: Group of each sample, shape (m,).
 
     Returns:
@@ -213,6 +216,7 @@ def leave_one_group_out(data: Sequence[Measurement], labels: Array) -> tuple[Fol
     Raises:
         InvalidArgumentError: If there is not one label per sample, or only one group.
     """
+    data = as_measurements(data)
     labels = np.asarray(labels)
     if labels.shape != (samples := sum(len(item.rows) for item in data),):
         raise InvalidArgumentError(f"labels have shape {labels.shape}; expected ({samples},), one per sample")
@@ -227,7 +231,7 @@ def leave_one_group_out(data: Sequence[Measurement], labels: Array) -> tuple[Fol
 
 
 def blocked_folds(
-    data: Sequence[Measurement], fraction: float = BLOCK_FRACTION, groups: Array | None = None
+    data: Measurement | Sequence[Measurement], fraction: float = BLOCK_FRACTION, groups: Array | None = None
 ) -> tuple[Fold, ...]:
     """Make two folds per principal direction of the joint values, which hold out its ends.
 
@@ -235,7 +239,7 @@ def blocked_folds(
     are held out together. If there is only one group, each configuration is its own group.
 
     Args:
-        data: Measurements of any kinds, m samples in all.
+        data: One measurement or several of any kinds, m samples in all.
         fraction: Fraction of the groups that a fold holds out.
         groups: Labels of samples that belong together, shape (m,), as from `contact_groups`; without it each
             configuration is its own group. Samples without a configuration go with their group, or are
@@ -247,6 +251,7 @@ def blocked_folds(
     Raises:
         NotObservableError: If all samples have the same joint values.
     """
+    data = as_measurements(data)
     has_configuration = np.concatenate(
         [np.full(len(item.rows), item.configurations_per_row > 0) for item in data]
     )

@@ -1,11 +1,26 @@
-"""From a nominal chain and measurements to a calibrated one."""
+"""Calibration procedure: from a nominal chain and measurements to a calibrated one.
+
+`calibrate` runs these stages in sequence:
+
+1. Select the parameters x of the robot that are unknown (`estimation.select_parameters`).
+2. Initialize unknown base and tool frames and instrument parameters (`initialization`).
+3. Minimize the cost (`estimation.minimize`)
+
+       C(x) = Σ ‖r_i(x)‖² + ‖W·x‖²,
+
+   with r_i the residual of a sample, divided by its standard deviation, and W one over the standard
+   deviations of the priors.
+4. Estimate noise scales, prior widths and robust weights from the fit, and repeat (`reweighting`).
+5. Reduce the correction if there are too few measurements to determine it (`shrinkage`).
+6. Return the evidence together with the calibrated chain (`result`).
+"""
 
 from __future__ import annotations
 
 import fnmatch
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,48 +30,17 @@ from ..estimation.parameters import select_parameters
 from ..estimation.priors import PriorGroups, Priors, has_default_prior, prior_weights
 from ..estimation.problem import Problem, merge_instrument_parameters
 from ..estimation.solver import METHODS, Progress, minimize
-from ..exceptions import DhcalError
+from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..measurements.base import Measurement
 from ..parallel import SERIAL, TaskExecutor
 from ..robot.chain import BASE_FRAME, Chain
+from .arguments import as_measurements, require_chain
 from .initialization import fit_frames, initialize_frames, make_problem
 from .result import Result
 from .reweighting import Fit, reweight
 from .shrinkage import compute_shrinkage_factor
 
 Method = Literal["lm", "gn"]
-
-
-def _bounds(problem: Problem, bounds: Mapping[str, tuple[float, float]]) -> Array:
-    """Least and largest x (2, p+s) of values that are bounded by name."""
-    outside = (BASE_FRAME, problem.errors.chain.tool_frame_index)
-    inside = [p for p in problem.errors.parameters if p.error_frame not in outside]
-    out = np.tile([[-np.inf], [np.inf]], len(problem.weights))
-    for pattern, (low, high) in bounds.items():
-        hit = [p for p in inside if fnmatch.fnmatchcase(p.name, pattern)]
-        if not hit:
-            raise DhcalError(
-                f"bounds for {pattern!r}: no such parameter; there are {', '.join(p.name for p in inside)}"
-            )
-        for p in hit:
-            if not low <= p.nominal <= high:
-                raise DhcalError(
-                    f"bounds for {pattern!r}: {low} to {high} must hold the nominal {p.nominal:g} of {p.name}"
-                )
-            out[:, problem.errors.parameters.index(p)] = low - p.nominal, high - p.nominal
-    return out
-
-
-def _validated_known(data: tuple[Measurement, ...], known: Mapping[str, float]) -> Mapping[str, float]:
-    """The known values, after checking that each belongs to an unknown of the data."""
-    names = [unknown.name for unknown in merge_instrument_parameters(data) if not unknown.is_local]
-    for name, value in known.items():
-        if name not in names:
-            there = f"there are {', '.join(names)}" if names else "these measurements bring none"
-            raise DhcalError(f"known {name!r}: no unknown of an instrument; {there}")
-        if not np.isfinite(value):
-            raise DhcalError(f"known {name!r}: {value} is not a finite number")
-    return known
 
 
 def calibrate(
@@ -68,7 +52,7 @@ def calibrate(
     priors: Priors | None = None,
     fix: Sequence[str] = (),
     free: Sequence[str] = (),
-    holdout: Sequence[Measurement] = (),
+    holdout: Measurement | Sequence[Measurement] = (),
     known: Mapping[str, float] | None = None,
     loss: str = "auto",
     bounds: Mapping[str, tuple[float, float]] | None = None,
@@ -76,36 +60,42 @@ def calibrate(
     progress: Progress | None = None,
     executor: TaskExecutor = SERIAL,
 ) -> Result:
-    """Identify a chain's errors from measurements.
+    """Identify the kinematic errors of a robot from measurements.
+
+    Standard deviations that an instrument does not state are estimated with the fit, one per group of
+    residuals. Default priors take the size of the identified errors. Measurements without a length scale,
+    such as contacts with unknown points, leave the size of the robot to other measurements and to the priors.
+
+    Unknown names and values raise `UnknownNameError`, arguments of a wrong type or contradicting options
+    `InvalidArgumentError`, and a diverging Gauss-Newton iteration `ConvergenceError`.
 
     Args:
-        chain: the nominal robot.
-        data: one measurement or several of any kinds.
-        parameters: sets of `parameters.SETS`; the chain's own default without it.
-        method: "lm", or "gn" for the paper's loop, which weighs metres and radians alike.
-        priors: "default", "none", or sigmas by parameter name or pattern over the default ones, each in
-            its parameter's unit. Without it "default" for lm and "none" for gn.
-        fix: parameters or sets held at nominal.
-        free: single parameters of any set added.
-        holdout: measurements to judge by, not fitted.
-        known: values in m and rad of instruments' unknowns by name, such as a surveyed anchor
-            `wire1.x`; they are held.
-        loss: "auto" lets every sample count alike but gross errors, which count for nothing; "linear" lets
-            them count, "huber", "cauchy" and "tukey" weigh by size. "auto" is "linear" with the paper's loop.
-        bounds: least and largest values in m and rad by the names or patterns of the robot's parameters;
-            base and tool stay free.
-        max_iterations: most steps of a loop.
-        progress: called with the iteration and the cost.
-        executor: what chunks of many samples are shared out to.
+        chain: Nominal robot.
+        data: One measurement or several of any kinds.
+        parameters: Names of parameter sets, keys of `estimation.PARAMETER_SETS`; the chain's own default set
+            if not given.
+        method: "lm" (Levenberg-Marquardt), or "gn" for the Gauss-Newton iteration of the paper, which weights
+            metres and radians equally.
+        priors: "default", "none", or standard deviations by parameter name or pattern on top of the default
+            ones, each in the unit of its parameter; "default" for "lm" and "none" for "gn" if not given.
+        fix: Names of parameters or sets to hold at their nominal values.
+        free: Names of single parameters of any set to identify as well.
+        holdout: Measurements that are not fitted but used to judge the result.
+        known: Values of instrument parameters by name, such as a surveyed anchor `wire1.x` [m or rad].
+        loss: "auto" rejects outliers and weights all other samples equally; "linear" weights all samples
+            equally; "huber", "cauchy" and "tukey" reduce the weight with the residual. Method "gn" always
+            weights all samples equally.
+        bounds: Lowest and highest values by name or pattern of the robot's parameters [m or rad]; base and
+            tool have no bounds.
+        max_iterations: Largest number of iterations of one solution.
+        progress: Called after each iteration with its number and the cost.
+        executor: Executor of the chunks of many samples.
 
-    Sigmas that no instrument states are estimated with the fit, a group of rows at a time, and default
-    priors take the size of the errors that are found, so that data and priors weigh right against each
-    other. Readings without a length leave the arm's size to others, and to the priors.
-
-    Raises:
-        DhcalError: no data, unknown names, or a plain Gauss-Newton loop that runs away.
+    Returns:
+        Calibrated chain with uncertainty and accuracy.
     """
-    data = tuple(data) if isinstance(data, Sequence) else (data,)
+    require_chain(chain)
+    data, holdout = as_measurements(data), as_measurements(holdout, "holdout")
     _check_options(data, method, loss, bounds)
     for item in (*data, *holdout):
         chain.validated_q(item.configurations())
@@ -118,12 +108,12 @@ def calibrate(
     if bounds:
         problem = replace(problem, bounds=_bounds(problem, bounds))
     fit = _solve(problem, method, max_iterations, progress)
-    kept = 1.0
+    shrinkage_factor = 1.0
     if method == "lm":
-        families = PriorGroups.from_expected(errors, problem.weights, has_default_prior(errors, priors))
-        fit = reweight(fit, loss, families, max_iterations, progress)
-        kept = compute_shrinkage_factor(fit.problem, fit.solution, families.groups())
-    return _result(fit, kept, tuple(holdout), method)
+        groups = PriorGroups.from_expected(errors, problem.weights, has_default_prior(errors, priors))
+        fit = reweight(fit, loss, groups, max_iterations, progress)
+        shrinkage_factor = compute_shrinkage_factor(fit.problem, fit.solution, groups.groups())
+    return _make_result(fit, shrinkage_factor, holdout, method)
 
 
 def _check_options(
@@ -132,51 +122,86 @@ def _check_options(
     loss: str,
     bounds: Mapping[str, tuple[float, float]] | None,
 ) -> None:
-    """Raise DhcalError if there are no data or options contradict each other."""
+    """Raise an error if there are no data, an option is unknown, or options contradict each other."""
     if not sum(len(item.rows) for item in data):
-        raise DhcalError("no measurements to fit")
+        raise InvalidArgumentError("no measurements to fit; expected at least one sample")
     if method not in METHODS:
-        raise DhcalError(f"method {method!r}: choose from {', '.join(METHODS)}")
+        raise UnknownNameError(f"unknown method {method!r}; choose from {', '.join(METHODS)}")
     if loss not in robust.LOSSES:
-        raise DhcalError(f"loss {loss!r}: choose from {', '.join(robust.LOSSES)}")
+        raise UnknownNameError(f"unknown loss {loss!r}; choose from {', '.join(robust.LOSSES)}")
     if loss not in ("auto", "linear") and method != "lm":
-        raise DhcalError(f"loss {loss!r} needs method lm; the paper's loop weighs all rows alike")
+        raise InvalidArgumentError(
+            f"loss {loss!r} requires method 'lm'; method {method!r} weights all samples equally"
+        )
     if bounds and method != "lm":
-        raise DhcalError("bounds need method lm; the paper's loop knows none")
+        raise InvalidArgumentError(f"bounds require method 'lm'; method {method!r} does not support bounds")
+
+
+def _validated_known(data: tuple[Measurement, ...], known: Mapping[str, float]) -> Mapping[str, float]:
+    """Return the known values after a check that each belongs to an instrument parameter of the data."""
+    names = [parameter.name for parameter in merge_instrument_parameters(data) if not parameter.is_local]
+    for name, value in known.items():
+        if name not in names:
+            choice = f"choose from {', '.join(names)}" if names else "these measurements have none"
+            raise UnknownNameError(f"known {name!r}: unknown instrument parameter; {choice}")
+        if not np.isfinite(value):
+            raise InvalidArgumentError(f"known {name!r}: {value} is not a finite number; expected m or rad")
+    return known
+
+
+def _bounds(problem: Problem, bounds: Mapping[str, tuple[float, float]]) -> Array:
+    """Return the lowest and highest x, shape (2, p), from bounds of values by name or pattern."""
+    frames = (BASE_FRAME, problem.errors.chain.tool_frame_index)
+    robot = [p for p in problem.errors.parameters if p.error_frame not in frames]
+    limits = np.tile([[-np.inf], [np.inf]], len(problem.weights))
+    for pattern, (low, high) in bounds.items():
+        bounded = [p for p in robot if fnmatch.fnmatchcase(p.name, pattern)]
+        if not bounded:
+            raise UnknownNameError(
+                f"bounds for {pattern!r}: no such parameter; choose from {', '.join(p.name for p in robot)}"
+            )
+        for p in bounded:
+            if not low <= p.nominal <= high:
+                raise InvalidArgumentError(
+                    f"bounds for {pattern!r}: [{low}, {high}] must contain the nominal value {p.nominal:g} "
+                    f"of {p.name}"
+                )
+            limits[:, problem.errors.parameters.index(p)] = low - p.nominal, high - p.nominal
+    return limits
 
 
 def _solve(problem: Problem, method: Method, max_iterations: int, progress: Progress | None) -> Fit:
     """Solve a problem with unit weights; `reweight` iterates method "lm" to full convergence later."""
-    options = {"loose": True} if method == "lm" else {}
+    options: dict[str, Any] = {"loose": True} if method == "lm" else {}
     solution = minimize(problem, method, None, max_iterations, progress, **options)
     weights = tuple(np.ones(len(item.rows)) for item in problem.data)
     fit = Fit(problem.data, problem, solution, weights)
     errors = problem.errors
     if not errors.has_transmission:
         return fit
-    # The gravity torques depend on the arm that was found: solve again with those.
+    # Gravity torques depend on the identified robot: solve again with those of the solution.
     problem = replace(problem, errors=errors.with_current_loads(solution.x[: len(errors.parameters)]))
-    again = minimize(problem, method, solution.x, max_iterations, progress, **options)
-    return replace(fit, problem=problem, solution=again, previous_iterations=solution.iterations)
+    second = minimize(problem, method, solution.x, max_iterations, progress, **options)
+    return replace(fit, problem=problem, solution=second, previous_iterations=solution.iterations)
 
 
-def _result(fit: Fit, kept: float, holdout: tuple[Measurement, ...], method: str) -> Result:
-    """Build the result from a fit and the fraction of its correction that is kept."""
+def _make_result(fit: Fit, shrinkage_factor: float, holdout: tuple[Measurement, ...], method: str) -> Result:
+    """Apply the shrinkage factor to the solution of a fit and build the result."""
     problem, errors = fit.problem, fit.problem.errors
-    x = kept * fit.solution.x
-    if kept:
-        found = errors.at(x[: len(errors.parameters)]).with_current_loads()
+    x = shrinkage_factor * fit.solution.x
+    if shrinkage_factor:
+        calibrated = errors.at(x[: len(errors.parameters)]).with_current_loads()
     else:
-        found = fit_frames(errors, fit.data, problem.known)
+        calibrated = fit_frames(errors, fit.data, problem.known)
     return Result(
         errors=errors,
         x=x,
-        chain=found,
+        chain=calibrated,
         data=fit.data,
         holdout=holdout,
         problem=problem,
         solution=replace(fit.solution, iterations=fit.iterations),
         method=method,
         weights=fit.weights,
-        shrinkage_factor=kept,
+        shrinkage_factor=shrinkage_factor,
     )

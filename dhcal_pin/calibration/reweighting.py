@@ -2,18 +2,32 @@
 
 The least-squares problem depends on three sets of numbers that are not known beforehand:
 
-- the standard deviation of each group of residuals whose instrument does not state it (variance components),
-- the width of the default priors (evidence procedure, MacKay 1992),
-- the weight of each sample under a robust loss (iteratively reweighted least squares).
+1. The standard deviations of residual groups whose instrument does not state them. Group g has a scale
 
-Each round estimates all three from the current solution, and solves the problem again. The rounds end when
-none of the numbers changes by more than 1 %.
+       s_g² = Σ_i w_i·‖r_gi‖² / (m_g·(1 - rank/m)),
+
+   with r_gi the residuals in units of the placeholder standard deviation, w_i robust weights, m_g the
+   weighted rows of the group and m those of all groups. This is a variance component estimate (Helmert
+   1907; Foerstner 1979) that shares the loss of degrees of freedom equally among the rows.
+2. The widths of the default priors, from the evidence procedure (MacKay 1992), see `estimation.priors`.
+3. The weight of each sample under a robust loss, from iteratively reweighted least squares, see
+   `estimation.robust`.
+
+Each round estimates all three from the current solution and solves the problem again, starting from it.
+Early rounds solve loosely. The rounds end when none of the numbers changes by more than 1 % and the last
+solution was iterated to full convergence.
+
+References:
+    F. R. Helmert, Die Ausgleichungsrechnung nach der Methode der kleinsten Quadrate, Teubner 1907.
+    W. Foerstner, Ein Verfahren zur Schaetzung von Varianz- und Kovarianzkomponenten, AVN 86, 1979.
+    D. J. C. MacKay, Bayesian Interpolation, Neural Computation 4, 1992.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,6 +45,8 @@ MIN_SIGMA_SCALE = 1e-6
 MAX_ROUNDS = 30
 # Rounds end when no scale, prior or weight changes by more than this fraction.
 CHANGE_TOL = 0.01
+# Stands in for the weight 0 of a parameter without a prior, to divide by.
+MIN_WEIGHT = 1e-300
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +136,7 @@ def _next_round(
         weights, change = robust.update_weights(weights, residuals, stage, state.weight_change)
         weighted = tuple(item.with_weights(w) for item, w in zip(weighted, weights, strict=True))
     priors = update_prior_scales(problem, solution, groups)
-    relative = np.log(scales / state.scales), (priors - problem.weights) / np.fmax(expected, 1e-300)
+    relative = np.log(scales / state.scales), (priors - problem.weights) / np.fmax(expected, MIN_WEIGHT)
     has_settled = max(change, *(np.abs(each).max(initial=0.0) for each in relative)) < CHANGE_TOL
     state = replace(state, fit=replace(fit, weights=tuple(weights)), weight_change=change)
     if has_settled and len(state.stages) > 1:
@@ -133,30 +149,38 @@ def _next_round(
         return replace(state, is_done=True)
     is_final = has_settled or rounds_left < 2
     if has_settled or all(new is old for new, old in zip(weighted, problem.data, strict=True)):
-        # Same rows: continue the previous iteration with the new priors.
-        problem, before, earlier = problem.with_prior_weights(priors), solution, fit.previous_iterations
+        # The rows are the same: continue the previous iteration with the new priors.
+        problem = problem.with_prior_weights(priors)
+        warm_start, previous_iterations = solution, fit.previous_iterations
     else:
-        problem, before, earlier = (
-            problem.with_data(weighted).with_prior_weights(priors),
-            None,
-            fit.iterations,
-        )
+        problem = problem.with_data(weighted).with_prior_weights(priors)
+        warm_start, previous_iterations = None, fit.iterations
         state = replace(state, scales=scales)
     solution = minimize(
-        problem, "lm", solution.x, max_iterations, progress, warm_start=before, loose=not is_final
+        problem, "lm", solution.x, max_iterations, progress, warm_start=warm_start, loose=not is_final
     )
-    fit = replace(state.fit, problem=problem, solution=solution, previous_iterations=earlier)
+    fit = replace(state.fit, problem=problem, solution=solution, previous_iterations=previous_iterations)
     return replace(state, fit=fit, is_final=is_final)
 
 
 def estimate_variance_components(
     problem: Problem, solution: SolverResult, data: tuple[Measurement, ...], weights: Sequence[Array]
 ) -> Array:
-    """How many of its sigmas each group of rows scatters in the fit, all items' groups in a row (g,).
+    """Estimate one noise scale per residual group from the residuals of a fit.
 
-    One where the instrument states its sigmas, or where there are not more rows than directions seen. A
-    group of no more rows than that could be met exactly, whatever it reads, and tells no scatter of its
-    own: it takes the one of all rows of its unit, and where the others are stated that of a placeholder.
+    Groups with stated standard deviations keep scale 1, and so do all groups if there are not more rows than
+    observable directions. A group with no more rows than that could be fitted exactly, so its residuals
+    do not show its noise. It takes the pooled scale of all groups of its unit that do not state their
+    standard deviations, or 1 if it is the only one.
+
+    Args:
+        problem: Problem that was solved.
+        solution: Solution of `problem`.
+        data: Measurements with their own standard deviations, without robust weights.
+        weights: Robust weight of each sample, one array of shape (m,) per measurement.
+
+    Returns:
+        Scales of shape (g,), in the order of the residual groups of the measurements.
     """
     if all(item.has_stated_sigma for item in data):
         return np.ones(sum(len(item.residual_groups) for item in data))
@@ -168,29 +192,54 @@ def estimate_variance_components(
         for item in data
     ]
     counts = [w.sum() for w in weights]
-    seen = qr.rank(solution.system.r)
-    share = 1 - seen / sum(len(r) * count for r, count in zip(residuals, counts, strict=True))
-    # Of each group: whether it is of angles, whether it is stated, its rows, and the sum of their squares.
+    rank = qr.rank(solution.system.r)
+    freedom = 1 - rank / sum(len(r) * count for r, count in zip(residuals, counts, strict=True))
     groups = [
-        (name == "orientation", item.has_stated_sigma, len(r[rows]) * count, np.sum(r[rows] ** 2 * w))
+        _ResidualGroup(
+            name == "orientation",
+            item.has_stated_sigma,
+            len(r[rows]) * count,
+            np.sum(r[rows] ** 2 * w),
+        )
         for item, r, w, count in zip(data, residuals, weights, counts, strict=True)
         for name, rows in item.residual_groups.items()
     ]
-    out = np.ones(len(groups))
-    for i, (angle, stated, rows, squares) in enumerate(groups if share > 0 else ()):
-        alike = [group for group in groups if group[0] == angle]
-        pooled = [group for group in alike if not group[1]]
-        if rows <= seen and len(alike) > 1:
-            rows, squares = (sum(group[k] for group in pooled) for k in (2, 3))
-            stated = stated or len(pooled) == 1
-        if not stated:
-            out[i] = max(float(np.sqrt(squares / (rows * share))), MIN_SIGMA_SCALE)
-    return out
+    scales = np.ones(len(groups))
+    for i, group in enumerate(groups if freedom > 0 else ()):
+        same_unit = [other for other in groups if other.is_angle == group.is_angle]
+        pooled = [other for other in same_unit if not other.is_stated]
+        n_rows, squares, is_stated = group.n_rows, group.squares, group.is_stated
+        if n_rows <= rank and len(same_unit) > 1:
+            n_rows = sum(other.n_rows for other in pooled)
+            squares = sum(other.squares for other in pooled)
+            is_stated = is_stated or len(pooled) == 1
+        if not is_stated:
+            scales[i] = max(float(np.sqrt(squares / (n_rows * freedom))), MIN_SIGMA_SCALE)
+    return scales
+
+
+class _ResidualGroup(NamedTuple):
+    """Residual group of one measurement: unit, weighted number of rows and sum of their squares."""
+
+    is_angle: bool
+    is_stated: bool
+    n_rows: float
+    squares: float
 
 
 def with_sigma_scales(data: tuple[Measurement, ...], scales: Array) -> tuple[Measurement, ...]:
-    """Scale the standard deviations of each group of rows."""
+    """Scale the standard deviations of each residual group.
+
+    Args:
+        data: Measurements.
+        scales: Scales of shape (g,), in the order of the residual groups of the measurements.
+
+    Returns:
+        The measurements with scaled standard deviations; the same objects if all scales are 1.
+    """
     if np.all(scales == 1):
         return data
-    left = iter(scales.tolist())
-    return tuple(item.with_scaled_sigma({name: next(left) for name in item.residual_groups}) for item in data)
+    remaining = iter(scales.tolist())
+    return tuple(
+        item.with_scaled_sigma({name: next(remaining) for name in item.residual_groups}) for item in data
+    )

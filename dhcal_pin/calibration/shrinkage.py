@@ -1,8 +1,39 @@
-"""How much of a correction few readings warrant: no more than will hardly leave the arm worse than nominal.
+"""Shrinkage: the fraction of a correction that too few measurements warrant.
 
-Few readings are met by many arms. Which of them is likely is a matter of how large errors are expected to be,
-and that is known only roughly. So the chance that a fit moves the tool away from where it is gets taken over
-all widths of the priors, each as far as the readings speak for it.
+With fewer equations than parameters many robots fit the measurements equally well. The solution x̂ is the
+most likely one under the priors, but the widths of the priors are only roughly known, and the correction
+may leave the robot worse than nominal. As in James-Stein estimation and in shrinkage of regression
+predictors (Copas), the correction c·x̂ with a factor 0 <= c <= 1 is then safer than x̂. Here c is the
+largest factor whose probability of harm is at most 0.2 %.
+
+Harm. At N configurations over the joint range, x̂ moves the tool by d = J·x̂ and the true errors x move it by
+e = J·x, with base and tool following as the measurements require. The correction c·d leaves a larger error
+than no correction, |e - c·d|² > |e|², if and only if
+
+    c·|d|² > 2·a,    a = dᵀ·e.
+
+Distribution of a. The whitened measurements, after elimination of base, tool and instrument parameters, are
+y = A·x + ε with ε ~ N(0, I). Group g of the errors has the prior x_g ~ N(0, w_g²·P_g) with an unknown width
+w_g. For given widths w everything is normal:
+
+    S(w)    = I + Σ_g w_g²·A_g·P_g·A_gᵀ              covariance of y
+    k(w)    =     Σ_g w_g²·A_g·P_g·J_gᵀ·d            covariance of y and a
+    log p(y|w) = -½·log|S| - ½·yᵀ·S⁻¹·y + const      evidence (MacKay 1992)
+    E[a|y,w]   = kᵀ·S⁻¹·y
+    Var[a|y,w] = Σ_g w_g²·dᵀ·J_g·P_g·J_gᵀ·d - kᵀ·S⁻¹·k
+
+Average over the widths. ln w_g ~ N(0, 1.5²) on a grid of powers of 2 from 1/16 to 16 gives the posterior
+p(w|y) ∝ p(y|w)·p(w) and
+
+    P(harm | c) = Σ_w p(w|y)·Φ((½·c·|d|² - E[a|y,w]) / sqrt(Var[a|y,w])).
+
+Shapes: p unknowns, i errors of the robot's links and joints, o other unknowns, r whitened rows, f groups,
+w combinations of widths.
+
+References:
+    W. James and C. Stein, Estimation with Quadratic Loss, Proc. 4th Berkeley Symposium, 1961.
+    J. B. Copas, Regression, Prediction and Shrinkage, J. Royal Statistical Society B 45, 1983.
+    D. J. C. MacKay, Bayesian Interpolation, Neural Computation 4, 1992.
 """
 
 from __future__ import annotations
@@ -19,137 +50,144 @@ from ..estimation.qr import RANK_RTOL, TriangularSystem, rank
 from ..estimation.solver import SolverResult
 from ..robot.chain import BASE_FRAME
 
-# The greatest chance of an arm that is worse than nominal.
+# Largest accepted probability that the calibrated robot is worse than the nominal one.
 MAX_HARM_PROBABILITY = 0.002
-
-
-# Widths of the priors, as multiples of the usual ones, and the standard deviation of their logarithm.
-PRIOR_WIDTHS, LOG_WIDTH_STD = 2.0 ** np.arange(-4, 5), 1.5
-
-
-# Configurations where the tool is judged.
+# Widths of the priors as multiples of the default ones.
+PRIOR_WIDTHS = 2.0 ** np.arange(-4, 5)
+# Standard deviation of the logarithm of the widths.
+LOG_WIDTH_STD = 1.5
+# Number of configurations at which the tool is compared.
 N_CONFIGURATIONS = 32
-
-
-# Readings are taken for no better than this share of the largest that an error could make of them.
+# Smallest noise, relative to the largest effect that an error of the widest prior has on a measurement.
 NOISE_FLOOR = 1e-6
+# Steps in which the factor is searched.
+N_FACTORS = 101
+
+
+def compute_shrinkage_factor(
+    problem: Problem, solution: SolverResult, groups: Sequence[tuple[Sequence[int], float]]
+) -> float:
+    """Compute the largest factor of a solution that is hardly worse than the nominal robot.
+
+    Args:
+        problem: Problem that was solved; its chain has base and tool frames that fit the nominal robot.
+        solution: Solution of `problem`.
+        groups: Parameters that share one unknown prior width, and one over the default standard deviation of
+            their priors.
+
+    Returns:
+        Factor c from 0 to 1; 1 if there are more equations than parameters or than observable directions, as
+        their residuals show how reliable the solution is.
+    """
+    errors, x = problem.errors, solution.x
+    n_rows = sum(len(item.rows) * item.residual_dim for item in problem.data)
+    if n_rows > len(x) or n_rows > rank(solution.system.r) or not groups:
+        return 1.0
+    frames = (BASE_FRAME, errors.chain.tool_frame_index)
+    robot = np.array([i for i, p in enumerate(errors.parameters) if p.error_frame not in frames], int)
+    if not x[robot].any():
+        return 1.0
+    others = np.setdiff1d(np.arange(len(x)), robot)
+    dependence, rows, measured = _eliminate(solution.system, x, robot, others)
+    displacement = _displacements(problem, x, robot, dependence)
+    change = displacement @ x[robot]
+    # Stated priors and those of joint errors keep their widths; they form the last group, of width 1.
+    std, members_of = 1 / problem.weights[robot], []
+    for members, default_weight in groups:
+        if errors.parameters[members[0]].coefficient_index is None:
+            members_of.append(np.isin(robot, members))
+            std[members_of[-1]] = 1 / default_weight
+    widths = np.array([[*row, 1.0] for row in itertools.product(PRIOR_WIDTHS, repeat=len(members_of))])
+    members_of.append(~np.any(members_of, 0))
+    rows, effect = rows * std, displacement.T @ change * std
+    noise = max(1.0, NOISE_FLOOR * float(np.abs(rows).max()) * PRIOR_WIDTHS.max())
+    rows, measured = rows / noise, measured / noise
+    log_evidence, mean, effect_std = _Evidence(
+        np.stack([rows[:, group] @ rows[:, group].T for group in members_of]),
+        np.stack([rows[:, group] @ effect[group] for group in members_of]),
+        np.array([np.sum(effect[group] ** 2) for group in members_of]),
+        measured,
+    ).at(widths)
+    log_posterior = log_evidence - 0.5 * np.sum((np.log(widths) / LOG_WIDTH_STD) ** 2, 1)
+    posterior = np.exp(log_posterior - log_posterior.max())
+    return _largest_safe_factor(mean, effect_std, posterior / posterior.sum(), float(change @ change))
+
+
+def _eliminate(system: TriangularSystem, x: Array, robot: Array, others: Array) -> tuple[Array, Array, Array]:
+    """Eliminate the other unknowns from the rows of the system.
+
+    Returns:
+        Least-squares change of the others per robot error (o, i), remaining rows (r, i) and right-hand side
+        (r,).
+    """
+    measured = system.z + system.r @ x
+    u, s, vt = np.linalg.svd(system.r[:, others], full_matrices=False)
+    is_observable = s > RANK_RTOL * s.max(initial=0.0)
+    u, s, vt, rows = u[:, is_observable], s[is_observable], vt[is_observable], system.r[:, robot]
+    return -vt.T @ ((u.T @ rows) / s[:, None]), rows - u @ (u.T @ rows), measured - u @ (u.T @ measured)
+
+
+def _displacements(problem: Problem, x: Array, robot: Array, dependence: Array) -> Array:
+    """Compute the tool displacement per robot error, (3·N, i), at N configurations over the joint range."""
+    from ..robot.sampling import joint_range  # lazy import: slow, and few calibrations need it
+
+    errors, n_parameters = problem.errors, len(problem.errors.parameters)
+    chain, bodies, twists = errors.derivative(x[:n_parameters])
+    q = np.random.default_rng(0).uniform(*joint_range(chain), (N_CONFIGURATIONS, chain.n_joints))
+    jacobian = np.zeros((3 * N_CONFIGURATIONS, len(x)))
+    jacobian[:, :n_parameters] = (
+        chain.tool_jacobian(chain.forward_kinematics(q), bodies, twists)[:, :3].reshape(n_parameters, -1).T
+    )
+    return jacobian[:, robot] + np.delete(jacobian, robot, 1) @ dependence
 
 
 @dataclass(frozen=True, eq=False)
 class _Evidence:
-    """What readings say of errors in f groups, each of a width of its own, along one change of the tool.
+    """Gaussian model of the measurements y and the effect a, with f groups of errors of unknown width.
 
     Attributes:
-        covariances: (f, r, r) variances of the whitened readings that each group makes at its usual width.
-        cross_covariance: (f, r) covariances of the readings with the errors' effect along the change.
-        effect_variances: (f,) variances of that effect.
-        readings: (r,) the readings.
+        covariances: Covariance of y by each group at width 1, (f, r, r).
+        cross_covariances: Covariance of y and a by each group at width 1, (f, r).
+        effect_variances: Variance of a by each group at width 1, (f,).
+        measured: Measurements y, (r,).
     """
 
     covariances: Array
-    cross_covariance: Array
+    cross_covariances: Array
     effect_variances: Array
-    readings: Array
+    measured: Array
 
     def at(self, widths: Array) -> tuple[Array, Array, Array]:
-        """Logarithm of the evidence, mean and standard deviation of the effect (w,) by widths (w, f)."""
-        square = widths**2
-        spread = np.tensordot(square, self.covariances, 1) + np.eye(len(self.readings))
-        root = np.linalg.cholesky(spread)
-        sides = np.stack(
+        """Compute log evidence, mean and standard deviation of a, (w,) each, for widths (w, f)."""
+        squares = widths**2
+        covariance = np.tensordot(squares, self.covariances, 1) + np.eye(len(self.measured))
+        root = np.linalg.cholesky(covariance)
+        right = np.stack(
             [
-                np.broadcast_to(self.readings, (len(widths), len(self.readings))),
-                square @ self.cross_covariance,
+                np.broadcast_to(self.measured, (len(widths), len(self.measured))),
+                squares @ self.cross_covariances,
             ],
             2,
         )
-        read, both = np.moveaxis(np.linalg.solve(root, sides), 2, 0)
-        log = -np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1) - 0.5 * np.sum(read**2, 1)
-        variance = square @ self.effect_variances - np.sum(both**2, 1)
-        return log, np.sum(read * both, 1), np.sqrt(np.maximum(variance, np.finfo(float).tiny))
+        measured, cross = np.moveaxis(np.linalg.solve(root, right), 2, 0)
+        log_evidence = -np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1) - 0.5 * np.sum(measured**2, 1)
+        variance = squares @ self.effect_variances - np.sum(cross**2, 1)
+        std = np.sqrt(np.maximum(variance, np.finfo(float).tiny))
+        return log_evidence, np.sum(measured * cross, 1), std
 
 
-def _eliminate(
-    triangle: TriangularSystem, x: Array, inside: Array, others: Array
-) -> tuple[Array, Array, Array]:
-    """How `others` follow what is `inside` (o, i), and the rows (r, i) and readings (r,) left of it."""
-    read = triangle.z + triangle.r @ x
-    u, s, vt = np.linalg.svd(triangle.r[:, others], full_matrices=False)
-    seen = s > RANK_RTOL * s.max(initial=0.0)
-    u, s, vt, rows = u[:, seen], s[seen], vt[seen], triangle.r[:, inside]
-    return -vt.T @ ((u.T @ rows) / s[:, None]), rows - u @ (u.T @ rows), read - u @ (u.T @ read)
-
-
-def compute_shrinkage_factor(
-    problem: Problem, solution: SolverResult, families: Sequence[tuple[Sequence[int], float]]
-) -> float:
-    """The share of a solution's x, 0 to 1, to keep; the rest of the way leads back to the nominal arm.
-
-    It is 1 where readings are left over, whose residuals show what the arm is worth. The tool is judged all
-    over the joints' range, with base and tool following the errors as the readings have it.
+def _largest_safe_factor(mean: Array, std: Array, posterior: Array, squared_change: float) -> float:
+    """Find the largest factor whose probability of harm is accepted; 0 if there is none.
 
     Args:
-        problem: as it was fitted; its base and tool start where they fit the nominal arm.
-        solution: its end.
-        families: errors of the robot whose size nobody knows well, and one over their usual prior's sigma.
+        mean: Mean of a = dᵀ·e for each combination of widths, (w,).
+        std: Standard deviation of a, (w,).
+        posterior: Probability of the widths, (w,).
+        squared_change: |d|².
     """
-    errors, x = problem.errors, solution.x
-    readings = sum(len(item.rows) * item.residual_dim for item in problem.data)
-    if readings > len(x) or readings > rank(solution.system.r) or not families:
-        return 1.0
-    robot, frames = len(errors.parameters), (BASE_FRAME, errors.chain.tool_frame_index)
-    inside = np.array([i for i, p in enumerate(errors.parameters) if p.error_frame not in frames], int)
-    if not x[inside].any():
-        return 1.0
-    from ..robot.sampling import (
-        joint_range,  # a good part of the start-up, and few fits need it
-    )
+    from scipy.special import ndtr  # lazy import: slow, and few calibrations need it
 
-    follow, rows, read = _eliminate(solution.system, x, inside, np.setdiff1d(np.arange(len(x)), inside))
-    chain, bodies, twists = errors.derivative(x[:robot])
-    q = np.random.default_rng(0).uniform(*joint_range(chain), (N_CONFIGURATIONS, chain.n_joints))
-    moved = np.zeros((3 * N_CONFIGURATIONS, len(x)))
-    moved[:, :robot] = (
-        chain.tool_jacobian(chain.forward_kinematics(q), bodies, twists)[:, :3].reshape(robot, -1).T
-    )
-    moved = moved[:, inside] + np.delete(moved, inside, 1) @ follow
-    change = moved @ x[inside]
-    # What has no width to look for, as a stated prior or a joint's own errors, keeps the one it has.
-    sigma, groups = 1 / problem.weights[inside], []
-    for members, usual in families:
-        if errors.parameters[members[0]].coefficient_index is None:
-            groups.append(np.isin(inside, members))
-            sigma[groups[-1]] = 1 / usual
-    widths = np.array([[*some, 1.0] for some in itertools.product(PRIOR_WIDTHS, repeat=len(groups))])
-    groups.append(~np.any(groups, 0))
-    rows, effect = rows * sigma, moved.T @ change * sigma
-    noise = max(1.0, NOISE_FLOOR * float(np.abs(rows).max()) * PRIOR_WIDTHS.max())
-    rows, read = rows / noise, read / noise
-    log, mean, std = _Evidence(
-        np.stack([rows[:, group] @ rows[:, group].T for group in groups]),
-        np.stack([rows[:, group] @ effect[group] for group in groups]),
-        np.array([np.sum(effect[group] ** 2) for group in groups]),
-        read,
-    ).at(widths)
-    log -= 0.5 * np.sum((np.log(widths) / LOG_WIDTH_STD) ** 2, 1)
-    likely = np.exp(log - log.max())
-    return _largest_safe_factor(mean, std, likely / likely.sum(), float(change @ change))
-
-
-def _largest_safe_factor(mean: Array, std: Array, likely: Array, size: float) -> float:
-    """The largest share with a small enough chance of harm, zero if there is none.
-
-    A share c of a change of the tool d leaves it worse than without where c·|d|² > 2·d·e, e the true one.
-
-    Args:
-        mean: (w,) of d·e, by widths.
-        std: (w,) of d·e, by widths.
-        likely: (w,) how likely those are.
-        size: |d|².
-    """
-    from scipy.special import ndtr  # a good part of the start-up, and few fits need it
-
-    shares = np.linspace(1, 0, 101)
-    chance = ndtr((0.5 * shares[:, None] * size - mean) / std) @ likely
-    good = np.flatnonzero(chance <= MAX_HARM_PROBABILITY)
-    return float(shares[good[0]]) if good.size else 0.0
+    factors = np.linspace(1, 0, N_FACTORS)
+    probability = ndtr((0.5 * factors[:, None] * squared_change - mean) / std) @ posterior
+    safe = np.flatnonzero(probability <= MAX_HARM_PROBABILITY)
+    return float(factors[safe[0]]) if safe.size else 0.0

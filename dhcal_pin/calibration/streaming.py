@@ -1,11 +1,20 @@
-"""Calibration from more samples than memory holds, read part by part wherever the part is reduced."""
+"""Calibration from more samples than memory holds, read part by part in every iteration.
+
+Only the triangular factor R of the whitened rows [J | r] is needed to solve a step, and R of all rows
+follows from the factors of the parts: QR of [R_1; R_2; ...]. Memory does therefore not grow with the number
+of parts. The parts are read where they are factored, for example in other processes, and the result does
+not depend on where.
+
+The first part alone initializes base and tool frames, and determines the standard deviations that the
+instrument does not state and the widths of the default priors. Outliers are not rejected (loss "linear").
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -15,57 +24,72 @@ from ..estimation.priors import Priors
 from ..estimation.problem import Chunk, Problem
 from ..estimation.qr import posterior_sqrt_covariance
 from ..estimation.solver import Progress, SolverResult, minimize
-from ..exceptions import DhcalError
+from ..estimation.uncertainty import UNBOUNDED_TOL
+from ..exceptions import InvalidArgumentError
 from ..identifiability import explanations
 from ..io.measurement_csv import Part
 from ..measurements.base import Measurement
 from ..parallel import SERIAL, TaskExecutor
 from ..robot.chain import Chain
+from .arguments import require_chain
 from .procedure import Method, calibrate
 from .result import Result
 
-_Found = TypeVar("_Found")
+_Value = TypeVar("_Value")
 
 
 @dataclass(frozen=True, eq=False)
 class StreamProblem(Problem):
-    """A problem whose samples come anew, part by part, each time that they are asked for.
+    """Least-squares problem whose samples are read again, part by part, whenever they are needed.
 
     Attributes:
-        parts: gives all parts from the first to the last; `data` is the first.
-        scales: factors to the sigmas of the parts' groups of rows.
+        parts: Function that returns all parts in order; `data` is the first one.
+        scales: Factors to the standard deviations of each residual group by name; None for 1.
     """
 
     parts: Callable[[], Iterable[Part]] = tuple
     scales: Mapping[str, float] | None = None
 
-    def map_chunks(self, function: Callable[[Chunk], _Found]) -> Iterator[_Found]:
-        """What a function finds in each part, in order."""
-        return self.executor.map(partial(_loaded, function, self.errors.chain, self.scales), self.parts())
+    def map_chunks(self, function: Callable[[Chunk], _Value]) -> Iterator[_Value]:
+        """Apply a function to each part.
+
+        Args:
+            function: Function of a chunk; it must be picklable for executors of other processes.
+
+        Returns:
+            Its values in the order of the parts.
+        """
+        return self.executor.map(
+            partial(_apply_to_part, function, self.errors.chain, self.scales), self.parts()
+        )
 
 
-def _loaded(
-    function: Callable[[Chunk], _Found], nominal: Chain, scales: Mapping[str, float] | None, part: Part
-) -> _Found:
+def _apply_to_part(
+    function: Callable[[Chunk], _Value], nominal: Chain, scales: Mapping[str, float] | None, part: Part
+) -> _Value:
+    """Read a part, scale its standard deviations and apply a function to it."""
     item = _read(part)
     return function(Chunk(item.with_scaled_sigma(scales) if scales else item, nominal))
 
 
 def _read(part: Part) -> Measurement:
+    """Return the samples of a part, which may be a function that reads them."""
     return part() if callable(part) else part
 
 
 @dataclass(frozen=True, eq=False)
 class StreamResult:
-    """What a stream told of a chain's errors.
+    """Calibration from a stream of samples.
 
     Attributes:
-        problem: with the nominal chain, base and tool as the first part places them, and its p unknowns.
-        x: (p,) identified errors, m and rad.
-        chain: the calibrated chain.
-        solution: the loop's end.
-        n_samples: how many there were.
-        before, after: RMS errors of all samples by group: "position" in m, "orientation" in rad.
+        problem: Problem with the nominal chain, its base and tool as initialized from the first part, and p
+            unknowns.
+        x: Identified errors, (p,) [m or rad].
+        chain: Calibrated chain.
+        solution: Solution of `problem`.
+        n_samples: Number of samples.
+        before: RMS errors of all samples before, by name: "position" [m], "orientation" [rad].
+        after: RMS errors of all samples after.
     """
 
     problem: StreamProblem
@@ -78,24 +102,24 @@ class StreamResult:
 
     @property
     def converged(self) -> bool:
-        """Whether the last step was too small to matter."""
+        """Whether the last step was negligible."""
         return self.solution.converged
 
     @property
     def rank(self) -> int:
-        """Number of directions that the data see, without priors."""
+        """Number of observable directions in parameter space, without priors."""
         return qr.rank(self.solution.system.r)
 
     @property
     def unobservable(self) -> list[str]:
-        """What the data cannot tell apart, one sentence a group."""
+        """One sentence per group of parameters that the data cannot distinguish, with the reason."""
         return explanations.explain_unobservable(self.problem, self.x, self.solution.system)
 
     @cached_property
     def std(self) -> Array:
-        """Standard deviations (p,) of x, m and rad; infinite where neither data nor a prior tell."""
-        root, hidden = posterior_sqrt_covariance(self.solution.system, self.problem.weights)
-        return np.where(np.sum(hidden**2, 1) > 1e-6, np.inf, np.linalg.norm(root, axis=1))
+        """Standard deviations of x, (p,) [m or rad]; infinite if neither data nor a prior determine it."""
+        root, unbounded = posterior_sqrt_covariance(self.solution.system, self.problem.weights)
+        return np.where(np.sum(unbounded**2, 1) > UNBOUNDED_TOL, np.inf, np.linalg.norm(root, axis=1))
 
 
 def calibrate_stream(
@@ -112,36 +136,41 @@ def calibrate_stream(
     executor: TaskExecutor = SERIAL,
     progress: Progress | None = None,
 ) -> StreamResult:
-    """Identifies a chain's errors from samples of one kind that are never all in memory.
+    """Identify the kinematic errors of a robot from samples of one kind that are never all in memory.
 
-    The first part alone places base and tool and tells sigmas that no instrument states; then all parts are
-    read once an iteration. Memory does not grow with them, and the digits do not depend on `where`.
+    All parts are read once per iteration.
 
     Args:
-        chain: the nominal robot.
-        parts: gives the parts anew at each call, as `lambda: iter_measurements("laser.csv", chain)`; some thousand
-            samples a part are best.
-        parameters: sets of `parameters.SETS`; the chain's own default without it.
-        method: "lm", or "gn" for the paper's loop.
-        priors: "default", "none", or sigmas by name.
-        fix: parameters or sets held at nominal.
-        free: single parameters of any set added.
-        known: values in m and rad of the instrument's unknowns by name.
-        max_iterations: most steps of a loop.
-        executor: what parts are shared out to.
-        progress: called with the iteration and the cost.
+        chain: Nominal robot.
+        parts: Function that returns the parts anew at each call, such as
+            `lambda: iter_measurements("laser.csv", chain)`; parts of some thousand samples are best.
+        parameters: Names of parameter sets, keys of `estimation.PARAMETER_SETS`; the chain's own default set
+            if not given.
+        method: "lm" (Levenberg-Marquardt), or "gn" for the Gauss-Newton iteration of the paper.
+        priors: "default", "none", or standard deviations by parameter name or pattern.
+        fix: Names of parameters or sets to hold at their nominal values.
+        free: Names of single parameters of any set to identify as well.
+        known: Values of instrument parameters by name [m or rad].
+        max_iterations: Largest number of iterations of one solution.
+        executor: Executor that reads and factors the parts.
+        progress: Called after each iteration with its number and the cost.
+
+    Returns:
+        Calibrated chain with the errors of all samples.
 
     Raises:
-        DhcalError: no part, an instrument with unknowns of its own, or what `calibrate` complains about.
+        InvalidArgumentError: If there are no samples, or an instrument has parameters that are not known.
     """
+    require_chain(chain)
     first = next(iter(parts()), None)
     if first is None:
-        raise DhcalError("no measurements to fit")
+        raise InvalidArgumentError("no measurements to fit; expected at least one part")
     head = _read(first)
     known = known or {}
-    if missing := [unknown.name for unknown in head.instrument_parameters if unknown.name not in known]:
-        raise DhcalError(
-            f"{head.kind}: {missing[0]} is unknown; a stream needs surveyed instruments, so give it as known"
+    if missing := [parameter.name for parameter in head.instrument_parameters if parameter.name not in known]:
+        raise InvalidArgumentError(
+            f"{head.kind}: {missing[0]} is unknown; a stream needs surveyed instruments, so give its value "
+            "in `known`"
         )
     fit = calibrate(
         chain,
@@ -156,31 +185,32 @@ def calibrate_stream(
         max_iterations=max_iterations,
     )
     problem = StreamProblem(
-        fit.errors, (head,), fit.problem.weights, known, executor, None, parts, _scales(fit, head)
+        fit.errors, (head,), fit.problem.weights, known, executor, None, parts, _sigma_scales(fit, head)
     )
     solution = minimize(problem, method, fit.x, max_iterations, progress)
-    end = fit.errors.at(solution.x)
-    samples, before, after = 0, {}, {}
-    for count, squares in problem.map_chunks(partial(_squares, (fit.nominal_refitted, end), known)):
-        samples += count
-        for total, found in zip((before, after), squares, strict=True):
-            for name, value in found.items():
+    calibrated = fit.errors.at(solution.x)
+    n_samples, before, after = 0, {}, {}
+    for count, sums in problem.map_chunks(
+        partial(_squared_errors, (fit.nominal_refitted, calibrated), known)
+    ):
+        n_samples += count
+        for total, part_sum in zip((before, after), sums, strict=True):
+            for name, value in part_sum.items():
                 total[name] = total.get(name, 0.0) + value
     before, after = (
-        {name: float(np.sqrt(value / samples)) for name, value in total.items()} for total in (before, after)
+        {name: float(np.sqrt(value / n_samples)) for name, value in total.items()}
+        for total in (before, after)
     )
-    return StreamResult(problem, solution.x, end, solution, samples, before, after)
+    return StreamResult(problem, solution.x, calibrated, solution, n_samples, before, after)
 
 
-def _scales(fit: Result, head: Measurement) -> dict[str, float] | None:
-    """What the first part tells of its sigmas, where the instrument does not."""
+def _sigma_scales(fit: Result, head: Measurement) -> dict[str, float] | None:
+    """Return the scales of unstated standard deviations that the fit of the first part determined."""
     if head.has_stated_sigma:
         return None
     (used,) = fit.problem.data
-    frames, u = (
-        fit.chain.forward_kinematics(head.configurations()),
-        fit.problem.instrument_values_of(head, fit.x),
-    )
+    frames = fit.chain.forward_kinematics(head.configurations())
+    u = fit.problem.instrument_values_of(head, fit.x)
     plain, scaled = (item.residual(frames, u) for item in (head, used))
     return {
         name: float(np.linalg.norm(plain[rows]) / np.linalg.norm(scaled[rows])) or 1.0
@@ -188,10 +218,10 @@ def _scales(fit: Result, head: Measurement) -> dict[str, float] | None:
     }
 
 
-def _squares(
+def _squared_errors(
     chains: tuple[Chain, ...], known: Mapping[str, float], chunk: Chunk
-) -> tuple[int, list[dict[str, Any]]]:
-    """A part's number of samples, and its summed squared errors by group under each chain."""
+) -> tuple[int, list[dict[str, float]]]:
+    """Return the number of samples of a part, and under each chain the sum of squared errors by name."""
     u, item = chunk.instrument_values(known), chunk.data
     return len(item.rows), [
         {name: float(np.sum(error**2)) for name, error in item.errors(chunk.frames(chain), u).items()}

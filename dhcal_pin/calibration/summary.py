@@ -1,4 +1,8 @@
-"""Numbers and tables as people read them: millimetres, degrees, digits as far as they are known."""
+"""Summary of a calibration for people: tables of estimates and accuracy, and one sentence as headline.
+
+Lengths are shown in millimetres, angles in degrees, changes and standard deviations of angles in
+milliradians. The number of decimals follows from the standard error of each figure.
+"""
 
 from __future__ import annotations
 
@@ -10,24 +14,26 @@ from ..formatting import SMALL_UNITS, Table, format_fixed, format_quantity, sign
 from .estimates import Estimate
 from .evaluation import Comparison
 
-# Fewer samples than this do not tell an accuracy; a longer text than this may be broken into lines.
+# With fewer samples the figures come with a note that they are not reliable.
 MIN_SAMPLES = 10
-
-
-# Gross errors among what was held out are worth a word where the RMS is this share of itself without them.
+# The headline gives the RMS without outliers if it is below this fraction of the RMS with them.
 OUTLIER_RMS_RATIO = 0.9
 
-
-# Groups of accuracy in words.
+# Groups of errors in words.
 GROUP_LABELS = {"position": "position error", "orientation": "orientation error", "residual": "residual"}
+# Statistics in words, by the attribute of `ErrorStatistics`.
+STATISTIC_LABELS = {"mean": "mean", "rms": "RMS", "p95": "95th percentile", "max": "maximum"}
 
 
-# Measures of accuracy in words.
-STATISTIC_LABELS = {"mean": "mean", "rms": "RMS", "p95": "95 % within", "max": "largest"}
+def estimate_table(estimates: Sequence[Estimate]) -> Table:
+    """Make a table of nominal and calibrated values, changes and standard deviations.
 
+    Args:
+        estimates: Estimates of a calibration.
 
-def estimate_table(found: Sequence[Estimate]) -> Table:
-    """Nominal and calibrated values, angles in degrees, changes and deviations in mrad."""
+    Returns:
+        Table with one row per parameter.
+    """
     rows = [
         [
             e.name,
@@ -36,23 +42,30 @@ def estimate_table(found: Sequence[Estimate]) -> Table:
             format_quantity(e.change, e.unit, e.std, small=True),
             e.certainty,
         ]
-        for e in found
+        for e in estimates
     ]
     return Table(["parameter", "nominal", "calibrated", "change", "std"], rows)
 
 
 def accuracy_table(comparisons: Sequence[Comparison]) -> Table:
-    """Before and after, held out and fitted, a line each; lengths in mm, angles in mrad."""
+    """Make a table of the error statistics before and after a calibration, in mm and mrad.
+
+    Args:
+        comparisons: Comparisons of a calibration.
+
+    Returns:
+        Table with one row per comparison, group of errors and state.
+    """
     rows = []
     for c in comparisons:
         for group, after in c.after.groups.items():
             factor, unit = SMALL_UNITS[after.unit]
             for state, side in (("before", c.before), ("after", c.after)):
                 statistics = side.groups[group]
-                places = significant_decimals(factor * statistics.rms_std)
+                decimals = significant_decimals(factor * statistics.rms_std)
                 values = [getattr(statistics, key) for key in STATISTIC_LABELS]
                 values += statistics.axes_rms or [math.nan] * 3
-                cells = [format_fixed(factor * value, places) for value in values]
+                cells = [format_fixed(factor * value, decimals) for value in values]
                 rows.append([f"{after.samples} {c.title}", f"{GROUP_LABELS[group]},{unit}", state, *cells])
     axes = [f"{axis}, RMS" for axis in "xyz"]
     return Table(
@@ -62,14 +75,15 @@ def accuracy_table(comparisons: Sequence[Comparison]) -> Table:
 
 @dataclass(frozen=True)
 class Headline:
-    """The one figure that people act on.
+    """Most important figure of a calibration.
 
     Attributes:
-        text: in words.
-        before, after: the figures with their unit.
-        percent_reduction: how much smaller in percent; negative where the error grew.
-        group: name of the group of errors, see `evaluation.GROUP_UNITS`.
-        comparison: the accuracy it is of, with as many samples as the group has.
+        text: Sentence with the figure.
+        before: RMS error before, with its unit.
+        after: RMS error after, with its unit.
+        percent_reduction: Reduction of the RMS error in percent; negative if the error grew.
+        group: Name of the group of errors, see `evaluation.GROUP_UNITS`.
+        comparison: Comparison that the figure is taken from; `n_samples` counts the samples of the group.
     """
 
     text: str
@@ -81,54 +95,71 @@ class Headline:
 
 
 def headline(comparisons: Sequence[Comparison]) -> Headline:
-    """The error on what was not fitted where there is such, and an honest word where there is not."""
+    """Summarize the accuracy in one sentence.
+
+    Args:
+        comparisons: Comparisons of a calibration; the first is used: hold-out samples, else cross-validated,
+            else fitted ones.
+
+    Returns:
+        The sentence and its figures.
+    """
     best = comparisons[0]
     group, after = next(iter(best.after.groups.items()))
     before = best.before.groups[group]
     best = replace(best, n_samples=after.samples)
     before_text, after_text = (
-        format_quantity(side.rms, side.unit, side.rms_std, True) for side in (before, after)
+        format_quantity(side.rms, side.unit, side.rms_std, small=True) for side in (before, after)
     )
-    what = f"RMS {GROUP_LABELS[group]} {describe_samples(best)}: {before_text} before, {after_text} after"
+    text = f"RMS {GROUP_LABELS[group]} {describe_samples(best)}: {before_text} before, {after_text} after"
     clean = best.after_without_outliers.groups.get(group)
     if clean and clean.rms < OUTLIER_RMS_RATIO * after.rms:
-        clean_text = format_quantity(clean.rms, clean.unit, clean.rms_std, True)
-        what += f", {clean_text} without {_outlier_count(best.n_outliers)} among them"
-    what += f". {_outlier_count(best.n_rejected).capitalize()} left aside." if best.n_rejected else "."
-    text = (
-        f"{what} {small_sample_note(best)}".strip()
-        if best.title != "fitted"
-        else f"Nothing was held out. {what}"
-    )
-    drop = 100 * (1 - after.rms / before.rms) if before.rms else 0.0
-    return Headline(text, before_text, after_text, drop, group, best)
+        clean_text = format_quantity(clean.rms, clean.unit, clean.rms_std, small=True)
+        text += f", {clean_text} without {_count_outliers(best.n_outliers)}"
+    text += f". {_count_outliers(best.n_rejected).capitalize()} rejected." if best.n_rejected else "."
+    if best.title == "fitted":
+        text = f"No hold-out samples. {text}"
+    elif note := small_sample_note(best):
+        text = f"{text} {note}"
+    reduction = 100 * (1 - after.rms / before.rms) if before.rms else 0.0
+    return Headline(text, before_text, after_text, reduction, group, best)
 
 
 def regressions(comparisons: Sequence[Comparison]) -> list[str]:
-    """Where the calibrated arm is worse than the nominal one, and what to do about it."""
-    worse = [describe_samples(c) for c in comparisons if headline([c]).percent_reduction < 0]
+    """List the comparisons in which the calibrated robot is worse than the nominal one.
+
+    Args:
+        comparisons: Comparisons of a calibration.
+
+    Returns:
+        One warning each, with what to do about it.
+    """
     return [
-        f"The calibrated arm is worse than the nominal one {where}: they warrant no such correction. Keep "
-        "the nominal arm, measure more poses, or identify fewer parameters."
-        for where in worse
+        f"The calibrated robot is worse than the nominal one {describe_samples(c)}. Keep the nominal robot, "
+        "measure more poses, or identify fewer parameters."
+        for c in comparisons
+        if headline([c]).percent_reduction < 0
     ]
 
 
-def _outlier_count(count: int) -> str:
-    return f"{count} gross errors" if count > 1 else "one gross error"
+def _count_outliers(count: int) -> str:
+    """Return the number of outliers in words."""
+    return f"{count} outliers" if count > 1 else "one outlier"
 
 
-def describe_samples(c: Comparison) -> str:
-    """Which samples a comparison is about, in words."""
-    many, was = ("sample", "was") if c.n_samples == 1 else ("samples", "were")
-    ends = {
-        "held out": f"{many} that {was} not fitted",
-        "cross-validated": f"{many}, each left out of the fit that it judges",
-        "fitted": f"fitted {many}",
-    }
-    return f"on {c.n_samples} {ends[c.title]}"
+def describe_samples(comparison: Comparison) -> str:
+    """Describe the samples of a comparison, such as "on 12 hold-out samples".
+
+    Args:
+        comparison: Comparison of a calibration.
+
+    Returns:
+        The description.
+    """
+    count = comparison.n_samples
+    return f"on {count} {comparison.title} {'sample' if count == 1 else 'samples'}"
 
 
-def small_sample_note(c: Comparison) -> str:
-    """A warning where a comparison has too few samples to be sure of."""
-    return "So few samples say little." if c.n_samples < MIN_SAMPLES else ""
+def small_sample_note(comparison: Comparison) -> str:
+    """Return a note if a comparison has too few samples for a reliable figure, else an empty text."""
+    return "So few samples give no reliable figure." if comparison.n_samples < MIN_SAMPLES else ""

@@ -248,8 +248,8 @@ def print_summary(fit: Result, files: Mapping[str, str]) -> None:
         f"{state} after {fit.iterations} iterations; {fit.n_samples} samples; "
         f"rank {fit.rank} of {len(fit.parameters)}; condition {fit.condition:.3g}",
     )
+    print_lines(*fit.shrinkage_notes, style="yellow")
     for label, texts in (
-        ("correction reduced", fit.shrinkage_notes),
         ("not observable", fit.unobservable),
         ("poorly identified", fit.weakly_observable),
     ):

@@ -72,7 +72,9 @@ def position_misfit(chain: Chain, q: Array, positions: Array) -> float:
     Returns:
         Distance [m].
     """
-    starts = candidate_frames(chain, (subsample(Position(q, positions)),), base=True, tool=True)
+    starts = candidate_frames(
+        chain, (subsample(Position(q, positions)),), is_base_unknown=True, is_tool_unknown=True
+    )
     return min(_position_misfit_from(start, q, positions) for start in starts)
 
 

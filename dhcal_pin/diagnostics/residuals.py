@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .._typing import Array
-from ..calibration.evaluation import compute_errors, error_group, instrument_values
+from ..calibration.evaluation import compute_errors, error_group, fit_instrument_parameters
 from ..calibration.result import Result
 from ..estimation.error_model import ErrorModel
 from ..estimation.parameters import offset
@@ -158,7 +158,7 @@ def joint_offset_profiles(fit: Result) -> list[JointProfile]:
 def _offset_equations(chain: Chain, data: Sequence[Measurement], fit: Result) -> tuple[Array, Array]:
     """Return a·r and a·a of each moving joint and sample, (k, m) each."""
     data = [item.initialized(chain) for item in data]
-    known = instrument_values(chain, data, fit.instruments if chain is fit.chain else {})
+    known = fit_instrument_parameters(chain, data, fit.instruments if chain is fit.chain else {})
     errors = ErrorModel(chain, tuple(offset(chain)))
     _, bodies, twists = errors.derivative(np.zeros(len(errors.parameters)))
     ar, aa = [], []

@@ -101,7 +101,7 @@ def result_to_dict(
 ) -> dict[str, Any]:
     """The JSON document of a calibration."""
     found = {c.title: c for c in fit.comparisons}
-    held = found.get("held out")
+    held = found.get("hold-out")
     return {
         "converged": fit.converged,
         "iterations": fit.iterations,

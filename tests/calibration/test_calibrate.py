@@ -246,8 +246,8 @@ def test_mixed_kinds_on_random_arms(seed):
         ({"priors": {"x9": 1.0}}, "no such parameter"),
         ({"priors": {"d*": -1.0}}, "must be positive"),
         ({"bounds": {"x9": (-1.0, 1.0)}}, "no such parameter"),
-        ({"bounds": {"d1": (5.0, 6.0)}}, "must hold the nominal"),
-        ({"bounds": {"d1": (-5.0, 6.0)}, "method": "gn"}, "bounds need method lm"),
+        ({"bounds": {"d1": (5.0, 6.0)}}, "must contain the nominal"),
+        ({"bounds": {"d1": (-5.0, 6.0)}, "method": "gn"}, "bounds require method 'lm'"),
     ],
 )
 def test_wrong_choices_are_named(sim_6dof, kwargs, message):

@@ -607,8 +607,11 @@ def test_a_correction_that_nothing_warrants_is_pointed_out(run, place):
         done(run("simulate", arm, *truth, "-m", "30", "--noise", "0.1mm,0.01deg", "-o", "exact.csv"))
         _, _, err = run("calibrate", arm, "exact.csv", "-o", "found.urdf")
         *_, remark, _, last = err.splitlines()
-        assert ("the calibrated arm is worse than the nominal one on 30 samples" in remark.lower()) is worse
-        assert last.startswith("RMS position error on 30 samples, each left out")
+        assert (
+            "the calibrated robot is worse than the nominal one on 30 cross-validated samples"
+            in remark.lower()
+        ) is worse
+        assert last.startswith("RMS position error on 30 cross-validated samples")
 
 
 def test_validate_names_impossible_rows_and_counts_them(run, place):

@@ -143,7 +143,7 @@ def test_wrong_losses_are_named(sim_6dof, sim_6dof_actual):
     data = Pose.simulate(sim_6dof_actual, np.zeros((5, 6)), Noise(), np.random.default_rng(0))
     with pytest.raises(DhcalError, match="choose from auto, linear, huber"):
         calibrate(sim_6dof, data, loss="l1")
-    with pytest.raises(DhcalError, match="needs method lm"):
+    with pytest.raises(DhcalError, match="requires method 'lm'"):
         calibrate(sim_6dof, data, method="gn", loss="huber")
 
 
@@ -154,13 +154,13 @@ def test_what_is_told_of_a_fit_is_of_the_samples_that_count(sim_6dof, sim_6dof_a
     told, expected = fit.comparisons[0], best.comparisons[0]
     assert (told.n_samples, told.n_rejected) == (57, 3)
     assert told.after["position_rms_m"] < 1.3 * expected.after["position_rms_m"]
-    assert "3 gross errors left aside." in headline(fit.comparisons).text
+    assert "3 outliers rejected." in headline(fit.comparisons).text
     figures = accuracy_figures(ReportContext.from_result(fit, Provenance()))[0]
     assert figures.panels[0].caption == "Position error, 57 fitted samples"
     held = calibrate(sim_6dof, clean, "dh", holdout=[dirty]).comparisons[0]
     assert (held.n_samples, held.n_outliers) == (60, 3)
     assert held.after["position_rms_m"] > 10 * held.after_without_outliers["position_rms_m"]
-    assert "without 3 gross errors among them" in headline([held]).text
+    assert "without 3 outliers" in headline([held]).text
 
 
 def test_only_the_worst_gross_errors_are_left_aside_unasked(sim_6dof, sim_6dof_actual):

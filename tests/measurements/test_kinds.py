@@ -10,7 +10,7 @@ import pytest
 from robots import URDF
 
 from dhcal_pin.calibration import calibrate
-from dhcal_pin.calibration.evaluation import instrument_values
+from dhcal_pin.calibration.evaluation import fit_instrument_parameters
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation import Problem, select_parameters
 from dhcal_pin.estimation.problem import linearize_and_factor
@@ -95,7 +95,7 @@ def truth_of(kind, chain, m, noise=None, seed=0):
     rng = np.random.default_rng(seed)
     q = rng.uniform(-2.5, 2.5, (m, chain.n_joints))
     data = kind.simulate(chain, q, noise or Noise(), rng).initialized(chain)
-    names = instrument_values(chain, [data], {})
+    names = fit_instrument_parameters(chain, [data], {})
     return data, np.array([names[unknown.name] for unknown in data.instrument_parameters])
 
 

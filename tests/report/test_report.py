@@ -150,13 +150,13 @@ class Texts(HTMLParser):
 def test_the_headline_is_the_error_on_what_was_not_fitted(fit, quick):
     held = accuracy(fit.chain, fit.holdout)["position_rms_m"]
     page = Texts(html.html_page(ReportContext.from_result(fit, Provenance())))
-    assert page.texts["h1"] == ["Position error on 12 samples that were not fitted"]
+    assert page.texts["h1"] == ["Position error on 12 hold-out samples"]
     first = page.texts["dd"]
     assert float(first[1].split()[0]) == pytest.approx(1e3 * held, abs=0.051)
     assert f"{first[0]} before, {first[1]} after." in markdown(ReportContext.from_result(fit, Provenance()))
     assert len(page.ids) == len(set(page.ids))
-    assert "12 held out" in fit._repr_html_()
-    assert "not fitted" in fit._repr_html_()
+    assert "12 hold-out" in fit._repr_html_()
+    assert "on 12 hold-out samples" in fit._repr_html_()
 
 
 @pytest.mark.parametrize("count", [0, 1])
@@ -164,10 +164,10 @@ def test_few_held_out_or_none_is_said(count, quick):
     found = ReportContext.from_result(fitted(held=count / 40), Provenance())
     page, text = Texts(html.html_page(found)), markdown(found)
     if count:
-        assert page.texts["h1"] == ["Position error on 1 sample that was not fitted"]
-        assert "So few samples say little." in text
+        assert page.texts["h1"] == ["Position error on 1 hold-out sample"]
+        assert "So few samples give no reliable figure." in text
     else:
-        ends = "on 40 samples, each left out of the fit that it judges"
+        ends = "on 40 cross-validated samples"
         assert page.texts["h1"] == [f"Position error {ends}"]
         assert f"position error {ends}" in text
 
