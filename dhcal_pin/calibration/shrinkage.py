@@ -184,6 +184,9 @@ def _largest_safe_factor(mean: Array, std: Array, posterior: Array, squared_chan
         std: Standard deviation of a, (w,).
         posterior: Probability of the widths, (w,).
         squared_change: |d|².
+
+    Returns:
+        The factor.
     """
     from scipy.special import ndtr  # lazy import: slow, and few calibrations need it
 

@@ -368,7 +368,7 @@ def test_wrong_priors(refused, text, words):
         ("a1 = 0.1\n", ["bounds.toml", "a1 = 0.1", "such as"]),
         ("a1 = [0.2, 0.1]\n", ["bounds.toml", "a1 = [0.2, 0.1]", "m or rad"]),
         ("a9 = [0.1, 0.2]\n", ["'a9'", "no such parameter", "a1"]),
-        ("a1 = [5.0, 6.0]\n", ["'a1'", "must hold the nominal"]),
+        ("a1 = [5.0, 6.0]\n", ["'a1'", "must contain the nominal"]),
     ],
 )
 def test_wrong_bounds(refused, text, words):
