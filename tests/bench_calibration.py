@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -84,8 +85,8 @@ def against_scipy(m: int, repeats: int) -> list[Row]:
         start = np.zeros(len(fit.x))
         found: dict[str, np.ndarray] = {}
 
-        def scipy(way: str, *functions: Callable, start=start, found=found) -> None:
-            found[way] = least_squares(functions[0], start, *functions[1:], x_scale="jac").x
+        def scipy(way: str, residual: Callable, *jacobian: Any, start=start, found=found) -> None:
+            found[way] = least_squares(residual, start, *jacobian, x_scale="jac").x
 
         mine = partial(calibrate, chain, data, sets)
         for way, functions, times, wanted in (

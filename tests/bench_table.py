@@ -22,8 +22,10 @@ import sysconfig
 import tempfile
 import time
 import venv
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import bench_batch
 import bench_calibration
@@ -190,12 +192,12 @@ def line(row: Row) -> str:
 
 def main() -> None:
     """Prints the table as it grows, then the growth of an iteration with samples and joints."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="fewer turns, smaller cases")
     quick = parser.parse_args().quick
     turns, began = (5 if quick else 15), time.time()
     print("| What | dhcal_pin | other | ratio | wanted |\n| --- | --- | --- | --- | --- |")
-    for part, arguments in (
+    parts: tuple[tuple[Callable[..., Iterable[Row]], tuple[Any, ...]], ...] = (
         (bench_kernel.iterations, ((100, 1000, 10000), turns)),
         (bench_kernel.jacobians, (turns,)),
         (bench_calibration.against_scipy, (1000, 1 if quick else 3)),
@@ -204,7 +206,8 @@ def main() -> None:
         (against_pybotics, (100, turns)),
         (bench_batch.rows, (3 if quick else 5,)),
         (start_up, (3 if quick else 7,)),
-    ):
+    )
+    for part, arguments in parts:
         for row in part(*arguments):
             print(line(row), flush=True)
     sizes = (100, 1000, 10000, 100000) if quick else (100, 1000, 10000, 100000, 1000000)

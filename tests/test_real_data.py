@@ -189,6 +189,7 @@ def planned_and_random(criterion: str, seeds: int, choices: int) -> np.ndarray:
 
         every = held_out(first)
         found = plan(chain, 40, noise=noise, parameters=sets, criterion=criterion, candidates=first.q)
+        assert found.index is not None
         drawn = [held_out(first.take(rng.choice(half, 40, replace=False))) for _ in range(choices)]
         out.append([held_out(first.take(found.index)) / every, np.median(drawn) / every])
     return np.array(out)

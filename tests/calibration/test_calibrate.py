@@ -158,7 +158,7 @@ def test_a_single_distance_tells_no_scatter_of_its_own(sim_6dof, sim_6dof_actual
     tip = touches.initialized(sim_6dof_actual)
     places = np.reshape([unknown.nominal for unknown in tip.instrument_parameters], (-1, 3))
     far = np.linalg.norm(places[1] - places[0]) + 1e-3
-    known = PointDistance(6, [touches.names[:2]], [far])
+    known = PointDistance(6, [(touches.names[0], touches.names[1])], [far])
     names = [touches.names[i] for i in touches.label]
     data = PointContact(touches.q, names, 1e-4 if stated else None)
     fit = calibrate(sim_6dof, [data, known], "minimal,tool")
@@ -285,7 +285,10 @@ def test_samples_that_are_met_exactly_do_not_foretell_the_others(sim_6dof, sim_6
     left_out, fitted = calibrate(sim_6dof, data, "dh", **options).comparisons
     assert fitted.after["position_rms_m"] < 1e-9
     alone = [
-        accuracy(calibrate(sim_6dof, data.take([one]), "dh", **options).chain, [data.take([1 - one])])
+        accuracy(
+            calibrate(sim_6dof, data.take(np.array([one])), "dh", **options).chain,
+            [data.take(np.array([1 - one]))],
+        )
         for one in (0, 1)
     ]
     wanted = np.sqrt(np.mean([found["position_rms_m"] ** 2 for found in alone]))
@@ -340,7 +343,7 @@ def test_touches_without_a_length_leave_the_size_of_the_arm_to_the_priors(sim_6d
     assert fit.problem.data[0].sigma.mean() == pytest.approx(noise, rel=0.2)
     # One known distance between two of the points, and its size is known.
     first, second = truth.poses(q[:2])[:, :3, 3]
-    known = PointDistance(6, [data.names[:2]], [np.linalg.norm(second - first)], 1e-5)
+    known = PointDistance(6, [(data.names[0], data.names[1])], [np.linalg.norm(second - first)], 1e-5)
     sized = calibrate(sim_6dof, [data, known], "minimal,tool", fix=fixed)
     assert not [text for text in sized.unobservable if "the size of the robot" in text]
     assert spread(sized.chain) / spread(truth) == pytest.approx(1, abs=5e-5 + 0.5 * noise)
@@ -377,7 +380,11 @@ def test_a_step_that_damping_makes_small_is_no_end(seed, prismatic, theta, d, a,
         "modified",
         tuple(f"j{i + 1}" for i in range(n)),
         np.array([letter == "1" for letter in prismatic]),
-        *map(np.array, (theta, d, a, np.pi / 2 * np.array(quarters) + tilt, beta)),
+        np.array(theta),
+        np.array(d),
+        np.array(a),
+        np.pi / 2 * np.array(quarters) + tilt,
+        np.array(beta),
         np.full(n, -np.inf),
         np.full(n, np.inf),
     )

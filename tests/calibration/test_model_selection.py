@@ -20,7 +20,7 @@ from dhcal_pin.estimation.parameters import select_parameters
 from dhcal_pin.estimation.solver import levenberg_marquardt
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io.measurement_csv import measurement_text
-from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.base import Measurement, Noise
 from dhcal_pin.measurements.contact import PointContact
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.measurements.position import Position
@@ -39,7 +39,7 @@ def simulated(sets: str, seed: int, m: int = 60, noise: float = 1e-4, kind=Pose)
     return arm, kind.simulate(truth, rng.uniform(-2.5, 2.5, (m, 6)), Noise(noise, noise), rng)
 
 
-def fitted(kind=Position, m: int = 40):
+def fitted(kind: type[Measurement] = Position, m: int = 40):
     arm = Chain.from_dh(paper("sim_6dof"))
     rng = np.random.default_rng(0)
     data = kind.simulate(

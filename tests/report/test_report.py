@@ -21,6 +21,7 @@ from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.calibration.result import Result
 from dhcal_pin.cli import main
 from dhcal_pin.diagnostics import predict_workspace, residuals, workspace
+from dhcal_pin.estimation import Priors
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.measurements import KINDS
 from dhcal_pin.measurements.base import Noise
@@ -177,7 +178,11 @@ def test_every_kind_and_few_data_have_a_report(kind, quick):
     nominal = Chain.from_dh(paper("sim_6dof"))
     rng = np.random.default_rng(3)
     actual = Chain.from_dh(paper("sim_6dof_actual"))
-    for count, noise, priors in ((30, Noise(1e-4, 1e-4), "default"), (3, Noise(), "none")):
+    cases: tuple[tuple[int, Noise, Priors], ...] = (
+        (30, Noise(1e-4, 1e-4), "default"),
+        (3, Noise(), "none"),
+    )
+    for count, noise, priors in cases:
         data = KINDS[kind].simulate(actual, rng.uniform(-1, 1, (count, 6)), noise, rng)
         found = ReportContext.from_result(
             calibrate(nominal, data, "minimal,base,tool", priors=priors, max_iterations=5), Provenance()

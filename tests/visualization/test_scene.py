@@ -236,6 +236,7 @@ def test_joints_that_miss_their_values_stand_where_pinocchio_has_them(window, tm
     missed = np.abs(pair[1].poses(poses(nominal, 5)) - calibrated.poses(poses(nominal, 5))).max()
     assert missed > 1e-3
     # Enlarged, the calibrated joints leave the nominal ones in proportion.
+    assert nominal.transmission is not None
     other = calibrated.with_transmission(nominal.transmission)
     window.open(tmp_path / "scene.html", scene_html(pair[0], other, package_dirs=[tmp_path]))
     window.call("setMagnification", 10)
