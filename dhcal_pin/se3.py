@@ -235,8 +235,8 @@ def exp6(twist: ArrayLike) -> Array:
     v, w = twist[..., :3], twist[..., 3:]
     _, second, third = exp_coefficients(np.linalg.norm(w, axis=-1))
     k = skew(w)
-    left = np.eye(3) + second[..., None, None] * k + third[..., None, None] * (k @ k)
-    return transform(exp3(w), (left @ v[..., None])[..., 0])
+    v_matrix = np.eye(3) + second[..., None, None] * k + third[..., None, None] * (k @ k)
+    return transform(exp3(w), (v_matrix @ v[..., None])[..., 0])
 
 
 def log6(pose: ArrayLike) -> Array:
@@ -250,8 +250,8 @@ def log6(pose: ArrayLike) -> Array:
     """
     pose = np.asarray(pose, float)
     w = log3(pose[..., :3, :3])
-    left_inverse = np.swapaxes(right_jacobian_inverse(w), -1, -2)
-    v = (left_inverse @ pose[..., :3, 3:])[..., 0]
+    v_matrix_inverse = np.swapaxes(right_jacobian_inverse(w), -1, -2)
+    v = (v_matrix_inverse @ pose[..., :3, 3:])[..., 0]
     return np.concatenate([v, w], -1)
 
 

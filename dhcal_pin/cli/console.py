@@ -33,6 +33,7 @@ from ..calibration.summary import (
 from ..diagnostics.reachability import UnreachableRow
 from ..estimation.solver import Progress
 from ..formatting import Table, format_quantity
+from ..identifiability import label_unobservable
 
 if TYPE_CHECKING:
     from .._typing import Array
@@ -248,12 +249,12 @@ def print_summary(fit: Result, files: Mapping[str, str]) -> None:
         f"{state} after {fit.iterations} iterations; {fit.n_samples} samples; "
         f"rank {fit.rank} of {len(fit.parameters)}; condition {fit.condition:.3g}",
     )
-    print_lines(*fit.shrinkage_notes, style="yellow")
-    for label, texts in (
-        ("not observable", fit.unobservable),
-        ("poorly identified", fit.weakly_observable),
-    ):
-        print_lines(*(f"{label}: {text}" for text in texts), style="yellow")
+    print_lines(
+        *fit.shrinkage_notes,
+        *(label_unobservable(text) for text in fit.unobservable),
+        *(f"poorly identified: {text}" for text in fit.weakly_observable),
+        style="yellow",
+    )
     print_lines(*(f"wrote {name}: {path}" for name, path in files.items()))
 
 

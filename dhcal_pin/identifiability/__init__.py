@@ -5,7 +5,12 @@ directions in `null_space`, their geometry in `propagation`, and the sentences f
 All of them analyze a linearized problem; what solves problems belongs to `estimation`.
 """
 
-from .explanations import EXPECTED, explain_unobservable, explain_weakly_observable
+from .explanations import (
+    EXPECTED,
+    explain_unobservable,
+    explain_weakly_observable,
+    label_unobservable,
+)
 from .observability import correlation, observability_indices, observable_fraction
 
 __all__ = [
@@ -13,6 +18,7 @@ __all__ = [
     "correlation",
     "explain_unobservable",
     "explain_weakly_observable",
+    "label_unobservable",
     "observability_indices",
     "observable_fraction",
 ]

@@ -385,6 +385,18 @@ def explain_unobservable(problem: Problem, x: Array, system: TriangularSystem) -
     return [SCALE, *sentences] if is_scale_unexplained else sentences
 
 
+def label_unobservable(sentence: str) -> str:
+    """Label a sentence of `explain_unobservable` for lists with other topics.
+
+    Args:
+        sentence: Sentence.
+
+    Returns:
+        Sentence with "not observable" in front; expected redundancies have their own label.
+    """
+    return sentence if sentence.startswith(EXPECTED) else f"not observable: {sentence}"
+
+
 def _merge_groups(groups: list[UnobservableGroup]) -> list[UnobservableGroup]:
     """Merge groups of one cause if their union has one identifiable combination.
 

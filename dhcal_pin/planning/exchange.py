@@ -137,8 +137,8 @@ class CandidateSet:
         """Return whether candidates (w,) are closer than `min_distance` to any of the coordinates (n, d)."""
         if not self.min_distance:
             return np.zeros(len(indices), bool)
-        own = self.coordinates[indices]
-        squares = np.sum(own**2, 1)[:, None] + np.sum(occupied**2, 1) - 2 * own @ occupied.T
+        coordinates = self.coordinates[indices]
+        squares = np.sum(coordinates**2, 1)[:, None] + np.sum(occupied**2, 1) - 2 * coordinates @ occupied.T
         return np.any(squares < self.min_distance**2, 1)
 
 

@@ -20,6 +20,7 @@ from ..calibration.model_selection import trial_table
 from ..diagnostics.residuals import median_sigmas
 from ..estimation import robust
 from ..formatting import Table, format_fixed, format_quantity
+from ..identifiability import label_unobservable
 from ..robot.chain import BASE_FRAME
 from . import figures
 from .context import ReportContext
@@ -329,7 +330,7 @@ def _observability_section(context: ReportContext) -> Section:
         sentences.append(f"Fixed at their nominal values and not assessed: {', '.join(fixed)}.")
     items = [
         *fit.shrinkage_notes,
-        *(f"not observable: {text}" for text in fit.unobservable),
+        *(label_unobservable(text) for text in fit.unobservable),
         *(f"poorly identified: {text}" for text in fit.weakly_observable),
     ]
     return Section("observability", "Observability", sentences, items, figures=figures.observability_figures)

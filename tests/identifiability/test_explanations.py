@@ -214,6 +214,14 @@ def test_claims_of_sentences_are_true(arm, sets):
         assert named_in_texts >= {names[i] for i in np.flatnonzero(participation > 1e-2)}
 
 
+def test_expected_redundancies_have_their_own_label():
+    texts = explain(problem(load("sim_3dof"), "dh", Position))
+    assert [explanations.label_unobservable(text) for text in texts] == [
+        texts[0],
+        f"not observable: {texts[1]}",
+    ]
+
+
 def test_signs_of_sums_follow_the_axes():
     """If the second axis is antiparallel to the first, their offsets subtract."""
     (text,) = explain(problem(load("antiparallel"), "dh"))
