@@ -1,4 +1,8 @@
-"""What was done and found: the JSON document, and where a result comes from."""
+"""JSON document of a calibration or validation, and the provenance of a result.
+
+The keys of the document are a contract with other programs. Lengths are in metres, angles in radians; NaN and
+infinity become null.
+"""
 
 from __future__ import annotations
 
@@ -23,20 +27,20 @@ from ..robot.chain import Chain
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a result comes from, as far as it does not know that itself.
+    """Facts about a calibration that its result does not contain.
 
     Attributes:
-        command: the command line that made it, without where it wrote.
-        inputs: SHA-256 of each input file, by path.
-        names: the file of each item of the fitted data; empty where they came from Python.
-        holdout_names: the same of the items held out.
-        settings: further choices, in words by name.
-        excluded_rows: reasons by file and row of what was not used at all.
-        warnings: what is hard to believe, by file.
-        remarks: sentences that belong beside the headline.
-        trials: what each family of joints' transmission errors brought, where they were tried.
-        hint: what they might bring, where they were not.
-        comparison: accuracy on samples that were each left out of a fit, where none were held out.
+        command: Command line, without the paths of the outputs.
+        inputs: SHA-256 of each input file by path.
+        names: File of each measurement of the fitted data; empty for data from Python.
+        holdout_names: File of each measurement of the hold-out data.
+        settings: Further choices as text, by name.
+        excluded_rows: Reasons why rows were not used, by file and row.
+        warnings: Warnings about the input data by file.
+        remarks: Sentences that are shown beside the headline.
+        trials: Trials of the families of transmission errors, if they were made.
+        hint: Improvement to expect from transmission errors, if they were not tried.
+        comparison: Cross-validated accuracy, if there are no hold-out samples.
     """
 
     command: str = ""
@@ -53,69 +57,97 @@ class Provenance:
 
 
 def file_digests(paths: Sequence[PathLike]) -> dict[str, str]:
-    """SHA-256 of each input file, by path as given."""
+    """Compute the SHA-256 of files.
+
+    Args:
+        paths: Paths of the files.
+
+    Returns:
+        Hexadecimal digests by path.
+    """
     return {str(path): hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in paths}
 
 
 def versions() -> dict[str, str]:
-    """Versions of what computed the result."""
+    """Return the versions of the packages that compute results."""
     return {name: metadata.version(name) for name in ("dhcal-pin", "pin", "numpy", "scipy")}
 
 
 def short_names(paths: Sequence[PathLike]) -> dict[str, str]:
-    """Each path's last parts, as few as tell them apart.
+    """Shorten paths to as many of their last parts as make them unique.
+
+    Args:
+        paths: Paths of files.
+
+    Returns:
+        Short name of each path.
 
     >>> short_names(["a/front/hole.csv", "a/back/hole.csv", "arm.urdf"])
     {'a/front/hole.csv': 'front/hole.csv', 'a/back/hole.csv': 'back/hole.csv', 'arm.urdf': 'arm.urdf'}
     """
     parts = {os.fspath(path): Path(path).parts for path in paths}
 
-    def tail(path: str) -> str:
+    def shortest_unique_end(path: str) -> str:
         for count in range(1, len(parts[path])):
-            mine = parts[path][-count:]
-            if all(other[-count:] != mine for name, other in parts.items() if name != path):
-                return "/".join(mine)
+            end = parts[path][-count:]
+            if all(other[-count:] != end for name, other in parts.items() if name != path):
+                return "/".join(end)
         return path
 
-    return {path: tail(path) for path in parts}
+    return {path: shortest_unique_end(path) for path in parts}
 
 
-# What the document says of accuracy and of a parameter; all that is known is under `comparisons`, `priors`.
+# Keys of an accuracy and of a parameter; further values are under `comparisons` and `priors`.
 _ACCURACY = "position_rms_m position_max_m orientation_rms_rad residual_rms residual_max unit".split()
-
-
 _PARAMETER = "name unit nominal value std observability posterior_to_prior_std fixed".split()
 
 
-def _select_keys(found: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
-    return {key: found[key] for key in keys if key in found}
+def _select_keys(content: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
+    return {key: content[key] for key in keys if key in content}
 
 
-def main_statistics(found: Mapping[str, Any]) -> dict[str, Any]:
-    """RMS and largest errors of what `accuracy` found."""
-    return _select_keys(found, _ACCURACY)
+def main_statistics(accuracy: Mapping[str, Any]) -> dict[str, Any]:
+    """Select RMS and largest errors.
+
+    Args:
+        accuracy: Flat keys and values of an accuracy, see `calibration.Accuracy`.
+
+    Returns:
+        The selected keys and values.
+    """
+    return _select_keys(accuracy, _ACCURACY)
 
 
 def result_to_dict(
     fit: Result, files: Mapping[str, str], inputs: Mapping[str, str], outliers: Sequence[int] = ()
 ) -> dict[str, Any]:
-    """The JSON document of a calibration."""
-    found = {c.title: c for c in fit.comparisons}
-    held = found.get("hold-out")
+    """Collect the JSON document of a calibration.
+
+    Args:
+        fit: Result of the calibration.
+        files: Paths of the written files by their meaning.
+        inputs: SHA-256 of each input file by path.
+        outliers: Outliers, as they are numbered in the files.
+
+    Returns:
+        Content of the document.
+    """
+    comparisons = {comparison.title: comparison for comparison in fit.comparisons}
+    fitted, holdout = comparisons["fitted"], comparisons.get("hold-out")
     return {
         "converged": fit.converged,
         "iterations": fit.iterations,
         "method": fit.method,
         "samples": fit.n_samples,
-        "samples_holdout": held.n_samples if held else 0,
+        "samples_holdout": holdout.n_samples if holdout else 0,
         "rank": fit.rank,
         "parameters_total": len(fit.parameters),
         "condition": fit.condition,
         "singular_values": qr.singular_values(fit.solution.system.r).tolist(),
-        "before": main_statistics(found["fitted"].before),
-        "after": main_statistics(found["fitted"].after),
-        "holdout_before": main_statistics(held.before) if held else {},
-        "holdout_after": main_statistics(held.after) if held else {},
+        "before": main_statistics(fitted.before),
+        "after": main_statistics(fitted.after),
+        "holdout_before": main_statistics(holdout.before) if holdout else {},
+        "holdout_after": main_statistics(holdout.after) if holdout else {},
         "comparisons": [comparison.to_dict() for comparison in fit.comparisons],
         "parameters": [_select_keys(asdict(estimate), _PARAMETER) for estimate in fit.estimates],
         "priors": {estimate.name: estimate.prior for estimate in fit.estimates if not estimate.fixed},
@@ -134,8 +166,18 @@ def result_to_dict(
 def validation_to_dict(
     chain: Chain, data: Sequence[Measurement], inputs: Mapping[str, str], known: Mapping[str, float]
 ) -> dict[str, Any]:
-    """The same document of a model that nothing was fitted to but instruments' unknown values."""
-    found = main_statistics(accuracy(chain, data, known))
+    """Collect the JSON document of a validation; it has the keys of a calibration.
+
+    Args:
+        chain: Validated robot.
+        data: Measurements.
+        inputs: SHA-256 of each input file by path.
+        known: Values of instrument parameters by name; the others are fitted to the data.
+
+    Returns:
+        Content of the document.
+    """
+    statistics = main_statistics(accuracy(chain, data, known))
     return {
         "converged": True,
         "iterations": 0,
@@ -145,8 +187,8 @@ def validation_to_dict(
         "rank": 0,
         "parameters_total": 0,
         "condition": 0.0,
-        "before": found,
-        "after": found,
+        "before": statistics,
+        "after": statistics,
         "holdout_before": {},
         "holdout_after": {},
         "parameters": [],
@@ -163,7 +205,14 @@ def validation_to_dict(
 
 
 def json_text(content: Any) -> str:
-    """JSON without NaN or infinity, which become null."""
+    """Format a document as JSON; NaN and infinity become null.
+
+    Args:
+        content: Content of the document.
+
+    Returns:
+        Text with a line feed at its end.
+    """
 
     def clean(value: Any) -> Any:
         if isinstance(value, dict):
@@ -175,5 +224,5 @@ def json_text(content: Any) -> str:
         return value
 
     text = json.dumps(clean(content), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    # A file's name need not be UTF-8; what is not becomes an escape that JSON knows.
+    # A file name need not be UTF-8. Python keeps its other bytes as surrogates, which become JSON escapes.
     return text.encode(errors="backslashreplace").decode()

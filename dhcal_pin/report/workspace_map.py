@@ -1,6 +1,6 @@
-"""Workspace maps as files: predicted position uncertainty beside measured errors.
+"""Maps of the workspace as files: predicted position uncertainty beside measured errors.
 
-A map is written as CSV, one row per cell of the workspace, or as an HTML page with drawings.
+A map is a CSV table with one row per cell of the workspace, or a page with two projections of it.
 """
 
 from __future__ import annotations
@@ -12,28 +12,35 @@ import numpy as np
 from ..calibration.evaluation import position_errors
 from ..diagnostics.workspace import WorkspaceMap, predict_workspace, workspace_map
 from ..estimation.uncertainty import Predictor
-from ..exceptions import DhcalError
+from ..exceptions import InvalidArgumentError
 from ..io.tabular import csv_text
 from ..measurements.base import Measurement
 from .html import map_page
 
 
 def check_map_ending(path: str) -> None:
-    """Raise DhcalError if a path ends neither in .csv nor in .html."""
+    """Raise an error if a path is neither that of a CSV file nor that of an HTML file.
+
+    Args:
+        path: Path of a map.
+
+    Raises:
+        InvalidArgumentError: The ending is unknown.
+    """
     if not path.lower().endswith((".csv", ".html")):
-        raise DhcalError(f"{path}: unknown ending; expected .csv or .html")
+        raise InvalidArgumentError(f"{path}: unknown ending; write a map as .csv or .html")
 
 
 def map_content(
     path: str, model: Predictor, data: Sequence[Measurement], known: Mapping[str, float] | None = None
 ) -> str:
-    """Compute a workspace map as CSV or HTML.
+    """Compute a map and render it as a table or a page, according to the ending of the path.
 
     Args:
-        path: Path of the file; its ending selects the format.
-        model: Calibrated robot with its uncertainty.
+        path: File that will be written, `.csv` or `.html`.
+        model: Calibration, or what its sidecar file contains of it.
         data: Measurements to compare with.
-        known: Known instrument parameters by name [m or rad]; the others are fitted to the data.
+        known: Values of their instrument parameters by name; others are fitted to the data.
 
     Returns:
         Text of the file.
@@ -41,8 +48,8 @@ def map_content(
     if path.lower().endswith(".csv"):
         return map_text(workspace_map(model, data, known))
     sentences = [
-        "Predicted standard deviation of the tool position for random configurations within the joint limits. "
-        "It follows from the uncertainty of the parameters. Unmodelled errors are not included."
+        "Standard deviation of the tool position that follows from the uncertainty of the parameters, for "
+        "configurations drawn within the joint limits. Unmodelled errors come in addition."
     ]
     q, errors = position_errors(model.chain, data, known)
     if len(errors):
@@ -50,22 +57,36 @@ def map_content(
         rms = [
             f"{1e3 * np.sqrt(np.mean(part**2)):.3g} mm" for part in (errors, std) if np.isfinite(part).all()
         ]
+        predicted = f" The predicted RMS error without this noise is {rms[1]}." if len(rms) > 1 else ""
         sentences.append(
-            f"At the {len(errors)} measured positions the RMS error is {rms[0]} including the noise of the "
-            + (f"instrument; the prediction without it is {rms[1]}." if len(rms) > 1 else "instrument.")
+            f"At the {len(errors)} measured positions the RMS error is {rms[0]}, including the noise of the "
+            f"instrument.{predicted}"
         )
-    title = f"Predicted accuracy of {model.chain.model.name or 'the robot'} over the workspace"
+    title = f"Predicted accuracy of {model.chain.model.name or 'the robot'}"
     return map_page(title, predict_workspace(model, data), sentences)
 
 
-def map_text(found: WorkspaceMap) -> str:
-    """Return the CSV text of a map: one row per cell, in millimetres."""
+def map_text(workspace: WorkspaceMap) -> str:
+    """Render a map as CSV in millimetres; columns of measurements exist only if there are any.
+
+    Args:
+        workspace: Map of the workspace.
+
+    Returns:
+        Text of the file.
+    """
     names = ("x[mm]", "y[mm]", "z[mm]")
-    columns = {name: (1e3 * found.centre[:, i]).round(6).tolist() for i, name in enumerate(names)}
-    columns |= {"position_std[mm]": (1e3 * found.std).tolist(), "worst[mm]": (1e3 * found.worst).tolist()}
-    columns["configurations"] = found.count.tolist()
-    if found.readings.any():
-        columns["readings"] = found.readings.tolist()
-        for name, part in (("measured_rms[mm]", found.measured), ("predicted_there[mm]", found.expected)):
-            columns[name] = ["" if np.isnan(value) else value for value in (1e3 * part).tolist()]
-    return csv_text(columns, ["predicted position uncertainty by cell of the workspace, measuring frame"])
+    columns = {name: (1e3 * workspace.centre[:, i]).round(6).tolist() for i, name in enumerate(names)}
+    columns |= {
+        "position_std[mm]": (1e3 * workspace.std).tolist(),
+        "worst[mm]": (1e3 * workspace.worst).tolist(),
+        "configurations": workspace.count.tolist(),
+    }
+    if workspace.readings.any():
+        columns["readings"] = workspace.readings.tolist()
+        for name, values in (
+            ("measured_rms[mm]", workspace.measured),
+            ("predicted_there[mm]", workspace.expected),
+        ):
+            columns[name] = ["" if np.isnan(value) else value for value in (1e3 * values).tolist()]
+    return csv_text(columns, ["predicted position uncertainty by cells of the workspace, measuring frame"])

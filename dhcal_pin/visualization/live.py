@@ -1,8 +1,8 @@
-"""Live MeshCat scene of a robot on the loopback address of this computer.
+"""Live MeshCat scene of a robot that a program moves.
 
-The offline page of `scene` needs no server. The live scene is for programs that move the robot. A server
-process listens on the loopback address and ends with the program. If it does not answer within
-`TIMEOUT_MS`, a DhcalError is raised; MeshCat itself would wait without limit.
+The offline page of `scene` needs no server. The live scene starts one in a process of its own, which listens
+on the loopback address only and ends with the program. Commands that are not answered within a time limit
+raise an error.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from ..robot.chain import Chain
 from .meshes import Visuals, visuals_of
 from .scene import MAX_TRIANGLES, kinematic_tree, with_shared_frames
 
-# Largest duration of one command [ms].
+# Longest time for one command of the server [ms].
 TIMEOUT_MS = 2000
-# Largest duration of the start, including imports from a slow disk [s].
+# Longest time for the start of the server, including imports from a slow disk [s].
 START_TIMEOUT_S = 30.0
-# Frames per second of `Live.play`.
+# Configurations per second while poses are played.
 FRAMES_PER_SECOND = 30
 # Colour and opacity of each layer.
 STYLES = {"nominal": (0x0072B2, 0.35), "calibrated": (0xE69F00, 1.0), "arm": (0x0072B2, 1.0)}
@@ -50,20 +50,20 @@ def serve(
     magnification: float = 1.0,
     triangles: int = MAX_TRIANGLES,
 ) -> Live:
-    """Start a live scene of one robot, or of a nominal and a calibrated robot.
+    """Start a live scene of a robot, or of a robot before and after its calibration.
 
     Args:
-        nominal: Nominal robot; transparent beside the calibrated one, opaque if alone.
-        calibrated: Calibrated robot, or calibration result.
-        package_dirs: Folders to search for meshes. Default: the folders above the URDF.
-        magnification: Factor by which the errors are magnified.
-        triangles: Largest number of triangles of all meshes together.
+        nominal: Nominal robot; transparent beside the calibrated one, solid if alone.
+        calibrated: Calibrated robot with the same joints, or the result of the calibration.
+        package_dirs: Folders that contain the meshes of the URDF; by default the folders above the URDF.
+        magnification: Magnification of the errors.
+        triangles: Largest number of triangles of all meshes.
 
     Returns:
-        Scene with all joints at zero. Close it, or use it in a `with` statement.
+        Scene with all joints at zero; close it, or use it in a `with` statement.
 
     Raises:
-        DhcalError: The robots have different joints, or the server does not start.
+        DhcalError: The two robots have different joints, or the server does not start.
     """
     if isinstance(calibrated, Result):
         nominal = replace(
@@ -72,19 +72,19 @@ def serve(
         calibrated = calibrated.chain
     arm = calibrated or nominal
     bodies = kinematic_tree(nominal, arm)["bodies"]
-    drawn = visuals_of(nominal, bodies, package_dirs, triangles)
+    visuals = visuals_of(nominal, bodies, package_dirs, triangles)
     if calibrated is None:
         arms = {"arm": arm}
     else:
         errors = se3.log6(se3.inverse(nominal.origins) @ arm.origins)
-        grown = replace(arm, origins=nominal.origins @ se3.exp6(magnification * errors))
-        arms = {"nominal": with_shared_frames(nominal, arm), "calibrated": grown}
+        magnified = replace(arm, origins=nominal.origins @ se3.exp6(magnification * errors))
+        arms = {"nominal": with_shared_frames(nominal, arm), "calibrated": magnified}
     window = _Window.start()
     scene = Live(window.web_url, arms, window)
     for name in arms:
         view = meshcat.Visualizer(window=window)[name]
         view.set_transform(se3.inverse(arm.base))
-        _draw(view, STYLES[name], drawn, len(bodies) - 1)
+        _draw(view, STYLES[name], visuals, len(bodies) - 1)
     size = float(np.linalg.norm(arm.origins[:, :3, 3], axis=1).sum())
     page = meshcat.Visualizer(window=window)
     page["/Cameras/default/rotated/<object>"].set_property("position", [0.7 * size, 0.4 * size, 0.8 * size])
@@ -99,7 +99,7 @@ class Live:
     """Running live scene.
 
     Attributes:
-        url: Address of the page for a browser on this computer.
+        url: Address of the page, for a browser on this computer.
         arms: Robots by layer.
     """
 
@@ -108,10 +108,13 @@ class Live:
     _window: _Window
 
     def show(self, q: Array) -> None:
-        """Show the robots at joint positions q, shape (n,) [rad or m].
+        """Move the robots to a configuration.
+
+        Args:
+            q: Joint positions, shape (n,) [rad or m].
 
         Raises:
-            DhcalError: The shape is wrong, or the server does not answer.
+            DhcalError: The shape of q is wrong, or the server does not answer within 3 s.
         """
         for name, chain in self.arms.items():
             for number, pose in enumerate(_body_poses(chain, q)):
@@ -122,16 +125,16 @@ class Live:
 
         Args:
             q: Joint positions, shape (m, n) [rad or m].
-            seconds: Duration of the motion from one configuration to the next [s].
+            seconds: Time from one configuration to the next [s].
 
         Raises:
-            DhcalError: The shape is wrong, or the server does not answer.
+            DhcalError: As for `show`.
         """
         q = next(iter(self.arms.values())).validated_q(q)
         steps = max(1, round(seconds * FRAMES_PER_SECOND))
         for start, end in zip(q, np.concatenate([q[1:], q[-1:]]), strict=True):
-            for share in np.arange(steps) / steps:
-                self.show(start + share * (end - start))
+            for fraction in np.arange(steps) / steps:
+                self.show(start + fraction * (end - start))
                 time.sleep(1 / FRAMES_PER_SECOND)
 
     def close(self) -> None:
@@ -146,43 +149,45 @@ class Live:
 
 
 def _body_poses(chain: Chain, q: Array) -> list[Array]:
-    """Compute the poses, shape (4, 4), of the bodies of `kinematic_tree` in the measuring frame."""
+    """Return the poses (4, 4) of the bodies of `scene.kinematic_tree` in the measuring frame."""
     model, data = chain.model, chain.model.createData()
     pin.framesForwardKinematics(model, data, chain.configurations(np.atleast_2d(q))[0])
-    poses = [chain.base @ pose.homogeneous for pose in (*data.oMi, data.oMf[chain.frame_id])]
+    model_poses = [*data.oMi, data.oMf[chain.frame_id]]
+    poses = [chain.base @ pose.homogeneous for pose in model_poses]
     return [*poses, poses[-1] @ chain.tool]
 
 
 def _draw(view: meshcat.Visualizer, style: tuple[int, float], visuals: Visuals, tool: int) -> None:
-    """Send the shapes of a robot, each under the number of its body, and a triad for the tool."""
+    """Send the shapes of a robot, each below the number of its body, and the axes of the tool frame."""
     color, opacity = style
     material = g.MeshPhongMaterial(color=color, opacity=opacity, transparent=opacity < 1)
     for number, shape in enumerate(visuals.shapes):
-        rotation = np.eye(4)
+        shape_from_geometry = np.eye(4)
         if "box" in shape:
             geometry = g.Box(shape["box"])
         elif "sphere" in shape:
             geometry = g.Sphere(shape["sphere"])
         elif "cylinder" in shape:
             radius, length = shape["cylinder"]
+            geometry = g.Cylinder(length, radius)
             # The axis of a cylinder is y in MeshCat and z in URDF.
-            geometry, rotation = g.Cylinder(length, radius), se3.exp6(np.array([0, 0, 0, np.pi / 2, 0, 0]))
+            shape_from_geometry = se3.exp6(np.array([0, 0, 0, np.pi / 2, 0, 0]))
         else:
             mesh = visuals.meshes[shape["mesh"]]
             geometry = g.TriangularMeshGeometry(mesh.vertices, mesh.triangles)
         placement = np.concatenate([np.reshape(shape["placement"], (3, 4)), [[0, 0, 0, 1]]])
         view[f"{shape['body']}/{number}"].set_object(geometry, material)
-        view[f"{shape['body']}/{number}"].set_transform(placement @ rotation)
+        view[f"{shape['body']}/{number}"].set_transform(placement @ shape_from_geometry)
     view[f"{tool}/frame"].set_object(g.triad(0.2))
 
 
 @dataclass(frozen=True, eq=False)
 class _Window:
-    """Connection of `meshcat.Visualizer` to a server, with a time limit for each answer.
+    """Connection of `meshcat.Visualizer` to the server; MeshCat's own one waits for an answer without limit.
 
     Attributes:
-        process: Server process.
-        socket: Socket that is connected to the server.
+        process: Process of the server.
+        socket: Connection to the server.
         folder: Folder of the socket file.
         web_url: Address of the page.
     """
@@ -194,7 +199,7 @@ class _Window:
 
     @classmethod
     def start(cls) -> _Window:
-        """Start a server process and connect to it."""
+        """Start a server and connect to it."""
         folder = TemporaryDirectory(prefix="dhcal-")
         address = f"ipc://{folder.name}/commands"
         process = subprocess.Popen(
@@ -203,8 +208,9 @@ class _Window:
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
-            # The server imports the same modules. It ignores the interrupt of a notebook cell.
+            # The server finds the same modules.
             env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            # An interrupted notebook cell does not interrupt the server.
             start_new_session=True,
         )
         assert process.stdout is not None
@@ -217,12 +223,14 @@ class _Window:
         window = cls(process, socket, folder, url)
         if not url:
             window.close()
-            raise DhcalError(f"the MeshCat server did not start within {START_TIMEOUT_S:.0f} s")
+            raise DhcalError(
+                f"the MeshCat server did not start within {START_TIMEOUT_S:.0f} s; start it again"
+            )
         socket.connect(address)
         return window
 
     def send(self, command: Any) -> None:
-        """Send one MeshCat command and wait for its answer."""
+        """Send a command of MeshCat and wait for the answer."""
         data = command.lower()
         try:
             if self.process.poll() is None:
@@ -237,7 +245,7 @@ class _Window:
         raise DhcalError(f"the MeshCat server at {self.web_url} does not answer; start a new scene")
 
     def close(self) -> None:
-        """Stop the server and remove the socket file."""
+        """Stop the server and remove its socket file."""
         self.socket.close()
         self.process.kill()
         self.process.communicate()

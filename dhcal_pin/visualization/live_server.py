@@ -1,8 +1,8 @@
-"""The process behind a live scene: MeshCat's server on the loopback address, until its parent goes.
+"""Server process of a live scene: the MeshCat server on the loopback address, until its parent ends.
 
-MeshCat's own listens on every address. This one takes commands through a socket file in a folder that
-only this user can open, and shows its page to browsers on this computer. `python -m
-dhcal_pin.live_server ADDRESS` writes the page's URL as its first line.
+The server of MeshCat listens on every address. This one receives commands through a socket file in a folder
+that only this user can open, and shows its page to browsers on this computer. `python -m
+dhcal_pin.visualization.live_server ADDRESS` prints the address of the page as its first line.
 """
 
 from __future__ import annotations
@@ -24,7 +24,11 @@ class _LocalBridge(ZMQWebSocketBridge):
 
 
 def main(address: str) -> None:
-    """Serves until standard input closes, as it does however the parent ends."""
+    """Serve until standard input closes, which happens when the parent process ends in any way.
+
+    Args:
+        address: Address of the socket for commands.
+    """
     bridge = _LocalBridge(zmq_url=address, host=LOOPBACK)
     bridge.ioloop.add_handler(sys.stdin, lambda *_: bridge.ioloop.stop(), bridge.ioloop.READ)
     print(bridge.web_url, flush=True)

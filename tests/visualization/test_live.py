@@ -1,4 +1,4 @@
-"""The live scene listens on this computer only, shows Pinocchio's poses, and reports a server that does not answer."""
+"""The live scene listens on this computer only, shows Pinocchio's poses, and reports a dead server."""
 
 from __future__ import annotations
 
