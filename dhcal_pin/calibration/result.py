@@ -256,7 +256,7 @@ class Result:
         out[unknown, unknown] = np.inf
         return out
 
-    @cached_property
+    @property
     def uncertainty(self) -> Uncertainty:
         """Uncertainty of the robot without that of the instruments, for predictions and for the sidecar."""
         root, unbounded = self._scaled_sqrt_covariance

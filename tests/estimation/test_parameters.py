@@ -1,4 +1,4 @@
-"""Every parameter set: derivatives at any value, ranks by theory, DH exact, names that users meet."""
+"""Parameter sets: derivatives by finite differences, ranks by theory, exact DH changes, names and messages."""
 
 from __future__ import annotations
 
@@ -9,18 +9,15 @@ import pytest
 from robots import paper, random_table, with_masses
 
 from dhcal_pin import se3
-from dhcal_pin.calibration.procedure import calibrate
-from dhcal_pin.estimation import qr
-from dhcal_pin.estimation.parameters import PARAMETER_SETS, select_parameters
-from dhcal_pin.estimation.problem import Problem, linearize_and_factor
-from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.measurements.base import Noise
-from dhcal_pin.measurements.pose import Pose
-from dhcal_pin.measurements.position import Position
-from dhcal_pin.robot.chain import Chain
+from dhcal_pin.calibration import calibrate
+from dhcal_pin.estimation import PARAMETER_SETS, Problem, linearize_and_factor, qr, select_parameters
+from dhcal_pin.exceptions import DhcalError, InvalidArgumentError, UnknownNameError
+from dhcal_pin.measurements import Noise, Pose, Position
+from dhcal_pin.robot import Chain
 
 
 def rank(chain: Chain, sets: str, kind: type = Pose, m: int = 60) -> int:
+    """Return the number of observable directions with exact measurements at random configurations."""
     errors = select_parameters(chain, sets)
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (m, chain.n_joints))
     zero = np.zeros(len(errors.parameters))
@@ -29,10 +26,10 @@ def rank(chain: Chain, sets: str, kind: type = Pose, m: int = 60) -> int:
 
 
 @pytest.mark.parametrize("sets", [*PARAMETER_SETS, "minimal,base,tool,offset", "dh,placement"])
-def test_derivative_at_any_value(sets):
+def test_derivatives_agree_with_finite_differences_at_any_value(sets):
     rng = np.random.default_rng(1)
     for _ in range(3):
-        # Some joint turns, so that every set has parameters.
+        # Half of the joints are revolute, so that every set has parameters.
         table = random_table(rng, size=4)
         chain = with_masses(
             Chain.from_dh(replace(table, prismatic=table.prismatic & (rng.random(4) < 0.5))), rng
@@ -40,21 +37,21 @@ def test_derivative_at_any_value(sets):
         errors = select_parameters(chain, sets)
         x = 0.1 * rng.normal(size=len(errors.parameters))
         q, h = rng.uniform(-1, 1, (4, 4)), 1e-6
-        placed, bodies, twists = errors.derivative(x)
+        chain, bodies, twists = errors.derivative(x)
         assert np.all(np.diff(bodies) >= 0)
-        velocities = placed.tool_jacobian(placed.forward_kinematics(q), bodies, twists)
-        np.testing.assert_allclose(placed.poses(q), errors.at(x).poses(q), atol=1e-15)
+        jacobian = chain.tool_jacobian(chain.forward_kinematics(q), bodies, twists)
+        np.testing.assert_allclose(chain.poses(q), errors.at(x).poses(q), atol=1e-15)
         for k in range(len(x)):
             step = h * np.eye(len(x))[k]
             up, down = errors.at(x + step).poses(q), errors.at(x - step).poses(q)
             linear = (up - down)[:, :3, 3] / (2 * h)
             angular = se3.log3(up[:, :3, :3] @ np.swapaxes(down[:, :3, :3], 1, 2)) / (2 * h)
-            np.testing.assert_allclose(velocities[k].T, np.concatenate([linear, angular], 1), atol=2e-9)
+            np.testing.assert_allclose(jacobian[k].T, np.concatenate([linear, angular], 1), atol=2e-9)
 
 
 @pytest.mark.parametrize("convention", ["standard", "modified"])
 def test_dh_changes_are_exact(convention):
-    """Large changes of every table entry equal the DH product with the changed table."""
+    """Large errors of all table entries give the poses of the changed table."""
     rng = np.random.default_rng(2)
     for _ in range(20):
         table = random_table(rng, convention, 5)
@@ -67,11 +64,13 @@ def test_dh_changes_are_exact(convention):
         np.testing.assert_allclose(errors.at(x).poses(q), other.poses(q), atol=1e-13)
         for p in errors.parameters:
             nominal = getattr(table, p.name.rstrip("12345"))[int(p.name[-1]) - 1]
-            gap = p.nominal - nominal
-            assert abs((gap + np.pi) % (2 * np.pi) - np.pi if p.unit == "rad" else gap) < 1e-12, p.name
+            difference = p.nominal - nominal
+            if p.unit == "rad":
+                difference = (difference + np.pi) % (2 * np.pi) - np.pi
+            assert abs(difference) < 1e-12, p.name
 
 
-def test_ranks_of_the_papers_arms():
+def test_ranks_of_the_robots_of_the_paper():
     assert rank(Chain.from_dh(paper("sim_6dof")), "dh") == 21
     assert rank(Chain.from_dh(paper("sim_6dof_actual")), "dh") == 24
     assert rank(Chain.from_dh(paper("sim_3dof")), "dh", Position) == 10
@@ -80,11 +79,11 @@ def test_ranks_of_the_papers_arms():
 
 @pytest.mark.parametrize("seed", range(8))
 def test_minimal_with_base_and_tool_is_complete(seed):
-    """4R + 2P + 6 directions, also with placement's six a joint beside it."""
+    """4R + 2P + 6 directions, also together with redundant sets."""
     table = random_table(np.random.default_rng(seed), size=5)
     chain = Chain.from_dh(table)
-    slides = int(table.prismatic.sum())
-    theory = 4 * (5 - slides) + 2 * slides + 6
+    n_prismatic = int(table.prismatic.sum())
+    theory = 4 * (5 - n_prismatic) + 2 * n_prismatic + 6
     assert rank(chain, "minimal,base,tool") == theory
     assert rank(chain, "minimal,placement,base,tool,offset") == theory
 
@@ -92,8 +91,8 @@ def test_minimal_with_base_and_tool_is_complete(seed):
 @pytest.mark.parametrize(
     "sets", ["dh,base,tool", "modified-dh,base,tool", "hayati,base,tool", "minimal,base,tool"]
 )
-def test_a_joint_that_mimics_another_has_errors_of_its_own(sets, mimicking):
-    """Six joints that move, five that are commanded: 4R + 6 directions, and the true arm is found."""
+def test_a_mimic_joint_has_errors_of_its_own(sets, mimicking):
+    """Six moving and five independent joints: 4R + 6 directions, and the true robot is identified."""
     assert rank(mimicking, sets) == 4 * 6 + 6
     rng = np.random.default_rng(3)
     errors = select_parameters(mimicking, sets)
@@ -103,9 +102,9 @@ def test_a_joint_that_mimics_another_has_errors_of_its_own(sets, mimicking):
     assert np.abs(fit.chain.poses(q[30:]) - truth.poses(q[30:])).max() < 1e-9
 
 
-def missed(arm: str, sets: str, seed: int, priors) -> float:
-    """How far a held-out pose is missed after exact poses of an arm off by up to 2° and 10 mm, m and rad."""
-    chain, rng = Chain.from_dh(paper(arm)), np.random.default_rng(seed)
+def hold_out_error(robot: str, sets: str, seed: int, priors) -> float:
+    """Return the largest hold-out error after a fit of exact poses; errors are up to 2° and 10 mm."""
+    chain, rng = Chain.from_dh(paper(robot)), np.random.default_rng(seed)
     errors = select_parameters(chain, sets)
     size = np.array([np.deg2rad(2) if p.unit == "rad" else 0.01 for p in errors.parameters])
     truth = errors.at(size * rng.uniform(-1, 1, len(size)))
@@ -116,26 +115,26 @@ def missed(arm: str, sets: str, seed: int, priors) -> float:
 
 IDENTIFIED = ["dh", "modified-dh", "hayati", "minimal", "placement"]
 PRIORS = pytest.mark.parametrize("priors", ["none", "default"])
-PAPERS = pytest.mark.parametrize("arm", ["sim_3dof", "sim_6dof", "sim_6dof_actual", "experiment"])
+ROBOTS = pytest.mark.parametrize("robot", ["sim_3dof", "sim_6dof", "sim_6dof_actual", "experiment"])
 
 
 @PRIORS
-@PAPERS
-def test_the_papers_arms_are_found_whatever_the_priors(arm, priors):
-    """Default priors fade with the scatter that they are weighed against."""
-    assert max(missed(arm, f"{sets},base,tool", 0, priors) for sets in IDENTIFIED) < 1e-9
+@ROBOTS
+def test_robots_of_the_paper_are_identified_with_and_without_priors(robot, priors):
+    """Default priors lose their influence as the estimated noise falls to zero."""
+    assert max(hold_out_error(robot, f"{sets},base,tool", 0, priors) for sets in IDENTIFIED) < 1e-9
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("frames", ["", ",base,tool"])
 @pytest.mark.parametrize("sets", IDENTIFIED)
 @PRIORS
-@PAPERS
-def test_the_papers_arms_are_found_in_every_seed(arm, priors, sets, frames):
-    assert max(missed(arm, sets + frames, seed, priors) for seed in range(100)) < 1e-9
+@ROBOTS
+def test_robots_of_the_paper_are_identified_in_every_seed(robot, priors, sets, frames):
+    assert max(hold_out_error(robot, sets + frames, seed, priors) for seed in range(100)) < 1e-9
 
 
-def test_minimal_has_four_a_revolute_and_two_a_sliding_joint():
+def test_minimal_has_four_parameters_per_revolute_and_two_per_prismatic_joint():
     table = replace(random_table(np.random.default_rng(0), size=3), prismatic=np.array([False, True, False]))
     names = [p.name for p in select_parameters(Chain.from_dh(table), "minimal").parameters]
     assert names == [
@@ -171,6 +170,17 @@ def test_fix_and_free(sim_6dof):
         ({"sets": "base", "fix": ["base"]}, "no parameter is left"),
     ],
 )
-def test_wrong_names_say_what_there_is(sim_6dof, kwargs, message):
-    with pytest.raises(DhcalError, match=message):
+def test_wrong_names_list_the_choices(sim_6dof, kwargs, message):
+    with pytest.raises((UnknownNameError, InvalidArgumentError), match=message):
         select_parameters(sim_6dof, **kwargs)
+
+
+def test_a_set_without_parameters_names_what_it_needs(sim_6dof):
+    with pytest.raises(DhcalError, match="'compliance'; the set needs .* masses"):
+        select_parameters(sim_6dof, "compliance")
+
+
+def test_every_set_has_a_help_text_of_one_line():
+    texts = [parameter_set.help for parameter_set in PARAMETER_SETS.values()]
+    assert all(0 < len(text) < 80 and "\n" not in text for text in texts)
+    assert len(set(texts)) == len(texts)

@@ -1,4 +1,4 @@
-"""Predictions of what a sidecar keeps, against the fit's and its parameters' own covariance."""
+"""Predictions from a sidecar file, against those of the fit and of the parameter covariance."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ def ur10() -> Chain:
     return Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
 
 
-def carried(fit: Result, q: np.ndarray) -> np.ndarray:
-    """The parameters' covariance carried to the tool by central differences, (m, 6, 6)."""
+def covariance_by_differences(fit: Result, q: np.ndarray) -> np.ndarray:
+    """Propagate the parameter covariance to the tool by central differences, shape (m, 6, 6)."""
     robot, h = len(fit.errors.parameters), 1e-5
     x, at = fit.x[:robot], fit.chain.poses(q)
     columns = []
     for i in range(robot):
         step = np.zeros(robot)
         step[i] = h
-        there, back = (fit.errors.at(x + sign * step).poses(q) for sign in (1, -1))
-        turn = (there - back)[:, :3, :3] @ np.swapaxes(at[:, :3, :3], 1, 2)
-        spin = np.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], -1)
-        columns.append(np.concatenate([(there - back)[:, :3, 3], spin], 1) / (2 * h))
+        up, down = (fit.errors.at(x + sign * step).poses(q) for sign in (1, -1))
+        rotation = (up - down)[:, :3, :3] @ np.swapaxes(at[:, :3, :3], 1, 2)
+        angular = np.stack([rotation[:, 2, 1], rotation[:, 0, 2], rotation[:, 1, 0]], -1)
+        columns.append(np.concatenate([(up - down)[:, :3, 3], angular], 1) / (2 * h))
     jacobian = np.stack(columns, -1)
     return jacobian @ fit.covariance[:robot, :robot] @ np.swapaxes(jacobian, 1, 2)
 
@@ -69,7 +69,7 @@ SETS = (
 
 
 @pytest.mark.parametrize("sets", SETS)
-def test_a_file_predicts_what_its_fit_predicts(ur10, tmp_path, sets):
+def test_predictions_from_a_file_agree_with_those_of_the_fit(ur10, tmp_path, sets):
     fit = fitted(ur10, sets)
     write_urdf(fit, tmp_path / "out.urdf")
     again = read_robot(tmp_path / "out.urdf", "tool0")
@@ -82,13 +82,13 @@ def test_a_file_predicts_what_its_fit_predicts(ur10, tmp_path, sets):
     np.testing.assert_allclose(theirs.orientation_std, mine.orientation_std, rtol=1e-9)
     size = np.sqrt(np.einsum("mii->mi", mine.covariance))
     assert np.max(np.abs(theirs.covariance - mine.covariance) / (size[:, :, None] * size[:, None])) <= 1e-9
-    # And both what the parameters' covariance says, without twists.
-    wanted = carried(fit, q[:20])
+    # And with the parameter covariance, without body twists.
+    wanted = covariance_by_differences(fit, q[:20])
     gap = np.abs(mine.covariance[:20] - wanted) / (size[:20, :, None] * size[:20, None])
     assert gap.max() < 1e-4
 
 
-def test_what_nothing_tells_stays_unknown(sim_6dof, tmp_path):
+def test_undetermined_directions_have_infinite_variance(sim_6dof, tmp_path):
     fit = fitted(sim_6dof, "dh,base", Position, 4, priors="none")
     write_urdf(fit, tmp_path / "out.urdf")
     known = read_uncertainty(sidecar_path(tmp_path / "out.urdf"), read_robot(tmp_path / "out.urdf"))
@@ -101,7 +101,7 @@ def test_what_nothing_tells_stays_unknown(sim_6dof, tmp_path):
 
 @pytest.fixture
 def calibrated(tmp_path, monkeypatch) -> Result:
-    """A working folder with a calibrated robot and further measurements of it."""
+    """Write a calibrated robot and further measurements of it to a working folder."""
     monkeypatch.chdir(tmp_path)
     fit = fitted(Chain.from_dh(read_dh(URDF / "sim_6dof.dh.toml")), "minimal,base,tool", count=30)
     other = Pose.simulate(fit.chain, np.random.default_rng(5).uniform(-1, 1, (50, 6)), Noise(1e-4, 1e-4),
@@ -111,7 +111,7 @@ def calibrated(tmp_path, monkeypatch) -> Result:
     return fit
 
 
-def test_validate_maps_the_prediction_beside_the_errors(calibrated, tmp_path):
+def test_the_map_of_validate_contains_predicted_and_measured_errors(calibrated, tmp_path):
     assert main(["validate", "out.urdf", "other.csv", "--map", "map.csv", "--json", "v.json"]) == 0
     names, *rows = [line for line in (tmp_path / "map.csv").read_text().splitlines() if line[0] != "#"]
     columns = dict(zip(names.split(","), zip(*(row.split(",") for row in rows), strict=True), strict=True))
@@ -121,7 +121,7 @@ def test_validate_maps_the_prediction_beside_the_errors(calibrated, tmp_path):
     measured, there = (
         np.array(columns[name])[some].astype(float) for name in ("measured_rms[mm]", "predicted_there[mm]")
     )
-    # Cell by cell they add up to what is said of all, and to what the fit itself predicts.
+    # The cells together have the RMS of all measurements, and the prediction of the fit.
     data = read_measurements("other.csv", calibrated.chain)
     found = json.loads((tmp_path / "v.json").read_text())
     assert found["files"] == {"json": "v.json", "map": "map.csv"}
@@ -132,7 +132,7 @@ def test_validate_maps_the_prediction_beside_the_errors(calibrated, tmp_path):
     assert {text for text, seen in zip(columns["measured_rms[mm]"], some, strict=True) if not seen} == {""}
 
 
-def test_a_map_as_a_page_and_what_is_refused(calibrated, tmp_path, capsys):
+def test_validate_writes_the_map_as_html_and_refuses_invalid_options(calibrated, tmp_path, capsys):
     assert main(["validate", "out.urdf", "other.csv", "--map", "map.html"]) == 0
     page = (tmp_path / "map.html").read_text()
     assert page.count("<svg") >= 2
@@ -165,7 +165,7 @@ def test_a_map_as_a_page_and_what_is_refused(calibrated, tmp_path, capsys):
         ("terms = []", "", "terms is missing"),
     ],
 )
-def test_a_wrong_table_is_refused(calibrated, tmp_path, old, new, words):
+def test_an_invalid_uncertainty_table_is_refused(calibrated, tmp_path, old, new, words):
     side = tmp_path / "out.calibration.toml"
     head, table = side.read_text().split("[uncertainty]")
     assert old in table
@@ -175,8 +175,8 @@ def test_a_wrong_table_is_refused(calibrated, tmp_path, old, new, words):
     assert str(side) in str(caught.value)
 
 
-def test_with_a_world_joint_the_prediction_is_the_same(calibrated, tmp_path):
-    """The base link is then the world itself."""
+def test_a_world_joint_does_not_change_the_prediction(calibrated, tmp_path):
+    """The base link of the written robot is then the link `world`."""
     data = measurement_text(calibrated.data[0], calibrated.chain)
     (tmp_path / "data.csv").write_text(data)
     robot = str(URDF / "sim_6dof.dh.toml")
@@ -193,7 +193,7 @@ def test_with_a_world_joint_the_prediction_is_the_same(calibrated, tmp_path):
     np.testing.assert_allclose(found[1].position_std, found[0].position_std, rtol=1e-8)
 
 
-def test_view_draws_the_ellipsoids_of_a_file(calibrated, tmp_path):
+def test_view_draws_the_uncertainty_ellipsoids_of_a_file(calibrated, tmp_path):
     robot = str(URDF / "sim_6dof.dh.toml")
     assert main(["view", robot, "out.urdf", "--data", "other.csv", "--html", "s.html"]) == 0
     scene = json.loads(
