@@ -41,12 +41,8 @@ def test_frames_and_derivatives_agree_with_those_of_single_chains(sets, seed):
     """Robots of one structure with revolute and prismatic joints, and different nominal geometry."""
     rng = np.random.default_rng(seed)
     table = random_table(rng)
-    models = [
-        select_parameters(
-            true_chain(select_parameters(Chain.from_dh(table), "placement,base,tool"), rng), sets
-        )
-        for _ in range(4)
-    ]
+    all_errors = select_parameters(Chain.from_dh(table), "placement,base,tool")
+    models = [select_parameters(true_chain(all_errors, rng), sets) for _ in range(4)]
     x = 1e-2 * rng.normal(size=(4, len(models[0].parameters)))
     q = random_joints(rng, table, 2 * 4 * 3).reshape(2, 4, 3, -1)
     chains, bodies, twists = ChainBatch.from_models(models).derivative(x)

@@ -1,4 +1,4 @@
-"""Parameter sets: derivatives by finite differences, ranks by theory, exact DH changes, names and messages."""
+"""Parameter sets: derivatives by finite differences, ranks by theory, exact DH changes, names, messages."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ def test_wrong_names_list_the_choices(sim_6dof, kwargs, message):
 
 
 def test_a_set_without_parameters_names_what_it_needs(sim_6dof):
-    with pytest.raises(DhcalError, match="'compliance'; the set needs .* masses"):
+    with pytest.raises(DhcalError, match=r"'compliance'; the set needs .* masses"):
         select_parameters(sim_6dof, "compliance")
 
 
