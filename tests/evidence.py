@@ -53,24 +53,24 @@ def table(text: str) -> dict[str, list[str]]:
 
 
 RENAMES = table("""
-chance=p_value
-Batch=BatchProblem Space=WorkspaceConstraints Touch=PointContact extend=select_error_families
-extract=extract_dh_table|extract_dh iter_measurements=iter_measurements group_folds=leave_one_group_out random_folds=k_fold
-region_folds=blocked_folds select=select_parameters solve=solve_batch
-aside=n_rejected at=perturbed carrying=with_payload chain=robot enough=recommended_size expected=prior_std
-freedom=degrees_of_freedom frames=row_frames gross=n_outliers helps=is_significant
-hidden=unbounded_directions holds=agrees kept=shrinkage_factor|shrinkage|is_selected|is_kept miss=residual_error noise=unit_weight_std
-of=from_arrays|from_models portable=transferable_instruments random=random_error ratio=relative_error
-reference=nominal_refitted remaining=posterior_to_prior_std rest=min_cost|residual_cost targets=values unknowns=instrument_parameters root=sqrt_covariance
+chance=p_value Batch=BatchProblem Space=WorkspaceConstraints Touch=PointContact
+extend=select_error_families extract=extract_dh_table|extract_dh iter_measurements=iter_measurements
+group_folds=leave_one_group_out random_folds=k_fold region_folds=blocked_folds select=select_parameters
+solve=solve_batch aside=n_rejected at=perturbed carrying=with_payload chain=robot enough=recommended_size
+expected=prior_std freedom=degrees_of_freedom frames=row_frames gross=n_outliers helps=is_significant
+hidden=unbounded_directions holds=agrees kept=shrinkage_factor|shrinkage|is_selected|is_kept
+miss=residual_error noise=unit_weight_std of=from_arrays|from_models portable=transferable_instruments
+random=random_error ratio=relative_error reference=nominal_refitted remaining=posterior_to_prior_std
+rest=min_cost|residual_cost targets=values unknowns=instrument_parameters root=sqrt_covariance
 samples=n_samples scores=standardized_residuals|studentized_residuals seen=observable_fraction
 triangle=system|triangular_system weakly_seen=weakly_observable without=after_without_outliers
 learnt=prior_uncertainty space=constraints|workspace
 """)
 KEY_RENAMES = table("""
-kept=shrinkage_factor|shrinkage|is_selected|is_kept held_back=shrinkage_notes doubts=warnings samples=n_samples samples_holdout=n_holdout
-parameters_total=n_parameters before=nominal after=calibrated remaining=posterior_to_prior_std
-weakly_seen=weakly_observable aside=n_rejected gross=n_outliers without=after_without_outliers
-allowed=tolerance chance=p_value ratio_to_random=relative_error
+kept=shrinkage_factor|shrinkage|is_selected|is_kept held_back=shrinkage_notes doubts=warnings
+samples=n_samples samples_holdout=n_holdout parameters_total=n_parameters before=nominal after=calibrated
+remaining=posterior_to_prior_std weakly_seen=weakly_observable aside=n_rejected gross=n_outliers
+without=after_without_outliers allowed=tolerance chance=p_value ratio_to_random=relative_error
 enough=recommended_size holds=agrees root=sqrt_covariance hidden=unbounded_directions
 wrong=error_parameters redrawn=resample_each_iteration choice=pose_selection errors=error_std
 stands=base_in_measuring_frame
