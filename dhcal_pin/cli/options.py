@@ -6,8 +6,8 @@ Shared options are dictionaries of keyword arguments of `argparse.ArgumentParser
 
 Help texts may contain placeholders such as `{losses}`. When the help is printed they are replaced by names
 and descriptions from the modules that define them. A new loss or measurement kind therefore appears without
-an edit in this package. This module imports nothing heavy when it is loaded;
-even `dataclasses` would take as long as all the rest of `dhcal --help`.
+an edit in this package. This module imports nothing heavy when it is loaded; even `dataclasses`
+would take noticeable time of `dhcal --help`.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
         Args:
             action: Option; the placeholders of its help text are replaced.
         """
-        if action.help:
+        if action.help and "{" in action.help:
             action.help = expand_placeholders(action.help)
         super().add_argument(action)
 

@@ -2,18 +2,11 @@
 
 This package selects and words what a reader sees. Values are computed in `calibration` and `diagnostics`,
 plots are drawn by `visualization`.
+
+The public names are listed in `__init__.pyi`. Each is loaded on first use, so that a calibration without a
+report does not load the modules that draw it.
 """
 
-from .context import ReportContext
-from .document import Provenance, json_text, result_to_dict, validation_to_dict
-from .html import report_files, write_report
+import lazy_loader
 
-__all__ = [
-    "Provenance",
-    "ReportContext",
-    "json_text",
-    "report_files",
-    "result_to_dict",
-    "validation_to_dict",
-    "write_report",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
