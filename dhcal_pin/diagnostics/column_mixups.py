@@ -192,12 +192,12 @@ def diagnose_mixups(chain: Chain, data: Measurement) -> list[str]:
         "and target)"
     )
     index = np.sort(np.random.default_rng(1).permutation(index)[:_N_HYPOTHESIS_SAMPLES])
-    rms_by_hypothesis = [
+    scored_hypotheses = [
         (position_misfit(chain, one.q, one.positions), one) for one in _hypotheses(chain, data, index)
     ]
-    best = min(value for value, _ in rms_by_hypothesis)
+    best = min(value for value, _ in scored_hypotheses)
     if best * _MIN_IMPROVEMENT < misfit:
-        ties = [hypothesis for value, hypothesis in rms_by_hypothesis if value <= _MAX_TIE_RATIO * best]
+        ties = [hypothesis for value, hypothesis in scored_hypotheses if value <= _MAX_TIE_RATIO * best]
         descriptions = " or ".join(dict.fromkeys(one.description for one in ties))
         checks = " or ".join(dict.fromkeys(one.check for one in ties))
         return [f"{problem}, but by only {1e3 * best:.3g} mm with {descriptions}; check {checks}"]
