@@ -14,7 +14,7 @@ import pinocchio as pin
 import pytest
 from robots import URDF, missing, paper, robot_file
 
-from dhcal_pin import Provenance, formatting, se3, write_report
+from dhcal_pin import Provenance, se3, write_report
 from dhcal_pin.calibration.evaluation import accuracy
 from dhcal_pin.calibration.partition import split
 from dhcal_pin.calibration.procedure import calibrate
@@ -55,32 +55,6 @@ def fit() -> Result:
 def quick(monkeypatch):
     """Fewer configurations over the workspace."""
     monkeypatch.setattr(workspace, "N_PREDICTED_CONFIGURATIONS", 300)
-
-
-# --- numbers ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("value", "std", "text"),
-    [
-        # The examples of the Particle Data Group's review, 5.3.
-        (0.827e-3, 0.119e-3, "0.83 mm"),
-        (0.827e-3, 0.367e-3, "0.8 mm"),
-        (14.7e-3, 0.96e-3, "14.7 mm"),
-        (-0.4e-9, 1e-6, "0.0000 mm"),
-        (3.5679, 1.2e-3, "3567.9 mm"),
-        (np.inf, 1e-3, "–"),
-        (1e-3, np.nan, "1.000 mm"),
-    ],
-)
-def test_numbers_have_the_digits_that_are_known(value, std, text):
-    assert formatting.format_quantity(value, "m", std) == text
-
-
-def test_rates_and_pure_numbers():
-    assert formatting.format_quantity(1.2346e-5, "rad/Nm", 1e-7) == "12.35 µrad/Nm"
-    assert formatting.format_quantity(-2.5e-3, "rad/rad", 4e-4, small=True) == "-2.5 mrad/rad"
-    assert formatting.format_quantity(-0.00125, "1", 1e-5) == "-0.00125"
 
 
 def test_a_joint_that_waves_is_seen_in_that_joint_alone():

@@ -1,0 +1,39 @@
+"""Text of numbers and tables."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dhcal_pin.formatting import Table, format_quantity, html_table, markdown_table
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "text"),
+    [
+        # Examples of the Particle Data Group's review, section 5.3.
+        (0.827e-3, 0.119e-3, "0.83 mm"),
+        (0.827e-3, 0.367e-3, "0.8 mm"),
+        (14.7e-3, 0.96e-3, "14.7 mm"),
+        (-0.4e-9, 1e-6, "0.0000 mm"),
+        (3.5679, 1.2e-3, "3567.9 mm"),
+        (np.inf, 1e-3, "–"),
+        (1e-3, np.nan, "1.000 mm"),
+    ],
+)
+def test_quantities_are_rounded_to_their_standard_deviation(value, std, text):
+    assert format_quantity(value, "m", std) == text
+
+
+def test_rates_and_pure_numbers():
+    assert format_quantity(1.2346e-5, "rad/Nm", 1e-7) == "12.35 µrad/Nm"
+    assert format_quantity(-2.5e-3, "rad/rad", 4e-4, small=True) == "-2.5 mrad/rad"
+    assert format_quantity(-0.00125, "1", 1e-5) == "-0.00125"
+
+
+def test_tables_align_numbers_and_escape_text():
+    table = Table(["name", "value"], [["a<b", "-1.5"]], caption="c")
+    assert markdown_table(table) == "| name | value |\n| --- | ---: |\n| a<b | -1.5 |"
+    text = html_table(table)
+    assert '<th scope="row">a&lt;b</th><td class="number">−1.5</td>' in text
+    assert "<caption>c</caption>" in text
