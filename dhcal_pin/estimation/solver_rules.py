@@ -205,7 +205,8 @@ def damping_after_rejection(damping: _Number, growth: _Number) -> tuple[_Number,
 def undamped_steps_are_due(iteration: Any, last_undamped: Any) -> Any:
     """Decide whether a series of undamped steps is tried after this iteration.
 
-    The first series follows UNDAMPED_INTERVAL iterations, each further one twice as many as the last.
+    The first series follows iteration UNDAMPED_INTERVAL; the iteration number of each further one is twice
+    that of the last.
 
     Args:
         iteration: Number of iterations so far.
