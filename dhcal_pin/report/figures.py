@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,9 +26,6 @@ from ..robot.chain import Chain
 from ..visualization import plots, scene
 from ..visualization.plots import SQUARE_PANEL, WIDE_PANEL
 from .context import ReportContext
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 # A joint whose errors are larger than this multiple of the joints' median gets a scale of its own. Errors
 # before the calibration are left out if they are larger than this multiple of those after it.
@@ -53,7 +49,7 @@ class Panel:
     key: str
     caption: str
     description: str
-    plot: Callable[..., Axes]
+    plot: Callable[..., object]
     size: tuple[float, float] = plots.PANEL
 
 

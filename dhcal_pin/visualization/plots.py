@@ -651,7 +651,7 @@ class SvgPanels:
 
     def draw(
         self,
-        plot: Callable[..., Axes],
+        plot: Callable[..., object],
         key: str,
         title: str,
         description: str,

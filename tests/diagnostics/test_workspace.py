@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pinocchio as pin
 import pytest
 
+from dhcal_pin import se3
 from dhcal_pin.calibration import calibrate
-from dhcal_pin.diagnostics import workspace_map
+from dhcal_pin.diagnostics import predict_workspace, workspace, workspace_map
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import Noise, Pose
 from dhcal_pin.robot.sampling import ConfigurationSampler, WorkspaceConstraints
@@ -55,3 +59,19 @@ def test_every_configuration_is_counted_in_its_cell(sim_6dof):
     cell = int(np.argmax(found.count))
     wanted = np.sqrt(np.mean(prediction.position_std[inside[:, cell]] ** 2))
     assert found.std[cell] == pytest.approx(wanted, rel=1e-12)
+
+
+def test_predicted_points_are_in_the_base_frame(monkeypatch, sim_6dof, sim_6dof_actual):
+    monkeypatch.setattr(workspace, "N_PREDICTED_CONFIGURATIONS", 300)
+    nominal, actual = sim_6dof, sim_6dof_actual
+    truth = replace(actual, base=se3.exp6(np.array([3.0, -2.0, 1.0, 0.3, 0.2, 2.0])))
+    rng = np.random.default_rng(0)
+    data = Pose.simulate(truth, rng.uniform(-1.5, 1.5, (40, 6)), Noise(1e-4, 1e-4), rng)
+    found = predict_workspace(calibrate(nominal, data, "dh,base"), [data])
+    model, state = actual.model, actual.model.createData()
+    for q, point in zip(data.q, found.measured, strict=True):
+        pin.framesForwardKinematics(model, state, actual.configurations(q[None])[0])
+        # Base and first joint are distinguished by the priors only, hence the millimetres.
+        assert np.abs(state.oMf[actual.frame_id].translation - point).max() < 0.02
+    assert found.std.shape == (300,)
+    assert np.median(found.std) > np.median(found.measured_std)

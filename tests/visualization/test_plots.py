@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from functools import partial
+from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
+import dhcal_pin
 from dhcal_pin.visualization import plots
 from dhcal_pin.visualization.plots import COLORS, svg_panels
 
@@ -177,3 +180,13 @@ def test_matplotlib_is_imported_for_plots_only():
         "sys.exit(any(name.split('.')[0] in ('matplotlib', 'jinja2') for name in sys.modules))"
     )
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
+
+
+def test_only_the_module_of_plots_imports_matplotlib():
+    package = Path(dhcal_pin.__file__).parent
+    importing = {
+        path.relative_to(package).as_posix()
+        for path in package.rglob("*.py")
+        if re.search(r"^\s*(from|import) matplotlib", path.read_text(encoding="utf-8"), re.MULTILINE)
+    }
+    assert importing == {"visualization/plots.py"}
