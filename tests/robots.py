@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from dhcal_pin import se3
 from dhcal_pin.io import read_dh
 from dhcal_pin.robot import Chain, DHTable, parse_urdf
 
@@ -108,3 +109,51 @@ def with_masses(chain: Chain, rng: np.random.Generator) -> Chain:
         )
     heavy = Chain.from_urdf(parse_urdf(ElementTree.tostring(root), "heavy.urdf"), chain.tip)
     return replace(heavy, parameters=chain.parameters)
+
+
+def random_rotation(rng: np.random.Generator) -> np.ndarray:
+    """Draw a rotation matrix, uniformly distributed."""
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q * np.sign(np.linalg.det(q))
+
+
+def with_random_frames(chain: Chain, rng: np.random.Generator) -> Chain:
+    """Move the base by up to five metres and the tool by up to half a metre, both turned at random."""
+    offset = lambda reach: reach * rng.uniform(-1, 1, 3) / np.sqrt(3)  # noqa: E731
+    base = se3.transform(random_rotation(rng), offset(5.0))
+    tool = se3.transform(random_rotation(rng), offset(0.5))
+    return chain.perturbed_at({0: base, chain.tool_frame_index: tool})
+
+
+def measured_arm(name: str) -> Chain:
+    """Return an arm for statistical tests: "paper", "slide" (with a prismatic joint), "ur5" or "panda"."""
+    if name == "paper":
+        return Chain.from_dh(paper("sim_6dof"))
+    if name == "slide":
+        zero, free = np.zeros(5), np.full(5, np.inf)
+        return Chain.from_dh(
+            DHTable(
+                "standard",
+                ("j1", "j2", "j3", "j4", "j5"),
+                np.array([False, False, True, False, False]),
+                np.array([0, 0, np.pi / 2, 0, 0]),
+                np.array([0.4, 0.1, 0.5, 0.2, 0.1]),
+                np.array([0.1, 0.3, 0, 0.05, 0]),
+                np.array([np.pi / 2, np.pi / 2, 0.3, -np.pi / 2, 0]),
+                zero,
+                -free,
+                free,
+            )
+        )
+    files = {"ur5": ("ur_description/urdf/ur5_robot.urdf", "tool0"),
+             "panda": ("panda_description/urdf/panda.urdf", "panda_link8")}  # fmt: skip
+    path, tip = files[name]
+    return Chain.from_urdf(robot_file(path), tip)
+
+
+def joint_sample(chain: Chain, m: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw joint positions (m, n) within the limits, at most a full turn or 0.8 m."""
+    low = np.where(chain.prismatic, -0.4, np.fmax(chain.lower, -np.pi))
+    high = np.where(chain.prismatic, 0.4, np.fmin(chain.upper, np.pi))
+    return rng.uniform(low, high, (m, chain.n_joints))

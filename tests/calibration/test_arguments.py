@@ -11,7 +11,7 @@ from robots import paper
 
 from dhcal_pin.calibration import accuracy, calibrate, calibrate_stream, cross_validate, extend, k_fold, split
 from dhcal_pin.exceptions import InvalidArgumentError, UnknownNameError
-from dhcal_pin.measurements.position import Position
+from dhcal_pin.measurements import Position
 from dhcal_pin.robot import Chain
 
 CHAIN = Chain.from_dh(paper("sim_6dof"))

@@ -26,10 +26,7 @@ from dhcal_pin.calibration.partition import (
     group_by_configuration,
 )
 from dhcal_pin.exceptions import DhcalError, InvalidArgumentError
-from dhcal_pin.measurements.base import Measurement
-from dhcal_pin.measurements.contact import PointContact, PointDistance
-from dhcal_pin.measurements.pose import RelativePose
-from dhcal_pin.measurements.position import Position
+from dhcal_pin.measurements import Measurement, PointContact, PointDistance, Position, RelativePose
 from dhcal_pin.robot import Chain
 
 N_JOINTS = 6

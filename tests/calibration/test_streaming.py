@@ -1,4 +1,4 @@
-"""Streams against the same samples in memory; flat memory; digits that no sharing out changes."""
+"""Streaming: same results as in memory, constant memory, same digits in other processes."""
 
 from __future__ import annotations
 
@@ -9,21 +9,16 @@ from functools import partial
 import numpy as np
 import pytest
 
-from dhcal_pin.calibration.evaluation import accuracy
-from dhcal_pin.calibration.procedure import calibrate
-from dhcal_pin.calibration.streaming import calibrate_stream
+from dhcal_pin.calibration import accuracy, calibrate, calibrate_stream
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io.measurement_csv import iter_measurements, measurement_text
-from dhcal_pin.measurements.base import Noise
-from dhcal_pin.measurements.length import Wires
-from dhcal_pin.measurements.pose import Pose
-from dhcal_pin.measurements.position import Position
+from dhcal_pin.io import iter_measurements, measurement_text
+from dhcal_pin.measurements import Noise, Pose, Position, Wires
 from dhcal_pin.parallel import open_executor
 
 
 @pytest.fixture
 def laser(tmp_path, sim_6dof_actual):
-    """A file of 1,000 positions with comments and blank lines in it, and the same in memory."""
+    """Write a file of 1,000 positions with comments and blank lines; return it and the same data."""
     rng = np.random.default_rng(0)
     data = Position.simulate(sim_6dof_actual, rng.uniform(-3, 3, (1000, 6)), Noise(1e-4), rng)
     lines = measurement_text(data, sim_6dof_actual, ["a tracker"]).splitlines()
@@ -34,7 +29,7 @@ def laser(tmp_path, sim_6dof_actual):
     return path, data
 
 
-def test_a_stream_tells_what_memory_tells(laser, sim_6dof):
+def test_stream_gives_the_result_of_the_same_samples_in_memory(laser, sim_6dof):
     path, data = laser
     parts = partial(iter_measurements, path, sim_6dof, 64)
     assert [len(part().rows) for part in parts()] == [64] * 15 + [40]
@@ -51,8 +46,8 @@ def test_a_stream_tells_what_memory_tells(laser, sim_6dof):
     assert 1e-3 < found.before["position"] < 0.1
 
 
-def test_sigmas_are_told_by_the_first_part(sim_6dof, sim_6dof_actual):
-    """Rotations a hundred times better than the placeholder: weighed as in memory, within their scatter."""
+def test_first_part_determines_unstated_standard_deviations(sim_6dof, sim_6dof_actual):
+    """Rotations a hundred times better than the placeholder are weighted as in memory."""
     rng = np.random.default_rng(0)
     data = Pose.simulate(sim_6dof_actual, rng.uniform(-3, 3, (2000, 6)), Noise(2e-3, 1e-5), rng)
     plain = Pose(data.q, data.poses)
@@ -63,7 +58,7 @@ def test_sigmas_are_told_by_the_first_part(sim_6dof, sim_6dof_actual):
     np.testing.assert_allclose(found.std, best.std, rtol=0.1)
 
 
-def test_processes_give_the_same_digits(laser, sim_6dof):
+def test_other_processes_give_the_same_digits(laser, sim_6dof):
     path, data = laser
     parts = partial(iter_measurements, path, sim_6dof, 100)
     alone = calibrate_stream(sim_6dof, parts, "dh")
@@ -93,8 +88,8 @@ print(int(status["VmHWM"].split()[0]) / 1024)
 """
 
 
-def peak(parts: int) -> float:
-    """Peak memory in MB of a process that streams so many parts of 4096 positions."""
+def peak_memory(parts: int) -> float:
+    """Measure the peak memory [MB] of a process that streams this many parts of 4096 positions."""
     run = subprocess.run(
         [sys.executable, "-c", MEMORY, str(parts)], check=True, capture_output=True, text=True
     )
@@ -102,12 +97,12 @@ def peak(parts: int) -> float:
 
 
 def test_memory_does_not_grow():
-    assert peak(12) - peak(3) < 4
+    assert peak_memory(12) - peak_memory(3) < 4
 
 
 @pytest.mark.slow
 def test_memory_does_not_grow_to_ten_million():
-    assert peak(2442) - peak(25) < 16
+    assert peak_memory(2442) - peak_memory(25) < 16
 
 
 def test_wrong_streams_are_named(laser, tmp_path, sim_6dof, sim_6dof_actual):
