@@ -2,7 +2,7 @@
 
 The model is nearly linear around a solution x. A fold is therefore solved from two triangular systems at x
 instead of a new iteration: one of its fitted rows, [R_f | z_f], and one of its held-out rows, [R_h | z_h].
-With prior weights W, the step of the fold's fit and its held-out error are
+With prior weights W, the step of the fit without the fold, and the error of the fold, are
 
     δ = argmin ‖R_f·δ - z_f‖² + ‖W·(x + δ)‖²,        error² = (‖R_h·δ - z_h‖² + ρ_h²) / m_h,
 

@@ -1,4 +1,4 @@
-"""Shrinkage: the fraction of a correction that too few measurements warrant.
+"""Shrinkage: how much of a correction to apply when there are few measurements.
 
 With fewer equations than parameters many robots fit the measurements equally well. The solution x̂ is the
 most likely one under the priors, but the widths of the priors are only roughly known, and the correction

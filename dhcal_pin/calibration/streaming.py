@@ -1,7 +1,7 @@
 """Calibration from more samples than memory holds, read part by part in every iteration.
 
 Only the triangular factor R of the whitened rows [J | r] is needed to solve a step, and R of all rows
-follows from the factors of the parts: QR of [R_1; R_2; ...]. Memory does therefore not grow with the number
+follows from the factors of the parts: QR of [R_1; R_2; ...]. Memory therefore does not grow with the number
 of parts. The parts are read where they are factored, for example in other processes, and the result does
 not depend on where.
 
@@ -169,8 +169,8 @@ def calibrate_stream(
     known = known or {}
     if missing := [parameter.name for parameter in head.instrument_parameters if parameter.name not in known]:
         raise InvalidArgumentError(
-            f"{head.kind}: {missing[0]} is unknown; a stream needs surveyed instruments, so give its value "
-            "in `known`"
+            f"{head.kind}: {missing[0]} is unknown; a stream needs known instrument parameters, so give "
+            "its value in `known`"
         )
     fit = calibrate(
         chain,

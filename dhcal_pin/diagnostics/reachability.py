@@ -1,4 +1,4 @@
-"""Rows of a measurement file that are impossible for the robot's geometry, found before anything is fitted.
+"""Rows of a measurement file that are impossible for the robot's geometry, found before the fit.
 
 For a robot whose base and tool are known, the joint positions of a row give the position p of the tool point.
 A row is impossible if a measured or commanded position z is much farther from p than in typical rows:

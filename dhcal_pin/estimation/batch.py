@@ -62,7 +62,7 @@ class BatchProblem:
         for item in self.data:
             if missing := [u.name for u in item.instrument_parameters if u.name not in self.known]:
                 raise InvalidArgumentError(
-                    f"{item.kind}: {missing[0]} is unknown; a batch needs surveyed instruments, "
+                    f"{item.kind}: {missing[0]} is unknown; a batch needs known instrument parameters, "
                     "so give it as known or calibrate one by one"
                 )
             if len(item.rows) % max(len(self), 1):

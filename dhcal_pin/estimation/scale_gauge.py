@@ -1,4 +1,4 @@
-"""Gauge of scale and orientation for measurements without a length.
+"""Undetermined scale and orientation (gauge freedom) of measurements without a length.
 
 Contact measurements state that the tool touches the same unknown point, plane or sphere several times. Their
 residuals e (misses [m]) determine neither the size of the robot nor its orientation in the measuring frame:
@@ -14,7 +14,9 @@ with the robot,
 with the size s and the mean rotation R relative to the nominal robot. For an error x_i that makes the robot
 grow at the rate a_i and rotate at the rate w_i, the derivative of the whitened model is, at R = 1,
 
-    J'_i = (J_i + (a_i/s)·e + w_i × e) / s       with the sign convention J = -∂e/∂x of the rows [J | e].
+    J'_i = (J_i + (a_i/s)·e + w_i × e) / s.
+
+The rows are [J | e] with J = -∂e/∂x.
 
 Size and orientation then have no effect on the cost, and remain to other measurements or to the priors.
 

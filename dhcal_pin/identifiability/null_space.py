@@ -6,13 +6,11 @@ computing Jacobians of hypothetical measurements, at joint positions drawn at ra
     N_structure ⊆ N_instrument ⊆ N_poses ⊆ N_data
 
 * N_data: null space of the measurements themselves.
-* N_poses: its part that stays unobservable if the joints that never moved do move. The rest has the cause
-"unmoved".
-* N_instrument: the part that stays unobservable with the instruments at other poses. The rest has the cause
-"poses".
+* N_poses: the part that stays unobservable even if all joints move. The rest has the cause "unmoved".
+* N_instrument: the part that stays unobservable with the instruments at other poses. The rest has the
+  cause "poses".
 * N_structure: the part that stays unobservable even if the tool poses are measured. The rest has the cause
-"instrument",
-  and N_structure has the cause "structure": the parameters are redundant for every instrument.
+  "instrument". N_structure has the cause "structure": the parameters are redundant for every instrument.
 
 Each layer is then spanned by combinations with few parameters on short parts of the chain, by Gaussian
 elimination with different column orders. References: Khalil & Dombre, Modeling, Identification and Control of

@@ -1,9 +1,9 @@
 """Atomic writing: several files are written together, or none of them.
 
 Each content goes to a temporary file in the folder of its target first. Then the temporary files are renamed
-to the targets, one by one; an existing target gets a second name before. If anything fails, the targets that
-were renamed already are restored. A rename is atomic (POSIX), so that a reader sees the old or the new
-content of a file, never a part of it.
+to the targets, one by one. Before that, an existing target is hard-linked to a backup name. If anything
+fails, the targets that were renamed already are restored. A rename is atomic (POSIX), so that a reader sees
+the old or the new content of a file, never a part of it.
 """
 
 from __future__ import annotations

@@ -51,8 +51,9 @@ def robot_name(path: PathLike) -> str:
 def _urdf_of_table(robot: RobotSource, path: PathLike) -> ConvertedRobot:
     """Convert a DH table to its exact URDF."""
     if robot.table is None:
-        others = ", ".join(_endings(FORMATS[1:]))
-        raise InvalidArgumentError(f"{os.fspath(path)}: {robot.path} is already a URDF; choose from {others}")
+        raise InvalidArgumentError(
+            f"{os.fspath(path)}: {robot.path} contains no DH table; only DH tables are converted to URDF"
+        )
     if robot.convention is not None:
         raise InvalidArgumentError(f"{robot.path}: a URDF has no DH convention; leave out --convention")
     sidecar = existing_sidecar(path)

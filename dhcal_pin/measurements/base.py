@@ -9,7 +9,7 @@ parameters u predict, such as the unknown anchor of a wire. With the frames of t
     (∂h/∂u) / sigma                         instrument Jacobian, (s, k, m)
 
 With the tool Jacobian J, (p, 6, c·m), of p error parameters x, the Jacobian of the whitened model is the
-product of observation matrix and J, (p, k, m). A least-squares step Δ makes [Jacobian]·Δ ≈ r.
+product of observation matrix and J, (p, k, m). A least-squares step Δ makes J_w·Δ ≈ r with this Jacobian J_w.
 
 Letters in shapes: m samples, n joints, k residuals per sample, c configurations per sample (1 or 2),
 s instrument parameters, p error parameters. Components come first and samples last, so that the samples of
@@ -250,7 +250,8 @@ class Measurement(ABC):
             u: Values of the instrument parameters, (s,).
 
         Returns:
-            "position" (m, 3) [m], "orientation" (m, 3) [rad], or the kind's own names (m, ·) [m].
+            "position" (m, 3) [m], "orientation" (m, 3) [rad], or other names (m, ·) [m]. Reports show errors
+            of other names as "residual" in metres.
         """
 
     def positions(self) -> Array:

@@ -9,9 +9,8 @@ Jacobian rows; measuring it changes M to M + AᵀA. Every criterion is minimized
   Gain: tr((I + A·C·Aᵀ)⁻¹·A·C·W·Wᵀ·C·Aᵀ) (Woodbury identity).
 * I, or task: the same with W such that tr(Wᵀ·C·W) is the mean squared position error over a task.
 * E: largest eigenvalue of V·C·Vᵀ over the observable directions V.
-* Bias and variance: √(tr(Wᵀ·C·W)·‖Wᵀ·B - G‖²), where B is the bias of the fitted unknowns by omitted ones;
-see
-  `BiasVarianceCriterion`.
+* Bias and variance: √(tr(Wᵀ·C·W)·‖Wᵀ·B - G‖²), where B is the bias of the fitted parameters by omitted
+  ones; see `BiasVarianceCriterion`.
 
 `value` returns the logarithm of the criterion: a difference of 0.01 is one per cent. `gains` ranks candidates
 and uses k×k determinants in place of p×p ones. C is never formed from M: that would lose half the digits.

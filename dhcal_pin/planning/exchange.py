@@ -6,9 +6,8 @@ selection S has the covariance C = (R₀ᵀR₀ + Σ_S AᵢᵀAᵢ)⁻¹, of whi
 R the R factor of [R₀; A_S].
 
 * Greedy: add the feasible candidate of the largest gain, n times.
-* Exchange: for each selected candidate in turn, remove it and add the best one of the others, if that lowers
-the
-  criterion; repeat until a pass gains less than `MIN_PASS_GAIN`.
+* Exchange: for each selected candidate in turn, remove it and add the best one of the others, if that
+  lowers the criterion; repeat until a pass gains less than `MIN_PASS_GAIN`.
 
 References:
     V. V. Fedorov, Theory of Optimal Experiments, Academic Press 1972: exchange.

@@ -4,9 +4,8 @@ Steps of `plan`:
 
 1. Draw candidates within the joint limits and the workspace, or take the given ones.
 2. Collect the knowledge before measuring (`information`), and the whitened Jacobian rows of all candidates.
-3. Select poses greedily, improve the selection by exchange (`exchange`), and move the poses to better ones
-between
-   the candidates (`refinement`), all for one criterion (`criteria`).
+3. Select poses greedily, improve the selection by exchange (`exchange`), and move the poses to
+   better ones between the candidates (`refinement`), all for one criterion (`criteria`).
 4. Predict the error over the number of poses, for the plan and for random poses.
 5. Order the poses as a short tour.
 """

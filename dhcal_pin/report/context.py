@@ -1,4 +1,4 @@
-"""What a report is about: a result, where it comes from, and the diagnostics that are computed once."""
+"""Report context: a result, its provenance, and the diagnostics that are computed once."""
 
 from __future__ import annotations
 

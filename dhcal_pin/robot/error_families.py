@@ -16,7 +16,7 @@ class ErrorFamily:
 
     Attributes:
         name: Name of the parameter set.
-        description: Physical cause, a noun phrase in the plural or without a number, for help and reports.
+        description: Physical cause, such as "gear ratio errors", for help and reports.
         requirement: What a robot must have for the family to have parameters, for error messages.
     """
 

@@ -77,7 +77,7 @@ TERMS = (
     ),
 )
 
-# Families that consist of diagonal terms, in the order of `TERMS`. The family `coupling` is not one of them.
+# Families of diagonal terms, in the order of `TERMS`; all of `FAMILIES` but the last one, coupling.
 TERM_FAMILIES = tuple(dict.fromkeys(term.family for term in TERMS))
 
 # Index of the term whose off-diagonal coefficients couple joints: the joint position itself.

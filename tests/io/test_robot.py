@@ -58,7 +58,7 @@ def test_a_converted_robot_has_the_same_poses(tmp_path, robot_format):
     ("source", "target", "words"),
     [
         (TABLE, "arm.png", r"arm\.png: unknown ending; choose from \.urdf, \.dh\.toml, \.dh\.csv, \.yaml"),
-        (ROBOT, "arm.urdf", r"is already a URDF; choose from \.dh\.toml"),
+        (ROBOT, "arm.urdf", r"contains no DH table; only DH tables are converted to URDF"),
         ("arm.origins.csv", "arm.urdf", "a table of joint origins cannot be read as a robot; choose from"),
     ],
 )
