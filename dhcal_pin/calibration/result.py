@@ -259,6 +259,10 @@ class Result:
     @property
     def uncertainty(self) -> Uncertainty:
         """Uncertainty of the robot without that of the instruments, for predictions and for the sidecar."""
+        return self._uncertainty
+
+    @cached_property
+    def _uncertainty(self) -> Uncertainty:
         root, unbounded = self._scaled_sqrt_covariance
         robot = len(self.errors.parameters)
         return Uncertainty.from_errors(
