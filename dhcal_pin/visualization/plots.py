@@ -621,7 +621,8 @@ def study_svg(title: str, header: Sequence[str], rows: Sequence[Sequence[Any]], 
             frameon=False,
         )
         root = _svg_tree(figure, "study")
-    root.set("xmlns", "http://www.w3.org/2000/svg")
+    # Pixels instead of points: the size of the text is then that of the report.
+    root.attrib |= {"xmlns": "http://www.w3.org/2000/svg", "width": f"{width:g}", "height": f"{height:g}"}
     return ElementTree.tostring(root, "unicode") + "\n"
 
 
@@ -825,7 +826,7 @@ def _make_logarithmic(ax: Axes, name: Literal["x", "y"]) -> None:
 
 def _power_text(value: float) -> str:
     """Return the text of a tick; distant powers of ten with a superscript."""
-    if 1e-3 < value < 1e4:
+    if 0.999e-3 < value < 1e4:
         return f"{value:g}"
     mantissa, exponent = f"{value:.0e}".split("e")
     superscript = str(int(exponent)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
