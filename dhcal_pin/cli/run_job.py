@@ -321,7 +321,7 @@ def _robot_files(fit: Result, job: Job) -> dict[PathLike, str | bytes]:
     assert isinstance(data, bytes)
     if job.world_joint and chain.transmission is not None and chain.transmission.has_compliance:
         raise InvalidArgumentError(
-            "--world-joint: not available with joint errors that depend on gravity, whose torques assume that "
+            "--world-joint: not available with errors that depend on gravity, whose torques assume that "
             "z of the robot's root link points up; omit it"
         )
     if job.world_joint:
