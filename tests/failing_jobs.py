@@ -1,4 +1,4 @@
-"""Jobs of a fleet that fail, in a module that worker processes can import."""
+"""Job runner that fails on purpose, in a module that worker processes can import."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import signal
 from dhcal_pin.exceptions import DhcalError
 
 
-def dies(job):
-    """A run that brings its process down where the robot is called so."""
+def run_or_fail(job):
+    """Kill the process, raise an error or return a document, depending on the name of the robot."""
     if "killer" in job.robot:
         os.kill(os.getpid(), signal.SIGKILL)
     if "defect" in job.robot:
-        raise ZeroDivisionError("by nought")
+        raise ZeroDivisionError("by zero")
     if "wrong" in job.robot:
         raise DhcalError("wrong: input")
     return {"converged": job.robot != "slow", "folder": os.getcwd()}

@@ -1,4 +1,4 @@
-"""`dhcal calibrate` over the robots of a manifest."""
+"""Command calibrate with a manifest of several robots."""
 
 from __future__ import annotations
 
@@ -13,15 +13,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from failing_jobs import dies
+from failing_jobs import run_or_fail
 from robots import URDF, paper
 
 from dhcal_pin.cli import main
 from dhcal_pin.cli.fleet import FAILED, read_fleet, run_fleet
-from dhcal_pin.io.measurement_csv import measurement_text
-from dhcal_pin.measurements.base import Noise
-from dhcal_pin.measurements.pose import Pose
-from dhcal_pin.robot.chain import Chain
+from dhcal_pin.io import measurement_text
+from dhcal_pin.measurements import Noise, Pose
+from dhcal_pin.robot import Chain
 
 
 def job(robot, output, *more, data="data.csv"):
@@ -31,8 +30,8 @@ def job(robot, output, *more, data="data.csv"):
 
 
 @pytest.fixture
-def place(tmp_path, monkeypatch):
-    """A folder `cells` with the paper's arm and measurements of the one that it really is."""
+def cells(tmp_path, monkeypatch):
+    """Folder `cells` with a robot of the paper and measurements of the robot with errors."""
     folder = tmp_path / "cells"
     folder.mkdir()
     shutil.copy(URDF / "sim_6dof.dh.toml", folder / "arm.dh.toml")
@@ -44,43 +43,43 @@ def place(tmp_path, monkeypatch):
     return folder
 
 
-def fleet(folder, text):
+def write_manifest(folder, text):
     (folder / "all.fleet.toml").write_text(text)
 
 
 RUN = ("calibrate", "cells/all.fleet.toml", "-o", "summary.csv")
 
 
-def test_a_failure_stops_no_other(place, capsys):
+def test_failed_job_does_not_stop_the_others(cells, capsys):
     missing = job("no.dh.toml", "c.urdf", 'name = "the third"')
-    fleet(
-        place,
+    write_manifest(
+        cells,
         "holdout = 0.3\n"
         + job("arm.dh.toml", "a.urdf", 'json = "a.json"')
         + job("arm.dh.toml", "b.urdf", 'parameters = "offset"', "seed = 5", "max-iterations = 50")
         + missing,
     )
     assert main.main([*RUN, "--jobs", "2", "--json", "summary.json"]) == 1
-    said = capsys.readouterr().err
-    assert sum("failed" in line for line in said.splitlines()) == 1
-    assert "2 of 3 robots calibrated" in said
+    err = capsys.readouterr().err
+    assert sum("failed" in line for line in err.splitlines()) == 1
+    assert "2 of 3 robots calibrated" in err
     rows = list(csv.DictReader(Path("summary.csv").read_text().splitlines()))
     assert [row["name"] for row in rows] == ["arm", "arm", "the third"]
     assert [row["status"] for row in rows] == ["ok", "ok", "failed"]
     assert "no.dh.toml" in rows[2]["message"]
     assert [row["samples_holdout"] for row in rows] == ["9", "9", ""]
-    # Without noise the whole model is exact, and joint zeros alone are not.
+    # Without noise the full model is exact; joint offsets alone are not.
     assert float(rows[0]["holdout_after_position_rms[mm]"]) < 1e-6
     assert float(rows[1]["holdout_after_position_rms[mm]"]) > 0.1
-    whole = json.loads(Path("summary.json").read_text())
-    assert (whole["robots"], whole["failed"]) == (3, 1)
-    assert whole["jobs"][2]["result"] is None
-    # Each robot's files are those that it gets alone, from its own folder.
-    os.chdir(place)
+    summary = json.loads(Path("summary.json").read_text())
+    assert (summary["robots"], summary["failed"]) == (3, 1)
+    assert summary["jobs"][2]["result"] is None
+    # Each robot has the files of a calibration alone, started in the folder of the manifest.
+    os.chdir(cells)
     assert main.main(["calibrate", "arm.dh.toml", "data.csv", "-o", "a2.urdf", "--holdout", "0.3"]) == 0
     assert Path("a.urdf").read_bytes() == Path("a2.urdf").read_bytes()
-    alone = json.loads(Path("a.json").read_text())
-    assert whole["jobs"][0]["result"]["holdout_after"] == alone["holdout_after"]
+    single = json.loads(Path("a.json").read_text())
+    assert summary["jobs"][0]["result"]["holdout_after"] == single["holdout_after"]
     assert not Path("c.urdf").exists()
 
 
@@ -103,15 +102,15 @@ def test_a_failure_stops_no_other(place, capsys):
         ("[[job]\n", ["all.fleet.toml", "not TOML"]),
     ],
 )
-def test_a_wrong_manifest_is_refused_before_anything_runs(place, capsys, text, words):
-    fleet(place, text)
-    before = sorted(place.iterdir())
+def test_invalid_manifest_is_refused_before_a_job_runs(cells, capsys, text, words):
+    write_manifest(cells, text)
+    before = sorted(cells.iterdir())
     assert main.main(RUN) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
     for word in words:
-        assert word in said
-    assert sorted(place.iterdir()) == before
+        assert word in err
+    assert sorted(cells.iterdir()) == before
     assert not Path("summary.csv").exists()
 
 
@@ -123,24 +122,24 @@ def test_a_wrong_manifest_is_refused_before_anything_runs(place, capsys, text, w
         (["--max-iterations", "5"], ["--max-iterations", "manifest"]),
     ],
 )
-def test_options_beside_a_manifest(place, capsys, more, words):
-    fleet(place, job("arm.dh.toml", "a.urdf"))
+def test_options_beside_a_manifest_are_refused(cells, capsys, more, words):
+    write_manifest(cells, job("arm.dh.toml", "a.urdf"))
     assert main.main([RUN[0], RUN[1], *more, *RUN[2:]]) == 2
-    said = capsys.readouterr().err
+    err = capsys.readouterr().err
     for word in words:
-        assert word in said
+        assert word in err
 
 
-def test_what_is_hard_to_believe_of_a_robot_is_told(place, capsys):
-    """A joint's sign that is wrong in one robot's file."""
-    lines = (place / "data.csv").read_text().splitlines()
+def test_warnings_are_in_console_and_summary(cells, capsys):
+    """In one file the sign of a joint is wrong."""
+    lines = (cells / "data.csv").read_text().splitlines()
     rows = [line.split(",") for line in lines[1:]]
     wrong = [",".join([*row[:2], repr(-float(row[2])), *row[3:]]) for row in rows]
-    (place / "wrong.csv").write_text("\n".join([lines[0], *wrong]))
-    fleet(place, job("arm.dh.toml", "a.urdf") + job("arm.dh.toml", "b.urdf", data="wrong.csv"))
+    (cells / "wrong.csv").write_text("\n".join([lines[0], *wrong]))
+    write_manifest(cells, job("arm.dh.toml", "a.urdf") + job("arm.dh.toml", "b.urdf", data="wrong.csv"))
     assert main.main([*RUN, "--jobs", "1", "--json", "summary.json"]) == 0
-    said = capsys.readouterr().err.splitlines()
-    (line,) = [line for line in said if "warning:" in line]
+    err = capsys.readouterr().err.splitlines()
+    (line,) = [line for line in err if "warning:" in line]
     assert "warning: wrong.csv: " in line
     assert "the opposite sign of joint joint_3" in line
     first, second = csv.DictReader(Path("summary.csv").read_text().splitlines())
@@ -151,22 +150,24 @@ def test_what_is_hard_to_believe_of_a_robot_is_told(place, capsys):
     assert [text.split(":")[0] for text in jobs[1]["result"]["warnings"]] == ["wrong.csv"]
 
 
-def test_a_process_that_dies_takes_no_other_with_it(place):
+def test_killed_process_does_not_stop_the_others(cells):
     names = ["a", "killer", "b", "defect", "slow", "wrong"]
-    fleet(place, "".join(job(name, f"{name}.out") for name in names))
-    entries = read_fleet(place / "all.fleet.toml")
-    told = {}
-    found = run_fleet(entries, place / "all.fleet.toml", dies, 2, told.__setitem__)
-    assert [outcome.status for outcome in found] == ["ok", FAILED, "ok", FAILED, "not converged", FAILED]
-    assert "killed" in found[1].message
-    assert "by nought" in found[3].message
-    assert found[5].message == "wrong: input"
-    assert found[0].document["folder"] == str(place)
-    assert [told[number] for number in range(len(names))] == found
+    write_manifest(cells, "".join(job(name, f"{name}.out") for name in names))
+    entries = read_fleet(cells / "all.fleet.toml")
+    outcomes = {}
+    result = run_fleet(entries, cells / "all.fleet.toml", run_or_fail, 2, outcomes.__setitem__)
+    assert [outcome.status for outcome in result] == ["ok", FAILED, "ok", FAILED, "not converged", FAILED]
+    assert "killed" in result[1].message
+    assert "by zero" in result[3].message
+    assert result[5].message == "wrong: input"
+    assert result[0].document["folder"] == str(cells)
+    assert [outcomes[number] for number in range(len(names))] == result
 
 
-def test_an_interrupt_leaves_whole_files(place):
-    fleet(place, "".join(job("arm.dh.toml", f"{i}.urdf", 'parameters = "offset"') for i in range(12)))
+def test_interrupt_leaves_complete_files(cells):
+    write_manifest(
+        cells, "".join(job("arm.dh.toml", f"{i}.urdf", 'parameters = "offset"') for i in range(12))
+    )
     command = [sys.executable, "-m", "dhcal_pin.cli", *RUN, "--jobs", "1"]
     root = str(URDF.parent)
     with subprocess.Popen(
@@ -174,7 +175,7 @@ def test_an_interrupt_leaves_whole_files(place):
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
-        # Where the tests run in the background, interrupts are ignored, and children inherit that.
+        # A process in the background ignores interrupts, and its children inherit that.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
         env=os.environ | {"PYTHONPATH": root},
     ) as running:
@@ -187,7 +188,7 @@ def test_an_interrupt_leaves_whole_files(place):
     assert "interrupted" in rest
     assert "Traceback" not in rest
     assert not Path("summary.csv").exists()
-    written = [path for path in place.iterdir() if path.suffix == ".urdf"]
+    written = [path for path in cells.iterdir() if path.suffix == ".urdf"]
     assert 1 <= len(written) < 12
     assert all(path.read_text().rstrip().endswith("</robot>") for path in written)
-    assert not [path for path in place.iterdir() if path.name.startswith(".dhcal")]
+    assert not [path for path in cells.iterdir() if path.name.startswith(".dhcal")]

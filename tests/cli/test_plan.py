@@ -1,4 +1,4 @@
-"""`dhcal plan`, and the map of `dhcal calibrate`, from the command line."""
+"""Command plan, and the map of the command calibrate."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 from robots import URDF, robot_file
 
 from dhcal_pin.cli import main
+from dhcal_pin.io import read_robot
 from dhcal_pin.io.measurement_csv import read_configurations
-from dhcal_pin.io.robot import read_robot
 
 ROBOT = str(URDF / "sim_6dof.dh.toml")
 TRUTH = str(URDF / "sim_6dof_actual.dh.toml")
@@ -18,11 +18,11 @@ TRUTH = str(URDF / "sim_6dof_actual.dh.toml")
 
 def run(capsys, *args) -> tuple[int, str, str]:
     status = main.main([*map(str, args)])
-    said = capsys.readouterr()
-    return status, said.out, said.err
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
 
 
-def test_a_plan_is_written_simulated_and_calibrated(tmp_path, capsys):
+def test_plan_and_its_json(tmp_path, capsys):
     poses, planned = tmp_path / "poses.csv", tmp_path / "plan.json"
     options = ("-n", 12, "--candidates", 400, "--sigma", "0.2mm,0.02deg", "--json", planned)
     status, _, err = run(capsys, "plan", ROBOT, "-o", poses, *options)
@@ -41,13 +41,13 @@ def test_a_plan_is_written_simulated_and_calibrated(tmp_path, capsys):
     assert document["rows"] is None
 
 
-def test_the_same_seed_writes_the_same_file(tmp_path, capsys):
+def test_seed_determines_the_plan(tmp_path, capsys):
     for name in ("a.csv", "b.csv"):
         run(capsys, "plan", ROBOT, "-n", 6, "--candidates", 200, "-o", tmp_path / name)
     assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
 
 
-def test_ten_more_among_measured_ones(tmp_path, capsys):
+def test_plan_from_measured_poses(tmp_path, capsys):
     data, chosen = tmp_path / "data.csv", tmp_path / "chosen.csv"
     run(capsys, "simulate", ROBOT, "--truth", TRUTH, "-m", 60, "--noise", "0.1mm,0.01deg", "-o", data)
     assert run(capsys, "plan", ROBOT, "-n", 10, "--from", data, "-o", chosen, "--json", "-")[0] == 0
@@ -59,13 +59,13 @@ def test_ten_more_among_measured_ones(tmp_path, capsys):
     more = tmp_path / "more.csv"
     options = ("-n", 5, "--data", data, "--candidates", 300, "-o", more, "--json", "-")
     found = json.loads(run(capsys, "plan", ROBOT, *options)[1])
-    # The noise is the data's own.
+    # The standard deviation is that of the data.
     assert found["sigma_position_m"] == pytest.approx(1e-4)
     assert found["predicted_position_rms_m"] < 1e-4
 
 
-def test_ten_more_for_a_calibrated_robot(tmp_path, capsys):
-    """Its sidecar tells what is known, unless readings or priors are given."""
+def test_plan_for_a_calibrated_robot(tmp_path, capsys):
+    """The uncertainty in the sidecar is the prior unless data or priors are given."""
     data, robot, out = tmp_path / "data.csv", tmp_path / "arm.urdf", tmp_path / "more.csv"
     run(capsys, "simulate", ROBOT, "--truth", TRUTH, "-m", 40, "--noise", "0.1mm,0.01deg", "-o", data)
     run(capsys, "calibrate", ROBOT, data, "-o", robot, "--parameters", "minimal,base,tool")
@@ -81,11 +81,11 @@ def test_ten_more_for_a_calibrated_robot(tmp_path, capsys):
     robust = ("-n", 10, "--from", data, "--criterion", "robust", "-o", out, "--json", "-")
     chosen = json.loads(run(capsys, "plan", ROBOT, *robust)[1])
     assert chosen["criterion"] == "robust"
-    # A gear's arcminute counts beside the noise.
+    # An arcminute of joint scatter is added to the noise.
     assert chosen["sigma_orientation_rad"] > 2e-4
 
 
-def test_a_task_by_positions_and_by_joints(tmp_path, capsys):
+def test_task_by_positions_and_by_joint_values(tmp_path, capsys):
     targets = tmp_path / "targets.csv"
     chain = read_robot(ROBOT)
     points = 1e3 * chain.poses(np.random.default_rng(0).uniform(-1, 1, (5, 6)))[:, :3, 3]
@@ -102,7 +102,7 @@ def test_a_task_by_positions_and_by_joints(tmp_path, capsys):
     assert not (tmp_path / "none.csv").exists()
 
 
-def test_the_tool_in_a_box_before_an_instrument(tmp_path, capsys):
+def test_box_and_visibility(tmp_path, capsys):
     robot = robot_file("ur_description/urdf/ur10_robot.urdf")
     poses = tmp_path / "poses.csv"
     space = ("--box", "0,-800,100:1200,800,1000mm", "--visible-from", "2.5,0,1m", "--cone", "40deg")
@@ -137,7 +137,7 @@ def test_the_tool_in_a_box_before_an_instrument(tmp_path, capsys):
         (("--parameters", "dhh"), "dhh"),
     ],
 )
-def test_wrong_input_is_one_line_and_nothing_is_written(tmp_path, capsys, options, words):
+def test_invalid_arguments_are_one_line_and_write_nothing(tmp_path, capsys, options, words):
     out = tmp_path / "poses.csv"
     status, _, err = run(capsys, "plan", ROBOT, "-n", 5, "--candidates", 50, "-o", out, *options)
     assert status == 2
@@ -146,7 +146,7 @@ def test_wrong_input_is_one_line_and_nothing_is_written(tmp_path, capsys, option
     assert not out.exists()
 
 
-def test_a_map_beside_the_calibrated_robot(tmp_path, capsys):
+def test_map_of_a_calibration(tmp_path, capsys):
     data, robot, cells = tmp_path / "data.csv", tmp_path / "arm.urdf", tmp_path / "map.csv"
     run(capsys, "simulate", ROBOT, "--truth", TRUTH, "-m", 30, "--noise", "0.1mm,0.01deg", "-o", data)
     assert run(capsys, "calibrate", ROBOT, data, "-o", robot, "--map", cells)[0] == 0
@@ -154,5 +154,5 @@ def test_a_map_beside_the_calibrated_robot(tmp_path, capsys):
     assert table.shape[1] == 6
     assert (table[:, 4] >= table[:, 3]).all()
     assert table[:, 5].sum() == 20_000
-    # Thirty poses at 0.1 mm leave some hundredths of a millimetre.
+    # Thirty poses with 0.1 mm noise determine the position to a few hundredths of a millimetre.
     assert 0.01 < np.sqrt(np.average(table[:, 3] ** 2, weights=table[:, 5])) < 0.5

@@ -1,0 +1,78 @@
+"""Parser and exit status of the command `dhcal`."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from command_line import CALIBRATE, folder_contents, parse_json
+
+from dhcal_pin.calibration import model_selection
+from dhcal_pin.cli import main
+from dhcal_pin.robot import sampling
+
+COMMANDS = tuple(command.name for command in main.COMMANDS)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_of_each_command_has_an_example_that_parses(run, name):
+    status, out, err = run(name, "--help")
+    assert (status, err) == (0, "")
+    example = out.split("example:\n")[1].strip()
+    args = main.build_parser().parse_args(example.split()[1:])
+    assert args.command == name
+
+
+def test_help_lists_all_commands(run):
+    status, out, _ = run("--help")
+    assert status == 0
+    assert {line.split()[0] for line in out.splitlines() if re.match(r"    \w", line)} == set(COMMANDS)
+    assert run("--version")[1].startswith("dhcal 0.")
+
+
+@pytest.mark.parametrize("args", [["--help"], ["calibrate"], ["calibrate", "--seed", "x"], ["--version"]])
+def test_help_and_argument_errors_load_nothing_heavy(args):
+    script = (
+        "import sys\n"
+        "from dhcal_pin.cli.main import main\n"
+        "try:\n    main(sys.argv[1:])\nexcept SystemExit:\n    pass\n"
+        "print(*sorted({'numpy', 'scipy', 'pinocchio', 'rich'} & set(sys.modules)), file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", script, *args], capture_output=True, text=True, check=True)
+    assert done.stderr.splitlines()[-1] == ""
+
+
+def test_installed_command(robot_folder):
+    command = [Path(sys.executable).with_name("dhcal"), *CALIBRATE, "--json", "-"]
+    good = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert good.returncode == 0
+    assert parse_json(good.stdout)["samples"] == 20
+    assert "wrote urdf: out.urdf" in good.stderr
+    command[3] = "no.csv"
+    bad = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (bad.returncode, bad.stdout) == (2, "")
+    assert bad.stderr.count("\n") == 1
+    assert "no.csv" in bad.stderr
+
+
+def test_interrupt_writes_nothing(run, robot_folder, monkeypatch):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    before = folder_contents(robot_folder)
+    monkeypatch.setattr(model_selection, "extend", interrupt)
+    assert run(*CALIBRATE, "--json", "-") == (130, "", "dhcal: interrupted; nothing written\n")
+    assert folder_contents(robot_folder) == before
+
+
+def test_lack_of_memory_is_one_line(assert_refused, monkeypatch):
+    def fail(*_):
+        raise MemoryError
+
+    monkeypatch.setattr(sampling, "joint_range", fail)
+    assert_refused(
+        ["not enough memory", "fewer"], "simulate", "arm.urdf", "-m", "1000000000000", "-o", "s.csv"
+    )

@@ -1,0 +1,51 @@
+"""Help texts that list names from other packages, and types of options."""
+
+from __future__ import annotations
+
+from argparse import ArgumentTypeError
+
+import pytest
+
+from dhcal_pin.cli.options import PLACEHOLDERS, IntegerType, expand_placeholders, split_commas
+from dhcal_pin.estimation import LOSSES, PARAMETER_SETS, Loss
+from dhcal_pin.io import FORMATS
+from dhcal_pin.measurements import KINDS
+from dhcal_pin.planning import CRITERIA
+from dhcal_pin.robot import FAMILIES
+
+NAMES = {
+    "criteria": CRITERIA,
+    "error_families": FAMILIES,
+    "kinds": KINDS,
+    "losses": LOSSES,
+    "parameter_sets": PARAMETER_SETS,
+    "robot_formats": [".urdf", ".dh.toml", ".dh.csv", ".yaml"],
+    "shipped_studies": ["figure3", "figure4", "ur10_poses"],
+    "written_formats": [ending for robot_format in FORMATS for ending in robot_format.endings],
+}
+
+
+@pytest.mark.parametrize("placeholder", PLACEHOLDERS)
+def test_placeholder_lists_all_names(placeholder):
+    text = expand_placeholders(f"{{{placeholder}}}")
+    assert [name for name in NAMES[placeholder] if name not in text] == []
+
+
+def test_new_loss_appears_in_the_help(run, monkeypatch):
+    monkeypatch.setitem(LOSSES, "welsch", Loss(("uniform",), "weights of 100 % at zero"))
+    status, out, _ = run("calibrate", "--help")
+    assert status == 0
+    assert "welsch (weights of 100 % at zero)" in " ".join(out.split())
+
+
+def test_integer_type():
+    positive = IntegerType(1)
+    assert positive("7") == 7
+    for text in ("0", "-1", "1.5", "many", "", str(2**63)):
+        with pytest.raises(ArgumentTypeError, match="expected an integer of at least 1"):
+            positive(text)
+
+
+def test_split_commas():
+    assert split_commas(" a, b,,c ") == ["a", "b", "c"]
+    assert split_commas("") == []

@@ -1,0 +1,298 @@
+"""Command calibrate with one robot: JSON, files, hold-out data and warnings."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import (
+    ACCURACY,
+    CALIBRATE,
+    KEYS,
+    folder_contents,
+    json_of,
+    parse_json,
+    positions_csv,
+    stdout_of,
+    tool_positions,
+    with_column,
+)
+from robots import URDF
+from scipy.spatial.transform import Rotation
+
+from dhcal_pin.io import measurement_text, read_dh
+from dhcal_pin.measurements import Position
+from dhcal_pin.robot import Chain, read_urdf
+
+
+def test_json_of_a_calibration(run, robot_folder):
+    out = stdout_of(
+        run(*CALIBRATE, "--holdout", "0.25", "--json", "-", "--parameters", "dh", "--fix", "theta1,d2")
+    )
+    document = parse_json(out)
+    assert document.keys() >= KEYS
+    assert document["converged"] is True
+    assert (document["samples"], document["samples_holdout"]) == (15, 5)
+    assert document["parameters_total"] == 10
+    assert document["rank"] <= 10
+    assert document["outliers"] == []
+    for key in ("before", "after", "holdout_before", "holdout_after"):
+        assert document[key].keys() == {"position_rms_m", "position_max_m"}
+    for row in document["parameters"]:
+        assert row.keys() == {
+            "name",
+            "unit",
+            "nominal",
+            "value",
+            "std",
+            "observability",
+            "posterior_to_prior_std",
+            "fixed",
+        }
+        assert 0 <= row["observability"] <= 1
+    nominal = {row["name"]: (row["nominal"], row["unit"]) for row in document["parameters"]}
+    assert nominal == {
+        **{f"theta{i}": (0.0, "rad") for i in (1, 2, 3)},
+        **{f"d{i}": (d, "m") for i, d in ((1, 0.433), (2, 0.0), (3, 0.0))},
+        **{f"a{i}": (a, "m") for i, a in ((1, 0.0), (2, 0.4), (3, 0.345))},
+        **{f"alpha{i}": (alpha, "rad") for i, alpha in ((1, np.pi / 2), (2, 0.0), (3, 0.0))},
+    }
+    fixed = {row["name"]: (row["value"], row["std"]) for row in document["parameters"] if row["fixed"]}
+    assert fixed == {"theta1": (0.0, 0.0), "d2": (0.0, 0.0)}
+    assert any("alpha3" in text for text in document["unobservable"])
+    assert document["files"] == {"urdf": "out.urdf", "sidecar": "out.calibration.toml"}
+    assert document["inputs"] == {
+        name: hashlib.sha256(Path(name).read_bytes()).hexdigest() for name in ("arm.dh.toml", "data.csv")
+    }
+    assert document["versions"].keys() >= {"dhcal-pin", "pin", "numpy"}
+    assert set(os.listdir(robot_folder)) == {*document["inputs"], *document["files"].values(), "arm.urdf"}
+
+
+def test_nominal_error_equals_closed_form(run, robot_folder):
+    document = json_of(run(*CALIBRATE, "--json", "-"))
+    rows = np.loadtxt("data.csv", delimiter=",", skiprows=1)
+    off = np.linalg.norm(tool_positions(rows[:, :3]) - rows[:, 3:], axis=1) / 1e3
+    assert document["before"]["position_rms_m"] == pytest.approx(np.sqrt(np.mean(off**2)), rel=1e-9)
+    assert document["before"]["position_max_m"] == pytest.approx(off.max(), rel=1e-9)
+    assert document["after"]["position_rms_m"] < document["before"]["position_rms_m"]
+
+
+def test_json_file_equals_json_on_stdout(run, robot_folder):
+    on_stdout = json_of(run(*CALIBRATE, "--json", "-"))
+    assert stdout_of(run(*CALIBRATE, "--json", robot_folder / "r.json")) == ""
+    in_file = parse_json(Path("r.json").read_text())
+    assert in_file.pop("files") == on_stdout.pop("files") | {"json": str(robot_folder / "r.json")}
+    assert in_file == on_stdout
+
+
+def test_single_measurement_gives_finite_json(run, robot_folder):
+    Path("data.csv").write_text(positions_csv(1))
+    for method in ("lm", "gn"):
+        document = json_of(run(*CALIBRATE, "--json", "-", "--method", method))
+        assert document["samples"] == 1
+        assert document["rank"] == 3
+
+
+def test_nominal_robot_is_not_changed(run, robot_folder):
+    before = folder_contents(robot_folder)
+    stdout_of(run("calibrate", "arm.urdf", "data.csv", "-o", "out.urdf"))
+    after = folder_contents(robot_folder)
+    assert {name: after[name] for name in before} == before
+    assert set(after) - set(before) == {"out.urdf", "out.calibration.toml"}
+
+
+def test_in_place_replaces_the_robot(run, robot_folder):
+    before = Path("arm.urdf").read_bytes()
+    stdout_of(run("calibrate", "arm.urdf", "data.csv", "-o", "arm.urdf", "--in-place"))
+    assert Path("arm.urdf").read_bytes() != before
+    assert Path("arm.calibration.toml").exists()
+    stdout_of(run("calibrate", "arm.urdf", "data.csv", "-o", "arm.urdf", "--in-place"))
+
+
+def test_existing_output_is_replaced_atomically(run, robot_folder):
+    Path("out.urdf").write_text("old")
+    with open("out.urdf") as reader:
+        stdout_of(run(*CALIBRATE))
+        assert reader.read() == "old"
+    assert read_urdf("out.urdf").name == "arm"
+
+
+def test_only_joint_origins_change(run, robot_folder):
+    stdout_of(run("calibrate", "arm.urdf", "data.csv", "-o", "out.urdf"))
+    trees = [ET.parse(name).getroot() for name in ("arm.urdf", "out.urdf")]
+    assert ET.tostring(trees[0]) != ET.tostring(trees[1])
+    for tree in trees:
+        for origin in tree.findall("joint/origin"):
+            origin.attrib.clear()
+    assert ET.tostring(trees[0]) == ET.tostring(trees[1])
+
+
+def test_sidecar_of_an_earlier_run_is_replaced(run, robot_folder):
+    """Base and tool of a DH file go into the URDF; an old sidecar would be applied in addition."""
+    Path("out.calibration.toml").write_text("[base]\nxyz_m = [1.0, 0.0, 0.0]\n")
+    document = json_of(run(*CALIBRATE, "--json", "-"))
+    again = json_of(run("validate", "out.urdf", "data.csv", "--json", "-"))
+    assert again["after"]["position_rms_m"] == pytest.approx(document["after"]["position_rms_m"], rel=1e-9)
+    assert document["files"] == {"urdf": "out.urdf", "sidecar": "out.calibration.toml"}
+
+
+def test_holdout_fraction_depends_on_the_seed(run, robot_folder):
+    def calibrate(seed, fraction="0.3"):
+        return json_of(run(*CALIBRATE, "--holdout", fraction, "--seed", seed, "--json", "-"))
+
+    first = calibrate(1)
+    assert (first["samples"], first["samples_holdout"]) == (14, 6)
+    assert calibrate(1) == first
+    assert calibrate(2)["holdout_before"] != first["holdout_before"]
+    none = calibrate(1, "0")
+    assert (none["samples"], none["samples_holdout"], none["holdout_after"]) == (20, 0, {})
+
+
+def test_regression_is_reported(run, robot_folder):
+    """The calibration of an exact robot fits noise only; that of a robot with errors is no regression."""
+    for truth, is_worse in ((), True), (("--truth", URDF / "sim_6dof_actual.dh.toml"), False):
+        arm = URDF / "sim_6dof.dh.toml"
+        stdout_of(run("simulate", arm, *truth, "-m", "30", "--noise", "0.1mm,0.01deg", "-o", "exact.csv"))
+        _, _, err = run("calibrate", arm, "exact.csv", "-o", "calibrated.urdf")
+        *_, remark, _, last = err.splitlines()
+        assert (
+            "the calibrated robot is worse than the nominal one on 30 cross-validated samples"
+            in remark.lower()
+        ) is is_worse
+        assert last.startswith("RMS position error on 30 cross-validated samples")
+
+
+def test_holdout_file(run, robot_folder):
+    Path("held.csv").write_text(positions_csv(7, 1))
+    document = json_of(run(*CALIBRATE, "--holdout", "held.csv", "--json", "-"))
+    assert (document["samples"], document["samples_holdout"]) == (20, 7)
+    assert set(document["inputs"]) == {"arm.dh.toml", "data.csv", "held.csv"}
+    alone = json_of(run("validate", "arm.urdf", "held.csv", "--json", "-"))
+    assert document["holdout_before"]["position_rms_m"] == pytest.approx(
+        alone["after"]["position_rms_m"], rel=1e-9
+    )
+    assert document["holdout_before"] != document["before"]
+
+
+def test_set_column_selects_the_holdout(run, robot_folder):
+    words = ["holdout" if row % 4 == 0 else "fit" for row in range(20)]
+    Path("data.csv").write_text(with_column("set", words))
+    document = json_of(run(*CALIBRATE, "--json", "-"))
+    assert (document["samples"], document["samples_holdout"]) == (15, 5)
+    both = json_of(run(*CALIBRATE, "--json", "-", "--holdout", "0.2"))
+    assert (both["samples"], both["samples_holdout"]) == (12, 8)
+    assert json_of(run("validate", "arm.urdf", "data.csv", "--json", "-"))["samples"] == 20
+
+
+def test_one_of_two_files_can_be_held_out(run, robot_folder):
+    Path("held.csv").write_text(with_column("set", ["holdout"] * 6))
+    document = json_of(run(*CALIBRATE[:3], "held.csv", *CALIBRATE[3:], "--json", "-"))
+    assert (document["samples"], document["samples_holdout"]) == (20, 6)
+
+
+def test_unreachable_rows_are_excluded_by_file(run, robot_folder):
+    Path("one.csv").write_text(positions_csv(12, 1, wrong=[3]))
+    Path("two.csv").write_text(positions_csv(10, 2, wrong=[5, 9]))
+    Path("three.csv").write_text(positions_csv(8, 3))
+    status, out, err = run(
+        *("calibrate", "arm.dh.toml", "one.csv", "two.csv", "three.csv", "-o", "out.urdf", "--json", "-")
+    )
+    document = parse_json(out)
+    assert status == 0
+    assert document["samples"] == (12 - 1) + (10 - 2) + 8
+    assert document["outliers"] == [3, 5, 9]
+    assert document["outliers_by_file"] == {"one.csv": [3], "two.csv": [5, 9]}
+    assert document["before"]["position_max_m"] < 0.01
+    for text in ("one.csv: row 3", "two.csv: row 5", "two.csv: row 9"):
+        assert f"{text} is excluded" in err
+
+
+def test_unreachable_rows_of_a_holdout_file_are_listed(run, robot_folder):
+    Path("held.csv").write_text(positions_csv(9, 1, wrong=[4]))
+    document = json_of(run(*CALIBRATE, "--holdout", "held.csv", "--json", "-"))
+    assert (document["samples"], document["samples_holdout"], document["outliers"]) == (20, 8, [4])
+
+
+def test_poses_and_positions_are_fitted_together(run, robot_folder):
+    sim = URDF / "sim_6dof.dh.toml"
+    for kind, seed in (("pose", 1), ("position", 2)):
+        args = ("--truth", URDF / "sim_6dof_actual.dh.toml", "-m", "15", "--kind", kind, "--seed", seed)
+        stdout_of(run("simulate", sim, *args, "-o", f"{kind}.csv"))
+    args = ("calibrate", sim, "pose.csv", "position.csv", "-o", "out.urdf", "--priors", "none", "--json", "-")
+    document = json_of(run(*args))
+    assert document["samples"] == 30
+    assert document["after"].keys() == ACCURACY
+    assert document["after"]["position_rms_m"] < 1e-9
+    assert document["after"]["orientation_rms_rad"] < 1e-9
+
+
+def test_exact_data_give_the_true_parameters(run, robot_folder):
+    sim, actual = URDF / "sim_6dof.dh.toml", URDF / "sim_6dof_actual.dh.toml"
+    stdout_of(run("simulate", sim, "--truth", actual, "-m", "20", "-o", "fit.csv"))
+    stdout_of(run("simulate", sim, "--truth", actual, "-m", "30", "--seed", "7", "-o", "other.csv"))
+    document = parse_json(
+        stdout_of(run("calibrate", sim, "fit.csv", "-o", "o.urdf", "--priors", "none", "--json", "-"))
+    )
+    assert document["after"]["position_rms_m"] < 1e-9
+    assert document["before"]["position_rms_m"] > 1e-2
+    other = json_of(run("validate", "o.urdf", "other.csv", "--json", "-"))
+    assert other["after"]["position_rms_m"] < 1e-9
+    assert other["after"]["orientation_rms_rad"] < 1e-9
+    truth = read_dh(actual)
+    values = {row["name"]: row["value"] for row in document["parameters"]}
+    for key in ("theta", "d", "a", "alpha"):
+        np.testing.assert_allclose([values[f"{key}{i}"] for i in range(1, 7)], getattr(truth, key), atol=1e-8)
+
+
+def test_restricted_parameters_are_reported(run, tmp_path, monkeypatch):
+    """With a small tilt between the parallel axes 2 and 3, modified DH needs offsets of metres."""
+    monkeypatch.chdir(tmp_path)
+    rows = [
+        (0, 675, 0, 180),
+        (0, 0, 350, 90),
+        (-90, 0, 1150, 0),
+        (0, -1000, -41, 90),
+        (0, 0, 0, -90),
+        (0, -240, 0, 90),
+    ]
+    keys = ("theta", "d", "a", "alpha")
+    joints = [
+        f'[[joint]]\nname = "A{i}"\ntype = "revolute"\n'
+        + "".join(f"{k} = {v}.0\n" for k, v in zip(keys, row, strict=True))
+        for i, row in enumerate(rows, 1)
+    ]
+    Path("arm.dh.toml").write_text(
+        'convention = "modified"\n[units]\nlength = "mm"\nangle = "deg"\n' + "".join(joints)
+    )
+    rng = np.random.default_rng(0)
+    arm = Chain.from_dh(read_dh("arm.dh.toml"))
+    q = rng.uniform(-2, 2, (40, 6))
+    pose = np.tile(np.eye(4), (40, 1, 1))
+    for i, (theta, d, a, alpha) in enumerate(rows):
+        tilt = Rotation.from_rotvec([0, 2e-3, 0] if i == 2 else [0, 0, 0]).as_matrix()
+        fixed = Rotation.from_euler("x", alpha, degrees=True).as_matrix()
+        spun = Rotation.from_rotvec((q[:, i, None] + np.deg2rad(theta)) * [0, 0, 1]).as_matrix()
+        step = np.tile(np.eye(4), (40, 1, 1))
+        step[:, :3, :3] = fixed @ tilt @ spun
+        step[:, :3, 3] = [a * 1e-3, 0, 0] + step[:, :3, 2] * d * 1e-3
+        pose = pose @ step
+    point = pose[:, :3, 3] + 0.1 * pose[:, :3, 0] + [3, 1, 0] + rng.normal(0, 1e-4, (40, 3))
+    Path("data.csv").write_text(measurement_text(Position(q, point), arm))
+    for sets, is_reported in (
+        ("modified-dh,base,tool", True),
+        ("minimal,base,tool", False),
+        ("base,tool", False),
+    ):
+        status, _, err = run("calibrate", "arm.dh.toml", "data.csv", "--parameters", sets, "-o", "out.urdf")
+        assert status == 0
+        assert ("arm.dh.toml: warning: --parameters minimal,base,tool reduces" in err) is is_reported
+    # Priors of parameters that are not in the full set are ignored.
+    Path("priors.toml").write_text('"theta*" = 0.01\n"base.*" = 2.0\n')
+    sets = ("--parameters", "modified-dh,base,tool", "--priors", "priors.toml")
+    status, _, err = run("calibrate", "arm.dh.toml", "data.csv", *sets, "-o", "out.urdf")
+    assert status == 0, err
+    assert "arm.dh.toml: warning: --parameters minimal,base,tool reduces" in err

@@ -1,0 +1,52 @@
+"""Command simulate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import stdout_of, tool_positions
+
+from dhcal_pin.io import read_measurement_file, read_robot
+from dhcal_pin.robot import Chain
+
+
+def test_seed_determines_the_file(run, robot_folder):
+    args = ("simulate", "arm.urdf", "-m", "6", "--noise", "0.1mm,0.01deg")
+    for name, seed in (("a.csv", 3), ("b.csv", 3), ("c.csv", 4)):
+        stdout_of(run(*args, "--seed", seed, "-o", name))
+    assert Path("a.csv").read_bytes() == Path("b.csv").read_bytes()
+    assert Path("a.csv").read_text().splitlines()[2:] != Path("c.csv").read_text().splitlines()[2:]
+
+
+def test_positions_equal_closed_form(run, robot_folder):
+    stdout_of(run("simulate", "arm.urdf", "-m", "50", "--kind", "position", "-o", "s.csv"))
+    measured = read_measurement_file("s.csv", Chain.from_urdf("arm.urdf")).data
+    np.testing.assert_allclose(measured.positions() * 1e3, tool_positions(np.degrees(measured.q)), atol=1e-10)
+
+
+def test_noise_has_the_given_standard_deviation(run, robot_folder):
+    stdout_of(run("simulate", "arm.urdf", "-m", "3000", "--noise", "0.2mm,1mrad", "-o", "s.csv"))
+    measured = read_measurement_file("s.csv", Chain.from_urdf("arm.urdf")).data
+    off = measured.positions() * 1e3 - tool_positions(np.degrees(measured.q))
+    np.testing.assert_allclose(off.std(0), 0.2, rtol=0.05)
+    assert measured.has_stated_sigma
+    errors = measured.errors(Chain.from_urdf("arm.urdf").forward_kinematics(measured.q), np.empty(0))[
+        "orientation"
+    ]
+    np.testing.assert_allclose(errors.std(0), 1e-3, rtol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper"), [(-30.0, 45.0), (190.0, 300.0), (-400.0, -200.0), (-10.0, 600.0)]
+)
+def test_joint_positions_respect_limits(run, robot_folder, lower, upper):
+    table = Path("arm.dh.toml").read_text()
+    first = table.index("[[joint]]", table.index("[[joint]]") + 1)
+    Path("tight.dh.toml").write_text(f"{table[:first]}lower = {lower}\nupper = {upper}\n{table[first:]}")
+    stdout_of(run("simulate", "tight.dh.toml", "-m", "200", "-o", "s.csv"))
+    q = np.degrees(read_measurement_file("s.csv", read_robot("tight.dh.toml")).data.q)
+    assert lower <= q[:, 0].min() < q[:, 0].max() <= upper
+    assert np.ptp(q[:, 0]) > 0.5 * min(upper - lower, 180)
+    assert np.abs(q[:, 1:]).max() <= 180

@@ -1,0 +1,83 @@
+"""Measurements of a small robot, and helpers for tests of the command line."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+
+from dhcal_pin.io import read_robot
+
+KEYS = {
+    *("converged", "iterations", "samples", "samples_holdout", "rank", "parameters_total", "condition"),
+    *("before", "after", "holdout_before", "holdout_after", "parameters", "unobservable", "outliers"),
+    *("files", "versions", "inputs"),
+}
+ACCURACY = {"position_rms_m", "position_max_m", "orientation_rms_rad"}
+HEADER = "joint_1[deg],joint_2[deg],joint_3[deg],x[mm],y[mm],z[mm]"
+# Command that the folder of the fixture `robot_folder` is made for.
+CALIBRATE = ("calibrate", "arm.dh.toml", "data.csv", "-o", "out.urdf")
+
+
+def tool_positions(degrees):
+    """Tool positions [mm] of the robot that the paper measured: a vertical axis and two links in a plane."""
+    q1, q2, q3 = np.radians(degrees).T
+    out = 400 * np.cos(q2) + 345 * np.cos(q2 + q3)
+    up = 433 + 400 * np.sin(q2) + 345 * np.sin(q2 + q3)
+    return np.stack([out * np.cos(q1), out * np.sin(q1), up], -1)
+
+
+def positions_csv(count, seed=0, wrong=(), error=1.0):
+    """Measured positions of that robot with noise of `error` mm; some rows (from 1) are off by 1 m."""
+    rng = np.random.default_rng(seed)
+    degrees = rng.uniform(-80, 80, (count, 3))
+    positions = tool_positions(degrees) + error * rng.normal(size=(count, 3))
+    positions[[row - 1 for row in wrong]] += 1000
+    rows = np.concatenate([degrees, positions], 1).tolist()
+    return "\n".join([HEADER, *(",".join(map(repr, row)) for row in rows)]) + "\n"
+
+
+def folder_contents(folder):
+    """Content of each file of a folder and its subfolders, by name."""
+    return {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def parse_json(text):
+    """Parse JSON; NaN and infinity, which are not part of JSON, are errors."""
+
+    def refuse(name):
+        raise AssertionError(f"{name} in JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def stdout_of(result):
+    """Standard output of a command that must succeed."""
+    status, out, err = result
+    assert status == 0, err
+    return out
+
+
+def json_of(result):
+    """JSON on standard output of a command that must succeed."""
+    return parse_json(stdout_of(result))
+
+
+def edited_csv(old, new, count=1):
+    """A measurement file in which a text is replaced."""
+    text = positions_csv(4)
+    assert old in text
+    return text.replace(old, new, count)
+
+
+def with_column(name, values):
+    """A measurement file with one more column, or several in one text."""
+    head, *rows = positions_csv(len(values)).splitlines()
+    return "\n".join([f"{head},{name}", *(f"{row},{value}" for row, value in zip(rows, values, strict=True))])
+
+
+def assert_same_poses(a, b, atol=1e-12):
+    """Assert that two robot files describe the same robot."""
+    one, two = read_robot(a), read_robot(b)
+    q = np.random.default_rng(0).uniform(-3, 3, (50, one.n_joints))
+    np.testing.assert_allclose(one.poses(q), two.poses(q), atol=atol)
