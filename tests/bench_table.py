@@ -197,7 +197,7 @@ def main() -> None:
     quick = parser.parse_args().quick
     turns, began = (5 if quick else 15), time.time()
     print("| What | dhcal_pin | other | ratio | wanted |\n| --- | --- | --- | --- | --- |")
-    parts: tuple[tuple[Callable[..., Iterable[Row]], tuple[Any, ...]], ...] = (
+    parts: list[tuple[Callable[..., Iterable[Row]], tuple[Any, ...]]] = [
         (bench_kernel.iterations, ((100, 1000, 10000), turns)),
         (bench_kernel.jacobians, (turns,)),
         (bench_calibration.against_scipy, (1000, 1 if quick else 3)),
@@ -206,7 +206,7 @@ def main() -> None:
         (against_pybotics, (100, turns)),
         (bench_batch.rows, (3 if quick else 5,)),
         (start_up, (3 if quick else 7,)),
-    )
+    ]
     for part, arguments in parts:
         for row in part(*arguments):
             print(line(row), flush=True)
