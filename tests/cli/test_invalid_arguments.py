@@ -114,7 +114,7 @@ ARGUMENTS = {
         ["convert", "arm.dh.toml", "arm.png"],
         ["arm.png", ".urdf", ".dh.toml", ".dh.csv"],
     ),
-    "convert URDF to URDF": (["convert", "arm.urdf", "two.urdf"], ["two.urdf", ".dh.toml", ".dh.csv"]),
+    "convert URDF to URDF": (["convert", "arm.urdf", "two.urdf"], ["two.urdf", "arm.urdf", "DH table"]),
     "convert to no ending": (["convert", "arm.urdf", "arm"], ["arm:", ".dh.toml", ".dh.csv"]),
     "convert nothing": (["convert", "no.dh.csv", "no.urdf"], ["no.dh.csv", "No such file"]),
     "convert with a tip": (["convert", "arm.dh.toml", "a.urdf", "--tip", "tool0"], ["arm.dh.toml", "--tip"]),
