@@ -4,7 +4,7 @@ Optimality criteria, knowledge before a measurement, and the search for good pos
 configurations, workspace constraints and collision checks belong to `robot`.
 """
 
-from .information import Information
+from .information import Information, plannable_kinds
 from .planner import CRITERIA, Plan, plan
 
 __all__ = [
@@ -12,4 +12,5 @@ __all__ = [
     "Information",
     "Plan",
     "plan",
+    "plannable_kinds",
 ]

@@ -345,20 +345,29 @@ def add_joint_scatter(chain: Chain, q: Array, noise: Noise) -> Noise:
     return Noise(float(np.hypot(noise.position, position)), float(np.hypot(noise.rotation, rotation)))
 
 
+def plannable_kinds() -> dict[str, type[Measurement]]:
+    """Select the kinds whose measurements are independent.
+
+    Returns:
+        Kinds by name with one configuration per row and no names that link rows.
+    """
+    return {
+        name: kind
+        for name, kind in KINDS.items()
+        if kind.configurations_per_row == 1 and "text" not in kind.columns.values()
+    }
+
+
 def _plannable_kind(kind: str) -> type[Measurement]:
-    """Return a kind whose measurements are independent: one configuration each, and no names that link rows.
+    """Return a kind that can be planned.
 
     Raises:
         UnknownNameError: The kind is unknown or cannot be planned.
     """
-    plannable = [
-        name
-        for name, measurement in KINDS.items()
-        if measurement.configurations_per_row == 1 and "text" not in measurement.columns.values()
-    ]
-    if kind not in plannable:
-        raise UnknownNameError(f"kind {kind!r} cannot be planned; choose from {', '.join(plannable)}")
-    return KINDS[kind]
+    kinds = plannable_kinds()
+    if kind not in kinds:
+        raise UnknownNameError(f"kind {kind!r} cannot be planned; choose from {', '.join(kinds)}")
+    return kinds[kind]
 
 
 def _sigma_of(data: Sequence[Measurement], kind: str) -> Noise | None:

@@ -239,7 +239,7 @@ def plan(
     goal = DesignGoal(
         information=information,
         full_information=full_information,
-        criterion=CRITERIA[criterion](observable, combinations, full_information, task_q),
+        criterion=CRITERIA[criterion].create(observable, combinations, full_information, task_q),
         task=combinations,
         n_observable=len(observable),
         existing=existing,
@@ -309,14 +309,40 @@ def _robust_criterion(
     )
 
 
-# Criteria by name, each from observable directions, task combinations, knowledge and joint positions of the
-# task.
-CRITERIA: dict[str, Callable[[Array, Array, Information, Array], Criterion]] = {
-    "D": lambda observable, combinations, full_information, task_q: DOptimality(),
-    "A": lambda observable, combinations, full_information, task_q: AOptimality(observable.T),
-    "E": lambda observable, combinations, full_information, task_q: EOptimality(observable),
-    "task": lambda observable, combinations, full_information, task_q: AOptimality(combinations),
-    "robust": _robust_criterion,
+@dataclass(frozen=True)
+class CriterionOption:
+    """Criterion that users select by name.
+
+    Attributes:
+        create: Function from observable directions, task combinations, knowledge and joint positions of the
+            task to the criterion.
+        help: One line for help texts.
+    """
+
+    create: Callable[[Array, Array, Information, Array], Criterion]
+    help: str
+
+
+CRITERIA: dict[str, CriterionOption] = {
+    "D": CriterionOption(
+        lambda observable, combinations, full_information, task_q: DOptimality(),
+        "volume of the confidence ellipsoid of all parameters",
+    ),
+    "A": CriterionOption(
+        lambda observable, combinations, full_information, task_q: AOptimality(observable.T),
+        "mean variance of the parameters",
+    ),
+    "E": CriterionOption(
+        lambda observable, combinations, full_information, task_q: EOptimality(observable),
+        "largest variance of any combination of parameters",
+    ),
+    "task": CriterionOption(
+        lambda observable, combinations, full_information, task_q: AOptimality(combinations),
+        "mean position error over the task",
+    ),
+    "robust": CriterionOption(
+        _robust_criterion, "as `task`, and also limits the bias from unmodelled effects"
+    ),
 }
 
 
