@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 if TYPE_CHECKING:
@@ -126,11 +126,6 @@ FIX: dict[str, Any] = {
     "help": "parameters or sets to keep at their nominal values",
 }
 FREE: dict[str, Any] = {"metavar": "NAME[,NAME]", "help": "single parameters to estimate in addition"}
-KIND: dict[str, Any] = {
-    "metavar": "KIND",
-    "default": "pose",
-    "help": "kind of measurement (default: %(default)s): {kinds}",
-}
 INSTRUMENT: dict[str, Any] = {
     "metavar": "FILE.toml",
     "help": "known values of the instrument, such as wire1.x, in a table [instrument]",
@@ -157,10 +152,15 @@ def add_execution_options(parser: argparse.ArgumentParser, jobs_help: str, jobs:
 # --- help texts from the domain --------------------------------------------------------------------
 
 
+def _described(entries: Mapping[str, Any]) -> str:
+    """List names with their help texts."""
+    return "; ".join(f"{name} ({entry.help})" for name, entry in entries.items())
+
+
 def _parameter_sets() -> str:
     from ..estimation.parameters import PARAMETER_SETS  # lazy import: loads Pinocchio
 
-    return ", ".join(PARAMETER_SETS)
+    return _described(PARAMETER_SETS)
 
 
 def _error_families() -> str:
@@ -172,19 +172,25 @@ def _error_families() -> str:
 def _losses() -> str:
     from ..estimation.robust import LOSSES  # lazy import: loads Pinocchio
 
-    return "; ".join(f"{name} ({loss.help})" for name, loss in LOSSES.items())
+    return _described(LOSSES)
 
 
 def _criteria() -> str:
-    from ..planning.planner import CRITERIA  # lazy import: loads Pinocchio
+    from ..planning import CRITERIA  # lazy import: loads Pinocchio
 
-    return ", ".join(CRITERIA)
+    return _described(CRITERIA)
 
 
 def _kinds() -> str:
     from ..measurements import KINDS  # lazy import: loads Pinocchio
 
     return ", ".join(KINDS)
+
+
+def _plannable_kinds() -> str:
+    from ..planning import plannable_kinds  # lazy import: loads Pinocchio
+
+    return ", ".join(plannable_kinds())
 
 
 def _robot_formats() -> str:
@@ -217,6 +223,7 @@ PLACEHOLDERS: dict[str, Callable[[], str]] = {
     "kinds": _kinds,
     "losses": _losses,
     "parameter_sets": _parameter_sets,
+    "plannable_kinds": _plannable_kinds,
     "robot_formats": _robot_formats,
     "shipped_studies": _shipped_studies,
     "written_formats": _written_formats,

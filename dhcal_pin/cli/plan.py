@@ -13,7 +13,6 @@ from .options import (
     FREE,
     INSTRUMENT,
     JSON,
-    KIND,
     NON_NEGATIVE_INTEGER,
     PARAMETERS,
     POSITIVE_INTEGER,
@@ -53,7 +52,12 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="joint values to write, ordered as a short tour",
     )
     parser.add_argument("--tip", **TIP)
-    parser.add_argument("--kind", **KIND)
+    parser.add_argument(
+        "--kind",
+        metavar="KIND",
+        default="pose",
+        help="kind of measurement (default: %(default)s): {plannable_kinds}",
+    )
     parser.add_argument(
         "--sigma",
         metavar="LENGTH[,ANGLE]",
@@ -106,7 +110,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--cone",
         metavar="ANGLE",
-        help="largest angle between the z axis of the tool and the direction to the instrument, as 30deg",
+        help="largest angle between the z axis of the tool and the direction to the instrument, such "
+        "as 30deg",
     )
     parser.add_argument(
         "--margin",

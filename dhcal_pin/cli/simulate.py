@@ -5,7 +5,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 
 from ..exceptions import InvalidArgumentError, UnknownNameError
-from .options import KIND, NON_NEGATIVE_INTEGER, POSITIVE_INTEGER, ROBOT, TIP
+from .options import NON_NEGATIVE_INTEGER, POSITIVE_INTEGER, ROBOT, TIP
 
 EXAMPLE = "dhcal simulate arm.dh.toml --truth actual.dh.toml -m 50 --noise 0.1mm,0.01deg -o data.csv"
 
@@ -30,7 +30,9 @@ def add_arguments(parser: ArgumentParser) -> None:
         "-o", "--output", metavar="data.csv", required=True, help="measurement CSV file to write"
     )
     parser.add_argument("--truth", metavar="T.urdf", help="robot with errors (default: ROBOT)")
-    parser.add_argument("--kind", **KIND)
+    parser.add_argument(
+        "--kind", metavar="KIND", default="pose", help="kind of measurement (default: %(default)s): {kinds}"
+    )
     parser.add_argument("--tip", **TIP)
     parser.add_argument(
         "--seed",

@@ -10,7 +10,7 @@ from dhcal_pin.cli.options import PLACEHOLDERS, IntegerType, expand_placeholders
 from dhcal_pin.estimation import LOSSES, PARAMETER_SETS, Loss
 from dhcal_pin.io import FORMATS
 from dhcal_pin.measurements import KINDS
-from dhcal_pin.planning import CRITERIA
+from dhcal_pin.planning import CRITERIA, plannable_kinds
 from dhcal_pin.robot import FAMILIES
 
 NAMES = {
@@ -19,6 +19,7 @@ NAMES = {
     "kinds": KINDS,
     "losses": LOSSES,
     "parameter_sets": PARAMETER_SETS,
+    "plannable_kinds": plannable_kinds(),
     "robot_formats": [".urdf", ".dh.toml", ".dh.csv", ".yaml"],
     "shipped_studies": ["figure3", "figure4", "ur10_poses"],
     "written_formats": [ending for robot_format in FORMATS for ending in robot_format.endings],
