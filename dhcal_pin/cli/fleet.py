@@ -272,7 +272,7 @@ def _run_in_process(runner: JobRunner, job: Job) -> FleetJobOutcome:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _job_document(job: Job) -> Mapping[str, Any]:
+def _run_one(job: Job) -> Mapping[str, Any]:
     """Run one job; return its JSON document."""
     return run_job(job).document
 
@@ -318,7 +318,7 @@ def run_manifest(args: Namespace) -> int:
             console.print_lines(f"        {outcome.message}", style="yellow")
 
     try:
-        outcomes = run_fleet(entries, args.robot, _job_document, args.jobs or os.cpu_count() or 1, show)
+        outcomes = run_fleet(entries, args.robot, _run_one, args.jobs or os.cpu_count() or 1, show)
     except KeyboardInterrupt:
         console.print_lines(f"dhcal: interrupted; {n_done} of {total} robots are done; no summary written")
         return 130
