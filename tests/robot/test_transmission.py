@@ -213,7 +213,7 @@ def test_commands_read_the_sidecar_of_calibrate(tmp_path, monkeypatch, capsys):
     assert first["joint"] == second["joint"]
     status, said = dhcal("calibrate", "found.urdf", "two.csv", "-o", "w.urdf", "--world-joint")
     assert status == 2
-    assert "--world-joint: not available with joint compliance" in said
+    assert "--world-joint: not available with errors that depend on gravity" in said
     assert not (tmp_path / "w.urdf").exists()
 
 
