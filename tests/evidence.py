@@ -68,7 +68,7 @@ learnt=prior_uncertainty space=constraints|workspace
 """)
 KEY_RENAMES = table("""
 mixing=mimic_multipliers slides=is_prismatic shift=mimic_offset poses=configurations compared=has_calibrated
-loads=gravity_bodies terms=transmissions centre=centre_of_mass
+arms=transmissions loads=gravity_bodies centre=centre_of_mass value=coefficient of=input_joint
 kept=shrinkage_factor|shrinkage|is_selected|is_kept held_back=shrinkage_notes doubts=warnings
 samples=n_samples samples_holdout=n_holdout parameters_total=n_parameters before=nominal after=calibrated
 remaining=posterior_to_prior_std weakly_seen=weakly_observable aside=n_rejected gross=n_outliers
