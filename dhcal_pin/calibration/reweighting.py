@@ -45,7 +45,7 @@ MIN_SIGMA_SCALE = 1e-6
 MAX_ROUNDS = 30
 # Rounds end when no scale, prior or weight changes by more than this fraction.
 CHANGE_TOL = 0.01
-# Stands in for the weight 0 of a parameter without a prior, to divide by.
+# Replaces the weight 0 of a parameter without a prior, to avoid a division by zero.
 MIN_WEIGHT = 1e-300
 
 

@@ -107,7 +107,7 @@ class Wires(PointMeasurement):
 
     @classmethod
     def present_columns(cls, values: Mapping[str, Any]) -> tuple[Column, ...]:
-        """Return `length`, or L1, L2, ... as many as the file has.
+        """Return the columns `length` or L1, L2, ... that the file has.
 
         Args:
             values: Columns of the file by name.
