@@ -2,12 +2,12 @@
 
 from .calibration.cross_validation import cross_validate as cross_validate
 from .calibration.evaluation import accuracy as accuracy
-from .calibration.model_selection import extend as extend
 from .calibration.partition import blocked_folds as blocked_folds
 from .calibration.partition import k_fold as k_fold
 from .calibration.partition import leave_one_group_out as leave_one_group_out
 from .calibration.partition import split as split
 from .calibration.procedure import calibrate as calibrate
+from .calibration.residual_table import ResidualTable as ResidualTable
 from .calibration.result import Result as Result
 from .calibration.streaming import calibrate_stream as calibrate_stream
 from .compensation import Compensation as Compensation
@@ -19,9 +19,9 @@ from .estimation.parameters import select_parameters as select_parameters
 from .estimation.uncertainty import Prediction as Prediction
 from .exceptions import DhcalError as DhcalError
 from .io.dh_file import read_dh as read_dh
-from .io.measurement_csv import iter_measurements as iter_measurements
-from .io.measurement_csv import read_measurements as read_measurements
-from .io.measurement_csv import read_targets as read_targets
+from .io.measurement_files import iter_measurements as iter_measurements
+from .io.measurement_files import read_measurements as read_measurements
+from .io.measurement_files import read_targets as read_targets
 from .io.robot import read_robot as read_robot
 from .io.robot import write_urdf as write_urdf
 from .measurements.base import Noise as Noise
@@ -44,6 +44,7 @@ from .report.document import Provenance as Provenance
 from .report.html import write_report as write_report
 from .robot.chain import Chain as Chain
 from .robot.chain import extract_dh_table as extract_dh_table
+from .robot.collision import Obstacle as Obstacle
 from .robot.dh import DHTable as DHTable
 from .robot.dh_urdf import dh_to_urdf as dh_to_urdf
 from .robot.sampling import WorkspaceConstraints as WorkspaceConstraints

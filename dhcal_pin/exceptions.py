@@ -26,3 +26,7 @@ class NotObservableError(DhcalError):
 
 class ConvergenceError(DhcalError):
     """An iteration diverged."""
+
+
+class RefusedCalibrationError(DhcalError):
+    """The verdict on a calibration is "refused", so its robot is not written."""

@@ -7,6 +7,7 @@ decimals are shown (rounding rule of the Particle Data Group).
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -134,16 +135,31 @@ def html_table(table: Table) -> str:
     return str(html_templates().get_template("table.html").make_module().render_table(table))  # pyright: ignore
 
 
+def escape_markdown(text: str) -> str:
+    """Escape a text so that Markdown shows it unchanged: no HTML, links or emphasis come from it.
+
+    Args:
+        text: Text on one or several lines.
+
+    Returns:
+        Escaped text on one line.
+    """
+    text = " ".join(text.split()).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    # An underscore within a word is plain text.
+    return re.sub(r"([\\`*\[\]|]|(?<![^\W_])_|_(?![^\W_]))", r"\\\1", text)
+
+
 def markdown_table(table: Table) -> str:
     """Render a table as Markdown with numbers aligned to the right.
 
     Args:
-        table: Table to render.
+        table: Table to render; its texts are escaped.
 
     Returns:
         Lines of Markdown, joined by line feeds.
     """
     rules = [" --- " if i < table.n_text_columns else " ---: " for i in range(len(table.header))]
-    lines = ["| " + " | ".join(table.header) + " |", "|" + "|".join(rules) + "|"]
-    lines += ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in table.rows]
-    return "\n".join(lines)
+    header, *rows = (
+        "| " + " | ".join(map(escape_markdown, row)) + " |" for row in (table.header, *table.rows)
+    )
+    return "\n".join([header, "|" + "|".join(rules) + "|", *rows])

@@ -6,18 +6,25 @@ depend on the executor and neither does any digit of a calibration.
 
 from __future__ import annotations
 
+import os
+import signal
+import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
+from multiprocessing.connection import wait
 from typing import Any, TypeVar
 
 from .exceptions import InvalidArgumentError
 
 _Task = TypeVar("_Task")
 _Output = TypeVar("_Output")
+# Seconds that a worker without its parent may take to save files.
+_SAVING_TIMEOUT_S = 60
 # Seconds to wait for a Dask scheduler.
 _CONNECT_TIMEOUT_S = 3
 
@@ -81,10 +88,29 @@ def open_executor(jobs: int = 1, scheduler: str | None = None) -> Iterator[TaskE
             threads = sum(client.nthreads().values())
             yield TaskExecutor(client.get_executor(pure=False), 2 * max(threads, 1))
     elif jobs > 1:
-        with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
+        with ProcessPoolExecutor(jobs, get_context("spawn"), initializer=end_with_parent) as pool:
             yield TaskExecutor(pool, 2 * jobs)
     else:
         yield SERIAL
+
+
+def end_with_parent() -> None:
+    """End this worker process as soon as the process that started it ends, even if that is killed.
+
+    A worker waits for its next task on a pipe that its siblings hold open as well. Without this function it
+    would wait for ever, and keep standard output open. A worker that is saving files completes that first.
+    """
+    parent = parent_process()
+    if parent is not None:
+
+        def watch() -> None:
+            wait([parent.sentinel])
+            # Waits while files are saved, see `saving.defer_signals`.
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(_SAVING_TIMEOUT_S)
+            os._exit(1)
+
+        threading.Thread(target=watch, daemon=True).start()
 
 
 def _connect_to_dask(address: str) -> Any:

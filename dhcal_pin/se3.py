@@ -21,6 +21,9 @@ from numpy.typing import ArrayLike
 
 from ._typing import Array
 
+# Cosine of the pitch below which roll and yaw turn about one axis: the rounding error of a quarter turn.
+_GIMBAL_LOCK_TOL = 1e-15
+
 
 def skew(w: ArrayLike) -> Array:
     """Build cross-product matrices.
@@ -255,6 +258,22 @@ def log6(pose: ArrayLike) -> Array:
     return np.concatenate([v, w], -1)
 
 
+def quaternion_to_matrix(quaternion: ArrayLike) -> Array:
+    """Convert unit quaternions to rotation matrices.
+
+    With w the scalar part and v the vector part, R = I + 2·w·[v] + 2·[v]², where [v] is the skew matrix of v.
+
+    Args:
+        quaternion: Quaternions w, x, y, z of norm 1, shape (..., 4).
+
+    Returns:
+        Rotation matrices, shape (..., 3, 3).
+    """
+    quaternion = np.asarray(quaternion, float)
+    cross = skew(quaternion[..., 1:])
+    return np.eye(3) + 2 * quaternion[..., :1, None] * cross + 2 * cross @ cross
+
+
 def nearest_rotation(matrix: Array) -> Array:
     """Find the rotations nearest to given matrices in the Frobenius norm.
 
@@ -281,3 +300,34 @@ def to_xyz_rpy(origin: Array) -> list[float]:
         x, y, z [m], roll, pitch, yaw [rad]; zeros have no minus sign.
     """
     return [float(v) + 0.0 for v in (*origin[:3, 3], *pin.rpy.matrixToRpy(origin[:3, :3]))]
+
+
+def nearest_rpy(rotation: Array, near: ArrayLike) -> Array:
+    """Compute the roll, pitch and yaw of a rotation that are nearest to given angles.
+
+    A rotation has two triples of angles, (r, p, y) and (r + π, π - p, y + π), each up to whole turns. At a
+    pitch of a quarter turn only the sum or the difference of roll and yaw is determined.
+
+    Args:
+        rotation: Rotation matrix Rz(yaw)·Ry(pitch)·Rx(roll), shape (3, 3).
+        near: Roll, pitch and yaw that the result shall be near to, shape (3,) [rad].
+
+    Returns:
+        Roll, pitch and yaw, shape (3,) [rad].
+    """
+    near = np.asarray(near, float)
+    angles = pin.rpy.matrixToRpy(rotation)
+    candidates = [angles, np.array([angles[0] + np.pi, np.pi - angles[1], angles[2] + np.pi])]
+    candidates = [near + _wrapped(candidate - near) for candidate in candidates]
+    if abs(np.cos(angles[1])) < _GIMBAL_LOCK_TOL:
+        # The rotation depends on roll - yaw at a pitch of π/2 and on roll + yaw at -π/2.
+        sign = np.sign(angles[1])
+        half = 0.5 * _wrapped(angles[0] - sign * angles[2] - near[0] + sign * near[2])
+        pitch = near[1] + _wrapped(sign * np.pi / 2 - near[1])
+        candidates.append(np.array([near[0] + half, pitch, near[2] - sign * half]))
+    return min(candidates, key=lambda angles: float(np.linalg.norm(angles - near)))
+
+
+def _wrapped(angles: Array) -> Array:
+    """Remove whole turns, so that angles are between -π and π."""
+    return angles - 2 * np.pi * np.round(angles / (2 * np.pi))

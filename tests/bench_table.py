@@ -37,7 +37,7 @@ from robots import robot_file
 
 from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.estimation.parameters import select_parameters
-from dhcal_pin.io.measurement_csv import measurement_text
+from dhcal_pin.io import measurement_text
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.position import Position
 from dhcal_pin.robot.chain import Chain

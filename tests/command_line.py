@@ -11,6 +11,7 @@ from dhcal_pin.io import read_robot
 KEYS = {
     *("converged", "iterations", "samples", "samples_holdout", "rank", "parameters_total", "condition"),
     *("before", "after", "holdout_before", "holdout_after", "parameters", "unobservable", "outliers"),
+    *("cross_validated_before", "cross_validated_after", "holdout_region_before", "holdout_region_after"),
     *("files", "versions", "inputs"),
 }
 ACCURACY = {"position_rms_m", "position_max_m", "orientation_rms_rad"}
@@ -19,19 +20,25 @@ HEADER = "joint_1[deg],joint_2[deg],joint_3[deg],x[mm],y[mm],z[mm]"
 CALIBRATE = ("calibrate", "arm.dh.toml", "data.csv", "-o", "out.urdf")
 
 
-def tool_positions(degrees):
-    """Tool positions [mm] of the robot that the paper measured: a vertical axis and two links in a plane."""
+# Height of the shoulder and lengths of the links [mm]: of the paper's robot as designed, and of the robot
+# with errors that is measured here.
+DESIGNED, ACTUAL = (433, 400, 345), (436, 403, 343)
+
+
+def tool_positions(degrees, lengths=DESIGNED):
+    """Tool positions [mm] of a robot with a vertical axis and two links in a plane."""
     q1, q2, q3 = np.radians(degrees).T
-    out = 400 * np.cos(q2) + 345 * np.cos(q2 + q3)
-    up = 433 + 400 * np.sin(q2) + 345 * np.sin(q2 + q3)
+    height, upper, fore = lengths
+    out = upper * np.cos(q2) + fore * np.cos(q2 + q3)
+    up = height + upper * np.sin(q2) + fore * np.sin(q2 + q3)
     return np.stack([out * np.cos(q1), out * np.sin(q1), up], -1)
 
 
 def positions_csv(count, seed=0, wrong=(), error=1.0):
-    """Measured positions of that robot with noise of `error` mm; some rows (from 1) are off by 1 m."""
+    """Positions of the robot with errors, with noise of `error` mm; some rows (from 1) are off by 1 m."""
     rng = np.random.default_rng(seed)
     degrees = rng.uniform(-80, 80, (count, 3))
-    positions = tool_positions(degrees) + error * rng.normal(size=(count, 3))
+    positions = tool_positions(degrees, ACTUAL) + error * rng.normal(size=(count, 3))
     positions[[row - 1 for row in wrong]] += 1000
     rows = np.concatenate([degrees, positions], 1).tolist()
     return "\n".join([HEADER, *(",".join(map(repr, row)) for row in rows)]) + "\n"

@@ -16,4 +16,5 @@ def run_or_fail(job):
         raise ZeroDivisionError("by zero")
     if "wrong" in job.robot:
         raise DhcalError("wrong: input")
-    return {"converged": job.robot != "slow", "folder": os.getcwd()}
+    status = "refused" if job.robot == "slow" else "ok"
+    return {"verdict": {"status": status, "reasons": []}, "folder": os.getcwd()}

@@ -15,7 +15,7 @@ import dhcal_pin
 PACKAGE = Path(dhcal_pin.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
 PACKAGES = sorted({path.parent for path in FILES} - {PACKAGE, PACKAGE / "data"})
-COMMANDS = set("calibrate validate convert simulate check demo plan compensate study view".split())
+COMMANDS = set("calibrate inspect validate convert simulate check demo plan compensate study view".split())
 # Identifiers of an earlier vocabulary, each with the standard term that replaced it.
 REPLACED = {
     "Triangle": "TriangularSystem",
@@ -58,7 +58,7 @@ REPLACED = {
     "counted": "inliers",
     "portable": "transferable_instruments",
     "left_out": "cross_validate_folds",
-    "Sheet": "CsvTable",
+    "Sheet": "DataTable",
     "scratch": "work_array",
     "Determinant": "DOptimality",
     "Pool": "CandidateSet",
@@ -181,7 +181,7 @@ def test_packages_are_small_and_say_what_belongs_there(folder):
 
 @pytest.mark.parametrize("folder", PACKAGES, ids=lambda folder: folder.name)
 def test_exported_names_exist_and_hide_no_module(folder):
-    package = import_module(f"dhcal_pin.{folder.name}")
+    package = import_module(".".join(["dhcal_pin", *folder.relative_to(PACKAGE).parts]))
     exported = getattr(package, "__all__", [])
     assert exported or folder.name == "cli"
     assert [name for name in exported if not hasattr(package, name)] == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from dhcal_pin import se3
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.cli import main
 from dhcal_pin.compensation import compensate
+from dhcal_pin.estimation import select_parameters
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import read_targets, write_urdf
 from dhcal_pin.measurements import Noise, Pose
@@ -140,6 +142,33 @@ def test_true_robot_reaches_positions(name):
         assert np.linalg.norm(there - targets[i, :3, 3]) <= 1e-9
 
 
+def test_robot_with_correction_curves_reaches_its_targets():
+    """The joint errors are added by plain arithmetic, and an ideal arm moves to the sums."""
+    rng = np.random.default_rng(5)
+    nominal = ROBOTS["ur10"]()
+    ideal = wrong(nominal, rng)
+    errors = select_parameters(ideal, "gain,harmonics,curves,coupling")
+    x = rng.normal(size=len(errors.parameters)) * errors.priors
+    value = dict(zip([p.name for p in errors.parameters], x, strict=True))
+    true = errors.at(x)
+    targets = true.poses(draw(nominal, 40, rng))
+    found = compensate(nominal, true, targets)
+    assert found.reached.all()
+    moved = found.q.copy()
+    for i, joint in enumerate(nominal.joint_names):
+        q = found.q[:, i]
+        moved[:, i] += value[f"{joint}.gain"] * q
+        for k in range(1, 33):
+            moved[:, i] += value[f"{joint}.sin{k}"] * np.sin(k * q) + value[f"{joint}.cos{k}"] * np.cos(k * q)
+        for j, other in enumerate(nominal.joint_names):
+            moved[:, i] += value.get(f"{joint}.{other}", 0.0) * found.q[:, j]
+    assert np.abs(moved - found.q).max() > 1e-3
+    for q, target in zip(moved, targets, strict=True):
+        there, goal = pinocchio_pose(ideal, q), pin.SE3(target)
+        assert np.linalg.norm(there.translation - goal.translation) <= 1e-9
+        assert np.linalg.norm(pin.log3(there.rotation.T @ goal.rotation)) <= 1e-9
+
+
 def noisy(m: int, seeds: range) -> tuple[list[float], list[float]]:
     """Squared misses of the true robot and squared predicted standard deviations, both in m²."""
     nominal = Chain.from_dh(paper("sim_6dof"))
@@ -259,7 +288,8 @@ def place(tmp_path, monkeypatch):
     )
 
 
-COMMAND = ("compensate", "ur5.urdf", "true.urdf", "targets.csv", "--tip", "tool0", "-o", "out.csv")
+BASE = ("compensate", "ur5.urdf", "true.urdf", "targets.csv", "--tip", "tool0", "-o", "out.csv")
+COMMAND = (*BASE, "--frame", "measuring")
 
 
 def rows():
@@ -280,7 +310,7 @@ def test_command_writes_joint_positions_and_corrected_targets(place, capsys, rot
     Path("targets.csv").write_text("\n".join([header, *(",".join(map(repr, row)) for row in table)]))
     assert main.main(COMMAND) == 0
     said = capsys.readouterr().err
-    assert "1 of 20 out of reach: row 4" in said
+    assert "1 of 20 out of reach: line 5" in said
     found = rows()
     assert len(found) == 20
     assert found[3]["status"] == "out of reach"
@@ -367,5 +397,177 @@ def test_chains_with_different_joints_are_refused(place, capsys):
     Path("true.urdf").write_text(text.replace("</robot>", f"{more}</robot>"))
     assert main.main(["compensate", "ur5.urdf", "true.urdf", "targets.csv", "-o", "out.csv"]) == 2
     assert "--tip" in capsys.readouterr().err
-    assert main.main([*COMMAND[:-1], "targets.csv"]) == 2
+    assert main.main([*BASE[:-1], "targets.csv"]) == 2
     assert "is an input" in capsys.readouterr().err
+
+
+def write_targets(poses):
+    header = "x[mm],y[mm],z[mm],qw,qx,qy,qz"
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
+    table = np.hstack([1e3 * poses[:, :3, 3], turns]).tolist()
+    Path("targets.csv").write_text("\n".join([header, *(",".join(map(repr, row)) for row in table), ""]))
+
+
+def joint_values(chain, unit="rad"):
+    return np.array([[float(row[f"{name}[{unit}]"]) for name in chain.joint_names] for row in rows()])
+
+
+def test_targets_are_poses_of_the_tip_in_the_base_frame(place, capsys):
+    """The base and the tool in the sidecar belong to the set-up of the measurement."""
+    nominal, true = place
+    arm = replace(true, base=np.eye(4), tool=np.eye(4))
+    targets = arm.poses(draw(nominal, 12, np.random.default_rng(3)))
+    write_targets(targets)
+    assert main.main(BASE) == 0
+    said = capsys.readouterr().err
+    assert "targets: the tip tool0 in the root link world" in said
+    assert "12 of 12 ok" in said
+    assert "--frame" not in said
+    q = joint_values(nominal)
+    np.testing.assert_allclose(arm.poses(q), targets, atol=1e-9)
+    sent = np.array([[float(row[f"{axis}[mm]"]) for axis in "xyz"] for row in rows()]) / 1e3
+    np.testing.assert_allclose(sent, nominal.poses(q)[:, :3, 3], atol=1e-12)
+    # The corrections are those of errors of a few millimetres and degrees.
+    assert 1e-3 < np.linalg.norm(sent - targets[:, :3, 3], axis=1).min()
+    assert np.linalg.norm(sent - targets[:, :3, 3], axis=1).max() < 0.1
+
+
+def test_targets_in_the_wrong_frame_are_hinted_at(place, capsys):
+    nominal, true = place
+    Path("true.calibration.toml").write_text("[base]\nxyz_m = [5.0, 0.0, 0.0]\n")
+    far = replace(true, base=se3.transform(np.eye(3), [5.0, 0, 0]), tool=np.eye(4))
+    write_targets(far.poses(draw(nominal, 5, np.random.default_rng(3))))
+    assert main.main(BASE) == 0
+    assert "hint: are the targets in the measuring frame" in capsys.readouterr().err
+    assert main.main([*BASE, "--frame", "measuring"]) == 0
+    said = capsys.readouterr().err
+    assert "targets: the measured point in the measuring frame" in said
+    assert "5 of 5 ok" in said
+
+
+def link_in_tip(chain, name):
+    """Pose of a link in the tip, by Pinocchio."""
+    data = chain.model.createData()
+    pin.framesForwardKinematics(chain.model, data, pin.neutral(chain.model))
+    link, tip = (data.oMf[chain.model.getFrameId(n, pin.FrameType.BODY)] for n in (name, chain.tip))
+    return (tip.inverse() * link).homogeneous
+
+
+@pytest.mark.parametrize("tcp", ["ee_link", "tcp.toml", "tool.calibration.toml"])
+def test_tcp_is_a_link_or_a_file(place, tcp):
+    """A link of the URDF, a file with the pose, and the tool of a sidecar."""
+    nominal, true = place
+    pose, nominal_pose = (link_in_tip(chain, "ee_link") for chain in (true, nominal))
+    if tcp != "ee_link":
+        pose = nominal_pose = se3.exp6([0.1, -0.02, 0.15, 0.3, 0.1, -0.2])
+        content = f"xyz_m = {pose[:3, 3].tolist()}\nrotvec_rad = {se3.log3(pose[:3, :3]).tolist()}\n"
+        Path(tcp).write_text(content if tcp == "tcp.toml" else f"[tool]\n{content}")
+    arm = replace(true, base=np.eye(4), tool=pose)
+    targets = arm.poses(draw(nominal, 6, np.random.default_rng(4)))
+    write_targets(targets)
+    assert main.main([*BASE, "--tcp", tcp]) == 0
+    np.testing.assert_allclose(arm.poses(joint_values(nominal)), targets, atol=1e-9)
+    sent = np.array([[float(row[f"{axis}[mm]"]) for axis in "xyz"] for row in rows()]) / 1e3
+    np.testing.assert_allclose(
+        sent, replace(nominal, tool=nominal_pose).poses(joint_values(nominal))[:, :3, 3], atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--tcp", "nothing"], ["--tcp nothing", "link", "TOML"]),
+        (["--tcp", "forearm_link"], ["'forearm_link'", "fixed to the tip"]),
+        (["--tcp", "empty.toml"], ["empty.toml", "xyz_m"]),
+        (["--frame", "tracker"], ["--frame", "base", "measuring"]),
+        (["--export", "moves.txt"], ["moves.txt", ".script", ".trajectory.csv", ".robodk.csv"]),
+        (["--export", "targets.csv.script/x.script"], ["no folder"]),
+        (["--joint-units", "turns"], ["--joint-units", "deg"]),
+    ],
+)
+def test_invalid_options_are_refused(place, capsys, options, words):
+    nominal, _ = place
+    write_targets(nominal.poses(np.zeros((1, 6))))
+    Path("empty.toml").write_text("a = 1\n")
+    try:
+        status = main.main([*BASE, *options])
+    except SystemExit as stop:
+        status = stop.code
+    said = capsys.readouterr().err
+    assert (status, said.count("\n")) == (2, 1)
+    for word in words:
+        assert word in said
+    assert not Path("out.csv").exists()
+
+
+def test_exchanged_robots_are_noticed(place, capsys):
+    nominal, _ = place
+    write_targets(nominal.poses(draw(nominal, 2, np.random.default_rng(5))))
+    exchanged = ["compensate", "true.urdf", "ur5.urdf", *BASE[3:]]
+
+    def warning(command):
+        assert main.main(command) == 0
+        return [line for line in capsys.readouterr().err.splitlines() if "look exchanged" in line]
+
+    assert warning([*BASE]) == []
+    (line,) = warning(exchanged)
+    assert "true.urdf: warning:" in line
+    assert "it has a sidecar, and ur5.urdf has none" in line
+    # Copies without their sidecars: the digits of the joint origins decide.
+    Path("true.calibration.toml").unlink()
+    assert warning([*BASE]) == []
+    (line,) = warning(exchanged)
+    assert "all digits of a calibration" in line
+    # Somebody has rounded the calibrated file; the nominal one has a quarter turn with all digits.
+    text = Path("true.urdf").read_text()
+    Path("true.urdf").write_text(re.sub(r"-?\d+\.\d{7,}", lambda number: f"{float(number[0]):.6f}", text))
+    assert warning([*BASE]) == []
+
+
+def test_joint_positions_in_degrees(place):
+    nominal, _ = place
+    write_targets(nominal.poses(draw(nominal, 3, np.random.default_rng(6))))
+    assert main.main(BASE) == 0
+    radians = joint_values(nominal)
+    assert main.main([*BASE, "--joint-units", "deg"]) == 0
+    np.testing.assert_allclose(np.radians(joint_values(nominal, "deg")), radians, rtol=1e-14)
+
+
+def test_exports_move_the_arm_to_the_targets_that_it_reaches(place, capsys):
+    nominal, true = place
+    poses = replace(true, base=np.eye(4), tool=np.eye(4)).poses(draw(nominal, 5, np.random.default_rng(7)))
+    poses[2, 0, 3] += 9.0
+    write_targets(poses)
+    files = ["moves.script", "moves.trajectory.csv", "moves.robodk.csv"]
+    assert main.main([*BASE, *(word for file in files for word in ("--export", file))]) == 0
+    said = capsys.readouterr().err
+    assert all(f"wrote {file}" in said for file in files)
+    q = np.array(
+        [
+            [float(row[f"{name}[rad]"]) for name in nominal.joint_names]
+            for row in rows()
+            if row["status"] == "ok"
+        ]
+    )
+    assert len(q) == 4
+    script = Path("moves.script").read_text()
+    moves = [line for line in script.splitlines() if "movej" in line]
+    found = np.array([re.findall(r"-?\d+\.\d+(?:e-\d+)?", line) for line in moves], float)
+    np.testing.assert_allclose(found, q, atol=1e-9)
+    assert re.findall("# target (\\d)", script) == ["1", "2", "4", "5"]
+    with open("moves.robodk.csv", newline="") as file:
+        table = list(csv.DictReader(file))
+    degrees = np.array([[float(row[f"J{i}"]) for i in range(1, 7)] for row in table])
+    np.testing.assert_allclose(np.radians(degrees), q, atol=1e-9)
+    xyz = np.array([[float(row[key]) for key in "XYZ"] for row in table])
+    np.testing.assert_allclose(xyz / 1e3, nominal.poses(q)[:, :3, 3], atol=1e-9)
+
+
+def test_exports_without_a_target_are_refused(place, capsys):
+    nominal, _ = place
+    poses = nominal.poses(np.zeros((1, 6)))
+    poses[0, 0, 3] = 9.0
+    write_targets(poses)
+    assert main.main([*BASE, "--export", "moves.script"]) == 2
+    assert "no target is reached" in capsys.readouterr().err
+    assert not Path("out.csv").exists()

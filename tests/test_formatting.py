@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from xml.etree import ElementTree
+
 import numpy as np
 import pytest
 
-from dhcal_pin.formatting import Table, format_quantity, html_table, markdown_table
+from dhcal_pin.formatting import Table, escape_markdown, format_quantity, html_table, markdown_table
 
 
 @pytest.mark.parametrize(
@@ -31,9 +33,34 @@ def test_rates_and_pure_numbers():
     assert format_quantity(-0.00125, "1", 1e-5) == "-0.00125"
 
 
+HOSTILE = (
+    "<script>alert(1)</script> [x](javascript:alert) ![y](http://e.vil) `z` **b** _i_ &lt; \\ |",
+    "a\n# b\n\n- c",
+    "snake_case __init__ a_ _b joint_1*",
+    "[a]: http://e.vil",
+    "![a][b]",
+    "<http://e.vil>",
+    "<!-- comment",
+)
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_markdown_shows_texts_unchanged(text):
+    """Compared with a renderer of Markdown."""
+    markdown_it = pytest.importorskip("markdown_it")
+    table = markdown_table(Table([text], [[text]]))
+    page = markdown_it.MarkdownIt().enable("table").render(f"x {escape_markdown(text)}\n\n{table}")
+    root = ElementTree.fromstring(f"<page>{page}</page>")
+    assert {element.tag for element in root.iter()} == {
+        *("page", "p", "table", "thead", "tbody", "tr", "th", "td")
+    }
+    plain = " ".join(text.split())
+    assert [root.findtext(f".//{tag}") for tag in ("p", "th", "td")] == [f"x {plain}", plain, plain]
+
+
 def test_tables_align_numbers_and_escape_text():
     table = Table(["name", "value"], [["a<b", "-1.5"]], caption="c")
-    assert markdown_table(table) == "| name | value |\n| --- | ---: |\n| a<b | -1.5 |"
+    assert markdown_table(table) == "| name | value |\n| --- | ---: |\n| a&lt;b | -1.5 |"
     text = html_table(table)
     assert '<th scope="row">a&lt;b</th><td class="number">−1.5</td>' in text
     assert "<caption>c</caption>" in text

@@ -12,16 +12,18 @@ import pytest
 from robots import DATA, MAPS, missing, robot_file
 
 from dhcal_pin.calibration import blocked_folds, calibrate, cross_validate, k_fold
+from dhcal_pin.calibration.evaluation import position_errors
 from dhcal_pin.cli import main
 from dhcal_pin.io import read_measurement_file, read_measurements, read_robot
 from dhcal_pin.measurements import Noise
 from dhcal_pin.planning import plan
-from dhcal_pin.robot import Chain
+from dhcal_pin.robot import Chain, joint_coverage
 
 SERIES = {
     "B": DATA / "ipa_ur10/Series_B/measurements_joint_configurations.csv",
     "D": DATA / "ipa_ur10/Series_D/measurements_iso_cubes.csv",
 }
+UR10 = "ur_description/urdf/ur10_robot.urdf"
 FOLDS = (lambda data: k_fold(data, 5), blocked_folds)
 PANDA = DATA / "mukca_panda/panda_with_ball.urdf"
 PANDA_2 = "back_left back_right front_center front_left front_right mid-high mid_left mid_right".split()
@@ -44,14 +46,16 @@ def dhcal(tmp_path, capsys):
         status = main.main([command, *map(str, (robot, *args, "--json", out))])
         captured = capsys.readouterr()
         assert status == 0, captured.err
-        assert ": warning: " not in captured.err, captured.err
+        warnings = [line for line in captured.err.splitlines() if ": warning: " in line]
+        # Series D has five values of the last joint.
+        assert [line for line in warnings if "lattice" not in line] == []
         return json.loads(out.read_text())
 
     return call
 
 
 def ur10(dhcal, series, sets, folder, *more):
-    robot = robot_file("ur_description/urdf/ur10_robot.urdf")
+    robot = robot_file(UR10)
     output = folder / f"{series}.urdf"
     options = ("--columns", MAPS / "ipa_ur10.toml", "--tip", "tool0", "--parameters", sets, "-o", output)
     return dhcal("calibrate", robot, SERIES[series], *options, *more), output
@@ -63,7 +67,7 @@ def test_tracker_series_of_a_ur10(dhcal, tmp_path, series, frames, best):
     # The reference is one split; another draws other rows.
     assert placed["holdout_after"]["position_rms_m"] == pytest.approx(frames, rel=0.05)
     for sets in ("minimal,base,tool", "placement,base,tool"):
-        fit, _ = ur10(dhcal, series, sets, tmp_path, "--holdout", "0.5")
+        fit, _ = ur10(dhcal, series, sets, tmp_path, "--holdout", "0.5", "--extend", "none")
         assert fit["converged"]
         assert fit["rank"] == 30
         assert fit["holdout_after"]["position_rms_m"] <= best
@@ -72,22 +76,23 @@ def test_tracker_series_of_a_ur10(dhcal, tmp_path, series, frames, best):
 
 @pytest.mark.parametrize(("series", "other", "most"), [("B", "D", 0.53e-3), ("D", "B", 0.50e-3)])
 def test_links_of_one_series_are_accurate_on_another(dhcal, tmp_path, series, other, most):
-    _, output = ur10(dhcal, series, "minimal,base,tool", tmp_path)
+    _, output = ur10(dhcal, series, "minimal,base,tool", tmp_path, "--extend", "none")
     columns = ("--columns", MAPS / "ipa_ur10.toml", "--tip", "tool0")
     moved = dhcal("validate", output, SERIES[other], *columns, "--fit-frames")
     assert moved["after"]["position_rms_m"] <= most
 
 
 @pytest.mark.parametrize(
-    ("series", "other", "held", "moved"), [("B", "D", 0.425e-3, 0.52e-3), ("D", "B", 0.36e-3, 0.49e-3)]
+    ("series", "other", "held", "moved"), [("B", "D", 0.16e-3, 0.24e-3), ("D", "B", 0.17e-3, 0.29e-3)]
 )
 def test_extensions_are_accurate_on_hold_out_and_on_another_series(
     dhcal, tmp_path, series, other, held, moved
 ):
-    fit, _ = ur10(dhcal, series, "minimal,base,tool", tmp_path, "--holdout", "0.5", "--extend", "auto")
+    fit, _ = ur10(dhcal, series, "minimal,base,tool", tmp_path, "--holdout", "0.5")
     assert fit["holdout_after"]["position_rms_m"] <= held
-    assert "compliance" in [trial["family"] for trial in fit["extension"] if trial["is_selected"]]
-    _, output = ur10(dhcal, series, "minimal,base,tool", tmp_path, "--extend", "auto")
+    assert {"harmonics", "compliance", "curves"} <= set(fit["extension"]["families"])
+    assert fit["extension"]["temperature"] > 10
+    _, output = ur10(dhcal, series, "minimal,base,tool", tmp_path)
     columns = ("--columns", MAPS / "ipa_ur10.toml", "--tip", "tool0")
     validated = dhcal("validate", output, SERIES[other], *columns, "--fit-frames")
     assert validated["after"]["position_rms_m"] <= moved
@@ -95,18 +100,90 @@ def test_extensions_are_accurate_on_hold_out_and_on_another_series(
 
 def test_split_by_regions_shows_overfitting_that_a_random_split_hides():
     """Harmonics without priors are better between measured poses and worse outside the measured region."""
-    chain = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    chain = Chain.from_urdf(robot_file(UR10), "tool0")
     data = read_measurement_file(SERIES["B"], chain, MAPS / "ipa_ur10.toml").data.take(np.s_[::4])
     free = {"*.sin*": 1e3, "*.cos*": 1e3}
     fits = [
-        calibrate(chain, data, "minimal,base,tool"),
-        calibrate(chain, data, "minimal,base,tool,harmonics", priors=free),
+        calibrate(chain, data, "minimal,base,tool", extend="none"),
+        calibrate(chain, data, "minimal,base,tool,harmonics", priors=free, extend="none"),
     ]
     plain, wild = ([cross_validate(fit, folds(fit.data)) for folds in FOLDS] for fit in fits)
     key = "position_rms_m"
     random, regions = (b.accuracy[key] / a.accuracy[key] for a, b in zip(plain, wild, strict=True))
     assert random < 0.95
     assert regions > 1.2
+
+
+@pytest.mark.parametrize(("series", "other"), [("B", "D"), ("D", "B")])
+def test_error_on_another_series_is_not_much_more_than_that_on_regions_left_out(
+    dhcal, tmp_path, series, other
+):
+    fit, output = ur10(dhcal, series, "minimal,base,tool", tmp_path, "--extend", "none")
+    assert fit["cross_validated_after"]["position_rms_m"] < fit["holdout_region_after"]["position_rms_m"]
+    assert fit["cross_validated_before"]["position_rms_m"] > 0.75e-3
+    columns = ("--columns", MAPS / "ipa_ur10.toml", "--tip", "tool0", "--fit-frames")
+    moved = dhcal("validate", output, SERIES[other], *columns, "--nominal", robot_file(UR10))
+    assert moved["after"]["position_rms_m"] < 1.25 * fit["holdout_region_after"]["position_rms_m"]
+    assert moved["before"]["position_rms_m"] > 1.3 * moved["after"]["position_rms_m"]
+    # The series have hardly a configuration in common.
+    assert moved["measured_region"]["samples_outside"] > 0.9 * moved["samples"]
+
+
+def actual_over_stated(number: int) -> tuple[str, float, float, float]:
+    """Compare the error on the rest of a series with the figures of a calibration with a narrow part of it.
+
+    Returns:
+        Why the figure beyond the measured region cannot be stated, and the errors inside the measured region,
+        as far from it as left-out regions, and farther away, the last two over the figure that was stated.
+    """
+    case = json.loads((DATA / "ipa_ur10/extrapolation_cases.json").read_text())[number]
+    chain = Chain.from_urdf(robot_file(UR10), "tool0")
+    data = read_measurement_file(SERIES[case["series"]], chain, MAPS / "ipa_ur10.toml").data
+    is_fitted = np.isin(np.arange(len(data.rows)), case["rows"])
+    fit = calibrate(chain, data.take(is_fitted), "minimal,base,tool", extend="none")
+    rest, found, region = data.take(~is_fitted), fit.generalization, fit.measured_region
+    assert region is not None
+    _, errors = position_errors(fit.chain, [rest])
+    distances = region.distances(rest.q)
+    parts = [
+        distances <= region.radius,
+        (distances > region.radius) & (distances <= region.reach),
+        distances > region.reach,
+    ]
+    inside, beyond, far = (
+        np.sqrt(np.mean(errors[mask] ** 2)) if mask.sum() > 9 else np.nan for mask in parts
+    )
+    if found.region_holdout is None or found.cross_validated is None:
+        return found.region_holdout_reason, np.nan, np.nan, np.nan
+    stated = found.region_holdout.after["position_rms_m"]
+    return "", inside / found.cross_validated.after["position_rms_m"], beyond / stated, far / stated
+
+
+def test_figures_of_a_narrow_part_hold_where_they_are_said_to_hold():
+    """The error is up to four times the stated one where nothing is said, and near it elsewhere."""
+    for number in (2, 9):
+        reason, inside, beyond, far = actual_over_stated(number)
+        assert reason == ""
+        assert 0.8 < inside < 1.7
+        assert 0.8 < beyond < 1.5
+        assert far > 2
+    assert actual_over_stated(48)[0] == "wrist_3_joint did not move"
+    assert actual_over_stated(61)[0] == "wrist_3_joint hardly moved outside one of the left-out regions"
+
+
+@pytest.mark.slow
+def test_figures_of_all_narrow_parts_hold_where_they_are_said_to_hold():
+    found = [actual_over_stated(number) for number in range(70)]
+    reasons = [reason for reason, *_ in found if reason]
+    inside, beyond, far = np.array([figures for reason, *figures in found if not reason]).T
+    assert len(reasons) <= 16
+    for ratios in (inside, beyond):
+        assert 0.9 < np.nanmedian(ratios) < 1.3
+        assert np.nanquantile(ratios, 0.9) < 1.8
+        assert np.nanmax(ratios) < 2.6
+    # Farther away nothing is stated, for a good reason.
+    assert np.nanmedian(far) > 1.5
+    assert np.nanmax(far) > 100
 
 
 def known_distances(path, places):
@@ -125,7 +202,7 @@ def hold_out_errors(dhcal, folder, arm, places, left, *more):
     touched = [path for place in kept for path in holes[place]]
     output = folder / "panda.urdf"
     known = known_distances(folder / "known.csv", kept)
-    options = ("--parameters", "placement,tool", "-o", output, *more)
+    options = ("--parameters", "placement,tool", "-o", output, "--extend", "none", *more)
     assert dhcal("calibrate", PANDA, *touched, known, *common, *options)["converged"]
     judge = (*holes[left], known_distances(folder / "left.csv", [left]), *common)
     found = [dhcal("validate", robot, *judge)["after"] for robot in (output, PANDA)]
@@ -141,9 +218,9 @@ def test_contacts_of_a_panda_with_sockets_at_eight_places(dhcal, tmp_path):
     assert consistency <= 0.34
     assert distance <= 0.2
     auto = [
-        hold_out_errors(dhcal, tmp_path, "panda_2_clean", PANDA_2, left, *EXTEND)[0] for left in PANDA_2[::2]
+        hold_out_errors(dhcal, tmp_path, "panda_2_clean", PANDA_2, left, *EXTEND)[0] for left in PANDA_2[::4]
     ]
-    extended, plain = (np.sqrt(np.mean(np.square(found), 0)) for found in (auto, fitted[::2]))
+    extended, plain = (np.sqrt(np.mean(np.square(found), 0)) for found in (auto, fitted[::4]))
     assert extended[0] < plain[0]
     assert extended[1] < 1.05 * plain[1]
 
@@ -160,12 +237,11 @@ def test_known_distances_determine_the_scale_of_the_robot(dhcal, tmp_path, left)
 
 @pytest.mark.parametrize(("left", "most"), [("back-high", 1.05), ("front", 0.74), ("right", 0.86)])
 def test_contacts_of_a_panda_with_sockets_at_three_places(dhcal, tmp_path, left, most):
-    """Two places do not predict a third one, so no extension is added."""
-    (fitted, distance), (nominal, _) = hold_out_errors(dhcal, tmp_path, "panda_1", PANDA_1, left)
+    (fitted, _), (nominal, _) = hold_out_errors(dhcal, tmp_path, "panda_1", PANDA_1, left)
     assert nominal > 7
     assert fitted <= most
     extended = hold_out_errors(dhcal, tmp_path, "panda_1", PANDA_1, left, *EXTEND)[0]
-    assert np.all(np.array(extended) <= [fitted + 1e-9, distance + 1e-9])
+    assert extended[0] < fitted
 
 
 def planned_and_random(criterion: str, seeds: int, choices: int) -> np.ndarray:
@@ -173,7 +249,7 @@ def planned_and_random(criterion: str, seeds: int, choices: int) -> np.ndarray:
 
     The plan uses joint values alone. The ratio of a single choice of forty poses scatters by 0.025.
     """
-    chain = read_robot(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    chain = read_robot(robot_file(UR10), "tool0")
     data = read_measurements(SERIES["B"], chain, MAPS / "ipa_ur10.toml")
     sets, noise = "minimal,base,tool", Noise(1e-4, np.deg2rad(0.01))
     out = []
@@ -184,7 +260,7 @@ def planned_and_random(criterion: str, seeds: int, choices: int) -> np.ndarray:
         first, second = data.take(np.sort(order[:half])), data.take(np.sort(order[half:]))
 
         def held_out(part, second=second) -> float:
-            return calibrate(chain, part, sets).validate(second)["position_rms_m"]
+            return calibrate(chain, part, sets, extend="none").validate(second)["position_rms_m"]
 
         all_poses = held_out(first)
         planned = plan(chain, 40, noise=noise, parameters=sets, criterion=criterion, candidates=first.q)
@@ -206,3 +282,42 @@ def test_planned_poses_of_a_series_are_better_than_random_ones(criterion, most):
     planned, random = planned_and_random(criterion, 12, 100).T
     assert planned.mean() <= most
     assert planned.mean() <= random.mean()
+
+
+def error_on_other_series(rows: np.ndarray | slice, extend: str = "auto") -> float:
+    """Calibrate with rows of series B; return the RMS position error on D, frames refitted [m]."""
+    chain = read_robot(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    fitted, judged = (read_measurements(SERIES[name], chain, MAPS / "ipa_ur10.toml") for name in "BD")
+    fit = calibrate(chain, fitted.take(rows), extend=extend)
+    return calibrate(fit.chain, judged, "base,tool").comparisons[-1].after.groups["position"].rms
+
+
+def rows_that_fill_bins(count: int) -> np.ndarray:
+    chain = read_robot(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    q = read_measurements(SERIES["B"], chain, MAPS / "ipa_ur10.toml").q
+    found = plan(
+        chain,
+        count,
+        noise=Noise(1e-4, np.deg2rad(0.01)),
+        parameters="minimal,base,tool",
+        criterion="curves",
+        candidates=q,
+    )
+    assert found.index is not None
+    everywhere, chosen = joint_coverage(chain, q), joint_coverage(chain, found.q)
+    visited = [sum(one.n_visited for one in coverage) for coverage in (everywhere, chosen)]
+    assert visited[1] >= 0.95 * visited[0]
+    return found.index
+
+
+def test_poses_that_fill_bins_determine_curves_that_transfer():
+    geometry = error_on_other_series(np.s_[::2], "none")
+    assert 0.45e-3 < geometry < 0.56e-3
+    assert error_on_other_series(rows_that_fill_bins(100)) <= 0.6 * geometry
+
+
+@pytest.mark.slow
+def test_poses_that_fill_bins_are_as_good_as_many_random_ones():
+    rng = np.random.default_rng(0)
+    random = [error_on_other_series(rng.permutation(1495)[:747]) for _ in range(7)]
+    assert error_on_other_series(rows_that_fill_bins(100)) <= 1.1 * np.median(random)

@@ -12,26 +12,46 @@ the fold is fitted by iteration.
 
 Unknowns that only held-out samples depend on, such as a contact point, are fitted to the held-out samples.
 
+`estimate_generalization` states two figures of a calibration: the error within the measured region, from
+random folds, and the error beyond it, from folds that leave out regions of joint space. A figure cannot be
+stated if the other samples of a fold do not determine the errors of the held-out ones: with the covariance
+Σ = (R_fᵀR_f + W²)⁻¹ of the fold's fit, the held-out errors that uncertain parameters cause have the RMS
+‖R_h·S‖/√m_h, S·Sᵀ = Σ. It must not exceed three times the noise, which has the RMS 1.
+
 Shapes: p unknowns, c columns (unknowns that are free), m samples of a measurement, k folds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import lstsq
 
 from .._typing import Array
-from ..estimation import qr
+from ..estimation import qr, robust
 from ..estimation.problem import Problem, linearize_and_factor
-from ..estimation.qr import TriangularSystem
-from ..exceptions import InvalidArgumentError
+from ..estimation.qr import (
+    TriangularSystem,
+    append_priors,
+    merge_r_factors,
+    posterior_sqrt_covariance,
+)
+from ..exceptions import InvalidArgumentError, NotObservableError
 from ..measurements.base import Measurement
-from .evaluation import Accuracy, compute_errors
-from .partition import Fold, blocked_folds, contact_groups
+from ..measurements.measured_region import MIN_SPREAD, MeasuredRegion, draw_joint_space
+from .evaluation import Accuracy, Comparison, PairedErrors, Title, compute_errors, fit_nominal
+from .partition import (
+    Fold,
+    blocked_folds,
+    configuration_groups,
+    contact_groups,
+    different_configurations,
+)
+from .summary import MIN_SAMPLES
 
 if TYPE_CHECKING:
     from .result import Result
@@ -39,9 +59,16 @@ if TYPE_CHECKING:
 # A fold is fitted by iteration if its cost exceeds that of the linear model by more than this fraction of the
 # mean cost of a fitted sample.
 _NONLINEARITY_TOL = 1e-3
+# Undetermined directions that change the held-out rows by less than this fraction have no effect on them.
+_UNBOUNDED_TOL = 1e-6
+# A fold does not determine the held-out errors if uncertain parameters contribute more to them than this, in
+# standard deviations of the measurements.
+MAX_PREDICTION_STD = 3.0
+# A joint hardly moved if its spread in some of the samples is below this fraction of its spread in all.
+_MIN_SPREAD_RATIO = 0.1
 
-# Function that returns the solution x (p,) of a problem with some of the samples.
-Refit = Callable[[Problem], Array]
+# Function that returns the solution x (p,) of a problem with some of the samples, from an approximate one.
+Refit = Callable[[Problem, Array], Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,13 +104,52 @@ class FoldSystems:
             The RMS in standard deviations.
         """
         step, _ = solve_columns(self.fitted, weights, x, columns)
-        held_out = self.held_out.r[:, columns]
-        residual = self.held_out.z - held_out @ step
-        own = self.is_unobserved[columns] & held_out.any(0)
-        if own.any():
-            basis = np.linalg.qr(held_out[:, own])[0]
-            residual = residual - basis @ (basis.T @ residual)
+        residual = self._without_own_unknowns(self.held_out.z - self.held_out.r[:, columns] @ step, columns)
         return float(np.sqrt((residual @ residual + self.held_out.min_cost) / self.n_rows))
+
+    def prediction_std(self, weights: Array, columns: Array) -> float:
+        """Compute the RMS of the held-out whitened rows that the uncertainty of the fit causes.
+
+        Args:
+            weights: One over the prior standard deviations of the unknowns, (p,).
+            columns: Mask of the unknowns that are fitted, (p,).
+
+        Returns:
+            The RMS in standard deviations; infinite if neither the other rows nor priors determine them.
+        """
+        known = columns & ~self.is_unobserved
+        if not known.any():
+            return 0.0
+        rows = self._without_own_unknowns(self.held_out.r[:, known], columns)
+        reduced = select_columns(self.fitted, known)
+        root, unbounded = posterior_sqrt_covariance(reduced, weights[known])
+        if np.linalg.norm(rows @ unbounded) > _UNBOUNDED_TOL * np.linalg.norm(rows):
+            return np.inf
+        return float(np.linalg.norm(rows @ root) / np.sqrt(self.n_rows))
+
+    def _without_own_unknowns(self, rows: Array, columns: Array) -> Array:
+        """Remove from held-out rows what unknowns explain that only the held-out rows depend on."""
+        own = self.held_out.r[:, columns & self.is_unobserved]
+        own = own[:, own.any(0)]
+        if not own.size:
+            return rows
+        basis = np.linalg.qr(own)[0]
+        return rows - basis @ (basis.T @ rows)
+
+
+def select_columns(system: TriangularSystem, columns: Array) -> TriangularSystem:
+    """Compute the triangular system of some of the unknowns, the others held.
+
+    Args:
+        system: System of p unknowns.
+        columns: Mask of the unknowns that stay, (p,).
+
+    Returns:
+        The system; the given one if all stay.
+    """
+    if columns.all():
+        return system
+    return TriangularSystem(merge_r_factors([system.rows[:, np.append(columns, True)]]))
 
 
 def solve_columns(system: TriangularSystem, weights: Array, x: Array, columns: Array) -> tuple[Array, float]:
@@ -102,6 +168,10 @@ def solve_columns(system: TriangularSystem, weights: Array, x: Array, columns: A
         The step, (c,), and the cost of rows and priors after it.
     """
     prior = weights[columns]
+    if prior.all():
+        reduced = select_columns(system, columns)
+        with_priors = append_priors(reduced, prior, x[columns])
+        return qr.pseudo_inverse(with_priors.r, with_priors.z), with_priors.min_cost
     a = np.concatenate([system.r[:, columns], np.diag(prior)])
     b = np.concatenate([system.z, -prior * x[columns]])
     solution = lstsq(a, b, lapack_driver="gelsy", check_finite=False)
@@ -119,41 +189,61 @@ def count_rows(problem: Problem) -> int:
     return sum(item.residual_dim * len(item.rows) for item in problem.data)
 
 
-def factor_folds(
-    problem: Problem, x: Array, folds: Sequence[Fold], progress: Callable[[int, float], None] | None = None
-) -> tuple[FoldSystems, ...]:
-    """Compute the triangular systems of each fold.
+def factor_partition(problem: Problem, x: Array, folds: Sequence[Fold]) -> tuple[FoldSystems, ...]:
+    """Compute the triangular systems of disjoint folds; the rows of each sample are factored once.
+
+    Args:
+        problem: Problem with the samples of all folds.
+        x: Point of the linearization, (p,).
+        folds: Folds of its measurements that have no sample in common.
+
+    Returns:
+        The systems of each fold.
+    """
+    rest = tuple(~np.any(masks, 0) for masks in zip(*folds, strict=True))
+    systems: list[TriangularSystem] = []
+    counts: list[int] = []
+    for masks in (*folds, rest):
+        part = problem.with_data([item.take(mask) for item, mask in zip(problem.data, masks, strict=True)])
+        counts.append(count_rows(part))
+        if counts[-1]:
+            systems.append(linearize_and_factor(part, x, small_angle=False))
+    return tuple(
+        FoldSystems(
+            TriangularSystem(merge_r_factors([other.rows for other in systems if other is not held_out])),
+            held_out,
+            n_rows,
+        )
+        for held_out, n_rows in zip(systems, counts[: len(folds)], strict=False)
+    )
+
+
+def factor_folds(problem: Problem, x: Array, folds: Sequence[Fold]) -> Iterator[FoldSystems]:
+    """Compute the triangular systems of any folds; the rows of consecutive disjoint folds are factored once.
 
     Args:
         problem: Problem with the samples of all folds.
         x: Point of the linearization, (p,).
         folds: Folds of its measurements.
-        progress: Called after each fold with the number of folds done and the fold's cost.
 
-    Returns:
+    Yields:
         The systems of each fold.
     """
-    systems = []
+    group: list[Fold] = []
     for fold in folds:
-        systems.append(_divide(problem, x, fold)[1])
-        if progress:
-            progress(len(systems), systems[-1].fitted.min_cost)
-    return tuple(systems)
+        if any(np.any(a & b) for other in group for a, b in zip(fold, other, strict=True)):
+            yield from factor_partition(problem, x, group)
+            group = []
+        group.append(fold)
+    if group:
+        yield from factor_partition(problem, x, group)
 
 
-def _divide(problem: Problem, x: Array, fold: Fold) -> tuple[Problem, FoldSystems]:
-    """Return the problem of the fitted samples of a fold, and the fold's systems at x (p,)."""
-    fitted, held_out = (
-        problem.with_data([item.take(mask) for item, mask in zip(problem.data, masks, strict=True)])
-        for masks in ([~mask for mask in fold], fold)
-    )
-    fitted_system = linearize_and_factor(fitted, x, small_angle=False)
-    held_out_system = linearize_and_factor(held_out, x, small_angle=False)
-    return fitted, FoldSystems(fitted_system, held_out_system, count_rows(held_out))
-
-
-def _solve_fold(fitted: Problem, systems: FoldSystems, x: Array, columns: Array, refit: Refit) -> Array:
+def _solve_fold(
+    problem: Problem, fold: Fold, systems: FoldSystems, x: Array, columns: Array, refit: Refit
+) -> Array:
     """Solve a fold by one step from x (p,) in the free columns, or by iteration if that is not enough."""
+    fitted = problem.with_data([item.take(~mask) for item, mask in zip(problem.data, fold, strict=True)])
     candidate = x.copy()
     step, cost = solve_columns(systems.fitted, fitted.weights, x, columns)
     candidate[columns] += step
@@ -161,7 +251,22 @@ def _solve_fold(fitted: Problem, systems: FoldSystems, x: Array, columns: Array,
     n_samples = sum(len(item.rows) for item in fitted.data)
     if fitted.cost(candidate) <= cost + _NONLINEARITY_TOL * cost / max(1, n_samples):
         return candidate
-    return refit(fitted)
+    return refit(fitted, candidate)
+
+
+@dataclass(frozen=True, eq=False)
+class FoldErrors:
+    """Errors of the held-out samples of a fold.
+
+    Attributes:
+        errors: Errors of each measurement with held-out samples, as from `compute_errors`.
+        rms: RMS of the held-out rows in standard deviations.
+        prediction_std: RMS of these rows that the uncertainty of the fold's fit causes.
+    """
+
+    errors: list[dict[str, Array]]
+    rms: float
+    prediction_std: float
 
 
 def cross_validate_folds(
@@ -171,7 +276,7 @@ def cross_validate_folds(
     folds: Sequence[Fold],
     refit: Refit,
     shrinkage_factor: float = 1.0,
-) -> Iterator[tuple[list[dict[str, Array]], float]]:
+) -> Iterator[FoldErrors]:
     """Generate the errors of the held-out samples of each fold.
 
     Args:
@@ -183,8 +288,7 @@ def cross_validate_folds(
         shrinkage_factor: Factor to the solution of each fold.
 
     Yields:
-        Errors of the held-out samples of each measurement, as from `compute_errors`, and their RMS in
-        standard deviations.
+        Errors of the held-out samples of each fold.
 
     Raises:
         InvalidArgumentError: If the folds were made for other data.
@@ -195,9 +299,8 @@ def cross_validate_folds(
             f"folds were made for other data; expected masks of {', '.join(map(str, sizes))} samples"
         )
     columns, robot = problem.is_interior(x), len(problem.errors.parameters)
-    for fold in folds:
-        fitted, systems = _divide(problem, x, fold)
-        solution = shrinkage_factor * _solve_fold(fitted, systems, x, columns, refit)
+    for fold, systems in zip(folds, factor_folds(problem, x, folds), strict=True):
+        solution = shrinkage_factor * _solve_fold(problem, fold, systems, x, columns, refit)
         unobserved = {
             parameter.name
             for parameter, is_unobserved in zip(
@@ -208,7 +311,11 @@ def cross_validate_folds(
         known = {name: v for name, v in problem.instruments(solution).items() if name not in unobserved}
         held_out = [item.take(mask) for item, mask in zip(data, fold, strict=True) if mask.any()]
         errors = compute_errors(problem.errors.at(solution[:robot]), held_out, known)
-        yield errors, systems.error(problem.weights, x, columns)
+        yield FoldErrors(
+            errors,
+            systems.error(problem.weights, x, columns),
+            systems.prediction_std(problem.weights, columns),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,7 +367,249 @@ def cross_validate(fit: Result, folds: Sequence[Fold] | None = None) -> CrossVal
         folds = blocked_folds(fit.data, groups=contact_groups(fit.problem, fit.x))
     results = list(cross_validate_folds(fit.problem, fit.solution.x, fit.data, folds, fit.refit))
     return CrossValidation(
-        tuple(Accuracy.from_errors(errors) for errors, _ in results),
-        np.array([error for _, error in results]),
-        Accuracy.from_errors([item for errors, _ in results for item in errors]),
+        tuple(Accuracy.from_errors(fold.errors) for fold in results),
+        np.array([fold.rms for fold in results]),
+        Accuracy.from_errors([item for fold in results for item in fold.errors]),
     )
+
+
+# --- accuracy within and beyond the measured region ------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class FoldComparison:
+    """Accuracy of the held-out samples of folds before and after a calibration.
+
+    Attributes:
+        comparison: The accuracy.
+        prediction_std: Largest RMS of the held-out rows of a fold that the uncertainty of its fit causes, in
+            standard deviations.
+        paired: Squared errors of each held-out configuration before and after.
+    """
+
+    comparison: Comparison
+    prediction_std: float
+    paired: PairedErrors
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether the other samples of each fold determine the errors of the held-out ones."""
+        return self.prediction_std <= MAX_PREDICTION_STD
+
+
+def compare_folds(fit: Result, folds: Sequence[Fold], title: Title) -> FoldComparison:
+    """Compare the accuracy of held-out samples before and after a calibration.
+
+    The nominal robot is judged in the same way: base, tool and instrument parameters are fitted to the other
+    samples of each fold.
+
+    Args:
+        fit: Result of a calibration.
+        folds: Folds of `fit.inliers`.
+        title: Title of the comparison.
+
+    Returns:
+        The comparison of the held-out samples of all folds together.
+    """
+    data = fit.inliers
+    nominal = replace(fit.errors, chain=fit.nominal_refitted)
+    before: list[dict[str, Array]] = []
+    for fold in folds:
+        fitted, held_out = (
+            [item.take(mask) for item, mask in zip(data, masks, strict=True) if mask.any()]
+            for masks in ([~mask for mask in fold], fold)
+        )
+        chain, instruments = fit_nominal(nominal, fitted, fit.problem.known)
+        before += compute_errors(chain, held_out, instruments)
+    after: list[dict[str, Array]] = []
+    largest_std = 0.0
+    for fold_after in cross_validate_folds(
+        fit.inlier_problem, fit.solution.x, data, folds, fit.refit, fit.shrinkage_factor
+    ):
+        after += fold_after.errors
+        largest_std = max(largest_std, fold_after.prediction_std)
+    if not fit.shrinkage_factor:
+        # Without a correction the calibrated robot is the nominal one.
+        after = before
+    labels = configuration_groups(data)
+    held_out_labels = np.concatenate([labels[np.concatenate(fold)] for fold in folds])
+    return FoldComparison(
+        _comparison(fit, title, before, after),
+        largest_std,
+        PairedErrors.from_errors(before, after, held_out_labels),
+    )
+
+
+def leave_regions_out(fit: Result, recalibrate: Callable[[list[Measurement]], Result]) -> Result:
+    """Judge a calibration by further ones, each without the samples of a region of joint space.
+
+    Unlike in `compare_folds`, everything is estimated again without the region: noise, prior widths, outliers
+    and additional parameters.
+
+    Args:
+        fit: Result of a calibration with all samples.
+        recalibrate: The same calibration of some of the samples.
+
+    Returns:
+        The same result with the comparison as `region_comparison`; None if all samples have the same joint
+        values.
+    """
+    try:
+        folds = blocked_folds(fit.data, groups=contact_groups(fit.problem, fit.x))
+    except NotObservableError:
+        return fit
+    before: list[dict[str, Array]] = []
+    after: list[dict[str, Array]] = []
+    for fold in folds:
+        part = recalibrate(
+            [item.take(~mask) for item, mask in zip(fit.data, fold, strict=True) if not mask.all()]
+        )
+        is_judged = [mask & (w > robust.ZERO_WEIGHT) for mask, w in zip(fold, fit.weights, strict=True)]
+        held_out = [item.take(mask) for item, mask in zip(fit.data, is_judged, strict=True) if mask.any()]
+        before += compute_errors(part.nominal_refitted, held_out, part.nominal_instruments)
+        after += compute_errors(part.chain, held_out, part.instruments)
+    return replace(fit, region_comparison=_comparison(fit, "region hold-out", before, after))
+
+
+def _comparison(
+    fit: Result, title: Title, before: Sequence[Mapping[str, Array]], after: Sequence[Mapping[str, Array]]
+) -> Comparison:
+    """Compare the errors of held-out samples before and after a calibration."""
+    accuracy_before, accuracy_after = map(Accuracy.from_errors, (before, after))
+    n_samples = sum(len(next(iter(item.values()))) for item in after)
+    n_rejected = fit.n_samples - sum(len(item.rows) for item in fit.inliers)
+    return Comparison(title, n_samples, accuracy_before, accuracy_after, n_rejected)
+
+
+@dataclass(frozen=True, eq=False)
+class Generalization:
+    """Accuracy on configurations that are not fitted: within the measured region and beyond it.
+
+    The shares are those of random configurations within the joint limits, see `measurements.measured_region`.
+
+    Attributes:
+        cross_validated: Accuracy within the measured region, from random folds of whole configurations; None
+            if it cannot be stated.
+        cross_validated_reason: Why it cannot be stated; empty if it can.
+        region_holdout: Accuracy beyond the measured region, from folds that leave out regions of joint space,
+            or from `leave_regions_out` if it was called; None if it cannot be stated.
+        region_holdout_reason: Why it cannot be stated; empty if it can.
+        covered_share: Share of the joint space in the measured region, 0 to 1.
+        reached_share: Share of the joint space that is no farther from the measured configurations than the
+            left-out regions are from the others, 0 to 1: there `region_holdout` holds. It is `covered_share`
+            if that cannot be stated. Nothing is known about the rest.
+    """
+
+    cross_validated: Comparison | None
+    cross_validated_reason: str
+    region_holdout: Comparison | None
+    region_holdout_reason: str
+    covered_share: float
+    reached_share: float
+
+
+def estimate_generalization(fit: Result) -> Generalization:
+    """Estimate the accuracy of a calibration within the measured region and beyond it.
+
+    Args:
+        fit: Result of a calibration.
+
+    Returns:
+        Both figures and the shares of the joint space where they hold.
+    """
+    q, samples = different_configurations(fit.inliers)
+    has_few = 1 < len(q) < MIN_SAMPLES
+    inside, beyond = fit.random_folds, None
+    inside_reason = "too few samples" if has_few else "all samples have the same joint values"
+    beyond_reason = inside_reason if len(q) else "the samples have no joint values"
+    if inside is not None and not has_few:
+        inside_reason = "" if inside.is_determined else "too few samples"
+    folds = region_folds(fit) if len(q) else ()
+    if folds and not has_few:
+        beyond = compare_folds(fit, folds, "region hold-out")
+        beyond_reason = _unknown_reason(fit, beyond, q, samples_held_out(folds, samples))
+    covered = reached = 0.0
+    if fit.measured_region is not None:
+        distances = fit.measured_region.distances(draw_joint_space(fit.chain))
+        covered = float(np.mean(distances <= fit.measured_region.radius))
+        reached = covered if beyond_reason else float(np.mean(distances <= fit.measured_region.reach))
+    return Generalization(
+        None if inside is None or inside_reason else inside.comparison,
+        inside_reason,
+        None if beyond is None or beyond_reason else fit.region_comparison or beyond.comparison,
+        beyond_reason,
+        covered,
+        reached,
+    )
+
+
+def region_folds(fit: Result) -> tuple[Fold, ...]:
+    """Return the folds of the inliers that leave out regions of joint space.
+
+    Args:
+        fit: Result of a calibration.
+
+    Returns:
+        The folds; none if all samples have the same joint values.
+    """
+    with suppress(NotObservableError):
+        return blocked_folds(fit.inliers, groups=contact_groups(fit.inlier_problem, fit.x))
+    return ()
+
+
+def measured_region(fit: Result) -> MeasuredRegion | None:
+    """Describe the region of joint space of the inliers.
+
+    Args:
+        fit: Result of a calibration.
+
+    Returns:
+        The region; None if no sample has joint values.
+    """
+    q, samples = different_configurations(fit.inliers)
+    if not len(q):
+        return None
+    region = MeasuredRegion.from_configurations(q, fit.chain.is_prismatic)
+    folds = region_folds(fit)
+    return region.with_reach(q, samples_held_out(folds, samples)) if folds else region
+
+
+def samples_held_out(folds: Sequence[Fold], samples: Array) -> Array:
+    """Return whether each fold holds out each of some samples.
+
+    Args:
+        folds: The k folds.
+        samples: Numbers of u samples among those of all measurements.
+
+    Returns:
+        Masks, (k, u).
+    """
+    return np.stack([np.concatenate(fold)[samples] for fold in folds])
+
+
+def _unknown_reason(fit: Result, regions: FoldComparison, q: Array, is_held_out: Array) -> str:
+    """Say why the error beyond the measured region cannot be stated.
+
+    Args:
+        fit: Result of a calibration.
+        regions: Accuracy of the left-out regions.
+        q: Different configurations, (u, n) [rad or m].
+        is_held_out: Whether each fold holds out each configuration, (k, u).
+
+    Returns:
+        The reason; empty if the error can be stated.
+    """
+
+    def names(mask: Array) -> str:
+        return ", ".join(np.array(fit.chain.joint_names)[mask].tolist())
+
+    spread = q.std(0)
+    if np.any(spread < MIN_SPREAD):
+        return f"{names(spread < MIN_SPREAD)} did not move"
+    if regions.is_determined:
+        return ""
+    others = np.min([q[~mask].std(0) for mask in is_held_out if not mask.all()], 0)
+    is_small = others < _MIN_SPREAD_RATIO * spread
+    if is_small.any():
+        return f"{names(is_small)} hardly moved outside one of the left-out regions"
+    return "too few samples outside one of the left-out regions"

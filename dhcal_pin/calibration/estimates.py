@@ -15,7 +15,7 @@ import numpy as np
 
 from .. import se3
 from .._typing import Array
-from ..estimation.error_model import ErrorParameter
+from ..estimation.error_model import ErrorParameter, frame_name
 from ..formatting import format_quantity
 from ..measurements.base import InstrumentParameter
 from ..robot.chain import BASE_FRAME, Chain
@@ -36,6 +36,9 @@ class Estimate:
         posterior_to_prior_std: Ratio of `std` to the standard deviation expected before the measurement.
         fixed: Whether the parameter was held at its nominal value.
         category: "robot", "frame" (base and tool) or "instrument".
+        frame: Frame in whose axes the parameter is defined, see `error_model.frame_name`; the measuring frame
+            for the base, the tip link for the tool, and empty for an instrument.
+        direction: Direction in this frame, such as "along x" or "about z".
     """
 
     name: str
@@ -48,6 +51,8 @@ class Estimate:
     posterior_to_prior_std: float
     fixed: bool
     category: str
+    frame: str = ""
+    direction: str = ""
 
     @property
     def change(self) -> float:
@@ -90,12 +95,13 @@ def make_estimates(
     estimates = []
     for p, (x, std, prior, observability, ratio), is_fixed in rows:
         nominal, value, category = p.nominal, p.nominal + x, "instrument"
+        frame, direction = p.definition(chain) if isinstance(p, ErrorParameter) else ("", "")
         if isinstance(p, ErrorParameter):
             category = "frame" if p.error_frame in frames else "robot"
         if isinstance(p, ErrorParameter) and category == "frame":
             value = float(components[p.error_frame] @ np.array(p.twist))
             nominal = value if is_fixed else nominal
-        estimates.append(
-            Estimate(p.name, p.unit, nominal, value, std, prior, observability, ratio, is_fixed, category)
-        )
+            frame = "measuring frame" if p.error_frame == BASE_FRAME else frame_name(chain, chain.tip_frame)
+        figures_of_one = (nominal, value, std, prior, observability, ratio)
+        estimates.append(Estimate(p.name, p.unit, *figures_of_one, is_fixed, category, frame, direction))
     return tuple(estimates)

@@ -16,7 +16,7 @@ the measurements before the errors are computed.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -24,14 +24,18 @@ import numpy as np
 from .._typing import Array
 from ..estimation import robust
 from ..estimation.error_model import ErrorModel
+from ..estimation.initialization import fit_frames
 from ..estimation.problem import Problem, merge_instrument_parameters
 from ..estimation.solver import minimize
+from ..measurements.arguments import as_measurements, require_chain
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
-from .arguments import as_measurements, require_chain
 
 # Unit of each group of errors, in the order of importance.
 GROUP_UNITS = {"position": "m", "orientation": "rad", "residual": "m"}
+
+# Samples that a comparison judges.
+Title = Literal["hold-out", "region hold-out", "cross-validated", "fitted"]
 
 
 def error_group(name: str) -> str:
@@ -180,6 +184,40 @@ def fit_instrument_parameters(
     return problem.instruments(minimize(problem).x)
 
 
+def fit_nominal(
+    nominal: ErrorModel, data: Sequence[Measurement], known: Mapping[str, float]
+) -> tuple[Chain, dict[str, float]]:
+    """Fit base, tool and instrument parameters of the nominal robot to measurements.
+
+    Args:
+        nominal: Nominal chain and its unknown parameters, of which base and tool are fitted.
+        data: Measurements of any kinds.
+        known: Values of instrument parameters by name [m or rad].
+
+    Returns:
+        The nominal chain with these frames, and the values of the instrument parameters that the measurements
+        depend on: not of a contact point that none of the samples touches.
+    """
+    chain = fit_frames(nominal, tuple(data), known)
+    data = [item.initialized(chain) for item in data]
+    values = fit_instrument_parameters(chain, data, known)
+    used = {
+        parameter.name
+        for item in data
+        if item.instrument_parameters
+        for parameter, jacobian in zip(
+            item.instrument_parameters,
+            item.instrument_jacobian(
+                chain.forward_kinematics(item.configurations()),
+                np.array([values[parameter.name] for parameter in item.instrument_parameters]),
+            ),
+            strict=True,
+        )
+        if jacobian.any()
+    }
+    return chain, {name: value for name, value in values.items() if name in used}
+
+
 def compute_errors(
     chain: Chain, data: Sequence[Measurement], known: Mapping[str, float] | None = None
 ) -> list[dict[str, Array]]:
@@ -282,21 +320,94 @@ def remove_outliers(errors: Sequence[Mapping[str, Array]]) -> tuple[list[dict[st
     return inliers, n_outliers
 
 
+@dataclass(frozen=True, eq=False)
+class PairedErrors:
+    """Mean squared errors of the same configurations before and after a calibration.
+
+    Attributes:
+        before: Of each of u configurations, shape (u,) [m² or rad²].
+        after: The same after the calibration.
+        n_components: Number of components of an error.
+    """
+
+    before: Array
+    after: Array
+    n_components: int
+
+    @classmethod
+    def from_errors(
+        cls, before: Sequence[Mapping[str, Array]], after: Sequence[Mapping[str, Array]], labels: Array
+    ) -> PairedErrors:
+        """Average the squared errors of the most important group over the samples of each configuration.
+
+        Args:
+            before: Errors of each measurement, as from `compute_errors`, with m samples in all.
+            after: The same after the calibration.
+            labels: Label of the configuration of each sample, shape (m,).
+
+        Returns:
+            The mean squared errors.
+        """
+        group = next(iter(error_norms(before)))
+        squares, kept, start, n_components = [], [], 0, 1
+        for items in zip(before, after, strict=True):
+            stop = start + len(next(iter(items[0].values())))
+            names = [name for name in items[0] if error_group(name) == group]
+            if names:
+                n_components = items[0][names[0]].shape[1]
+                squares.append([np.sum(item[names[0]] ** 2, 1) for item in items])
+                kept.append(labels[start:stop])
+            start = stop
+        _, index, counts = np.unique(np.concatenate(kept), return_inverse=True, return_counts=True)
+        values = np.concatenate(squares, 1)
+        mean_squares = [np.bincount(index, row) / counts for row in values]
+        return cls(*mean_squares, n_components=n_components)
+
+    def without_outliers(self) -> PairedErrors:
+        """Leave out configurations that are outliers both before and after: wrong measurements."""
+        is_outlier = np.logical_and(
+            *(
+                robust.standardize_mean_squares(squares, self.n_components) > robust.OUTLIER_THRESHOLD
+                for squares in (self.before, self.after)
+            )
+        )
+        return replace(self, before=self.before[~is_outlier], after=self.after[~is_outlier])
+
+    @property
+    def ratio(self) -> float:
+        """RMS error after relative to the RMS error before."""
+        return float(np.sqrt(np.mean(self.after) / max(np.mean(self.before), np.finfo(float).tiny)))
+
+    @property
+    def t(self) -> float:
+        """Mean change of the squared error in standard errors: negative if the error fell; NaN if unknown.
+
+        Student's t statistic of paired differences, with u - 1 degrees of freedom.
+        """
+        change = self.after - self.before
+        if len(change) < 2:
+            return np.nan
+        error = np.std(change, ddof=1) / np.sqrt(len(change))
+        return float(np.mean(change) / error) if error > 0 else 0.0
+
+
 @dataclass(frozen=True)
 class Comparison:
     """Accuracy before and after a calibration on the same samples.
 
     Attributes:
-        title: "hold-out", "cross-validated" (each sample is judged by a fit without it) or "fitted".
+        title: "hold-out", "region hold-out" (regions of joint space are judged by a fit without them, and may
+            overlap), "cross-validated" (each sample is judged by a fit without it) or "fitted".
         n_samples: Number of samples.
-        before: Accuracy of the nominal robot, base and tool fitted.
+        before: Accuracy of the nominal robot. Its base, tool and instrument parameters are fitted to the same
+            samples as those of the calibrated robot.
         after: Accuracy of the calibrated robot.
         n_rejected: Number of fitted samples with zero weight; they are not in the figures.
         n_outliers: Number of outliers among hold-out samples; they are in the figures.
         after_without_outliers: `after` without these; empty if there are none.
     """
 
-    title: Literal["hold-out", "cross-validated", "fitted"]
+    title: Title
     n_samples: int
     before: Accuracy
     after: Accuracy

@@ -1,69 +1,122 @@
-"""Model selection: which families of joint errors the measurements support.
+"""Model selection: families of joint errors that the measurements support, and how much samples count.
 
-Forward selection by cross-validation. A family is a set of parameters that describe one physical cause,
-such as `harmonics` for gear eccentricity. In each round every remaining family is tried on top of those
-selected before. The family with the lowest cross-validated error is added if
+A calibration estimates the geometry first. The standard deviations of its priors are then held, and two
+questions are asked.
 
-1. the error of held-out regions of joint space, e_k for fold k, falls by more than the standard error of
-   its mean change and by more than 1 %;
-2. an F-test on all data rejects that the family has no effect:
+1. Which families of joint errors do the measurements support? Forward selection: the family with the lowest
+   cross-validated error is added if
 
-       F = ((C_0 - C_1)/q) / (C_1/(m - p - q)),    P(F_{q, m-p-q} > F) < 0.01,
+   - the log evidence rises by more than `MIN_LOG_BAYES_FACTOR`. With m whitened rows [J | r] divided by the
+     standard deviation s of the residuals, the cost C of rows and priors, and the triangular factor R of
+     [J; W],
 
-   with C_0, C_1 the costs without and with the q parameters of the family, m rows and p other parameters.
+         log E = -C/2 - m·log s - log|det R| + log|det W|.
 
-Cross-validation also selects the width of the family's priors: the narrowest one whose error is within one
-standard error of the lowest (the "one standard error rule"). A family that extrapolates badly under wide
-priors may be useful under narrow ones.
+     The standard deviation w of the priors of each family, and s, are those of greatest evidence,
+     w² = Σ x_i² / Σ γ_i and s² = ‖r‖² / (m - Σ γ_i) (MacKay 1992), but w is never above the expected one;
+   - the squared error of random folds falls by more than `MIN_IMPROVEMENT` of the family. Folds are random,
+     not regions of joint space, as fast periodic errors are visible between neighbouring configurations only.
 
-All trials use one linearization of the model around the fit without extensions, with columns for all
-families. The selected families are then identified together with the geometry, as both share directions of
-parameter space.
+   If a family is supported, eccentricity and elasticity are added in any case. Their priors shrink them where
+   the measurements do not determine them. The model is then fitted by iteration.
+
+2. How many independent samples do the measurements count for? The residuals of a real arm are correlated:
+   they are errors of the model, equal in neighbouring configurations. N configurations then contain the
+   information of N/T independent ones. The temperature T multiplies the variance of the residuals. It is 1
+   unless the measurements contradict that: regions of joint space are left out in turn, and
+
+       log p = -½·Σ_f m_f·(e_f²/(1 + v_f) + log(1 + v_f))
+
+   compares the held-out mean square e_f² of region f with its prediction, the variance v_f by the
+   uncertainty of the fit plus 1 for the noise, in units of the residual variance. If T = 1 + N/100 predicts
+   better than T = 1, or if the residuals of neighbouring configurations are correlated, the result is fitted
+   again with
+
+       T = 1 + N/20,
+
+   so that all samples together count as about 20 independent ones. Predicted standard deviations of the tool
+   are scaled such that they agree with the errors of the left-out regions.
+
+Without a supported family, and with T = 1, the fit is exactly that of the geometry.
 
 Shapes: p unknowns of the robot with all families and of the instruments, k folds.
 
 References:
-    L. Breiman, J. Friedman, R. Olshen and C. Stone, Classification and Regression Trees, Wadsworth 1984.
-    B. Laurent and P. Massart, Adaptive Estimation of a Quadratic Functional, Annals of Statistics 28, 2000.
+    D. J. C. MacKay, Bayesian Interpolation, Neural Computation 4, 1992.
+    P. Gruenwald and T. van Ommen, Inconsistency of Bayesian Inference for Misspecified Linear Models, and a
+    Proposal for Repairing It, Bayesian Analysis 12, 2017.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .._typing import Array
-from ..estimation.error_model import ErrorParameter
-from ..estimation.parameters import EXTENSIONS, PARAMETER_SETS
+from ..estimation import robust
+from ..estimation.error_model import ErrorModel, ErrorParameter
+from ..estimation.parameters import CURVE_ORDERS, EXTENSIONS, PARAMETER_SETS
+from ..estimation.priors import PriorGroups, effective_parameters
 from ..estimation.problem import Problem, linearize_and_factor
-from ..estimation.qr import TriangularSystem
-from ..estimation.solver import Progress
-from ..exceptions import InvalidArgumentError, UnknownNameError
-from ..formatting import Table, format_fixed
-from ..measurements.base import Measurement
-from ..robot.chain import Chain
-from ..robot.error_families import FAMILIES
-from .arguments import require_chain
-from .cross_validation import (
-    FoldSystems,
-    count_rows,
-    factor_folds,
-    solve_columns,
-    standard_error,
+from ..estimation.qr import (
+    TriangularSystem,
+    append_priors,
+    merge_r_factors,
+    posterior_sqrt_covariance,
+    pseudo_inverse,
 )
-from .partition import blocked_folds, contact_groups
-from .procedure import calibrate
-from .result import Result
+from ..estimation.solver import Progress, minimize
+from ..exceptions import UnknownNameError
+from ..formatting import Table, format_fixed
+from ..robot.error_families import COMPLIANCE, COUPLING, CURVES, FAMILIES, GAIN, HARMONICS
+from .cross_validation import FoldSystems, count_rows, factor_partition, select_columns, solve_columns
+from .partition import configuration_groups, contact_groups, k_fold, region_partitions
+from .reweighting import Fit, reweight, with_sigma_scales
 
-# Widths of a family's priors that are tried, as fractions of the default ones.
-PRIOR_WIDTHS = (1.0, 0.3, 0.1, 0.03)
-# Smallest relative improvement of the cross-validated error for which a family is added.
-MIN_IMPROVEMENT = 0.01
-# Largest p-value of the F-test for which a family is added.
-MAX_P_VALUE = 0.01
+if TYPE_CHECKING:
+    from .result import Result
+
+# Families of low order in the order in which they are tried, and the smallest relative improvement of the
+# cross-validated squared error for which each is added. Eccentricity and elasticity have a physical cause in
+# every arm and hold outside the measured region; the others have to improve the error noticeably.
+TIERS = ((HARMONICS, COMPLIANCE), (GAIN, COUPLING))
+MIN_IMPROVEMENT = {HARMONICS: 0.0, COMPLIANCE: 0.0, GAIN: 0.1, COUPLING: 0.1, CURVES: 0.02}
+# Smallest rise of the log evidence for which a family is added: odds of 250 to 1.
+MIN_LOG_BAYES_FACTOR = 5.5
+# Number of random folds.
+N_FOLDS = 5
+# Smallest number of different configurations for a selection.
+MIN_CONFIGURATIONS = 2 * N_FOLDS
+# Samples per unit of temperature: T = 1 + N/20.
+SAMPLES_PER_TEMPERATURE = 20
+# The same for the temperature that is compared with 1.
+SAMPLES_PER_TESTED_TEMPERATURE = 100
+# Difference of the log predictive density per held-out row for which T = 1 is rejected. Simulated arms with
+# independent noise stay below 0.01 but for few samples; a real UR10 has 0.04 to 0.2.
+MIN_LOG_DENSITY_GAIN = 0.02
+# Correlation of neighbouring residuals for which T = 1 is rejected, in standard deviations.
+MAX_WHITE_CORRELATION = 4.0
+# Largest number of configurations of each measurement whose neighbours are compared.
+MAX_NEIGHBOURS = 2000
+# Squared distance of scaled joint values below which two configurations are the same.
+SAME_CONFIGURATION = 1e-10
+# Evidence iteration: largest number of rounds, and relative change of a width that ends it.
+MAX_EVIDENCE_ROUNDS = 20
+EVIDENCE_TOL = 0.05
+# Smallest noise, as a fraction of the residuals of the geometry; families explain no more of them.
+MIN_NOISE = 0.02
+# Narrowest prior of a family, as a fraction of the expected one.
+MIN_PRIOR_WIDTH = 1e-3
+# From this number of rows per line on, curves are tried only if lines stand out of the spectrum.
+SCREENED_ROWS_PER_UNKNOWN = 2
+# Highest line of white residuals, as a square in standard deviations, and largest excess of the sum of all.
+MAX_WHITE_LINE, SCREENING_SIGMAS = 15.0, 3.0
+# Limits of the scale of predicted standard deviations.
+MIN_PREDICTION_SCALE, MAX_PREDICTION_SCALE = 0.3, 3.0
 # Largest ratio of the errors with and without a family for which a hint is given.
 MAX_HINT_RATIO = 0.9
 # Smallest number of rows that must remain per parameter of a family for a hint.
@@ -72,8 +125,6 @@ MIN_ROWS_PER_PARAMETER = 5
 MAX_HINT_SAMPLES = 500
 # Negative logarithm of the largest p-value for which a hint is given: one in a million.
 HINT_LOG_P = 14
-# Smaller p-values are shown as "< 1e-06".
-MIN_SHOWN_P_VALUE = 1e-6
 
 # All parameters that positions and poses can determine, wherever instrument and target are.
 FULL_SET = "minimal,base,tool"
@@ -85,29 +136,30 @@ class FamilyTrial:
 
     Attributes:
         family: Name of the family, one of `estimation.EXTENSIONS`.
-        cv_before: Cross-validated error without the family, in standard deviations.
-        cv_after: Cross-validated error with it, in standard deviations.
-        standard_error: Standard error of the difference.
-        p_value: Probability that chance alone lowers the cost of all data as much.
-        prior_width: Width of its priors as a fraction of the default one.
+        cv_before: Error of random held-out folds without the family, in standard deviations.
+        cv_after: The same with it; as before if its evidence is too small to try.
+        log_bayes_factor: Rise of the log evidence by the family.
+        prior_width: Standard deviation of its priors of greatest evidence, as a fraction of the default one.
         is_selected: Whether it was added.
     """
 
     family: str
     cv_before: float
     cv_after: float
-    standard_error: float
-    p_value: float
+    log_bayes_factor: float
     prior_width: float
     is_selected: bool = False
 
     @property
-    def is_significant(self) -> bool:
+    def improvement(self) -> float:
+        """Relative reduction of the squared error of the held-out folds."""
+        return 1 - (self.cv_after / self.cv_before) ** 2 if self.cv_before else 0.0
+
+    @property
+    def is_supported(self) -> bool:
         """Whether the measurements support the family."""
-        reduction = self.cv_before - self.cv_after
         return (
-            reduction > max(self.standard_error, MIN_IMPROVEMENT * self.cv_before)
-            and self.p_value < MAX_P_VALUE
+            self.log_bayes_factor > MIN_LOG_BAYES_FACTOR and self.improvement > MIN_IMPROVEMENT[self.family]
         )
 
 
@@ -120,130 +172,438 @@ def trial_table(trials: Sequence[FamilyTrial]) -> Table:
     Returns:
         Table with one row per family.
     """
-    header = ["family", "verdict", "before", "after"]
-    header += ["standard error of the change", "p-value", "prior width"]
+    header = ["family", "verdict", "before", "after", "log evidence", "prior width"]
     rows = [
         [
             trial.family,
             "added" if trial.is_selected else "not selected",
             format_fixed(trial.cv_before, 3),
             format_fixed(trial.cv_after, 3),
-            format_fixed(trial.standard_error, 3),
-            f"{trial.p_value:.1g}" if trial.p_value > MIN_SHOWN_P_VALUE else f"< {MIN_SHOWN_P_VALUE:g}",
-            f"{trial.prior_width:g} of default",
+            f"{trial.log_bayes_factor:+.1f}",
+            f"{trial.prior_width:.2g} of default",
         ]
         for trial in trials
     ]
     return Table(header, rows, n_text_columns=2)
 
 
-@dataclass(frozen=True, eq=False)
-class _LinearizedFit:
-    """Linear model around a fit without extensions, with columns for all families.
+@dataclass(frozen=True)
+class Extension:
+    """What a calibration added to the geometry, and how much its samples count.
 
     Attributes:
-        problem: Problem with the parameters and default priors of all families.
-        system: Triangular system of all its data.
+        trials: Trials of the selected families in the order of selection, then of the others.
+        temperature: Temperature T of the residuals.
+        n_configurations: Number N of different fitted configurations.
+        prediction_scale: Factor to predicted standard deviations of the tool.
+        random_ratio: Error of random left-out samples as a fraction of that of the geometry alone; NaN if no
+            family was added.
+        region_ratio: The same of left-out regions of joint space; NaN if none can be left out.
+    """
+
+    trials: tuple[FamilyTrial, ...] = ()
+    temperature: float = 1.0
+    n_configurations: int = 0
+    prediction_scale: float = 1.0
+    random_ratio: float = float("nan")
+    region_ratio: float = float("nan")
+
+    @property
+    def families(self) -> tuple[str, ...]:
+        """Names of the added families."""
+        return tuple(trial.family for trial in self.trials if trial.is_selected)
+
+    @property
+    def effective_samples(self) -> float:
+        """Number of independent configurations that the measurements count for."""
+        return self.n_configurations / self.temperature
+
+    @property
+    def sentences(self) -> list[str]:
+        """Say what was added, what it improves and how much the samples count."""
+        widths = {trial.family: trial.prior_width for trial in self.trials}
+        added = ", ".join(f"{name} (prior width {widths[name]:.2g} of default)" for name in self.families)
+        changes = [
+            f"{kind} {_percent(ratio)}"
+            for kind, ratio in (("at random", self.random_ratio), ("by region", self.region_ratio))
+            if np.isfinite(ratio)
+        ]
+        first = f"Added to the geometry: {added or 'nothing'}."
+        if changes:
+            first += f" Change of the error of left-out samples: {', '.join(changes)}."
+        second = (
+            f"{self.n_configurations} configurations count as {self.effective_samples:.3g} independent ones"
+        )
+        return [first, f"{second} (temperature of the residuals {self.temperature:.3g})."]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content for the JSON document."""
+        return {
+            "families": list(self.families),
+            "temperature": self.temperature,
+            "effective_samples": self.effective_samples,
+            "configurations": self.n_configurations,
+            "prediction_scale": self.prediction_scale,
+            "random_ratio": self.random_ratio,
+            "region_ratio": self.region_ratio,
+            "trials": [asdict(trial) for trial in self.trials],
+        }
+
+
+def _percent(ratio: float) -> str:
+    """Format a ratio as a change in percent."""
+    return f"{100 * (ratio - 1):+.0f} %"
+
+
+@dataclass(frozen=True)
+class _Model:
+    """Selected families, with the hyperparameters of greatest evidence.
+
+    Attributes:
+        widths: Standard deviation of the priors of each family, as a fraction of the expected one.
+        noise: Standard deviation of the whitened residuals.
+        log_evidence: Log evidence, up to a constant.
+        values: Values of the parameters of the families by name.
+    """
+
+    widths: Mapping[str, float]
+    noise: float
+    log_evidence: float
+    values: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidates:
+    """Linear model around a fit with the columns of further families.
+
+    Attributes:
+        problem: Problem with the parameters and the expected priors of all families.
         x: Point of the linearization, (p,).
         family: Name of the family of each unknown, "" for the unknowns of the fit, (p,).
-        folds: Triangular systems of the folds.
     """
 
     problem: Problem
-    system: TriangularSystem
     x: Array
     family: Array
-    folds: tuple[FoldSystems, ...] = ()
 
-    def weights_and_columns(self, selected: dict[str, float]) -> tuple[Array, Array]:
-        """Return prior weights (p,) and mask of the columns (p,) with families of these prior widths."""
-        width = np.array([selected.get(name, 1.0) for name in self.family])
-        return self.problem.weights / width, (self.family == "") | np.isin(self.family, list(selected))
+    @cached_property
+    def folds(self) -> tuple[FoldSystems, ...]:
+        """Triangular systems of random folds of whole configurations."""
+        return factor_partition(self.problem, self.x, k_fold(self.problem.data, N_FOLDS))
 
-    def errors(self, selected: dict[str, float]) -> Array:
-        """Compute the held-out error of each fold, (k,), with families of these prior widths."""
-        weights, columns = self.weights_and_columns(selected)
-        return np.array([fold.error(weights, self.x, columns) for fold in self.folds])
+    @cached_property
+    def system(self) -> TriangularSystem:
+        """Triangular system of all data."""
+        return TriangularSystem(merge_r_factors([fold.held_out.rows for fold in self.folds]))
 
-    def cost(self, selected: dict[str, float]) -> float:
-        """Compute the lowest cost of all data and priors with families of these prior widths."""
-        weights, columns = self.weights_and_columns(selected)
-        return solve_columns(self.system, weights, self.x, columns)[1]
+    def weights(self, widths: Mapping[str, float]) -> Array:
+        """Return the weights of the priors (p,) for prior widths as fractions of the expected ones."""
+        return self.problem.weights / np.array([widths.get(name, 1.0) for name in self.family])
 
-    def degrees_of_freedom(self, name: str, selected: dict[str, float]) -> tuple[int, int]:
-        """Return the number of parameters that a family adds, and the number of rows that remain."""
-        added = int(np.sum(self.family == name))
-        return added, count_rows(self.problem) - int(np.sum(self.weights_and_columns(selected)[1])) - added
+    def columns(self, widths: Mapping[str, float]) -> Array:
+        """Return the mask of the unknowns (p,) of the fit and of some families."""
+        return (self.family == "") | np.isin(self.family, list(widths))
 
-    def trial(self, name: str, selected: dict[str, float]) -> FamilyTrial:
-        """Try a family on top of the selected ones."""
-        before = self.errors(selected)
-        tried = [(self.errors(selected | {name: width}), width) for width in PRIOR_WIDTHS]
-        best = min((errors for errors, _ in tried), key=np.mean)
-        # One standard error rule, from the narrowest width on.
-        after, width = next(
-            (errors, width)
-            for errors, width in reversed(tried)
-            if np.mean(errors - best) <= standard_error(errors - best)
-        )
-        added, remaining = self.degrees_of_freedom(name, selected)
-        cost_before, cost_after = self.cost(selected), self.cost(selected | {name: 1.0})
-        p_value = 1.0
-        if remaining > 0 and cost_after > 0:
-            from scipy.special import fdtrc  # lazy import: slow, and few calibrations need it
+    def maximize_evidence(self, widths: Mapping[str, float]) -> _Model:
+        """Find the prior widths of some families, and the noise, of greatest evidence.
 
-            f = (cost_before - cost_after) / added / (cost_after / remaining)
-            p_value = float(fdtrc(added, remaining, f))
-        error = standard_error(before - after)
-        return FamilyTrial(name, float(before.mean()), float(after.mean()), error, p_value, width)
+        Args:
+            widths: First guess of the widths by family.
 
+        Returns:
+            The model.
+        """
+        columns = self.columns(widths)
+        reduced, n_rows = select_columns(self.system, columns), count_rows(self.problem)
+        family, x, expected = self.family[columns], self.x[columns], self.problem.weights[columns]
+        noise = float(np.sqrt(self.system.cost / n_rows))
+        smallest = MIN_NOISE * noise
+        rounds = 0
+        while True:
+            weights = self.weights(widths)[columns]
+            rows = TriangularSystem(reduced.rows / noise)
+            posterior = append_priors(rows, weights, x)
+            root = posterior_sqrt_covariance(rows, weights)[0]
+            determined = 1 - np.einsum("ij,ij->i", root, root) * weights**2
+            step = pseudo_inverse(posterior.r, posterior.z)
+            misfit = rows.min_cost + float(np.sum((rows.r @ step - rows.z) ** 2))
+            updated_noise = noise * float(np.sqrt(misfit / max(n_rows - np.sum(determined), 1.0)))
+            updated_noise = max(updated_noise, smallest)
+            updated = {name: _best_width(x + step, determined, expected, family == name) for name in widths}
+            changes = [np.log(updated_noise / noise)] + [np.log(updated[k] / widths[k]) for k in widths]
+            rounds += 1
+            if np.abs(changes).max() < EVIDENCE_TOL or rounds == MAX_EVIDENCE_ROUNDS:
+                break
+            widths, noise = updated, updated_noise
+        log_det = np.sum(np.log(np.abs(np.diag(posterior.r)))) - np.sum(np.log(weights[weights > 0]))
+        log_evidence = -0.5 * posterior.min_cost - float(log_det) - n_rows * np.log(noise)
+        names = [parameter.name for parameter in self.problem.errors.parameters]
+        values = {
+            names[i]: float(value)
+            for i, value, name in zip(np.flatnonzero(columns), x + step, family, strict=True)
+            if name
+        }
+        return _Model(widths, noise, log_evidence, values)
 
-def _missing_parameters(fit: Result, families: Sequence[str]) -> dict[str, list[ErrorParameter]]:
-    """Return the parameters of each family that has some which the fit does not have."""
-    identified = {p.name for p in fit.errors.parameters}
-    by_family = {name: PARAMETER_SETS[name](fit.errors.chain) for name in families}
-    return {name: ps for name, ps in by_family.items() if any(p.name not in identified for p in ps)}
+    def cv_error(self, model: _Model) -> float:
+        """Compute the RMS error of the random folds with the families of a model."""
+        weights, columns = self.weights(model.widths) * model.noise, self.columns(model.widths)
+        squares = [fold.n_rows * fold.error(weights, self.x, columns) ** 2 for fold in self.folds]
+        return float(np.sqrt(sum(squares) / sum(fold.n_rows for fold in self.folds)))
 
-
-def _linearize_fit(
-    fit: Result, data: Sequence[Measurement], families: dict[str, list[ErrorParameter]]
-) -> _LinearizedFit:
-    """Linearize a fit on some of its data with the parameters of families, without folds."""
-    identified = {p.name for p in fit.errors.parameters}
-    added = [p for parameters in families.values() for p in parameters if p.name not in identified]
-    errors = fit.errors.with_parameters(added)
-    robot = len(fit.errors.parameters)
-    names = [p.name for p in fit.errors.parameters]
-    # x and prior weight of each identified parameter; the others start from 0 with their default priors.
-    start = dict(zip(names, zip(fit.x[:robot], fit.problem.weights[:robot], strict=True), strict=True))
-    values = [start.get(p.name, (0.0, 1 / p.prior)) for p in errors.parameters]
-    x = np.array([*(value for value, _ in values), *fit.x[robot:]])
-    weights = np.array([*(weight for _, weight in values), *fit.problem.weights[robot:]])
-    family_of = {
-        p.name: name for name, parameters in families.items() for p in parameters if p.name not in identified
-    }
-    problem = replace(fit.problem, errors=errors, weights=weights, data=tuple(data))
-    return _LinearizedFit(
-        problem,
-        linearize_and_factor(problem, x, small_angle=False),
-        x,
-        np.array([family_of.get(p.name, "") for p in errors.parameters] + [""] * len(fit.x[robot:])),
-    )
+    def trial(self, name: str, current: _Model) -> FamilyTrial:
+        """Try a family on top of those of a model."""
+        model = self.maximize_evidence({**current.widths, name: 1.0})
+        gain = model.log_evidence - current.log_evidence
+        before = after = float("nan")
+        if gain > MIN_LOG_BAYES_FACTOR:
+            before, after = self.cv_error(current), self.cv_error(model)
+        return FamilyTrial(name, before, after, gain, model.widths[name])
 
 
-def select_error_families(
-    fit: Result, families: Sequence[str] = EXTENSIONS, progress: Progress | None = None
-) -> tuple[FamilyTrial, ...]:
-    """Select the families of joint errors that lower the cross-validated error, one after the other.
+def _best_width(x: Array, determined: Array, expected: Array, members: Array) -> float:
+    """Return the prior width of greatest evidence of some parameters, as a fraction of the expected one.
 
     Args:
-        fit: Calibration without them, by method "lm" and with priors.
-        families: Names of `estimation.EXTENSIONS` to try; those without a parameter on this robot are
-            skipped.
-        progress: Called after each fold with the number of folds done and the cost.
+        x: Parameters, (p,).
+        determined: Fraction of each parameter that the data determine, (p,).
+        expected: Reciprocal expected standard deviations, (p,).
+        members: Mask of the parameters of the family, (p,).
 
     Returns:
-        Trials of the selected families in the order of selection, then trials of the others on top of those.
+        √(Σ x² / Σ γ), between `MIN_PRIOR_WIDTH` and 1.
+    """
+    count = max(float(np.sum(determined[members])), EVIDENCE_TOL)
+    size = np.sqrt(float(np.sum((x * expected)[members] ** 2)) / count)
+    return float(np.clip(size, MIN_PRIOR_WIDTH, 1.0))
+
+
+def _missing_parameters(errors: ErrorModel, families: Sequence[str]) -> dict[str, list[ErrorParameter]]:
+    """Return the parameters of each family that are neither estimated nor fixed, if there are any."""
+    known = {p.name for p in (*errors.parameters, *errors.fixed)}
+    by_family = {
+        name: [p for p in PARAMETER_SETS[name](errors.chain) if p.name not in known] for name in families
+    }
+    return {name: parameters for name, parameters in by_family.items() if parameters}
+
+
+def _with_families(
+    problem: Problem, x: Array, families: dict[str, list[ErrorParameter]]
+) -> tuple[Problem, Array, Array]:
+    """Add the parameters of families to a problem at x; return it with x and the family of each unknown."""
+    errors = problem.errors.with_parameters([p for parameters in families.values() for p in parameters])
+    robot = len(problem.errors.parameters)
+    names = [p.name for p in problem.errors.parameters]
+    # x and prior weight of each estimated parameter; the others start from 0 with their expected priors.
+    start = dict(zip(names, zip(x[:robot], problem.weights[:robot], strict=True), strict=True))
+    values = np.array([start.get(p.name, (0.0, 1 / p.prior)) for p in errors.parameters]).reshape(-1, 2)
+    x = np.concatenate([values[:, 0], x[robot:]])
+    weights = np.concatenate([values[:, 1], problem.weights[robot:]])
+    family_of = {p.name: name for name, parameters in families.items() for p in parameters}
+    family = np.array(
+        [*(family_of.get(p.name, "") for p in errors.parameters), *[""] * (len(x) - len(values))]
+    )
+    bounds = problem.bounds
+    if bounds is not None:
+        free = np.tile([[-np.inf], [np.inf]], len(x))
+        free[:, family == ""] = bounds
+        bounds = free
+    errors = errors.with_current_loads(x[: len(errors.parameters)])
+    return replace(problem, errors=errors, weights=weights, bounds=bounds), x, family
+
+
+def _select(candidates: _Candidates, names: Sequence[str], model: _Model) -> tuple[list[FamilyTrial], _Model]:
+    """Select families one after the other.
+
+    Args:
+        candidates: Linear model with the columns of all families.
+        names: Families to try.
+        model: Families that are selected already.
+
+    Returns:
+        Trials of the selected families in order, then of the others on top of those; the selected model.
+    """
+    remaining, chosen = list(names), list[FamilyTrial]()
+    while True:
+        trials = [candidates.trial(name, model) for name in remaining]
+        supported = [trial for trial in trials if trial.is_supported]
+        if not supported:
+            return [*chosen, *trials], model
+        best = min(supported, key=lambda trial: trial.cv_after)
+        chosen.append(replace(best, is_selected=True))
+        model = candidates.maximize_evidence({**model.widths, best.family: best.prior_width})
+        remaining.remove(best.family)
+
+
+def _may_have_curves(fit: Fit) -> bool:
+    """Check whether lines stand out of the spectrum of the residuals over the joint values.
+
+    The check costs far less than a trial of the curves. With the whitened column a of a joint, the residuals
+    r with standard deviation 1, and white residuals, the sums
+
+        z² = (Σ a·r·sin kq)² / Σ |a|²·sin² kq,    and the same with the cosine,
+
+    are distributed as χ²_1, or smaller where the geometry has taken up a part.
+
+    Args:
+        fit: Fit without curves.
+
+    Returns:
+        Whether the highest line or the sum of all exceeds what white residuals have; always true for few
+        rows, and for measurements with two configurations per row.
+    """
+    problem, robot = fit.problem, len(fit.problem.errors.parameters)
+    chain = problem.errors.at(fit.solution.x[:robot])
+    first = [p for p in PARAMETER_SETS[HARMONICS](chain) if p.name.endswith(("sin1", "cos1"))]
+    n_lines = len(first) * (CURVE_ORDERS.stop - CURVE_ORDERS.start)
+    n_rows = count_rows(problem)
+    is_single = all(item.configurations_per_row == 1 for item in problem.data)
+    if n_rows < SCREENED_ROWS_PER_UNKNOWN * n_lines or not is_single:
+        return True
+    # The columns of sin q and cos q give the column a = a·sin q·sin q + a·cos q·cos q of each joint.
+    errors = ErrorModel(chain, ()).with_parameters(first)
+    instruments = fit.solution.x[robot:]
+    spectrum = replace(problem, errors=errors, weights=np.zeros(len(first) + len(instruments)), bounds=None)
+    linearization = spectrum.linearize(np.concatenate([np.zeros(len(first)), instruments]))
+    joints = [chain.joint_names.index(p.name.rsplit(".", 1)[0]) for p in errors.parameters]
+    sums = np.zeros((2, 2, len(CURVE_ORDERS), chain.n_joints))
+    for chunk in spectrum.chunks:
+        rows, q = linearization.rows(chunk), chunk.data.q.T
+        products = np.einsum("pkm,km->pm", rows[: len(first)], rows[-1])
+        squares = np.einsum("pkm,pkm->pm", rows[: len(first)], rows[: len(first)])
+        both = np.zeros((2, *q.shape))
+        for row, parameter, joint in zip(range(len(first)), errors.parameters, joints, strict=True):
+            function = np.sin if parameter.name.endswith("sin1") else np.cos
+            both[0, joint] += products[row] * function(q[joint])
+            both[1, joint] += squares[row]
+        for index, k in enumerate(CURVE_ORDERS):
+            for part, function in enumerate((np.sin, np.cos)):
+                value = function(k * q)
+                sums[0, part, index] += np.sum(both[0] * value, 1)
+                sums[1, part, index] += np.sum(both[1] * value**2, 1)
+    variance = fit.solution.system.cost / n_rows
+    z2 = sums[0] ** 2 / np.maximum(sums[1] * variance, np.finfo(float).tiny)
+    return bool(z2.max() > MAX_WHITE_LINE or z2.sum() > n_lines + SCREENING_SIGMAS * np.sqrt(2 * n_lines))
+
+
+@dataclass(frozen=True, eq=False)
+class _RegionErrors:
+    """Errors of left-out regions of joint space, with their prediction.
+
+    Attributes:
+        n_rows: Number of held-out rows of each region, (k,).
+        squares: Mean square of the held-out rows, in units of the residual variance, (k,).
+        variances: Mean variance of these rows by the uncertainty of the fit, in the same units, (k,).
+        noise: Standard deviation of the whitened residuals.
+    """
+
+    n_rows: Array
+    squares: Array
+    variances: Array
+    noise: float
+
+    @property
+    def log_density(self) -> float:
+        """Log density of the held-out rows, up to a constant."""
+        total = 1 + self.variances
+        return float(-0.5 * np.sum(self.n_rows * (self.squares / total + np.log(total))))
+
+    @property
+    def rms(self) -> float:
+        """RMS of all held-out whitened rows."""
+        return self.noise * float(np.sqrt(np.sum(self.n_rows * self.squares) / np.sum(self.n_rows)))
+
+
+class _Regions:
+    """Left-out regions of joint space, and fits of the other samples at any temperature."""
+
+    def __init__(self, problem: Problem, x: Array, noise: float):
+        """Factor the rows of the regions.
+
+        Args:
+            problem: Problem at temperature 1.
+            x: Point of the linearization, (p,).
+            noise: Standard deviation of the whitened residuals.
+        """
+        self._x, self._noise, self._weights = x, noise, problem.weights * noise
+        self._folds = [
+            fold
+            for folds in region_partitions(problem.data, contact_groups(problem, x))
+            for fold in factor_partition(problem, x, folds)
+            if fold.n_rows
+        ]
+
+    def __len__(self) -> int:
+        """Return the number of regions."""
+        return len(self._folds)
+
+    def errors(self, temperature: float) -> _RegionErrors:
+        """Fit the other samples of each region at a temperature, and compare errors and predictions."""
+        weights = self._weights * np.sqrt(temperature)
+        columns = np.ones(len(weights), bool)
+        squares = [fold.error(weights, self._x, columns) ** 2 for fold in self._folds]
+        std = [fold.prediction_std(weights, columns) for fold in self._folds]
+        return _RegionErrors(
+            np.array([fold.n_rows for fold in self._folds], float),
+            np.array(squares) / self._noise**2,
+            temperature * np.array(std) ** 2,
+            self._noise,
+        )
+
+
+def neighbour_correlation(problem: Problem, x: Array) -> float:
+    """Compute the correlation of the residuals of neighbouring configurations, in standard deviations.
+
+    With the residuals r_i and r_j of the pairs of samples that are nearest to each other in joint space,
+
+        z = Σ r_i·r_j / √(Σ (r_i·r_j)²),
+
+    which is standard normal for independent residuals.
+
+    Args:
+        problem: Problem with any measurements; kinds with two configurations per row are left out.
+        x: Its solution, (p,).
+
+    Returns:
+        z; 0 without a pair.
+    """
+    chain = problem.errors.at(x[: len(problem.errors.parameters)])
+    products = [np.empty(0)]
+    for item in problem.data:
+        if item.configurations_per_row != 1 or len(item.rows) < 2:
+            continue
+        item = item.take(np.s_[:: -(-len(item.rows) // MAX_NEIGHBOURS)])
+        values = problem.instrument_values_of(item, x)
+        residual = item.residual(chain.forward_kinematics(item.configurations()), values)
+        std = item.q.std(0)
+        q = item.q[:, std > 0] / std[std > 0]
+        squares = np.sum(q**2, 1)
+        distances = squares[:, None] + squares - 2 * q @ q.T
+        # Samples of the same configuration share the error of the robot, but also noise of the instrument.
+        distances[distances < SAME_CONFIGURATION] = np.inf
+        nearest = np.argmin(distances, 1)
+        pairs = np.unique(np.sort(np.stack([np.arange(len(q)), nearest]), 0), axis=1)
+        products.append(np.sum(residual[:, pairs[0]] * residual[:, pairs[1]], 0))
+    product = np.concatenate(products)
+    norm = float(np.linalg.norm(product))
+    return float(np.sum(product)) / norm if norm else 0.0
+
+
+def extend(
+    fit: Fit, families: Sequence[str], loss: str, max_iterations: int, progress: Progress | None
+) -> tuple[Fit, Extension]:
+    """Add the families of joint errors that the measurements support, and find how much the samples count.
+
+    Args:
+        fit: Fit of the geometry by method "lm", with priors.
+        families: Names of `estimation.EXTENSIONS` to try; those without a parameter on this robot, or whose
+            parameters are fixed or estimated already, are skipped.
+        loss: Key of `robust.LOSSES`.
+        max_iterations: Largest number of iterations of one solution.
+        progress: Called with the iteration and the cost.
+
+    Returns:
+        The fit, and what was added; the given fit if nothing was.
 
     Raises:
         UnknownNameError: If a family is unknown.
@@ -252,22 +612,151 @@ def select_error_families(
         raise UnknownNameError(
             f"unknown extension {unknown[0]!r}; choose from {', '.join(EXTENSIONS)}, or auto or none"
         )
-    candidates = _missing_parameters(fit, families)
-    if not candidates:
-        return ()
-    model = _linearize_fit(fit, fit.problem.data, candidates)
-    folds = blocked_folds(model.problem.data, groups=contact_groups(model.problem, model.x))
-    model = replace(model, folds=factor_folds(model.problem, model.x, folds, progress))
-    selected: dict[str, float] = {}
-    selected_trials: list[FamilyTrial] = []
-    while True:
-        trials = [model.trial(name, selected) for name in candidates if name not in selected]
-        significant = [trial for trial in trials if trial.is_significant]
-        if not significant:
-            return (*selected_trials, *trials)
-        best = min(significant, key=lambda trial: trial.cv_after)
-        selected[best.family] = best.prior_width
-        selected_trials.append(replace(best, is_selected=True))
+    n_configurations = len(np.unique(configuration_groups(fit.data)))
+    missing = _missing_parameters(fit.problem.errors, families)
+    if n_configurations < MIN_CONFIGURATIONS or not _noise(fit) > 0:
+        return fit, Extension(n_configurations=n_configurations)
+    trials, model, random_ratio = _select_families(fit, missing)
+    selected = {name: missing[name] for name in model.widths}
+    extended, noise = (
+        _fit_selected(fit, selected, model, max_iterations, progress) if selected else (fit, _noise(fit))
+    )
+    regions = _Regions(extended.problem, extended.solution.x, noise)
+    temperature, scale, region_ratio = 1.0, 1.0, float("nan")
+    if regions:
+        correlation = neighbour_correlation(extended.problem, extended.solution.x)
+        if not _is_independent(regions, correlation, n_configurations):
+            temperature = 1 + n_configurations / SAMPLES_PER_TEMPERATURE
+    if not selected and temperature == 1:
+        return fit, Extension(trials, n_configurations=n_configurations)
+    if regions:
+        errors = regions.errors(temperature)
+        geometry = _Regions(fit.problem, fit.solution.x, _noise(fit))
+        region_ratio = errors.rms / geometry.errors(1.0).rms
+        if temperature > 1:
+            ratio = float(np.sqrt(np.median(errors.squares / errors.variances)))
+            scale = float(np.clip(ratio, MIN_PREDICTION_SCALE, MAX_PREDICTION_SCALE))
+    extension = Extension(trials, temperature, n_configurations, scale, random_ratio, region_ratio)
+    problem = extended.problem
+    n_groups = sum(len(item.residual_groups) for item in problem.data)
+    problem = problem.with_data(with_sigma_scales(problem.data, np.full(n_groups, noise)))
+    problem = problem.at_temperature(temperature)
+    solution = minimize(problem, "lm", extended.solution.x, max_iterations, progress, loose=True)
+    extended = replace(extended, problem=problem, solution=solution, previous_iterations=extended.iterations)
+    groups = PriorGroups.none()
+    return reweight(extended, loss, groups, max_iterations, progress, effective_parameters), extension
+
+
+def _fit_selected(
+    fit: Fit,
+    selected: dict[str, list[ErrorParameter]],
+    model: _Model,
+    max_iterations: int,
+    progress: Progress | None,
+) -> tuple[Fit, float]:
+    """Fit the geometry and selected families at temperature 1.
+
+    Args:
+        fit: Fit of the geometry.
+        selected: Parameters of the families.
+        model: Prior widths and values of the families from the linear model around the fit.
+        max_iterations: Largest number of iterations.
+        progress: Called with the iteration and the cost.
+
+    Returns:
+        The fit, with the prior widths of greatest evidence, and the standard deviation of its residuals.
+    """
+    problem, x, family = _with_families(fit.problem, fit.solution.x, selected)
+    names = [parameter.name for parameter in problem.errors.parameters]
+    x[: len(names)] = [model.values.get(name, value) for name, value in zip(names, x, strict=False)]
+    candidates = _Candidates(problem, x, family)
+    problem = replace(problem, weights=candidates.weights(model.widths))
+    solution = minimize(problem, "lm", x, max_iterations, progress, loose=True)
+    problem = _without_outliers(problem, solution.x)
+    solution = minimize(problem, "lm", solution.x, max_iterations, progress, loose=True)
+    # `weights` divides the expected weights by the widths.
+    candidates = replace(candidates, x=solution.x, problem=candidates.problem.with_data(problem.data))
+    model = candidates.maximize_evidence(model.widths)
+    problem = replace(problem, weights=candidates.weights(model.widths))
+    extended = replace(fit, problem=problem, solution=solution, previous_iterations=fit.iterations)
+    return extended, model.noise
+
+
+def _without_outliers(problem: Problem, x: Array) -> Problem:
+    """Return a problem whose outliers at x (p,) have no weight."""
+    chain = problem.errors.at(x[: len(problem.errors.parameters)])
+    data = []
+    for item in problem.data:
+        values = problem.instrument_values_of(item, x)
+        residual = item.residual(chain.forward_kinematics(item.configurations()), values)
+        is_outlier = robust.standardized_residuals(residual) > robust.OUTLIER_THRESHOLD
+        data.append(item.with_weights(np.where(is_outlier, robust.ZERO_WEIGHT, 1.0)))
+    return problem.with_data(data)
+
+
+def _noise(fit: Fit) -> float:
+    """Return the standard deviation of the whitened residuals of a fit."""
+    freedom = count_rows(fit.problem) - effective_parameters(fit.problem, fit.solution)
+    return float(np.sqrt(fit.solution.system.cost / max(freedom, 1.0)))
+
+
+def _select_families(
+    fit: Fit, missing: dict[str, list[ErrorParameter]]
+) -> tuple[tuple[FamilyTrial, ...], _Model, float]:
+    """Select families of joint errors.
+
+    Args:
+        fit: Fit of the geometry.
+        missing: Parameters of the families to try.
+
+    Returns:
+        Trials of the selected families, then of the others; the selected model; error of random left-out
+        samples as a fraction of that of the geometry, NaN if nothing was selected.
+    """
+    trials: list[FamilyTrial] = []
+    model, random_ratio = _Model({}, _noise(fit), float("nan"), {}), float("nan")
+    low_order = {name: parameters for name, parameters in missing.items() if name != CURVES}
+    stages: list[tuple[dict[str, list[ErrorParameter]], tuple[tuple[str, ...], ...]]] = []
+    if low_order:
+        stages.append((low_order, TIERS))
+    if CURVES in missing and _may_have_curves(fit):
+        stages.append(({CURVES: missing[CURVES]}, ((CURVES,),)))
+    for added, tiers in stages:
+        families = {name: ps for name, ps in missing.items() if name in (*model.widths, *added, *TIERS[0])}
+        candidates = _Candidates(*_with_families(fit.problem, fit.solution.x, families))
+        model = candidates.maximize_evidence(model.widths)
+        for tier in tiers:
+            more, model = _select(candidates, [name for name in tier if name in added], model)
+            trials += more
+        if model.widths:
+            # The arm has errors of its joints: those with a physical cause are shrunk, not selected.
+            physical = [name for name in TIERS[0] if name in families and name not in model.widths]
+            model = candidates.maximize_evidence({**model.widths, **dict.fromkeys(physical, 1.0)})
+            trials = [
+                replace(trial, is_selected=True, prior_width=model.widths[trial.family])
+                if trial.family in physical
+                else trial
+                for trial in trials
+            ]
+            geometry = candidates.cv_error(candidates.maximize_evidence({}))
+            random_ratio = candidates.cv_error(model) / geometry if geometry else 1.0
+    return tuple(sorted(trials, key=lambda trial: not trial.is_selected)), model, random_ratio
+
+
+def _is_independent(regions: _Regions, correlation: float, n_configurations: int) -> bool:
+    """Check whether the samples may be independent.
+
+    Args:
+        regions: Left-out regions.
+        correlation: Correlation of neighbouring residuals, in standard deviations.
+        n_configurations: Number of different configurations.
+
+    Returns:
+        Whether neither left-out regions nor neighbouring residuals contradict independent samples.
+    """
+    tested = regions.errors(1 + n_configurations / SAMPLES_PER_TESTED_TEMPERATURE)
+    gain = (tested.log_density - regions.errors(1.0).log_density) / np.sum(tested.n_rows)
+    return gain < MIN_LOG_DENSITY_GAIN and correlation < MAX_WHITE_CORRELATION
 
 
 def family_hint(fit: Result) -> str:
@@ -278,18 +767,20 @@ def family_hint(fit: Result) -> str:
     the bound P(χ²_q > q + 2·sqrt(q·t) + 2·t) <= exp(-t) of Laurent and Massart (2000).
 
     Args:
-        fit: Calibration by method "lm" and with priors.
+        fit: Calibration of the geometry by method "lm" and with priors.
 
     Returns:
         One sentence; empty without a significant family.
     """
     data = [item.take(np.s_[:: max(1, -(-len(item.rows) // MAX_HINT_SAMPLES))]) for item in fit.problem.data]
-    candidates = _missing_parameters(fit, EXTENSIONS)
-    model = _linearize_fit(fit, data, candidates)
-    cost_before, best = model.cost({}), (MAX_HINT_RATIO, "")
-    for name in candidates:
-        added, remaining = model.degrees_of_freedom(name, {})
-        cost_after = model.cost({name: 1.0})
+    missing = _missing_parameters(fit.errors, [name for name in EXTENSIONS if name != CURVES])
+    problem, x, family = _with_families(replace(fit.problem, data=tuple(data)), fit.x, missing)
+    system, n_rows = linearize_and_factor(problem, x, small_angle=False), count_rows(problem)
+    cost_before, best = solve_columns(system, problem.weights, x, family == "")[1], (MAX_HINT_RATIO, "")
+    for name in missing:
+        columns = (family == "") | (family == name)
+        added, remaining = int(np.sum(family == name)), n_rows - int(np.sum(columns))
+        cost_after = solve_columns(system, problem.weights, x, columns)[1]
         if remaining < MIN_ROWS_PER_PARAMETER * added or not cost_after > 0:
             continue
         threshold = added + 2 * np.sqrt(HINT_LOG_P * added) + 2 * HINT_LOG_P
@@ -301,48 +792,6 @@ def family_hint(fit: Result) -> str:
         f"residuals vary with the joint values ({FAMILIES[name].description}?); "
         f"--extend auto may reduce them by about {100 * (1 - ratio):.0f} %"
     )
-
-
-def extend(
-    chain: Chain,
-    data: Measurement | Sequence[Measurement],
-    parameters: str | None = None,
-    families: Sequence[str] = EXTENSIONS,
-    **options: Any,
-) -> tuple[Result, tuple[FamilyTrial, ...]]:
-    """Calibrate with those families of joint errors that the measurements support.
-
-    Args:
-        chain: Nominal robot.
-        data: One measurement or several of any kinds.
-        parameters: Names of parameter sets, separated by commas; the chain's own default set if not given.
-        families: Names of `estimation.EXTENSIONS` that may be added.
-        **options: Keyword arguments of `calibrate`; method "lm" and priors are required.
-
-    Returns:
-        Result with the selected families, and the trials of all families.
-
-    Raises:
-        InvalidArgumentError: If the method is not "lm" or there are no priors.
-    """
-    require_chain(chain)
-    priors = options.get("priors") or "default"
-    if families and (options.get("method", "lm") != "lm" or priors == "none"):
-        raise InvalidArgumentError(
-            "an extension requires method lm and priors; leave out --method gn and --priors none"
-        )
-    parameters = chain.parameters if parameters is None else parameters
-    fit = calibrate(chain, data, parameters, **options)
-    trials = select_error_families(fit, families, options.get("progress"))
-    widths = {trial.family: trial.prior_width for trial in trials if trial.is_selected}
-    if not widths:
-        return fit, trials
-    narrowed = {
-        p.name: p.prior * width for name, width in widths.items() for p in PARAMETER_SETS[name](chain)
-    }
-    stated = {} if isinstance(priors, str) else dict(priors)
-    options["priors"] = narrowed | stated
-    return calibrate(chain, data, ",".join([parameters, *widths]), **options), trials
 
 
 def is_restricted(sets: Sequence[str]) -> bool:

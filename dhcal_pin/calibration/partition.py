@@ -23,8 +23,8 @@ import numpy as np
 from .._typing import Array
 from ..estimation.problem import Problem, merge_instrument_parameters
 from ..exceptions import InvalidArgumentError, NotObservableError
+from ..measurements.arguments import as_measurements
 from ..measurements.base import Measurement
-from .arguments import as_measurements
 
 # Joint values that differ by less are the same configuration [rad or m].
 CONFIGURATION_TOL = 1e-6
@@ -133,6 +133,29 @@ def configuration_groups(data: Sequence[Measurement]) -> Array:
         groups = group_by_configuration(np.concatenate(rows))
         labels[samples] = samples[np.unique(groups, return_index=True)[1][groups]]
     return _by_first_appearance(labels)
+
+
+def different_configurations(data: Sequence[Measurement]) -> tuple[Array, Array]:
+    """Return the different configurations of measurements.
+
+    Args:
+        data: Measurements of any kinds, m samples in all.
+
+    Returns:
+        Joint values in the order of first appearance, shape (u, n) [rad or m], and the first sample of each,
+        shape (u,), counted from 0 to m - 1. Shapes (0, 0) and (0,) if no sample has a configuration.
+    """
+    q, samples, start = [np.empty((0, 0))], [np.empty(0, int)], 0
+    for item in data:
+        if item.configurations_per_row and len(item.rows):
+            q.append(item.configurations())
+            samples.append(np.tile(np.arange(start, start + len(item.rows)), item.configurations_per_row))
+        start += len(item.rows)
+    if len(q) == 1:
+        return q[0], samples[0]
+    rows = np.concatenate(q[1:])
+    first = np.unique(group_by_configuration(rows), return_index=True)[1]
+    return rows[first], np.concatenate(samples)[first]
 
 
 def split(
@@ -252,6 +275,66 @@ def blocked_folds(
         NotObservableError: If all samples have the same joint values.
     """
     data = as_measurements(data)
+    along, label, is_counted = _principal_coordinates(data, groups)
+    folds: dict[bytes, Fold] = {}
+    for coordinate in along.T:
+        low, high = np.quantile(coordinate, [fraction, 1 - fraction])
+        for is_end in (coordinate <= low, coordinate >= high):
+            if not is_end.all():
+                held_out = np.zeros(len(is_counted), bool)
+                held_out[is_counted] = is_end
+                folds.setdefault(held_out.tobytes(), _by_measurement(data, held_out[label]))
+    if not folds:
+        raise NotObservableError(
+            "cross-validation by regions: all samples have the same joint values; "
+            "expected samples at different joint values"
+        )
+    return tuple(folds.values())
+
+
+def region_partitions(
+    data: Measurement | Sequence[Measurement], groups: Array | None = None
+) -> tuple[tuple[Fold, ...], ...]:
+    """Divide the measured joint space into four regions, once per pair of principal directions.
+
+    The medians along two principal directions of the joint values divide the samples. Samples that belong
+    together are in one region, see `blocked_folds`.
+
+    Args:
+        data: One measurement or several of any kinds, m samples in all.
+        groups: Labels of samples that belong together, shape (m,), as in `blocked_folds`.
+
+    Returns:
+        Partitions of the samples into two to four folds each; empty if all samples have the same joint
+        values.
+    """
+    data = as_measurements(data)
+    along, label, is_counted = _principal_coordinates(data, groups)
+    partitions = []
+    for pair in (along[:, i : i + 2] for i in range(0, along.shape[1], 2)):
+        side = pair > np.median(pair, 0)
+        # Samples without a configuration are never held out: region -1.
+        region = np.full(len(is_counted), -1)
+        region[is_counted] = side @ (1 << np.arange(side.shape[1]))
+        folds = [_by_measurement(data, (region == i)[label]) for i in range(4)]
+        folds = [fold for fold in folds if any(mask.any() for mask in fold)]
+        if len(folds) > 1:
+            partitions.append(tuple(folds))
+    return tuple(partitions)
+
+
+def _principal_coordinates(data: tuple[Measurement, ...], groups: Array | None) -> tuple[Array, Array, Array]:
+    """Return coordinates of groups of samples along the principal directions of the joint values.
+
+    Args:
+        data: Measurements, m samples in all.
+        groups: Labels of samples that belong together, shape (m,); configurations if not given. If there is
+            only one group, each configuration is its own group.
+
+    Returns:
+        Coordinates (c, d) of the c groups with a configuration along d directions, group of each sample (m,),
+        and flags of the groups with a configuration (g,).
+    """
     has_configuration = np.concatenate(
         [np.full(len(item.rows), item.configurations_per_row > 0) for item in data]
     )
@@ -261,7 +344,7 @@ def blocked_folds(
     label = np.unique(merged, return_inverse=True)[1]
     count = np.bincount(label[has_configuration], minlength=label.max(initial=-1) + 1)
     if groups is not None and np.count_nonzero(count) == 1:
-        return blocked_folds(data, fraction)
+        return _principal_coordinates(data, None)
     centre = np.stack(
         [np.bincount(label[has_configuration], column, len(count)) for column in q[has_configuration].T], 1
     )
@@ -269,20 +352,8 @@ def blocked_folds(
     std = centre.std(0)
     scaled = (centre - centre.mean(0))[:, std > 0] / std[std > 0]
     _, spread, directions = np.linalg.svd(scaled, full_matrices=False)
-    folds: dict[bytes, Fold] = {}
-    for along in (scaled @ directions[spread > _MIN_RELATIVE_SPREAD * spread.max(initial=0.0)].T).T:
-        low, high = np.quantile(along, [fraction, 1 - fraction])
-        for is_end in (along <= low, along >= high):
-            if not is_end.all():
-                held_out = np.zeros(len(count), bool)
-                held_out[count > 0] = is_end
-                folds.setdefault(held_out.tobytes(), _by_measurement(data, held_out[label]))
-    if not folds:
-        raise NotObservableError(
-            "cross-validation by regions: all samples have the same joint values; "
-            "expected samples at different joint values"
-        )
-    return tuple(folds.values())
+    along = scaled @ directions[spread > _MIN_RELATIVE_SPREAD * spread.max(initial=0.0)].T
+    return along, label, count > 0
 
 
 def contact_groups(problem: Problem, x: Array) -> Array:

@@ -3,7 +3,7 @@
 `calibrate` runs these stages in sequence:
 
 1. Select the parameters x of the robot that are unknown (`estimation.select_parameters`).
-2. Initialize unknown base and tool frames and instrument parameters (`initialization`).
+2. Initialize unknown base and tool frames and instrument parameters (`estimation.initialization`).
 3. Minimize the cost (`estimation.minimize`)
 
        C(x) = Σ ‖r_i(x)‖² + ‖W·x‖²,
@@ -12,7 +12,9 @@
    deviations of the priors.
 4. Estimate noise scales, prior widths and robust weights from the fit, and repeat (`reweighting`).
 5. Reduce the correction if there are too few measurements to determine it (`shrinkage`).
-6. Return the evidence together with the calibrated chain (`result`).
+6. Add families of joint errors that the measurements support, and reduce the weight of the measurements
+   against the priors where residuals are correlated (`model_selection`).
+7. Return the evidence together with the calibrated chain (`result`).
 """
 
 from __future__ import annotations
@@ -20,22 +22,27 @@ from __future__ import annotations
 import fnmatch
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 
 from .._typing import Array
 from ..estimation import robust
-from ..estimation.parameters import select_parameters
+from ..estimation.error_model import ErrorModel
+from ..estimation.initialization import fit_frames, initialize_frames, make_problem
+from ..estimation.parameters import EXTENSIONS, fold_harmonics, select_parameters
 from ..estimation.priors import PriorGroups, Priors, has_default_prior, prior_weights
 from ..estimation.problem import Problem, merge_instrument_parameters
 from ..estimation.solver import METHODS, Progress, minimize
 from ..exceptions import InvalidArgumentError, UnknownNameError
+from ..measurements.arguments import as_measurements, require_chain
 from ..measurements.base import Measurement
 from ..parallel import SERIAL, TaskExecutor
 from ..robot.chain import BASE_FRAME, Chain
-from .arguments import as_measurements, require_chain
-from .initialization import fit_frames, initialize_frames, make_problem
+from . import model_selection
+from .cross_validation import leave_regions_out
+from .model_selection import Extension
 from .result import Result
 from .reweighting import Fit, reweight
 from .shrinkage import compute_shrinkage_factor
@@ -52,9 +59,10 @@ def calibrate(
     priors: Priors | None = None,
     fix: Sequence[str] = (),
     free: Sequence[str] = (),
-    holdout: Measurement | Sequence[Measurement] = (),
+    holdout: Measurement | Sequence[Measurement] | Literal["region"] = (),
     known: Mapping[str, float] | None = None,
     loss: str = "auto",
+    extend: str | Sequence[str] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     max_iterations: int = 100,
     progress: Progress | None = None,
@@ -80,11 +88,15 @@ def calibrate(
             ones, each in the unit of its parameter; "default" for "lm" and "none" for "gn" if not given.
         fix: Names of parameters or sets to hold at their nominal values.
         free: Names of single parameters of any set to identify as well.
-        holdout: Measurements that are not fitted but used to judge the result.
+        holdout: Measurements that are not fitted but used to judge the result. "region" fits all samples and
+            judges the result by further calibrations, each of which leaves out a region of joint space.
         known: Values of instrument parameters by name, such as a surveyed anchor `wire1.x` [m or rad].
         loss: "auto" rejects outliers and weights all other samples equally; "linear" weights all samples
             equally; "huber", "cauchy" and "tukey" reduce the weight with the residual. Method "gn" always
             weights all samples equally.
+        extend: Families of joint errors that are added where the measurements support them: "auto" for all,
+            "none", or names of `estimation.EXTENSIONS`; see `model_selection`. The default is "auto", but
+            "none" for method "gn", without priors, and where only base and tool are unknown.
         bounds: Lowest and highest values by name or pattern of the robot's parameters [m or rad]; base and
             tool have no bounds.
         max_iterations: Largest number of iterations of one solution.
@@ -95,12 +107,31 @@ def calibrate(
         Calibrated chain with uncertainty and accuracy.
     """
     require_chain(chain)
+    if isinstance(holdout, str) and holdout == "region":
+        recalibrate = partial(
+            calibrate,
+            chain,
+            parameters=parameters,
+            method=method,
+            priors=priors,
+            fix=fix,
+            free=free,
+            known=known,
+            loss=loss,
+            extend=extend,
+            bounds=bounds,
+            max_iterations=max_iterations,
+            progress=progress,
+            executor=executor,
+        )
+        return leave_regions_out(recalibrate(data), recalibrate)
     data, holdout = as_measurements(data), as_measurements(holdout, "holdout")
     _check_options(data, method, loss, bounds)
     for item in (*data, *holdout):
         chain.validated_q(item.configurations())
     priors = priors if priors is not None else ("none" if method == "gn" else "default")
     errors = select_parameters(chain, parameters if parameters is not None else chain.parameters, fix, free)
+    families = _extension_families(extend, errors, method, priors)
     known = _validated_known(data, known or {})
     errors = initialize_frames(errors, data, known, max_iterations)
     data = tuple(item.initialized(errors.chain) for item in data)
@@ -113,7 +144,10 @@ def calibrate(
         groups = PriorGroups.from_expected(errors, problem.weights, has_default_prior(errors, priors))
         fit = reweight(fit, loss, groups, max_iterations, progress)
         shrinkage_factor = compute_shrinkage_factor(fit.problem, fit.solution, groups.groups())
-    return _make_result(fit, shrinkage_factor, holdout, method)
+    extension = None
+    if families and shrinkage_factor == 1:
+        fit, extension = model_selection.extend(fit, families, loss, max_iterations, progress)
+    return _make_result(fit, shrinkage_factor, holdout, method, extension)
 
 
 def _check_options(
@@ -137,6 +171,24 @@ def _check_options(
         raise InvalidArgumentError(f"bounds require method 'lm'; method {method!r} does not support bounds")
 
 
+def _extension_families(
+    extend: str | Sequence[str] | None, errors: ErrorModel, method: str, priors: Priors
+) -> tuple[str, ...]:
+    """Return the families that may be added, by default none if method, priors or parameters forbid it."""
+    if extend in ("none", ""):
+        return ()
+    is_possible = method == "lm" and priors != "none"
+    if extend is None or extend == "auto":
+        frames = errors.only_frames()
+        is_frames_only = frames is not None and len(frames.parameters) == len(errors.parameters)
+        return EXTENSIONS if is_possible and not is_frames_only else ()
+    if not is_possible:
+        raise InvalidArgumentError(
+            "an extension requires method lm and priors; leave out --method gn and --priors none"
+        )
+    return tuple(name.strip() for name in extend.split(",")) if isinstance(extend, str) else tuple(extend)
+
+
 def _validated_known(data: tuple[Measurement, ...], known: Mapping[str, float]) -> Mapping[str, float]:
     """Return the known values after a check that each belongs to an instrument parameter of the data."""
     names = [parameter.name for parameter in merge_instrument_parameters(data) if not parameter.is_local]
@@ -157,9 +209,8 @@ def _bounds(problem: Problem, bounds: Mapping[str, tuple[float, float]]) -> Arra
     for pattern, (low, high) in bounds.items():
         bounded = [p for p in robot if fnmatch.fnmatchcase(p.name, pattern)]
         if not bounded:
-            raise UnknownNameError(
-                f"bounds for {pattern!r}: no such parameter; choose from {', '.join(p.name for p in robot)}"
-            )
+            choices = ", ".join(fold_harmonics(p.name for p in robot))
+            raise UnknownNameError(f"bounds for {pattern!r}: no such parameter; choose from {choices}")
         for p in bounded:
             if not low <= p.nominal <= high:
                 raise InvalidArgumentError(
@@ -185,7 +236,13 @@ def _solve(problem: Problem, method: Method, max_iterations: int, progress: Prog
     return replace(fit, problem=problem, solution=second, previous_iterations=solution.iterations)
 
 
-def _make_result(fit: Fit, shrinkage_factor: float, holdout: tuple[Measurement, ...], method: str) -> Result:
+def _make_result(
+    fit: Fit,
+    shrinkage_factor: float,
+    holdout: tuple[Measurement, ...],
+    method: str,
+    extension: Extension | None,
+) -> Result:
     """Apply the shrinkage factor to the solution of a fit and build the result."""
     problem, errors = fit.problem, fit.problem.errors
     x = shrinkage_factor * fit.solution.x
@@ -204,4 +261,5 @@ def _make_result(fit: Fit, shrinkage_factor: float, holdout: tuple[Measurement, 
         method=method,
         weights=fit.weights,
         shrinkage_factor=shrinkage_factor,
+        extension=extension,
     )

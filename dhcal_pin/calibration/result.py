@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -36,32 +36,48 @@ from ..estimation import qr, robust
 from ..estimation.error_model import ErrorModel, ErrorParameter
 from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.qr import TriangularSystem, append_priors, posterior_sqrt_covariance
-from ..estimation.solver import SolverResult, bounded_step, minimize
+from ..estimation.solver import SolverResult, bounded_step, minimize, next_iterate
 from ..estimation.uncertainty import UNBOUNDED_TOL, Prediction, Uncertainty
 from ..exceptions import DhcalError
 from ..identifiability import explanations, observability
+from ..measurements.arguments import as_measurements
 from ..measurements.base import InstrumentParameter, Measurement
+from ..measurements.measured_region import MeasuredRegion
+from ..plausibility.mixups import Diagnosis, diagnose_mixups
 from ..robot.chain import Chain
 from . import summary
-from .arguments import as_measurements
-from .cross_validation import cross_validate_folds
+from .cross_validation import (
+    FoldComparison,
+    Generalization,
+    compare_folds,
+    estimate_generalization,
+    measured_region,
+)
 from .estimates import Estimate, make_estimates
 from .evaluation import (
     Accuracy,
     Comparison,
+    PairedErrors,
     accuracy,
     compute_errors,
+    fit_nominal,
     remove_outliers,
 )
-from .initialization import fit_frames
+from .model_selection import Extension
 from .partition import configuration_groups, k_fold
+from .residual_table import ResidualTable, residual_table
+from .verdict import Verdict, judge
 
 # Stated standard deviations are rejected if the reduced cost exceeds 1 by this many standard deviations.
 CONTRADICTION_SIGMAS = 3.0
+# Upper limit of the interval that holds 95 %, as a quantile of Student's t and of the normal distribution.
+CONFIDENCE = 0.975
 # Smallest scale of standard deviations, for residuals that are exactly zero.
 MIN_SCALE = 1e-9
-# Number of folds of the cross-validation without hold-out samples.
-N_FOLDS = 10
+# Number of random folds of the cross-validation.
+N_FOLDS = 5
+# So few configurations are held out one by one instead.
+MAX_LEAVE_ONE_OUT = 10
 # Largest number of iterations of a fold's own fit.
 MAX_REFIT_ITERATIONS = 100
 # Rows left over by no more than this fraction of all count as none: rounding.
@@ -84,8 +100,14 @@ class Result:
         solution: Solution of `problem`.
         method: "lm" or "gn".
         weights: Robust weight of each fitted sample, one array of shape (m,) per measurement; 0 if rejected.
+        input_warnings: Warnings about the files of the measurements.
+        decision: Verdict that led to this result, if it has no correction for that reason.
         shrinkage_factor: Factor c in `x = c · solution.x`; below 1 if there are too few measurements, see
             `shrinkage`.
+        region_comparison: Accuracy on regions of joint space that were left out of further calibrations; None
+            if there were none, see `leave_regions_out`.
+        extension: Families of joint errors that were added, and how much the samples count; None if nothing
+            was tried.
     """
 
     errors: ErrorModel
@@ -98,6 +120,10 @@ class Result:
     method: str
     weights: tuple[Array, ...]
     shrinkage_factor: float = 1.0
+    region_comparison: Comparison | None = None
+    extension: Extension | None = None
+    input_warnings: tuple[str, ...] = ()
+    decision: Verdict | None = None
 
     @property
     def model(self) -> pin.Model:
@@ -110,9 +136,23 @@ class Result:
 
         The accuracy before and after a calibration thus differs by the errors of the robot alone.
         """
-        if not self.shrinkage_factor:
-            return self.chain
-        return fit_frames(self.errors, tuple(self.inliers), self.problem.known)
+        return self._nominal[0]
+
+    @cached_property
+    def _nominal(self) -> tuple[Chain, dict[str, float]]:
+        """`nominal_refitted` and the instrument parameters that fit it best."""
+        nominal = self.errors if self.shrinkage_factor else ErrorModel(self.chain, ())
+        return fit_nominal(nominal, self.inliers, self.problem.known)
+
+    @property
+    def nominal_instruments(self) -> dict[str, float]:
+        """Values of the instrument parameters that fit `nominal_refitted` best, by name [m or rad]."""
+        return self._nominal[1]
+
+    @property
+    def inlier_problem(self) -> Problem:
+        """`problem` without rejected samples; its measurements correspond to `inliers`."""
+        return self.problem.with_data(self._without_rejected(self.problem.data))
 
     @property
     def inliers(self) -> list[Measurement]:
@@ -175,10 +215,37 @@ class Result:
         return [f"Too few measurements: {applied} correction applied. Measure more poses."]
 
     @property
+    def verdict(self) -> Verdict:
+        """Whether the calibrated robot may be used, with the reasons."""
+        return self._verdict
+
+    @cached_property
+    def _verdict(self) -> Verdict:
+        return self.decision or judge(self)
+
+    @property
+    def accepted(self) -> Result:
+        """This result, without the correction if the verdict keeps the nominal robot."""
+        if not (self.verdict.keeps_nominal and self.shrinkage_factor):
+            return self
+        return replace(
+            self,
+            x=np.zeros_like(self.x),
+            chain=self.nominal_refitted,
+            shrinkage_factor=0.0,
+            decision=self.verdict,
+        )
+
+    @cached_property
+    def diagnosis(self) -> Diagnosis:
+        """Mistakes in the measurements that explain them better than the measurements as they were read."""
+        return diagnose_mixups(self.errors.chain, self.data)
+
+    @property
     def prior_std(self) -> Array:
         """Standard deviations before the measurement, (p,): of the priors used, else of the default ones."""
         default = np.array([parameter.prior for parameter in self.parameters])
-        weights = self.problem.weights
+        weights = self.problem.prior_weights
         return np.where(weights > 0, 1 / np.where(weights > 0, weights, 1.0), default)
 
     @property
@@ -194,14 +261,40 @@ class Result:
     @cached_property
     def degrees_of_freedom(self) -> float:
         """Number of weighted rows minus the effective number of parameters that the data determine."""
-        count = 0.0
-        for item, weights in zip(self.data, self.weights, strict=True):
-            frames = self.chain.forward_kinematics(item.configurations())
-            count += (
-                len(item.residual(frames, self.problem.instrument_values_of(item, self.x))) * weights.sum()
-            )
+        count = sum(n_rows for _, _, n_rows in self._row_counts)
         freedom = count - float(np.sum((self.solution.system.r @ self._sqrt_covariance[0]) ** 2))
         return freedom if freedom > MIN_FREEDOM_RATIO * count else 0.0
+
+    @cached_property
+    def _row_counts(self) -> list[tuple[str, bool, float]]:
+        """Name, whether sigmas are stated, and weighted number of rows of each residual group."""
+        counts = []
+        for item, weights in zip(self.data, self.weights, strict=True):
+            frames = self.chain.forward_kinematics(item.configurations())
+            residual = item.residual(frames, self.problem.instrument_values_of(item, self.x))
+            counts += [
+                (name, item.has_stated_sigma, len(residual[rows]) * weights.sum())
+                for name, rows in item.residual_groups.items()
+            ]
+        return counts
+
+    @property
+    def noise_degrees_of_freedom(self) -> float:
+        """Degrees of freedom of the least known noise scale; infinite if all sigmas are stated.
+
+        The residual groups share the loss of degrees of freedom in proportion to their rows. A group with few
+        rows takes the common scale of its unit, as in `reweighting.estimate_variance_components`.
+        """
+        estimated = [
+            (name == "orientation", count) for name, is_stated, count in self._row_counts if not is_stated
+        ]
+        if not estimated:
+            return np.inf
+        least = min(
+            count if count > self.rank else sum(other for unit, other in estimated if unit == is_angle)
+            for is_angle, count in estimated
+        )
+        return self.degrees_of_freedom * least / sum(count for _, _, count in self._row_counts)
 
     @property
     def unit_weight_std(self) -> float:
@@ -212,15 +305,22 @@ class Result:
 
     @cached_property
     def _sigma_scale(self) -> float:
-        """Factor to the standard deviations of the whitened rows; NaN if it cannot be determined."""
+        """Factor to the standard deviations of the whitened rows; NaN if it cannot be determined.
+
+        A noise scale that is estimated from few rows is uncertain itself, and the errors then have Student's
+        t distribution. The factor widens the standard deviations so that ±1.96 of them contain 95 % of it.
+        """
         if all(item.has_stated_sigma for item in self.data):
             surprise = (
                 1 + CONTRADICTION_SIGMAS * np.sqrt(2 / self.degrees_of_freedom)
                 if self.degrees_of_freedom
                 else np.inf
             )
-            return self.unit_weight_std if self.unit_weight_std**2 > surprise else 1.0
-        return self.unit_weight_std
+            # Also without degrees of freedom, where the scale is not a number.
+            if not self.unit_weight_std**2 > surprise:
+                return 1.0
+            return self.unit_weight_std * _student_ratio(self.degrees_of_freedom)
+        return self.unit_weight_std * _student_ratio(self.noise_degrees_of_freedom)
 
     @cached_property
     def _sqrt_covariance(self) -> tuple[Array, Array]:
@@ -239,6 +339,8 @@ class Result:
             root, unbounded = posterior_sqrt_covariance(
                 TriangularSystem(system.rows / max(scale, MIN_SCALE)), self.problem.weights
             )
+        # The variance of correlated residuals counts T times against the priors.
+        root = root * np.sqrt(self.problem.temperature)
         # The part of the correction that was not applied is an error of its own.
         not_applied = (self.solution.x - self.x)[:, None]
         return (np.concatenate([root, not_applied], 1) if self.shrinkage_factor < 1 else root), unbounded
@@ -265,8 +367,15 @@ class Result:
     def _uncertainty(self) -> Uncertainty:
         root, unbounded = self._scaled_sqrt_covariance
         robot = len(self.errors.parameters)
+        # Predictions agree with the errors of left-out regions, see `model_selection`.
+        scale = self.extension.prediction_scale if self.extension else 1.0
         return Uncertainty.from_errors(
-            self.errors, self.x[:robot], self.chain, root[:robot], unbounded[:robot]
+            self.errors,
+            self.x[:robot],
+            self.chain,
+            scale * root[:robot],
+            unbounded[:robot],
+            self.problem.temperature,
         )
 
     def predict(self, q: Array) -> Prediction:
@@ -300,8 +409,16 @@ class Result:
 
     @property
     def instruments(self) -> dict[str, float]:
-        """Values of all instrument parameters by name [m or rad]."""
-        return self.problem.instruments(self.x)
+        """Values of the instrument parameters by name [m or rad].
+
+        A parameter that no fitted sample depends on, such as a point that only hold-out samples touch, is not
+        among them.
+        """
+        is_used = np.any(self.solution.system.r != 0, 0)[len(self.errors.parameters) :]
+        unused = {
+            p.name for p, used in zip(self.problem.instrument_parameters, is_used, strict=True) if not used
+        }
+        return {name: v for name, v in self.problem.instruments(self.x).items() if name not in unused}
 
     @cached_property
     def studentized_residuals(self) -> tuple[Array, ...]:
@@ -311,11 +428,16 @@ class Result:
 
     @cached_property
     def outliers(self) -> tuple[Array, ...]:
-        """Row numbers of the outliers of each fitted measurement."""
+        """Lines of the outliers of each fitted measurement; numbers from 1 for samples from Python."""
         return tuple(
             item.rows[residuals > robust.OUTLIER_THRESHOLD]
             for item, residuals in zip(self.data, self.studentized_residuals, strict=True)
         )
+
+    @cached_property
+    def residuals(self) -> ResidualTable:
+        """Residuals of all fitted and held-out samples with their files, lines and weights."""
+        return residual_table(self)
 
     @property
     def transferable_instruments(self) -> dict[str, float]:
@@ -327,31 +449,62 @@ class Result:
     def comparisons(self) -> tuple[Comparison, ...]:
         """Accuracy before and after: of hold-out or cross-validated samples, then of the fitted ones.
 
-        Without hold-out samples, ten-fold cross-validation judges each sample by a fit without it. Rejected
-        samples are in neither; outliers among the hold-out samples are included.
+        Regions that were left out, if any, come before the cross-validated samples. Without hold-out samples,
+        five-fold cross-validation judges each sample by a fit without it; up to ten configurations are held
+        out one by one. Rejected samples are in none of these; outliers among the hold-out samples are in.
         """
-        inliers = self.inliers
+        inliers, (nominal, instruments) = self.inliers, self._nominal
         count = sum(len(item.rows) for item in inliers)
-        n_rejected = self.n_samples - count
-        before = accuracy(self.nominal_refitted, inliers)
+        before = accuracy(nominal, inliers, instruments)
         after = accuracy(self.chain, inliers, self.instruments)
-        fitted = Comparison("fitted", count, before, after, n_rejected)
-        if self.holdout:
-            return (self._compare_holdout(), fitted)
+        fitted = Comparison("fitted", count, before, after, self.n_samples - count)
+        found = [self._compare_holdout()] if self.holdout else []
+        if self.region_comparison and self.generalization.region_holdout:
+            found.append(self.region_comparison)
+        # So few samples that no correction is possible cannot judge one either.
+        is_judged = bool(self.shrinkage_factor) or self.decision is not None
+        if self.random_folds and not self.holdout and is_judged:
+            found.append(self.random_folds.comparison)
+        return (*found, fitted)
+
+    @cached_property
+    def random_folds(self) -> FoldComparison | None:
+        """Accuracy of samples that are held out in random folds; None with a single configuration."""
+        inliers = self.inliers
         n_configurations = len(np.unique(configuration_groups(inliers)))
         if n_configurations < 2:
-            return (fitted,)
-        folds = k_fold(inliers, min(N_FOLDS, n_configurations))
-        problem = self.problem.with_data(self._without_rejected(self.problem.data))
-        errors = [
-            item
-            for fold_errors, _ in cross_validate_folds(
-                problem, self.solution.x, inliers, folds, self.refit, self.shrinkage_factor
-            )
-            for item in fold_errors
-        ]
-        after = Accuracy.from_errors(errors)
-        return (Comparison("cross-validated", count, before, after, n_rejected), fitted)
+            return None
+        n_folds = N_FOLDS if n_configurations > MAX_LEAVE_ONE_OUT else n_configurations
+        folds = k_fold(inliers, n_folds)
+        return compare_folds(self, folds, "cross-validated")
+
+    @cached_property
+    def held_out_errors(self) -> PairedErrors | None:
+        """Squared errors of held-out or cross-validated configurations; None with a single configuration.
+
+        Configurations that are outliers before and after the calibration are wrong measurements. They are
+        left out.
+        """
+        if not self.holdout:
+            return self.random_folds.paired if self.random_folds else None
+        nominal, instruments = self._nominal
+        before = compute_errors(nominal, self.holdout, instruments)
+        after = compute_errors(self.chain, self.holdout, self.instruments)
+        return PairedErrors.from_errors(before, after, configuration_groups(self.holdout)).without_outliers()
+
+    @cached_property
+    def generalization(self) -> Generalization:
+        """Accuracy within the measured region and beyond it, and the shares of the joint space of both."""
+        return estimate_generalization(self)
+
+    @property
+    def measured_region(self) -> MeasuredRegion | None:
+        """Region of joint space around the fitted configurations; None if no sample has joint values."""
+        return self._measured_region
+
+    @cached_property
+    def _measured_region(self) -> MeasuredRegion | None:
+        return measured_region(self)
 
     def _compare_holdout(self) -> Comparison:
         """Compare the accuracy before and after on the hold-out samples."""
@@ -360,25 +513,29 @@ class Result:
         return Comparison(
             "hold-out",
             sum(len(item.rows) for item in self.holdout),
-            accuracy(self.nominal_refitted, self.holdout),
+            accuracy(self._nominal[0], self.holdout, self._nominal[1]),
             Accuracy.from_errors(errors),
             n_outliers=n_outliers,
             after_without_outliers=Accuracy.from_errors(inliers) if n_outliers else Accuracy(),
         )
 
-    def refit(self, problem: Problem) -> Array:
+    def refit(self, problem: Problem, start: Array) -> Array:
         """Fit some of the samples by the same method.
 
-        The fit starts from the nominal robot, as x contains information of all samples. If this calibration
-        did not converge, the fit stops after as many iterations.
+        If there are parameters without a prior, the fit starts from the nominal robot, as the values of
+        undetermined parameters in x contain information of all samples. If this calibration did not converge,
+        the fit stops after as many iterations.
 
         Args:
             problem: `self.problem` with a part of its samples.
+            start: Approximate solution, shape (p,) [m or rad].
 
         Returns:
             Solution x, shape (p,) [m or rad].
         """
         nominal = np.zeros_like(self.x)
+        if self.converged and problem.weights.all():
+            return next_iterate(problem, minimize(problem, "lm", start, MAX_REFIT_ITERATIONS, loose=True))
         if not self.converged:
             with suppress(DhcalError):  # method "gn" may diverge on few samples
                 return minimize(problem, self.method, nominal, self.iterations).x
@@ -388,7 +545,7 @@ class Result:
     def estimates(self) -> tuple[Estimate, ...]:
         """Estimates of all identified parameters, then of the fixed ones."""
         with np.errstate(divide="ignore"):
-            priors = 1 / self.problem.weights
+            priors = 1 / self.problem.prior_weights
         figures = np.stack(
             [self.x, self.std, priors, self.observable_fraction, self.posterior_to_prior_std], 1
         )
@@ -436,3 +593,12 @@ class Result:
         with_priors = append_priors(system, self.problem.weights, self.solution.x)
         step = bounded_step(self.problem, with_priors, self.solution.x)
         return float(np.linalg.norm(with_priors.r @ step)) <= eps * np.sqrt(max(1, self.n_samples))
+
+
+def _student_ratio(degrees_of_freedom: float) -> float:
+    """Return the 97.5 % quantile of Student's t distribution relative to that of the normal distribution."""
+    from scipy.special import ndtri, stdtrit  # lazy import: a third of the import time of this package
+
+    if not degrees_of_freedom:
+        return np.nan
+    return float(stdtrit(degrees_of_freedom, CONFIDENCE) / ndtri(CONFIDENCE))

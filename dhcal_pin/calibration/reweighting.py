@@ -4,11 +4,13 @@ The least-squares problem depends on three sets of numbers that are not known be
 
 1. The standard deviations of residual groups whose instrument does not state them. Group g has a scale
 
-       s_g² = Σ_i w_i·‖r_gi‖² / (m_g·(1 - rank/m)),
+       s_g² = Σ_i w_i·‖r_gi‖² / (m_g·(1 - p/m)),
 
    with r_gi the residuals in units of the placeholder standard deviation, w_i robust weights, m_g the
-   weighted rows of the group and m those of all groups. This is a variance component estimate (Helmert
-   1907; Foerstner 1979) that shares the loss of degrees of freedom equally among the rows.
+   weighted rows of the group, m those of all groups and p the number of parameters that the data determine:
+   the rank of the Jacobian for geometric errors alone, and the effective number of parameters (MacKay 1992)
+   for families of joint errors, many of which only their priors determine. This is a variance component
+   estimate (Helmert 1907; Foerstner 1979) that shares the loss of degrees of freedom equally among the rows.
 2. The widths of the default priors, from the evidence procedure (MacKay 1992), see `estimation.priors`.
 3. The weight of each sample under a robust loss, from iteratively reweighted least squares, see
    `estimation.robust`.
@@ -25,8 +27,8 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -35,7 +37,7 @@ from .._typing import Array
 from ..estimation import qr, robust
 from ..estimation.priors import PriorGroups, update_prior_scales
 from ..estimation.problem import Problem
-from ..estimation.robust import studentized_residuals
+from ..estimation.robust import WeightChange, studentized_residuals
 from ..estimation.solver import Progress, SolverResult, minimize
 from ..measurements.base import Measurement
 
@@ -47,6 +49,9 @@ MAX_ROUNDS = 30
 CHANGE_TOL = 0.01
 # Replaces the weight 0 of a parameter without a prior, to avoid a division by zero.
 MIN_WEIGHT = 1e-300
+
+# Function that returns the number of parameters that the data of a solved problem determine.
+CountDetermined = Callable[[Problem, SolverResult], float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +86,7 @@ class ReweightState:
         fit: Current fit.
         scales: Scale of the standard deviation of each residual group, shape (g,).
         stages: Robust stages that are left, the current one first; see `robust.LOSSES`.
-        weight_change: Largest change of a robust weight in the last round.
+        weight_change: Change of the robust weights in the last round.
         is_final: Whether the last solution was iterated to full convergence.
         is_done: Whether all numbers have settled.
     """
@@ -89,12 +94,32 @@ class ReweightState:
     fit: Fit
     scales: Array
     stages: tuple[str, ...]
-    weight_change: float = np.inf
+    weight_change: WeightChange = field(default_factory=WeightChange)
     is_final: bool = False
     is_done: bool = False
 
 
-def reweight(fit: Fit, loss: str, groups: PriorGroups, max_iterations: int, progress: Progress | None) -> Fit:
+def observable_directions(problem: Problem, solution: SolverResult) -> float:
+    """Return the number of directions of parameter space that the data determine.
+
+    Args:
+        problem: Problem that was solved.
+        solution: Its solution.
+
+    Returns:
+        Rank of the whitened Jacobian.
+    """
+    return qr.rank(solution.system.r)
+
+
+def reweight(
+    fit: Fit,
+    loss: str,
+    groups: PriorGroups,
+    max_iterations: int,
+    progress: Progress | None,
+    count_determined: CountDetermined = observable_directions,
+) -> Fit:
     """Solve a problem again until noise scales, prior widths and robust weights have settled.
 
     Args:
@@ -103,6 +128,7 @@ def reweight(fit: Fit, loss: str, groups: PriorGroups, max_iterations: int, prog
         groups: Parameters whose default priors share one scale.
         max_iterations: Largest number of iterations of one solution.
         progress: Called with the iteration and the cost.
+        count_determined: Function that returns the number of parameters that the data determine.
 
     Returns:
         The fit of the last round.
@@ -112,7 +138,7 @@ def reweight(fit: Fit, loss: str, groups: PriorGroups, max_iterations: int, prog
         fit, np.ones(sum(len(item.residual_groups) for item in fit.data)), robust.LOSSES[loss].stages
     )
     for rounds_left in reversed(range(MAX_ROUNDS)):
-        state = _next_round(state, groups, expected, rounds_left, max_iterations, progress)
+        state = _next_round(state, groups, expected, rounds_left, max_iterations, progress, count_determined)
         if state.is_done:
             break
     return state.fit
@@ -125,11 +151,12 @@ def _next_round(
     rounds_left: int,
     max_iterations: int,
     progress: Progress | None,
+    count_determined: CountDetermined,
 ) -> ReweightState:
     """Estimate scales, priors and weights from the current solution, and solve again if they changed."""
     fit, stage = state.fit, state.stages[0]
-    problem, solution, weights, change = fit.problem, fit.solution, fit.weights, 0.0
-    scales = estimate_variance_components(problem, solution, fit.data, weights)
+    problem, solution, weights, change = fit.problem, fit.solution, fit.weights, WeightChange(0.0)
+    scales = estimate_variance_components(problem, solution, fit.data, weights, count_determined)
     weighted = with_sigma_scales(fit.data, scales)
     if stage != "uniform":
         residuals = studentized_residuals(problem, solution, weighted, weights)
@@ -137,13 +164,13 @@ def _next_round(
         weighted = tuple(item.with_weights(w) for item, w in zip(weighted, weights, strict=True))
     priors = update_prior_scales(problem, solution, groups)
     relative = np.log(scales / state.scales), (priors - problem.weights) / np.fmax(expected, MIN_WEIGHT)
-    has_settled = max(change, *(np.abs(each).max(initial=0.0) for each in relative)) < CHANGE_TOL
+    has_settled = max(change.size, *(np.abs(each).max(initial=0.0) for each in relative)) < CHANGE_TOL
     state = replace(state, fit=replace(fit, weights=tuple(weights)), weight_change=change)
     if has_settled and len(state.stages) > 1:
         if stage != "uniform" or any(
             map(robust.has_possible_outliers, studentized_residuals(problem, solution, weighted, weights))
         ):
-            return replace(state, stages=state.stages[1:], weight_change=np.inf)
+            return replace(state, stages=state.stages[1:], weight_change=WeightChange())
         state = replace(state, stages=state.stages[:1])
     if has_settled and state.is_final:
         return replace(state, is_done=True)
@@ -164,12 +191,16 @@ def _next_round(
 
 
 def estimate_variance_components(
-    problem: Problem, solution: SolverResult, data: tuple[Measurement, ...], weights: Sequence[Array]
+    problem: Problem,
+    solution: SolverResult,
+    data: tuple[Measurement, ...],
+    weights: Sequence[Array],
+    count_determined: CountDetermined,
 ) -> Array:
     """Estimate one noise scale per residual group from the residuals of a fit.
 
     Groups with stated standard deviations keep scale 1, and so do all groups if there are not more rows than
-    observable directions. A group with no more rows than that could be fitted exactly, so its residuals
+    determined parameters. A group with no more rows than that could be fitted exactly, so its residuals
     do not show its noise. It takes the pooled scale of all groups of its unit that do not state their
     standard deviations, or 1 if it is the only one.
 
@@ -178,6 +209,7 @@ def estimate_variance_components(
         solution: Solution of `problem`.
         data: Measurements with their own standard deviations, without robust weights.
         weights: Robust weight of each sample, one array of shape (m,) per measurement.
+        count_determined: Function that returns the number of parameters that the data determine.
 
     Returns:
         Scales of shape (g,), in the order of the residual groups of the measurements.
@@ -192,8 +224,8 @@ def estimate_variance_components(
         for item in data
     ]
     counts = [w.sum() for w in weights]
-    rank = qr.rank(solution.system.r)
-    freedom = 1 - rank / sum(len(r) * count for r, count in zip(residuals, counts, strict=True))
+    n_determined = count_determined(problem, solution)
+    freedom = 1 - n_determined / sum(len(r) * count for r, count in zip(residuals, counts, strict=True))
     groups = [
         _ResidualGroup(
             name == "orientation",
@@ -209,7 +241,7 @@ def estimate_variance_components(
         same_unit = [other for other in groups if other.is_angle == group.is_angle]
         pooled = [other for other in same_unit if not other.is_stated]
         n_rows, squares, is_stated = group.n_rows, group.squares, group.is_stated
-        if n_rows <= rank and len(same_unit) > 1:
+        if n_rows <= n_determined and len(same_unit) > 1:
             n_rows = sum(other.n_rows for other in pooled)
             squares = sum(other.squares for other in pooled)
             is_stated = is_stated or len(pooled) == 1

@@ -27,11 +27,11 @@ from ..estimation.solver import Progress, SolverResult, minimize
 from ..estimation.uncertainty import UNBOUNDED_TOL
 from ..exceptions import InvalidArgumentError
 from ..identifiability import explanations
-from ..io.measurement_csv import Part
+from ..io.measurement_files import Part
+from ..measurements.arguments import require_chain
 from ..measurements.base import Measurement
 from ..parallel import SERIAL, TaskExecutor
 from ..robot.chain import Chain
-from .arguments import require_chain
 from .procedure import Method, calibrate
 from .result import Result
 
@@ -182,10 +182,17 @@ def calibrate_stream(
         free=free,
         known=known,
         loss="linear",
+        extend="none",
         max_iterations=max_iterations,
     )
     problem = StreamProblem(
-        fit.errors, (head,), fit.problem.weights, known, executor, None, parts, _sigma_scales(fit, head)
+        fit.errors,
+        (head,),
+        fit.problem.weights,
+        known,
+        executor,
+        parts=parts,
+        scales=_sigma_scales(fit, head),
     )
     solution = minimize(problem, method, fit.x, max_iterations, progress)
     calibrated = fit.errors.at(solution.x)

@@ -9,20 +9,34 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from ..formatting import SMALL_UNITS, Table, format_fixed, format_quantity, significant_decimals
 from .estimates import Estimate
 from .evaluation import Comparison
 
+if TYPE_CHECKING:
+    from .cross_validation import Generalization
+
 # With fewer samples the figures come with a note that they are not reliable.
 MIN_SAMPLES = 10
 # The headline gives the RMS without outliers if it is below this fraction of the RMS with them.
 OUTLIER_RMS_RATIO = 0.9
+# Smaller shares of the joint space are shown as "under 1 %", and larger ones than the rest as "over 99 %".
+MIN_SHOWN_SHARE = 0.01
 
 # Groups of errors in words.
 GROUP_LABELS = {"position": "position error", "orientation": "orientation error", "residual": "residual"}
 # Statistics in words, by the attribute of `ErrorStatistics`.
 STATISTIC_LABELS = {"mean": "mean", "rms": "RMS", "p95": "95th percentile", "max": "maximum"}
+
+# Explanation of `definition_table`.
+DEFINITION_TEXT = (
+    "A parameter of the robot is a translation along, or a rotation about, an axis of a frame. The last "
+    "table names the frames. “Origin of J” is the frame into which the <origin> of joint J places it, before "
+    "the joint moves. “Link L” is the frame of link L. Base and tool are given by position and rotation "
+    "vector."
+)
 
 
 def estimate_table(estimates: Sequence[Estimate]) -> Table:
@@ -45,6 +59,23 @@ def estimate_table(estimates: Sequence[Estimate]) -> Table:
         for e in estimates
     ]
     return Table(["parameter", "nominal", "calibrated", "change", "std"], rows)
+
+
+def definition_table(estimates: Sequence[Estimate]) -> Table:
+    """Make a table of the frames and directions in which the parameters are defined.
+
+    Args:
+        estimates: Estimates of a calibration.
+
+    Returns:
+        Table with one row per frame; instrument parameters are not in it.
+    """
+    by_frame: dict[str, list[str]] = {}
+    for e in estimates:
+        if e.frame:
+            by_frame.setdefault(e.frame, []).append(f"{e.name} {e.direction}")
+    rows = [[frame, ", ".join(texts)] for frame, texts in by_frame.items()]
+    return Table(["frame", "parameters and their directions"], rows, n_text_columns=2)
 
 
 def accuracy_table(comparisons: Sequence[Comparison]) -> Table:
@@ -125,6 +156,65 @@ def headline(comparisons: Sequence[Comparison]) -> Headline:
     return Headline(text, before_text, after_text, reduction, group, best)
 
 
+def generalization_lines(
+    generalization: Generalization, comparisons: Sequence[Comparison]
+) -> tuple[str, str]:
+    """State the accuracy within the measured region and beyond it, one line each.
+
+    Args:
+        generalization: Both figures of a calibration.
+        comparisons: Comparisons of the calibration; hold-out samples are preferred to cross-validated ones.
+
+    Returns:
+        The lines.
+    """
+    inside, beyond = generalization.cross_validated, generalization.region_holdout
+    if comparisons[0].title == "hold-out":
+        inside = comparisons[0]
+    covered = format_share(generalization.covered_share)
+    unknown = format_share(1 - generalization.reached_share)
+    return (
+        f"Measured region ({covered} of joint space): "
+        + (
+            f"{_before_and_after(inside)}."
+            if inside
+            else f"cannot be said, {generalization.cross_validated_reason}."
+        ),
+        f"Beyond it: {_before_and_after(beyond)}; for {unknown} of joint space not known."
+        if beyond
+        else f"Beyond it: cannot be said, {generalization.region_holdout_reason}.",
+    )
+
+
+def _before_and_after(comparison: Comparison) -> str:
+    """Return the most important RMS error before and after."""
+    group, after = next(iter(comparison.after.groups.items()))
+    before_text, after_text = (
+        format_quantity(side.rms, side.unit, after.rms_std, small=True)
+        for side in (comparison.before.groups[group], after)
+    )
+    return f"{before_text} before, {after_text} after"
+
+
+def format_share(share: float) -> str:
+    """Format a share of random configurations in percent; it is never exactly 0 or 100 %.
+
+    Args:
+        share: Share, 0 to 1.
+
+    Returns:
+        Text such as "12 %" or "under 1 %".
+
+    >>> format_share(0.004)
+    'under 1 %'
+    """
+    if share < MIN_SHOWN_SHARE:
+        return f"under {100 * MIN_SHOWN_SHARE:.0f} %"
+    if share > 1 - MIN_SHOWN_SHARE:
+        return f"over {100 * (1 - MIN_SHOWN_SHARE):.0f} %"
+    return f"{100 * share:.0f} %"
+
+
 def regressions(comparisons: Sequence[Comparison]) -> list[str]:
     """List the comparisons in which the calibrated robot is worse than the nominal one.
 
@@ -157,6 +247,8 @@ def describe_samples(comparison: Comparison) -> str:
         The description.
     """
     count = comparison.n_samples
+    if comparison.title == "region hold-out":
+        return "on regions that were left out"
     return f"on {count} {comparison.title} {'sample' if count == 1 else 'samples'}"
 
 

@@ -6,7 +6,10 @@ from argparse import ArgumentParser, Namespace
 
 from ..exceptions import InvalidArgumentError
 from .job import Job, add_job_arguments, is_manifest
-from .options import STDOUT, add_execution_options
+from .options import add_execution_options
+
+# Exit status of a refused calibration.
+REFUSED = 3
 
 EXAMPLE = "dhcal calibrate ur10.urdf laser.csv --tip tool0 --holdout 0.3 -o ur10_calibrated.urdf"
 
@@ -28,7 +31,8 @@ def run(args: Namespace) -> int:
         args: Parsed arguments.
 
     Returns:
-        Exit status: 0, or 1 if a robot of a manifest failed.
+        Exit status: 0; 1 if a robot of a manifest failed or was refused; 3 if the robot was refused and
+        nothing but JSON and report was written.
 
     Raises:
         InvalidArgumentError: Arguments are missing or contradict each other.
@@ -48,23 +52,24 @@ def _calibrate_robot(args: Namespace) -> int:
     """Calibrate one robot and show its result."""
     from ..parallel import open_executor  # lazy import, as the following: they load Pinocchio
     from . import console
-    from .outputs import write_outputs
     from .run_job import run_job
 
+    job = Job.from_args(args)
     with (
         open_executor(args.jobs or 1, args.scheduler) as executor,
         console.show_progress("fitting") as progress,
     ):
-        outcome = run_job(Job.from_args(args), progress, executor)
-    if args.json == STDOUT:
-        write_outputs({}, args.json, outcome.document)
-    console.print_trials(outcome.trials)
+        outcome = run_job(job, progress, executor)
+    console.print_extension(outcome.fit.extension)
     console.print_summary(outcome.fit, outcome.files)
     for path, rows in outcome.unreachable.items():
         console.print_unreachable_rows(path, rows)
         console.print_outliers(path, outcome.outliers.get(path, []), outcome.rejected.get(path, []))
+    for path, texts in outcome.notes.items():
+        console.print_notes([f"{path}: {text}" for text in texts])
     for path, texts in outcome.warnings.items():
         console.print_warnings(path, texts)
     console.print_hint(outcome.hint)
     console.print_headline(outcome.fit)
-    return 0
+    console.print_verdict(outcome.fit.verdict, job.force)
+    return REFUSED if outcome.fit.verdict.is_refused and not job.force else 0

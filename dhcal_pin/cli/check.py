@@ -5,7 +5,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
 
-from .options import JSON, ROBOT, TIP
+from .options import JSON, ROBOT, add_urdf_options
 
 EXAMPLE = "dhcal check arm.dh.toml"
 
@@ -17,7 +17,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         parser: Parser of the command.
     """
     parser.add_argument("robot", **ROBOT)
-    parser.add_argument("--tip", **TIP)
+    add_urdf_options(parser)
     parser.add_argument("--json", **JSON)
 
 
@@ -36,7 +36,7 @@ def run(args: Namespace) -> int:
     from .outputs import require_writable_outputs, write_outputs
 
     require_writable_outputs([args.json], [args.robot])
-    rows = crosscheck(read_robot(args.robot, args.tip))
+    rows = crosscheck(read_robot(args.robot, args.tip, package_dirs=args.package_dir))
     all_agree = all(row.agrees for row in rows)
     routes = [asdict(row) | {"agrees": row.agrees} for row in rows]
     write_outputs({}, args.json, {"agree": all_agree, "routes": routes})

@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 import math
+import os
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ..exceptions import InvalidArgumentError
-from .options import TIP
+from .options import ROBOT, add_motion_options, add_urdf_options
 
 if TYPE_CHECKING:
     from .._typing import Array
     from ..compensation import Compensation
     from ..io import TargetPoses
+    from ..programs import Program
     from ..robot import Chain
 
 EXAMPLE = "dhcal compensate ur10.urdf ur10_calibrated.urdf targets.csv --tip tool0 -o corrected.csv"
+
+# Frames of the targets; the first is the default.
+FRAMES = BASE, MEASURING = "base", "measuring"
+# A number of a URDF with this many significant digits was computed and not typed.
+_COMPUTED_DIGITS = 15
+# Numbers that differ from a multiple of this angle by less than the tolerance are design values [rad].
+_DESIGN_ANGLE, _DESIGN_TOL = math.pi / 12, 1e-6
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -25,8 +34,12 @@ def add_arguments(parser: ArgumentParser) -> None:
     Args:
         parser: Parser of the command.
     """
-    parser.add_argument("nominal", metavar="NOMINAL.urdf", help="robot model of the controller")
-    parser.add_argument("calibrated", metavar="CALIBRATED.urdf", help="the same robot, calibrated")
+    parser.add_argument(
+        "nominal", metavar="NOMINAL.urdf", type=ROBOT["type"], help="robot model of the controller"
+    )
+    parser.add_argument(
+        "calibrated", metavar="CALIBRATED.urdf", type=ROBOT["type"], help="the same robot, calibrated"
+    )
     parser.add_argument("targets", metavar="targets.csv", help="positions or poses of the tool")
     parser.add_argument(
         "-o",
@@ -35,7 +48,21 @@ def add_arguments(parser: ArgumentParser) -> None:
         required=True,
         help="joint values and corrected targets to write, one row per target",
     )
-    parser.add_argument("--tip", **TIP)
+    add_urdf_options(parser)
+    parser.add_argument(
+        "--frame",
+        choices=FRAMES,
+        default=BASE,
+        help="frame of the targets: base (base link of the robot, default) or measuring (measuring frame of "
+        "the calibration)",
+    )
+    parser.add_argument(
+        "--tcp",
+        metavar="FRAME|FILE",
+        help="tool that reaches the targets: a link fixed to the tip, or a TOML file with xyz_m and "
+        "rotvec_rad in the tip link (default: the tip; with --frame measuring the measured point)",
+    )
+    add_motion_options(parser, "rad")
 
 
 def run(args: Namespace) -> int:
@@ -46,40 +73,175 @@ def run(args: Namespace) -> int:
 
     Returns:
         Exit status 0.
-
-    Raises:
-        InvalidArgumentError: The two robots have different tips.
     """
     from ..compensation import compensate  # lazy import, as the following: they load Pinocchio
-    from ..io import read_robot, read_targets
-    from ..io.robot import has_dh_table
+    from ..io import read_targets
+    from ..programs import program_text, require_program_ending
     from . import console
     from .outputs import existing_sidecars, require_writable_outputs, write_outputs
 
     robots = [args.nominal, args.calibrated]
-    require_writable_outputs([args.output], [*robots, *existing_sidecars(robots), args.targets])
-    nominal, calibrated = (read_robot(path, None if has_dh_table(path) else args.tip) for path in robots)
+    tcp_file = [args.tcp] if args.tcp and os.path.exists(args.tcp) else []
+    require_writable_outputs(
+        [args.output, *args.export], [*robots, *existing_sidecars(robots), args.targets, *tcp_file]
+    )
+    for path in args.export:
+        require_program_ending(path)
+    nominal, calibrated = read_robots(args)
+    targets = read_targets(args.targets, calibrated)
+    with console.progress_bar("compensating", len(targets.values)) as progress:
+        result = compensate(nominal, calibrated, targets.values, targets.near, progress)
+    contents = {args.output: corrected_text(result, calibrated, targets, args.joint_units)}
+    for path in args.export:
+        contents[path] = program_text(_program(result, nominal), path)
+    write_outputs(contents)
+    frame = f"the root link {calibrated.urdf.root}" if args.frame == BASE else "the measuring frame"
+    console.print_lines(f"targets: {_tool_text(args, calibrated)} in {frame}")
+    console.print_notes([f"{targets.source}: {text}" for text in targets.notes])
+    console.print_compensation(result, calibrated, targets)
+    if warning := exchange_warning(args.nominal, args.calibrated, nominal, calibrated):
+        console.print_warnings(args.nominal, [warning])
+    console.print_hint(_frame_hint(args, result))
+    console.print_lines(*(f"wrote {path}" for path in contents))
+    return 0
+
+
+def read_robots(args: Namespace) -> tuple[Chain, Chain]:
+    """Read both robots, with the base and the tool that the targets refer to.
+
+    Args:
+        args: Parsed arguments.
+
+    Returns:
+        Nominal and calibrated robot.
+
+    Raises:
+        InvalidArgumentError: The two robots have different tips, or --tcp is neither a link nor a file.
+    """
+    from dataclasses import replace  # lazy import, as the following: they are slow to load
+
+    import numpy as np
+
+    from ..io import read_robot
+    from ..io.robot import has_dh_table
+    from ..io.sidecar import read_tool
+
+    nominal, calibrated = (
+        read_robot(path, None if has_dh_table(path) else args.tip, package_dirs=args.package_dir)
+        for path in (args.nominal, args.calibrated)
+    )
     if nominal.tip != calibrated.tip and args.tip is None:
         raise InvalidArgumentError(
             f"{args.calibrated}: its tip is {calibrated.tip!r}, but the tip of {args.nominal} is "
             f"{nominal.tip!r}; choose one with --tip"
         )
-    targets = read_targets(args.targets, calibrated)
-    with console.progress_bar("compensating", len(targets.values)) as progress:
-        result = compensate(nominal, calibrated, targets.values, targets.near, progress)
-    write_outputs({args.output: corrected_text(result, calibrated, targets)})
-    console.print_compensation(result, calibrated, targets)
-    console.print_lines(f"wrote {args.output}")
-    return 0
+    chains = nominal, calibrated
+    if args.frame == BASE:
+        chains = tuple(replace(chain, base=np.eye(4), tool=np.eye(4)) for chain in chains)
+    if args.tcp:
+        is_link = args.tcp in calibrated.urdf.links
+        if not is_link and not os.path.exists(args.tcp):
+            raise InvalidArgumentError(
+                f"--tcp {args.tcp}: neither a link of {args.calibrated} nor a file; expected a link fixed to "
+                "the tip, or a TOML file with xyz_m and rotvec_rad"
+            )
+        chains = tuple(
+            replace(chain, tool=chain.pose_in_tip(args.tcp) if is_link else read_tool(args.tcp))
+            for chain in chains
+        )
+    return chains[0], chains[1]
 
 
-def corrected_text(result: Compensation, chain: Chain, targets: TargetPoses) -> str:
+def _tool_text(args: Namespace, chain: Chain) -> str:
+    """Describe the tool that reaches the targets."""
+    if args.tcp:
+        return f"the tool {args.tcp}"
+    return f"the tip {chain.tip}" if args.frame == BASE else "the measured point"
+
+
+def _frame_hint(args: Namespace, result: Compensation) -> str:
+    """Suggest --frame measuring if most targets are not reached, and the sidecar says where the base is."""
+    from ..io.sidecar import existing_sidecar  # lazy import: loads Pinocchio
+
+    if args.frame != BASE or result.reached.mean() >= 0.5 or not existing_sidecar(args.calibrated):
+        return ""
+    return "are the targets in the measuring frame of the calibration? then add --frame measuring"
+
+
+def exchange_warning(nominal_path: str, calibrated_path: str, nominal: Chain, calibrated: Chain) -> str:
+    """Return a warning if the nominal and the calibrated robot look exchanged.
+
+    They do in two cases. Only the nominal robot has a sidecar, which a calibration writes. Or both or none
+    have one, and of the numbers that differ between the URDFs most are computed in the nominal file and most
+    are not in the calibrated one. A number is computed if it has at least 15 significant digits and is not a
+    multiple of 15 degrees: a calibration writes all digits, and people do not.
+
+    Args:
+        nominal_path: Path of the nominal robot.
+        calibrated_path: Path of the calibrated robot.
+        nominal: Nominal robot.
+        calibrated: Calibrated robot.
+
+    Returns:
+        One sentence; empty if there is no reason for doubt.
+    """
+    from ..io.sidecar import existing_sidecar  # lazy import: loads Pinocchio
+
+    has_sidecar = [existing_sidecar(path) is not None for path in (nominal_path, calibrated_path)]
+    if has_sidecar == [True, False]:
+        reason = f"it has a sidecar, and {calibrated_path} has none"
+    elif has_sidecar == [False, True] or not _looks_computed(nominal, calibrated):
+        return ""
+    else:
+        reason = f"its joint origins have all digits of a calibration, and those of {calibrated_path} do not"
+    return f"nominal and calibrated robot look exchanged: {reason}; the nominal robot comes first"
+
+
+def _looks_computed(first: Chain, second: Chain) -> bool:
+    """Return whether the numbers that differ are mostly computed in the first URDF only."""
+    import numpy as np  # lazy import: it is slow to load
+
+    shares = []
+    for one, other in ((first, second), (second, first)):
+        numbers = {joint.name: (*joint.origin[:3, 3], *joint.rpy) for joint in other.urdf.joints}
+        pairs = [
+            pair
+            for joint in one.urdf.joints
+            for pair in zip((*joint.origin[:3, 3], *joint.rpy), numbers.get(joint.name, ()), strict=False)
+        ]
+        shares.append(np.mean([_is_computed(float(a)) for a, b in pairs if a != b] or [False]))
+    return shares[0] > 0.5 > shares[1]
+
+
+def _is_computed(number: float) -> bool:
+    """Return whether a number has more digits than people write and is not a design angle."""
+    digits = repr(number).split("e")[0].lstrip("-0.").replace(".", "")
+    distance = abs(number - _DESIGN_ANGLE * round(number / _DESIGN_ANGLE))
+    return len(digits) >= _COMPUTED_DIGITS and distance > _DESIGN_TOL
+
+
+def _program(result: Compensation, nominal: Chain) -> Program:
+    """Create the program that visits all targets that are reached."""
+    import numpy as np  # lazy import, as the following: they are slow to load
+
+    from ..programs import Program, Stop
+
+    stops = [Stop(f"target {i + 1}", result.q[i], result.poses[i]) for i in np.flatnonzero(result.reached)]
+    if not stops:
+        raise InvalidArgumentError("--export: no target is reached; correct the targets or choose --frame")
+    return Program(
+        nominal, "targets corrected by dhcal compensate", "The moves are not checked for collisions.", stops
+    )
+
+
+def corrected_text(result: Compensation, chain: Chain, targets: TargetPoses, joint_units: str = "rad") -> str:
     """Format corrected targets.
 
     Args:
         result: Corrected targets.
         chain: Calibrated robot.
         targets: Targets as read, with their units.
+        joint_units: "rad" (with metres) or "deg" (with millimetres) of the joint values.
 
     Returns:
         CSV text with one row per target: joint values, corrected target in the units of the input, remaining
@@ -88,13 +250,15 @@ def corrected_text(result: Compensation, chain: Chain, targets: TargetPoses) -> 
     import numpy as np  # lazy import, as the following: they are slow to load
 
     from .. import se3
-    from ..io.measurement_columns import QUATERNION, ROTVEC, joint_units
+    from ..io.measurement_files.columns import QUATERNION, ROTVEC
+    from ..io.measurement_files.writing import joint_columns
     from ..io.tabular import csv_text
     from ..units import ANGLES, LENGTHS
 
-    columns: dict[str, Sequence[str]] = {}
-    for name, values in zip(chain.joint_names, result.q.T, strict=True):
-        columns[f"{name}[{'m' if joint_units(chain, name) is LENGTHS else 'rad'}]"] = _cells(values)
+    columns: dict[str, Sequence[str]] = {
+        name: _cells(np.array(values))
+        for name, values in joint_columns(result.q, chain, angle_unit=joint_units).items()
+    }
     for i, name in enumerate(("x", "y", "z")):
         unit = targets.units[name]
         columns[f"{name}[{unit}]"] = _cells(result.poses[:, i, 3] * LENGTHS[unit])

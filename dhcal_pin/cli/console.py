@@ -15,25 +15,31 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import Progress as ProgressBar
 from rich.table import Table as ConsoleTable
 from rich.text import Text
 
 from ..calibration.evaluation import GROUP_UNITS, Accuracy
-from ..calibration.model_selection import FamilyTrial, trial_table
+from ..calibration.model_selection import Extension
 from ..calibration.result import Result
 from ..calibration.summary import (
     GROUP_LABELS,
     STATISTIC_LABELS,
     accuracy_table,
     estimate_table,
+    generalization_lines,
     headline,
     regressions,
 )
+from ..calibration.verdict import Verdict
+from ..diagnostics.inspection import FileInspection, column_table
 from ..diagnostics.reachability import UnreachableRow
 from ..estimation.solver import Progress
 from ..formatting import Table, format_quantity
 from ..identifiability import label_unobservable
+from ..io.tables import format_lines
+from ..messages import escape_control_characters
 
 if TYPE_CHECKING:
     from .._typing import Array
@@ -46,6 +52,9 @@ if TYPE_CHECKING:
 
 # Longest list of rows in a sentence; the files that are written contain all of them.
 MAX_LISTED_ROWS = 12
+
+# Reasons why rows cannot be used that are listed; the JSON document has all of them.
+MAX_LISTED_REASONS = 5
 
 # Width of tables in files and pipes, in characters: wide enough not to fold them.
 _FILE_WIDTH = 140
@@ -62,6 +71,11 @@ def _console() -> Console:
     return console
 
 
+def _text(text: str, style: str = "") -> Text:
+    """Create a text; names and labels of files in it cannot control the terminal."""
+    return Text(escape_control_characters(text), style=style)
+
+
 def print_table(title: str, content: Table) -> None:
     """Print a table under its title.
 
@@ -72,12 +86,12 @@ def print_table(title: str, content: Table) -> None:
     console = _console()
     table = ConsoleTable(header_style="bold", box=None, pad_edge=False)
     for i, name in enumerate(content.header):
-        table.add_column(name, justify="left" if i < content.n_text_columns else "right")
+        table.add_column(_text(name), justify="left" if i < content.n_text_columns else "right")
     for row in content.rows:
-        table.add_row(*map(Text, row))
+        table.add_row(*map(_text, row))
     console.print()
     # The title of a rich table would be folded to the width of the table.
-    console.print(Text(title, style="bold"), soft_wrap=True)
+    console.print(_text(title, "bold"), soft_wrap=True)
     console.print(table)
 
 
@@ -90,7 +104,7 @@ def print_lines(*texts: str, style: str = "") -> None:
     """
     console = _console()
     for text in texts:
-        console.print(Text(text, style=style), soft_wrap=True)
+        console.print(_text(text, style), soft_wrap=True)
 
 
 def print_notes(texts: Sequence[str]) -> None:
@@ -143,8 +157,8 @@ def show_progress(title: str) -> Iterator[Progress | None]:
     if not console.is_terminal:
         yield None
         return
-    with console.status(title) as status:
-        yield lambda iteration, cost: status.update(f"{title}: iteration {iteration}, cost {cost:.6g}")
+    with console.status(_text(title)) as status:
+        yield lambda iteration, cost: status.update(_text(f"{title}: iteration {iteration}, cost {cost:.6g}"))
 
 
 @contextmanager
@@ -161,7 +175,8 @@ def progress_bar(title: str, total: int, n_done: int = 0) -> Iterator[Callable[[
     """
     console = _console()
     with ProgressBar(console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task(title, total=total, completed=n_done)
+        # The bar reads markup such as [bold] in its description.
+        task = bar.add_task(escape(escape_control_characters(title)), total=total, completed=n_done)
         yield lambda count: bar.update(task, completed=count)
 
 
@@ -195,7 +210,7 @@ def print_unreachable_rows(path: str, unreachable: Sequence[UnreachableRow]) -> 
         unreachable: Rows with the reason.
     """
     for item in unreachable:
-        print_lines(f"{path}: row {item.row} is excluded: {item.reason}", style="yellow")
+        print_lines(f"{path}: line {item.row} is excluded: {item.reason}", style="yellow")
 
 
 def print_outliers(path: str, rows: Sequence[int], rejected: Sequence[int]) -> None:
@@ -203,8 +218,8 @@ def print_outliers(path: str, rows: Sequence[int], rejected: Sequence[int]) -> N
 
     Args:
         path: Path of the measurement file.
-        rows: Row numbers of the outliers.
-        rejected: Row numbers with zero weight in the fit.
+        rows: Lines of the outliers.
+        rejected: Lines with zero weight in the fit.
     """
     excluded = [row for row in rows if row in rejected]
     included = [row for row in rows if row not in rejected]
@@ -216,22 +231,19 @@ def print_outliers(path: str, rows: Sequence[int], rejected: Sequence[int]) -> N
 
 
 def _count_outliers(rows: Sequence[int]) -> str:
-    """Count outliers and name their rows."""
+    """Count outliers and name their lines."""
     plural = "s" if len(rows) > 1 else ""
-    return f"{len(rows)} outlier{plural} (row{plural} {_listed(rows)})"
+    return f"{len(rows)} outlier{plural} (line{plural} {_listed(rows)})"
 
 
-def print_trials(trials: Sequence[FamilyTrial]) -> None:
-    """Print the effect of each joint error family.
+def print_extension(extension: Extension | None) -> None:
+    """Print what was added to the geometry, and how much the samples count.
 
     Args:
-        trials: Families that were tried; nothing is printed if there are none.
+        extension: Families of joint errors and their effect; nothing is printed if none was tried.
     """
-    if trials:
-        title = (
-            "joint error families: cross-validated error over regions of joint space, in standard deviations"
-        )
-        print_table(title, trial_table(trials))
+    for sentence in extension.sentences if extension else []:
+        print_lines(sentence)
 
 
 def print_summary(fit: Result, files: Mapping[str, str]) -> None:
@@ -259,13 +271,30 @@ def print_summary(fit: Result, files: Mapping[str, str]) -> None:
 
 
 def print_headline(fit: Result) -> None:
-    """Print the accuracy in one sentence; called last, so that it stays visible in the terminal.
+    """Print the accuracy, and where it holds; called last, so that it stays visible in the terminal.
 
     Args:
         fit: Result of a calibration.
     """
+    print_lines("", *generalization_lines(fit.generalization, fit.comparisons))
     print_lines(*regressions(fit.comparisons), style="yellow")
     print_lines("", headline(fit.comparisons).text, style="bold")
+
+
+def print_verdict(verdict: Verdict, is_forced: bool) -> None:
+    """Print the verdict and its reasons.
+
+    Args:
+        verdict: Verdict on a calibration.
+        is_forced: Whether a refused robot is written.
+    """
+    style = {"ok": "green", "caution": "yellow", "refused": "red"}[verdict.status]
+    if verdict.is_refused:
+        outcome = "written because of --force" if is_forced else "no robot written; --force overrides"
+        print_lines(f"verdict: refused ({outcome})", style=style)
+    else:
+        print_lines(f"verdict: {verdict.status}", style=style)
+    print_lines(*(f"  {reason}" for reason in verdict.reasons), style=style)
 
 
 def print_validation(title: str, accuracies: Mapping[str, Accuracy]) -> None:
@@ -285,6 +314,54 @@ def print_validation(title: str, accuracies: Mapping[str, Accuracy]) -> None:
             ]
             rows += [[f"{GROUP_LABELS[group]}, {label}", *cells]] if cells else []
     print_table(title, Table(["error", *accuracies], rows))
+
+
+# --- inspect ---------------------------------------------------------------------------------------
+
+
+def print_inspection(inspection: FileInspection) -> None:
+    """Print what a measurement file contains.
+
+    Args:
+        inspection: Content of the file.
+    """
+    print_table(_inspection_title(inspection), column_table(inspection.columns))
+    for column in inspection.columns:
+        if column.counts and column.role != "ignored":
+            texts = [f"{text} ({count} rows)" for text, count in column.counts.items()]
+            print_lines(f"{column.name}: {_listed(texts)}")
+    ignored = [column.name for column in inspection.columns if column.role == "ignored"]
+    if len(ignored) == len(inspection.columns) and not inspection.problem:
+        print_lines("No column is known. With --robot a column map is proposed.")
+    elif ignored and not inspection.column_map:
+        print_lines(f"not used: {', '.join(ignored)}")
+    print_notes(inspection.notes)
+    # With a robot, a warning names them.
+    if inspection.repeated_lines and inspection.configurations is None:
+        print_lines(f"lines equal to earlier ones: {format_lines(inspection.repeated_lines)}", style="yellow")
+    if bad := inspection.bad_rows:
+        rows = f"{len(bad)} row{'s' if len(bad) > 1 else ''} cannot be used"
+        reasons = [f"  line {line}: {reason}" for line, reason in bad.items()]
+        print_lines(f"{rows}, line{'s' if len(bad) > 1 else ''} {format_lines(bad)}:", style="yellow")
+        print_lines(*reasons[:MAX_LISTED_REASONS], style="yellow")
+    print_lines(*(f"warning: {text}" for text in inspection.warnings), style="yellow")
+    if inspection.problem:
+        print_lines(f"problem: {inspection.problem}", style="red")
+    if inspection.column_map:
+        print_lines("", "Lines of a column map (--columns); check columns and units:", *inspection.column_map)
+    elif not (bad or inspection.warnings or inspection.problem or inspection.configurations is None):
+        print_lines("No problems found.")
+
+
+def _inspection_title(inspection: FileInspection) -> str:
+    """Return the most important facts on a file in one line."""
+    facts = [
+        inspection.kind or "unknown kind",
+        f"{inspection.rows} rows (lines {inspection.first_line}-{inspection.last_line})",
+    ]
+    if inspection.configurations is not None:
+        facts.append(f"{inspection.configurations} configurations")
+    return f"{inspection.path}: {', '.join([*facts, inspection.form])}"
 
 
 # --- check, plan, compensate, study ----------------------------------------------------------------
@@ -341,11 +418,18 @@ def print_plan(plan: Plan) -> None:
         print_lines(f"Diminishing returns beyond {plan.recommended_size} poses (less than 1 % per ten).")
     else:
         print_lines(f"No diminishing returns up to {sizes[-1]} poses (still at least 1 % per ten).")
+    if plan.curves:
+        rows = [
+            [str(one.n_poses), f"{100 * one.filled_share:.0f} %", f"{1e6 * one.curve_std:.0f}"]
+            for one in plan.curves
+        ]
+        table = Table(["poses", "bins filled", "curve std, µrad"], rows, n_text_columns=0)
+        print_table("joint correction curves, RMS of all joints", table)
     print_notes(plan.notes)
 
 
 def print_compensation(result: Compensation, chain: Chain, targets: TargetPoses) -> None:
-    """Print how many targets have which status, and the rows of those that are not corrected exactly.
+    """Print how many targets have which status, and the lines of those that are not corrected exactly.
 
     Args:
         result: Corrected targets.
@@ -355,15 +439,15 @@ def print_compensation(result: Compensation, chain: Chain, targets: TargetPoses)
     from ..compensation import SINGULAR  # lazy import: only this command needs it
 
     for status in dict.fromkeys(result.status):
-        rows = [row for row, other in enumerate(result.status, 1) if other == status]
+        rows = [row for row, other in enumerate(result.status) if other == status]
         text = f"{targets.source}: {len(rows)} of {len(result.status)} {status}"
         if status == "ok":
             print_lines(text)
             continue
         items = [
-            f"row {row}"
+            f"line {targets.lines[row]}"
             if status == SINGULAR
-            else f"row {row} ({_distance(result.residual_error[row - 1])} away)"
+            else f"line {targets.lines[row]} ({_distance(result.residual_error[row])} away)"
             for row in rows
         ]
         print_lines(f"{text}: {_listed(items)}", style="yellow")

@@ -1,10 +1,12 @@
-"""`dhcal convert`: write a robot file in another format."""
+"""`dhcal convert`: write a robot file in another format, or the stops of a recording as measurements."""
 
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
 
-from .options import ROBOT, TIP
+from ..exceptions import InvalidArgumentError
+from .options import ROBOT, add_urdf_options
 
 EXAMPLE = "dhcal convert arm.dh.toml arm.urdf"
 
@@ -15,18 +17,45 @@ def add_arguments(parser: ArgumentParser) -> None:
     Args:
         parser: Parser of the command.
     """
-    parser.add_argument("input", metavar="IN", help=ROBOT["help"])
     parser.add_argument(
-        "output", metavar="OUT", help="file to write; its ending selects the format: {written_formats}"
+        "input",
+        metavar="IN",
+        type=ROBOT["type"],
+        help=f"{ROBOT['help']}; or a recording: .bag, .mcap, or the folder of a ROS 2 bag",
     )
-    parser.add_argument("--tip", **TIP)
+    parser.add_argument(
+        "output",
+        metavar="OUT",
+        help="file to write; its ending selects the format: {written_formats}; of a recording, a measurement "
+        "file (.csv)",
+    )
+    add_urdf_options(parser)
     parser.add_argument(
         "--convention", choices=("standard", "modified"), help="DH convention of the file to write"
+    )
+    parser.add_argument(
+        "--pose-topic",
+        metavar="TOPIC",
+        help="topic of the measured poses or points of a recording, TOPIC:FRAME for a child frame of "
+        "transforms; without it the candidates are listed",
+    )
+    parser.add_argument(
+        "--joint-topic",
+        metavar="TOPIC",
+        help="topic of the joint positions of a recording (default: the only one of its type, or "
+        "/joint_states)",
+    )
+    parser.add_argument(
+        "--robot",
+        **{
+            **ROBOT,
+            "help": "write the joints of this robot only; needed for prismatic joints of a recording",
+        },
     )
 
 
 def run(args: Namespace) -> int:
-    """Convert a robot file to the format that the ending of the output selects.
+    """Convert a robot file to the format that the ending of the output selects, or a recording.
 
     Args:
         args: Parsed arguments.
@@ -34,13 +63,41 @@ def run(args: Namespace) -> int:
     Returns:
         Exit status 0.
     """
-    from ..io.robot import convert_robot  # lazy import, as the following: they load Pinocchio
+    from ..io.measurement_files.bag import is_bag  # lazy import, as the following: they load Pinocchio
     from . import console
     from .outputs import require_writable_outputs, write_outputs
 
-    require_writable_outputs([args.output], [args.input])
-    text, notes = convert_robot(args.input, args.output, args.tip, args.convention)
+    robots = [args.robot] if args.robot else []
+    require_writable_outputs([args.output], [args.input, *robots])
+    text, notes = (_convert_bag if is_bag(args.input) else _convert_robot)(args)
     write_outputs({args.output: text})
     console.print_lines(f"wrote {args.output}")
     console.print_notes(notes)
     return 0
+
+
+def _convert_robot(args: Namespace) -> tuple[str, Sequence[str]]:
+    """Return the text of a robot in another format, and notes on it."""
+    from ..io.robot import convert_robot  # lazy import: loads Pinocchio
+
+    for option, value in (("--pose-topic", args.pose_topic), ("--joint-topic", args.joint_topic)):
+        if value:
+            raise InvalidArgumentError(
+                f"{option}: {args.input} is no recording; expected .bag, .mcap or a folder"
+            )
+    if args.robot:
+        raise InvalidArgumentError("--robot: only for a recording; omit it")
+    return convert_robot(args.input, args.output, args.tip, args.convention)
+
+
+def _convert_bag(args: Namespace) -> tuple[str, Sequence[str]]:
+    """Return the text of the stops of a recording, and notes on them."""
+    from ..io import read_robot  # lazy import, as the following: they load Pinocchio
+    from ..io.measurement_files.bag import convert_bag
+
+    if not args.output.lower().endswith(".csv"):
+        raise InvalidArgumentError(f"{args.output}: a recording becomes a measurement file; expected .csv")
+    if args.convention:
+        raise InvalidArgumentError("--convention: a recording has none; omit it")
+    chain = read_robot(args.robot, args.tip, package_dirs=args.package_dir) if args.robot else None
+    return convert_bag(args.input, args.pose_topic, args.joint_topic, chain)

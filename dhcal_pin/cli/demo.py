@@ -45,21 +45,21 @@ def run(args: Namespace) -> int:
         Exit status 0.
     """
     from . import console  # lazy import, as the following: they load Pinocchio
-    from .outputs import require_writable_outputs, write_outputs
+    from .outputs import require_writable_outputs
 
     require_writable_outputs([args.json], [])
-    document = run_demo(args.out)
-    write_outputs({}, args.json, document)
+    document = run_demo(args.out, args.json)
     if args.open:
         console.open_page(document["files"]["report"])
     return 0
 
 
-def run_demo(folder: PathLike) -> dict[str, Any]:
+def run_demo(folder: PathLike, json_target: str | None = None) -> dict[str, Any]:
     """Run experiment and simulations, show the results and write all files.
 
     Args:
         folder: Folder for the files; created if it does not exist.
+        json_target: Path of a further JSON file, or `-` for standard output.
 
     Returns:
         JSON document of the experiment.
@@ -79,7 +79,8 @@ def run_demo(folder: PathLike) -> dict[str, Any]:
     except OSError as error:
         raise InvalidArgumentError(f"{folder}: cannot create this folder: {error.strerror}") from error
     experiment = run_experiment()
-    console.print_unreachable_rows("Table 5", experiment.unreachable_rows)
+    for item in experiment.unreachable_rows:
+        console.print_lines(f"Table 5: row {item.row} is excluded: {item.reason}", style="yellow")
     header = ["position RMS in mm", "fitted", "leave-one-out"]
     sections = [
         _Section(
@@ -100,7 +101,7 @@ def run_demo(folder: PathLike) -> dict[str, Any]:
         )
     )
     _print_section(sections[-1])
-    document = _write_results(experiment, folder, sections)
+    document = _write_results(experiment, folder, sections, json_target)
     console.print_lines("", *(f"wrote {path}" for path in document["files"].values()))
     return document
 
@@ -143,7 +144,9 @@ def experiment_remarks(experiment: PaperExperiment) -> list[str]:
     ]
 
 
-def _write_results(experiment: PaperExperiment, folder: str, sections: Sequence[_Section]) -> dict[str, Any]:
+def _write_results(
+    experiment: PaperExperiment, folder: str, sections: Sequence[_Section], json_target: str | None
+) -> dict[str, Any]:
     """Write URDFs, JSON, summary, scene and report; return the JSON document."""
     from ..formatting import markdown_table  # lazy import, as the following: they load Pinocchio
     from ..io import shipped_file, urdf_files
@@ -179,7 +182,7 @@ def _write_results(experiment: PaperExperiment, folder: str, sections: Sequence[
     summary += [f"Row {row} of Table 5 is excluded: {reason}." for row, reason in excluded.items()]
     for section in sections:
         summary += [f"## {section.title}", markdown_table(section.table), *section.remarks]
-    contents: dict[PathLike, str | bytes] = {
+    contents: dict[PathLike, str | bytes | None] = {
         **urdf_files(experiment.fit.chain, files["urdf"]),
         files["nominal"]: experiment.chain.urdf.data,
         **html.report_files(experiment.fit, [files["report"]], source),
@@ -189,5 +192,5 @@ def _write_results(experiment: PaperExperiment, folder: str, sections: Sequence[
         files["json"]: json_text(document),
         files["summary"]: "\n\n".join([*summary, ""]),
     }
-    write_outputs(contents)
+    write_outputs(contents, json_target, document)
     return document

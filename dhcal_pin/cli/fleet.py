@@ -23,7 +23,7 @@ import os
 import signal
 from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import Field, dataclass, field, fields
 from typing import Any
@@ -34,13 +34,16 @@ from ..io.robot import robot_name
 from ..io.sidecar import sidecar_path
 from ..io.tabular import csv_text
 from ..io.toml_table import TomlTable
+from ..messages import message_line
+from ..parallel import end_with_parent
+from ..ros_packages import resolve_robot_path
 from . import console
 from .job import Job, option_flags
 from .options import STDOUT, IntegerType
-from .outputs import require_writable_outputs, write_outputs
+from .outputs import forget_written_files, require_writable_outputs, write_outputs, written_files
 from .run_job import run_job
 
-OK, NOT_CONVERGED, FAILED = "ok", "not converged", "failed"
+OK, REFUSED, FAILED = "ok", "refused", "failed"
 
 
 @dataclass(frozen=True)
@@ -61,8 +64,8 @@ class FleetJobOutcome:
     """Outcome of one job of a manifest.
 
     Attributes:
-        status: "ok", "not converged" (its files are written nevertheless) or "failed".
-        message: Reason of the failure, or warnings about the input.
+        status: "failed", or the verdict on the calibration: "ok", "caution" or "refused".
+        message: Reason of the failure, or reasons of the verdict and warnings about the input.
         document: JSON document as of `dhcal calibrate`; empty if the job failed.
     """
 
@@ -112,6 +115,7 @@ def read_fleet(path: PathLike) -> list[FleetJob]:
                 raise FileFormatError(
                     f"{job_table.where}: {key} is missing; every [[job]] needs robot, data and output"
                 )
+        options["robot"] = resolve_robot_path(options["robot"])
         job = Job(**options)
         entries.append(FleetJob(str(name or robot_name(job.robot)), job))
     _require_distinct_files(entries, path)
@@ -176,7 +180,7 @@ def _real_path(folder: str, path: str) -> str:
 
 def _output_paths(job: Job) -> list[str]:
     """List the files that a job writes."""
-    paths = (job.output, sidecar_path(job.output), job.map, job.json, *job.report)
+    paths = (job.output, sidecar_path(job.output), job.map, job.curves, job.json, job.residuals, *job.report)
     return [path for path in paths if path]
 
 
@@ -226,8 +230,9 @@ def run_fleet(
         # Spawn instead of fork: forking a process that has threads can block forever.
         context = multiprocessing.get_context("spawn")
         pool = ProcessPoolExecutor(count, context, initializer=_initialize_process, initargs=(folder,))
+        futures: dict[Future[FleetJobOutcome], int] = {}
         try:
-            futures = {pool.submit(_run_in_process, runner, entries[index].job): index for index in indices}
+            futures |= {pool.submit(_run_in_process, runner, entries[index].job): index for index in indices}
             for future in as_completed(futures):
                 index = futures[future]
                 try:
@@ -238,6 +243,11 @@ def run_fleet(
                     on_done(index, outcomes[index])
         finally:
             pool.shutdown(cancel_futures=True)
+            # After an interrupt, the jobs that were running have still ended and may have written files.
+            for future, index in futures.items():
+                if index not in outcomes and not future.cancelled() and future.exception() is None:
+                    outcomes[index] = future.result()
+                    on_done(index, outcomes[index])
         return lost
 
     for index in sorted(run_in_pool(range(len(entries)), min(n_processes, len(entries)))):
@@ -250,24 +260,30 @@ def run_fleet(
 
 def _initialize_process(folder: str) -> None:
     """Change to the folder of the manifest; between jobs the process ignores interrupts."""
+    end_with_parent()
     os.chdir(folder)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _run_in_process(runner: JobRunner, job: Job) -> FleetJobOutcome:
     """Run one job and convert its errors to an outcome; an interrupt ends only this job."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    forget_written_files()
     try:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         document = runner(job)
-        warnings = "; ".join(f"warning: {text}" for text in document.get("warnings", []))
-        return FleetJobOutcome(OK if document["converged"] else NOT_CONVERGED, warnings, document)
+        verdict = document["verdict"]
+        notes = [*verdict["reasons"], *(f"warning: {text}" for text in document.get("warnings", []))]
+        return FleetJobOutcome(verdict["status"], "; ".join(notes), document)
     except DhcalError as error:
-        return FleetJobOutcome(FAILED, " ".join(str(error).split()))
+        return FleetJobOutcome(FAILED, message_line(error))
     except KeyboardInterrupt:
-        return FleetJobOutcome(FAILED, "interrupted; nothing written")
+        written = ", ".join(written_files())
+        what = f"these files are written: {written}" if written else "nothing written"
+        return FleetJobOutcome(FAILED, f"interrupted; {what}")
     except Exception as error:  # A defect that one job reveals must not lose the results of the others.
-        text = " ".join(str(error).split())
-        return FleetJobOutcome(FAILED, f"{type(error).__name__}: {text}; please report this error")
+        return FleetJobOutcome(
+            FAILED, f"{type(error).__name__}: {message_line(error)}; please report this error"
+        )
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
@@ -299,7 +315,7 @@ def run_manifest(args: Namespace) -> int:
         args: Parsed arguments of `dhcal calibrate`.
 
     Returns:
-        Exit status: 0 all jobs done, 1 a job failed, 130 interrupted.
+        Exit status: 0 all jobs done, 1 a job failed or was refused without `force`, 130 interrupted.
     """
     _require_manifest_arguments(args)
     entries = read_fleet(args.robot)
@@ -310,7 +326,7 @@ def run_manifest(args: Namespace) -> int:
     def show(index: int, outcome: FleetJobOutcome) -> None:
         nonlocal n_done
         n_done += 1
-        style = {OK: "", FAILED: "red"}.get(outcome.status, "yellow")
+        style = {OK: "", REFUSED: "red", FAILED: "red"}.get(outcome.status, "yellow")
         counter = f"{n_done:{len(str(total))}} of {total}"
         line = f"{counter}  {entries[index].name:{width}}  {_outcome_text(outcome)}"
         console.print_lines(line, style=style)
@@ -319,14 +335,21 @@ def run_manifest(args: Namespace) -> int:
 
     try:
         outcomes = run_fleet(entries, args.robot, _run_one, args.jobs or os.cpu_count() or 1, show)
+        contents: dict[PathLike, str | bytes | None] = {args.output: summary_text(entries, outcomes)}
+        write_outputs(contents, args.json, _fleet_document(entries, outcomes))
     except KeyboardInterrupt:
+        if written_files():
+            raise
         console.print_lines(f"dhcal: interrupted; {n_done} of {total} robots are done; no summary written")
         return 130
-    contents: dict[PathLike, str | bytes] = {args.output: summary_text(entries, outcomes)}
-    write_outputs(contents, args.json, _fleet_document(entries, outcomes))
-    n_failed = sum(outcome.status == FAILED for outcome in outcomes)
-    console.print_lines(f"{total - n_failed} of {total} robots calibrated", f"wrote {args.output}")
-    return 1 if n_failed else 0
+    n_written = sum(map(_is_written, outcomes))
+    console.print_lines(f"{n_written} of {total} robots calibrated", f"wrote {args.output}")
+    return 0 if n_written == total else 1
+
+
+def _is_written(outcome: FleetJobOutcome) -> bool:
+    """Return whether a corrected robot was written: neither failed nor refused, or refused but forced."""
+    return "urdf" in outcome.document.get("files", {})
 
 
 def _require_manifest_arguments(args: Namespace) -> None:
@@ -394,4 +417,5 @@ def _fleet_document(entries: Sequence[FleetJob], outcomes: Sequence[FleetJobOutc
         | {"status": outcome.status, "message": outcome.message, "result": outcome.document or None}
         for entry, outcome in zip(entries, outcomes, strict=True)
     ]
-    return {"robots": len(jobs), "failed": sum(job["status"] == FAILED for job in jobs), "jobs": jobs}
+    count = {status: sum(job["status"] == status for job in jobs) for status in (FAILED, REFUSED)}
+    return {"robots": len(jobs), **count, "jobs": jobs}

@@ -25,16 +25,21 @@ from .options import (
     FREE,
     INSTRUMENT,
     JSON,
+    MEND,
     NON_NEGATIVE_INTEGER,
+    PACKAGE_DIR,
     PARAMETERS,
     POSITIVE_INTEGER,
     ROBOT,
+    SKIP_BAD_ROWS,
     TIP,
 )
 
 if TYPE_CHECKING:
     from ..calibration import Method
 
+# Value of --holdout for regions of joint space that are left out in turn.
+REGION = "region"
 # File extension of a manifest of several jobs.
 MANIFEST_ENDING = ".fleet.toml"
 
@@ -47,6 +52,7 @@ class Job:
         metadata={
             "flags": ("robot",),
             "metavar": "ROBOT",
+            "type": ROBOT["type"],
             "help": f"{ROBOT['help']}; or a manifest of several robots, NAME{MANIFEST_ENDING}",
         }
     )
@@ -68,14 +74,17 @@ class Job:
         }
     )
     tip: str | None = field(default=None, metadata=TIP)
+    package_dir: tuple[str, ...] = field(default=(), metadata=PACKAGE_DIR)
     columns: str | None = field(default=None, metadata=COLUMNS)
+    skip_bad_rows: bool = field(default=False, metadata=SKIP_BAD_ROWS)
+    mend: tuple[str, ...] = field(default=(), metadata=MEND)
     parameters: str | None = field(default=None, metadata=PARAMETERS)
     extend: str = field(
-        default="none",
+        default="auto",
         metadata={
             "metavar": "auto|none|FAMILY[,FAMILY]",
-            "help": "joint error families to add if they reduce the cross-validated error: auto (try all), "
-            "none (default), or some of {error_families}",
+            "help": "joint error families to add if the measurements support them: auto (try all; default), "
+            "none (geometry only), or some of {error_families}",
         },
     )
     fix: str = field(default="", metadata=FIX)
@@ -83,9 +92,10 @@ class Job:
     holdout: str | None = field(
         default=None,
         metadata={
-            "metavar": "FRACTION|FILE",
+            "metavar": f"FRACTION|FILE|{REGION}",
             "help": "hold-out data, excluded from the fit to measure the accuracy: a fraction such as 0.3, "
-            "or a measurement file",
+            f"or a measurement file; {REGION}: fit all data, and repeat the calibration without each region "
+            "of joint space",
         },
     )
     method: Method = field(
@@ -155,6 +165,10 @@ class Job:
             "help": "write the tool pose into the URDF, as a link of this name fixed to the tip",
         },
     )
+    force: bool = field(
+        default=False,
+        metadata={"help": "write the corrected robot even if the calibration is refused"},
+    )
     report: tuple[str, ...] = field(
         default=(),
         metadata={
@@ -164,6 +178,23 @@ class Job:
         },
     )
     json: str | None = field(default=None, metadata={**JSON, "is_output": True})
+    curves: str | None = field(
+        default=None,
+        metadata={
+            "metavar": "CURVES.csv",
+            "help": "write joint corrections for controllers that accept a table: joint, value and the angle "
+            "to add to it before it is commanded, in steps of 1 degree (.csv)",
+            "is_output": True,
+        },
+    )
+    residuals: str | None = field(
+        default=None,
+        metadata={
+            "metavar": "R.csv",
+            "help": "write the residuals of all measurements with their files and lines (.csv)",
+            "is_output": True,
+        },
+    )
     map: str | None = field(
         default=None,
         metadata={
@@ -207,7 +238,8 @@ class Job:
             value = getattr(self, option.name)
             flag = option_flags(option)[-1]
             if flag.startswith("-") and not option.metadata.get("is_output") and value != option.default:
-                words += [flag] if value is True else [flag, names.get(str(value), str(value))]
+                for item in value if isinstance(value, tuple) else (value,):
+                    words += [flag] if item is True else [flag, names.get(str(item), str(item))]
         return shlex.join(words)
 
 

@@ -10,6 +10,7 @@ from importlib import import_module
 from typing import Any, NamedTuple, NoReturn
 
 from ..exceptions import DhcalError
+from ..messages import message_line
 from .options import CommandParser, HelpFormatter
 
 
@@ -30,8 +31,9 @@ class Command(NamedTuple):
 COMMANDS = (
     Command("demo", "demo", "reproduce the experiment and the simulations of the paper"),
     Command("calibrate", "calibrate", "estimate the errors of a robot and write the corrected URDF"),
+    Command("inspect", "inspect", "say what measurement files contain, without a fit"),
     Command("validate", "validate", "compute the accuracy of a robot model on measurements"),
-    Command("convert", "convert", "convert a robot file to another format"),
+    Command("convert", "convert", "convert a robot file to another format, or a bag of ROS to measurements"),
     Command("view", "view", "show the nominal and the calibrated robot on one offline web page"),
     Command("check", "check", "compare the Jacobian with the paper, Pinocchio and finite differences"),
     Command("plan", "plan", "choose the poses to measure and predict the resulting accuracy"),
@@ -112,20 +114,31 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Words of the command line; those of this process by default.
 
     Returns:
-        Exit status: 0 done, 1 a check or a robot of a manifest failed, 2 invalid input, 130 interrupted.
+        Exit status: 0 done, 1 a check or a robot of a manifest failed, 2 invalid input, 3 a calibration was
+        refused, 130 interrupted.
     """
-    args = build_parser().parse_args(argv)
-    # The matrices are small and narrow: more BLAS threads only wait. BLAS reads these when NumPy is loaded.
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
     try:
+        args = build_parser().parse_args(argv)
+        # The matrices are small: more BLAS threads only wait. BLAS reads these when NumPy is loaded.
+        for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+            os.environ.setdefault(name, "1")
+        if (outputs := _outputs_module()) is not None:
+            outputs.forget_written_files()
         return args.run(args)
     except DhcalError as error:
-        print(f"dhcal: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"dhcal: {message_line(error)}", file=sys.stderr)
         return 2
     except MemoryError:
         print("dhcal: not enough memory; use fewer samples", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("dhcal: interrupted; nothing written", file=sys.stderr)
+        outputs = _outputs_module()
+        written = ", ".join(outputs.written_files()) if outputs is not None else ""
+        what = f"these files are written: {written}" if written else "nothing written"
+        print(f"dhcal: interrupted; {message_line(what)}", file=sys.stderr)
         return 130
+
+
+def _outputs_module() -> Any:
+    """Return the module of output files if it is loaded; loading it here would take as long as a command."""
+    return sys.modules.get(f"{__package__}.outputs")

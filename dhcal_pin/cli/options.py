@@ -18,6 +18,8 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
+from ..messages import message_line
+
 if TYPE_CHECKING:
     from ..io.robot_format import RobotFormat
 
@@ -41,7 +43,12 @@ def split_commas(text: str) -> list[str]:
 
 
 class CommandParser(argparse.ArgumentParser):
-    """Argument parser that reports an error in one line."""
+    """Argument parser that reports an error in one line and takes -300mm and -1,2,3mm as values."""
+
+    def __init__(self, *args: Any, **options: Any):
+        super().__init__(*args, **options)
+        # argparse takes a word with a minus sign for a value only if this pattern matches it.
+        self._negative_number_matcher = re.compile(r"-\.?\d")
 
     def error(self, message: str) -> NoReturn:
         """Print one line to stderr and exit with status 2.
@@ -49,7 +56,7 @@ class CommandParser(argparse.ArgumentParser):
         Args:
             message: Description of the error.
         """
-        print(f"{self.prog}: {' '.join(message.split())}; see {self.prog} --help", file=sys.stderr)
+        print(f"{self.prog}: {message_line(message)}; see {self.prog} --help", file=sys.stderr)
         sys.exit(2)
 
 
@@ -109,12 +116,54 @@ POSITIVE_INTEGER = IntegerType(1)
 NON_NEGATIVE_INTEGER = IntegerType(0)
 
 
+def robot_path(text: str) -> str:
+    """Return the path of a robot file; `example:NAME` is a robot of example-robot-data.
+
+    Args:
+        text: Word of the command line.
+
+    Returns:
+        Path of the file, which need not exist.
+
+    Raises:
+        ArgumentTypeError: There is no such robot.
+    """
+    from ..exceptions import UnknownNameError  # lazy import, as the following: only for robots
+    from ..ros_packages import resolve_robot_path
+
+    try:
+        return resolve_robot_path(text)
+    except UnknownNameError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
 # --- shared options --------------------------------------------------------------------------------
 
-ROBOT: dict[str, Any] = {"metavar": "ROBOT", "help": "robot: {robot_formats}"}
-DATA: dict[str, Any] = {"metavar": "DATA", "nargs": "+", "help": "measurement CSV files"}
+ROBOT: dict[str, Any] = {
+    "metavar": "ROBOT",
+    "type": robot_path,
+    "help": "robot: {robot_formats}, or example:NAME",
+}
+DATA: dict[str, Any] = {
+    "metavar": "DATA",
+    "nargs": "+",
+    "help": "measurement files: text such as CSV, Excel, Parquet",
+}
 TIP: dict[str, Any] = {"metavar": "LINK", "help": "tip link of a URDF (default: the deepest leaf link)"}
+PACKAGE_DIR: dict[str, Any] = {
+    "metavar": "DIR",
+    "help": "folder with the packages of meshes, or of one package; may be repeated (also searched: the "
+    "folders above the URDF, ROS_PACKAGE_PATH, AMENT_PREFIX_PATH)",
+}
 COLUMNS: dict[str, Any] = {"metavar": "MAP.toml", "help": "column map of files in another layout"}
+SKIP_BAD_ROWS: dict[str, Any] = {
+    "help": "skip rows that lack a number or a name, instead of an error that lists them"
+}
+MEND: dict[str, Any] = {
+    "metavar": "CHANGE",
+    "help": "undo a mistake in the measurements, as a refused calibration names it, such as "
+    "sign:elbow_joint; CHANGE@FILE for one of several files; may be repeated",
+}
 JSON: dict[str, Any] = {"metavar": "FILE", "help": "write the result as JSON; - for stdout"}
 PARAMETERS: dict[str, Any] = {
     "metavar": "SET[,SET]",
@@ -134,6 +183,40 @@ SCHEDULER: dict[str, Any] = {
     "metavar": "ADDRESS",
     "help": "run on the Dask cluster of this scheduler, such as tcp://host:8786",
 }
+
+
+def add_urdf_options(parser: argparse.ArgumentParser) -> None:
+    """Add --tip and --package-dir, the options of every command that reads a URDF.
+
+    Args:
+        parser: Parser of a command.
+    """
+    parser.add_argument("--tip", **TIP)
+    parser.add_argument("--package-dir", action="append", default=[], **PACKAGE_DIR)
+
+
+def add_motion_options(parser: argparse.ArgumentParser, joint_units: str) -> None:
+    """Add --joint-units and --export, the options of commands that write joint positions.
+
+    Args:
+        parser: Parser of a command.
+        joint_units: Default units, "deg" or "rad".
+    """
+    parser.add_argument(
+        "--joint-units",
+        choices=("deg", "rad"),
+        default=joint_units,
+        help="units of the joint positions: deg (degrees and millimetres) or rad (radians and metres) "
+        "(default: %(default)s)",
+    )
+    parser.add_argument(
+        "--export",
+        metavar="FILE",
+        action="append",
+        default=[],
+        help="program for a controller: .script (URScript), .trajectory.csv (joint trajectory in s and rad) "
+        "or .robodk.csv (joint positions and tool poses in deg and mm); may be repeated",
+    )
 
 
 def add_execution_options(parser: argparse.ArgumentParser, jobs_help: str, jobs: int | None) -> None:
@@ -164,9 +247,10 @@ def _parameter_sets() -> str:
 
 
 def _error_families() -> str:
-    from ..robot.error_families import FAMILIES  # lazy import: only for help
+    from ..estimation.parameters import EXTENSIONS  # lazy import: loads Pinocchio
+    from ..robot.error_families import FAMILIES
 
-    return "; ".join(f"{family.name} ({family.description})" for family in FAMILIES.values())
+    return "; ".join(f"{name} ({FAMILIES[name].description})" for name in EXTENSIONS)
 
 
 def _losses() -> str:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 
 from .._typing import PathLike
-from ..exceptions import InvalidArgumentError
-from ..io.atomic import require_writable, write_files
+from ..exceptions import FileFormatError, InvalidArgumentError
 from ..io.sidecar import existing_sidecar
 from ..report.document import json_text
+from ..saving import defer_signals, is_stream, require_writable, write_files
 from .options import STDOUT
 
 
@@ -43,7 +45,8 @@ def require_writable_outputs(outputs: Sequence[str | None], inputs: Sequence[str
     for number, path in enumerate(paths):
         if any(is_same_file(path, other) for other in inputs):
             raise InvalidArgumentError(f"{path}: is an input file; choose another output path")
-        if any(is_same_file(path, other) for other in paths[:number]):
+        # Several outputs may go to one device, such as /dev/null.
+        if not is_stream(path) and any(is_same_file(path, other) for other in paths[:number]):
             raise InvalidArgumentError(f"{path}: is another output already; choose a different path for each")
         require_writable(path)
 
@@ -85,17 +88,65 @@ def json_path(target: str | None) -> str | None:
     return target if target != STDOUT else None
 
 
+# Files that this process has written for the current command, for the message after an interrupt.
+_written: list[str] = []
+
+
+def forget_written_files() -> None:
+    """Start a new command in this process."""
+    _written.clear()
+
+
+def written_files() -> list[str]:
+    """Return the paths of the files that the current command has written."""
+    return list(_written)
+
+
 def write_outputs(
-    contents: Mapping[PathLike, str | bytes], json_target: str | None = None, document: object = None
+    contents: Mapping[PathLike, str | bytes | None],
+    json_target: str | None = None,
+    document: object = None,
 ) -> None:
-    """Write the files of a command, all or none, and its JSON.
+    """Write all outputs of a command, all or none.
 
     Args:
-        contents: Content of each file, by path.
+        contents: Content of each file, by path; None removes a file.
         json_target: Path of the JSON file, or `-` to print it alone on stdout; none by default.
         document: Content of the JSON.
     """
-    path = json_path(json_target)
-    write_files({**contents, path: json_text(document)} if path else contents)
-    if json_target == STDOUT:
-        sys.stdout.write(json_text(document))
+    if path := json_path(json_target):
+        contents = {**contents, path: json_text(document)}
+
+    def print_json() -> None:
+        print_to_stdout(json_text(document))
+
+    # An interrupt waits until the files are noted as written.
+    with defer_signals():
+        write_files(contents, print_json if json_target == STDOUT else None)
+        _written.extend(os.fspath(path) for path, content in contents.items() if content is not None)
+
+
+def print_to_stdout(text: str) -> None:
+    """Print a JSON text and nothing else on standard output.
+
+    Args:
+        text: JSON text.
+
+    Raises:
+        FileFormatError: Nobody reads standard output any more, or its disk is full.
+    """
+    try:
+        try:
+            sys.stdout.write(text)
+        except UnicodeEncodeError:
+            # Standard output has another encoding; JSON can escape all characters.
+            sys.stdout.write(json.dumps(json.loads(text), indent=2) + "\n")
+        sys.stdout.flush()
+    except OSError as error:
+        # Python would try to write the rest when it ends, and print a traceback.
+        with suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise FileFormatError(
+            f"standard output: cannot write the JSON: {error.strerror}; no file is written; name a file with "
+            "--json"
+        ) from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING, Any
@@ -17,19 +18,24 @@ from .options import (
     PARAMETERS,
     POSITIVE_INTEGER,
     ROBOT,
-    TIP,
+    add_motion_options,
+    add_urdf_options,
     split_commas,
 )
 
 if TYPE_CHECKING:
     from .._typing import Array, PathLike
     from ..planning import Plan
-    from ..robot import Chain, WorkspaceConstraints
+    from ..programs import Program
+    from ..robot import Chain, Obstacle, WorkspaceConstraints
 
 EXAMPLE = "dhcal plan ur10.urdf -n 40 --tip tool0 --sigma 0.1mm,0.01deg -o poses.csv"
 
 # Standard deviation of a laser tracker and a precise robot, used without --sigma and --data.
 _DEFAULT_SIGMA = "0.1mm,0.01deg"
+
+# Decimals of joint positions in degrees and millimetres: 0.36 arc seconds.
+_DEGREE_DECIMALS = 4
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 
@@ -51,7 +57,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         required=True,
         help="joint values to write, ordered as a short tour",
     )
-    parser.add_argument("--tip", **TIP)
+    add_urdf_options(parser)
     parser.add_argument(
         "--kind",
         metavar="KIND",
@@ -103,6 +109,21 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--box", metavar="X,Y,Z:X,Y,ZUNIT", help="allowed box of the tool in the measuring frame"
     )
     parser.add_argument(
+        "--floor",
+        metavar="HEIGHT|none",
+        default="0mm",
+        help="height of the floor above the root link, which the robot stays above (default: %(default)s); "
+        "none for a robot without a floor, such as one on a ceiling",
+    )
+    parser.add_argument(
+        "--obstacle",
+        metavar="SCENE.urdf|X,Y,Z:X,Y,ZUNIT",
+        action="append",
+        default=[],
+        help="obstacle in the frame of the root link: the collision shapes of a URDF, or a box; may be "
+        "repeated",
+    )
+    parser.add_argument(
         "--visible-from",
         metavar="X,Y,ZUNIT",
         help="position of the instrument; its line of sight to the tool must be free",
@@ -126,6 +147,8 @@ def add_arguments(parser: ArgumentParser) -> None:
         default=0,
         help="random seed of the candidates (default: %(default)s)",
     )
+    add_motion_options(parser, "deg")
+    parser.add_argument("--html", metavar="FILE", help="page with a preview of the poses and the moves")
     parser.add_argument("--json", **JSON)
 
 
@@ -140,11 +163,11 @@ def run(args: Namespace) -> int:
     """
     import numpy as np  # lazy import, as the following: they are slow to load
 
-    from ..io import read_measurement_file, read_priors, read_robot
-    from ..io.measurement_csv import configurations_text, read_configurations
+    from ..io import configurations_text, read_configurations, read_measurement_file, read_priors, read_robot
     from ..io.sidecar import existing_sidecar, read_instrument, read_uncertainty
     from ..measurements import Noise
     from ..planning import plan
+    from ..programs import program_text, require_program_ending
     from ..report.document import file_digests, versions
     from ..units import parse_noise
     from . import console
@@ -153,11 +176,14 @@ def run(args: Namespace) -> int:
     files = [
         *(args.data or []),
         *filter(None, (args.candidates_from, args.task, args.columns, args.instrument)),
+        *filter(_is_scene, args.obstacle),
     ]
     priors = [args.priors] if args.priors not in (None, "default") else []
     inputs = [args.robot, *existing_sidecars([args.robot]), *files, *priors]
-    require_writable_outputs([args.output, args.json], inputs)
-    chain = read_robot(args.robot, args.tip)
+    require_writable_outputs([args.output, args.json, args.html, *args.export], inputs)
+    for path in args.export:
+        require_program_ending(path)
+    chain = read_robot(args.robot, args.tip, package_dirs=args.package_dir)
     space = _workspace_constraints(args)
     candidates: int | Array = args.candidates
     if args.candidates_from:
@@ -188,6 +214,7 @@ def run(args: Namespace) -> int:
             seed=args.seed,
         )
     noise = result.information.noise
+    moves = move_texts(result)
     comments = [
         f"{args.count} poses to measure ({args.kind}, criterion {result.criterion}), as a short tour",
         f"predicted position error {1e3 * result.error:.4g} mm RMS with standard deviation "
@@ -195,24 +222,133 @@ def run(args: Namespace) -> int:
     ]
     document = _plan_document(result, args)
     document |= {"inputs": file_digests(inputs), "versions": versions()}
-    write_outputs({args.output: configurations_text(result.q, chain, comments)}, args.json, document)
+    decimals = _DEGREE_DECIMALS if args.joint_units == "deg" else None
+    text = configurations_text(result.q, chain, [*comments, *moves], args.joint_units, decimals)
+    contents: dict[PathLike, str | bytes] = {args.output: text}
+    for path in args.export:
+        contents[path] = program_text(_program(result, chain), path)
+    if args.html:
+        contents[args.html] = _preview(result, chain, space, args)
+    write_outputs(contents, args.json, document)
     console.print_plan(result)
-    console.print_lines(f"wrote {args.output}")
+    is_free = all(result.is_way_free)
+    console.print_lines(*moves, style="" if is_free else "yellow")
+    console.print_lines(*(f"wrote {path}" for path in contents))
     return 0
 
 
+def move_texts(result: Plan) -> list[str]:
+    """Describe the moves between the poses of a plan.
+
+    Args:
+        result: Plan.
+
+    Returns:
+        Sentences; none if there is nothing to collide with.
+    """
+    if not result.is_way_free:
+        return []
+    blocked = [str(i) for i, is_free in enumerate(result.is_way_free, 1) if not is_free]
+    with_way_points = [str(i) for i, way in enumerate(result.ways, 1) if len(way)]
+    texts = []
+    if with_way_points:
+        listed = ", ".join(with_way_points)
+        texts.append(f"Way points lead around collisions to poses {listed} (--export, --html).")
+    if blocked:
+        texts.append(f"The straight moves to poses {', '.join(blocked)} collide; no way around was found.")
+    return texts or ["The straight moves in joint space from pose to pose are free of collisions."]
+
+
+def _program(result: Plan, chain: Chain) -> Program:
+    """Create the program that visits the poses."""
+    from dataclasses import replace  # lazy import, as the following: they are slow to load
+
+    import numpy as np
+
+    from ..programs import Program, Stop
+
+    poses = replace(chain, base=np.eye(4)).poses(result.q)
+    is_checked = bool(result.is_way_free)
+    stops = [
+        Stop(f"pose {i + 1}", q, pose, tuple(way), not is_checked or result.is_way_free[i])
+        for i, (q, pose, way) in enumerate(zip(result.q, poses, result.ways, strict=True))
+    ]
+    warning = (
+        "The move to pose 1 is not checked for collisions; the others are checked against the model."
+        if is_checked
+        else "The moves are not checked for collisions."
+    )
+    return Program(chain, "poses to measure, by dhcal plan", warning, stops)
+
+
+def _preview(result: Plan, chain: Chain, space: WorkspaceConstraints, args: Namespace) -> str:
+    """Return the page that shows the poses, the path, floor and obstacles."""
+    import numpy as np  # lazy import, as the following: they are slow to load
+
+    from ..io.robot import robot_name
+    from ..visualization import Preview, scene_html
+
+    path = [part for way, q in zip(result.ways, result.q, strict=True) for part in (way, q[None])]
+    stops = np.cumsum([len(way) + 1 for way in result.ways]) - 1
+    return scene_html(
+        chain,
+        preview=Preview(np.concatenate(path), stops.tolist(), space),
+        title=f"{len(result.q)} poses for {robot_name(args.robot)}",
+    )
+
+
+def _is_scene(obstacle: str) -> bool:
+    """Return whether the value of --obstacle names a file and not a box."""
+    return obstacle.lower().endswith(".urdf") or os.path.exists(obstacle)
+
+
+def _obstacles(args: Namespace) -> list[Obstacle]:
+    """Create the obstacles of --obstacle."""
+    from dataclasses import replace  # lazy import, as the following: they load Pinocchio
+
+    from ..robot import Obstacle, obstacles_from_urdf, read_urdf
+
+    obstacles = []
+    for text in args.obstacle:
+        if _is_scene(text):
+            obstacles += obstacles_from_urdf(replace(read_urdf(text), package_dirs=tuple(args.package_dir)))
+        else:
+            obstacles.append(Obstacle.box(*_parse_box(text, "--obstacle", "a URDF, or corners")))
+    return obstacles
+
+
+def _floor(text: str) -> float | None:
+    """Parse the height of the floor [m]; None without a floor."""
+    from ..units import LENGTHS  # lazy import: slow to load
+
+    if text == "none":
+        return None
+    match = re.fullmatch(rf"\s*({_NUMBER})\s*([a-zµμ]+)\s*", text)
+    if not match or match[2] not in LENGTHS:
+        raise InvalidArgumentError(f"--floor {text}: expected a height with a unit, such as -800mm, or none")
+    return float(match[1]) / LENGTHS[match[2]]
+
+
+def _parse_box(text: str, option: str, expected: str = "corners") -> Array:
+    """Parse the lowest and the highest corner of a box, shape (2, 3) [m]."""
+    import numpy as np  # lazy import: slow to load
+
+    box = _parse_points(text, option, "200,-400,100:900,400,800mm", 2, expected)
+    if not np.all(box[0] < box[1]):
+        raise InvalidArgumentError(
+            f"{option} {text}: the first corner must be below the second in x, y and z"
+        )
+    return box
+
+
 def _workspace_constraints(args: Namespace) -> WorkspaceConstraints:
-    """Create the constraints of the tool from --box, --visible-from and --cone."""
+    """Create the constraints of the robot from --box, --visible-from, --cone, --floor and --obstacle."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
     from ..robot import WorkspaceConstraints
     from ..units import ANGLES
 
-    box = _parse_points(args.box, "--box", "200,-400,100:900,400,800mm", 2) if args.box else None
-    if box is not None and not np.all(box[0] < box[1]):
-        raise InvalidArgumentError(
-            f"--box {args.box}: the first corner must be below the second in x, y and z"
-        )
+    box = _parse_box(args.box, "--box") if args.box else None
     instrument = None
     if args.visible_from:
         instrument = _parse_points(args.visible_from, "--visible-from", "3000,0,1200mm", 1)[0]
@@ -226,10 +362,10 @@ def _workspace_constraints(args: Namespace) -> WorkspaceConstraints:
             raise InvalidArgumentError(
                 f"--cone {args.cone}: invalid half angle; expected at most 180deg, such as 30deg"
             )
-    return WorkspaceConstraints(box, instrument, cone)
+    return WorkspaceConstraints(box, instrument, cone, _floor(args.floor), _obstacles(args))
 
 
-def _parse_points(text: str, option: str, example: str, count: int) -> Array:
+def _parse_points(text: str, option: str, example: str, count: int, expected: str = "x,y,z") -> Array:
     """Parse points, shape (count, 3) [m], from coordinates with one unit at the end."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
@@ -239,7 +375,8 @@ def _parse_points(text: str, option: str, example: str, count: int) -> Array:
     match = re.fullmatch(rf"({point}(?::{point}){{{count - 1}}})([a-zµμ]+)\s*", text)
     if not match or match[2] not in LENGTHS:
         raise InvalidArgumentError(
-            f"{option} {text}: invalid coordinates; expected x,y,z with a unit at the end, such as {example}"
+            f"{option} {text}: invalid coordinates; expected {expected} with a unit at the end, such as "
+            f"{example}"
         )
     return np.array(re.findall(_NUMBER, match[1]), float).reshape(count, 3) / LENGTHS[match[2]]
 
@@ -260,11 +397,10 @@ def read_task(path: PathLike, chain: Chain) -> Array:
     import numpy as np  # lazy import, as the following: they are slow to load
 
     from ..compensation import compensate
-    from ..io import read_targets
-    from ..io.measurement_csv import read_configurations
-    from ..io.tabular import read_csv_table
+    from ..io import read_configurations, read_targets
+    from ..io.tables import read_table
 
-    columns = read_csv_table(path).columns
+    columns = read_table(path).columns
     if any(name in columns for name in chain.joint_names):
         return read_configurations(path, chain)
     targets = read_targets(path, chain)
@@ -297,8 +433,16 @@ def _plan_document(result: Plan, args: Namespace) -> dict[str, Any]:
         "recommended_size": result.recommended_size,
         "curve": _curve(result.sizes, result.errors),
         "random_curve": _curve(result.random_sizes, result.random_errors),
+        "joint_curves": [
+            {"poses": one.n_poses, "filled_share": one.filled_share, "curve_std_rad": one.curve_std}
+            for one in result.curves
+        ],
+        "way_points": {str(i): way.tolist() for i, way in enumerate(result.ways, 1) if len(way)},
+        "blocked_moves": [i for i, is_free in enumerate(result.is_way_free, 1) if not is_free],
         "notes": list(result.notes),
-        "files": {"poses": args.output} | ({"json": path} if path else {}),
+        "files": {"poses": args.output}
+        | ({"json": path} if path else {})
+        | ({"html": args.html} if args.html else {}),
     }
 
 

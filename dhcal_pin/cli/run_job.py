@@ -7,7 +7,7 @@ A job runs in these steps. Invalid input is found before anything is written.
    known; the rest is split into data to fit and hold-out data.
 3. Calibrate, with additional joint error families if requested.
 4. Collect warnings about the data and the choice of parameters, and a hint on error families.
-5. Write URDF, sidecar, report, map and JSON, all or none.
+5. Write URDF, sidecar, report, map and JSON, all or none; of a refused calibration only report and JSON.
 """
 
 from __future__ import annotations
@@ -15,32 +15,37 @@ from __future__ import annotations
 import fnmatch
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from .._typing import PathLike
 from ..calibration import model_selection, partition, procedure, summary
+from ..calibration.cross_validation import leave_regions_out
 from ..calibration.model_selection import FULL_SET, is_restricted
 from ..calibration.result import Result
-from ..diagnostics.input_checks import find_input_warnings, poorly_fitted_files
+from ..diagnostics.curves import find_lattices
+from ..diagnostics.input_checks import find_value_warnings, poorly_fitted_files
 from ..diagnostics.reachability import UnreachableRow, find_unreachable_rows
-from ..estimation.parameters import EXTENSIONS, select_parameters
+from ..estimation.parameters import select_parameters
 from ..estimation.robust import ZERO_WEIGHT
 from ..estimation.solver import Progress
 from ..exceptions import InvalidArgumentError
-from ..io.measurement_csv import read_measurement_file
+from ..io.measurement_files import MeasurementFile, read_measurement_file
 from ..io.robot import read_robot, urdf_files
 from ..io.settings import parse_payload, read_bounds, read_priors
 from ..io.sidecar import read_instrument, sidecar_path
+from ..io.tabular import csv_text
 from ..measurements.base import Measurement
 from ..measurements.position import require_common_reference_target
 from ..parallel import SERIAL, TaskExecutor
+from ..plausibility.hypotheses import mend
 from ..report.document import Provenance, file_digests, result_to_dict, short_names
 from ..robot import urdf_edit
 from ..robot.chain import Chain
-from .job import Job
+from ..robot.correction_table import correction_columns, joint_corrections
+from .job import REGION, Job
 from .options import split_commas
 from .outputs import (
     existing_sidecars,
@@ -49,6 +54,12 @@ from .outputs import (
     require_urdf_ending,
     require_writable_outputs,
     write_outputs,
+)
+
+# Warning about an empty table of --curves.
+NO_CORRECTIONS = (
+    "the table of --curves has no rows, because no joint has harmonics; estimate them with --parameters or "
+    "--extend"
 )
 
 # More parameters are suggested if they reduce the error at least to this fraction.
@@ -67,10 +78,10 @@ class CalibrationOutcome:
         document: The same as a JSON document.
         files: Paths of the files written, by what they are.
         unreachable: Rows that the robot cannot reach, by measurement file; excluded from everything.
-        outliers: Row numbers of outliers, by measurement file.
-        rejected: Row numbers with zero weight in the fit, by measurement file.
+        outliers: Lines of outliers, by measurement file.
+        rejected: Lines with zero weight in the fit, by measurement file.
         warnings: Warnings about the input, by file.
-        trials: Effect of each error family of --extend.
+        notes: What of the input is not used, by file.
         hint: Suggestion to use --extend; empty if there is none.
     """
 
@@ -81,14 +92,14 @@ class CalibrationOutcome:
     outliers: dict[str, list[int]]
     rejected: dict[str, list[int]]
     warnings: dict[str, list[str]]
-    trials: tuple[model_selection.FamilyTrial, ...]
+    notes: dict[str, list[str]]
     hint: str
 
 
 def run_job(
     job: Job, progress: Progress | None = None, executor: TaskExecutor = SERIAL
 ) -> CalibrationOutcome:
-    """Calibrate one robot and write its files, in this process or another; nothing is shown.
+    """Calibrate one robot and write its outputs, in this process or another; no messages are shown.
 
     Args:
         job: Options of the calibration.
@@ -100,7 +111,7 @@ def run_job(
         raised and no file is written.
     """
     inputs = _checked_inputs(job)
-    chain = read_robot(job.robot, job.tip)
+    chain = read_robot(job.robot, job.tip, package_dirs=job.package_dir)
     if job.payload:
         chain = chain.with_payload(parse_payload(job.payload))
     sets = chain.parameters if job.parameters is None else job.parameters
@@ -120,9 +131,19 @@ def run_job(
         "executor": executor,
     }
     measurements = list(data.fit.values())
-    fit, trials = model_selection.extend(
-        chain, measurements, sets, _families(job.extend), method=job.method, **restrictions, **options
+    extend = None if job.extend == "auto" else job.extend
+    fit = procedure.calibrate(
+        chain, measurements, sets, method=job.method, extend=extend, **restrictions, **options
     )
+    if job.holdout == REGION:
+        without_holdout = restrictions | options | {"holdout": (), "extend": extend}
+        fit = leave_regions_out(
+            fit, lambda part: procedure.calibrate(chain, part, sets, method=job.method, **without_holdout)
+        )
+    fit = replace(
+        fit, input_warnings=tuple(f"{p}: {text}" for p, texts in data.warnings.items() for text in texts)
+    )
+    fit = fit.accepted
     # More parameters are not suggested if the choice was deliberate, or if the columns may be mixed up.
     is_deliberate = job.method != "lm" or any(restrictions.values())
     if not is_deliberate and not any(data.warnings.values()) and is_restricted(split_commas(sets)):
@@ -132,20 +153,32 @@ def run_job(
         # A warning about the columns of a file already explains a poor fit.
         data.warnings[path] += texts if not data.warnings[path] else []
     hint = _family_hint(fit, data, sets, job)
+    data.warnings.setdefault(job.robot, []).extend(find_lattices(fit))
 
-    contents = _robot_files(fit, job)
+    # A refused robot must not reach a controller; JSON and report explain why it was refused.
+    is_kept = job.force or not fit.verdict.is_refused
+    contents = _robot_files(fit, job) if is_kept else {}
     files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
-    if job.map:
+    if job.map and is_kept:
         from ..report import workspace_map  # lazy import: only for maps
 
         contents[job.map] = workspace_map.map_content(job.map, fit, fit.holdout, fit.instruments)
         files["map"] = job.map
+    if job.curves and is_kept:
+        corrections = joint_corrections(fit.chain)
+        contents[job.curves] = csv_text(correction_columns(corrections))
+        files["curves"] = job.curves
+        if not corrections:
+            data.warnings.setdefault(job.robot, []).append(NO_CORRECTIONS)
+    if job.residuals:
+        contents[job.residuals] = csv_text(fit.residuals.file_columns())
+        files["residuals"] = job.residuals
     if path := json_path(job.json):
         files["json"] = path
     files |= {
         "report" if number == 1 else f"report_{number}": path for number, path in enumerate(job.report, 1)
     }
-    source = _provenance(job, sets, data, inputs, trials, hint)
+    source = _provenance(job, sets, data, inputs, hint)
     if job.report:
         from ..report import html  # lazy import: only for reports
 
@@ -156,9 +189,9 @@ def run_job(
     )
     rejected = dict(zip(data.fit, (rows.tolist() for rows in zero_weight), strict=True))
     document = _job_document(fit, data, outliers, files, source)
-    write_outputs(contents, json_path(job.json), document)
+    write_outputs(contents, job.json, document)
     return CalibrationOutcome(
-        fit, document, files, data.unreachable, outliers, rejected, data.warnings, trials, hint
+        fit, document, files, data.unreachable, outliers, rejected, data.warnings, data.notes, hint
     )
 
 
@@ -174,17 +207,21 @@ class _JobData:
         holdout: Hold-out measurements with their file.
         unreachable: Rows that the robot cannot reach, by file; in neither of the two.
         warnings: Warnings about the input, by file.
+        notes: What of the input is not used, by file.
     """
 
     fit: dict[str, Measurement]
     holdout: list[tuple[str, Measurement]]
     unreachable: dict[str, list[UnreachableRow]]
     warnings: dict[str, list[str]]
+    notes: dict[str, list[str]]
 
 
 def _holdout_file(job: Job) -> str | None:
     """Return the measurement file that --holdout names, if it names one."""
-    return job.holdout if job.holdout is not None and os.path.exists(job.holdout) else None
+    if job.holdout is None or job.holdout == REGION or not os.path.exists(job.holdout):
+        return None
+    return job.holdout
 
 
 def _checked_inputs(job: Job) -> list[str]:
@@ -199,9 +236,10 @@ def _checked_inputs(job: Job) -> list[str]:
     settings += [path for path in (job.bounds, job.instrument, job.columns) if path]
     inputs = [job.robot, *existing_sidecars([job.robot]), *measured, *settings]
     require_urdf_ending(job.output)
-    require_writable_outputs([job.json, *job.report], inputs)
+    require_writable_outputs([job.json, job.residuals, *job.report], inputs)
     protected = [*measured, *settings] if job.in_place else inputs
-    outputs = [job.output, sidecar_path(job.output), job.map, job.json, *job.report]
+    outputs = [job.output, sidecar_path(job.output), job.map, job.curves, job.json, job.residuals]
+    outputs += job.report
     require_writable_outputs(outputs, protected)
     if job.report:
         from ..report import html  # lazy import: only for reports
@@ -220,6 +258,20 @@ def _without(data: Measurement, unreachable: Sequence[UnreachableRow]) -> Measur
     return data.take(~np.isin(data.rows, [item.row for item in unreachable]))
 
 
+def _mended(chain: Chain, file: MeasurementFile, changes: Sequence[str]) -> MeasurementFile:
+    """Return a measurement file after the changes of --mend."""
+    # `KEY@FILE` changes one file only.
+    chosen = [change.partition("@") for change in changes]
+    keys = [key for key, _, source in chosen if source in ("", file.source)]
+    if not keys:
+        return file
+    data = file.data
+    for key in keys:
+        data = mend(chain, data, key)
+    is_held_out = np.isin(data.rows, file.holdout.rows)
+    return replace(file, data=data, fit=data.take(~is_held_out), holdout=data.take(is_held_out))
+
+
 def _read_data(chain: Chain, job: Job, has_known_frames: bool) -> _JobData:
     """Read all measurements and split them by their `set` columns and by --holdout."""
     holdout_file = _holdout_file(job)
@@ -227,11 +279,15 @@ def _read_data(chain: Chain, job: Job, has_known_frames: bool) -> _JobData:
     holdout: list[tuple[str, Measurement]] = []
     unreachable: dict[str, list[UnreachableRow]] = {}
     warnings: dict[str, list[str]] = {}
+    notes: dict[str, list[str]] = {}
     by_file: dict[str, Measurement] = {}
     for path in [*job.data, *filter(None, [holdout_file])]:
-        measured = read_measurement_file(path, chain, job.columns)
+        read = read_measurement_file(path, chain, job.columns, skip_bad_rows=job.skip_bad_rows)
+        measured = _mended(chain, read, job.mend)
         by_file[path] = measured.data
-        warnings[path] = find_input_warnings(chain, measured)
+        notes[path] = list(measured.notes)
+        # The values of a mended file are not those of its columns. The verdict looks for mixed-up columns.
+        warnings[path] = [] if job.mend else find_value_warnings(chain, measured)
         # Without base and tool it is not known where the robot can place the measured point.
         unreachable[path] = find_unreachable_rows(chain, measured) if has_known_frames else []
         if path == holdout_file:
@@ -240,13 +296,13 @@ def _read_data(chain: Chain, job: Job, has_known_frames: bool) -> _JobData:
             fit.append(_without(measured.fit, unreachable[path]))
             holdout.append((path, _without(measured.holdout, unreachable[path])))
     require_common_reference_target(by_file)
-    if job.holdout is not None and not holdout_file:
+    if job.holdout not in (None, REGION) and not holdout_file:
         try:
             fraction = float(job.holdout)
         except ValueError:
             raise InvalidArgumentError(
-                f"--holdout {job.holdout}: neither a file nor a number; expected a measurement file or a "
-                "fraction such as 0.3"
+                f"--holdout {job.holdout}: neither a file nor a number; expected a measurement file, a "
+                "fraction such as 0.3, or region"
             ) from None
         remaining, drawn = partition.split(fit, fraction, job.seed)
         split_files = [
@@ -258,15 +314,11 @@ def _read_data(chain: Chain, job: Job, has_known_frames: bool) -> _JobData:
         raise InvalidArgumentError(
             f"{', '.join(job.data)}: every row is held out; leave some rows for the fit"
         )
-    return _JobData(fitted, [(path, item) for path, item in holdout if len(item.rows)], unreachable, warnings)
+    held_out = [(path, item) for path, item in holdout if len(item.rows)]
+    return _JobData(fitted, held_out, unreachable, warnings, notes)
 
 
 # --- calibration -----------------------------------------------------------------------------------
-
-
-def _families(extend: str) -> tuple[str, ...]:
-    """Return the error families that --extend allows."""
-    return {"none": (), "auto": EXTENSIONS}.get(extend, tuple(split_commas(extend)))
 
 
 def _family_hint(fit: Result, data: _JobData, sets: str, job: Job) -> str:
@@ -289,7 +341,8 @@ def improvement_hint(fit: Result, chain: Chain, data: Sequence[Measurement], **o
     Returns:
         A sentence, or an empty text if the reduction is small or unknown.
     """
-    current = fit.comparisons[0]
+    # The other calibration does not leave out regions.
+    current = next(each for each in fit.comparisons if each.title != "region hold-out")
     group, after = next(iter(current.after.groups.items()))
     if current.title == "fitted" or after.rms < EXACT_FIT_RATIO * current.before.groups[group].rms:
         return ""
@@ -297,7 +350,7 @@ def improvement_hint(fit: Result, chain: Chain, data: Sequence[Measurement], **o
         # The user's priors are for the chosen sets; drop those without a parameter in the full set.
         names = [p.name for p in select_parameters(chain, FULL_SET).parameters]
         options["priors"] = {key: std for key, std in priors.items() if fnmatch.filter(names, key)}
-    full_fit = procedure.calibrate(chain, data, FULL_SET, **options)
+    full_fit = procedure.calibrate(chain, data, FULL_SET, extend="none", **options)
     full = full_fit.comparisons[0]
     if not full_fit.converged or full.after.groups[group].rms > MAX_ERROR_RATIO * after.rms:
         return ""
@@ -316,19 +369,22 @@ def _robot_files(fit: Result, job: Job) -> dict[PathLike, str | bytes]:
     chain = fit.chain
     # A base in the URDF must not be applied a second time by the sidecar.
     written = replace(chain, base=np.eye(4)) if job.world_joint else chain
-    contents = urdf_files(written, job.output, fit.transferable_instruments, fit.uncertainty)
-    data = contents[job.output]
-    assert isinstance(data, bytes)
     if job.world_joint and chain.transmission is not None and chain.transmission.has_compliance:
         raise InvalidArgumentError(
             "--world-joint: not available with errors that depend on gravity, whose torques assume that "
             "z of the robot's root link points up; omit it"
         )
-    if job.world_joint:
-        data = urdf_edit.with_world(data, chain.base)
-    if job.tool_frame:
-        data = urdf_edit.with_tool_frame(data, chain.tip, job.tool_frame, chain.tool)
-    return contents | {job.output: data}
+
+    def edit(data: bytes) -> bytes:
+        if job.world_joint:
+            data = urdf_edit.with_world(data, chain.base)
+        if job.tool_frame:
+            data = urdf_edit.with_tool_frame(data, chain.tip, job.tool_frame, chain.tool)
+        return data
+
+    return urdf_files(
+        written, job.output, fit.transferable_instruments, fit.uncertainty, fit.measured_region, edit
+    )
 
 
 def _provenance(
@@ -336,7 +392,6 @@ def _provenance(
     sets: str,
     data: _JobData,
     inputs: Sequence[str],
-    trials: Sequence[model_selection.FamilyTrial],
     hint: str,
 ) -> Provenance:
     """Describe files, command and settings for the report."""
@@ -344,7 +399,9 @@ def _provenance(
     settings = {"parameters": sets, "loss": job.loss, "seed": str(job.seed)}
     if job.payload:
         settings["payload"] = job.payload
-    if job.holdout is not None:
+    if job.holdout == REGION:
+        settings["hold-out"] = "regions of joint space in turn; all samples are fitted"
+    elif job.holdout is not None:
         settings["hold-out"] = names.get(
             job.holdout, f"fraction {job.holdout} of each file, drawn with the seed"
         )
@@ -358,7 +415,7 @@ def _provenance(
             names[path]: {item.row: item.reason for item in rows} for path, rows in data.unreachable.items()
         },
         warnings={names[path]: texts for path, texts in data.warnings.items()},
-        trials=trials,
+        notes={names[path]: texts for path, texts in data.notes.items()},
         hint=hint,
     )
 
@@ -381,9 +438,13 @@ def _job_document(
     )
     return document | {
         "outliers_by_file": rows,
-        "warnings": [f"{path}: {text}" for path, texts in data.warnings.items() for text in texts],
+        "warnings": [
+            f"{path}: {text}"
+            for by_file in (data.notes, data.warnings)
+            for path, texts in by_file.items()
+            for text in texts
+        ],
         "command": source.command,
         "settings": source.settings,
-        "extension": [asdict(trial) for trial in source.trials],
         "hint": source.hint,
     }

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
+from typing import TYPE_CHECKING
 
 from ..exceptions import InvalidArgumentError, UnknownNameError
-from .options import NON_NEGATIVE_INTEGER, POSITIVE_INTEGER, ROBOT, TIP
+from .options import NON_NEGATIVE_INTEGER, POSITIVE_INTEGER, ROBOT, add_urdf_options
+
+if TYPE_CHECKING:
+    from ..robot import Chain
 
 EXAMPLE = "dhcal simulate arm.dh.toml --truth actual.dh.toml -m 50 --noise 0.1mm,0.01deg -o data.csv"
 
@@ -16,7 +20,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     Args:
         parser: Parser of the command.
     """
-    parser.add_argument("robot", metavar="ROBOT", help=f"nominal {ROBOT['help']}")
+    parser.add_argument("robot", metavar="ROBOT", type=ROBOT["type"], help=f"nominal {ROBOT['help']}")
     parser.add_argument(
         "-m", "--samples", type=POSITIVE_INTEGER, required=True, metavar="M", help="number of samples"
     )
@@ -29,11 +33,19 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--output", metavar="data.csv", required=True, help="measurement CSV file to write"
     )
-    parser.add_argument("--truth", metavar="T.urdf", help="robot with errors (default: ROBOT)")
+    parser.add_argument(
+        "--truth", metavar="T.urdf", type=ROBOT["type"], help="robot with errors (default: ROBOT)"
+    )
+    parser.add_argument(
+        "--errors",
+        metavar="LENGTH,ANGLE",
+        help="robot with random errors: standard deviations of the position and orientation of every joint "
+        "origin, such as 1mm,0.3deg; drawn with the seed",
+    )
     parser.add_argument(
         "--kind", metavar="KIND", default="pose", help="kind of measurement (default: %(default)s): {kinds}"
     )
-    parser.add_argument("--tip", **TIP)
+    add_urdf_options(parser)
     parser.add_argument(
         "--seed",
         metavar="N",
@@ -54,7 +66,7 @@ def run(args: Namespace) -> int:
 
     Raises:
         UnknownNameError: There is no such kind of measurement.
-        InvalidArgumentError: The two robots have different joints.
+        InvalidArgumentError: The two robots have different joints, or --truth and --errors are both given.
     """
     import numpy as np  # lazy import, as the following: they are slow to load
 
@@ -69,6 +81,8 @@ def run(args: Namespace) -> int:
     robots = [args.robot, *([args.truth] if args.truth else [])]
     require_writable_outputs([args.output], [*robots, *existing_sidecars(robots)])
     noise = Noise(*parse_noise(args.noise))
+    if args.truth and args.errors:
+        raise InvalidArgumentError("--errors: not allowed with --truth, which is the robot with errors")
     if args.kind not in KINDS:
         raise UnknownNameError(f"--kind: unknown kind {args.kind!r}; choose from {', '.join(KINDS)}")
     nominal = truth = read_robot(args.robot, args.tip)
@@ -79,10 +93,27 @@ def run(args: Namespace) -> int:
                 f"{args.truth}: its joints are {', '.join(truth.joint_names)}; "
                 f"expected those of {args.robot}: {', '.join(nominal.joint_names)}"
             )
+    elif args.errors:
+        truth = _with_random_errors(nominal, *parse_noise(args.errors, "--errors"), args.seed)
     rng = np.random.default_rng(args.seed)
     q = rng.uniform(*joint_range(nominal), (args.samples, nominal.n_joints))
     data = KINDS[args.kind].simulate(truth, q, noise, rng)
-    comment = f"simulated {args.kind} of {args.truth or args.robot}, noise {args.noise}, seed {args.seed}"
+    errors = f" with random errors {args.errors}" if args.errors else ""
+    comment = (
+        f"simulated {args.kind} of {args.truth or args.robot}{errors}, noise {args.noise}, seed {args.seed}"
+    )
     write_outputs({args.output: measurement_text(data, nominal, [comment])})
     console.print_lines(f"wrote {args.output}")
     return 0
+
+
+def _with_random_errors(nominal: Chain, length: float, angle: float, seed: int) -> Chain:
+    """Move every joint origin by normally distributed errors, with standard deviations in m and rad."""
+    import numpy as np  # lazy import, as the following: they are slow to load
+
+    from ..estimation import select_parameters
+
+    errors = select_parameters(nominal, "placement")
+    std = np.array([length if parameter.unit == "m" else angle for parameter in errors.parameters])
+    # A separate generator, so that the robot does not depend on the number of samples.
+    return errors.at(std * np.random.default_rng([seed, 1]).standard_normal(len(std)))

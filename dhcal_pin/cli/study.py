@@ -1,23 +1,19 @@
 """`dhcal study`: simulate calibrations over a grid of settings; write medians as CSV and plot.
 
-A study runs in blocks of calibrations. Each finished block is appended to a journal `OUT.part`, whose first
-line identifies the study. After an interruption the same command resumes with the next block.
+A study runs in blocks of calibrations. Each finished block is appended to a journal `OUT.part`. After an
+interruption the same command resumes with the next block.
 """
 
 from __future__ import annotations
 
-import json
 import os
 from argparse import ArgumentParser, Namespace
-from collections.abc import Sequence
-from contextlib import suppress
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING
 
-from ..exceptions import FileFormatError
 from .options import add_execution_options
 
 if TYPE_CHECKING:
-    from ..studies import StudyGrid
+    from ..studies import StudyGrid, StudyJournal
 
 EXAMPLE = "dhcal study ur10_poses --jobs 2 -o results.csv"
 
@@ -48,79 +44,64 @@ def run(args: Namespace) -> int:
     Returns:
         Exit status: 0 done, 130 interrupted.
     """
-    from dataclasses import fields  # lazy import, as the following: they load Pinocchio
-
-    from .. import studies
+    from .. import studies  # lazy import, as the following: they load Pinocchio
     from ..io import shipped_file
-    from ..io.tabular import csv_text
     from ..parallel import open_executor
-    from ..visualization.plots import study_svg
+    from ..saving import complete_interrupted_save
     from . import console
-    from .outputs import existing_sidecars, require_writable_outputs, write_outputs
+    from .outputs import existing_sidecars, require_writable_outputs, written_files
 
     is_file = os.path.exists(args.study) or args.study.endswith(".toml")
     path = args.study if is_file else shipped_file(f"{args.study}.study.toml")
-    journal = f"{args.output}.part"
-    figure = f"{os.path.splitext(args.output)[0]}.svg"
+    journal_path = f"{args.output}.part"
     study = studies.read_study(path)
     inputs = [os.fspath(path), *study.robots, *existing_sidecars(study.robots)]
-    require_writable_outputs([args.output, journal, figure], inputs)
-    blocks = _read_journal(journal, study)
+    require_writable_outputs([args.output, journal_path, _figure_path(args.output)], inputs)
+    complete_interrupted_save(journal_path)
     total = len(study.tasks())
-    if blocks:
-        console.print_lines(f"{journal}: resuming after {len(blocks)} of {total} blocks")
+    n_done = 0
     try:
-        with (
-            open_executor(args.jobs, args.scheduler) as executor,
-            console.progress_bar(study.title or "study", total, len(blocks)) as progress,
-            _open_journal(journal, study, blocks) as file,
-        ):
-            for block in studies.run(study, len(blocks), executor):
-                # Flush each line at once: if the process is killed, only unfinished blocks are lost.
-                file.write(json.dumps(block) + "\n")
-                file.flush()
-                blocks.append(block)
-                progress(len(blocks))
+        with studies.open_journal(journal_path, study) as journal:
+            if n_done := len(journal.blocks):
+                console.print_lines(f"{journal_path}: resuming after {n_done} of {total} blocks")
+            with (
+                open_executor(args.jobs, args.scheduler) as executor,
+                console.progress_bar(study.title or "study", total, n_done) as progress,
+            ):
+                for block in studies.run(study, n_done, executor):
+                    journal.append(block)
+                    n_done = len(journal.blocks)
+                    progress(n_done)
+            _write_results(study, journal, args.output)
     except KeyboardInterrupt:
+        if written_files():
+            raise
         console.print_lines(
-            f"dhcal: interrupted; {journal} contains {len(blocks)} of {total} blocks; run the same command "
+            f"dhcal: interrupted; {journal_path} contains {n_done} of {total} blocks; run the same command "
             "to resume"
         )
         return 130
-    header, rows = studies.result_table(study, blocks)
-    drawing = study_svg(study.title or "study", header, rows, len(fields(studies.Setting)))
-    columns = dict(zip(header, zip(*rows, strict=True), strict=True))
-    contents = {args.output: csv_text(columns)} | ({figure: drawing} if drawing else {})
-    write_outputs(contents)
-    os.unlink(journal)
-    console.print_study(study, header, rows)
-    console.print_lines(*(f"wrote {path}" for path in contents))
     return 0
 
 
-def _read_journal(journal: str, study: StudyGrid) -> list[list[list[float]]]:
-    """Read the blocks that an interrupted run of this study has finished."""
-    from ..io.tabular import read_text  # lazy import: loads Pinocchio
-
-    if not os.path.exists(journal):
-        return []
-    digest, *lines = read_text(journal).split("\n")
-    if digest != study.digest:
-        raise FileFormatError(
-            f"{journal}: belongs to another study or to other robots; finish that study, or remove the file"
-        )
-    blocks = []
-    # The last line is empty, or incomplete if the process was killed.
-    with suppress(ValueError):
-        for line in lines[:-1]:
-            blocks.append(json.loads(line))
-    return blocks
+def _figure_path(output: str) -> str:
+    return f"{os.path.splitext(output)[0]}.svg"
 
 
-def _open_journal(journal: str, study: StudyGrid, blocks: Sequence[list[list[float]]]) -> TextIO:
-    """Write the journal with its complete lines only, and open it to append more."""
-    from .outputs import write_outputs  # lazy import: loads Pinocchio
+def _write_results(study: StudyGrid, journal: StudyJournal, output: str) -> None:
+    """Write table and plot of a finished study, remove its journal, and show the table."""
+    from dataclasses import fields  # lazy import, as the following: they load Pinocchio
 
-    lines = (study.digest, *map(json.dumps, blocks))
-    write_outputs({journal: "".join(f"{line}\n" for line in lines)})
-    return open(journal, "a", encoding="utf-8")
+    from .. import studies
+    from ..io.tabular import csv_text
+    from ..visualization.plots import study_svg
+    from . import console
+    from .outputs import write_outputs
+
+    header, rows = studies.result_table(study, journal.blocks)
+    drawing = study_svg(study.title or "study", header, rows, len(fields(studies.Setting)))
+    columns = dict(zip(header, zip(*rows, strict=True), strict=True))
+    contents = {output: csv_text(columns)} | ({_figure_path(output): drawing} if drawing else {})
+    write_outputs({**contents, journal.path: None})
+    console.print_study(study, header, rows)
+    console.print_lines(*(f"wrote {path}" for path in contents))

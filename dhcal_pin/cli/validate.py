@@ -3,17 +3,30 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from ..exceptions import InvalidArgumentError
-from .options import COLUMNS, DATA, JSON, ROBOT, TIP
+from .options import COLUMNS, DATA, JSON, ROBOT, SKIP_BAD_ROWS, add_urdf_options
 
 if TYPE_CHECKING:
+    from ..calibration import Accuracy, Result
     from ..estimation.uncertainty import Predictor
     from ..io import MeasurementFile
+    from ..measurements import Measurement
     from ..robot import Chain
 
-EXAMPLE = "dhcal validate ur10_calibrated.urdf other.csv --tip tool0 --fit-frames"
+EXAMPLE = "dhcal validate ur10_calibrated.urdf other.csv --tip tool0 --nominal ur10.urdf --fit-frames"
+
+# Base and tool are taken to be those of another set-up if fitting them to the measurements divides the error
+# by at least this number.
+FRAMES_ERROR_RATIO = 10.0
+# Smaller errors [m or rad] show no difference of the frames.
+MIN_FRAMES_ERROR = 1e-6
+# Base and tool of two robots are the same if no entry of their poses differs by more than this.
+FRAMES_TOL = 1e-9
+# Number of samples from which this is found out; with fewer than the least number it is unknown.
+MIN_FRAMES_SAMPLES, MAX_FRAMES_SAMPLES = 12, 1000
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -24,12 +37,20 @@ def add_arguments(parser: ArgumentParser) -> None:
     """
     parser.add_argument("robot", **ROBOT)
     parser.add_argument("data", **DATA)
-    parser.add_argument("--tip", **TIP)
+    add_urdf_options(parser)
     parser.add_argument("--columns", **COLUMNS)
+    parser.add_argument("--skip-bad-rows", action="store_true", **SKIP_BAD_ROWS)
     parser.add_argument(
         "--sidecar",
         metavar="S.toml",
         help="file with base, tool and joint errors (default: NAME.calibration.toml beside ROBOT)",
+    )
+    parser.add_argument(
+        "--nominal",
+        metavar="ROBOT",
+        type=ROBOT["type"],
+        help="robot before the calibration, shown beside ROBOT; its base and tool are fitted to the "
+        "measurements if ROBOT has others",
     )
     parser.add_argument(
         "--fit-frames", action="store_true", help="fit base and tool to the measurements first"
@@ -52,38 +73,59 @@ def run(args: Namespace) -> int:
     Returns:
         Exit status 0.
     """
-    from ..calibration import accuracy, calibrate  # lazy import, as the following: they load Pinocchio
-    from ..io import read_measurement_file, read_robot
-    from ..io.sidecar import existing_sidecar, read_instrument
+    from ..calibration import accuracy  # lazy import, as the following: they load Pinocchio
+    from ..diagnostics import find_extrapolation
+    from ..io import (
+        existing_sidecar,
+        read_instrument,
+        read_measured_region,
+        read_measurement_file,
+        read_robot,
+    )
     from ..measurements.position import require_common_reference_target
     from ..report.document import file_digests, main_statistics, result_to_dict, validation_to_dict
     from ..report.workspace_map import map_content
     from . import console
-    from .outputs import json_path, require_writable_outputs, write_outputs
+    from .outputs import existing_sidecars, json_path, require_writable_outputs, write_outputs
 
     sidecar = args.sidecar or existing_sidecar(args.robot)
-    inputs = [args.robot, *args.data, *filter(None, (sidecar, args.columns))]
+    robots = [args.robot, args.nominal] if args.nominal else [args.robot]
+    inputs = [*robots, *args.data, *filter(None, (sidecar, args.columns)), *existing_sidecars(robots[1:])]
     require_writable_outputs([args.json, args.map], inputs)
-    chain = read_robot(args.robot, args.tip, sidecar)
+    chain = read_robot(args.robot, args.tip, sidecar, args.package_dir)
     predictor = _predictor(chain, sidecar, args) if args.map else None
-    files = [read_measurement_file(path, chain, args.columns) for path in args.data]
+    files = [
+        read_measurement_file(path, chain, args.columns, skip_bad_rows=args.skip_bad_rows)
+        for path in args.data
+    ]
     data = [file.data for file in files]
     instrument = read_instrument(sidecar) if sidecar else {}
     used = {parameter.name for item in data for parameter in item.instrument_parameters}
     require_common_reference_target(dict(zip(args.data, data, strict=True)), instrument)
     known = {name: value for name, value in instrument.items() if name in used}
-    nominal = accuracy(chain, data, known)
-    accuracies = {"base and tool as given": nominal}
+    given = accuracy(chain, data, known)
+    accuracies = {"base and tool as given": given}
     if args.fit_frames:
-        # The loss is linear: validation includes all samples, outliers too.
-        fit = calibrate(chain, data, "base,tool", known=known, loss="linear")
+        fit = _fit_frames(chain, data, known)
+        chain, known = fit.chain, known | fit.instruments
         accuracies["base and tool fitted"] = fit.comparisons[-1].after
-        document = result_to_dict(fit, {}, file_digests(inputs))
+        document = result_to_dict(fit, {}, file_digests(inputs), is_calibration=False)
     else:
         document = validation_to_dict(chain, data, file_digests(inputs), known)
-    document["before"] = main_statistics(nominal)
+    document["before"] = main_statistics(given)
+    remarks: list[str] = []
+    if args.nominal:
+        nominal, remarks = _nominal_accuracy(chain, data, known, args)
+        document["before"] = main_statistics(nominal)
+        accuracies = {"nominal": nominal, "calibrated": list(accuracies.values())[-1]}
     warnings = {file.source: _input_warnings(chain, file, args.fit_frames) for file in files}
-    document["warnings"] = [f"{path}: {text}" for path, texts in warnings.items() for text in texts]
+    if not args.fit_frames and _frames_differ(chain, data, known, given):
+        warnings[args.robot] = ["the frames (base, tool) differ: run again with --fit-frames"]
+    notes = [f"{file.source}: {text}" for file in files for text in file.notes]
+    document["warnings"] = notes + [f"{path}: {text}" for path, texts in warnings.items() for text in texts]
+    region = read_measured_region(sidecar, chain) if sidecar else None
+    extrapolation = find_extrapolation(region, chain, data, known) if region else None
+    document["measured_region"] = extrapolation and extrapolation.to_dict()
     path = json_path(args.json)
     document["files"] = {"json": path} if path else {}
     contents = {}
@@ -91,11 +133,63 @@ def run(args: Namespace) -> int:
         document["files"]["map"] = args.map
         contents[args.map] = map_content(args.map, predictor, data, known)
     write_outputs(contents, args.json, document)
+    console.print_validation(f"{args.robot}: accuracy on {document['samples']} samples", accuracies)
+    console.print_lines("", *remarks, *(extrapolation.sentences if extrapolation else ()))
+    console.print_lines(*(f"wrote map: {path}" for path in contents))
+    console.print_notes(notes)
     for path, texts in warnings.items():
         console.print_warnings(path, texts)
-    console.print_validation(f"{args.robot}: accuracy on {document['samples']} samples", accuracies)
-    console.print_lines(*(f"wrote map: {path}" for path in contents))
     return 0
+
+
+def _fit_frames(chain: Chain, data: Sequence[Measurement], known: Mapping[str, float]) -> Result:
+    """Fit base and tool; the loss is linear, as validation includes all samples, outliers too."""
+    from ..calibration import calibrate  # lazy import: loads Pinocchio
+
+    return calibrate(chain, data, "base,tool", known=known, loss="linear")
+
+
+def _nominal_accuracy(
+    chain: Chain, data: Sequence[Measurement], known: Mapping[str, float], args: Namespace
+) -> tuple[Accuracy, list[str]]:
+    """Compute the accuracy of the nominal robot; fit its base and tool if the calibrated robot has others.
+
+    Returns:
+        The accuracy, and a note if base or tool were fitted.
+    """
+    import numpy as np  # lazy import, as the following
+
+    from ..calibration import accuracy, calibrate
+    from ..io import read_robot
+
+    nominal = read_robot(args.nominal, args.tip, None, args.package_dir)
+    if nominal.joint_names != chain.joint_names:
+        raise InvalidArgumentError(
+            f"{args.nominal}: joints {', '.join(nominal.joint_names)}; expected the joints of {args.robot}: "
+            f"{', '.join(chain.joint_names)}"
+        )
+    pairs = {"base": (nominal.base, chain.base), "tool": (nominal.tool, chain.tool)}
+    others = [name for name, (a, b) in pairs.items() if not np.allclose(a, b, rtol=0, atol=FRAMES_TOL)]
+    if not others:
+        return accuracy(nominal, data, known), []
+    fit = calibrate(nominal, data, ",".join(others), known=known, loss="linear")
+    note = f"nominal: {' and '.join(others)} fitted to these measurements"
+    return fit.comparisons[-1].after, [note]
+
+
+def _frames_differ(
+    chain: Chain, data: Sequence[Measurement], known: Mapping[str, float], given: Accuracy
+) -> bool:
+    """Check whether fitting base and tool to the measurements would reduce the error many times."""
+    import numpy as np  # lazy import
+
+    n_samples = sum(len(item.rows) for item in data)
+    group, error = next(iter(given.groups.items()))
+    if n_samples < MIN_FRAMES_SAMPLES or error.rms < MIN_FRAMES_ERROR:
+        return False
+    step = max(1, -(-n_samples // MAX_FRAMES_SAMPLES))
+    fit = _fit_frames(chain, [item.take(np.s_[::step]) for item in data], known)
+    return FRAMES_ERROR_RATIO * fit.comparisons[-1].after.groups[group].rms < error.rms
 
 
 def _input_warnings(chain: Chain, file: MeasurementFile, has_unknown_frames: bool) -> list[str]:
@@ -106,7 +200,7 @@ def _input_warnings(chain: Chain, file: MeasurementFile, has_unknown_frames: boo
     unreachable = [] if has_unknown_frames else find_unreachable_rows(chain, file)
     return [
         *find_input_warnings(chain, file),
-        *(f"row {item.row}: {item.reason}" for item in unreachable),
+        *(f"line {item.row}: {item.reason}" for item in unreachable),
     ]
 
 

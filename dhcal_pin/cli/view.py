@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ..exceptions import InvalidArgumentError
-from .options import POSITIVE_INTEGER, ROBOT, TIP
+from .options import POSITIVE_INTEGER, ROBOT, add_urdf_options
 
 if TYPE_CHECKING:
     from ..measurements import Measurement
@@ -24,7 +24,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     Args:
         parser: Parser of the command.
     """
-    parser.add_argument("nominal", metavar="NOMINAL.urdf", help=ROBOT["help"])
+    parser.add_argument("nominal", metavar="NOMINAL.urdf", type=ROBOT["type"], help=ROBOT["help"])
     parser.add_argument("calibrated", metavar="CALIBRATED.urdf", nargs="?", help="the same robot, calibrated")
     parser.add_argument(
         "--data", metavar="DATA", nargs="+", default=[], help="measurement CSV files to draw and play"
@@ -53,7 +53,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--live", action="store_true", help="serve a moving scene on this computer until Ctrl-C, no page"
     )
-    parser.add_argument("--tip", **TIP)
+    add_urdf_options(parser)
 
 
 def run(args: Namespace) -> int:
@@ -81,7 +81,10 @@ def run(args: Namespace) -> int:
     sidecars = existing_sidecars(robots)
     page = args.html or os.path.join(tempfile.mkdtemp(prefix="dhcal-"), f"{robot_name(args.nominal)}.html")
     require_writable_outputs([page], [*robots, *sidecars, *args.data])
-    chains = [read_robot(path, None if has_dh_table(path) else args.tip) for path in robots]
+    chains = [
+        read_robot(path, None if has_dh_table(path) else args.tip, package_dirs=args.package_dir)
+        for path in robots
+    ]
     data = [read_measurements(path, chains[0]) for path in args.data]
     if args.live:
         return _serve_live(chains, data, args)

@@ -8,20 +8,21 @@ are, such as the spread of positions or the angles between rotations.
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping
+from collections.abc import Container, Mapping, Sequence
 
 import numpy as np
 
 from .._typing import Array
 from ..calibration.evaluation import compute_errors
-from ..calibration.initialization import align
-from ..io.measurement_columns import ROTVEC, SECOND_PREFIX
-from ..io.measurement_csv import MeasurementFile
+from ..estimation.initialization import align
+from ..io.measurement_files import MeasurementFile
+from ..io.measurement_files.columns import ROTVEC, SECOND_PREFIX
 from ..measurements.base import Measurement
 from ..measurements.columns import MAX_TOOL_OFFSET
+from ..plausibility.displacement import workspace_radius
+from ..plausibility.mixups import diagnose_mixups
 from ..robot.chain import Chain
 from ..units import ANGLES, LENGTHS
-from .column_mixups import diagnose_mixups, median_radius, orientation_misfit
 from .reachability import reach_sphere
 
 # Larger joint positions mean a wrong unit: no revolute joint turns further [rad], no prismatic joint slides
@@ -44,20 +45,53 @@ _MAX_SPREAD_RATIO = 3.0
 _MIN_SCALE, _MAX_SCALED_MISFIT = 50.0, 0.5
 # A rotation vector need not be longer than a turn; this much is left for rounding [rad].
 _ROTVEC_SLACK_RAD = 0.1
-# Half of the rotations differ by more than this from the robot's in another rotation convention [rad].
-_MAX_ORIENTATION_MISFIT_RAD = 0.35
 # A calibrated robot usually has smaller errors than this share of its reach, and smaller ones than this angle
 # [rad].
-_MAX_RELATIVE_MISFIT, _MAX_MISFIT_RAD = 0.02, 0.1
+_MAX_RELATIVE_MISFIT, _MAX_CALIBRATED_RAD = 0.02, 0.1
+# Larger residuals, relative to the size of the workspace or [rad], mean another robot or notation.
+_MAX_MISFIT, _MAX_MISFIT_RAD = 0.05, 0.2
 # Fewer positions or rotations than this cannot be compared.
 _MIN_SAMPLES = 3
 # Largest number of rows that the geometric checks use.
 _MAX_ROWS = 2000
-# Row numbers that a warning lists before it says how many more there are.
+# Lines that a warning lists before it says how many more there are.
 _MAX_LISTED_ROWS = 5
 
 
 def find_input_warnings(chain: Chain, file: MeasurementFile) -> list[str]:
+    """Find implausible values and mixed-up columns in a measurement file.
+
+    Args:
+        chain: Nominal robot.
+        file: Measurement file.
+
+    Returns:
+        One sentence per warning; an empty list for most files.
+    """
+    values, repeated = find_value_warnings(chain, file), _check_repeated_rows(file)
+    if values != repeated:
+        # Implausible values explain why measurements do not fit the robot; copied rows do not.
+        return values
+    return [*_check_fit(chain, file), *repeated]
+
+
+def _check_fit(chain: Chain, file: MeasurementFile) -> list[str]:
+    """Return a warning about columns that are mixed up, or measurements that do not fit the robot."""
+    diagnosis = diagnose_mixups(chain, [file.data])
+    if diagnosis.hypotheses:
+        return [diagnosis.sentence]
+    length, angle = diagnosis.before.length_scale, diagnosis.before.angle_scale
+    if not (length > _MAX_MISFIT * workspace_radius(chain) or angle > _MAX_MISFIT_RAD):
+        return []
+    size = f"{np.rad2deg(angle):.3g} deg" if angle > _MAX_MISFIT_RAD else f"{1e3 * length:.3g} mm"
+    return [
+        f"the measurements differ from this robot by {size}, with the best base and target; check the robot "
+        "and tip, the units, order, signs and zeros of the joints, and the notation of rotations: unit, "
+        "order of a quaternion, axes and frame of Euler angles"
+    ]
+
+
+def find_value_warnings(chain: Chain, file: MeasurementFile) -> list[str]:
     """Find implausible values in a measurement file.
 
     Args:
@@ -69,12 +103,13 @@ def find_input_warnings(chain: Chain, file: MeasurementFile) -> list[str]:
     """
     joint_units = _check_joint_units(chain, file)
     joints = [*joint_units.values(), *_check_small_joints(chain, file)]
-    lengths = _check_lengths(chain, file)
-    # With implausible joint positions, the modelled motion says nothing about the measured values.
-    mixups = [] if joints or lengths else diagnose_mixups(chain, file.data)
-    rotations = [] if joints or mixups else _check_rotations(chain, file)
-    limits = _check_limits(chain, file, joint_units)
-    return [*joints, *lengths, *mixups, *rotations, *limits, *_check_repeated_rows(file)]
+    return [
+        *joints,
+        *_check_lengths(chain, file),
+        *_check_rotations(file),
+        *_check_limits(chain, file, joint_units),
+        *_check_repeated_rows(file),
+    ]
 
 
 def poorly_fitted_files(
@@ -91,7 +126,7 @@ def poorly_fitted_files(
         Warnings by file, one sentence each; empty lists for well fitted files.
     """
     _, reach = reach_sphere(chain)
-    limits = {"orientation": _MAX_MISFIT_RAD}
+    limits = {"orientation": _MAX_CALIBRATED_RAD}
     out: dict[str, list[str]] = {path: [] for path in data}
     for (path, item), all_errors in zip(
         data.items(), compute_errors(chain, list(data.values()), known), strict=True
@@ -117,6 +152,18 @@ def poorly_fitted_files(
     return out
 
 
+def median_radius(points: Array) -> float:
+    """Compute the median distance of points from their median, which outliers hardly change.
+
+    Args:
+        points: Shape (m, 3) [m].
+
+    Returns:
+        Distance [m].
+    """
+    return float(np.median(np.linalg.norm(points - np.median(points, 0), axis=1)))
+
+
 def _joint_positions_by_configuration(file: MeasurementFile) -> list[Array]:
     """Return the joint positions (m, n) of each configuration of a row."""
     data = file.data
@@ -135,10 +182,10 @@ def _format_as_written(value: float, unit: str) -> str:
 
 
 def _format_rows(file: MeasurementFile, mask: Array) -> str:
-    """Return a text such as `row 3` or `rows 3, 5, 8, 9, 12 and 4 more`."""
+    """Return a text such as `line 3` or `lines 3, 5, 8, 9, 12 and 4 more`."""
     rows = [str(row) for row in file.data.rows[mask]]
     listed, more = rows[:_MAX_LISTED_ROWS], len(rows) - _MAX_LISTED_ROWS
-    return f"row{'s' if len(rows) > 1 else ''} {', '.join(listed)}" + (
+    return f"line{'s' if len(rows) > 1 else ''} {', '.join(listed)}" + (
         f" and {more} more" if more > 0 else ""
     )
 
@@ -243,8 +290,8 @@ def _check_position_spread(chain: Chain, file: MeasurementFile, reach: float) ->
     return []
 
 
-def _check_rotations(chain: Chain, file: MeasurementFile) -> list[str]:
-    """Return a warning about rotation vectors longer than a turn, or rotations that do not fit the joints."""
+def _check_rotations(file: MeasurementFile) -> list[str]:
+    """Return a warning about rotation vectors longer than a turn."""
     vectors = [file.values[name] for name in ROTVEC if name in file.values]
     unit = file.units.get("rx", "")
     if len(vectors) == 3 and unit:
@@ -254,18 +301,7 @@ def _check_rotations(chain: Chain, file: MeasurementFile) -> list[str]:
                 f"a rotation vector rx,ry,rz has the length {_format_as_written(longest, unit)}, more than a "
                 "turn; if the values are degrees, write [deg]; Euler angles need a column map (--columns)"
             ]
-    measured = file.data.rotations()
-    if len(measured) < _MIN_SAMPLES:
-        return []
-    index = _subsample(len(measured))
-    misfit = orientation_misfit(chain.poses(file.data.q[index])[:, :3, :3], measured[index])
-    if misfit <= _MAX_ORIENTATION_MISFIT_RAD:
-        return []
-    return [
-        f"the measured rotations differ from this robot by {np.rad2deg(misfit):.0f} deg (median, with the "
-        "best base and target); check the unit, the order of a quaternion, the axes and frame of Euler "
-        "angles, the rows of a matrix, and the tip"
-    ]
+    return []
 
 
 def _check_limits(chain: Chain, file: MeasurementFile, reported: Container[str]) -> list[str]:
@@ -289,18 +325,30 @@ def _check_repeated_rows(file: MeasurementFile) -> list[str]:
     """Return a warning about rows with the same joint positions and the same measured values."""
     columns: list[Array] = [column for q in _joint_positions_by_configuration(file) for column in q.T]
     columns += [np.asarray(values) for values in file.values.values()]
-    if not columns or not len(columns[0]):
+    original = first_equal_rows(columns)
+    is_repeated = original < np.arange(len(original))
+    if not is_repeated.any():
         return []
+    lines, example = file.data.rows, int(np.flatnonzero(is_repeated)[0])
+    return [
+        f"{_format_rows(file, is_repeated)}: identical to other rows in every digit (line {lines[example]} "
+        f"to line {lines[original[example]]}); a copied measurement counts twice, remove it"
+    ]
+
+
+def first_equal_rows(columns: Sequence[Array]) -> Array:
+    """Find rows that are equal in all columns.
+
+    Args:
+        columns: Numbers or texts, (m,) each.
+
+    Returns:
+        Index of the first row that is equal to each row, (m,); its own index for a row without an earlier
+        one.
+    """
+    if not columns or not len(columns[0]):
+        return np.empty(0, int)
     # Ranks, as columns of texts and of numbers cannot be stacked.
     keys = np.stack([np.unique(column, return_inverse=True)[1] for column in columns], -1)
     first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)[1:]
-    is_repeated = np.ones(len(keys), bool)
-    is_repeated[first] = False
-    if not is_repeated.any():
-        return []
-    example = int(np.flatnonzero(is_repeated)[0])
-    original = int(file.data.rows[first[inverse[example]]])
-    return [
-        f"{_format_rows(file, is_repeated)}: identical to other rows in every digit (row "
-        f"{file.data.rows[example]} to row {original}); a copied measurement counts twice, remove it"
-    ]
+    return first[inverse.reshape(-1)]

@@ -17,7 +17,7 @@ import numpy as np
 
 from .. import se3
 from .._typing import Array
-from ..io.measurement_csv import MeasurementFile
+from ..io.measurement_files import MeasurementFile
 from ..robot.chain import Chain
 from ..robot.inverse_kinematics import position_task, solve_ik, without_rotary_limits
 
@@ -44,7 +44,7 @@ class UnreachableRow:
     """Row of a file that is impossible.
 
     Attributes:
-        row: Row number in the file, from 1.
+        row: Line in the file; for data from Python the number of the sample, from 1.
         error: Distance between the position and the one at the row's joint positions [m].
         reason: Explanation for users, without a full stop.
     """
@@ -119,6 +119,7 @@ def find_unreachable_rows(chain: Chain, file: MeasurementFile) -> list[Unreachab
         The impossible rows in the order of the file.
     """
     impossible: dict[int, UnreachableRow] = {}
+    rows = file.data.rows.tolist()
     centre, radius = reach_sphere(chain)
     q = file.data.q
     modelled = chain.poses(q)[:, :3, 3]
@@ -134,7 +135,7 @@ def find_unreachable_rows(chain: Chain, file: MeasurementFile) -> list[Unreachab
         errors = np.linalg.norm(positions - modelled, axis=1)
         limit = max(MAX_TYPICAL_RATIO * float(np.median(errors[distinct])), share * extent)
         for i in np.flatnonzero(errors > limit):
-            if i + 1 in impossible or errors[i] < EXACT_POSITION_TOL:
+            if rows[i] in impossible or errors[i] < EXACT_POSITION_TOL:
                 continue
             reason = f"its joint positions lead {1e3 * errors[i]:.0f} mm away from the {what} position"
             distance = np.linalg.norm(positions[i] - centre)
@@ -145,7 +146,7 @@ def find_unreachable_rows(chain: Chain, file: MeasurementFile) -> list[Unreachab
                 )
             elif (solution := solve_position(chain, positions[i], np.median(q, 0))) is not None:
                 reason += f", which the robot reaches with ({_format_joints(chain, solution)})"
-            impossible[int(i) + 1] = UnreachableRow(int(i) + 1, float(errors[i]), reason)
+            impossible[rows[i]] = UnreachableRow(rows[i], float(errors[i]), reason)
     return [impossible[row] for row in sorted(impossible)]
 
 

@@ -38,7 +38,7 @@ class Outlier:
 
     Attributes:
         item: Index of the measurement object in the fitted data.
-        row: Row number in its file.
+        row: Line in its file; for data from Python the number of the sample, from 1.
         error_norms: Error by group, "position" [m], "orientation" [rad] or "residual" [m].
         score: Studentized residual; standard normal for a sample that is not an outlier.
     """

@@ -18,45 +18,16 @@ returns a `SolverResult`:
     True
     >>> calibrated = errors.at(result.x)
 
-`solve_batch` does the same for many small problems at once. Everything here follows from the triangular
+`solve_batch` does the same for many small problems at once. `initialization` finds base and tool frames to
+start from. Everything here follows from the triangular
 system of one linearization (`TriangularSystem`).
 
-The choice of initial frames, noise scales and hold-out data belongs to `calibration`. Reports on parameters
+The choice of noise scales and hold-out data belongs to `calibration`. Reports on parameters
 that the data do not determine belong to `identifiability`.
+
+The public names are listed in `__init__.pyi`. Each is loaded on first use.
 """
 
-from .batch import BatchProblem, BatchResult, solve_batch
-from .error_model import ErrorModel, ErrorParameter
-from .parameters import PARAMETER_SETS, ParameterSet, select_parameters
-from .priors import Priors
-from .problem import Problem, linearize_and_factor
-from .qr import TriangularSystem
-from .robust import LOSSES, Loss
-from .solver import METHODS, Progress, SolverResult, gauss_newton, levenberg_marquardt, minimize
-from .uncertainty import Prediction, Predictor, Uncertainty
+import lazy_loader
 
-__all__ = [
-    "LOSSES",
-    "METHODS",
-    "PARAMETER_SETS",
-    "BatchProblem",
-    "BatchResult",
-    "ErrorModel",
-    "ErrorParameter",
-    "Loss",
-    "ParameterSet",
-    "Prediction",
-    "Predictor",
-    "Priors",
-    "Problem",
-    "Progress",
-    "SolverResult",
-    "TriangularSystem",
-    "Uncertainty",
-    "gauss_newton",
-    "levenberg_marquardt",
-    "linearize_and_factor",
-    "minimize",
-    "select_parameters",
-    "solve_batch",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -20,7 +20,7 @@ constant twists, and come last in the list.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -28,13 +28,21 @@ import numpy as np
 
 from .._kernels import perturb_frames
 from .._typing import Array
+from ..formatting import format_fixed
 from ..robot.chain import BASE_FRAME, Chain, bodies_of_frames
 from ..robot.transmission import Transmission
+
+# Difference to 1 of a direction's largest component below which it is named by an axis: 0.08 degrees.
+AXIS_NAME_TOL = 1e-6
+# Distance from the origin of the frame below which an axis passes through it [m].
+AXIS_POINT_TOL = 5e-7
 
 
 @dataclass(frozen=True)
 class ErrorParameter:
     """Scalar kinematic error.
+
+    `definition` says in which frame and direction it is defined.
 
     Attributes:
         name: Name for users, such as `d2` or `elbow_joint.rx`.
@@ -45,7 +53,7 @@ class ErrorParameter:
         error_frame: Index of the error frame: 0 base, 2j joint j, 2j+1 link j, 2k+2 tip, 2k+3 tool.
         twist: Twist [v, ω] per unit of the error, in axes of the error frame.
         prior: Standard deviation expected before any measurement, in the unit of the value.
-        coefficient_index: Index into the flattened transmission coefficients; None for a geometric error.
+        coefficient_index: Index of the transmission coefficient; None for a geometric error.
     """
 
     name: str
@@ -55,6 +63,20 @@ class ErrorParameter:
     twist: tuple[float, ...]
     prior: float
     coefficient_index: int | None = None
+
+    def definition(self, chain: Chain) -> tuple[str, str]:
+        """Describe the frame and the direction in which the error is defined.
+
+        Args:
+            chain: Nominal chain.
+
+        Returns:
+            Frame as in `frame_name`, and direction in its axes as in `direction_name`. A transmission
+            coefficient is defined by its joint: "joint NAME" and "position".
+        """
+        if self.coefficient_index is not None:
+            return f"joint {chain.moving_joints[self.error_frame // 2 - 1]}", "position"
+        return frame_name(chain, self.error_frame), direction_name(self.twist)
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,3 +227,58 @@ class ErrorModel:
         outside = (BASE_FRAME, self.chain.tool_frame_index)
         frame_parameters = tuple(p for p in self.parameters if p.error_frame in outside)
         return replace(self, parameters=frame_parameters) if frame_parameters else None
+
+
+def frame_name(chain: Chain, error_frame: int) -> str:
+    """Name an error frame for people.
+
+    Args:
+        chain: Kinematic chain.
+        error_frame: Index of the error frame: 0 base, 2j joint j, 2j+1 link j, 2k+2 tip, 2k+3 tool.
+
+    Returns:
+        "origin of JOINT" for the frame into which the `<origin>` of a joint places it, before the joint
+        moves; "link LINK" for the frame of a link, which moves with its joint; "tool" for the measured point.
+    """
+    if error_frame == chain.tool_frame_index:
+        return "tool"
+    if error_frame == chain.tip_frame:
+        return f"link {chain.tip}"
+    number, is_link = divmod(error_frame, 2)
+    if number == 0:
+        return f"link {chain.urdf.root}"
+    joint = chain.urdf.joint(chain.moving_joints[number - 1])
+    return f"link {joint.child}" if is_link else f"origin of {joint.name}"
+
+
+def direction_name(twist: Sequence[float]) -> str:
+    """Describe the direction of a translation or rotation.
+
+    Args:
+        twist: Twist [v, ω] in axes of its frame, shape (6,); v alone for a translation, and for a rotation
+            about an axis through a point p, ω and v = p × ω.
+
+    Returns:
+        Text such as "along x", "about -z", "along (0.000, 0.600, 0.800)" or, if the axis does not pass
+        through the origin of the frame, "about x through (0.000, 0.100, 0.000) m".
+    """
+    v, w = np.array(twist[:3]), np.array(twist[3:])
+    if not w.any():
+        return f"along {_axis_name(v)}"
+    # Point of the axis next to the origin of the frame.
+    point = np.cross(w, v) / (w @ w)
+    place = f" through {_vector_text(point)} m" if np.abs(point).max() > AXIS_POINT_TOL else ""
+    return f"about {_axis_name(w)}{place}"
+
+
+def _axis_name(vector: Array) -> str:
+    """Return x, y or z with its sign, or the components of the unit vector."""
+    vector = vector / np.linalg.norm(vector)
+    largest = int(np.argmax(np.abs(vector)))
+    if np.abs(vector[largest]) > 1 - AXIS_NAME_TOL:
+        return f"{'-' if vector[largest] < 0 else ''}{'xyz'[largest]}"
+    return _vector_text(vector)
+
+
+def _vector_text(vector: Array) -> str:
+    return f"({', '.join(format_fixed(component, 3) for component in vector.tolist())})"

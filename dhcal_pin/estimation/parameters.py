@@ -26,17 +26,19 @@ References:
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from .. import se3
+from .._typing import Array
 from ..exceptions import DhcalError, InvalidArgumentError, UnknownNameError
 from ..robot.chain import BASE_FRAME, Chain, extract_dh_table, joint_frame, link_frame, without_mimics
 from ..robot.dh import Convention
-from ..robot.error_families import COUPLING, FAMILIES
-from ..robot.transmission import COUPLING_PRIOR, COUPLING_TERM, TERM_FAMILIES, TERMS, Transmission
+from ..robot.error_families import COMPLIANCE, COUPLING, CURVES, FAMILIES, GAIN, HARMONICS
+from ..robot.transmission import MAX_CURVE_ORDER, n_coefficients, split_coefficients
 from .error_model import ErrorModel, ErrorParameter
 
 # Prior standard deviations of manufacturing and assembly errors: lengths [m], angles and joint offsets [rad].
@@ -47,9 +49,24 @@ OFFSET_PRIOR = np.deg2rad(2.0)
 FRAME_LENGTH_PRIOR = 10.0
 FRAME_ANGLE_PRIOR = 10.0
 
-# Smallest maximum [rad or N·m] of a transmission term. A term that stays below is omitted: some URDFs have
-# links with token masses.
-MIN_TERM = 0.1
+# Prior standard deviations of transmission coefficients, typical of industrial arms: gear ratios are off by
+# 0.2 % [1]; eccentricity is about 1 mrad, and a higher harmonic about 0.1 mrad [rad]; a joint yields by about
+# 0.1 mrad/Nm [rad/Nm]; coupling [rad/rad or rad/m].
+GAIN_PRIOR = 2e-3
+HARMONIC_PRIOR, CURVE_PRIOR = 1e-3, 1e-4
+COMPLIANCE_PRIOR = 1e-4
+COUPLING_PRIOR = 2e-3
+
+# Orders of the harmonics of the set `harmonics`, and of the set `curves`.
+HARMONIC_ORDERS, CURVE_ORDERS = range(1, 3), range(3, MAX_CURVE_ORDER + 1)
+
+# Smallest maximum [N·m] of the gravity torque on a compliant joint. A joint that is loaded less has no
+# compliance: some URDFs have links with token masses.
+MIN_TORQUE = 0.1
+# Largest number of harmonics of a joint that messages list one by one.
+MAX_LISTED_HARMONICS = 4
+_HARMONIC_NAME = re.compile(r"(.+)\.((?:sin|cos)\d+)")
+
 # Difference to 1 of an axis' largest component below which the axis counts as an axis of its frame.
 AXIS_ALIGNMENT_TOL = 1e-5
 # Angle [rad] between joint axes below which `hayati` replaces d by β.
@@ -258,39 +275,81 @@ def tool(chain: Chain) -> list[ErrorParameter]:
 
 
 def _transmission_parameter(
-    chain: Chain, coefficient: tuple[int, int, int], name: str, unit: str, prior: float
+    chain: Chain, joint: int, index: int, name: str, unit: str, prior: float
 ) -> ErrorParameter:
-    """Build the parameter of one coefficient (term, joint, source joint) of the transmission."""
+    """Build the parameter of the transmission coefficient with an index, which moves an independent joint."""
     # The error acts at the first moving joint that the independent joint drives.
-    moving_joint = int(np.flatnonzero(chain.mimic_matrix[:, coefficient[1]])[0])
+    moving_joint = int(np.flatnonzero(chain.mimic_matrix[:, joint])[0])
     twist = _joint_twist(chain.axes[moving_joint].tolist(), chain.prismatic[moving_joint])
-    nominal = 0.0 if chain.transmission is None else float(chain.transmission.coefficients[coefficient])
-    index = int(np.ravel_multi_index(coefficient, (len(TERMS), chain.n_joints, chain.n_joints)))
-    return ErrorParameter(name, unit, nominal, link_frame(moving_joint + 1), twist, prior, index)
+    nominal = 0.0 if chain.transmission is None else float(chain.transmission.coefficients[index])
+    full_name = f"{chain.joint_names[joint]}.{name}"
+    return ErrorParameter(full_name, unit, nominal, link_frame(moving_joint + 1), twist, prior, index)
 
 
-def family(chain: Chain, name: str) -> list[ErrorParameter]:
-    """Build the coefficients of all terms of a family of joint errors.
+def _coefficient_indices(chain: Chain) -> tuple[Array, Array, Array]:
+    """Return the indices of linear coefficients (n, n), harmonics (K, 2, n) and compliance (n,)."""
+    return split_coefficients(np.arange(n_coefficients(chain.n_joints)), chain.n_joints)
 
-    Terms that are negligible in all configurations are omitted, such as the gravity torque about a vertical
-    axis.
+
+def _revolute_joints(chain: Chain) -> list[int]:
+    """Return the numbers of the independent joints that are revolute."""
+    return np.flatnonzero(~chain.is_prismatic).tolist()
+
+
+def gain(chain: Chain) -> list[ErrorParameter]:
+    """Build the relative error of each joint's gear ratio.
 
     Args:
         chain: Nominal chain.
-        name: One of `transmission.TERM_FAMILIES`.
 
     Returns:
-        1 parameter for each term and joint that the family applies to.
+        1 parameter per joint [1].
     """
-    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (chain.n_joints, 64))
-    is_effective = np.abs(Transmission.zero(chain.loads).terms(q)).max(-1) > MIN_TERM
+    linear, _, _ = _coefficient_indices(chain)
     return [
-        _transmission_parameter(chain, (t, i, i), f"{joint}.{term.name}", term.unit, term.prior)
-        for i, joint in enumerate(chain.joint_names)
-        for t, term in enumerate(TERMS)
-        if term.family == name
-        and is_effective[t, i]
-        and (term.applies_to_prismatic or not chain.is_prismatic[i])
+        _transmission_parameter(chain, i, int(linear[i, i]), "gain", "1", GAIN_PRIOR)
+        for i in range(chain.n_joints)
+    ]
+
+
+def harmonics(
+    chain: Chain, orders: Sequence[int] = HARMONIC_ORDERS, prior: float = HARMONIC_PRIOR
+) -> list[ErrorParameter]:
+    """Build the periodic errors of each revolute joint: sine and cosine of multiples of its position.
+
+    Args:
+        chain: Nominal chain.
+        orders: Multiples, periods per turn of the joint.
+        prior: Standard deviation of a coefficient before any measurement [rad].
+
+    Returns:
+        2 parameters for each revolute joint and order [rad].
+    """
+    _, indices, _ = _coefficient_indices(chain)
+    return [
+        _transmission_parameter(chain, i, int(indices[k - 1, part, i]), f"{function}{k}", "rad", prior)
+        for i in _revolute_joints(chain)
+        for k in orders
+        for part, function in enumerate(("sin", "cos"))
+    ]
+
+
+def compliance(chain: Chain) -> list[ErrorParameter]:
+    """Build the rotation of each revolute joint per unit of its gravity torque.
+
+    Args:
+        chain: Nominal chain.
+
+    Returns:
+        1 parameter for each revolute joint that gravity loads in some configuration [rad/Nm].
+    """
+    _, _, indices = _coefficient_indices(chain)
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (chain.n_joints, 64))
+    is_loaded = np.abs(chain.loads.torques(q)).max(-1) > MIN_TORQUE
+    return [
+        _transmission_parameter(chain, i, int(indices[i]), "compliance", "rad/Nm", COMPLIANCE_PRIOR)
+        for i in _revolute_joints(chain)
+        if is_loaded[i]
     ]
 
 
@@ -303,17 +362,19 @@ def coupling(chain: Chain) -> list[ErrorParameter]:
     Returns:
         1 parameter for each pair of a revolute joint and another joint [rad/rad or rad/m].
     """
+    linear, _, _ = _coefficient_indices(chain)
     return [
         _transmission_parameter(
             chain,
-            (COUPLING_TERM, i, j),
-            f"{joint}.{source}",
+            i,
+            int(linear[i, j]),
+            source,
             "rad/m" if chain.is_prismatic[j] else "rad/rad",
             COUPLING_PRIOR,
         )
-        for i, joint in enumerate(chain.joint_names)
+        for i in _revolute_joints(chain)
         for j, source in enumerate(chain.joint_names)
-        if i != j and not chain.is_prismatic[i]
+        if i != j
     ]
 
 
@@ -351,10 +412,15 @@ PARAMETER_SETS: dict[str, ParameterSet] = {
     "tool": ParameterSet(tool, "pose of the measured point in the tip frame"),
     "offset": ParameterSet(offset, "zero position of each joint"),
     **{
-        name: ParameterSet(functools.partial(family, name=name), FAMILIES[name].description)
-        for name in TERM_FAMILIES
+        name: ParameterSet(build, FAMILIES[name].description)
+        for name, build in (
+            (GAIN, gain),
+            (HARMONICS, harmonics),
+            (CURVES, functools.partial(harmonics, orders=CURVE_ORDERS, prior=CURVE_PRIOR)),
+            (COMPLIANCE, compliance),
+            (COUPLING, coupling),
+        )
     },
-    COUPLING: ParameterSet(coupling, FAMILIES[COUPLING].description),
 }
 
 # Sets that model selection may add.
@@ -404,6 +470,31 @@ def select_parameters(
     return ErrorModel(chain, (), fixed_parameters).with_parameters(free_parameters)
 
 
+def fold_harmonics(names: Iterable[str]) -> list[str]:
+    """Replace the harmonics of each joint by one entry, for messages that list parameters.
+
+    Args:
+        names: Names of parameters.
+
+    Returns:
+        Names in the same order; more than `MAX_LISTED_HARMONICS` harmonics of a joint are one entry.
+
+    >>> fold_harmonics(["j1.gain", "j1.sin3", "j1.cos3", "j1.sin4", "j1.cos4", "j1.sin5", "j2.sin3"])
+    ['j1.gain', 'j1.sin3 ... sin5 (5 harmonics)', 'j2.sin3']
+    """
+    listed = list(names)
+    by_joint: dict[str, list[str]] = {}
+    for match in filter(None, map(_HARMONIC_NAME.fullmatch, listed)):
+        by_joint.setdefault(match[1], []).append(match[2])
+    folded = {
+        f"{joint}.{function}": f"{joint}.{functions[0]} ... {functions[-1]} ({len(functions)} harmonics)"
+        for joint, functions in by_joint.items()
+        if len(functions) > MAX_LISTED_HARMONICS
+        for function in functions
+    }
+    return list(dict.fromkeys(folded.get(name, name) for name in listed))
+
+
 def _fixed_names(chain: Chain, fix: Sequence[str], pool: dict[str, ErrorParameter]) -> set[str]:
     """Return the names of all fixed parameters; fixed sets are expanded."""
     out = set[str]()
@@ -412,7 +503,8 @@ def _fixed_names(chain: Chain, fix: Sequence[str], pool: dict[str, ErrorParamete
         members = {p.name for p in PARAMETER_SETS[name](chain)} if is_set else {name}
         if not members & set(pool):
             problem = "none of its parameters is unknown" if is_set else "no such parameter"
-            raise UnknownNameError(f"cannot fix {name!r}: {problem}; choose from {', '.join(pool)}")
+            choices = ", ".join(fold_harmonics(pool))
+            raise UnknownNameError(f"cannot fix {name!r}: {problem}; choose from {choices}")
         out |= members
     return out
 
@@ -426,7 +518,6 @@ def _freed_parameters(chain: Chain, names: Sequence[str]) -> dict[str, ErrorPara
         if name in PARAMETER_SETS:
             raise UnknownNameError(f"cannot free {name!r}: it is a whole set; add it to the parameters")
         if name not in parameters:
-            raise UnknownNameError(
-                f"cannot free {name!r}: no such parameter; choose from {', '.join(parameters)}"
-            )
+            choices = ", ".join(fold_harmonics(parameters))
+            raise UnknownNameError(f"cannot free {name!r}: no such parameter; choose from {choices}")
     return {name: parameters[name] for name in names}

@@ -31,11 +31,16 @@ from .._typing import Array
 from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..robot.chain import BASE_FRAME
 from .error_model import ErrorModel
+from .parameters import fold_harmonics
 from .problem import Problem
 from .qr import posterior_sqrt_covariance
 from .solver import SolverResult
 
 Priors = Literal["default", "none"] | Mapping[str, float]
+
+# Smallest and largest prior standard deviation, in the unit of the parameter. Beyond them the squares of the
+# weights lose all digits of the data, or the prior has no effect.
+MIN_PRIOR_STD, MAX_PRIOR_STD = 1e-12, 1e6
 
 # Number of determined parameters that the expected standard deviation counts for against smaller errors.
 EXPECTATION_COUNT = 0.5
@@ -53,7 +58,7 @@ def prior_weights(errors: ErrorModel, priors: Priors) -> Array:
         Weights 1/σ of shape (p,); zero without a prior.
 
     Raises:
-        InvalidArgumentError: If a standard deviation is not positive.
+        InvalidArgumentError: If a standard deviation is not from `MIN_PRIOR_STD` to `MAX_PRIOR_STD`.
         UnknownNameError: If the choice is unknown, or no parameter matches a name.
     """
     if isinstance(priors, str):
@@ -67,12 +72,12 @@ def prior_weights(errors: ErrorModel, priors: Priors) -> Array:
     for pattern, value in priors.items():
         matches = [i for i, name in enumerate(names) if fnmatch.fnmatchcase(name, pattern)]
         if not matches:
-            raise UnknownNameError(
-                f"prior for {pattern!r}: no such parameter; choose from {', '.join(names)}"
-            )
-        if not value > 0:
+            choices = ", ".join(fold_harmonics(names))
+            raise UnknownNameError(f"prior for {pattern!r}: no such parameter; choose from {choices}")
+        if not MIN_PRIOR_STD <= value <= MAX_PRIOR_STD:
             raise InvalidArgumentError(
-                f"prior for {pattern!r}: {value} must be positive, in the unit of the parameter"
+                f"prior for {pattern!r}: {value} must be positive, from {MIN_PRIOR_STD:g} to "
+                f"{MAX_PRIOR_STD:g} in the unit of the parameter; fix a parameter that is known exactly"
             )
         sigma[matches] = value
     return 1 / sigma
@@ -135,6 +140,11 @@ class PriorGroups:
             np.array(max_weights),
         )
 
+    @classmethod
+    def none(cls) -> PriorGroups:
+        """Return no groups: all priors keep their standard deviations."""
+        return cls(np.empty(0, int), np.empty(0, int), np.empty(0), np.empty(0))
+
     def groups(self) -> list[tuple[list[int], float]]:
         """List the groups.
 
@@ -145,6 +155,21 @@ class PriorGroups:
             (self.members[self.group_index == i].tolist(), weight)
             for i, weight in enumerate(self.expected_weights.tolist())
         ]
+
+
+def effective_parameters(problem: Problem, solution: SolverResult) -> float:
+    """Compute the effective number of parameters that the data determine (MacKay 1992).
+
+    Args:
+        problem: Problem that was solved, in p unknowns.
+        solution: Its solution, with the triangular factor R of the whitened Jacobian.
+
+    Returns:
+        γ = ‖R·S‖², with a square root S of the covariance: 1 per parameter that the data determine, 0 per
+        parameter that its prior determines.
+    """
+    root = posterior_sqrt_covariance(solution.system, problem.weights)[0]
+    return float(np.sum((solution.system.r @ root) ** 2))
 
 
 def update_prior_scales(problem: Problem, solution: SolverResult, groups: PriorGroups) -> Array:

@@ -25,7 +25,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -42,6 +42,8 @@ from .scale_gauge import ScaleGauge, normalize_by_scale
 
 # Largest number of samples in a chunk.
 CHUNK_SIZE = 2000
+# Number of columns above which the rows of a small chunk are merged without a factorization of their own.
+MANY_COLUMNS = 200
 # Distance [m or rad] to a bound below which the bound is active.
 ACTIVE_BOUND_TOL = 1e-12
 
@@ -57,10 +59,13 @@ class Problem:
     Attributes:
         errors: Nominal chain and its p errors.
         data: Measurements of any kinds.
-        weights: Reciprocal prior standard deviations of shape (p+s,); zero without a prior.
+        weights: Weights √T/σ of the prior rows, with the prior standard deviations σ and the temperature T,
+            shape (p+s,); zero without a prior.
         known: Values of instrument parameters that are not estimated, by name [m or rad].
         executor: Executes the work on the chunks. The result does not depend on it.
         bounds: Smallest and largest x, shape (2, p+s) [m and rad]; None if nothing is bounded.
+        temperature: Factor T by which correlation of the residuals enlarges their variance: N samples count
+            as N/T independent ones against the priors. The whitened rows do not contain it.
     """
 
     errors: ErrorModel
@@ -69,6 +74,12 @@ class Problem:
     known: Mapping[str, float] = field(default_factory=dict)
     executor: TaskExecutor = SERIAL
     bounds: Array | None = None
+    temperature: float = 1.0
+
+    @property
+    def prior_weights(self) -> Array:
+        """Reciprocal prior standard deviations 1/σ of shape (p+s,); zero without a prior."""
+        return self.weights / np.sqrt(self.temperature)
 
     @cached_property
     def instrument_parameters(self) -> tuple[InstrumentParameter, ...]:
@@ -170,9 +181,25 @@ class Problem:
         Returns:
             Problem with the same data and chunks.
         """
-        out = replace(self, weights=weights)
+        return self._with_same_rows(weights=weights)
+
+    def _with_same_rows(self, **changes: Any) -> Problem:
+        """Return the problem with changes that do not concern its rows, with the same chunks."""
+        out = replace(self, **changes)
         vars(out).update(chunks=self.chunks, scale_gauge=self.scale_gauge)
         return out
+
+    def at_temperature(self, temperature: float) -> Problem:
+        """Return the problem with the same priors at another temperature of the residuals.
+
+        Args:
+            temperature: Factor T on the variance of the residuals.
+
+        Returns:
+            Problem with the same data and chunks.
+        """
+        weights = self.prior_weights * np.sqrt(temperature)
+        return self._with_same_rows(weights=weights, temperature=temperature)
 
     def is_interior(self, x: Array) -> Array:
         """Find the unknowns whose bounds are not active.
@@ -294,8 +321,12 @@ class Linearization:
                 exact ones.
 
         Returns:
-            R factor of shape (p+s+1, p+s+1).
+            R factor of shape (p+s+1, p+s+1); the rows themselves, shape (u, p+s+1), if there are many columns
+            and fewer rows.
         """
+        n_rows = chunk.data.residual_dim * len(chunk.data.rows)
+        if MANY_COLUMNS < self._n_columns > n_rows and not small_angle:
+            return self.rows(chunk).reshape(self._n_columns, -1).T
         data, frames = chunk.data, chunk.frames(self.chain)
         # The kernel computes the columns of geometric errors while it factors them; they are never stored.
         # All other columns, and all columns of measurements that are normalized by scale, are filled before.

@@ -221,21 +221,32 @@ def merge_r_factors(factors: Sequence[Array]) -> Array:
 def combine_r_factors(factors: Iterable[Array], p: int) -> TriangularSystem:
     """Merge the R factors of all chunks of data, one after the other.
 
-    Two factors are in memory at a time.
+    Two factors are in memory at a time. The plain rows of small chunks are collected first.
 
     Args:
-        factors: R factors of [J | r], shape (p+1, p+1) each.
+        factors: R factors of [J | r], shape (p+1, p+1) each, or plain rows, shape (u, p+1) with u <= p.
         p: Number of unknowns.
 
     Returns:
         System of all rows; zero if there are no factors.
     """
-    merged = None
+    merged: Array | None = None
+    pending: list[Array] = []
     for factor in factors:
-        merged = factor if merged is None else merge_r_factors((merged, factor))
-    if merged is None:
-        merged = np.zeros((p + 1, p + 1))
-    return TriangularSystem(merged)
+        pending.append(factor)
+        if sum(map(len, pending)) > p:
+            merged = _merge_with(merged, pending)
+            pending = []
+    if pending:
+        merged = _merge_with(merged, pending)
+    return TriangularSystem(np.zeros((p + 1, p + 1)) if merged is None else merged)
+
+
+def _merge_with(merged: Array | None, pending: Sequence[Array]) -> Array:
+    """Merge pending factors or rows with the factor of all rows before them, if there is one."""
+    if merged is None and len(pending) == 1 and len(pending[0]) == pending[0].shape[1]:
+        return pending[0]
+    return merge_r_factors(pending if merged is None else (merged, *pending))
 
 
 def append_rows(system: TriangularSystem, diagonal: Array, right: Array) -> TriangularSystem:
@@ -308,6 +319,10 @@ def posterior_sqrt_covariance(system: TriangularSystem, weights: Array) -> tuple
     full = append_priors(system, weights, 0.0).r
     if _is_well_conditioned(full):
         return lapack.dtrtri(full)[0], np.empty((len(weights), 0))
+    # Unknowns of different units may alone cause the condition.
+    scale = np.linalg.norm(full, axis=0)
+    if weights.all() and _is_well_conditioned(full / scale):
+        return lapack.dtrtri(full / scale)[0] / scale[:, None], np.empty((len(weights), 0))
     _, s, vt = np.linalg.svd(system.r)
     n_observable = int(np.sum(s > RANK_RTOL * s[0]))
     observable, unobservable = vt[:n_observable].T, vt[n_observable:].T

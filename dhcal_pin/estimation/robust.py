@@ -41,6 +41,7 @@ import numpy as np
 from .._typing import Array
 from ..measurements.base import Measurement
 from . import qr
+from .priors import effective_parameters
 from .problem import CHUNK_SIZE, Chunk, Linearization, Problem, chunk_residual, linearize_and_factor
 from .qr import posterior_sqrt_covariance
 from .solver import SolverResult
@@ -174,27 +175,49 @@ def sample_weights(t: Array, stage: str) -> Array:
     return np.maximum(np.where(t > cutoff, 0.0, weight_function(t)), ZERO_WEIGHT)
 
 
+@dataclass(frozen=True, eq=False)
+class WeightChange:
+    """Change of the weights in one round of IRLS, before damping.
+
+    Attributes:
+        size: Largest change of a weight.
+        steps: Changes of each measurement's weights, shape (m,) each; empty before the first round.
+        n_reversals: Number of rounds of this stage that nearly undid the change of the round before.
+    """
+
+    size: float = np.inf
+    steps: tuple[Array, ...] = ()
+    n_reversals: int = 0
+
+
 def update_weights(
-    previous: Sequence[Array], residuals: Sequence[Array], stage: str, last_change: float
-) -> tuple[list[Array], float]:
+    previous: Sequence[Array], residuals: Sequence[Array], stage: str, last: WeightChange
+) -> tuple[list[Array], WeightChange]:
     """Compute the weights of the next round of IRLS.
 
-    Weights whose change hardly falls alternate between two sets; their mean is used then.
+    Weights whose change hardly falls alternate between two sets; their mean is used then. Weights of samples
+    with much leverage alternate again after that. From the second time on, every round makes a part of the
+    change only, and half of that part after each further time.
 
     Args:
         previous: Weights of each measurement's samples, shape (m,) each.
         residuals: Standardized residuals of each measurement, shape (m,) each.
         stage: Key of `WEIGHT_FUNCTIONS`.
-        last_change: Largest change of a weight in the last round.
+        last: Change of the weights in the last round of this stage.
 
     Returns:
-        New weights, and the largest change of a weight.
+        New weights, and their change.
     """
     weights = [sample_weights(t, stage) for t in residuals]
-    change = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(weights, previous, strict=True))
-    if change > OSCILLATION_RATIO * last_change:
-        weights = [0.5 * (a + b) for a, b in zip(weights, previous, strict=True)]
-    return weights, change
+    steps = tuple(a - b for a, b in zip(weights, previous, strict=True))
+    size = max(float(np.abs(step).max(initial=0.0)) for step in steps)
+    is_stalled = size > OSCILLATION_RATIO * last.size
+    is_reversed = is_stalled and sum(map(np.vdot, steps, last.steps)) < 0
+    n_reversals = last.n_reversals + is_reversed
+    damping = 0.5 ** max(n_reversals - 1, int(is_stalled))
+    if damping < 1:
+        weights = [damping * a + (1 - damping) * b for a, b in zip(weights, previous, strict=True)]
+    return weights, WeightChange(size, steps, n_reversals)
 
 
 def has_possible_outliers(t: Array) -> bool:
@@ -226,6 +249,9 @@ def studentized_residuals(
     """
     n_rows = sum(np.count_nonzero(w > 0.5) * item.residual_dim for item, w in zip(data, weights, strict=True))
     n_unknowns = len(solution.x)
+    if problem.temperature > 1:
+        # The priors decide on many unknowns.
+        n_unknowns = effective_parameters(problem, solution)
     if n_rows <= n_unknowns and n_rows <= qr.rank(solution.system.r):
         return [np.zeros(len(item.rows)) for item in data]
     chain = problem.errors.at(solution.x[: len(problem.errors.parameters)])

@@ -93,16 +93,24 @@ class Uncertainty:
         entries: Indices of the uncertain coefficients in the flattened transmission, shape (e,).
         sqrt_covariance: Square root of the covariance, shape (6(k+1)+e, r).
         unbounded_directions: Directions that neither data nor priors determine, shape (6(k+1)+e, h).
+        temperature: Factor on the variance of correlated residuals that the covariance contains.
     """
 
     chain: Chain
     entries: Array
     sqrt_covariance: Array
     unbounded_directions: Array
+    temperature: float = 1.0
 
     @classmethod
     def from_errors(
-        cls, errors: ErrorModel, x: Array, chain: Chain, sqrt_covariance: Array, unbounded_directions: Array
+        cls,
+        errors: ErrorModel,
+        x: Array,
+        chain: Chain,
+        sqrt_covariance: Array,
+        unbounded_directions: Array,
+        temperature: float = 1.0,
     ) -> Uncertainty:
         """Transform the covariance of identified parameters.
 
@@ -112,6 +120,7 @@ class Uncertainty:
             chain: Calibrated chain.
             sqrt_covariance: Square root of the parameters' covariance, shape (p, r).
             unbounded_directions: Undetermined directions of the parameters, shape (p, h).
+            temperature: Factor on the variance of correlated residuals that the covariance contains.
 
         Returns:
             Uncertainty of the calibrated chain.
@@ -127,7 +136,7 @@ class Uncertainty:
             "pij,pj->pi", link_from_body[bodies[:n_geometric]], twists[:n_geometric]
         )
         rows = np.concatenate([body_twists.reshape(6 * n_bodies, -1), np.eye(len(bodies))[n_geometric:]])
-        return cls(chain, entries, rows @ sqrt_covariance, rows @ unbounded_directions)
+        return cls(chain, entries, rows @ sqrt_covariance, rows @ unbounded_directions, temperature)
 
     def of_parameters(self, errors: ErrorModel, scale: Array) -> tuple[Array, Array]:
         """Compute the covariance of further parameters of the calibrated chain.
@@ -178,7 +187,7 @@ class Uncertainty:
         frames = self.chain.forward_kinematics(q)
         jacobian = self._tool_jacobian(frames)
         root, undetermined = (
-            np.einsum("pim,pr->mir", jacobian, part)
+            np.tensordot(jacobian, part, (0, 0)).swapaxes(0, 1)
             for part in (self.sqrt_covariance, self.unbounded_directions)
         )
         covariance = root @ np.swapaxes(root, 1, 2)

@@ -3,22 +3,10 @@
 Numbers (rank, observability indices, directions) are in `observability`, the causes of unobservable
 directions in `null_space`, their geometry in `propagation`, and the sentences for users in `explanations`.
 All of them analyze a linearized problem; what solves problems belongs to `estimation`.
+
+The public names are listed in `__init__.pyi`. Each is loaded on first use.
 """
 
-from .explanations import (
-    EXPECTED,
-    explain_unobservable,
-    explain_weakly_observable,
-    label_unobservable,
-)
-from .observability import correlation, observability_indices, observable_fraction
+import lazy_loader
 
-__all__ = [
-    "EXPECTED",
-    "correlation",
-    "explain_unobservable",
-    "explain_weakly_observable",
-    "label_unobservable",
-    "observability_indices",
-    "observable_fraction",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -6,6 +6,10 @@ and each joint that it passes must leave it unchanged (see `propagation`). If no
 only the parameters are named. An advice is given only if the hypothetical measurement makes the
 parameters observable (see `null_space`).
 
+Correction curves, the harmonics of high order, are explained apart from the other parameters: limited ranges
+of the joints leave many combinations of them open. The other parameters are explained as if the curves were
+known, and one sentence states how many combinations of the curves are open.
+
 Redundancies of the model, such as base pose and origin of joint 1, exist for every instrument. Their
 sentences start with `EXPECTED`, and users can ignore them.
 """
@@ -13,7 +17,7 @@ sentences start with `EXPECTED`, and users can ignore them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -21,11 +25,13 @@ import numpy as np
 from .._typing import Array
 from ..estimation import qr
 from ..estimation.error_model import ErrorParameter
+from ..estimation.parameters import CURVE_ORDERS, fold_harmonics
 from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.qr import TriangularSystem
 from ..measurements.pose import Pose
 from ..measurements.position import Position
 from ..robot.chain import BASE_FRAME, Chain
+from ..robot.transmission import harmonic_orders
 from . import observability
 from .null_space import Cause, ObservabilityProbe, UnobservableGroup, group_directions
 from .propagation import (
@@ -370,6 +376,76 @@ def explain_unobservable(problem: Problem, x: Array, system: TriangularSystem) -
     """
     if qr.rank(system.r) == len(x):
         return []
+    curve_joints = _curve_joints(problem)
+    if (curve_joints < 0).all():
+        return _explain_null_space(problem, x)
+    kept = np.flatnonzero(curve_joints < 0)
+    is_explained = qr.rank(system.r[:, kept]) == len(kept)
+    sentences = [] if is_explained else _explain_null_space(*_with_known_curves(problem, x, kept))
+    return [*sentences, *_explain_curves(ObservabilityProbe(problem, x), system.r, curve_joints)]
+
+
+def _curve_joints(problem: Problem) -> Array:
+    """Return the joint of each unknown that belongs to a correction curve, -1 for others, shape (p,)."""
+    n = problem.errors.chain.n_joints
+    indices = np.array(
+        [-1 if p.coefficient_index is None else p.coefficient_index for p in problem.errors.parameters], int
+    )
+    is_curve = harmonic_orders(indices, n) >= CURVE_ORDERS.start
+    others = np.full(len(problem.instrument_parameters), -1)
+    return np.concatenate([np.where(is_curve, indices % n, -1), others])
+
+
+def _with_known_curves(problem: Problem, x: Array, kept: Array) -> tuple[Problem, Array]:
+    """Return a problem in which only some unknowns remain, and their values; the others stay as in x."""
+    errors, n_robot = problem.errors, len(problem.errors.parameters)
+    known = x.copy()
+    known[kept] = 0.0
+    parameters = tuple(errors.parameters[i] for i in kept if i < n_robot)
+    reduced = replace(errors, chain=errors.at(known[:n_robot]), parameters=parameters)
+    return replace(problem, errors=reduced, weights=problem.weights[kept], bounds=None), x[kept]
+
+
+def _explain_curves(probe: ObservabilityProbe, r: Array, curve_joints: Array) -> list[str]:
+    """Explain how many combinations of the correction curves are not identifiable, and of which joints.
+
+    Args:
+        probe: Problem, and values at which its Jacobian is taken.
+        r: R factor of the measurements, shape (p, p).
+        curve_joints: Joint of each unknown that belongs to a curve, -1 for others, shape (p,).
+
+    Returns:
+        One sentence; none if all combinations are identifiable once the other unknowns are known.
+    """
+    others = curve_joints < 0
+
+    def n_open(factor: Array) -> int:
+        n_all, n_others = len(others) - qr.rank(factor), int(others.sum()) - qr.rank(factor[:, others])
+        return n_all - n_others
+
+    if not (count := n_open(r)):
+        return []
+    shares = np.sum(qr.null_space(r) ** 2, 1)
+    by_joint = {
+        name: round(float(shares[curve_joints == i].sum())) for i, name in enumerate(probe.chain.joint_names)
+    }
+    listed = ", ".join(f"{name} {share}" for name, share in by_joint.items() if share)
+    samples = sum(len(item.rows) for item in probe.problem.data)
+    if qr.rank(r) == probe.n_equations:
+        reason = f"{probe.n_equations} equations for {len(others)} parameters"
+        advice = f"measure at least {-(-count * samples // probe.n_equations)} more poses"
+    elif n_open(probe.hypothetical_r_factor(range(probe.chain.n_joints))) < count:
+        reason, advice = "the poses are too similar", "measure poses over the full range of the joints"
+    else:
+        reason, advice = "the ranges of the joints are too small", "only the priors determine them"
+    return [
+        f"correction curves: {reason}; {count} of {int((~others).sum())} combinations of harmonics are not "
+        f"identifiable{f' ({listed})' if listed else ''}; {advice}"
+    ]
+
+
+def _explain_null_space(problem: Problem, x: Array) -> list[str]:
+    """Explain all unobservable directions of a problem at x (p,)."""
     probe = ObservabilityProbe(problem, x)
     # Even a small last step rotates the null space by more than the tolerance, so take the Jacobian at x.
     r = linearize_and_factor(problem, x, small_angle=False).r
@@ -449,9 +525,16 @@ def explain_weakly_observable(
         probe.n_repetitions
     )
     scaled = directions / prior_std[:, None]
+    # The curve of a joint is explained as a whole.
+    curve_joints = _curve_joints(problem)
+    is_same_curve = (curve_joints[:, None] == curve_joints) & (curve_joints >= 0)
+    projector = np.abs(scaled @ scaled.T)
+    adjacency = (projector > _MIN_CORRELATION) | (
+        is_same_curve & np.logical_and.outer(*[np.diag(projector) > _MIN_CORRELATION] * 2)
+    )
     variance = (scaled * std_ratios**2) @ scaled.T
     out = []
-    for members in observability.connected_components(np.abs(scaled @ scaled.T) > _MIN_CORRELATION):
+    for members in observability.connected_components(adjacency):
         block = np.ix_(members, members)
         count = max(1, round(float(np.trace((scaled @ scaled.T)[block]))))
         ratio_squared, main = (part[..., -count:] for part in np.linalg.eigh(variance[block]))
@@ -459,7 +542,7 @@ def explain_weakly_observable(
             "" if len(members) == 1 else " of one combination" if count == 1 else f" of {count} combinations"
         )
         text = (
-            f"{join_names([names[i] for i in members])}: standard deviation{what} still "
+            f"{join_names(fold_harmonics(names[i] for i in members))}: standard deviation{what} still "
             f"{100 * np.sqrt(ratio_squared[0]):.0f} %{' or more' * (count > 1)} of the prior"
         )
         geometric = [plain_errors.parameters[i] for i in members if i < len(plain_errors.parameters)]

@@ -39,7 +39,8 @@ from ..robot.dh import CONVENTIONS, Convention, DHTable
 from ..units import ANGLES, LENGTHS
 from .robot_format import ConvertedRobot, RobotSource
 from .sidecar import existing_sidecar
-from .tabular import Column, CsvTable, parse_number, read_csv_table, require_usable_names
+from .tables import Column, DataTable, read_table
+from .tabular import parse_number, require_usable_names
 from .toml_table import TomlTable, pose_content, read_pose
 
 # Columns of numbers with their units, those among them that are required, and the limits with their defaults.
@@ -105,7 +106,8 @@ def _read_dh_toml(path: PathLike) -> DHTable:
 
 
 def _read_dh_csv(path: PathLike) -> DHTable:
-    table = read_csv_table(path)
+    table = read_table(path)
+    table.require_good_rows()
     notes = _notes(table)
     convention = notes.get("convention")
     if convention not in CONVENTIONS:
@@ -149,13 +151,13 @@ def _read_dh_csv(path: PathLike) -> DHTable:
     return _build_table(table.source, convention, columns, poses)
 
 
-def _notes(table: CsvTable) -> dict[str, str]:
+def _notes(table: DataTable) -> dict[str, str]:
     """Return the comments `key: value` of a table."""
     pairs = (comment.split(":", 1) for comment in table.comments if ":" in comment)
     return {key.strip().lower(): value.strip() for key, value in pairs}
 
 
-def _parse_pose_note(table: CsvTable, key: str, note: str) -> Array:
+def _parse_pose_note(table: DataTable, key: str, note: str) -> Array:
     try:
         numbers = [float(word) for word in note.split()]
     except ValueError:
@@ -166,7 +168,7 @@ def _parse_pose_note(table: CsvTable, key: str, note: str) -> Array:
     return read_pose(TomlTable(table.source, content, f"[{key}]"))
 
 
-def _parse_limit(table: CsvTable, column: Column, row: int, joint_type: str, no_limit: float) -> float:
+def _parse_limit(table: DataTable, column: Column, row: int, joint_type: str, no_limit: float) -> float:
     """Parse the limit of a joint; the column's unit is an angle, a length, or both as in `lower[rad|m]`."""
     cell = table.cells[row][column.index].strip()
     if not cell:

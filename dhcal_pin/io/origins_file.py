@@ -3,19 +3,50 @@
 A chain keeps one origin for each moving joint: the product of the origins of all fixed joints before it and
 of its own. A URDF has an origin for each joint. `joint_origins` distributes the changes of a chain over the
 joints of its URDF; `origins_text` writes all of them as a table, for robots that are maintained as xacro.
+`origin_table` shows what a calibration changed.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from .. import se3
 from .._typing import Array, PathLike
+from ..formatting import Table, format_fixed
 from ..robot.chain import Chain
+from ..robot.urdf import UrdfJoint
 from .robot_format import ConvertedRobot, RobotSource
 
 # Components of an origin, in the order of `se3.to_xyz_rpy`: metres, then radians.
 ORIGIN_KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
+
+# Largest distance [m] and angle [rad] by which an origin may move and still count as unmoved, far below what
+# any instrument measures. Where base and first joint are redundant, the ratio of their prior variances,
+# (1 mm)² to (10 m)², leaves 1e-8 of the correction of the base to the joint.
+MIN_MOVE = 1e-8
+
+
+def without_negligible_moves(chain: Chain) -> Chain:
+    """Return a chain whose joint origins are exactly nominal where they moved less than rounding errors.
+
+    Translation and rotation of each origin are compared separately with the URDF.
+
+    Args:
+        chain: Chain whose origins may differ from those of its URDF.
+
+    Returns:
+        Chain with the nominal translation or rotation of each origin that moved by at most `MIN_MOVE`.
+    """
+    nominal = Chain.from_urdf(chain.urdf, chain.tip).origins
+    origins = chain.origins.copy()
+    change = se3.inverse(nominal) @ origins
+    same_position = np.linalg.norm(change[:, :3, 3], axis=1) <= MIN_MOVE
+    same_rotation = np.linalg.norm(se3.log3(change[:, :3, :3]), axis=1) <= MIN_MOVE
+    origins[same_position, :3, 3] = nominal[same_position, :3, 3]
+    origins[same_rotation, :3, :3] = nominal[same_rotation, :3, :3]
+    return replace(chain, origins=origins)
 
 
 def joint_origins(chain: Chain) -> tuple[dict[str, Array], Array]:
@@ -38,19 +69,77 @@ def joint_origins(chain: Chain) -> tuple[dict[str, Array], Array]:
     parent, moving_index, last_fixed = np.eye(4), 0, None
     for joint in chain.urdf.path(chain.tip):
         if joint.type != "fixed":
-            if not np.array_equal(chain.origins[moving_index], nominal.origins[moving_index]):
-                changed[joint.name] = se3.inverse(parent) @ chain.origins[moving_index]
+            new, old = chain.origins[moving_index], nominal.origins[moving_index]
+            if not np.array_equal(new, old):
+                changed[joint.name] = _changed_origin(joint, parent, new, old)
             parent, moving_index, last_fixed = np.eye(4), moving_index + 1, None
         else:
-            last_fixed = joint.name, parent
+            last_fixed = joint, parent
             parent = parent @ joint.origin
-    if np.array_equal(chain.origins[-1], nominal.origins[-1]):
+    new, old = chain.origins[-1], nominal.origins[-1]
+    if np.array_equal(new, old):
         return changed, chain.tool
     if last_fixed is None:
-        return changed, se3.inverse(nominal.origins[-1]) @ chain.origins[-1] @ chain.tool
-    name, parent = last_fixed
-    changed[name] = se3.inverse(parent) @ chain.origins[-1]
+        return changed, se3.inverse(old) @ new @ chain.tool
+    joint, parent = last_fixed
+    changed[joint.name] = _changed_origin(joint, parent, new, old)
     return changed, chain.tool
+
+
+def _changed_origin(joint: UrdfJoint, parent: Array, new: Array, old: Array) -> Array:
+    """Compute the origin of a joint so that it has a new pose in the moving joint before it.
+
+    Args:
+        joint: Joint of the URDF.
+        parent: Pose of its parent link in the moving joint before it, shape (4, 4) [m].
+        new: New pose of the joint in the moving joint before it, shape (4, 4) [m].
+        old: Its nominal pose, shape (4, 4) [m].
+
+    Returns:
+        Origin in the parent link, shape (4, 4) [m]. A translation or rotation that is unchanged is exactly
+        that of the file.
+    """
+    origin = se3.inverse(parent) @ new
+    if np.array_equal(new[:3, 3], old[:3, 3]):
+        origin[:3, 3] = joint.origin[:3, 3]
+    if np.array_equal(new[:3, :3], old[:3, :3]):
+        origin[:3, :3] = joint.origin[:3, :3]
+    return origin
+
+
+def origin_table(chain: Chain) -> Table:
+    """Make a table of the origins of all joints that moved, before and after, as in the URDF.
+
+    Args:
+        chain: Calibrated chain; its URDF is the nominal one.
+
+    Returns:
+        Table with two rows per joint: `xyz` [m] with the distance and `rpy` [rad] with the angle by which the
+        origin moved. Without a moved joint it has no rows.
+    """
+    changed, _ = joint_origins(without_negligible_moves(chain))
+    rows = []
+    for joint in chain.urdf.path(chain.tip):
+        if joint.name not in changed:
+            continue
+        old, new = joint.origin, changed[joint.name]
+        distance = float(np.linalg.norm(new[:3, 3] - old[:3, 3]))
+        angle = float(np.linalg.norm(se3.log3(old[:3, :3].T @ new[:3, :3])))
+        rows += [
+            [joint.name, "xyz", _numbers(old[:3, 3]), _numbers(new[:3, 3]), f"{1e3 * distance:.3f} mm"],
+            [joint.name, "rpy", _numbers(joint.rpy), _numbers(_rpy(joint, new)), f"{np.degrees(angle):.4f}°"],
+        ]
+    return Table(["joint", "origin", "before", "after", "moved"], rows, n_text_columns=4)
+
+
+def _rpy(joint: UrdfJoint, origin: Array) -> Array:
+    """Return the angles of a new origin of a joint that are nearest to those of the file, shape (3,)."""
+    return se3.nearest_rpy(origin[:3, :3], joint.rpy)
+
+
+def _numbers(values: Array) -> str:
+    """Format numbers with six decimals (1 µm, 1 µrad) at most."""
+    return " ".join(format_fixed(value, 6).rstrip("0").rstrip(".") for value in values.tolist())
 
 
 def origins_text(chain: Chain) -> str:
@@ -62,11 +151,12 @@ def origins_text(chain: Chain) -> str:
     Returns:
         One row per joint: its name, then x, y, z [m] and roll, pitch, yaw [rad] in its parent link.
     """
-    changed, _ = joint_origins(chain)
+    changed, _ = joint_origins(without_negligible_moves(chain))
     lines = ["joint," + ",".join(f"{key}[{'m' if key in 'xyz' else 'rad'}]" for key in ORIGIN_KEYS)]
     for joint in chain.urdf.path(chain.tip):
         origin = changed.get(joint.name, joint.origin)
-        lines.append(",".join([joint.name, *map(repr, se3.to_xyz_rpy(origin))]))
+        numbers = (*origin[:3, 3], *_rpy(joint, origin))
+        lines.append(",".join([joint.name, *(repr(float(value) + 0.0) for value in numbers)]))
     return "\n".join(lines) + "\n"
 
 

@@ -8,7 +8,7 @@ sidecar.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
@@ -17,14 +17,17 @@ import numpy as np
 
 from .._typing import PathLike
 from ..estimation.uncertainty import Uncertainty
-from ..exceptions import DhcalError, FileFormatError, InvalidArgumentError
+from ..exceptions import DhcalError, FileFormatError, InvalidArgumentError, RefusedCalibrationError
+from ..measurements.measured_region import MeasuredRegion
+from ..messages import escape_control_characters
 from ..robot.chain import Chain
 from ..robot.dh import Convention, DHTable
 from ..robot.urdf import parse_urdf, read_urdf
 from ..robot.urdf_edit import with_origins
-from .atomic import write_files
+from ..ros_packages import resolve_robot_path, validated_package_dirs
+from ..saving import complete_interrupted_save, write_files
 from .dh_file import convert_to_dh, read_dh
-from .origins_file import convert_to_origins, joint_origins
+from .origins_file import convert_to_origins, joint_origins, without_negligible_moves
 from .robot_format import ConvertedRobot, RobotFormat, RobotSource
 from .sidecar import existing_sidecar, sidecar_path, sidecar_text, with_sidecar
 from .ur_kinematics import convert_to_ur_kinematics, read_ur_kinematics
@@ -43,22 +46,28 @@ def robot_name(path: PathLike) -> str:
         path: Path such as `dir/arm.dh.toml`.
 
     Returns:
-        File name up to the first dot, such as `arm`.
+        File name up to the first dot, such as `arm`, with escapes for characters that XML cannot hold.
     """
-    return Path(path).name.split(".")[0] or "arm"
+    return escape_control_characters(Path(path).name.split(".")[0]) or "arm"
 
 
 def _urdf_of_table(robot: RobotSource, path: PathLike) -> ConvertedRobot:
     """Convert a DH table to its exact URDF."""
-    if robot.table is None:
-        raise InvalidArgumentError(
-            f"{os.fspath(path)}: {robot.path} contains no DH table; only DH tables are converted to URDF"
-        )
-    if robot.convention is not None:
-        raise InvalidArgumentError(f"{robot.path}: a URDF has no DH convention; leave out --convention")
+    return ConvertedRobot(robot.chain.urdf.data.decode(), _notes_beside(path))
+
+
+def _copy_of_urdf(source: PathLike, target: PathLike) -> ConvertedRobot:
+    """Copy a URDF, which need not have a single deepest tip."""
+    notes = _notes_beside(target)
+    if sidecar := existing_sidecar(source):
+        notes.append(f"{sidecar} is not copied; it holds base, tool and joint errors")
+    return ConvertedRobot(read_urdf(source).data.decode(), notes)
+
+
+def _notes_beside(path: PathLike) -> list[str]:
+    """Note a sidecar beside a URDF that is to be written."""
     sidecar = existing_sidecar(path)
-    notes = [f"{sidecar} lies beside it and is read with it"] if sidecar else []
-    return ConvertedRobot(robot.chain.urdf.data.decode(), notes)
+    return [f"{sidecar} lies beside it and is read with it"] if sidecar else []
 
 
 # The formats that robots are read from and written to. An ending selects its row; the longest one wins.
@@ -118,19 +127,23 @@ def has_dh_table(path: PathLike) -> bool:
     return robot_format is not None and robot_format.read_table is not None
 
 
-def _read(path: PathLike, tip: str | None, sidecar: PathLike | None) -> tuple[Chain, DHTable | None]:
+def _read(
+    path: PathLike, tip: str | None, sidecar: PathLike | None, package_dirs: Sequence[PathLike] = ()
+) -> tuple[Chain, DHTable | None]:
     """Read the chain of a robot file and its sidecar, and its DH table if it has one."""
+    path, folders = resolve_robot_path(path), validated_package_dirs(package_dirs)
+    complete_interrupted_save(path)
     robot_format = find_format(path)
     table = None
     if robot_format is None:
-        chain = Chain.from_urdf(path, tip)
+        chain = Chain.from_urdf(replace(read_urdf(path), package_dirs=folders), tip)
     elif robot_format.read_table is not None:
         if tip is not None:
             raise InvalidArgumentError(f"{os.fspath(path)}: a DH table has one tip; leave out --tip")
         table = robot_format.read_table(path)
         chain = Chain.from_dh(table, robot_name(path))
     elif robot_format.read_urdf is not None:
-        chain = Chain.from_urdf(robot_format.read_urdf(path), tip)
+        chain = Chain.from_urdf(replace(robot_format.read_urdf(path), package_dirs=folders), tip)
     else:
         readable = ", ".join(_endings(other for other in FORMATS if other.is_readable))
         raise FileFormatError(
@@ -140,25 +153,32 @@ def _read(path: PathLike, tip: str | None, sidecar: PathLike | None) -> tuple[Ch
     return (chain if sidecar is None else with_sidecar(chain, sidecar)), table
 
 
-def read_robot(path: PathLike, tip: str | None = None, sidecar: PathLike | None = None) -> Chain:
+def read_robot(
+    path: PathLike,
+    tip: str | None = None,
+    sidecar: PathLike | None = None,
+    package_dirs: Sequence[PathLike] = (),
+) -> Chain:
     """Read a robot and its sidecar.
 
     Args:
-        path: File in one of `FORMATS`; a file with another ending is read as a URDF.
+        path: File in one of `FORMATS`; a file with another ending is read as a URDF. `example:NAME` is a
+            robot of example-robot-data.
         tip: Tip link of a URDF; the deepest leaf if None.
         sidecar: Sidecar to read in place of the one beside the robot.
+        package_dirs: Folders in which packages with meshes are searched first.
 
     Returns:
         The chain from the base link to the tip. A file that is missing or invalid, and a tip given for a DH
         table, raise a `DhcalError`.
     """
-    return _read(path, tip, sidecar)[0]
+    return _read(path, tip, sidecar, package_dirs)[0]
 
 
 def convert_robot(
     source: PathLike, target: PathLike, tip: str | None = None, convention: Convention | None = None
 ) -> ConvertedRobot:
-    """Convert a robot file to another format, chosen by the ending of the target.
+    """Convert a robot file to another format, chosen by the ending of the target; a URDF can be copied.
 
     Args:
         source: File to read.
@@ -170,13 +190,21 @@ def convert_robot(
         Text of the target file, and notes on what it could not hold.
 
     Raises:
-        InvalidArgumentError: No format has the ending of the target.
+        InvalidArgumentError: No format has the ending of the target, or a URDF has a DH convention.
     """
     robot_format = find_format(target)
     if robot_format is None:
         raise InvalidArgumentError(
             f"{os.fspath(target)}: unknown ending; choose from {', '.join(_endings(FORMATS))}"
         )
+    source_format = find_format(source)
+    if robot_format.read_urdf is not None:
+        if convention is not None:
+            raise InvalidArgumentError(
+                f"{os.fspath(target)}: a URDF has no DH convention; leave out --convention"
+            )
+        if source_format is None or source_format.read_urdf is not None:
+            return _copy_of_urdf(source, target)
     chain, table = _read(source, tip, None)
     return robot_format.convert(RobotSource(os.fspath(source), chain, table, convention), target)
 
@@ -186,18 +214,23 @@ def urdf_files(
     path: PathLike,
     instrument: Mapping[str, float] | None = None,
     uncertainty: Uncertainty | None = None,
+    measured_region: MeasuredRegion | None = None,
+    edit: Callable[[bytes], bytes] = lambda data: data,
 ) -> dict[PathLike, str | bytes]:
     """Return the contents of a calibrated URDF and its sidecar, without writing them.
 
-    The URDF is parsed again and compared with the chain. A sidecar is needed only for a base, a tool, a
-    payload, joint errors, instrument parameters or an uncertainty. One that exists already is always
-    replaced, because it would be read with the new URDF.
+    An origin that moved by less than `origins_file.MIN_MOVE` keeps its text. The URDF is parsed again and
+    compared with the chain. A sidecar is needed only for a base, a tool, a payload, joint errors, instrument
+    parameters, an uncertainty or a measured region. One that exists already is always replaced, because it
+    would be read with the new URDF.
 
     Args:
         chain: Calibrated robot.
         path: Path of the URDF.
         instrument: Instrument parameters by name [m or rad].
         uncertainty: Uncertainty of the calibrated robot.
+        measured_region: Region of joint space that was measured for the calibration.
+        edit: Last change of the URDF, such as more links; the sidecar contains the hash of the result.
 
     Returns:
         Contents by path.
@@ -205,6 +238,7 @@ def urdf_files(
     Raises:
         DhcalError: The written text would not be the same robot.
     """
+    chain = without_negligible_moves(chain)
     origins, tool = joint_origins(chain)
     data = with_origins(chain.urdf, origins)
     parsed = Chain.from_urdf(parse_urdf(data, os.fspath(path)), chain.tip)
@@ -221,16 +255,36 @@ def urdf_files(
             f"{os.fspath(path)}: not written: the tool of the URDF as read back differs by {difference:.2g}; "
             "please report it"
         )
+    data = edit(data)
     contents: dict[PathLike, str | bytes] = {path: data}
     is_replaced = existing_sidecar(path) is not None
-    sidecar = sidecar_text(chain, tool, instrument, uncertainty, required=is_replaced)
+    sidecar = sidecar_text(chain, tool, data, instrument, uncertainty, measured_region, required=is_replaced)
     if sidecar is not None:
         contents[sidecar_path(path)] = sidecar
     return contents
 
 
+class Judgement(Protocol):
+    """What `write_urdf` needs of the verdict on a calibration."""
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether the calibrated robot must not be used."""
+        ...
+
+    @property
+    def reasons(self) -> Sequence[str]:
+        """Sentences."""
+        ...
+
+
 class CalibratedRobot(Protocol):
     """What `write_urdf` needs of a calibration result."""
+
+    @property
+    def verdict(self) -> Judgement:
+        """Whether the calibrated robot may be used."""
+        ...
 
     @property
     def chain(self) -> Chain:
@@ -247,8 +301,13 @@ class CalibratedRobot(Protocol):
         """Uncertainty of the calibrated chain."""
         ...
 
+    @property
+    def measured_region(self) -> MeasuredRegion | None:
+        """Region of joint space that was measured for the calibration."""
+        ...
 
-def write_urdf(fit: CalibratedRobot | Chain, path: PathLike) -> None:
+
+def write_urdf(fit: CalibratedRobot | Chain, path: PathLike, force: bool = False) -> None:
     """Write a calibrated URDF and its sidecar.
 
     Only the origins of joints that moved change; every other byte is that of the nominal file. `urdf_files`
@@ -257,14 +316,24 @@ def write_urdf(fit: CalibratedRobot | Chain, path: PathLike) -> None:
     Args:
         fit: Result of a calibration, or a chain alone.
         path: Path of the URDF to write.
+        force: Write the robot even if the verdict on its calibration is "refused".
 
     Raises:
         InvalidArgumentError: The path is the nominal robot itself.
+        RefusedCalibrationError: The verdict is "refused".
     """
-    is_chain = isinstance(fit, Chain)
-    chain = fit if is_chain else fit.chain
+    if not (force or isinstance(fit, Chain)) and fit.verdict.is_refused:
+        reasons = " ".join(fit.verdict.reasons)
+        raise RefusedCalibrationError(
+            f"{os.fspath(path)}: not written, the calibration was refused: {reasons} Pass force=True to "
+            "write it nevertheless."
+        )
+    chain = fit if isinstance(fit, Chain) else fit.chain
     nominal = chain.urdf.source
     if os.path.exists(path) and os.path.exists(nominal) and os.path.samefile(path, nominal):
         raise InvalidArgumentError(f"{os.fspath(path)}: is the nominal robot itself; write to another file")
-    instrument, uncertainty = (None, None) if is_chain else (fit.transferable_instruments, fit.uncertainty)
-    write_files(urdf_files(chain, path, instrument, uncertainty))
+    if isinstance(fit, Chain):
+        contents = urdf_files(chain, path)
+    else:
+        contents = urdf_files(chain, path, fit.transferable_instruments, fit.uncertainty, fit.measured_region)
+    write_files(contents)

@@ -6,7 +6,7 @@ import os
 import re
 
 from .._typing import PathLike
-from ..estimation.priors import Priors
+from ..estimation.priors import MAX_PRIOR_STD, MIN_PRIOR_STD, Priors
 from ..exceptions import InvalidArgumentError
 from ..robot.transmission import Payload
 from .sidecar import MAX_PAYLOAD_DISTANCE_M, MAX_PAYLOAD_KG
@@ -64,8 +64,14 @@ def read_priors(choice: str | None) -> Priors | None:
             f"--priors {choice}: unknown choice; expected default, none, or a file of standard deviations"
         )
     table = TomlTable.read(choice)
-    expected = 'a positive standard deviation in m or rad, such as "theta*" = 0.01'
-    return {name: table.number(name, above=0, expected=expected) for name in table.keys()}
+    expected = (
+        f"a positive standard deviation in m or rad from {MIN_PRIOR_STD:g} to {MAX_PRIOR_STD:g}, such as "
+        '"theta*" = 0.01; use --fix for a parameter that is known exactly'
+    )
+    return {
+        name: table.number(name, at_least=MIN_PRIOR_STD, at_most=MAX_PRIOR_STD, expected=expected)
+        for name in table.keys()
+    }
 
 
 def parse_payload(text: str, label: str = "--payload") -> Payload:

@@ -14,8 +14,10 @@ The sidecar of `arm.urdf` is the TOML file `arm.calibration.toml` beside it:
     mass_kg = 5.0
     centre_m = [0.0, 0.0, 0.08]
 
-    [joint.elbow_joint]                # coefficients of `robot.transmission.TERMS`
+    [joint.elbow_joint]                # coefficients of `robot.transmission`
     gain = 0.001
+    harmonics = [[1, 2e-4, -1e-4]]     # order, sine and cosine of each harmonic [rad]
+    compliance_rad_per_nm = -2e-5
 
     [joint.elbow_joint.coupling]       # coefficients of other joints' positions
     wrist_1_joint = 0.0001
@@ -28,6 +30,20 @@ The sidecar of `arm.urdf` is the TOML file `arm.calibration.toml` beside it:
     terms = ["elbow_joint.gain"]
     sqrt_covariance = "..."            # rows of little-endian doubles in base64
     unbounded_directions = "..."
+    temperature = 75.8                 # factor on the variance of the residuals that the covariance contains
+
+    [manifest]
+    urdf_sha256 = "..."                # hash of the URDF that this file was written with
+    joints_sha256 = "..."              # hash of its joints from the root to the tip
+
+    [measured]                         # `measurements.MeasuredRegion`
+    joints = ["elbow_joint"]
+    lower = [-1.5]                     # smallest and largest measured values [rad or m]
+    upper = [0.5]
+    spread = [0.6]                     # standard deviations of the measured values [rad or m]
+    radius = 0.9                       # of the region, and how far its accuracy was judged, in spreads
+    reach = 1.5
+    configurations = "..."             # rows of little-endian doubles in base64, one per joint
 
 Absent tables mean identity frames, ideal joints and unknown uncertainty. Numbers are written with all digits
 and read back bit-identical. Errors in the content of a file are `FileFormatError`, unknown joints
@@ -38,7 +54,9 @@ from __future__ import annotations
 
 import base64
 import binascii
+import hashlib
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -47,17 +65,34 @@ import numpy as np
 import tomli_w
 
 from .._typing import Array, PathLike
-from ..estimation.parameters import EXTENSIONS, PARAMETER_SETS
+from ..estimation.parameters import PARAMETER_SETS, fold_harmonics
 from ..estimation.uncertainty import Uncertainty
 from ..exceptions import FileFormatError, UnknownNameError
+from ..measurements.measured_region import MeasuredRegion
+from ..messages import quote
 from ..robot.chain import Chain
-from ..robot.transmission import COUPLING_TERM, TERMS, Payload, Transmission
-from .toml_table import TomlTable, pose_content, read_pose
+from ..robot.error_families import FAMILIES
+from ..robot.transmission import (
+    MAX_CURVE_ORDER,
+    Payload,
+    Transmission,
+    n_coefficients,
+    split_coefficients,
+)
+from ..robot.urdf import Urdf, parse_urdf, suggest_names
+from ..saving import complete_interrupted_save
+from .toml_table import TomlTable, is_number, pose_content, read_pose
 
 # Heaviest payload [kg] and farthest centre [m]; beyond them the unit is wrong.
 MAX_PAYLOAD_KG, MAX_PAYLOAD_DISTANCE_M = 1e5, 1e2
 # Largest coefficient of a joint error, in its unit.
 _MAX_COEFFICIENT = 1e6
+# Keys of single harmonics, which the key `harmonics` replaces.
+_FORMER_HARMONIC_KEYS = ("sin_rad", "cos_rad", "sin2_rad", "cos2_rad")
+# Entry of `harmonics` as tomli_w writes it.
+_HARMONIC_LINES = re.compile(r"^ {4}\[\n +(\d+),\n +(\S+),\n +(\S+),\n {4}\]", re.MULTILINE)
+# Decimals of the numbers [m or rad] that the hash of the joints depends on.
+_DIGEST_DECIMALS = 12
 # Length of the lines of base64 text [characters].
 _LINE_LENGTH = 76
 
@@ -66,12 +101,18 @@ _HEADER = """\
 # tool: pose of the measured point in the tip frame. Metres; rotation vectors in radians.
 """
 _JOINT_HEADER = """\
-# joint: what is added to the commanded position q of a joint, by q and the torque of gravity.
+# joint: what is added to the commanded position q of a joint, by q and the torque of gravity. harmonics:
+# k and the factors of sin(k q) and cos(k q) in radians.
 """
 _UNCERTAINTY_HEADER = """\
 # uncertainty: square root of the covariance of the errors, and directions that neither the measurements nor
 # a prior determine. Rows: six per link (motion in m and rad; the base link's in the measuring frame), then
 # the terms. Little-endian doubles in base64.
+"""
+_MEASURED_HEADER = """\
+# measured: configurations that represent the measured region of joint space. A configuration is in the region
+# if its distance to one of them, in spreads of the joints, is at most the radius. The accuracy beyond it was
+# judged up to the distance `reach`. Rows: the joints.
 """
 
 
@@ -96,6 +137,7 @@ def existing_sidecar(path: PathLike) -> str | None:
     Returns:
         Path of the sidecar; None if there is none.
     """
+    complete_interrupted_save(path)
     return sidecar_path(path) if os.path.exists(sidecar_path(path)) else None
 
 
@@ -110,18 +152,25 @@ def with_sidecar(chain: Chain, path: PathLike) -> Chain:
         path: Path of the sidecar.
 
     Returns:
-        The chain. If its tip is not the tip of the sidecar, its tool stays.
+        The chain. If its tip is not the tip of the sidecar, its tool stays. Unknown links and joints raise
+        an `UnknownNameError`.
 
     Raises:
         FileFormatError: The sidecar is invalid, or its payload is carried by another tip.
     """
     table = TomlTable.read(path)
     tip = table.text("tip", chain.tip)
+    if tip not in chain.urdf.links:
+        raise UnknownNameError(
+            f"{table.where}: tip = {quote(tip)}: no such link; {suggest_names(tip, chain.urdf.links)}"
+        )
     frames = {key: read_pose(table.table(key)) for key in ("base", "tool") if key in table}
     payload = _read_payload(table.table("payload")) if "payload" in table else None
     joints = table.table("joint") if "joint" in table else None
-    # `read_instrument` and `read_uncertainty` read the tables [instrument] and [uncertainty].
-    for key in ("instrument", "uncertainty"):
+    if "manifest" in table:
+        _check_manifest(table.table("manifest"), chain.urdf, tip)
+    # `read_instrument`, `read_uncertainty` and `read_measured_region` read these tables.
+    for key in ("instrument", "uncertainty", "measured"):
         table.get(key, {})
     table.finish()
     if tip != chain.tip:
@@ -138,6 +187,58 @@ def with_sidecar(chain: Chain, path: PathLike) -> Chain:
     return chain
 
 
+def read_tool(path: PathLike) -> Array:
+    """Read the pose of a tool.
+
+    Args:
+        path: TOML file with `xyz_m` and `rotvec_rad`, or a sidecar with them in the table `[tool]`.
+
+    Returns:
+        Pose of the tool in the tip link, shape (4, 4) [m].
+
+    Raises:
+        FileFormatError: The file has neither.
+    """
+    table = TomlTable.read(path)
+    if "tool" in table:
+        return read_pose(table.table("tool"))
+    if "xyz_m" not in table and "rotvec_rad" not in table:
+        raise FileFormatError(f"{table.where}: no tool; expected xyz_m and rotvec_rad, or a table [tool]")
+    return read_pose(table)
+
+
+def _check_manifest(table: TomlTable, urdf: Urdf, tip: str) -> None:
+    """Require that the sidecar was written with this URDF, or with one that has the same joints.
+
+    Only the joints from the root to the tip count: a changed mesh or another gripper does not matter.
+    """
+    digest, joints_digest = table.text("urdf_sha256"), table.text("joints_sha256", "")
+    table.finish()
+    actual = hashlib.sha256(urdf.data).hexdigest()
+    if digest != actual and joints_digest != _joints_digest(urdf, tip):
+        raise FileFormatError(
+            f"{table.path}: does not belong to {urdf.source}: it was written with another content of that "
+            "file; calibrate again, restore the other file, or, if you edited the robot yourself, write "
+            f'urdf_sha256 = "{actual}" in [manifest]'
+        )
+
+
+def _manifest_content(data: bytes, tip: str) -> dict[str, str]:
+    """Return the table [manifest] for a URDF that is written with the sidecar."""
+    urdf = parse_urdf(data, "")
+    return {"urdf_sha256": hashlib.sha256(data).hexdigest(), "joints_sha256": _joints_digest(urdf, tip)}
+
+
+def _joints_digest(urdf: Urdf, tip: str) -> str:
+    """Return the SHA-256 of the joints from the root to a link."""
+    lines = []
+    for joint in urdf.path(tip):
+        # Rounded, because sines and cosines differ in the last digit between computers.
+        numbers = np.round([*joint.origin.ravel(), *joint.axis], _DIGEST_DECIMALS) + 0.0
+        lines.append(repr((joint.name, joint.type, joint.parent, joint.child, numbers.tolist(), joint.mimic)))
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+
+
 def _read_payload(table: TomlTable) -> Payload:
     mass = table.number("mass_kg", above=0, at_most=MAX_PAYLOAD_KG)
     x, y, z = table.vector("centre_m", 3, (0.0, 0.0, 0.0), at_most=MAX_PAYLOAD_DISTANCE_M)
@@ -147,7 +248,7 @@ def _read_payload(table: TomlTable) -> Payload:
 
 def _read_transmission(chain: Chain, table: TomlTable) -> Transmission:
     """Read the tables [joint.NAME]; joints of the robot that are not on the chain are ignored."""
-    coefficients = Transmission.zero(chain.loads).coefficients
+    coefficients = np.zeros(n_coefficients(chain.n_joints))
     for name in table.keys():
         joint = table.table(name)
         if name in chain.joint_names:
@@ -165,24 +266,59 @@ def _joints_off_path(chain: Chain) -> set[str]:
 
 
 def _read_joint(chain: Chain, i: int, table: TomlTable, coefficients: Array) -> None:
-    """Read the table of joint i into the coefficients, shape (t, n, n)."""
+    """Read the table of joint i into the coefficients of a transmission, shape (c,)."""
+    linear, harmonics, compliance = split_coefficients(coefficients, chain.n_joints)
     if chain.is_prismatic[i]:
         table.name += " (prismatic)"
-    for t, term in enumerate(TERMS):
-        if term.applies_to_prismatic or not chain.is_prismatic[i]:
-            coefficients[t, i, i] = _coefficient(table, term.key)
+    linear[i, i] = _coefficient(table, "gain")
     if not chain.is_prismatic[i]:
+        harmonics[:, :, i] = _read_harmonics(table)
+        compliance[i] = _coefficient(table, "compliance_rad_per_nm")
         coupling = table.table("coupling")
         others = {name: j for j, name in enumerate(chain.joint_names) if j != i}
         for name in coupling.keys():
             value = _coefficient(coupling, name)
             if name in others:
-                coefficients[COUPLING_TERM, i, others[name]] = value
+                linear[i, others[name]] = value
             elif name not in _joints_off_path(chain):
                 raise UnknownNameError(
                     f"{coupling.where}: {name!r} is not another joint; choose from {', '.join(others)}"
                 )
     table.finish()
+
+
+def _read_harmonics(table: TomlTable) -> Array:
+    """Return the harmonics of a joint, shape (K, 2) [rad]."""
+    for key in _FORMER_HARMONIC_KEYS:
+        if key in table.keys():
+            raise FileFormatError(
+                f"{table.where}: unknown key {key!r}; write harmonics = [[order, sin_rad, cos_rad], ...]"
+            )
+    out = np.zeros((MAX_CURVE_ORDER, 2))
+    entries = table.array("harmonics") if "harmonics" in table else []
+    orders = [_checked_harmonic(table, entry)[0] for entry in entries]
+    for order, entry in zip(orders, entries, strict=True):
+        if orders.count(order) > 1:
+            raise FileFormatError(f"{table.where}: harmonics has the order {order} twice; write it once")
+        out[order - 1] = entry[1:]
+    return out
+
+
+def _checked_harmonic(table: TomlTable, entry: Any) -> list[Any]:
+    """Return an entry of `harmonics` after checking it: order, sine and cosine."""
+    is_valid = (
+        isinstance(entry, list)
+        and len(entry) == 3
+        and all(is_number(value) and abs(value) <= _MAX_COEFFICIENT for value in entry)
+        and isinstance(entry[0], int)
+        and 1 <= entry[0] <= MAX_CURVE_ORDER
+    )
+    if not is_valid:
+        raise FileFormatError(
+            f"{table.where}: harmonics has the entry {entry!r}; expected [order, sin_rad, cos_rad] with an "
+            f"order from 1 to {MAX_CURVE_ORDER}, such as [1, 2e-4, -1e-4]"
+        )
+    return entry
 
 
 def _coefficient(table: TomlTable, key: str) -> float:
@@ -225,25 +361,61 @@ def read_uncertainty(path: PathLike, chain: Chain) -> Uncertainty | None:
     texts = {
         key: table.get(key, expected="base64 text") for key in ("sqrt_covariance", "unbounded_directions")
     }
+    temperature = table.number("temperature", 1.0, at_least=1)
     table.finish()
     if joints != list(chain.moving_joints):
         raise table.error("joints", f"expected the joints of this robot: {', '.join(chain.moving_joints)}")
     indices = _coefficient_indices(chain)
-    if not isinstance(terms, list) or not all(isinstance(name, str) and name in indices for name in terms):
-        raise UnknownNameError(f"{table.where}: terms = {terms!r}; choose from {', '.join(indices)}")
+    if not isinstance(terms, list):
+        raise table.error("terms", "expected a list of names")
+    if unknown := [name for name in terms if not isinstance(name, str) or name not in indices]:
+        choices = ", ".join(fold_harmonics(indices))
+        raise UnknownNameError(f"{table.where}: terms has {quote(unknown[0])}; choose from {choices}")
     n_rows = 6 * (len(chain.moving_joints) + 1) + len(terms)
     sqrt_covariance, unbounded_directions = (
         _decode_rows(text, n_rows, f"{table.where}: {key}") for key, text in texts.items()
     )
+    entries = np.array([indices[name] for name in terms], int)
     if terms and chain.transmission is None:
         chain = chain.with_transmission(Transmission.zero(chain.loads))
-    entries = np.array([indices[name] for name in terms], int)
-    return Uncertainty(chain, entries, sqrt_covariance, unbounded_directions)
+    return Uncertainty(chain, entries, sqrt_covariance, unbounded_directions, temperature)
+
+
+def read_measured_region(path: PathLike, chain: Chain) -> MeasuredRegion | None:
+    """Read the table [measured] of a sidecar.
+
+    Args:
+        path: The sidecar.
+        chain: Calibrated robot, as read with the sidecar.
+
+    Returns:
+        Region of joint space that was measured for the calibration; None without the table.
+
+    Raises:
+        FileFormatError: The table is invalid or belongs to a robot with other joints.
+    """
+    document = TomlTable.read(path)
+    if "measured" not in document:
+        return None
+    table = document.table("measured")
+    joints = table.get("joints", expected="a list of names")
+    lower, upper, spread = (table.vector(key, chain.n_joints) for key in ("lower", "upper", "spread"))
+    radius, reach = (table.number(key, at_least=0) for key in ("radius", "reach"))
+    text = table.get("configurations", expected="base64 text")
+    table.finish()
+    if joints != list(chain.joint_names):
+        raise table.error("joints", f"expected the joints of this robot: {', '.join(chain.joint_names)}")
+    rows = _decode_rows(text, chain.n_joints, f"{table.where}: configurations")
+    if not rows.size:
+        raise table.error("configurations", "expected at least one configuration")
+    return MeasuredRegion(
+        chain.is_prismatic, np.array(lower), np.array(upper), np.array(spread), rows.T.copy(), radius, reach
+    )
 
 
 def _coefficient_indices(chain: Chain) -> dict[str, int]:
-    """Return the index of each parameter in the flat coefficients of the transmission."""
-    parameters = (parameter for name in EXTENSIONS for parameter in PARAMETER_SETS[name](chain))
+    """Return the index of each parameter's transmission coefficient."""
+    parameters = (parameter for name in FAMILIES for parameter in PARAMETER_SETS[name](chain))
     return {p.name: p.coefficient_index for p in parameters if p.coefficient_index is not None}
 
 
@@ -269,8 +441,10 @@ def _decode_rows(text: Any, n_rows: int, where: str) -> Array:
 def sidecar_text(
     chain: Chain,
     tool: Array,
+    urdf: bytes,
     instrument: Mapping[str, float] | None = None,
     uncertainty: Uncertainty | None = None,
+    measured_region: MeasuredRegion | None = None,
     *,
     required: bool = False,
 ) -> str | None:
@@ -279,8 +453,10 @@ def sidecar_text(
     Args:
         chain: Calibrated robot, whose base, payload and joint errors are written.
         tool: Pose of the measured point in the tip frame, shape (4, 4) [m].
+        urdf: Content of the URDF that is written with the sidecar; its hash connects both.
         instrument: Instrument parameters by name [m or rad].
         uncertainty: Uncertainty of the robot.
+        measured_region: Region of joint space that was measured.
         required: Return the text even if the URDF alone holds everything.
 
     Returns:
@@ -291,6 +467,7 @@ def sidecar_text(
         "joint": _transmission_content(chain),
         "instrument": {name: float(value) for name, value in (instrument or {}).items()},
         "uncertainty": _uncertainty_content(uncertainty),
+        "measured": _measured_content(chain, measured_region),
     }
     tables = {key: table for key, table in tables.items() if table}
     has_frames = not all(np.array_equal(pose, np.eye(4)) for pose in (chain.base, tool))
@@ -299,8 +476,12 @@ def sidecar_text(
     header = _HEADER
     header += _JOINT_HEADER if "joint" in tables else ""
     header += _UNCERTAINTY_HEADER if "uncertainty" in tables else ""
+    header += _MEASURED_HEADER if "measured" in tables else ""
     frames = {"base": pose_content(chain.base), "tool": pose_content(tool)}
-    return header + tomli_w.dumps({"tip": chain.tip, **frames, **tables}, multiline_strings=True)
+    content = {"tip": chain.tip, **frames, "manifest": _manifest_content(urdf, chain.tip), **tables}
+    text = tomli_w.dumps(content, multiline_strings=True)
+    # tomli_w writes each number on a line of its own; one line per harmonic is easier to read.
+    return header + _HARMONIC_LINES.sub(r"    [\1, \2, \3]", text)
 
 
 def _payload_content(payload: Payload | None) -> dict[str, Any]:
@@ -311,20 +492,21 @@ def _transmission_content(chain: Chain) -> dict[str, Any]:
     """Return the tables [joint.NAME] of all coefficients that are not zero."""
     if chain.transmission is None:
         return {}
-    coefficients, names = chain.transmission.coefficients, chain.joint_names
+    transmission, names = chain.transmission, chain.joint_names
     content: dict[str, Any] = {}
     for i, name in enumerate(names):
+        harmonics = transmission.harmonics[:, :, i]
         joint: dict[str, Any] = {
-            term.key: coefficients[t, i, i].item() for t, term in enumerate(TERMS) if coefficients[t, i, i]
+            "gain": transmission.linear[i, i].item(),
+            "harmonics": [[k + 1, *harmonics[k].tolist()] for k in np.flatnonzero(harmonics.any(1)).tolist()],
+            "compliance_rad_per_nm": transmission.compliance[i].item(),
+            "coupling": {
+                names[j]: transmission.linear[i, j].item()
+                for j in np.flatnonzero(transmission.linear[i])
+                if j != i
+            },
         }
-        coupling = {
-            names[j]: coefficients[COUPLING_TERM, i, j].item()
-            for j in np.flatnonzero(coefficients[COUPLING_TERM, i])
-            if j != i
-        }
-        if coupling:
-            joint["coupling"] = coupling
-        if joint:
+        if joint := {key: value for key, value in joint.items() if value}:
             content[name] = joint
     return content
 
@@ -339,6 +521,22 @@ def _uncertainty_content(uncertainty: Uncertainty | None) -> dict[str, Any]:
         "terms": [names[int(index)] for index in uncertainty.entries],
         "sqrt_covariance": _encode_rows(uncertainty.sqrt_covariance),
         "unbounded_directions": _encode_rows(uncertainty.unbounded_directions),
+        "temperature": uncertainty.temperature,
+    }
+
+
+def _measured_content(chain: Chain, region: MeasuredRegion | None) -> dict[str, Any]:
+    """Return the table [measured]; empty without a region."""
+    if region is None:
+        return {}
+    return {
+        "joints": list(chain.joint_names),
+        "lower": region.lower.tolist(),
+        "upper": region.upper.tolist(),
+        "spread": region.spread.tolist(),
+        "radius": region.radius,
+        "reach": region.reach,
+        "configurations": _encode_rows(region.configurations.T),
     }
 
 

@@ -23,6 +23,7 @@ from typing import Any, TypeVar
 from .. import se3
 from .._typing import Array, PathLike
 from ..exceptions import FileFormatError
+from ..messages import quote
 from .tabular import read_toml
 
 T = TypeVar("T", str, int, bool)
@@ -55,7 +56,9 @@ class TomlTable:
         """
         self.path, self.name = os.fspath(path), name
         if not isinstance(raw, dict):
-            raise FileFormatError(f"{self.where}: {raw!r} is not a table; write a table of keys and values")
+            raise FileFormatError(
+                f"{self.where}: {quote(raw)} is not a table; write a table of keys and values"
+            )
         self._raw: dict[str, Any] = raw
         # A dict, because the message of `finish` names the keys in the order of the questions.
         self._known_keys: dict[str, None] = {}
@@ -96,7 +99,7 @@ class TomlTable:
         Returns:
             Exception that names file, table, key and value.
         """
-        return FileFormatError(f"{self.where}: {key} = {self._raw[key]!r}; {expected}")
+        return FileFormatError(f"{self.where}: {key} = {quote(self._raw[key])}; {expected}")
 
     def get(self, key: str, default: Any = None, *, expected: str = "a value") -> Any:
         """Return a value of any type.

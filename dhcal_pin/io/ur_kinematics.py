@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import hashlib
 import os
+from contextlib import suppress
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -17,12 +19,14 @@ import pinocchio as pin
 from .. import se3
 from .._typing import PathLike
 from ..exceptions import FileFormatError, InvalidArgumentError
+from ..messages import quote
 from ..robot.chain import Chain, extract_dh_table
 from ..robot.dh import DHTable
 from ..robot.dh_extraction import extract_dh
+from ..robot.urdf import MAX_ORIGIN
 from .origins_file import ORIGIN_KEYS
 from .robot_format import ConvertedRobot, RobotSource
-from .tabular import read_text
+from .tabular import parse_number, read_text
 
 # Joints of a UR arm, and the names of their origins in the file.
 UR_JOINTS = {
@@ -35,6 +39,8 @@ UR_JOINTS = {
 }
 # Largest distance of the tip from the axis of the last joint [m or rad, entries of a pose].
 _MAX_TIP_ERROR = 1e-9
+# Largest size of a file [byte]; PyYAML reads about 100 kB per second.
+_MAX_BYTES = 1 << 17
 # Number of hexadecimal digits of the hash.
 _HASH_DIGITS = 15
 
@@ -91,9 +97,15 @@ def ur_kinematics_text(chain: Chain) -> str:
     """
     lines = ["kinematics:"]
     for name, origin in ur_kinematics(chain).items():
-        lines += [f"  {name}:", *(f"    {key}: {value!r}" for key, value in origin.items())]
+        lines += [f"  {name}:", *(f"    {key}: {_yaml_number(value)}" for key, value in origin.items())]
     digest = int(hashlib.sha256("\n".join(lines).encode()).hexdigest()[:_HASH_DIGITS], 16)
     return "\n".join([*lines, f"  hash: calib_{digest}", ""])
+
+
+def _yaml_number(value: float) -> str:
+    """Write a number that YAML 1.1 reads as a number: with a decimal point even before an exponent."""
+    mantissa, *exponent = repr(value).split("e")
+    return "e".join([mantissa if "." in mantissa else f"{mantissa}.0", *exponent])
 
 
 def read_ur_kinematics(path: PathLike) -> DHTable:
@@ -112,24 +124,33 @@ def read_ur_kinematics(path: PathLike) -> DHTable:
 
     source = os.fspath(path)
     try:
-        document = yaml.safe_load(read_text(path))
-    except yaml.YAMLError as error:
-        raise FileFormatError(f"{source}: not YAML: {' '.join(str(error).split())}") from None
+        # The base loader returns scalars as texts. Other loaders convert 1:30 to 90, and leave 1e-5 a text.
+        document = yaml.load(read_text(path, max_bytes=_MAX_BYTES), yaml.BaseLoader)
+    except (yaml.YAMLError, RecursionError) as error:
+        reason = "nested too deeply" if isinstance(error, RecursionError) else " ".join(str(error).split())
+        raise FileFormatError(f"{source}: not YAML: {reason}; correct that line") from None
     content = document.get("kinematics") if isinstance(document, dict) else None
     origins = []
     for name in UR_JOINTS.values():
         entry = content.get(name) if isinstance(content, dict) else None
-        values = [entry.get(key) for key in ORIGIN_KEYS] if isinstance(entry, dict) else []
-        numbers = [float(value) for value in values if isinstance(value, int | float)]
-        if len(numbers) != len(ORIGIN_KEYS) or not np.isfinite(numbers).all():
+        if not isinstance(entry, dict) or not set(ORIGIN_KEYS) <= set(entry):
             raise FileFormatError(
                 f"{source}: kinematics: {name} needs the numbers {', '.join(ORIGIN_KEYS)} in m and rad"
             )
+        numbers = [_origin_number(entry[key], f"{source}: kinematics: {name}: {key}") for key in ORIGIN_KEYS]
         origins.append(se3.transform(pin.rpy.rpyToMatrix(*numbers[3:]), numbers[:3]))
     origins.append(np.eye(4))
     n_joints = len(UR_JOINTS)
     no_limit = np.full(n_joints, np.inf)
     return extract_dh(origins, list(UR_JOINTS), np.zeros(n_joints), -no_limit, no_limit, "modified").table
+
+
+def _origin_number(value: Any, where: str) -> float:
+    """Parse a number of an origin."""
+    with suppress(ValueError):
+        if isinstance(value, str) and abs(number := parse_number(value)) <= MAX_ORIGIN:
+            return number
+    raise FileFormatError(f"{where}: {quote(value)}; expected a number in m or rad up to ±{MAX_ORIGIN:g}")
 
 
 def convert_to_ur_kinematics(robot: RobotSource, path: PathLike) -> ConvertedRobot:

@@ -2,12 +2,14 @@
 
 A measurement kind is one class in a module of this package and one entry of `KINDS`. Files, simulation,
 calibration and planning take the kinds from `KINDS`. Units, files and robots are the concern of other
-packages; here lengths are metres, angles radians, and a robot is a `Chain`.
+packages; here lengths are metres, angles radians, and a robot is a `Chain`. `measured_region` describes which
+part of the joint space measurements cover.
 """
 
 from .base import InstrumentParameter, Measurement, Noise
 from .contact import PlaneContact, PointContact, PointDistance, SphereContact
 from .length import Distance, Wires
+from .measured_region import MeasuredRegion
 from .pose import Pose, RelativePose
 from .position import MultiTargetPosition, Position, PositionComponents
 
@@ -33,6 +35,7 @@ __all__ = [
     "KINDS",
     "Distance",
     "InstrumentParameter",
+    "MeasuredRegion",
     "Measurement",
     "MultiTargetPosition",
     "Noise",

@@ -86,7 +86,9 @@ class Measurement(ABC):
 
     Attributes:
         q: Joint positions of the first configuration of each sample, (m, n) [rad or m].
-        rows: Row number of each sample in its file, (m,); the first data row is 1.
+        rows: Line of each sample in its file, (m,), as text editors count; samples from Python are numbered
+            from 1.
+        source: Name of the file; empty for samples from Python.
         has_stated_sigma: Whether the standard deviations are those of the instrument, not placeholders that
             are estimated with the fit.
         instrument_parameters: The s instrument parameters, in the order of u.
@@ -96,6 +98,7 @@ class Measurement(ABC):
     rows: Array
     has_stated_sigma: bool
     instrument_parameters: tuple[InstrumentParameter, ...]
+    source: str
 
     # Name of the kind in files, on the command line and in studies.
     kind: ClassVar[str]
@@ -188,6 +191,16 @@ class Measurement(ABC):
     @abstractmethod
     def residual_dim(self) -> int:
         """Number k of residuals per sample."""
+
+    @property
+    def residual_names(self) -> tuple[str, ...]:
+        """Names of the k residuals of a sample, such as "position_x" or "length_2"."""
+        names: list[str] = []
+        for group, rows in self.residual_groups.items():
+            count = len(range(self.residual_dim)[rows])
+            endings = "xyz" if group in ("position", "orientation") else range(1, count + 1)
+            names += [f"{group}_{ending}" for ending in endings] if count > 1 else [group]
+        return tuple(names)
 
     def configurations(self) -> Array:
         """Return the joint positions (c·m, n) of all samples, one configuration after the other."""

@@ -80,6 +80,7 @@ class PoseMeasurement(Measurement):
         self._initialize(
             q=q,
             rows=np.arange(1, m + 1),
+            source="",
             poses=validated_poses(poses, m, kind),
             sigma=validated_sigma(sigma if is_stated else LENGTH_SIGMA, (m, 3), f"{kind}: sigma"),
             rotation_sigma=validated_sigma(

@@ -67,6 +67,7 @@ class PointMeasurement(Measurement):
         self._initialize(
             q=q,
             rows=np.arange(1, len(q) + 1),
+            source="",
             values=values,
             sigma=validated_sigma(LENGTH_SIGMA if sigma is None else sigma, (len(q), values.shape[1]), where),
             has_stated_sigma=sigma is not None,
@@ -244,6 +245,11 @@ class PositionComponents(PointMeasurement):
     def _arguments(cls, values: Mapping[str, Any]) -> dict[str, Any]:
         axes = [i for i, axis in enumerate(_AXES) if axis in values]
         return super()._arguments(values) | {"axes": axes}
+
+    @property
+    def residual_names(self) -> tuple[str, ...]:
+        """Names of the k residuals of a sample: those of a position for the measured axes."""
+        return tuple(f"position_{_AXES[i]}" for i in self.axes)
 
     def value_columns(self) -> tuple[Column, ...]:
         """Return the columns of the measured axes."""

@@ -2,45 +2,10 @@
 
 Everything here reproduces or checks the paper "Positioning Accuracy Improvement of Robots by Link Parameter
 Calibration". Methods that other packages use do not belong here.
+
+The public names are listed in `__init__.pyi`. Each is loaded on first use.
 """
 
-from .experiment import PaperExperiment, paper_arm, run_experiment
-from .factors import (
-    alpf,
-    apply_correction,
-    differential_motion,
-    error_factors,
-    laf,
-    ldf,
-    link_vectors,
-    pseudo_inverse_step,
-    q_matrices,
-    tail_matrices,
-    thf,
-    tool_error,
-)
-from .jacobian_check import Agreement, crosscheck
-from .simulations import Simulation, simulate, simulation_rows
+import lazy_loader
 
-__all__ = [
-    "Agreement",
-    "PaperExperiment",
-    "Simulation",
-    "alpf",
-    "apply_correction",
-    "crosscheck",
-    "differential_motion",
-    "error_factors",
-    "laf",
-    "ldf",
-    "link_vectors",
-    "paper_arm",
-    "pseudo_inverse_step",
-    "q_matrices",
-    "run_experiment",
-    "simulate",
-    "simulation_rows",
-    "tail_matrices",
-    "thf",
-    "tool_error",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

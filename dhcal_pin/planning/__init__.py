@@ -2,15 +2,10 @@
 
 Optimality criteria, knowledge before a measurement, and the search for good poses belong here. Random
 configurations, workspace constraints and collision checks belong to `robot`.
+
+The public names are listed in `__init__.pyi`. Each is loaded on first use.
 """
 
-from .information import Information, plannable_kinds
-from .planner import CRITERIA, Plan, plan
+import lazy_loader
 
-__all__ = [
-    "CRITERIA",
-    "Information",
-    "Plan",
-    "plan",
-    "plannable_kinds",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -9,6 +9,10 @@ R the R factor of [R₀; A_S].
 * Exchange: for each selected candidate in turn, remove it and add the best one of the others, if that
   lowers the criterion; repeat until a pass gains less than `MIN_PASS_GAIN`.
 
+Where joint correction curves are wanted, the bins of the joints are filled evenly first (`bin_filling`): that
+term is added to the gains and to the value of the criterion, and is so large that the criterion only decides
+between candidates that fill the bins equally well.
+
 References:
     V. V. Fedorov, Theory of Optimal Experiments, Academic Press 1972: exchange.
     T. J. Mitchell, An algorithm for the construction of D-optimal experimental designs, Technometrics 16
@@ -19,13 +23,14 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import lapack
 
 from .._typing import Array
+from .bin_filling import filling_cost, filling_gains
 from .criteria import Criterion
 
 # A pass of exchanges that lowers the logarithm of the criterion by less is the last one.
@@ -68,6 +73,8 @@ class CandidateSet:
         min_distance: Smallest distance of two selected candidates.
         is_feasible: Expensive test of a candidate by its index; called only for candidates that are about to
             be selected.
+        bin_columns: Columns of the coordinates that are joint values whose bins are filled evenly, shape
+            (j,); none by default.
         infeasible: Candidates that failed the test so far, shape (m,); updated in place.
     """
 
@@ -75,6 +82,7 @@ class CandidateSet:
     coordinates: Array
     min_distance: float = 0.0
     is_feasible: Callable[[int], bool] = _always_feasible
+    bin_columns: Array = field(default_factory=lambda: np.zeros(0, int))
     infeasible: Array = field(default_factory=lambda: np.zeros(0, bool))
 
     @classmethod
@@ -84,6 +92,7 @@ class CandidateSet:
         coordinates: Array,
         min_distance: float = 0.0,
         is_feasible: Callable[[int], bool] = _always_feasible,
+        bin_columns: Sequence[int] | Array = (),
     ) -> CandidateSet:
         """Create a set of candidates of which none is known to be infeasible.
 
@@ -92,11 +101,13 @@ class CandidateSet:
             coordinates: Coordinates, shape (m, d).
             min_distance: Smallest distance of two selected candidates.
             is_feasible: Test of a candidate by its index.
+            bin_columns: Columns of the coordinates that are joint values whose bins are filled evenly.
 
         Returns:
             Candidates.
         """
-        return cls(rows, coordinates, min_distance, is_feasible, np.zeros(rows.shape[2], bool))
+        columns, infeasible = np.array(bin_columns, int), np.zeros(rows.shape[2], bool)
+        return cls(rows, coordinates, min_distance, is_feasible, columns, infeasible)
 
     def rows_of(self, selected: Array) -> Array:
         """Return the rows of selected candidates.
@@ -108,6 +119,29 @@ class CandidateSet:
             Rows, shape (n, k, p).
         """
         return np.ascontiguousarray(self.rows[:, :, selected].transpose(2, 1, 0))
+
+    def filling_gains(self, indices: Array, occupied: Array) -> Array:
+        """Rate candidates by how evenly the bins of the joints are filled with each of them.
+
+        Args:
+            indices: Indices of candidates, shape (w,).
+            occupied: Coordinates of the other configurations, shape (n, d).
+
+        Returns:
+            Terms to add to the gains of a criterion, shape (w,); zero if no bins are filled.
+        """
+        return filling_gains(self.coordinates[indices][:, self.bin_columns], occupied[:, self.bin_columns])
+
+    def filling_cost(self, occupied: Array) -> float:
+        """Compute how unevenly configurations fill the bins of the joints.
+
+        Args:
+            occupied: Coordinates of all configurations, shape (n, d).
+
+        Returns:
+            Term to add to the value of a criterion; zero if no bins are filled.
+        """
+        return filling_cost(occupied[:, self.bin_columns])
 
     def best_candidate(self, gains: Array, indices: Array, occupied: Array) -> int | None:
         """Find the feasible candidate of the largest gain.
@@ -167,8 +201,9 @@ def select_greedily(
     for _ in range(count):
         rows = candidates.rows_of(np.array(out, int))
         gains = criterion.gains(candidates.rows, compute_sqrt_covariance(prior_factor, rows))
-        gains[out] = -np.inf
         occupied = np.concatenate([existing, candidates.coordinates[out]])
+        gains += candidates.filling_gains(every, occupied)
+        gains[out] = -np.inf
         best = candidates.best_candidate(gains, every, occupied)
         if best is None:
             break
@@ -199,27 +234,37 @@ def improve_by_exchange(
     """
     selected = selected.copy()
 
+    every = np.arange(candidates.rows.shape[2])
+
     def sqrt_covariance(indices: Array) -> Array:
         return compute_sqrt_covariance(prior_factor, candidates.rows_of(indices))
 
-    value = criterion.value(sqrt_covariance(selected))
+    def occupied_by(indices: Array) -> Array:
+        return np.concatenate([existing, candidates.coordinates[indices]])
+
+    def design_value(indices: Array) -> float:
+        return criterion.value(sqrt_covariance(indices)) + candidates.filling_cost(occupied_by(indices))
+
+    value = design_value(selected)
     for _ in range(max_passes):
         value_before = value
         gains = criterion.gains(candidates.rows, sqrt_covariance(selected))
+        gains += candidates.filling_gains(every, occupied_by(selected))
         gains[selected] = np.inf
         promising = np.argsort(-gains)[: max(MAX_EXCHANGE_CANDIDATES, 2 * len(selected))]
         rows = np.ascontiguousarray(candidates.rows[:, :, promising])
         for slot in range(len(selected)):
             others = np.delete(selected, slot)
+            occupied = occupied_by(others)
             gains = criterion.gains(rows, sqrt_covariance(others))
+            gains += candidates.filling_gains(promising, occupied)
             gains[np.isin(promising, others)] = -np.inf
-            occupied = np.concatenate([existing, candidates.coordinates[others]])
             best = candidates.best_candidate(gains, promising, occupied)
             if best is None or best == selected[slot]:
                 continue
             trial = selected.copy()
             trial[slot] = best
-            trial_value = criterion.value(sqrt_covariance(trial))
+            trial_value = design_value(trial)
             if trial_value < value:
                 selected, value = trial, trial_value
         if value_before - value < MIN_PASS_GAIN:

@@ -220,9 +220,11 @@ class Information:
         sigma, x = 1 / prior_weights(errors, priors), np.zeros(len(errors.parameters))
         fit, values = None, dict(known or {})
         if data:
-            fit = calibrate(chain, data, parameters, priors=priors, fix=fix, free=free, known=known)
+            fit = calibrate(
+                chain, data, parameters, priors=priors, fix=fix, free=free, known=known, extend="none"
+            )
             errors, x = fit.errors, fit.x[: len(x)]
-            sigma, values = 1 / fit.problem.weights, values | fit.instruments
+            sigma, values = 1 / fit.problem.prior_weights, values | fit.instruments
             noise = noise or _sigma_of(fit.problem.data, kind)
         if noise is None:
             raise InvalidArgumentError(

@@ -7,7 +7,10 @@ Steps of `plan`:
 3. Select poses greedily, improve the selection by exchange (`exchange`), and move the poses to
    better ones between the candidates (`refinement`), all for one criterion (`criteria`).
 4. Predict the error over the number of poses, for the plan and for random poses.
-5. Order the poses as a short tour.
+5. Order the poses as a short tour whose moves are free of collisions (`tour`).
+
+For joint correction curves the poses fill the bins of each joint evenly (`bin_filling`) before the criterion
+decides, and step 4 also predicts the standard deviation of the curves (`curve_prediction`).
 """
 
 from __future__ import annotations
@@ -25,9 +28,11 @@ from ..estimation.uncertainty import Uncertainty
 from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..measurements.base import Measurement, Noise
 from ..robot.chain import Chain
-from ..robot.sampling import ConfigurationSampler, WorkspaceConstraints, scale_joint_units, shortest_tour
-from ..robot.transmission import TERM_FAMILIES
+from ..robot.collision import CollisionChecker
+from ..robot.error_families import COMPLIANCE, CURVES, GAIN, HARMONICS
+from ..robot.sampling import ConfigurationSampler, WorkspaceConstraints, limits_with_margin, scale_joint_units
 from .criteria import AOptimality, BiasVarianceCriterion, Criterion, DOptimality, EOptimality
+from .curve_prediction import CurvePrediction, predict_curves
 from .exchange import (
     MAX_EXCHANGE_CANDIDATES,
     CandidateSet,
@@ -37,6 +42,7 @@ from .exchange import (
 )
 from .information import Information, add_joint_scatter
 from .refinement import DesignGoal, refine
+from .tour import find_tour
 
 # Margins to the joint limits [rad] and [m].
 MARGIN_ANGLE, MARGIN_LENGTH = np.deg2rad(2.0), 5e-3
@@ -53,6 +59,8 @@ MIN_DISTANCE_RAD = np.deg2rad(20.0)
 UNOBSERVABLE_RTOL = 1e-6
 # Diminishing returns: this many more poses lower the error that a check shows by less than this fraction.
 EXTRA_POSES, MIN_EXTRA_GAIN = 10, 0.01
+# Numbers of poses for which the knowledge of the joint correction curves is predicted.
+CURVE_SIZES = (50, 100, 200)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +82,11 @@ class Plan:
         recommended_size: Number of poses with diminishing returns: ten more lower the error that a check with
             this instrument shows by less than 1 %. None if it is larger than all sizes.
         notes: Sentences on what was not considered.
+        curves: Expected knowledge of the joint correction curves without the plan, with it and with plans of
+            `CURVE_SIZES` poses, by size; empty unless the criterion fills bins.
+        ways: Way points before each pose, shapes (w, dof) [rad or m]; most are empty.
+        is_way_free: Whether the moves to each pose are free of collisions, see `tour`; true for the first.
+            Empty if there is nothing to collide with.
     """
 
     q: Array
@@ -87,6 +100,9 @@ class Plan:
     random_errors: Array
     recommended_size: int | None
     notes: tuple[str, ...]
+    curves: tuple[CurvePrediction, ...] = ()
+    ways: tuple[Array, ...] = ()
+    is_way_free: tuple[bool, ...] = ()
 
     @cached_property
     def log_det(self) -> float:
@@ -159,14 +175,16 @@ def plan(
         criterion: "D" volume of the uncertainty, "A" mean variance, "E" largest variance, all in units of the
             priors; "task" predicted position error over the task; "robust" this and, in equal parts, the
             error by joint gains, harmonics and compliance that the fit omits, with an additional joint
-            scatter of one arcminute.
+            scatter of one arcminute; "curves" fills the bins of each joint evenly (see `robot.coverage`), and
+            "D" decides between poses that do so equally well; "curves,task" and the like name another
+            criterion for that.
         data: Existing measurements to complement.
         known: Values of known instrument parameters, as in `calibrate`.
         prior_uncertainty: Uncertainty of the calibration that made the chain; it replaces the priors.
         task: Joint positions where the tool must be accurate, shape (m, n) [rad or m]; None for the given
             candidates, or for the whole joint space.
         candidates: Number of candidates to draw, or joint positions to choose from, shape (m, n) [rad or m].
-        space: Constraints of the tool pose for drawn candidates.
+        space: Constraints of drawn candidates; floor and obstacles also hold for the moves between poses.
         margin: Margins to the joint limits: `rotation` [rad], `position` [m].
         seed: Seed of all random draws.
 
@@ -175,11 +193,10 @@ def plan(
 
     Raises:
         UnknownNameError: The criterion is unknown.
-        InvalidArgumentError: The number of poses or candidates is out of range, or too few candidates are
-            feasible.
+        InvalidArgumentError: The number of poses or candidates is out of range, too few candidates are
+            feasible, or the criterion is `curves` and no joint is revolute.
     """
-    if criterion not in CRITERIA:
-        raise UnknownNameError(f"unknown criterion {criterion!r}; choose from {', '.join(CRITERIA)}")
+    main_criterion, fills_bins = _split_criterion(criterion)
     if count < 1:
         raise InvalidArgumentError(f"{count} poses: expected at least 1")
     if isinstance(candidates, int) and not count <= candidates <= MAX_CANDIDATES:
@@ -188,15 +205,14 @@ def plan(
         )
     rng = np.random.default_rng(seed)
     margin = margin or Noise(MARGIN_LENGTH, MARGIN_ANGLE)
+    space = space or WorkspaceConstraints()
     sampler, notes = None, []
     if isinstance(candidates, int):
-        sampler = ConfigurationSampler.from_chain(
-            chain, space or WorkspaceConstraints(), margin.rotation, margin.position
-        )
+        sampler = ConfigurationSampler.from_chain(chain, space, margin.rotation, margin.position)
         q = sampler.draw(candidates, rng)
         notes += [sampler.collision.note] if sampler.collision.note else []
         task_q = (
-            replace(sampler, workspace=WorkspaceConstraints()).draw(N_TASK_SAMPLES, rng)
+            replace(sampler, workspace=WorkspaceConstraints(floor=space.floor)).draw(N_TASK_SAMPLES, rng)
             if task is None
             else chain.validated_q(task)
         )
@@ -204,10 +220,19 @@ def plan(
         q = chain.validated_q(candidates)
         task_q = q if task is None else chain.validated_q(task)
     omitted_sets = ()
-    if criterion == "robust":
-        omitted_sets, noise = TERM_FAMILIES, noise and add_joint_scatter(chain, q, noise)
+    if main_criterion == "robust":
+        omitted_sets, noise = (GAIN, HARMONICS, COMPLIANCE), noise and add_joint_scatter(chain, q, noise)
+    bin_columns, sets = np.zeros(0, int), parameters
+    if fills_bins:
+        bin_columns = np.flatnonzero(~chain.is_prismatic)
+        sets = _without_curves(parameters or chain.parameters)
+        if not bin_columns.size:
+            raise InvalidArgumentError(
+                f"criterion {criterion!r}: only revolute joints have correction curves, and the robot has no "
+                "revolute joint"
+            )
     full_information = Information.from_prior(
-        chain, q, kind, noise, parameters, priors, fix, free, data, known, omitted_sets, prior_uncertainty
+        chain, q, kind, noise, sets, priors, fix, free, data, known, omitted_sets, prior_uncertainty
     )
     information = full_information.without_omitted()
     coordinates = scale_joint_units(chain, q)
@@ -222,6 +247,7 @@ def plan(
         coordinates,
         _min_distance(coordinates, count, rng),
         _always_feasible if sampler is None else lambda i: sampler.is_feasible(q[i]),
+        bin_columns,
     )
     every_nth = np.arange(0, len(q), max(1, len(q) // N_TASK_SAMPLES))
     observable = information.observable_directions(
@@ -239,11 +265,12 @@ def plan(
     goal = DesignGoal(
         information=information,
         full_information=full_information,
-        criterion=CRITERIA[criterion].create(observable, combinations, full_information, task_q),
+        criterion=CRITERIA[main_criterion].create(observable, combinations, full_information, task_q),
         task=combinations,
         n_observable=len(observable),
         existing=existing,
         sampler=sampler,
+        bin_columns=bin_columns,
     )
     prior_factor = full_information.prior_factor
     greedy = select_greedily(candidate_set, prior_factor, count, goal.criterion, np.zeros(0, int), existing)
@@ -263,12 +290,25 @@ def plan(
         refined = q[selected]
     else:
         refined = refine(goal, q[selected], sampler, candidate_set.min_distance, rng)
+    curves = ()
+    if fills_bins:
+        curve_information = Information.from_prior(
+            chain, q, kind, noise, parameters, priors, fix, free, data, known, (CURVES,), prior_uncertainty
+        )
+        plans = _plans_of_sizes(goal, candidate_set, q, greedy, refined)
+        measured = np.concatenate([q[:0], *(item.configurations() for item in data)])
+        curves = predict_curves(curve_information, plans, measured, q[~candidate_set.infeasible])
     sizes, errors = _error_curve(goal, candidate_set, q, greedy, selected, refined, rng)
     random_sizes, random_errors = _random_errors(goal, candidate_set, sizes[sizes <= count], rng)
-    order = shortest_tour(scale_joint_units(chain, refined))
+    checker = CollisionChecker.from_chain(chain, space.environment) if sampler is None else sampler.collision
+    notes += [checker.note] if sampler is None and checker.note else []
+    limits = limits_with_margin(chain, margin.rotation, margin.position)
+    # Given candidates stay as they are.
+    can_turn = ~chain.is_prismatic & (sampler is not None)
+    tour = find_tour(refined, checker, *limits, can_turn, rng)
     return Plan(
-        q=refined[order],
-        index=selected[order] if sampler is None else None,
+        q=tour.q,
+        index=selected[tour.order] if sampler is None else None,
         criterion=criterion,
         information=information,
         task=combinations,
@@ -278,6 +318,9 @@ def plan(
         random_errors=random_errors,
         recommended_size=_recommended_size(sizes, errors, information.noise.position),
         notes=tuple(notes),
+        curves=curves,
+        ways=tour.ways,
+        is_way_free=() if checker.geometry is None else tour.is_way_free,
     )
 
 
@@ -323,6 +366,9 @@ class CriterionOption:
     help: str
 
 
+# Criterion that fills the bins of the joints evenly before another one decides.
+FILLS_BINS = "curves"
+
 CRITERIA: dict[str, CriterionOption] = {
     "D": CriterionOption(
         lambda observable, combinations, full_information, task_q: DOptimality(),
@@ -343,7 +389,39 @@ CRITERIA: dict[str, CriterionOption] = {
     "robust": CriterionOption(
         _robust_criterion, "as `task`, and also limits the bias from unmodelled effects"
     ),
+    FILLS_BINS: CriterionOption(
+        lambda observable, combinations, full_information, task_q: DOptimality(),
+        "fills each joint's bins of 5° evenly, for joint correction curves; then as `D`, or as another "
+        "criterion in `curves,task`",
+    ),
 }
+
+
+def _split_criterion(text: str) -> tuple[str, bool]:
+    """Split the name of a criterion, or two names joined by a comma of which one is `curves`.
+
+    Returns:
+        Name of the criterion, and whether the bins of the joints are filled evenly before it decides.
+
+    Raises:
+        UnknownNameError: A name is unknown, or two criteria are combined otherwise.
+    """
+    names = text.split(",")
+    main = [name for name in names if name != FILLS_BINS] or [FILLS_BINS]
+    if len(names) > 2 or len(main) > 1 or main[0] not in CRITERIA:
+        raise UnknownNameError(
+            f"unknown criterion {text!r}; choose from {', '.join(CRITERIA)}, or combine {FILLS_BINS} with "
+            f"another one as in {FILLS_BINS},task"
+        )
+    return main[0], FILLS_BINS in names
+
+
+def _without_curves(sets: str) -> str:
+    """Return names of parameter sets without that of the curves, unless there is no other."""
+    # The bins determine the curves. As unknowns of the criterion, their hundreds of coefficients would make
+    # the selection slow without making it better.
+    others = [name for name in sets.split(",") if name.strip() != CURVES]
+    return ",".join(others) or sets
 
 
 def _always_feasible(_: int) -> bool:
@@ -359,6 +437,28 @@ def _min_distance(coordinates: Array, count: int, rng: np.random.Generator) -> f
     distances = np.linalg.norm(sample[:, None] - sample[None], axis=2)
     distances += np.diag(np.full(len(sample), np.inf))
     return min(MIN_DISTANCE_RAD, float(np.median(distances.min(1))))
+
+
+def _plans_of_sizes(
+    goal: DesignGoal, candidates: CandidateSet, q: Array, greedy: Array, refined: Array
+) -> list[Array]:
+    """Select plans of several sizes that fill the bins of the joints.
+
+    Args:
+        goal: What to optimize.
+        candidates: All candidates.
+        q: Their joint positions, shape (m, dof) [rad or m].
+        greedy: Greedy selection in its order, shape (n,).
+        refined: Joint positions of the plan, shape (n, dof) [rad or m].
+
+    Returns:
+        Joint positions of an empty plan, of `refined` and of plans of `CURVE_SIZES` poses, by size.
+    """
+    prior_factor, nearby = goal.full_information.prior_factor, replace(candidates, min_distance=0.0)
+    n_more = max(0, CURVE_SIZES[-1] - len(greedy))
+    order = select_greedily(nearby, prior_factor, n_more, goal.criterion, greedy, goal.existing)
+    plans = {size: q[order[:size]] for size in (0, *CURVE_SIZES) if size <= len(order)}
+    return [plan for _, plan in sorted((plans | {len(refined): refined}).items())]
 
 
 def _error_curve(
@@ -406,16 +506,19 @@ def _error_curve(
     sqrt_covariance = compute_sqrt_covariance(
         prior_factor, np.ascontiguousarray(plan_rows.transpose(2, 1, 0))
     )
+    coordinates = scale_joint_units(information.chain, refined)
     gains = goal.criterion.gains(candidates.rows, sqrt_covariance)
+    gains += candidates.filling_gains(np.arange(len(gains)), np.concatenate([goal.existing, coordinates]))
     gains[candidates.infeasible] = -np.inf
     gains[selected] = -np.inf
     promising = np.argsort(-gains)[: min(MAX_EXCHANGE_CANDIDATES, int(np.isfinite(gains).sum()))]
     # The plan's poses come first and are feasible.
     extended = CandidateSet.from_rows(
         np.concatenate([plan_rows, candidates.rows[:, :, promising]], 2),
-        np.concatenate([scale_joint_units(information.chain, refined), candidates.coordinates[promising]]),
+        np.concatenate([coordinates, candidates.coordinates[promising]]),
         candidates.min_distance,
         lambda i: i < count or candidates.is_feasible(int(promising[i - count])),
+        candidates.bin_columns,
     )
     order = select_greedily(
         extended, prior_factor, max(count, EXTRA_POSES), goal.criterion, np.arange(count), goal.existing

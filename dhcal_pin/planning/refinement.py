@@ -12,6 +12,7 @@ import numpy as np
 
 from .._typing import Array
 from ..robot.sampling import ConfigurationSampler, scale_joint_units
+from .bin_filling import filling_cost, filling_gains
 from .criteria import Criterion
 from .exchange import CandidateSet, compute_sqrt_covariance
 from .information import Information
@@ -36,6 +37,7 @@ class DesignGoal:
         n_observable: Number of observable directions.
         existing: Coordinates of existing measurements, shape (n, d).
         sampler: Feasible configurations; None if the candidates are given.
+        bin_columns: Joints whose bins are filled evenly before the criterion decides, shape (j,).
     """
 
     information: Information
@@ -45,6 +47,7 @@ class DesignGoal:
     n_observable: int
     existing: Array
     sampler: ConfigurationSampler | None
+    bin_columns: Array
 
 
 def refine(
@@ -63,31 +66,43 @@ def refine(
         Improved joint positions, shape (n, dof) [rad or m].
     """
     information, criterion = goal.full_information, goal.criterion
-    prior_factor = information.prior_factor
+    prior_factor, columns = information.prior_factor, goal.bin_columns
     q = q.copy()
     rows = np.ascontiguousarray(information.rows(q).transpose(2, 1, 0))
-    value = criterion.value(compute_sqrt_covariance(prior_factor, rows))
+
+    def design_value(rows: Array, occupied: Array) -> float:
+        return criterion.value(compute_sqrt_covariance(prior_factor, rows)) + filling_cost(
+            occupied[:, columns]
+        )
+
+    present = scale_joint_units(sampler.chain, q)
+    value = design_value(rows, np.concatenate([goal.existing, present]))
     for round_number in range(N_ROUNDS):
         nearby = sampler.perturb(q, STEP * SHRINK_FACTOR**round_number, N_NEIGHBOURS, rng)
         is_feasible = lambda i, nearby=nearby: sampler.is_feasible(nearby[i])  # noqa: E731
         candidates = CandidateSet.from_rows(
             information.rows(nearby), scale_joint_units(sampler.chain, nearby), min_distance, is_feasible
         )
-        candidates.infeasible[:] = ~sampler.workspace.contains(sampler.chain.poses(nearby))
+        candidates.infeasible[:] = ~sampler.in_workspace(nearby)
         for slot in range(len(q)):
             block = np.arange(slot * N_NEIGHBOURS, (slot + 1) * N_NEIGHBOURS)
             rest = compute_sqrt_covariance(prior_factor, np.delete(rows, slot, 0))
             block_rows = np.concatenate([candidates.rows[:, :, block], rows[slot].T[:, :, None]], 2)
+            others = np.concatenate([goal.existing, np.delete(present, slot, 0)])
+            block_coordinates = np.concatenate([candidates.coordinates[block], present[slot : slot + 1]])
             gains = criterion.gains(block_rows, rest)
+            gains += filling_gains(block_coordinates[:, columns], others[:, columns])
             # The last gain is that of the present configuration.
             better = np.where(gains[:-1] > gains[-1], gains[:-1], -np.inf)
-            others = scale_joint_units(sampler.chain, np.delete(q, slot, 0))
-            best = candidates.best_candidate(better, block, np.concatenate([goal.existing, others]))
+            best = candidates.best_candidate(better, block, others)
             if best is None:
                 continue
             trial = rows.copy()
             trial[slot] = candidates.rows[:, :, best].T
-            trial_value = criterion.value(compute_sqrt_covariance(prior_factor, trial))
+            trial_value = design_value(
+                trial, np.concatenate([others, candidates.coordinates[best : best + 1]])
+            )
             if trial_value < value:
                 rows, value, q[slot] = trial, trial_value, nearby[best]
+                present[slot] = candidates.coordinates[best]
     return q

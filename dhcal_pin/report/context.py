@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from ..calibration import summary
 from ..calibration.evaluation import Comparison
 from ..calibration.result import Result
+from ..diagnostics.curves import JointCurve, fitted_coverage, joint_curves
 from ..diagnostics.residuals import JointProfile, Outlier, find_outliers, joint_offset_profiles
 from ..diagnostics.workspace import WorkspacePrediction, predict_workspace
+from ..robot.coverage import JointCoverage
 from .document import Provenance, short_names
 
 
@@ -22,6 +25,8 @@ class ReportContext:
         outliers: Outliers among the fitted samples.
         joint_profiles: Residual joint errors over the range of each moving joint.
         workspace: Predicted accuracy over the workspace.
+        coverage: Values of each revolute joint that the fitted samples visited.
+        joint_curves: Correction curves of the joints with harmonics.
     """
 
     fit: Result
@@ -29,6 +34,8 @@ class ReportContext:
     outliers: Sequence[Outlier]
     joint_profiles: Sequence[JointProfile]
     workspace: WorkspacePrediction
+    coverage: Sequence[JointCoverage]
+    joint_curves: Sequence[JointCurve]
 
     @classmethod
     def from_result(cls, fit: Result, source: Provenance) -> ReportContext:
@@ -42,7 +49,15 @@ class ReportContext:
             The context.
         """
         workspace = predict_workspace(fit, fit.data)
-        return cls(fit, source, find_outliers(fit), joint_offset_profiles(fit), workspace)
+        return cls(
+            fit=fit,
+            source=source,
+            outliers=find_outliers(fit),
+            joint_profiles=joint_offset_profiles(fit),
+            workspace=workspace,
+            coverage=fitted_coverage(fit),
+            joint_curves=joint_curves(fit),
+        )
 
     @property
     def data_names(self) -> list[str]:
@@ -61,6 +76,11 @@ class ReportContext:
         if cross_validated is None or self.fit.holdout:
             return own
         return (cross_validated, *(c for c in own if c.title == "fitted"))
+
+    @property
+    def generalization_lines(self) -> tuple[str, ...]:
+        """Accuracy within the measured region and beyond it, one line each."""
+        return summary.generalization_lines(self.fit.generalization, self.comparisons)
 
     @property
     def robot_name(self) -> str:

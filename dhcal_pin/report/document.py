@@ -17,9 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from .._typing import PathLike
+from ..calibration.cross_validation import Generalization
 from ..calibration.evaluation import Comparison, accuracy
-from ..calibration.model_selection import FamilyTrial
 from ..calibration.result import Result
+from ..calibration.verdict import Verdict
 from ..estimation import qr
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
@@ -37,8 +38,8 @@ class Provenance:
         settings: Further choices as text, by name.
         excluded_rows: Reasons why rows were not used, by file and row.
         warnings: Warnings about the input data by file.
+        notes: What of the input data is not used, by file.
         remarks: Sentences that are shown beside the headline.
-        trials: Trials of the families of transmission errors, if they were made.
         hint: Improvement to expect from transmission errors, if they were not tried.
         comparison: Cross-validated accuracy, if there are no hold-out samples.
     """
@@ -50,8 +51,8 @@ class Provenance:
     settings: Mapping[str, str] = field(default_factory=dict)
     excluded_rows: Mapping[str, Mapping[int, str]] = field(default_factory=dict)
     warnings: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    notes: Mapping[str, Sequence[str]] = field(default_factory=dict)
     remarks: Sequence[str] = ()
-    trials: Sequence[FamilyTrial] = ()
     hint: str = ""
     comparison: Comparison | None = None
 
@@ -99,7 +100,7 @@ def short_names(paths: Sequence[PathLike]) -> dict[str, str]:
 
 # Keys of an accuracy and of a parameter; further values are under `comparisons` and `priors`.
 _ACCURACY = "position_rms_m position_max_m orientation_rms_rad residual_rms residual_max unit".split()
-_PARAMETER = "name unit nominal value std observability posterior_to_prior_std fixed".split()
+_PARAMETER = "name unit nominal value std observability posterior_to_prior_std fixed frame direction".split()
 
 
 def _select_keys(content: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
@@ -119,15 +120,20 @@ def main_statistics(accuracy: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def result_to_dict(
-    fit: Result, files: Mapping[str, str], inputs: Mapping[str, str], outliers: Sequence[int] = ()
+    fit: Result,
+    files: Mapping[str, str],
+    inputs: Mapping[str, str],
+    outliers: Sequence[int] = (),
+    is_calibration: bool = True,
 ) -> dict[str, Any]:
-    """Collect the JSON document of a calibration.
+    """Collect the JSON document of a calibration, or of a validation that fits base and tool.
 
     Args:
         fit: Result of the calibration.
         files: Paths of the written files by their meaning.
         inputs: SHA-256 of each input file by path.
         outliers: Outliers, as they are numbered in the files.
+        is_calibration: Whether the accuracy on configurations that are not fitted is stated, too.
 
     Returns:
         Content of the document.
@@ -135,6 +141,7 @@ def result_to_dict(
     comparisons = {comparison.title: comparison for comparison in fit.comparisons}
     fitted, holdout = comparisons["fitted"], comparisons.get("hold-out")
     return {
+        "verdict": fit.verdict.to_dict(),
         "converged": fit.converged,
         "iterations": fit.iterations,
         "method": fit.method,
@@ -148,9 +155,11 @@ def result_to_dict(
         "after": main_statistics(fitted.after),
         "holdout_before": main_statistics(holdout.before) if holdout else {},
         "holdout_after": main_statistics(holdout.after) if holdout else {},
+        **generalization_to_dict(fit.generalization if is_calibration else None),
         "comparisons": [comparison.to_dict() for comparison in fit.comparisons],
         "parameters": [_select_keys(asdict(estimate), _PARAMETER) for estimate in fit.estimates],
         "priors": {estimate.name: estimate.prior for estimate in fit.estimates if not estimate.fixed},
+        "extension": fit.extension.to_dict() if fit.extension else None,
         "shrinkage_factor": fit.shrinkage_factor,
         "shrinkage_notes": fit.shrinkage_notes,
         "unobservable": fit.unobservable,
@@ -161,6 +170,31 @@ def result_to_dict(
         "versions": versions(),
         "inputs": dict(inputs),
     }
+
+
+def generalization_to_dict(generalization: Generalization | None) -> dict[str, Any]:
+    """Return the accuracy on configurations that are not fitted.
+
+    Args:
+        generalization: The accuracy and where it holds; None if it is unknown.
+
+    Returns:
+        Keys and values of the document; None where something is unknown.
+    """
+    names = ("cross_validated", "holdout_region")
+    comparisons: tuple[Comparison | None, ...] = (None, None)
+    reasons: tuple[str, ...] = ("", "")
+    shares: tuple[float | None, ...] = (None, None)
+    if generalization is not None:
+        comparisons = (generalization.cross_validated, generalization.region_holdout)
+        reasons = (generalization.cross_validated_reason, generalization.region_holdout_reason)
+        shares = (generalization.covered_share, generalization.reached_share)
+    out: dict[str, Any] = {}
+    for name, comparison, reason in zip(names, comparisons, reasons, strict=True):
+        out[f"{name}_before"] = main_statistics(comparison.before) if comparison else None
+        out[f"{name}_after"] = main_statistics(comparison.after) if comparison else None
+        out[f"{name}_reason"] = reason
+    return out | dict(zip(("covered_share", "reached_share"), shares, strict=True))
 
 
 def validation_to_dict(
@@ -179,6 +213,7 @@ def validation_to_dict(
     """
     statistics = main_statistics(accuracy(chain, data, known))
     return {
+        "verdict": Verdict("ok").to_dict(),
         "converged": True,
         "iterations": 0,
         "method": "none",
@@ -191,8 +226,10 @@ def validation_to_dict(
         "after": statistics,
         "holdout_before": {},
         "holdout_after": {},
+        **generalization_to_dict(None),
         "parameters": [],
         "unobservable": [],
+        "extension": None,
         "shrinkage_factor": 1.0,
         "shrinkage_notes": [],
         "weakly_observable": [],

@@ -190,6 +190,46 @@ def _offset_unit(profile: JointProfile) -> str:
     return "m" if profile.is_prismatic else "rad"
 
 
+def joint_curve_figures(context: ReportContext) -> list[FigureGroup]:
+    """Draw the correction curve of each joint with its band and the joint values that were not measured.
+
+    Args:
+        context: Result and diagnostics.
+
+    Returns:
+        One group of figures; none if no joint has harmonics.
+    """
+    curves = context.joint_curves
+    if not curves:
+        return []
+    # Where nothing was measured the band is wide; it does not set the scale.
+    limit = max(_largest_offset(c.correction[c.is_measured], c.std[c.is_measured]) for c in curves)
+    panels = []
+    for i, curve in enumerate(curves):
+        coverage = curve.coverage
+        largest = _shown(float(np.max(np.abs(curve.correction[curve.is_measured]), initial=0.0)), "rad")
+        text = (
+            f"Correction of {coverage.joint} over its position, with its 95 % band; at most {largest} at the "
+            f"measured joint values, which are {coverage.n_visited} of {coverage.n_in_range} bins."
+        )
+        plot = partial(
+            plots.plot_joint_corrections,
+            curve.values,
+            curve.correction,
+            curve.std,
+            gaps=coverage.gaps,
+            joint=coverage.joint,
+            limit=limit,
+        )
+        panels.append(Panel(f"correction-{i}", coverage.joint, text, plot, WIDE_PANEL))
+    legend = [
+        LegendEntry("correction", "after", "line"),
+        LegendEntry("95 % band", "after", "area"),
+        LegendEntry("not measured", "unknown", "cell"),
+    ]
+    return [FigureGroup(panels, legend=legend, layout="wide")]
+
+
 def _joint_error_group(context: ReportContext) -> FigureGroup:
     group = next(iter(context.fit.comparisons[0].after.groups))
     quantity, panels = GROUP_LABELS[group], []

@@ -19,7 +19,7 @@ from ..calibration.summary import GROUP_LABELS, STATISTIC_LABELS
 from ..diagnostics.workspace import WorkspacePrediction
 from ..exceptions import InvalidArgumentError
 from ..formatting import format_quantity
-from ..io.atomic import write_files
+from ..saving import write_files
 from ..visualization.plots import svg_panels
 from . import figures, sections
 from .context import ReportContext
@@ -144,7 +144,8 @@ def _header(context: ReportContext) -> dict[str, Any]:
         "heading": heading,
         "values": values,
         "details": _details(best, head.group),
-        "remarks": context.source.remarks,
+        "verdict": context.fit.verdict,
+        "remarks": [*context.source.remarks, *context.generalization_lines],
         "warnings": [*([note] if note else []), *sections.warnings(context)],
     }
 

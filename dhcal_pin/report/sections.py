@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,10 +17,12 @@ from .. import formatting
 from ..calibration import summary
 from ..calibration.estimates import Estimate
 from ..calibration.model_selection import trial_table
+from ..diagnostics.curves import JointCurve, find_lattices
 from ..diagnostics.residuals import median_sigmas
 from ..estimation import robust
 from ..formatting import Table, format_fixed, format_quantity
 from ..identifiability import label_unobservable
+from ..io.origins_file import origin_table
 from ..robot.chain import BASE_FRAME
 from . import figures
 from .context import ReportContext
@@ -29,6 +31,8 @@ from .figures import FigureGroup
 
 # A longer list of outliers is cut: the file as a whole is then more likely wrong than single rows.
 MAX_OUTLIERS = 40
+# Ranges of a joint that were not measured and are listed; the widest ones.
+MAX_GAPS = 3
 
 
 @dataclass(frozen=True)
@@ -115,6 +119,7 @@ def report_sections(context: ReportContext) -> list[Section]:
         _accuracy_section(context),
         _residual_section(context),
         _transmission_section(context),
+        _joint_section(context),
         _workspace_section(context),
         Section("scene", "Nominal and calibrated robot", figures=figures.scene_figures),
         _parameter_section(context),
@@ -134,8 +139,6 @@ def warnings(context: ReportContext) -> list[str]:
         Sentences.
     """
     fit, texts = context.fit, []
-    if not fit.converged:
-        texts.append("The iteration did not converge; all values are those of its last step.")
     texts += summary.regressions(context.comparisons)
     if not np.isfinite(fit.unit_weight_std):
         texts.append(
@@ -154,14 +157,27 @@ def warnings(context: ReportContext) -> list[str]:
 def _accuracy_section(context: ReportContext) -> Section:
     frames = {e.name.split(".")[0] for e in context.fit.estimates if e.category == "frame" and not e.fixed}
     fitted = f" with its {' and '.join(sorted(frames))} fitted to the same measurements" if frames else ""
+    comparisons, generalization = list(context.comparisons), context.fit.generalization
+    sentences = [
+        f"“Before” is the nominal robot{fitted}. The difference between before and after is therefore "
+        "due to the robot parameters alone."
+    ]
+    if generalization.region_holdout:
+        sentences.append(
+            "“Region hold-out” samples are the ends of the measured region along each principal direction of "
+            "the joint values; each end is judged by a fit of the other samples. Their error holds for "
+            f"{summary.format_share(generalization.reached_share)} of the joint space: where a configuration "
+            "is no farther from the measured ones than these ends are from the others. The measured region "
+            f"itself is {summary.format_share(generalization.covered_share)} of the joint space. Nothing is "
+            "known about the accuracy in the rest."
+        )
+        if generalization.region_holdout not in comparisons:
+            comparisons.insert(1, generalization.region_holdout)
     return Section(
         "accuracy",
         "Accuracy",
-        [
-            f"“Before” is the nominal robot{fitted}. The difference between before and after is therefore "
-            "due to the robot parameters alone."
-        ],
-        tables=[summary.accuracy_table(context.comparisons)],
+        sentences,
+        tables=[summary.accuracy_table(comparisons)],
         figures=figures.accuracy_figures,
     )
 
@@ -199,23 +215,76 @@ def _residual_section(context: ReportContext) -> Section:
 
 
 def _transmission_section(context: ReportContext) -> Section:
-    key, title, trials = "transmission", "Transmission errors", context.source.trials
-    if not trials:
+    key, title, extension = "transmission", "Transmission errors", context.fit.extension
+    if extension is None:
         hint = context.source.hint
         return Section(key, title, [f"{hint[0].upper()}{hint[1:]}."] if hint else [])
-    selected = [trial.family for trial in trials if trial.is_selected]
-    conclusion = (
-        f"Added to the geometry: {', '.join(selected)}."
-        if selected
-        else "No family was added to the geometry."
-    )
     text = (
-        "Errors are cross-validated over regions of joint space, in standard deviations of a measurement, "
-        "without and with the family. Each family is tried in addition to those added before. It is added "
-        "if the error falls by more than its standard error and the improvement is unlikely to be due to "
-        "chance."
+        "Each family is tried in addition to those added before. Errors are those of random left-out "
+        "samples, in standard deviations, without and with the family. A family is added if the evidence "
+        "rises and this error falls. The prior width is the standard deviation of greatest evidence."
     )
-    return Section(key, title, [conclusion, text], tables=[trial_table(trials)])
+    tables = [trial_table(extension.trials)] if extension.trials else []
+    return Section(key, title, [*extension.sentences, *([text] if tables else [])], tables=tables)
+
+
+def _joint_section(context: ReportContext) -> Section:
+    """Return the correction curves of the joints, or which joint values were measured if there are none."""
+    curves = {curve.coverage.joint: curve for curve in context.joint_curves}
+    coverage = context.coverage
+    header = ["joint", "not measured", "bins visited"]
+    rows = [[c.joint, _format_gaps(c.gaps), f"{c.n_visited} of {c.n_in_range}"] for c in coverage]
+    bins = "A bin is 5° wide and counts as visited if one configuration lies in it."
+    if curves:
+        title = "Joint correction curves"
+        sentences = [
+            "The angle to add to a joint value before it is commanded, as far as it depends on that joint "
+            "alone and repeats with every turn.",
+            "A curve is known where joint values were measured. In the other ranges it continues harmonics "
+            f"that were fitted elsewhere, and its band is wide. {bins} The table has the largest correction "
+            "at measured joint values, and the median standard deviation at measured and at other ones.",
+        ]
+        header += ["largest correction", "std, measured", "std, other"]
+        rows = [row + _curve_cells(curves.get(c.joint)) for row, c in zip(rows, coverage, strict=True)]
+        items = [f"{text[:1].upper()}{text[1:]}." for text in find_lattices(context.fit)]
+    else:
+        items = []
+        title = "Measured joint values"
+        sentences = [
+            f"Errors of a joint are extrapolated to joint values that were not measured. {bins}",
+        ]
+    bars = [BarColumn("share", [ShareBar(c.share) for c in coverage])]
+    table = BarTable(header, rows, n_text_columns=2, bars=bars)
+    tables = [table] if rows else []
+    return Section(
+        "joints", title, sentences if rows else [], items, tables, figures=figures.joint_curve_figures
+    )
+
+
+def _format_gaps(gaps: Sequence[tuple[float, float]]) -> str:
+    """List the widest ranges of joint values that were not measured, in their order."""
+    widest = sorted(gaps, key=lambda gap: gap[0] - gap[1])[:MAX_GAPS]
+    texts = [
+        f"{np.degrees(low):g}° to {np.degrees(high):g}°".replace("-", "−") for low, high in sorted(widest)
+    ]
+    if n_hidden := len(gaps) - len(widest):
+        texts.append(f"{n_hidden} more")
+    return ", ".join(texts) or "–"
+
+
+def _curve_cells(curve: JointCurve | None) -> list[str]:
+    """Return the largest correction of a joint, and the median std at measured and at other values."""
+    if curve is None:
+        return ["", "", ""]
+    is_measured = curve.is_measured
+    cells = [_format_small(float(np.max(np.abs(curve.correction[is_measured]), initial=0.0)))]
+    for chosen in (is_measured, ~is_measured):
+        cells.append(_format_small(float(np.median(curve.std[chosen]))) if chosen.any() else "–")
+    return cells
+
+
+def _format_small(angle: float) -> str:
+    return format_quantity(angle, "rad", angle / 10, small=True)
 
 
 def _workspace_section(context: ReportContext) -> Section:
@@ -293,7 +362,14 @@ def _parameter_section(context: ReportContext) -> Section:
         "(nothing) to 1 (all). Below 1, other parameters have partly the same effect on the measurements; "
         "the priors then decide how the effect is shared between them."
     )
-    return Section("parameters", "Parameters", [text], tables=tables)
+    if (origins := origin_table(context.fit.chain)).rows:
+        tables.append(replace(origins, caption="Joint origins in the URDF, m and rad"))
+    tables.append(replace(summary.definition_table(context.fit.estimates), caption="Frames"))
+    note = (
+        "At a pitch near ±90°, roll and yaw of an origin can change much more than the origin turns; the "
+        "column “moved” has the angle of the turn."
+    )
+    return Section("parameters", "Parameters", [text, summary.DEFINITION_TEXT, note], tables=tables)
 
 
 def _estimate_bars(estimates: Sequence[Estimate]) -> list[BarColumn]:
@@ -354,12 +430,13 @@ def _outlier_section(context: ReportContext) -> Section:
     else:
         text = f"No fitted sample has a standardized residual above {threshold}."
     items = [
-        f"{name}, row {row}: not used, {reason}"
+        f"{name}, line {row}: not used, {reason}"
         for name, reasons in context.source.excluded_rows.items()
         for row, reason in reasons.items()
     ]
+    items += [f"{name}: {text}" for name, texts in context.source.notes.items() for text in texts]
     items += [f"{name}: warning: {text}" for name, texts in context.source.warnings.items() for text in texts]
-    table = Table(["file", "row", "error", "score"], rows)
+    table = Table(["file", "line", "error", "score"], rows)
     return Section("outliers", "Outliers", [text], items, [table] if rows else [])
 
 
@@ -437,18 +514,23 @@ def markdown(context: ReportContext) -> str:
         Text of the Markdown file.
     """
     head = summary.headline(context.comparisons)
+    verdict = context.fit.verdict
+    escape = formatting.escape_markdown
     parts = [
-        f"# Calibration of {context.robot_name}",
-        f"**{head.text}**",
-        *context.source.remarks,
-        *warnings(context),
+        f"# Calibration of {escape(context.robot_name)}",
+        f"**Verdict: {verdict.status}**",
+        *map(escape, verdict.reasons),
+        f"**{escape(head.text)}**",
+        *map(escape, context.source.remarks),
+        *map(escape, context.generalization_lines),
+        *map(escape, warnings(context)),
     ]
     for section in report_sections(context):
-        blocks = [*section.sentences]
+        blocks = [*map(escape, section.sentences)]
         if section.items:
-            blocks.append("\n".join(f"- {item}" for item in section.items))
+            blocks.append("\n".join(f"- {escape(item)}" for item in section.items))
         for table in section.tables:
-            blocks += [f"**{table.caption}**"] if table.caption else []
+            blocks += [f"**{escape(table.caption)}**"] if table.caption else []
             blocks.append(formatting.markdown_table(table))
         parts += [f"## {section.title}", *blocks] if blocks else []
     return "\n\n".join(parts) + "\n"

@@ -6,6 +6,13 @@ from .chain import extract_dh_table as extract_dh_table
 from .chain import joint_frame as joint_frame
 from .chain import link_frame as link_frame
 from .collision import CollisionChecker as CollisionChecker
+from .collision import Obstacle as Obstacle
+from .collision import obstacles_from_urdf as obstacles_from_urdf
+from .correction_table import JointCorrection as JointCorrection
+from .correction_table import joint_corrections as joint_corrections
+from .coverage import JointCoverage as JointCoverage
+from .coverage import joint_coverage as joint_coverage
+from .coverage import lattice_warnings as lattice_warnings
 from .dh import Convention as Convention
 from .dh import DHTable as DHTable
 from .dh_extraction import Extraction as Extraction

@@ -39,12 +39,13 @@ from .. import _kernels, se3
 from .._kernels.kinematics import error_frame_poses
 from .._kernels.types import FrameBatch, JointState
 from .._typing import Array
-from ..exceptions import DhcalError, InvalidArgumentError
+from ..exceptions import DhcalError, InvalidArgumentError, UnknownNameError
+from ..messages import quote
 from .dh import Convention, DHTable
 from .dh_extraction import Extraction, extract_dh
 from .dh_urdf import dh_to_urdf
-from .transmission import TERMS, GravityLoads, Payload, Transmission
-from .urdf import Urdf, parse_urdf, read_urdf
+from .transmission import GravityLoads, Payload, Transmission, n_coefficients
+from .urdf import Urdf, parse_urdf, read_urdf, suggest_names
 from .urdf_path import (
     axis_frame,
     build_model,
@@ -295,7 +296,7 @@ class Chain:
         Raises:
             InvalidArgumentError: The type or the shape of the coefficients does not fit the chain.
         """
-        shape = (len(TERMS), self.n_joints, self.n_joints)
+        shape = (n_coefficients(self.n_joints),)
         if not isinstance(transmission, Transmission):
             raise InvalidArgumentError(
                 f"transmission has type {type(transmission).__name__}; expected a Transmission"
@@ -397,6 +398,33 @@ class Chain:
         _kernels.propagate_frames(self._link_and_tool_transforms, self.prismatic, state, frames)
         return FrameBatch(frames[:-1], frames[-1, :4], terms)
 
+    def pose_in_tip(self, link: str) -> Array:
+        """Return the constant pose of another link in the tip link.
+
+        Args:
+            link: Name of a link that no joint moves against the tip.
+
+        Returns:
+            Pose, shape (4, 4) [m].
+
+        Raises:
+            UnknownNameError: There is no such link.
+            InvalidArgumentError: A joint moves the link against the tip.
+        """
+        if link not in self.urdf.links:
+            raise UnknownNameError(
+                f"{self.urdf.source}: unknown link {quote(link)}; {suggest_names(link, self.urdf.links)}"
+            )
+        # Links behind the tip move with it if its origin was changed, so the poses are those of the URDF.
+        model = build_model(self.urdf)
+        frame, tip = (model.frames[model.getFrameId(name, pin.FrameType.BODY)] for name in (link, self.tip))
+        if frame.parentJoint != tip.parentJoint:
+            raise InvalidArgumentError(
+                f"{self.urdf.source}: a joint moves {quote(link)} against the tip {quote(self.tip)}; "
+                "expected a link that is fixed to the tip"
+            )
+        return (tip.placement.inverse() * frame.placement).homogeneous
+
     def poses(self, q: ArrayLike) -> Array:
         """Compute tool poses.
 
@@ -416,7 +444,7 @@ class Chain:
         Args:
             frames: Frames of this chain at m samples.
             bodies: Body numbers in ascending order, shape (p,). The number k+1+e stands for entry e of the
-                flattened transmission coefficients.
+                transmission coefficients.
             twists: Twists [v, ω] in the frames of the bodies, shape (p, 6); not used for coefficients.
             out: Array of shape (p, 6, m) that holds the result.
 
@@ -428,17 +456,25 @@ class Chain:
         n_bodies, n_geometric = len(frames.columns), len(bodies)
         if n_geometric and bodies[-1] >= n_bodies:
             n_geometric = int(np.searchsorted(bodies, n_bodies))
-            out[n_geometric:] = self._transmission_jacobian(frames, bodies[n_geometric:] - n_bodies)
+            self._fill_transmission_jacobian(frames, bodies[n_geometric:] - n_bodies, out[n_geometric:])
             bodies, twists = bodies[:n_geometric], twists[:n_geometric]
         _kernels.point_jacobian(frames.columns, frames.tool[3], bodies, twists, out[:n_geometric])
         return out
 
-    def _transmission_jacobian(self, frames: FrameBatch, entries: Array) -> Array:
-        """Compute the tool twist per unit of entries (e,) of the flattened coefficients, shape (e, 6, m)."""
+    def _fill_transmission_jacobian(self, frames: FrameBatch, entries: Array, out: Array) -> None:
+        """Compute the tool twist per unit of transmission coefficients (e,) into an array (e, 6, m).
+
+        All coefficients of a joint share the twist of its motion, which each one scales by its own term.
+        """
         assert self.transmission is not None
         assert frames.terms is not None
-        term, joint, source = np.unravel_index(entries, self.transmission.coefficients.shape)
-        return self.joint_jacobian(frames)[joint] * frames.terms[term, source][:, None]
+        by_joint, terms = self.joint_jacobian(frames), frames.terms
+        transmission = self.transmission.evaluating(entries)
+        if transmission is not self.transmission:
+            terms = transmission.terms(terms[0])
+        located = (indices.tolist() for indices in transmission.locate(entries))
+        for joint, term, source, column in zip(*located, out, strict=True):
+            np.multiply(by_joint[joint], terms[term, source], out=column)
 
     def joint_jacobian(self, frames: FrameBatch) -> Array:
         """Compute the geometric Jacobian with respect to the actual positions of the independent joints.

@@ -1,30 +1,96 @@
-"""Self-collision and line of sight, by Pinocchio and Coal.
+"""Collisions of a robot with itself, the floor and obstacles, and line of sight, by Pinocchio and Coal.
 
 The collision geometry of the URDF is checked pair by pair. Pairs of shapes on one link or on neighbouring
 links are not checked. Pairs that collide both at the neutral configuration and in the middle of the joint
-limits are not checked either: their shapes overlap in the robot description. A line of sight is a thin
-capsule between instrument and tool.
+limits are not checked either: their shapes overlap in the robot description.
+
+Floor and obstacles stand still in the frame of the root link. They are checked against the shapes that the
+chain moves, with a clearance. A robot without collision geometry is represented by thin capsules between its
+joints. The first link may stand on the floor or on an obstacle: such a pair is not checked if it collides at
+the neutral configuration and in the middle of the limits. A line of sight is a thin capsule between
+instrument and tool.
 """
 
 from __future__ import annotations
 
-import os
+import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import coal
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
+from .. import se3
 from .._typing import Array
+from ..exceptions import FileFormatError
+from ..native_output import discard_native_messages
+from ..ros_packages import mesh_remedy
 from .chain import Chain
+from .urdf import Urdf
+from .urdf_path import build_model
 
 # Diameter of a line of sight [m].
 SIGHT_DIAMETER = 5e-3
+# Smallest distance of the robot from floor and obstacles [m]: calibration errors and the steps of the check.
+CLEARANCE = 10e-3
+# Radius of the capsules that represent a robot without collision geometry, and the mount of its tool [m].
+_LINK_RADIUS, _TOOL_RADIUS = 20e-3, 5e-3
+# Length of a capsule below which it is omitted [m].
+_MIN_CAPSULE_LENGTH = 1e-3
+# Name and size of the floor [m]. It is a box, because Coal finds collisions of meshes and half-spaces slowly.
+FLOOR, _FLOOR_SIZE = "floor", (100.0, 100.0, 2.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Obstacle:
+    """Body that stands still.
+
+    Attributes:
+        name: Name for messages.
+        shape: Shape of Coal.
+        placement: Pose of the shape in the frame of the root link, shape (4, 4) [m].
+    """
+
+    name: str
+    shape: Any
+    placement: Array
+
+    @classmethod
+    def box(cls, low: ArrayLike, high: ArrayLike, name: str = "box") -> Obstacle:
+        """Create a box whose edges are parallel to the axes of the root link.
+
+        Args:
+            low: Lowest x, y, z, shape (3,) [m].
+            high: Highest x, y, z, shape (3,) [m].
+            name: Name for messages.
+
+        Returns:
+            Obstacle.
+        """
+        low, high = np.asarray(low, float), np.asarray(high, float)
+        return cls(name, coal.Box(*(high - low).tolist()), se3.transform(np.eye(3), 0.5 * (low + high)))
+
+    @classmethod
+    def floor(cls, height: float) -> Obstacle:
+        """Create the floor.
+
+        Args:
+            height: z of its surface in the frame of the root link [m].
+
+        Returns:
+            Obstacle of the name `FLOOR`.
+        """
+        length, width, depth = _FLOOR_SIZE
+        return cls.box(
+            np.array([-length / 2, -width / 2, height - depth]),
+            np.array([length / 2, width / 2, height]),
+            FLOOR,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,74 +99,53 @@ class CollisionChecker:
 
     Attributes:
         chain: Kinematic chain of the robot.
-        geometry: Pinocchio's collision shapes and the pairs to check; None if the robot has no usable shapes.
+        geometry: Pinocchio's collision shapes and the pairs to check; None if there is nothing to check.
         note: What is not checked and why, or an empty text.
+        n_robot_shapes: Number of shapes of the robot, which precede those of floor and obstacles.
     """
 
     chain: Chain
     geometry: Any
     note: str = ""
+    n_robot_shapes: int = 0
 
     @classmethod
-    def from_chain(
-        cls, chain: Chain, package_dirs: Sequence[str | os.PathLike[str]] | None = None
-    ) -> CollisionChecker:
+    def from_chain(cls, chain: Chain, obstacles: Sequence[Obstacle] = ()) -> CollisionChecker:
         """Load the collision geometry of a chain's URDF.
 
         Args:
             chain: Kinematic chain of the robot.
-            package_dirs: Folders with the packages of the meshes; the folders above the URDF by default.
+            obstacles: Floor and obstacles.
 
         Returns:
-            Checker; without geometry if a mesh is missing or the URDF has no collision shapes.
+            Checker. If a mesh is missing or the URDF has no collision shapes, it checks floor and obstacles
+            only.
         """
-        if package_dirs is None:
-            package_dirs = list(Path(chain.urdf.source).absolute().parents)
-        text = chain.urdf.data.decode("utf-8-sig")
-        folders = [os.fspath(path) for path in package_dirs]
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                geometry = pin.buildGeomFromUrdfString(
-                    chain.model, text, pin.GeometryType.COLLISION, package_dirs=folders
-                )
-        except (ValueError, RuntimeError) as error:
-            reason = " ".join(str(error).split())
-            return cls(chain, None, f"self-collision is not checked: a mesh is missing: {reason}")
-        if not geometry.ngeoms:
-            return cls(chain, None, "self-collision is not checked: the URDF has no collision geometry")
-        joints = [item.parentJoint for item in geometry.geometryObjects]
-        parents = chain.model.parents
-        for second, b in enumerate(joints):
-            for first, a in enumerate(joints[:second]):
-                if a != b and parents[a] != b and parents[b] != a:
-                    geometry.addCollisionPair(pin.CollisionPair(first, second))
-        checker = cls(chain, geometry)
-        low, high = (np.clip(limit, -np.pi, np.pi) for limit in (chain.lower, chain.upper))
-        middle = chain.configurations((low + high)[None] / 2)[0]
-        neutral = pin.neutral(chain.model)
-        for pair in checker._colliding_pairs(neutral) & checker._colliding_pairs(middle):
-            geometry.removeCollisionPair(pin.CollisionPair(*pair))
-        return checker
+        geometry, problem = _load_geometry(chain.urdf, chain.model)
+        note = f"self-collision is not checked: {problem}" if problem else ""
+        if geometry is not None:
+            _add_self_collision_pairs(chain, geometry)
+        if not obstacles:
+            return cls(chain, geometry, note, geometry.ngeoms if geometry is not None else 0)
+        if geometry is None:
+            geometry = _links_as_capsules(chain)
+            note = f"{note}; floor and obstacles are checked against straight lines between the joints"
+        _add_tool(chain, geometry)
+        n_robot_shapes = geometry.ngeoms
+        _add_obstacles(chain, geometry, obstacles)
+        return cls(chain, geometry, note, n_robot_shapes)
 
     @cached_property
     def _data(self) -> tuple[pin.Data, pin.GeometryData]:
         """Work data of the model and of the geometry."""
-        return self.chain.model.createData(), pin.GeometryData(self.geometry)
-
-    def _colliding_pairs(self, configuration: Array) -> set[tuple[int, int]]:
-        """Return the indices of the pairs of shapes that collide."""
-        data = pin.GeometryData(self.geometry)
-        model = self.chain.model
-        pin.computeCollisions(model, model.createData(), self.geometry, data, configuration, False)
-        return {
-            (pair.first, pair.second)
-            for pair, result in zip(self.geometry.collisionPairs, data.collisionResults, strict=True)
-            if result.isCollision()
-        }
+        shapes = pin.GeometryData(self.geometry)
+        for pair, request in zip(self.geometry.collisionPairs, shapes.collisionRequests, strict=True):
+            if max(pair.first, pair.second) >= self.n_robot_shapes:
+                request.security_margin = CLEARANCE
+        return self.chain.model.createData(), shapes
 
     def is_collision_free(self, q: Array) -> bool:
-        """Return whether no two shapes collide; True if the robot has no geometry.
+        """Return whether no two shapes collide; True if there is nothing to check.
 
         Args:
             q: Joint positions, shape (n,) [rad or m].
@@ -115,9 +160,10 @@ class CollisionChecker:
         return not pin.computeCollisions(self.chain.model, data, self.geometry, shapes, configuration, True)
 
     def has_line_of_sight(self, q: Array, eye: Array, point: Array) -> bool:
-        """Return whether the robot leaves the line between two points free.
+        """Return whether robot and obstacles leave the line between two points free.
 
-        The links behind the last moving joint are ignored, because the measured point is on them.
+        The links behind the last moving joint are ignored, because the measured point is on them. The floor
+        is ignored, because it may end before the instrument.
 
         Args:
             q: Joint positions, shape (n,) [rad or m].
@@ -125,7 +171,7 @@ class CollisionChecker:
             point: Position of the measured point in the frame of the base link, shape (3,) [m].
 
         Returns:
-            Whether the line is free; True if the robot has no geometry.
+            Whether the line is free; True if there is nothing to check.
         """
         if self.geometry is None:
             return True
@@ -150,5 +196,133 @@ class CollisionChecker:
                 coal.CollisionResult(),
             )
             for i, item in enumerate(self.geometry.geometryObjects)
-            if item.parentJoint < last_joint
+            if item.parentJoint < last_joint and item.name != FLOOR
         )
+
+
+def obstacles_from_urdf(urdf: Urdf) -> list[Obstacle]:
+    """Read the collision shapes of a scene that stands still.
+
+    The root link of the scene is that of the robot. The joints of the scene are at their neutral positions.
+
+    Args:
+        urdf: Scene.
+
+    Returns:
+        One obstacle per shape, named by its link.
+
+    Raises:
+        FileFormatError: The scene has no collision shapes, or a mesh is missing.
+    """
+    model = build_model(urdf)
+    geometry, problem = _load_geometry(urdf, model)
+    if geometry is None:
+        raise FileFormatError(f"{urdf.source}: {problem}; expected obstacles as <collision> elements")
+    data, shapes = model.createData(), pin.GeometryData(geometry)
+    pin.updateGeometryPlacements(model, data, geometry, shapes, pin.neutral(model))
+    return [
+        Obstacle(model.frames[item.parentFrame].name, item.geometry, placement.homogeneous)
+        for item, placement in zip(geometry.geometryObjects, shapes.oMg, strict=True)
+    ]
+
+
+def _load_geometry(urdf: Urdf, model: pin.Model) -> tuple[Any, str]:
+    """Load the collision shapes of a URDF; None with the reason if there are none."""
+    text = urdf.data.decode("utf-8-sig")
+    try:
+        with warnings.catch_warnings(), discard_native_messages():
+            warnings.simplefilter("ignore")
+            geometry = pin.buildGeomFromUrdfString(
+                model, text, pin.GeometryType.COLLISION, package_dirs=urdf.mesh_folders()
+            )
+    except (ValueError, RuntimeError) as error:
+        reason = " ".join(str(error).split())
+        # Pinocchio names the mesh in its sentence.
+        mesh = re.search(r"Mesh (.*) could not be found", reason)
+        remedy = f"; {mesh_remedy(mesh[1])}" if mesh else ""
+        return None, f"a mesh is missing: {reason}{remedy}"
+    if not geometry.ngeoms:
+        return None, "the URDF has no collision geometry"
+    return geometry, ""
+
+
+def _add_self_collision_pairs(chain: Chain, geometry: Any) -> None:
+    """Add all pairs of shapes on links that are not neighbours, but those that overlap in the URDF."""
+    joints = [item.parentJoint for item in geometry.geometryObjects]
+    parents = chain.model.parents
+    for second, b in enumerate(joints):
+        for first, a in enumerate(joints[:second]):
+            if a != b and parents[a] != b and parents[b] != a:
+                geometry.addCollisionPair(pin.CollisionPair(first, second))
+    for pair in _always_colliding_pairs(chain, geometry):
+        geometry.removeCollisionPair(pin.CollisionPair(*pair))
+
+
+def _always_colliding_pairs(chain: Chain, geometry: Any, margin: float = 0.0) -> set[tuple[int, int]]:
+    """Return the pairs that collide at the neutral configuration and in the middle of the joint limits."""
+    low, high = (np.clip(limit, -np.pi, np.pi) for limit in (chain.lower, chain.upper))
+    middle = chain.configurations((low + high)[None] / 2)[0]
+    found = []
+    for configuration in (pin.neutral(chain.model), middle):
+        data = pin.GeometryData(geometry)
+        for request in data.collisionRequests:
+            request.security_margin = margin
+        pin.computeCollisions(chain.model, chain.model.createData(), geometry, data, configuration, False)
+        found.append(
+            {
+                (pair.first, pair.second)
+                for pair, result in zip(geometry.collisionPairs, data.collisionResults, strict=True)
+                if result.isCollision()
+            }
+        )
+    return found[0] & found[1]
+
+
+def _links_as_capsules(chain: Chain) -> Any:
+    """Represent the links between the moving joints of a chain by capsules."""
+    geometry = pin.GeometryModel()
+    for name, origin in zip(chain.moving_joints, chain.origins[1:], strict=True):
+        _add_capsule(geometry, chain, name, np.zeros(3), origin[:3, 3], _LINK_RADIUS)
+    return geometry
+
+
+def _add_tool(chain: Chain, geometry: Any) -> None:
+    """Add a capsule from the tip to the tool, which no URDF contains."""
+    tip = chain.origins[-1]
+    _add_capsule(
+        geometry, chain, chain.moving_joints[-1], tip[:3, 3], (tip @ chain.tool)[:3, 3], _TOOL_RADIUS
+    )
+
+
+def _add_capsule(geometry: Any, chain: Chain, joint: str, start: Array, end: Array, radius: float) -> None:
+    """Add a capsule between two points (3,) in the frame of a moving joint."""
+    length = float(np.linalg.norm(end - start))
+    if length < _MIN_CAPSULE_LENGTH:
+        return
+    rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), (end - start) / length).matrix()
+    placement, index = pin.SE3(rotation, 0.5 * (start + end)), chain.model.getJointId(joint)
+    name = f"capsule {geometry.ngeoms} of {joint}"
+    geometry.addGeometryObject(pin.GeometryObject(name, index, 0, placement, coal.Capsule(radius, length)))
+
+
+def _add_obstacles(chain: Chain, geometry: Any, obstacles: Sequence[Obstacle]) -> None:
+    """Add obstacles and their pairs with all shapes that the chain moves."""
+    model = chain.model
+    moving = [model.getJointId(name) for name in chain.moving_joints]
+    # Moving joints of the chain that move each shape.
+    movers = [set(model.supports[item.parentJoint]) & set(moving) for item in geometry.geometryObjects]
+    on_first_joint = pin.GeometryModel(geometry)
+    for pair in list(on_first_joint.collisionPairs):
+        on_first_joint.removeCollisionPair(pair)
+    for number, obstacle in enumerate(obstacles):
+        name = obstacle.name if obstacle.name == FLOOR else f"obstacle {number} {obstacle.name}"
+        item = pin.GeometryObject(name, 0, 0, pin.SE3(obstacle.placement), obstacle.shape)
+        for target in (geometry, on_first_joint):
+            index = target.addGeometryObject(item)
+        for shape, joints in enumerate(movers):
+            if joints == {moving[0]}:
+                on_first_joint.addCollisionPair(pin.CollisionPair(shape, index))
+            if joints:
+                geometry.addCollisionPair(pin.CollisionPair(shape, index))
+    for pair in _always_colliding_pairs(chain, on_first_joint, CLEARANCE):
+        geometry.removeCollisionPair(pin.CollisionPair(*pair))

@@ -1,8 +1,7 @@
 """Families of joint errors: the parameter sets that describe how a joint misses its commanded position.
 
-A family is one parameter set, such as `harmonics`, and one candidate of the automatic model selection. The
-formulas of its terms are the rows of `transmission.TERMS`. This module imports nothing heavy, because the
-help of the command line lists the families.
+A family is one parameter set, such as `harmonics`. The formula of all of them is in `transmission`. This
+module imports nothing heavy, because the help of the command line lists the families.
 """
 
 from __future__ import annotations
@@ -25,15 +24,17 @@ class ErrorFamily:
     requirement: str
 
 
-COUPLING = "coupling"
+GAIN, HARMONICS, CURVES = "gain", "harmonics", "curves"
+COMPLIANCE, COUPLING = "compliance", "coupling"
 
 FAMILIES = {
     family.name: family
     for family in (
-        ErrorFamily("gain", "gear ratio errors", "a moving joint"),
-        ErrorFamily("harmonics", "gear eccentricity", "a revolute joint"),
+        ErrorFamily(GAIN, "gear ratio errors", "a moving joint"),
+        ErrorFamily(HARMONICS, "gear eccentricity", "a revolute joint"),
+        ErrorFamily(CURVES, "joint correction curves", "a revolute joint"),
         ErrorFamily(
-            "compliance",
+            COMPLIANCE,
             "joint elasticity under gravity",
             "a revolute joint that gravity loads, and links with masses in the URDF",
         ),

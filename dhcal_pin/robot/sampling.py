@@ -1,14 +1,17 @@
 """Random configurations within joint limits and workspace constraints, and a short tour through them.
 
 Configurations are drawn uniformly in joint space. They are rejected if the tool leaves the workspace, if the
-robot collides with itself, or if it hides the tool from the instrument. `shortest_tour` orders configurations
-by 2-opt (Croes 1958), so that a robot moves little from one to the next.
+robot collides with itself, the floor or an obstacle, or if the tool is hidden from the instrument.
+
+`shortest_tour` orders configurations by 2-opt (Croes 1958), so that a robot moves little from one to the
+next.
 
 Shapes: m samples, n joints.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +20,7 @@ from .. import se3
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from .chain import Chain
-from .collision import CollisionChecker
+from .collision import CollisionChecker, Obstacle
 
 # Number of draws per requested configuration before the workspace is considered too narrow.
 MAX_DRAWS_PER_SAMPLE = 200
@@ -35,7 +38,10 @@ _MIN_TOUR_GAIN = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class WorkspaceConstraints:
-    """Constraints of the tool pose, in the measuring frame (by default the frame of the base link).
+    """Constraints of the robot's poses.
+
+    The tool is constrained in the measuring frame (by default the frame of the root link), the whole robot in
+    the frame of the root link.
 
     Attributes:
         box: Lowest and highest x, y, z of the tool point, shape (2, 3) [m]; None for any position.
@@ -43,11 +49,21 @@ class WorkspaceConstraints:
             visibility does not matter.
         max_view_angle: Maximum angle between the z axis of the tool and the direction to the instrument
             [rad].
+        floor: z of the floor in the frame of the root link [m]; None without a floor.
+        obstacles: Obstacles.
     """
 
     box: Array | None = None
     instrument_position: Array | None = None
     max_view_angle: float = np.pi
+    floor: float | None = None
+    obstacles: Sequence[Obstacle] = ()
+
+    @property
+    def environment(self) -> tuple[Obstacle, ...]:
+        """Floor and obstacles."""
+        floor = () if self.floor is None else (Obstacle.floor(self.floor),)
+        return (*floor, *self.obstacles)
 
     def contains(self, poses: Array) -> Array:
         """Return which tool poses are inside the box and face the instrument.
@@ -80,15 +96,28 @@ def joint_range(chain: Chain, angle: float = 0.0, length: float = 0.0) -> tuple[
     Returns:
         Lowest and highest joint positions, each of shape (n,) [rad or m].
     """
-    is_prismatic = _is_prismatic(chain)
-    span, margin = np.where(is_prismatic, _MAX_STROKE, _MAX_ANGLE), np.where(is_prismatic, length, angle)
-    # The margin is at most a quarter of the range, so that half of it remains.
-    margin = np.minimum(margin, (chain.upper - chain.lower) / 4)
-    low, high = chain.lower + margin, chain.upper - margin
+    low, high = limits_with_margin(chain, angle, length)
+    span = np.where(_is_prismatic(chain), _MAX_STROKE, _MAX_ANGLE)
     return (
         np.where(high > -span, np.maximum(low, -span), np.maximum(low, high - 2 * span)),
         np.where(low < span, np.minimum(high, span), np.minimum(high, low + 2 * span)),
     )
+
+
+def limits_with_margin(chain: Chain, angle: float, length: float) -> tuple[Array, Array]:
+    """Return the joint limits less a margin.
+
+    Args:
+        chain: Kinematic chain.
+        angle: Margin to the limits of revolute joints [rad].
+        length: Margin to the limits of prismatic joints [m].
+
+    Returns:
+        Lowest and highest joint positions, each of shape (n,) [rad or m]; infinite without a limit.
+    """
+    # The margin is at most a quarter of the range, so that half of it remains.
+    margin = np.minimum(np.where(_is_prismatic(chain), length, angle), (chain.upper - chain.lower) / 4)
+    return chain.lower + margin, chain.upper - margin
 
 
 def _is_prismatic(chain: Chain) -> Array:
@@ -129,7 +158,24 @@ class ConfigurationSampler:
         Returns:
             Sampler with the collision geometry of the URDF.
         """
-        return cls(chain, workspace, *joint_range(chain, angle, length), CollisionChecker.from_chain(chain))
+        checker = CollisionChecker.from_chain(chain, workspace.environment)
+        return cls(chain, workspace, *joint_range(chain, angle, length), checker)
+
+    def in_workspace(self, q: Array) -> Array:
+        """Return in which configurations the tool is in the workspace and above the floor.
+
+        Args:
+            q: Joint positions, shape (m, n) [rad or m].
+
+        Returns:
+            Whether the constraints of the tool are satisfied, shape (m,).
+        """
+        poses = self.chain.poses(q)
+        inside = self.workspace.contains(poses)
+        if self.workspace.floor is not None:
+            base = self.chain.base
+            inside &= (poses[:, :3, 3] - base[:3, 3]) @ base[:3, 2] >= self.workspace.floor
+        return inside
 
     def draw(self, count: int, rng: np.random.Generator) -> Array:
         """Draw uniform joint positions whose tool poses are in the workspace; collisions are not checked.
@@ -147,12 +193,12 @@ class ConfigurationSampler:
         out = np.empty((0, self.chain.n_joints))
         for _ in range(MAX_DRAWS_PER_SAMPLE):
             q = rng.uniform(self.low, self.high, (count, self.chain.n_joints))
-            out = np.concatenate([out, q[self.workspace.contains(self.chain.poses(q))]])
+            out = np.concatenate([out, q[self.in_workspace(q)]])
             if len(out) >= count:
                 return out[:count]
         raise InvalidArgumentError(
             f"only {len(out)} of {MAX_DRAWS_PER_SAMPLE * count} random configurations have the tool in the "
-            "workspace; widen the box or the view angle, or reduce the number of candidates"
+            "workspace; widen the box or the view angle, lower the floor, or reduce the number of candidates"
         )
 
     def perturb(self, q: Array, step: float, count: int, rng: np.random.Generator) -> Array:
@@ -205,13 +251,14 @@ def scale_joint_units(chain: Chain, q: Array) -> Array:
     return q * np.where(_is_prismatic(chain), RAD_PER_METRE, 1.0)
 
 
-def shortest_tour(q: Array) -> Array:
+def shortest_tour(q: Array, detours: Array | None = None) -> Array:
     """Find an order of configurations with little motion between successive ones, by 2-opt.
 
     The search starts from the nearest-neighbour tour. The result is a local minimum.
 
     Args:
         q: Configurations in comparable units, shape (m, n).
+        detours: Lengths that are added to the distances between configurations, shape (m, m), symmetric.
 
     Returns:
         Order of the configurations, shape (m,).
@@ -220,6 +267,8 @@ def shortest_tour(q: Array) -> Array:
     distances = np.zeros((count + 1, count + 1))
     # An additional point at distance 0 from all others turns the closed tour of 2-opt into an open one.
     distances[:count, :count] = np.linalg.norm(q[:, None] - q[None], axis=2)
+    if detours is not None:
+        distances[:count, :count] += detours
     order, unvisited = [count], set(range(count))
     current = int(np.argmin(np.linalg.norm(q - q.mean(0), axis=1)))
     while unvisited:

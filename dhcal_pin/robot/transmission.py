@@ -2,89 +2,35 @@
 
 The actual position of independent joint i at commanded positions q is
 
-    q_i + Σ_t Σ_j W[t, i, j] · f_t(q_j, τ_j)
+    q_i + Σ_j A_ij·q_j + Σ_k (S_ki·sin(k·q_i) + C_ki·cos(k·q_i)) + c_i·τ_i(q)
 
-where f_t are the terms of `TERMS`, τ is the generalised gravity torque, and W is the array of coefficients,
-shape (t, n, n). W[t] is diagonal except for the term f(q_j) = q_j, whose off-diagonal entries couple a joint
-to the positions of other joints.
+with the gain A_ii, the coupling A_ij of joint i to joint j, the harmonics S_ki and C_ki of order k = 1 … K,
+the compliance c_i, and the generalised gravity torque τ. All coefficients are entries of one vector:
 
-Shapes: t terms, n independent joints, k moving joints (k > n only with mimic joints), m samples. Arrays of
-joint positions are (n, m) in this module.
+    A row by row (n·n), then S_k (n) and C_k (n) of each order k, then c (n)
 
-To add a term, add one row to `TERMS`. Parameters, sidecar keys, and the formula in the 3-D viewer follow from
-it. A new family also needs one row in `error_families.FAMILIES`.
+The vector has room for all orders up to `MAX_CURVE_ORDER`. Only the orders that are in use are evaluated.
+
+The functions q, sin q, cos q, sin 2q, cos 2q, …, τ are the *terms*. The derivative of the tool pose by a
+coefficient is the twist of the joint's own motion, scaled by one term. The harmonics of a joint therefore
+share one Jacobian column.
+
+Shapes: t terms, n independent joints, k moving joints (k > n only with mimic joints), m samples, c
+coefficients, e selected coefficients. Arrays of joint positions are (n, m) in this module.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
 
 from .._typing import Array
 
-
-@dataclass(frozen=True)
-class TransmissionTerm:
-    """One term of a joint's transmission error.
-
-    Attributes:
-        name: Suffix of the parameter name, as in `elbow_joint.sin`.
-        key: Key in the sidecar file.
-        family: Name of its family in `error_families.FAMILIES`.
-        unit: Unit of the coefficient.
-        prior: Standard deviation of the coefficient before any measurement.
-        value: Function from joint positions and gravity torques, both (n, m) in SI units, to the term (n, m).
-        javascript: The same function as a JavaScript expression in `q` and `torque`, for the 3-D viewer.
-        applies_to_prismatic: Whether prismatic joints have the term as well.
-        depends_on_load: Whether the term depends on the gravity torque.
-    """
-
-    name: str
-    key: str
-    family: str
-    unit: str
-    prior: float
-    value: Callable[[Array, Array], Array]
-    javascript: str
-    applies_to_prismatic: bool = False
-    depends_on_load: bool = False
-
-
-# The priors are typical of industrial arms: gear ratios are off by 0.2 %, eccentricity is about 1 mrad, and
-# a joint yields by about 0.1 mrad/Nm.
-TERMS = (
-    TransmissionTerm("gain", "gain", "gain", "1", 2e-3, lambda q, load: q, "q", applies_to_prismatic=True),
-    TransmissionTerm("sin", "sin_rad", "harmonics", "rad", 1e-3, lambda q, load: np.sin(q), "Math.sin(q)"),
-    TransmissionTerm("cos", "cos_rad", "harmonics", "rad", 1e-3, lambda q, load: np.cos(q), "Math.cos(q)"),
-    TransmissionTerm(
-        "sin2", "sin2_rad", "harmonics", "rad", 1e-3, lambda q, load: np.sin(2 * q), "Math.sin(2 * q)"
-    ),
-    TransmissionTerm(
-        "cos2", "cos2_rad", "harmonics", "rad", 1e-3, lambda q, load: np.cos(2 * q), "Math.cos(2 * q)"
-    ),
-    TransmissionTerm(
-        "compliance",
-        "compliance_rad_per_nm",
-        "compliance",
-        "rad/Nm",
-        1e-4,
-        lambda q, load: load,
-        "torque",
-        depends_on_load=True,
-    ),
-)
-
-# Families of diagonal terms, in the order of `TERMS`; all of `FAMILIES` but the last one, coupling.
-TERM_FAMILIES = tuple(dict.fromkeys(term.family for term in TERMS))
-
-# Index of the term whose off-diagonal coefficients couple joints: the joint position itself.
-COUPLING_TERM = 0
-
-# Standard deviation of a coupling coefficient before any measurement [rad/rad or rad/m].
-COUPLING_PRIOR = 2e-3
+# Highest order of the harmonics: 32 periods per turn of a joint.
+MAX_CURVE_ORDER = 32
 
 # Maximum number of cached torque arrays, one per array of joint positions. A full cache is emptied.
 MAX_CACHED_TORQUES = 256
@@ -167,12 +113,15 @@ class Transmission:
     """Transmission errors of a chain's independent joints.
 
     Attributes:
-        coefficients: Coefficients W of the formula in the module docstring, shape (t, n, n).
+        coefficients: All coefficients of the formula in the module docstring, shape (c,).
         loads: Gravity torques on the joints.
+        min_order: Order up to which the harmonics are evaluated even if their coefficients are zero, so that
+            the derivatives by them are available.
     """
 
     coefficients: Array
     loads: GravityLoads
+    min_order: int = 0
 
     @classmethod
     def zero(cls, loads: GravityLoads) -> Transmission:
@@ -184,25 +133,52 @@ class Transmission:
         Returns:
             Transmission for which actual and commanded positions agree.
         """
-        n = loads.mimic_matrix.shape[1]
-        return cls(np.zeros((len(TERMS), n, n)), loads)
+        return cls(np.zeros(n_coefficients(loads.mimic_matrix.shape[1])), loads)
+
+    @property
+    def linear(self) -> Array:
+        """Change of each joint per unit of every joint's position, shape (n, n), as a view."""
+        return self._parts[0]
+
+    @property
+    def harmonics(self) -> Array:
+        """Coefficients of sine and cosine of each order, shape (K, 2, n) [rad], as a view."""
+        return self._parts[1]
+
+    @property
+    def compliance(self) -> Array:
+        """Change of each joint per unit of its gravity torque, shape (n,) [rad/Nm], as a view."""
+        return self._parts[2]
 
     @property
     def has_compliance(self) -> bool:
         """Whether gravity torques change the joint positions."""
-        return any(self.coefficients[t].any() for t, term in enumerate(TERMS) if term.depends_on_load)
+        return bool(self.compliance.any())
+
+    @cached_property
+    def _parts(self) -> tuple[Array, Array, Array]:
+        """Views of the coefficients: linear, harmonics and compliance."""
+        return split_coefficients(self.coefficients, self.loads.mimic_matrix.shape[1])
+
+    @cached_property
+    def order(self) -> int:
+        """Highest order of the harmonics that are evaluated; 0 for none."""
+        used = np.flatnonzero(self.harmonics.any((1, 2)))
+        return max(self.min_order, int(used[-1]) + 1 if used.size else 0)
 
     def terms(self, q: Array) -> Array:
-        """Evaluate all terms.
+        """Evaluate the terms q, sin q, cos q, sin 2q, cos 2q, … and τ.
 
         Args:
             q: Commanded joint positions, shape (n, m) [rad or m].
 
         Returns:
-            Values of the terms, shape (t, n, m).
+            Values of the t = 2·order + 2 terms, shape (t, n, m).
         """
-        torques = self.loads.torques(q)
-        return np.stack([term.value(q, torques) for term in TERMS])
+        out = np.empty((2 * self.order + 2, *q.shape))
+        out[0], out[-1] = q, self.loads.torques(q)
+        fill_harmonics(q, out[1:-1].reshape(self.order, 2, *q.shape))
+        return out
 
     def errors(self, terms: Array) -> Array:
         """Compute the differences between actual and commanded joint positions.
@@ -213,18 +189,116 @@ class Transmission:
         Returns:
             Joint errors, shape (n, m) [rad or m].
         """
-        return np.tensordot(self.coefficients, terms, ((0, 2), (0, 1)))
+        n = len(self.linear)
+        joints, weights = np.arange(n), np.zeros((len(terms), n, n))
+        weights[0], weights[-1, joints, joints] = self.linear, self.compliance
+        weights[1:-1, joints, joints] = self.harmonics[: self.order].reshape(-1, n)
+        return np.tensordot(weights, terms, ((0, 2), (0, 1)))
+
+    def locate(self, entries: Array) -> tuple[Array, Array, Array]:
+        """Find the joint that each of some coefficients moves, and its term.
+
+        Args:
+            entries: Indices of coefficients, shape (e,).
+
+        Returns:
+            Joint that moves, index of the term in the result of `terms`, and joint at which the term is
+            evaluated, each of shape (e,).
+        """
+        n = len(self.linear)
+        rows, sources = np.divmod(entries, n)
+        is_linear, is_compliance = rows < n, rows == len(self.coefficients) // n - 1
+        terms = np.where(is_linear, 0, np.where(is_compliance, 2 * self.order + 1, rows - n + 1))
+        return np.where(is_linear, rows, sources), terms, sources
+
+    def evaluating(self, entries: Array) -> Transmission:
+        """Return a transmission that evaluates the terms of some coefficients.
+
+        Args:
+            entries: Indices of coefficients, shape (e,).
+
+        Returns:
+            This transmission if it has these terms, otherwise a copy.
+        """
+        order = int(harmonic_orders(entries, len(self.linear)).max(initial=0))
+        return self if order <= self.order else replace(self, min_order=order)
 
     def with_coefficients_added(self, entries: Array, changes: Array) -> Transmission:
         """Return a copy with increments added to some coefficients.
 
         Args:
-            entries: Indices into the flattened coefficients, shape (e,).
+            entries: Indices of coefficients, shape (e,).
             changes: Increments, shape (e,).
 
         Returns:
-            Transmission with the sums as coefficients.
+            Transmission with the sums as coefficients. The harmonics among them are evaluated even where the
+            sum is zero.
         """
         coefficients = self.coefficients.copy()
-        coefficients.reshape(-1)[entries] += changes
-        return replace(self, coefficients=coefficients)
+        coefficients[entries] += changes
+        return replace(self.evaluating(entries), coefficients=coefficients)
+
+
+def n_coefficients(n: int) -> int:
+    """Return the number of transmission coefficients.
+
+    Args:
+        n: Number of independent joints.
+
+    Returns:
+        Length c of the vector of coefficients.
+    """
+    return n * (n + 2 * MAX_CURVE_ORDER + 1)
+
+
+def split_coefficients(coefficients: Array, n: int) -> tuple[Array, Array, Array]:
+    """Split a vector of coefficients, or of their indices, into its parts.
+
+    Args:
+        coefficients: One value per coefficient, shape (c,).
+        n: Number of independent joints.
+
+    Returns:
+        Views of the linear part, shape (n, n), with gains on the diagonal and couplings beside it; of the
+        harmonics, shape (K, 2, n), sine before cosine; and of the compliance, shape (n,).
+    """
+    rows = coefficients.reshape(-1, n)
+    return rows[:n], rows[n:-1].reshape(MAX_CURVE_ORDER, 2, n), rows[-1]
+
+
+def harmonic_orders(entries: Array, n: int) -> Array:
+    """Return the orders of some coefficients.
+
+    Args:
+        entries: Indices of coefficients, shape (e,).
+        n: Number of independent joints.
+
+    Returns:
+        Order of each coefficient, shape (e,); 0 if it is no harmonic.
+    """
+    orders = (entries // n - n) // 2 + 1
+    return np.where((entries >= n * n) & (orders <= MAX_CURVE_ORDER), orders, 0)
+
+
+def fill_harmonics(q: Array, out: Array) -> None:
+    """Compute sines and cosines of the multiples of joint positions.
+
+    The orders 1 and 2 are evaluated directly, the others by adding twice the angle:
+
+        sin (k+2)q = sin kq·cos 2q + cos kq·sin 2q,    cos (k+2)q = cos kq·cos 2q - sin kq·sin 2q.
+
+    The rounding errors grow in proportion to k.
+
+    Args:
+        q: Joint positions, shape (n, m) [rad].
+        out: Array to fill with sin kq and cos kq for k = 1 … K, shape (K, 2, n, m).
+    """
+    for k, harmonic in enumerate(out[:2], 1):
+        np.sin(k * q, out=harmonic[0])
+        np.cos(k * q, out=harmonic[1])
+    for (sine, cosine), harmonic in zip(out, out[2:], strict=False):
+        double_sine, double_cosine = out[1]
+        np.multiply(sine, double_cosine, out=harmonic[0])
+        harmonic[0] += cosine * double_sine
+        np.multiply(cosine, double_cosine, out=harmonic[1])
+        harmonic[1] -= sine * double_sine

@@ -15,7 +15,6 @@ from __future__ import annotations
 import difflib
 import html
 import math
-import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -25,8 +24,10 @@ from xml.parsers import expat
 import numpy as np
 
 from .. import se3
-from .._typing import Array
+from .._typing import Array, PathLike
 from ..exceptions import FileFormatError, UnknownNameError
+from ..messages import quote
+from ..ros_packages import mesh_folders, resolve_robot_path
 
 # Maximum size of a file [byte], number of links and of joints, and depth of nested elements.
 _MAX_BYTES = 16 << 20
@@ -39,10 +40,17 @@ _MAX_CHAIN = 500
 # Maximum magnitude of an origin's numbers [m or rad]; larger ones are typing errors.
 MAX_ORIGIN = 1e4
 
+# Maximum mass of a link [kg].
+MAX_MASS = 1e6
+
 _JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 
-# Elements of which a joint may have one.
-_UNIQUE_ELEMENTS = ("origin", "axis", "parent", "child", "limit", "mimic")
+# Elements of which a joint, a link or an inertial may have one.
+_UNIQUE_ELEMENTS = {
+    "joint": ("origin", "axis", "parent", "child", "limit", "mimic"),
+    "link": ("inertial",),
+    "inertial": ("origin", "mass", "inertia"),
+}
 
 # Attributes that Pinocchio requires; it reports a missing one without a line number.
 _REQUIRED_ATTRIBUTES = {
@@ -109,6 +117,7 @@ class UrdfJoint:
         parent: Name of the parent link.
         child: Name of the child link.
         origin: Pose of the joint frame in the parent link, shape (4, 4) [m]; identity if the file has none.
+        rpy: Roll, pitch and yaw of the origin as in the file, shape (3,) [rad]; zeros if the file has none.
         axis: Unit axis in the joint frame, shape (3,); (1, 0, 0) if the file has none.
         lower: Lower limit [rad or m]; -inf if the file has none and for continuous joints.
         upper: Upper limit [rad or m]; inf if the file has none and for continuous joints.
@@ -124,6 +133,7 @@ class UrdfJoint:
     parent: str
     child: str
     origin: Array
+    rpy: Array
     axis: Array
     lower: float
     upper: float
@@ -145,6 +155,7 @@ class Urdf:
         links: Names of the links in the order of the file.
         joints: Joints in the order of the file.
         root: Name of the link without a parent.
+        package_dirs: Folders in which packages with meshes are searched first, see `mesh_folders`.
     """
 
     source: str
@@ -153,6 +164,7 @@ class Urdf:
     links: tuple[str, ...]
     joints: tuple[UrdfJoint, ...]
     root: str
+    package_dirs: tuple[str, ...] = ()
 
     @cached_property
     def _joints_by_name(self) -> dict[str, UrdfJoint]:
@@ -178,6 +190,10 @@ class Urdf:
             suggestion = suggest_names(name, self._joints_by_name)
             raise UnknownNameError(f"{self.source}: unknown joint {quote(name)}; {suggestion}")
         return self._joints_by_name[name]
+
+    def mesh_folders(self) -> list[str]:
+        """List the folders in which the meshes of the robot are searched, see `ros_packages`."""
+        return mesh_folders(self.source, self.package_dirs)
 
     def leaves(self) -> tuple[str, ...]:
         """Return the links without children, in the order of the file."""
@@ -207,11 +223,11 @@ class Urdf:
         return tuple(reversed(joints))
 
 
-def read_urdf(path: str | os.PathLike[str]) -> Urdf:
+def read_urdf(path: PathLike) -> Urdf:
     """Read and check a URDF file.
 
     Args:
-        path: Path of the file.
+        path: Path of the file, or `example:NAME` for a robot of example-robot-data.
 
     Returns:
         Checked file.
@@ -219,7 +235,7 @@ def read_urdf(path: str | os.PathLike[str]) -> Urdf:
     Raises:
         FileFormatError: The file cannot be read or is not a valid URDF; the message names the line.
     """
-    source = os.fspath(path)
+    source = resolve_robot_path(path)
     try:
         with open(source, "rb") as file:
             data = file.read(_MAX_BYTES + 1)
@@ -256,6 +272,9 @@ def parse_urdf(data: bytes, source: str) -> Urdf:
     if b"\0" in data:
         raise FileFormatError(f"{source}:1: zero bytes as in UTF-16; convert the file to UTF-8")
     robot, link_tags, joint_tags = scan_tags(data, source)
+    for tag in link_tags.values():
+        if "inertial" in tag.children:
+            _check_inertial(tag.children["inertial"])
     joints = {name: _parse_joint(tag) for name, tag in joint_tags.items()}
     root = _find_root(robot, link_tags, joints, joint_tags)
     return Urdf(source, data, robot.attributes["name"], tuple(link_tags), tuple(joints.values()), root)
@@ -277,7 +296,11 @@ def scan_tags(data: bytes, source: str) -> tuple[UrdfTag, dict[str, UrdfTag], di
         FileFormatError: The XML is not well-formed.
     """
     parser = expat.ParserCreate("utf-8")
-    depth, robot, joint = 0, None, None
+    depth, robot = 0, None
+    # Link or joint and which of both it is, and in a link its inertial, whose children are collected.
+    parent: UrdfTag | None = None
+    inertial: UrdfTag | None = None
+    kind = ""
     tags_by_kind: dict[str, dict[str, UrdfTag]] = {"link": {}, "joint": {}}
 
     def current_tag(label: str, attributes: dict[str, str]) -> UrdfTag:
@@ -302,8 +325,14 @@ def scan_tags(data: bytes, source: str) -> tuple[UrdfTag, dict[str, UrdfTag], di
         nonlocal depth
         depth -= 1
 
+    def add_child(tag: UrdfTag, kind: str, element: str, attributes: dict[str, str]) -> UrdfTag:
+        child = current_tag(f"{tag.label} <{element[:60]}>", attributes)
+        if element in _UNIQUE_ELEMENTS[kind] and element in tag.children:
+            raise child.error("a second element of this kind; keep one")
+        return tag.children.setdefault(element, child)
+
     def on_start(element: str, attributes: dict[str, str]) -> None:
-        nonlocal depth, robot, joint
+        nonlocal depth, robot, parent, inertial, kind
         depth, label = depth + 1, f"<{element[:60]}>"
         if depth > _MAX_DEPTH:
             raise current_tag(label, {}).error(f"nested too deep; at most {_MAX_DEPTH} levels are accepted")
@@ -318,7 +347,7 @@ def scan_tags(data: bytes, source: str) -> tuple[UrdfTag, dict[str, UrdfTag], di
             if not attributes.get("name"):
                 raise robot.error('no name; expected name="..."')
         elif depth == 2:
-            joint = None
+            parent = inertial = None
             if element not in tags_by_kind:
                 return
             name, siblings = attributes.get("name", ""), tags_by_kind[element]
@@ -332,12 +361,12 @@ def scan_tags(data: bytes, source: str) -> tuple[UrdfTag, dict[str, UrdfTag], di
             if len(siblings) > _MAX_ELEMENTS:
                 raise tag.error(f"too many; at most {_MAX_ELEMENTS} are accepted")
             siblings[name] = tag
-            joint = tag if element == "joint" else None
-        elif depth == 3 and joint is not None:
-            child = current_tag(f"{joint.label} {label}", attributes)
-            if element in _UNIQUE_ELEMENTS and element in joint.children:
-                raise child.error("a second element of this kind; keep one")
-            joint.children.setdefault(element, child)
+            parent, kind = tag, element
+        elif depth == 3 and parent is not None:
+            child = add_child(parent, kind, element, attributes)
+            inertial = child if kind == "link" and element == "inertial" else None
+        elif depth == 4 and inertial is not None:
+            add_child(inertial, "inertial", element, attributes)
 
     parser.XmlDeclHandler, parser.StartDoctypeDeclHandler = on_declaration, on_doctype
     parser.StartElementHandler, parser.EndElementHandler = on_start, on_end
@@ -376,18 +405,6 @@ def parse_numbers(tag: UrdfTag, key: str, count: int) -> list[float]:
         if not _NUMBER.fullmatch(word) or not math.isfinite(float(word)):
             raise tag.error(f"{key} has {quote(word)}; expected a finite number such as 0.25 or -1e-3")
     return [float(word) for word in words]
-
-
-def quote(text: str) -> str:
-    """Quote a text for a message, on one line and shortened to 60 characters.
-
-    Args:
-        text: Text of any length.
-
-    Returns:
-        Quoted text.
-    """
-    return repr(text if len(text) <= 60 else text[:57] + "...")
 
 
 def suggest_names(name: str, known: Iterable[str]) -> str:
@@ -434,8 +451,10 @@ def _rotation(roll: float, pitch: float, yaw: float) -> Array:
     )
 
 
-def _parse_origin(tag: UrdfTag) -> Array:
-    """Parse an <origin> to a pose, shape (4, 4)."""
+def _parse_origin(tag: UrdfTag | None) -> tuple[Array, Array]:
+    """Parse an <origin> to a pose, shape (4, 4), and its roll, pitch and yaw, shape (3,)."""
+    if tag is None:
+        return np.eye(4), np.zeros(3)
     if "quat_xyzw" in tag.attributes:
         raise tag.error("quat_xyzw is ignored by most readers of URDF; write the rotation as rpy")
     values = {key: [0.0, 0.0, 0.0] for key in ("xyz", "rpy")}
@@ -443,7 +462,7 @@ def _parse_origin(tag: UrdfTag) -> Array:
         values[key] = parse_numbers(tag, key, 3)
         if max(map(abs, values[key])) > MAX_ORIGIN:
             raise tag.error(f"{key} is beyond ±{MAX_ORIGIN:g}; expected metres in xyz and radians in rpy")
-    return se3.transform(_rotation(*values["rpy"]), values["xyz"])
+    return se3.transform(_rotation(*values["rpy"]), values["xyz"]), np.array(values["rpy"])
 
 
 def _parse_axis(tag: UrdfTag, moving: bool) -> Array:
@@ -455,6 +474,22 @@ def _parse_axis(tag: UrdfTag, moving: bool) -> Array:
     if moving:
         raise tag.error(f"the axis has length {norm:g}; expected a direction of length 1, such as 0 0 1")
     return np.array([1.0, 0.0, 0.0])
+
+
+def _check_inertial(tag: UrdfTag) -> None:
+    """Require valid numbers in an <inertial>; Pinocchio would leave out its mass and only print a message."""
+    if "mass" not in tag.children:
+        raise tag.error('no <mass>; expected <mass value="..."/>, or remove the inertial')
+    mass = tag.children["mass"]
+    if "value" not in mass.attributes:
+        raise mass.error("no value; expected value=...")
+    if not 0 <= parse_numbers(mass, "value", 1)[0] <= MAX_MASS:
+        raise mass.error(f"value is outside of 0 to {MAX_MASS:g}; expected kilograms")
+    if "origin" in tag.children:
+        _parse_origin(tag.children["origin"])
+    if inertia := tag.children.get("inertia"):
+        for key in sorted({"ixx", "ixy", "ixz", "iyy", "iyz", "izz"} & set(inertia.attributes)):
+            parse_numbers(inertia, key, 1)
 
 
 def _parse_joint(tag: UrdfTag) -> UrdfJoint:
@@ -493,12 +528,14 @@ def _parse_joint(tag: UrdfTag) -> UrdfJoint:
         factor, offset = values.get(("mimic", "multiplier"), 1.0), values.get(("mimic", "offset"), 0.0)
         mimic = children["mimic"].attributes["joint"], factor, offset
     moving = joint_type in ("revolute", "continuous", "prismatic")
+    origin, rpy = _parse_origin(children.get("origin"))
     return UrdfJoint(
         name=tag.attributes["name"],
         type=joint_type,
         parent=children["parent"].attributes["link"],
         child=children["child"].attributes["link"],
-        origin=_parse_origin(children["origin"]) if "origin" in children else np.eye(4),
+        origin=origin,
+        rpy=rpy,
         axis=_parse_axis(children["axis"], moving) if "axis" in children else np.array([1.0, 0.0, 0.0]),
         lower=lower,
         upper=upper,

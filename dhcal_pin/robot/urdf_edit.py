@@ -4,8 +4,8 @@
 recorded. Comments, order, quotes and line ends stay. `with_world` and `with_tool_frame` append a link and a
 fixed joint for the measuring frame and for the measured point.
 
-Numbers are written with `repr`, the shortest text that reads back as the same double. The angles of `rpy`
-come from `pin.rpy.matrixToRpy`.
+Numbers are written with `repr`, the shortest text that reads back as the same double. A rotation has several
+triples of roll, pitch and yaw; the one nearest to that of the file is written (`se3.nearest_rpy`).
 """
 
 from __future__ import annotations
@@ -15,11 +15,10 @@ from collections.abc import Mapping
 from xml.parsers import expat
 
 import numpy as np
-import pinocchio as pin
 
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
-from ..se3 import to_xyz_rpy
+from ..se3 import nearest_rpy, to_xyz_rpy
 from .urdf import MAX_ORIGIN, Urdf, UrdfJoint, parse_urdf, xml_attribute
 
 # Maximum deviation of RᵀR from the identity, and of the last row of a pose from (0, 0, 0, 1).
@@ -150,7 +149,7 @@ def _attribute_spans(data: bytes, start: int) -> tuple[dict[bytes, tuple[int, in
 def _origin_edits(urdf: Urdf, joint: UrdfJoint, origin: Array) -> list[tuple[int, int, bytes]]:
     """Return the edits (start, end, new bytes) that give a joint a new origin, shape (4, 4)."""
     u, _, vt = np.linalg.svd(origin[:3, :3])
-    rpy, old = pin.rpy.matrixToRpy(u @ vt), joint.origin
+    rpy, old = nearest_rpy(u @ vt, joint.rpy), joint.origin
     texts = {
         key: " ".join(repr(float(x) + 0.0) for x in value).encode()  # + 0.0 turns -0.0 into 0.0
         for key, value, is_unchanged in (

@@ -19,7 +19,9 @@ import pinocchio as pin
 from .. import se3
 from .._typing import Array
 from ..exceptions import DhcalError, FileFormatError
-from .urdf import Urdf, UrdfJoint, quote, suggest_names
+from ..messages import quote
+from ..native_output import discard_native_messages
+from .urdf import Urdf, UrdfJoint, suggest_names
 
 # Maximum number of moving joints. The work grows with the cube of the number of parameters.
 _MAX_MOVING_JOINTS = 64
@@ -39,7 +41,9 @@ def build_model(urdf: Urdf) -> pin.Model:
     """
     try:
         # Pinocchio separates numbers at spaces only; XML allows any white space.
-        return pin.buildModelFromXML(urdf.data.decode("utf-8-sig").translate(dict.fromkeys(b"\t\r\n", " ")))
+        text = urdf.data.decode("utf-8-sig").translate(dict.fromkeys(b"\t\r\n", " "))
+        with discard_native_messages():
+            return pin.buildModelFromXML(text)
     except (ValueError, RuntimeError) as error:
         raise FileFormatError(f"{urdf.source}: Pinocchio does not accept this URDF: {error}") from error
 

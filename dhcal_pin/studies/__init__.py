@@ -1,18 +1,11 @@
 """Studies: simulated calibrations over a grid of settings.
 
-This package holds the grid with its file, and the simulation of its settings. The command line, the journal
-and the plots of a study belong to `cli` and `visualization`.
+This package holds the grid with its file, the simulation of its settings, and the journal of an unfinished
+study. The command line and the plots of a study belong to `cli` and `visualization`.
+
+The public names are listed in `__init__.pyi`. Each is loaded on first use.
 """
 
-from .grid import Case, Setting, StudyGrid, read_study
-from .runner import MEASURE_UNITS, result_table, run
+import lazy_loader
 
-__all__ = [
-    "MEASURE_UNITS",
-    "Case",
-    "Setting",
-    "StudyGrid",
-    "read_study",
-    "result_table",
-    "run",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

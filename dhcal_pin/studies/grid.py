@@ -32,6 +32,7 @@ from ..measurements.base import Noise
 from ..planning.planner import plan
 from ..robot.chain import Chain
 from ..robot.sampling import joint_range
+from ..ros_packages import EXAMPLE_PREFIX, resolve_robot_path
 from ..units import parse_noise
 
 # Number of calibrations of a task, which takes some tenths of a second.
@@ -56,7 +57,8 @@ class Setting:
     """One combination of the grid; every entry can be a list in the file.
 
     Attributes:
-        robot: File of the nominal robot, in the folder of the study or part of the package.
+        robot: File of the nominal robot, in the folder of the study or part of the package, or
+            `example:NAME` for a robot of example-robot-data.
         tip: Tip link of URDFs; by default the deepest leaf.
         truth: File of the true robot; by default true robots are nominal robots with random errors.
         error_std: Standard deviations of the random errors, length and angle.
@@ -277,7 +279,9 @@ def _validated(setting: Setting, where: str) -> Setting:
 
 
 def _find_robot_file(name: str, path: PathLike) -> Path:
-    """Return the path of a robot file in the folder of the study, or of one that is part of the package."""
+    """Return the path of a robot file in the folder of the study, in the package or in example-robot-data."""
+    if name.startswith(EXAMPLE_PREFIX):
+        return Path(resolve_robot_path(name))
     in_folder = Path(path).resolve().parent / name
     return in_folder if in_folder.exists() else shipped_file(name)
 

@@ -55,7 +55,7 @@ def serve(
     Args:
         nominal: Nominal robot; transparent beside the calibrated one, solid if alone.
         calibrated: Calibrated robot with the same joints, or the result of the calibration.
-        package_dirs: Folders that contain the meshes of the URDF; by default the folders above the URDF.
+        package_dirs: Folders that contain the meshes of the URDF; by default those of `ros_packages`.
         magnification: Magnification of the errors.
         triangles: Largest number of triangles of all meshes.
 

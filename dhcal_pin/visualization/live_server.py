@@ -1,24 +1,61 @@
 """Server process of a live scene: the MeshCat server on the loopback address, until its parent ends.
 
-The server of MeshCat listens on every address. This one receives commands through a socket file in a folder
-that only this user can open, and shows its page to browsers on this computer. `python -m
+The server of MeshCat listens on every address and answers everyone. This one receives commands through a
+socket file in a folder that only this user can open. It answers browsers on this computer that know its
+address, which contains a random token, and that ask for the loopback address: a page of another site cannot
+reach it through a name that resolves to this computer (DNS rebinding). `python -m
 dhcal_pin.visualization.live_server ADDRESS` prints the address of the page as its first line.
 """
 
 from __future__ import annotations
 
+import re
+import secrets
 import sys
 from functools import partial
 
 import tornado.web
-from meshcat.servers.zmqserver import ZMQWebSocketBridge
+from meshcat.servers.zmqserver import VIEWER_ROOT, WebSocketHandler, ZMQWebSocketBridge
 
 LOOPBACK = "127.0.0.1"
+# Names of the loopback address that a browser may ask for.
+_HOSTS = rf"({re.escape(LOOPBACK)}|localhost)"
+_SCRIPT = "main.min.js"
+# As the page of MeshCat, but the connection has the token.
+_PAGE = f"""<!DOCTYPE html>
+<html>
+<head><meta charset="utf-8"><title>dhcal</title></head>
+<body style="margin: 0">
+<div id="meshcat-pane" style="width: 100vw; height: 100vh; overflow: hidden"></div>
+<script src="{_SCRIPT}"></script>
+<script>
+var viewer = new MeshCat.Viewer(document.getElementById("meshcat-pane"));
+viewer.connect(`ws://${{location.host}}${{location.pathname}}socket`);
+</script>
+</body>
+</html>
+"""
+
+
+class _PageHandler(tornado.web.RequestHandler):
+    def get(self) -> None:
+        self.set_header("Cache-Control", "no-store")
+        self.write(_PAGE)
 
 
 class _LocalBridge(ZMQWebSocketBridge):
     def make_app(self) -> tornado.web.Application:
-        app = super().make_app()
+        self.token = secrets.token_urlsafe(16)
+        root = f"/{re.escape(self.token)}"
+        app = tornado.web.Application()
+        app.add_handlers(
+            _HOSTS,
+            [
+                (f"{root}/", _PageHandler),
+                (f"{root}/({re.escape(_SCRIPT)})", tornado.web.StaticFileHandler, {"path": VIEWER_ROOT}),
+                (f"{root}/socket", WebSocketHandler, {"bridge": self}),
+            ],
+        )
         app.listen = partial(app.listen, address=LOOPBACK)
         return app
 
@@ -31,7 +68,7 @@ def main(address: str) -> None:
     """
     bridge = _LocalBridge(zmq_url=address, host=LOOPBACK)
     bridge.ioloop.add_handler(sys.stdin, lambda *_: bridge.ioloop.stop(), bridge.ioloop.READ)
-    print(bridge.web_url, flush=True)
+    print(f"http://{LOOPBACK}:{bridge.fileserver_port}/{bridge.token}/", flush=True)
     bridge.run()
 
 

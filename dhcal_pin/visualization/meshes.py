@@ -18,7 +18,6 @@ import base64
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
@@ -28,8 +27,11 @@ import pinocchio as pin
 
 from .. import se3
 from .._typing import Array, PathLike
+from ..native_output import discard_native_messages
 from ..robot.chain import Chain
+from ..robot.collision import FLOOR, Obstacle
 from ..robot.dh_urdf import MATERIALS
+from ..ros_packages import mesh_remedy
 
 # Steps of the grid of vertices along the longest side of a mesh: 0.1 mm on most links.
 GRID = 8000
@@ -64,18 +66,19 @@ def visuals_of(
     Args:
         chain: The robot.
         bodies: Its bodies as in `scene.kinematic_tree`, from which rods are built.
-        package_dirs: Folders that contain the meshes; by default the folders above the URDF.
+        package_dirs: Folders that contain the meshes; by default those of `ros_packages`.
         triangles: Largest number of triangles of all meshes.
 
     Returns:
         Shapes and meshes.
     """
-    if package_dirs is None:
-        package_dirs = list(Path(chain.urdf.source).absolute().parents)
+    folders = (
+        chain.urdf.mesh_folders() if package_dirs is None else [os.fspath(path) for path in package_dirs]
+    )
     # Pinocchio separates numbers by spaces only, but XML allows any white space.
     text = chain.urdf.data.decode("utf-8-sig").translate(dict.fromkeys(b"\t\r\n", " "))
-    model = pin.buildModelFromXML(text)
-    objects, missing = _load_visuals(model, text, [os.fspath(path) for path in package_dirs])
+    model = _build_model(text)
+    objects, missing = _load_visuals(model, text, folders)
     if not len(objects) and not missing:
         shapes = _skeleton(bodies, set(range(len(bodies))))
         return Visuals(shapes, [], "Drawn as a skeleton: the URDF has no visual geometry.")
@@ -122,7 +125,7 @@ def rows(pose: Array) -> list[float]:
 def _load_visuals(
     model: pin.Model, text: str, folders: Sequence[str]
 ) -> tuple[Sequence[pin.GeometryObject], dict[str, list[str]]]:
-    """Return the visual objects, and by link the file names of missing or unreadable meshes."""
+    """Return the visual objects, and by link the file names of meshes that are missing or unreadable."""
     if (objects := _load_geometry(model, text, folders)) is not None:
         return objects, {}
     # Pinocchio rejects the whole URDF if one mesh is missing, so each mesh is loaded in a robot of one link.
@@ -134,25 +137,42 @@ def _load_visuals(
             single = ElementTree.Element("robot", name="single")
             ElementTree.SubElement(single, "link", name="single").append(visual)
             single_text = ElementTree.tostring(single, "unicode")
-            if mesh is not None and not _can_load(single_text, folders):
+            if not _can_load(single_text, folders):
                 link.remove(visual)
-                missing.setdefault(link.get("name", ""), []).append(mesh.get("filename", ""))
+                name = "a shape" if mesh is None else mesh.get("filename", "")
+                missing.setdefault(link.get("name", ""), []).append(name)
     return _load_geometry(model, ElementTree.tostring(robot, "unicode"), folders) or [], missing
 
 
 def _can_load(text: str, folders: Sequence[str]) -> bool:
-    return _load_geometry(pin.buildModelFromXML(text), text, folders) is not None
+    return _load_geometry(_build_model(text), text, folders) is not None
+
+
+def _build_model(text: str) -> pin.Model:
+    with discard_native_messages():
+        return pin.buildModelFromXML(text)
 
 
 def _load_geometry(
     model: pin.Model, text: str, folders: Sequence[str]
 ) -> Sequence[pin.GeometryObject] | None:
-    """Return all visual objects, or None if a mesh cannot be loaded."""
+    """Return all visual objects, or None if one of them cannot be loaded or is not finite."""
     try:
-        geometry = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.VISUAL, package_dirs=[*folders])
+        with discard_native_messages():
+            geometry = pin.buildGeomFromUrdfString(
+                model, text, pin.GeometryType.VISUAL, package_dirs=[*folders]
+            )
     except (ValueError, RuntimeError):
         return None
-    return geometry.geometryObjects
+    objects = geometry.geometryObjects
+    return objects if all(_is_finite(item.geometry) for item in objects) else None
+
+
+def _is_finite(geometry: Any) -> bool:
+    """Return whether all sizes of a primitive, or all vertices of a mesh, are finite."""
+    primitive = _primitive(geometry)
+    sizes = geometry.vertices() if primitive is None else next(iter(primitive.values()))
+    return bool(np.isfinite(sizes).all())
 
 
 def _missing_meshes_note(missing: dict[str, list[str]]) -> str:
@@ -160,7 +180,11 @@ def _missing_meshes_note(missing: dict[str, list[str]]) -> str:
         return ""
     names = [f"{os.path.basename(name)} ({link})" for link, files in missing.items() for name in files]
     more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
-    return f"Drawn as rods, because meshes are missing or unreadable: {', '.join(names[:MAX_NAMED])}{more}."
+    remedy = mesh_remedy(next(name for files in missing.values() for name in files))
+    return (
+        f"Drawn as rods, because meshes are missing or unreadable: {', '.join(names[:MAX_NAMED])}{more}. "
+        f"{remedy[0].upper()}{remedy[1:]}."
+    )
 
 
 def _parent_body(model: pin.Model, chain: Chain, frame: int, placement: pin.SE3) -> tuple[int, Array]:
@@ -181,6 +205,28 @@ def _parent_body(model: pin.Model, chain: Chain, frame: int, placement: pin.SE3)
     if frame != tip:
         return joint, placement.homogeneous
     return model.njoints, (model.frames[tip].placement.inverse() * placement).homogeneous
+
+
+def obstacle_shapes(obstacles: Sequence[Obstacle], n_meshes: int) -> tuple[list[dict[str, Any]], list[Mesh]]:
+    """Return the shapes of obstacles for the page, on body 0.
+
+    Args:
+        obstacles: Obstacles; the floor is not drawn, because the page has a grid.
+        n_meshes: Number of meshes that the page has already.
+
+    Returns:
+        Shapes with placements in the frame of the root link, and their meshes.
+    """
+    shapes, meshes = [], []
+    for obstacle in obstacles:
+        if obstacle.name == FLOOR:
+            continue
+        shape = _primitive(obstacle.shape)
+        if shape is None:
+            shape = {"mesh": n_meshes + len(meshes)}
+            meshes.append(Mesh.from_geometry(obstacle.shape))
+        shapes.append({"body": 0, "placement": rows(np.round(obstacle.placement, 9)), **shape})
+    return shapes, meshes
 
 
 def _primitive(geometry: Any) -> dict[str, Any] | None:
@@ -265,12 +311,12 @@ class Mesh:
         """Reduce the number of triangles by collapsing the edges that change the form least.
 
         Args:
-            limit: Largest number of triangles.
+            limit: Largest number of triangles, which a mesh that would vanish exceeds.
 
         Returns:
             Simplified mesh, or the mesh itself if it is small enough.
         """
-        mesh = self
+        mesh, limit = self, max(limit, 1)
         for grid in COARSER_GRIDS:
             if len(mesh.triangles) <= limit:
                 break
@@ -280,7 +326,9 @@ class Mesh:
                 corners, triangles = fast_simplification.simplify(
                     mesh.vertices / mesh.step, mesh.triangles, target_count=limit
                 )[:2]
-                mesh = Mesh.on_grid(mesh.step * corners, np.asarray(triangles, int))
+                # Few triangles can collapse to nothing; the mesh on the coarser grid stays then.
+                if len(triangles):
+                    mesh = Mesh.on_grid(mesh.step * corners, np.asarray(triangles, int))
         return mesh
 
     def encoded(self) -> dict[str, Any]:

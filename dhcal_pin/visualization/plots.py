@@ -56,6 +56,8 @@ COLORS = {
     "level-4": "#c8b866",
     "level-5": "#fee838",
 }
+# Half width of a 95 % band in standard deviations.
+_BAND_SIGMAS = 1.96
 # Number of levels of a map, from small to large standard deviations.
 N_LEVELS = 6
 # Colours of the lines of a study (Okabe and Ito) and the line styles of each further round of colours.
@@ -324,6 +326,56 @@ def plot_joint_offsets(
         limit = max(float(np.max(np.abs(value) + 2 * std)) for value, std in offsets.values())
     half = 1.05 * factor * limit or 1.0
     ax.set(xlabel=f"{joint}, {angle}", ylabel=f"joint error, {shown_unit}", ylim=(-half, half))
+    return ax
+
+
+def plot_joint_corrections(
+    values: Array,
+    correction: Array,
+    std: Array,
+    ax: Axes | None = None,
+    *,
+    gaps: Sequence[tuple[float, float]] = (),
+    joint: str = "joint position",
+    limit: float | None = None,
+) -> Axes:
+    """Plot the correction of a joint over its position, with its 95 % band and the gaps between measurements.
+
+    Args:
+        values: Joint values in ascending order, shape (v,) [rad].
+        correction: Angle to add to each of them, shape (v,) [rad].
+        std: Standard deviation of the correction, shape (v,) [rad].
+        ax: Axes to draw into; a new figure if None.
+        gaps: Ranges of joint values that were not measured, which are shaded [rad].
+        joint: Name of the joint.
+        limit: Largest correction that the vertical axis shows on both sides [rad]; from the data if None.
+
+    Returns:
+        The axes.
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    ax = _axes(ax)
+    scale, angle = _shown_joint_unit(is_prismatic=False)
+    factor, shown_unit = _shown_unit("rad")
+    for number, (low, high) in enumerate(gaps):
+        label = "_" * bool(number) + "not measured"
+        ax.axvspan(scale * low, scale * high, color=COLORS["unknown"], linewidth=0, label=label)
+    ax.axhline(0.0, color=COLORS["text"], linewidth=1.0)
+    largest = np.abs(correction) + _BAND_SIGMAS * std
+    if limit is None:
+        limit = float(np.max(largest[np.isfinite(largest)], initial=0.0))
+    half = 1.05 * factor * limit or 1.0
+    # An infinite standard deviation fills the height of the axes.
+    reach = np.minimum(_BAND_SIGMAS * factor * std, 4 * half)
+    x, middle = scale * values, factor * correction
+    band = ax.fill_between(x, middle - reach, middle + reach, linewidth=0, label="95 % band")
+    band.set_facecolor((COLORS["after"], 0.25))
+    ax.plot(x, middle, color=COLORS["after"], linewidth=1.2, label="correction")
+    ax.set(xlabel=f"{joint}, {angle}", ylabel=f"correction, {shown_unit}")
+    ax.set(xlim=(x[0], x[-1]), ylim=(-half, half))
+    # Steps of 90°, 45°, 30° and the like.
+    ax.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 1.5, 3, 4.5, 9, 10]))
     return ax
 
 

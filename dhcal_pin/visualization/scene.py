@@ -33,8 +33,9 @@ from ..estimation.uncertainty import Predictor
 from ..exceptions import InvalidArgumentError
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
-from ..robot.transmission import TERMS, GravityLoads
-from .meshes import rows, visuals_of
+from ..robot.sampling import WorkspaceConstraints
+from ..robot.transmission import GravityLoads
+from .meshes import obstacle_shapes, rows, visuals_of
 from .subsampling import evenly_spaced_indices
 
 # Largest number of measured points and of configurations to play; more would make the page slow.
@@ -53,6 +54,21 @@ DEFAULT_STROKE_M = 0.5
 PAGE = Path(__file__).with_name("viewer.html")
 
 
+@dataclass(frozen=True, eq=False)
+class Preview:
+    """Poses that the arm will visit, and what stands around it.
+
+    Attributes:
+        q: Joint positions on the way, shape (m, n) [rad or m]; moves between them are straight.
+        stops: Rows of `q` at which the arm stops.
+        workspace: Floor and obstacles.
+    """
+
+    q: Array
+    stops: Sequence[int]
+    workspace: WorkspaceConstraints
+
+
 def scene_html(
     nominal: Chain,
     calibrated: Chain | Result | None = None,
@@ -61,6 +77,7 @@ def scene_html(
     measurements: Sequence[Measurement] | None = None,
     known: Mapping[str, float] | None = None,
     predictor: Predictor | None = None,
+    preview: Preview | None = None,
     title: str = "Robot calibration",
     package_dirs: Sequence[PathLike] | None = None,
     magnification: float = 1.0,
@@ -78,8 +95,9 @@ def scene_html(
         known: Values of instrument parameters by name, as in `Result.instruments`; by default their initial
             values.
         predictor: Source of the uncertainty of the tool position; by default the result.
+        preview: Poses to play in place of `q`, drawn with the path of the tool, floor and obstacles.
         title: Heading of the page.
-        package_dirs: Folders that contain the meshes of the URDF; by default the folders above the URDF.
+        package_dirs: Folders that contain the meshes of the URDF; by default those of `ros_packages`.
         magnification: Initial magnification of errors, from 1 to `MAX_MAGNIFICATION`.
         triangles: Largest number of triangles of all meshes; 15,000 still show the form of each link.
 
@@ -107,6 +125,10 @@ def scene_html(
     shown = nominal if calibrated is None else calibrated
     tree = kinematic_tree(nominal, shown)
     visuals = visuals_of(nominal, tree["bodies"], package_dirs, triangles)
+    obstacles, obstacle_meshes = obstacle_shapes(
+        preview.workspace.obstacles if preview else (), len(visuals.meshes)
+    )
+    q = preview.q if preview else q
     parts = [item.configurations() for item in measurements if item.configurations_per_row]
     played = [q] if q is not None else parts
     configurations = np.concatenate([np.empty((0, nominal.n_joints)), *map(nominal.validated_q, played)])
@@ -126,22 +148,26 @@ def scene_html(
         "magnification": magnification,
         "max_magnification": MAX_MAGNIFICATION,
         "joints": _sliders(nominal, np.concatenate([configurations, samples])),
-        "configurations": configurations[evenly_spaced_indices(len(configurations), MAX_POINTS)].tolist(),
+        "configurations": (
+            configurations
+            if preview
+            else configurations[evenly_spaced_indices(len(configurations), MAX_POINTS)]
+        ).tolist(),
+        "stops": [int(i) for i in preview.stops] if preview else [],
+        "obstacles": obstacles,
+        "floor": (preview.workspace.floor if preview else None) or 0.0,
         "samples": samples[drawn].tolist(),
         "points": np.round((points[drawn] - base[:3, 3]) @ base[:3, :3], 9).tolist(),
         "residuals": np.round(residuals[drawn] @ base[:3, :3], 9).tolist(),
         "ellipsoids": ellipsoids,
         "shapes": visuals.shapes,
-        "meshes": [mesh.encoded() for mesh in visuals.meshes],
+        "meshes": [mesh.encoded() for mesh in (*visuals.meshes, *obstacle_meshes)],
         **tree,
     }
     data = json.dumps(scene, separators=(",", ":"), ensure_ascii=False).replace("<", "\\u003c")
-    terms = ", ".join(f"{term.name}: (q, torque) => {term.javascript}" for term in TERMS)
     replacements = {
         "@TITLE@": html.escape(title),
         "/*@MESHCAT@*/": _meshcat(),
-        # Script text, not data of the scene: the page's security policy forbids evaluating strings.
-        "/*@TERMS@*/": terms,
         "@SCENE@": data,
     }
     marks = "|".join(map(re.escape, replacements))
@@ -280,32 +306,30 @@ def _joint_input(chain: Chain, j: int) -> dict[str, Any]:
 
 
 def _transmission(chain: Chain) -> dict[str, Any]:
-    """Return the transmission errors of a robot.
-
-    Each of `terms` adds `coefficient` times the term `name`, evaluated at the joint `input_joint`, to the
-    position of the joint `joint`. `gravity_bodies` exist if a joint is elastic; see `_gravity_bodies`.
+    """Return the transmission errors of a robot; see the formula in `robot.transmission`.
 
     Args:
         chain: The robot.
 
     Returns:
-        `terms` and `gravity_bodies`.
+        `linear`: gains and couplings, row by row; `harmonics`: joint, order and coefficients of sine and
+        cosine of each harmonic; and, if a joint is elastic, `compliance` of each joint and `gravity_bodies`,
+        see `_gravity_bodies`. Empty for ideal joints.
     """
-    if chain.transmission is None:
-        return {"terms": []}
-    coefficients = chain.transmission.coefficients
-    terms = [
-        {
-            "name": TERMS[t].name,
-            "joint": int(i),
-            "input_joint": int(j),
-            "coefficient": float(coefficients[t, i, j]),
-        }
-        for t, i, j in np.argwhere(coefficients)
-    ]
-    if not chain.transmission.has_compliance:
-        return {"terms": terms}
-    return {"terms": terms, "gravity_bodies": _gravity_bodies(chain, chain.transmission.loads)}
+    transmission = chain.transmission
+    if transmission is None:
+        return {}
+    errors: dict[str, Any] = {
+        "linear": transmission.linear.tolist(),
+        "harmonics": [
+            [i, k + 1, *transmission.harmonics[k, :, i].tolist()]
+            for k, i in np.argwhere(transmission.harmonics.any(1)).tolist()
+        ],
+    }
+    if transmission.has_compliance:
+        errors["compliance"] = transmission.compliance.tolist()
+        errors["gravity_bodies"] = _gravity_bodies(chain, transmission.loads)
+    return errors
 
 
 def _gravity_bodies(chain: Chain, loads: GravityLoads) -> list[dict[str, Any]]:

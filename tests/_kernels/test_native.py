@@ -300,19 +300,20 @@ from dhcal_pin import Chain, Noise, Pose, calibrate
 assert (_kernels.propagate_frames.__module__ == "dhcal_pin._kernels.native") == (sys.argv[1] == "compiled")
 nominal, actual = Chain.from_dh(paper("sim_6dof")), Chain.from_dh(paper("sim_6dof_actual"))
 rng = np.random.default_rng(0)
-data = Pose.simulate(actual, rng.uniform(-3, 3, (60, 6)), Noise(1e-4, 1e-4), rng)
-fit = calibrate(nominal, data, "dh")
+data = Pose.simulate(actual, rng.uniform(-3, 3, (90, 6)), Noise(1e-4, 1e-4), rng)
+fit = calibrate(nominal, data, sys.argv[2])
 print(json.dumps([fit.converged, fit.x.tolist(), fit.std.tolist()]))
 """
 
 
-def test_calibration_without_compiled_kernels_gives_the_same_values():
+@pytest.mark.parametrize("sets", ["dh", "dh,harmonics,curves"])
+def test_calibration_without_compiled_kernels_gives_the_same_values(sets):
     places = Path(native.__file__).parents[2], ROOT / "tests"
     environ = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, map(Path.resolve, places)))}
     ends = [
         json.loads(
             subprocess.run(
-                [sys.executable, "-c", CALIBRATION, way],
+                [sys.executable, "-c", CALIBRATION, way, sets],
                 env=environ,
                 capture_output=True,
                 text=True,

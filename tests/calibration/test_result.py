@@ -18,6 +18,7 @@ from dhcal_pin.robot import Chain
 
 # Standard deviations of the simulated noise [m], [rad].
 POSITION_STD, ROTATION_STD = 1e-4, np.deg2rad(0.01)
+NOISE = Noise(POSITION_STD, ROTATION_STD)
 
 
 def test_accuracy_before_has_refitted_frames(sim_6dof, sim_6dof_actual):
@@ -53,6 +54,46 @@ def test_standard_deviations_match_scatter_over_repeats(sim_6dof, sim_6dof_actua
                 scores.append((p.nominal + x - truth[p.name]) / std)
     assert np.std(scores) == pytest.approx(1.0, abs=0.1)
     assert abs(np.mean(scores)) < 0.15
+
+
+def coverage(nominal: Chain, actual: Chain, n_poses: int, n_repeats: int) -> float:
+    """Fraction of the true parameters within ±1.96 standard deviations, with noise that is estimated."""
+    truth = np.array([p.nominal for p in select_parameters(actual, "dh").parameters])
+    within = []
+    for seed in range(n_repeats):
+        rng = np.random.default_rng(seed)
+        data = Pose.simulate(actual, rng.uniform(-2.5, 2.5, (n_poses, 6)), NOISE, rng)
+        fit = calibrate(nominal, Pose(data.q, data.poses), "dh", priors="none", loss="linear")
+        value = np.array([p.nominal for p in fit.parameters]) + fit.x
+        within += [np.abs(value - truth) < 1.96 * fit.std]
+    return float(np.mean(within))
+
+
+def test_noise_that_few_poses_determine_widens_the_standard_deviations(sim_6dof, sim_6dof_actual):
+    """91.5 to 92.8 % with the quantiles of a normal distribution."""
+    assert 0.94 < coverage(sim_6dof, sim_6dof_actual, 8, 300) < 0.97
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n_poses", [6, 8, 12, 25, 60])
+def test_standard_deviations_contain_the_truth_for_any_number_of_poses(sim_6dof, sim_6dof_actual, n_poses):
+    assert 0.93 < coverage(sim_6dof, sim_6dof_actual, n_poses, 2000) < 0.96
+
+
+def test_standard_deviations_follow_students_t_distribution(sim_6dof, sim_6dof_actual):
+    """Its 97.5 % quantile with 12 degrees of freedom is 2.1788 (tables); eight poses have 2 x 24 rows."""
+    rng = np.random.default_rng(0)
+    data = Pose.simulate(sim_6dof_actual, rng.uniform(-2.5, 2.5, (8, 6)), NOISE, rng)
+    fit = calibrate(sim_6dof, Pose(data.q, data.poses), "dh", priors="none", loss="linear")
+    assert fit.noise_degrees_of_freedom == pytest.approx(12)
+    normal = np.linalg.norm(posterior_sqrt_covariance(fit.solution.system, fit.problem.weights)[0], axis=1)
+    np.testing.assert_allclose(fit.std, 2.1788 / 1.95996 * fit.unit_weight_std * normal, rtol=1e-4)
+    stated = calibrate(sim_6dof, data, "dh", priors="none")
+    assert stated.noise_degrees_of_freedom == np.inf
+    normal = np.linalg.norm(
+        posterior_sqrt_covariance(stated.solution.system, stated.problem.weights)[0], axis=1
+    )
+    np.testing.assert_allclose(stated.std, normal, rtol=1e-12)
 
 
 def test_predicted_covariance_matches_scatter_over_repeats(sim_6dof, sim_6dof_actual):

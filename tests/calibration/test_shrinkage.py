@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from robots import joint_sample, measured_arm
+from scipy.stats import multivariate_normal, norm
 
-from dhcal_pin.calibration import calibrate
+from dhcal_pin.calibration import calibrate, procedure
+from dhcal_pin.calibration.shrinkage import compute_shrinkage_factor
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import Noise, Pose, Position
 from dhcal_pin.robot import Chain
+from dhcal_pin.robot.sampling import joint_range
 
 # Standard deviations of the simulated noise [m], [rad].
 POSITION_STD, ROTATION_STD = 1e-4, np.deg2rad(0.01)
@@ -38,6 +43,70 @@ def count_worse_than_nominal(name: str, sets: str, kind, poses, seeds) -> int:
         worse += after > before
         assert bool(fit.shrinkage_notes) == (fit.shrinkage_factor < 1)
     return worse
+
+
+def factor_by_definition(problem, solution, groups) -> float:
+    """The largest factor with at most 0.2 % harm, from posteriors of the errors instead of their effects.
+
+    Only for robots whose base and tool are known: nothing has to be eliminated.
+    """
+    errors, x, r = problem.errors, solution.x, solution.system.r
+    measured = solution.system.z + r @ x
+    # Derivatives of the tool position by differences, at the documented configurations.
+    chain = errors.chain
+    q = np.random.default_rng(0).uniform(*joint_range(chain), (32, chain.n_joints))
+    step = 1e-6 * np.eye(len(x))
+    jacobian = np.stack(
+        [(errors.at(x + h).poses(q) - errors.at(x - h).poses(q))[:, :3, 3].ravel() / 2e-6 for h in step], 1
+    )
+    change = jacobian @ x
+    effect = jacobian.T @ change
+    widths = 2.0 ** np.arange(-4, 5)
+    log_weights, means, stds = [], [], []
+    for combination in itertools.product(widths, repeat=len(groups)):
+        std = 1 / problem.weights
+        for width, (members, weight) in zip(combination, groups, strict=True):
+            std[members] = width / weight
+        covariance = r @ np.diag(std**2) @ r.T + np.eye(len(r))
+        evidence = multivariate_normal.logpdf(measured, np.zeros(len(r)), covariance)
+        # ln w has the standard deviation 1.5, and the grid is even in it.
+        log_weights.append(evidence + norm.logpdf(np.log(combination), 0, 1.5).sum())
+        posterior = np.linalg.inv(r.T @ r + np.diag(std**-2))
+        means.append(effect @ posterior @ r.T @ measured)
+        stds.append(np.sqrt(effect @ posterior @ effect))
+    weights = np.exp(np.array(log_weights) - max(log_weights))
+    weights /= weights.sum()
+    safe = [
+        c
+        for c in np.linspace(0, 1, 101)
+        if norm.cdf((0.5 * c * change @ change - means) / np.array(stds)) @ weights <= 0.002
+    ]
+    return max(safe, default=0.0)
+
+
+def test_the_factor_follows_from_its_definition(monkeypatch):
+    calls = []
+
+    def record(*args):
+        calls.append(args)
+        return compute_shrinkage_factor(*args)
+
+    monkeypatch.setattr(procedure, "compute_shrinkage_factor", record)
+    nominal, found = measured_arm("paper"), []
+    for seed in range(24):
+        rng = np.random.default_rng(seed)
+        errors = select_parameters(nominal, "dh")
+        size = np.array([np.deg2rad(1.0) if p.unit == "rad" else 5e-3 for p in errors.parameters])
+        truth = errors.at((0.1, 1.0, 3.0)[seed % 3] * size * rng.uniform(-1, 1, len(size)))
+        noise = Noise(2e-3, 2e-2) if seed % 2 else Noise(POSITION_STD, ROTATION_STD)
+        data = Position.simulate(truth, joint_sample(nominal, 2 + seed % 5, rng), noise, rng)
+        fit = calibrate(nominal, data, "dh", extend="none")
+        found.append((fit.shrinkage_factor, factor_by_definition(*calls[-1])))
+    assert len(calls) == 24
+    for factor, expected in found:
+        assert factor == pytest.approx(expected, abs=0.011)
+    # Some corrections are applied in part.
+    assert sum(0.05 < factor < 0.95 for factor, _ in found) >= 3
 
 
 def two_poses(chain: Chain, rng: np.random.Generator):

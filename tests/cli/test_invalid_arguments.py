@@ -114,7 +114,6 @@ ARGUMENTS = {
         ["convert", "arm.dh.toml", "arm.png"],
         ["arm.png", ".urdf", ".dh.toml", ".dh.csv"],
     ),
-    "convert URDF to URDF": (["convert", "arm.urdf", "two.urdf"], ["two.urdf", "arm.urdf", "DH table"]),
     "convert to no ending": (["convert", "arm.urdf", "arm"], ["arm:", ".dh.toml", ".dh.csv"]),
     "convert nothing": (["convert", "no.dh.csv", "no.urdf"], ["no.dh.csv", "No such file"]),
     "convert with a tip": (["convert", "arm.dh.toml", "a.urdf", "--tip", "tool0"], ["arm.dh.toml", "--tip"]),
@@ -194,7 +193,7 @@ def test_full_disk_writes_nothing(assert_refused, monkeypatch):
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("tempfile.mkstemp", full)
+    monkeypatch.setattr("os.fsync", full)
     assert_refused(["out.urdf", "No space left"], *CALIBRATE, "--json", "r.json")
 
 

@@ -53,8 +53,6 @@ DATA = {
         ["data.csv:1:", "'qw'", "without a unit"],
     ),
     "broken header": (edited_csv("x[mm]", "x[mm"), ["data.csv:1:", "'x[mm'", "name[unit]"]),
-    "semicolons": (positions_csv(4).replace(",", ";"), ["data.csv:1:", "commas"]),
-    "comma at the end": (positions_csv(4).replace("\n", ",\n"), ["data.csv:1:", "header ''"]),
     "same column twice": (edited_csv("y[mm]", "x[m]"), ["data.csv:1:", "'x' appears twice", "remove one"]),
     "joint missing": (
         "\n".join(line[line.index(",") + 1 :] for line in LINES),

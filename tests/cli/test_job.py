@@ -18,7 +18,10 @@ VALUES = {
     "data": '["a.csv", "b.csv"]',
     "output": '"out.urdf"',
     "tip": '"tool0"',
+    "package_dir": '["meshes", "more"]',
     "columns": '"map.toml"',
+    "skip_bad_rows": "true",
+    "mend": '["sign:a", "rows:above"]',
     "parameters": '"dh"',
     "extend": '"gain"',
     "fix": '"d2"',
@@ -35,15 +38,20 @@ VALUES = {
     "in_place": "true",
     "world_joint": "true",
     "tool_frame": '"tcp"',
+    "force": "true",
     "report": '["r.html", "r.md"]',
     "json": '"r.json"',
+    "curves": '"curves.csv"',
+    "residuals": '"residuals.csv"',
     "map": '"map.csv"',
 }
 ARGUMENTS = (
-    "calibrate arm.urdf a.csv b.csv -o out.urdf --tip tool0 --columns map.toml --parameters dh --extend gain "
+    "calibrate arm.urdf a.csv b.csv -o out.urdf --tip tool0 --package-dir meshes --package-dir more "
+    "--columns map.toml --skip-bad-rows --mend sign:a --mend rows:above --parameters dh --extend gain "
     "--fix d2 --free d3 --holdout 0.3 --method gn --loss tukey --priors none --bounds bounds.toml "
     "--instrument known.toml --payload 5kg --max-iterations 7 --seed 3 --in-place --world-joint "
-    "--tool-frame tcp --report r.html --report r.md --json r.json --map map.csv"
+    "--tool-frame tcp --force --report r.html --report r.md --json r.json --curves curves.csv "
+    "--residuals residuals.csv --map map.csv"
 )
 
 
@@ -74,9 +82,11 @@ def test_manifest_has_the_options_of_the_command_line(tmp_path, separator):
 def test_command_parses_to_the_same_job():
     job = job_of(ARGUMENTS)
     text = job.command({"arm.urdf": "robots/arm.urdf"})
-    outputs = "-o out.urdf --in-place --report r.html --report r.md --json r.json --map map.csv"
+    outputs = "-o out.urdf --in-place --report r.html --report r.md --json r.json --map map.csv "
+    outputs += "--curves curves.csv --residuals residuals.csv"
     assert job_of(f"{text.replace('robots/', '').removeprefix('dhcal ')} {outputs}") == job
-    assert not {"-o", "--in-place", "--report", "--json", "--map"} & set(text.split())
+    flags = {"-o", "--in-place", "--report", "--json", "--curves", "--residuals", "--map"}
+    assert not flags & set(text.split())
 
 
 def test_methods_are_those_of_the_solver():

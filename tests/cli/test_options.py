@@ -8,14 +8,14 @@ import pytest
 
 from dhcal_pin.cli.options import PLACEHOLDERS, IntegerType, expand_placeholders, split_commas
 from dhcal_pin.estimation import LOSSES, PARAMETER_SETS, Loss
+from dhcal_pin.estimation.parameters import EXTENSIONS
 from dhcal_pin.io import FORMATS
 from dhcal_pin.measurements import KINDS
 from dhcal_pin.planning import CRITERIA, plannable_kinds
-from dhcal_pin.robot import FAMILIES
 
 NAMES = {
     "criteria": CRITERIA,
-    "error_families": FAMILIES,
+    "error_families": EXTENSIONS,
     "kinds": KINDS,
     "losses": LOSSES,
     "parameter_sets": PARAMETER_SETS,

@@ -9,8 +9,8 @@ import pytest
 from robots import URDF, robot_file
 
 from dhcal_pin.cli import main
-from dhcal_pin.io import read_robot
-from dhcal_pin.io.measurement_csv import read_configurations
+from dhcal_pin.io import read_configurations, read_robot
+from dhcal_pin.robot import joint_coverage
 
 ROBOT = str(URDF / "sim_6dof.dh.toml")
 TRUTH = str(URDF / "sim_6dof_actual.dh.toml")
@@ -51,11 +51,17 @@ def test_plan_from_measured_poses(tmp_path, capsys):
     data, chosen = tmp_path / "data.csv", tmp_path / "chosen.csv"
     run(capsys, "simulate", ROBOT, "--truth", TRUTH, "-m", 60, "--noise", "0.1mm,0.01deg", "-o", data)
     assert run(capsys, "plan", ROBOT, "-n", 10, "--from", data, "-o", chosen, "--json", "-")[0] == 0
-    status, out, _ = run(capsys, "plan", ROBOT, "-n", 10, "--from", data, "-o", chosen, "--json", "-")
+    exact = tmp_path / "exact.csv"
+    options = ("--joint-units", "rad", "--json", "-")
+    status, out, _ = run(capsys, "plan", ROBOT, "-n", 10, "--from", data, "-o", exact, *options)
     assert status == 0
     rows = np.array(json.loads(out)["rows"]) - 1
     chain = read_robot(ROBOT)
-    assert np.array_equal(read_configurations(chosen, chain), read_configurations(data, chain)[rows])
+    assert np.array_equal(read_configurations(exact, chain), read_configurations(data, chain)[rows])
+    # Degrees, by default, have four decimals.
+    assert "joint_1[deg]" in chosen.read_text()
+    found = np.degrees(read_configurations(chosen, chain) - read_configurations(exact, chain))
+    assert 0 < np.abs(found).max() <= 0.5001e-4
     more = tmp_path / "more.csv"
     options = ("-n", 5, "--data", data, "--candidates", 300, "-o", more, "--json", "-")
     found = json.loads(run(capsys, "plan", ROBOT, *options)[1])
@@ -83,6 +89,29 @@ def test_plan_for_a_calibrated_robot(tmp_path, capsys):
     assert chosen["criterion"] == "robust"
     # An arcminute of joint scatter is added to the noise.
     assert chosen["sigma_orientation_rad"] > 2e-4
+
+
+def test_plan_for_curves_from_measured_poses(tmp_path, capsys):
+    data, chosen, planned = tmp_path / "data.csv", tmp_path / "chosen.csv", tmp_path / "plan.json"
+    run(capsys, "simulate", ROBOT, "--truth", TRUTH, "-m", 80, "--noise", "0.1mm,0.01deg", "-o", data)
+    options = ("-n", 20, "--from", data, "--criterion", "curves", "-o", chosen, "--json", planned)
+    status, _, err = run(capsys, "plan", ROBOT, *options)
+    assert status == 0
+    document = json.loads(planned.read_text())
+    assert document["criterion"] == "curves"
+    assert len(set(document["rows"])) == 20
+    # There are 80 poses to choose from.
+    assert [row["poses"] for row in document["joint_curves"]] == [0, 20, 50]
+    shares = [row["filled_share"] for row in document["joint_curves"]]
+    std = [row["curve_std_rad"] for row in document["joint_curves"]]
+    assert 0 == shares[0] < shares[1] < shares[2] <= 1
+    assert std[0] > std[1] > std[2] > 0
+    table = err[err.index("joint correction curves") :].splitlines()
+    assert table[1].split() == ["poses", "bins", "filled", "curve", "std,", "µrad"]
+    assert table[4].split() == ["50", f"{100 * shares[2]:.0f}", "%", f"{1e6 * std[2]:.0f}"]
+    chain = read_robot(ROBOT)
+    visited = [one.n_visited for one in joint_coverage(chain, read_configurations(chosen, chain))]
+    assert min(visited) >= 18
 
 
 def test_task_by_positions_and_by_joint_values(tmp_path, capsys):
@@ -135,6 +164,13 @@ def test_box_and_visibility(tmp_path, capsys):
         (("--priors", "none"), "needs priors"),
         (("--from", "nowhere.csv"), "nowhere.csv"),
         (("--parameters", "dhh"), "dhh"),
+        (("--floor", "0"), "--floor 0: expected a height with a unit"),
+        (("--floor", "2m"), "lower the floor"),
+        (("--obstacle", "1,2,3mm"), "--obstacle 1,2,3mm"),
+        (("--obstacle", "1,0,0:0,1,1m"), "below the second"),
+        (("--obstacle", "nowhere.urdf"), "nowhere.urdf"),
+        (("--obstacle", str(URDF / "sim_6dof.urdf")), "no collision geometry; expected obstacles"),
+        (("--export", "moves.gcode"), "unknown ending; choose from .script"),
     ],
 )
 def test_invalid_arguments_are_one_line_and_write_nothing(tmp_path, capsys, options, words):
@@ -156,3 +192,87 @@ def test_map_of_a_calibration(tmp_path, capsys):
     assert table[:, 5].sum() == 20_000
     # Thirty poses with 0.1 mm noise determine the position to a few hundredths of a millimetre.
     assert 0.01 < np.sqrt(np.average(table[:, 3] ** 2, weights=table[:, 5])) < 0.5
+
+
+UR10 = ("plan", "example:ur10", "--tip", "tool0", "--candidates", 300, "-n", 10)
+# A table beside the robot, as a link of a scene on a leg, and as a box.
+TABLE = """<robot name="cell"><link name="cell"/><link name="table"><collision><origin xyz="0 0 -0.2"/>
+<geometry><box size="0.8 0.7 0.4"/></geometry></collision></link><joint name="leg" type="fixed">
+<origin xyz="0.8 -0.65 0.4"/><parent link="cell"/><child link="table"/></joint></robot>"""
+TABLE_BOX = "400,-1000,0:1200,-300,400mm"
+
+
+def lowest_tool(path, tip="tool0"):
+    chain = read_robot("example:ur10", tip)
+    return chain.poses(read_configurations(path, chain))[:, 2, 3].min()
+
+
+def test_robot_stays_above_the_floor_by_default(tmp_path, capsys):
+    poses = tmp_path / "poses.csv"
+    status, _, err = run(capsys, *UR10, "-o", poses)
+    assert status == 0
+    assert lowest_tool(poses) > 0
+    assert "free of collisions" in err
+    assert run(capsys, *UR10, "-o", poses, "--floor", "-300mm")[0] == 0
+    assert -0.3 < lowest_tool(poses) < 0
+    assert run(capsys, *UR10, "-o", poses, "--floor", "none")[0] == 0
+    assert lowest_tool(poses) < -0.3
+
+
+def test_obstacles_of_a_scene_and_boxes(tmp_path, capsys):
+    """A scene and the equal box give the same plan, whose tools are not in the table."""
+    scene, pages = tmp_path / "cell.urdf", {}
+    scene.write_text(TABLE)
+    for name, obstacle in (("scene", scene), ("box", TABLE_BOX)):
+        poses, pages[name] = tmp_path / f"{name}.csv", tmp_path / f"{name}.html"
+        status, out, _ = run(
+            capsys, *UR10, "-o", poses, "--obstacle", obstacle, "--html", pages[name], "--json", "-"
+        )
+        assert status == 0
+        document = json.loads(out)
+        assert document["blocked_moves"] == []
+        assert document["files"]["html"] == str(pages[name])
+    assert (tmp_path / "scene.csv").read_text() == (tmp_path / "box.csv").read_text()
+    assert (
+        str(scene)
+        in json.loads(run(capsys, *UR10, "-o", poses, "--obstacle", scene, "--json", "-")[1])["inputs"]
+    )
+    chain = read_robot("example:ur10", "tool0")
+    q = read_configurations(poses, chain)
+    place = chain.poses(q)[:, :3, 3]
+    assert not ((place > [0.4, -1.0, 0]) & (place < [1.2, -0.3, 0.4])).all(1).any()
+    page = pages["box"].read_text().split('type="application/json">')[1].split("</script>")[0]
+    preview = json.loads(page)
+    (shape,) = preview["obstacles"]
+    np.testing.assert_allclose(shape["box"], [0.8, 0.7, 0.4])
+    np.testing.assert_allclose(np.reshape(shape["placement"], (3, 4))[:, 3], [0.8, -0.65, 0.2])
+    assert preview["floor"] == 0
+    np.testing.assert_allclose(np.array(preview["configurations"])[preview["stops"]], q, atol=1e-6)
+
+
+def test_exports_visit_the_poses_in_their_order(tmp_path, capsys):
+    poses, names = tmp_path / "poses.csv", ("p.script", "p.trajectory.csv", "p.robodk.csv")
+    exports = [word for name in names for word in ("--export", tmp_path / name)]
+    assert run(capsys, *UR10, "-o", poses, *exports)[0] == 0
+    q = read_configurations(poses, read_robot("example:ur10", "tool0"))
+    degrees = np.loadtxt(tmp_path / "p.robodk.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(np.radians(degrees[:, :6]), q, atol=1e-6)
+    script = (tmp_path / "p.script").read_text()
+    assert [f"# pose {i}" in script for i in range(1, 12)] == [True] * 10 + [False]
+    assert "pose 1 is not checked" in script
+    trajectory = np.loadtxt(tmp_path / "p.trajectory.csv", delimiter=",", skiprows=1)
+    for pose in q:
+        assert np.abs(trajectory[:, 1:] - pose).max(1).min() < 1e-6
+
+
+def test_a_robot_without_geometry_is_checked_as_lines(tmp_path, capsys):
+    poses = tmp_path / "poses.csv"
+    status, _, err = run(
+        capsys, "plan", ROBOT, "-n", 8, "--candidates", 200, "-o", poses, "--floor", "-500mm"
+    )
+    assert status == 0
+    assert "checked against straight lines between the joints" in err
+    chain = read_robot(ROBOT)
+    frames = chain.forward_kinematics(read_configurations(poses, chain))
+    assert frames.columns[2:, 3, 2].min() > -0.5
+    assert frames.tool[3, 2].min() > -0.5

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import os
 import xml.etree.ElementTree as ET
@@ -49,6 +50,8 @@ def test_json_of_a_calibration(run, robot_folder):
             "nominal",
             "value",
             "std",
+            "frame",
+            "direction",
             "observability",
             "posterior_to_prior_std",
             "fixed",
@@ -92,7 +95,10 @@ def test_json_file_equals_json_on_stdout(run, robot_folder):
 def test_single_measurement_gives_finite_json(run, robot_folder):
     Path("data.csv").write_text(positions_csv(1))
     for method in ("lm", "gn"):
-        document = json_of(run(*CALIBRATE, "--json", "-", "--method", method))
+        status, out, _ = run(*CALIBRATE, "--json", "-", "--method", method)
+        document = parse_json(out)
+        assert status == 3
+        assert document["verdict"]["reasons"][0].startswith("No joint ever moved")
         assert document["samples"] == 1
         assert document["rank"] == 3
 
@@ -152,18 +158,66 @@ def test_holdout_fraction_depends_on_the_seed(run, robot_folder):
     assert (none["samples"], none["samples_holdout"], none["holdout_after"]) == (20, 0, {})
 
 
-def test_regression_is_reported(run, robot_folder):
-    """The calibration of an exact robot fits noise only; that of a robot with errors is no regression."""
-    for truth, is_worse in ((), True), (("--truth", URDF / "sim_6dof_actual.dh.toml"), False):
+def test_accuracy_within_and_beyond_the_measured_region(run, robot_folder):
+    Path("data.csv").write_text(positions_csv(60))
+    status, out, err = run(*CALIBRATE, "--json", "-")
+    assert status == 0
+    document = parse_json(out)
+    figures = {}
+    for name in ("cross_validated", "holdout_region"):
+        assert document[f"{name}_reason"] == ""
+        for stage in ("before", "after"):
+            figures[name, stage] = document[f"{name}_{stage}"]["position_rms_m"]
+            assert document[f"{name}_{stage}"].keys() <= {"position_rms_m", "position_max_m"}
+    # The calibrated robot leaves the noise of 1 mm along each axis and a little more.
+    for (_, stage), value in figures.items():
+        assert bool(np.sqrt(3) * 0.9e-3 < value < np.sqrt(3) * 1.3e-3) is (stage == "after")
+    assert 0 <= document["covered_share"] <= document["reached_share"] <= 1
+    lines = [line for line in err.splitlines() if line.startswith(("Measured region", "Beyond it"))]
+    assert len(lines) == 2
+    for (_, stage), value in figures.items():
+        assert f"{1e3 * value:.2f} mm {stage}" in " ".join(lines)
+    assert max(map(len, lines)) <= 90
+
+
+def test_regions_are_left_out_of_complete_calibrations(run, robot_folder):
+    Path("data.csv").write_text(positions_csv(60))
+    plain = json_of(run(*CALIBRATE, "--json", "-"))
+    status, out, err = run(*CALIBRATE, "--holdout", "region", "--report", "report.md", "--json", "-")
+    assert status == 0
+    document = parse_json(out)
+    # All rows are fitted.
+    assert document["parameters"] == plain["parameters"]
+    assert (document["samples"], document["samples_holdout"], document["holdout_after"]) == (60, 0, {})
+    for stage in ("holdout_region_before", "holdout_region_after"):
+        assert document[stage]["position_rms_m"] == pytest.approx(plain[stage]["position_rms_m"], rel=0.05)
+    assert document["holdout_region_after"] != plain["holdout_region_after"]
+    assert document["comparisons"][0]["title"] == "region hold-out"
+    assert "RMS position error on regions that were left out" in err
+    assert "regions of joint space in turn" in Path("report.md").read_text()
+
+
+def test_figures_that_cannot_be_stated_are_null(run, robot_folder):
+    Path("data.csv").write_text(positions_csv(4))
+    status, out, err = run(*CALIBRATE, "--json", "-")
+    assert status == 0
+    document = parse_json(out)
+    for name in ("cross_validated", "holdout_region"):
+        assert (document[f"{name}_before"], document[f"{name}_after"]) == (None, None)
+        assert "too few samples" in document[f"{name}_reason"]
+    assert err.count("cannot be said, too few samples") == 2
+
+
+def test_robot_without_errors_is_kept(run, robot_folder):
+    """The calibration of an exact robot fits noise only, so nothing of it is applied."""
+    for truth, is_kept in ((), True), (("--truth", URDF / "sim_6dof_actual.dh.toml"), False):
         arm = URDF / "sim_6dof.dh.toml"
         stdout_of(run("simulate", arm, *truth, "-m", "30", "--noise", "0.1mm,0.01deg", "-o", "exact.csv"))
-        _, _, err = run("calibrate", arm, "exact.csv", "-o", "calibrated.urdf")
-        *_, remark, _, last = err.splitlines()
-        assert (
-            "the calibrated robot is worse than the nominal one on 30 cross-validated samples"
-            in remark.lower()
-        ) is is_worse
-        assert last.startswith("RMS position error on 30 cross-validated samples")
+        document = json_of(run("calibrate", arm, "exact.csv", "-o", "calibrated.urdf", "--json", "-"))
+        reasons = document["verdict"]["reasons"]
+        assert document["verdict"]["status"] == ("caution" if is_kept else "ok")
+        assert any("not significantly better than the nominal one" in text for text in reasons) is is_kept
+        assert (document["after"] == document["before"]) is is_kept
 
 
 def test_holdout_file(run, robot_folder):
@@ -204,17 +258,73 @@ def test_unreachable_rows_are_excluded_by_file(run, robot_folder):
     document = parse_json(out)
     assert status == 0
     assert document["samples"] == (12 - 1) + (10 - 2) + 8
-    assert document["outliers"] == [3, 5, 9]
-    assert document["outliers_by_file"] == {"one.csv": [3], "two.csv": [5, 9]}
+    assert document["outliers"] == [4, 6, 10]
+    assert document["outliers_by_file"] == {"one.csv": [4], "two.csv": [6, 10]}
     assert document["before"]["position_max_m"] < 0.01
-    for text in ("one.csv: row 3", "two.csv: row 5", "two.csv: row 9"):
+    for text in ("one.csv: line 4", "two.csv: line 6", "two.csv: line 10"):
         assert f"{text} is excluded" in err
+
+
+def test_residuals_are_written_with_files_and_lines(run, robot_folder):
+    """Comments and blank lines count as in a text editor; outliers are the same lines in JSON and console."""
+    head, *rows = positions_csv(30, 1, error=0.1).splitlines()
+    cells = rows[20].split(",")
+    rows[20] = ",".join([*cells[:3], str(float(cells[3]) + 40), *cells[4:]])
+    Path("one.csv").write_text("\n".join(["# laser", head, "", *rows[:10], "# pause", *rows[10:]]))
+    Path("two.csv").write_text(positions_csv(8, 2, error=0.1))
+    args = (
+        "calibrate",
+        "arm.dh.toml",
+        "one.csv",
+        "--holdout",
+        "two.csv",
+        "-o",
+        "out.urdf",
+        "--loss",
+        "tukey",
+    )
+    status, out, err = run(*args, "--parameters", "dh,base", "--residuals", "r.csv", "--json", "-")
+    document = parse_json(out)
+    assert status == 0, err
+    assert document["files"]["residuals"] == "r.csv"
+    with open("r.csv", newline="") as file:
+        table = list(csv.DictReader(file))
+    assert [(row["file"], int(row["line"]), row["set"]) for row in table] == [
+        *(("one.csv", line, "fit") for line in [*range(4, 14), *range(15, 35)]),
+        *(("two.csv", line, "holdout") for line in range(2, 10)),
+    ]
+    outliers = [int(row["line"]) for row in table if row["outlier"] == "1"]
+    assert outliers == document["outliers"] == document["outliers_by_file"]["one.csv"] == [25]
+    assert "one.csv: 1 outlier (line 25)" in err
+    assert [row["line"] for row in table if row["weight"] == "0.0"] == ["25"]
+    assert {row["weight"] for row in table if row["set"] == "holdout"} == {""}
+    norms = [
+        np.linalg.norm([float(row[f"position_{axis}[m]"]) for axis in "xyz"])
+        for row in table
+        if row["set"] == "holdout"
+    ]
+    rms = np.sqrt(np.mean(np.square(norms)))
+    assert document["holdout_after"]["position_rms_m"] == pytest.approx(rms, rel=1e-12)
+
+
+def test_residuals_of_a_refused_calibration_are_written(run, robot_folder):
+    rows = positions_csv(40, error=0.1).splitlines()
+    Path("data.csv").write_text("\n".join([rows[0], *(mirrored(row) for row in rows[1:])]))
+    status, _, err = run(*CALIBRATE, "--residuals", "r.csv")
+    assert (status, Path("out.urdf").exists()) == (3, False), err
+    assert len(Path("r.csv").read_text().splitlines()) == 41
+
+
+def mirrored(row):
+    """A row of a measurement file with y in the opposite direction."""
+    *joints, x, y, z = row.split(",")
+    return ",".join([*joints, x, str(-float(y)), z])
 
 
 def test_unreachable_rows_of_a_holdout_file_are_listed(run, robot_folder):
     Path("held.csv").write_text(positions_csv(9, 1, wrong=[4]))
     document = json_of(run(*CALIBRATE, "--holdout", "held.csv", "--json", "-"))
-    assert (document["samples"], document["samples_holdout"], document["outliers"]) == (20, 8, [4])
+    assert (document["samples"], document["samples_holdout"], document["outliers"]) == (20, 8, [5])
 
 
 def test_poses_and_positions_are_fitted_together(run, robot_folder):

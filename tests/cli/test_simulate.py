@@ -38,6 +38,25 @@ def test_noise_has_the_given_standard_deviation(run, robot_folder):
     np.testing.assert_allclose(errors.std(0), 1e-3, rtol=0.05)
 
 
+def test_random_errors_have_the_given_standard_deviation(run, robot_folder):
+    """The nominal robot with base and tool fitted leaves the errors of three joint origins."""
+    command = ("simulate", "arm.urdf", "-m", "40", "--kind", "pose")
+    stdout_of(run(*command, "--errors", "1mm,0.3deg", "-o", "a.csv"))
+    stdout_of(run(*command, "--errors", "1mm,0.3deg", "--seed", "1", "-o", "b.csv"))
+    stdout_of(run(*command, "--errors", "0mm", "-o", "exact.csv"))
+    nominal = Chain.from_urdf("arm.urdf")
+    norms = {}
+    for name in ("a.csv", "b.csv", "exact.csv"):
+        measured = read_measurement_file(name, nominal).data
+        norms[name] = np.linalg.norm(measured.positions() - nominal.poses(measured.q)[:, :3, 3], axis=1)
+    assert norms["exact.csv"].max() < 1e-12
+    assert (norms["a.csv"][:10] != norms["b.csv"][:10]).all()
+    # 0.3 degrees turn an arm of 745 mm by 4 mm.
+    assert 1e-3 < np.median(norms["a.csv"]) < 2e-2
+    status, _, err = run(*command, "--errors", "1mm", "--truth", "arm.dh.toml", "-o", "c.csv")
+    assert (status, "--errors: not allowed with --truth" in err) == (2, True)
+
+
 @pytest.mark.parametrize(
     ("lower", "upper"), [(-30.0, 45.0), (190.0, 300.0), (-400.0, -200.0), (-10.0, 600.0)]
 )

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import HEADER, KEYS, json_of, parse_json, tool_positions
+from command_line import CALIBRATE, HEADER, KEYS, json_of, parse_json, stdout_of, tool_positions
 from robots import URDF
 
 
@@ -55,6 +55,98 @@ def test_unreachable_rows_are_reported_and_included(run, robot_folder):
     document = parse_json(out)
     assert (status, document["samples"]) == (0, 8)
     assert document["after"]["position_rms_m"] == pytest.approx(np.sqrt(np.mean(off**2)), rel=1e-9)
-    assert [text.split(": ")[1] for text in document["warnings"]] == ["row 7", "row 8"]
-    assert "warning: row 7: its joint positions lead 1095 mm away" in err
-    assert run("validate", URDF / "experiment.dh.toml", table, "--fit-frames")[2].count("warning: row") == 0
+    assert [text.split(": ")[1] for text in document["warnings"]][-2:] == ["line 11", "line 12"]
+    assert "warning: line 11: its joint positions lead 1095 mm away" in err
+    assert run("validate", URDF / "experiment.dh.toml", table, "--fit-frames")[2].count("warning: line") == 0
+
+
+def calibrated_and_new_data(run, degrees, frame=None):
+    """Calibrate the robot of the folder; write new measurements of it at joint values (m, 3) [deg]."""
+    stdout_of(run(*CALIBRATE))
+    rng = np.random.default_rng(7)
+    positions = tool_positions(degrees) + rng.normal(size=(len(degrees), 3))
+    positions = positions if frame is None else positions @ frame[0].T + frame[1]
+    rows = np.concatenate([degrees, positions], 1)
+    np.savetxt("new.csv", rows, "%.9f", ",", header=HEADER, comments="")
+
+
+def test_nominal_and_calibrated_robot_side_by_side(run, robot_folder):
+    rotation = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    degrees = np.random.default_rng(3).uniform(-70, 70, (40, 3))
+    calibrated_and_new_data(run, degrees, (rotation, np.array([2000.0, 0, -300])))
+    args = ("validate", "out.urdf", "new.csv", "--nominal", "arm.dh.toml", "--json", "-")
+    status, out, err = run(*args, "--fit-frames")
+    document = parse_json(out)
+    assert status == 0
+    assert document.keys() >= KEYS
+    assert set(document["inputs"]) == {"out.urdf", "new.csv", "arm.dh.toml", "out.calibration.toml"}
+    # The simulated robot is the nominal one: its error is the noise of 1 mm along each axis.
+    assert document["before"]["position_rms_m"] == pytest.approx(np.sqrt(3) * 1e-3, rel=0.2)
+    assert document["after"]["position_rms_m"] == pytest.approx(np.sqrt(3) * 1e-3, rel=0.2)
+    header = next(line for line in err.splitlines() if line.startswith("error"))
+    assert header.split() == ["error", "nominal", "calibrated"]
+    assert "base and tool fitted to these measurements" in err
+    # Both robots have the same frames, which do not hold for these measurements, and the command says so.
+    status, out, err = run(*args)
+    document = parse_json(out)
+    assert status == 0
+    assert document["before"]["position_rms_m"] > 1
+    assert document["after"]["position_rms_m"] > 1
+    assert "the frames (base, tool) differ: run again with --fit-frames" in err
+    assert any("--fit-frames" in text for text in document["warnings"])
+
+
+def test_frames_of_the_nominal_robot_are_fitted_if_those_of_the_calibrated_one_were(run, robot_folder):
+    degrees = np.random.default_rng(3).uniform(-70, 70, (40, 3))
+    far = (np.eye(3), np.array([2000.0, 0, -300]))
+    calibrated_and_new_data(run, degrees, far)
+    options = ("--parameters", "dh,base", "-o", "far.urdf")
+    stdout_of(run("calibrate", "arm.dh.toml", "new.csv", *options))
+    args = ("validate", "far.urdf", "new.csv", "--nominal", "arm.dh.toml", "--json", "-")
+    status, out, err = run(*args)
+    document = parse_json(out)
+    assert status == 0
+    assert "nominal: base fitted to these measurements" in err
+    for stage in ("before", "after"):
+        assert document[stage]["position_rms_m"] == pytest.approx(np.sqrt(3) * 1e-3, rel=0.2)
+    # A robot without errors gets no correction.
+    assert document["after"]["position_rms_m"] == pytest.approx(document["before"]["position_rms_m"])
+
+
+def test_equal_frames_are_not_reported(run, robot_folder):
+    calibrated_and_new_data(run, np.random.default_rng(3).uniform(-70, 70, (40, 3)))
+    document = json_of(run("validate", "out.urdf", "new.csv", "--json", "-"))
+    assert document["warnings"] == []
+
+
+def test_nominal_robot_with_other_joints_is_refused(run, robot_folder):
+    calibrated_and_new_data(run, np.zeros((4, 3)))
+    other = URDF / "sim_6dof.dh.toml"
+    status, _, err = run("validate", "out.urdf", "new.csv", "--nominal", other)
+    assert status == 2
+    assert "expected the joints of out.urdf" in err
+
+
+def test_samples_outside_the_measured_region(run, robot_folder):
+    """Joint 2 was measured up to 80°; half of the new samples are about 80° beyond."""
+    rng = np.random.default_rng(3)
+    inside, outside = rng.uniform(-60, 60, (2, 30, 3))
+    outside[:, 1] = rng.uniform(150, 170, 30)
+    calibrated_and_new_data(run, np.concatenate([inside, outside]))
+    status, out, err = run("validate", "out.urdf", "new.csv", "--json", "-")
+    assert status == 0
+    region = parse_json(out)["measured_region"]
+    assert 30 <= region["samples_outside"] <= 36
+    largest = np.max(outside[:, 1]) - np.max(np.loadtxt("data.csv", delimiter=",", skiprows=1)[:, 1])
+    assert region["largest_excess"] == {"joint_2": pytest.approx(np.radians(largest), abs=1e-6)}
+    assert region["outside"]["position_samples"] == region["samples_outside"]
+    assert region["inside"]["position_samples"] == 60 - region["samples_outside"]
+    assert f"{region['samples_outside']} of 60 samples" in err
+    assert f"Beyond the measured range: joint_2 by {largest:.0f}°." in err
+
+
+def test_a_robot_without_a_measured_region_has_none(run, robot_folder):
+    document = json_of(run("validate", "arm.urdf", "data.csv", "--json", "-"))
+    assert document["measured_region"] is None
+    assert document["holdout_region_after"] is None
+    assert document["cross_validated_after"] is None

@@ -9,7 +9,7 @@ import pytest
 from robots import robot_file
 
 from dhcal_pin.diagnostics import find_input_warnings
-from dhcal_pin.io.measurement_csv import read_measurement_file
+from dhcal_pin.io import read_measurement_file
 from dhcal_pin.robot import Chain
 
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from dhcal_pin import se3
 from dhcal_pin.cli.main import main
-from dhcal_pin.io.measurement_csv import measurement_text
+from dhcal_pin.io import measurement_text
 from dhcal_pin.measurements import KINDS, Noise, Position, Wires
 from dhcal_pin.robot import Chain
 from dhcal_pin.robot.inverse_kinematics import wrap_into_limits
@@ -49,7 +49,7 @@ def test_a_wrong_unit_gives_one_warning(warnings_of, ur10, kind, units, expected
 
 @pytest.mark.parametrize(
     ("declared", "true", "expected"),
-    [("rad", "deg", "more than a turn"), ("deg", "rad", "rotations differ from this robot by")],
+    [("rad", "deg", "more than a turn"), ("deg", "rad", "rotation vectors are in rad, but were read as deg")],
 )
 def test_rotation_vectors_in_the_wrong_unit(warnings_of, ur10, declared, true, expected):
     (text,) = warnings_of(
@@ -85,7 +85,7 @@ def test_transposed_rotations_give_a_warning(warnings_of, ur10):
         for line, row in zip(lines[1:], (-rotvec).tolist(), strict=True)
     ]
     (found,) = warnings_of(ur10, "\n".join([lines[0], *rows]))
-    assert "rows of a matrix" in found
+    assert "measured rotations are inverse" in found
 
 
 @pytest.mark.parametrize("moving", [[0], [5], [0, 5], [0, 1, 2, 5]])
@@ -150,13 +150,13 @@ def test_joints_beyond_their_limits(warnings_of, ur10):
     q[[3, 7], 2] = [3.3, -3.15]
     q[11, 2] = np.pi + 1e-5
     (text,) = warnings_of(ur10, csv_text_of(ur10, q))
-    assert "joint elbow_joint is beyond its limits, -3.142 rad to 3.142 rad, in rows 4, 8;" in text
+    assert "joint elbow_joint is beyond its limits, -3.142 rad to 3.142 rad, in lines 5, 9;" in text
 
 
 def test_repeated_rows_give_a_warning(warnings_of, ur10):
     lines = csv_text_of(ur10, joint_positions(ur10)).splitlines()
     (text,) = warnings_of(ur10, "\n".join([*lines, lines[3], lines[3], lines[9]]))
-    assert text.startswith("rows 31, 32, 33: identical to other rows in every digit (row 31 to row 3)")
+    assert text.startswith("lines 32, 33, 34: identical to other rows in every digit (line 32 to line 4)")
 
 
 def test_repeated_measurements_of_one_configuration_give_no_warning(warnings_of, ur10):
@@ -197,7 +197,7 @@ def test_warnings_on_the_command_line(tmp_path, monkeypatch, capsys, command):
     assert main([command, "arm.dh.toml", "data.csv", *more]) == 0
     found = [line for line in capsys.readouterr().err.splitlines() if "warning:" in line]
     assert len(found) == 1
-    assert found[0].startswith("data.csv: warning: row 13: identical to other rows")
+    assert found[0].startswith("data.csv: warning: line 14: identical to other rows")
 
 
 def test_two_anchors_with_one_name_give_warnings(tmp_path, monkeypatch, capsys):
@@ -211,7 +211,7 @@ def test_two_anchors_with_one_name_give_warnings(tmp_path, monkeypatch, capsys):
         (tmp_path / file).write_text(measurement_text(Wires(q, length[:, None]), arm))
     assert main(["calibrate", "arm.dh.toml", "one.csv", "-o", "out.urdf"]) == 0
     assert ": warning: " not in capsys.readouterr().err
-    assert main(["calibrate", "arm.dh.toml", "one.csv", "two.csv", "-o", "out.urdf"]) == 0
+    assert main(["calibrate", "arm.dh.toml", "one.csv", "two.csv", "-o", "two.urdf"]) == 3
     found = [line for line in capsys.readouterr().err.splitlines() if "warning:" in line]
     assert found
     assert all(

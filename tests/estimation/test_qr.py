@@ -90,6 +90,25 @@ def test_row_space_and_null_space_are_complements():
     np.testing.assert_allclose(both @ both.T, np.eye(6), atol=1e-14)
 
 
+@pytest.mark.parametrize("largest", [1.0, 1e9])
+def test_priors_couple_observable_and_unobservable_directions(largest):
+    """Of five directions two are determined, one of them much better: (RᵀR + W²)⁻¹ with sixty digits."""
+    rng = np.random.default_rng(3)
+    directions = np.linalg.qr(rng.normal(size=(5, 5)))[0][:2]
+    exact_rows = np.array([[largest], [3.0]]) * directions
+    rows = np.zeros((6, 6))
+    rows[:2, :5] = np.linalg.qr(exact_rows, mode="r")
+    weights = np.array([1.0, 0.3, 2.0, 0.7, 5.0])
+    root, unbounded = qr.posterior_sqrt_covariance(TriangularSystem(rows), weights)
+    assert unbounded.shape == (5, 0)
+    with mpmath.workdps(60):
+        information = mpmath.matrix(exact_rows.tolist()).T * mpmath.matrix(exact_rows.tolist())
+        exact = (information + mpmath.diag((weights**2).tolist())) ** -1
+        exact = np.array(exact.tolist(), float)
+    std = np.sqrt(np.diag(exact))
+    np.testing.assert_allclose(root @ root.T / np.outer(std, std), exact / np.outer(std, std), atol=1e-6)
+
+
 def test_the_step_is_exact_at_condition_1e8():
     """Nearly parallel axes: the same rows solved with fifty digits give the same step."""
     errors = select_parameters(Chain.from_dh(paper("sim_6dof")), "dh")

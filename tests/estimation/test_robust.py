@@ -10,7 +10,13 @@ import pytest
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.calibration.summary import headline
 from dhcal_pin.estimation import LOSSES, linearize_and_factor
-from dhcal_pin.estimation.robust import WEIGHT_FUNCTIONS, residual_covariances, standardized_residuals
+from dhcal_pin.estimation.robust import (
+    WEIGHT_FUNCTIONS,
+    WeightChange,
+    residual_covariances,
+    standardized_residuals,
+    update_weights,
+)
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.measurements import Noise, Pose, Position, Wires
 from dhcal_pin.report.context import ReportContext
@@ -188,3 +194,18 @@ def test_losses_name_their_stages_and_have_help_texts_of_one_line():
         assert set(loss.stages) <= set(WEIGHT_FUNCTIONS)
         assert 0 < len(loss.help) < 100
         assert "\n" not in loss.help
+
+
+@pytest.mark.parametrize("slope", [-0.5, -1.0, -2.0, -4.0, -7.0])
+def test_weights_that_alternate_settle(slope):
+    """Each new weight is the fixed point 0.5 plus `slope` times the distance of the old weight from it."""
+    weights, last = [np.array([0.52, 1.0])], WeightChange()
+    for _ in range(25):
+        wanted = 0.5 + slope * (weights[0][0] - 0.5)
+        # Huber's weight of this residual is the wanted one; the second sample is good.
+        residuals = [np.array([1.345 / min(max(wanted, 0.01), 1.0), 0.5])]
+        weights, last = update_weights(weights, residuals, "huber_no_cutoff", last)
+        if last.size < 1e-3:
+            break
+    assert last.size < 1e-3
+    assert weights[0] == pytest.approx([0.5, 1.0], abs=2e-3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from robots import joint_sample, measured_arm
 
 from dhcal_pin.estimation import (
     METHODS,
@@ -14,8 +15,9 @@ from dhcal_pin.estimation import (
     select_parameters,
 )
 from dhcal_pin.estimation import solver_rules as rules
+from dhcal_pin.estimation.initialization import make_problem
 from dhcal_pin.exceptions import ConvergenceError, UnknownNameError
-from dhcal_pin.measurements import Noise, Position
+from dhcal_pin.measurements import Noise, Position, SphereContact
 
 
 def case(sim_6dof, sim_6dof_actual, sets="dh", m=20):
@@ -37,6 +39,21 @@ def test_a_warm_start_continues_a_loose_solution_exactly(sets, sim_6dof, sim_6do
     assert not loose.converged
     assert loose.iterations < full.iterations
     np.testing.assert_array_equal(continued.iterates, full.iterates)
+
+
+@pytest.mark.parametrize("seed", [0, 10])
+def test_a_loose_solution_is_not_a_step_that_damping_shortened(seed):
+    """Touches of a sphere: in a curved valley a damped step is negligible, and the undamped one is not."""
+    nominal = measured_arm("paper")
+    errors = select_parameters(nominal, "minimal,base,tool")
+    rng = np.random.default_rng(seed)
+    size = np.where(errors.priors < 1, errors.priors, 0.3)
+    truth = errors.at(size * rng.uniform(-1, 1, len(size)))
+    data = SphereContact.simulate(truth, joint_sample(nominal, 40, rng), Noise(1e-4), rng)
+    problem = make_problem(errors, (data.initialized(nominal),), 1 / errors.priors, {})
+    start = np.zeros(len(problem.weights))
+    full, loose = (levenberg_marquardt(problem, start, 100, loose=loose) for loose in (False, True))
+    assert problem.cost(loose.x) <= 1.0001 * problem.cost(full.x)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -99,6 +116,23 @@ def test_step_rules_agree_for_floats_and_arrays():
 )
 def test_damping_follows_the_gain_ratio(gain, factor):
     assert rules.damping_after_acceptance(1.0, gain, False) == pytest.approx(factor)
+
+
+@pytest.mark.parametrize(
+    ("trial_cost", "predicted", "accepted"),
+    [
+        (0.5, 0.6, True),
+        # A thousandth of the predicted reduction is the least (Nocedal and Wright, algorithm 4.1, η > 0).
+        (1 - 2e-3, 1.0, True),
+        (1 - 5e-4, 1.0, False),
+        (1.0, 1.0, False),
+        (1 + 1e-6, 1.0, False),
+        (2.0, -1.0, False),
+    ],
+)
+def test_a_step_must_reduce_the_cost_by_a_part_of_the_prediction(trial_cost, predicted, accepted):
+    gain = rules.gain_ratio(1.0, trial_cost, predicted)
+    assert bool(rules.is_acceptable(1.0, trial_cost, gain, False)) is accepted
 
 
 def test_undamped_steps_become_rarer():

@@ -16,8 +16,8 @@ from dhcal_pin.cli.main import main
 from dhcal_pin.estimation.parameters import select_parameters
 from dhcal_pin.estimation.uncertainty import UNBOUNDED_TOL
 from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io import measurement_text, read_measurements
 from dhcal_pin.io.dh_file import read_dh
-from dhcal_pin.io.measurement_csv import measurement_text, read_measurements
 from dhcal_pin.io.robot import read_robot, write_urdf
 from dhcal_pin.io.sidecar import read_uncertainty, sidecar_path
 from dhcal_pin.measurements.base import Noise
@@ -65,6 +65,7 @@ SETS = (
     "dh,base,tool",
     "placement,base,tool",
     "minimal,base,tool,gain,harmonics,compliance,coupling",
+    "minimal,base,tool,curves",
 )
 
 
@@ -76,12 +77,13 @@ def test_predictions_from_a_file_agree_with_those_of_the_fit(ur10, tmp_path, set
     known = read_uncertainty(sidecar_path(tmp_path / "out.urdf"), again)
     assert known is not None
     q = np.random.default_rng(1).uniform(-3, 3, (200, 6))
+    # Joints that moved by less than 10 nm keep their bytes in the URDF.
     mine, theirs = fit.predict(q), known.predict(q)
-    np.testing.assert_allclose(theirs.poses, mine.poses, atol=1e-11)
-    np.testing.assert_allclose(theirs.position_std, mine.position_std, rtol=1e-9)
-    np.testing.assert_allclose(theirs.orientation_std, mine.orientation_std, rtol=1e-9)
+    np.testing.assert_allclose(theirs.poses, mine.poses, atol=1e-8)
+    np.testing.assert_allclose(theirs.position_std, mine.position_std, rtol=1e-7)
+    np.testing.assert_allclose(theirs.orientation_std, mine.orientation_std, rtol=1e-7)
     size = np.sqrt(np.einsum("mii->mi", mine.covariance))
-    assert np.max(np.abs(theirs.covariance - mine.covariance) / (size[:, :, None] * size[:, None])) <= 1e-9
+    assert np.max(np.abs(theirs.covariance - mine.covariance) / (size[:, :, None] * size[:, None])) <= 1e-7
     # And with the parameter covariance, without body twists.
     wanted = covariance_by_differences(fit, q[:20])
     gap = np.abs(mine.covariance[:20] - wanted) / (size[:20, :, None] * size[:20, None])

@@ -334,3 +334,60 @@ def test_poses_over_the_full_range_need_no_advice(arm):
 
 def test_identifiable_robot_needs_no_explanation():
     assert explain(problem(load("panda"), "dh")) == []
+
+
+CURVES_TEXT = re.compile(
+    r"correction curves: (.*); (\d+) of (\d+) combinations of harmonics are not identifiable \((.*)\); (.*)"
+)
+
+
+def curve_parts(text: str) -> tuple[str, ...]:
+    """Reason, number of open combinations, their total, joints and advice of a sentence."""
+    match = CURVES_TEXT.fullmatch(text)
+    assert match is not None, text
+    return match.groups()
+
+
+def test_open_combinations_of_curves_are_counted_by_joint():
+    """Joint 5 covers 20°: the rank falls by this number; the other sentences are those without curves."""
+    arm = load("ur10")
+    q = draw_q(arm, 250)
+    q[:, 4] = 0.5 + 0.06 * q[:, 4]
+    of, plain = problem(arm, "minimal,base,tool,curves", q=q), problem(arm, "minimal,base,tool", q=q)
+    *others, text = explain(of)
+    assert others == explain(plain)
+    reason, count, total, joints, advice = curve_parts(text)
+    assert (reason, total) == ("the poses are too similar", "360")
+    assert int(count) == rank(plain) + 360 - rank(of)
+    shares = dict(part.split() for part in joints.split(", "))
+    assert list(shares) == ["wrist_2_joint"]
+    assert 40 < int(shares["wrist_2_joint"]) <= 60
+    # The advice is followed.
+    assert advice == "measure poses over the full range of the joints"
+    q[:, 4] = draw_q(arm, 250, 1)[:, 4]
+    assert not any("curves" in text for text in explain(problem(arm, "minimal,base,tool,curves", q=q)))
+
+
+def test_too_few_equations_for_curves():
+    of = problem(load("ur10"), "minimal,base,tool,curves", m=50)
+    text = explain(of)[-1]
+    reason, count, _, _, advice = curve_parts(text)
+    assert reason == "300 equations for 396 parameters"
+    assert int(count) == 396 - 300 - 6
+    assert advice == f"measure at least {-(-int(count) // 6)} more poses"
+
+
+def test_weakly_observable_curve_of_a_joint_is_one_sentence():
+    arm = load("ur10")
+    q = draw_q(arm, 250)
+    q[:, 4] = 0.5 + 0.5 * q[:, 4]
+    of = problem(arm, "minimal,base,tool,curves", q=q)
+    system = linearize_and_factor(of, np.zeros(len(of.weights)), False)
+    texts = explanations.explain_weakly_observable(
+        of, np.zeros(len(of.weights)), system, of.errors.priors, 0.05
+    )
+    about = [text for text in texts if "wrist_2_joint.sin" in text or "wrist_2_joint.cos" in text]
+    assert len(about) == 1
+    assert re.match(
+        r"wrist_2_joint\.\w+ \.\.\. \w+ \(\d+ harmonics\): standard deviation of \d+ comb", about[0]
+    )

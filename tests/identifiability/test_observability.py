@@ -35,7 +35,9 @@ def test_indices_ignore_unobservable_directions():
 
 def test_second_index_is_the_inverse_condition(sim_6dof):
     q = np.random.default_rng(0).uniform(-3, 3, (30, 6))
-    fit = calibrate(sim_6dof, Pose.simulate(sim_6dof, q, NOISE, np.random.default_rng(0)), "dh")
+    fit = calibrate(
+        sim_6dof, Pose.simulate(sim_6dof, q, NOISE, np.random.default_rng(0)), "dh", extend="none"
+    )
     assert fit.observability_indices["O2"] == pytest.approx(1 / fit.condition)
 
 
@@ -50,7 +52,7 @@ def test_correlation_agrees_with_repetitions(sim_3dof):
     """100 repetitions at the same poses; the standard deviation of a correlation of 0 is 1/√100."""
     q = np.random.default_rng(0).uniform(-3, 3, (12, 3))
     fits = [
-        calibrate(sim_3dof, Pose.simulate(sim_3dof, q, NOISE, np.random.default_rng(s)), "dh")
+        calibrate(sim_3dof, Pose.simulate(sim_3dof, q, NOISE, np.random.default_rng(s)), "dh", extend="none")
         for s in range(100)
     ]
     seen = fits[0].posterior_to_prior_std < 0.1
@@ -117,7 +119,7 @@ def standardized_errors(chain: Chain, kind, draw, seeds: int):
         rng = np.random.default_rng(seed)
         x = errors.priors * rng.normal(size=len(errors.parameters))
         truth = errors.at(x)
-        fit = calibrate(chain, kind.simulate(truth, draw(rng), NOISE, rng))
+        fit = calibrate(chain, kind.simulate(truth, draw(rng), NOISE, rng), extend="none")
         score = (fit.x - x) / fit.std
         is_known = fit.posterior_to_prior_std < observability.MAX_KNOWN_STD_RATIO
         known += score[is_known].tolist()

@@ -164,7 +164,7 @@ def test_invalid_toml_files_raise_an_error_that_names_the_problem(tmp_path, edit
         (change("d[mm]", "offset[mm]"), 2, ["unknown column 'offset'", "theta"]),
         (change("606.8", "nan"), 3, ["'d'", "'nan' is not a finite number"]),
         (change("606.8", ""), 3, ["'d'", "is empty"]),
-        (change("606.8", "606,8"), 3, ["9 values under a header of 8 columns"]),
+        (change("606.8", "606,8"), 3, ["9 values for 8 columns"]),
         (change("606.8", "6e7"), None, ["'shoulder'", "d is 60000 m", "unit"]),
         (change("lift", "shoulder"), None, ["occurs twice"]),
         (change("lift", ""), None, ["joint name ''"]),

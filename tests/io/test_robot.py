@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from robots import URDF, write
 
+from dhcal_pin import se3
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io import FORMATS, convert_robot, read_robot, robot_name
+from dhcal_pin.io import FORMATS, convert_robot, read_robot, robot, robot_name, urdf_files
 from dhcal_pin.io.robot import find_format, has_dh_table
 
 TABLE, ROBOT = URDF / "ur10.dh.toml", URDF / "sim_6dof.urdf"
@@ -28,6 +29,24 @@ def test_the_longest_ending_selects_the_format(name, expected):
     robot_format = find_format(name)
     assert robot_format is not None
     assert robot_format.name == expected
+
+
+@pytest.mark.parametrize("move", [1e-11, 1e-9, 1e-6])
+def test_a_urdf_that_is_not_the_calibrated_robot_is_not_written(monkeypatch, tmp_path, move):
+    """Ten picometres are more than the rounding of decimal numbers."""
+    chain = read_robot(ROBOT)
+    edit = robot.with_origins
+
+    def wrong(urdf, origins):
+        joint = urdf.joint("joint_2")
+        return edit(urdf, origins | {joint.name: joint.origin @ se3.translation([move, 0, 0])})
+
+    assert urdf_files(chain, tmp_path / "a.urdf")
+    monkeypatch.setattr(robot, "with_origins", wrong)
+    with pytest.raises(
+        DhcalError, match=r"a\.urdf: not written: the tool of the URDF as read back differs by"
+    ):
+        urdf_files(chain, tmp_path / "a.urdf")
 
 
 def test_endings_are_unique():
@@ -58,7 +77,6 @@ def test_a_converted_robot_has_the_same_poses(tmp_path, robot_format):
     ("source", "target", "words"),
     [
         (TABLE, "arm.png", r"arm\.png: unknown ending; choose from \.urdf, \.dh\.toml, \.dh\.csv, \.yaml"),
-        (ROBOT, "arm.urdf", r"contains no DH table; only DH tables are converted to URDF"),
         ("arm.origins.csv", "arm.urdf", "a table of joint origins cannot be read as a robot; choose from"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import tomllib
 from dataclasses import replace
 
@@ -12,8 +13,16 @@ from robots import write
 from dhcal_pin import se3
 from dhcal_pin.estimation import Uncertainty
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io import read_instrument, read_robot, read_uncertainty, urdf_files, write_urdf
+from dhcal_pin.io import (
+    read_instrument,
+    read_measured_region,
+    read_robot,
+    read_uncertainty,
+    urdf_files,
+    write_urdf,
+)
 from dhcal_pin.io.sidecar import sidecar_text
+from dhcal_pin.measurements import MeasuredRegion
 
 
 def test_base_and_tool_are_read_back_from_the_sidecar(tmp_path, scara):
@@ -49,9 +58,12 @@ def test_an_invalid_sidecar_is_an_error(tmp_path, text, words, scara):
 
 
 def test_sidecar_text_is_toml(scara):
-    text = sidecar_text(replace(scara, tip='a "b"'), np.eye(4), required=True)
+    urdf = b'<robot name="r"><link name="a &quot;b&quot;"/></robot>'
+    text = sidecar_text(replace(scara, tip='a "b"'), np.eye(4), urdf, required=True)
     assert text is not None
-    assert set(tomllib.loads(text)) == {"tip", "base", "tool"}
+    content = tomllib.loads(text)
+    assert set(content) == {"tip", "base", "tool", "manifest"}
+    assert content["manifest"]["urdf_sha256"] == hashlib.sha256(urdf).hexdigest()
 
 
 def test_numbers_are_read_back_bit_identical(tmp_path, scara):
@@ -65,7 +77,9 @@ def test_numbers_are_read_back_bit_identical(tmp_path, scara):
     n_rows = 6 * (len(scara.moving_joints) + 1)
     rows = np.random.default_rng(0).normal(size=(2, n_rows, 3))
     known = Uncertainty(scara, np.array([], int), rows[0], rows[1])
-    for path, content in urdf_files(scara, tmp_path / "out.urdf", values, known).items():
+    q = np.random.default_rng(1).normal(size=(9, scara.n_joints))
+    region = MeasuredRegion.from_configurations(q, scara.is_prismatic).with_reach(q, q.T > 0)
+    for path, content in urdf_files(scara, tmp_path / "out.urdf", values, known, region).items():
         write(tmp_path, str(path), content)
     side = tmp_path / "out.calibration.toml"
     assert {name: value.hex() for name, value in read_instrument(side).items()} == {
@@ -75,5 +89,42 @@ def test_numbers_are_read_back_bit_identical(tmp_path, scara):
     assert again is not None
     np.testing.assert_array_equal(again.sqrt_covariance, rows[0])
     np.testing.assert_array_equal(again.unbounded_directions, rows[1])
+    region_again = read_measured_region(side, scara)
+    assert region_again is not None
+    for name in ("lower", "upper", "spread", "configurations", "radius", "reach", "is_prismatic"):
+        np.testing.assert_array_equal(getattr(region_again, name), getattr(region, name))
     assert side.read_text().startswith("# ")
     assert 'sqrt_covariance = """\n' in side.read_text()
+
+
+REGION = """[measured]
+joints = ["shoulder", "lift"]
+lower = [0.0, 0.0]
+upper = [1.0, 0.1]
+spread = [0.5, 0.05]
+radius = 0.2
+reach = 0.3
+configurations = "AAAAAAAAAAAAAAAAAAAAAA=="
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('"lift"', '"drop"', "expected the joints of this robot: shoulder, lift"),
+        ("0.2", "-0.2", "radius"),
+        ("[1.0, 0.1]", "[1.0]", "2 numbers"),
+        ("AAAA", "A?AA", "base64"),
+        ("AAAAAAAAAAAAAAAAAAAAAA==", "", "at least one configuration"),
+        ("radius", "raduis", "raduis"),
+    ],
+)
+def test_an_invalid_measured_region_is_an_error(tmp_path, scara, old, new, words):
+    path = write(tmp_path, "arm.calibration.toml", REGION)
+    region = read_measured_region(path, scara)
+    assert region is not None
+    assert region.configurations.shape == (1, 2)
+    write(tmp_path, "arm.calibration.toml", REGION.replace(old, new))
+    with pytest.raises(DhcalError, match=words) as caught:
+        read_measured_region(path, scara)
+    assert str(path) in str(caught.value)

@@ -15,7 +15,7 @@ from dhcal_pin import se3
 from dhcal_pin.cli.main import main
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import dh_text, read_robot
-from dhcal_pin.io.ur_kinematics import read_ur_kinematics, ur_kinematics, ur_kinematics_text
+from dhcal_pin.io.ur_kinematics import _yaml_number, read_ur_kinematics, ur_kinematics, ur_kinematics_text
 from dhcal_pin.robot import Chain, DHTable
 
 FACTORY = DATA / "ur_factory/ur10_delta_dh.csv"
@@ -114,6 +114,34 @@ def test_written_files_are_read_back(tmp_path):
     }  # fmt: skip
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (200, 6))
     np.testing.assert_allclose(read_ur_kinematics(path).poses(q), table.poses(q), atol=1e-12)
+
+
+@pytest.mark.parametrize("value", [1e-5, -1e-5, 1e-300, 5e-324, 1.0000000000000002e-7, 1e16, 1e22, 0.25, 0.0])
+def test_written_numbers_are_numbers_of_yaml(tmp_path, value):
+    """YAML 1.1 reads 1e-05 as a text."""
+    entry = "".join(f"\n    {key}: {_yaml_number(value)}" for key in ("x", "y", "z", "roll", "pitch", "yaw"))
+    assert yaml.safe_load(f"shoulder: {entry}")["shoulder"]["x"] == value
+
+
+def test_small_offsets_are_read_back(tmp_path):
+    table = ur10({"theta": np.full(6, 1e-5), "d": np.full(6, 1e-7)})
+    path = tmp_path / "kinematics.yaml"
+    path.write_text(ur_kinematics_text(Chain.from_dh(table)))
+    content = yaml.safe_load(path.read_text())["kinematics"]
+    content.pop("hash")
+    assert {type(value) for origin in content.values() for value in origin.values()} == {float}
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (200, 6))
+    np.testing.assert_allclose(read_ur_kinematics(path).poses(q), table.poses(q), atol=1e-12)
+
+
+def test_numbers_of_yaml_1_2_are_read(tmp_path):
+    """Other programs write 1e-05, which is a number in YAML 1.2."""
+    path = tmp_path / "kinematics.yaml"
+    text = ur_kinematics_text(Chain.from_dh(ur10()))
+    path.write_text(text.replace("z: 0.1273", "z: 1273e-04"))
+    assert "1273e-04" in path.read_text()
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (20, 6))
+    np.testing.assert_allclose(read_ur_kinematics(path).poses(q), ur10().poses(q), atol=1e-12)
 
 
 def test_the_flange_of_a_ros_urdf_stays():

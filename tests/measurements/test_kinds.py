@@ -14,7 +14,7 @@ from dhcal_pin.calibration.evaluation import fit_instrument_parameters
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation import Problem, select_parameters
 from dhcal_pin.estimation.problem import linearize_and_factor
-from dhcal_pin.io.measurement_csv import measurement_text, read_measurements
+from dhcal_pin.io import measurement_text, read_measurements
 from dhcal_pin.measurements import KINDS, Noise, PlaneContact, PointContact, PointDistance, Pose
 from dhcal_pin.measurements.base import concatenate, whitened_jacobian
 

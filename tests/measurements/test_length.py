@@ -13,7 +13,7 @@ from robots import URDF
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.cli.main import main
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io.measurement_csv import measurement_text
+from dhcal_pin.io import measurement_text
 from dhcal_pin.io.sidecar import read_instrument
 from dhcal_pin.measurements import Noise, Wires
 
@@ -26,6 +26,33 @@ def wires(chain, m, seed=0):
     length = np.linalg.norm(chain.poses(q)[:, None, :3, 3] - anchors, axis=2)
     true = {f"wire{i + 1}.{axis}": float(anchors[i, j]) for i in range(3) for j, axis in enumerate("xyz")}
     return Wires(q, length), true
+
+
+def test_the_derivative_of_lengths_by_instrument_parameters(sim_6dof):
+    """Central differences of the modelled lengths, with anchors and zeros unknown."""
+    rng = np.random.default_rng(0)
+    q, points = rng.uniform(-2.5, 2.5, (9, 6)), rng.normal(size=(1, 3, 9))
+    data = Wires(q, rng.uniform(1, 2, (9, 2)), 1e-4, offsets=[np.nan, np.nan]).initialized(sim_6dof)
+    names = [parameter.name for parameter in data.instrument_parameters]
+    assert [name for name in names if name.endswith("zero")] == ["wire1.zero", "wire2.zero"]
+    u = rng.normal(size=len(names))
+    _, _, jacobian = data.model(points, u)
+    for i, step in enumerate(1e-6 * np.eye(len(u))):
+        numeric = (data.model(points, u + step)[0] - data.model(points, u - step)[0]) / 2e-6
+        np.testing.assert_allclose(jacobian[i], numeric, atol=1e-8)
+    # A longer zero makes a longer reading.
+    assert (jacobian[-2:].sum(1) == 1).all()
+
+
+def test_anchors_start_at_the_lengths_without_their_known_zeros(sim_6dof):
+    """Exact lengths with a zero of 0.3 m give the true anchors at once."""
+    rng = np.random.default_rng(0)
+    anchors = np.array([[-1.4, 0, 0.5], [-1.4, 0.26, 0.05]])
+    q = rng.uniform(-2.5, 2.5, (40, 6))
+    length = np.linalg.norm(sim_6dof.poses(q)[:, None, :3, 3] - anchors, axis=2)
+    data = Wires(q, length + np.array([0.3, -0.2]), 1e-4, offsets=[0.3, -0.2]).initialized(sim_6dof)
+    found = np.reshape([parameter.nominal for parameter in data.instrument_parameters], (2, 3))
+    np.testing.assert_allclose(found, anchors, atol=1e-9)
 
 
 def test_known_anchors_make_the_base_observable(sim_6dof, sim_6dof_actual):

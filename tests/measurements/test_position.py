@@ -10,7 +10,7 @@ from robots import URDF
 from dhcal_pin import se3
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.cli.main import main
-from dhcal_pin.io.measurement_csv import measurement_text
+from dhcal_pin.io import measurement_text
 from dhcal_pin.measurements import MultiTargetPosition, Noise
 
 

@@ -39,6 +39,24 @@ def criterion_values(candidates: CandidateSet, selected, weights: np.ndarray) ->
     }
 
 
+def test_e_optimality_prefers_rows_that_lower_the_largest_variance():
+    """The second candidate knows much more, but about a direction that is not the worst."""
+    criterion = EOptimality(np.eye(2))
+    sqrt_covariance = np.diag([1.0, 0.9])
+    rows = np.zeros((2, 1, 2))
+    rows[0, 0, 0], rows[1, 0, 1] = 0.8, 2.5
+    gains = criterion.gains(rows, sqrt_covariance)
+    before = criterion.value(sqrt_covariance)
+    after = [
+        criterion.value(np.linalg.inv(np.linalg.cholesky(np.diag([1.0, 0.9**-2]) + np.outer(row, row)).T))
+        for row in rows[:, 0].T
+    ]
+    # Only the first candidate lowers the criterion.
+    assert after[0] < before - 0.1
+    assert after[1] == pytest.approx(before)
+    assert gains[0] > gains[1] > 0
+
+
 CRITERIA = {"D": DOptimality(), "A": AOptimality(np.eye(5)[:, :3]), "E": EOptimality(np.eye(5))}
 WEIGHTS = np.eye(5)[:, :3]
 

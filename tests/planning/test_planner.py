@@ -146,7 +146,7 @@ def simulated(chain: Chain, kind: str, choices, seed: int) -> list[float]:
     held = ConfigurationSampler.from_chain(chain, WorkspaceConstraints(), 0.0, 0.0).draw(100, rng)
     out = []
     for q in choices(seed):
-        fit = calibrate(chain, KINDS[kind].simulate(truth, q, NOISE, rng), SETS)
+        fit = calibrate(chain, KINDS[kind].simulate(truth, q, NOISE, rng), SETS, extend="none")
         difference = fit.chain.poses(held)[:, :3, 3] - truth.poses(held)[:, :3, 3]
         out.append(float(np.sqrt(np.mean(np.sum(difference**2, 1)))))
     return out
@@ -209,7 +209,7 @@ def relative_errors(name: str, kind: str, seeds: int) -> np.ndarray:
         truth = errors.at(size * rng.standard_normal(len(size)))
         errors_of_robot = []
         for q in (robust.q, plain.q, candidate_set[rng.choice(400, 20, replace=False)], candidate_set):
-            fit = calibrate(chain, KINDS[kind].simulate(truth, q, NOISE, rng), SETS)
+            fit = calibrate(chain, KINDS[kind].simulate(truth, q, NOISE, rng), SETS, extend="none")
             difference = fit.chain.poses(held)[:, :3, 3] - truth.poses(held)[:, :3, 3]
             errors_of_robot.append(np.sqrt(np.mean(np.sum(difference**2, 1))))
         out.append(np.array(errors_of_robot[:3]) / errors_of_robot[3])
@@ -412,5 +412,8 @@ def test_missing_collision_geometry_is_noted():
     found = plan(arm("sim_6dof"), 6, noise=NOISE, candidates=100)
     assert "no collision geometry" in found.notes[0]
     chain = arm("ur10")
-    lost = replace(chain, urdf=replace(chain.urdf, source="/nowhere/ur10.urdf"))
-    assert "mesh is missing" in plan(lost, 6, noise=NOISE, candidates=100).notes[0]
+    data = chain.urdf.data.replace(b"package://example-robot-data/", b"package://lost/")
+    lost = replace(chain, urdf=replace(chain.urdf, data=data))
+    note = plan(lost, 6, noise=NOISE, candidates=100).notes[0]
+    assert "mesh is missing" in note
+    assert "the package lost with --package-dir" in note

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from dhcal_pin.calibration import calibrate
-from dhcal_pin.measurements import Noise, Position
+from dhcal_pin.estimation import select_parameters
+from dhcal_pin.measurements import Noise, Pose, Position
 from dhcal_pin.report import Provenance, ReportContext
 from dhcal_pin.report.sections import Section, markdown, report_sections
 
@@ -22,8 +23,53 @@ def test_outliers_are_listed_with_file_row_and_size(sim_3dof, quick):
     rng = np.random.default_rng(0)
     data = Position.simulate(sim_3dof, rng.uniform(-1.5, 1.5, (60, 3)), Noise(1e-4), rng)
     data.values[16] += [0.0, 0.03, 0.04]
-    source = Provenance(names=["in/laser.csv"], excluded_rows={"laser.csv": {3: "because"}})
+    source = Provenance(
+        names=["in/laser.csv"], excluded_rows={"laser.csv": {3: "because"}}, notes={"laser.csv": ["x"]}
+    )
     text = markdown(ReportContext.from_result(calibrate(sim_3dof, data, "dh", loss="tukey"), source))
     row = next(line for line in text.splitlines() if line.startswith("| laser.csv | 17 |"))
     assert float(row.split("|")[3].split()[0]) == pytest.approx(50, abs=1)
-    assert "laser.csv, row 3: not used, because" in text
+    assert "laser.csv, line 3: not used, because" in text
+    assert "laser.csv: x" in text
+
+
+def joint_section(fit) -> Section:
+    sections = report_sections(ReportContext.from_result(fit, Provenance()))
+    return next(section for section in sections if section.key == "joints")
+
+
+def test_joint_values_that_were_measured(fit, quick):
+    section = joint_section(fit)
+    assert section.title == "Measured joint values"
+    (table,) = section.tables
+    assert list(table.header) == ["joint", "not measured", "bins visited"]
+    assert [row[0] for row in table.rows] == list(fit.chain.joint_names)
+    # The values are between -86° and 86°; the table lists the widest gaps.
+    assert all(row[1].startswith("−180° to −8") or "−180° to −7" in row[1] for row in table.rows)
+    counts = [len(set(np.rint(np.rad2deg(fit.data[0].q[:, i]) / 5))) for i in range(6)]
+    assert [row[2] for row in table.rows] == [f"{count} of 72" for count in counts]
+
+
+def test_joint_correction_curves_of_joints_with_harmonics(sim_6dof, quick):
+    rng = np.random.default_rng(0)
+    errors = select_parameters(sim_6dof, "curves")
+    truth = errors.at(errors.priors * rng.standard_normal(len(errors.priors)))
+    data = Pose.simulate(truth, rng.uniform(-np.pi, 1.0, (60, 6)), Noise(1e-5, 1e-5), rng)
+    joint = sim_6dof.joint_names[1]
+    names = [p.name for p in errors.parameters if p.name.startswith(f"{joint}.")]
+    fit = calibrate(sim_6dof, data, "dh", free=names, extend="none")
+    context = ReportContext.from_result(fit, Provenance())
+    section = joint_section(fit)
+    assert section.title == "Joint correction curves"
+    (table,) = section.tables
+    filled = [row for row in table.rows if row[3]]
+    assert [row[0] for row in filled] == [joint]
+    assert all(text.endswith(("mrad", "µrad")) for text in filled[0][3:])
+    assert section.figures is not None
+    (group,) = section.figures(context)
+    (panel,) = group.panels
+    assert panel.caption == joint
+    assert f"which are {filled[0][2]} bins" in panel.description
+    ax = panel.plot()
+    assert len(ax.patches) == len(context.joint_curves[0].coverage.gaps)
+    assert "Joint correction curves" in markdown(context)

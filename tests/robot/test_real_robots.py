@@ -209,7 +209,8 @@ def recovered(chain: Chain, sets: str, seed: int) -> float:
 
 
 WITH_FRAMES = [f"{s},base,tool" for s in ("dh", "modified-dh", "hayati", "minimal", "placement", "offset")]
-EVERY_SET = [*PARAMETER_SETS, *WITH_FRAMES]
+# Few samples do not determine the curves.
+EVERY_SET = [*(name for name in PARAMETER_SETS if name != "curves"), *WITH_FRAMES]
 
 
 @pytest.mark.parametrize("sets", EVERY_SET)

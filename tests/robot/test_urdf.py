@@ -26,6 +26,7 @@ from urdf_mutations import (
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.robot import parse_urdf, read_urdf
 from dhcal_pin.robot.urdf_edit import with_origins
+from dhcal_pin.robot.urdf_path import build_model
 
 
 def test_there_are_69_robots():
@@ -117,6 +118,9 @@ def two(first: str, second: str) -> str:
 
 
 BACK = '<parent link="b"/><child link="a"/>'
+INERTIAL = (
+    '<inertial><mass value="2.5"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
+)
 REFUSED = [
     # (bytes, line, fragment)
     (b"", 1, "empty"),
@@ -234,6 +238,7 @@ REFUSED = [
         for new in ("", "nan", "-inf", "1 2", "x")
     ),
     (robot(LINKS + joint().replace('"-1"', '"3"')), 2, "<limit>: lower 3 is above upper 2; swap them"),
+    (robot(LINKS + joint().replace('"-1"', '"2.001"')), 2, "lower 2.001 is above upper 2; swap them"),
     (robot(LINKS + joint('<dynamics damping="x"/>')), 2, "<dynamics>: damping has 'x'"),
     (robot(LINKS + joint("<dynamics/>")), 2, "<dynamics>: neither damping nor friction; add one"),
     (robot(LINKS + joint('<calibration rising="x"/>')), 2, "<calibration>: rising has 'x'"),
@@ -260,6 +265,26 @@ REFUSED = [
         3,
         "link 'b': neither this link nor link 'a' is the child of a joint; a robot has one root",
     ),
+    # Pinocchio leaves out the mass of these links and only prints a message.
+    *(
+        (
+            robot(f'<link name="a"><inertial>\n{inside}</inertial></link>'),
+            3,
+            f"link 'a' <inertial> {fragment}",
+        )
+        for inside, fragment in (
+            ('<mass value="2,5"/>', "<mass>: value has '2,5'; expected a finite number"),
+            ('<mass value="1kg"/>', "<mass>: value has '1kg'"),
+            ('<mass value="nan"/>', "<mass>: value has 'nan'"),
+            ('<mass value="-1"/>', "<mass>: value is outside of 0 to 1e+06; expected kilograms"),
+            ("<mass/>", "<mass>: no value"),
+            ('<mass value="1"/><mass value="2"/>', "<mass>: a second element of this kind"),
+            ('<mass value="1"/><origin xyz="0 0 a"/>', "<origin>: xyz has 'a'"),
+            ('<mass value="1"/><inertia ixx="0,1"/>', "<inertia>: ixx has '0,1'"),
+        )
+    ),
+    (robot('<link name="a"><inertial/></link>'), 2, "link 'a' <inertial>: no <mass>"),
+    (robot(f'<link name="a">{INERTIAL}\n{INERTIAL}</link>'), 3, "<inertial>: a second element of this kind"),
     (
         robot("".join(f'<link name="{i}"/>\n' for i in range(20_002))),
         20_003,
@@ -286,10 +311,20 @@ def test_unusual_but_valid_files_are_accepted():
         b'<?xml version = "1.0"?>\n<!-- ${a} <xacro:b/> -->' + robot('<link name="a">$(b)</link>'),
         robot('<link name="a"/><!-- <!DOCTYPE r> -->').replace(b"<robot", b'<robot xmlns:xacro="x"'),
         robot('<link name="a"/>' + "<a>" * 63 + "</a>" * 63),
+        robot('<link name="a"><inertial><mass value="1"/></inertial><visual/></link>'),
+        robot(f'<link name="a">{INERTIAL}<visual><inertial/></visual></link><x><inertial/></x>'),
         robot('<link name="a"/><link name="b" />' + joint('<origin xyz="1e4 -1e4 0"/>', "a")),
     ):
         assert parse_urdf(data, "f").root == "a"
         assert pin.buildModelFromXML(data.decode()).nframes >= 2
+
+
+def test_the_mass_of_a_link_is_that_of_pinocchio(capfd):
+    data = robot(f'<link name="a"/><link name="b">{INERTIAL}<visual/></link>' + joint())
+    model = build_model(parse_urdf(data, "f"))
+    assert model.inertias[1].mass == 2.5
+    # Pinocchio's parser reports the empty <visual> on stderr.
+    assert capfd.readouterr().err == ""
 
 
 def test_unreadable_files(tmp_path):

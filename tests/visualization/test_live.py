@@ -6,7 +6,10 @@ import os
 import signal
 import webbrowser
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
+from http.client import HTTPConnection
+from urllib.parse import urlsplit
 
 import numpy as np
 import pinocchio as pin
@@ -75,8 +78,49 @@ def test_a_server_that_is_gone_is_named_in_time(scene, end):
     for process in processes(scene):
         process.send_signal(end)
     for _ in range(2):
-        with pytest.raises(DhcalError, match=r"127\.0\.0\.1:\d+/static/ does not answer; start a new scene"):
+        with pytest.raises(DhcalError, match=r"127\.0\.0\.1:\d+/[\w-]+/ does not answer; start a new scene"):
             scene.show(np.zeros(6))
+
+
+def status_of(url: str, host: str = "", path: str | None = None, **headers: str) -> int:
+    """Status of a request to the server of an address, as a browser that was told another name sends it."""
+    parts = urlsplit(url)
+    connection = HTTPConnection(parts.hostname or "", parts.port, timeout=10)
+    connection.putrequest("GET", parts.path if path is None else path, skip_host=True)
+    connection.putheader("Host", host or parts.netloc)
+    for name, value in headers.items():
+        connection.putheader(name.replace("_", "-"), value)
+    connection.endheaders()
+    with closing(connection):
+        return connection.getresponse().status
+
+
+UPGRADE = {
+    "Upgrade": "websocket",
+    "Connection": "Upgrade",
+    "Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ==",
+    "Sec_WebSocket_Version": "13",
+}
+
+
+def test_only_who_knows_the_address_gets_the_scene(scene):
+    url, path = scene.url, urlsplit(scene.url).path
+    port = urlsplit(url).port
+    assert len(path) > 20
+    assert status_of(url) == 200
+    assert status_of(url, f"localhost:{port}") == 200
+    assert status_of(url, path=f"{path}main.min.js") == 200
+    assert status_of(url, path=f"{path}socket", **UPGRADE) == 101
+    # A page whose name resolves to this computer: its host and its origin agree.
+    for host in ("evil.example", f"evil.example:{port}", f"127.0.0.1.evil.example:{port}", ""):
+        origin = {"Origin": f"http://{host}"}
+        assert status_of(url, host or "evil", **origin) == 404
+        assert status_of(url, host or "evil", f"{path}socket", **UPGRADE, **origin) == 404
+    # A page that asks for this address but has another origin.
+    other = UPGRADE | {"Origin": "http://evil.example"}
+    assert status_of(url, path=f"{path}socket", **other) == 403
+    for guess in ("/", "/static/", "/socket", "/static/%00", "/%00", f"{path}%00", f"{path}../main.min.js"):
+        assert status_of(url, path=guess) == 404
 
 
 def test_the_server_ends_with_the_scene(sim_6dof):

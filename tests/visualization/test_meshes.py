@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from robots import robot_file
 from scipy.spatial import cKDTree
+from urdf_mutations import joint, robot
 
 from dhcal_pin.robot.chain import Chain
 from dhcal_pin.robot.urdf import parse_urdf
@@ -116,14 +117,59 @@ def test_a_lost_mesh_costs_its_own_link_alone(tmp_path):
     assert {shape["body"] for shape in lost.shapes if "cylinder" in shape} == {3, 6}
 
 
+def stl(*triangles) -> bytes:
+    """A binary STL file."""
+    body = b"".join(np.zeros(3, "<f4").tobytes() + np.array(t, "<f4").tobytes() + b"\0\0" for t in triangles)
+    return bytes(80) + np.uint32(len(triangles)).tobytes() + body
+
+
+TRIANGLE = [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        stl(TRIANGLE, [[0, 0, 0], [1, np.nan, 0], [0, 1, 0]]),
+        stl([[0, 0, np.inf], [1, 0, 0], [0, 1, 0]]),
+        stl(TRIANGLE)[:100],
+    ],
+    ids=["nan", "infinite", "truncated"],
+)
+def test_a_mesh_that_is_not_finite_is_drawn_as_a_rod(tmp_path, content, capfd):
+    (tmp_path / "bad.stl").write_bytes(content)
+    (tmp_path / "good.stl").write_bytes(stl(TRIANGLE))
+    visual = '<visual><geometry><mesh filename="{}.stl"/></geometry></visual>'
+    text = robot(
+        f'<link name="a">{visual.format("bad")}</link><link name="b">{visual.format("good")}</link>' + joint()
+    )
+    visuals = looked(Chain.from_urdf(parse_urdf(text, str(tmp_path / "arm.urdf"))))
+    assert visuals.note.startswith("Drawn as rods, because meshes are missing or unreadable: bad.stl (a)")
+    assert len(visuals.meshes) == 1
+    # Link b is the tip.
+    assert {shape["body"] for shape in visuals.shapes} == {0, 2}
+    # Coal reports a mesh with NaN on stderr.
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("limit", [0, 1, 2, 10])
+def test_no_mesh_vanishes(limit):
+    mesh = Mesh.on_grid(*ball(10))
+    assert 0 < len(mesh.simplify(limit).triangles) < len(mesh.triangles)
+
+
 def test_without_any_mesh_the_whole_arm_is_a_skeleton(tmp_path):
     source = robot_file(UR5)
-    chain = Chain.from_urdf(parse_urdf(source.read_bytes(), str(tmp_path / "arm.urdf")))
+    # A copy of the robot finds the meshes of the installed package; one of another package finds none.
+    copy = Chain.from_urdf(parse_urdf(source.read_bytes(), str(tmp_path / "arm.urdf")))
+    assert len(looked(copy).meshes) == 7
+    data = source.read_bytes().replace(b"package://example-robot-data/robots/", b"package://")
+    chain = Chain.from_urdf(parse_urdf(data, str(tmp_path / "arm.urdf")))
     lost = looked(chain)
     assert not lost.meshes
     assert "and 4 more" in lost.note
     assert {shape["body"] for shape in lost.shapes} >= set(range(7))
-    assert len(looked(chain, list(source.parents)).meshes) == 7
+    assert len(looked(chain, [source.parents[2]]).meshes) == 7
+    assert "the package ur_description with --package-dir" in lost.note
     page = scene_html(chain)
     scene = json.loads(page.split('type="application/json">')[1].split("</script>")[0])
     assert scene["note"] == lost.note

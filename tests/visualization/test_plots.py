@@ -49,6 +49,7 @@ def dots_of(svg: str, color: str) -> np.ndarray:
         partial(plots.plot_errors_by_sample, {"fitted": (np.arange(3), np.ones(3))}),
         partial(plots.plot_errors_over_joint, np.linspace(-1, 1, 200), np.ones(200)),
         partial(plots.plot_joint_offsets, np.arange(3.0), {"after": (np.zeros(3), np.ones(3))}),
+        partial(plots.plot_joint_corrections, np.arange(3.0), np.zeros(3), np.ones(3)),
         partial(plots.plot_singular_values, np.array([1.0, 0.5, 1e-17]), 2),
         partial(plots.plot_position_std_map, np.random.default_rng(0).normal(size=(50, 3)), np.ones(50)),
         partial(plots.plot_arms, {"before": np.eye(3), "after": 2 * np.eye(3)}),
@@ -75,6 +76,31 @@ def test_plots_are_in_shown_units():
     assert ax.get_xlabel() == "joint position, °"
     assert ax.lines[-1].get_xdata().tolist() == [0.0, 180.0]
     assert ax.lines[-1].get_ydata().tolist() == [1.0, 2.0]
+
+
+def test_joint_corrections_have_a_band_and_gaps():
+    values = np.deg2rad(np.linspace(-180, 180, 73))
+    correction, std = 1e-3 * np.sin(values), np.where(values < 0, 1e-4, 1e-3)
+    gaps = [(-np.pi, -np.pi / 2), (0.0, np.pi)]
+    ax = plots.plot_joint_corrections(values, correction, std, gaps=gaps, joint="elbow", limit=2e-3)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("elbow, °", "correction, mrad")
+    spans = [gap.get_bbox().intervalx for gap in ax.patches]
+    assert np.array(spans) == pytest.approx(np.array([[-180, -90], [0, 180]]))
+    assert np.asarray(ax.lines[-1].get_ydata()) == pytest.approx(1e3 * correction)
+    band = ax.collections[0].get_paths()[0]
+    assert band.contains_point((-90, -1 + 0.19))
+    assert not band.contains_point((-90, -1 + 0.21))
+    assert band.contains_point((90, 1 + 1.9))
+    assert ax.get_ylim() == pytest.approx((-2.1, 2.1))
+    assert ax.get_xticks()[1:-1].tolist() == [-90, 0, 90]
+    assert ax.get_legend_handles_labels()[1] == ["not measured", "95 % band", "correction"]
+
+
+def test_a_correction_that_is_not_determined_fills_the_axes():
+    values, std = np.linspace(-1, 1, 11), np.full(11, np.inf)
+    ax = plots.plot_joint_corrections(values, np.zeros(11), std, limit=1e-3)
+    assert np.isfinite(ax.collections[0].get_paths()[0].vertices).all()
+    assert ax.collections[0].get_paths()[0].contains_point((0, 1.0))
 
 
 def test_a_histogram_counts_every_sample():

@@ -19,15 +19,17 @@ from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.calibration.result import Result
 from dhcal_pin.cli.main import main
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io.measurement_csv import measurement_text
+from dhcal_pin.io import measurement_text
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.length import Distance
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.measurements.position import MultiTargetPosition, Position
 from dhcal_pin.robot.chain import Chain
-from dhcal_pin.robot.transmission import COUPLING_PRIOR, COUPLING_TERM, TERMS, Transmission
+from dhcal_pin.robot.collision import Obstacle
+from dhcal_pin.robot.sampling import WorkspaceConstraints
+from dhcal_pin.robot.transmission import Transmission, n_coefficients, split_coefficients
 from dhcal_pin.robot.urdf import parse_urdf
-from dhcal_pin.visualization.scene import scene_html, show
+from dhcal_pin.visualization.scene import Preview, scene_html, show
 
 FILES = {
     "ur10": ("ur_description/urdf/ur10_robot.urdf", None),
@@ -217,14 +219,14 @@ WEIGHTS = re.sub(
 
 
 def driven(chain: Chain, seed: int) -> Chain:
-    """With every term that its joints can have, some also off the diagonal."""
-    rng, n = np.random.default_rng(seed), chain.n_joints
-    held = np.zeros((len(TERMS), n, n))
-    held[:, range(n), range(n)] = [
-        [term.prior * (term.applies_to_prismatic or not s) for s in chain.is_prismatic] for term in TERMS
-    ]
-    held[COUPLING_TERM] += COUPLING_PRIOR * ~np.eye(n, dtype=bool)
-    return chain.with_transmission(Transmission(held * rng.uniform(1, 3, held.shape), chain.loads))
+    """With every error that its joints can have."""
+    rng = np.random.default_rng(seed)
+    coefficients = rng.uniform(1, 3, n_coefficients(chain.n_joints))
+    linear, harmonics, compliance = split_coefficients(coefficients, chain.n_joints)
+    linear *= 2e-3
+    harmonics *= 1e-4 * ~chain.is_prismatic
+    compliance *= 1e-4 * ~chain.is_prismatic
+    return chain.with_transmission(Transmission(coefficients, chain.loads))
 
 
 @pytest.mark.parametrize("robot", ["ur10", "odd"])
@@ -370,3 +372,32 @@ def test_a_calibrated_robots_sidecar_puts_the_points_where_its_tool_is(tmp_path,
 def test_view_serves_live_only_alone(tmp_path, capsys):
     assert main(["view", str(URDF / "sim_6dof.dh.toml"), "--live", "--html", str(tmp_path / "a.html")]) == 2
     assert "--live writes no page" in capsys.readouterr().err
+
+
+STOPS = """() => {
+  const object = dhcal.viewer.scene_tree.find(["dhcal", "stops"]).object;
+  const found = [];
+  object.traverse(node => { if (node.instanceMatrix) found.push(...node.instanceMatrix.array); });
+  return found;
+}"""
+
+
+def test_preview_shows_stops_path_and_obstacles(window, tmp_path):
+    """Layers are seen by their pixels, dots are at the tools of the stops; way points are not counted."""
+    chain = Chain.from_dh(paper("sim_6dof"))
+    q = poses(chain, 4)
+    obstacle = Obstacle.box([0.3, -0.6, 0.0], [0.9, -0.2, 0.5])
+    space = WorkspaceConstraints(floor=-0.25, obstacles=[obstacle, Obstacle.floor(-0.25)])
+    window.open(tmp_path / "scene.html", scene_html(chain, preview=Preview(q, [0, 1, 3], space)))
+    page = window.page
+    assert page.locator("#which").inner_text() == "3 poses"
+    labels = page.locator("#layers label").all_inner_texts()
+    assert {"Planned poses", "Path of the tool", "Obstacles"} <= set(labels)
+    pictures = [window.look()["print"]]
+    for layer in ("stops", "path", "obstacles"):
+        pictures.append(window.look("setLayer", layer, False)["print"])
+    assert len(set(pictures)) == 4
+    places = np.reshape(page.evaluate(STOPS), (3, 4, 4))[:, 3, :3]
+    np.testing.assert_allclose(places, chain.poses(q[[0, 1, 3]])[:, :3, 3], atol=1e-6)
+    # The floor is the grid; it is not drawn as a box too.
+    assert page.evaluate("[dhcal.scene.floor, dhcal.scene.obstacles.length]") == [-0.25, 1]

@@ -1,0 +1,303 @@
+"""Verdict: whether a calibrated robot may be used, with the reasons.
+
+A verdict is "ok", "caution" (usable, but with a restriction) or "refused" (the calibrated robot must not be
+used). Each rule is one function that returns its findings on a result. `judge` lists all rules. The verdict
+is the most severe finding.
+
+The limits separate simulated mistakes from honest measurements of robots with errors of up to 2 degrees and
+10 mm in every joint, and from real series; see `tests/calibration/test_mistakes.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from ..estimation.initialization import initialize_frames
+from ..estimation.parameters import select_parameters
+from ..formatting import format_quantity
+from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
+from ..plausibility.mixups import Diagnosis
+from ..robot.chain import BASE_FRAME
+from .evaluation import accuracy, fit_nominal
+from .summary import GROUP_LABELS
+
+if TYPE_CHECKING:
+    from .result import Result
+
+Status = Literal["ok", "caution", "refused"]
+# Statuses, the most severe one last.
+STATUSES: tuple[Status, ...] = ("ok", "caution", "refused")
+
+# A joint that moves less than this never moved [rad or m].
+MIN_MOTION = 1e-3
+# Displacement by a correction, relative to that of manufacturing errors as the default priors expect them:
+# above the first, measurements and robot are to be checked; above the second, no manufacturing error is so
+# large. Errors of up to 2 degrees and 10 mm in every joint reach 10.
+MAX_USUAL_DISPLACEMENT, MAX_DISPLACEMENT = 12.0, 16.0
+# Errors after the fit: positions relative to the size of the workspace, rotations [rad]. Above the first,
+# measurements and robot are to be checked; above the second, they do not belong together.
+MAX_USUAL_ERROR, MAX_ERROR = (0.02, 0.1), (0.05, 0.3)
+# Base or tool should be estimated if that alone reduces the RMS error of the nominal robot below this share.
+MAX_FRAME_RATIO = 1 / 3
+# Largest number of iterations of such a fit.
+MAX_FRAME_ITERATIONS = 20
+# A calibrated robot is worse if its squared held-out errors exceed those of the nominal one by this many
+# standard errors, and by this many times what the uncertainty of its parameters explains.
+MIN_WORSE_T, MIN_WORSE_RATIO = 3.0, 2.0
+# Probability that chance makes a robot appear better that is not.
+MAX_CHANCE = 0.025
+# Largest share of outliers of a measurement that needs no caution.
+MAX_OUTLIER_SHARE = 0.1
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something about a calibration that its user must know.
+
+    Attributes:
+        status: Verdict that this finding alone leads to.
+        reason: What was found and what to do, in one or two sentences.
+        keeps_nominal: Whether the nominal robot should be used in place of the calibrated one.
+    """
+
+    status: Status
+    reason: str
+    keeps_nominal: bool = False
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a calibrated robot may be used.
+
+    Attributes:
+        status: "ok", "caution" or "refused".
+        reasons: Sentences, those of the most severe findings first; empty if the status is "ok".
+        keeps_nominal: Whether the nominal robot should be used in place of the calibrated one.
+    """
+
+    status: Status
+    reasons: tuple[str, ...] = ()
+    keeps_nominal: bool = False
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether the calibrated robot must not be used."""
+        return self.status == "refused"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return status and reasons for the JSON document."""
+        return {"status": self.status, "reasons": list(self.reasons)}
+
+    @classmethod
+    def from_findings(cls, findings: Iterable[Finding]) -> Verdict:
+        """Combine findings.
+
+        Args:
+            findings: Any number of findings.
+
+        Returns:
+            The most severe status, with the reasons of all findings.
+        """
+        ordered = sorted(findings, key=lambda finding: -STATUSES.index(finding.status))
+        status = ordered[0].status if ordered else "ok"
+        return cls(
+            status,
+            tuple(finding.reason for finding in ordered),
+            status != "refused" and any(finding.keeps_nominal for finding in ordered),
+        )
+
+
+def judge(fit: Result) -> Verdict:
+    """Judge a calibration by all rules.
+
+    Args:
+        fit: Result of a calibration.
+
+    Returns:
+        The verdict.
+    """
+    findings = _unmoved_joints(fit)
+    if not any(finding.status == "refused" for finding in findings):
+        findings += _mixups(fit.diagnosis)
+    if not any(finding.status == "refused" for finding in findings):
+        # A mistake in the measurements explains all of these.
+        findings += [
+            *_convergence(fit),
+            *_implausible_correction(fit),
+            *_implausible_errors(fit),
+            *_held_out_errors(fit),
+            *_few_measurements(fit),
+            *_outliers(fit),
+        ]
+    return Verdict.from_findings(findings)
+
+
+def _unmoved_joints(fit: Result) -> list[Finding]:
+    """Refuse measurements in which most joints never moved; advise caution if a few did not."""
+    q = [item.configurations() for item in fit.data if item.configurations_per_row]
+    if not q:
+        return []
+    names = fit.chain.joint_names
+    moved = np.ptp(np.concatenate(q), 0) > MIN_MOTION
+    unmoved = [name for name, has_moved in zip(names, moved, strict=True) if not has_moved]
+    if not unmoved:
+        return []
+    if len(unmoved) == len(names):
+        text = "No joint ever moved: all measurements are of one configuration."
+        return [Finding("refused", f"{text} Measure configurations that differ in all joints.")]
+    text = f"{'Joints' if len(unmoved) > 1 else 'Joint'} {_join(unmoved)} never moved"
+    if (len(names) > 2 and 2 * len(unmoved) > len(names)) or sum(moved) < 2:
+        text += ", so the measurements do not show the errors of the robot."
+        return [Finding("refused", f"{text} Measure configurations that differ in all joints.")]
+    text += ": the calibration holds only where they stand."
+    return [Finding("caution", f"{text} Move them, too.")]
+
+
+def _mixups(diagnosis: Diagnosis) -> list[Finding]:
+    """Refuse measurements that another reading explains decisively better, and say how to mend them."""
+    if not diagnosis.hypotheses:
+        return []
+    return [Finding("refused", f"{diagnosis.sentence} {diagnosis.remedy}")]
+
+
+def _convergence(fit: Result) -> list[Finding]:
+    """Refuse a fit that did not converge: its values are those of an arbitrary last step."""
+    if fit.converged:
+        return []
+    return [
+        Finding(
+            "refused",
+            f"The fit did not converge in {fit.iterations} iterations. Identify fewer parameters, measure "
+            "more poses, or allow more iterations (--max-iterations).",
+        )
+    ]
+
+
+def _implausible_correction(fit: Result) -> list[Finding]:
+    """Refuse corrections that are far larger than manufacturing errors."""
+    if not _n_robot_parameters(fit):
+        return []
+    size = measure_correction(fit.errors, fit.chain)
+    if size.ratio <= MAX_USUAL_DISPLACEMENT:
+        return []
+    status: Status = "refused" if size.ratio > MAX_DISPLACEMENT else "caution"
+    return [Finding(status, f"The correction {_describe(size)}. {_plausible_cause(fit)}")]
+
+
+def _implausible_errors(fit: Result) -> list[Finding]:
+    """Refuse a robot that does not fit the measurements after the calibration either."""
+    for group, after in fit.comparisons[-1].after.groups.items():
+        is_angle = group == "orientation"
+        error = after.rms / (1.0 if is_angle else workspace_radius(fit.chain))
+        if error <= MAX_USUAL_ERROR[is_angle]:
+            continue
+        rms = format_quantity(after.rms, after.unit, after.rms_std, small=True)
+        text = f"The fit leaves an RMS {GROUP_LABELS[group]} of {rms}"
+        # With fewer parameters than the robot has errors, the robot is better than before, but not good.
+        is_restricted = fit.diagnosis.is_explained and not _missing_frames(fit)
+        status: Status = "refused" if error > MAX_ERROR[is_angle] and not is_restricted else "caution"
+        return [Finding(status, f"{text}. {_plausible_cause(fit)}")]
+    return []
+
+
+def _describe(size: CorrectionSize) -> str:
+    """Describe the size of a correction, to be read after "the correction"."""
+    unit = "rad" if size.is_angle else "m"
+    moved = format_quantity(size.displacement, unit, 0.1 * size.displacement)
+    frame = "the tool" if size.frame == "tool" else f"the axis of {size.frame}"
+    return f"moves {frame} by {moved}, {size.ratio:.0f} times what manufacturing errors would"
+
+
+def _missing_frames(fit: Result) -> list[str]:
+    """Return which of base and tool are not estimated, if the nominal robot fits much better with them."""
+    frames = {"base": BASE_FRAME, "tool": fit.errors.chain.tool_frame_index}
+    estimated = {parameter.error_frame for parameter in fit.errors.parameters}
+    missing = [name for name, frame in frames.items() if frame not in estimated]
+    if not missing:
+        return []
+    errors = select_parameters(fit.errors.chain, "base,tool")
+    errors = initialize_frames(errors, fit.data, fit.problem.known, MAX_FRAME_ITERATIONS)
+    chain, instruments = fit_nominal(errors, fit.inliers, fit.problem.known)
+    group, before = next(iter(fit.comparisons[-1].before.groups.items()))
+    with_frames = accuracy(chain, fit.inliers, instruments).groups[group]
+    return missing if with_frames.rms < MAX_FRAME_RATIO * before.rms else []
+
+
+def _plausible_cause(fit: Result) -> str:
+    """Name the most plausible cause of an implausible result."""
+    if fit.diagnosis.is_explained:
+        if missing := _missing_frames(fit):
+            verb = "are" if len(missing) > 1 else "is"
+            return (
+                f"The measurements fit this robot if its {' and '.join(missing)} {verb} estimated: "
+                "--parameters minimal,base,tool."
+            )
+        if _n_robot_parameters(fit) < len(select_parameters(fit.errors.chain, "minimal").parameters):
+            return "More parameters of the robot fit the measurements: --parameters minimal,base,tool."
+    if fit.diagnosis.fits_separately:
+        return "Each file fits this robot by itself: base or tool differ between the files."
+    if fit.input_warnings:
+        return f"{fit.input_warnings[0][0].upper()}{fit.input_warnings[0][1:]}."
+    return (
+        "Check the robot, its tip, the units, order, signs and zeros of the joints, and the notation of "
+        "rotations."
+    )
+
+
+def _held_out_errors(fit: Result) -> list[Finding]:
+    """Refuse a robot that is worse than the nominal one; keep the nominal one if there is no difference."""
+    paired = fit.held_out_errors
+    if paired is None or not (fit.shrinkage_factor and _n_robot_parameters(fit)):
+        return []
+    from scipy.special import stdtrit  # lazy import: slow
+
+    head = fit.comparisons[0]
+    group, after = next(iter(head.after.groups.items()))
+    before, change = head.before.groups[group], paired.t
+    texts = [format_quantity(side.rms, side.unit, side.rms_std, small=True) for side in (before, after)]
+    figures = f"{texts[1]} on {head.title} samples, {texts[0]} for the nominal one"
+    if change > MIN_WORSE_T and paired.ratio**2 - 1 > MIN_WORSE_RATIO * _overfitting(fit):
+        text = f"The calibrated robot is worse than the nominal one: {figures}. Keep the nominal robot."
+        return [Finding("refused", text)]
+    if change < stdtrit(len(paired.before) - 1, MAX_CHANCE):
+        return []
+    text = f"The calibrated robot is not significantly better than the nominal one ({figures})"
+    return [Finding("caution", f"{text}. No correction is applied; measure more poses.", True)]
+
+
+def _overfitting(fit: Result) -> float:
+    """Return the increase of the squared error that the uncertainty of the parameters causes, relative to it.
+
+    A robot that needs no correction becomes worse by this much, which is no reason to doubt the measurements.
+    """
+    return fit.random_folds.prediction_std**2 if fit.random_folds else np.inf
+
+
+def _few_measurements(fit: Result) -> list[Finding]:
+    """Advise caution if there are too few measurements to apply the correction in full."""
+    return [Finding("caution", note, not fit.shrinkage_factor) for note in fit.shrinkage_notes]
+
+
+def _outliers(fit: Result) -> list[Finding]:
+    """Advise caution if many samples are outliers."""
+    n_outliers = sum(map(len, fit.outliers))
+    if n_outliers <= MAX_OUTLIER_SHARE * fit.n_samples:
+        return []
+    share = f"{100 * n_outliers / fit.n_samples:.0f} %"
+    text = f"{n_outliers} of {fit.n_samples} samples ({share}) are outliers. Check the measurements"
+    return [Finding("caution", f"{text}; --loss tukey reduces their influence.")]
+
+
+def _n_robot_parameters(fit: Result) -> int:
+    """Return the number of parameters of the robot itself that are estimated, without base and tool."""
+    frames = (BASE_FRAME, fit.errors.chain.tool_frame_index)
+    return sum(parameter.error_frame not in frames for parameter in fit.errors.parameters)
+
+
+def _join(names: list[str]) -> str:
+    """Join names with commas and a final "and"."""
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

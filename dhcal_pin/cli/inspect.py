@@ -1,0 +1,70 @@
+"""`dhcal inspect`: say what measurement files contain, without a fit."""
+
+from __future__ import annotations
+
+import os
+from argparse import ArgumentParser, Namespace
+from dataclasses import asdict
+
+from ..exceptions import InvalidArgumentError
+from .options import COLUMNS, DATA, JSON, ROBOT, add_urdf_options
+
+EXAMPLE = "dhcal inspect laser.csv --robot ur10.urdf --tip tool0"
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the arguments of `dhcal inspect`.
+
+    Args:
+        parser: Parser of the command.
+    """
+    parser.add_argument("data", **DATA)
+    parser.add_argument(
+        "--robot", **{**ROBOT, "help": f"compare with the joints and limits of this {ROBOT['help']}"}
+    )
+    parser.add_argument("--columns", **COLUMNS)
+    add_urdf_options(parser)
+    parser.add_argument("--json", **JSON)
+
+
+def run(args: Namespace) -> int:
+    """Show the content of files.
+
+    Args:
+        args: Parsed arguments.
+
+    Returns:
+        Exit status 0, also for a file that `dhcal calibrate` would refuse.
+
+    Raises:
+        InvalidArgumentError: A column map is given without a robot.
+    """
+    from ..diagnostics import inspect_file  # lazy import, as the following: they load Pinocchio
+    from ..io import read_robot
+    from ..report.document import file_digests
+    from . import console
+    from .outputs import existing_sidecars, require_writable_outputs, write_outputs
+
+    if args.columns and not args.robot:
+        raise InvalidArgumentError("--columns: needs --robot, as the map names its joints")
+    robots = [args.robot] if args.robot else []
+    inputs = [*robots, *existing_sidecars(robots), *args.data, *([args.columns] if args.columns else [])]
+    require_writable_outputs([args.json], inputs)
+    chain = read_robot(args.robot, args.tip, package_dirs=args.package_dir) if args.robot else None
+    inspections = [inspect_file(path, chain, args.columns) for path in args.data]
+    robot = None
+    if chain is not None:
+        robot = {"path": args.robot, "tip": chain.tip, "joints": list(chain.joint_names)}
+    document = {
+        "robot": robot,
+        "files": [asdict(inspection) for inspection in inspections],
+        "warnings": [f"{one.path}: {text}" for one in inspections for text in one.warnings],
+        "inputs": file_digests(inputs),
+    }
+    write_outputs({}, args.json, document)
+    if chain is not None:
+        robot_file = os.path.basename(args.robot)
+        console.print_lines(f"{robot_file}: tip {chain.tip}, {chain.n_joints} joints")
+    for inspection in inspections:
+        console.print_inspection(inspection)
+    return 0

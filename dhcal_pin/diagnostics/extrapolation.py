@@ -1,0 +1,147 @@
+"""How far measurements lie outside the region of joint space that a robot was calibrated in.
+
+The accuracy of a calibration is known within its measured region. Errors of samples inside and outside are
+therefore compared separately. Of new configurations that are drawn like those of the calibration, 5 % lie
+outside, see `measurements.measured_region`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..calibration.evaluation import Accuracy, compute_errors
+from ..calibration.summary import GROUP_LABELS
+from ..formatting import format_quantity
+from ..measurements.base import Measurement
+from ..measurements.measured_region import MeasuredRegion
+from ..robot.chain import Chain
+
+# A joint value is beyond the measured range of its joint if it exceeds it by more than this [rad or m].
+_MIN_EXCESS = 1e-6
+# Largest number of joints that a sentence names.
+_MAX_JOINTS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Extrapolation:
+    """Samples inside and outside the measured region of a calibration.
+
+    Attributes:
+        n_samples: Number of samples.
+        n_outside: Number of samples outside the region.
+        n_beyond_reach: Number of samples that are farther away than regions that were left out.
+        max_distance: Largest distance of a sample from the region's configurations, in radii of the region.
+        max_excess: Largest distance of a joint value from the measured range of each joint [rad or m]; only
+            joints that exceed it.
+        is_prismatic: Whether each of these joints is prismatic.
+        inside: Accuracy of the samples inside; empty if there are none.
+        outside: Accuracy of the samples outside; empty if there are none.
+    """
+
+    n_samples: int
+    n_outside: int
+    n_beyond_reach: int
+    max_distance: float
+    max_excess: Mapping[str, float]
+    is_prismatic: Mapping[str, bool]
+    inside: Accuracy
+    outside: Accuracy
+
+    @property
+    def sentences(self) -> list[str]:
+        """Sentences on the number of samples outside, the errors there, and the joints that exceed."""
+        if not self.n_samples:
+            return []
+        if not self.n_outside:
+            return [f"All {self.n_samples} samples are within the measured region of the calibration."]
+        share = 100 * self.n_outside / self.n_samples
+        out = [
+            f"{self.n_outside} of {self.n_samples} samples ({share:.0f} %) are outside the measured region "
+            "of the calibration."
+        ]
+        if self.n_beyond_reach:
+            out.append(
+                f"{self.n_beyond_reach} of them are farther away than the regions that were left out to "
+                "judge the calibration: no accuracy was stated there."
+            )
+        for group in [name for name in self.inside.groups if name in self.outside.groups]:
+            inside, outside = self.inside.groups[group], self.outside.groups[group]
+            texts = [
+                format_quantity(side.rms, side.unit, side.rms_std, small=True) for side in (inside, outside)
+            ]
+            out.append(f"RMS {GROUP_LABELS[group]}: {texts[0]} inside, {texts[1]} outside.")
+        exceeding = [
+            f"{name} by {1e3 * value:.0f} mm"
+            if self.is_prismatic[name]
+            else f"{name} by {np.rad2deg(value):.0f}°"
+            for name, value in self.max_excess.items()
+        ]
+        if not exceeding:
+            text = "No joint is beyond its measured range, but the combinations of joint values are new."
+            return [*out, text]
+        more = f" and {len(exceeding) - _MAX_JOINTS} more joints" if len(exceeding) > _MAX_JOINTS else ""
+        return [*out, f"Beyond the measured range: {', '.join(exceeding[:_MAX_JOINTS])}{more}."]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content for the JSON document."""
+        return {
+            "samples_outside": self.n_outside,
+            "samples_beyond_reach": self.n_beyond_reach,
+            "largest_distance": self.max_distance,
+            "largest_excess": dict(self.max_excess),
+            "inside": self.inside.to_dict(),
+            "outside": self.outside.to_dict(),
+        }
+
+
+def find_extrapolation(
+    region: MeasuredRegion, chain: Chain, data: Sequence[Measurement], known: Mapping[str, float]
+) -> Extrapolation:
+    """Find the samples outside the measured region of a calibration, and the errors inside and outside.
+
+    Args:
+        region: Measured region of the calibration.
+        chain: Calibrated chain.
+        data: Measurements of any kinds. Samples without joint values are ignored.
+        known: Values of instrument parameters by name [m or rad]; the others are fitted to the data.
+
+    Returns:
+        The samples and their errors. A sample with several configurations is outside if one of them is.
+    """
+    data = [item for item in data if item.configurations_per_row and len(item.rows)]
+    errors = compute_errors(chain, data, known)
+    # The distance of a sample is that of its farthest configuration.
+    distances = [
+        region.distances(item.configurations()).reshape(item.configurations_per_row, -1).max(0)
+        for item in data
+    ]
+    is_outside = [each > region.radius for each in distances]
+    inside, outside = (
+        Accuracy.from_errors(
+            [
+                {name: values[mask] for name, values in each.items()}
+                for each, mask in zip(errors, masks, strict=True)
+                if mask.any()
+            ]
+        )
+        for masks in ([np.logical_not(mask) for mask in is_outside], is_outside)
+    )
+    q = np.concatenate([item.configurations() for item in data] or [np.empty((0, chain.n_joints))])
+    excess = dict(zip(chain.joint_names, region.excess(q).max(0, initial=0.0).tolist(), strict=True))
+    beyond = {name: value for name, value in excess.items() if value > _MIN_EXCESS}
+    prismatic = dict(zip(chain.joint_names, chain.is_prismatic.tolist(), strict=True))
+    distance = max((float(each.max()) for each in distances), default=0.0)
+    return Extrapolation(
+        n_samples=sum(map(len, is_outside)),
+        n_outside=int(sum(mask.sum() for mask in is_outside)),
+        n_beyond_reach=int(sum(np.sum(each > region.reach) for each in distances)),
+        max_distance=distance / region.radius if region.radius else (np.inf if distance else 0.0),
+        max_excess=dict(sorted(beyond.items(), key=lambda item: -item[1])),
+        is_prismatic={name: prismatic[name] for name in beyond},
+        inside=inside,
+        outside=outside,
+    )

@@ -1,0 +1,305 @@
+"""What a measurement file contains, without a fit: columns, ranges, coverage, and rows that cannot be used.
+
+Without a robot, every column with the unit of a length or an angle that is no measured value counts as a
+joint. With a robot, ranges are compared with the joint limits, and the checks of `input_checks` are made.
+
+The coverage of a revolute joint is the share of 5° bins that its positions visited: of those within the joint
+limits if the robot is known, otherwise of all bins between its smallest and its largest position. Joint
+positions that differ by less than a milliradian and a millimetre are one configuration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+
+from .._typing import Array, PathLike
+from ..exceptions import DhcalError
+from ..formatting import Table
+from ..io.measurement_files import columns as file_columns
+from ..io.measurement_files.map_proposal import header_problem, propose_map
+from ..io.measurement_files.reading import (
+    MeasurementFile,
+    open_measurement_table,
+    parse_measurements,
+)
+from ..io.tables import Column, DataTable, read_table
+from ..robot.chain import Chain
+from ..robot.coverage import BIN_WIDTH_RAD, joint_coverage
+from ..units import ANGLES, LENGTHS
+from .input_checks import find_input_warnings, first_equal_rows
+
+# Decimals to which joint positions of one configuration are equal [rad or m].
+_CONFIGURATION_DECIMALS = 3
+# A column is numeric if at least this share of its cells are numbers.
+_MIN_NUMERIC_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class ColumnSummary:
+    """Content of a column.
+
+    Attributes:
+        name: Name in the header, or number of a column without a name.
+        unit: Unit in the header.
+        role: "joint", "measured", "sigma", "other" (such as the set or commanded positions) or "ignored".
+        minimum: Smallest number, in `unit`; None for texts.
+        maximum: Largest number, in `unit`; None for texts.
+        lower: Lower joint limit, in `unit`; None without a robot or a limit.
+        upper: Upper joint limit, in `unit`; None without a robot or a limit.
+        coverage: Share of the 5° bins that were visited; None for columns other than revolute joints.
+        counts: Number of rows with each text; empty for numbers.
+    """
+
+    name: str
+    unit: str
+    role: str
+    minimum: float | None = None
+    maximum: float | None = None
+    lower: float | None = None
+    upper: float | None = None
+    coverage: float | None = None
+    counts: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FileInspection:
+    """Content of a measurement file.
+
+    Attributes:
+        path: Name of the file.
+        form: How it is written, such as "semicolons, decimal commas".
+        rows: Number of rows with values, usable or not.
+        first_line: Line of the first row.
+        last_line: Line of the last row.
+        kind: Measurement kind; empty if the columns are those of none.
+        columns: Content of each column.
+        configurations: Number of different configurations; None if no joint is known.
+        repeated_lines: Lines that are equal to an earlier one in all joints and measured values.
+        bad_rows: Reason why a row cannot be used, by line.
+        problem: Error that `dhcal calibrate` would raise; empty if it reads the file.
+        column_map: Lines of a column map that would read a file with unknown columns; empty if not needed.
+        warnings: Suspected mistakes, one sentence each.
+        notes: What of the file is not read, such as further sheets.
+    """
+
+    path: str
+    form: str
+    rows: int
+    first_line: int
+    last_line: int
+    kind: str
+    columns: tuple[ColumnSummary, ...]
+    configurations: int | None
+    repeated_lines: tuple[int, ...]
+    bad_rows: Mapping[int, str]
+    problem: str = ""
+    column_map: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def inspect_file(
+    source: PathLike | Any, chain: Chain | None = None, columns: PathLike | None = None
+) -> FileInspection:
+    """Say what a measurement file contains.
+
+    Args:
+        source: Measurement file, or a data frame.
+        chain: Nominal robot; without it the joints are not compared with anything.
+        columns: Column map for a file of another maker; needs a robot.
+
+    Returns:
+        The content. A file that is no table is an error.
+    """
+    if chain is None:
+        table = read_table(source)
+        return _inspect_table(table, None)
+    table = open_measurement_table(source, chain, columns)
+    try:
+        file = parse_measurements(table, chain, skip_bad_rows=True)
+    except DhcalError as error:
+        inspection = _inspect_table(table, chain)
+        if file_columns.needs_column_map(table, chain):
+            lines = tuple(propose_map(table, chain))
+            return replace(inspection, problem=header_problem(table, chain), column_map=lines)
+        return replace(inspection, problem=str(error))
+    return replace(
+        _inspect_table(table, chain),
+        configurations=_count_configurations(file),
+        bad_rows=file.bad_rows,
+        warnings=tuple(find_input_warnings(chain, file)),
+    )
+
+
+def _names(table: DataTable) -> Mapping[str, Column]:
+    """Return the columns by name; none if the header cannot be read."""
+    try:
+        return table.columns
+    except DhcalError:
+        return {}
+
+
+def _is_numeric(table: DataTable, index: int) -> bool:
+    """Return whether most cells of a column are numbers."""
+    values = table.values(index)
+    return np.isfinite(values).sum() >= max(1, _MIN_NUMERIC_SHARE * len(values))
+
+
+def _role(column: Column, chain: Chain | None) -> str:
+    """Return the role of a column; without a robot, an unknown column with a unit is a joint."""
+    name = column.name
+    if name in file_columns.VALUE_COLUMNS:
+        return "sigma" if name.startswith("sigma_") else "measured"
+    if name in file_columns.AUXILIARY_COLUMNS:
+        return "other"
+    if chain is None:
+        return "joint" if column.unit in {*LENGTHS, *ANGLES} else "ignored"
+    return "joint" if name.removeprefix(file_columns.SECOND_PREFIX) in chain.joint_names else "ignored"
+
+
+def _inspect_table(table: DataTable, chain: Chain | None) -> FileInspection:
+    """Summarize the columns and rows of a table."""
+    lines = sorted([*table.lines, *table.bad_rows])
+    named = {column.index: column for column in _names(table).values()}
+    try:
+        kind = file_columns.find_kind(table).kind if named else ""
+    except DhcalError:
+        kind = ""
+    numeric = [
+        i for i in named if _role(named[i], chain) not in ("other", "ignored") and _is_numeric(table, i)
+    ]
+    usable = table.without_bad_rows(numeric)
+    summaries = tuple(
+        _summarize_column(usable, named.get(i) or Column(str(i + 1), "", i), chain if i in named else None)
+        for i in range(len(table.headers))
+        if i in named or table.has_numbers_as_header or any(row[i].strip() for row in table.cells)
+    )
+    compared = [
+        _comparable(usable, column)
+        for column in named.values()
+        if _role(column, chain) in ("joint", "measured")
+    ]
+    original = first_equal_rows(compared)
+    repeated = np.flatnonzero(original < np.arange(len(original)))
+    return FileInspection(
+        path=table.source,
+        form=table.description,
+        rows=len(lines),
+        first_line=lines[0],
+        last_line=lines[-1],
+        kind=kind,
+        columns=summaries,
+        configurations=None,
+        repeated_lines=tuple(usable.lines[row] for row in repeated.tolist()),
+        bad_rows=usable.bad_rows,
+        notes=table.notes,
+    )
+
+
+def _comparable(table: DataTable, column: Column) -> Array:
+    """Return the numbers or texts of a column, (m,)."""
+    is_numeric = _is_numeric(table, column.index)
+    return table.values(column.index) if is_numeric else np.array(table.text(column), str)
+
+
+def _summarize_column(table: DataTable, column: Column, chain: Chain | None) -> ColumnSummary:
+    """Summarize one column."""
+    is_unnamed = not table.headers[column.index] or table.has_numbers_as_header
+    role = "ignored" if is_unnamed else _role(column, chain)
+    if not _is_numeric(table, column.index):
+        texts, counts = np.unique(table.text(column), return_counts=True)
+        by_text = dict(zip(texts.tolist(), counts.tolist(), strict=True))
+        return ColumnSummary(column.name, column.unit, role, counts=by_text)
+    values = table.values(column.index)
+    values = values[np.isfinite(values)]
+    summary = ColumnSummary(
+        column.name, column.unit, role, float(values.min(initial=np.inf)), float(values.max(initial=-np.inf))
+    )
+    if role != "joint":
+        return summary
+    name = column.name.removeprefix(file_columns.SECOND_PREFIX)
+    divisor = {**LENGTHS, **ANGLES}.get(column.unit)
+    if divisor is None or (chain is not None and column.unit not in file_columns.joint_units(chain, name)):
+        return summary
+    if chain is None:
+        coverage = _coverage_of_range(values / divisor) if column.unit in ANGLES else None
+        return replace(summary, coverage=coverage)
+    j = chain.joint_names.index(name)
+    lower, upper = (
+        float(limit * divisor) if np.isfinite(limit) else None for limit in (chain.lower[j], chain.upper[j])
+    )
+    return replace(
+        summary, lower=lower, upper=upper, coverage=_coverage_of_limits(chain, j, values / divisor)
+    )
+
+
+def _coverage_of_range(values: Array) -> float:
+    """Return the share of visited bins between the smallest and the largest of angles (m,) [rad]."""
+    bins = np.unique(np.rint(values / BIN_WIDTH_RAD))
+    return len(bins) / (bins[-1] - bins[0] + 1)
+
+
+def _coverage_of_limits(chain: Chain, joint: int, values: Array) -> float | None:
+    """Return the share of visited bins within the limits of a joint; None if it is prismatic."""
+    if chain.is_prismatic[joint]:
+        return None
+    q = np.zeros((len(values), chain.n_joints))
+    q[:, joint] = values
+    by_name = {one.joint: one for one in joint_coverage(chain, q)}
+    return by_name[chain.joint_names[joint]].share
+
+
+def _count_configurations(file: MeasurementFile) -> int | None:
+    """Count the different configurations of a file."""
+    if not file.data.configurations_per_row:
+        return None
+    return len(np.unique(np.round(file.data.configurations(), _CONFIGURATION_DECIMALS), axis=0))
+
+
+# --- table for people ------------------------------------------------------------------------------
+
+
+def column_table(columns: Sequence[ColumnSummary]) -> Table:
+    """Make a table of the columns of numbers; those of one rotation, and of sigmas, share a row.
+
+    Args:
+        columns: Content of the columns.
+
+    Returns:
+        Table of ranges, limits and coverage, in the units of the file. Columns that are ignored are only in
+        it if all are, as in a file without a known header.
+    """
+    is_foreign = all(column.role == "ignored" for column in columns)
+    numeric = [
+        column
+        for column in columns
+        if column.minimum is not None and column.maximum is not None
+        if is_foreign or column.role != "ignored"
+    ]
+    rows = []
+    for _, group in groupby(numeric, _group_key):
+        members = list(group)
+        first, last = members[0], members[-1]
+        names = first.name if len(members) == 1 else f"{first.name} … {last.name}"
+        low = min(column.minimum for column in members if column.minimum is not None)
+        high = max(column.maximum for column in members if column.maximum is not None)
+        limits = [f"{limit:.6g}" if limit is not None else "–" for limit in (first.lower, first.upper)]
+        has_limits = first.lower is not None or first.upper is not None
+        coverage = "" if first.coverage is None else f"{100 * first.coverage:.0f} %"
+        cells = [f"{low:.6g}", f"{high:.6g}", " to ".join(limits) if has_limits else "", coverage]
+        rows.append([names, first.unit, *cells])
+    return Table(["column", "unit", "smallest", "largest", "limits", "5° bins"], rows, n_text_columns=2)
+
+
+def _group_key(column: ColumnSummary) -> tuple[str, ...]:
+    """Return the key of the columns that share a row of the table."""
+    name = column.name
+    for group in (file_columns.QUATERNION, file_columns.ROTVEC, file_columns.COMMANDED, file_columns.AFTER):
+        if name in group:
+            return (*group, column.unit)
+    return ("sigma", column.unit) if column.role == "sigma" else (name,)

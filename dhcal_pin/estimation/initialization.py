@@ -1,0 +1,240 @@
+"""Initialization of unknown base and tool frames from the measurements, without a guess by the user.
+
+The base frame B places the robot in the measuring frame, the tool frame (rotation R_T, offset t) places the
+measured target on the tip. With F_i the tip pose of the nominal robot, a sample measures a position p_i,
+and for a pose also a rotation R_i:
+
+    p_i ≈ B·(F_i·t),    R_i ≈ R_B·R_Fi·R_T.
+
+1. For a fixed offset t, the base has a closed form: the rigid motion that aligns the points F_i·t with the
+   p_i in the least-squares sense, from the singular value decomposition of their covariance (Kabsch 1976;
+   Arun, Huang and Blostein 1987).
+2. If t is unknown, it is tried on a grid of 27 points around the tip, and the best candidates are kept.
+3. The tool rotation is the mean of R_Fiᵀ·R_Bᵀ·R_i, projected on the rotations.
+4. Each candidate is refined by a nonlinear fit of the frames alone, and the best one is kept.
+
+Positions come first because they determine the base even if the orientations hardly vary. A start from the
+rotations (hand-eye calibration) then ends in a wrong minimum.
+
+`fit_frames` is also used to compare the accuracy before and after a calibration: the nominal robot, with the
+base and tool frames that fit the same measurements best.
+
+Shapes: m samples, n joints, p unknowns of the robot.
+
+References:
+    W. Kabsch, A Solution for the Best Rotation to Relate Two Sets of Vectors, Acta Cryst. A 32, 1976.
+    K. Arun, T. Huang and S. Blostein, Least-Squares Fitting of Two 3-D Point Sets, IEEE PAMI 9, 1987.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from .. import se3
+from .._typing import Array
+from ..measurements.base import Measurement
+from ..robot.chain import BASE_FRAME, Chain
+from ..se3 import nearest_rotation
+from .error_model import ErrorModel
+from .problem import Problem, merge_instrument_parameters
+from .solver import minimize, next_iterate
+
+# Spacing of the grid of tool offsets that are tried [m].
+_TOOL_OFFSET = 0.25
+# Largest number of samples of each measurement that candidates are computed from and compared with.
+_MAX_SAMPLES = 100
+# Number of candidates that are refined by a fit.
+_MAX_CANDIDATES = 4
+# No further candidates are tried once the relative misfit of the best one is below this.
+GOOD_RELATIVE_MISFIT = 0.01
+# Largest number of iterations of a fit of the frames to all data.
+_MAX_ITERATIONS = 100
+
+
+def align(source: Array, target: Array) -> tuple[Array, Array]:
+    """Compute the rigid motions that align points with others in the least-squares sense.
+
+    Args:
+        source: Points to move, shape (..., m, 3) [m].
+        target: Points to reach, shape (m, 3) [m].
+
+    Returns:
+        Motions, shape (..., 4, 4), and RMS distances after them, shape (...) [m].
+    """
+    source_mean, target_mean = source.mean(-2), target.mean(0)
+    a, b = source - source_mean[..., None, :], target - target_mean
+    product = b.T @ a
+    rotation = nearest_rotation(product)
+    motion = se3.transform(rotation, target_mean - (rotation @ source_mean[..., None])[..., 0])
+    # Sum of |R·a - b|² of the centred points.
+    cost = np.vdot(b, b) + np.sum(a**2, (-2, -1)) - 2 * np.sum(rotation * product, (-2, -1))
+    return motion, np.sqrt(np.maximum(cost, 0.0) / len(target))
+
+
+def subsample(item: Measurement) -> Measurement:
+    """Take at most 100 samples of a measurement, drawn at random as their order may be systematic.
+
+    Args:
+        item: Measurement.
+
+    Returns:
+        The same kind of measurement with the drawn samples in their order.
+    """
+    return item.take(np.sort(np.random.default_rng(0).permutation(len(item.rows))[:_MAX_SAMPLES]))
+
+
+def candidate_frames(
+    chain: Chain, data: Sequence[Measurement], is_base_unknown: bool, is_tool_unknown: bool
+) -> Iterator[Chain]:
+    """Generate chains with base and tool computed from the measured positions, the best aligned first.
+
+    Nothing is generated with fewer than three measured positions.
+
+    Args:
+        chain: Nominal chain.
+        data: Measurements of any kinds.
+        is_base_unknown: Whether to compute the base; otherwise that of the chain is used.
+        is_tool_unknown: Whether to compute the tool; otherwise that of the chain is used.
+
+    Yields:
+        Chains that differ by base and tool.
+    """
+    with_positions = [item for item in data if len(item.positions())]
+    bare = chain.with_base_and_tool(np.eye(4), np.eye(4))
+    tips = [bare.poses(item.q) for item in with_positions]
+    if sum(len(pose) for pose in tips) < 3 or not (is_base_unknown or is_tool_unknown):
+        return
+    tip = np.concatenate(tips)
+    measured = np.concatenate([item.positions() for item in with_positions])
+    if not is_base_unknown:
+        # With a known base the target is measured directly in the tip frame.
+        local = se3.inverse(chain.base @ tip)
+        offset = np.mean((local[:, :3, :3] @ measured[..., None])[..., 0] + local[:, :3, 3], 0)
+        best = [(chain.base, offset)]
+    else:
+        steps = [0.0, -_TOOL_OFFSET, _TOOL_OFFSET]
+        grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
+        offsets = grid if is_tool_unknown else chain.tool[None, :3, 3]
+        points = tip[:, :3, 3] + (tip[:, :3, :3] @ offsets.T).transpose(2, 0, 1)
+        motions, distances = align(points, measured)
+        order = np.argsort(distances, kind="stable")[:_MAX_CANDIDATES]
+        best = [(motions[k], offsets[k]) for k in order]
+    for base, offset in best:
+        rotation = chain.tool[:3, :3]
+        rotations = [
+            np.swapaxes((base @ pose)[:, :3, :3], 1, 2) @ item.rotations()
+            for pose, item in zip(tips, with_positions, strict=True)
+            if len(item.rotations())
+        ]
+        if is_tool_unknown and rotations:
+            rotation = nearest_rotation(np.concatenate(rotations).sum(0))
+        yield chain.with_base_and_tool(base, se3.transform(rotation, offset))
+
+
+def relative_misfit(chain: Chain, data: Sequence[Measurement]) -> float:
+    """Compute the RMS position error relative to the RMS distance of the positions from their mean.
+
+    Args:
+        chain: Chain with base and tool.
+        data: Measurements, some of which contain positions.
+
+    Returns:
+        The ratio; infinite if all measured positions are equal.
+    """
+    with_positions = [item for item in data if len(item.positions())]
+    measured = np.concatenate([item.positions() for item in with_positions])
+    modelled = np.concatenate([chain.poses(item.q)[:, :3, 3] for item in with_positions])
+    spread = np.linalg.norm(measured - measured.mean(0))
+    return float(np.linalg.norm(measured - modelled) / spread) if spread else np.inf
+
+
+def make_problem(
+    errors: ErrorModel, data: tuple[Measurement, ...], weights: Array, known: Mapping[str, float]
+) -> Problem:
+    """Make the least-squares problem of a robot and its instruments.
+
+    Instrument parameters have wide priors of their own if the robot has any priors.
+
+    Args:
+        errors: Nominal chain and its p unknown parameters.
+        data: Measurements with initialized instrument parameters.
+        weights: One over the prior standard deviations of the robot's parameters, shape (p,); 0 without.
+        known: Values of instrument parameters by name [m or rad].
+
+    Returns:
+        The problem.
+    """
+    wide = np.array(
+        [
+            1 / parameter.prior
+            for parameter in merge_instrument_parameters(data)
+            if parameter.name not in known
+        ]
+    )
+    return Problem(errors, data, np.concatenate([weights, wide * np.any(weights)]), known)
+
+
+def _fit_frames(
+    frames: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float], max_iterations: int
+) -> tuple[float, Chain]:
+    """Fit base and tool alone; return the approximate cost and the chain with them."""
+    data = tuple(item.initialized(frames.chain) for item in data)
+    problem = make_problem(frames, data, 1 / frames.priors, known)
+    solution = minimize(problem, max_iterations=max_iterations, loose=True)
+    cost = solution.system.cost + float(np.sum((problem.weights * solution.x) ** 2))
+    return cost, frames.at(next_iterate(problem, solution)[: len(frames.parameters)])
+
+
+def initialize_frames(
+    errors: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float], max_iterations: int
+) -> ErrorModel:
+    """Initialize unknown base and tool frames from a subsample of the measurements.
+
+    Args:
+        errors: Nominal chain and its unknown parameters.
+        data: Measurements of any kinds.
+        known: Values of instrument parameters by name [m or rad].
+        max_iterations: Largest number of iterations of each fit.
+
+    Returns:
+        The same parameters on the nominal chain with these frames.
+    """
+    frames = errors.only_frames()
+    if frames is None:
+        return errors
+    unknown_frames = {p.error_frame for p in frames.parameters}
+    drawn = tuple(subsample(item) for item in data)
+    best: tuple[float, Chain] | None = None
+    for start in candidate_frames(
+        errors.chain,
+        drawn,
+        BASE_FRAME in unknown_frames,
+        errors.chain.tool_frame_index in unknown_frames,
+    ):
+        fitted = _fit_frames(replace(frames, chain=start), drawn, known, max_iterations)
+        best = fitted if best is None else min(best, fitted, key=lambda each: each[0])
+        if relative_misfit(best[1], drawn) < GOOD_RELATIVE_MISFIT:
+            break
+    best = best or _fit_frames(frames, data, known, max_iterations)
+    return replace(errors, chain=best[1])
+
+
+def fit_frames(errors: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float]) -> Chain:
+    """Fit the unknown base and tool frames of the nominal chain to all measurements.
+
+    Args:
+        errors: Nominal chain and its unknown parameters.
+        data: Measurements of any kinds.
+        known: Values of instrument parameters by name [m or rad].
+
+    Returns:
+        The nominal chain with these frames.
+    """
+    frames = errors.only_frames()
+    if frames is None:
+        return errors.chain.with_current_loads()
+    start = replace(frames, chain=errors.chain.with_current_loads())
+    return _fit_frames(start, data, known, _MAX_ITERATIONS)[1]

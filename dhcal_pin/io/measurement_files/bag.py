@@ -1,0 +1,340 @@
+"""Recordings of ROS 1, ROS 2 and MCAP, read with rosbags (`pip install 'dhcal-pin[bags]'`).
+
+The joint positions come from a topic of `sensor_msgs/JointState`, the measured positions or poses from a
+topic of one of `POSE_TYPES`. Times are those in the headers of the messages; if the headers of the two topics
+have no time in common, the times at which the messages were recorded. The stops of the arm become the rows of
+a measurement file, see `standstills`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from ... import se3
+from ..._typing import Array, PathLike
+from ...exceptions import DhcalError, FileFormatError, InvalidArgumentError
+from ...measurements.base import Measurement
+from ...measurements.pose import Pose
+from ...measurements.position import Position
+from ...robot.chain import Chain
+from ..tabular import csv_text, require_usable_names
+from .standstills import JointSeries, PoseSeries, Stops, find_stops
+from .writing import joint_columns, value_columns
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+
+# Endings of recordings that are one file; ROS 2 writes folders.
+ENDINGS = (".bag", ".mcap", ".db3")
+_JOINT_STATE = "sensor_msgs/msg/JointState"
+# Topic that is read if there are several of joint positions.
+_USUAL_JOINT_TOPIC = "/joint_states"
+# Separator between a topic of transforms and the child frame.
+_FRAME_SEPARATOR = ":"
+# Messages of a topic of transforms that are searched for frames.
+_N_TRANSFORM_MESSAGES = 500
+# Smallest norm of a quaternion that is a rotation.
+_MIN_NORM = 0.5
+_NANO = 1e-9
+
+
+class _PoseSample(NamedTuple):
+    """Position, quaternion (x, y, z, w) if there is one, and frame of a message."""
+
+    header: Any
+    position: Any
+    quaternion: Any
+
+
+class _RecordedJoints(NamedTuple):
+    """Joint positions with two times of each message [s], columns of (k, 2): its header, its recording."""
+
+    names: tuple[str, ...]
+    times: Array
+    q: Array
+
+
+class _RecordedPoses(NamedTuple):
+    """Poses with two times of each message [s], columns of (p, 2): its header, its recording."""
+
+    times: Array
+    positions: Array
+    rotations: Array | None
+    frame: str
+
+
+# Function that takes position and rotation from a message of each type.
+POSE_TYPES: Mapping[str, Callable[[Any], _PoseSample]] = {
+    "geometry_msgs/msg/PoseStamped": lambda m: _PoseSample(m.header, m.pose.position, m.pose.orientation),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m: _PoseSample(
+        m.header, m.pose.pose.position, m.pose.pose.orientation
+    ),
+    "geometry_msgs/msg/PointStamped": lambda m: _PoseSample(m.header, m.point, None),
+    "geometry_msgs/msg/TransformStamped": lambda m: _PoseSample(
+        m.header, m.transform.translation, m.transform.rotation
+    ),
+    "nav_msgs/msg/Odometry": lambda m: _PoseSample(m.header, m.pose.pose.position, m.pose.pose.orientation),
+}
+# Types of messages with several transforms.
+_TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+
+
+class ConvertedBag(NamedTuple):
+    """Measurement file made from a recording.
+
+    Attributes:
+        text: Text of the CSV file.
+        notes: Sentences on the recording.
+    """
+
+    text: str
+    notes: list[str]
+
+
+def is_bag(path: PathLike) -> bool:
+    """Return whether a path is that of a recording: by its ending, or a folder of ROS 2.
+
+    Args:
+        path: Path of a file or a folder.
+    """
+    return os.fspath(path).lower().endswith(ENDINGS) or os.path.exists(os.path.join(path, "metadata.yaml"))
+
+
+def convert_bag(
+    path: PathLike, pose_topic: str | None, joint_topic: str | None = None, chain: Chain | None = None
+) -> ConvertedBag:
+    """Make a measurement file from the stops of a recording.
+
+    Args:
+        path: Recording.
+        pose_topic: Topic of the measured positions or poses; `TOPIC:FRAME` for a child frame of a topic of
+            transforms.
+        joint_topic: Topic of the joint positions; if None the only one of its type, or `/joint_states`.
+        chain: Robot, whose joints are written; without it all joints are written, as revolute ones.
+
+    Returns:
+        Text of the file, and notes.
+
+    Raises:
+        InvalidArgumentError: A topic is missing; the message names the candidates.
+        FileFormatError: The recording cannot be read, or has no stops.
+    """
+    source = os.fspath(path)
+    with _open_bag(source) as reader:
+        joint_topic = _choose_joint_topic(reader, source, joint_topic)
+        if pose_topic is None or not _has_pose_topic(reader, pose_topic):
+            problem = "name the topic of the measured poses with --pose-topic"
+            if pose_topic is not None:
+                problem = f"--pose-topic {pose_topic}: no topic of positions or poses"
+            candidates = ", ".join(_pose_candidates(reader)) or "none"
+            raise InvalidArgumentError(f"{source}: {problem}; candidates: {candidates}")
+        joints = _read_joints(reader, source, joint_topic, chain)
+        poses = _read_poses(reader, source, pose_topic)
+    notes = []
+    # Column of the times that are used.
+    clock = 0
+    if not _have_common_times(joints.times[:, 0], poses.times[:, 0]):
+        clock = 1
+        notes.append("the stamps of the topics have no time in common; the times of the recording are used")
+    try:
+        stops = find_stops(*_in_order(joints, poses, clock))
+    except DhcalError as error:
+        raise FileFormatError(f"{source}: {joint_topic}, {pose_topic}: {error}") from None
+    frame = poses.frame or "unknown"
+    notes = [
+        f"{_count_stops(len(stops.q))} of {joint_topic} and {pose_topic} (frame {frame})",
+        *notes,
+        f"the clock of {pose_topic} is {stops.clock_offset:+.2f} s off that of {joint_topic}",
+    ]
+    if stops.n_without_poses:
+        notes.append(f"left out {_count_stops(stops.n_without_poses)} without a pose")
+    return ConvertedBag(_stops_text(stops, joints.names, chain, [f"{source}: {notes[0]}", *notes[1:]]), notes)
+
+
+def _count_stops(count: int) -> str:
+    return f"{count} stop{'' if count == 1 else 's'}"
+
+
+def _stops_text(stops: Stops, names: tuple[str, ...], chain: Chain | None, comments: list[str]) -> str:
+    """Return the text of a measurement file with one row per stop."""
+    data: Measurement
+    if stops.rotations is None:
+        data = Position(stops.q, stops.positions)
+    else:
+        data = Pose(stops.q, se3.transform(stops.rotations, stops.positions))
+    if chain is not None:
+        joints = joint_columns(stops.q, chain)
+    else:
+        joints = {f"{name}[rad]": stops.q[:, j].tolist() for j, name in enumerate(names)}
+    times = np.round(stops.times - stops.times[0], 3).tolist()
+    return csv_text({"time[s]": times, **joints, **value_columns(data)}, comments)
+
+
+# --- reading ---------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _open_bag(source: str) -> Iterator[AnyReader]:
+    """Open a recording; errors of its content become errors that name it."""
+    try:
+        from rosbags.highlevel import AnyReader  # lazy import: an optional package
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise FileFormatError(
+            f"{source}: reading recordings needs rosbags; install it with pip install 'dhcal-pin[bags]'"
+        ) from None
+    if not os.path.exists(source):
+        raise FileFormatError(
+            f"{source}: cannot read it: no such file or folder; give the path of a recording"
+        )
+    try:
+        with AnyReader([Path(source)], default_typestore=get_typestore(Stores.LATEST)) as reader:
+            yield reader
+    except DhcalError:
+        raise
+    # A damaged recording raises errors of many types, such as those of its decompressor or database.
+    except Exception as error:
+        reason = str(error) or type(error).__name__
+        raise FileFormatError(f"{source}: not a readable recording: {reason}; record it again") from error
+
+
+def _choose_joint_topic(reader: AnyReader, source: str, wanted: str | None) -> str:
+    """Return the topic of the joint positions."""
+    topics = [name for name, info in reader.topics.items() if info.msgtype == _JOINT_STATE]
+    if wanted is not None and wanted in topics:
+        return wanted
+    if wanted is None and (len(topics) == 1 or _USUAL_JOINT_TOPIC in topics):
+        return topics[0] if len(topics) == 1 else _USUAL_JOINT_TOPIC
+    problem = "name the topic of the joint positions with --joint-topic"
+    if wanted is not None:
+        problem = f"--joint-topic {wanted}: no topic of joint positions"
+    raise InvalidArgumentError(f"{source}: {problem}; candidates: {', '.join(topics) or 'none'}")
+
+
+def _has_pose_topic(reader: AnyReader, spec: str) -> bool:
+    """Return whether a recording has a topic of poses, or of transforms if the child frame is given."""
+    topic, _, frame = spec.partition(_FRAME_SEPARATOR)
+    info = reader.topics.get(topic)
+    if info is None:
+        return False
+    return info.msgtype in _TRANSFORMS if frame else info.msgtype in POSE_TYPES
+
+
+def _pose_candidates(reader: AnyReader) -> list[str]:
+    """Describe the topics that poses can be read from."""
+    out = []
+    for name, info in reader.topics.items():
+        if info.msgtype in POSE_TYPES:
+            kind = os.path.basename(info.msgtype or "")
+            out.append(f"{name} ({kind}, {info.msgcount} messages)")
+        if info.msgtype in _TRANSFORMS:
+            frames: dict[str, str] = {}
+            for number, (_, message) in enumerate(_messages(reader, name)):
+                frames |= {each.child_frame_id: each.header.frame_id for each in message.transforms}
+                if number > _N_TRANSFORM_MESSAGES:
+                    break
+            out += [f"{name}{_FRAME_SEPARATOR}{child} (in {frame})" for child, frame in frames.items()]
+    return out
+
+
+def _messages(reader: AnyReader, topic: str) -> Iterator[tuple[float, Any]]:
+    """Yield the messages of a topic with the times at which they were recorded [s]."""
+    connections = [connection for connection in reader.connections if connection.topic == topic]
+    for connection, timestamp, data in reader.messages(connections):
+        yield timestamp * _NANO, reader.deserialize(data, connection.msgtype)
+
+
+def _stamp(header: Any) -> float:
+    """Return the time in a header [s]."""
+    return header.stamp.sec + header.stamp.nanosec * _NANO
+
+
+def _read_joints(reader: AnyReader, source: str, topic: str, chain: Chain | None) -> _RecordedJoints:
+    """Read the joint positions, of the robot's joints only if it is known."""
+    times, rows = [], []
+    current: dict[str, float] = {}
+    wanted = tuple(chain.joint_names) if chain is not None else None
+    names = wanted
+    for recorded, message in _messages(reader, topic):
+        # Drivers may publish the joints of arm and gripper in messages of their own.
+        current |= dict(zip(message.name, np.asarray(message.position, float).tolist(), strict=False))
+        if wanted is None:
+            names = tuple(current)
+        if names and all(name in current for name in names):
+            times.append((_stamp(message.header), recorded))
+            rows.append([current[name] for name in names])
+    if not rows or names is None:
+        problem = "has no joint positions"
+        if missing := [name for name in wanted or () if name not in current]:
+            problem = f"has no joint {missing[0]!r}; its joints are {', '.join(current) or 'none'}"
+        raise FileFormatError(f"{source}: {topic} {problem}")
+    require_usable_names(names, f"{source}: {topic}")
+    # The first messages may lack the joints of another driver.
+    complete = [i for i, row in enumerate(rows) if len(row) == len(names) and np.isfinite(row).all()]
+    if not complete:
+        raise FileFormatError(f"{source}: {topic} has no finite joint positions")
+    return _RecordedJoints(
+        names, np.array([times[i] for i in complete]), np.array([rows[i] for i in complete])
+    )
+
+
+def _read_poses(reader: AnyReader, source: str, spec: str) -> _RecordedPoses:
+    """Read positions or poses."""
+    topic, _, child = spec.partition(_FRAME_SEPARATOR)
+    times, positions, quaternions, frame = [], [], [], ""
+    for recorded, message in _messages(reader, topic):
+        for sample in _samples_of(reader.topics[topic].msgtype or "", message, child):
+            point, quaternion = sample.position, sample.quaternion
+            # Some trackers send NaN while they do not see the target.
+            if not np.isfinite((point.x, point.y, point.z)).all():
+                continue
+            times.append((_stamp(sample.header), recorded))
+            positions.append((point.x, point.y, point.z))
+            if quaternion is not None:
+                quaternions.append((quaternion.w, quaternion.x, quaternion.y, quaternion.z))
+            frame = sample.header.frame_id
+    if not positions:
+        raise FileFormatError(f"{source}: {spec} has no finite positions")
+    rotations = _rotations(np.array(quaternions), f"{source}: {spec}") if quaternions else None
+    return _RecordedPoses(np.array(times), np.array(positions, float), rotations, frame)
+
+
+def _samples_of(message_type: str, message: Any, child: str) -> Iterator[_PoseSample]:
+    """Yield the poses of a message; of a list of transforms those of one child frame."""
+    if message_type in _TRANSFORMS:
+        for transform in message.transforms:
+            if transform.child_frame_id == child:
+                yield POSE_TYPES["geometry_msgs/msg/TransformStamped"](transform)
+    else:
+        yield POSE_TYPES[message_type](message)
+
+
+def _rotations(quaternions: Array, where: str) -> Array:
+    """Convert quaternions (w, x, y, z), shape (p, 4), to rotation matrices, shape (p, 3, 3)."""
+    norms = np.linalg.norm(quaternions, axis=1)
+    if not (norms > _MIN_NORM).all():
+        raise FileFormatError(f"{where}: has a quaternion of norm {norms.min():.3g}; expected 1")
+    return se3.quaternion_to_matrix(quaternions / norms[:, None])
+
+
+def _have_common_times(first: Array, second: Array) -> bool:
+    """Return whether two series of times overlap, and none of them has the same time in all messages."""
+    is_set = all(len(times) == 1 or np.ptp(times) > 0 for times in (first, second))
+    return is_set and bool(first.min() <= second.max() and second.min() <= first.max())
+
+
+def _in_order(joints: _RecordedJoints, poses: _RecordedPoses, clock: int) -> tuple[JointSeries, PoseSeries]:
+    """Return the series in the order of one clock, without repeated times."""
+    joint_times, i = np.unique(joints.times[:, clock], return_index=True)
+    pose_times, j = np.unique(poses.times[:, clock], return_index=True)
+    rotations = None if poses.rotations is None else poses.rotations[j]
+    return (
+        JointSeries(joints.names, joint_times, joints.q[i]),
+        PoseSeries(pose_times, poses.positions[j], rotations, poses.frame),
+    )

@@ -1,0 +1,294 @@
+"""Column maps: read measurement files of other vendors.
+
+A column map is a TOML file that describes the columns of a vendor's file. Every key except the columns
+themselves has a default:
+
+    separator = ";"        # ",", ";", "tab", or "space" for any white space; detected by default
+    decimal = ","          # "." or ","; detected by default
+    skip = 2               # number of lines before the header (default 0)
+    header = true          # false: the file has no header; columns are numbers counted from 1
+    comment = "#"          # start of a comment line; "" if there are none
+    encoding = "cp1252"    # UTF-8 by default
+
+    [joints]               # joints of the robot from base to tip, or those in `names`
+    order = ["A1", "A2"]   # header or number of each joint's column
+    unit = "deg"           # or one unit per joint, such as ["deg", "mm"]
+    sign = [1, -1]         # optional
+    offset = [0.0, 90.0]   # optional, in that unit: joint = sign * column + offset
+
+    [columns]              # project column = vendor column
+    x = {from = "X pos", unit = "mm"}
+    sigma_x = {from = 9, unit = "mm", scale = 0.5}    # value = scale * column + offset
+    point = {from = "socket"}
+
+    [rotation]             # how the rotation of the target is written
+    convention = "euler"   # or "rotvec", "quaternion", "matrix" (9 columns, row by row)
+    axes = "ZYX"           # euler: axes in the order of the columns
+    frame = "intrinsic"    # euler: about the rotated axes; "extrinsic": about the fixed axes
+    order = "wxyz"         # quaternion, in place of the keys of euler; or "xyzw"
+    columns = ["A", "B", "C"]
+    unit = "deg"           # euler and rotvec
+
+    [constant]             # text for the whole file; {file}, {stem}, {parent} are parts of its path
+    point = "{parent}/{stem}"
+
+`[to_joints]` has the keys of `[joints]` and describes the second configuration of a row. Columns of the file
+that the map does not name are ignored. The map applies to every file, except to files with a header of the
+project's own that lack columns of the map.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ..._typing import PathLike
+from ...exceptions import FileFormatError, UnknownNameError
+from ...messages import quote
+from ...robot.chain import Chain
+from ...units import ANGLES, UNITS
+from ..tables import SEPARATORS, TextLayout
+from ..toml_table import TomlTable, is_number
+from .columns import ROTVEC, SECOND_PREFIX, column_contents, known_columns, unknown_column_error
+
+# Placeholders in a constant, each written in braces.
+PATH_PARTS = ("file", "stem", "parent")
+# Number of columns of each convention of rotations, and the other keys that it needs.
+_CONVENTIONS: Mapping[str, tuple[int, tuple[str, ...]]] = {
+    "rotvec": (3, ("unit",)),
+    "euler": (3, ("unit", "axes", "frame")),
+    "quaternion": (4, ("order",)),
+    "matrix": (9, ()),
+}
+# Pattern of the value of each of these keys, and its description.
+_CONVENTION_KEYS = {
+    "unit": ("|".join(ANGLES), " or ".join(ANGLES)),
+    "axes": (r"(?i:([xyz])(?!\1)([xyz])(?!\2)[xyz])", 'three axes, such as "XYZ" or "ZYZ"'),
+    "frame": ("intrinsic|extrinsic", "intrinsic (rotated axes) or extrinsic (fixed axes)"),
+    "order": ("wxyz|xyzw", "wxyz or xyzw"),
+}
+
+
+@dataclass(frozen=True)
+class ColumnRule:
+    """Rule that makes a column of the project from a column of the vendor: scale * column + offset.
+
+    Attributes:
+        name: Name of the project's column.
+        content: "length", "angle", "number" or "text".
+        unit: Unit of the vendor's column and of the offset.
+        source_column: Header of the vendor's column, or its number counted from 1.
+        scale: Factor.
+        offset: Summand, in `unit`.
+    """
+
+    name: str
+    content: str
+    unit: str
+    source_column: str | int
+    scale: float = 1.0
+    offset: float = 0.0
+
+
+@dataclass(frozen=True)
+class Rotation:
+    """Notation of a rotation. Keys that the convention does not need are empty.
+
+    Attributes:
+        convention: "rotvec", "euler", "quaternion" or "matrix".
+        columns: Header or number of each of the vendor's columns.
+        unit: Unit of angles.
+        axes: Euler axes in lower case, such as "zyx".
+        frame: "intrinsic" or "extrinsic".
+        order: "wxyz" or "xyzw".
+    """
+
+    convention: str
+    columns: tuple[str | int, ...]
+    unit: str = ""
+    axes: str = ""
+    frame: str = ""
+    order: str = ""
+
+
+@dataclass(frozen=True)
+class ColumnMap:
+    """Checked content of a column map.
+
+    Attributes:
+        source: Name of the map's file.
+        rules: Columns of the project that are columns of the vendor.
+        rotation: Notation of the rotation; None if the file has none.
+        constants: Columns of the project that have one text for the whole file.
+        layout: How the file is divided into cells.
+    """
+
+    source: str
+    rules: tuple[ColumnRule, ...]
+    rotation: Rotation | None
+    constants: Mapping[str, str]
+    layout: TextLayout
+
+
+# --- reading a map ---------------------------------------------------------------------------------
+
+
+def read_map(path: PathLike, chain: Chain) -> ColumnMap:
+    """Read a column map and check it for a robot.
+
+    Args:
+        path: TOML file.
+        chain: The robot.
+
+    Returns:
+        The map.
+
+    Raises:
+        FileFormatError: The map is invalid or contradicts itself.
+        UnknownNameError: The map names a column that the robot's files cannot have.
+    """
+    table = TomlTable.read(path)
+    contents = column_contents(chain)
+    layout = _layout(table)
+    rules: list[ColumnRule] = []
+    for key, prefix in (("joints", ""), ("to_joints", SECOND_PREFIX)):
+        if key in table:
+            names = [prefix + name for name in chain.joint_names]
+            rules += _joint_rules(table.table(key), names, contents)
+    rules += _column_rules(table.table("columns"), contents)
+    rotation = _rotation(table.table("rotation")) if "rotation" in table else None
+    constants = _constants(table.table("constant"), contents)
+    table.finish()
+    names = [*(rule.name for rule in rules), *constants, *(ROTVEC if rotation else ())]
+    if repeated := [name for i, name in enumerate(names) if name in names[:i]]:
+        raise FileFormatError(f"{table.where}: column {repeated[0]!r} is given twice; remove one")
+    for name in names:
+        if name not in contents:
+            raise unknown_column_error(table.where, name, known_columns(chain), names, chain.joint_names)
+    return ColumnMap(table.path, tuple(rules), rotation, constants, layout)
+
+
+def _layout(table: TomlTable) -> TextLayout:
+    """Read how the file is divided into cells."""
+    layout = TextLayout(
+        separator=table.choice("separator", SEPARATORS) if "separator" in table else "",
+        decimal=table.choice("decimal", (".", ",")) if "decimal" in table else "",
+        skip=table.value("skip", int, 0, expected="a number of lines, as in skip = 2"),
+        has_header=table.value("header", bool, True),
+        comment=table.text("comment", "#"),
+        encoding=table.text("encoding", "utf-8"),
+    )
+    if layout.separator == layout.decimal == ",":
+        raise FileFormatError(f"{table.where}: separator and decimal are both ','; change one of them")
+    if layout.skip < 0:
+        raise table.error("skip", "expected the number of lines before the header")
+    try:
+        # Codecs of Python that do not encode text, such as rot13, raise LookupError.
+        "a".encode(layout.encoding)
+    except (LookupError, ValueError):
+        raise UnknownNameError(
+            f"{table.where}: unknown encoding {quote(layout.encoding)}; expected one such as utf-8 or cp1252"
+        ) from None
+    return layout
+
+
+def _joint_rules(table: TomlTable, joints: Sequence[str], contents: Mapping[str, str]) -> list[ColumnRule]:
+    order = table.array("order")
+    size = len(order)
+    names = table.array("names", joints, size=size)
+    unit = table.get("unit", "")
+    units = table.array("unit", size=size) if isinstance(unit, list) else [unit] * size
+    signs = table.array("sign", [1] * size, size=size)
+    offsets = table.array("offset", [0] * size, size=size)
+    table.finish()
+    if any(type(sign) is bool or sign not in (1, -1) for sign in signs):
+        raise table.error("sign", "expected 1 or -1 for each joint")
+    for offset in offsets:
+        if not is_number(offset):
+            raise table.error("offset", f"{quote(offset)} is not a number")
+    return [
+        _rule(table, str(name), contents, source, unit, float(sign), float(offset))
+        for name, source, unit, sign, offset in zip(names, order, units, signs, offsets, strict=True)
+    ]
+
+
+def _column_rules(table: TomlTable, contents: Mapping[str, str]) -> list[ColumnRule]:
+    rules = []
+    for name in table.keys():
+        entry = table.table(name)
+        source = entry.get("from", expected='the header of a column, as in from = "X pos"')
+        unit = entry.get("unit", "")
+        scale, offset = entry.number("scale", 1.0), entry.number("offset", 0.0)
+        entry.finish()
+        rules.append(_rule(entry, name, contents, source, unit, scale, offset))
+    return rules
+
+
+def _rule(
+    table: TomlTable,
+    name: str,
+    contents: Mapping[str, str],
+    source: Any,
+    unit: Any,
+    scale: float,
+    offset: float,
+) -> ColumnRule:
+    """Build the rule of a column of the project."""
+    # Unknown names of columns are reported by `read_map`.
+    content = contents.get(name, "")
+    units = UNITS.get(content, {})
+    if not isinstance(unit, str):
+        raise FileFormatError(f"{table.where}: {name}: unit {quote(unit)}; expected a text in quotes")
+    if content and (units or unit) and unit not in units:
+        choices = ", ".join(f'"{choice}"' for choice in units if choice.isascii())
+        remedy = f"write unit = one of {choices}" if units else "leave the unit out"
+        raise UnknownNameError(f"{table.where}: {name}: unit {quote(unit)}; {remedy}")
+    if content == "text" and (scale, offset) != (1.0, 0.0):
+        raise FileFormatError(f"{table.where}: {name}: is text; leave scale and offset out")
+    return ColumnRule(name, content, unit, _source_column(table, source), scale, offset)
+
+
+def _source_column(table: TomlTable, value: Any) -> str | int:
+    """Check the name of a vendor's column."""
+    if type(value) is str or (type(value) is int and value > 0):
+        return value
+    raise FileFormatError(
+        f"{table.where}: {quote(value)} is not a column; write its header, or its number counted from 1"
+    )
+
+
+def _rotation(table: TomlTable) -> Rotation:
+    convention = table.choice("convention", _CONVENTIONS)
+    count, needed_keys = _CONVENTIONS[convention]
+    values: dict[str, str] = {}
+    for key, (pattern, description) in _CONVENTION_KEYS.items():
+        if key not in needed_keys:
+            if key in table:
+                raise table.error(key, f"does not go with {convention}; leave it out")
+            continue
+        expected = f"{description} for {convention}"
+        value = table.text(key, expected=expected)
+        if not re.fullmatch(pattern, value):
+            raise table.error(key, f"expected {expected}")
+        values[key] = value if key == "unit" else value.lower()
+    columns = table.array("columns", size=count)
+    table.finish()
+    return Rotation(convention, tuple(_source_column(table, name) for name in columns), **values)
+
+
+def _constants(table: TomlTable, contents: Mapping[str, str]) -> dict[str, str]:
+    constants: dict[str, str] = {}
+    for name in (name for name, content in contents.items() if content == "text" and name in table):
+        example = f'a text in quotes, as in {name} = "{{stem}}"'
+        constants[name] = table.text(name, expected=example)
+        if not constants[name]:
+            raise table.error(name, f"expected {example}")
+        if unknown := set(re.findall(r"\{([^}]*)\}", constants[name])) - set(PATH_PARTS):
+            choices = ", ".join(f"{{{part}}}" for part in PATH_PARTS)
+            raise UnknownNameError(
+                f"{table.where}: {name}: unknown placeholder {{{min(unknown)}}}; choose from {choices}"
+            )
+    table.finish()
+    return constants

@@ -1,0 +1,248 @@
+"""Columns of measurement files: their names, their contents, and the measurement kind that they make.
+
+A column is a joint of the robot, a value column of a measurement kind, or an auxiliary column. The header
+alone selects the kind: of all kinds whose required columns are present, the one with the most required
+columns, and among those the one with the fewest columns in all. A rotation can be given as a quaternion in
+place of a rotation vector.
+
+Other columns are ignored if they cannot be meant as a joint or a measured value: times, counters, texts, and
+quantities other than lengths and angles. Any other unknown column is an error, as it may be misspelt.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from ...exceptions import FileFormatError, UnknownNameError
+from ...measurements import KINDS
+from ...measurements.base import Measurement
+from ...robot.chain import Chain
+from ...units import ANGLES, LENGTHS
+from ..tables import Column, DataTable
+from ..tabular import require_usable_names
+
+QUATERNION = ("qw", "qx", "qy", "qz")
+ROTVEC = ("rx", "ry", "rz")
+# Positions that the controller was commanded to, and positions measured again after a calibration. They serve
+# the reachability check and the judgement of a compensation, and are never fitted.
+COMMANDED = ("commanded_x", "commanded_y", "commanded_z")
+AFTER = ("after_x", "after_y", "after_z")
+# Prefix of a joint's name in the columns of the second configuration of a row.
+SECOND_PREFIX = "to:"
+
+# Columns for people only; a reader ignores them without a note.
+_REMARKS = frozenset(("pose_id", "time"))
+AUXILIARY_COLUMNS = frozenset(("set", *_REMARKS, *COMMANDED, *AFTER))
+VALUE_COLUMNS = frozenset(name for kind in KINDS.values() for name in kind.columns) | frozenset(QUATERNION)
+_KNOWN = VALUE_COLUMNS | AUXILIARY_COLUMNS
+# Content of each column other than joints: "length", "angle", "number" or "text".
+_CONTENTS: dict[str, str] = {
+    **{name: content for kind in KINDS.values() for name, content in kind.columns.items()},
+    **dict.fromkeys(QUATERNION, "number"),
+    **dict.fromkeys(("set", *_REMARKS), "text"),
+    **dict.fromkeys((*COMMANDED, *AFTER), "length"),
+}
+# Names of times and counters in the files of other programs.
+_TIME_OR_COUNTER = re.compile(
+    r".*(?:time|stamp|date|datum|zeit).*|t|no\.?|nr\.?|#|i|id|idx|index|row|line|sample|seq|unnamed.*",
+    re.IGNORECASE,
+)
+# Least similarity (0 to 1, `difflib`) of a suggestion to an unknown name.
+_MIN_SIMILARITY = 0.7
+# Longest part of an unknown name that is compared [characters]: the comparison takes quadratic time.
+_MAX_COMPARED = 100
+
+
+def joint_units(chain: Chain, name: str) -> Mapping[str, float]:
+    """Return the units allowed in the column of a joint.
+
+    Args:
+        chain: Robot with the joint.
+        name: Name of the joint.
+
+    Returns:
+        Divisor to SI units of each unit: lengths for a prismatic joint, otherwise angles.
+    """
+    joint = chain.urdf.joint(name)
+    return LENGTHS if joint.type == "prismatic" else ANGLES
+
+
+def column_contents(chain: Chain) -> dict[str, str]:
+    """Return the content of each column that a measurement file of a robot can have.
+
+    Args:
+        chain: The robot.
+
+    Returns:
+        "length", "angle", "number" or "text" by column name.
+    """
+    joints = {
+        prefix + joint.name: "length" if joint.type == "prismatic" else "angle"
+        for joint in chain.urdf.joints
+        for prefix in ("", SECOND_PREFIX)
+    }
+    return {**_CONTENTS, **joints}
+
+
+def check_joint_names(chain: Chain) -> None:
+    """Check that the joints of a robot can be columns beside the measured values.
+
+    Args:
+        chain: The robot.
+
+    Raises:
+        FileFormatError: A joint's name cannot be a header, or is the name of another column.
+    """
+    require_usable_names(chain.joint_names, chain.urdf.source)
+    if clashes := sorted(_KNOWN & set(chain.joint_names)):
+        raise FileFormatError(
+            f"{chain.urdf.source}: joint {clashes[0]!r} has the name of a measurement column; "
+            "rename the joint"
+        )
+
+
+def known_columns(chain: Chain) -> frozenset[str]:
+    """Return the names of all columns that a measurement file of a robot can have.
+
+    Args:
+        chain: The robot.
+    """
+    names = [joint.name for joint in chain.urdf.joints]
+    return _KNOWN | {prefix + name for name in names for prefix in ("", SECOND_PREFIX)}
+
+
+def needs_column_map(table: DataTable, chain: Chain) -> bool:
+    """Return whether a file has no header, or one that names no joint or no measured value.
+
+    A file with too few unknown columns to be described by a map does not need one.
+
+    Args:
+        table: Table of a measurement file.
+        chain: The robot.
+    """
+    if table.has_numbers_as_header:
+        return True
+    names = set(table.columns)
+    joints = {prefix + joint for joint in chain.joint_names for prefix in ("", SECOND_PREFIX)}
+    n_unknown = len(names - known_columns(chain))
+    if names & VALUE_COLUMNS:
+        return not names & joints and n_unknown >= chain.n_joints
+    return n_unknown >= (1 if names & joints else chain.n_joints)
+
+
+def check_columns(table: DataTable, chain: Chain) -> list[str]:
+    """Check that every column is a joint of the robot, a measured value, or can be ignored.
+
+    Args:
+        table: Table of a measurement file.
+        chain: The robot.
+
+    Returns:
+        Labels of the columns that are ignored, such as `column 'comment'`.
+
+    Raises:
+        UnknownNameError: A column is unknown; the message suggests a similar name.
+    """
+    known = known_columns(chain)
+    columns = table.columns
+    for name, column in columns.items():
+        if name not in known and not _can_be_ignored(table, column, known):
+            raise unknown_column_error(table.header_location, name, known, columns, chain.joint_names)
+    used = {columns[name].index for name in columns if name in known}
+    return [
+        table.column_label(index)
+        for index, cell in enumerate(table.headers)
+        if index not in used and (cell or any(row[index].strip() for row in table.cells))
+    ]
+
+
+def _can_be_ignored(table: DataTable, column: Column, known: Iterable[str]) -> bool:
+    """Return whether an unknown column cannot be meant as a joint or a measured value."""
+    if _TIME_OR_COUNTER.fullmatch(column.name):
+        return True
+    if _suggestions(column.name, known, table.columns) or column.unit in {*LENGTHS, *ANGLES}:
+        return False
+    if column.unit:
+        return True
+    is_number = np.isfinite(table.values(column.index))
+    return not all(is_number[row] or not cells[column.index].strip() for row, cells in enumerate(table.cells))
+
+
+def unknown_column_error(
+    where: str, name: str, known: Iterable[str], present: Iterable[str], joint_names: Iterable[str]
+) -> UnknownNameError:
+    """Build the error of a column that is neither a joint nor a measured value.
+
+    Args:
+        where: File and line of the header, for the message.
+        name: Name of the column.
+        known: Names of all columns that a file can have.
+        present: Names of the columns of the file.
+        joint_names: Names of the robot's joints.
+
+    Returns:
+        Exception whose message suggests a similar name.
+    """
+    suggestions = _suggestions(name, known, present)
+    remedy = (
+        f"did you mean {suggestions[0]!r}?"
+        if suggestions
+        else f"remove it; the joints are {', '.join(joint_names)}"
+    )
+    return UnknownNameError(
+        f"{where}: column {name!r} is neither a joint of this robot nor a known measurement column; {remedy}"
+    )
+
+
+def _suggestions(name: str, known: Iterable[str], present: Iterable[str]) -> list[str]:
+    """Return the known names that are most similar to a misspelt one, except those that are present."""
+    wanted = name[:_MAX_COMPARED].lower()
+    similarity = {
+        other: difflib.SequenceMatcher(None, wanted, other.lower()).ratio()
+        for other in known
+        if other not in _REMARKS
+    }
+    best = max(_MIN_SIMILARITY, *similarity.values())
+    # A column that is present already cannot be the intended one.
+    return sorted({other for other, ratio in similarity.items() if ratio == best} - set(present))
+
+
+def find_kind(table: DataTable) -> type[Measurement]:
+    """Find the measurement kind of a file from its columns.
+
+    Args:
+        table: Table of a measurement file.
+
+    Returns:
+        Class of the kind.
+
+    Raises:
+        FileFormatError: The columns of no kind are complete, or a column does not belong to the kind.
+    """
+    present = set(table.columns) & VALUE_COLUMNS
+    if present & set(QUATERNION):
+        present = present - set(QUATERNION) | set(ROTVEC)
+    candidates = [
+        (len(required), -len(kind.columns), kind)
+        for kind in KINDS.values()
+        for required in kind.required_columns
+        if required <= present
+    ]
+    if not candidates:
+        incomplete = f"; {', '.join(sorted(present))} alone is not enough" if present else ""
+        raise FileFormatError(
+            f"{table.header_location}: no measured values{incomplete}; a position needs the columns "
+            "x[mm],y[mm],z[mm], a pose needs qw,qx,qy,qz in addition"
+        )
+    kind = max(candidates, key=lambda candidate: candidate[:2])[2]
+    if unrelated := sorted(present - set(kind.columns)):
+        raise FileFormatError(
+            f"{table.header_location}: column {unrelated[0]!r} does not go with "
+            f"{', '.join(sorted(present & set(kind.columns)))}; "
+            f"a {kind.kind} file has {', '.join(kind.columns)}"
+        )
+    return kind

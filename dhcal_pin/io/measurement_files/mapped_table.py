@@ -1,0 +1,206 @@
+"""Files of other makers, read through a column map as tables with the project's own columns."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Set
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ... import se3
+from ..._typing import Array, PathLike
+from ...exceptions import DhcalError, FileFormatError
+from ...units import ANGLES
+from ..tables import DataTable, read_table
+from ..tables.data_frame import is_data_frame
+from .column_map import PATH_PARTS, ColumnMap, ColumnRule, Rotation
+from .columns import ROTVEC
+
+# Largest deviation of a matrix' singular values from 1. A larger one is an error, not rounding.
+_MAX_ORTHOGONALITY_ERROR = 1e-3
+# Greatest number of column names that a message lists.
+_MAX_LISTED_NAMES = 30
+
+
+@dataclass(frozen=True)
+class _VendorTable:
+    """File of another maker with the map of its columns.
+
+    Attributes:
+        table: Table of the file.
+        column_map: Map of its columns.
+    """
+
+    table: DataTable
+    column_map: ColumnMap
+
+    def column_index(self, name: str | int) -> int | None:
+        """Return the index of a column, counted from 0; None if it is absent."""
+        headers = self.table.headers
+        if isinstance(name, int):
+            return name - 1 if name <= len(headers) else None
+        if headers.count(name) > 1:
+            raise FileFormatError(
+                f"{self.table.header_location}: column {name!r} appears twice; give its number in the map"
+            )
+        return headers.index(name) if name in headers else None
+
+    def index(self, name: str | int) -> int:
+        """Return the index of a column that the file has."""
+        index = self.column_index(name)
+        assert index is not None
+        return index
+
+    def missing_columns(self) -> list[str | int]:
+        """Return the columns of the map that the file does not have."""
+        rotation = self.column_map.rotation.columns if self.column_map.rotation else ()
+        names = [*(rule.source_column for rule in self.column_map.rules), *rotation]
+        return [name for name in names if self.column_index(name) is None]
+
+    def without_bad_rows(self) -> _VendorTable:
+        """Return the table without the rows that lack a number."""
+        rotation = self.column_map.rotation.columns if self.column_map.rotation else ()
+        rules = [rule.source_column for rule in self.column_map.rules if rule.content != "text"]
+        indices = [self.index(name) for name in (*rules, *rotation)]
+        return replace(self, table=self.table.without_bad_rows(indices))
+
+    def text(self, name: str | int) -> list[str]:
+        """Return the cells of a column."""
+        index = self.index(name)
+        return [row[index].strip() for row in self.table.cells]
+
+    def values(self, name: str | int) -> Array:
+        """Return the numbers of a column, shape (m,)."""
+        return self.table.values(self.index(name))
+
+
+def read_mapped_table(source: PathLike | Any, column_map: ColumnMap, known: Set[str]) -> DataTable:
+    """Read a file of another maker as a table with the project's own columns.
+
+    A file whose header has the project's columns only, and lacks columns of the map, is read as it is.
+
+    Args:
+        source: File, or data frame.
+        column_map: Map of its columns.
+        known: Columns that a file of the project can have.
+
+    Returns:
+        Table with the columns of the map.
+
+    Raises:
+        FileFormatError: A column of the map is missing.
+    """
+    if _is_native(source, known) and not _matches(source, column_map):
+        return read_table(source)
+    vendor = _VendorTable(read_table(source, column_map.layout), column_map)
+    table = vendor.table
+    if missing := vendor.missing_columns():
+        raise FileFormatError(
+            f"{table.header_location}: no column {missing[0]!r}, which {column_map.source} names; the file "
+            f"({table.description}) has {', '.join(map(repr, table.headers[:_MAX_LISTED_NAMES]))}"
+        )
+    vendor = vendor.without_bad_rows()
+    columns = {_header(rule.name, rule.unit): _apply_rule(vendor, rule) for rule in column_map.rules}
+    if column_map.rotation:
+        columns |= _rotation_columns(vendor, column_map.rotation)
+    for name, text in column_map.constants.items():
+        columns[name] = [_fill_placeholders(text, source)] * len(vendor.table.lines)
+    table = vendor.table
+    return DataTable.from_columns(
+        table.source,
+        columns,
+        table.lines,
+        header_line=table.header_line,
+        comments=table.comments,
+        bad_rows=table.bad_rows,
+        description=table.description,
+        notes=table.notes,
+    )
+
+
+def _header(name: str, unit: str) -> str:
+    """Return the header cell of a column of the project."""
+    return f"{name}[{unit}]" if unit else name
+
+
+def _fill_placeholders(text: str, source: PathLike | Any) -> str:
+    """Replace {file}, {stem} and {parent}; braces in the path itself stay, other than with str.format."""
+    absolute = Path("DataFrame" if is_data_frame(source) else source).absolute()
+    values = absolute.name, absolute.stem, absolute.parent.name
+    parts: dict[str, str] = dict(zip(PATH_PARTS, values, strict=True))
+    pattern = "|".join(f"{{{part}}}" for part in PATH_PARTS)
+    return re.sub(pattern, lambda match: parts[match[0][1:-1]], text)
+
+
+def _is_native(source: PathLike | Any, known: Set[str]) -> bool:
+    """Return whether the header of a file is the project's own."""
+    try:
+        return set(read_table(source).columns) <= known
+    except DhcalError:
+        return False
+
+
+def _matches(source: PathLike | Any, column_map: ColumnMap) -> bool:
+    """Return whether a file has a header with all columns of a map."""
+    if not column_map.layout.has_header:
+        return False
+    try:
+        return not _VendorTable(read_table(source, column_map.layout), column_map).missing_columns()
+    except DhcalError:
+        return False
+
+
+def _apply_rule(vendor: _VendorTable, rule: ColumnRule) -> Array | list[str]:
+    """Return the values of a column of the project, (m,)."""
+    if rule.content == "text":
+        return vendor.text(rule.source_column)
+    values = vendor.values(rule.source_column)
+    return values if (rule.scale, rule.offset) == (1.0, 0.0) else rule.scale * values + rule.offset
+
+
+def _rotation_columns(vendor: _VendorTable, notation: Rotation) -> dict[str, Array | list[str]]:
+    """Return the values (m,) of each column of the project that holds the rotation, by header cell."""
+    columns = [vendor.values(name) for name in notation.columns]
+    if notation.convention in ("rotvec", "quaternion"):
+        names = ROTVEC if notation.convention == "rotvec" else [f"q{letter}" for letter in notation.order]
+        return {_header(name, notation.unit): values for name, values in zip(names, columns, strict=True)}
+    values = np.stack(columns, -1)
+    if notation.convention == "euler":
+        rotations = euler_to_matrix(values / ANGLES[notation.unit], notation.axes, notation.frame)
+    else:
+        rotations = _orthonormalized(values.reshape(-1, 3, 3), vendor.table)
+    components = np.ascontiguousarray(se3.log3(rotations).T)
+    return {_header(name, "rad"): column for name, column in zip(ROTVEC, components, strict=True)}
+
+
+def euler_to_matrix(angles: Array, axes: str, frame: str) -> Array:
+    """Convert Euler angles to rotation matrices.
+
+    Args:
+        angles: Angles about the three axes in their order, shape (m, 3) [rad].
+        axes: Three letters such as "xyz".
+        frame: "intrinsic" for rotations about the axes as rotated so far, "extrinsic" for fixed axes.
+
+    Returns:
+        Rotation matrices, shape (m, 3, 3).
+    """
+    first, second, third = (
+        se3.exp3(angles[:, i, None] * np.eye(3)["xyz".index(axis)]) for i, axis in enumerate(axes)
+    )
+    return first @ second @ third if frame == "intrinsic" else third @ second @ first
+
+
+def _orthonormalized(matrices: Array, table: DataTable) -> Array:
+    """Return the rotations nearest to matrices, shape (m, 3, 3)."""
+    u, s, vt = np.linalg.svd(matrices)
+    error = np.abs(s - 1).max(-1) + (np.linalg.det(matrices) < 0)
+    if (wrong := np.flatnonzero(error > _MAX_ORTHOGONALITY_ERROR)).size:
+        raise FileFormatError(
+            f"{table.source}:{table.lines[wrong[0]]}: the nine numbers are not a rotation matrix "
+            f"(error {error[wrong[0]]:.2g}); "
+            "write them row by row, right-handed, with an error below one thousandth"
+        )
+    return u @ vt

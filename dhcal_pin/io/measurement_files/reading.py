@@ -1,0 +1,377 @@
+"""Reading of measurement files: tables of joint positions and measured values.
+
+The joints are columns under their URDF names, and the measured values are columns whose names select the
+measurement kind (see `columns`). Every length and angle carries its unit in brackets. A table can come from a
+text file, an Excel workbook, a Parquet file or a data frame (see the package `tables`). Files of other makers
+are read through a column map (see `column_map`).
+
+Errors in the content of a file are `FileFormatError` or, for unknown columns and units, `UnknownNameError`.
+Their messages name the file, the line as counted by a text editor, and the column. `Measurement.rows` has
+the same line numbers.
+
+Shapes: m rows of data, n joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ... import se3
+from ..._typing import Array, PathLike
+from ...exceptions import DhcalError, FileFormatError
+from ...measurements.base import Measurement
+from ...robot.chain import Chain
+from ...units import LENGTHS, UNITS
+from ..tables import Column, DataTable, format_lines, read_table
+from .columns import (
+    AFTER,
+    COMMANDED,
+    QUATERNION,
+    ROTVEC,
+    SECOND_PREFIX,
+    check_columns,
+    check_joint_names,
+    find_kind,
+    joint_units,
+    known_columns,
+    needs_column_map,
+)
+
+# Smallest accepted standard deviation [m or rad]; no instrument is as accurate.
+_MIN_SIGMA = 1e-15
+# Largest deviation of a quaternion's norm from 1. Rounding to three decimals stays below it.
+_MAX_NORM_ERROR = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class MeasurementFile:
+    """Content of a measurement file.
+
+    Attributes:
+        source: Name of the file.
+        data: Samples of all rows.
+        fit: Samples to be fitted: all, or those whose column `set` says so.
+        holdout: Samples that the column `set` holds out.
+        commanded: Positions that the controller was commanded to, shape (m, 3) [m]; None without the columns.
+        measured_after: Positions measured again with calibrated parameters, shape (m, 3) [m]; None without
+            the columns.
+        values: Columns of measured values, shape (m,) each, in SI units or as text.
+        units: Unit that each column was written in.
+        notes: Sentences on what of the file is not used: columns, skipped rows, sheets.
+        bad_rows: Reason why a row was skipped, by line.
+    """
+
+    source: str
+    data: Measurement
+    fit: Measurement
+    holdout: Measurement
+    commanded: Array | None
+    measured_after: Array | None
+    values: Mapping[str, Any] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    bad_rows: Mapping[int, str] = field(default_factory=dict)
+
+
+def read_measurements(
+    source: PathLike | Any, chain: Chain, columns: PathLike | None = None, *, skip_bad_rows: bool = False
+) -> Measurement:
+    """Read all samples of a measurement file.
+
+    Args:
+        source: Text file, Excel workbook, Parquet file, or a data frame such as one of pandas.
+        chain: Robot that was measured.
+        columns: Column map for a file of another maker.
+        skip_bad_rows: Whether rows without a number or a name in a column are skipped; otherwise they are an
+            error.
+
+    Returns:
+        Samples of the kind that the columns select.
+    """
+    return read_measurement_file(source, chain, columns, skip_bad_rows=skip_bad_rows).data
+
+
+def read_measurement_file(
+    source: PathLike | Any, chain: Chain, columns: PathLike | None = None, *, skip_bad_rows: bool = False
+) -> MeasurementFile:
+    """Read a measurement file with its division into fitted and held-out samples.
+
+    Args:
+        source: Text file, Excel workbook, Parquet file, or a data frame such as one of pandas.
+        chain: Robot that was measured.
+        columns: Column map for a file of another maker.
+        skip_bad_rows: Whether rows without a number or a name in a column are skipped; otherwise they are an
+            error.
+
+    Returns:
+        Content of the file.
+    """
+    check_joint_names(chain)
+    return parse_measurements(open_measurement_table(source, chain, columns), chain, skip_bad_rows)
+
+
+def open_measurement_table(source: PathLike | Any, chain: Chain, columns: PathLike | None) -> DataTable:
+    """Read the table of a measurement file, through a column map if one is given.
+
+    Args:
+        source: Text file, Excel workbook, Parquet file, or a data frame such as one of pandas.
+        chain: Robot that was measured.
+        columns: Column map for a file of another maker; None for a file with the project's own columns.
+
+    Returns:
+        Table with the project's own columns.
+    """
+    if columns is None:
+        return read_table(source)
+    from .column_map import read_map  # lazy import, as the following: only for files of other makers
+    from .mapped_table import read_mapped_table
+
+    return read_mapped_table(source, read_map(columns, chain), known_columns(chain))
+
+
+def parse_measurements(table: DataTable, chain: Chain, skip_bad_rows: bool = False) -> MeasurementFile:
+    """Parse the samples of a table.
+
+    Args:
+        table: Table of a measurement file, or of a part of one.
+        chain: Robot that was measured.
+        skip_bad_rows: Whether rows without a number or a name in a column are skipped.
+
+    Returns:
+        Content of the table.
+    """
+    if needs_column_map(table, chain):
+        from .map_proposal import missing_header_error  # lazy import: only for the message
+
+        raise missing_header_error(table, chain)
+    ignored = check_columns(table, chain)
+    kind = find_kind(table)
+    prefixes = ("", SECOND_PREFIX)[: kind.configurations_per_row]
+    for prefix in prefixes:
+        _require_joints(table, chain, prefix)
+    table = _usable_rows(table, chain, kind, prefixes, skip_bad_rows)
+    values = parse_values(table, kind)
+    _require_all_sigmas(table, kind, values)
+    q = [parse_joint_positions(table, chain, prefix) for prefix in prefixes]
+    data = build_measurement(table, kind, q or [np.zeros((len(table.lines), chain.n_joints))], values)
+    is_holdout = _parse_holdout_mask(table)
+    return MeasurementFile(
+        source=table.source,
+        data=data,
+        fit=data.take(~is_holdout),
+        holdout=data.take(is_holdout),
+        commanded=_parse_group(table, COMMANDED, LENGTHS),
+        measured_after=_parse_group(table, AFTER, LENGTHS),
+        values=values,
+        units=column_units(table),
+        notes=(*table.notes, *ignored_columns_note(ignored), *skipped_rows_note(table)),
+        bad_rows=table.bad_rows,
+    )
+
+
+def ignored_columns_note(labels: Sequence[str]) -> list[str]:
+    """Return one sentence that names ignored columns, none if there are no such columns.
+
+    Args:
+        labels: Labels such as `column 'comment'`.
+    """
+    names = ", ".join(label.removeprefix("column ") for label in labels)
+    return [f"column{'s' if len(labels) > 1 else ''} {names} ignored"] if labels else []
+
+
+def skipped_rows_note(table: DataTable) -> list[str]:
+    """Return one sentence that names the skipped rows of a table, none if there are no such rows.
+
+    Args:
+        table: Table of a measurement file.
+    """
+    if not table.bad_rows:
+        return []
+    count, lines = len(table.bad_rows), format_lines(table.bad_rows)
+    first = next(iter(table.bad_rows.values()))
+    if count == 1:
+        return [f"line {lines} skipped: {first}"]
+    return [f"{count} lines skipped: {lines}; the first because {first}"]
+
+
+def _usable_rows(
+    table: DataTable, chain: Chain, kind: type[Measurement], prefixes: Sequence[str], skip_bad_rows: bool
+) -> DataTable:
+    """Return the table without the rows that lack a number or a name, or raise an error that names them."""
+    joints = [prefix + name for prefix in prefixes for name in chain.joint_names]
+    quantities = {**kind.columns, **dict.fromkeys((*QUATERNION, *COMMANDED, *AFTER), ""), "set": "text"}
+    texts = {name for name, quantity in quantities.items() if quantity == "text"}
+    used = [name for name in (*joints, *quantities) if name in table.columns]
+    table = table.without_bad_rows(
+        [table.columns[name].index for name in used if name not in texts],
+        [table.columns[name].index for name in used if name in texts],
+    )
+    if not skip_bad_rows:
+        table.require_good_rows(", or use --skip-bad-rows")
+    if not len(table.lines):
+        raise FileFormatError(f"{table.source}: no row has all numbers; correct the file or its columns")
+    return table
+
+
+def build_measurement(
+    table: DataTable, kind: type[Measurement], q: Sequence[Array], values: Mapping[str, Any]
+) -> Measurement:
+    """Build the samples with their file and lines, and put the name of the file in front of an error.
+
+    Args:
+        table: Table that the values are from.
+        kind: Measurement kind.
+        q: Joint positions of each configuration, (m, n) [rad or m].
+        values: Columns by name, (m,) each.
+
+    Returns:
+        The samples.
+
+    Raises:
+        FileFormatError: The values contradict each other.
+    """
+    try:
+        data = kind.from_columns(q, values)
+    except DhcalError as error:
+        raise FileFormatError(f"{table.source}: {error}") from None
+    return data.replace(rows=np.array(table.lines), source=table.source)
+
+
+def parse_joint_positions(table: DataTable, chain: Chain, prefix: str = "") -> Array:
+    """Parse the columns of the joints.
+
+    Args:
+        table: Table with a column for each joint.
+        chain: Robot with the joints.
+        prefix: Text before each joint's name, such as "to:" for the second configuration of a row.
+
+    Returns:
+        Joint positions, shape (m, n) [rad or m]; a missing column is an error.
+    """
+    _require_joints(table, chain, prefix)
+    columns = [(table.columns[prefix + name], joint_units(chain, name)) for name in chain.joint_names]
+    return np.stack([table.to_si(column, units) for column, units in columns], -1)
+
+
+def _require_joints(table: DataTable, chain: Chain, prefix: str) -> None:
+    """Raise an error if the column of a joint is missing."""
+    missing = [name for name in chain.joint_names if prefix + name not in table.columns]
+    if missing:
+        units = {name: "mm" if joint_units(chain, name) is LENGTHS else "deg" for name in chain.joint_names}
+        expected = ",".join(f"{prefix}{name}[{unit}]" for name, unit in units.items())
+        raise FileFormatError(
+            f"{table.header_location}: no column for joint {prefix + missing[0]!r}; "
+            f"this robot needs {expected}"
+        )
+
+
+def parse_values(table: DataTable, kind: type[Measurement]) -> dict[str, Any]:
+    """Parse the columns of a kind in SI units or as text; a quaternion becomes a rotation vector.
+
+    Args:
+        table: Table of a measurement file.
+        kind: Measurement kind.
+
+    Returns:
+        Columns by name, (m,) each.
+
+    Raises:
+        FileFormatError: A standard deviation is not above zero, a name is empty, or there are two rotations.
+    """
+    values: dict[str, Any] = {}
+    for name, content in kind.columns.items():
+        if name not in table.columns:
+            continue
+        column = table.columns[name]
+        values[name] = table.text(column) if content == "text" else table.to_si(column, UNITS[content])
+        if "sigma" in name and (too_small := np.flatnonzero(values[name] < _MIN_SIGMA)).size:
+            raise FileFormatError(
+                f"{table.cell_location(int(too_small[0]), name)}: must be above zero; "
+                "leave the sigma columns out if they are not known"
+            )
+        if content == "text" and "" in values[name]:
+            raise FileFormatError(
+                f"{table.cell_location(values[name].index(''), name)}: is empty; write a name"
+            )
+    if set(QUATERNION) & set(table.columns):
+        if set(ROTVEC) & set(table.columns):
+            raise FileFormatError(f"{table.header_location}: both qw… and rx… given; keep one rotation")
+        rotvec = se3.log3(_parse_quaternion(table))
+        values |= {name: rotvec[:, i] for i, name in enumerate(ROTVEC)}
+    return values
+
+
+def _parse_quaternion(table: DataTable) -> Array:
+    """Parse the quaternion columns to rotation matrices, shape (m, 3, 3)."""
+    quaternion = _parse_group(table, QUATERNION, None)
+    assert quaternion is not None
+    with np.errstate(over="ignore"):
+        norm = np.linalg.norm(quaternion, axis=1)
+    wrong = np.flatnonzero(np.abs(norm - 1) > _MAX_NORM_ERROR)
+    if wrong.size:
+        raise FileFormatError(
+            f"{table.source}:{table.lines[wrong[0]]}: the quaternion's norm is {norm[wrong[0]]:.4g}; "
+            "it must be 1 within a thousandth (order qw,qx,qy,qz)"
+        )
+    return se3.quaternion_to_matrix(quaternion / norm[:, None])
+
+
+def _parse_group(table: DataTable, names: Sequence[str], units: Mapping[str, float] | None) -> Array | None:
+    """Parse k columns that belong together, shape (m, k), in SI units; return None if all are absent."""
+    missing = [name for name in names if name not in table.columns]
+    if len(missing) == len(names):
+        return None
+    if missing:
+        present = [name for name in names if name in table.columns]
+        raise FileFormatError(
+            f"{table.header_location}: {', '.join(present)} without {missing[0]!r}; "
+            f"give {','.join(names)} or none"
+        )
+    columns = [table.columns[name] for name in names]
+    if units is not None:
+        return np.stack([table.to_si(column, units) for column in columns], -1)
+    for column in columns:
+        if column.unit:
+            raise FileFormatError(
+                f"{table.header_location}: column {column.name!r} is a pure number; "
+                f"write {column.name} without a unit"
+            )
+    return np.stack([table.finite_numbers(column) for column in columns], -1)
+
+
+def _require_all_sigmas(table: DataTable, kind: type[Measurement], values: Mapping[str, Any]) -> None:
+    """Raise an error if some standard deviations are given without the others."""
+    wanted = [f"sigma_{name}" for name in kind.columns if name in values and f"sigma_{name}" in kind.columns]
+    wanted = wanted or [name for name in kind.columns if name.startswith("sigma_")]
+    given = [name for name in wanted if name in values]
+    if given and len(given) < len(wanted):
+        missing = next(name for name in wanted if name not in values)
+        raise FileFormatError(
+            f"{table.header_location}: {', '.join(given)} without {missing!r}; "
+            f"give {','.join(wanted)} or none"
+        )
+
+
+def _parse_holdout_mask(table: DataTable) -> Array:
+    """Parse the column `set`, shape (m,): True for samples that are held out."""
+    column: Column | None = table.columns.get("set")
+    if column is None:
+        return np.zeros(len(table.lines), bool)
+    words = table.text(column)
+    for row, word in enumerate(words):
+        if word not in ("fit", "holdout"):
+            raise FileFormatError(f"{table.cell_location(row, 'set')}: {word!r} must be fit or holdout")
+    return np.array([word == "holdout" for word in words])
+
+
+def column_units(table: DataTable) -> dict[str, str]:
+    """Return the unit of each column, by name.
+
+    Args:
+        table: Table of a measurement file.
+    """
+    return {name: column.unit for name, column in table.columns.items()}

@@ -1,0 +1,96 @@
+"""Files of targets that a tool shall reach, and of joint positions alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..._typing import Array, PathLike
+from ...exceptions import FileFormatError
+from ...measurements.pose import Pose
+from ...measurements.position import Position
+from ...robot.chain import Chain
+from ..tables import read_table
+from .columns import check_columns, check_joint_names, find_kind
+from .reading import (
+    build_measurement,
+    column_units,
+    ignored_columns_note,
+    open_measurement_table,
+    parse_joint_positions,
+    parse_values,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class TargetPoses:
+    """Positions or poses that a tool shall reach.
+
+    Attributes:
+        source: Name of the file.
+        values: Positions, shape (m, 3) [m], or poses, shape (m, 4, 4), if the file has rotations.
+        near: Joint positions near which solutions are wanted, shape (m, n) [rad or m]; None without the
+            columns.
+        units: Unit that each column was written in.
+        lines: Line of each target in the file, shape (m,).
+        notes: Sentences on what of the file is not used.
+    """
+
+    source: str
+    values: Array
+    near: Array | None
+    units: Mapping[str, str]
+    lines: Array
+    notes: tuple[str, ...] = ()
+
+
+def read_targets(path: PathLike, chain: Chain) -> TargetPoses:
+    """Read target positions or poses of a tool.
+
+    Args:
+        path: File with the columns of a position or a pose; those of the joints are optional.
+        chain: Robot with the tool.
+
+    Returns:
+        The targets.
+
+    Raises:
+        FileFormatError: The columns are those of another measurement kind.
+    """
+    check_joint_names(chain)
+    table = read_table(path)
+    table.require_good_rows()
+    ignored = check_columns(table, chain)
+    kind = find_kind(table)
+    if kind not in (Pose, Position):
+        raise FileFormatError(
+            f"{table.header_location}: the columns are those of a {kind.kind} measurement; targets have "
+            "x[mm],y[mm],z[mm], with or without qw,qx,qy,qz or rx[rad],ry[rad],rz[rad]"
+        )
+    has_joints = bool(set(chain.joint_names) & set(table.columns))
+    near = parse_joint_positions(table, chain) if has_joints else None
+    placeholder = np.zeros((len(table.lines), chain.n_joints))
+    data = build_measurement(table, kind, [placeholder], parse_values(table, kind))
+    values = data.poses if isinstance(data, Pose) else data.positions()
+    notes = (*table.notes, *ignored_columns_note(ignored))
+    return TargetPoses(table.source, values, near, column_units(table), data.rows, notes)
+
+
+def read_configurations(path: PathLike, chain: Chain, columns: PathLike | None = None) -> Array:
+    """Read the joint positions of a file; measured values beside them are ignored.
+
+    Args:
+        path: File with a column for each joint, or one that `columns` describes.
+        chain: Robot with the joints.
+        columns: Column map for a file of another maker.
+
+    Returns:
+        Joint positions, shape (m, n) [rad or m].
+    """
+    check_joint_names(chain)
+    table = open_measurement_table(path, chain, columns)
+    table.require_good_rows()
+    check_columns(table, chain)
+    return parse_joint_positions(table, chain)

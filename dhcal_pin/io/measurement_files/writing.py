@@ -1,0 +1,100 @@
+"""Text of measurement files: samples of any kind, and joint positions alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..._typing import Array
+from ...measurements.base import Measurement
+from ...robot.chain import Chain
+from ...units import ANGLES, LENGTHS
+from ..tabular import csv_text
+from .columns import SECOND_PREFIX, check_joint_names, joint_units
+
+# Unit of prismatic joints beside the unit of revolute joints.
+_LENGTH_UNITS = {"rad": "m", "deg": "mm"}
+
+
+def measurement_text(data: Measurement, chain: Chain, comments: Sequence[str] = ()) -> str:
+    """Return the CSV text of samples of any kind.
+
+    Args:
+        data: Samples to write.
+        chain: Robot that was measured.
+        comments: Comment lines before the header.
+
+    Returns:
+        Table in metres and radians with all digits, so that it reads back bit-identical.
+    """
+    check_joint_names(chain)
+    count = data.configurations_per_row
+    configurations = np.split(data.configurations(), max(count, 1))
+    columns: dict[str, Any] = {}
+    for prefix, q in zip(("", SECOND_PREFIX)[:count], configurations, strict=False):
+        columns |= joint_columns(q, chain, prefix)
+    return csv_text(columns | value_columns(data), comments)
+
+
+def value_columns(data: Measurement) -> dict[str, list[Any]]:
+    """Return the columns of measured values and standard deviations, in metres and radians.
+
+    Args:
+        data: Samples to write.
+
+    Returns:
+        Values, m each, by header.
+    """
+    columns: dict[str, list[Any]] = {}
+    for name, values in data.to_columns().items():
+        unit = {"length": "[m]", "angle": "[rad]", "text": ""}[data.columns[name]]
+        columns[name + unit] = list(values) if unit == "" else values.tolist()
+    return columns
+
+
+def configurations_text(
+    q: Array, chain: Chain, comments: Sequence[str], angle_unit: str = "rad", decimals: int | None = None
+) -> str:
+    """Return the CSV text of joint positions.
+
+    Args:
+        q: Joint positions, shape (m, n) [rad or m].
+        chain: Robot with the joints.
+        comments: Comment lines before the header.
+        angle_unit: "rad" (with metres) or "deg" (with millimetres).
+        decimals: Number of decimals; None for all digits.
+
+    Returns:
+        Table of the joint positions. In radians with all digits it reads back bit-identical.
+    """
+    check_joint_names(chain)
+    return csv_text(joint_columns(q, chain, angle_unit=angle_unit, decimals=decimals), comments)
+
+
+def joint_columns(
+    q: Array, chain: Chain, prefix: str = "", angle_unit: str = "rad", decimals: int | None = None
+) -> dict[str, list[float]]:
+    """Return the columns of joint positions for a CSV file.
+
+    Args:
+        q: Joint positions, shape (m, n) [rad or m].
+        chain: Robot with the joints.
+        prefix: Text before each joint's name.
+        angle_unit: "rad" (with metres) or "deg" (with millimetres).
+        decimals: Number of decimals; None for all digits.
+
+    Returns:
+        Values, m each, by header.
+    """
+    columns = {}
+    for name, values in zip(chain.joint_names, q.T, strict=True):
+        is_length = joint_units(chain, name) is LENGTHS
+        unit = _LENGTH_UNITS[angle_unit] if is_length else angle_unit
+        factor = LENGTHS[unit] if is_length else ANGLES[unit]
+        scaled = values * factor
+        columns[f"{prefix}{name}[{unit}]"] = (
+            scaled if decimals is None else np.round(scaled, decimals) + 0.0
+        ).tolist()
+    return columns

@@ -1,0 +1,69 @@
+"""Sources of tables: which reader reads which file.
+
+To add a file format, add a module with a reader and one row to `FORMATS`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from ..._typing import PathLike
+from ...exceptions import FileFormatError
+from .data_frame import data_frame_table, is_data_frame, read_parquet
+from .spreadsheet import read_spreadsheet
+from .table import DataTable
+from .text import DETECTED, TextLayout, read_text_table
+
+
+class TableFormat(NamedTuple):
+    """File format of a table.
+
+    Attributes:
+        name: Name in messages.
+        endings: Endings of file names, lower case; none for the format of all other files.
+        read: Function that reads a file.
+    """
+
+    name: str
+    endings: tuple[str, ...]
+    read: Callable[[PathLike, TextLayout], DataTable]
+
+
+FORMATS = (
+    TableFormat("Excel", (".xlsx", ".xlsm"), read_spreadsheet),
+    TableFormat("Parquet", (".parquet", ".pq"), read_parquet),
+    TableFormat("text", (), read_text_table),
+)
+# Endings of files that cannot be read, and what to do with them.
+_UNREADABLE = {
+    ".xls": "save it as .xlsx",
+    ".ods": "save it as .xlsx or .csv",
+    ".bag": "convert it with `dhcal convert`",
+    ".db3": "convert its folder with `dhcal convert`",
+    ".mcap": "convert it with `dhcal convert`",
+}
+
+
+def read_table(source: PathLike | Any, layout: TextLayout = DETECTED) -> DataTable:
+    """Read a table from a file or a data frame.
+
+    Args:
+        source: Path of a text file, an Excel workbook or a Parquet file, or a data frame.
+        layout: What is known about the layout of a text file; the rest is detected.
+
+    Returns:
+        The table.
+
+    Raises:
+        FileFormatError: The file cannot be read, or has no table.
+    """
+    if is_data_frame(source):
+        return data_frame_table(source)
+    name = os.fspath(source).lower()
+    for ending, remedy in _UNREADABLE.items():
+        if name.endswith(ending):
+            raise FileFormatError(f"{os.fspath(source)}: {ending} files cannot be read; {remedy}")
+    reader = next(form for form in FORMATS if not form.endings or name.endswith(form.endings))
+    return reader.read(source, layout)

@@ -1,0 +1,123 @@
+"""Tables in Excel workbooks, read with openpyxl (`pip install 'dhcal-pin[excel]'`).
+
+The first sheet with content is read. Its rows are numbered as in Excel. Rows whose only cell starts with `#`
+are comments, as in a text file. Of a formula the value is read that Excel saved with it.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterable, Sequence
+from datetime import date, datetime, time
+from typing import Any
+from zipfile import BadZipFile
+
+from ..._typing import PathLike
+from ...exceptions import FileFormatError
+from .table import DataTable
+from .text import TextLayout, detect_decimal
+
+
+def read_spreadsheet(path: PathLike, layout: TextLayout) -> DataTable:
+    """Read a table from an Excel workbook.
+
+    Args:
+        path: Path of the file.
+        layout: What is known about the file; separator and encoding have no meaning here.
+
+    Returns:
+        The table.
+
+    Raises:
+        FileFormatError: openpyxl is not installed, or the file is not a workbook with a table.
+    """
+    source = os.fspath(path)
+    try:
+        from openpyxl import load_workbook  # lazy import: an optional package
+        from openpyxl.utils.exceptions import InvalidFileException
+    except ImportError:
+        raise FileFormatError(
+            f"{source}: reading Excel files needs openpyxl; install it with pip install 'dhcal-pin[excel]', "
+            "or save the sheet as CSV"
+        ) from None
+    try:
+        with warnings.catch_warnings():
+            # Unknown extensions of a workbook, such as charts, do not matter here.
+            warnings.simplefilter("ignore", UserWarning)
+            workbook = load_workbook(path, read_only=True, data_only=True)
+            sheets = {
+                sheet.title: _numbered_rows(sheet.iter_rows(values_only=True))
+                for sheet in workbook.worksheets
+            }
+            workbook.close()
+    except OSError as error:
+        raise FileFormatError(
+            f"{source}: cannot read it: {error.strerror or error}; give the path of a file"
+        ) from error
+    except (BadZipFile, InvalidFileException, KeyError, ValueError) as error:
+        raise FileFormatError(f"{source}: not an Excel workbook: {error}; save it as .xlsx") from error
+    filled = {title: rows for title, rows in sheets.items() if rows}
+    if not filled:
+        raise FileFormatError(f"{source}: is empty; the first row must be a header such as joint_1[deg]")
+    title, rows = next(iter(filled.items()))
+    others = [other for other in filled if other != title]
+    notes = (f"read sheet {title!r}, not {', '.join(map(repr, others))}",) if others else ()
+    return _build_table(source, rows, layout, f"Excel sheet {title!r}", notes)
+
+
+def _numbered_rows(rows: Iterable[Sequence[Any]]) -> list[tuple[int, list[Any]]]:
+    """Return the values of the rows with content, with their numbers; empty cells are empty texts."""
+    values = (
+        (number, ["" if value is None else value for value in row]) for number, row in enumerate(rows, 1)
+    )
+    return [(number, cells) for number, cells in values if any(cell != "" for cell in cells)]
+
+
+def _cell_text(value: Any, decimal: str) -> str:
+    """Return the text of a cell; numbers with all digits."""
+    if isinstance(value, datetime | date | time):
+        return value.isoformat()
+    return repr(value).replace(".", decimal) if isinstance(value, float) else str(value).strip()
+
+
+def _build_table(
+    source: str,
+    rows: list[tuple[int, list[Any]]],
+    layout: TextLayout,
+    description: str,
+    notes: tuple[str, ...],
+) -> DataTable:
+    """Divide the rows of a sheet into comments, header and data."""
+    comments: list[str] = []
+    content: list[tuple[int, list[Any]]] = []
+    for number, cells in rows:
+        first, *others = [cell for cell in cells if cell != ""]
+        if number <= layout.skip:
+            continue
+        if layout.comment and not others and str(first).startswith(layout.comment):
+            comments.append(str(first).removeprefix(layout.comment).strip())
+        else:
+            content.append((number, cells))
+    if len(content) <= layout.has_header:
+        raise FileFormatError(f"{source}: no rows under the header; add at least one row")
+    decimal = layout.decimal or detect_decimal(
+        cell for _, cells in content for cell in cells if isinstance(cell, str)
+    )
+    texts = [(number, [_cell_text(cell, decimal) for cell in cells]) for number, cells in content]
+    header_line, headers = texts[0]
+    data = texts[layout.has_header :]
+    while headers and not headers[-1] and not any("".join(cells[len(headers) - 1 :]) for _, cells in data):
+        headers.pop()
+    width = len(headers)
+    return DataTable(
+        source,
+        tuple(headers if layout.has_header else map(str, range(1, width + 1))),
+        [(cells + [""] * width)[:width] for _, cells in data],
+        [number for number, _ in data],
+        header_line,
+        tuple(comments),
+        decimal=decimal,
+        description=description,
+        notes=notes,
+    )

@@ -1,0 +1,350 @@
+"""Tables of text and numbers, whatever file they come from.
+
+A `DataTable` has a header cell for each of its c columns, and m rows with the line of the file that each
+comes from. All readers of this package return one. Header cells `name` or `name[unit]` become `Column`
+objects, and `DataTable.to_si` converts a column to SI units. Every error names the file, the line and the
+column. Lines are counted from 1, as text editors and spreadsheets do.
+
+Rows that cannot be used are not an error at first: they are moved to `DataTable.bad_rows` with the reason, so
+that a reader can name all of them in one message or leave them out.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+
+from ..._typing import Array
+from ...exceptions import FileFormatError, UnknownNameError
+from ...messages import quote
+from ...units import MAX_SI_VALUE
+from ..tabular import parse_number
+
+
+@dataclass(frozen=True)
+class Column:
+    """Header entry `name[unit]`.
+
+    Attributes:
+        name: Name of the column.
+        unit: Unit in brackets; empty if the header has none.
+        index: Position in the header, counted from 0.
+    """
+
+    name: str
+    unit: str
+    index: int
+
+    def divisor(self, units: Mapping[str, float], where: str) -> float:
+        """Return the divisor that converts the column to SI units.
+
+        Args:
+            units: Divisor of each allowed unit.
+            where: File and line of the header, for messages.
+
+        Returns:
+            Divisor of the column's unit.
+
+        Raises:
+            FileFormatError: The column has no unit.
+            UnknownNameError: The unit is unknown or belongs to another quantity.
+        """
+        if self.unit in units:
+            return units[self.unit]
+        choices = ", ".join(f"{self.name}[{unit}]" for unit in units if unit.isascii())
+        if not self.unit:
+            raise FileFormatError(f"{where}: column {self.name!r} has no unit; write one of {choices}")
+        raise UnknownNameError(
+            f"{where}: column {self.name!r} has unit {self.unit!r}; write one of {choices}"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class DataTable:
+    """Table of a file, or of a part of one, with m rows and c columns.
+
+    Attributes:
+        source: Name of the file.
+        headers: Header cell of each column, or its number if the file has no header.
+        cells: Text of the cells of each row, m rows.
+        lines: Line of each row in the file.
+        header_line: Line of the header, or of the first row if the file has none.
+        comments: Text of the comment lines, without `#`.
+        numbers: Numbers of the columns that were parsed already, shape (m,) each, by column index.
+        decimal: Decimal sign of the cells.
+        bad_rows: Reason why a row was left out, by line.
+        description: How the file is written, such as "semicolons, decimal commas".
+        notes: Sentences on what was not read, such as further sheets.
+    """
+
+    source: str
+    headers: tuple[str, ...]
+    cells: Sequence[Sequence[str]]
+    lines: Sequence[int]
+    header_line: int
+    comments: tuple[str, ...] = ()
+    numbers: Mapping[int, Array] = field(default_factory=dict)
+    decimal: str = "."
+    bad_rows: Mapping[int, str] = field(default_factory=dict)
+    description: str = ""
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def from_columns(
+        cls, source: str, columns: Mapping[str, Array | Sequence[str]], lines: Sequence[int], **others: Any
+    ) -> DataTable:
+        """Build a table from its columns.
+
+        Args:
+            source: Name of the file.
+            columns: Numbers as an array, or texts, m each, by header cell.
+            lines: Line of each row.
+            **others: Further attributes.
+
+        Returns:
+            The table.
+        """
+        values = list(columns.values())
+        numbers = {i: column for i, column in enumerate(values) if isinstance(column, np.ndarray)}
+        rows = _ColumnRows(values, len(lines))
+        return cls(source, tuple(columns), rows, lines, **{"header_line": 1, "numbers": numbers} | others)
+
+    @property
+    def header_location(self) -> str:
+        """File and line of the header, for messages."""
+        return f"{self.source}:{self.header_line}"
+
+    @cached_property
+    def has_numbers_as_header(self) -> bool:
+        """Whether most header cells are numbers, so that the file probably has no header."""
+        cells = [cell for cell in self.headers if cell]
+        return 2 * sum(math.isfinite(self._parse(cell)) for cell in cells) >= max(1, len(cells))
+
+    @cached_property
+    def columns(self) -> dict[str, Column]:
+        """Columns by name; those without a name are left out."""
+        if self.has_numbers_as_header:
+            raise FileFormatError(
+                f"{self.header_location}: numbers where the header must be; "
+                "write one such as joint_1[deg],…,x[mm],y[mm],z[mm]"
+            )
+        columns: dict[str, Column] = {}
+        for index, cell in enumerate(self.headers):
+            if not cell:
+                continue
+            match = re.fullmatch(r"\s*([^\[\]]+?)\s*(?:\[\s*([^\[\]]*?)\s*\])?\s*", cell)
+            if not match:
+                raise FileFormatError(
+                    f"{self.header_location}: header {quote(cell)}: write name or name[unit], with commas "
+                    "between them"
+                )
+            name, unit = match[1], match[2] or ""
+            if name in columns:
+                raise FileFormatError(
+                    f"{self.header_location}: column {quote(name)} appears twice; remove one"
+                )
+            columns[name] = Column(name, unit, index)
+        return columns
+
+    def column_label(self, index: int) -> str:
+        """Return how messages call a column: its name without the unit, or its number.
+
+        Args:
+            index: Index of the column, counted from 0.
+        """
+        name = self.headers[index].split("[")[0].strip() or self.headers[index]
+        return f"column {quote(name)}" if name else f"column {index + 1}"
+
+    def cell_location(self, row: int, column: str) -> str:
+        """Return file, line and column of a cell, for messages.
+
+        Args:
+            row: Index of the row, counted from 0.
+            column: Name of the column.
+
+        Returns:
+            Text such as `data.csv:7: column 'x'`.
+        """
+        return f"{self.source}:{self.lines[row]}: column {column!r}"
+
+    # ----------------------------------------------------------------------------------------- values
+    def to_si(self, column: Column, units: Mapping[str, float]) -> Array:
+        """Return the numbers of a column in SI units.
+
+        Args:
+            column: Column of this table.
+            units: Divisor of each allowed unit.
+
+        Returns:
+            Values, shape (m,) [m or rad].
+
+        Raises:
+            FileFormatError: A number is too large. A cell that is not a number and a unit that is missing or
+                unknown raise the errors of `finite_numbers` and `Column.divisor`.
+        """
+        values = self.finite_numbers(column) / column.divisor(units, self.header_location)
+        too_large = np.flatnonzero(np.abs(values) > MAX_SI_VALUE)
+        if too_large.size:
+            row = int(too_large[0])
+            text = self.cells[row][column.index].strip()
+            raise FileFormatError(
+                f"{self.cell_location(row, column.name)}: {text} {column.unit} is beyond "
+                f"{MAX_SI_VALUE:g} {next(iter(units))}; correct the number or the unit"
+            )
+        return values
+
+    def finite_numbers(self, column: Column) -> Array:
+        """Return the numbers of a column, in the column's own unit.
+
+        Args:
+            column: Column of this table.
+
+        Returns:
+            Finite numbers, shape (m,).
+
+        Raises:
+            FileFormatError: A cell is not a finite number.
+        """
+        values = self.values(column.index)
+        wrong = np.flatnonzero(~np.isfinite(values))
+        if wrong.size:
+            row = int(wrong[0])
+            raise FileFormatError(
+                f"{self.source}:{self.lines[row]}: {self._bad_number(row, column.index)}; "
+                "correct or remove the row"
+            )
+        return values
+
+    def values(self, index: int) -> Array:
+        """Return the numbers of a column.
+
+        Args:
+            index: Index of the column, counted from 0.
+
+        Returns:
+            Numbers, shape (m,); NaN where a cell is not a number.
+        """
+        known = self.numbers.get(index)
+        return known if known is not None else np.array([self._parse(row[index]) for row in self.cells])
+
+    def text(self, column: Column) -> list[str]:
+        """Return the cells of a column as text.
+
+        Args:
+            column: Column of this table.
+
+        Returns:
+            One text per row, without surrounding white space.
+        """
+        return [row[column.index].strip() for row in self.cells]
+
+    def _parse(self, cell: str) -> float:
+        """Return the number in a cell, NaN if it is none."""
+        if self.decimal != ".":
+            # A point would be a sign for thousands.
+            cell = "" if "." in cell else cell.replace(self.decimal, ".")
+        with suppress(ValueError):
+            return parse_number(cell)
+        return math.nan
+
+    def _bad_number(self, row: int, index: int) -> str:
+        """Return why a cell is not a finite number."""
+        text = self.cells[row][index].strip()
+        signs = " with decimal commas" if self.decimal == "," else ""
+        problem = f"{quote(text)} is not a finite number{signs}" if text else "is empty"
+        return f"{self.column_label(index)}: {problem}" if text else f"{self.column_label(index)} {problem}"
+
+    # --------------------------------------------------------------------------------------- bad rows
+    def without_bad_rows(self, numbers: Iterable[int], texts: Iterable[int] = ()) -> DataTable:
+        """Move the rows with a missing value to `bad_rows`.
+
+        Args:
+            numbers: Indices of the columns that must have finite numbers.
+            texts: Indices of the columns that must not be empty.
+
+        Returns:
+            The table without these rows, with the numbers of these columns parsed.
+        """
+        values = {index: self.values(index) for index in numbers}
+        reasons: dict[int, str] = {}
+        for index, column in values.items():
+            for row in np.flatnonzero(~np.isfinite(column)).tolist():
+                reasons.setdefault(row, self._bad_number(row, index))
+        for index in texts:
+            for row, cells in enumerate(self.cells):
+                if not cells[index].strip():
+                    reasons.setdefault(row, f"{self.column_label(index)} is empty; write a name")
+        table = replace(self, numbers={**self.numbers, **values})
+        if not reasons:
+            return table
+        bad = {self.lines[row]: reasons[row] for row in sorted(reasons)}
+        rows = [row for row in range(len(self.lines)) if row not in reasons]
+        return replace(
+            table,
+            cells=[self.cells[row] for row in rows],
+            lines=[self.lines[row] for row in rows],
+            numbers={index: column[rows] for index, column in table.numbers.items()},
+            bad_rows=dict(sorted({**self.bad_rows, **bad}.items())),
+        )
+
+    def require_good_rows(self, alternative: str = "") -> None:
+        """Require that no row was left out.
+
+        Args:
+            alternative: What else the message advises than to correct or remove the rows.
+
+        Raises:
+            FileFormatError: The message names the lines of all bad rows, and the reason of the first.
+        """
+        if not self.bad_rows:
+            return
+        line, reason = next(iter(self.bad_rows.items()))
+        what, others = "the row", ""
+        if len(self.bad_rows) > 1:
+            what = "them"
+            others = f"; {len(self.bad_rows)} rows cannot be used: lines {format_lines(self.bad_rows)}"
+        raise FileFormatError(
+            f"{self.source}:{line}: {reason}{others}; correct or remove {what}{alternative}"
+        )
+
+
+class _ColumnRows(Sequence[list[str]]):
+    """Rows of a table that is stored by columns; cells are made on access."""
+
+    def __init__(self, columns: Sequence[Array | Sequence[str]], count: int):
+        self._columns, self._count = columns, count
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, index: Any) -> Any:
+        if not -self._count <= index < self._count:
+            raise IndexError(index)
+        return [
+            repr(float(column[index])) if isinstance(column, np.ndarray) else column[index]
+            for column in self._columns
+        ]
+
+
+def format_lines(lines: Iterable[int]) -> str:
+    """Return a list of line numbers as text, with consecutive ones joined.
+
+    Args:
+        lines: Line numbers in ascending order.
+
+    >>> format_lines([2, 5, 6, 7, 11])
+    '2, 5-7, 11'
+    """
+    parts = []
+    for _, pairs in groupby(enumerate(lines), lambda pair: pair[1] - pair[0]):
+        run = [line for _, line in pairs]
+        parts.append(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}")
+    return ", ".join(parts)

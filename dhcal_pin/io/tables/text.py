@@ -1,0 +1,281 @@
+"""Tables in text files: separators, decimal signs, comments, header.
+
+What the layout of a file does not state is detected from its lines:
+
+- Separator: of comma, semicolon, tab and runs of spaces the one under which most rows have as many cells as
+  the header, and most of their cells are numbers. Commas are preferred among equals.
+- Decimal sign: a comma, if there are numbers with a decimal comma and none with a decimal point.
+
+Lines are split one by one, so that an unbalanced quote does not extend over the following lines. A row with
+another number of cells than the header is a bad row; empty cells at the end of a row do not count.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..._typing import Array, PathLike
+from ...exceptions import FileFormatError
+from ..tabular import parse_number, read_text
+from .table import DataTable
+
+# Characters of a line without content: spreadsheets write empty rows as separators only.
+BLANK_CHARACTERS = " \t,;"
+# Separator characters by their names; None for any white space. The order is that of preference.
+SEPARATORS: Mapping[str, str | None] = {",": ",", ";": ";", "tab": "\t", "space": None}
+# Names of separators in descriptions.
+_SEPARATOR_NAMES = {",": "commas", ";": "semicolons", "tab": "tabs", "space": "spaces"}
+# Rows that the separator and the decimal sign are detected from.
+_N_SEPARATOR_ROWS, _N_DECIMAL_ROWS = 50, 2000
+# A number without and with a decimal sign.
+_INTEGER = re.compile(r"[+-]?\d+(?:[eE][+-]?\d+)?")
+_DECIMALS = {sign: re.compile(rf"[+-]?(?:\d+\{sign}\d*|\{sign}\d+)(?:[eE][+-]?\d+)?") for sign in ".,"}
+
+
+@dataclass(frozen=True)
+class TextLayout:
+    """How a text file is divided into cells.
+
+    Attributes:
+        separator: Key of `SEPARATORS`; empty if it is to be detected.
+        decimal: Decimal sign; empty if it is to be detected.
+        skip: Number of lines before the header.
+        has_header: Whether the first row is a header.
+        comment: Start of a comment line; empty if there are none.
+        encoding: Encoding of the file.
+    """
+
+    separator: str = ""
+    decimal: str = ""
+    skip: int = 0
+    has_header: bool = True
+    comment: str = "#"
+    encoding: str = "utf-8"
+
+
+# Layout of a file of which nothing is known.
+DETECTED = TextLayout()
+
+
+def read_text_table(path: PathLike, layout: TextLayout) -> DataTable:
+    """Read a table from a text file.
+
+    Args:
+        path: Path of the file.
+        layout: What is known about the file.
+
+    Returns:
+        The table; `parse_lines` names the possible errors.
+    """
+    return parse_lines(os.fspath(path), enumerate(read_text(path, layout.encoding).splitlines(), 1), layout)
+
+
+def parse_lines(source: str, numbered: Iterable[tuple[int, str]], layout: TextLayout = DETECTED) -> DataTable:
+    """Parse numbered lines of a text file, possibly of a part of it.
+
+    Args:
+        source: Name of the file, for messages.
+        numbered: Line number and text of each line; the first one with content is the header.
+        layout: What is known about the file.
+
+    Returns:
+        The table.
+
+    Raises:
+        FileFormatError: There is no header or no row.
+    """
+    comments: list[str] = []
+    content: list[tuple[int, str]] = []
+    for line_number, line in numbered:
+        if line_number <= layout.skip or not line.strip(BLANK_CHARACTERS):
+            continue
+        if layout.comment and line.lstrip().startswith(layout.comment):
+            comments.append(line.lstrip()[len(layout.comment) :].strip())
+        else:
+            content.append((line_number, line))
+    if not content:
+        raise FileFormatError(
+            f"{source}: is empty; the first line must be a header such as joint_1[deg],…,x[mm],y[mm],z[mm]"
+        )
+    texts = [line for _, line in content]
+    separator = layout.separator or _detect_separator(texts[:_N_SEPARATOR_ROWS])
+    split = _splitter(separator)
+    header_line, header = content[0]
+    try:
+        headers = [cell.strip() for cell in split(header)]
+    except csv.Error as error:
+        raise FileFormatError(f"{source}:{header_line}: {error}; correct the header") from error
+    if not layout.has_header:
+        headers = [str(number) for number in range(1, len(headers) + 1)]
+    while headers and not headers[-1]:
+        headers.pop()
+    rows = content[layout.has_header :]
+    if not rows:
+        raise FileFormatError(
+            f"{source}: no rows under the header in line {header_line}; add at least one row"
+        )
+    good, bad = _divide_rows(rows, separator, len(headers))
+    body = [line for _, line in good]
+    decimal = layout.decimal or _decimal_of_lines(body[:_N_DECIMAL_ROWS], separator)
+    name = _SEPARATOR_NAMES[separator]
+    return DataTable(
+        source,
+        tuple(headers),
+        _TextRows(body, split),
+        [line_number for line_number, _ in good],
+        header_line,
+        tuple(comments),
+        _parse_numbers(body, separator, decimal),
+        decimal,
+        bad,
+        f"{name}, decimal commas" if decimal == "," else name,
+    )
+
+
+class _TextRows(Sequence[list[str]]):
+    """Rows of separated text, split on access: numeric columns are parsed without splitting."""
+
+    def __init__(self, rows: Sequence[str], split: Callable[[str], list[str]]):
+        self._rows, self._split = rows, split
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self._split(self._rows[int(index)])
+
+
+def _splitter(separator: str) -> Callable[[str], list[str]]:
+    """Return the function that splits a line; `csv.Error` if a cell is too long."""
+    character = SEPARATORS[separator]
+    if character is None:
+        return str.split
+    return lambda line: next(csv.reader([line], delimiter=character))
+
+
+def _divide_rows(
+    rows: Sequence[tuple[int, str]], separator: str, width: int
+) -> tuple[list[tuple[int, str]], dict[int, str]]:
+    """Return the rows that have a cell for each column, and the reasons why the others do not, by line."""
+    split, name = _splitter(separator), _SEPARATOR_NAMES[separator]
+    counts: dict[int, int] = {}
+    bad: dict[int, str] = {}
+    for line_number, text in rows:
+        try:
+            counts[line_number] = _count_cells(text, separator, split)
+        except csv.Error as error:
+            bad[line_number] = f"not text separated by {name}: {error}"
+    # A decimal comma among commas makes a cell more, which an empty last cell may hide.
+    frequency = Counter(counts.values())
+    usual = max(frequency, key=lambda count: (frequency[count], -count), default=width)
+    good: list[tuple[int, str]] = []
+    for line_number, text in rows:
+        count = counts.get(line_number, -1)
+        if count == width or (
+            count > width
+            and (count == usual or separator != ",")
+            and not any(cell.strip() for cell in split(text)[width:])
+        ):
+            good.append((line_number, text))
+        elif count >= 0:
+            hint = " and decimal points" if separator == "," else ""
+            bad[line_number] = f"{count} values for {width} columns, with {name} between them{hint}"
+    return good, dict(sorted(bad.items()))
+
+
+def _count_cells(text: str, separator: str, split: Callable[[str], list[str]]) -> int:
+    """Return the number of cells of a row; `csv.Error` if one is too long."""
+    character = SEPARATORS[separator]
+    if character is None or '"' in text or len(text) > csv.field_size_limit():
+        return len(split(text))
+    return text.count(character) + 1
+
+
+def _detect_separator(lines: Sequence[str]) -> str:
+    """Return the separator of a file from its header and first rows."""
+    scores: dict[str, tuple[float, int]] = {}
+    candidates = [name for name in SEPARATORS if len(_split_stripped(lines[0], name)) > 1]
+    for name in candidates if len(candidates) > 1 else ():
+        rows = [_split_stripped(line, name) for line in lines]
+        width = len(rows[0])
+        fitting = [row for row in rows[1:] if len(row) <= width]
+        n_numbers = sum(_is_decimal(cell) for row in fitting for cell in row)
+        scores[name] = n_numbers / (width * max(1, len(rows) - 1)), width
+    return max(scores, key=lambda name: scores[name], default=candidates[0] if candidates else ",")
+
+
+def _split_stripped(line: str, separator: str) -> list[str]:
+    """Return the cells of a line without empty ones at its end; none if the line cannot be split."""
+    try:
+        cells = [cell.strip() for cell in _splitter(separator)(line)]
+    except csv.Error:
+        return []
+    while cells and not cells[-1]:
+        cells.pop()
+    return cells
+
+
+def _is_decimal(cell: str) -> bool:
+    """Return whether a cell is a number with either decimal sign."""
+    return any(pattern.fullmatch(cell) for pattern in (_INTEGER, *_DECIMALS.values()))
+
+
+def _decimal_of_lines(rows: Sequence[str], separator: str) -> str:
+    """Return the decimal sign of rows that are not split yet."""
+    if not any("," in line and (separator != "," or '"' in line) for line in rows):
+        return "."
+    split = _splitter(separator)
+    return detect_decimal(cell for line in rows for cell in split(line))
+
+
+def detect_decimal(cells: Iterable[str]) -> str:
+    """Return the decimal sign of some cells.
+
+    Args:
+        cells: Numbers and other texts.
+
+    Returns:
+        A comma if there are numbers with a decimal comma and none with a decimal point, otherwise a point.
+    """
+    cells = [cell.strip() for cell in cells]
+    has = {sign: any(map(pattern.fullmatch, cells)) for sign, pattern in _DECIMALS.items()}
+    return "," if has[","] and not has["."] else "."
+
+
+def _parse_numbers(rows: Sequence[str], separator: str, decimal: str) -> dict[int, Array]:
+    """Parse all columns that are numeric in the first row.
+
+    Args:
+        rows: Lines with a cell for each column.
+        separator: Key of `SEPARATORS`.
+        decimal: Decimal sign.
+
+    Returns:
+        Numbers, shape (m,) each, by column index; empty if a cell is quoted, or if a cell of such a column is
+        not a number.
+    """
+    has_points = decimal == "," and any("." in line for line in rows)
+    if not rows or has_points or any('"' in line for line in rows):
+        return {}
+    numeric = []
+    for i, cell in enumerate(_splitter(separator)(rows[0])):
+        with suppress(ValueError):
+            parse_number(cell.replace(decimal, "."))
+            numeric.append(i)
+    if not numeric:
+        return {}
+    lines = (line.replace(",", ".") for line in rows) if decimal == "," else rows
+    try:
+        table = np.loadtxt(lines, delimiter=SEPARATORS[separator], comments=None, usecols=numeric, ndmin=2)
+    except ValueError:
+        return {}
+    return dict(zip(numeric, np.ascontiguousarray(table.T), strict=True))

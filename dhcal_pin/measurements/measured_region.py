@@ -1,0 +1,170 @@
+"""Region of joint space that measured configurations cover, and how far other configurations are from it.
+
+The distance of two configurations is the Euclidean norm of their joint differences, each divided by the
+standard deviation of the measured values of that joint. Differences of revolute joints are taken modulo one
+turn. Up to `MAX_CONFIGURATIONS` of the measured configurations, at most half of them, represent the region.
+They are drawn at random. The radius of the region is the 95th percentile of the distances from the others to
+the nearest of them. A further configuration that is drawn like the measured ones is thus in the region with a
+probability of 95 %, however the measured ones are distributed.
+
+Shapes: m configurations, k representatives, n joints.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .._typing import Array
+from ..robot.chain import Chain
+
+# Largest number of configurations that represent a region.
+MAX_CONFIGURATIONS = 200
+# Quantile of the distances between measured configurations that is the radius of a region, and of the
+# distances of parts that are left out that is its reach.
+RADIUS_QUANTILE = 0.95
+# Smallest spread of a joint that distances are divided by [rad or m]: a joint that hardly moved.
+MIN_SPREAD = 1e-3
+# Largest number of configurations whose distances are computed for a quantile.
+MAX_DISTANCES = 1000
+# Number of random configurations from which the covered share of the joint space is computed.
+N_CONFIGURATIONS = 2000
+# Distances are computed for this many configurations at once.
+_CHUNK_SIZE = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredRegion:
+    """Region of joint space around measured configurations.
+
+    Attributes:
+        is_prismatic: Whether each joint is prismatic, (n,).
+        lower: Smallest measured value of each joint, (n,) [rad or m].
+        upper: Largest measured value of each joint, (n,) [rad or m].
+        spread: Standard deviation of the measured values of each joint, (n,) [rad or m].
+        configurations: Configurations that represent the region, (k, n) [rad or m].
+        radius: Largest distance from the nearest of them inside the region.
+        reach: Largest distance at which the accuracy was judged by leaving out regions; at least the radius.
+    """
+
+    is_prismatic: Array
+    lower: Array
+    upper: Array
+    spread: Array
+    configurations: Array
+    radius: float
+    reach: float
+
+    @classmethod
+    def from_configurations(cls, q: Array, is_prismatic: Array) -> MeasuredRegion:
+        """Describe the region of measured configurations.
+
+        Args:
+            q: Different configurations, (m, n) [rad or m], m > 0.
+            is_prismatic: Whether each joint is prismatic, (n,).
+
+        Returns:
+            The region; its reach is its radius.
+        """
+        region = cls(is_prismatic, q.min(0), q.max(0), q.std(0), q, 0.0, 0.0)
+        drawn = _is_drawn(len(q))
+        if drawn.all():
+            return region
+        region = replace(region, configurations=q[drawn])
+        distances = region.distances(_thinned(q[~drawn]))
+        radius = float(np.quantile(distances, RADIUS_QUANTILE, method="higher"))
+        return replace(region, radius=radius, reach=radius)
+
+    def with_reach(self, q: Array, is_left_out: Array) -> MeasuredRegion:
+        """Determine the reach from parts of the region that were left out in turn.
+
+        Args:
+            q: The different configurations, (m, n) [rad or m].
+            is_left_out: Whether each part contains each configuration, (k, m).
+
+        Returns:
+            Region whose reach is the 95th percentile of the distances of the left-out configurations from the
+            others.
+        """
+        distances = [
+            replace(self, configurations=q[~mask][_is_drawn(int(np.sum(~mask)))]).distances(_thinned(q[mask]))
+            for mask in is_left_out
+            if not mask.all()
+        ]
+        reach = float(np.quantile(np.concatenate(distances), RADIUS_QUANTILE)) if distances else 0.0
+        return replace(self, reach=max(self.radius, reach))
+
+    def distances(self, q: Array) -> Array:
+        """Compute the distances of configurations from the nearest one that represents the region.
+
+        Args:
+            q: Configurations, (m, n) [rad or m].
+
+        Returns:
+            Distances, (m,), in spreads of the joints.
+        """
+        centres, out = self.configurations, np.empty(len(q))
+        for start in range(0, len(q), _CHUNK_SIZE):
+            part = q[start : start + _CHUNK_SIZE]
+            squares = np.zeros((len(part), len(centres)))
+            for joint, spread in enumerate(np.maximum(self.spread, MIN_SPREAD)):
+                difference = part[:, None, joint] - centres[None, :, joint]
+                if not self.is_prismatic[joint]:
+                    difference = difference - 2 * np.pi * np.round(difference / (2 * np.pi))
+                squares += (difference / spread) ** 2
+            out[start : start + _CHUNK_SIZE] = np.sqrt(squares.min(1))
+        return out
+
+    def contains(self, q: Array) -> Array:
+        """Check which configurations are in the region.
+
+        Args:
+            q: Configurations, (m, n) [rad or m].
+
+        Returns:
+            Whether each is in the region, (m,).
+        """
+        return self.distances(q) <= self.radius
+
+    def excess(self, q: Array) -> Array:
+        """Compute how far joint values are outside the measured range of their joint.
+
+        Args:
+            q: Configurations, (m, n) [rad or m].
+
+        Returns:
+            Distances from the range, (m, n) [rad or m], 0 inside; of revolute joints modulo one turn.
+        """
+        width = self.upper - self.lower
+        above = q - self.upper
+        outside = np.maximum(np.maximum(above, self.lower - q), 0.0)
+        above = np.mod(above, 2 * np.pi)
+        # From the upper end of the range on, the rest of the turn leads back to the lower end.
+        around = np.maximum(np.minimum(above, 2 * np.pi - width - above), 0.0)
+        return np.where(self.is_prismatic, outside, np.minimum(outside, around))
+
+
+def _is_drawn(count: int) -> Array:
+    """Draw the configurations that represent so many; return their mask (count,)."""
+    n_drawn = max(1, min(MAX_CONFIGURATIONS, count // 2))
+    return np.random.default_rng(0).permutation(count) < n_drawn
+
+
+def _thinned(q: Array) -> Array:
+    """Return every k-th configuration (m, n), at most as many as quantiles of distances need."""
+    return q[:: max(1, -(-len(q) // MAX_DISTANCES))]
+
+
+def draw_joint_space(chain: Chain) -> Array:
+    """Draw configurations evenly from the joint space within the limits.
+
+    Args:
+        chain: Kinematic chain.
+
+    Returns:
+        Configurations, (2000, n) [rad or m], always the same ones.
+    """
+    from ..robot.sampling import joint_range  # lazy import: slow, and few calibrations need it
+
+    return np.random.default_rng(0).uniform(*joint_range(chain), (N_CONFIGURATIONS, chain.n_joints))

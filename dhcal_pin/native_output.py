@@ -1,0 +1,37 @@
+"""Messages that compiled libraries print themselves, below Python."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+# File descriptor of standard error.
+_STDERR = 2
+# A second thread would otherwise take the discarded stream for the original one.
+_LOCK = threading.RLock()
+
+
+@contextmanager
+def discard_native_messages() -> Iterator[None]:
+    """Discard what compiled libraries print to standard error in the `with` block.
+
+    Parsers of URDFs and meshes print remarks that name neither the file nor the line. The project checks the
+    file before, or handles the failure after the call. The block should contain only the call: messages of
+    Python and of other threads are discarded as well.
+    """
+    with _LOCK:
+        try:
+            original = os.dup(_STDERR)
+        except OSError:  # standard error is closed
+            yield
+            return
+        null = os.open(os.devnull, os.O_WRONLY)
+        try:
+            os.dup2(null, _STDERR)
+            yield
+        finally:
+            os.dup2(original, _STDERR)
+            os.close(original)
+            os.close(null)

@@ -1,0 +1,8 @@
+"""Public names of dhcal_pin.planning; `__init__.py` loads each on first use."""
+
+from .curve_prediction import CurvePrediction as CurvePrediction
+from .information import Information as Information
+from .information import plannable_kinds as plannable_kinds
+from .planner import CRITERIA as CRITERIA
+from .planner import Plan as Plan
+from .planner import plan as plan

@@ -1,0 +1,16 @@
+"""Plausibility: whether measurements and corrections can be what they are said to be.
+
+A `Hypothesis` (`hypotheses`) is one assumption about what was mixed up in measurements, such as the sign of a
+joint, and the change that undoes it. The evidence of the measurements with and without that change
+(`evidence`) decides between hypotheses (`mixups`). `displacement` compares the size of a correction with
+manufacturing errors.
+
+Not here: single implausible values, such as joints beyond their limits (`diagnostics`), and the judgement of
+a calibration (`calibration.verdict`).
+
+The public names are listed in `__init__.pyi`. Each is loaded on first use.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,11 @@
+"""Public names of dhcal_pin.plausibility; `__init__.py` loads each on first use."""
+
+from .displacement import CorrectionSize as CorrectionSize
+from .displacement import measure_correction as measure_correction
+from .evidence import Evidence as Evidence
+from .evidence import fit_evidence as fit_evidence
+from .hypotheses import Hypothesis as Hypothesis
+from .hypotheses import list_hypotheses as list_hypotheses
+from .hypotheses import mend as mend
+from .mixups import Diagnosis as Diagnosis
+from .mixups import diagnose_mixups as diagnose_mixups

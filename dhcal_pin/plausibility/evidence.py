@@ -1,0 +1,211 @@
+"""Evidence of measurements for a robot with small errors, by which hypotheses about the data are compared.
+
+The whitened measurements, with base, tool and instrument parameters eliminated, are y = A·x + ε. The errors
+x of the robot have the prior x ~ N(0, w²·P) with the default variances P and an unknown width w, and the
+noise is ε ~ N(0, σ²·I) with an unknown scale σ. With the singular values s_i of A·√P, the components y_i of y
+along its left singular vectors, and the rest ρ² = ‖y‖² - Σ y_i² of dimension m,
+
+    log p(y | w, σ) = -½·Σ [log(σ² + w²·s_i²) + y_i²/(σ² + w²·s_i²)] - m·log σ - ρ²/(2·σ²) + const.
+
+Eliminating base, tool and instrument parameters b, whose rows are F·b, divides the density by the volume
+√det(FᵀF) of their flat priors. The evidence is the maximum over grids of w and σ, with ln w ~ N(0, 1.5²) as
+in `calibration.shrinkage` (MacKay 1992). It prices a correction that is larger than manufacturing errors as
+well as residuals that are larger than noise, so that a model with more parameters than equations is judged
+as well.
+
+Standard deviations are scaled by the residuals, separately for lengths and angles. A sample whose residual
+is far above the others gets a larger standard deviation of its own. The determinants of both are part of the
+evidence, so that evidence of the same samples with other changes can be compared.
+
+Reference: D. J. C. MacKay, Bayesian Interpolation, Neural Computation 4, 1992.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .._typing import Array
+from ..estimation.error_model import ErrorModel
+from ..estimation.initialization import initialize_frames, make_problem
+from ..estimation.parameters import select_parameters
+from ..estimation.problem import Problem
+from ..estimation.qr import RANK_RTOL, TriangularSystem
+from ..estimation.solver import minimize
+from ..measurements.base import ANGLE_SIGMA, LENGTH_SIGMA, Measurement
+from ..measurements.pose import PoseMeasurement
+from ..measurements.position import PointMeasurement
+from ..robot.chain import BASE_FRAME, Chain
+
+# Errors that the robot may have; base and tool are free, so that instrument and target may be anywhere.
+_PARAMETERS = "minimal,base,tool"
+# Widths w of the priors, and logarithm of the standard deviation of ln w.
+_WIDTHS = 2.0 ** np.arange(-1, 5)
+_LOG_WIDTH_STD = 1.5
+# Width of the priors while the robot is fitted: errors of some centimetres and degrees.
+_FIT_WIDTH = 4.0
+# Noise scales σ around the residuals of the fit.
+_NOISE_SCALES = 10.0 ** np.arange(-1, 2.01, 0.25)
+# Largest number of iterations of a fit, and of one of base and tool alone.
+_N_ITERATIONS, _N_FRAME_ITERATIONS = 12, 20
+# Largest number of fits with new noise scales. They end when the scales fall by less than this, on the mean
+# of the logarithms.
+_N_ROUNDS, _MIN_CHANGE = 5, 0.1
+# Smallest and largest scale of the placeholder standard deviations.
+_MIN_SCALE, _MAX_SCALE = 1e-2, 1e7
+# Samples with residuals above this multiple of the median get a standard deviation of their own.
+_OUTLIER_RATIO = 4.0
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Evidence of measurements for a robot with small errors.
+
+    Attributes:
+        log: Logarithm of the evidence, up to a constant that depends on number and kind of the samples only.
+        width: Errors of the robot, in default standard deviations.
+        length_scale: Standard deviation of a length residual [m]; NaN if no lengths are measured.
+        angle_scale: Standard deviation of an angle residual [rad]; NaN if no angles are measured.
+    """
+
+    log: float
+    width: float
+    length_scale: float
+    angle_scale: float
+
+
+def fit_evidence(chain: Chain, data: Sequence[Measurement]) -> Evidence:
+    """Fit a robot with small errors to measurements and compute the evidence.
+
+    Args:
+        chain: Nominal robot; its base and tool are ignored.
+        data: Measurements of any kinds; their standard deviations are ignored.
+
+    Returns:
+        The evidence.
+    """
+    equal = tuple(_with_equal_sigmas(item) for item in data)
+    errors = initialize_frames(select_parameters(chain, _PARAMETERS), equal, {}, _N_FRAME_ITERATIONS)
+    equal = tuple(item.initialized(errors.chain) for item in equal)
+    is_robot = _is_robot(errors)
+    n_rows = sum(item.residual_dim * len(item.rows) for item in equal)
+    problem = make_problem(errors, equal, 1 / (errors.priors * np.where(is_robot, _FIT_WIDTH, 1.0)), {})
+    solution = minimize(problem, max_iterations=_N_ITERATIONS, loose=True)
+    noise = _estimate_noise(problem, solution.x)
+    for _ in range(_N_ROUNDS):
+        weighted = problem.with_data(noise.data)
+        solution = minimize(weighted, x=solution.x, max_iterations=_N_ITERATIONS, loose=True)
+        new = _estimate_noise(problem, solution.x)
+        if new.log_determinant > noise.log_determinant - _MIN_CHANGE * n_rows:
+            break
+        noise = new
+    log, width, factor = _maximize(
+        solution.system,
+        solution.x,
+        np.pad(np.where(is_robot, errors.priors, 0.0), (0, len(solution.x) - len(is_robot))),
+        n_rows,
+    )
+    return Evidence(
+        log - noise.log_determinant, width, factor * noise.length_scale, factor * noise.angle_scale
+    )
+
+
+def _is_robot(errors: ErrorModel) -> Array:
+    """Return which parameters belong to the robot itself, not to base and tool, (p,)."""
+    frames = (BASE_FRAME, errors.chain.tool_frame_index)
+    return np.array([parameter.error_frame not in frames for parameter in errors.parameters])
+
+
+def _with_equal_sigmas(item: Measurement) -> Measurement:
+    """Return measurements with the placeholder standard deviations."""
+    values: dict[str, Array] = {}
+    if isinstance(item, PoseMeasurement):
+        values["rotation_sigma"] = np.full_like(item.rotation_sigma, ANGLE_SIGMA)
+    if isinstance(item, PoseMeasurement | PointMeasurement):
+        values["sigma"] = np.full_like(item.sigma, LENGTH_SIGMA)
+    return item.replace(**values)
+
+
+@dataclass(frozen=True, eq=False)
+class _Noise:
+    """Noise of measurements as estimated from the residuals of a fit.
+
+    Attributes:
+        data: Measurements with these standard deviations.
+        log_determinant: Sum of the logarithms of all factors to the standard deviations of the rows.
+        length_scale: Standard deviation of a length residual [m]; NaN if no lengths are measured.
+        angle_scale: Standard deviation of an angle residual [rad]; NaN if no angles are measured.
+    """
+
+    data: tuple[Measurement, ...]
+    log_determinant: float
+    length_scale: float
+    angle_scale: float
+
+
+def _estimate_noise(problem: Problem, x: Array) -> _Noise:
+    """Estimate scales of lengths and angles, and the weights of outliers, from the residuals at x."""
+    chain = problem.errors.at(x[: len(problem.errors.parameters)])
+    # Mean square of each sample (m,) by item and name of the residual group.
+    squares: list[dict[str, Array]] = []
+    for item in problem.data:
+        u = problem.instrument_values_of(item, x)
+        r = item.residual(chain.forward_kinematics(item.configurations()), u)
+        squares.append({name: np.mean(r[rows] ** 2, 0) for name, rows in item.residual_groups.items()})
+    scales = {}
+    for is_angle in (False, True):
+        values = [v for item in squares for name, v in item.items() if (name == "orientation") == is_angle]
+        median = np.median(np.concatenate(values)) if values else np.nan
+        scales[is_angle] = float(np.clip(np.sqrt(median), _MIN_SCALE, _MAX_SCALE))
+    data, log_determinant = [], 0.0
+    for item, by_name in zip(problem.data, squares, strict=True):
+        factors = {name: scales[name == "orientation"] for name in by_name}
+        ratio = np.max([np.sqrt(v) / factors[name] for name, v in by_name.items()], 0)
+        excess = np.fmax(ratio / _OUTLIER_RATIO, 1.0)
+        data.append(item.with_scaled_sigma(factors).with_weights(excess**-2))
+        rows_per_sample = {
+            name: len(range(item.residual_dim)[rows]) for name, rows in item.residual_groups.items()
+        }
+        log_determinant += len(item.rows) * sum(
+            count * np.log(factors[name]) for name, count in rows_per_sample.items()
+        )
+        log_determinant += item.residual_dim * float(np.sum(np.log(excess)))
+    return _Noise(tuple(data), log_determinant, LENGTH_SIGMA * scales[False], ANGLE_SIGMA * scales[True])
+
+
+def _maximize(
+    system: TriangularSystem, x: Array, prior_std: Array, n_rows: int
+) -> tuple[float, float, float]:
+    """Maximize the evidence over the width of the priors and the scale of the noise.
+
+    Args:
+        system: Triangular system of the whitened rows at x, (p,).
+        x: Point of the linearization.
+        prior_std: Default prior standard deviations of the robot's errors; 0 for all other unknowns, (p,).
+        n_rows: Number of whitened rows.
+
+    Returns:
+        Logarithm of the evidence, width w and noise scale σ.
+    """
+    robot = prior_std > 0
+    measured, rows = system.z + system.r @ x, system.r[:, robot] * prior_std[robot]
+    u, s, _ = np.linalg.svd(system.r[:, ~robot], full_matrices=False)
+    is_observable = s > RANK_RTOL * s.max(initial=0.0)
+    u, log_frames = u[:, is_observable], float(np.sum(np.log(s[is_observable])))
+    rows, measured = rows - u @ (u.T @ rows), measured - u @ (u.T @ measured)
+    left, singular_values, _ = np.linalg.svd(rows, full_matrices=False)
+    components = left.T @ measured
+    rest = system.min_cost + max(0.0, float(measured @ measured - components @ components))
+    n_rest = max(0, n_rows - u.shape[1] - len(singular_values))
+    noise, width = np.meshgrid(_NOISE_SCALES, _WIDTHS)
+    variance = noise[..., None] ** 2 + (width[..., None] * singular_values) ** 2
+    log = -0.5 * (
+        np.sum(np.log(variance) + components**2 / variance, -1)
+        + 2 * n_rest * np.log(noise)
+        + rest / noise**2
+        + (np.log(width) / _LOG_WIDTH_STD) ** 2
+    )
+    best = np.unravel_index(np.argmax(log), log.shape)
+    return float(log[best]) - log_frames, float(width[best]), float(noise[best])

@@ -1,0 +1,503 @@
+"""Hypotheses about what was mixed up in measurements, each with the change that undoes it.
+
+A change maps measurements as they were read to measurements as they would be without the mistake. It is
+described by data, so that a remedy for the file can be derived from it.
+
+Only changes that base and tool cannot absorb are listed: neither the zero of the first and of the last joint,
+nor another right-handed order of the axes of measured positions.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations, permutations
+from typing import Literal, Protocol
+
+import numpy as np
+
+from .. import se3
+from .._typing import Array
+from ..exceptions import UnknownNameError
+from ..measurements.base import Measurement
+from ..measurements.pose import Pose, PoseMeasurement
+from ..measurements.position import MultiTargetPosition, PointMeasurement, Position
+from ..robot.chain import Chain
+from ..units import ANGLES, LENGTHS
+
+QuaternionNotation = Literal["xyzw", "wxyz"]
+QUATERNION_ORDERS: tuple[QuaternionNotation, ...] = ("xyzw", "wxyz")
+# Number of coordinates of the instrument and of the target.
+N_PLACES = 6
+# Largest rotation vector [rad] of which a smaller unit can be undone: longer ones have lost whole turns.
+_MAX_SMALL_ROTATION = np.pi / ANGLES["deg"]
+
+
+class Change(Protocol):
+    """Change of measurements that undoes a mistake."""
+
+    def apply(self, item: Measurement) -> Measurement | None:
+        """Return the changed measurements; None if the change does not apply to this kind.
+
+        Args:
+            item: Measurements as they were read.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class JointChange:
+    """Other joint columns: q_j becomes sign_j · factor_j · q_source_j + offset_j.
+
+    Attributes:
+        sources: Column that holds joint j, for each of the n joints.
+        signs: 1 or -1 for each joint.
+        offsets: Summand for each joint [rad or m].
+        factors: Factor of the unit for each joint.
+    """
+
+    sources: tuple[int, ...]
+    signs: tuple[int, ...]
+    offsets: tuple[float, ...]
+    factors: tuple[float, ...]
+
+    @classmethod
+    def of(
+        cls,
+        n: int,
+        *,
+        sources: Sequence[int] | None = None,
+        signs: Sequence[int] | None = None,
+        offsets: Sequence[float] | None = None,
+        factors: Sequence[float] | None = None,
+    ) -> JointChange:
+        """Make a change of n joints in which everything that is not given stays as it is.
+
+        Args:
+            n: Number of joints.
+            sources: See the attributes.
+            signs: See the attributes.
+            offsets: See the attributes.
+            factors: See the attributes.
+
+        Returns:
+            The change.
+        """
+        return cls(
+            tuple(sources if sources is not None else range(n)),
+            tuple(signs if signs is not None else [1] * n),
+            tuple(offsets if offsets is not None else [0.0] * n),
+            tuple(factors if factors is not None else [1.0] * n),
+        )
+
+    def apply(self, item: Measurement) -> Measurement | None:
+        """Return the measurements at the changed joint positions.
+
+        Args:
+            item: Measurements as they were read.
+
+        Returns:
+            None for kinds without joint positions.
+        """
+        if not item.configurations_per_row:
+            return None
+        q = item.configurations()[:, self.sources]
+        return item.resample(q * np.array(self.signs) * self.factors + self.offsets)
+
+
+@dataclass(frozen=True)
+class RowShift:
+    """Joint positions belong to the measured values `step` rows below them.
+
+    Attributes:
+        step: 1 or -1.
+    """
+
+    step: int
+
+    def apply(self, item: Measurement) -> Measurement | None:
+        """Return the measured values with the joint positions of neighbouring rows.
+
+        Args:
+            item: Measurements as they were read; rows without a neighbour are left out.
+
+        Returns:
+            None for kinds without joint positions, or if no two rows are neighbours.
+        """
+        if not item.configurations_per_row or len(item.rows) < 2:
+            return None
+        order = np.argsort(item.rows, kind="stable")
+        gaps = np.diff(item.rows[order])
+        if not np.any(gaps > 0):
+            return None
+        first = np.flatnonzero(gaps == gaps[gaps > 0].min())
+        upper, lower = order[first], order[first + 1]
+        joints, values = (upper, lower) if self.step > 0 else (lower, upper)
+        q = item.configurations().reshape(item.configurations_per_row, len(item.rows), -1)[:, joints]
+        return item.take(values).resample(q.reshape(-1, q.shape[-1]))
+
+
+@dataclass(frozen=True)
+class LengthChange:
+    """Other unit of measured lengths.
+
+    Attributes:
+        factor: Factor to all measured lengths and positions.
+    """
+
+    factor: float
+
+    def apply(self, item: Measurement) -> Measurement | None:
+        """Return the measurements with scaled lengths.
+
+        Args:
+            item: Measurements as they were read.
+
+        Returns:
+            None for kinds that measure no lengths.
+        """
+        if isinstance(item, PoseMeasurement):
+            return _with_positions(item, self.factor * item.poses[:, :3, 3])
+        if isinstance(item, PointMeasurement) and item.has_length_scale:
+            return item.replace(values=self.factor * item.values)
+        return None
+
+
+@dataclass(frozen=True)
+class AxisChange:
+    """Other axes of measured positions, rotations unchanged: axis i is sign_i times axis source_i as read.
+
+    Attributes:
+        sources: Column that holds each axis.
+        signs: 1 or -1 for each axis.
+    """
+
+    sources: tuple[int, int, int]
+    signs: tuple[int, int, int] = (1, 1, 1)
+
+    def apply(self, item: Measurement) -> Measurement | None:
+        """Return the measurements with changed positions.
+
+        Args:
+            item: Measurements as they were read.
+
+        Returns:
+            None for kinds without positions.
+        """
+        if not isinstance(item, Pose | Position | MultiTargetPosition):
+            return None
+        return _with_positions(item, item.positions()[:, self.sources] * np.array(self.signs))
+
+
+@dataclass(frozen=True)
+class MirroredPoses:
+    """Positions and rotations in a left-handed measuring frame."""
+
+    def apply(self, item: Measurement) -> Measurement | None:
+        """Return the poses with the sign of z changed.
+
+        Args:
+            item: Measurements as they were read.
+
+        Returns:
+            None for kinds other than poses.
+        """
+        mirror = np.diag([1.0, 1.0, -1.0, 1.0])
+        return item.replace(poses=mirror @ item.poses @ mirror) if isinstance(item, Pose) else None
+
+
+@dataclass(frozen=True)
+class QuaternionOrder:
+    """Other order of the components of measured quaternions.
+
+    Attributes:
+        order: True order of the columns that were read in the other one.
+    """
+
+    order: QuaternionNotation
+
+    def apply(self, item: Measurement) -> Measurement | None:
+        """Return the poses with the rotations of the reordered quaternions.
+
+        Args:
+            item: Measurements as they were read.
+
+        Returns:
+            None for kinds other than poses.
+        """
+        # Read as w, x, y, z, the columns x, y, z, w have to move by one; the other way round, back.
+        step = 1 if self.order == "xyzw" else -1
+        return _with_rotations(
+            item, lambda rotations: _quaternion_to_matrix(np.roll(_matrix_to_quaternion(rotations), step, 1))
+        )
+
+
+@dataclass(frozen=True)
+class InversePose:
+    """Poses of the measuring frame in the tool frame, in place of the tool in the measuring frame."""
+
+    def apply(self, item: Measurement) -> Measurement | None:
+        """Return the inverse poses.
+
+        Args:
+            item: Measurements as they were read.
+
+        Returns:
+            None for kinds other than poses.
+        """
+        return item.replace(poses=se3.inverse(item.poses)) if isinstance(item, PoseMeasurement) else None
+
+
+@dataclass(frozen=True)
+class InverseRotation:
+    """Inverse rotations beside correct positions."""
+
+    def apply(self, item: Measurement) -> Measurement | None:
+        """Return the poses with inverse rotations.
+
+        Args:
+            item: Measurements as they were read.
+
+        Returns:
+            None for kinds other than poses.
+        """
+        return _with_rotations(item, lambda rotations: np.swapaxes(rotations, 1, 2))
+
+
+@dataclass(frozen=True)
+class RotationUnit:
+    """Rotation vectors in radians that were read as degrees."""
+
+    def apply(self, item: Measurement) -> Measurement | None:
+        """Return the poses with rotation vectors in radians.
+
+        Args:
+            item: Measurements as they were read.
+
+        Returns:
+            None for kinds other than poses, and if a vector is too long for that.
+        """
+        if not isinstance(item, PoseMeasurement):
+            return None
+        vectors = se3.log3(item.poses[:, :3, :3])
+        if np.linalg.norm(vectors, axis=1).max(initial=0.0) > _MAX_SMALL_ROTATION:
+            return None
+        return _with_rotations(item, lambda _: se3.exp3(ANGLES["deg"] * vectors))
+
+
+def _with_positions(item: Measurement, positions: Array) -> Measurement:
+    """Return measurements with other positions, (m, 3) [m]."""
+    if isinstance(item, PoseMeasurement):
+        poses = item.poses.copy()
+        poses[:, :3, 3] = positions
+        return item.replace(poses=poses)
+    return item.replace(values=positions)
+
+
+def _with_rotations(item: Measurement, change: Callable[[Array], Array]) -> Measurement | None:
+    """Return poses whose rotations (m, 3, 3) are changed by a function."""
+    if not isinstance(item, PoseMeasurement):
+        return None
+    poses = item.poses.copy()
+    poses[:, :3, :3] = change(item.poses[:, :3, :3])
+    return item.replace(poses=poses)
+
+
+def _matrix_to_quaternion(rotations: Array) -> Array:
+    """Convert rotations (m, 3, 3) to unit quaternions w, x, y, z of either sign, (m, 4)."""
+    vectors = se3.log3(rotations)
+    angles = np.linalg.norm(vectors, axis=1, keepdims=True)
+    # sin(a/2)/a, with its limit 1/2 at 0.
+    return np.concatenate([np.cos(0.5 * angles), vectors * 0.5 * np.sinc(0.5 * angles / np.pi)], 1)
+
+
+def _quaternion_to_matrix(quaternions: Array) -> Array:
+    """Convert unit quaternions w, x, y, z of either sign, (m, 4), to rotations (m, 3, 3)."""
+    w, v = quaternions[:, :1, None], quaternions[:, 1:]
+    skew = se3.skew(v)
+    return np.eye(3) + 2 * w * skew + 2 * skew @ skew
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """Assumption about what was mixed up.
+
+    Attributes:
+        key: Short name, by which users select the change.
+        description: What was mixed up, as a clause.
+        change: Change that undoes it.
+    """
+
+    key: str
+    description: str
+    change: Change
+
+    def apply(self, data: Sequence[Measurement]) -> list[Measurement] | None:
+        """Undo the mistake in measurements.
+
+        Args:
+            data: Measurements as they were read.
+
+        Returns:
+            Changed measurements; those that the change does not apply to are unchanged. None if it applies
+            to none of them.
+        """
+        changed = [self.change.apply(item) for item in data]
+        if all(item is None for item in changed):
+            return None
+        return [old if new is None else new for new, old in zip(changed, data, strict=True)]
+
+    def log_jacobian(self, data: Sequence[Measurement]) -> float:
+        """Return the logarithm of the determinant of the change of the measured values.
+
+        Args:
+            data: Measurements as they were read.
+        """
+        if not isinstance(self.change, LengthChange):
+            return 0.0
+        n_lengths = sum(_count_lengths(item) for item in data if self.change.apply(item) is not None)
+        # The places of instrument and target scale with the lengths.
+        return float(max(0, n_lengths - N_PLACES) * np.log(self.change.factor))
+
+
+def _count_lengths(item: Measurement) -> int:
+    """Return the number of measured lengths."""
+    return 3 * len(item.rows) if isinstance(item, PoseMeasurement) else item.residual_dim * len(item.rows)
+
+
+def list_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypothesis]:
+    """List the hypotheses about measurements of a robot, the simpler ones first.
+
+    Args:
+        chain: Nominal robot.
+        data: Measurements; only hypotheses about their kinds are listed.
+
+    Yields:
+        Hypotheses.
+    """
+    yield from _joint_hypotheses(chain)
+    yield from _order_hypotheses(chain)
+    yield from _unit_hypotheses(chain)
+    for step, side in ((1, "above"), (-1, "below")):
+        yield Hypothesis(
+            f"rows:{side}", f"each row holds the joint values of the row {side}", RowShift(-step)
+        )
+    if any(isinstance(item, Pose) for item in data):
+        yield from _pose_hypotheses()
+    else:
+        # Positions alone are the same in all left-handed frames, up to a rotation of the base.
+        yield Hypothesis("axes:x,y,-z", "the measuring frame is mirrored", AxisChange((0, 1, 2), (1, 1, -1)))
+    yield Hypothesis(
+        "poses:inverse", "the poses are inverse, of the measuring frame in the tool frame", InversePose()
+    )
+    yield Hypothesis("rotations:inverse", "the measured rotations are inverse", InverseRotation())
+
+
+def mend(chain: Chain, data: Measurement, key: str) -> Measurement:
+    """Undo a mistake in measurements, such as the wrong sign of a joint.
+
+    Args:
+        chain: Nominal robot.
+        data: Measurements as they were read.
+        key: Key of a hypothesis, as a refused calibration names it.
+
+    Returns:
+        The changed measurements.
+
+    Raises:
+        UnknownNameError: There is no such change of these measurements.
+    """
+    by_key = {hypothesis.key: hypothesis for hypothesis in list_hypotheses(chain, [data])}
+    if key not in by_key:
+        near = difflib.get_close_matches(key, by_key, 3, 0.0)
+        raise UnknownNameError(f"--mend {key!r}: unknown change; choose one such as {', '.join(near)}")
+    changed = by_key[key].change.apply(data)
+    if changed is None:
+        raise UnknownNameError(f"--mend {key!r}: does not apply to measurements of kind {data.kind}")
+    return changed
+
+
+def _joint_hypotheses(chain: Chain) -> Iterator[Hypothesis]:
+    """Yield wrong signs and zeros."""
+    n = chain.n_joints
+    for j, name in enumerate(chain.joint_names):
+        signs = [-1 if i == j else 1 for i in range(n)]
+        text = f"the sign of joint {name} is wrong"
+        yield Hypothesis(f"sign:{name}", text, JointChange.of(n, signs=signs))
+    yield Hypothesis("sign:all", "the signs of all joints are wrong", JointChange.of(n, signs=[-1] * n))
+    for j, name in enumerate(chain.joint_names[1:-1], 1):
+        for wrong in (90, -90, 180) if not chain.is_prismatic[j] else ():
+            offsets = [np.deg2rad(-wrong) if i == j else 0.0 for i in range(n)]
+            text = f"the zero of joint {name} is off by {wrong} deg"
+            yield Hypothesis(f"zero:{name}:{-wrong:+d}deg", text, JointChange.of(n, offsets=offsets))
+
+
+def _order_hypotheses(chain: Chain) -> Iterator[Hypothesis]:
+    """Yield exchanged and shifted joint columns."""
+    n, names = chain.n_joints, chain.joint_names
+    for i, j in combinations(range(n), 2):
+        if chain.is_prismatic[i] == chain.is_prismatic[j]:
+            sources = list(range(n))
+            sources[i], sources[j] = j, i
+            text = f"the columns of joints {names[i]} and {names[j]} are exchanged"
+            yield Hypothesis(f"swap:{names[i]}:{names[j]}", text, JointChange.of(n, sources=sources))
+    if n < 3:
+        return
+    for key, sources, text in (
+        ("columns:-1", (*range(1, n), 0), "shifted by one"),
+        ("columns:+1", (n - 1, *range(n - 1)), "shifted by one"),
+        ("columns:reversed", tuple(range(n))[::-1], "in reverse order"),
+    ):
+        yield Hypothesis(key, f"the joint columns are {text}", JointChange.of(n, sources=sources))
+
+
+def _unit_hypotheses(chain: Chain) -> Iterator[Hypothesis]:
+    """Yield wrong units of joints, lengths and rotation vectors."""
+    n, revolute = chain.n_joints, [j for j in range(chain.n_joints) if not chain.is_prismatic[j]]
+    for members, large, small, factor in (
+        (revolute, "deg", "rad", ANGLES["deg"]),
+        ([j for j in range(n) if j not in revolute], "mm", "m", LENGTHS["mm"]),
+    ):
+        groups = [members, *([j] for j in members if len(members) > 1)] if members else []
+        for group in groups:
+            is_single = len(group) == 1
+            name = chain.joint_names[group[0]] if is_single else ""
+            key, label = (f"joint:{name}", f"joint {name} is") if is_single else ("joints", "the joints are")
+            for true, read, value in ((large, small, 1 / factor), (small, large, factor)):
+                factors = [value if i in group else 1.0 for i in range(n)]
+                text = f"{label} in {true}, but {'was' if is_single else 'were'} read as {read}"
+                yield Hypothesis(f"{key}:{true}-not-{read}", text, JointChange.of(n, factors=factors))
+    for true, read in permutations(("m", "mm", "in"), 2):
+        text = f"measured lengths are in {true}, but were read as {read}"
+        yield Hypothesis(f"lengths:{true}-not-{read}", text, LengthChange(LENGTHS[read] / LENGTHS[true]))
+    text = "measured rotation vectors are in rad, but were read as deg"
+    yield Hypothesis("rotations:rad-not-deg", text, RotationUnit())
+
+
+def _pose_hypotheses() -> Iterator[Hypothesis]:
+    """Yield other axes of the positions beside the rotations, and other notations of the rotations."""
+    for i, axis in enumerate("xyz"):
+        x, y, z = (-1 if j == i else 1 for j in range(3))
+        yield _axis_hypothesis((0, 1, 2), (x, y, z), f"the sign of measured {axis} is wrong")
+    yield Hypothesis("frame:left-handed", "positions and rotations are mirrored", MirroredPoses())
+    yield _axis_hypothesis((0, 1, 2), (-1, -1, -1), "the signs of measured x, y and z are wrong")
+    for sources, text in (
+        ((1, 0, 2), "measured x and y are exchanged"),
+        ((2, 1, 0), "measured x and z are exchanged"),
+        ((0, 2, 1), "measured y and z are exchanged"),
+        ((1, 2, 0), "measured x, y and z are shifted by one column"),
+        ((2, 0, 1), "measured x, y and z are shifted by one column"),
+    ):
+        yield _axis_hypothesis(sources, (1, 1, 1), text)
+    for order in QUATERNION_ORDERS:
+        text = f"quaternions are in the order {' '.join(order)}, but were read in the other one"
+        yield Hypothesis(f"quaternions:{order}", text, QuaternionOrder(order))
+
+
+def _axis_hypothesis(
+    sources: tuple[int, int, int], signs: tuple[int, int, int], description: str
+) -> Hypothesis:
+    """Return a hypothesis about the axes of measured positions; its key lists the true x, y and z."""
+    axes = ("-" * (sign < 0) + "xyz"[source] for source, sign in zip(sources, signs, strict=True))
+    return Hypothesis(f"axes:{','.join(axes)}", description, AxisChange(sources, signs))

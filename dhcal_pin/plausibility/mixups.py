@@ -1,0 +1,209 @@
+"""Diagnosis of mixed-up data: the hypotheses that explain measurements decisively better than their file.
+
+First, the evidence of the measurements as they were read is computed. If they fit a robot with small errors,
+no hypothesis is tried. Otherwise each hypothesis changes the same samples, and its evidence is computed in
+the same way. A hypothesis is decisive if its evidence exceeds that of the file by the factor exp(15). Several
+hypotheses can describe the same change of the data, such as the sign of a joint and the zeros of two others;
+all of them are reported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..formatting import format_quantity
+from ..measurements.base import Measurement
+from ..robot.chain import Chain
+from .evidence import Evidence, fit_evidence
+from .hypotheses import Hypothesis, RowShift, list_hypotheses
+
+# Evidence of too few measurements: nothing is known about them.
+NO_EVIDENCE = Evidence(log=0.0, width=0.0, length_scale=np.nan, angle_scale=np.nan)
+# Measurements are suspicious if they need errors of this width, in default standard deviations, or leave
+# residuals of this size [m], [rad].
+_SUSPICIOUS_WIDTH, _SUSPICIOUS_LENGTH, _SUSPICIOUS_ANGLE = 4.0, 2e-3, 1e-2
+# Logarithm of the ratio of evidence above which a hypothesis is decisive. Honest data reach 4.
+_MIN_LOG_RATIO = 15.0
+# Residuals that fall by this factor are named in the sentence.
+_MIN_NAMED_RATIO = 2.0
+# Hypotheses within this difference of the best one are reported beside it.
+_MAX_LOG_TIE = 3.0
+# Fewer rows fit too many hypotheses: base and tool alone have twelve unknowns.
+_MIN_ROWS = 24
+# The same for contacts with unknown objects.
+_MIN_CONTACT_ROWS = 60
+# Positions this many times farther from the centre than the median are wrong by themselves.
+_MAX_DISTANCE_RATIO = 8.0
+# A shift of the rows is tried if at least this share of the samples has a neighbouring row.
+_MIN_SHIFTED_SHARE = 0.25
+# Largest number of measurements that are examined, those with the most samples.
+_MAX_ITEMS = 6
+# Number of samples that the evidence is computed from, in all and at least of each measurement.
+_N_SAMPLES, _MIN_SAMPLES_PER_ITEM = 50, 8
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Hypotheses that explain measurements decisively better than the measurements as they were read.
+
+    Attributes:
+        before: Evidence of the measurements as they were read.
+        hypotheses: Equivalent hypotheses, the simplest first; empty if none is decisive.
+        after: Evidence with the first hypothesis.
+        source: File that the hypotheses are about; empty for all measurements together.
+        fits_separately: Whether each of several measurements fits the robot, but not all of them together.
+    """
+
+    before: Evidence
+    hypotheses: tuple[Hypothesis, ...] = ()
+    after: Evidence | None = None
+    source: str = ""
+    fits_separately: bool = False
+
+    @property
+    def is_suspicious(self) -> bool:
+        """Whether the measurements, as they were read, need large errors or leave large residuals."""
+        return is_suspicious(self.before)
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether a robot with errors of any size fits the measurements, if base and tool are free."""
+        return not leaves_residuals(self.before)
+
+    @property
+    def sentence(self) -> str:
+        """What was mixed up and what undoing it would change; only with a hypothesis."""
+        first, *others = (hypothesis.description for hypothesis in self.hypotheses)
+        assert self.after is not None
+        text = f"In {self.source}, {first}" if self.source else f"{first[0].upper()}{first[1:]}"
+        if others:
+            text += f" (or {' or '.join(others)})"
+        for before, after, unit in (
+            (self.before.length_scale, self.after.length_scale, "m"),
+            (self.before.angle_scale, self.after.angle_scale, "rad"),
+        ):
+            if before > _MIN_NAMED_RATIO * after:
+                sizes = [format_quantity(v, unit, 0.1 * v, small=True) for v in (before, after)]
+                return f"{text}: undoing this reduces the residuals from {sizes[0]} to {sizes[1]}."
+        return f"{text}: undoing this makes the measurements fit a robot with ordinary errors."
+
+    @property
+    def remedy(self) -> str:
+        """What to do about it; only with a hypothesis."""
+        where = f"@{self.source}" if self.source else ""
+        keys = [f"--mend {hypothesis.key}{where}" for hypothesis in self.hypotheses]
+        return f"Correct the measurements, or add {' or '.join(keys)}."
+
+
+def diagnose_mixups(chain: Chain, data: Sequence[Measurement]) -> Diagnosis:
+    """Look for a mistake in measurements that explains why they do not fit the robot.
+
+    A mistake may be in all measurements or in one of several.
+
+    Args:
+        chain: Nominal robot; its base and tool are ignored.
+        data: Measurements of any kinds.
+
+    Returns:
+        The diagnosis; without hypotheses if the measurements fit the robot, or if none is decisive.
+    """
+    items = sorted((item for item in data if item.configurations_per_row), key=lambda item: -len(item.rows))
+    items = items[:_MAX_ITEMS]
+    if not items:
+        return Diagnosis(NO_EVIDENCE)
+    diagnosis = _diagnose(chain, items)
+    if diagnosis.hypotheses or not diagnosis.is_suspicious or len(items) < 2:
+        return diagnosis
+    separate = [(item, _diagnose(chain, [item])) for item in items]
+    for item, one in separate:
+        if one.hypotheses:
+            return replace(one, source=item.source)
+    return replace(diagnosis, fits_separately=not any(one.is_suspicious for _, one in separate))
+
+
+def _diagnose(chain: Chain, data: Sequence[Measurement]) -> Diagnosis:
+    """Look for one mistake in all of the measurements."""
+    samples, neighbourhood = _draw_samples(data)
+    n_rows = sum(item.residual_dim * len(item.rows) for item in samples)
+    # Few contacts fit almost any robot: their object is unknown, too.
+    needed = _MIN_CONTACT_ROWS if all(item.is_contact for item in samples) else _MIN_ROWS
+    if n_rows < needed:
+        return Diagnosis(NO_EVIDENCE)
+    before = fit_evidence(chain, samples)
+    if not is_suspicious(before):
+        return Diagnosis(before)
+    scored: list[tuple[Hypothesis, Evidence, float]] = []
+    for hypothesis in list_hypotheses(chain, samples):
+        changed = _apply(hypothesis, samples, neighbourhood)
+        if changed is not None:
+            after = fit_evidence(chain, changed)
+            log = after.log * _count(samples) / _count(changed) + hypothesis.log_jacobian(samples)
+            scored.append((hypothesis, after, log))
+    best = max((log for _, _, log in scored), default=-np.inf)
+    if best - before.log < _MIN_LOG_RATIO:
+        return Diagnosis(before)
+    ties = [(hypothesis, after) for hypothesis, after, log in scored if log >= best - _MAX_LOG_TIE]
+    return Diagnosis(before, tuple(hypothesis for hypothesis, _ in ties), ties[0][1])
+
+
+def is_suspicious(evidence: Evidence) -> bool:
+    """Return whether measurements may be mixed up: they need large errors or leave large residuals.
+
+    Args:
+        evidence: Evidence of the measurements as they were read.
+    """
+    return evidence.width >= _SUSPICIOUS_WIDTH or leaves_residuals(evidence)
+
+
+def leaves_residuals(evidence: Evidence) -> bool:
+    """Return whether no robot fits the measurements, however large its errors are.
+
+    Args:
+        evidence: Evidence of the measurements as they were read.
+    """
+    return evidence.length_scale > _SUSPICIOUS_LENGTH or evidence.angle_scale > _SUSPICIOUS_ANGLE
+
+
+def _count(data: Sequence[Measurement]) -> int:
+    """Return the number of samples."""
+    return sum(len(item.rows) for item in data)
+
+
+def _apply(
+    hypothesis: Hypothesis, samples: Sequence[Measurement], neighbourhood: Sequence[Measurement]
+) -> list[Measurement] | None:
+    """Apply a hypothesis to the samples; None if it does not apply to most of them."""
+    if not isinstance(hypothesis.change, RowShift):
+        return hypothesis.apply(samples)
+    shifted = hypothesis.apply(neighbourhood)
+    if shifted is None:
+        return None
+    kept = [item.take(np.isin(item.rows, drawn.rows)) for item, drawn in zip(shifted, samples, strict=True)]
+    return kept if _count(kept) >= _MIN_SHIFTED_SHARE * _count(samples) else None
+
+
+def _draw_samples(data: Sequence[Measurement]) -> tuple[list[Measurement], list[Measurement]]:
+    """Draw samples of each measurement; return them, and the same with the rows above and below each."""
+    count = max(_MIN_SAMPLES_PER_ITEM, -(-_N_SAMPLES // len(data)))
+    samples, neighbourhood = [], []
+    for measured in data:
+        item = _without_far_positions(measured)
+        item = item.take(np.argsort(item.rows, kind="stable"))
+        m = len(item.rows)
+        index = np.sort(np.random.default_rng(0).permutation(m)[:count])
+        nearby = np.unique(np.clip(np.concatenate([index - 1, index, index + 1]), 0, m - 1))
+        samples.append(item.take(index))
+        neighbourhood.append(item.take(nearby))
+    return samples, neighbourhood
+
+
+def _without_far_positions(item: Measurement) -> Measurement:
+    """Leave out positions far from all others, which would spoil the initial frames."""
+    positions = item.positions()
+    if not len(positions):
+        return item
+    distances = np.linalg.norm(positions - np.median(positions, 0), axis=1)
+    return item.take(distances <= _MAX_DISTANCE_RATIO * np.median(distances))

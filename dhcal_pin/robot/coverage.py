@@ -1,0 +1,185 @@
+"""Coverage of the revolute joints: which parts of a turn the measured configurations visited.
+
+A correction curve of a joint is determined only near the joint values that were measured. A turn is therefore
+divided into bins of 5°, and a bin counts as visited if one configuration lies in it. Joint values that differ
+by a turn are the same, as correction curves have a period of one turn. The bins are centred on multiples of
+5°, so that scatter around a commanded value such as 30° does not distribute it over two bins.
+
+If a joint took few different values and each of them in many configurations (a lattice), different harmonics
+have the same values at all of them. A curve with harmonics up to order K over a range S has 1 + K·S/π degrees
+of freedom (Shannon number). `JointCoverage.is_lattice` compares the number of different values with it.
+
+Shapes: m configurations, n independent joints, b bins of a turn.
+
+Reference:
+    D. Slepian and H. O. Pollak, Prolate spheroidal wave functions, Fourier analysis and uncertainty I, Bell
+    System Technical Journal 40 (1961), 43-63: degrees of freedom of band-limited functions over a range.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .._typing import Array
+from .chain import Chain
+
+# Number of bins of a turn, and the width of a bin [rad].
+N_BINS = 72
+BIN_WIDTH_RAD = 2 * np.pi / N_BINS
+# Centres of the bins, from minus half a turn on [rad].
+BIN_CENTRES = BIN_WIDTH_RAD * (np.arange(N_BINS) - N_BINS // 2)
+
+# Joint values count as equal if no harmonic of a curve changes its phase by more than this [rad].
+_SAME_PHASE_RAD = 0.1
+# Configurations that differ by less than about this in every joint count once [rad or m].
+_SAME_CONFIGURATION = 1e-3
+# Rounding of joint limits [rad].
+_LIMIT_TOL = 1e-6
+# The values of a lattice occur in at least this number of configurations each, on average.
+_MIN_REPETITIONS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class JointCoverage:
+    """Parts of a turn that a revolute joint visited.
+
+    Attributes:
+        joint: Name of the joint.
+        values: Joint values of the different configurations, shape (m,) [rad].
+        counts: Number of configurations in each bin, shape (b,).
+        is_in_range: Whether each bin is within the joint limits, shape (b,).
+    """
+
+    joint: str
+    values: Array
+    counts: Array
+    is_in_range: Array
+
+    @property
+    def n_in_range(self) -> int:
+        """Number of bins within the joint limits."""
+        return int(self.is_in_range.sum())
+
+    @property
+    def n_visited(self) -> int:
+        """Number of bins within the joint limits with at least one configuration."""
+        return int((self.is_in_range & (self.counts > 0)).sum())
+
+    @property
+    def share(self) -> float:
+        """Share of the bins within the joint limits that were visited."""
+        return self.n_visited / self.n_in_range if self.n_in_range else 0.0
+
+    @property
+    def gaps(self) -> list[tuple[float, float]]:
+        """Ranges within the joint limits and half a turn that were not visited, lowest first [rad]."""
+        is_gap = self.is_in_range & (self.counts == 0)
+        # The first bin is half at the lower end and half at the upper one.
+        changes = np.flatnonzero(np.diff([False, *is_gap, is_gap[0], False]))
+        edges = np.clip(BIN_CENTRES[0] + BIN_WIDTH_RAD * (changes - 0.5), -np.pi, np.pi)
+        return [(float(low), float(high)) for low, high in edges.reshape(-1, 2)]
+
+    def n_different_values(self, order: int) -> int:
+        """Count the joint values that a curve can distinguish.
+
+        Args:
+            order: Highest harmonic of the curve.
+
+        Returns:
+            Number of different values.
+        """
+        tolerance, count, last = _SAME_PHASE_RAD / order, 0, -np.inf
+        for value in self._from_widest_gap():
+            if value - last > tolerance:
+                count, last = count + 1, value
+        return count
+
+    def is_lattice(self, order: int) -> bool:
+        """Return whether the joint took so few different values that harmonics cannot be told apart.
+
+        Args:
+            order: Highest harmonic of the curve.
+
+        Returns:
+            Whether the values repeat, and are fewer than the degrees of freedom of a curve over their range;
+            false for a joint that did not move.
+        """
+        count = self.n_different_values(order)
+        if count < 2 or _MIN_REPETITIONS * count > len(self.values):
+            return False
+        return count < 1 + order * self._from_widest_gap()[-1] / np.pi
+
+    def _from_widest_gap(self) -> Array:
+        """Return the joint values from the end of the widest gap of the turn, ascending (m,) [rad]."""
+        values = np.sort(np.mod(self.values, 2 * np.pi))
+        if not len(values):
+            return values
+        gaps = np.diff(values, append=values[0] + 2 * np.pi)
+        first = values[(np.argmax(gaps) + 1) % len(values)]
+        return np.sort(np.mod(values - first, 2 * np.pi))
+
+
+def bin_indices(values: Array) -> Array:
+    """Compute the bins of joint values.
+
+    Args:
+        values: Joint values [rad].
+
+    Returns:
+        Indices into `BIN_CENTRES`, in the shape of the values.
+    """
+    return (np.rint(values / BIN_WIDTH_RAD).astype(int) + N_BINS // 2) % N_BINS
+
+
+def joint_coverage(chain: Chain, q: Array) -> tuple[JointCoverage, ...]:
+    """Compute which parts of a turn the revolute joints visited.
+
+    Args:
+        chain: Robot.
+        q: Joint positions, shape (m, n) [rad or m]; repeated configurations count once.
+
+    Returns:
+        Coverage of each revolute joint, in the order of the chain.
+    """
+    _, first = np.unique(np.rint(q / _SAME_CONFIGURATION), axis=0, return_index=True)
+    different = q[np.sort(first)]
+    out = []
+    for i in np.flatnonzero(~chain.is_prismatic):
+        out.append(
+            JointCoverage(
+                joint=chain.joint_names[i],
+                values=different[:, i],
+                counts=np.bincount(bin_indices(different[:, i]), minlength=N_BINS),
+                is_in_range=_bins_in_range(float(chain.lower[i]), float(chain.upper[i])),
+            )
+        )
+    return tuple(out)
+
+
+def _bins_in_range(lower: float, upper: float) -> Array:
+    """Return whether the centres of the bins, or values whole turns away, are within joint limits (b,)."""
+    if upper - lower >= 2 * np.pi:
+        return np.full(N_BINS, True)
+    return np.mod(BIN_CENTRES - lower + _LIMIT_TOL, 2 * np.pi) <= upper - lower + 2 * _LIMIT_TOL
+
+
+def lattice_warnings(coverage: Sequence[JointCoverage], order: int) -> list[str]:
+    """Describe joints whose values do not determine a correction curve because they form a lattice.
+
+    Args:
+        coverage: Coverage of the joints.
+        order: Highest harmonic of the curves.
+
+    Returns:
+        One sentence for each joint.
+    """
+    return [
+        f"the values of {one.joint} form a lattice, {one.n_different_values(order)} different ones in "
+        f"{len(one.values)} configurations: the correction curve is not determined between them; measure at "
+        "other values too"
+        for one in coverage
+        if one.is_lattice(order)
+    ]

@@ -1,0 +1,198 @@
+"""Record of a commit: which temporary files are renamed to which targets.
+
+A record lies in every folder of a commit and names only files of its own folder. The record of the first
+folder, the primary one, is written last: with it the run is committed. Whoever finds a record completes the
+commit if the primary record exists, and removes the record otherwise.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from .._typing import PathLike
+from ..exceptions import FileFormatError
+from .folder_locks import lock_folders
+from .signals import defer_signals
+
+RECORD_NAME = ".dhcal-save.json"
+_TEMPORARY = re.compile(r"\.dhcal-[0-9a-f]{16}-\d+\.(?:new|old)")
+
+
+@dataclass(frozen=True)
+class CommitRecord:
+    """What a commit does in one folder.
+
+    Attributes:
+        token: Random text that all records of a commit share.
+        folders: All folders of the commit, the primary one first.
+        renames: Pairs of the name of a temporary file and the name of its target.
+        removals: Names of files to remove.
+    """
+
+    token: str
+    folders: Sequence[str]
+    renames: Sequence[Sequence[str]]
+    removals: Sequence[str]
+
+    @classmethod
+    def read(cls, folder: str) -> CommitRecord | None:
+        """Read the record in a folder.
+
+        Args:
+            folder: Path of the folder.
+
+        Returns:
+            The record; None if there is none.
+
+        Raises:
+            FileFormatError: The file with the name of a record is not a record.
+        """
+        path = os.path.join(folder, RECORD_NAME)
+        if not os.path.isfile(path):
+            return None
+        try:
+            with open(path, encoding="utf-8") as file:
+                record = cls(**json.load(file))
+            names = [name for pair in record.renames for name in pair]
+            is_valid = all(_is_name(name) for name in (*names, *record.removals))
+            is_valid &= all(_TEMPORARY.fullmatch(temporary) for temporary, _ in record.renames)
+            is_valid &= len(record.folders) > 0 and all(map(os.path.isabs, record.folders))
+        except FileNotFoundError:  # another run has just completed the commit
+            return None
+        except (OSError, ValueError, TypeError) as error:
+            raise FileFormatError(f"{path}: cannot be read: {error}; remove this file") from error
+        if not is_valid:
+            raise FileFormatError(f"{path}: is not a record of saved files; remove this file")
+        return record
+
+    def text(self) -> str:
+        """Return the content of the file."""
+        return json.dumps(asdict(self))
+
+
+def _is_name(name: Any) -> bool:
+    """Return whether a value is the name of a file in its folder, and not a path to elsewhere."""
+    return isinstance(name, str) and name not in ("", os.curdir, os.pardir) and os.path.basename(name) == name
+
+
+def temporary_name(token: str, number: int, kind: str) -> str:
+    """Return the name of a temporary file.
+
+    Args:
+        token: Random text of the commit.
+        number: Number of the file.
+        kind: "new" for a content, "old" for a backup.
+
+    Returns:
+        Name that `remove_stale` recognises.
+    """
+    return f".dhcal-{token}-{number}.{kind}"
+
+
+def remove_stale(folder: str) -> None:
+    """Remove the temporary files of runs that were killed before their commit.
+
+    Args:
+        folder: Locked folder, in which no run is saving.
+    """
+    with os.scandir(folder) as entries:
+        stale = [entry.path for entry in entries if _TEMPORARY.fullmatch(entry.name)]
+    for path in stale:
+        _remove(path)
+
+
+def complete(folder: str) -> None:
+    """Complete the commit whose record lies in a folder, or discard a record that was not committed.
+
+    Completing it again after an interruption has the same result.
+
+    Args:
+        folder: Folder of the commit. Errors are `OSError`.
+    """
+    record = CommitRecord.read(folder)
+    if record is None:
+        return
+    primary = record.folders[0]
+    committed = CommitRecord.read(primary)
+    if committed is None or committed.token != record.token:
+        _remove(os.path.join(folder, RECORD_NAME))
+        return
+    parts = {other: CommitRecord.read(other) for other in committed.folders}
+    own = {other: part for other, part in parts.items() if part is not None and part.token == record.token}
+    for other, part in own.items():
+        _apply(other, part)
+    # All records stay until all folders are complete, so that the commit is found in each of them.
+    for other in reversed(own):
+        _remove(os.path.join(other, RECORD_NAME))
+
+
+def _apply(folder: str, record: CommitRecord) -> None:
+    """Rename and remove the files of one folder."""
+    for temporary, name in record.renames:
+        # A file that is missing was renamed before an interruption.
+        with suppress(FileNotFoundError):
+            os.replace(os.path.join(folder, temporary), os.path.join(folder, name))
+    for name in record.removals:
+        _remove(os.path.join(folder, name))
+    flush_folder(folder)
+
+
+def _remove(path: str) -> None:
+    with suppress(FileNotFoundError):
+        os.unlink(path)
+
+
+def flush_folder(folder: str) -> None:
+    """Flush the names of a folder to the disk, where the file system can do so.
+
+    Args:
+        folder: Path of the folder.
+    """
+    with suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def complete_interrupted_save(path: PathLike) -> None:
+    """Complete the commit of a run that was killed while it saved files beside a file.
+
+    Args:
+        path: File that is about to be read.
+
+    Raises:
+        FileFormatError: The commit cannot be completed; the message names the files.
+    """
+    folder = os.path.dirname(os.path.realpath(path))
+    if not os.path.exists(os.path.join(folder, RECORD_NAME)):
+        return
+    with defer_signals() as signals, lock_folders([folder], signals):
+        complete_or_explain(folder)
+
+
+def complete_or_explain(folder: str) -> None:
+    """Complete the commit whose record lies in a folder.
+
+    Args:
+        folder: Locked folder.
+
+    Raises:
+        FileFormatError: The commit cannot be completed; the message names the files.
+    """
+    try:
+        complete(folder)
+    except OSError as error:
+        record = CommitRecord.read(folder)
+        names = [name for _, name in record.renames] if record else []
+        raise FileFormatError(
+            f"{folder}: a run was killed while it saved {', '.join(names)}, and this cannot be completed: "
+            f"{error.strerror}; these files do not belong together: save them again, and remove {RECORD_NAME}"
+        ) from error

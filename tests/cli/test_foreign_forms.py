@@ -1,0 +1,322 @@
+"""Measurement files as they come: every form of one table gives the same calibration to the last digit."""
+
+from __future__ import annotations
+
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from command_line import CALIBRATE, json_of, parse_json, positions_csv
+
+import dhcal_pin as dh
+from dhcal_pin.exceptions import DhcalError
+
+HEADER, *FULL_ROWS = positions_csv(20, seed=3).splitlines()
+# Ten digits: openpyxl writes sixteen, one too few for every double.
+CELLS = [[f"{float(cell):.10g}" for cell in row.split(",")] for row in FULL_ROWS]
+ROWS = [",".join(row) for row in CELLS]
+TEXT = "\n".join([HEADER, *ROWS]) + "\n"
+NUMBERS = np.array(CELLS, float)
+TIMES = [datetime(2026, 5, 4, 10, 0) + timedelta(seconds=7.5 * i) for i in range(len(ROWS))]
+GERMAN = ["Nr", "Achse 1 [°]", "Achse 2 [°]", "Achse 3 [°]", "X-Koordinate", "Y-Koordinate", "Z-Koordinate"]
+MAP = """[joints]
+order = ["Achse 1 [°]", "Achse 2 [°]", "Achse 3 [°]"]
+unit = "deg"
+[columns]
+x = {from = "X-Koordinate", unit = "mm"}
+y = {from = "Y-Koordinate", unit = "mm"}
+z = {from = "Z-Koordinate", unit = "mm"}
+"""
+
+
+def with_columns(*columns, sign=","):
+    """Return the file with further columns: pairs of header and cells."""
+    lines = [sign.join([*HEADER.split(","), *(name for name, _ in columns)])]
+    lines += [sign.join([*row, *(cells[i] for _, cells in columns)]) for i, row in enumerate(CELLS)]
+    return "\n".join(lines) + "\n"
+
+
+def frame(**others):
+    return pd.DataFrame(NUMBERS, columns=pd.Index(HEADER.split(","))).assign(**others)
+
+
+def write_excel(path, *, as_text=False):
+    from openpyxl import Workbook
+
+    workbook = Workbook()
+    sheet = workbook.create_sheet("Messung", 0)
+    sheet.append(["# FARO"])
+    sheet.append([*HEADER.split(","), "measured at"])
+    for row, moment in zip(CELLS, TIMES, strict=True):
+        numbers = [cell.replace(".", ",") if as_text else float(cell) for cell in row]
+        sheet.append([*numbers, moment])
+    workbook.create_sheet("Notizen").append(["warm-up 30 min"])
+    workbook.save(path)
+
+
+def write(name, content):
+    Path(name).write_bytes(content if isinstance(content, bytes) else content.encode())
+
+
+CLOCK = ["time", [moment.strftime("%H:%M:%S") for moment in TIMES]]
+FORMS = {
+    "semicolons": lambda: write("data.csv", TEXT.replace(",", ";")),
+    "semicolons and decimal commas": lambda: write("data.csv", TEXT.replace(",", ";").replace(".", ",")),
+    "tabs": lambda: write("data.csv", TEXT.replace(",", "\t")),
+    "tabs and decimal commas": lambda: write("data.csv", TEXT.replace(",", "\t").replace(".", ",")),
+    "runs of spaces": lambda: write("data.csv", TEXT.replace(",", "   ")),
+    "quoted decimal commas": lambda: write(
+        "data.csv",
+        "\n".join([HEADER, *(",".join(f'"{c.replace(".", ",")}"' for c in row) for row in CELLS)]),
+    ),
+    "byte order mark": lambda: write("data.csv", b"\xef\xbb\xbf" + TEXT.encode()),
+    "CRLF": lambda: write("data.csv", TEXT.replace("\n", "\r\n")),
+    "BOM, CRLF, semicolons, decimal commas": lambda: write(
+        "data.csv",
+        b"\xef\xbb\xbf" + TEXT.replace(",", ";").replace(".", ",").replace("\n", "\r\n").encode(),
+    ),
+    "separators at the end": lambda: write("data.csv", TEXT.replace("\n", ",,\n")),
+    "known time": lambda: write("data.csv", with_columns(["time[s]", [str(7.5 * i) for i in range(20)]])),
+}
+# Name of the form, function that writes it, and the note on it.
+NOTED_FORMS = {
+    "time": (lambda: write("data.csv", with_columns(["Timestamp", CLOCK[1]])), "column 'Timestamp' ignored"),
+    "unix time": (
+        lambda: write("data.csv", with_columns(["t", [str(moment.timestamp()) for moment in TIMES]])),
+        "column 't' ignored",
+    ),
+    "comments": (
+        lambda: write("data.csv", with_columns(["remark", ["", "ok, good", *["x"] * 18]], sign=";")),
+        "column 'remark' ignored",
+    ),
+    "temperature and counter": (
+        lambda: write(
+            "data.csv", with_columns(["temperature[°C]", ["21.5"] * 20], ["No.", [str(i) for i in range(20)]])
+        ),
+        "columns 'temperature', 'No.' ignored",
+    ),
+    "index without a name": (
+        lambda: write("data.csv", frame().to_csv()),
+        "column 1 ignored",
+    ),
+    "Parquet": (
+        lambda: frame(at=pd.to_datetime(TIMES), note=["a"] * 20).to_parquet("data.parquet"),
+        "columns 'at', 'note' ignored",
+    ),
+    "Excel": (lambda: write_excel("data.xlsx"), "read sheet 'Messung', not 'Notizen'"),
+    "Excel with texts": (lambda: write_excel("data.xlsx", as_text=True), "column 'measured at' ignored"),
+}
+
+
+@pytest.fixture
+def expected(run, robot_folder):
+    """Return the parameters of the plain file, which is then removed."""
+    write("data.csv", TEXT)
+    parameters = json_of(run(*CALIBRATE, "--json", "-"))["parameters"]
+    Path("data.csv").unlink()
+    return parameters
+
+
+def calibrate(run, *options):
+    """Calibrate with the only file data.*; return the JSON document and the output for people."""
+    (path,) = [path.name for path in Path().iterdir() if path.name.startswith("data.")]
+    status, out, err = run("calibrate", "arm.dh.toml", path, *CALIBRATE[3:], "--json", "-", *options)
+    assert status == 0, err
+    return parse_json(out), err
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_each_form_gives_the_same_result(run, expected, form):
+    FORMS[form]()
+    document, err = calibrate(run)
+    assert document["parameters"] == expected
+    assert "ignored" not in err
+    assert not any("ignored" in text for text in document["warnings"])
+
+
+@pytest.mark.parametrize("form", NOTED_FORMS)
+def test_each_form_gives_the_same_result_and_a_note(run, expected, form):
+    write_form, note = NOTED_FORMS[form]
+    write_form()
+    document, err = calibrate(run)
+    assert document["parameters"] == expected
+    assert note in err
+    assert any(text.endswith(note) for text in document["warnings"])
+
+
+@pytest.mark.parametrize("decimal", [".", ","])
+@pytest.mark.parametrize("ending", ["csv", "xlsx", "parquet"])
+def test_a_header_in_another_language_with_a_map(run, expected, ending, decimal):
+    Path("map.toml").write_text(MAP)
+    table = pd.DataFrame(NUMBERS, columns=pd.Index(GERMAN[1:]))
+    table.insert(0, GERMAN[0], range(1, 21))
+    if ending == "csv":
+        table.to_csv("data.csv", sep=";", decimal=decimal, index=False, encoding="utf-8-sig")
+    elif ending == "xlsx":
+        table.to_excel("data.xlsx", index=False, startrow=2, startcol=1)
+    else:
+        table.to_parquet("data.parquet")
+    document, _ = calibrate(run, "--columns", "map.toml")
+    assert document["parameters"] == expected
+
+
+def test_data_frames(run, expected, robot_folder):
+    arm = dh.read_robot("arm.dh.toml")
+    write("data.csv", TEXT)
+    reference = dh.read_measurements("data.csv", arm)
+    for table in (frame(), frame().astype(object), frame(note="a"), frame().convert_dtypes()):
+        data = dh.read_measurements(table, arm)
+        assert (data.source, data.rows.tolist()) == ("DataFrame", list(range(1, 21)))
+        assert data.q.tolist() == reference.q.tolist()
+        assert data.positions().tolist() == reference.positions().tolist()
+    fit = dh.calibrate(arm, dh.read_measurements(frame(), arm), "dh")
+    assert [estimate.value for estimate in fit.estimates] == [row["value"] for row in expected]
+    Path("map.toml").write_text(MAP)
+    german = pd.DataFrame(NUMBERS, columns=pd.Index(GERMAN[1:]))
+    assert dh.read_measurements(german, arm, "map.toml").q.tolist() == reference.q.tolist()
+    broken = frame()
+    broken.loc[4, "x[mm]"] = np.nan
+    broken.loc[7, "joint_2[deg]"] = np.inf
+    with pytest.raises(DhcalError, match=r"DataFrame:5: column 'x' is empty; 2 rows .* lines 5, 8;"):
+        dh.read_measurements(broken.astype(object), arm)
+    assert dh.read_measurements(broken, arm, skip_bad_rows=True).rows.tolist() == [
+        *range(1, 5),
+        *(6, 7),
+        *range(9, 21),
+    ]
+
+
+# --- bad rows --------------------------------------------------------------------------------------
+
+# Lines of the file: a comment in line 2 shifts the rows.
+BAD = {5: (3, "nan"), 9: (4, ""), 10: (0, "error"), 11: (5, "inf"), 15: (None, "pause, 10 min")}
+
+
+def with_bad_rows():
+    """Return a file in which five lines are no measurement, and the file without these lines."""
+    lines = [HEADER, "# laser", *ROWS]
+    good = [line for number, line in enumerate(lines, 1) if number not in BAD]
+    for number, (index, text) in BAD.items():
+        cells = lines[number - 1].split(",")
+        lines[number - 1] = text if index is None else ",".join([*cells[:index], text, *cells[index + 1 :]])
+    return "\n".join(lines), "\n".join(good)
+
+
+def test_all_bad_rows_are_listed_in_one_message(assert_refused, run, robot_folder):
+    write("data.csv", with_bad_rows()[0])
+    words = ["data.csv:5: column 'x': 'nan' is not a finite number; 5 rows", "lines 5, 9-11, 15;"]
+    assert_refused([*words, "or use --skip-bad-rows"], *CALIBRATE)
+    assert_refused([*words, "or use --skip-bad-rows"], "validate", "arm.urdf", "data.csv")
+
+
+def test_bad_rows_are_skipped_on_request(run, robot_folder):
+    text, good = with_bad_rows()
+    write("data.csv", good)
+    expected = json_of(run(*CALIBRATE, "--json", "-"))
+    write("data.csv", text)
+    status, out, err = run(*CALIBRATE, "--skip-bad-rows", "--json", "-", "--residuals", "r.csv")
+    document = parse_json(out)
+    assert (status, document["samples"]) == (0, 15)
+    assert document["parameters"] == expected["parameters"]
+    note = "data.csv: 5 lines skipped: 5, 9-11, 15; the first because column 'x': 'nan' is not a finite"
+    note += " number"
+    assert note in err
+    assert note in document["warnings"]
+    # The lines of the other rows are those of the file.
+    lines = [int(row.split(",")[1]) for row in Path("r.csv").read_text().splitlines()[1:]]
+    assert lines == [line for line in range(3, 23) if line not in BAD]
+    skipped = json_of(run("validate", "arm.urdf", "data.csv", "--skip-bad-rows", "--json", "-"))
+    assert skipped["samples"] == 15
+
+
+def test_bad_rows_of_excel_and_of_a_mapped_file(assert_refused, run, robot_folder):
+    table = pd.DataFrame(NUMBERS, columns=pd.Index(GERMAN[1:])).astype(object)
+    table.loc[3, GERMAN[2]] = "?"
+    table.loc[9, GERMAN[4]] = None
+    table.to_excel("data.xlsx", index=False)
+    Path("map.toml").write_text(MAP)
+    calibrate = ("calibrate", "arm.dh.toml", "data.xlsx", "-o", "out.urdf", "--columns", "map.toml")
+    assert_refused(["data.xlsx:5: column 'Achse 2': '?' is not", "lines 5, 11;"], *calibrate)
+    assert json_of(run(*calibrate, "--skip-bad-rows", "--json", "-"))["samples"] == 18
+
+
+def test_no_usable_row_is_an_error(assert_refused, run, robot_folder):
+    write("data.csv", "\n".join([HEADER, *(["1,2,3,a,b,c"] * 3)]))
+    assert_refused(["data.csv: no row has all numbers"], *CALIBRATE, "--skip-bad-rows")
+
+
+# --- column maps that messages propose -------------------------------------------------------------
+
+
+def proposed_map(err):
+    """Return the lines in backticks that contain an equals sign, as a file."""
+    return "\n".join(part for part in err.split("`")[1::2] if "=" in part) + "\n"
+
+
+@pytest.mark.parametrize("sign", [",", ";", "\t"])
+def test_a_file_without_header_proposes_a_map_that_reads_it(run, expected, sign):
+    write("data.csv", TEXT.split("\n", 1)[1].replace(",", sign))
+    status, _, err = run(*CALIBRATE)
+    assert (status, err.count("\n")) == (2, 1)
+    assert "data.csv:1: numbers where the header must be" in err
+    assert 'joints = {order = [1, 2, 3], unit = "deg"}' in err
+    Path("map.toml").write_text(proposed_map(err))
+    assert calibrate(run, "--columns", "map.toml")[0]["parameters"] == expected
+
+
+def test_a_header_in_another_language_proposes_a_map_that_reads_it(run, expected):
+    table = pd.DataFrame(NUMBERS, columns=pd.Index(GERMAN[1:]))
+    table.insert(0, GERMAN[0], range(1, 21))
+    table.to_csv("data.csv", sep=";", decimal=",", index=False)
+    status, _, err = run(*CALIBRATE)
+    assert (status, err.count("\n")) == (2, 1)
+    assert "data.csv:1: no column is a joint of this robot (joint_1, joint_2, joint_3)" in err
+    Path("map.toml").write_text(proposed_map(err))
+    assert calibrate(run, "--columns", "map.toml")[0]["parameters"] == expected
+
+
+# --- files that cannot be read ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("data.xlsx", b"PK\x03\x04 no zip", ["data.xlsx: not an Excel workbook", "save it as .xlsx"]),
+        ("data.xlsx", TEXT.encode(), ["data.xlsx: not an Excel workbook"]),
+        ("data.parquet", TEXT.encode(), ["data.parquet: not a Parquet file"]),
+        ("data.xls", b"\xd0\xcf\x11\xe0", ["data.xls: .xls files cannot be read; save it as .xlsx"]),
+        ("data.bag", b"#ROSBAG V2.0\n", ["data.bag: .bag files cannot be read", "dhcal convert"]),
+    ],
+)
+def test_files_that_are_no_tables(assert_refused, run, robot_folder, name, content, words):
+    write(name, content)
+    assert_refused(words, "calibrate", "arm.dh.toml", name, "-o", "out.urdf")
+    assert_refused(["cannot read it"], "calibrate", "arm.dh.toml", f"none-{name[:8]}.xlsx", "-o", "out.urdf")
+
+
+def test_optional_packages_are_named(assert_refused, run, robot_folder, monkeypatch):
+    for name, package, extra in (("data.xlsx", "openpyxl", "excel"), ("data.parquet", "pyarrow", "parquet")):
+        write(name, b"")
+        monkeypatch.setitem(__import__("sys").modules, package, None)
+        assert_refused([f"needs {package}", f"dhcal-pin[{extra}]"], *CALIBRATE[:2], name, *CALIBRATE[3:])
+
+
+@pytest.mark.parametrize(
+    ("header", "word"),
+    [
+        ("X[mm]", "did you mean 'x'?"),
+        ("poinnt", "did you mean 'point'?"),
+        ("flange[deg]", "'flange' is neither"),
+        ("offset[mm]", "'offset' is neither"),
+        ("weight", "'weight' is neither"),
+    ],
+)
+def test_columns_that_may_be_meant_are_not_ignored(assert_refused, run, robot_folder, header, word):
+    """A misspelt name, an angle or a length, and numbers without a unit."""
+    text = with_columns([header, [str(i**2) for i in range(20)]])
+    if header == "X[mm]":
+        text = TEXT.replace("x[mm]", header)
+    write("data.csv", text)
+    assert_refused(["data.csv:1:", word], *CALIBRATE)

@@ -1,0 +1,178 @@
+"""Files that broke a command once: one line that helps, exit status 2, and nothing written."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from pathlib import Path
+
+import pytest
+from command_line import CALIBRATE, positions_csv
+
+ORIGINS = "shoulder upper_arm forearm wrist_1 wrist_2 wrist_3".split()
+COLUMN_MAP = """
+[joints]
+order = ["A1", "A2", "A3"]
+unit = "deg"
+[columns]
+x = {from = "X", unit = "mm"}
+y = {from = "Y", unit = "mm"}
+z = {from = "Z", unit = "mm"}
+"""
+# 310 digits: more than a double can hold.
+HUGE = "9" * 310
+
+
+def ur_kinematics(value: str) -> str:
+    """A UR kinematics file all of whose numbers are one text."""
+    lines = ["kinematics:"]
+    for name in ORIGINS:
+        lines += [f"  {name}:", *(f"    {key}: {value}" for key in "x y z roll pitch yaw".split())]
+    return "\n".join([*lines, ""])
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        *(
+            "2001-99-99",
+            "2001-01-01",
+            "0b_",
+            "0x_",
+            "1:30",
+            "!!int x",
+            "!!float x",
+            "!!bool x",
+            "!!timestamp x",
+        ),
+        *("1" + 400 * "0", ".inf", ".nan", "1_000", "[1]", "{a: 1}", "~", "1,5", "2e5", "-10001"),
+    ],
+)
+def test_yaml_values_that_are_no_numbers(assert_refused, value):
+    Path("k.yaml").write_text(ur_kinematics(value))
+    words = ["k.yaml: kinematics: shoulder: x: ", "expected a number in m or rad"]
+    assert_refused(words, "convert", "k.yaml", "o.urdf")
+
+
+@pytest.mark.parametrize("text", ["[" * 3000, "{a: " * 3000, "- " * 30_000, "a: [*b]", "\t- x", "%TAG ! x:"])
+def test_text_that_is_no_yaml(assert_refused, text):
+    Path("k.yaml").write_text(text)
+    assert_refused(["k.yaml: "], "convert", "k.yaml", "o.urdf")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('unit = "deg"', 'unit = ["rad", ["m"], "rad"]', ["[joints]", "unit ['m']", "text in quotes"]),
+        ('unit = "mm"', "unit = 5", ["[columns.x]", "unit 5", "text in quotes"]),
+        ("", '[rotation]\nconvention = ["euler"]\n', ["[rotation]", "convention = ['euler']", "rotvec"]),
+        *(
+            ("\n[joints]", f'\nencoding = "{name}"\n[joints]', ["unknown encoding", name, "cp1252"])
+            for name in ("rot13", "hex", "undefined", "none")
+        ),
+        ("\n[joints]", '\nencoding = "punycode"\n[joints]', ["data.csv", "is not PUNYCODE"]),
+        ("\n[joints]", '\nencoding = "utf\\u00008"\n[joints]', ["map.toml: line 2", "zero character"]),
+    ],
+)
+def test_column_maps(assert_refused, old, new, words):
+    # The line with a letter beyond ASCII is not Punycode.
+    rows = positions_csv(20).split("\n", 1)[1]
+    Path("data.csv").write_text(f"# \u00e4\nA1,A2,A3,X,Y,Z\n{rows}")
+    text = COLUMN_MAP.replace(old, new, 1) if old else COLUMN_MAP + new
+    Path("map.toml").write_text(text)
+    assert_refused(words, *CALIBRATE, "--columns", "map.toml")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "option"),
+    [
+        ("bounds.toml", f"d1 = [-{HUGE}, {HUGE}]", "--bounds"),
+        ("known.toml", f'[instrument]\n"wire1.x" = {HUGE}', "--instrument"),
+        ("known.toml", f'[instrument]\n"wire1.x" = {hex(16**10_000)}', "--instrument"),
+        ("priors.toml", f"d1 = {HUGE}", "--priors"),
+    ],
+)
+def test_integers_beyond_doubles(assert_refused, name, text, option):
+    Path(name).write_text(text)
+    assert_refused([name, "integer of ", "expected"], *CALIBRATE, option, name)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"[payload]\nmass_kg = {HUGE}",
+        f"[payload]\nmass_kg = 1\ncentre_m = [{HUGE}, 0, 0]",
+        f"[base]\nxyz_m = [{HUGE}, 0, 0]",
+        f"[joint.joint_1]\ngain = {HUGE}",
+    ],
+)
+def test_integers_beyond_doubles_in_a_sidecar(assert_refused, text):
+    Path("arm.calibration.toml").write_text(text)
+    assert_refused(["arm.calibration.toml: [", "integer of 1030 bits"], "validate", "arm.urdf", "data.csv")
+
+
+@pytest.mark.parametrize("tip", ["5", '"tool"', '"base"'])
+def test_a_sidecar_whose_tip_is_no_link(assert_refused, tip):
+    """Its tool was ignored silently."""
+    Path("arm.calibration.toml").write_text(f"tip = {tip}\n[tool]\nxyz_m = [0, 0, 0.1]\n")
+    assert_refused(["arm.calibration.toml", "tip = "], "validate", "arm.urdf", "data.csv")
+
+
+@pytest.mark.parametrize("value", ["1e-300", "1e-160", "5e-324", "1e160", "1e300"])
+def test_prior_standard_deviations_beyond_all_measure(assert_refused, value):
+    Path("priors.toml").write_text(f'"a*" = {value}\n')
+    assert_refused(
+        ["priors.toml: a* = ", "from 1e-12 to 1e+06", "--fix"], *CALIBRATE, "--priors", "priors.toml"
+    )
+
+
+@pytest.mark.parametrize("value", ["1e-12", "1e6"])
+def test_prior_standard_deviations_at_the_limits(run, robot_folder, recwarn, value):
+    Path("priors.toml").write_text(f'"a*" = {value}\n')
+    assert run(*CALIBRATE, "--priors", "priors.toml")[0] == 0
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        ".".join(["a"] * 50_000) + " = 1",
+        "[" + ' . "b"'.join(["a"] * 50_000) + "]",
+        "a = " + "[" * 50_000,
+        "a = " + "{a=" * 50_000,
+        "a = " + "9" * 50_000,
+    ],
+)
+def test_deep_toml(assert_refused, text):
+    Path("priors.toml").write_text(text)
+    start = time.perf_counter()
+    assert_refused(["priors.toml: "], *CALIBRATE, "--priors", "priors.toml")
+    assert time.perf_counter() - start < 5
+
+
+def test_zero_bytes_in_the_paths_of_a_manifest(assert_refused):
+    Path("a.fleet.toml").write_text('[[job]]\nrobot = "a\\u0000.urdf"\ndata = "d.csv"\noutput = "o.urdf"\n')
+    assert_refused(["a.fleet.toml: line 2: a zero character"], "calibrate", "a.fleet.toml", "-o", "s.csv")
+
+
+def test_a_message_does_not_repeat_a_long_value(assert_refused, run):
+    Path("priors.toml").write_text(f'd1 = "{"x" * 3000}"')
+    assert_refused(["priors.toml: d1 = 'xxx", "..."], *CALIBRATE, "--priors", "priors.toml")
+    assert len(run(*CALIBRATE, "--priors", "priors.toml")[2]) < 400
+
+
+@pytest.mark.parametrize(
+    "options", [["--report", "r.html"], ["--report", "r.md"], ["--json", "r.json"], ["--map", "m.csv"]]
+)
+def test_a_file_name_that_is_not_utf_8(run, robot_folder, options):
+    names = [os.fsdecode(b"d\xff.csv"), os.fsdecode(b"r\xff.dh.toml"), os.fsdecode(b"o\xff.urdf")]
+    shutil.copy("data.csv", names[0])
+    shutil.copy("arm.dh.toml", names[1])
+    status, _, err = run("calibrate", names[1], names[0], "-o", names[2], *options)
+    assert status == 0, err
+    assert r"wrote urdf: o\udcff.urdf" in err
+    assert Path(names[2]).read_bytes().startswith(b"<?xml")
+    Path(options[1]).read_text(encoding="utf-8")
+    assert run("view", names[1], names[2], "--html", "v.html")[0] == 0
+    assert run("simulate", names[1], "-m", "5", "-o", "s.csv")[0] == 0

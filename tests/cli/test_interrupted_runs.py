@@ -1,0 +1,36 @@
+"""Commands that are interrupted or killed: old files or new ones, and no trace after the next run."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import interrupted_runs
+import pytest
+
+
+def outcomes(folder: Path, command: str, name: str, n_steps: int, n_times: int) -> dict[str, int]:
+    """Interrupt a command in another process, which checks all files; count how they were left."""
+    words = [interrupted_runs.__file__, str(folder), command, name, str(n_steps), str(n_times), "1"]
+    done = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+COMMANDS = [("report", "SIGKILL"), ("in place", "SIGINT"), ("study", "SIGINT")]
+
+
+@pytest.mark.parametrize(("command", "name"), COMMANDS)
+def test_interrupted_commands_leave_old_or_new_files(tmp_path, command, name):
+    assert sum(outcomes(tmp_path, command, name, 2, 1).values()) == 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["SIGKILL", "SIGINT"])
+@pytest.mark.parametrize("command", interrupted_runs.COMMANDS)
+def test_hundreds_of_interrupted_commands_leave_old_or_new_files(tmp_path, command, name):
+    left = outcomes(tmp_path, command, name, 100, 100)
+    assert sum(left.values()) == 200
+    assert min(left["old"], left["new"]) > 0

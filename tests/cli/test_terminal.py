@@ -1,0 +1,96 @@
+"""Names and labels of files do not control the terminal, and no library prints on it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import unicodedata
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import HEADER, positions_csv
+from robots import URDF
+
+# Clears the screen, rings the bell, turns the text around; also as a C1 control character.
+HOSTILE = "\x1b[2J\x07\u202e\x9b31m"
+
+
+def assert_harmless(text):
+    assert {unicodedata.category(char) for char in text} & {"Cf", "Cs", "Zl", "Zp"} == set()
+    assert {char for char in text if unicodedata.category(char) == "Cc"} <= {"\n"}
+
+
+def hostile_name(name):
+    """A file with control characters in its name."""
+    path = f"{HOSTILE}{name}"
+    shutil.copy(name, path)
+    return path
+
+
+@pytest.mark.parametrize("wrong", [(), (3,)])
+def test_paths(run, robot_folder, wrong):
+    Path("data.csv").write_text(positions_csv(20, wrong=wrong))
+    robot, data = hostile_name("arm.dh.toml"), hostile_name("data.csv")
+    status, out, err = run("calibrate", robot, data, "-o", f"{HOSTILE}o.urdf", "--json", "-")
+    assert status == 0, err
+    assert r"\x1b[2J\x07\u202e\x9b31mo.urdf" in err
+    assert_harmless(err)
+    assert json.loads(out)["files"]["urdf"] == f"{HOSTILE}o.urdf"
+    assert_harmless(run("validate", robot, data)[2])
+    assert_harmless(run("validate", robot, f"{HOSTILE}none.csv")[2])
+    assert_harmless(run("calibrate", robot, "--tip", HOSTILE, data, "-o", "o.urdf")[2])
+    assert_harmless(run("calibrate", robot, data, "-o", "o.urdf", "--method", HOSTILE)[2])
+
+
+def test_labels_of_points(run, robot_folder):
+    rng = np.random.default_rng(0)
+    rows = [
+        f"{','.join(map(str, rng.uniform(-80, 80, 3)))},{label}"
+        for label in (f"{HOSTILE}a", f"{HOSTILE}b")
+        for _ in range(12)
+    ]
+    header = HEADER.split(",x[mm]")[0]
+    Path("touch.csv").write_text("\n".join([f"{header},point", *rows]), encoding="utf-8")
+    status, _, err = run("calibrate", "arm.urdf", "touch.csv", "-o", "o.urdf", "--force")
+    assert status == 0, err
+    assert_harmless(err)
+
+
+def test_names_in_a_manifest_and_in_a_study(run, robot_folder):
+    name = json.dumps(HOSTILE)
+    Path("a.fleet.toml").write_text(
+        f'[[job]]\nname = {name}\nrobot = {name}\ndata = "data.csv"\noutput = "o.urdf"\n', encoding="utf-8"
+    )
+    status, _, err = run("calibrate", "a.fleet.toml", "-o", "s.csv")
+    assert status == 1
+    assert r"\x1b[2J" in err
+    assert_harmless(err)
+    shutil.copy(URDF / "sim_3dof.dh.toml", "sim.dh.toml")
+    Path("s.study.toml").write_text(
+        f'title = {name}\nseeds = 3\n[settings]\nrobot = "sim.dh.toml"\nposes = 10\n', encoding="utf-8"
+    )
+    status, _, err = run("study", "s.study.toml", "-o", "s.csv")
+    assert status == 0, err
+    assert_harmless(err)
+
+
+def test_nothing_but_the_command_prints(robot_folder):
+    """NumPy and the parser of URDFs printed warnings, which Python's own capture does not see."""
+    text = Path("arm.urdf").read_text()
+    # Two hundred equal rows, and an element that the parser of URDFs reports.
+    Path("chatty.urdf").write_text(text.replace("</link>", "<visual/></link>", 1))
+    Path("equal.csv").write_text("\n".join([HEADER, *["10,20,30,500,250,750"] * 200]))
+    command = [sys.executable, "-m", "dhcal_pin.cli", "calibrate", "chatty.urdf", "equal.csv", "-o", "o.urdf"]
+    # Without this variable, Python shows a warning and goes on.
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONWARNINGS"}
+    for options in ([], ["--parameters", "dh", "--priors", "none"], ["--force"]):
+        done = subprocess.run(
+            [*command, *options], capture_output=True, text=True, env=environment, check=False
+        )
+        assert done.returncode in (0, 3), done.stderr
+        assert "Warning" not in done.stderr
+        assert "Error:" not in done.stderr

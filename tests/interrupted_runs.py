@@ -1,0 +1,247 @@
+"""Whole commands that are interrupted or killed, what they leave behind, and what the next command says.
+
+Run as a script in a process of its own, because it forks: `interrupted_runs.py FOLDER COMMAND SIGNAL N_STEPS
+N_TIMES SEED` interrupts the command at so many instructions of its saving and at so many random times.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import random
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+from command_line import positions_csv
+from robots import URDF
+from signal_steps import SignalAtStep, count_steps
+
+from dhcal_pin import saving
+from dhcal_pin.cli import outputs
+from dhcal_pin.cli.main import main as dhcal
+
+FLEET = """
+[[job]]
+robot = "arm.urdf"
+data = "data.csv"
+output = "out.urdf"
+report = "r.md"
+json = "r.json"
+"""
+STUDY = """
+seeds = {seeds}
+[settings]
+robot = "arm.dh.toml"
+poses = [6, 12]
+"""
+CALIBRATE = ("calibrate", "arm.urdf", "data.csv", "-o", "out.urdf")
+# Words of each command, and the names of its outputs.
+COMMANDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "calibrate": (CALIBRATE, ("out.urdf", "out.calibration.toml")),
+    "in place": (
+        ("calibrate", "arm.urdf", "data.csv", "-o", "arm.urdf", "--in-place"),
+        ("arm.urdf", "arm.calibration.toml"),
+    ),
+    "report": (
+        (*CALIBRATE, "--report", "sub/r.md", "--json", "sub/r.json", "--residuals", "residuals.csv"),
+        ("out.urdf", "out.calibration.toml", "sub/r.md", "sub/r.json", "residuals.csv"),
+    ),
+    "study": (("study", "s.study.toml", "-o", "s.csv"), ("s.csv", "s.svg")),
+    "fleet": (
+        ("calibrate", "a.fleet.toml", "-o", "f.csv", "--jobs", "1", "--json", "sub/f.json"),
+        ("out.urdf", "out.calibration.toml", "r.md", "r.json"),
+    ),
+}
+# Files that a command may leave for the next run, which continues with them.
+JOURNALS = {"study": "s.csv.part"}
+
+
+class Interruption:
+    """One command in a folder with old outputs, which is to replace them by new ones.
+
+    Attributes:
+        words: Words of the command.
+        names: Names of its outputs.
+        old: Content of each output before.
+        new: Content of each output after.
+    """
+
+    def __init__(self, root: Path, command: str):
+        self.root, self.command = root, command
+        self.words, self.names = COMMANDS[command]
+        os.chdir(root)
+        self._make_inputs(old=True)
+        self._run_alone()
+        self.old = self.read()
+        self._make_inputs(old=False)
+        self._run_alone()
+        self.new = self.read()
+        assert all(self.old.values())
+        assert all(self.new.values())
+        assert self.old != self.new
+
+    def _make_inputs(self, old: bool) -> None:
+        for name in ("arm.urdf", "arm.dh.toml"):
+            if name not in self.names or old:
+                shutil.copy(URDF / name.replace("arm", "experiment"), name)
+        (self.root / "sub").mkdir(exist_ok=True)
+        Path("data.csv").write_text(positions_csv(20, seed=0 if old else 5))
+        Path("s.study.toml").write_text(STUDY.format(seeds=20 if old else 30))
+        Path("a.fleet.toml").write_text(FLEET)
+
+    def _run_alone(self) -> None:
+        status = self._in_child(lambda: dhcal(self.words))
+        assert status == 0, Path("stderr").read_text()
+
+    def _in_child(self, function: Callable[[], int], kill_after: float = 0, number: int = 0) -> int:
+        """Run a function in a session of its own until all its processes have ended; return its status."""
+        child = os.fork()
+        if not child:
+            os.setsid()
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            descriptor = os.open("stderr", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+            os.dup2(descriptor, 2)
+            sys.stderr = os.fdopen(2, "w", closefd=False)
+            status = 99
+            try:
+                status = function()
+            finally:
+                sys.stderr.flush()
+                os._exit(status)
+        if kill_after:
+            time.sleep(kill_after)
+            # As a terminal does, for the command and its workers.
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(child, number) if number == signal.SIGINT else os.kill(child, number)
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        while any(_session(process) == child for process in psutil.process_iter()):
+            time.sleep(0.01)
+        return status
+
+    def read(self) -> dict[str, bytes | None]:
+        """Return the content of each output."""
+        paths = {name: self.root / name for name in self.names}
+        return {name: path.read_bytes() if path.exists() else None for name, path in paths.items()}
+
+    def reset(self) -> None:
+        """Restore the old outputs, and remove everything else that a run has left."""
+        for path in self.files():
+            path.unlink()
+        self._make_inputs(old=True)
+        self._make_inputs(old=False)
+        for name, content in self.old.items():
+            assert content is not None
+            (self.root / name).write_bytes(content)
+
+    def files(self) -> list[Path]:
+        """Return all files of the folder."""
+        return [path for path in self.root.rglob("*") if path.is_file()]
+
+    def saving_steps(self) -> int:
+        """Count the instructions of the saving."""
+        self.reset()
+        counts = self.root.with_name("count")
+
+        def run() -> int:
+            write = outputs.write_outputs
+            _replace_write_outputs(lambda *args: counts.write_text(str(count_steps(lambda: write(*args)))))
+            return dhcal(self.words)
+
+        self._in_child(run)
+        return int(counts.read_text())
+
+    def interrupt_at_step(self, step: int, number: int) -> str:
+        """Send a signal at an instruction of the saving and check the consequences."""
+
+        def run() -> int:
+            write = outputs.write_outputs
+
+            def traced(*args: object) -> None:
+                with SignalAtStep(step, number):
+                    write(*args)  # pyright: ignore
+
+            _replace_write_outputs(traced)
+            return dhcal(self.words)
+
+        self.reset()
+        return self.check(self._in_child(run), number)
+
+    def interrupt_after(self, seconds: float, number: int) -> str:
+        """Send a signal at a time and check the consequences."""
+        self.reset()
+        status = self._in_child(lambda: dhcal(self.words), seconds, number)
+        return self.check(status, number)
+
+    def check(self, status: int, number: int) -> str:
+        """Check what an interrupted run has left, what it said, and what the next commands do."""
+        said = Path("stderr").read_text()
+        found = self.read()
+        left = "old" if found == self.old else "new" if found == self.new else "mixed"
+        details = (status, left, said, [path.name for path in self.files()])
+        if number == signal.SIGINT:
+            # The files of an interrupted run are complete, and the message names them.
+            assert left != "mixed", details
+            assert not [path for path in self.files() if path.name.startswith(".dhcal-")], details
+            assert status in (0, 130), details
+            if self.command != "fleet" and status == 130:
+                assert ("these files are written" in said) == (left == "new"), details
+        robot = self.names[0]
+        if robot.endswith(".urdf"):
+            said_next = io.StringIO()
+            with contextlib.redirect_stderr(said_next):
+                next_status = dhcal(["validate", robot, "data.csv"])
+            assert next_status == 0 or self.names[1] in said_next.getvalue(), (details, said_next.getvalue())
+            assert next_status == 2 or self.read() in (self.old, self.new), details
+        # The next run leaves its own files only.
+        self._run_alone()
+        if self.command != "in place":
+            assert self.read() == self.new, details
+        hidden = [path.name for path in self.files() if path.name.startswith(".dhcal-")]
+        assert hidden == [], (details, hidden)
+        assert not (self.root / JOURNALS.get(self.command, "none")).exists()
+        return left
+
+
+def _session(process: psutil.Process) -> int:
+    try:
+        return os.getsid(process.pid) if process.status() != psutil.STATUS_ZOMBIE else 0
+    except (psutil.NoSuchProcess, ProcessLookupError):
+        return 0
+
+
+def _replace_write_outputs(function: Callable[..., object]) -> None:
+    """Replace the function that saves, in all modules that have imported it."""
+    from dhcal_pin.cli import fleet, run_job
+
+    for module in (outputs, run_job, fleet):
+        module.write_outputs = function  # pyright: ignore
+
+
+def main(folder: str, command: str, name: str, n_steps: str, n_times: str, seed: str) -> None:
+    """Interrupt a command many times, and print how many runs left what."""
+    rng, number = random.Random(int(seed)), signal.Signals[name]
+    assert saving.write_files  # the modules are loaded before the processes fork
+    root = Path(folder).resolve() / "run"
+    root.mkdir(parents=True, exist_ok=True)
+    interruption = Interruption(root, command)
+    left = []
+    if int(n_steps):
+        steps = interruption.saving_steps()
+        left += [interruption.interrupt_at_step(rng.randrange(steps), number) for _ in range(int(n_steps))]
+    interruption.reset()
+    start = time.perf_counter()
+    interruption._run_alone()
+    duration = time.perf_counter() - start
+    left += [interruption.interrupt_after(rng.uniform(0, duration), number) for _ in range(int(n_times))]
+    print(json.dumps({key: left.count(key) for key in ("old", "mixed", "new")}))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

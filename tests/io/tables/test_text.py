@@ -1,0 +1,110 @@
+"""Text files: CSV tables and TOML."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from robots import write
+
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io import read_toml
+from dhcal_pin.io.tables import read_table
+from dhcal_pin.io.tabular import csv_text, require_usable_names
+
+
+def test_an_unbalanced_quote_affects_its_row_only(tmp_path):
+    path = write(tmp_path, "a.csv", 'a,b\n1,2\n"3,4\n5,6\n')
+    with pytest.raises(DhcalError, match=r"a\.csv:3: 1 values for 2 columns"):
+        read_table(path).require_good_rows()
+
+
+def test_a_cell_that_is_too_long_is_an_error(tmp_path):
+    with pytest.raises(DhcalError, match=r"a\.csv:2: not text separated by commas"):
+        read_table(write(tmp_path, "a.csv", f"a,b\n1,{'2' * 200_000}\n")).require_good_rows()
+
+
+def test_deeply_nested_toml_is_an_error(tmp_path):
+    with pytest.raises(DhcalError, match="not TOML"):
+        read_toml(write(tmp_path, "a.toml", "a = " + "[" * 100_000))
+
+
+@pytest.mark.parametrize("text", ["=cmd|' /C calc'!A0", "+1+1", "-2+3", "@SUM(A1)", " =1", "\t=1", "\r=1"])
+def test_a_text_is_no_formula_of_a_spreadsheet(text):
+    rows = list(csv.reader(csv_text({"a": [text], "b": ["-1.5"], "c": [-2.5]}).splitlines()[1:]))
+    cell = " ".join(",".join(rows[0]).split())
+    assert cell.startswith("'")
+    assert csv_text({"b": ["-1.5", "+2e5"], "c": [-2.5, None]}) == "b,c\n-1.5,-2.5\n+2e5,\n"
+
+
+def test_a_comment_is_one_line():
+    assert csv_text({"a": [1]}, ["b\nc,\r\u2028d"]) == "# b\\nc,\\r\\u2028d\na\n1\n"
+
+
+@pytest.mark.parametrize("name", ["=1", "+a", "@b", "-c"])
+def test_no_joint_name_heads_a_column_as_a_formula(name):
+    with pytest.raises(DhcalError, match=r"arm\.urdf: joint name .*rename the joint"):
+        require_usable_names([name], "arm.urdf")
+
+
+# --- detection -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "headers", "numbers", "description"),
+    [
+        ("a,b\n1,2\n", ("a", "b"), [[1, 2]], "commas"),
+        ("a, b, c\n1, 2, 3\n", ("a", "b", "c"), [[1, 2, 3]], "commas"),
+        ("X, mm;Y, mm\n1,5;2\n3;4\n", ("X, mm", "Y, mm"), [[1.5, 2], [3, 4]], "semicolons, decimal commas"),
+        ("X, mm\tY, mm\n1,5\t2,5\n", ("X, mm", "Y, mm"), [[1.5, 2.5]], "tabs, decimal commas"),
+        ("a\tb\n1.5\t2\n", ("a", "b"), [[1.5, 2]], "tabs"),
+        ("a   b\tc\n 1  2.5   -3e-2\n", ("a", "b", "c"), [[1, 2.5, -0.03]], "spaces"),
+        ('a,b\n"1,5","2,5e-3"\n', ("a", "b"), [[1.5, 0.0025]], "commas, decimal commas"),
+        ("a;b\n1,5;2\n,5;-3,\n", ("a", "b"), [[1.5, 2], [0.5, -3]], "semicolons, decimal commas"),
+        ("a;b\n1;2\n", ("a", "b"), [[1, 2]], "semicolons"),
+        ("a;b\n1.5;2\n", ("a", "b"), [[1.5, 2]], "semicolons"),
+        # With points as well, commas are not decimal: the cell is no number.
+        ("a;b\n1.5;2,5\n", ("a", "b"), [[1.5, np.nan]], "semicolons"),
+        ("a;b\n1.234,5;2,5\n", ("a", "b"), [[np.nan, 2.5]], "semicolons, decimal commas"),
+        ("a,b,c,\n1,2,3,\n4,5,6,\n", ("a", "b", "c"), [[1, 2, 3], [4, 5, 6]], "commas"),
+        ("a\n1\n2\n", ("a",), [[1], [2]], "commas"),
+        ('a;b\n1;"two; three"\n4;5\n', ("a", "b"), [[1, np.nan], [4, 5]], "semicolons"),
+    ],
+)
+def test_separator_and_decimal_sign_are_detected(tmp_path, text, headers, numbers, description):
+    table = read_table(write(tmp_path, "a.csv", text))
+    assert (table.headers, table.description, table.bad_rows) == (headers, description, {})
+    np.testing.assert_array_equal(np.stack([table.values(i) for i in range(len(headers))], -1), numbers)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    rows=st.lists(st.lists(st.floats(-1e6, 1e6), min_size=4, max_size=4), min_size=1, max_size=6),
+    separator=st.sampled_from([",", ";", "\t", "  "]),
+    decimal=st.sampled_from([".", ","]),
+    ending=st.sampled_from(["\n", "\r\n"]),
+    mark=st.sampled_from(["", "\ufeff"]),
+)
+def test_numbers_read_back_bit_identical(tmp_path_factory, rows, separator, decimal, ending, mark):
+    """Any numbers under any separator, decimal sign, line end and byte order mark."""
+    cells = [[repr(value).replace(".", decimal) for value in row] for row in rows]
+    if separator == decimal:
+        cells = [[f'"{cell}"' for cell in row] for row in cells]
+    text = ending.join(separator.join(row) for row in [["a", "b", "c", "d"], *cells])
+    table = read_table(write(tmp_path_factory.mktemp("text"), "a.csv", mark + text))
+    values = np.stack([table.values(i) for i in range(4)], -1)
+    assert values.tolist() == rows
+    assert table.lines == list(range(2, len(rows) + 2))
+
+
+def test_a_decimal_comma_between_commas_is_a_bad_row(tmp_path):
+    """Also where an empty last cell hides that the row has one cell more."""
+    path = write(tmp_path, "a.csv", "a,b,c\n1,2,3\n1,2,\n1,5,2,\n4,5,6\n")
+    table = read_table(path)
+    assert list(table.bad_rows) == [4]
+    assert table.lines == [2, 3, 5]
+    with pytest.raises(DhcalError, match=r"a\.csv:4: 4 values for 3 columns, with commas .* decimal points"):
+        table.require_good_rows()

@@ -1,0 +1,212 @@
+"""Diagnosis of mixed-up joints, frames, rows and notations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from measurement_files import frames, joint_positions, real_ur10
+from robots import robot_file
+
+from dhcal_pin import se3
+from dhcal_pin.measurements import Distance, Noise, PointContact, Pose, Position, Wires
+from dhcal_pin.plausibility import diagnose_mixups, list_hypotheses, mend
+from dhcal_pin.robot import Chain
+
+
+@pytest.fixture(scope="module")
+def ur10() -> Chain:
+    return Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+
+
+def measured(kind, m=60, seed=0, reach=0.4):
+    """Measurements of a UR10 with errors, by an instrument somewhere; no joint limit is exceeded."""
+    arm = real_ur10()
+    base, tool = frames()
+    arm = arm.with_base_and_tool(base, tool)
+    rng = np.random.default_rng(seed)
+    return kind.simulate(arm, reach * joint_positions(arm, m, seed), Noise(1e-4, 1e-4), rng)
+
+
+def with_joints(data, change):
+    return data.resample(change(data.configurations()))
+
+
+def swapped(i, j):
+    order = np.arange(6)
+    order[[i, j]] = j, i
+    return lambda q: q[:, order]
+
+
+def shifted(j, degrees):
+    return lambda q: q + np.deg2rad(degrees) * (np.arange(6) == j)
+
+
+def flipped(j):
+    return lambda q: q * np.where(np.arange(6) == j, -1, 1)
+
+
+NAMES = [
+    f"{name}_joint" for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+]
+MIXUPS = [
+    *((flipped(j), f"sign:{name}") for j, name in enumerate(NAMES)),
+    (lambda q: -q, "sign:all"),
+    (shifted(1, 90), "zero:shoulder_lift_joint:-90deg"),
+    (shifted(4, -90), "zero:wrist_2_joint:+90deg"),
+    (shifted(2, 180), "zero:elbow_joint:-180deg"),
+    (swapped(0, 2), "swap:shoulder_pan_joint:elbow_joint"),
+    (swapped(3, 4), "swap:wrist_1_joint:wrist_2_joint"),
+    (lambda q: np.roll(q, 1, 1), "columns:-1"),
+    (lambda q: q[:, ::-1], "columns:reversed"),
+    (np.rad2deg, "joints:deg-not-rad"),
+    (np.deg2rad, "joints:rad-not-deg"),
+    (lambda q: np.where(np.arange(6) == 3, np.rad2deg(q), q), "joint:wrist_1_joint:deg-not-rad"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", [Pose, Position])
+@pytest.mark.parametrize(("mixup", "key"), MIXUPS, ids=[key for _, key in MIXUPS])
+def test_mixed_up_joints_are_named_and_mended(ur10, kind, mixup, key):
+    """The robot has errors of millimetres."""
+    data = measured(kind)
+    wrong = with_joints(data, mixup)
+    found = diagnose_mixups(ur10, [wrong])
+    assert key in [hypothesis.key for hypothesis in found.hypotheses]
+    assert f"--mend {key}" in found.remedy
+    np.testing.assert_allclose(mend(ur10, wrong, key).q, data.q, atol=1e-12)
+    assert not diagnose_mixups(ur10, [data]).is_suspicious
+
+
+def with_rotations(data, change):
+    poses = data.poses.copy()
+    poses[:, :3, :3] = change(poses[:, :3, :3])
+    return data.replace(poses=poses)
+
+
+def quaternions_in_another_order(rotations):
+    """Rotations of quaternions x, y, z, w that are read as w, x, y, z; from the eigenvectors of K."""
+    out = []
+    for r in rotations:
+        k = np.array([
+            [r[0, 0] - r[1, 1] - r[2, 2], 0, 0, 0],
+            [r[0, 1] + r[1, 0], r[1, 1] - r[0, 0] - r[2, 2], 0, 0],
+            [r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], r[2, 2] - r[0, 0] - r[1, 1], 0],
+            [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], np.trace(r)],
+        ])  # fmt: skip
+        w, x, y, z = np.linalg.eigh(k)[1][:, -1]
+        out.append([
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ])  # fmt: skip
+    return np.array(out)
+
+
+def with_positions(data, change):
+    if isinstance(data, Position):
+        return data.replace(values=change(data.values))
+    poses = data.poses.copy()
+    poses[:, :3, 3] = change(poses[:, :3, 3])
+    return data.replace(poses=poses)
+
+
+POSE_MIXUPS = [
+    (lambda d: with_rotations(d, quaternions_in_another_order), "quaternions:xyzw"),
+    (lambda d: with_rotations(d, lambda r: np.swapaxes(r, 1, 2)), "rotations:inverse"),
+    (lambda d: with_rotations(d, lambda r: se3.exp3(np.deg2rad(se3.log3(r)))), "rotations:rad-not-deg"),
+    (lambda d: d.replace(poses=np.linalg.inv(d.poses)), "poses:inverse"),
+    (lambda d: with_positions(d, lambda p: p * [1, -1, 1]), "axes:x,-y,z"),
+    (lambda d: with_positions(d, lambda p: p[:, [1, 0, 2]]), "axes:y,x,z"),
+    (lambda d: with_positions(d, lambda p: p / 1e3), "lengths:m-not-mm"),
+    (lambda d: with_positions(d, lambda p: p * 25.4), "lengths:mm-not-in"),
+]
+
+
+@pytest.mark.parametrize(("mixup", "key"), POSE_MIXUPS, ids=[key for _, key in POSE_MIXUPS])
+def test_mixed_up_poses_are_named_and_mended(ur10, mixup, key):
+    data = measured(Pose)
+    wrong = mixup(data)
+    found = diagnose_mixups(ur10, [wrong])
+    assert key in [hypothesis.key for hypothesis in found.hypotheses]
+    np.testing.assert_allclose(mend(ur10, wrong, key).poses, data.poses, atol=1e-9)
+
+
+@pytest.mark.parametrize("change", [lambda p: p[:, [1, 0, 2]], lambda p: p * [1, -1, 1]])
+def test_a_mirrored_frame_of_positions_is_named(ur10, change):
+    found = diagnose_mixups(ur10, [with_positions(measured(Position), change)])
+    assert [hypothesis.key for hypothesis in found.hypotheses] == ["axes:x,y,-z"]
+    assert "the measuring frame is mirrored" in found.sentence.lower()
+
+
+@pytest.mark.parametrize(("step", "key"), [(1, "rows:below"), (-1, "rows:above")])
+@pytest.mark.parametrize("kind", [Pose, Position])
+def test_rows_shifted_by_one_are_named(ur10, kind, step, key):
+    data = measured(kind, 150, reach=1.0)
+    upper, lower = np.arange(149), np.arange(1, 150)
+    joints, values = (lower, upper) if step > 0 else (upper, lower)
+    wrong = data.take(values).replace(q=data.q[joints], rows=np.arange(1, 150))
+    found = diagnose_mixups(ur10, [wrong])
+    assert [hypothesis.key for hypothesis in found.hypotheses] == [key]
+    # A random part of the rows, as of a hold-out split, is enough.
+    part = wrong.take(np.random.default_rng(1).permutation(149)[:100])
+    assert [hypothesis.key for hypothesis in diagnose_mixups(ur10, [part]).hypotheses] == [key]
+    mended = mend(ur10, wrong, key)
+    assert len(mended.rows) == 148
+    np.testing.assert_allclose(mended.q, data.take(np.isin(data.rows, mended.rows + (step < 0))).q)
+
+
+@pytest.mark.parametrize("kind", [Wires, Distance, PointContact])
+def test_other_instruments_show_mixed_up_joints(ur10, kind):
+    data = measured(kind)
+    wrong = with_joints(data, flipped(2))
+    assert "sign:elbow_joint" in [hypothesis.key for hypothesis in diagnose_mixups(ur10, [wrong]).hypotheses]
+    assert not diagnose_mixups(ur10, [data]).hypotheses
+
+
+def test_the_file_of_a_mistake_is_named(ur10):
+    good = [measured(Position, 40, seed).replace(source=f"{seed}.csv") for seed in range(3)]
+    wrong = with_joints(good[1], flipped(3))
+    found = diagnose_mixups(ur10, [good[0], wrong, good[2]])
+    assert found.source == "1.csv"
+    assert found.remedy.endswith("--mend sign:wrist_1_joint@1.csv.")
+
+
+def test_files_with_different_frames_fit_separately(ur10):
+    arm = real_ur10()
+    rng = np.random.default_rng(2)
+    items = [
+        Position.simulate(
+            arm.with_base_and_tool(base, np.eye(4)), joint_positions(arm, 40, seed), Noise(1e-4), rng
+        )
+        for seed, base in enumerate((np.eye(4), frames()[0]))
+    ]
+    found = diagnose_mixups(ur10, items)
+    assert found.fits_separately
+    assert not found.hypotheses
+
+
+def test_another_robot_gives_no_hypothesis(ur10):
+    other = Chain.from_urdf(robot_file("ur_description/urdf/ur3_robot.urdf"), "tool0")
+    data = Position.simulate(other, joint_positions(other, 60), Noise(1e-4), np.random.default_rng(1))
+    found = diagnose_mixups(ur10, [data.replace(q=data.q)])
+    assert found.is_suspicious
+    assert not found.hypotheses
+
+
+@pytest.mark.parametrize("kind", [Pose, Position])
+def test_outliers_are_not_mixed_up_columns(ur10, kind):
+    rng = np.random.default_rng(5)
+    data = measured(kind, 80)
+    is_wrong = np.isin(np.arange(80), rng.permutation(80)[:8])
+    data = with_positions(data, lambda p: p + is_wrong[:, None] * rng.normal(size=p.shape))
+    assert not diagnose_mixups(ur10, [data]).hypotheses
+
+
+def test_keys_are_unique_and_unknown_ones_refused(ur10):
+    data = measured(Pose, 12)
+    keys = [hypothesis.key for hypothesis in list_hypotheses(ur10, [data])]
+    assert len(keys) == len(set(keys)) > 60
+    with pytest.raises(ValueError, match="sign:elbow_joint"):
+        mend(ur10, data, "sign:elbow")
+    with pytest.raises(ValueError, match="does not apply"):
+        mend(ur10, measured(Position, 12), "poses:inverse")
