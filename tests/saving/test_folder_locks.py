@@ -37,7 +37,8 @@ def test_files_of_concurrent_runs_are_not_mixed(tmp_path):
         for name in names
     ]
     for run in runs:
-        assert run.stdout is not None and run.stdout.readline() == "ready\n"
+        assert run.stdout is not None
+        assert run.stdout.readline() == "ready\n"
     for run in runs:
         assert run.stdin is not None
         run.stdin.write("start\n")
