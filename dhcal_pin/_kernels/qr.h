@@ -77,6 +77,22 @@ apply_reflector_pair(const int columns, double *restrict first, double *restrict
             a[k * count + t] -= f[k] * v[t] + g[k] * u[t];
 }
 
+/* Whether n doubles are all zero, of either sign. */
+static inline __attribute__((always_inline)) int is_zero(const double *row, Size n)
+{
+    const Bits *bits = (const Bits *)row;
+    for (Size start = 0; start < n; start += BLOCK_SAMPLES) {
+        const Size count = n - start < BLOCK_SAMPLES ? n - start : BLOCK_SAMPLES;
+        Bits any = 0;
+        for (Size t = 0; t < count; t++)
+            any |= bits[start + t];
+        /* The shift removes the sign bit. */
+        if (any << 1)
+            return 0;
+    }
+    return 1;
+}
+
 /* Replace r (c, c) by the R factor of [r; block] with `count` lanes per column, an even number; overwrite
    block. */
 SIMD_CLONES static void update_r_factor(double *restrict r, Lanes *restrict block, Size c, Size count)
@@ -85,6 +101,9 @@ SIMD_CLONES static void update_r_factor(double *restrict r, Lanes *restrict bloc
         Lanes *v = block + j * count, *u = j + 1 < c ? v + count : v;
         double *first = r + j * c, *second = first + c;
         Lanes vv[2] = {{0}}, vu[2] = {{0}}, uu[2] = {{0}};
+        /* Blocks of a triangular or diagonal matrix start with zero columns, which change nothing. */
+        if (is_zero((const double *)v, (u - v + count) * LANES))
+            continue;
         for (Size t = 0; t < count; t += 2)
             for (int i = 0; i < 2; i++)
                 vv[i] += v[t + i] * v[t + i], vu[i] += v[t + i] * u[t + i];
@@ -162,22 +181,6 @@ static void append_rows(RowBuffer *f, const double *rows, Size n)
         if (f->n_rows == BLOCK_ROWS)
             flush_rows(f);
     }
-}
-
-/* Whether n doubles are all zero, of either sign. */
-static inline __attribute__((always_inline)) int is_zero(const double *row, Size n)
-{
-    const Bits *bits = (const Bits *)row;
-    for (Size start = 0; start < n; start += BLOCK_SAMPLES) {
-        const Size count = n - start < BLOCK_SAMPLES ? n - start : BLOCK_SAMPLES;
-        Bits any = 0;
-        for (Size t = 0; t < count; t++)
-            any |= bits[start + t];
-        /* The shift removes the sign bit. */
-        if (any << 1)
-            return 0;
-    }
-    return 1;
 }
 
 /* Columns that are not zero in the rows of each of k residuals.

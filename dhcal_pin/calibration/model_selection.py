@@ -51,7 +51,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -280,25 +279,26 @@ class _Candidates:
         problem: Problem with the parameters and the expected priors of all families.
         x: Point of the linearization, (p,).
         family: Name of the family of each unknown, "" for the unknowns of the fit, (p,).
+        system: Triangular system of all data.
+        folds: Triangular systems of random folds of whole configurations; empty if nothing is selected.
     """
 
     problem: Problem
     x: Array
     family: Array
+    system: TriangularSystem
+    folds: tuple[FoldSystems, ...] = ()
 
-    @cached_property
-    def folds(self) -> tuple[FoldSystems, ...]:
-        """Triangular systems of random folds of whole configurations."""
-        return factor_partition(self.problem, self.x, k_fold(self.problem.data, N_FOLDS))
-
-    @cached_property
-    def system(self) -> TriangularSystem:
-        """Triangular system of all data."""
-        return TriangularSystem(merge_r_factors([fold.held_out.rows for fold in self.folds]))
+    @classmethod
+    def with_folds(cls, problem: Problem, x: Array, family: Array) -> _Candidates:
+        """Factor the data in random folds."""
+        folds = factor_partition(problem, x, k_fold(problem.data, N_FOLDS))
+        system = TriangularSystem(merge_r_factors([fold.held_out.rows for fold in folds]))
+        return cls(problem, x, family, system, folds)
 
     def weights(self, widths: Mapping[str, float]) -> Array:
         """Return the weights of the priors (p,) for prior widths as fractions of the expected ones."""
-        return self.problem.weights / np.array([widths.get(name, 1.0) for name in self.family])
+        return _prior_weights(self.problem, self.family, widths)
 
     def columns(self, widths: Mapping[str, float]) -> Array:
         """Return the mask of the unknowns (p,) of the fit and of some families."""
@@ -359,6 +359,20 @@ class _Candidates:
         if gain > MIN_LOG_BAYES_FACTOR:
             before, after = self.cv_error(current), self.cv_error(model)
         return FamilyTrial(name, before, after, gain, model.widths[name])
+
+
+def _prior_weights(problem: Problem, family: Array, widths: Mapping[str, float]) -> Array:
+    """Return the weights of the priors (p,) of a problem with the expected widths for other widths.
+
+    Args:
+        problem: Problem with the expected priors.
+        family: Name of the family of each unknown, (p,).
+        widths: Standard deviations of the priors of each family, as fractions of the expected ones.
+
+    Returns:
+        Weights (p,).
+    """
+    return problem.weights / np.array([widths.get(name, 1.0) for name in family])
 
 
 def _best_width(x: Array, determined: Array, expected: Array, members: Array) -> float:
@@ -641,10 +655,16 @@ def extend(
     n_groups = sum(len(item.residual_groups) for item in problem.data)
     problem = problem.with_data(with_sigma_scales(problem.data, np.full(n_groups, noise)))
     problem = problem.at_temperature(temperature)
-    solution = minimize(problem, "lm", extended.solution.x, max_iterations, progress, loose=True)
-    extended = replace(extended, problem=problem, solution=solution, previous_iterations=extended.iterations)
+    # The rows are divided by the noise; they are not linearized again.
+    start = replace(extended.solution, system=TriangularSystem(extended.solution.system.rows / noise))
+    solution = minimize(problem, "lm", start.x, max_iterations, progress, warm_start=start, loose=True)
+    extended = replace(extended, problem=problem, solution=solution)
+    # Outliers were found already: the last robust stage decides which of them are rejected.
+    stages = robust.LOSSES[loss].stages[-1:]
+    if stages == ("uniform",):
+        extended = replace(extended, weights=fit.weights)
     groups = PriorGroups.none()
-    return reweight(extended, loss, groups, max_iterations, progress, effective_parameters), extension
+    return reweight(extended, stages, groups, max_iterations, progress, effective_parameters), extension
 
 
 def _fit_selected(
@@ -669,29 +689,29 @@ def _fit_selected(
     problem, x, family = _with_families(fit.problem, fit.solution.x, selected)
     names = [parameter.name for parameter in problem.errors.parameters]
     x[: len(names)] = [model.values.get(name, value) for name, value in zip(names, x, strict=False)]
-    candidates = _Candidates(problem, x, family)
-    problem = replace(problem, weights=candidates.weights(model.widths))
-    solution = minimize(problem, "lm", x, max_iterations, progress, loose=True)
-    problem = _without_outliers(problem, solution.x)
-    solution = minimize(problem, "lm", solution.x, max_iterations, progress, loose=True)
-    # `weights` divides the expected weights by the widths.
-    candidates = replace(candidates, x=solution.x, problem=candidates.problem.with_data(problem.data))
-    model = candidates.maximize_evidence(model.widths)
-    problem = replace(problem, weights=candidates.weights(model.widths))
-    extended = replace(fit, problem=problem, solution=solution, previous_iterations=fit.iterations)
-    return extended, model.noise
+    selected_problem = problem.with_prior_weights(_prior_weights(problem, family, model.widths))
+    solution = minimize(selected_problem, "lm", x, max_iterations, progress, loose=True)
+    trimmed = _outlier_weights(problem, solution.x)
+    problem = problem.with_data([item.with_weights(w) for item, w in zip(problem.data, trimmed, strict=True)])
+    selected_problem = problem.with_prior_weights(selected_problem.weights)
+    solution = minimize(selected_problem, "lm", solution.x, max_iterations, progress, loose=True)
+    # `_Candidates` divides the expected weights of its problem by the widths.
+    model = _Candidates(problem, solution.x, family, solution.system).maximize_evidence(model.widths)
+    problem = problem.with_prior_weights(_prior_weights(problem, family, model.widths))
+    weights = tuple(np.maximum(a * b, robust.ZERO_WEIGHT) for a, b in zip(fit.weights, trimmed, strict=True))
+    return Fit(fit.data, problem, solution, weights, fit.iterations), model.noise
 
 
-def _without_outliers(problem: Problem, x: Array) -> Problem:
-    """Return a problem whose outliers at x (p,) have no weight."""
+def _outlier_weights(problem: Problem, x: Array) -> tuple[Array, ...]:
+    """Return the weight of each sample (m,) of each measurement: 1, or hardly any for outliers at x (p,)."""
     chain = problem.errors.at(x[: len(problem.errors.parameters)])
-    data = []
+    weights = []
     for item in problem.data:
         values = problem.instrument_values_of(item, x)
         residual = item.residual(chain.forward_kinematics(item.configurations()), values)
         is_outlier = robust.standardized_residuals(residual) > robust.OUTLIER_THRESHOLD
-        data.append(item.with_weights(np.where(is_outlier, robust.ZERO_WEIGHT, 1.0)))
-    return problem.with_data(data)
+        weights.append(np.where(is_outlier, robust.ZERO_WEIGHT, 1.0))
+    return tuple(weights)
 
 
 def _noise(fit: Fit) -> float:
@@ -723,7 +743,7 @@ def _select_families(
         stages.append(({CURVES: missing[CURVES]}, ((CURVES,),)))
     for added, tiers in stages:
         families = {name: ps for name, ps in missing.items() if name in (*model.widths, *added, *TIERS[0])}
-        candidates = _Candidates(*_with_families(fit.problem, fit.solution.x, families))
+        candidates = _Candidates.with_folds(*_with_families(fit.problem, fit.solution.x, families))
         model = candidates.maximize_evidence(model.widths)
         for tier in tiers:
             more, model = _select(candidates, [name for name in tier if name in added], model)

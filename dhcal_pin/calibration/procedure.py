@@ -142,7 +142,7 @@ def calibrate(
     shrinkage_factor = 1.0
     if method == "lm":
         groups = PriorGroups.from_expected(errors, problem.weights, has_default_prior(errors, priors))
-        fit = reweight(fit, loss, groups, max_iterations, progress)
+        fit = reweight(fit, robust.LOSSES[loss].stages, groups, max_iterations, progress)
         shrinkage_factor = compute_shrinkage_factor(fit.problem, fit.solution, groups.groups())
     extension = None
     if families and shrinkage_factor == 1:

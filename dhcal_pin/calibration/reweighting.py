@@ -114,7 +114,7 @@ def observable_directions(problem: Problem, solution: SolverResult) -> float:
 
 def reweight(
     fit: Fit,
-    loss: str,
+    stages: tuple[str, ...],
     groups: PriorGroups,
     max_iterations: int,
     progress: Progress | None,
@@ -123,8 +123,8 @@ def reweight(
     """Solve a problem again until noise scales, prior widths and robust weights have settled.
 
     Args:
-        fit: Fit with unit scales, unit weights and the expected prior widths.
-        loss: Key of `robust.LOSSES`.
+        fit: Fit with unit scales and the expected prior widths; its weights are the first ones.
+        stages: Robust stages, see `robust.LOSSES`.
         groups: Parameters whose default priors share one scale.
         max_iterations: Largest number of iterations of one solution.
         progress: Called with the iteration and the cost.
@@ -134,9 +134,7 @@ def reweight(
         The fit of the last round.
     """
     expected = fit.problem.weights
-    state = ReweightState(
-        fit, np.ones(sum(len(item.residual_groups) for item in fit.data)), robust.LOSSES[loss].stages
-    )
+    state = ReweightState(fit, np.ones(sum(len(item.residual_groups) for item in fit.data)), stages)
     for rounds_left in reversed(range(MAX_ROUNDS)):
         state = _next_round(state, groups, expected, rounds_left, max_iterations, progress, count_determined)
         if state.is_done:

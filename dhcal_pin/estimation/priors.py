@@ -165,11 +165,11 @@ def effective_parameters(problem: Problem, solution: SolverResult) -> float:
         solution: Its solution, with the triangular factor R of the whitened Jacobian.
 
     Returns:
-        γ = ‖R·S‖², with a square root S of the covariance: 1 per parameter that the data determine, 0 per
-        parameter that its prior determines.
+        γ = ‖R·S‖² = r - ‖W·S‖², with a square root S of the covariance, r columns, and prior weights W: 1 per
+        parameter that the data determine, 0 per parameter that its prior determines.
     """
     root = posterior_sqrt_covariance(solution.system, problem.weights)[0]
-    return float(np.sum((solution.system.r @ root) ** 2))
+    return root.shape[1] - float(np.einsum("ij,ij,i->", root, root, problem.weights**2))
 
 
 def update_prior_scales(problem: Problem, solution: SolverResult, groups: PriorGroups) -> Array:

@@ -297,6 +297,10 @@ def pseudo_inverse(r: Array, z: Array) -> Array:
     # Back substitution takes a hundredth of the time of the singular value decomposition.
     if _is_well_conditioned(r):
         return lapack.dtrtrs(r, z)[0]
+    # Unknowns of different units may alone cause the condition. None of them may count as zero.
+    scale = np.linalg.norm(r, axis=0)
+    if scale.min(initial=np.inf) > RANK_RTOL * scale.max(initial=0.0) and _is_well_conditioned(r / scale):
+        return lapack.dtrtrs(r / scale, z)[0] / scale
     return np.linalg.lstsq(r, z, rcond=RANK_RTOL)[0]
 
 

@@ -291,11 +291,12 @@ def residual_covariances(problem: Problem, solution: SolverResult, weights: Sequ
     Returns:
         Covariances of each measurement, shape (m, k, k) each.
     """
-    # `solution.system` was linearized one step earlier, where other directions may be unobservable. With the
-    # wide priors of frames and instruments its covariance would then not fit these rows.
-    root = posterior_sqrt_covariance(
-        linearize_and_factor(problem, solution.x, small_angle=False), problem.weights
-    )[0]
+    system = solution.system
+    if solution.converged:
+        # The system was linearized one step earlier, where other directions may be unobservable. With the
+        # wide priors of frames and instruments its covariance would then not fit these rows.
+        system = linearize_and_factor(problem, solution.x, small_angle=False)
+    root = posterior_sqrt_covariance(system, problem.weights)[0]
     chunks = problem.map_chunks(partial(_prediction_covariance, problem.linearize(solution.x), root))
     out = []
     for item, weight in zip(problem.data, weights, strict=True):
