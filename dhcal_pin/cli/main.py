@@ -61,13 +61,18 @@ class _LazyCommandParser(CommandParser):
         Returns:
             Namespace, and words that no argument takes.
         """
-        if not self._has_arguments:
-            self._has_arguments = True
-            module = import_module(f".{self._module}", __package__)
-            self.epilog = f"example:\n  {module.EXAMPLE}"
-            module.add_arguments(self)
-            self.set_defaults(run=module.run)
+        self.declare_arguments()
         return super().parse_known_args(*args, **options)
+
+    def declare_arguments(self) -> None:
+        """Declare the arguments of the command, once."""
+        if self._has_arguments:
+            return
+        self._has_arguments = True
+        module = import_module(f".{self._module}", __package__)
+        self.epilog = f"example:\n  {module.EXAMPLE}"
+        module.add_arguments(self)
+        self.set_defaults(run=module.run)
 
 
 class _VersionAction(argparse.Action):
@@ -98,13 +103,30 @@ def build_parser() -> argparse.ArgumentParser:
     )
     for command in COMMANDS:
         commands.add_parser(
-            command.name,
-            module=command.module,
-            help=command.help,
-            description=f"{command.help[0].upper()}{command.help[1:]}.",
-            formatter_class=HelpFormatter,
+            command.name, help=command.help, **_parser_options(command), formatter_class=HelpFormatter
         )
     return parser
+
+
+def command_parsers() -> dict[str, argparse.ArgumentParser]:
+    """Build the complete parsers of all commands, for their documentation.
+
+    Returns:
+        Parsers by the name of the command.
+    """
+    out: dict[str, argparse.ArgumentParser] = {}
+    for command in COMMANDS:
+        parser = _LazyCommandParser(
+            prog=f"dhcal {command.name}", **_parser_options(command), formatter_class=HelpFormatter
+        )
+        parser.declare_arguments()
+        out[command.name] = parser
+    return out
+
+
+def _parser_options(command: Command) -> dict[str, Any]:
+    """Return the arguments of the parser of a command."""
+    return {"module": command.module, "description": f"{command.help[0].upper()}{command.help[1:]}."}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

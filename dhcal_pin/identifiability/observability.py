@@ -38,8 +38,8 @@ def observable_fraction(r: Array) -> Array:
     """Compute how much of each parameter lies in the observable subspace.
 
     The fraction is the diagonal of the projector P: 1 for an identifiable parameter, 0 for one without effect
-        on
-    the measurements, and between them for a parameter that is identifiable only in combination with others.
+    on the measurements, and between them for a parameter that is identifiable only in combination with
+    others.
 
     Args:
         r: R factor of the whitened Jacobian, shape (p, p).

@@ -135,7 +135,7 @@ def csv_text(columns: Mapping[str, Iterable[Any]], comments: Iterable[str] = ())
     Args:
         columns: Values by header, all of one length m. Numbers are written with all digits, None as an empty
             cell. A text that spreadsheets would execute as a formula gets an apostrophe before it.
-        comments: Lines that precede the header, each after `# `.
+        comments: Lines that precede the header, each after a number sign and a space.
 
     Returns:
         Comment lines, header and m rows.

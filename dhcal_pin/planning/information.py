@@ -47,8 +47,8 @@ class Information:
     """Knowledge before a measurement, and the information of measurements at any configurations.
 
     Shapes: p robot parameters, s instrument parameters of the kind, s' further unknowns of instruments. The
-        unknowns are
-    the robot parameters, then the instrument parameters, in units of their prior standard deviations.
+    unknowns are the robot parameters, then the instrument parameters, in units of their prior standard
+    deviations.
 
     Attributes:
         errors: Error model of the robot.

@@ -235,6 +235,7 @@ def validation_to_dict(
         "weakly_observable": [],
         "observability_indices": {},
         "outliers": [],
+        "outliers_by_file": {},
         "files": {},
         "versions": versions(),
         "inputs": dict(inputs),

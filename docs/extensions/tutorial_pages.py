@@ -1,0 +1,35 @@
+"""Pages of the notebooks: copies of `notebooks/`, or of the executed notebooks of the last run."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+from sphinx.application import Sphinx
+
+
+def copy_notebooks(app: Sphinx) -> None:
+    """Copy the notebooks to the folder of the tutorials.
+
+    Args:
+        app: Running build.
+    """
+    source = Path(app.srcdir)
+    for notebook in sorted((source.parent / "notebooks").glob("*.ipynb")):
+        executed = source / "_build" / "notebooks" / notebook.name
+        is_current = executed.exists() and executed.stat().st_mtime > notebook.stat().st_mtime
+        shutil.copyfile(executed if is_current else notebook, source / "tutorials" / notebook.name)
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Register the extension.
+
+    Args:
+        app: Running build.
+
+    Returns:
+        Properties of the extension.
+    """
+    app.connect("builder-inited", copy_notebooks)
+    return {"parallel_read_safe": True}

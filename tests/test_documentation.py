@@ -1,0 +1,183 @@
+"""The documentation: commands and Python blocks run, names and messages exist, examples follow the schemas.
+
+Blocks of a page run in the order of the page, in a folder of their own with the files of the examples:
+
+- ```sh: commands `dhcal …`;
+- ```python: Python, one namespace per page;
+- ```toml and ```text that start with `# file: NAME`: written to this file.
+
+Other blocks of text are not executed. A block of text behind a line `<!-- output: last N -->` shows the last
+N lines of the command before it; numbers may differ.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import shlex
+import shutil
+import textwrap
+import tomllib
+from importlib import import_module
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+from robots import ROOT
+
+import dhcal_pin
+from dhcal_pin.cli import main
+
+DOCS = ROOT / "docs"
+PAGES = sorted(path for path in DOCS.rglob("*.md") if "_build" not in path.parts)
+SCHEMAS = DOCS / "reference" / "schemas"
+_FENCE = re.compile(r"^( *)```(\w+)\n(.*?)^\1```$", re.DOTALL | re.MULTILINE)
+_OUTPUT = re.compile(r"<!-- output: last (\d+) -->\s*$")
+_NUMBER = re.compile(r"\d+(\.\d+)?(e[-+]?\d+)?")
+_SIMULATE = "simulate ur10.urdf --tip tool0 -m"
+
+
+def page_name(path: Path) -> str:
+    return path.relative_to(DOCS).as_posix()
+
+
+def run(command: str) -> None:
+    """Run a command that must succeed."""
+    assert main.main(shlex.split(command)) == 0, command
+
+
+def blocks(page: Path) -> list[tuple[str, str, str]]:
+    """Return the language, the text and the preceding text of each block of a page."""
+    text = page.read_text(encoding="utf-8")
+    return [
+        (match[2], textwrap.dedent(match[3]), text[: match.start()].rstrip(" "))
+        for match in _FENCE.finditer(text)
+    ]
+
+
+@pytest.fixture(scope="session")
+def examples(tmp_path_factory):
+    """Folder with the robots and measurements that the examples name."""
+    folder = tmp_path_factory.mktemp("examples")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        shutil.copy(ROOT / "urdf" / "sim_3dof.dh.toml", "arm.dh.toml")
+        shutil.copy(ROOT / "urdf" / "sim_3dof_actual.dh.toml", "arm_actual.dh.toml")
+        run("convert example:ur10 ur10.urdf")
+        run(f"{_SIMULATE} 100 --errors 1mm,0.3deg --noise 0.05mm --kind position -o laser.csv")
+        run(f"{_SIMULATE} 60 --errors 1mm,0.3deg --noise 0.05mm,0.01deg --seed 1 -o pose.csv")
+        shutil.copy("laser.csv", "other_day.csv")
+        run("simulate arm.dh.toml --truth arm_actual.dh.toml -m 30 --noise 0.1mm,0.01deg -o arm.csv")
+        run("calibrate ur10.urdf laser.csv --tip tool0 --extend none -o ur10_calibrated.urdf")
+        Path("targets.csv").write_text("x[mm],y[mm],z[mm]\n600,200,500\n500,-300,400\n")
+        lines = [line for line in Path("laser.csv").read_text().splitlines() if not line.startswith("#")]
+        header = lines[0].split(",")
+        rows = np.array([line.split(",") for line in lines[1:]], float)
+        _write_foreign_file(header, rows)
+        rows[:, [name.startswith("elbow_joint") for name in header]] *= -1
+        np.savetxt("wrong_sign.csv", rows, delimiter=",", header=lines[0], comments="")
+    return folder
+
+
+def _write_foreign_file(header: list[str], rows: np.ndarray) -> None:
+    """Write measurements with another header, semicolons, decimal commas, degrees and millimetres."""
+    factors = [180 / np.pi if "[rad]" in name else 1e3 if name.endswith("[m]") else 1.0 for name in header]
+    names = [*(f"A{i}" for i in range(1, 7)), "X pos", "Y pos", "Z pos"]
+    lines = [";".join(repr(x).replace(".", ",") for x in row) for row in (rows * factors)[:, :9].tolist()]
+    Path("tracker.csv").write_text("\n".join([";".join(names), *lines]) + "\n")
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)], ids=page_name)
+def test_blocks_of_a_page_run_in_order(page, examples, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(shutil.copytree(examples, tmp_path / "page"))
+    namespace: dict = {}
+    output: list[str] = []
+    for _, text, _ in blocks(page):
+        if name := re.match(r"# file: (\S+)\n", text):
+            Path(name[1]).write_text(text, encoding="utf-8")
+    for language, text, before in blocks(page):
+        if language == "sh":
+            for line in text.replace("\\\n", " ").splitlines():
+                assert line.startswith("dhcal "), f"{line}: mark it as text, or begin it with dhcal"
+                capsys.readouterr()
+                status = main.main(shlex.split(line, comments=True)[1:])
+                captured = capsys.readouterr()
+                assert status == 0, f"{line}: {captured.err}"
+                output = [one for one in (captured.out + captured.err).splitlines() if one.strip()]
+        elif language == "python":
+            exec(compile(text, page_name(page), "exec"), namespace)
+        elif language == "toml":
+            tomllib.loads(text)
+        if shown := _OUTPUT.search(before):
+            masked = [_NUMBER.sub("#", line) for line in output[-int(shown[1]) :]]
+            assert [_NUMBER.sub("#", line) for line in text.splitlines()] == masked
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_names_of_the_code_exist(page):
+    missing = []
+    for name in set(re.findall(r"`(dhcal_pin(?:\.\w+)+)`", page.read_text(encoding="utf-8"))):
+        parts = name.split(".")
+        value = dhcal_pin
+        for i, part in enumerate(parts[1:], 1):
+            try:
+                value = getattr(value, part)
+            except AttributeError:
+                try:
+                    value = import_module(".".join(parts[: i + 1]))
+                except ImportError:
+                    missing.append(name)
+                    break
+    assert missing == []
+
+
+def source_texts() -> str:
+    """Return all texts of the package; placeholders of messages become a gap."""
+    out = []
+    for path in Path(dhcal_pin.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                out.append(node.value)
+            elif isinstance(node, ast.JoinedStr):
+                parts = (part.value if isinstance(part, ast.Constant) else "…" for part in node.values)
+                out.append("".join(map(str, parts)))
+    return "\n".join(out)
+
+
+def test_messages_of_the_troubleshooting_page_exist():
+    page = (DOCS / "troubleshooting.md").read_text(encoding="utf-8").split("## No error")[0]
+    messages = re.findall(r"^\| `([^`]+)` \|", page, re.MULTILINE)
+    texts = source_texts()
+    assert len(messages) > 40
+    assert [message for message in messages if message not in texts] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_examples_follow_the_schemas(page):
+    for language, text, _ in blocks(page):
+        if name := re.search(r"^# schema: (\w+)$", text, re.MULTILINE):
+            assert language == "toml"
+            schema = json.loads((SCHEMAS / f"{name[1]}.schema.json").read_text())
+            jsonschema.validate(tomllib.loads(text), schema)
+
+
+def test_files_of_a_run_follow_the_schemas(examples, tmp_path, monkeypatch):
+    monkeypatch.chdir(shutil.copytree(examples, tmp_path / "run"))
+    run("calibrate ur10.urdf laser.csv --tip tool0 --holdout 0.3 -o out.urdf --json out.json")
+    run("validate out.urdf laser.csv --tip tool0 --json validation.json")
+    run("convert ur10.urdf ur10.dh.toml --tip tool0")
+    documents = {
+        "result": [json.loads(Path(name).read_text()) for name in ("out.json", "validation.json")],
+        "sidecar": [tomllib.loads(Path("out.calibration.toml").read_text())],
+        "dh": [tomllib.loads(Path(name).read_text()) for name in ("ur10.dh.toml", "arm.dh.toml")],
+        "column_map": [tomllib.loads(path.read_text()) for path in (ROOT / "tests" / "maps").glob("*.toml")],
+    }
+    for name, contents in documents.items():
+        schema = json.loads((SCHEMAS / f"{name}.schema.json").read_text())
+        for content in contents:
+            jsonschema.validate(content, schema)
+    broken = documents["result"][0] | {"verdict": {"status": "perfect", "reasons": []}}
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(broken, json.loads((SCHEMAS / "result.schema.json").read_text()))
