@@ -15,7 +15,9 @@ import dhcal_pin
 PACKAGE = Path(dhcal_pin.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
 PACKAGES = sorted({path.parent for path in FILES} - {PACKAGE, PACKAGE / "data"})
-COMMANDS = set("calibrate inspect validate convert simulate check demo plan compensate study view".split())
+COMMANDS = set(
+    "calibrate doctor inspect validate convert simulate check demo plan compensate study view".split()
+)
 # Identifiers of an earlier vocabulary, each with the standard term that replaced it.
 REPLACED = {
     "Triangle": "TriangularSystem",

@@ -1,7 +1,7 @@
-"""Checks of measurement files before a fit, and of residuals and accuracy after it.
+"""Checks of measurement files before a fit, of residuals and accuracy after it, and of the installation.
 
-Diagnostics read a robot, measurements and a calibration, and return findings; they change nothing and write
-nothing. Their presentation belongs to the packages `report` and `cli`.
+Diagnostics read a robot, measurements and a calibration, and return findings; they change nothing and leave
+no files. Their presentation belongs to the packages `report` and `cli`.
 
 The public names are listed in `__init__.pyi`. Each is loaded on first use.
 """

@@ -13,6 +13,9 @@ from .inspection import ColumnSummary as ColumnSummary
 from .inspection import FileInspection as FileInspection
 from .inspection import column_table as column_table
 from .inspection import inspect_file as inspect_file
+from .installation import InstallationCheck as InstallationCheck
+from .installation import check_calibration as check_calibration
+from .installation import check_installation as check_installation
 from .reachability import UnreachableRow as UnreachableRow
 from .reachability import find_unreachable_rows as find_unreachable_rows
 from .residuals import JointProfile as JointProfile

@@ -1,0 +1,43 @@
+"""`dhcal doctor`: say what is installed and whether it works."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from dataclasses import asdict
+
+from .options import JSON
+
+EXAMPLE = "dhcal doctor"
+_STYLES = {"ok": "", "note": "yellow", "failed": "bold red"}
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the arguments of `dhcal doctor`.
+
+    Args:
+        parser: Parser of the command.
+    """
+    parser.add_argument("--json", **JSON)
+
+
+def run(args: Namespace) -> int:
+    """Check the installation and calibrate a small robot.
+
+    Args:
+        args: Parsed arguments.
+
+    Returns:
+        Exit status: 0 if the installation works, else 1.
+    """
+    from ..diagnostics.installation import check_installation  # lazy import: loads Pinocchio
+    from . import console
+    from .outputs import require_writable_outputs, write_outputs
+
+    require_writable_outputs([args.json], [])
+    checks = []
+    for check in check_installation():
+        checks.append(check)
+        console.print_lines(f"{check.status:6}  {check.name}: {check.text}", style=_STYLES[check.status])
+    is_working = all(check.status != "failed" for check in checks)
+    write_outputs({}, args.json, {"works": is_working, "checks": [asdict(check) for check in checks]})
+    return 0 if is_working else 1
