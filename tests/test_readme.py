@@ -10,14 +10,36 @@ from robots import ROOT
 
 from dhcal_pin.cli import main
 
+TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    """Return the fenced blocks of a language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", TEXT, re.DOTALL | re.MULTILINE)
+
+
+def without_numbers(text: str) -> list[str]:
+    """Return the lines of a text with a sign in place of each number."""
+    return [re.sub(r"\d+(\.\d+)?", "#", line) for line in text.splitlines() if line.strip()]
+
 
 def test_commands_of_the_readme_run_one_after_another(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    text = (ROOT / "README.md").read_text()
-    blocks = re.findall(r"^ *```sh\n(.*?)^ *```", text, re.DOTALL | re.MULTILINE)
-    commands = [line.strip() for block in blocks for line in block.splitlines()]
+    commands = [line for block in blocks("sh") for line in block.splitlines()]
     run = [shlex.split(command)[1:] for command in commands if command.startswith("dhcal ")]
     assert {"convert", "simulate", "calibrate"} <= {words[0] for words in run}
     for words in run:
+        capsys.readouterr()
         assert main.main(words) == 0, capsys.readouterr().err
+    result = without_numbers(capsys.readouterr().err)
+    shown = without_numbers(blocks("text")[-1])
+    assert result[-len(shown) :] == shown
     assert Path("report.html").stat().st_size > 1e5
+    for block in blocks("python"):
+        exec(compile(block, "README.md", "exec"), {})
+
+
+def test_links_of_the_readme_exist():
+    links = re.findall(r"\]\(([^)#]+)\)", TEXT)
+    assert len(links) > 20
+    assert [link for link in links if not (ROOT / link).exists()] == []
