@@ -42,7 +42,6 @@ from ..parallel import SERIAL, TaskExecutor
 from ..robot.chain import BASE_FRAME, Chain
 from . import model_selection
 from .cross_validation import leave_regions_out
-from .model_selection import Extension
 from .result import Result
 from .reweighting import Fit, reweight
 from .shrinkage import compute_shrinkage_factor
@@ -144,10 +143,12 @@ def calibrate(
         groups = PriorGroups.from_expected(errors, problem.weights, has_default_prior(errors, priors))
         fit = reweight(fit, robust.LOSSES[loss].stages, groups, max_iterations, progress)
         shrinkage_factor = compute_shrinkage_factor(fit.problem, fit.solution, groups.groups())
-    extension = None
-    if families and shrinkage_factor == 1:
-        fit, extension = model_selection.extend(fit, families, loss, max_iterations, progress)
-    return _make_result(fit, shrinkage_factor, holdout, method, extension)
+    result = _make_result(fit, shrinkage_factor, holdout, method)
+    # Residuals of mixed-up measurements say nothing about other errors.
+    if not families or shrinkage_factor < 1 or result.diagnosis.hypotheses:
+        return result
+    fit, extension = model_selection.extend(fit, families, loss, max_iterations, progress)
+    return replace(_make_result(fit, shrinkage_factor, holdout, method), extension=extension)
 
 
 def _check_options(
@@ -241,7 +242,6 @@ def _make_result(
     shrinkage_factor: float,
     holdout: tuple[Measurement, ...],
     method: str,
-    extension: Extension | None,
 ) -> Result:
     """Apply the shrinkage factor to the solution of a fit and build the result."""
     problem, errors = fit.problem, fit.problem.errors
@@ -261,5 +261,4 @@ def _make_result(
         method=method,
         weights=fit.weights,
         shrinkage_factor=shrinkage_factor,
-        extension=extension,
     )

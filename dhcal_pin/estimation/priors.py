@@ -189,7 +189,7 @@ def update_prior_scales(problem: Problem, solution: SolverResult, groups: PriorG
     expected = groups.expected_weights
     root = posterior_sqrt_covariance(solution.system, problem.weights)[0][members]
     # γ: fraction of each parameter that the data determine.
-    determined = 1 - np.einsum("ij,ij->i", root, root) * problem.weights[members] ** 2
+    determined = np.fmax(0.0, 1 - np.einsum("ij,ij->i", root, root) * problem.weights[members] ** 2)
     squares = np.bincount(group_index, solution.x[members] ** 2) * expected**2
     count = np.bincount(group_index, determined)
     extra = np.where(squares <= count, EXPECTATION_COUNT, 0.0)

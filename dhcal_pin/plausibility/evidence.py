@@ -13,9 +13,11 @@ in `calibration.shrinkage` (MacKay 1992). It prices a correction that is larger 
 well as residuals that are larger than noise, so that a model with more parameters than equations is judged
 as well.
 
-Standard deviations are scaled by the residuals, separately for lengths and angles. A sample whose residual
-is far above the others gets a larger standard deviation of its own. The determinants of both are part of the
-evidence, so that evidence of the same samples with other changes can be compared.
+Standard deviations are scaled by the residuals, separately for lengths and angles. The scale is the quantile
+(n + p)/(2·n) of the residuals of n rows and p unknowns: p rows can be fitted exactly, and half of the others
+may be outliers. A sample whose residual is far above that scale gets a larger standard deviation of its own.
+The determinants of both are part of the evidence, so that evidence of the same samples with other changes can
+be compared.
 
 Reference: D. J. C. MacKay, Bayesian Interpolation, Neural Computation 4, 1992.
 """
@@ -47,15 +49,16 @@ _LOG_WIDTH_STD = 1.5
 # Width of the priors while the robot is fitted: errors of some centimetres and degrees.
 _FIT_WIDTH = 4.0
 # Noise scales σ around the residuals of the fit.
-_NOISE_SCALES = 10.0 ** np.arange(-1, 2.01, 0.25)
+_NOISE_SCALES = 10.0 ** np.arange(-1, 5.01, 0.25)
 # Largest number of iterations of a fit, and of one of base and tool alone.
 _N_ITERATIONS, _N_FRAME_ITERATIONS = 12, 20
 # Largest number of fits with new noise scales. They end when the scales fall by less than this, on the mean
 # of the logarithms.
-_N_ROUNDS, _MIN_CHANGE = 5, 0.1
-# Smallest and largest scale of the placeholder standard deviations.
-_MIN_SCALE, _MAX_SCALE = 1e-2, 1e7
-# Samples with residuals above this multiple of the median get a standard deviation of their own.
+_N_ROUNDS, _MIN_CHANGE = 20, 0.1
+# Smallest and largest scale of the placeholder standard deviations. Residuals below the smallest one count as
+# exact: how small they are says nothing about a hypothesis.
+_MIN_SCALE, _MAX_SCALE = 1e-4, 1e7
+# Samples with residuals above this multiple of the scale get a standard deviation of their own.
 _OUTLIER_RATIO = 4.0
 
 
@@ -93,19 +96,20 @@ def fit_evidence(chain: Chain, data: Sequence[Measurement]) -> Evidence:
     n_rows = sum(item.residual_dim * len(item.rows) for item in equal)
     problem = make_problem(errors, equal, 1 / (errors.priors * np.where(is_robot, _FIT_WIDTH, 1.0)), {})
     solution = minimize(problem, max_iterations=_N_ITERATIONS, loose=True)
-    noise = _estimate_noise(problem, solution.x)
+    noise = new = _estimate_noise(problem, solution.x)
     for _ in range(_N_ROUNDS):
+        noise = new
         weighted = problem.with_data(noise.data)
         solution = minimize(weighted, x=solution.x, max_iterations=_N_ITERATIONS, loose=True)
         new = _estimate_noise(problem, solution.x)
         if new.log_determinant > noise.log_determinant - _MIN_CHANGE * n_rows:
             break
-        noise = new
     log, width, factor = _maximize(
         solution.system,
         solution.x,
         np.pad(np.where(is_robot, errors.priors, 0.0), (0, len(solution.x) - len(is_robot))),
         n_rows,
+        noise.min_factor,
     )
     return Evidence(
         log - noise.log_determinant, width, factor * noise.length_scale, factor * noise.angle_scale
@@ -137,12 +141,14 @@ class _Noise:
         log_determinant: Sum of the logarithms of all factors to the standard deviations of the rows.
         length_scale: Standard deviation of a length residual [m]; NaN if no lengths are measured.
         angle_scale: Standard deviation of an angle residual [rad]; NaN if no angles are measured.
+        min_factor: Smallest common factor to the standard deviations that leaves none below `_MIN_SCALE`.
     """
 
     data: tuple[Measurement, ...]
     log_determinant: float
     length_scale: float
     angle_scale: float
+    min_factor: float
 
 
 def _estimate_noise(problem: Problem, x: Array) -> _Noise:
@@ -154,11 +160,13 @@ def _estimate_noise(problem: Problem, x: Array) -> _Noise:
         u = problem.instrument_values_of(item, x)
         r = item.residual(chain.forward_kinematics(item.configurations()), u)
         squares.append({name: np.mean(r[rows] ** 2, 0) for name, rows in item.residual_groups.items()})
+    n_rows = sum(item.residual_dim * len(item.rows) for item in problem.data)
+    share = min(1.0, 0.5 * (1 + len(x) / n_rows))
     scales = {}
     for is_angle in (False, True):
         values = [v for item in squares for name, v in item.items() if (name == "orientation") == is_angle]
-        median = np.median(np.concatenate(values)) if values else np.nan
-        scales[is_angle] = float(np.clip(np.sqrt(median), _MIN_SCALE, _MAX_SCALE))
+        typical = np.quantile(np.concatenate(values), share) if values else np.nan
+        scales[is_angle] = float(np.clip(np.sqrt(typical), _MIN_SCALE, _MAX_SCALE))
     data, log_determinant = [], 0.0
     for item, by_name in zip(problem.data, squares, strict=True):
         factors = {name: scales[name == "orientation"] for name in by_name}
@@ -172,11 +180,17 @@ def _estimate_noise(problem: Problem, x: Array) -> _Noise:
             count * np.log(factors[name]) for name, count in rows_per_sample.items()
         )
         log_determinant += item.residual_dim * float(np.sum(np.log(excess)))
-    return _Noise(tuple(data), log_determinant, LENGTH_SIGMA * scales[False], ANGLE_SIGMA * scales[True])
+    return _Noise(
+        tuple(data),
+        log_determinant,
+        LENGTH_SIGMA * scales[False],
+        ANGLE_SIGMA * scales[True],
+        _MIN_SCALE / np.nanmin([*scales.values()]),
+    )
 
 
 def _maximize(
-    system: TriangularSystem, x: Array, prior_std: Array, n_rows: int
+    system: TriangularSystem, x: Array, prior_std: Array, n_rows: int, min_factor: float
 ) -> tuple[float, float, float]:
     """Maximize the evidence over the width of the priors and the scale of the noise.
 
@@ -185,6 +199,7 @@ def _maximize(
         x: Point of the linearization.
         prior_std: Default prior standard deviations of the robot's errors; 0 for all other unknowns, (p,).
         n_rows: Number of whitened rows.
+        min_factor: Smallest scale σ.
 
     Returns:
         Logarithm of the evidence, width w and noise scale σ.
@@ -199,7 +214,7 @@ def _maximize(
     components = left.T @ measured
     rest = system.min_cost + max(0.0, float(measured @ measured - components @ components))
     n_rest = max(0, n_rows - u.shape[1] - len(singular_values))
-    noise, width = np.meshgrid(_NOISE_SCALES, _WIDTHS)
+    noise, width = np.meshgrid(np.fmax(_NOISE_SCALES, min_factor), _WIDTHS)
     variance = noise[..., None] ** 2 + (width[..., None] * singular_values) ** 2
     log = -0.5 * (
         np.sum(np.log(variance) + components**2 / variance, -1)

@@ -362,7 +362,9 @@ class Hypothesis:
 
 
 def _count_lengths(item: Measurement) -> int:
-    """Return the number of measured lengths."""
+    """Return the number of measured lengths; the size of a touched object is given, not measured."""
+    if item.is_contact:
+        return 0
     return 3 * len(item.rows) if isinstance(item, PoseMeasurement) else item.residual_dim * len(item.rows)
 
 

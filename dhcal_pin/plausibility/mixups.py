@@ -31,18 +31,16 @@ _MIN_LOG_RATIO = 15.0
 _MIN_NAMED_RATIO = 2.0
 # Hypotheses within this difference of the best one are reported beside it.
 _MAX_LOG_TIE = 3.0
-# Fewer rows fit too many hypotheses: base and tool alone have twelve unknowns.
-_MIN_ROWS = 24
-# The same for contacts with unknown objects.
-_MIN_CONTACT_ROWS = 60
+# Fewer rows for each unknown of frames and instrument fit too many hypotheses. Base and tool have twelve.
+_MIN_ROWS_PER_UNKNOWN, _N_FRAME_UNKNOWNS = 2, 12
 # Positions this many times farther from the centre than the median are wrong by themselves.
 _MAX_DISTANCE_RATIO = 8.0
 # A shift of the rows is tried if at least this share of the samples has a neighbouring row.
 _MIN_SHIFTED_SHARE = 0.25
 # Largest number of measurements that are examined, those with the most samples.
 _MAX_ITEMS = 6
-# Number of samples that the evidence is computed from, in all and at least of each measurement.
-_N_SAMPLES, _MIN_SAMPLES_PER_ITEM = 50, 8
+# Smallest numbers of samples and rows that the evidence is computed from, and of samples of each measurement.
+_N_SAMPLES, _N_ROWS, _MIN_SAMPLES_PER_ITEM = 50, 200, 8
 
 
 @dataclass(frozen=True)
@@ -101,7 +99,8 @@ class Diagnosis:
 def diagnose_mixups(chain: Chain, data: Sequence[Measurement]) -> Diagnosis:
     """Look for a mistake in measurements that explains why they do not fit the robot.
 
-    A mistake may be in all measurements or in one of several.
+    A mistake may be in all measurements or in one of several. Contacts with planes and spheres are left out:
+    a robot with other errors can touch an unknown surface exactly, whatever the mistake is.
 
     Args:
         chain: Nominal robot; its base and tool are ignored.
@@ -110,8 +109,8 @@ def diagnose_mixups(chain: Chain, data: Sequence[Measurement]) -> Diagnosis:
     Returns:
         The diagnosis; without hypotheses if the measurements fit the robot, or if none is decisive.
     """
-    items = sorted((item for item in data if item.configurations_per_row), key=lambda item: -len(item.rows))
-    items = items[:_MAX_ITEMS]
+    items = [item for item in data if item.configurations_per_row and not _is_surface_contact(item)]
+    items = sorted(items, key=lambda item: -len(item.rows))[:_MAX_ITEMS]
     if not items:
         return Diagnosis(NO_EVIDENCE)
     diagnosis = _diagnose(chain, items)
@@ -124,13 +123,17 @@ def diagnose_mixups(chain: Chain, data: Sequence[Measurement]) -> Diagnosis:
     return replace(diagnosis, fits_separately=not any(one.is_suspicious for _, one in separate))
 
 
+def _is_surface_contact(item: Measurement) -> bool:
+    """Return whether the samples touch a surface, which gives one equation each."""
+    return item.is_contact and item.residual_dim == 1
+
+
 def _diagnose(chain: Chain, data: Sequence[Measurement]) -> Diagnosis:
     """Look for one mistake in all of the measurements."""
     samples, neighbourhood = _draw_samples(data)
     n_rows = sum(item.residual_dim * len(item.rows) for item in samples)
-    # Few contacts fit almost any robot: their object is unknown, too.
-    needed = _MIN_CONTACT_ROWS if all(item.is_contact for item in samples) else _MIN_ROWS
-    if n_rows < needed:
+    n_instrument = len({parameter.name for item in samples for parameter in item.instrument_parameters})
+    if n_rows < _MIN_ROWS_PER_UNKNOWN * (_N_FRAME_UNKNOWNS + n_instrument):
         return Diagnosis(NO_EVIDENCE)
     before = fit_evidence(chain, samples)
     if not is_suspicious(before):
@@ -187,9 +190,10 @@ def _apply(
 
 def _draw_samples(data: Sequence[Measurement]) -> tuple[list[Measurement], list[Measurement]]:
     """Draw samples of each measurement; return them, and the same with the rows above and below each."""
-    count = max(_MIN_SAMPLES_PER_ITEM, -(-_N_SAMPLES // len(data)))
     samples, neighbourhood = [], []
     for measured in data:
+        needed = max(_N_SAMPLES, _N_ROWS // measured.residual_dim)
+        count = max(_MIN_SAMPLES_PER_ITEM, -(-needed // len(data)))
         item = _without_far_positions(measured)
         item = item.take(np.argsort(item.rows, kind="stable"))
         m = len(item.rows)
