@@ -321,3 +321,55 @@ def test_poses_that_fill_bins_are_as_good_as_many_random_ones():
     rng = np.random.default_rng(0)
     random = [error_on_other_series(rng.permutation(1495)[:747]) for _ in range(7)]
     assert error_on_other_series(rows_that_fill_bins(100)) <= 1.1 * np.median(random)
+
+
+REAL_SERIES = {
+    **{
+        f"UR10, {name}": (robot_file(UR10), [path], "--tip tool0", MAPS / "ipa_ur10.toml")
+        for name, path in SERIES.items()
+    },
+    **{
+        arm: (
+            PANDA,
+            sorted((DATA / "mukca_panda" / arm).glob("*/hole_[01].csv")),
+            "--tip ball_link --parameters placement,tool",
+            MAPS / "mukca_panda.toml",
+        )
+        for arm in ("panda_1", "panda_2_clean")
+    },
+    "positioner": (
+        DATA / "positioner_2axis/positioner.dh.toml",
+        [DATA / "positioner_2axis/measurements.csv"],
+        "--parameters minimal,base,tool",
+        None,
+    ),
+    "FR3 with a camera": (
+        robot_file("panda_description/urdf/panda.urdf"),
+        [DATA / "fr3_d405/camera_in_board.csv"],
+        "--tip panda_link8",
+        None,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REAL_SERIES)
+def test_no_real_series_is_refused(tmp_path, capsys, name):
+    robot, files, options, columns = REAL_SERIES[name]
+    output = tmp_path / "result.json"
+    words = [
+        "calibrate",
+        robot,
+        *files,
+        *options.split(),
+        "--extend",
+        "none",
+        "--json",
+        output,
+        "-o",
+        tmp_path / "out.urdf",
+    ]
+    words += ["--columns", columns] if columns else []
+    assert main.main([str(word) for word in words]) == 0, capsys.readouterr().err
+    verdict = json.loads(output.read_text())["verdict"]
+    assert verdict["status"] in ("ok", "caution"), verdict
+    assert (verdict["status"] == "caution") == bool(verdict["reasons"])
