@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
 
+from ..messages import message_line
 from .options import JSON
 
 EXAMPLE = "dhcal doctor"
@@ -29,9 +31,13 @@ def run(args: Namespace) -> int:
     Returns:
         Exit status: 0 if the installation works, else 1.
     """
-    from ..diagnostics.installation import check_installation  # lazy import: loads Pinocchio
-    from . import console
-    from .outputs import require_writable_outputs, write_outputs
+    try:
+        from ..diagnostics.installation import check_installation  # lazy import: loads Pinocchio
+        from . import console
+        from .outputs import require_writable_outputs, write_outputs
+    except ImportError as error:
+        print(f"failed  imports: {message_line(error)}; install dhcal-pin again", file=sys.stderr)
+        return 1
 
     require_writable_outputs([args.json], [])
     checks = []

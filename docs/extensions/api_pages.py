@@ -22,6 +22,16 @@ PACKAGES = (
     "visualization report studies paper"
 ).split()
 _FOLDER = Path("reference/api")
+# Order of the packages on the page of `dhcal_pin` itself.
+_TOP_ORDER = (
+    "calibration io measurements robot planning compensation report visualization diagnostics estimation "
+    "paper exceptions"
+).split()
+# Types as Sphinx writes them, and as they are shown.
+_ANY = r"~?(?:typing\.)?Any"
+_SHAPE, _DTYPE = rf"tuple\[{_ANY}, \.\.\.\]", rf"~?(?:numpy\.)?dtype\[{_ANY}\]"
+_ARRAY = re.compile(rf"~?(?:numpy\.)?ndarray\[{_SHAPE}, {_DTYPE}\]")
+_QUALIFIED = re.compile(r"~?\b(?:[a-z_]\w*\.)+(?=\w)")
 # Symbols that reStructuredText would read as markup.
 _BARS = re.compile(r"(?<![`\\])\|")
 _TRAILING_UNDERSCORE = re.compile(r"(?<=\w)_(?=[\s,;:).=·\]]|$)")
@@ -57,11 +67,14 @@ def _public_names(package: str) -> list[str]:
 def _top_page() -> list[str]:
     lines = [*_heading("dhcal_pin"), ".. py:module:: dhcal_pin", ""]
     lines += ["Names of the package itself: ``import dhcal_pin as dh``.", ""]
-    for package in dict.fromkeys(map(_module_of, dir(dhcal_pin))):
-        lines += [package, "-" * len(package), ""]
-        for name in dir(dhcal_pin):
-            if _module_of(name) == package:
-                lines += _directive(f"dhcal_pin.{name}", getattr(dhcal_pin, name))
+    packages = dict.fromkeys([*_TOP_ORDER, *map(_module_of, dir(dhcal_pin))])
+    for package in packages:
+        names = [name for name in dir(dhcal_pin) if _module_of(name) == package]
+        if names:
+            lines += [package, "-" * len(package), ""]
+        # Functions first.
+        for name in sorted(names, key=lambda name: inspect.isclass(getattr(dhcal_pin, name))):
+            lines += _directive(f"dhcal_pin.{name}", getattr(dhcal_pin, name))
     return lines
 
 
@@ -123,6 +136,17 @@ def _escape_docstring(app: Sphinx, what: str, name: str, value: Any, options: An
     lines[:] = [_TRAILING_UNDERSCORE.sub(r"\\_", _BARS.sub(r"\\|", line)) for line in lines]
 
 
+def _shorten(text: str | None) -> str | None:
+    """Shorten the types of a signature."""
+    return text and _QUALIFIED.sub("", _ARRAY.sub("Array", text))
+
+
+def _shorten_signature(
+    app: Sphinx, what: str, name: str, value: Any, options: Any, signature: str, returned: str
+) -> tuple[str | None, str | None]:
+    return _shorten(signature), _shorten(returned)
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register the extension.
 
@@ -134,4 +158,5 @@ def setup(app: Sphinx) -> dict[str, Any]:
     """
     app.connect("builder-inited", write_pages)
     app.connect("autodoc-process-docstring", _escape_docstring, priority=100)
+    app.connect("autodoc-process-signature", _shorten_signature)
     return {"parallel_read_safe": True}

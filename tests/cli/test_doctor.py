@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from importlib import metadata
 
 import numpy as np
@@ -63,3 +64,12 @@ def test_broken_installation_fails_the_self_test(run, monkeypatch, broken):
     status, _, err = run("doctor")
     assert status == 1
     assert "failed  self-test" in err
+
+
+def test_package_that_cannot_be_imported_is_named(run, monkeypatch):
+    monkeypatch.delitem(sys.modules, "dhcal_pin.diagnostics.installation")
+    monkeypatch.setitem(sys.modules, "dhcal_pin.diagnostics.installation", None)
+    status, out, err = run("doctor")
+    assert (status, out, err.count("\n")) == (1, "", 1)
+    assert err.startswith("failed  imports: ")
+    assert "installation" in err
