@@ -13,8 +13,9 @@ from scipy.optimize import least_squares
 
 from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.estimation.error_model import ErrorModel
+from dhcal_pin.estimation.parameters import select_parameters
 from dhcal_pin.estimation.problem import Problem
-from dhcal_pin.measurements.base import whitened_jacobian
+from dhcal_pin.measurements.base import Noise, whitened_jacobian
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.robot.chain import Chain
 
@@ -99,4 +100,28 @@ def against_scipy(m: int, repeats: int) -> list[Row]:
             )
         reached = [float(np.sum(residual(x) ** 2)) for x in (fit.x, *found.values())]
         assert reached[0] <= min(reached[1:]) * (1 + 1e-6), reached
+    return out
+
+
+def with_families(chain: Chain, m: int) -> Pose:
+    """Measurements of an arm with errors of its joints up to the 32nd harmonic, and elastic joints."""
+    rng = np.random.default_rng(0)
+    errors = select_parameters(chain, "minimal,base,tool,harmonics,compliance,curves")
+    x = rng.standard_normal(len(errors.parameters)) * np.minimum(errors.priors, 0.1)
+    q = rng.uniform(-2.5, 2.5, (m, chain.n_joints))
+    return Pose.simulate(errors.at(x).with_current_loads(), q, Noise(5e-5, 1e-4), rng)
+
+
+def against_geometry_only(m: int, repeats: int) -> list[Row]:
+    """The default, which tries families of joint errors, against the geometry alone on the same data."""
+    chain, sets = robots()["UR10, minimal,base,tool"]
+    out = []
+    for what, data, wanted in (
+        ("no family supported", measured(chain, sets, m)[2], "≤ 10"),
+        ("curves added", with_families(chain, m), "≤ 2 s"),
+    ):
+        ways = [partial(calibrate, chain, data, sets, extend=extend) for extend in ("auto", "none")]
+        ours, theirs = clocked(ways, repeats)
+        name = f"calibration: default as a multiple of geometry only, {what}, m={m}"
+        out.append(Row(name, ours, theirs, ours / theirs, wanted))
     return out

@@ -201,6 +201,7 @@ def main() -> None:
         (bench_kernel.iterations, ((100, 1000, 10000), turns)),
         (bench_kernel.jacobians, (turns,)),
         (bench_calibration.against_scipy, (1000, 1 if quick else 3)),
+        (bench_calibration.against_geometry_only, (1000, 1 if quick else 3)),
         (against_ceres, (1000, turns)),
         (against_figaroh, (100 if quick else 1000, turns)),
         (against_pybotics, (100, turns)),

@@ -83,7 +83,7 @@ def test_links_of_one_series_are_accurate_on_another(dhcal, tmp_path, series, ot
 
 
 @pytest.mark.parametrize(
-    ("series", "other", "held", "moved"), [("B", "D", 0.16e-3, 0.24e-3), ("D", "B", 0.17e-3, 0.29e-3)]
+    ("series", "other", "held", "moved"), [("B", "D", 0.16e-3, 0.24e-3), ("D", "B", 0.17e-3, 0.26e-3)]
 )
 def test_extensions_are_accurate_on_hold_out_and_on_another_series(
     dhcal, tmp_path, series, other, held, moved
@@ -91,7 +91,7 @@ def test_extensions_are_accurate_on_hold_out_and_on_another_series(
     fit, _ = ur10(dhcal, series, "minimal,base,tool", tmp_path, "--holdout", "0.5")
     assert fit["holdout_after"]["position_rms_m"] <= held
     assert {"harmonics", "compliance", "curves"} <= set(fit["extension"]["families"])
-    assert fit["extension"]["temperature"] > 10
+    assert fit["extension"]["temperature"] > 5
     _, output = ur10(dhcal, series, "minimal,base,tool", tmp_path)
     columns = ("--columns", MAPS / "ipa_ur10.toml", "--tip", "tool0")
     validated = dhcal("validate", output, SERIES[other], *columns, "--fit-frames")

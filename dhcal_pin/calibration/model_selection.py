@@ -30,18 +30,21 @@ questions are asked.
    compares the held-out mean square e_f² of region f with its prediction, the variance v_f by the
    uncertainty of the fit plus 1 for the noise, in units of the residual variance. If T = 1 + N/100 predicts
    better than T = 1, or if the residuals of neighbouring configurations are correlated, the result is fitted
-   again with
+   again with the design effect (Kish 1965) of N samples of the mean correlation ρ̄,
 
-       T = 1 + N/20,
+       T = 1 + (N - 1)·ρ̄,    ρ̄ = mean of 0.015 + 0.15·exp(-d_ij²/2l²) over all pairs i ≠ j,
 
-   so that all samples together count as about 20 independent ones. Predicted standard deviations of the tool
-   are scaled such that they agree with the errors of the left-out regions.
+   with the distance d_ij of two configurations and l = 0.5 rad. Configurations in a small part of joint space
+   thus count as fewer independent ones than as many that are far apart, and no number of them counts as more
+   than 67. Predicted standard deviations of the tool are scaled such that they agree with the errors of the
+   left-out regions.
 
 Without a supported family, and with T = 1, the fit is exactly that of the geometry.
 
 Shapes: p unknowns of the robot with all families and of the instruments, k folds.
 
 References:
+    L. Kish, Survey Sampling, Wiley 1965, section 5.4.
     D. J. C. MacKay, Bayesian Interpolation, Neural Computation 4, 1992.
     P. Gruenwald and T. van Ommen, Inconsistency of Bayesian Inference for Misspecified Linear Models, and a
     Proposal for Repairing It, Bayesian Analysis 12, 2017.
@@ -71,9 +74,16 @@ from ..estimation.qr import (
 from ..estimation.solver import Progress, minimize
 from ..exceptions import UnknownNameError
 from ..formatting import Table, format_fixed
+from ..measurements.base import Measurement
 from ..robot.error_families import COMPLIANCE, COUPLING, CURVES, FAMILIES, GAIN, HARMONICS
 from .cross_validation import FoldSystems, count_rows, factor_partition, select_columns, solve_columns
-from .partition import configuration_groups, contact_groups, k_fold, region_partitions
+from .partition import (
+    configuration_groups,
+    contact_groups,
+    different_configurations,
+    k_fold,
+    region_partitions,
+)
 from .reweighting import Fit, reweight, with_sigma_scales
 
 if TYPE_CHECKING:
@@ -90,13 +100,14 @@ MIN_LOG_BAYES_FACTOR = 5.5
 N_FOLDS = 5
 # Smallest number of different configurations for a selection.
 MIN_CONFIGURATIONS = 2 * N_FOLDS
-# Samples per unit of temperature: T = 1 + N/20.
-SAMPLES_PER_TEMPERATURE = 20
-# The same for the temperature that is compared with 1.
+# Correlation of the residuals of configurations that are far apart, what is added to it for near ones,
+# and the distance [rad] over which this falls.
+FAR_CORRELATION, NEAR_CORRELATION, CORRELATION_LENGTH = 0.015, 0.15, 0.5
+# Samples per unit of the temperature that is compared with 1.
 SAMPLES_PER_TESTED_TEMPERATURE = 100
 # Difference of the log predictive density per held-out row for which T = 1 is rejected. Simulated arms with
 # independent noise stay below 0.01 but for few samples; a real UR10 has 0.04 to 0.2.
-MIN_LOG_DENSITY_GAIN = 0.02
+MIN_LOG_DENSITY_GAIN = 0.015
 # Correlation of neighbouring residuals for which T = 1 is rejected, in standard deviations.
 MAX_WHITE_CORRELATION = 4.0
 # Largest number of configurations of each measurement whose neighbours are compared.
@@ -113,7 +124,7 @@ MIN_PRIOR_WIDTH = 1e-3
 # From this number of rows per line on, curves are tried only if lines stand out of the spectrum.
 SCREENED_ROWS_PER_UNKNOWN = 2
 # Highest line of white residuals, as a square in standard deviations, and largest excess of the sum of all.
-MAX_WHITE_LINE, SCREENING_SIGMAS = 15.0, 3.0
+MAX_WHITE_LINE, SCREENING_SIGMAS = 20.0, 3.0
 # Limits of the scale of predicted standard deviations.
 MIN_PREDICTION_SCALE, MAX_PREDICTION_SCALE = 0.3, 3.0
 # Largest ratio of the errors with and without a family for which a hint is given.
@@ -262,7 +273,7 @@ class _Model:
         widths: Standard deviation of the priors of each family, as a fraction of the expected one.
         noise: Standard deviation of the whitened residuals.
         log_evidence: Log evidence, up to a constant.
-        values: Values of the parameters of the families by name.
+        values: Values of its parameters by name.
     """
 
     widths: Mapping[str, float]
@@ -337,12 +348,8 @@ class _Candidates:
             widths, noise = updated, updated_noise
         log_det = np.sum(np.log(np.abs(np.diag(posterior.r)))) - np.sum(np.log(weights[weights > 0]))
         log_evidence = -0.5 * posterior.min_cost - float(log_det) - n_rows * np.log(noise)
-        names = [parameter.name for parameter in self.problem.errors.parameters]
-        values = {
-            names[i]: float(value)
-            for i, value, name in zip(np.flatnonzero(columns), x + step, family, strict=True)
-            if name
-        }
+        names = np.array(_unknown_names(self.problem))[columns]
+        values = dict(zip(names.tolist(), (x + step).tolist(), strict=True))
         return _Model(widths, noise, log_evidence, values)
 
     def cv_error(self, model: _Model) -> float:
@@ -359,6 +366,11 @@ class _Candidates:
         if gain > MIN_LOG_BAYES_FACTOR:
             before, after = self.cv_error(current), self.cv_error(model)
         return FamilyTrial(name, before, after, gain, model.widths[name])
+
+
+def _unknown_names(problem: Problem) -> list[str]:
+    """Return the names of the unknowns of a problem, robot and instruments."""
+    return [one.name for one in (*problem.errors.parameters, *problem.instrument_parameters)]
 
 
 def _prior_weights(problem: Problem, family: Array, widths: Mapping[str, float]) -> Array:
@@ -480,7 +492,9 @@ def _may_have_curves(fit: Fit) -> bool:
     spectrum = replace(problem, errors=errors, weights=np.zeros(len(first) + len(instruments)), bounds=None)
     linearization = spectrum.linearize(np.concatenate([np.zeros(len(first)), instruments]))
     joints = [chain.joint_names.index(p.name.rsplit(".", 1)[0]) for p in errors.parameters]
-    sums = np.zeros((2, 2, len(CURVE_ORDERS), chain.n_joints))
+    # Σ a·r·exp(ikq) and Σ |a|²·exp(2ikq) of each order k and joint, and Σ |a|².
+    lines = np.zeros((2, len(CURVE_ORDERS), chain.n_joints), complex)
+    sizes = np.zeros(chain.n_joints)
     for chunk in spectrum.chunks:
         rows, q = linearization.rows(chunk), chunk.data.q.T
         products = np.einsum("pkm,km->pm", rows[: len(first)], rows[-1])
@@ -490,13 +504,17 @@ def _may_have_curves(fit: Fit) -> bool:
             function = np.sin if parameter.name.endswith("sin1") else np.cos
             both[0, joint] += products[row] * function(q[joint])
             both[1, joint] += squares[row]
-        for index, k in enumerate(CURVE_ORDERS):
-            for part, function in enumerate((np.sin, np.cos)):
-                value = function(k * q)
-                sums[0, part, index] += np.sum(both[0] * value, 1)
-                sums[1, part, index] += np.sum(both[1] * value**2, 1)
+        sizes += np.sum(both[1], 1)
+        turn = np.exp(1j * q)
+        wave = turn**CURVE_ORDERS.start
+        for index in range(len(CURVE_ORDERS)):
+            lines[0, index] += np.einsum("jm,jm->j", both[0], wave)
+            lines[1, index] += np.einsum("jm,jm,jm->j", both[1], wave, wave)
+            wave *= turn
+    squares = np.stack([sizes - lines[1].real, sizes + lines[1].real]) / 2
     variance = fit.solution.system.cost / n_rows
-    z2 = sums[0] ** 2 / np.maximum(sums[1] * variance, np.finfo(float).tiny)
+    products = np.stack([lines[0].imag, lines[0].real])
+    z2 = products**2 / np.maximum(squares * variance, np.finfo(float).tiny)
     return bool(z2.max() > MAX_WHITE_LINE or z2.sum() > n_lines + SCREENING_SIGMAS * np.sqrt(2 * n_lines))
 
 
@@ -591,8 +609,7 @@ def neighbour_correlation(problem: Problem, x: Array) -> float:
         residual = item.residual(chain.forward_kinematics(item.configurations()), values)
         std = item.q.std(0)
         q = item.q[:, std > 0] / std[std > 0]
-        squares = np.sum(q**2, 1)
-        distances = squares[:, None] + squares - 2 * q @ q.T
+        distances = _squared_distances(q)
         # Samples of the same configuration share the error of the robot, but also noise of the instrument.
         distances[distances < SAME_CONFIGURATION] = np.inf
         nearest = np.argmin(distances, 1)
@@ -601,6 +618,41 @@ def neighbour_correlation(problem: Problem, x: Array) -> float:
     product = np.concatenate(products)
     norm = float(np.linalg.norm(product))
     return float(np.sum(product)) / norm if norm else 0.0
+
+
+def design_effect(data: Sequence[Measurement], is_prismatic: Array) -> float:
+    """Compute by how much the correlation of residuals enlarges the variance of a mean (Kish 1965).
+
+    Distances of revolute joints are chords of the unit circle; those of prismatic joints are in standard
+    deviations of the joint.
+
+    Args:
+        data: Measurements of any kinds.
+        is_prismatic: Whether each joint is prismatic, (n,).
+
+    Returns:
+        Number of configurations over the number of independent ones with the same information, at least 1.
+    """
+    q = different_configurations(data)[0]
+    n_configurations = len(q)
+    q = q[:: -(-n_configurations // MAX_NEIGHBOURS)] if n_configurations else q
+    if len(q) < 2:
+        return 1.0
+    turning, sliding = q[:, ~is_prismatic], q[:, is_prismatic]
+    std = sliding.std(0)
+    points = np.hstack([np.cos(turning), np.sin(turning), sliding[:, std > 0] / std[std > 0]])
+    near = np.exp(-0.5 * _squared_distances(points) / CORRELATION_LENGTH**2)
+    mean = (np.sum(near) - np.trace(near)) / (len(q) * (len(q) - 1))
+    return 1 + (n_configurations - 1) * (FAR_CORRELATION + NEAR_CORRELATION * float(mean))
+
+
+def _squared_distances(points: Array) -> Array:
+    """Return the squared distances (m, m) of points (m, n)."""
+    squares = np.sum(points**2, 1)
+    out = points @ (-2 * points.T)
+    out += squares
+    out += squares[:, None]
+    return out
 
 
 def extend(
@@ -639,8 +691,8 @@ def extend(
     temperature, scale, region_ratio = 1.0, 1.0, float("nan")
     if regions:
         correlation = neighbour_correlation(extended.problem, extended.solution.x)
-        if not _is_independent(regions, correlation, n_configurations):
-            temperature = 1 + n_configurations / SAMPLES_PER_TEMPERATURE
+        if correlation >= MAX_WHITE_CORRELATION or not _is_independent(regions, n_configurations):
+            temperature = design_effect(fit.data, extended.problem.errors.chain.is_prismatic)
     if not selected and temperature == 1:
         return fit, Extension(trials, n_configurations=n_configurations)
     if regions:
@@ -686,9 +738,10 @@ def _fit_selected(
     Returns:
         The fit, with the prior widths of greatest evidence, and the standard deviation of its residuals.
     """
-    problem, x, family = _with_families(fit.problem, fit.solution.x, selected)
-    names = [parameter.name for parameter in problem.errors.parameters]
-    x[: len(names)] = [model.values.get(name, value) for name, value in zip(names, x, strict=False)]
+    problem, _, family = _with_families(fit.problem, fit.solution.x, selected)
+    x = np.array([model.values[name] for name in _unknown_names(problem)])
+    if problem.bounds is not None:
+        x = np.clip(x, *problem.bounds)
     selected_problem = problem.with_prior_weights(_prior_weights(problem, family, model.widths))
     solution = minimize(selected_problem, "lm", x, max_iterations, progress, loose=True)
     trimmed = _outlier_weights(problem, solution.x)
@@ -763,20 +816,19 @@ def _select_families(
     return tuple(sorted(trials, key=lambda trial: not trial.is_selected)), model, random_ratio
 
 
-def _is_independent(regions: _Regions, correlation: float, n_configurations: int) -> bool:
-    """Check whether the samples may be independent.
+def _is_independent(regions: _Regions, n_configurations: int) -> bool:
+    """Check whether the errors of left-out regions are those of independent samples.
 
     Args:
         regions: Left-out regions.
-        correlation: Correlation of neighbouring residuals, in standard deviations.
         n_configurations: Number of different configurations.
 
     Returns:
-        Whether neither left-out regions nor neighbouring residuals contradict independent samples.
+        Whether independent samples predict the errors as well as correlated ones.
     """
     tested = regions.errors(1 + n_configurations / SAMPLES_PER_TESTED_TEMPERATURE)
     gain = (tested.log_density - regions.errors(1.0).log_density) / np.sum(tested.n_rows)
-    return gain < MIN_LOG_DENSITY_GAIN and correlation < MAX_WHITE_CORRELATION
+    return bool(gain < MIN_LOG_DENSITY_GAIN)
 
 
 def family_hint(fit: Result) -> str:

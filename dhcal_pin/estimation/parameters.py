@@ -274,16 +274,37 @@ def tool(chain: Chain) -> list[ErrorParameter]:
     return _frame_parameters("tool", chain.tool_frame_index, FRAME_LENGTH_PRIOR, FRAME_ANGLE_PRIOR)
 
 
-def _transmission_parameter(
-    chain: Chain, joint: int, index: int, name: str, unit: str, prior: float
-) -> ErrorParameter:
-    """Build the parameter of the transmission coefficient with an index, which moves an independent joint."""
+def _transmission_parameters(
+    chain: Chain, joint: int, coefficients: Sequence[tuple[int, str, str]], prior: float
+) -> list[ErrorParameter]:
+    """Build the parameters of transmission coefficients that move an independent joint.
+
+    Args:
+        chain: Nominal chain.
+        joint: Number of the joint.
+        coefficients: Index, name and unit of each coefficient.
+        prior: Standard deviation of each coefficient before any measurement.
+
+    Returns:
+        1 parameter per coefficient.
+    """
     # The error acts at the first moving joint that the independent joint drives.
     moving_joint = int(np.flatnonzero(chain.mimic_matrix[:, joint])[0])
     twist = _joint_twist(chain.axes[moving_joint].tolist(), chain.prismatic[moving_joint])
-    nominal = 0.0 if chain.transmission is None else float(chain.transmission.coefficients[index])
-    full_name = f"{chain.joint_names[joint]}.{name}"
-    return ErrorParameter(full_name, unit, nominal, link_frame(moving_joint + 1), twist, prior, index)
+    nominal = None if chain.transmission is None else chain.transmission.coefficients
+    frame, joint_name = link_frame(moving_joint + 1), chain.joint_names[joint]
+    return [
+        ErrorParameter(
+            f"{joint_name}.{name}",
+            unit,
+            0.0 if nominal is None else float(nominal[index]),
+            frame,
+            twist,
+            prior,
+            index,
+        )
+        for index, name, unit in coefficients
+    ]
 
 
 def _coefficient_indices(chain: Chain) -> tuple[Array, Array, Array]:
@@ -307,8 +328,9 @@ def gain(chain: Chain) -> list[ErrorParameter]:
     """
     linear, _, _ = _coefficient_indices(chain)
     return [
-        _transmission_parameter(chain, i, int(linear[i, i]), "gain", "1", GAIN_PRIOR)
+        parameter
         for i in range(chain.n_joints)
+        for parameter in _transmission_parameters(chain, i, [(int(linear[i, i]), "gain", "1")], GAIN_PRIOR)
     ]
 
 
@@ -326,12 +348,15 @@ def harmonics(
         2 parameters for each revolute joint and order [rad].
     """
     _, indices, _ = _coefficient_indices(chain)
-    return [
-        _transmission_parameter(chain, i, int(indices[k - 1, part, i]), f"{function}{k}", "rad", prior)
-        for i in _revolute_joints(chain)
-        for k in orders
-        for part, function in enumerate(("sin", "cos"))
-    ]
+    out = []
+    for i in _revolute_joints(chain):
+        coefficients = [
+            (int(indices[k - 1, part, i]), f"{function}{k}", "rad")
+            for k in orders
+            for part, function in enumerate(("sin", "cos"))
+        ]
+        out += _transmission_parameters(chain, i, coefficients, prior)
+    return out
 
 
 def compliance(chain: Chain) -> list[ErrorParameter]:
@@ -346,11 +371,12 @@ def compliance(chain: Chain) -> list[ErrorParameter]:
     _, _, indices = _coefficient_indices(chain)
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (chain.n_joints, 64))
     is_loaded = np.abs(chain.loads.torques(q)).max(-1) > MIN_TORQUE
-    return [
-        _transmission_parameter(chain, i, int(indices[i]), "compliance", "rad/Nm", COMPLIANCE_PRIOR)
-        for i in _revolute_joints(chain)
-        if is_loaded[i]
-    ]
+    out = []
+    for i in _revolute_joints(chain):
+        if is_loaded[i]:
+            coefficients = [(int(indices[i]), "compliance", "rad/Nm")]
+            out += _transmission_parameters(chain, i, coefficients, COMPLIANCE_PRIOR)
+    return out
 
 
 def coupling(chain: Chain) -> list[ErrorParameter]:
@@ -363,19 +389,14 @@ def coupling(chain: Chain) -> list[ErrorParameter]:
         1 parameter for each pair of a revolute joint and another joint [rad/rad or rad/m].
     """
     linear, _, _ = _coefficient_indices(chain)
-    return [
-        _transmission_parameter(
-            chain,
-            i,
-            int(linear[i, j]),
-            source,
-            "rad/m" if chain.is_prismatic[j] else "rad/rad",
-            COUPLING_PRIOR,
-        )
-        for i in _revolute_joints(chain)
-        for j, source in enumerate(chain.joint_names)
-        if i != j
-    ]
+    units = ["rad/m" if is_prismatic else "rad/rad" for is_prismatic in chain.is_prismatic]
+    out = []
+    for i in _revolute_joints(chain):
+        coefficients = [
+            (int(linear[i, j]), source, units[j]) for j, source in enumerate(chain.joint_names) if i != j
+        ]
+        out += _transmission_parameters(chain, i, coefficients, COUPLING_PRIOR)
+    return out
 
 
 @dataclass(frozen=True)
