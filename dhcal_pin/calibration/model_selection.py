@@ -656,7 +656,7 @@ def _squared_distances(points: Array) -> Array:
 
 
 def extend(
-    fit: Fit, families: Sequence[str], loss: str, max_iterations: int, progress: Progress | None
+    fit: Fit, families: Sequence[str], max_iterations: int, progress: Progress | None
 ) -> tuple[Fit, Extension]:
     """Add the families of joint errors that the measurements support, and find how much the samples count.
 
@@ -664,7 +664,6 @@ def extend(
         fit: Fit of the geometry by method "lm", with priors.
         families: Names of `estimation.EXTENSIONS` to try; those without a parameter on this robot, or whose
             parameters are fixed or estimated already, are skipped.
-        loss: Key of `robust.LOSSES`.
         max_iterations: Largest number of iterations of one solution.
         progress: Called with the iteration and the cost.
 
@@ -712,11 +711,10 @@ def extend(
     solution = minimize(problem, "lm", start.x, max_iterations, progress, warm_start=start, loose=True)
     extended = replace(extended, problem=problem, solution=solution)
     # Outliers were found already: the last robust stage decides which of them are rejected.
-    stages = robust.LOSSES[loss].stages[-1:]
-    if stages == ("uniform",):
+    if fit.stage == robust.KEPT:
         extended = replace(extended, weights=fit.weights)
     groups = PriorGroups.none()
-    return reweight(extended, stages, groups, max_iterations, progress, effective_parameters), extension
+    return reweight(extended, (fit.stage,), groups, max_iterations, progress, effective_parameters), extension
 
 
 def _fit_selected(
@@ -744,7 +742,7 @@ def _fit_selected(
         x = np.clip(x, *problem.bounds)
     selected_problem = problem.with_prior_weights(_prior_weights(problem, family, model.widths))
     solution = minimize(selected_problem, "lm", x, max_iterations, progress, loose=True)
-    trimmed = _outlier_weights(problem, solution.x)
+    trimmed = _outlier_weights(problem, solution.x, fit.weights)
     problem = problem.with_data([item.with_weights(w) for item, w in zip(problem.data, trimmed, strict=True)])
     selected_problem = problem.with_prior_weights(selected_problem.weights)
     solution = minimize(selected_problem, "lm", solution.x, max_iterations, progress, loose=True)
@@ -752,17 +750,20 @@ def _fit_selected(
     model = _Candidates(problem, solution.x, family, solution.system).maximize_evidence(model.widths)
     problem = problem.with_prior_weights(_prior_weights(problem, family, model.widths))
     weights = tuple(np.maximum(a * b, robust.ZERO_WEIGHT) for a, b in zip(fit.weights, trimmed, strict=True))
-    return Fit(fit.data, problem, solution, weights, fit.iterations), model.noise
+    return Fit(fit.data, problem, solution, weights, fit.iterations, fit.stage), model.noise
 
 
-def _outlier_weights(problem: Problem, x: Array) -> tuple[Array, ...]:
-    """Return the weight of each sample (m,) of each measurement: 1, or hardly any for outliers at x (p,)."""
+def _outlier_weights(problem: Problem, x: Array, previous: Sequence[Array]) -> tuple[Array, ...]:
+    """Return the weight of each sample (m,) of each measurement: 1, or hardly any for outliers at x (p,).
+
+    Samples of low previous weight do not count for the scale of the residuals.
+    """
     chain = problem.errors.at(x[: len(problem.errors.parameters)])
     weights = []
-    for item in problem.data:
+    for item, w in zip(problem.data, previous, strict=True):
         values = problem.instrument_values_of(item, x)
         residual = item.residual(chain.forward_kinematics(item.configurations()), values)
-        is_outlier = robust.standardized_residuals(residual) > robust.OUTLIER_THRESHOLD
+        is_outlier = robust.standardized_residuals(residual, None, w > 0.5) > robust.OUTLIER_THRESHOLD
         weights.append(np.where(is_outlier, robust.ZERO_WEIGHT, 1.0))
     return tuple(weights)
 

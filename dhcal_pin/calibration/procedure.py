@@ -90,9 +90,9 @@ def calibrate(
         holdout: Measurements that are not fitted but used to judge the result. "region" fits all samples and
             judges the result by further calibrations, each of which leaves out a region of joint space.
         known: Values of instrument parameters by name, such as a surveyed anchor `wire1.x` [m or rad].
-        loss: "auto" rejects outliers and weights all other samples equally; "linear" weights all samples
-            equally; "huber", "cauchy" and "tukey" reduce the weight with the residual. Method "gn" always
-            weights all samples equally.
+        loss: "auto" rejects samples that disagree with a majority and weights all others equally; "linear"
+            weights all samples equally; "huber", "cauchy" and "tukey" reduce the weight with the residual.
+            Method "gn" always weights all samples equally.
         extend: Families of joint errors that are added where the measurements support them: "auto" for all,
             "none", or names of `estimation.EXTENSIONS`; see `model_selection`. The default is "auto", but
             "none" for method "gn", without priors, and where only base and tool are unknown.
@@ -147,7 +147,7 @@ def calibrate(
     # Residuals of mixed-up measurements say nothing about other errors.
     if not families or shrinkage_factor < 1 or result.diagnosis.hypotheses:
         return result
-    fit, extension = model_selection.extend(fit, families, loss, max_iterations, progress)
+    fit, extension = model_selection.extend(fit, families, max_iterations, progress)
     return replace(_make_result(fit, shrinkage_factor, holdout, method), extension=extension)
 
 

@@ -428,10 +428,15 @@ class Result:
 
     @cached_property
     def outliers(self) -> tuple[Array, ...]:
-        """Lines of the outliers of each fitted measurement; numbers from 1 for samples from Python."""
+        """Lines of the outliers of each fitted measurement; numbers from 1 for samples from Python.
+
+        Outliers are the samples that were rejected and those whose studentized residual is large.
+        """
         return tuple(
-            item.rows[residuals > robust.OUTLIER_THRESHOLD]
-            for item, residuals in zip(self.data, self.studentized_residuals, strict=True)
+            item.rows[(residuals > robust.OUTLIER_THRESHOLD) | (weights <= robust.ZERO_WEIGHT)]
+            for item, residuals, weights in zip(
+                self.data, self.studentized_residuals, self.weights, strict=True
+            )
         )
 
     @cached_property

@@ -13,7 +13,8 @@ The least-squares problem depends on three sets of numbers that are not known be
    estimate (Helmert 1907; Foerstner 1979) that shares the loss of degrees of freedom equally among the rows.
 2. The widths of the default priors, from the evidence procedure (MacKay 1992), see `estimation.priors`.
 3. The weight of each sample under a robust loss, from iteratively reweighted least squares, see
-   `estimation.robust`.
+   `estimation.robust`; loss "auto" starts from the samples that a majority agrees with, see
+   `trimmed_squares`.
 
 Each round estimates all three from the current solution and solves the problem again, starting from it.
 Early rounds solve loosely. The rounds end when none of the numbers changes by more than 1 % and the last
@@ -40,6 +41,8 @@ from ..estimation.problem import Problem
 from ..estimation.robust import WeightChange, studentized_residuals
 from ..estimation.solver import Progress, SolverResult, minimize
 from ..measurements.base import Measurement
+from .partition import configuration_groups
+from .trimmed_squares import find_good_samples
 
 # Smallest scale of a standard deviation: a nanometre or a nanoradian for a placeholder of 1 mm or 1 mrad.
 MIN_SIGMA_SCALE = 1e-6
@@ -64,6 +67,7 @@ class Fit:
         solution: Solution of `problem`.
         weights: Robust weight of each sample, one array of shape (m,) per measurement.
         previous_iterations: Number of iterations of the solutions before this one.
+        stage: Robust stage that the weights are from, see `robust.LOSSES`.
     """
 
     data: tuple[Measurement, ...]
@@ -71,6 +75,7 @@ class Fit:
     solution: SolverResult
     weights: tuple[Array, ...]
     previous_iterations: int = 0
+    stage: str = robust.KEPT
 
     @property
     def iterations(self) -> int:
@@ -139,7 +144,7 @@ def reweight(
         state = _next_round(state, groups, expected, rounds_left, max_iterations, progress, count_determined)
         if state.is_done:
             break
-    return state.fit
+    return replace(state.fit, stage=state.stages[-1])
 
 
 def _next_round(
@@ -156,20 +161,22 @@ def _next_round(
     problem, solution, weights, change = fit.problem, fit.solution, fit.weights, WeightChange(0.0)
     scales = estimate_variance_components(problem, solution, fit.data, weights, count_determined)
     weighted = with_sigma_scales(fit.data, scales)
-    if stage != "uniform":
+    if stage == robust.TRIMMED:
+        found = find_good_samples(problem, solution, weighted, configuration_groups(fit.data))
+        weights, change = found.weights, robust.weight_change(found.weights, fit.weights)
+        # The rounds go on with these weights, then with those of the nonlinear model.
+        state = replace(state, stages=(robust.KEPT, found.stage))
+    elif stage in robust.WEIGHT_FUNCTIONS:
         residuals = studentized_residuals(problem, solution, weighted, weights)
         weights, change = robust.update_weights(weights, residuals, stage, state.weight_change)
+    if any((w != 1).any() for w in weights):
         weighted = tuple(item.with_weights(w) for item, w in zip(weighted, weights, strict=True))
     priors = update_prior_scales(problem, solution, groups)
     relative = np.log(scales / state.scales), (priors - problem.weights) / np.fmax(expected, MIN_WEIGHT)
     has_settled = max(change.size, *(np.abs(each).max(initial=0.0) for each in relative)) < CHANGE_TOL
     state = replace(state, fit=replace(fit, weights=tuple(weights)), weight_change=change)
     if has_settled and len(state.stages) > 1:
-        if stage != "uniform" or any(
-            map(robust.has_possible_outliers, studentized_residuals(problem, solution, weighted, weights))
-        ):
-            return replace(state, stages=state.stages[1:], weight_change=WeightChange())
-        state = replace(state, stages=state.stages[:1])
+        return replace(state, stages=state.stages[1:], weight_change=WeightChange())
     if has_settled and state.is_final:
         return replace(state, is_done=True)
     is_final = has_settled or rounds_left < 2

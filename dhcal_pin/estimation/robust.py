@@ -48,12 +48,18 @@ from .solver import SolverResult
 
 # Standardized residual above which a sample is an outlier: one good sample in three million exceeds it.
 OUTLIER_THRESHOLD = 5.0
-# Standardized residual above which loss "auto" rejects a sample. Unmodelled errors of good samples in a far
-# corner of the workspace stay below.
-REJECTION_THRESHOLD = 12.0
+# Standardized residual above which loss "auto" rejects a sample if outliers are set apart from all other
+# samples: one good sample in four thousand exceeds it.
+REJECTION_THRESHOLD = 3.5
+# The same if residuals of all sizes occur. Unmodelled errors of good samples in a far corner of the workspace
+# stay below.
+FAR_THRESHOLD = 12.0
 
 # Smallest variance of a whitened residual, relative to its noise; below it the fit reproduces the sample.
 MIN_VARIANCE = 1e-3
+# Stages without a weight function: search for good samples, which chooses the last stage
+# (`calibration.trimmed_squares`), and unchanged weights.
+TRIMMED, KEPT = "trimmed", "kept"
 # Ratio of successive weight changes above which the weights oscillate.
 OSCILLATION_RATIO = 0.8
 # Weight of a rejected sample; small enough to have no effect, and not zero so that one can divide by it.
@@ -85,9 +91,8 @@ def _tukey(t: Array) -> Array:
 # Weight function of each stage, and the standardized residual above which its weight is zero. Without that
 # limit every outlier keeps a constant influence: with 10 % outliers the error is about 25 % larger.
 WEIGHT_FUNCTIONS: dict[str, tuple[Callable[[Array], Array], float]] = {
-    "uniform": (_uniform, np.inf),
-    "huber_no_cutoff": (_huber, np.inf),
     "reject": (_uniform, REJECTION_THRESHOLD),
+    "reject_far": (_uniform, FAR_THRESHOLD),
     "huber": (_huber, OUTLIER_THRESHOLD),
     "cauchy": (_cauchy, OUTLIER_THRESHOLD),
     "tukey": (_tukey, OUTLIER_THRESHOLD),
@@ -99,8 +104,8 @@ class Loss:
     """Robust loss that a user can choose.
 
     Attributes:
-        stages: Keys of `WEIGHT_FUNCTIONS` in the order of their use, each until the weights have settled.
-            Stages after "uniform" are skipped if there are no outliers.
+        stages: Keys of `WEIGHT_FUNCTIONS`, TRIMMED or KEPT in the order of their use, each until the weights
+            have settled.
         help: One line for help texts.
     """
 
@@ -108,57 +113,72 @@ class Loss:
     help: str
 
 
-# "auto" finds the outliers by a fit with Huber's weights, which a single outlier cannot dominate. It then
-# fits the other samples with unit weights.
+# "auto" finds the samples that a majority agrees with, whatever the others are. It then fits these samples
+# with unit weights.
 LOSSES: dict[str, Loss] = {
-    "auto": Loss(
-        ("uniform", "huber_no_cutoff", "reject"),
-        f"unit weights; only samples beyond {REJECTION_THRESHOLD:g} standard deviations are rejected",
-    ),
-    "linear": Loss(("uniform",), "unit weights for all samples, outliers included"),
+    "auto": Loss((KEPT, TRIMMED), "unit weights for all samples that agree with a majority, reject outliers"),
+    "linear": Loss((KEPT,), "unit weights for all samples, outliers included"),
     "huber": Loss(("huber",), "down-weight beyond 1.345 standard deviations, reject outliers"),
     "cauchy": Loss(("cauchy",), "down-weight smoothly with the size of the residual, reject outliers"),
     "tukey": Loss(("tukey",), "down-weight smoothly to zero at 4.685 standard deviations"),
 }
 
 
-def standardized_residuals(residual: Array, covariances: Array | None = None) -> Array:
+def standardized_residuals(
+    residual: Array, covariances: Array | None = None, is_good: Array | None = None
+) -> Array:
     """Compute the standardized residual t of each sample of one measurement.
 
     Args:
         residual: Whitened residuals of shape (k, m).
         covariances: Covariance of each sample's whitened residual up to a common factor, shape (m, k, k); the
             identity if None.
+        is_good: Whether each sample counts for the scale, shape (m,); all if None.
 
     Returns:
         Standardized residuals of shape (m,), standard normal for good samples.
     """
     k = len(residual)
     if covariances is None:
-        return standardize_mean_squares(np.sum(residual**2, 0) / k, k)
+        return standardize_mean_squares(np.sum(residual**2, 0) / k, k, is_good)
     # A residual that the fit makes zero for any measured value must not be divided by its variance.
     regularized = covariances + MIN_VARIANCE * np.eye(k)
     return standardize_mean_squares(
-        np.sum(residual.T * np.linalg.solve(regularized, residual.T[..., None])[..., 0], 1) / k, k
+        np.sum(residual.T * np.linalg.solve(regularized, residual.T[..., None])[..., 0], 1) / k, k, is_good
     )
 
 
-def standardize_mean_squares(mean_squares: Array, k: int) -> Array:
+def standardize_mean_squares(mean_squares: Array, k: int, is_good: Array | None = None) -> Array:
     """Transform mean squares of residuals to standardized residuals t (Wilson & Hilferty).
 
     Args:
         mean_squares: Mean square of the k residuals of each sample, shape (m,).
         k: Number of residuals per sample.
+        is_good: Whether each sample counts for the median, shape (m,); all if None.
 
     Returns:
         Standardized residuals of shape (m,); zero if the median is zero.
     """
     mean = 1 - 2 / (9 * k)
     # The median of χ²_k/k is mean³.
-    scale = np.median(mean_squares) / mean**3 if len(mean_squares) else 0.0
+    inliers = mean_squares if is_good is None else mean_squares[is_good]
+    scale = np.median(inliers) / mean**3 if len(inliers) else 0.0
     if scale <= 0:
         return np.zeros(len(mean_squares))
-    return (np.cbrt(mean_squares / scale) - mean) / np.sqrt(2 / (9 * k))
+    return standardize_ratios(mean_squares / scale, k)
+
+
+def standardize_ratios(ratios: Array, k: int) -> Array:
+    """Transform mean squares of residuals relative to the noise to standardized residuals t.
+
+    Args:
+        ratios: Mean square of the k residuals of each sample over the variance of good ones, shape (m,).
+        k: Number of residuals per sample.
+
+    Returns:
+        Standardized residuals of shape (m,).
+    """
+    return (np.cbrt(ratios) - (1 - 2 / (9 * k))) / np.sqrt(2 / (9 * k))
 
 
 def sample_weights(t: Array, stage: str) -> Array:
@@ -220,16 +240,18 @@ def update_weights(
     return weights, WeightChange(size, steps, n_reversals)
 
 
-def has_possible_outliers(t: Array) -> bool:
-    """Check for samples beyond the outlier threshold; further outliers may hide behind them.
+def weight_change(weights: Sequence[Array], previous: Sequence[Array]) -> WeightChange:
+    """Compute the change of weights.
 
     Args:
-        t: Standardized residuals of shape (m,).
+        weights: New weights of each measurement's samples, shape (m,) each.
+        previous: Their weights before.
 
     Returns:
-        Whether any exceeds OUTLIER_THRESHOLD.
+        The change, with `n_reversals` 0.
     """
-    return bool((t > OUTLIER_THRESHOLD).any())
+    steps = tuple(a - b for a, b in zip(weights, previous, strict=True))
+    return WeightChange(max(float(np.abs(step).max(initial=0.0)) for step in steps), steps)
 
 
 def studentized_residuals(
@@ -266,7 +288,11 @@ def studentized_residuals(
         if n_unknowns >= NEGLIGIBLE_LEVERAGE * n_rows
         else [None] * len(data)
     )
-    return [standardized_residuals(*both) for both in zip(residuals, covariances, strict=True)]
+    # Rejected samples do not count for the scale.
+    return [
+        standardized_residuals(residual, covariance, w > 0.5)
+        for residual, covariance, w in zip(residuals, covariances, weights, strict=True)
+    ]
 
 
 def _chunks_of(results: Iterator[Array], item: Measurement) -> Iterator[Array]:

@@ -424,8 +424,9 @@ def _outlier_section(context: ReportContext) -> Section:
     if rows:
         n_hidden = len(context.outliers) - len(rows)
         text = (
-            f"Fitted samples whose standardized residual exceeds {threshold}; a normally distributed one "
-            "does so once in three million." + (f" {n_hidden} more are not listed." if n_hidden else "")
+            f"Rejected samples, and fitted samples whose standardized residual exceeds {threshold}; a "
+            "normally distributed one does so once in three million."
+            + (f" {n_hidden} more are not listed." if n_hidden else "")
         )
     else:
         text = f"No fitted sample has a standardized residual above {threshold}."

@@ -11,6 +11,8 @@ from dhcal_pin.calibration import calibrate
 from dhcal_pin.calibration.summary import headline
 from dhcal_pin.estimation import LOSSES, linearize_and_factor
 from dhcal_pin.estimation.robust import (
+    KEPT,
+    TRIMMED,
     WEIGHT_FUNCTIONS,
     WeightChange,
     residual_covariances,
@@ -166,15 +168,15 @@ def test_statistics_of_a_fit_exclude_rejected_samples(sim_6dof, sim_6dof_actual)
     assert "without 3 outliers" in headline([held]).text
 
 
-def test_loss_auto_rejects_only_the_largest_outliers(sim_6dof, sim_6dof_actual):
-    """Nine sigma at one pose may be a model error; four hundred are not."""
+def test_loss_auto_rejects_outliers_that_are_set_apart(sim_6dof, sim_6dof_actual):
+    """Nine and four hundred sigma at two poses, whereas all others agree."""
     q = np.random.default_rng(3).uniform(-3, 3, (60, 6))
     data = Pose.simulate(sim_6dof_actual, q, Noise(1e-4, 1e-4), np.random.default_rng(3))
     poses = data.poses.copy()
     poses[[5, 20], :3, 3] += [[9e-4, 0, 0], [0, 4e-2, 0]]
     fit = calibrate(sim_6dof, data.replace(poses=poses), "dh")
     assert fit.outliers[0].tolist() == [6, 21]
-    assert np.flatnonzero(fit.weights[0] < 0.5).tolist() == [20]
+    assert np.flatnonzero(fit.weights[0] < 0.5).tolist() == [5, 20]
 
 
 def test_leverages_are_those_of_the_orthogonal_projection(sim_6dof, sim_6dof_actual):
@@ -191,7 +193,7 @@ def test_leverages_are_those_of_the_orthogonal_projection(sim_6dof, sim_6dof_act
 
 def test_losses_name_their_stages_and_have_help_texts_of_one_line():
     for loss in LOSSES.values():
-        assert set(loss.stages) <= set(WEIGHT_FUNCTIONS)
+        assert set(loss.stages) <= {*WEIGHT_FUNCTIONS, TRIMMED, KEPT}
         assert 0 < len(loss.help) < 100
         assert "\n" not in loss.help
 
@@ -204,7 +206,7 @@ def test_weights_that_alternate_settle(slope):
         wanted = 0.5 + slope * (weights[0][0] - 0.5)
         # Huber's weight of this residual is the wanted one; the second sample is good.
         residuals = [np.array([1.345 / min(max(wanted, 0.01), 1.0), 0.5])]
-        weights, last = update_weights(weights, residuals, "huber_no_cutoff", last)
+        weights, last = update_weights(weights, residuals, "huber", last)
         if last.size < 1e-3:
             break
     assert last.size < 1e-3

@@ -1,0 +1,167 @@
+"""Least trimmed squares: the default fit is that of the good samples, whatever the outliers are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from robots import joint_sample, measured_arm
+
+from dhcal_pin.calibration import calibrate
+from dhcal_pin.estimation import select_parameters
+from dhcal_pin.estimation.initialization import align
+from dhcal_pin.measurements import Noise, PointContact, Pose, Position, Wires
+
+SIGMA = 1e-4
+KINDS = {kind.kind: kind for kind in (Pose, Position, Wires, PointContact)}
+
+
+def without_sigma(data):
+    """Return the same samples without stated standard deviations."""
+    if isinstance(data, Pose):
+        return Pose(data.q, data.poses)
+    if isinstance(data, PointContact):
+        return PointContact(data.q, [data.names[i] for i in data.label]).replace(values=data.values)
+    return type(data)(data.q, data.values)
+
+
+def with_outliers(data, bad, is_clustered, rng):
+    """Move the given samples by 10 to 500 standard deviations, all alike if they are clustered."""
+    directions = rng.normal(size=(len(bad), 3))
+    if is_clustered:
+        directions[:] = directions[0]
+        sizes = np.exp(rng.uniform(np.log(15), np.log(200))) + rng.normal(size=len(bad))
+    else:
+        sizes = np.exp(rng.uniform(np.log(10), np.log(500), len(bad)))
+    jump = directions / np.linalg.norm(directions, axis=1)[:, None] * SIGMA * np.reshape(sizes, (-1, 1))
+    if isinstance(data, Pose):
+        poses = data.poses.copy()
+        poses[bad, :3, 3] += jump
+        return data.replace(poses=poses)
+    values = data.values.copy()
+    values[bad] += jump
+    return data.replace(values=values)
+
+
+def tool_error(fit, actual, q):
+    """Return the RMS position error after alignment, and scaling if contacts do not determine the scale."""
+    found, true = fit.chain.poses(q)[:, :3, 3], actual.poses(q)[:, :3, 3]
+    if isinstance(fit.data[0], PointContact):
+        found = found * np.linalg.norm(true - true.mean(0)) / np.linalg.norm(found - found.mean(0))
+    return align(found, true)[1]
+
+
+def trial(kind, m, fraction, is_clustered, is_stated, seed):
+    """Return the ratio of errors to a fit of the good samples alone, and the counts of named samples.
+
+    None if the good samples do not determine the robot twice, or another point has a majority.
+    """
+    rng = np.random.default_rng([seed, m])
+    chain = measured_arm("slide")
+    errors = select_parameters(chain, "minimal,base,tool")
+    sizes = [1e-3 if p.unit == "m" else 2e-3 for p in errors.parameters]
+    actual = errors.at(rng.normal(size=len(sizes)) * sizes)
+    clean = KINDS[kind].simulate(actual, joint_sample(chain, m, rng), Noise(SIGMA, SIGMA), rng)
+    bad = np.sort(rng.permutation(m)[: max(1, round(fraction * m))]) if fraction else np.empty(0, int)
+    good = np.setdiff1d(np.arange(m), bad)
+    if is_clustered and isinstance(clean, PointContact):
+        shares = np.bincount(clean.label[bad], minlength=4) / np.bincount(clean.label, minlength=4)
+        if shares.max() >= 0.5:
+            return None
+    dirty = with_outliers(clean, bad, is_clustered, rng) if len(bad) else clean
+    if not is_stated:
+        clean, dirty = without_sigma(clean), without_sigma(dirty)
+    expected = calibrate(chain, clean.take(good), "minimal,base,tool", extend="none", loss="linear")
+    if len(good) * clean.residual_dim < 2 * expected.rank:
+        return None
+    fit = calibrate(chain, dirty, "minimal,base,tool", extend="none")
+    q = joint_sample(chain, 200, np.random.default_rng(10**6 + seed))
+    named = np.isin(np.arange(m) + 1, fit.outliers[0])
+    ratio = tool_error(fit, actual, q) / tool_error(expected, actual, q)
+    return ratio, named[bad].sum(), len(bad), named[good].sum(), len(good)
+
+
+@pytest.mark.parametrize("is_clustered", [False, True])
+@pytest.mark.parametrize(("kind", "m"), [("pose", 30), ("position", 60), ("wires", 60), ("point", 60)])
+def test_outliers_that_hide_each_other_are_found(kind, m, is_clustered):
+    """A third of the samples; a fit to all samples is 3 to 60 times worse, and finds hardly any."""
+    trials = [trial(kind, m, 0.3, is_clustered, is_stated, 1) for is_stated in (False, True)]
+    assert all(trials)
+    for ratio, n_found, n_bad, n_false, _ in filter(None, trials):
+        assert ratio <= 1.10
+        assert (n_found, n_false) == (n_bad, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_stated", [False, True])
+@pytest.mark.parametrize("is_clustered", [False, True])
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_outliers_in_many_trials(kind, is_clustered, is_stated):
+    for fraction in (0.01, 0.1, 0.2, 0.3, 0.4):
+        found = []
+        for m in (30, 60, 200):
+            trials = [trial(kind, m, fraction, is_clustered, is_stated, seed) for seed in range(20)]
+            trials = [each for each in trials if each]
+            if not trials:
+                continue
+            median = np.median([each[0] for each in trials])
+            assert median <= (1.25 if fraction > 0.3 else 1.10), (m, fraction)
+            found += trials
+        _, n_found, n_bad, n_false, n_good = np.sum(found, 0)
+        print(kind, is_clustered, is_stated, fraction, n_found, n_bad, n_false, n_good)
+        assert n_false <= 0.01 * n_good
+        # With 30 samples and 40 % outliers, some outliers of 10 sigma are at poses that no good sample tells.
+        assert n_found >= (0.97 if fraction > 0.3 else 0.99) * n_bad
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_without_outliers_the_digits_are_those_of_least_squares(kind):
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        chain = measured_arm("slide")
+        data = KINDS[kind].simulate(chain, joint_sample(chain, 40, rng), Noise(SIGMA, SIGMA), rng)
+        for item in (data, without_sigma(data)):
+            fits = [
+                calibrate(chain, item, "minimal,base,tool", extend="none", loss=loss)
+                for loss in ("auto", "linear")
+            ]
+            np.testing.assert_array_equal(fits[0].x, fits[1].x)
+            assert np.all(fits[0].weights[0] == 1)
+
+
+def test_samples_of_one_configuration_may_be_wrong_together_or_alone():
+    """Each configuration has five samples, all wrong at a quarter of them, and one wrong at all others."""
+    rng = np.random.default_rng(2)
+    chain = measured_arm("slide")
+    q = np.repeat(joint_sample(chain, 40, rng), 5, axis=0)
+    clean = Position.simulate(chain, q, Noise(SIGMA), rng)
+    bad = np.concatenate([np.arange(50), np.arange(50, 200, 5)])
+    dirty = without_sigma(with_outliers(clean, bad, False, rng))
+    fit = calibrate(chain, dirty, "minimal,base,tool", extend="none")
+    assert np.isin(bad + 1, fit.outliers[0]).all()
+    assert np.setdiff1d(fit.outliers[0], bad + 1).size <= 1
+
+
+def test_many_samples_are_searched_in_a_part_and_all_judged():
+    rng = np.random.default_rng(3)
+    chain = measured_arm("slide")
+    clean = Pose.simulate(chain, joint_sample(chain, 2500, rng), Noise(SIGMA, SIGMA), rng)
+    bad = np.sort(rng.permutation(2500)[:1000])
+    fit = calibrate(
+        chain, without_sigma(with_outliers(clean, bad, True, rng)), "minimal,base,tool", extend="none"
+    )
+    named = np.isin(np.arange(2500) + 1, fit.outliers[0])
+    assert named[bad].all()
+    assert named.sum() <= 1003
+
+
+def test_errors_of_all_sizes_point_to_the_model_and_are_kept():
+    """Student's t with two degrees of freedom: no gap divides good samples from bad ones."""
+    rng = np.random.default_rng(4)
+    chain = measured_arm("slide")
+    q = joint_sample(chain, 200, rng)
+    exact = Position.simulate(chain, q, Noise(), rng)
+    data = Position(q, exact.values + SIGMA * rng.standard_t(2, (200, 3)))
+    fit = calibrate(chain, data, "minimal,base,tool", extend="none")
+    weights = fit.weights[0]
+    assert set(weights) <= {1.0, 1e-12}
+    assert np.sum(weights < 0.5) < 0.5 * len(fit.outliers[0])
