@@ -18,13 +18,12 @@ h smallest squared residuals. The search follows FAST-LTS (Rousseeuw & Van Dries
    best fits are iterated until their samples do not change.
 4. Extend the samples of each of the best fits by all whose studentized residual is small, and fit again,
    until they do not change. These fits compete by a likelihood in which good samples have one unknown noise
-   scale and each bad block b has its own: with j of m samples bad, ν₀ and ν_j degrees of freedom of fits to
-   all and to the good samples, mean squares s₀² and s_j², and n_b rows of a bad block with mean square b²,
+   scale and each bad block b has its own: with ν₀ and ν_g degrees of freedom of fits to all and to the good
+   samples, mean squares s₀² and s_g², and n_b rows of a bad block with mean square b²,
 
-       ½·ν_j·log(s_j²) + Σ_b ½·n_b·log(b²) + log C(m, j)        against        ½·ν₀·log(s₀²)
+       ½·ν_g·log(s_g²) + Σ_b ½·n_b·log(b²)        against        ½·ν₀·log(s₀²)
 
-   The last term counts the ways to choose the bad samples. All samples are good unless the left side is
-   smaller and there is at least one clear outlier.
+   All samples are good unless the left side is smaller and there is at least one clear outlier.
 
 Outliers by mistakes are set apart from good samples. If errors of all sizes occur instead, the model is
 incomplete, and samples are only rejected if they are very far off.
@@ -46,7 +45,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from math import lgamma
 
 import numpy as np
 
@@ -518,8 +516,7 @@ def _log_likelihood(rows: _Rows, is_good: Array, scales: Array, redundancy: floa
         The negative logarithm; infinite if the good samples have no more rows than unknowns.
     """
     squares = rows.residual_squares(rows.solve(is_good[None].astype(float), scales[None]))[0]
-    u, m, n_bad = len(rows.prior_right), len(is_good), int(np.sum(~is_good))
-    fitted, total = is_good[rows.sample], lgamma(m + 1) - lgamma(n_bad + 1) - lgamma(m - n_bad + 1)
+    u, fitted, total = len(rows.prior_right), is_good[rows.sample], 0.0
     freedom = 1 - u * redundancy / rows.counts[fitted].sum()
     if not freedom > 0:
         return np.inf
