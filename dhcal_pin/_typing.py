@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from typing import Any
 
 from numpy.typing import NDArray
@@ -11,3 +12,5 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 # Path of a file, as `open` accepts it.
 PathLike = str | os.PathLike[str]
+# Callback of a long computation: name of the phase, number of its current step, and largest number of steps.
+Progress = Callable[[str, int, int], None]

@@ -25,6 +25,11 @@ CALIBRATE = ("calibrate", "arm.dh.toml", "data.csv", "-o", "out.urdf")
 DESIGNED, ACTUAL = (433, 400, 345), (436, 403, 343)
 
 
+def unfolded(screen):
+    """Text of a screen without line breaks, to look for a sentence."""
+    return " ".join(screen.split())
+
+
 def tool_positions(degrees, lengths=DESIGNED):
     """Tool positions [mm] of a robot with a vertical axis and two links in a plane."""
     q1, q2, q3 = np.radians(degrees).T

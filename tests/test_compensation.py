@@ -310,7 +310,8 @@ def test_command_writes_joint_positions_and_corrected_targets(place, capsys, rot
     Path("targets.csv").write_text("\n".join([header, *(",".join(map(repr, row)) for row in table)]))
     assert main.main(COMMAND) == 0
     said = capsys.readouterr().err
-    assert "1 of 20 out of reach: line 5" in said
+    assert "1 of 20 out of reach" in said
+    assert "  line 5 (" in said
     found = rows()
     assert len(found) == 20
     assert found[3]["status"] == "out of reach"
@@ -506,7 +507,7 @@ def test_exchanged_robots_are_noticed(place, capsys):
     exchanged = ["compensate", "true.urdf", "ur5.urdf", *BASE[3:]]
 
     def warning(command):
-        assert main.main(command) == 0
+        assert main.main([*command, "--verbose"]) == 0
         return [line for line in capsys.readouterr().err.splitlines() if "look exchanged" in line]
 
     assert warning([*BASE]) == []

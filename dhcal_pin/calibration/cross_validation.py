@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.linalg import lstsq
 
-from .._typing import Array
+from .._typing import Array, Progress
 from ..estimation import qr, robust
 from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.qr import (
@@ -440,7 +440,11 @@ def compare_folds(fit: Result, folds: Sequence[Fold], title: Title) -> FoldCompa
     )
 
 
-def leave_regions_out(fit: Result, recalibrate: Callable[[list[Measurement]], Result]) -> Result:
+def leave_regions_out(
+    fit: Result,
+    recalibrate: Callable[[list[Measurement]], Result],
+    progress: Progress | None = None,
+) -> Result:
     """Judge a calibration by further ones, each without the samples of a region of joint space.
 
     Unlike in `compare_folds`, everything is estimated again without the region: noise, prior widths, outliers
@@ -449,6 +453,7 @@ def leave_regions_out(fit: Result, recalibrate: Callable[[list[Measurement]], Re
     Args:
         fit: Result of a calibration with all samples.
         recalibrate: The same calibration of some of the samples.
+        progress: Called with "left-out regions", the number of the region and the number of regions.
 
     Returns:
         The same result with the comparison as `region_comparison`; None if all samples have the same joint
@@ -460,7 +465,9 @@ def leave_regions_out(fit: Result, recalibrate: Callable[[list[Measurement]], Re
         return fit
     before: list[dict[str, Array]] = []
     after: list[dict[str, Array]] = []
-    for fold in folds:
+    for number, fold in enumerate(folds, 1):
+        if progress:
+            progress("left-out regions", number, len(folds))
         part = recalibrate(
             [item.take(~mask) for item, mask in zip(fit.data, fold, strict=True) if not mask.all()]
         )

@@ -58,7 +58,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .._typing import Array
+from .._typing import Array, Progress
 from ..estimation import robust
 from ..estimation.error_model import ErrorModel, ErrorParameter
 from ..estimation.parameters import CURVE_ORDERS, EXTENSIONS, PARAMETER_SETS
@@ -71,7 +71,7 @@ from ..estimation.qr import (
     posterior_sqrt_covariance,
     pseudo_inverse,
 )
-from ..estimation.solver import Progress, minimize
+from ..estimation.solver import minimize
 from ..exceptions import UnknownNameError
 from ..formatting import Table, format_fixed
 from ..measurements.base import Measurement
@@ -108,6 +108,8 @@ SAMPLES_PER_TESTED_TEMPERATURE = 100
 # Difference of the log predictive density per held-out row for which T = 1 is rejected. Simulated arms with
 # independent noise stay below 0.01 but for few samples; a real UR10 has 0.04 to 0.2.
 MIN_LOG_DENSITY_GAIN = 0.015
+# Name of this work for the user, and its steps: choose families, fit them, compare left-out regions.
+PHASE, _N_STEPS = "joint error families", 3
 # Correlation of neighbouring residuals for which T = 1 is rejected, in standard deviations.
 MAX_WHITE_CORRELATION = 4.0
 # Largest number of configurations of each measurement whose neighbours are compared.
@@ -665,7 +667,7 @@ def extend(
         families: Names of `estimation.EXTENSIONS` to try; those without a parameter on this robot, or whose
             parameters are fixed or estimated already, are skipped.
         max_iterations: Largest number of iterations of one solution.
-        progress: Called with the iteration and the cost.
+        progress: Called with the name of the phase, the number of its step and the largest number of steps.
 
     Returns:
         The fit, and what was added; the given fit if nothing was.
@@ -681,11 +683,13 @@ def extend(
     missing = _missing_parameters(fit.problem.errors, families)
     if n_configurations < MIN_CONFIGURATIONS or not _noise(fit) > 0:
         return fit, Extension(n_configurations=n_configurations)
+    report = progress or _ignore
+    report(PHASE, 1, _N_STEPS)
     trials, model, random_ratio = _select_families(fit, missing)
     selected = {name: missing[name] for name in model.widths}
-    extended, noise = (
-        _fit_selected(fit, selected, model, max_iterations, progress) if selected else (fit, _noise(fit))
-    )
+    report(PHASE, 2, _N_STEPS)
+    extended, noise = _fit_selected(fit, selected, model, max_iterations) if selected else (fit, _noise(fit))
+    report(PHASE, 3, _N_STEPS)
     regions = _Regions(extended.problem, extended.solution.x, noise)
     temperature, scale, region_ratio = 1.0, 1.0, float("nan")
     if regions:
@@ -708,7 +712,7 @@ def extend(
     problem = problem.at_temperature(temperature)
     # The rows are divided by the noise; they are not linearized again.
     start = replace(extended.solution, system=TriangularSystem(extended.solution.system.rows / noise))
-    solution = minimize(problem, "lm", start.x, max_iterations, progress, warm_start=start, loose=True)
+    solution = minimize(problem, "lm", start.x, max_iterations, warm_start=start, loose=True)
     extended = replace(extended, problem=problem, solution=solution)
     # Outliers were found already: the last robust stage decides which of them are rejected.
     if fit.stage == robust.KEPT:
@@ -717,12 +721,15 @@ def extend(
     return reweight(extended, (fit.stage,), groups, max_iterations, progress, effective_parameters), extension
 
 
+def _ignore(phase: str, step: int, total: int) -> None:
+    """Receive the progress if nobody else does."""
+
+
 def _fit_selected(
     fit: Fit,
     selected: dict[str, list[ErrorParameter]],
     model: _Model,
     max_iterations: int,
-    progress: Progress | None,
 ) -> tuple[Fit, float]:
     """Fit the geometry and selected families at temperature 1.
 
@@ -731,7 +738,6 @@ def _fit_selected(
         selected: Parameters of the families.
         model: Prior widths and values of the families from the linear model around the fit.
         max_iterations: Largest number of iterations.
-        progress: Called with the iteration and the cost.
 
     Returns:
         The fit, with the prior widths of greatest evidence, and the standard deviation of its residuals.
@@ -741,11 +747,11 @@ def _fit_selected(
     if problem.bounds is not None:
         x = np.clip(x, *problem.bounds)
     selected_problem = problem.with_prior_weights(_prior_weights(problem, family, model.widths))
-    solution = minimize(selected_problem, "lm", x, max_iterations, progress, loose=True)
+    solution = minimize(selected_problem, "lm", x, max_iterations, loose=True)
     trimmed = _outlier_weights(problem, solution.x, fit.weights)
     problem = problem.with_data([item.with_weights(w) for item, w in zip(problem.data, trimmed, strict=True)])
     selected_problem = problem.with_prior_weights(selected_problem.weights)
-    solution = minimize(selected_problem, "lm", solution.x, max_iterations, progress, loose=True)
+    solution = minimize(selected_problem, "lm", solution.x, max_iterations, loose=True)
     # `_Candidates` divides the expected weights of its problem by the widths.
     model = _Candidates(problem, solution.x, family, solution.system).maximize_evidence(model.widths)
     problem = problem.with_prior_weights(_prior_weights(problem, family, model.widths))

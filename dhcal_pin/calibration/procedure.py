@@ -27,14 +27,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .._typing import Array
+from .._typing import Array, Progress
 from ..estimation import robust
 from ..estimation.error_model import ErrorModel
 from ..estimation.initialization import fit_frames, initialize_frames, make_problem
 from ..estimation.parameters import EXTENSIONS, fold_harmonics, select_parameters
 from ..estimation.priors import PriorGroups, Priors, has_default_prior, prior_weights
 from ..estimation.problem import Problem, merge_instrument_parameters
-from ..estimation.solver import METHODS, Progress, minimize
+from ..estimation.solver import METHODS, minimize
 from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..measurements.arguments import as_measurements, require_chain
 from ..measurements.base import Measurement
@@ -99,7 +99,8 @@ def calibrate(
         bounds: Lowest and highest values by name or pattern of the robot's parameters [m or rad]; base and
             tool have no bounds.
         max_iterations: Largest number of iterations of one solution.
-        progress: Called after each iteration with its number and the cost.
+        progress: Called with the name of the current phase, such as "robust weights", the number of its step
+            and the largest number of steps.
         executor: Executor of the chunks of many samples.
 
     Returns:
@@ -120,10 +121,9 @@ def calibrate(
             extend=extend,
             bounds=bounds,
             max_iterations=max_iterations,
-            progress=progress,
             executor=executor,
         )
-        return leave_regions_out(recalibrate(data), recalibrate)
+        return leave_regions_out(recalibrate(data, progress=progress), recalibrate, progress)
     data, holdout = as_measurements(data), as_measurements(holdout, "holdout")
     _check_options(data, method, loss, bounds)
     for item in (*data, *holdout):
@@ -225,7 +225,9 @@ def _bounds(problem: Problem, bounds: Mapping[str, tuple[float, float]]) -> Arra
 def _solve(problem: Problem, method: Method, max_iterations: int, progress: Progress | None) -> Fit:
     """Solve a problem with unit weights; `reweight` iterates method "lm" to full convergence later."""
     options: dict[str, Any] = {"loose": True} if method == "lm" else {}
-    solution = minimize(problem, method, None, max_iterations, progress, **options)
+    if progress:
+        options["progress"] = lambda iteration, cost: progress("fit", iteration, max_iterations)
+    solution = minimize(problem, method, None, max_iterations, **options)
     weights = tuple(np.ones(len(item.rows)) for item in problem.data)
     fit = Fit(problem.data, problem, solution, weights)
     errors = problem.errors
@@ -233,7 +235,7 @@ def _solve(problem: Problem, method: Method, max_iterations: int, progress: Prog
         return fit
     # Gravity torques depend on the identified robot: solve again with those of the solution.
     problem = replace(problem, errors=errors.with_current_loads(solution.x[: len(errors.parameters)]))
-    second = minimize(problem, method, solution.x, max_iterations, progress, **options)
+    second = minimize(problem, method, solution.x, max_iterations, **options)
     return replace(fit, problem=problem, solution=second, previous_iterations=solution.iterations)
 
 

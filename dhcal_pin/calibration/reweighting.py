@@ -34,12 +34,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .._typing import Array
+from .._typing import Array, Progress
 from ..estimation import qr, robust
 from ..estimation.priors import PriorGroups, update_prior_scales
 from ..estimation.problem import Problem
 from ..estimation.robust import WeightChange, studentized_residuals
-from ..estimation.solver import Progress, SolverResult, minimize
+from ..estimation.solver import SolverResult, minimize
 from ..measurements.base import Measurement
 from .partition import configuration_groups
 from .trimmed_squares import find_good_samples
@@ -48,6 +48,8 @@ from .trimmed_squares import find_good_samples
 MIN_SIGMA_SCALE = 1e-6
 # Largest number of rounds.
 MAX_ROUNDS = 30
+# Name of the rounds for the user.
+PHASE = "robust weights"
 # Rounds end when no scale, prior or weight changes by more than this fraction.
 CHANGE_TOL = 0.01
 # Replaces the weight 0 of a parameter without a prior, to avoid a division by zero.
@@ -132,7 +134,7 @@ def reweight(
         stages: Robust stages, see `robust.LOSSES`.
         groups: Parameters whose default priors share one scale.
         max_iterations: Largest number of iterations of one solution.
-        progress: Called with the iteration and the cost.
+        progress: Called with the name of the phase, the number of its step and the largest number of steps.
         count_determined: Function that returns the number of parameters that the data determine.
 
     Returns:
@@ -141,7 +143,9 @@ def reweight(
     expected = fit.problem.weights
     state = ReweightState(fit, np.ones(sum(len(item.residual_groups) for item in fit.data)), stages)
     for rounds_left in reversed(range(MAX_ROUNDS)):
-        state = _next_round(state, groups, expected, rounds_left, max_iterations, progress, count_determined)
+        if progress:
+            progress(PHASE, MAX_ROUNDS - rounds_left, MAX_ROUNDS)
+        state = _next_round(state, groups, expected, rounds_left, max_iterations, count_determined)
         if state.is_done:
             break
     return replace(state.fit, stage=state.stages[-1])
@@ -153,7 +157,6 @@ def _next_round(
     expected: Array,
     rounds_left: int,
     max_iterations: int,
-    progress: Progress | None,
     count_determined: CountDetermined,
 ) -> ReweightState:
     """Estimate scales, priors and weights from the current solution, and solve again if they changed."""
@@ -188,9 +191,7 @@ def _next_round(
         problem = problem.with_data(weighted).with_prior_weights(priors)
         warm_start, previous_iterations = None, fit.iterations
         state = replace(state, scales=scales)
-    solution = minimize(
-        problem, "lm", solution.x, max_iterations, progress, warm_start=warm_start, loose=not is_final
-    )
+    solution = minimize(problem, "lm", solution.x, max_iterations, warm_start=warm_start, loose=not is_final)
     fit = replace(state.fit, problem=problem, solution=solution, previous_iterations=previous_iterations)
     return replace(state, fit=fit, is_final=is_final)
 

@@ -23,7 +23,7 @@ from ..estimation import qr
 from ..estimation.priors import Priors
 from ..estimation.problem import Chunk, Problem
 from ..estimation.qr import posterior_sqrt_covariance
-from ..estimation.solver import Progress, SolverResult, minimize
+from ..estimation.solver import IterationCallback, SolverResult, minimize
 from ..estimation.uncertainty import UNBOUNDED_TOL
 from ..exceptions import InvalidArgumentError
 from ..identifiability import explanations
@@ -134,7 +134,7 @@ def calibrate_stream(
     known: Mapping[str, float] | None = None,
     max_iterations: int = 100,
     executor: TaskExecutor = SERIAL,
-    progress: Progress | None = None,
+    progress: IterationCallback | None = None,
 ) -> StreamResult:
     """Identify the kinematic errors of a robot from samples of one kind that are never all in memory.
 

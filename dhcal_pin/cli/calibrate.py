@@ -52,24 +52,14 @@ def _calibrate_robot(args: Namespace) -> int:
     """Calibrate one robot and show its result."""
     from ..parallel import open_executor  # lazy import, as the following: they load Pinocchio
     from . import console
+    from .calibration_screen import calibration_screen
     from .run_job import run_job
 
     job = Job.from_args(args)
     with (
         open_executor(args.jobs or 1, args.scheduler) as executor,
-        console.show_progress("fitting") as progress,
+        console.show_progress("reading the files") as progress,
     ):
         outcome = run_job(job, progress, executor)
-    console.print_extension(outcome.fit.extension)
-    console.print_summary(outcome.fit, outcome.files)
-    for path, rows in outcome.unreachable.items():
-        console.print_unreachable_rows(path, rows)
-        console.print_outliers(path, outcome.outliers.get(path, []), outcome.rejected.get(path, []))
-    for path, texts in outcome.notes.items():
-        console.print_notes([f"{path}: {text}" for text in texts])
-    for path, texts in outcome.warnings.items():
-        console.print_warnings(path, texts)
-    console.print_hint(outcome.hint)
-    console.print_headline(outcome.fit)
-    console.print_verdict(outcome.fit.verdict, job.force)
+    console.show(calibration_screen(outcome, job), args.verbosity)
     return REFUSED if outcome.fit.verdict.is_refused and not job.force else 0

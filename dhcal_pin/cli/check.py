@@ -34,11 +34,12 @@ def run(args: Namespace) -> int:
     from ..paper.jacobian_check import crosscheck
     from . import console
     from .outputs import require_writable_outputs, write_outputs
+    from .result_screens import crosscheck_screen
 
     require_writable_outputs([args.json], [args.robot])
     rows = crosscheck(read_robot(args.robot, args.tip, package_dirs=args.package_dir))
     all_agree = all(row.agrees for row in rows)
     routes = [asdict(row) | {"agrees": row.agrees} for row in rows]
     write_outputs({}, args.json, {"agree": all_agree, "routes": routes})
-    console.print_crosscheck(args.robot, rows)
+    console.show(crosscheck_screen(args.robot, rows), args.verbosity)
     return 0 if all_agree else 1

@@ -79,6 +79,7 @@ def run(args: Namespace) -> int:
     from ..programs import program_text, require_program_ending
     from . import console
     from .outputs import existing_sidecars, require_writable_outputs, write_outputs
+    from .result_screens import compensation_screen
 
     robots = [args.nominal, args.calibrated]
     tcp_file = [args.tcp] if args.tcp and os.path.exists(args.tcp) else []
@@ -96,13 +97,17 @@ def run(args: Namespace) -> int:
         contents[path] = program_text(_program(result, nominal), path)
     write_outputs(contents)
     frame = f"the root link {calibrated.urdf.root}" if args.frame == BASE else "the measuring frame"
-    console.print_lines(f"targets: {_tool_text(args, calibrated)} in {frame}")
-    console.print_notes([f"{targets.source}: {text}" for text in targets.notes])
-    console.print_compensation(result, calibrated, targets)
-    if warning := exchange_warning(args.nominal, args.calibrated, nominal, calibrated):
-        console.print_warnings(args.nominal, [warning])
-    console.print_hint(_frame_hint(args, result))
-    console.print_lines(*(f"wrote {path}" for path in contents))
+    warning = exchange_warning(args.nominal, args.calibrated, nominal, calibrated)
+    screen = compensation_screen(
+        f"targets: {_tool_text(args, calibrated)} in {frame}",
+        result,
+        calibrated,
+        targets,
+        {args.nominal: [warning]} if warning else {},
+        _frame_hint(args, result),
+        contents,
+    )
+    console.show(screen, args.verbosity)
     return 0
 
 

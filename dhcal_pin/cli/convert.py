@@ -66,13 +66,14 @@ def run(args: Namespace) -> int:
     from ..io.measurement_files.bag import is_bag  # lazy import, as the following: they load Pinocchio
     from . import console
     from .outputs import require_writable_outputs, write_outputs
+    from .result_screens import files_block, notes_block
+    from .screen import Screen
 
     robots = [args.robot] if args.robot else []
     require_writable_outputs([args.output], [args.input, *robots])
     text, notes = (_convert_bag if is_bag(args.input) else _convert_robot)(args)
     write_outputs({args.output: text})
-    console.print_lines(f"wrote {args.output}")
-    console.print_notes(notes)
+    console.show(Screen([notes_block(notes), files_block([args.output])]), args.verbosity)
     return 0
 
 

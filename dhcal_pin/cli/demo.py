@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..exceptions import InvalidArgumentError
 from .options import JSON
+from .screen import Block, Screen, Verbosity
 
 if TYPE_CHECKING:
     from .._typing import PathLike
@@ -48,18 +49,21 @@ def run(args: Namespace) -> int:
     from .outputs import require_writable_outputs
 
     require_writable_outputs([args.json], [])
-    document = run_demo(args.out, args.json)
+    document = run_demo(args.out, args.json, args.verbosity)
     if args.open:
         console.open_page(document["files"]["report"])
     return 0
 
 
-def run_demo(folder: PathLike, json_target: str | None = None) -> dict[str, Any]:
+def run_demo(
+    folder: PathLike, json_target: str | None = None, verbosity: Verbosity = "normal"
+) -> dict[str, Any]:
     """Run experiment and simulations, show the results and write all files.
 
     Args:
         folder: Folder for the files; created if it does not exist.
         json_target: Path of a further JSON file, or `-` for standard output.
+        verbosity: What is shown.
 
     Returns:
         JSON document of the experiment.
@@ -79,30 +83,30 @@ def run_demo(folder: PathLike, json_target: str | None = None) -> dict[str, Any]
     except OSError as error:
         raise InvalidArgumentError(f"{folder}: cannot create this folder: {error.strerror}") from error
     experiment = run_experiment()
-    for item in experiment.unreachable_rows:
-        console.print_lines(f"Table 5: row {item.row} is excluded: {item.reason}", style="yellow")
     header = ["position RMS in mm", "fitted", "leave-one-out"]
-    sections = [
-        _Section(
-            f"The experiment, {len(experiment.data.q)} of {len(experiment.measurements.data.q)} rows",
-            Table(header, experiment.rows),
-            experiment_remarks(experiment),
-        ),
+    shown = _Section(
+        f"The experiment, {len(experiment.data.q)} of {len(experiment.measurements.data.q)} rows",
+        Table(header, experiment.rows),
+        experiment_remarks(experiment),
+    )
+    details = [
         _Section("Parameters, least squares", estimate_table(experiment.fit.estimates)),
-    ]
-    for section in sections:
-        _print_section(section)
-    sections.append(
         _Section(
             f"The simulations: largest error of {simulations.TESTS} test poses in mm by iteration, median of "
             f"{simulations.SEEDS} seeds; runs with an exact fit and runs with the true parameters",
             Table(simulations.SIMULATION_HEADER, simulations.simulation_rows()),
             simulations.SIMULATION_REMARKS,
-        )
-    )
-    _print_section(sections[-1])
-    document = _write_results(experiment, folder, sections, json_target)
-    console.print_lines("", *(f"wrote {path}" for path in document["files"].values()))
+        ),
+    ]
+    document = _write_results(experiment, folder, [shown, *details], json_target)
+    excluded = [f"Table 5: row {item.row} is excluded: {item.reason}" for item in experiment.unreachable_rows]
+    names = [os.path.basename(path) for path in document["files"].values()]
+    blocks = [
+        *shown.blocks(),
+        Block(excluded, "yellow", noun="excluded row of Table 5", rank=0, n_kept=0, has_space=True),
+        Block([f"wrote into {folder}: {', '.join(names)}"], has_space=True),
+    ]
+    console.show(Screen(blocks, [block for section in details for block in section.blocks()]), verbosity)
     return document
 
 
@@ -113,13 +117,12 @@ class _Section(NamedTuple):
     table: Table
     remarks: Sequence[str] = ()
 
-
-def _print_section(section: _Section) -> None:
-    """Print a table and its remarks."""
-    from . import console  # lazy import: loads Pinocchio
-
-    console.print_table(section.title, section.table)
-    console.print_lines(*section.remarks)
+    def blocks(self) -> list[Block]:
+        """Return the blocks of a screen."""
+        return [
+            Block(self.table, title=self.title, has_space=True),
+            Block(self.remarks, noun="remark", rank=1),
+        ]
 
 
 def experiment_remarks(experiment: PaperExperiment) -> list[str]:

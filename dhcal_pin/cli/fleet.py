@@ -42,8 +42,9 @@ from .job import Job, option_flags
 from .options import STDOUT, IntegerType
 from .outputs import forget_written_files, require_writable_outputs, write_outputs, written_files
 from .run_job import run_job
+from .screen import Block, Screen
 
-OK, REFUSED, FAILED = "ok", "refused", "failed"
+OK, CAUTION, REFUSED, FAILED = "ok", "caution", "refused", "failed"
 
 
 @dataclass(frozen=True)
@@ -320,21 +321,20 @@ def run_manifest(args: Namespace) -> int:
     _require_manifest_arguments(args)
     entries = read_fleet(args.robot)
     require_writable_outputs([args.output, args.json], [args.robot, *file_paths(entries, args.robot)])
-    width = max(len(entry.name) for entry in entries)
     total, n_done = len(entries), 0
 
-    def show(index: int, outcome: FleetJobOutcome) -> None:
-        nonlocal n_done
-        n_done += 1
-        style = {OK: "", REFUSED: "red", FAILED: "red"}.get(outcome.status, "yellow")
-        counter = f"{n_done:{len(str(total))}} of {total}"
-        line = f"{counter}  {entries[index].name:{width}}  {_outcome_text(outcome)}"
-        console.print_lines(line, style=style)
-        if outcome.status != FAILED and outcome.message:
-            console.print_lines(f"        {outcome.message}", style="yellow")
-
     try:
-        outcomes = run_fleet(entries, args.robot, _run_one, args.jobs or os.cpu_count() or 1, show)
+        with console.progress_bar("calibrating robots", total) as progress:
+
+            def show(index: int, outcome: FleetJobOutcome) -> None:
+                nonlocal n_done
+                n_done += 1
+                progress(n_done)
+                if args.verbosity == "verbose":
+                    line = f"{n_done} of {total}: {_robot_text(entries[index], outcome)}"
+                    console.print_lines(line, style=_STYLES.get(outcome.status, "yellow"))
+
+            outcomes = run_fleet(entries, args.robot, _run_one, args.jobs or os.cpu_count() or 1, show)
         contents: dict[PathLike, str | bytes | None] = {args.output: summary_text(entries, outcomes)}
         write_outputs(contents, args.json, _fleet_document(entries, outcomes))
     except KeyboardInterrupt:
@@ -343,8 +343,35 @@ def run_manifest(args: Namespace) -> int:
         console.print_lines(f"dhcal: interrupted; {n_done} of {total} robots are done; no summary written")
         return 130
     n_written = sum(map(_is_written, outcomes))
-    console.print_lines(f"{n_written} of {total} robots calibrated", f"wrote {args.output}")
+    console.show(_fleet_screen(entries, outcomes, args), args.verbosity)
     return 0 if n_written == total else 1
+
+
+# Styles of robots by status, the most severe first.
+_STYLES = {FAILED: "red", REFUSED: "red", CAUTION: "yellow", OK: ""}
+
+
+def _fleet_screen(
+    entries: Sequence[FleetJob], outcomes: Sequence[FleetJobOutcome], args: Namespace
+) -> Screen:
+    """Describe the outcomes; robots that need attention come first."""
+    blocks = []
+    for rank, (status, style) in enumerate(reversed(_STYLES.items())):
+        pairs = zip(entries, outcomes, strict=True)
+        texts = [_robot_text(entry, outcome) for entry, outcome in pairs if outcome.status == status]
+        blocks.append(Block(texts, style, noun=f"robot with status {status}", rank=rank))
+    n_written = sum(map(_is_written, outcomes))
+    text = f"{n_written} of {len(entries)} robots calibrated"
+    return Screen(
+        [*reversed(blocks), Block([f"wrote {args.output}"]), Block([text], "bold", is_verdict=True)]
+    )
+
+
+def _robot_text(entry: FleetJob, outcome: FleetJobOutcome) -> str:
+    """Describe the outcome of one robot, with the reasons and warnings."""
+    text = f"{entry.name}: {_outcome_text(outcome)}"
+    has_notes = outcome.status != FAILED and outcome.message
+    return f"{text}; {outcome.message}" if has_notes else text
 
 
 def _is_written(outcome: FleetJobOutcome) -> bool:

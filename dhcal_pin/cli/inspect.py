@@ -44,6 +44,7 @@ def run(args: Namespace) -> int:
     from ..report.document import file_digests
     from . import console
     from .outputs import existing_sidecars, require_writable_outputs, write_outputs
+    from .result_screens import inspection_screen
 
     if args.columns and not args.robot:
         raise InvalidArgumentError("--columns: needs --robot, as the map names its joints")
@@ -62,9 +63,8 @@ def run(args: Namespace) -> int:
         "inputs": file_digests(inputs),
     }
     write_outputs({}, args.json, document)
+    about = ""
     if chain is not None:
-        robot_file = os.path.basename(args.robot)
-        console.print_lines(f"{robot_file}: tip {chain.tip}, {chain.n_joints} joints")
-    for inspection in inspections:
-        console.print_inspection(inspection)
+        about = f"{os.path.basename(args.robot)}: tip {chain.tip}, {chain.n_joints} joints"
+    console.show(inspection_screen(about, inspections), args.verbosity)
     return 0

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, NoReturn
 
 from ..exceptions import DhcalError
 from ..messages import message_line
-from .options import CommandParser, HelpFormatter
+from .options import CommandParser, HelpFormatter, add_verbosity_options
 
 
 class Command(NamedTuple):
@@ -73,6 +73,7 @@ class _LazyCommandParser(CommandParser):
         module = import_module(f".{self._module}", __package__)
         self.epilog = f"example:\n  {module.EXAMPLE}"
         module.add_arguments(self)
+        add_verbosity_options(self)
         self.set_defaults(run=module.run)
 
 

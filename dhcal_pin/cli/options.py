@@ -195,6 +195,22 @@ def add_urdf_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--package-dir", action="append", default=[], **PACKAGE_DIR)
 
 
+def add_verbosity_options(parser: argparse.ArgumentParser) -> None:
+    """Add --quiet and --verbose, which exclude each other.
+
+    Args:
+        parser: Parser of a command.
+    """
+    group = parser.add_mutually_exclusive_group()
+    for name, text in (
+        ("quiet", "show the verdict only"),
+        ("verbose", "show all tables, notes and warnings (default: one screen)"),
+    ):
+        group.add_argument(
+            f"--{name}", dest="verbosity", action="store_const", const=name, default="normal", help=text
+        )
+
+
 def add_motion_options(parser: argparse.ArgumentParser, joint_units: str) -> None:
     """Add --joint-units and --export, the options of commands that write joint positions.
 

@@ -172,6 +172,7 @@ def run(args: Namespace) -> int:
     from ..units import parse_noise
     from . import console
     from .outputs import existing_sidecars, require_writable_outputs, write_outputs
+    from .result_screens import plan_screen
 
     files = [
         *(args.data or []),
@@ -230,10 +231,7 @@ def run(args: Namespace) -> int:
     if args.html:
         contents[args.html] = _preview(result, chain, space, args)
     write_outputs(contents, args.json, document)
-    console.print_plan(result)
-    is_free = all(result.is_way_free)
-    console.print_lines(*moves, style="" if is_free else "yellow")
-    console.print_lines(*(f"wrote {path}" for path in contents))
+    console.show(plan_screen(result, moves, contents), args.verbosity)
     return 0
 
 

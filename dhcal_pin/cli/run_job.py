@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from .._typing import PathLike
+from .._typing import PathLike, Progress
 from ..calibration import model_selection, partition, procedure, summary
 from ..calibration.cross_validation import leave_regions_out
 from ..calibration.model_selection import FULL_SET, is_restricted
@@ -30,7 +30,6 @@ from ..diagnostics.input_checks import find_value_warnings, poorly_fitted_files
 from ..diagnostics.reachability import UnreachableRow, find_unreachable_rows
 from ..estimation.parameters import select_parameters
 from ..estimation.robust import ZERO_WEIGHT
-from ..estimation.solver import Progress
 from ..exceptions import InvalidArgumentError
 from ..io.measurement_files import MeasurementFile, read_measurement_file
 from ..io.robot import read_robot, urdf_files
@@ -77,6 +76,9 @@ class CalibrationOutcome:
         fit: Result of the calibration.
         document: The same as a JSON document.
         files: Paths of the files written, by what they are.
+        n_rows: Number of rows that were read, by measurement file.
+        fitted: Measurements that were fitted, by file.
+        held_out: Measurements that were held out, each with its file.
         unreachable: Rows that the robot cannot reach, by measurement file; excluded from everything.
         outliers: Lines of outliers, by measurement file.
         rejected: Lines with zero weight in the fit, by measurement file.
@@ -88,6 +90,9 @@ class CalibrationOutcome:
     fit: Result
     document: dict[str, Any]
     files: dict[str, str]
+    n_rows: dict[str, int]
+    fitted: dict[str, Measurement]
+    held_out: list[tuple[str, Measurement]]
     unreachable: dict[str, list[UnreachableRow]]
     outliers: dict[str, list[int]]
     rejected: dict[str, list[int]]
@@ -103,7 +108,7 @@ def run_job(
 
     Args:
         job: Options of the calibration.
-        progress: Callback of the solver, with iteration and cost.
+        progress: Called with the name of the phase, the number of its step and the largest number of steps.
         executor: Where the samples are processed.
 
     Returns:
@@ -127,19 +132,29 @@ def run_job(
         "known": read_instrument(job.instrument) if job.instrument else None,
         "loss": job.loss,
         "max_iterations": job.max_iterations,
-        "progress": progress,
         "executor": executor,
     }
     measurements = list(data.fit.values())
     extend = None if job.extend == "auto" else job.extend
     fit = procedure.calibrate(
-        chain, measurements, sets, method=job.method, extend=extend, **restrictions, **options
+        chain,
+        measurements,
+        sets,
+        method=job.method,
+        extend=extend,
+        progress=progress,
+        **restrictions,
+        **options,
     )
     if job.holdout == REGION:
         without_holdout = restrictions | options | {"holdout": (), "extend": extend}
         fit = leave_regions_out(
-            fit, lambda part: procedure.calibrate(chain, part, sets, method=job.method, **without_holdout)
+            fit,
+            lambda part: procedure.calibrate(chain, part, sets, method=job.method, **without_holdout),
+            progress,
         )
+    if progress:
+        progress("accuracy and verdict", 1, 1)
     fit = replace(
         fit, input_warnings=tuple(f"{p}: {text}" for p, texts in data.warnings.items() for text in texts)
     )
@@ -191,7 +206,18 @@ def run_job(
     document = _job_document(fit, data, outliers, files, source)
     write_outputs(contents, job.json, document)
     return CalibrationOutcome(
-        fit, document, files, data.unreachable, outliers, rejected, data.warnings, data.notes, hint
+        fit=fit,
+        document=document,
+        files=files,
+        n_rows=data.n_rows,
+        fitted=data.fit,
+        held_out=data.holdout,
+        unreachable=data.unreachable,
+        outliers=outliers,
+        rejected=rejected,
+        warnings=data.warnings,
+        notes=data.notes,
+        hint=hint,
     )
 
 
@@ -205,6 +231,7 @@ class _JobData:
     Attributes:
         fit: Measurements to fit, by file.
         holdout: Hold-out measurements with their file.
+        n_rows: Number of rows that were read, by file.
         unreachable: Rows that the robot cannot reach, by file; in neither of the two.
         warnings: Warnings about the input, by file.
         notes: What of the input is not used, by file.
@@ -212,6 +239,7 @@ class _JobData:
 
     fit: dict[str, Measurement]
     holdout: list[tuple[str, Measurement]]
+    n_rows: dict[str, int]
     unreachable: dict[str, list[UnreachableRow]]
     warnings: dict[str, list[str]]
     notes: dict[str, list[str]]
@@ -315,7 +343,8 @@ def _read_data(chain: Chain, job: Job, has_known_frames: bool) -> _JobData:
             f"{', '.join(job.data)}: every row is held out; leave some rows for the fit"
         )
     held_out = [(path, item) for path, item in holdout if len(item.rows)]
-    return _JobData(fitted, held_out, unreachable, warnings, notes)
+    n_rows = {path: len(item.rows) for path, item in by_file.items()}
+    return _JobData(fitted, held_out, n_rows, unreachable, warnings, notes)
 
 
 # --- calibration -----------------------------------------------------------------------------------

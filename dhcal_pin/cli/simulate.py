@@ -77,6 +77,8 @@ def run(args: Namespace) -> int:
     from ..units import parse_noise
     from . import console
     from .outputs import existing_sidecars, require_writable_outputs, write_outputs
+    from .result_screens import files_block
+    from .screen import Screen
 
     robots = [args.robot, *([args.truth] if args.truth else [])]
     require_writable_outputs([args.output], [*robots, *existing_sidecars(robots)])
@@ -103,7 +105,7 @@ def run(args: Namespace) -> int:
         f"simulated {args.kind} of {args.truth or args.robot}{errors}, noise {args.noise}, seed {args.seed}"
     )
     write_outputs({args.output: measurement_text(data, nominal, [comment])})
-    console.print_lines(f"wrote {args.output}")
+    console.show(Screen([files_block([args.output])]), args.verbosity)
     return 0
 
 

@@ -72,7 +72,7 @@ def run(args: Namespace) -> int:
                     journal.append(block)
                     n_done = len(journal.blocks)
                     progress(n_done)
-            _write_results(study, journal, args.output)
+            _write_results(study, journal, args)
     except KeyboardInterrupt:
         if written_files():
             raise
@@ -88,7 +88,7 @@ def _figure_path(output: str) -> str:
     return f"{os.path.splitext(output)[0]}.svg"
 
 
-def _write_results(study: StudyGrid, journal: StudyJournal, output: str) -> None:
+def _write_results(study: StudyGrid, journal: StudyJournal, args: Namespace) -> None:
     """Write table and plot of a finished study, remove its journal, and show the table."""
     from dataclasses import fields  # lazy import, as the following: they load Pinocchio
 
@@ -97,11 +97,11 @@ def _write_results(study: StudyGrid, journal: StudyJournal, output: str) -> None
     from ..visualization.plots import study_svg
     from . import console
     from .outputs import write_outputs
+    from .result_screens import study_screen
 
     header, rows = studies.result_table(study, journal.blocks)
     drawing = study_svg(study.title or "study", header, rows, len(fields(studies.Setting)))
     columns = dict(zip(header, zip(*rows, strict=True), strict=True))
-    contents = {output: csv_text(columns)} | ({_figure_path(output): drawing} if drawing else {})
+    contents = {args.output: csv_text(columns)} | ({_figure_path(args.output): drawing} if drawing else {})
     write_outputs({**contents, journal.path: None})
-    console.print_study(study, header, rows)
-    console.print_lines(*(f"wrote {path}" for path in contents))
+    console.show(study_screen(study, header, rows, contents), args.verbosity)

@@ -87,6 +87,7 @@ def run(args: Namespace) -> int:
     from ..report.workspace_map import map_content
     from . import console
     from .outputs import existing_sidecars, json_path, require_writable_outputs, write_outputs
+    from .result_screens import validation_screen
 
     sidecar = args.sidecar or existing_sidecar(args.robot)
     robots = [args.robot, args.nominal] if args.nominal else [args.robot]
@@ -133,12 +134,15 @@ def run(args: Namespace) -> int:
         document["files"]["map"] = args.map
         contents[args.map] = map_content(args.map, predictor, data, known)
     write_outputs(contents, args.json, document)
-    console.print_validation(f"{args.robot}: accuracy on {document['samples']} samples", accuracies)
-    console.print_lines("", *remarks, *(extrapolation.sentences if extrapolation else ()))
-    console.print_lines(*(f"wrote map: {path}" for path in contents))
-    console.print_notes(notes)
-    for path, texts in warnings.items():
-        console.print_warnings(path, texts)
+    screen = validation_screen(
+        f"{args.robot}: accuracy on {document['samples']} samples",
+        accuracies,
+        [*remarks, *(extrapolation.sentences if extrapolation else ())],
+        notes,
+        warnings,
+        contents,
+    )
+    console.show(screen, args.verbosity)
     return 0
 
 

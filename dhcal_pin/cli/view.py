@@ -74,6 +74,8 @@ def run(args: Namespace) -> int:
     from ..visualization import scene
     from . import console
     from .outputs import existing_sidecars, require_writable_outputs, write_outputs
+    from .result_screens import files_block
+    from .screen import Screen
 
     if args.live and (args.html or args.open):
         raise InvalidArgumentError("--live writes no page; omit --html and --open")
@@ -99,7 +101,7 @@ def run(args: Namespace) -> int:
         triangles=args.simplify,
     )
     write_outputs({page: text})
-    console.print_lines(f"wrote {page}")
+    console.show(Screen([files_block([page])]), args.verbosity)
     if args.open or not args.html:
         console.open_page(page)
     return 0

@@ -285,7 +285,7 @@ def column_table(columns: Sequence[ColumnSummary]) -> Table:
     for _, group in groupby(numeric, _group_key):
         members = list(group)
         first, last = members[0], members[-1]
-        names = first.name if len(members) == 1 else f"{first.name} … {last.name}"
+        names = first.name if len(members) == 1 else f"{first.name} to {last.name}"
         low = min(column.minimum for column in members if column.minimum is not None)
         high = max(column.maximum for column in members if column.maximum is not None)
         limits = [f"{limit:.6g}" if limit is not None else "–" for limit in (first.lower, first.upper)]

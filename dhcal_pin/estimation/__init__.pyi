@@ -15,7 +15,6 @@ from .qr import TriangularSystem as TriangularSystem
 from .robust import LOSSES as LOSSES
 from .robust import Loss as Loss
 from .solver import METHODS as METHODS
-from .solver import Progress as Progress
 from .solver import SolverResult as SolverResult
 from .solver import gauss_newton as gauss_newton
 from .solver import levenberg_marquardt as levenberg_marquardt

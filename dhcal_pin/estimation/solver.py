@@ -57,7 +57,7 @@ from .qr import (
 from .solver_rules import has_diverged, step_is_negligible
 
 # Receives the iteration number and the cost.
-Progress = Callable[[int, float], None]
+IterationCallback = Callable[[int, float], None]
 
 # A loose solution ends when a step changes the rows by less than this fraction of their norm. Noise scales
 # and prior widths estimated there agree with those at the minimum.
@@ -107,7 +107,7 @@ def minimize(
     method: str = "lm",
     x: Array | None = None,
     max_iterations: int = 100,
-    progress: Progress | None = None,
+    progress: IterationCallback | None = None,
     **options: Any,
 ) -> SolverResult:
     """Minimize the cost of a problem.
@@ -195,7 +195,7 @@ def _is_stationary(
 
 
 def gauss_newton(
-    problem: Problem, x: Array, max_iterations: int, progress: Progress | None = None
+    problem: Problem, x: Array, max_iterations: int, progress: IterationCallback | None = None
 ) -> SolverResult:
     """Minimize by undamped steps with a pseudo-inverse: the paper's iteration, equations (37) to (39).
 
@@ -250,7 +250,7 @@ def levenberg_marquardt(
     problem: Problem,
     x: Array,
     max_iterations: int,
-    progress: Progress | None = None,
+    progress: IterationCallback | None = None,
     warm_start: SolverResult | None = None,
     loose: bool = False,
 ) -> SolverResult:

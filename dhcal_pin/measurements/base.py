@@ -134,10 +134,10 @@ class Measurement(ABC):
     def __repr__(self) -> str:
         """Return the kind, the number of samples and the standard deviations."""
         count = len(self.rows)
-        parts = [f"{count} sample{'' if count == 1 else 's'}", *self._description()]
+        parts = [f"{count} sample{'' if count == 1 else 's'}", *self.description()]
         return f"{type(self).__name__}({', '.join(parts)})"
 
-    def _description(self) -> list[str]:
+    def description(self) -> list[str]:
         """Return what `repr` says besides the number of samples."""
         return []
 

@@ -74,8 +74,9 @@ class PointContact(PointMeasurement):
         """Return the names of the samples' points."""
         return {"point": [self.names[i] for i in self.label]}
 
-    def _description(self) -> list[str]:
-        return [f"{len(self.names)} points", *super()._description()]
+    def description(self) -> list[str]:
+        """Return what `repr` says besides the number of samples."""
+        return [f"{len(self.names)} points", *super().description()]
 
     def model(self, points: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return the tool points relative to the touched points, and their derivatives."""

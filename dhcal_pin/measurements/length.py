@@ -129,9 +129,10 @@ class Wires(PointMeasurement):
         count = self.values.shape[1]
         return self.COLUMNS[:1] if count == 1 else self.COLUMNS[1 : count + 1]
 
-    def _description(self) -> list[str]:
+    def description(self) -> list[str]:
+        """Return what `repr` says besides the number of samples."""
         count = self.values.shape[1]
-        return [f"{count} wire{'s' if count > 1 else ''}", *super()._description()]
+        return [f"{count} wire{'s' if count > 1 else ''}", *super().description()]
 
     def _instrument_values(self, u: Array) -> tuple[Array, Array]:
         """Return anchors (w, 3) and offsets (w,) with the unknown ones taken from u."""

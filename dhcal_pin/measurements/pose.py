@@ -90,7 +90,8 @@ class PoseMeasurement(Measurement):
             instrument_parameters=(),
         )
 
-    def _description(self) -> list[str]:
+    def description(self) -> list[str]:
+        """Return what `repr` says besides the number of samples."""
         if not self.has_stated_sigma:
             return ["sigma not stated"]
         return [format_sigma((self.sigma, 1e3, "mm"), (self.rotation_sigma, 180 / np.pi, "deg"))]

@@ -99,7 +99,8 @@ class PointMeasurement(Measurement):
         values = {c.name: self.values[:, i] for i, c in enumerate(columns) if not c.is_implied}
         return values | self.text_values(), {c.sigma_name: self.sigma[:, i] for i, c in enumerate(columns)}
 
-    def _description(self) -> list[str]:
+    def description(self) -> list[str]:
+        """Return what `repr` says besides the number of samples."""
         return [format_sigma((self.sigma, 1e3, "mm")) if self.has_stated_sigma else "sigma not stated"]
 
     @property
@@ -319,8 +320,9 @@ class MultiTargetPosition(PointMeasurement):
         """Return the names of the samples' targets."""
         return {"target": [self.names[i] for i in self.label]}
 
-    def _description(self) -> list[str]:
-        return [f"{len(self.names)} targets", *super()._description()]
+    def description(self) -> list[str]:
+        """Return what `repr` says besides the number of samples."""
+        return [f"{len(self.names)} targets", *super().description()]
 
     def initialized(self, chain: Chain) -> Self:
         """Return a copy in which each further target starts at its mean position in the chain's tool frame.

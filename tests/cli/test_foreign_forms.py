@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from command_line import CALIBRATE, json_of, parse_json, positions_csv
+from command_line import CALIBRATE, json_of, parse_json, positions_csv, unfolded
 
 import dhcal_pin as dh
 from dhcal_pin.exceptions import DhcalError
@@ -222,7 +222,7 @@ def test_bad_rows_are_skipped_on_request(run, robot_folder):
     assert document["parameters"] == expected["parameters"]
     note = "data.csv: 5 lines skipped: 5, 9-11, 15; the first because column 'x': 'nan' is not a finite"
     note += " number"
-    assert note in err
+    assert note in unfolded(err)
     assert note in document["warnings"]
     # The lines of the other rows are those of the file.
     lines = [int(row.split(",")[1]) for row in Path("r.csv").read_text().splitlines()[1:]]

@@ -112,7 +112,7 @@ def test_interrupt_while_the_files_are_saved(run, robot_folder, monkeypatch):
 
 
 def test_interrupt_after_the_files_are_saved(run, robot_folder, monkeypatch):
-    monkeypatch.setattr(console, "print_extension", interrupt)
+    monkeypatch.setattr(console, "show", interrupt)
     status, _, err = run(*CALIBRATE)
     assert (status, "these files are written: out.urdf" in err) == (130, True)
     # The next command of the process starts anew.
@@ -263,7 +263,7 @@ def test_interrupt_of_a_study(run, study, monkeypatch):
         patched.setattr(outputs, "write_outputs", interrupt)
         status, _, err = run(*STUDY)
     assert (status, "s.csv.part contains 4 of 4 blocks; run the same command to resume" in err) == (130, True)
-    monkeypatch.setattr(console, "print_study", interrupt)
+    monkeypatch.setattr(console, "show", interrupt)
     status, _, err = run(*STUDY)
     assert (status, err.splitlines()[-1]) == (
         130,

@@ -1,0 +1,250 @@
+"""What `dhcal calibrate` shows: verdict, input, accuracy, largest corrections, warnings and files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from ..calibration.estimates import Estimate
+from ..calibration.evaluation import Comparison
+from ..calibration.result import Result
+from ..calibration.summary import (
+    DEFINITION_TEXT,
+    GROUP_LABELS,
+    accuracy_table,
+    definition_table,
+    estimate_table,
+    format_share,
+    headline,
+    regressions,
+    small_sample_note,
+)
+from ..calibration.verdict import Verdict
+from ..formatting import Table, format_quantity
+from ..identifiability import EXPECTED, label_unobservable
+from ..io import origin_table
+from ..report.document import short_names
+from .job import Job
+from .run_job import CalibrationOutcome
+from .screen import Block, Screen, list_first
+
+# Number of corrections that are shown.
+N_CORRECTIONS = 5
+
+_VERDICT_STYLES = {"ok": "green", "caution": "yellow", "refused": "red"}
+
+
+def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
+    """Describe the result of a calibration.
+
+    Args:
+        outcome: Result, and what was found in the input.
+        job: Options of the calibration.
+
+    Returns:
+        The screen; its details are the tables of parameters, frames, accuracy and joint origins.
+    """
+    fit = outcome.fit
+    names = short_names([job.robot, *outcome.n_rows])
+    unidentified = [
+        *(label_unobservable(text) for text in fit.unobservable if not text.startswith(EXPECTED)),
+        *(f"poorly identified: {text}" for text in fit.weakly_observable),
+    ]
+    warnings = [f"{names[p]}: warning: {text}" for p, texts in outcome.warnings.items() for text in texts]
+    notes = [f"note: {names[p]}: {text}" for p, texts in outcome.notes.items() for text in texts]
+    hints = [f"hint: {outcome.hint}"] if outcome.hint else []
+    files = [f"wrote {name}: {path}" for name, path in outcome.files.items()]
+    blocks = [
+        Block(_robot_lines(fit, names[job.robot], outcome.document["settings"]["parameters"])),
+        Block(_data_lines(outcome, names), noun="file", rank=7),
+        *_accuracy_blocks(fit),
+        _correction_block(fit),
+        Block(unidentified, "yellow", noun="note on parameters", rank=0, n_kept=0, has_space=True),
+        Block(notes, noun="note on the files", rank=1, n_kept=0),
+        Block(hints, "yellow", noun="hint", rank=2, n_kept=0),
+        Block(list(_row_lines(outcome, names)), "yellow", noun="note on rows", rank=3),
+        Block(warnings, "yellow", noun="warning", rank=4),
+        Block(files, noun="file written", rank=6, has_space=True),
+        *verdict_blocks(fit.verdict, job.force),
+    ]
+    return Screen(blocks, _details(fit))
+
+
+def verdict_blocks(verdict: Verdict, is_forced: bool) -> list[Block]:
+    """Describe a verdict and its reasons.
+
+    Args:
+        verdict: Verdict on a calibration.
+        is_forced: Whether a refused robot is written.
+
+    Returns:
+        Blocks that are the last ones of a screen.
+    """
+    style = _VERDICT_STYLES[verdict.status]
+    text = f"verdict: {verdict.status}"
+    if verdict.is_refused:
+        text += f" ({'written because of --force' if is_forced else 'no robot written; --force overrides'})"
+    reasons = [f"  {reason}" for reason in verdict.reasons]
+    return [
+        Block([text], style, is_verdict=True),
+        Block(reasons, style, noun="reason", rank=8, is_verdict=True),
+    ]
+
+
+# --- input -----------------------------------------------------------------------------------------
+
+
+def _robot_lines(fit: Result, robot: str, sets: str) -> list[str]:
+    """Describe the robot, its tip and its joints, and what was estimated."""
+    first, *_, last = fit.chain.joint_names * 2
+    count = fit.chain.n_joints
+    joints = f"{count} joints from {first} to {last}" if count > 1 else f"joint {first}"
+    families = fit.extension.families if fit.extension else ()
+    added = f"; joint errors added: {', '.join(families)}" if families else ""
+    return [
+        f"{robot}: tip {fit.chain.tip}, {joints}",
+        f"estimated: {sets.replace(',', ', ')} ({len(fit.parameters)} parameters){added}",
+    ]
+
+
+def _data_lines(outcome: CalibrationOutcome, names: Mapping[str, str]) -> list[str]:
+    """Describe each measurement file: rows, kind and standard deviations, and how the rows were used."""
+    lines = []
+    for path, n_rows in outcome.n_rows.items():
+        fitted = [outcome.fitted[path]] if path in outcome.fitted else []
+        held_out = [item for name, item in outcome.held_out if name == path]
+        facts = [f"{n_rows} rows"]
+        for item in [*fitted, *held_out][:1]:
+            facts += [item.kind, *item.description()]
+        counts = {"fitted": fitted, "held out": held_out} if held_out else {}
+        uses = [f"{sum(len(item.rows) for item in items)} {use}" for use, items in counts.items()]
+        lines.append(f"{names[path]}: {', '.join(facts)}{'; ' if uses else ''}{', '.join(uses)}")
+    return lines
+
+
+def _row_lines(outcome: CalibrationOutcome, names: Mapping[str, str]) -> Iterator[str]:
+    """Describe the rows that are not used, and the outliers."""
+    for path, unreachable in outcome.unreachable.items():
+        for item in unreachable:
+            yield f"{names[path]}: line {item.row} is excluded: {item.reason}"
+    for path, rows in outcome.outliers.items():
+        rejected = outcome.rejected[path]
+        if excluded := [row for row in rows if row in rejected]:
+            yield f"{names[path]}: {_count_outliers(excluded)} excluded from the fit"
+        if included := [row for row in rows if row not in rejected]:
+            count = _count_outliers(included)
+            yield f"{names[path]}: {count} kept in the fit; use --loss tukey to down-weight them"
+
+
+def _count_outliers(rows: list[int]) -> str:
+    """Count outliers and name their lines."""
+    plural = "s" if len(rows) > 1 else ""
+    return f"{len(rows)} outlier{plural} (line{plural} {list_first(rows)})"
+
+
+# --- accuracy and corrections ----------------------------------------------------------------------
+
+
+def _accuracy_blocks(fit: Result) -> list[Block]:
+    """Describe the accuracy within the measured region and outside it, before and after."""
+    known = fit.generalization
+    inside = fit.comparisons[0] if fit.comparisons[0].title == "hold-out" else known.cross_validated
+    rows = [
+        *_accuracy_rows(inside, "inside the measured region"),
+        *_accuracy_rows(known.region_holdout, "outside of it"),
+    ]
+    sentences = []
+    for comparison, place, reason in (
+        (inside, "inside the measured region", known.cross_validated_reason),
+        (known.region_holdout, "outside of it", known.region_holdout_reason),
+    ):
+        if comparison is None:
+            sentences.append(f"Accuracy {place}: cannot be said, {reason}.")
+        elif note := small_sample_note(comparison):
+            sentences.append(f"Accuracy {place}: {note}")
+    if rows:
+        covered, unknown = format_share(known.covered_share), format_share(1 - known.reached_share)
+        sentences.append(f"Measured region: {covered} of joint space. Accuracy unknown: {unknown} of it.")
+    else:
+        sentences.append(headline(fit.comparisons).text)
+    if inside is not None and inside.after_without_outliers.groups:
+        group, clean = next(iter(inside.after_without_outliers.groups.items()))
+        rms = format_quantity(clean.rms, clean.unit, clean.rms_std, small=True)
+        plural = "s" if inside.n_outliers > 1 else ""
+        sentences.append(
+            f"Without {inside.n_outliers} outlier{plural} inside: {GROUP_LABELS[group]} {rms} after."
+        )
+    return [
+        Block(Table(["RMS error", "judged on", "before", "after"], rows, 2), has_space=True),
+        Block(sentences),
+        Block(regressions(fit.comparisons), "yellow"),
+    ]
+
+
+def _accuracy_rows(comparison: Comparison | None, place: str) -> Iterator[list[str]]:
+    """Make the rows of one comparison, one per group of errors."""
+    if comparison is None:
+        return
+    for group, after in comparison.after.groups.items():
+        is_region = comparison.title == "region hold-out"
+        judged = "left-out regions" if is_region else f"{after.samples} {comparison.title}"
+        cells = [
+            format_quantity(side.rms, side.unit, side.rms_std, small=True)
+            for side in (comparison.before.groups[group], after)
+        ]
+        yield [f"{group} {place}", judged, *cells]
+
+
+def _correction_block(fit: Result) -> Block:
+    """Describe the largest corrections of the robot, relative to the errors expected beforehand."""
+    corrections = largest_corrections(fit) if fit.shrinkage_factor and not fit.verdict.is_refused else []
+    rows = [
+        [e.name, *(format_quantity(v, e.unit, e.std, small=True) for v in (e.change, e.std))]
+        for e in corrections
+    ]
+    table = Table(["largest corrections", "change", "std"], rows)
+    return Block(table, noun="correction", rank=5, n_kept=min(3, len(rows)), has_space=True)
+
+
+def largest_corrections(fit: Result, count: int = N_CORRECTIONS) -> list[Estimate]:
+    """Choose the largest corrections of a robot.
+
+    Args:
+        fit: Result of a calibration.
+        count: Largest number of corrections.
+
+    Returns:
+        Estimates of parameters of the robot, without base, tool and instruments, in the order of their
+        changes relative to the prior standard deviations.
+    """
+    sizes = np.abs(fit.x) / fit.prior_std
+    estimates = fit.estimates[: len(sizes)]
+    order = [i for i in np.argsort(-sizes, kind="stable") if estimates[i].category == "robot" and sizes[i]]
+    return [estimates[i] for i in order[:count]]
+
+
+# --- details ---------------------------------------------------------------------------------------
+
+
+def _details(fit: Result) -> list[Block]:
+    """Describe everything else: all parameters and where they are defined, accuracy, joint origins."""
+    state = "converged" if fit.converged else "NOT converged"
+    return [
+        Block(fit.extension.sentences if fit.extension else []),
+        Block(accuracy_table(fit.comparisons), title="accuracy", has_space=True),
+        Block(origin_table(fit.chain), title="joint origins in the URDF, in m and rad", has_space=True),
+        Block(estimate_table(fit.estimates), title="parameters", has_space=True),
+        Block([DEFINITION_TEXT], has_space=True),
+        Block(definition_table(fit.estimates), has_space=True),
+        Block(
+            [
+                f"{state} after {fit.iterations} iterations; {fit.n_samples} samples; "
+                f"rank {fit.rank} of {len(fit.parameters)}; condition {fit.condition:.3g}",
+                *(text for text in fit.unobservable if text.startswith(EXPECTED)),
+                headline(fit.comparisons).text,
+            ],
+            has_space=True,
+        ),
+        Block([""]),
+    ]

@@ -1,0 +1,422 @@
+"""What the commands other than `dhcal calibrate` show."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..calibration.evaluation import GROUP_UNITS, Accuracy
+from ..calibration.summary import GROUP_LABELS, STATISTIC_LABELS
+from ..diagnostics.inspection import FileInspection, column_table
+from ..formatting import Table, format_quantity
+from ..io.tables import format_lines
+from ..report.document import short_names
+from .screen import Block, Screen, list_first
+
+if TYPE_CHECKING:
+    from .._typing import Array
+    from ..compensation import Compensation
+    from ..io import TargetPoses
+    from ..paper.jacobian_check import Agreement
+    from ..planning import Plan
+    from ..robot import Chain
+    from ..studies import StudyGrid
+
+
+# Columns of a study that fit on a screen; --verbose shows the others.
+MAIN_STUDY_COLUMNS = (
+    "converged",
+    "iterations",
+    "position_rms[m]",
+    "position_rms_p90[m]",
+    "orientation_rms[rad]",
+)
+
+
+def notes_block(texts: Sequence[str]) -> Block:
+    """Describe notes on a result.
+
+    Args:
+        texts: Notes.
+
+    Returns:
+        Block of the notes.
+    """
+    return Block([f"note: {text}" for text in texts], noun="note", rank=1)
+
+
+def warnings_block(warnings: Mapping[str, Sequence[str]]) -> Block:
+    """Describe warnings about files.
+
+    Args:
+        warnings: Warnings by file.
+
+    Returns:
+        Block of the warnings.
+    """
+    texts = [f"{path}: warning: {text}" for path, items in warnings.items() for text in items]
+    return Block(texts, "yellow", noun="warning", rank=2)
+
+
+def files_block(paths: Iterable[object]) -> Block:
+    """Describe the files that were written.
+
+    Args:
+        paths: Paths.
+
+    Returns:
+        Block of the files.
+    """
+    return Block([f"wrote {path}" for path in paths], noun="file written", rank=3)
+
+
+def validation_screen(
+    title: str,
+    accuracies: Mapping[str, Accuracy],
+    remarks: Sequence[str],
+    notes: Sequence[str],
+    warnings: Mapping[str, Sequence[str]],
+    files: Iterable[str],
+) -> Screen:
+    """Describe the accuracy of a model on measurements.
+
+    Args:
+        title: What was judged.
+        accuracies: Accuracy by the column that shows it.
+        remarks: Sentences on the figures.
+        notes: What of the input is not used.
+        warnings: Warnings by file.
+        files: Files that were written.
+
+    Returns:
+        The screen.
+    """
+    rows = []
+    for group in GROUP_UNITS:
+        columns = [each.groups[group] for each in accuracies.values() if group in each.groups]
+        for key, label in STATISTIC_LABELS.items():
+            cells = [
+                format_quantity(getattr(column, key), column.unit, column.rms_std, small=True)
+                for column in columns
+            ]
+            rows += [[f"{GROUP_LABELS[group]}, {label}", *cells]] if cells else []
+    blocks = [
+        Block(Table(["error", *accuracies], rows), title=title, is_verdict=True),
+        Block(remarks, noun="remark", rank=1, has_space=True),
+        notes_block(notes),
+        warnings_block(warnings),
+        files_block(f"map: {path}" for path in files),
+    ]
+    return Screen(blocks)
+
+
+# --- inspect ---------------------------------------------------------------------------------------
+
+
+def inspection_screen(robot: str, inspections: Sequence[FileInspection]) -> Screen:
+    """Describe what measurement files contain.
+
+    Args:
+        robot: Description of the robot; empty without one.
+        inspections: Content of each file.
+
+    Returns:
+        The screen; its verdict is what is wrong with each file.
+    """
+    first = Block([robot] if robot else [])
+    blocks = [block for inspection in inspections for block in _inspection_blocks(inspection)]
+    if len(inspections) == 1:
+        return Screen([first, *blocks])
+    return Screen([first, *_overview(inspections)], blocks)
+
+
+def _overview(inspections: Sequence[FileInspection]) -> list[Block]:
+    """Describe each of several files in a sentence; those that cannot be read come first."""
+    names = short_names([inspection.path for inspection in inspections])
+    problems, doubtful, others = [], [], []
+    for inspection in inspections:
+        name = names[inspection.path]
+        title = _inspection_title(inspection).replace(inspection.path, name, 1)
+        count = len(inspection.warnings) + len(inspection.bad_rows)
+        if inspection.problem:
+            problems.append(f"{name}: problem: {inspection.problem}")
+        elif count:
+            doubtful.append(f"{title}; {count} warning{'s' if count > 1 else ''}, see --verbose")
+        else:
+            others.append(title)
+    return [
+        Block(problems, "red", noun="file with a problem", rank=2, is_verdict=True, has_space=True),
+        Block(doubtful, "yellow", noun="file with warnings", rank=1, is_verdict=True),
+        Block(others, noun="file without problems", rank=0, is_verdict=True),
+    ]
+
+
+def _inspection_blocks(inspection: FileInspection) -> list[Block]:
+    """Describe what a measurement file contains."""
+    texts = []
+    for column in inspection.columns:
+        if column.counts and column.role != "ignored":
+            counts = [f"{text} ({count} rows)" for text, count in column.counts.items()]
+            texts.append(f"{column.name}: {list_first(counts)}")
+    ignored = [column.name for column in inspection.columns if column.role == "ignored"]
+    if len(ignored) == len(inspection.columns) and not inspection.problem:
+        texts.append("No column is known. With --robot a column map is proposed.")
+    elif ignored and not inspection.column_map:
+        texts.append(f"not used: {', '.join(ignored)}")
+    doubtful = []
+    # With a robot, a warning names them.
+    if inspection.repeated_lines and inspection.configurations is None:
+        doubtful.append(f"lines equal to earlier ones: {format_lines(inspection.repeated_lines)}")
+    reasons = []
+    if bad := inspection.bad_rows:
+        plural = "s" if len(bad) > 1 else ""
+        doubtful.append(f"{len(bad)} row{plural} cannot be used, line{plural} {format_lines(bad)}:")
+        reasons = [f"  line {line}: {reason}" for line, reason in bad.items()]
+    warnings = [f"warning: {text}" for text in inspection.warnings]
+    problems = [f"problem: {inspection.problem}"] if inspection.problem else []
+    is_good = not (bad or warnings or problems or inspection.column_map)
+    verdict = ["No problems found."] if is_good and inspection.configurations is not None else []
+    return [
+        Block([_inspection_title(inspection)], "bold", is_verdict=True, has_space=True),
+        Block(column_table(inspection.columns), noun="column", rank=2, n_kept=3),
+        Block(texts, noun="remark on columns", rank=0),
+        notes_block(inspection.notes),
+        Block(doubtful, "yellow", is_verdict=True),
+        Block(reasons, "yellow", noun="reason", rank=3),
+        Block(warnings, "yellow", noun="warning", rank=4, is_verdict=True),
+        Block(problems, "red", is_verdict=True),
+        Block(
+            inspection.column_map,
+            title="Lines of a column map (--columns); check columns and units:",
+            has_space=True,
+            is_verbatim=True,
+        ),
+        Block(verdict, "green", is_verdict=True),
+    ]
+
+
+def _inspection_title(inspection: FileInspection) -> str:
+    """Return the most important facts on a file in one line."""
+    facts = [
+        inspection.kind or "unknown kind",
+        f"{inspection.rows} rows (lines {inspection.first_line}-{inspection.last_line})",
+    ]
+    if inspection.configurations is not None:
+        facts.append(f"{inspection.configurations} configurations")
+    return f"{inspection.path}: {', '.join([*facts, inspection.form])}"
+
+
+# --- check, plan, compensate, study ----------------------------------------------------------------
+
+
+def crosscheck_screen(robot: str, agreements: Sequence[Agreement]) -> Screen:
+    """Describe how well other computations agree with the error factors of the paper.
+
+    Args:
+        robot: Path of the robot.
+        agreements: One comparison per computation.
+
+    Returns:
+        The screen.
+    """
+    rows = [
+        [
+            agreement.route,
+            str(agreement.columns) if agreement.columns else "",
+            f"{agreement.difference:.1e}",
+            f"{agreement.tolerance:.0e}",
+            "agrees" if agreement.agrees else "DISAGREES",
+        ]
+        for agreement in agreements
+    ]
+    table = Table(["computation", "columns", "difference", "tolerance", "verdict"], rows)
+    title = f"{robot}: largest difference from the error factors of the paper [m, rad]"
+    n_agree = sum(agreement.agrees for agreement in agreements)
+    text = f"{n_agree} of {len(agreements)} computations agree."
+    style = "green" if n_agree == len(agreements) else "red"
+    return Screen([Block(table, title=title), Block([text], style, is_verdict=True)])
+
+
+def plan_screen(plan: Plan, moves: Sequence[str], files: Iterable[object]) -> Screen:
+    """Describe the predicted error over the number of poses, and compare a plan with random poses.
+
+    Args:
+        plan: Plan.
+        moves: Sentences on the moves between the poses.
+        files: Files that were written.
+
+    Returns:
+        The screen.
+    """
+    sizes, count = plan.sizes.tolist(), len(plan.q)
+    random_errors = dict(zip(plan.random_sizes.tolist(), plan.random_errors.tolist(), strict=True))
+    selected = {*random_errors, count, sizes[-1]}
+    selected |= {plan.recommended_size} if plan.recommended_size else set()
+    rows = [
+        [
+            str(size),
+            f"{1e3 * error:.4f}",
+            f"{1e3 * random_errors[size]:.4f}" if size in random_errors else "",
+        ]
+        for size, error in zip(sizes, plan.errors.tolist(), strict=True)
+        if size in selected
+    ]
+    table = Table(["poses", "planned, mm", "random, mm"], rows, n_text_columns=0)
+    percent = round(100 * (1 - plan.relative_error))
+    change = f"{abs(percent)} % {'lower' if percent > 0 else 'higher'}" if percent else "About the same"
+    comparison = f"{change} predicted error {'than' if percent else 'as'} {count} random poses."
+    size = (
+        f"Diminishing returns beyond {plan.recommended_size} poses (less than 1 % per ten)."
+        if plan.recommended_size
+        else f"No diminishing returns up to {sizes[-1]} poses (still at least 1 % per ten)."
+    )
+    curves = [
+        [str(one.n_poses), f"{100 * one.filled_share:.0f} %", f"{1e6 * one.curve_std:.0f}"]
+        for one in plan.curves
+    ]
+    curve_table = Table(["poses", "bins filled", "curve std, µrad"], curves, n_text_columns=0)
+    is_free = all(plan.is_way_free)
+    return Screen(
+        [
+            Block(
+                table,
+                title="predicted RMS position error over the task",
+                noun="number of poses",
+                rank=4,
+                n_kept=4,
+            ),
+            Block(
+                curve_table,
+                title="joint correction curves, RMS of all joints",
+                noun="number of poses",
+                rank=4,
+                n_kept=2,
+                has_space=True,
+            ),
+            notes_block(plan.notes),
+            Block(moves, "" if is_free else "yellow", noun="remark on moves", rank=2),
+            files_block(files),
+            Block([size], has_space=True),
+            Block([comparison], "bold", is_verdict=True),
+        ]
+    )
+
+
+def compensation_screen(
+    frame: str,
+    result: Compensation,
+    chain: Chain,
+    targets: TargetPoses,
+    warnings: Mapping[str, Sequence[str]],
+    hint: str,
+    files: Iterable[object],
+) -> Screen:
+    """Describe how many targets have which status, and the lines of those that are not corrected exactly.
+
+    Args:
+        frame: Sentence on the frame of the targets.
+        result: Corrected targets.
+        chain: Calibrated robot.
+        targets: Targets as read.
+        warnings: Warnings by file.
+        hint: Suggestion; empty if there is none.
+        files: Files that were written.
+
+    Returns:
+        The screen.
+    """
+    from ..compensation import SINGULAR  # lazy import: only this command needs it
+
+    counts, lines = [], []
+    for status in dict.fromkeys(result.status):
+        rows = [row for row, other in enumerate(result.status) if other == status]
+        counts.append(
+            Block(
+                [f"{targets.source}: {len(rows)} of {len(result.status)} {status}"],
+                "" if status == "ok" else "yellow",
+                is_verdict=True,
+            )
+        )
+        if status == "ok":
+            continue
+        items = [
+            f"  line {targets.lines[row]}"
+            if status == SINGULAR
+            else f"  line {targets.lines[row]} ({_distance(result.residual_error[row])} away)"
+            for row in rows
+        ]
+        lines.append(Block(items, "yellow", title=f"{status}:", noun=f"target {status}", rank=1, n_kept=3))
+    notes = list(targets.notes)
+    notes = [f"{targets.source}: {text}" for text in notes]
+    if chain.n_joints > 6:
+        notes.append(
+            f"{chain.n_joints} joints reach a target in many ways, and the corrected targets hold only "
+            "for these joint values; send the joint values to the controller"
+        )
+    elif chain.n_joints < 6 and targets.values.ndim == 3 and not result.reached.all():
+        notes.append(
+            f"{chain.n_joints} joints cannot reach every orientation; omit the orientation from the targets"
+        )
+    hints = [f"hint: {hint}"] if hint else []
+    return Screen(
+        [
+            Block([frame]),
+            *lines,
+            notes_block(notes),
+            warnings_block(warnings),
+            Block(hints, "yellow"),
+            files_block(files),
+            *counts,
+        ]
+    )
+
+
+def _distance(error: Array) -> str:
+    """Format a position and an orientation error, shape (2,) [m, rad]."""
+    angle = np.rad2deg(error[1])
+    return f"{1e3 * error[0]:.3g} mm" + (f", {angle:.3g}°" if angle > 0 else "")
+
+
+def study_screen(
+    study: StudyGrid, header: Sequence[str], rows: Sequence[Sequence[Any]], files: Iterable[object]
+) -> Screen:
+    """Describe the results of a study in mm and degrees, with the settings that differ.
+
+    Args:
+        study: Study.
+        header: Names of the columns, the settings first.
+        rows: Values of the columns, one row per setting.
+        files: Files that were written.
+
+    Returns:
+        The screen; the table of all figures is in its details.
+    """
+    from ..studies import Setting  # lazy import: only this command needs it
+
+    n_settings = len(fields(Setting))
+    varied = [i for i in range(n_settings) if len({row[i] for row in rows}) > 1]
+    # The column behind the settings is the number of calibrations, which is in the title.
+    known = [i for i in range(n_settings + 1, len(header)) if any(row[i] is not None for row in rows)]
+    names = [name.replace("[m]", ", mm").replace("[rad]", ", °").replace("_", " ") for name in header]
+    scales = [1e3 if "[m]" in name else np.rad2deg(1.0) if "[rad]" in name else 1.0 for name in header]
+
+    def table(columns: Sequence[int]) -> Table:
+        cells = [
+            [str(row[i]) for i in varied]
+            + ["" if row[i] is None else f"{row[i] * scales[i]:.3g}" for i in columns]
+            for row in rows
+        ]
+        return Table([names[i] for i in (*varied, *columns)], cells, n_text_columns=len(varied))
+
+    title = f"{study.title or 'study'}: medians over {study.seeds} calibrations per setting"
+    main = [i for i in known if header[i] in MAIN_STUDY_COLUMNS] or known
+    return Screen(
+        [
+            Block(table(main), title=title, noun="setting", rank=0),
+            files_block(files),
+        ],
+        [Block(table(known), title=title)] if main != known else [],
+    )

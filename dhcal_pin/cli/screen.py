@@ -1,0 +1,320 @@
+"""Layout of what a command shows: all of it, or as much as fits on one screen.
+
+A command describes its result as a `Screen`. The default view has at most `HEIGHT` lines of at most `WIDTH`
+columns. Nothing in it is cut off: long texts continue on the next line, and blocks with many items show the
+first ones and the number of the others, which --verbose shows. This module does not print.
+"""
+
+from __future__ import annotations
+
+import unicodedata
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import zip_longest
+from typing import Literal, NamedTuple
+
+from ..formatting import Table
+from ..messages import escape_control_characters
+
+# Views of a screen: the verdict only, one screen, everything.
+Verbosity = Literal["quiet", "normal", "verbose"]
+
+# Size of a small terminal, without the line of the next prompt.
+WIDTH, HEIGHT = 80, 23
+
+# Longest list in a sentence; the files that are written contain all items.
+MAX_LISTED = 12
+
+# Indentation of continuation lines.
+_INDENT = "  "
+# Spaces between the columns of a table.
+_GAP = "  "
+# Smallest width of a column whose texts are folded.
+_MIN_COLUMN = 12
+# A word that is longer than a line continues after one of these characters, if possible.
+_BREAKS = "/\\_-.,:="
+
+
+class Line(NamedTuple):
+    """Line of output with its style, such as "yellow" or "bold"."""
+
+    text: str
+    style: str = ""
+
+
+@dataclass(frozen=True)
+class Block:
+    """Part of a screen: texts or a table.
+
+    Attributes:
+        content: Texts, each on a line of its own, or a table.
+        style: Style, such as "yellow" or "bold".
+        title: Line above the content; it is not shown without content.
+        noun: What an item is, such as "note on the files", for the number of items that are left out; a block
+            without it is never shortened.
+        rank: Blocks of the lowest rank are shortened first.
+        n_kept: Number of items that remain until all blocks are shortened.
+        is_verdict: Whether the block is also shown if only the verdict is asked for.
+        has_space: Whether an empty line precedes the block if there is space for it.
+        is_verbatim: Whether the texts are to be copied, so that no line of them is folded.
+    """
+
+    content: Sequence[str] | Table
+    style: str = ""
+    title: str = ""
+    noun: str = ""
+    rank: int = 0
+    n_kept: int = 1
+    is_verdict: bool = False
+    has_space: bool = False
+    is_verbatim: bool = False
+
+
+@dataclass(frozen=True)
+class Screen:
+    """Result of a command as it is shown.
+
+    Attributes:
+        blocks: What is always shown, shortened to one screen unless everything is asked for.
+        details: What is shown above the blocks if everything is asked for.
+    """
+
+    blocks: Sequence[Block]
+    details: Sequence[Block] = field(default=())
+
+    def lines(self, verbosity: Verbosity, width: int | None = WIDTH) -> list[Line]:
+        """Lay out the screen.
+
+        Args:
+            verbosity: What is shown.
+            width: Largest number of columns; None for texts of any length. The view "normal" is never wider
+                than `WIDTH`.
+
+        Returns:
+            Lines; at most `HEIGHT` for the view "normal" if the blocks that are never shortened allow it.
+        """
+        if verbosity == "quiet":
+            return _full_lines([block for block in self.blocks if block.is_verdict], width)
+        if verbosity == "verbose":
+            return _full_lines([*self.details, *self.blocks], width)
+        return _shortened_lines(self.blocks, min(width or WIDTH, WIDTH), HEIGHT)
+
+
+# --- blocks ----------------------------------------------------------------------------------------
+
+
+class _Part(NamedTuple):
+    """Block that is folded to the width of the screen: heading and items, each several lines of text."""
+
+    block: Block
+    heading: list[str]
+    items: list[list[str]]
+
+    def lines(self, count: int) -> list[Line]:
+        """Return the heading, the first items, and the number of the others."""
+        n_hidden = len(self.items) - count
+        texts = [*self.heading, *(text for item in self.items[:count] for text in item)]
+        if n_hidden:
+            first, *rest = self.block.noun.split(" ")
+            noun = " ".join([first if n_hidden == 1 else f"{first}s", *rest])
+            text = f"{n_hidden}{' more' if count else ''} {noun}; see --verbose"
+            texts = [*texts, _INDENT + text] if count else [text]
+        return [Line(text, self.block.style) for text in texts]
+
+
+def _part(block: Block, width: int | None) -> _Part:
+    """Fold a block."""
+    title = fold(block.title, width) if block.title else []
+    if isinstance(block.content, Table):
+        header, rows = fold_table(block.content, width)
+        return _Part(block, [*title, *header] if rows else [], rows)
+    items = [fold(text, None if block.is_verbatim else width) for text in block.content]
+    return _Part(block, title if items else [], items)
+
+
+def _full_lines(blocks: Sequence[Block], width: int | None) -> list[Line]:
+    """Lay out blocks with all items and empty lines."""
+    parts = [_part(block, width) for block in blocks]
+    return _joined(parts, [len(part.items) for part in parts], has_spaces=True)
+
+
+def _shortened_lines(blocks: Sequence[Block], width: int, height: int) -> list[Line]:
+    """Lay out blocks; leave out items, then empty lines, then more items, until they fit."""
+    parts = [_part(block, width) for block in blocks]
+    counts = [len(part.items) for part in parts]
+    by_rank = sorted((part.block.rank, i) for i, part in enumerate(parts) if part.block.noun)
+    has_spaces = True
+    for is_last in (False, True):
+        for _, i in by_rank:
+            n_kept = 0 if is_last else parts[i].block.n_kept
+            while counts[i] > n_kept and len(_joined(parts, counts, has_spaces)) > height:
+                counts[i] -= 1
+        has_spaces = has_spaces and len(_joined(parts, counts, has_spaces)) <= height
+    return _joined(parts, counts, has_spaces)
+
+
+def _joined(parts: Sequence[_Part], counts: Sequence[int], has_spaces: bool) -> list[Line]:
+    """Join blocks with so many items each."""
+    lines: list[Line] = []
+    for part, count in zip(parts, counts, strict=True):
+        new = part.lines(count)
+        if new and lines and has_spaces and part.block.has_space:
+            lines.append(Line(""))
+        lines += new
+    return lines
+
+
+def list_first(items: Sequence[object]) -> str:
+    """Join the first items of a list and count the others.
+
+    Args:
+        items: Items.
+
+    Returns:
+        Text such as "3, 8, 15 and 4 more".
+    """
+    text = ", ".join(map(str, items[:MAX_LISTED]))
+    return text + (f" and {len(items) - MAX_LISTED} more" if len(items) > MAX_LISTED else "")
+
+
+# --- folding ---------------------------------------------------------------------------------------
+
+
+def cell_width(text: str) -> int:
+    """Count the columns of a terminal that a text takes.
+
+    Args:
+        text: Text on one line.
+
+    Returns:
+        Number of columns: 2 for a wide East Asian character, 0 for a combining one, else 1.
+    """
+    return sum(map(_char_width, text))
+
+
+def _char_width(char: str) -> int:
+    if unicodedata.combining(char):
+        return 0
+    return 2 if unicodedata.east_asian_width(char) in "WF" else 1
+
+
+def fold(text: str, width: int | None, indent: str = _INDENT) -> list[str]:
+    """Fold a text into lines; characters that control a terminal are escaped.
+
+    Args:
+        text: Text; its leading spaces are kept on all lines.
+        width: Largest number of columns; None for one line of any length.
+        indent: Further indentation of continuation lines.
+
+    Returns:
+        Lines with all characters of the text but the spaces between them.
+
+    >>> fold("wrote measurements/a.csv", 16)
+    ['wrote', '  measurements/', '  a.csv']
+    """
+    text = escape_control_characters(text)
+    margin = text[: len(text) - len(text.lstrip(" "))]
+    if width is None or cell_width(text) <= width:
+        return [text]
+    lines, line = [], margin
+    for word in text.split():
+        separator = " " if line.strip() else ""
+        if cell_width(line + separator + word) <= width:
+            line += separator + word
+            continue
+        if separator:
+            lines.append(line)
+            line = margin + indent
+        *full, rest = _split_word(word, width - cell_width(margin + indent))
+        for piece in full:
+            lines.append(line + piece)
+            line = margin + indent
+        line += rest
+    return [*lines, line]
+
+
+def _split_word(word: str, width: int) -> list[str]:
+    """Split a long word into pieces of at most `width` columns, preferably after a character of `_BREAKS`."""
+    pieces = []
+    while cell_width(word) > width:
+        end = 1
+        while cell_width(word[: end + 1]) <= width:
+            end += 1
+        after_break = 1 + max(word.rfind(char, 0, end) for char in _BREAKS)
+        end = after_break if after_break > end // 3 else end
+        pieces.append(word[:end])
+        word = word[end:]
+    return [*pieces, word]
+
+
+def fold_table(table: Table, width: int | None) -> tuple[list[str], list[list[str]]]:
+    """Lay out a table.
+
+    The texts of the header are folded. If the table is still too wide, its text columns are folded; if that
+    is not enough, the last columns follow in a further table below.
+
+    Args:
+        table: Table.
+        width: Largest number of columns of the terminal; None for a table of any width.
+
+    Returns:
+        Lines of the header, and the lines of each row.
+    """
+    n_text = table.n_text_columns
+    header = [escape_control_characters(name) for name in table.header]
+    rows = [[escape_control_characters(cell) for cell in row] for row in table.rows]
+    widths = [max(map(cell_width, column)) for column in zip(header, *rows, strict=True)]
+    if width is None:
+        return _header_lines(header, widths, n_text), [_row_lines(row, widths, n_text) for row in rows]
+    if sum(widths) + len(_GAP) * (len(widths) - 1) > width:
+        words = [max(name.split() or [""], key=cell_width) for name in header]
+        widths = [max(map(cell_width, column)) for column in zip(words, *rows, strict=True)]
+    n_columns = len(header)
+    while n_columns > n_text + 1 and _fixed_width(widths[:n_columns], n_text) > width:
+        n_columns -= 1
+    _narrow(widths, n_text, width - _fixed_width(widths[:n_columns], 0) + sum(widths[:n_text]))
+    heading = _header_lines(header[:n_columns], widths, n_text)
+    items = [_row_lines(row[:n_columns], widths, n_text) for row in rows]
+    if n_columns < len(header):
+        kept = [*range(n_text), *range(n_columns, len(header))]
+        rest = Table([header[i] for i in kept], [[row[i] for i in kept] for row in rows], n_text)
+        below, more = fold_table(rest, width)
+        items += [["", *below, *more[0]], *more[1:]]
+    return heading, items
+
+
+def _fixed_width(widths: Sequence[int], n_text: int) -> int:
+    """Return the width of a table whose text columns are folded as far as possible."""
+    columns = [min(one, _MIN_COLUMN) for one in widths[:n_text]] + list(widths[n_text:])
+    return sum(columns) + len(_GAP) * (len(columns) - 1)
+
+
+def _narrow(widths: list[int], n_text: int, available: int) -> None:
+    """Reduce the widest text columns until all of them take the available columns."""
+    while n_text and sum(widths[:n_text]) > available and max(widths[:n_text]) > _MIN_COLUMN:
+        widths[widths.index(max(widths[:n_text]))] -= 1
+
+
+def _header_lines(header: Sequence[str], widths: Sequence[int], n_text: int) -> list[str]:
+    """Fold the cells of a header; their last lines stand above the rows."""
+    cells = [fold(cell, width, "") for cell, width in zip(header, widths, strict=False)]
+    height = max(map(len, cells))
+    return _grid_lines([[""] * (height - len(cell)) + cell for cell in cells], widths, n_text)
+
+
+def _row_lines(row: Sequence[str], widths: Sequence[int], n_text: int) -> list[str]:
+    """Fold the cells of a row; their first lines stand side by side."""
+    cells = [fold(cell, width, "") for cell, width in zip(row, widths, strict=False)]
+    return _grid_lines(cells, widths, n_text)
+
+
+def _grid_lines(cells: Sequence[Sequence[str]], widths: Sequence[int], n_text: int) -> list[str]:
+    """Join the lines of cells; texts are aligned to the left and numbers to the right."""
+    lines = []
+    for texts in zip_longest(*cells, fillvalue=""):
+        padded = []
+        for i, (text, width) in enumerate(zip(texts, widths, strict=False)):
+            space = " " * (width - cell_width(text))
+            padded.append(text + space if i < n_text else space + text)
+        lines.append(_GAP.join(padded).rstrip())
+    return lines

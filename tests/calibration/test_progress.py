@@ -1,0 +1,46 @@
+"""Progress of a calibration: every phase is named and its steps are counted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from robots import URDF
+
+from dhcal_pin import Chain, Noise, Position, calibrate, read_dh
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return Chain.from_dh(read_dh(URDF / "sim_6dof.dh.toml"))
+
+
+def phases(arm, **options):
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-2.0, 2.0, (60, 6))
+    data = Position.simulate(arm, q, Noise(1e-4, 1e-4), rng)
+    calls = []
+    calibrate(arm, data, progress=lambda *call: calls.append(call), **options)
+    assert all(1 <= step <= total for _, step, total in calls)
+    for name in {name for name, _, _ in calls}:
+        steps = [step for phase, step, _ in calls if phase == name]
+        # A phase that comes again starts from its first step.
+        assert all(b in (a + 1, 1) for a, b in zip(steps, steps[1:], strict=False))
+    return {name: total for name, _, total in calls}
+
+
+def test_phases_of_a_calibration(arm):
+    assert phases(arm) == {"fit": 100, "robust weights": 30, "joint error families": 3}
+
+
+def test_geometry_alone(arm):
+    assert phases(arm, extend="none", max_iterations=50) == {"fit": 50, "robust weights": 30}
+
+
+def test_left_out_regions(arm):
+    found = phases(arm, extend="none", holdout="region")
+    assert set(found) == {"fit", "robust weights", "left-out regions"}
+    assert found["left-out regions"] >= 5
+
+
+def test_gauss_newton(arm):
+    assert phases(arm, method="gn") == {"fit": 100}

@@ -1,0 +1,190 @@
+"""Default output: one screen of 80 x 24, whatever the robot, the kind, the names and the result."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import CALIBRATE, positions_csv, stdout_of, unfolded
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from robots import URDF
+
+from dhcal_pin.cli.screen import HEIGHT, WIDTH, Block, Screen, cell_width, fold
+from dhcal_pin.formatting import Table
+from dhcal_pin.measurements import KINDS
+
+ARMS = ("experiment.dh.toml", "sim_6dof.dh.toml", "scara.urdf", "planar_2r.urdf")
+# Folders and names that are much longer than a line.
+LONG_FOLDER = "/".join(["measurements of the cell behind the second press"] * 4)
+
+
+def assert_fits(err):
+    """The text has the size of one screen, and nothing in it is cut off."""
+    lines = err.splitlines()
+    assert len(lines) <= 24, err
+    assert max(map(cell_width, lines), default=0) <= 80, err
+    assert not re.search(r"\.\.\.|…", err), err
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_calibrations_of_all_kinds(run, robot_folder, kind):
+    arm = URDF / "experiment.dh.toml"
+    stdout_of(run("simulate", arm, "--errors", "1mm,0.3deg", "-m", 40, "--kind", kind, "-o", "k.csv"))
+    status, _, err = run("calibrate", arm, "k.csv", "-o", "o.urdf", "--extend", "none", "--force")
+    assert status == 0, err
+    assert_fits(err)
+    lines = err.splitlines()
+    assert any(line.startswith("verdict: ") for line in lines)
+    assert f"k.csv: {len(Path('k.csv').read_text().splitlines()) - 2} rows, {kind}" in unfolded(err)
+
+
+@pytest.mark.parametrize("arm", [path.name for path in sorted(URDF.glob("*.urdf"))[:6]])
+def test_calibrations_of_several_robots(run, robot_folder, arm):
+    stdout_of(run("simulate", URDF / arm, "--errors", "1mm,0.3deg", "-m", 40, "-o", "d.csv"))
+    command = ("calibrate", URDF / arm, "d.csv", "-o", "o.urdf", "--holdout", "0.3", "--force")
+    status, _, err = run(*command)
+    assert status == 0, err
+    assert_fits(err)
+
+
+@pytest.mark.parametrize("n_files", [1, 40])
+def test_long_paths_and_many_files(run, robot_folder, n_files):
+    folder = Path(LONG_FOLDER)
+    folder.mkdir(parents=True)
+    names = [str(folder / f"{'position of the reflector ' * 4}{i}.csv") for i in range(n_files)]
+    for i, name in enumerate(names):
+        # One row of each file is far off.
+        Path(name).write_text(positions_csv(20, seed=i, wrong=(3,)))
+    outputs = ("-o", folder / "out.urdf", "--report", folder / "r.html", "--json", folder / "r.json")
+    status, _, err = run("calibrate", "arm.dh.toml", *names, *outputs)
+    assert status == 0, err
+    assert_fits(err)
+    assert "verdict: " in err
+    if n_files > 1:
+        assert re.search(r"\d+ more files?; see --verbose", err)
+        assert re.search(r"\d+ (more )?notes? on rows; see --verbose", err)
+    for command in (("inspect", *names, "--robot", "arm.dh.toml"), ("validate", "arm.dh.toml", *names)):
+        status, _, err = run(*command)
+        assert status == 0
+        assert_fits(err)
+
+
+def test_a_refusal_with_many_warnings(run, robot_folder):
+    """Forty copied rows, twenty wrong ones, and a column that is not known."""
+    lines = positions_csv(60, wrong=range(1, 21)).splitlines()
+    rows = [f"{line},x" for line in [*lines[1:], *lines[1:41]]]
+    Path("data.csv").write_text("\n".join([f"{lines[0]},remark", *rows]))
+    status, _, err = run(*CALIBRATE, "--max-iterations", "1")
+    assert status == 3
+    assert_fits(err)
+    head, reasons = err.split("verdict: refused (no robot written; --force overrides)\n")
+    assert "did not converge" in unfolded(reasons)
+    assert "wrote" not in head
+    # The same command shows the rest.
+    full = run(*CALIBRATE, "--max-iterations", "1", "--verbose")[2]
+    assert len(full) > 2 * len(err)
+    assert "see --verbose" not in full
+
+
+def test_views(run, robot_folder):
+    normal, quiet, verbose = (run(*CALIBRATE, *options)[2] for options in ((), ("--quiet",), ("--verbose",)))
+    assert quiet == "verdict: ok\n"
+    assert_fits(normal)
+    for words in ("arm.dh.toml: tip ", "3 joints from joint_1 to joint_3", "data.csv: 20 rows, position"):
+        assert words in normal
+        assert words in verbose
+    for title in ("parameters", "accuracy", "joint origins in the URDF, in m and rad"):
+        assert f"\n{title}\n" in verbose
+    # Each parameter has a row with its value, and a place in the table of its frame.
+    for name in ("theta1", "alpha3", "base.x", "tool.z"):
+        assert len(re.findall(rf"(?<!\w){re.escape(name)}(?!\w)", verbose)) >= 2 or name not in verbose
+    assert "theta1" in verbose
+    assert run("calibrate", "--quiet", "--verbose")[0] == 2
+
+
+def test_corrections_are_ordered_by_their_size(run, robot_folder):
+    err = run(*CALIBRATE)[2].splitlines()
+    start = next(i for i, line in enumerate(err) if line.startswith("largest corrections"))
+    rows = [line.split() for line in err[start + 1 : start + 6]]
+    assert all(len(row) == 5 for row in rows)
+    # Lengths have priors of 5 mm or less and angles of 1 degree or less; the largest come first.
+    relative = [abs(float(row[1])) / (5 if row[2] == "mm" else 17.5) for row in rows]
+    assert relative[0] == max(relative)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("check", "arm.dh.toml"),
+        ("plan", "arm.urdf", "-n", 12, "--candidates", 60, "-o", "poses.csv"),
+        ("simulate", "arm.urdf", "-m", 5, "-o", "s.csv"),
+        ("convert", "arm.dh.toml", "converted.urdf"),
+        ("view", "arm.urdf", "--html", "scene.html"),
+        ("demo",),
+    ],
+    ids=lambda command: command[0],
+)
+def test_other_commands(run, robot_folder, command):
+    status, _, err = run(*command)
+    assert status == 0, err
+    assert_fits(err)
+    # Nothing but the verdict, if there is one.
+    assert len(run(*command, "--quiet")[2].splitlines()) <= 1
+
+
+def test_targets_out_of_reach(run, robot_folder):
+    far = "\n".join(f"{1000 + i},{i},9000" for i in range(50))
+    Path("targets.csv").write_text(f"x[mm],y[mm],z[mm]\n{far}\n")
+    status, _, err = run("compensate", "arm.urdf", "arm.urdf", "targets.csv", "-o", "c.csv")
+    assert status == 0, err
+    assert_fits(err)
+    assert "more targets out of reach; see --verbose" in err
+
+
+TEXTS = st.text("abc/ 你é-=\x1b\u0301", min_size=0, max_size=300)
+TABLES = st.integers(1, 4).flatmap(
+    lambda n: st.builds(
+        Table,
+        st.lists(TEXTS, min_size=n + 2, max_size=n + 2),
+        st.lists(st.lists(st.text("ab_/.", max_size=60), min_size=n + 2, max_size=n + 2), max_size=30),
+        st.integers(1, n),
+    )
+)
+NUMBER_TABLE = Table(["name", "value"], [["a" * i, "1.25 mm"] for i in range(60)])
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.one_of(st.lists(TEXTS, max_size=30), st.just(NUMBER_TABLE)), max_size=8))
+def test_any_screen_fits(contents):
+    blocks = [Block(content, noun="item", rank=i % 3) for i, content in enumerate(contents)]
+    lines = Screen([*blocks, Block(["verdict: ok"])]).lines("normal")
+    assert len(lines) <= HEIGHT
+    assert max(cell_width(line.text) for line in lines) <= WIDTH
+    assert lines[-1].text == "verdict: ok"
+
+
+@given(TEXTS, st.integers(8, 40))
+def test_folding_keeps_all_characters(text, width):
+    lines = fold(text, width)
+    assert all(cell_width(line) <= width for line in lines)
+    plain = fold(text, None)[0]
+    assert "".join("".join(lines).split()) == "".join(plain.split())
+
+
+def test_a_table_that_is_too_wide_continues_below():
+    table = Table(["name", *(f"column {i}" for i in range(20))], [["arm", *["123.456"] * 20]] * 3)
+    lines = [line.text for line in Screen([Block(table)]).lines("verbose", WIDTH)]
+    assert max(map(len, lines)) <= WIDTH
+    assert sum(line.count("123.456") for line in lines) == 60
+    assert sum(line.startswith("arm") for line in lines) == 3 * sum(line.startswith("name") for line in lines)
+
+
+def test_a_shortened_list_counts_the_others():
+    numbers = np.arange(50).astype(str).tolist()
+    lines = [line.text for line in Screen([Block(numbers, noun="file")]).lines("normal")]
+    assert lines == [*numbers[: HEIGHT - 1], f"  {50 - HEIGHT + 1} more files; see --verbose"]
+    everything = Screen([Block(numbers, noun="file")]).lines("verbose")
+    assert [line.text for line in everything] == numbers
