@@ -11,14 +11,12 @@ from ..calibration.evaluation import Comparison
 from ..calibration.result import Result
 from ..calibration.summary import (
     DEFINITION_TEXT,
-    GROUP_LABELS,
     accuracy_table,
     definition_table,
     estimate_table,
     format_share,
     headline,
     regressions,
-    small_sample_note,
 )
 from ..calibration.verdict import Verdict
 from ..formatting import Table, format_quantity
@@ -47,10 +45,16 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
     """
     fit = outcome.fit
     names = short_names([job.robot, *outcome.n_rows])
-    unidentified = [
-        *(label_unobservable(text) for text in fit.unobservable if not text.startswith(EXPECTED)),
-        *(f"poorly identified: {text}" for text in fit.weakly_observable),
-    ]
+    is_refused = fit.verdict.is_refused
+    # The parameters of a refused robot have no meaning.
+    unidentified = (
+        []
+        if is_refused
+        else [
+            *(label_unobservable(text) for text in fit.unobservable if not text.startswith(EXPECTED)),
+            *(f"poorly identified: {text}" for text in fit.weakly_observable),
+        ]
+    )
     warnings = [f"{names[p]}: warning: {text}" for p, texts in outcome.warnings.items() for text in texts]
     notes = [f"note: {names[p]}: {text}" for p, texts in outcome.notes.items() for text in texts]
     hints = [f"hint: {outcome.hint}"] if outcome.hint else []
@@ -65,7 +69,8 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
         Block(hints, "yellow", noun="hint", rank=2, n_kept=0),
         Block(list(_row_lines(outcome, names)), "yellow", noun="note on rows", rank=3),
         Block(warnings, "yellow", noun="warning", rank=4),
-        Block(files, noun="file written", rank=6, has_space=True),
+        Block(files, noun="file written", rank=6),
+        Block([] if is_refused else [headline(fit.comparisons).text], "bold", has_space=True),
         *verdict_blocks(fit.verdict, job.force),
     ]
     return Screen(blocks, _details(fit))
@@ -87,7 +92,7 @@ def verdict_blocks(verdict: Verdict, is_forced: bool) -> list[Block]:
         text += f" ({'written because of --force' if is_forced else 'no robot written; --force overrides'})"
     reasons = [f"  {reason}" for reason in verdict.reasons]
     return [
-        Block([text], style, is_verdict=True),
+        Block([text], style, is_verdict=True, has_space=verdict.is_refused),
         Block(reasons, style, noun="reason", rank=8, is_verdict=True),
     ]
 
@@ -154,27 +159,17 @@ def _accuracy_blocks(fit: Result) -> list[Block]:
         *_accuracy_rows(inside, "inside the measured region"),
         *_accuracy_rows(known.region_holdout, "outside of it"),
     ]
-    sentences = []
-    for comparison, place, reason in (
-        (inside, "inside the measured region", known.cross_validated_reason),
-        (known.region_holdout, "outside of it", known.region_holdout_reason),
-    ):
-        if comparison is None:
-            sentences.append(f"Accuracy {place}: cannot be said, {reason}.")
-        elif note := small_sample_note(comparison):
-            sentences.append(f"Accuracy {place}: {note}")
+    sentences = [
+        f"Accuracy {place}: cannot be said, {reason}."
+        for comparison, place, reason in (
+            (inside, "inside the measured region", known.cross_validated_reason),
+            (known.region_holdout, "outside of it", known.region_holdout_reason),
+        )
+        if comparison is None
+    ]
     if rows:
         covered, unknown = format_share(known.covered_share), format_share(1 - known.reached_share)
         sentences.append(f"Measured region: {covered} of joint space. Accuracy unknown: {unknown} of it.")
-    else:
-        sentences.append(headline(fit.comparisons).text)
-    if inside is not None and inside.after_without_outliers.groups:
-        group, clean = next(iter(inside.after_without_outliers.groups.items()))
-        rms = format_quantity(clean.rms, clean.unit, clean.rms_std, small=True)
-        plural = "s" if inside.n_outliers > 1 else ""
-        sentences.append(
-            f"Without {inside.n_outliers} outlier{plural} inside: {GROUP_LABELS[group]} {rms} after."
-        )
     return [
         Block(Table(["RMS error", "judged on", "before", "after"], rows, 2), has_space=True),
         Block(sentences),
@@ -242,7 +237,6 @@ def _details(fit: Result) -> list[Block]:
                 f"{state} after {fit.iterations} iterations; {fit.n_samples} samples; "
                 f"rank {fit.rank} of {len(fit.parameters)}; condition {fit.condition:.3g}",
                 *(text for text in fit.unobservable if text.startswith(EXPECTED)),
-                headline(fit.comparisons).text,
             ],
             has_space=True,
         ),

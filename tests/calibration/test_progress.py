@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from robots import URDF
@@ -24,7 +26,7 @@ def phases(arm, **options):
     for name in {name for name, _, _ in calls}:
         steps = [step for phase, step, _ in calls if phase == name]
         # A phase that comes again starts from its first step.
-        assert all(b in (a + 1, 1) for a, b in zip(steps, steps[1:], strict=False))
+        assert all(b in (a + 1, 1) for a, b in pairwise(steps))
     return {name: total for name, _, total in calls}
 
 
