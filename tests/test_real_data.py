@@ -43,7 +43,7 @@ def dhcal(tmp_path, capsys):
     def call(command, robot, *args):
         """Run a command that must succeed; return its JSON."""
         out = tmp_path / "result.json"
-        status = main.main([command, *map(str, (robot, *args, "--json", out))])
+        status = main.main([command, *map(str, (robot, *args, "--json", out, "--verbose"))])
         captured = capsys.readouterr()
         assert status == 0, captured.err
         warnings = [line for line in captured.err.splitlines() if ": warning: " in line]

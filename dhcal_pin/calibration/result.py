@@ -60,12 +60,14 @@ from .evaluation import (
     PairedErrors,
     accuracy,
     compute_errors,
+    error_group,
     fit_nominal,
     remove_outliers,
 )
 from .model_selection import Extension
 from .partition import configuration_groups, k_fold
 from .residual_table import ResidualTable, residual_table
+from .result_plots import ResultPlots
 from .verdict import Verdict, judge
 
 # Stated standard deviations are rejected if the reduced cost exceeds 1 by this many standard deviations.
@@ -85,7 +87,7 @@ MIN_FREEDOM_RATIO = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Result:
+class Result(ResultPlots):
     """Calibrated robot with the uncertainty of its parameters and its accuracy.
 
     Attributes:
@@ -443,6 +445,28 @@ class Result:
     def residuals(self) -> ResidualTable:
         """Residuals of all fitted and held-out samples with their files, lines and weights."""
         return residual_table(self)
+
+    @cached_property
+    def error_norms(self) -> dict[str, tuple[Array, Array]]:
+        """Error norms of all samples before and after, shape (N,) each, by group [m or rad].
+
+        The samples are in the order of `residuals`: first the fitted ones, outliers included, then the
+        held-out ones. Samples without a group have NaN.
+        """
+        nominal, instruments = self._nominal
+        counts = [len(item.rows) for item in (*self.data, *self.holdout)]
+        starts = np.cumsum([0, *counts])
+        norms: dict[str, tuple[Array, Array]] = {}
+        for side, chain, known in ((0, nominal, instruments), (1, self.chain, self.instruments)):
+            errors = [
+                error for data in (self.data, self.holdout) for error in compute_errors(chain, data, known)
+            ]
+            for start, groups in zip(starts, errors, strict=False):
+                for name, values in groups.items():
+                    empty = np.full((2, starts[-1]), np.nan)
+                    sides = norms.setdefault(error_group(name), (empty[0], empty[1]))
+                    sides[side][start : start + len(values)] = np.linalg.norm(values, axis=1)
+        return norms
 
     @property
     def transferable_instruments(self) -> dict[str, float]:

@@ -65,7 +65,7 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
         *_accuracy_blocks(fit),
         _correction_block(fit),
         Block(unidentified, "yellow", noun="note on parameters", rank=0, n_kept=0, has_space=True),
-        Block(notes, noun="note on the files", rank=1, n_kept=0),
+        Block(notes, noun="note on the files", rank=1),
         Block(hints, "yellow", noun="hint", rank=2, n_kept=0),
         Block(list(_row_lines(outcome, names)), "yellow", noun="note on rows", rank=3),
         Block(warnings, "yellow", noun="warning", rank=4),

@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -43,6 +44,9 @@ from .exchange import (
 from .information import Information, add_joint_scatter
 from .refinement import DesignGoal, refine
 from .tour import find_tour
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 # Margins to the joint limits [rad] and [m].
 MARGIN_ANGLE, MARGIN_LENGTH = np.deg2rad(2.0), 5e-3
@@ -125,6 +129,28 @@ class Plan:
     def relative_error(self) -> float:
         """Predicted error divided by that of as many random poses."""
         return self.error / self.random_error
+
+    def plot_curve(self, ax: Axes | None = None) -> Axes:
+        """Plot the predicted error over the number of poses, of planned and of random ones.
+
+        Example:
+            `plan.plot_curve().figure.savefig("poses.png")`
+
+        Args:
+            ax: Axes to draw into; a new figure if None.
+
+        Returns:
+            The axes.
+        """
+        from ..visualization.plots import plot_plan_curve  # lazy import: matplotlib is slow to load
+
+        return plot_plan_curve(
+            (self.sizes, self.errors),
+            (self.random_sizes, self.random_errors),
+            (len(self.q), self.error),
+            self.recommended_size,
+            ax,
+        )
 
     def expected_error(self, q: Array) -> float:
         """Predict the RMS position error over the task after measuring at other configurations.

@@ -6,8 +6,8 @@ Every plot function draws into the axes `ax`, or into a new figure if `ax` is No
     ax.figure.savefig("errors.png")
 
 Arguments are in SI units; the axes show mm, mrad and degrees. No function uses `matplotlib.pyplot`, so plots
-do not depend on a display or on figures of the caller. This is the only module that imports matplotlib. The
-imports are inside functions, because they take about 0.4 s and most commands draw nothing.
+do not depend on a display or on figures of the caller. Only this module and `fit_plots` import matplotlib.
+The imports are inside functions, because they take about 0.4 s and most commands draw nothing.
 
 `svg_panels` draws plots for a web page. The SVG is the same for the same data on every machine: identifiers
 are hashed with a fixed salt, no date is written, and the layout is computed with the font that is part of
@@ -57,7 +57,7 @@ COLORS = {
     "level-5": "#fee838",
 }
 # Half width of a 95 % band in standard deviations.
-_BAND_SIGMAS = 1.96
+BAND_SIGMAS = 1.96
 # Number of levels of a map, from small to large standard deviations.
 N_LEVELS = 6
 # Colours of the lines of a study (Okabe and Ito) and the line styles of each further round of colours.
@@ -72,17 +72,17 @@ SQUARE_PANEL = (420.0, 406.0)
 _LEFT, _RIGHT, _TOP, _BOTTOM = 50.0, 10.0, 10.0, 36.0
 
 # Line style of the nominal robot: distinguishes it where colours do not.
-_DASHED = (0, (2.5, 1.6))
+DASHED = (0, (2.5, 1.6))
 # Largest number of dots of one series.
-_MAX_DOTS = 800
+MAX_DOTS = 800
 # Series with fewer dots are drawn with larger dots.
 _MAX_LARGE_DOTS = 100
 # Diameter of small and large dots [pt].
-_DOT_SIZES = (3.0, 5.0)
+DOT_SIZES = (3.0, 5.0)
 # Largest number of bins of a histogram.
 _MAX_BINS = 28
 # The axis of a histogram is logarithmic if the medians before and after differ by more than this factor.
-_MAX_MEDIAN_RATIO = 4.0
+MAX_MEDIAN_RATIO = 4.0
 # Number of parts of a joint's range with a median each, and fewest samples of a part.
 _MEDIAN_PARTS, _MIN_PART_SAMPLES = 12, 5
 # Cells along each side of a map.
@@ -157,9 +157,9 @@ def plot_error_histogram(
     from matplotlib.ticker import MaxNLocator
 
     ax = _axes(ax)
-    factor, shown_unit = _shown_unit(unit)
+    factor, unit_name = shown_unit(unit)
     before, after = factor * np.asarray(before), factor * np.asarray(after)
-    edges, is_log = _histogram_edges(before, after)
+    edges, is_log = histogram_edges(before, after)
     for state, values in (("before", before), ("after", after)):
         counts = np.histogram(np.clip(values, edges[0], edges[-1]), edges)[0]
         ax.stairs(
@@ -169,24 +169,32 @@ def plot_error_histogram(
             facecolor=(COLORS[state], 0.2),
             edgecolor=COLORS[state],
             linewidth=1.5,
-            linestyle=_DASHED if state == "before" else "-",
+            linestyle=DASHED if state == "before" else "-",
             label=state,
         )
     if is_log:
-        _make_logarithmic(ax, "x")
-    ax.set(xlabel=f"{quantity}, {shown_unit}", ylabel="samples", xlim=(edges[0], edges[-1]))
+        make_logarithmic(ax, "x")
+    ax.set(xlabel=f"{quantity}, {unit_name}", ylabel="samples", xlim=(edges[0], edges[-1]))
     ax.set_ylim(0.0, max(5.0, ax.get_ylim()[1]))
     ax.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     return ax
 
 
-def _histogram_edges(before: Array, after: Array) -> tuple[Array, bool]:
-    """Return the edges of the bins, and whether they are spaced logarithmically."""
+def histogram_edges(before: Array, after: Array) -> tuple[Array, bool]:
+    """Choose the bins of histograms of the errors before and after a calibration.
+
+    Args:
+        before: Error norms of the nominal robot, shape (m,).
+        after: Error norms of the calibrated robot, shape (m,).
+
+    Returns:
+        Edges of the bins, and whether they are spaced logarithmically.
+    """
     errors = np.concatenate([before, after])
     high = float(errors.max()) or 1.0
     n_bins = min(_MAX_BINS, max(8, len(after) // 3))
     small, large = sorted((float(np.median(before)), float(np.median(after))))
-    if large <= _MAX_MEDIAN_RATIO * small or small == large:
+    if large <= MAX_MEDIAN_RATIO * small or small == large:
         return np.linspace(0.0, high, n_bins + 1), False
     low = max(float(np.quantile(errors, 0.01)), 1e-6 * high)
     return np.geomspace(low, high, n_bins + 1), True
@@ -212,17 +220,17 @@ def plot_errors_by_sample(
         The axes.
     """
     ax = _axes(ax)
-    factor, shown_unit = _shown_unit(unit)
+    factor, unit_name = shown_unit(unit)
     n_samples = sum(len(numbers) for numbers, _ in samples.values())
     for role, (numbers, errors) in samples.items():
         if role == "outlier":
-            size, limit = _DOT_SIZES[1], len(numbers)
+            size, limit = DOT_SIZES[1], len(numbers)
         else:
-            size, limit = _DOT_SIZES[n_samples < _MAX_LARGE_DOTS], 2 * _MAX_DOTS
+            size, limit = DOT_SIZES[n_samples < _MAX_LARGE_DOTS], 2 * MAX_DOTS
         chosen = evenly_spaced_indices(len(numbers), limit)
         color = COLORS[sample_color(role, has_holdout="hold-out" in samples)]
-        _plot_dots(ax, numbers[chosen], factor * errors[chosen], color, size, label=role)
-    ax.set(xlabel="sample", ylabel=f"{quantity}, {shown_unit}")
+        plot_dots(ax, numbers[chosen], factor * errors[chosen], color, size, label=role)
+    ax.set(xlabel="sample", ylabel=f"{quantity}, {unit_name}")
     ax.set_ylim(bottom=0.0)
     return ax
 
@@ -267,11 +275,11 @@ def plot_errors_over_joint(
         The axes.
     """
     ax = _axes(ax)
-    scale, angle = _shown_joint_unit(is_prismatic)
-    factor, shown_unit = _shown_unit(unit)
-    chosen = evenly_spaced_indices(len(values), _MAX_DOTS)
-    size = _DOT_SIZES[len(chosen) < _MAX_LARGE_DOTS]
-    _plot_dots(ax, scale * values[chosen], factor * errors[chosen], COLORS["sample"], size, label="sample")
+    scale, angle = shown_joint_unit(is_prismatic)
+    factor, unit_name = shown_unit(unit)
+    chosen = evenly_spaced_indices(len(values), MAX_DOTS)
+    size = DOT_SIZES[len(chosen) < _MAX_LARGE_DOTS]
+    plot_dots(ax, scale * values[chosen], factor * errors[chosen], COLORS["sample"], size, label="sample")
     edges = np.linspace(values.min(), values.max(), _MEDIAN_PARTS + 1)
     part = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, _MEDIAN_PARTS - 1)
     full = [k for k in range(_MEDIAN_PARTS) if np.sum(part == k) >= _MIN_PART_SAMPLES]
@@ -279,7 +287,7 @@ def plot_errors_over_joint(
         centres = 0.5 * (edges[:-1] + edges[1:])[full]
         medians = np.array([np.median(errors[part == k]) for k in full])
         ax.plot(scale * centres, factor * medians, color=COLORS["after"], label="median")
-    ax.set(xlabel=f"{joint}, {angle}", ylabel=f"{quantity}, {shown_unit}")
+    ax.set(xlabel=f"{joint}, {angle}", ylabel=f"{quantity}, {unit_name}")
     ax.set_ylim(bottom=0.0)
     return ax
 
@@ -307,8 +315,8 @@ def plot_joint_offsets(
         The axes.
     """
     ax = _axes(ax)
-    scale, angle = _shown_joint_unit(is_prismatic)
-    factor, shown_unit = _shown_unit("m" if is_prismatic else "rad")
+    scale, angle = shown_joint_unit(is_prismatic)
+    factor, unit_name = shown_unit("m" if is_prismatic else "rad")
     ax.axhline(0.0, color=COLORS["text"], linewidth=1.0)
     for state, (value, std) in offsets.items():
         ax.errorbar(
@@ -316,16 +324,16 @@ def plot_joint_offsets(
             factor * value,
             yerr=2 * factor * std,
             color=COLORS[state],
-            linestyle=_DASHED if state == "before" else "-",
+            linestyle=DASHED if state == "before" else "-",
             marker="o",
-            markersize=_DOT_SIZES[0] + 1,
+            markersize=DOT_SIZES[0] + 1,
             markeredgewidth=0,
             label=state,
         )
     if limit is None:
         limit = max(float(np.max(np.abs(value) + 2 * std)) for value, std in offsets.values())
     half = 1.05 * factor * limit or 1.0
-    ax.set(xlabel=f"{joint}, {angle}", ylabel=f"joint error, {shown_unit}", ylim=(-half, half))
+    ax.set(xlabel=f"{joint}, {angle}", ylabel=f"joint error, {unit_name}", ylim=(-half, half))
     return ax
 
 
@@ -356,23 +364,23 @@ def plot_joint_corrections(
     from matplotlib.ticker import MaxNLocator
 
     ax = _axes(ax)
-    scale, angle = _shown_joint_unit(is_prismatic=False)
-    factor, shown_unit = _shown_unit("rad")
+    scale, angle = shown_joint_unit(is_prismatic=False)
+    factor, unit_name = shown_unit("rad")
     for number, (low, high) in enumerate(gaps):
         label = "_" * bool(number) + "not measured"
         ax.axvspan(scale * low, scale * high, color=COLORS["unknown"], linewidth=0, label=label)
     ax.axhline(0.0, color=COLORS["text"], linewidth=1.0)
-    largest = np.abs(correction) + _BAND_SIGMAS * std
+    largest = np.abs(correction) + BAND_SIGMAS * std
     if limit is None:
         limit = float(np.max(largest[np.isfinite(largest)], initial=0.0))
     half = 1.05 * factor * limit or 1.0
     # An infinite standard deviation fills the height of the axes.
-    reach = np.minimum(_BAND_SIGMAS * factor * std, 4 * half)
+    reach = np.minimum(BAND_SIGMAS * factor * std, 4 * half)
     x, middle = scale * values, factor * correction
     band = ax.fill_between(x, middle - reach, middle + reach, linewidth=0, label="95 % band")
     band.set_facecolor((COLORS["after"], 0.25))
     ax.plot(x, middle, color=COLORS["after"], linewidth=1.2, label="correction")
-    ax.set(xlabel=f"{joint}, {angle}", ylabel=f"correction, {shown_unit}")
+    ax.set(xlabel=f"{joint}, {angle}", ylabel=f"correction, {unit_name}")
     ax.set(xlim=(x[0], x[-1]), ylim=(-half, half))
     # Steps of 90°, 45°, 30° and the like.
     ax.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 1.5, 3, 4.5, 9, 10]))
@@ -394,16 +402,56 @@ def plot_singular_values(singular_values: Array, rank: int, ax: Axes | None = No
     # Exact zeros are drawn at this ratio, below every rounding error.
     ratios = np.maximum(singular_values / singular_values[0], 1e-18)
     numbers = np.arange(1, len(ratios) + 1)
-    _plot_dots(ax, numbers[:rank], ratios[:rank], COLORS["after"], _DOT_SIZES[1], label="observable")
+    plot_dots(ax, numbers[:rank], ratios[:rank], COLORS["after"], DOT_SIZES[1], label="observable")
     if rank < len(ratios):
         ax.axhline(RANK_RTOL, color=COLORS["outlier"], linewidth=1.0, linestyle=":")
-        _plot_dots(
-            ax, numbers[rank:], ratios[rank:], COLORS["outlier"], _DOT_SIZES[1], label="not observable"
-        )
+        plot_dots(ax, numbers[rank:], ratios[rank:], COLORS["outlier"], DOT_SIZES[1], label="not observable")
     ax.set(xlabel="direction", ylabel="relative to the largest", xlim=(0, len(ratios) + 1))
     lowest = min(float(ratios.min()), 0.1)
-    _make_logarithmic(ax, "y")
+    make_logarithmic(ax, "y")
     ax.set_ylim(10.0 ** math.floor(math.log10(lowest)), 2.0)
+    return ax
+
+
+def plot_plan_curve(
+    planned: tuple[Array, Array],
+    random: tuple[Array, Array],
+    chosen: tuple[int, float],
+    recommended_size: int | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Plot the predicted error over the number of poses.
+
+    Args:
+        planned: Numbers of planned poses (c,) and predicted RMS position error of each (c,) [m].
+        random: Numbers of random poses (d,) and predicted error of each (d,) [m].
+        chosen: Number of poses of the plan and their predicted error [m].
+        recommended_size: Number of poses with diminishing returns, if any.
+        ax: Axes to draw into; a new figure if None.
+
+    Returns:
+        The axes.
+    """
+    ax = _axes(ax)
+    ax.plot(
+        random[0],
+        1e3 * np.asarray(random[1]),
+        "s",
+        color=COLORS["before"],
+        linestyle=DASHED,
+        markersize=DOT_SIZES[1],
+        label="random poses",
+    )
+    ax.plot(
+        planned[0], 1e3 * np.asarray(planned[1]), color=COLORS["after"], linewidth=2.0, label="planned poses"
+    )
+    plot_dots(ax, np.array([chosen[0]]), 1e3 * np.array([chosen[1]]), COLORS["after"], 8.0, label="this plan")
+    if recommended_size:
+        ax.axvline(recommended_size, color=COLORS["text"], linestyle=":", linewidth=1.2, label="recommended")
+    make_logarithmic(ax, "x")
+    make_logarithmic(ax, "y")
+    ax.set(xlabel="measured poses", ylabel="predicted position error, mm RMS")
+    ax.legend(frameon=False)
     return ax
 
 
@@ -435,7 +483,7 @@ def plot_position_std_map(
     _fill_cells(ax, corners[~np.isfinite(cell_std)], size, COLORS["unknown"])
     if measured is not None and len(measured):
         chosen = measured[evenly_spaced_indices(len(measured), _MAX_MAP_SAMPLES)][:, columns]
-        _plot_dots(ax, chosen[:, 0], chosen[:, 1], COLORS["measured"], 2.4, label="measured samples")
+        plot_dots(ax, chosen[:, 0], chosen[:, 1], COLORS["measured"], 2.4, label="measured samples")
     _show_plane(ax, points[:, columns], plane)
     return ax
 
@@ -509,17 +557,17 @@ def plot_arms(
     columns = ["xyz".index(name) for name in plane]
     shown = [points[:, columns] for points in arms.values()]
     if samples is not None and len(samples):
-        chosen = samples[evenly_spaced_indices(len(samples), _MAX_DOTS)][:, columns]
-        size = _DOT_SIZES[len(chosen) < _MAX_LARGE_DOTS]
-        _plot_dots(ax, chosen[:, 0], chosen[:, 1], COLORS["sample"], size, label="samples")
+        chosen = samples[evenly_spaced_indices(len(samples), MAX_DOTS)][:, columns]
+        size = DOT_SIZES[len(chosen) < _MAX_LARGE_DOTS]
+        plot_dots(ax, chosen[:, 0], chosen[:, 1], COLORS["sample"], size, label="samples")
         shown.append(chosen)
     for state, points in arms.items():
         ax.plot(
             *points[:, columns].T,
             color=COLORS[state],
-            linestyle=_DASHED if state == "before" else "-",
+            linestyle=DASHED if state == "before" else "-",
             marker="o",
-            markersize=_DOT_SIZES[1],
+            markersize=DOT_SIZES[1],
             markeredgewidth=0,
             label=state,
         )
@@ -589,16 +637,16 @@ def plot_study(
             color=STUDY_COLORS[color],
             linestyle=STUDY_LINE_STYLES[cycle % len(STUDY_LINE_STYLES)],
             marker="o",
-            markersize=_DOT_SIZES[0] + 1,
+            markersize=DOT_SIZES[0] + 1,
             markeredgewidth=0,
             label=label,
         )
     ax.set(title=title, xlabel=header[abscissa].replace("_", " "), ylabel="median")
     errors = np.maximum(points[:, 1], floor)
     if 0 < points[:, 0].min() and points[:, 0].max() > _MIN_LOG_RATIO_X * points[:, 0].min():
-        _make_logarithmic(ax, "x")
+        make_logarithmic(ax, "x")
     if 0 < errors.min() and errors.max() > _MIN_LOG_RATIO_Y * errors.min():
-        _make_logarithmic(ax, "y")
+        make_logarithmic(ax, "y")
     elif errors.min() >= 0:
         ax.set_ylim(bottom=0.0)
     return ax
@@ -837,34 +885,82 @@ def _svg_tree(figure: Figure, key: str) -> ElementTree.Element:
 
 
 # --- shared by the plots ----------------------------------------------------------------------------
-def _axes(ax: Axes | None) -> Axes:
-    if ax is not None:
-        return ax
+def new_axes(n_panels: int = 1, size: tuple[float, float] = (6.4, 3.6)) -> list[Axes]:
+    """Create axes in the style of this package, in a new figure that does not depend on a display.
+
+    Args:
+        n_panels: Number of axes, at most three in a row.
+        size: Width and height of each [inch].
+
+    Returns:
+        Axes.
+    """
+    import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    return Figure(layout="constrained").add_subplot()
+    n_across = min(3, n_panels)
+    n_down = math.ceil(n_panels / n_across)
+    with mpl.rc_context(_RC_PARAMS):
+        figure = Figure((size[0] * n_across, size[1] * n_down), layout="constrained")
+        panels = list(figure.subplots(n_down, n_across, squeeze=False).flat)
+    for unused in panels[n_panels:]:
+        unused.set_axis_off()
+    return panels[:n_panels]
 
 
-def _shown_unit(unit: str) -> tuple[float, str]:
-    """Return factor and name of the unit in which errors are shown."""
+def _axes(ax: Axes | None) -> Axes:
+    return ax if ax is not None else new_axes()[0]
+
+
+def shown_unit(unit: str) -> tuple[float, str]:
+    """Return the unit in which errors are shown.
+
+    Args:
+        unit: SI unit.
+
+    Returns:
+        Factor from the SI unit, and name.
+    """
     factor, name = SMALL_UNITS[unit]
     return factor, name.strip()
 
 
-def _shown_joint_unit(is_prismatic: bool) -> tuple[float, str]:
-    """Return factor and name of the unit in which joint positions are shown."""
+def shown_joint_unit(is_prismatic: bool) -> tuple[float, str]:
+    """Return the unit in which joint positions are shown.
+
+    Args:
+        is_prismatic: Whether the joint positions are lengths.
+
+    Returns:
+        Factor from the SI unit, and name.
+    """
     factor, name = UNITS["m" if is_prismatic else "rad"]
     return factor, name.strip()
 
 
-def _plot_dots(ax: Axes, x: Array, y: Array, color: str, size: float, label: str) -> None:
+def plot_dots(ax: Axes, x: Array, y: Array, color: str, size: float, label: str) -> None:
+    """Plot dots.
+
+    Args:
+        ax: Axes to draw into.
+        x: Horizontal coordinates, shape (m,).
+        y: Vertical coordinates, shape (m,).
+        color: Colour.
+        size: Diameter [pt].
+        label: Text in the legend.
+    """
     ax.plot(
         x, y, "o", color=color, alpha=0.8, markersize=size, markeredgewidth=0, linestyle="none", label=label
     )
 
 
-def _make_logarithmic(ax: Axes, name: Literal["x", "y"]) -> None:
-    """Make an axis logarithmic, with plain numbers at 1, 2 and 5 in each decade if there are few decades."""
+def make_logarithmic(ax: Axes, name: Literal["x", "y"]) -> None:
+    """Make an axis logarithmic, with plain numbers at 1, 2 and 5 in each decade if there are few decades.
+
+    Args:
+        ax: Axes.
+        name: Axis.
+    """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     axis = ax.xaxis if name == "x" else ax.yaxis

@@ -122,7 +122,9 @@ def expected(run, robot_folder):
 def calibrate(run, *options):
     """Calibrate with the only file data.*; return the JSON document and the output for people."""
     (path,) = [path.name for path in Path().iterdir() if path.name.startswith("data.")]
-    status, out, err = run("calibrate", "arm.dh.toml", path, *CALIBRATE[3:], "--json", "-", *options)
+    status, out, err = run(
+        "calibrate", "arm.dh.toml", path, *CALIBRATE[3:], "--json", "-", "--verbose", *options
+    )
     assert status == 0, err
     return parse_json(out), err
 

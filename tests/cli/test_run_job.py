@@ -257,7 +257,8 @@ def test_unreachable_rows_are_excluded_by_file(run, robot_folder):
     Path("two.csv").write_text(positions_csv(10, 2, wrong=[5, 9]))
     Path("three.csv").write_text(positions_csv(8, 3))
     status, out, err = run(
-        *("calibrate", "arm.dh.toml", "one.csv", "two.csv", "three.csv", "-o", "out.urdf", "--json", "-")
+        *("calibrate", "arm.dh.toml", "one.csv", "two.csv", "three.csv", "-o", "out.urdf", "--json", "-"),
+        "--verbose",
     )
     document = parse_json(out)
     assert status == 0

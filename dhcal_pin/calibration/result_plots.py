@@ -1,0 +1,245 @@
+"""Plots and tables that a result makes of itself.
+
+The drawing code is in `visualization`, above this package. It is imported when a method is called.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, cast
+
+from .. import formatting
+from .._typing import Array
+from ..exceptions import InvalidArgumentError
+from .summary import generalization_lines, headline
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from .result import Result
+
+
+class ResultPlots:
+    """Methods of `Result` that draw or tabulate it.
+
+    Every plot is drawn into the axes `ax`, or into a new figure if `ax` is None, and the axes are returned:
+
+        ax = fit.plot_accuracy()
+        ax.figure.savefig("accuracy.png")
+
+    A notebook shows the figure of the axes, `fit.plot_accuracy().figure`.
+    """
+
+    @property
+    def _result(self) -> Result:
+        return cast("Result", self)
+
+    def plot_accuracy(self, ax: Axes | None = None, *, group: str | None = None) -> Axes:
+        """Plot the error before and after: RMS as a dot, and a line up to the 95th percentile.
+
+        Example:
+            `fit.plot_accuracy().figure.savefig("accuracy.png")`
+
+        Args:
+            ax: Axes to draw into; a new figure if None.
+            group: "position", "orientation" or "residual"; the first that was measured if None.
+
+        Returns:
+            The axes.
+        """
+        from ..visualization import fit_plots  # lazy import: matplotlib is slow to load
+
+        return fit_plots.plot_accuracy(self._result, ax, group=group)
+
+    def plot_residuals(
+        self, ax: Axes | None = None, *, over: str | Array = "sample", group: str | None = None
+    ) -> Axes:
+        """Plot the errors of all samples before and after, fitted and held-out ones on the same axes.
+
+        Example:
+            `fit.plot_residuals(over="elbow_joint").figure.savefig("elbow.png")`
+
+        Args:
+            ax: Axes to draw into; a new figure if None.
+            over: "sample" (in the order of the files), "histogram", the name of a joint, or a number per
+                sample, shape (N,), such as the time [s]; fitted samples come first, as in `residuals`.
+            group: "position", "orientation" or "residual"; the first that was measured if None.
+
+        Returns:
+            The axes.
+        """
+        from ..visualization import fit_plots  # lazy import: matplotlib is slow to load
+
+        return fit_plots.plot_residuals(self._result, ax, over=over, group=group)
+
+    def plot_joint_corrections(self, ax: Sequence[Axes] | None = None) -> list[Axes]:
+        """Plot the correction curve of each joint with its 95 % band and the gaps between measurements.
+
+        Example:
+            `fit.plot_joint_corrections()[0].figure.savefig("curves.png")`
+
+        Args:
+            ax: Axes to draw into, one per joint with a curve; a new figure if None.
+
+        Returns:
+            The axes, one per joint with harmonics.
+
+        Raises:
+            InvalidArgumentError: No joint has a correction curve, or the number of axes is another one.
+        """
+        from ..diagnostics.curves import joint_curves  # lazy import, as the following
+        from ..visualization import plots
+
+        curves = joint_curves(self._result)
+        if not curves:
+            raise InvalidArgumentError(
+                "no joint has a correction curve; estimate harmonics with parameters or extend"
+            )
+        panels = plots.new_axes(len(curves), (3.6, 2.6)) if ax is None else list(ax)
+        if len(panels) != len(curves):
+            raise InvalidArgumentError(f"ax: {len(panels)} axes; expected one per curve, {len(curves)}")
+        for panel, curve in zip(panels, curves, strict=True):
+            coverage = curve.coverage
+            plots.plot_joint_corrections(
+                curve.values,
+                curve.correction,
+                curve.std,
+                panel,
+                gaps=coverage.gaps,
+                joint=coverage.joint,
+            )
+        return panels
+
+    def plot_parameters(self, ax: Axes | None = None, *, count: int = 40) -> Axes:
+        """Plot the corrections of the robot with two standard deviations, relative to their priors.
+
+        Example:
+            `fit.plot_parameters().figure.savefig("parameters.png")`
+
+        Args:
+            ax: Axes to draw into; a new figure if None.
+            count: Largest number of parameters; those with the largest corrections are drawn.
+
+        Returns:
+            The axes.
+        """
+        from ..visualization import fit_plots  # lazy import: matplotlib is slow to load
+
+        return fit_plots.plot_parameters(self._result, ax, count=count)
+
+    def plot_singular_values(self, ax: Axes | None = None) -> Axes:
+        """Plot the singular values of the whitened Jacobian relative to the largest one.
+
+        Example:
+            `fit.plot_singular_values().figure.savefig("singular_values.png")`
+
+        Args:
+            ax: Axes to draw into; a new figure if None.
+
+        Returns:
+            The axes.
+        """
+        from ..visualization import fit_plots  # lazy import: matplotlib is slow to load
+
+        return fit_plots.plot_singular_values(self._result, ax)
+
+    def plot_correlation(self, ax: Axes | None = None) -> Axes:
+        """Plot the correlation matrix of all estimated parameters.
+
+        Example:
+            `fit.plot_correlation().figure.savefig("correlation.png")`
+
+        Args:
+            ax: Axes to draw into; a new figure if None.
+
+        Returns:
+            The axes.
+        """
+        from ..visualization import fit_plots  # lazy import: matplotlib is slow to load
+
+        return fit_plots.plot_correlation(self._result, ax)
+
+    def plot_workspace(self, ax: Axes | None = None, *, plane: str = "xz") -> Axes:
+        """Plot a map of the predicted standard deviation of the tool position, with the measured positions.
+
+        Example:
+            `fit.plot_workspace(plane="xy").figure.savefig("map.png")`
+
+        Args:
+            ax: Axes to draw into; a new figure if None.
+            plane: Horizontal and vertical coordinate in the base frame: "xy", "xz" or "yz".
+
+        Returns:
+            The axes.
+        """
+        from ..diagnostics.workspace import predict_workspace  # lazy import, as the following
+        from ..visualization import fit_plots
+
+        workspace = predict_workspace(self._result, self._result.inliers)
+        return fit_plots.plot_workspace(workspace.points, workspace.std, workspace.measured, ax, plane=plane)
+
+    def to_dataframe(self) -> Any:
+        """Return the estimates of all parameters as a `pandas.DataFrame`, one row per parameter.
+
+        Example:
+            `fit.to_dataframe().sort_values("change").to_csv("parameters.csv")`
+
+        Returns:
+            Data frame with the name of the parameter as index and the attributes of `Estimate` as columns, in
+            SI units.
+
+        Raises:
+            InvalidArgumentError: pandas is not installed.
+        """
+        try:
+            import pandas as pd  # lazy import: an optional package
+        except ModuleNotFoundError:
+            raise InvalidArgumentError("to_dataframe: pandas is not installed; pip install pandas") from None
+        rows = [
+            {
+                "name": e.name,
+                "unit": e.unit,
+                "nominal": e.nominal,
+                "value": e.value,
+                "change": e.change,
+                "std": e.std,
+                "prior": e.prior,
+                "observability": e.observability,
+                "fixed": e.fixed,
+                "category": e.category,
+                "frame": e.frame,
+                "direction": e.direction,
+            }
+            for e in self._result.estimates
+        ]
+        return pd.DataFrame(rows).set_index("name")
+
+    def summary(self) -> str:
+        """Summarize the result in a few sentences: verdict, accuracy, where it holds, and what was estimated.
+
+        Example:
+            `print(fit.summary())`
+
+        Returns:
+            Text of several lines.
+        """
+        fit = self._result
+        count = len(fit.parameters)
+        lines = [
+            f"Verdict: {fit.verdict.status}.",
+            *fit.verdict.reasons,
+            headline(fit.comparisons).text,
+            *generalization_lines(fit.generalization, fit.comparisons),
+            f"{count} parameters from {fit.n_samples} samples; {fit.rank} combinations are identifiable; "
+            f"{'converged' if fit.converged else 'NOT converged'} after {fit.iterations} iterations.",
+        ]
+        largest = sorted(
+            (e for e in fit.estimates if e.category == "robot" and not e.fixed and e.change),
+            key=lambda e: -abs(e.change) * e.posterior_to_prior_std / e.std if e.std else 0.0,
+        )[:5]
+        if largest:
+            texts = [
+                f"{e.name} {formatting.format_quantity(e.change, e.unit, e.std, small=True)}" for e in largest
+            ]
+            lines.append(f"Largest corrections: {', '.join(texts)}.")
+        return "\n".join(lines)
