@@ -44,6 +44,7 @@ from ..measurements.arguments import as_measurements
 from ..measurements.base import InstrumentParameter, Measurement
 from ..measurements.measured_region import MeasuredRegion
 from ..plausibility.mixups import Diagnosis, diagnose_mixups
+from ..result_plots import ResultPlots
 from ..robot.chain import Chain
 from . import summary
 from .cross_validation import (
@@ -67,7 +68,6 @@ from .evaluation import (
 from .model_selection import Extension
 from .partition import configuration_groups, k_fold
 from .residual_table import ResidualTable, residual_table
-from .result_plots import ResultPlots
 from .verdict import Verdict, judge
 
 # Stated standard deviations are rejected if the reduced cost exceeds 1 by this many standard deviations.

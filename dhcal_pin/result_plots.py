@@ -8,15 +8,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, cast
 
-from .. import formatting
-from .._typing import Array
-from ..exceptions import InvalidArgumentError
-from .summary import generalization_lines, headline
+from . import formatting
+from ._typing import Array
+from .calibration.summary import generalization_lines, headline
+from .exceptions import InvalidArgumentError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from .result import Result
+    from .calibration.result import Result
 
 
 class ResultPlots:
@@ -47,7 +47,7 @@ class ResultPlots:
         Returns:
             The axes.
         """
-        from ..visualization import fit_plots  # lazy import: matplotlib is slow to load
+        from .visualization import fit_plots  # lazy import: matplotlib is slow to load
 
         return fit_plots.plot_accuracy(self._result, ax, group=group)
 
@@ -68,7 +68,7 @@ class ResultPlots:
         Returns:
             The axes.
         """
-        from ..visualization import fit_plots  # lazy import: matplotlib is slow to load
+        from .visualization import fit_plots  # lazy import: matplotlib is slow to load
 
         return fit_plots.plot_residuals(self._result, ax, over=over, group=group)
 
@@ -87,8 +87,8 @@ class ResultPlots:
         Raises:
             InvalidArgumentError: No joint has a correction curve, or the number of axes is another one.
         """
-        from ..diagnostics.curves import joint_curves  # lazy import, as the following
-        from ..visualization import plots
+        from .diagnostics.curves import joint_curves  # lazy import, as the following
+        from .visualization import plots
 
         curves = joint_curves(self._result)
         if not curves:
@@ -123,7 +123,7 @@ class ResultPlots:
         Returns:
             The axes.
         """
-        from ..visualization import fit_plots  # lazy import: matplotlib is slow to load
+        from .visualization import fit_plots  # lazy import: matplotlib is slow to load
 
         return fit_plots.plot_parameters(self._result, ax, count=count)
 
@@ -139,7 +139,7 @@ class ResultPlots:
         Returns:
             The axes.
         """
-        from ..visualization import fit_plots  # lazy import: matplotlib is slow to load
+        from .visualization import fit_plots  # lazy import: matplotlib is slow to load
 
         return fit_plots.plot_singular_values(self._result, ax)
 
@@ -155,7 +155,7 @@ class ResultPlots:
         Returns:
             The axes.
         """
-        from ..visualization import fit_plots  # lazy import: matplotlib is slow to load
+        from .visualization import fit_plots  # lazy import: matplotlib is slow to load
 
         return fit_plots.plot_correlation(self._result, ax)
 
@@ -172,8 +172,8 @@ class ResultPlots:
         Returns:
             The axes.
         """
-        from ..diagnostics.workspace import predict_workspace  # lazy import, as the following
-        from ..visualization import fit_plots
+        from .diagnostics.workspace import predict_workspace  # lazy import, as the following
+        from .visualization import fit_plots
 
         workspace = predict_workspace(self._result, self._result.inliers)
         return fit_plots.plot_workspace(workspace.points, workspace.std, workspace.measured, ax, plane=plane)
