@@ -190,7 +190,7 @@ def _before_and_after(comparison: Comparison) -> str:
     """Return the most important RMS error before and after."""
     group, after = next(iter(comparison.after.groups.items()))
     before_text, after_text = (
-        format_quantity(side.rms, side.unit, after.rms_std, small=True)
+        format_quantity(side.rms, side.unit, side.rms_std, small=True)
         for side in (comparison.before.groups[group], after)
     )
     return f"{before_text} before, {after_text} after"

@@ -156,13 +156,13 @@ def _accuracy_blocks(fit: Result) -> list[Block]:
     known = fit.generalization
     inside = fit.comparisons[0] if fit.comparisons[0].title == "hold-out" else known.cross_validated
     rows = [
-        *_accuracy_rows(inside, "inside the measured region"),
+        *_accuracy_rows(inside, "in the measured region"),
         *_accuracy_rows(known.region_holdout, "outside of it"),
     ]
     sentences = [
         f"Accuracy {place}: cannot be said, {reason}."
         for comparison, place, reason in (
-            (inside, "inside the measured region", known.cross_validated_reason),
+            (inside, "in the measured region", known.cross_validated_reason),
             (known.region_holdout, "outside of it", known.region_holdout_reason),
         )
         if comparison is None

@@ -180,7 +180,7 @@ def test_accuracy_within_and_beyond_the_measured_region(run, robot_folder):
     shown = [float(row[i]) for row in rows for i in (-4, -2)]
     expected = [1e3 * value for value in figures.values()]
     assert shown == pytest.approx(expected, rel=0.05)
-    assert "position inside the measured region  60 cross-validated" in err
+    assert "position in the measured region  60 cross-validated" in err
     assert f"Measured region: {format_share(document['covered_share'])} of joint space." in err
 
 
