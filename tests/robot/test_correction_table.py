@@ -128,7 +128,9 @@ def test_calibrate_writes_the_table(capsys, tmp_path, monkeypatch, arm):
     status, err = run(*command)
     assert status == 0, err
     assert Path("curves.csv").read_text() == "joint,value[deg],correction[deg]\n"
-    assert "warning: the table of --curves has no rows, because no joint has harmonics" in " ".join(err.split())
+    assert "warning: the table of --curves has no rows, because no joint has harmonics" in " ".join(
+        err.split()
+    )
     before = Path("a.csv").read_text()
     status, err = run(*command[:-1], "a.csv")
     assert status == 2
