@@ -101,7 +101,7 @@ class Interruption:
         assert status == 0, Path("stderr").read_text()
 
     def _in_child(self, function: Callable[[], int], kill_after: float = 0, number: int = 0) -> int:
-        """Run a function in a session of its own until all its processes have ended; return its status."""
+        """Run a function in a child process, wait for all processes it started, and return its status."""
         child = os.fork()
         if not child:
             os.setsid()

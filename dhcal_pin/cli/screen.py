@@ -154,7 +154,7 @@ def _shortened_lines(blocks: Sequence[Block], width: int, height: int) -> list[L
 
 
 def _joined(parts: Sequence[_Part], counts: Sequence[int], has_spaces: bool) -> list[Line]:
-    """Join blocks with so many items each."""
+    """Join the first items of each block; `counts` has their numbers."""
     lines: list[Line] = []
     for part, count in zip(parts, counts, strict=True):
         new = part.lines(count)

@@ -146,13 +146,13 @@ class MeasuredRegion:
 
 
 def _is_drawn(count: int) -> Array:
-    """Draw the configurations that represent so many; return their mask (count,)."""
+    """Draw a random part of `count` configurations that represents all of them; return its mask (count,)."""
     n_drawn = max(1, min(MAX_CONFIGURATIONS, count // 2))
     return np.random.default_rng(0).permutation(count) < n_drawn
 
 
 def _thinned(q: Array) -> Array:
-    """Return every k-th configuration (m, n), at most as many as quantiles of distances need."""
+    """Return evenly spaced rows of q (m, n), at most `MAX_DISTANCES`."""
     return q[:: max(1, -(-len(q) // MAX_DISTANCES))]
 
 

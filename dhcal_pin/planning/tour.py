@@ -30,7 +30,7 @@ from ..robot.sampling import scale_joint_units, shortest_tour
 
 # Largest change of a joint between two configurations that are checked, in the units of `scale_joint_units`.
 MAX_STEP_RAD = np.deg2rad(1.0)
-# Every so many steps are checked first, because most collisions are longer.
+# Interval of the steps that are checked first. Most collisions extend over more steps.
 COARSE_STRIDE = 8
 # Additional distance of two poses between which a move collides: longer than any move.
 DETOUR_RAD = 100.0

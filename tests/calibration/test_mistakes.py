@@ -163,17 +163,17 @@ MISTAKES = {
 }
 
 
-def measure_with_mistake(name: str, robot: str, seed: int) -> tuple[Chain, Measurement, Measurement]:
-    """Return the nominal arm, its measurements, and the same with a mistake."""
+def measure_with_mistake(name: str, robot: str, seed: int) -> tuple[Chain, Measurement]:
+    """Return the nominal arm and measurements with a mistake."""
     rng = np.random.default_rng([seed, *robot.encode()])
     chain, mistake = arm(robot), MISTAKES[name]
     true = with_errors(chain, 2e-3, np.deg2rad(0.3), rng)
     data = mistake.kind.simulate(true, configurations(chain, int(rng.integers(30, 100)), rng), NOISE, rng)
-    return chain, data, mistake.apply(data)
+    return chain, mistake.apply(data)
 
 
 def is_named(name: str, chain: Chain, fit: Result) -> bool:
-    """Return whether a refusal names the mistake; another change that undoes it counts as well."""
+    """Return whether a refusal names the mistake."""
     mistake = MISTAKES[name]
     if mistake.reason:
         return any(mistake.reason in reason for reason in fit.verdict.reasons)
@@ -182,7 +182,7 @@ def is_named(name: str, chain: Chain, fit: Result) -> bool:
 
 def judge_mistake(name: str, robot: str, seed: int) -> str:
     """Return "named", "refused" for another reason, or the status of the verdict."""
-    chain, _, wrong = measure_with_mistake(name, robot, seed)
+    chain, wrong = measure_with_mistake(name, robot, seed)
     fit = calibrate(chain, wrong, PARAMETERS, extend="none")
     if not fit.verdict.is_refused:
         return fit.verdict.status
