@@ -28,6 +28,13 @@ h smallest squared residuals. The search follows FAST-LTS (Rousseeuw & Van Dries
 Outliers by mistakes are set apart from good samples. If errors of all sizes occur instead, the model is
 incomplete, and samples are only rejected if they are very far off.
 
+The search is skipped if there are many data and the residuals of the fit to all samples look like noise. With
+many rows per unknown, independent outliers hardly bend the fit: unknowns divided by rows is the fraction of
+their squares that spreads over all samples. Outliers that agree with each other can bend the fit.
+The residuals of good and bad samples then differ by multiples of a common shift. In both cases the squares do
+not follow the χ² distribution of noise: a few are far too large, or too many or too few of them are in some
+tenth of the distribution.
+
 Only the selection is used further. Module `estimation.robust` judges it with the nonlinear model, and the
 solution is an ordinary least-squares fit of the good samples.
 
@@ -41,7 +48,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -56,12 +63,17 @@ from ..estimation.robust import (
     OUTLIER_THRESHOLD,
     REJECTION_THRESHOLD,
     ZERO_WEIGHT,
+    is_chi_square,
+    standardize_mean_squares,
     standardize_ratios,
     standardized_residuals,
 )
 from ..estimation.solver import SolverResult
 from ..measurements.base import Measurement
 
+# The search is only skipped with at least so many rows per unknown, where the rows of one configuration count
+# once, and so many samples of each measurement.
+MIN_ROWS_PER_UNKNOWN, MIN_TESTED_SAMPLES = 30, 100
 # Largest number of samples that take part in the search.
 MAX_SAMPLES = 200
 # Largest number of coordinates; the matrices of the search take 8·b·u² bytes.
@@ -227,6 +239,8 @@ def find_good_samples(
         The good samples; all samples if there are too few to judge each other.
     """
     counts = [len(item.rows) for item in data]
+    if _looks_like_noise(problem.with_data(data), solution.x, groups):
+        return GoodSamples([np.ones(count) for count in counts], "reject_far")
     drawn = _draw_samples(sum(counts))
     starts = np.cumsum([0, *counts])
     taken = [drawn[(drawn >= a) & (drawn < b)] - a for a, b in pairwise(starts)]
@@ -255,6 +269,47 @@ def find_good_samples(
     return GoodSamples([weights[a:b] for a, b in pairwise(starts)], stage)
 
 
+def _looks_like_noise(problem: Problem, x: Array, groups: Array) -> bool:
+    """Return whether many residuals of a fit to all samples follow the distribution of noise.
+
+    Args:
+        problem: Problem with all samples.
+        x: Solution, shape (p+s,).
+        groups: Label of each sample's configuration, shape (m,).
+
+    Returns:
+        Whether the search for outliers is unnecessary; False also if the data are too few to tell.
+    """
+    starts = np.cumsum([0, *(len(item.rows) for item in problem.data)])
+    n_rows = sum(
+        item.residual_dim * len(np.unique(groups[a:b]))
+        for item, (a, b) in zip(problem.data, pairwise(starts), strict=True)
+    )
+    if n_rows < MIN_ROWS_PER_UNKNOWN * len(x) or min(np.diff(starts)) < MIN_TESTED_SAMPLES:
+        return False
+    for item, residual in zip(problem.data, _residuals(problem, x), strict=True):
+        for rows in item.residual_groups.values():
+            k = np.arange(len(residual))[rows].size
+            mean_squares = np.mean(residual[rows] ** 2, 0)
+            t = (
+                standardize_ratios(mean_squares, k)
+                if item.has_stated_sigma
+                else standardize_mean_squares(mean_squares, k)
+            )
+            if t.max() > OUTLIER_THRESHOLD or not is_chi_square(mean_squares, k, not item.has_stated_sigma):
+                return False
+    return True
+
+
+def _residuals(problem: Problem, x: Array) -> Iterator[Array]:
+    """Yield the whitened residuals of each measurement, shape (k, m) each."""
+    chain = problem.errors.at(x[: len(problem.errors.parameters)])
+    chunks = problem.map_chunks(partial(chunk_residual, chain, problem.instruments(x)))
+    for item in problem.data:
+        parts = [next(chunks) for _ in range(0, len(item.rows), CHUNK_SIZE)]
+        yield np.concatenate([np.empty((item.residual_dim, 0)), *parts], 1)
+
+
 def _judge(problem: Problem, x: Array, rows: _Rows, scales: Array, threshold: float) -> list[Array]:
     """Judge all samples by a solution that a part of them was searched for.
 
@@ -268,12 +323,9 @@ def _judge(problem: Problem, x: Array, rows: _Rows, scales: Array, threshold: fl
     Returns:
         Weights of each measurement's samples, shape (m,) each: 1 for good samples, ZERO_WEIGHT for others.
     """
-    chain = problem.errors.at(x[: len(problem.errors.parameters)])
-    residuals = problem.map_chunks(partial(chunk_residual, chain, problem.instruments(x)))
     weights = []
-    for item, classes in zip(problem.data, rows.row_classes, strict=True):
-        parts = [next(residuals) for _ in range(0, len(item.rows), CHUNK_SIZE)]
-        residual = np.concatenate([np.empty((item.residual_dim, 0)), *parts], 1) / scales[classes][:, None]
+    for residual, classes in zip(_residuals(problem, x), rows.row_classes, strict=True):
+        residual = residual / scales[classes][:, None]
         t = standardize_ratios(np.mean(residual**2, 0), len(residual))
         weights.append(np.where(t > threshold, ZERO_WEIGHT, 1.0))
     return weights

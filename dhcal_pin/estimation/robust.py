@@ -55,6 +55,9 @@ REJECTION_THRESHOLD = 3.5
 # stay below.
 FAR_THRESHOLD = 12.0
 
+# Number of equally likely parts of the distribution of squares, and largest χ² of the counts in them. It is
+# exceeded by two in a hundred sets of good samples.
+N_PARTS, MAX_PARTS_CHI_SQUARE = 10, 20.0
 # Smallest variance of a whitened residual, relative to its noise; below it the fit reproduces the sample.
 MIN_VARIANCE = 1e-3
 # Stages without a weight function: search for good samples, which chooses the last stage
@@ -179,6 +182,26 @@ def standardize_ratios(ratios: Array, k: int) -> Array:
         Standardized residuals of shape (m,).
     """
     return (np.cbrt(ratios) - (1 - 2 / (9 * k))) / np.sqrt(2 / (9 * k))
+
+
+def is_chi_square(mean_squares: Array, k: int, is_scaled: bool) -> bool:
+    """Return whether mean squares of residuals follow the distribution χ²_k/k (Pearson's test).
+
+    Args:
+        mean_squares: Mean square of the k residuals of each sample, shape (m,).
+        k: Number of residuals per sample.
+        is_scaled: Whether the distribution is scaled so that the means agree.
+
+    Returns:
+        Whether the counts in equally likely parts of the distribution are as expected.
+    """
+    from scipy.special import gammaincinv  # lazy import: slow
+
+    mean = mean_squares.mean() if is_scaled else 1.0
+    bounds = mean * gammaincinv(k / 2, np.arange(1, N_PARTS) / N_PARTS) * 2 / k
+    counts = np.bincount(np.searchsorted(bounds, mean_squares), minlength=N_PARTS)
+    expected = len(mean_squares) / N_PARTS
+    return bool(np.sum((counts - expected) ** 2) / expected <= MAX_PARTS_CHI_SQUARE)
 
 
 def sample_weights(t: Array, stage: str) -> Array:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from robots import joint_sample, measured_arm
 
-from dhcal_pin.calibration import calibrate
+from dhcal_pin.calibration import calibrate, trimmed_squares
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.initialization import align
 from dhcal_pin.measurements import Noise, PointContact, Pose, Position, Wires
@@ -165,3 +165,41 @@ def test_errors_of_all_sizes_point_to_the_model_and_are_kept():
     weights = fit.weights[0]
     assert set(weights) <= {1.0, 1e-12}
     assert np.sum(weights < 0.5) < 0.5 * len(fit.outliers[0])
+
+
+@pytest.mark.parametrize("slip", [2e-4, 1e-3, 1e-2])
+def test_a_slip_that_the_fit_could_absorb_is_found_in_many_samples(slip):
+    """From one sample on, an encoder reads another value. A fit to all samples takes a part of the slip."""
+    rng = np.random.default_rng(5)
+    chain = measured_arm("slide")
+    q = joint_sample(chain, 1000, rng)
+    read = q.copy()
+    read[700:, 1] += slip
+    clean = Pose.simulate(chain, q, Noise(SIGMA, SIGMA), rng)
+    fit = calibrate(chain, Pose(read, clean.poses), "minimal,base,tool", extend="none")
+    wrong = fit.weights[0] < 0.5
+    # A slip of two standard deviations is hardly an outlier; those of 10 and more are.
+    assert wrong[:700].sum() <= 3
+    assert wrong[700:].mean() >= (0.99 if slip >= 1e-3 else 0.0)
+
+
+def test_residuals_that_look_like_noise_need_no_search(monkeypatch):
+    """The search is more expensive than the calibration itself."""
+    rng = np.random.default_rng(6)
+    chain = measured_arm("slide")
+    data = Pose.simulate(chain, joint_sample(chain, 1000, rng), Noise(SIGMA, SIGMA), rng)
+    searches = []
+    search = trimmed_squares._search
+    monkeypatch.setattr(trimmed_squares, "_search", lambda *args: searches.append(1) or search(*args))
+    for item in (data, without_sigma(data)):
+        fits = [
+            calibrate(chain, item, "minimal,base,tool", extend="none", loss=loss)
+            for loss in ("auto", "linear")
+        ]
+        np.testing.assert_array_equal(fits[0].x, fits[1].x)
+    assert not searches
+    wrong = data.poses.copy()
+    wrong[7, :3, 3] += 20 * SIGMA
+    fit = calibrate(chain, data.replace(poses=wrong), "minimal,base,tool", extend="none")
+    assert searches
+    assert fit.outliers[0].tolist() == [8]

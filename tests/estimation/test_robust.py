@@ -15,6 +15,7 @@ from dhcal_pin.estimation.robust import (
     TRIMMED,
     WEIGHT_FUNCTIONS,
     WeightChange,
+    is_chi_square,
     residual_covariances,
     standardized_residuals,
     update_weights,
@@ -211,3 +212,17 @@ def test_weights_that_alternate_settle(slope):
             break
     assert last.size < 1e-3
     assert weights[0] == pytest.approx([0.5, 1.0], abs=2e-3)
+
+
+def test_pearsons_test_of_squares():
+    """Squares of normal numbers pass, at any scale if it is estimated; mixtures and equal ones do not."""
+    rng = np.random.default_rng(0)
+    passed = []
+    for k in (1, 2, 3, 6):
+        for _ in range(100):
+            squares = 4 * np.mean(rng.normal(size=(k, 400)) ** 2, 0)
+            passed.append(is_chi_square(squares, k, True))
+            assert not is_chi_square(squares, k, False)
+        assert not is_chi_square(np.ones(400), k, True)
+        assert not is_chi_square(np.where(np.arange(400) < 120, 9.0, 1.0) * squares, k, True)
+    assert np.mean(passed) > 0.95
