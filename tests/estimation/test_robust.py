@@ -224,5 +224,5 @@ def test_pearsons_test_of_squares():
             squares = np.mean(rng.normal(size=(k, 400)) ** 2, 0)
             passed += [is_chi_square(4 * squares, k, True), is_chi_square(squares, k, False)]
             assert not is_chi_square(4 * squares, k, False)
-            assert not is_chi_square(np.where(np.arange(400) < 120, 9.0, 1.0) * squares, k, True)
+            assert not is_chi_square(np.where(np.arange(400) < 120, 36.0, 1.0) * squares, k, True)
     assert np.mean(passed) > 0.95
