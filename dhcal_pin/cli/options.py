@@ -159,6 +159,7 @@ COLUMNS: dict[str, Any] = {"metavar": "MAP.toml", "help": "column map of files i
 SKIP_BAD_ROWS: dict[str, Any] = {
     "help": "skip rows that lack a number or a name, instead of an error that lists them"
 }
+FIT_FRAMES: dict[str, Any] = {"help": "fit base and tool to the measurements first"}
 MEND: dict[str, Any] = {
     "metavar": "CHANGE",
     "help": "undo a mistake in the measurements, as a refused calibration names it, such as "

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from ..exceptions import InvalidArgumentError
-from .options import COLUMNS, DATA, JSON, ROBOT, SKIP_BAD_ROWS, add_urdf_options
+from .options import COLUMNS, DATA, FIT_FRAMES, JSON, ROBOT, SKIP_BAD_ROWS, add_urdf_options
 
 if TYPE_CHECKING:
-    from ..calibration import Accuracy, Result
+    from ..calibration import Accuracy
     from ..estimation.uncertainty import Predictor
     from ..io import MeasurementFile
     from ..measurements import Measurement
@@ -18,15 +18,8 @@ if TYPE_CHECKING:
 
 EXAMPLE = "dhcal validate ur10_calibrated.urdf other.csv --tip tool0 --nominal ur10.urdf --fit-frames"
 
-# Base and tool are taken to be those of another set-up if fitting them to the measurements divides the error
-# by at least this number.
-FRAMES_ERROR_RATIO = 10.0
-# Smaller errors [m or rad] show no difference of the frames.
-MIN_FRAMES_ERROR = 1e-6
 # Base and tool of two robots are the same if no entry of their poses differs by more than this.
 FRAMES_TOL = 1e-9
-# Number of samples from which this is found out; with fewer than the least number it is unknown.
-MIN_FRAMES_SAMPLES, MAX_FRAMES_SAMPLES = 12, 1000
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -52,9 +45,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="robot before the calibration, shown beside ROBOT; its base and tool are fitted to the "
         "measurements if ROBOT has others",
     )
-    parser.add_argument(
-        "--fit-frames", action="store_true", help="fit base and tool to the measurements first"
-    )
+    parser.add_argument("--fit-frames", action="store_true", **FIT_FRAMES)
     parser.add_argument(
         "--map",
         metavar="MAP",
@@ -74,7 +65,7 @@ def run(args: Namespace) -> int:
         Exit status 0.
     """
     from ..calibration import accuracy  # lazy import, as the following: they load Pinocchio
-    from ..diagnostics import find_extrapolation
+    from ..diagnostics import FRAMES_WARNING, find_extrapolation, fit_frames, frames_differ
     from ..io import (
         existing_sidecar,
         read_instrument,
@@ -107,7 +98,7 @@ def run(args: Namespace) -> int:
     given = accuracy(chain, data, known)
     accuracies = {"base and tool as given": given}
     if args.fit_frames:
-        fit = _fit_frames(chain, data, known)
+        fit = fit_frames(chain, data, known)
         chain, known = fit.chain, known | fit.instruments
         accuracies["base and tool fitted"] = fit.comparisons[-1].after
         document = result_to_dict(fit, {}, file_digests(inputs), is_calibration=False)
@@ -120,8 +111,8 @@ def run(args: Namespace) -> int:
         document["before"] = main_statistics(nominal)
         accuracies = {"nominal": nominal, "calibrated": list(accuracies.values())[-1]}
     warnings = {file.source: _input_warnings(chain, file, args.fit_frames) for file in files}
-    if not args.fit_frames and _frames_differ(chain, data, known, given):
-        warnings[args.robot] = ["the frames (base, tool) differ: run again with --fit-frames"]
+    if not args.fit_frames and frames_differ(chain, data, known):
+        warnings[args.robot] = [FRAMES_WARNING]
     notes = [f"{file.source}: {text}" for file in files for text in file.notes]
     document["warnings"] = notes + [f"{path}: {text}" for path, texts in warnings.items() for text in texts]
     region = read_measured_region(sidecar, chain) if sidecar else None
@@ -146,13 +137,6 @@ def run(args: Namespace) -> int:
     return 0
 
 
-def _fit_frames(chain: Chain, data: Sequence[Measurement], known: Mapping[str, float]) -> Result:
-    """Fit base and tool; the loss is linear, as validation includes all samples, outliers too."""
-    from ..calibration import calibrate  # lazy import: loads Pinocchio
-
-    return calibrate(chain, data, "base,tool", known=known, loss="linear")
-
-
 def _nominal_accuracy(
     chain: Chain, data: Sequence[Measurement], known: Mapping[str, float], args: Namespace
 ) -> tuple[Accuracy, list[str]]:
@@ -163,7 +147,8 @@ def _nominal_accuracy(
     """
     import numpy as np  # lazy import, as the following
 
-    from ..calibration import accuracy, calibrate
+    from ..calibration import accuracy
+    from ..diagnostics import fit_frames
     from ..io import read_robot
 
     nominal = read_robot(args.nominal, args.tip, None, args.package_dir)
@@ -176,24 +161,9 @@ def _nominal_accuracy(
     others = [name for name, (a, b) in pairs.items() if not np.allclose(a, b, rtol=0, atol=FRAMES_TOL)]
     if not others:
         return accuracy(nominal, data, known), []
-    fit = calibrate(nominal, data, ",".join(others), known=known, loss="linear")
+    fit = fit_frames(nominal, data, known, ",".join(others))
     note = f"nominal: {' and '.join(others)} fitted to these measurements"
     return fit.comparisons[-1].after, [note]
-
-
-def _frames_differ(
-    chain: Chain, data: Sequence[Measurement], known: Mapping[str, float], given: Accuracy
-) -> bool:
-    """Check whether fitting base and tool to the measurements would reduce the error many times."""
-    import numpy as np  # lazy import
-
-    n_samples = sum(len(item.rows) for item in data)
-    group, error = next(iter(given.groups.items()))
-    if n_samples < MIN_FRAMES_SAMPLES or error.rms < MIN_FRAMES_ERROR:
-        return False
-    step = max(1, -(-n_samples // MAX_FRAMES_SAMPLES))
-    fit = _fit_frames(chain, [item.take(np.s_[::step]) for item in data], known)
-    return FRAMES_ERROR_RATIO * fit.comparisons[-1].after.groups[group].rms < error.rms
 
 
 def _input_warnings(chain: Chain, file: MeasurementFile, has_unknown_frames: bool) -> list[str]:

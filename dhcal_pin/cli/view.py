@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ..exceptions import InvalidArgumentError
-from .options import POSITIVE_INTEGER, ROBOT, add_urdf_options
+from .options import FIT_FRAMES, POSITIVE_INTEGER, ROBOT, add_urdf_options
 
 if TYPE_CHECKING:
     from ..measurements import Measurement
@@ -53,6 +53,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--live", action="store_true", help="serve a moving scene on this computer until Ctrl-C, no page"
     )
+    parser.add_argument("--fit-frames", action="store_true", **FIT_FRAMES)
     add_urdf_options(parser)
 
 
@@ -66,19 +67,24 @@ def run(args: Namespace) -> int:
         Exit status 0.
 
     Raises:
-        InvalidArgumentError: --live is combined with options of the page.
+        InvalidArgumentError: --live with options of the page, or --fit-frames without measurements.
     """
-    from ..io import read_measurements, read_robot  # lazy import, as the following: they load Pinocchio
+    from ..diagnostics import FRAMES_WARNING, fit_frames, frames_differ  # lazy import, as the following
+    from ..io import read_measurements, read_robot
     from ..io.robot import has_dh_table, robot_name
     from ..io.sidecar import existing_sidecar, read_instrument, read_uncertainty
     from ..visualization import scene
     from . import console
     from .outputs import existing_sidecars, require_writable_outputs, write_outputs
-    from .result_screens import files_block
+    from .result_screens import files_block, warnings_block
     from .screen import Screen
 
     if args.live and (args.html or args.open):
         raise InvalidArgumentError("--live writes no page; omit --html and --open")
+    if args.fit_frames and not args.data:
+        raise InvalidArgumentError(
+            "--fit-frames: needs --data, the measurements to which base and tool are fitted"
+        )
     robots = [args.nominal, *([args.calibrated] if args.calibrated else [])]
     sidecars = existing_sidecars(robots)
     page = args.html or os.path.join(tempfile.mkdtemp(prefix="dhcal-"), f"{robot_name(args.nominal)}.html")
@@ -88,20 +94,29 @@ def run(args: Namespace) -> int:
         for path in robots
     ]
     data = [read_measurements(path, chains[0]) for path in args.data]
+    sidecar = existing_sidecar(robots[-1])
+    known = read_instrument(sidecar) if sidecar else {}
+    predictor = read_uncertainty(sidecar, chains[-1]) if sidecar and len(chains) > 1 else None
+    warnings = {}
+    if args.fit_frames:
+        predictor = None  # The uncertainty holds for base and tool as calibrated.
+        fits = [fit_frames(chain, data, known) for chain in chains]
+        chains, known = [fit.chain for fit in fits], known | fits[-1].instruments
+    elif data and frames_differ(chains[-1], data, known):
+        warnings[robots[-1]] = [FRAMES_WARNING]
     if args.live:
         return _serve_live(chains, data, args)
-    sidecar = existing_sidecar(robots[-1])
     text = scene.scene_html(
         *chains,
         measurements=data,
-        known=read_instrument(sidecar) if sidecar else None,
-        predictor=read_uncertainty(sidecar, chains[-1]) if sidecar and len(chains) > 1 else None,
+        known=known,
+        predictor=predictor,
         title=" and ".join(robot_name(path) for path in robots),
         magnification=args.magnification,
         triangles=args.simplify,
     )
     write_outputs({page: text})
-    console.show(Screen([files_block([page])]), args.verbosity)
+    console.show(Screen([warnings_block(warnings), files_block([page])]), args.verbosity)
     if args.open or not args.html:
         console.open_page(page)
     return 0

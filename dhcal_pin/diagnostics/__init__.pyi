@@ -6,6 +6,9 @@ from .curves import fitted_coverage as fitted_coverage
 from .curves import joint_curves as joint_curves
 from .extrapolation import Extrapolation as Extrapolation
 from .extrapolation import find_extrapolation as find_extrapolation
+from .frames import FRAMES_WARNING as FRAMES_WARNING
+from .frames import fit_frames as fit_frames
+from .frames import frames_differ as frames_differ
 from .input_checks import find_input_warnings as find_input_warnings
 from .input_checks import find_value_warnings as find_value_warnings
 from .input_checks import poorly_fitted_files as poorly_fitted_files

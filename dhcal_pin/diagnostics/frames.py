@@ -1,0 +1,67 @@
+"""Base and tool of another set-up: recognize them in measurements, and fit them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ..calibration import Result, accuracy, calibrate
+from ..measurements.base import Measurement
+from ..robot.chain import Chain
+
+# Base and tool are taken to be those of another set-up if fitting them to the measurements divides the error
+# by at least this number.
+ERROR_RATIO = 10.0
+# Smaller errors [m or rad] show no difference of the frames.
+MIN_ERROR = 1e-6
+# Number of samples from which this is found out; with fewer than the least number it is unknown.
+MIN_SAMPLES, MAX_SAMPLES = 12, 1000
+
+FRAMES_WARNING = "the frames (base, tool) differ: run again with --fit-frames"
+
+
+def fit_frames(
+    chain: Chain,
+    data: Sequence[Measurement],
+    known: Mapping[str, float] | None = None,
+    frames: str = "base,tool",
+) -> Result:
+    """Fit base and tool to measurements; the rest of the robot is kept.
+
+    All samples take part with their full weight, outliers too, as in a validation.
+
+    Args:
+        chain: Robot.
+        data: Measurements.
+        known: Values of instrument parameters by name.
+        frames: Which of base and tool are fitted, separated by a comma.
+
+    Returns:
+        Result of the fit.
+    """
+    return calibrate(chain, data, frames, known=known, loss="linear")
+
+
+def frames_differ(
+    chain: Chain, data: Sequence[Measurement], known: Mapping[str, float] | None = None
+) -> bool:
+    """Check whether fitting base and tool to the measurements would reduce the error many times.
+
+    Args:
+        chain: Robot with base and tool of the set-up that it is believed to be in.
+        data: Measurements.
+        known: Values of instrument parameters by name.
+
+    Returns:
+        Whether base or tool are those of another set-up; False where the measurements are too few to tell.
+    """
+    n_samples = sum(len(item.rows) for item in data)
+    if n_samples < MIN_SAMPLES:
+        return False
+    group, error = next(iter(accuracy(chain, data, known).groups.items()))
+    if error.rms < MIN_ERROR:
+        return False
+    step = max(1, -(-n_samples // MAX_SAMPLES))
+    fit = fit_frames(chain, [item.take(np.s_[::step]) for item in data], known)
+    return ERROR_RATIO * fit.comparisons[-1].after.groups[group].rms < error.rms
