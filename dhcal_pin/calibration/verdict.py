@@ -241,7 +241,7 @@ def _plausible_cause(fit: Result) -> str:
     if fit.diagnosis.fits_separately:
         return "Each file fits this robot by itself: base or tool differ between the files."
     if fit.input_warnings:
-        return f"{fit.input_warnings[0][0].upper()}{fit.input_warnings[0][1:]}."
+        return f"{fit.input_warnings[0]}."
     return (
         "Check the robot, its tip, the units, order, signs and zeros of the joints, and the notation of "
         "rotations."

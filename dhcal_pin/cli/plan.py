@@ -194,7 +194,7 @@ def run(args: Namespace) -> int:
     sidecar = None if args.data or args.priors else existing_sidecar(args.robot)
     prior_uncertainty = read_uncertainty(sidecar, chain) if sidecar else None
     sigma = args.sigma or (None if any(item.kind == args.kind for item in data) else _DEFAULT_SIGMA)
-    with console.show_progress(f"choosing {args.count} poses"):
+    with console.show_progress(f"choosing {args.count} poses") as progress:
         result = plan(
             chain,
             args.count,
@@ -213,6 +213,7 @@ def run(args: Namespace) -> int:
             space=space,
             margin=Noise(*parse_noise(args.margin, "--margin")),
             seed=args.seed,
+            progress=progress,
         )
     noise = result.information.noise
     moves = move_texts(result)

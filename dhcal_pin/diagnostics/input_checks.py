@@ -104,11 +104,27 @@ def find_value_warnings(chain: Chain, file: MeasurementFile) -> list[str]:
     joint_units = _check_joint_units(chain, file)
     joints = [*joint_units.values(), *_check_small_joints(chain, file)]
     return [
+        *_check_tip(chain, file),
         *joints,
         *_check_lengths(chain, file),
         *_check_rotations(file),
         *_check_limits(chain, file, joint_units),
         *_check_repeated_rows(file),
+    ]
+
+
+def _check_tip(chain: Chain, file: MeasurementFile) -> list[str]:
+    """Return a warning if joints behind the tip move."""
+    behind = [
+        name
+        for name in file.other_moving_joints
+        if chain.tip in {joint.child for joint in chain.urdf.path(chain.urdf.joint(name).parent)}
+    ]
+    if not behind:
+        return []
+    return [
+        f"moving joints behind the tip {chain.tip} are ignored: {', '.join(behind)}; if a link behind them "
+        "was measured, name it with --tip"
     ]
 
 

@@ -15,14 +15,14 @@ decides, and step 4 also predicts the standard deviation of the curves (`curve_p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .._typing import Array
+from .._typing import Array, Progress
 from ..estimation import qr
 from ..estimation.priors import Priors
 from ..estimation.uncertainty import Uncertainty
@@ -63,6 +63,15 @@ MIN_DISTANCE_RAD = np.deg2rad(20.0)
 UNOBSERVABLE_RTOL = 1e-6
 # Diminishing returns: this many more poses lower the error that a check shows by less than this fraction.
 EXTRA_POSES, MIN_EXTRA_GAIN = 10, 0.01
+# Phases of `plan`, in their order.
+PHASES = (
+    "drawing candidates",
+    "selecting poses",
+    "exchanging poses",
+    "moving poses",
+    "predicting errors",
+    "path",
+)
 # Numbers of poses for which the knowledge of the joint correction curves is predicted.
 CURVE_SIZES = (50, 100, 200)
 
@@ -183,6 +192,7 @@ def plan(
     space: WorkspaceConstraints | None = None,
     margin: Noise | None = None,
     seed: int = 0,
+    progress: Progress | None = None,
 ) -> Plan:
     """Select configurations to measure.
 
@@ -213,6 +223,7 @@ def plan(
         space: Constraints of drawn candidates; floor and obstacles also hold for the moves between poses.
         margin: Margins to the joint limits: `rotation` [rad], `position` [m].
         seed: Seed of all random draws.
+        progress: Called at the start of each of `PHASES` with its name, its number and the number of phases.
 
     Returns:
         Poses and predicted errors.
@@ -229,6 +240,8 @@ def plan(
         raise InvalidArgumentError(
             f"{candidates} candidates for {count} poses: expected from {count} to {MAX_CANDIDATES}"
         )
+    phases = _report_phases(progress)
+    next(phases)
     rng = np.random.default_rng(seed)
     margin = margin or Noise(MARGIN_LENGTH, MARGIN_ANGLE)
     space = space or WorkspaceConstraints()
@@ -299,6 +312,7 @@ def plan(
         bin_columns=bin_columns,
     )
     prior_factor = full_information.prior_factor
+    next(phases)
     greedy = select_greedily(candidate_set, prior_factor, count, goal.criterion, np.zeros(0, int), existing)
     if len(greedy) < count:
         # Not enough candidates have the minimum distance, so select the others without it.
@@ -311,11 +325,14 @@ def plan(
             f"only {len(greedy)} of {len(q)} candidates are feasible; expected at least {count}: "
             "relax the constraints or use more candidates"
         )
+    next(phases)
     selected = improve_by_exchange(candidate_set, prior_factor, greedy, goal.criterion, existing)
+    next(phases)
     if sampler is None:
         refined = q[selected]
     else:
         refined = refine(goal, q[selected], sampler, candidate_set.min_distance, rng)
+    next(phases)
     curves = ()
     if fills_bins:
         curve_information = Information.from_prior(
@@ -326,6 +343,7 @@ def plan(
         curves = predict_curves(curve_information, plans, measured, q[~candidate_set.infeasible])
     sizes, errors = _error_curve(goal, candidate_set, q, greedy, selected, refined, rng)
     random_sizes, random_errors = _random_errors(goal, candidate_set, sizes[sizes <= count], rng)
+    next(phases)
     checker = CollisionChecker.from_chain(chain, space.environment) if sampler is None else sampler.collision
     notes += [checker.note] if sampler is None and checker.note else []
     limits = limits_with_margin(chain, margin.rotation, margin.position)
@@ -348,6 +366,14 @@ def plan(
         ways=tour.ways,
         is_way_free=() if checker.geometry is None else tour.is_way_free,
     )
+
+
+def _report_phases(progress: Progress | None) -> Iterator[None]:
+    """Report the next phase each time that the iterator is advanced."""
+    for number, phase in enumerate(PHASES, 1):
+        if progress:
+            progress(phase, number, len(PHASES))
+        yield
 
 
 def _robust_criterion(

@@ -225,6 +225,29 @@ def test_joints_that_never_moved_are_refused(run, robot_folder, moving, reason):
     assert not Path("out.urdf").exists()
 
 
+def test_a_tip_inside_the_chain_is_refused_and_the_ignored_joints_are_named(run, robot_folder):
+    write_columns(tracker_columns())
+    command = ("calibrate", UR10, "data.csv", "--tip", "wrist_1_link", "-o", "out.urdf", "--json", "-")
+    status, out, err = run(*command)
+    assert status == 3
+    document = parse_json(out)
+    cause = "data.csv: moving joints behind the tip wrist_1_link are ignored: wrist_2_joint, wrist_3_joint; "
+    assert cause in document["verdict"]["reasons"][0]
+    assert "--tip" in document["verdict"]["reasons"][0]
+    assert "data.csv: columns 'wrist_2_joint', 'wrist_3_joint' ignored" in document["warnings"]
+    assert "tip wrist_1_link, 4 joints from shoulder_pan_joint to wrist_1_joint" in unfolded(err)
+    assert not Path("out.urdf").exists()
+
+
+@pytest.mark.parametrize(
+    ("has_moved", "change"), [(True, {}), (False, {"wrist_3_joint[deg]": np.full(60, 3.0)})]
+)
+def test_joints_behind_the_tip_are_named_if_they_move(run, robot_folder, has_moved, change):
+    write_columns(tracker_columns() | change)
+    out = run("inspect", "data.csv", "--robot", UR10, "--tip", "wrist_2_link", "--json", "-")[1]
+    assert ("behind the tip wrist_2_link are ignored: wrist_3_joint" in out) == has_moved
+
+
 def test_six_positions_give_no_accuracy_and_no_correction(run, robot_folder):
     write_columns(positions_only(tracker_columns(6)))
     command = ("calibrate", UR10, "data.csv", "--tip", "tool0", "-o", "out.urdf", "--json", "-")

@@ -417,3 +417,14 @@ def test_missing_collision_geometry_is_noted():
     note = plan(lost, 6, noise=NOISE, candidates=100).notes[0]
     assert "mesh is missing" in note
     assert "the package lost with --package-dir" in note
+
+
+@pytest.mark.parametrize(
+    "candidates", [200, np.random.default_rng(2).uniform(-1, 1, (60, 6))], ids=["drawn", "given"]
+)
+def test_progress_names_each_phase_once(candidates):
+    calls = []
+    plan(arm("sim_6dof"), 8, noise=NOISE, candidates=candidates, progress=lambda *call: calls.append(call))
+    assert [step for _, step, _ in calls] == [1, 2, 3, 4, 5, 6]
+    assert {total for _, _, total in calls} == {6}
+    assert len({phase for phase, _, _ in calls}) == 6

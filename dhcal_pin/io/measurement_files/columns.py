@@ -115,6 +115,16 @@ def known_columns(chain: Chain) -> frozenset[str]:
     return _KNOWN | {prefix + name for name in names for prefix in ("", SECOND_PREFIX)}
 
 
+def joints_off_the_chain(chain: Chain) -> list[str]:
+    """Return the names of the joints of the URDF whose values do not change the pose of the tip.
+
+    Args:
+        chain: The robot.
+    """
+    used = {*chain.joint_names, *chain.moving_joints}
+    return [joint.name for joint in chain.urdf.joints if joint.name not in used]
+
+
 def needs_column_map(table: DataTable, chain: Chain) -> bool:
     """Return whether a file has no header, or one that names no joint or no measured value.
 
@@ -152,7 +162,8 @@ def check_columns(table: DataTable, chain: Chain) -> list[str]:
     for name, column in columns.items():
         if name not in known and not _can_be_ignored(table, column, known):
             raise unknown_column_error(table.header_location, name, known, columns, chain.joint_names)
-    used = {columns[name].index for name in columns if name in known}
+    other_joints = {prefix + name for name in joints_off_the_chain(chain) for prefix in ("", SECOND_PREFIX)}
+    used = {columns[name].index for name in columns if name in known - other_joints}
     return [
         table.column_label(index)
         for index, cell in enumerate(table.headers)

@@ -37,6 +37,7 @@ from .columns import (
     check_joint_names,
     find_kind,
     joint_units,
+    joints_off_the_chain,
     known_columns,
     needs_column_map,
 )
@@ -63,6 +64,7 @@ class MeasurementFile:
         units: Unit that each column was written in.
         notes: Sentences on what of the file is not used: columns, skipped rows, sheets.
         bad_rows: Reason why a row was skipped, by line.
+        other_moving_joints: Joints of the robot that move in the file, but not the tip of the chain.
     """
 
     source: str
@@ -75,6 +77,7 @@ class MeasurementFile:
     units: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     bad_rows: Mapping[int, str] = field(default_factory=dict)
+    other_moving_joints: tuple[str, ...] = ()
 
 
 def read_measurements(
@@ -170,7 +173,14 @@ def parse_measurements(table: DataTable, chain: Chain, skip_bad_rows: bool = Fal
         units=column_units(table),
         notes=(*table.notes, *ignored_columns_note(ignored), *skipped_rows_note(table)),
         bad_rows=table.bad_rows,
+        other_moving_joints=_find_other_moving_joints(table, chain),
     )
+
+
+def _find_other_moving_joints(table: DataTable, chain: Chain) -> tuple[str, ...]:
+    """Return the joints off the chain whose columns do not hold the same value in all rows."""
+    present = [name for name in joints_off_the_chain(chain) if name in table.columns]
+    return tuple(name for name in present if len(np.unique(table.values(table.columns[name].index))) > 1)
 
 
 def ignored_columns_note(labels: Sequence[str]) -> list[str]:
