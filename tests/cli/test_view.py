@@ -23,7 +23,8 @@ def other_set_up(robot_folder):
 
 def residuals_of(page):
     """Read the lengths of the residuals that a page draws [m]."""
-    residuals = json.loads(re.search(r'"residuals":(\[\[.*?\]\])', page.read_text("utf-8"))[1])
+    (text,) = re.findall(r'"residuals":(\[\[.*?\]\])', page.read_text("utf-8"))
+    residuals = json.loads(text)
     return np.linalg.norm(residuals, axis=1)
 
 
