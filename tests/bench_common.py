@@ -1,4 +1,4 @@
-"""Robots, readings and clocks that the benchmarks share."""
+"""Robots, measurements and timing that the benchmarks share."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from dhcal_pin.robot.dh import DHTable
 
 @dataclass(frozen=True)
 class Row:
-    """A line of the table: what is compared, both times in seconds, and the ratio that is wanted."""
+    """Row of the table: what is compared, both times [s], and the wanted ratio."""
 
     what: str
     ours: float
@@ -31,9 +31,10 @@ class Row:
 
 
 def clocked(ways: Sequence[Callable[[], object]], repeats: int, turn: float = 5e-3) -> list[float]:
-    """Median CPU seconds of each way, taken in turns so that the machine's moods hit all alike.
+    """Return the median CPU time of each way [s].
 
-    A turn lasts at least so many seconds: a loop finds its own data in the caches, not a rival's.
+    The ways alternate, so that a change of the machine's speed affects all of them. A turn lasts at least `turn`
+    seconds, so that the caches hold the data of the present way.
     """
     counts = []
     for way in ways:
@@ -52,7 +53,7 @@ def clocked(ways: Sequence[Callable[[], object]], repeats: int, turn: float = 5e
 
 
 def robots() -> dict[str, tuple[Chain, str]]:
-    """The paper's arm with DH errors, and a UR10 with the minimal set and both frames unknown."""
+    """Return the paper's arm with DH errors, and a UR10 with the minimal set and both frames unknown."""
     return {
         "paper's 6-DOF, dh": (Chain.from_dh(paper("sim_6dof")), "dh"),
         "UR10, minimal,base,tool": (
@@ -63,12 +64,12 @@ def robots() -> dict[str, tuple[Chain, str]]:
 
 
 def panda() -> Chain:
-    """Franka's arm, to its hand."""
+    """Return Franka's arm up to its hand."""
     return Chain.from_urdf(robot_file("panda_description/urdf/panda.urdf"), "panda_link8")
 
 
 def serial(joints: int) -> DHTable:
-    """An arm of so many revolute joints, no two axes parallel."""
+    """Return an arm of revolute joints, of which no two axes are parallel."""
     rng = np.random.default_rng(joints)
     zero = np.zeros(joints)
     return DHTable(
@@ -86,7 +87,7 @@ def serial(joints: int) -> DHTable:
 
 
 def measured(chain: Chain, sets: str, m: int, seed: int = 0) -> tuple[ErrorModel, np.ndarray, Pose]:
-    """An arm with errors of a millimetre and a milliradian in a frame of its own: model, truth, poses."""
+    """Simulate an arm with errors of 1 mm and 1 mrad in another frame; return model, errors and poses."""
     rng = np.random.default_rng(seed)
     errors = select_parameters(chain, sets)
     truth = 1e-3 * rng.standard_normal(len(errors.parameters))
@@ -98,7 +99,7 @@ def measured(chain: Chain, sets: str, m: int, seed: int = 0) -> tuple[ErrorModel
 
 
 def problem(chain: Chain, sets: str, m: int) -> tuple[Problem, np.ndarray]:
-    """The calibration as the solver sees it, and the truth, near which an iteration is clocked."""
+    """Return the problem of a calibration, and the true errors, at which iterations are timed."""
     rng = np.random.default_rng(0)
     errors = select_parameters(chain, sets)
     truth = 1e-3 * rng.standard_normal(len(errors.parameters))

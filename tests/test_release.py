@@ -18,6 +18,7 @@ def repository(tmp_path):
     shutil.copy(ROOT / ".ci" / "release", tmp_path / ".ci" / "release")
     (tmp_path / "pyproject.toml").write_text('[project]\nversion = "0.2.0"\n')
     (tmp_path / "CHANGELOG.md").write_text("# Changes\n\n## Unreleased\n\n## 0.2.0\n\n- News.\n\n## 0.1.0\n")
+    (tmp_path / "CITATION.cff").write_text("title: name\nversion: 0.2.0\nlicense: none\n")
     git(tmp_path, "init", "-q")
     commit(tmp_path)
     return tmp_path
@@ -50,6 +51,7 @@ def test_complete_release_passes_before_and_after_the_tag(repository):
     [
         ("pyproject.toml", "0.2.0", "0.1.9", "version 0.1.9; expected 0.2.0"),
         ("CHANGELOG.md", "## Unreleased\n", "## Unreleased\n\n- More.\n", "changes under 'Unreleased'"),
+        ("CITATION.cff", "0.2.0", "0.1.0", "expected the line 'version: 0.2.0'"),
         ("CHANGELOG.md", "## 0.2.0", "## 0.2.1", "the first section is not that of 0.2.0"),
     ],
 )
