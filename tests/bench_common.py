@@ -33,8 +33,8 @@ class Row:
 def clocked(ways: Sequence[Callable[[], object]], repeats: int, turn: float = 5e-3) -> list[float]:
     """Return the median CPU time of each way [s].
 
-    The ways alternate, so that a change of the machine's speed affects all of them. A turn lasts at least `turn`
-    seconds, so that the caches hold the data of the present way.
+    The ways alternate, so that a change of the machine's speed affects all of them. A turn lasts at least
+    `turn` seconds, so that the caches hold the data of the present way.
     """
     counts = []
     for way in ways:

@@ -29,6 +29,8 @@ from robots import ROOT
 
 import dhcal_pin
 from dhcal_pin.cli import main
+from dhcal_pin.estimation import parameters
+from dhcal_pin.io.tables import sources
 
 DOCS = ROOT / "docs"
 PAGES = sorted(path for path in DOCS.rglob("*.md") if "_build" not in path.parts)
@@ -92,6 +94,9 @@ def _write_foreign_file(header: list[str], rows: np.ndarray) -> None:
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)], ids=page_name)
 def test_blocks_of_a_page_run_in_order(page, examples, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(shutil.copytree(examples, tmp_path / "page"))
+    # What a page adds to the tables of the package is removed after its test.
+    monkeypatch.setattr(parameters, "PARAMETER_SETS", dict(parameters.PARAMETER_SETS))
+    monkeypatch.setattr(sources, "FORMATS", sources.FORMATS)
     namespace: dict = {}
     output: list[str] = []
     for _, text, _ in blocks(page):
