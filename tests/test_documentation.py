@@ -19,6 +19,7 @@ import shlex
 import shutil
 import textwrap
 import tomllib
+from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
 
@@ -29,8 +30,10 @@ from robots import ROOT
 
 import dhcal_pin
 from dhcal_pin.cli import main
+from dhcal_pin.cli.job import Job
 from dhcal_pin.estimation import parameters
 from dhcal_pin.io.tables import sources
+from dhcal_pin.studies.grid import Setting
 
 DOCS = ROOT / "docs"
 PAGES = sorted(path for path in DOCS.rglob("*.md") if "_build" not in path.parts)
@@ -166,6 +169,18 @@ def test_examples_follow_the_schemas(page):
             assert language == "toml"
             schema = json.loads((SCHEMAS / f"{name[1]}.schema.json").read_text())
             jsonschema.validate(tomllib.loads(text), schema)
+
+
+def test_schemas_of_settings_have_all_keys():
+    fleet = json.loads((SCHEMAS / "fleet.schema.json").read_text())
+    names = {"name", *(option.name for option in fields(Job))}
+    keys = names | {name.replace("_", "-") for name in names}
+    assert set(fleet["$defs"]["job"]["properties"]) == keys
+    assert set(fleet["properties"]) == keys - {"name"} | {"job"}
+    study = json.loads((SCHEMAS / "study.schema.json").read_text())
+    assert set(study["properties"]["settings"]["properties"]) == {option.name for option in fields(Setting)}
+    for path in (ROOT / "urdf").glob("*.study.toml"):
+        jsonschema.validate(tomllib.loads(path.read_text()), study)
 
 
 def test_files_of_a_run_follow_the_schemas(examples, tmp_path, monkeypatch):
