@@ -28,6 +28,7 @@ extensions = [
     "api_pages",
     "cli_pages",
     "mathml",
+    "plot_pictures",
     "tutorial_pages",
 ]
 exclude_patterns = ["_build", "extensions"]

@@ -44,12 +44,30 @@ def _heading(text: str) -> list[str]:
 def _directive(name: str, value: Any) -> list[str]:
     """Write the directive of one public name."""
     if inspect.isclass(value):
-        return [f".. autoclass:: {name}", "   :members:", ""]
+        return [f".. autoclass:: {name}", "   :members:", *_inherited(value), ""]
     if inspect.isfunction(value):
         return [f".. autofunction:: {name}", ""]
     kind = type(value).__name__
     keys = ", ".join(f"``{key}``" for key in value) if isinstance(value, Mapping) else f"``{value!r}``"
     return [f".. py:data:: {name}", f"   :type: {kind}", "", f"   {keys}", ""]
+
+
+def _inherited(value: type) -> list[str]:
+    """Return the option that shows the members of bases that have no entry of their own."""
+    bases = [base for base in value.__mro__[1:] if base.__module__.startswith("dhcal_pin.")]
+    if all(_is_public(base) for base in bases):
+        return []
+    # Other bases are those of Python and those with an entry.
+    others = [base.__name__ for base in value.__mro__[1:] if base not in bases or _is_public(base)]
+    return [f"   :inherited-members: {', '.join(others)}"]
+
+
+def _is_public(value: type) -> bool:
+    """Return whether a class has an entry on a page."""
+    package = value.__module__.split(".")[1]
+    return hasattr(dhcal_pin, value.__name__) or (
+        package in PACKAGES and value.__name__ in _public_names(package)
+    )
 
 
 def _module_of(name: str) -> str:
