@@ -30,7 +30,7 @@ import numpy as np
 from .._typing import Array, Progress
 from ..estimation import robust
 from ..estimation.error_model import ErrorModel
-from ..estimation.initialization import fit_frames, initialize_frames, make_problem
+from ..estimation.initialization import fit_frames, gross_outliers, initialize_frames, make_problem
 from ..estimation.parameters import EXTENSIONS, fold_harmonics, select_parameters
 from ..estimation.priors import PriorGroups, Priors, has_default_prior, prior_weights
 from ..estimation.problem import Problem, merge_instrument_parameters
@@ -137,7 +137,11 @@ def calibrate(
     problem = replace(make_problem(errors, data, prior_weights(errors, priors), known), executor=executor)
     if bounds:
         problem = replace(problem, bounds=_bounds(problem, bounds))
-    fit = _solve(problem, method, max_iterations, progress)
+    weights = [np.ones(len(item.rows)) for item in data]
+    if method == "lm" and loss != "linear":
+        is_gross = gross_outliers(errors.chain, data)
+        weights = [np.where(each, robust.ZERO_WEIGHT, 1.0) for each in is_gross]
+    fit = _solve(problem, weights, method, max_iterations, progress)
     shrinkage_factor = 1.0
     if method == "lm":
         groups = PriorGroups.from_expected(errors, problem.weights, has_default_prior(errors, priors))
@@ -222,14 +226,22 @@ def _bounds(problem: Problem, bounds: Mapping[str, tuple[float, float]]) -> Arra
     return limits
 
 
-def _solve(problem: Problem, method: Method, max_iterations: int, progress: Progress | None) -> Fit:
-    """Solve a problem with unit weights; `reweight` iterates method "lm" to full convergence later."""
+def _solve(
+    problem: Problem,
+    weights: Sequence[Array],
+    method: Method,
+    max_iterations: int,
+    progress: Progress | None,
+) -> Fit:
+    """Solve a problem with given weights; `reweight` iterates method "lm" to full convergence later."""
+    data = problem.data
+    if any((w != 1).any() for w in weights):
+        problem = problem.with_data([item.with_weights(w) for item, w in zip(data, weights, strict=True)])
     options: dict[str, Any] = {"loose": True} if method == "lm" else {}
     if progress:
         options["progress"] = lambda iteration, cost: progress("fit", iteration, max_iterations)
     solution = minimize(problem, method, None, max_iterations, **options)
-    weights = tuple(np.ones(len(item.rows)) for item in problem.data)
-    fit = Fit(problem.data, problem, solution, weights)
+    fit = Fit(data, problem, solution, tuple(weights))
     errors = problem.errors
     if not errors.has_transmission:
         return fit

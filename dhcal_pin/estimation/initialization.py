@@ -12,6 +12,16 @@ and for a pose also a rotation R_i:
 2. If t is unknown, it is tried on a grid of 27 points around the tip, and the best candidates are kept.
 3. The tool rotation is the mean of R_Fiᵀ·R_Bᵀ·R_i, projected on the rotations.
 4. Each candidate is refined by a nonlinear fit of the frames alone, and the best one is kept.
+5. If even the best candidate disagrees with the positions, some of them may be gross mistakes, which ruin any
+   least-squares start. Samples that disagree with a majority are left out then, and steps 1 to 4 repeated.
+
+Step 5 uses that the equations are linear in the entries of A = R_Bᵀ, in c = R_Bᵀ·b with the position b of the
+base, and in t, if A need not be a rotation:
+
+    A·p_i - c - R_Fi·t = f_i,       f_i the position of F_i.
+
+The majority is that of least trimmed squares (Rousseeuw and Van Driessen 2006): fits to random subsets, each
+followed by fits to the half of the samples with the smallest distances.
 
 Positions come first because they determine the base even if the orientations hardly vary. A start from the
 rotations (hand-eye calibration) then ends in a wrong minimum.
@@ -23,6 +33,7 @@ Shapes: m samples, n joints, p unknowns of the robot.
 
 References:
     W. Kabsch, A Solution for the Best Rotation to Relate Two Sets of Vectors, Acta Cryst. A 32, 1976.
+    P. J. Rousseeuw and K. Van Driessen, Computing LTS Regression for Large Data Sets, DMKD 12, 2006.
     K. Arun, T. Huang and S. Blostein, Least-Squares Fitting of Two 3-D Point Sets, IEEE PAMI 9, 1987.
 """
 
@@ -50,6 +61,12 @@ _MAX_SAMPLES = 100
 _MAX_CANDIDATES = 4
 # No further candidates are tried once the relative misfit of the best one is below this.
 GOOD_RELATIVE_MISFIT = 0.01
+# Number of random subsets of samples, and of fits to the better half of the samples that follow each of them.
+_N_SUBSETS, _N_CONCENTRATIONS = 300, 4
+# A sample disagrees with a majority if its distance is more than this multiple of the majority's.
+_MAX_DISTANCE_RATIO = 10.0
+# Fraction of the largest information below which a direction of the linear equations is held at zero.
+_MIN_INFORMATION = 1e-10
 # Largest number of iterations of a fit of the frames to all data.
 _MAX_ITERATIONS = 100
 
@@ -151,6 +168,115 @@ def relative_misfit(chain: Chain, data: Sequence[Measurement]) -> float:
     return float(np.linalg.norm(measured - modelled) / spread) if spread else np.inf
 
 
+def agreeing_samples(
+    chain: Chain, data: Sequence[Measurement], is_base_unknown: bool, is_tool_unknown: bool
+) -> list[Array]:
+    """Find the samples whose measured positions agree with those of a majority, by the linear equations.
+
+    Args:
+        chain: Nominal chain.
+        data: Measurements of any kinds.
+        is_base_unknown: Whether the base is unknown; otherwise that of the chain is used.
+        is_tool_unknown: Whether the tool is unknown; otherwise that of the chain is used.
+
+    Returns:
+        Whether each sample agrees, shape (m,) for each measurement; True for samples without a position, and
+        for all samples if they are too few to judge each other.
+    """
+    out = [np.ones(len(item.rows), bool) for item in data]
+    with_positions = [(k, item) for k, item in enumerate(data) if len(item.positions())]
+    if not with_positions or not (is_base_unknown or is_tool_unknown):
+        return out
+    bare = chain.with_base_and_tool(np.eye(4), np.eye(4))
+    tip = np.concatenate([bare.poses(item.q) for _, item in with_positions])
+    measured = np.concatenate([item.positions() for _, item in with_positions])
+    m, columns = len(tip), []
+    right = tip[:, :3, 3]
+    if is_base_unknown:
+        centre = np.median(measured, 0)
+        spread = np.median(np.linalg.norm(measured - centre, axis=1)) or 1.0
+        scaled = (measured - centre) / spread
+        columns += [np.einsum("kl,mi->mkli", np.eye(3), scaled).reshape(m, 3, 9)]
+        columns += [np.broadcast_to(-np.eye(3), (m, 3, 3))]
+    else:
+        local = se3.inverse(chain.base)
+        right = right - (local[:3, :3] @ measured[..., None])[..., 0] - local[:3, 3]
+    if is_tool_unknown:
+        columns.append(-tip[:, :3, :3])
+    else:
+        right = right + tip[:, :3, :3] @ chain.tool[:3, 3]
+    distances = _trimmed_distances(np.concatenate(columns, 2), right)
+    if distances is None:
+        return out
+    is_agreeing = iter(distances <= _largest_distance(distances, measured))
+    for k, item in with_positions:
+        out[k] = np.array([next(is_agreeing) for _ in item.rows])
+    return out
+
+
+def _trimmed_distances(columns: Array, right: Array) -> Array | None:
+    """Return the distances of linear equations from their least trimmed squares fit.
+
+    Args:
+        columns: Matrices of the equations, shape (m, 3, u).
+        right: Right-hand sides, shape (m, 3).
+
+    Returns:
+        Distances, shape (m,); None if half of the equations do not determine the unknowns.
+    """
+    m, _, u = columns.shape
+    majority, size = m // 2 + 1, -(-u // 3) + 1
+    if majority <= size:
+        return None
+    rng = np.random.default_rng(0)
+    chosen = np.argsort(rng.random((_N_SUBSETS, m)), axis=1)[:, :size]
+    information = np.einsum("mku,mkv->muv", columns, columns).reshape(m, u * u)
+    products = np.einsum("mku,mk->mu", columns, right)
+    floor = _MIN_INFORMATION * m * np.max(information.reshape(m, u, u).diagonal(0, 1, 2)) * np.eye(u)
+    squares = np.empty((0, m))
+    for _ in range(_N_CONCENTRATIONS + 1):
+        weights = np.zeros((_N_SUBSETS, m))
+        np.put_along_axis(weights, chosen, 1.0, 1)
+        total = (weights @ information).reshape(-1, u, u) + floor
+        solutions = np.linalg.solve(total, (weights @ products)[..., None])[..., 0]
+        modelled = (columns.reshape(-1, u) @ solutions.T).reshape(m, 3, -1)
+        squares = np.sum((modelled - right[..., None]) ** 2, 1).T
+        chosen = np.argpartition(squares, majority - 1, axis=1)[:, :majority]
+    best = np.argmin(np.sum(np.take_along_axis(squares, chosen, 1), 1))
+    return np.sqrt(squares[best])
+
+
+def gross_outliers(chain: Chain, data: Sequence[Measurement]) -> list[Array]:
+    """Find samples whose position is so far from that of the initialized chain that a fit must begin without.
+
+    Args:
+        chain: Nominal chain with initialized base and tool.
+        data: Measurements of any kinds.
+
+    Returns:
+        Whether each sample is a gross outlier, shape (m,) for each measurement; False for samples without a
+        position.
+    """
+    out = [np.zeros(len(item.rows), bool) for item in data]
+    with_positions = [k for k, item in enumerate(data) if len(item.positions())]
+    if with_positions:
+        measured = [data[k].positions() for k in with_positions]
+        distances = [
+            np.linalg.norm(chain.poses(data[k].q)[:, :3, 3] - each, axis=1)
+            for k, each in zip(with_positions, measured, strict=True)
+        ]
+        limit = _largest_distance(np.concatenate(distances), np.concatenate(measured))
+        for k, distance in zip(with_positions, distances, strict=True):
+            out[k] = distance > limit
+    return out
+
+
+def _largest_distance(distances: Array, measured: Array) -> float:
+    """Return the largest distance of a sample that agrees, from all distances (m,) and positions (m, 3)."""
+    spread = np.median(np.linalg.norm(measured - np.median(measured, 0), axis=1))
+    return float(max(_MAX_DISTANCE_RATIO * np.median(distances), GOOD_RELATIVE_MISFIT * spread))
+
+
 def make_problem(
     errors: ErrorModel, data: tuple[Measurement, ...], weights: Array, known: Mapping[str, float]
 ) -> Problem:
@@ -206,20 +332,33 @@ def initialize_frames(
     if frames is None:
         return errors
     unknown_frames = {p.error_frame for p in frames.parameters}
+    is_unknown = BASE_FRAME in unknown_frames, errors.chain.tool_frame_index in unknown_frames
     drawn = tuple(subsample(item) for item in data)
-    best: tuple[float, Chain] | None = None
-    for start in candidate_frames(
-        errors.chain,
-        drawn,
-        BASE_FRAME in unknown_frames,
-        errors.chain.tool_frame_index in unknown_frames,
-    ):
-        fitted = _fit_frames(replace(frames, chain=start), drawn, known, max_iterations)
-        best = fitted if best is None else min(best, fitted, key=lambda each: each[0])
-        if relative_misfit(best[1], drawn) < GOOD_RELATIVE_MISFIT:
-            break
+    best = _best_frames(frames, drawn, known, max_iterations, is_unknown)
+    if best and relative_misfit(best[1], drawn) >= GOOD_RELATIVE_MISFIT:
+        kept = agreeing_samples(errors.chain, drawn, *is_unknown)
+        if not all(each.all() for each in kept):
+            drawn = tuple(item.take(each) for item, each in zip(drawn, kept, strict=True))
+            best = _best_frames(frames, drawn, known, max_iterations, is_unknown) or best
     best = best or _fit_frames(frames, data, known, max_iterations)
     return replace(errors, chain=best[1])
+
+
+def _best_frames(
+    frames: ErrorModel,
+    data: tuple[Measurement, ...],
+    known: Mapping[str, float],
+    max_iterations: int,
+    is_unknown: tuple[bool, bool],
+) -> tuple[float, Chain] | None:
+    """Return the cost and the chain of the best candidate, see `candidate_frames`; None if there is none."""
+    best: tuple[float, Chain] | None = None
+    for start in candidate_frames(frames.chain, data, *is_unknown):
+        fitted = _fit_frames(replace(frames, chain=start), data, known, max_iterations)
+        best = fitted if best is None else min(best, fitted, key=lambda each: each[0])
+        if relative_misfit(best[1], data) < GOOD_RELATIVE_MISFIT:
+            break
+    return best
 
 
 def fit_frames(errors: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float]) -> Chain:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from robots import joint_sample, measured_arm
+from robots import joint_sample, measured_arm, with_random_frames
 
 from dhcal_pin.calibration import calibrate, trimmed_squares
 from dhcal_pin.estimation import select_parameters
@@ -33,6 +33,11 @@ def with_outliers(data, bad, is_clustered, rng):
     else:
         sizes = np.exp(rng.uniform(np.log(10), np.log(500), len(bad)))
     jump = directions / np.linalg.norm(directions, axis=1)[:, None] * SIGMA * np.reshape(sizes, (-1, 1))
+    return moved(data, bad, jump)
+
+
+def moved(data, bad, jump):
+    """Move the given samples."""
     if isinstance(data, Pose):
         poses = data.poses.copy()
         poses[bad, :3, 3] += jump
@@ -203,3 +208,27 @@ def test_residuals_that_look_like_noise_need_no_search(monkeypatch):
     fit = calibrate(chain, data.replace(poses=wrong), "minimal,base,tool", extend="none")
     assert searches
     assert fit.outliers[0].tolist() == [8]
+
+
+@pytest.mark.parametrize("is_clustered", [False, True])
+@pytest.mark.parametrize("kind", [Pose, Position])
+def test_outliers_of_half_a_metre_do_not_spoil_the_start(kind, is_clustered):
+    """With them a least-squares fit of base and tool, or of the robot, ends in a wrong minimum."""
+    for seed in range(4):
+        rng = np.random.default_rng([seed, 7])
+        chain = with_random_frames(measured_arm("slide"), rng)
+        clean = kind.simulate(chain, joint_sample(chain, 40, rng), Noise(SIGMA, SIGMA), rng)
+        bad = np.sort(rng.permutation(40)[:14])
+        jump = rng.normal(size=(1 if is_clustered else len(bad), 3))
+        jump *= 0.5 / np.linalg.norm(jump, axis=1)[:, None]
+        dirty = moved(clean, bad, np.broadcast_to(jump, (len(bad), 3)))
+        nominal = chain.with_base_and_tool(np.eye(4), np.eye(4))
+        good = np.setdiff1d(np.arange(40), bad)
+        fit, expected = (
+            calibrate(nominal, data, "minimal,base,tool", extend="none")
+            for data in (without_sigma(dirty), without_sigma(clean.take(good)))
+        )
+        assert np.isin(bad + 1, fit.outliers[0]).all(), seed
+        assert len(fit.outliers[0]) <= len(bad) + 1
+        q = joint_sample(chain, 200, rng)
+        assert tool_error(fit, chain, q) <= 1.3 * tool_error(expected, chain, q), seed
