@@ -14,7 +14,7 @@ import numpy as np
 
 from ..._typing import Array, PathLike
 from ...exceptions import FileFormatError
-from .table import DataTable
+from .table import DataTable, require_few_rows
 from .text import TextLayout, detect_decimal
 
 # Kinds of NumPy arrays that are numbers, and that are times.
@@ -78,7 +78,9 @@ def read_parquet(path: PathLike, layout: TextLayout) -> DataTable:
             "pip install 'dhcal-pin[parquet]', or save the table as CSV"
         ) from None
     try:
-        table = pyarrow.parquet.read_table(source)
+        with pyarrow.parquet.ParquetFile(source) as file:
+            require_few_rows(source, file.metadata.num_rows)
+            table = file.read()
     except OSError as error:
         raise FileFormatError(
             f"{source}: cannot read it: {error.strerror or error}; give the path of a file"

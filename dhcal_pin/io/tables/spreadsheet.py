@@ -11,12 +11,15 @@ import warnings
 from collections.abc import Iterable, Sequence
 from datetime import date, datetime, time
 from typing import Any
-from zipfile import BadZipFile
+from zipfile import BadZipFile, ZipFile
 
 from ..._typing import PathLike
 from ...exceptions import FileFormatError
 from .table import DataTable
 from .text import TextLayout, detect_decimal
+
+# Largest size of all sheets and texts of a workbook [byte]; openpyxl reads 4 MiB per second.
+MAX_XML_BYTES = 32 << 20
 
 
 def read_spreadsheet(path: PathLike, layout: TextLayout) -> DataTable:
@@ -42,6 +45,7 @@ def read_spreadsheet(path: PathLike, layout: TextLayout) -> DataTable:
             "or save the sheet as CSV"
         ) from None
     try:
+        _require_small(path, source)
         with warnings.catch_warnings():
             # Unknown extensions of a workbook, such as charts, do not matter here.
             warnings.simplefilter("ignore", UserWarning)
@@ -64,6 +68,17 @@ def read_spreadsheet(path: PathLike, layout: TextLayout) -> DataTable:
     others = [other for other in filled if other != title]
     notes = (f"read sheet {title!r}, not {', '.join(map(repr, others))}",) if others else ()
     return _build_table(source, rows, layout, f"Excel sheet {title!r}", notes)
+
+
+def _require_small(path: PathLike, source: str) -> None:
+    """Require that the unpacked sheets and texts of a workbook are small enough to be read in seconds."""
+    with ZipFile(path) as archive:
+        size = sum(entry.file_size for entry in archive.infolist() if entry.filename.endswith(".xml"))
+    if size > MAX_XML_BYTES:
+        raise FileFormatError(
+            f"{source}: a workbook of {size >> 20} MiB when unpacked, more than {MAX_XML_BYTES >> 20} MiB; "
+            "save the sheet as CSV"
+        )
 
 
 def _numbered_rows(rows: Iterable[Sequence[Any]]) -> list[tuple[int, list[Any]]]:

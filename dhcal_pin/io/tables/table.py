@@ -28,6 +28,9 @@ from ...messages import quote
 from ...units import MAX_SI_VALUE
 from ..tabular import parse_number
 
+# Largest number of rows of a table. With more of them a calibration takes more than 20 s and 1 GB.
+MAX_ROWS = 200_000
+
 
 @dataclass(frozen=True)
 class Column:
@@ -313,6 +316,23 @@ class DataTable:
             others = f"; {len(self.bad_rows)} rows cannot be used: lines {format_lines(self.bad_rows)}"
         raise FileFormatError(
             f"{self.source}:{line}: {reason}{others}; correct or remove {what}{alternative}"
+        )
+
+
+def require_few_rows(source: str, count: int) -> None:
+    """Require that a table is small enough for the memory.
+
+    Args:
+        source: Name of the file, for messages.
+        count: Number of rows, which may include lines without content.
+
+    Raises:
+        FileFormatError: There are too many rows.
+    """
+    if count > MAX_ROWS:
+        raise FileFormatError(
+            f"{source}: {count} rows, more than {MAX_ROWS}; keep one in "
+            f"{-(-count // MAX_ROWS)} of them, or calibrate with `calibrate_stream` of the Python package"
         )
 
 

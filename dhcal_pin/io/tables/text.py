@@ -26,7 +26,7 @@ import numpy as np
 from ..._typing import Array, PathLike
 from ...exceptions import FileFormatError
 from ..tabular import parse_number, read_text
-from .table import DataTable
+from .table import DataTable, require_few_rows
 
 # Characters of a line without content: spreadsheets write empty rows as separators only.
 BLANK_CHARACTERS = " \t,;"
@@ -34,6 +34,8 @@ BLANK_CHARACTERS = " \t,;"
 SEPARATORS: Mapping[str, str | None] = {",": ",", ";": ";", "tab": "\t", "space": None}
 # Names of separators in descriptions.
 _SEPARATOR_NAMES = {",": "commas", ";": "semicolons", "tab": "tabs", "space": "spaces"}
+# Longest line of a table.
+MAX_LINE_LENGTH = 1 << 20
 # Rows that the separator and the decimal sign are detected from.
 _N_SEPARATOR_ROWS, _N_DECIMAL_ROWS = 50, 2000
 # A number without and with a decimal sign.
@@ -74,9 +76,21 @@ def read_text_table(path: PathLike, layout: TextLayout) -> DataTable:
         layout: What is known about the file.
 
     Returns:
-        The table; `parse_lines` names the possible errors.
+        The table.
+
+    Raises:
+        FileFormatError: The file is too large, or has no table; see `parse_lines`.
     """
-    return parse_lines(os.fspath(path), enumerate(read_text(path, layout.encoding).splitlines(), 1), layout)
+    source, text = os.fspath(path), read_text(path, layout.encoding)
+    require_few_rows(source, text.count("\n"))
+    lines = text.splitlines()
+    longest = max(range(len(lines)), key=lambda i: len(lines[i]), default=None)
+    if longest is not None and len(lines[longest]) > MAX_LINE_LENGTH:
+        raise FileFormatError(
+            f"{source}:{longest + 1}: a line of {len(lines[longest])} characters, more than "
+            f"{MAX_LINE_LENGTH}; check that the file is a table"
+        )
+    return parse_lines(source, enumerate(lines, 1), layout)
 
 
 def parse_lines(source: str, numbered: Iterable[tuple[int, str]], layout: TextLayout = DETECTED) -> DataTable:
