@@ -16,7 +16,7 @@ PACKAGE = Path(dhcal_pin.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
 PACKAGES = sorted({path.parent for path in FILES} - {PACKAGE, PACKAGE / "data"})
 COMMANDS = set(
-    "calibrate doctor inspect validate convert simulate check demo plan compensate study view".split()
+    "app calibrate doctor inspect validate convert simulate check demo plan compensate study view".split()
 )
 # Identifiers of an earlier vocabulary, each with the standard term that replaced it.
 REPLACED = {

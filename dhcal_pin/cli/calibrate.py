@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
+from contextlib import nullcontext
 
 from ..exceptions import InvalidArgumentError
 from .job import Job, add_job_arguments, is_manifest
@@ -22,6 +23,13 @@ def add_arguments(parser: ArgumentParser) -> None:
     """
     add_job_arguments(parser)
     add_execution_options(parser, "processes (default: 1; with a manifest, one per processor)", jobs=None)
+    parser.add_argument(
+        "--progress",
+        choices=("status", "lines"),
+        default="status",
+        help="status: a status line on a terminal (default); lines: a line `progress: PHASE STEP/TOTAL` on "
+        "stderr for each step, for programs that run this command",
+    )
 
 
 def run(args: Namespace) -> int:
@@ -56,10 +64,11 @@ def _calibrate_robot(args: Namespace) -> int:
     from .run_job import run_job
 
     job = Job.from_args(args)
-    with (
-        open_executor(args.jobs or 1, args.scheduler) as executor,
-        console.show_progress("reading the files") as progress,
-    ):
+    shown = {
+        "status": console.show_progress("reading the files"),
+        "lines": nullcontext(console.print_progress),
+    }
+    with open_executor(args.jobs or 1, args.scheduler) as executor, shown[args.progress] as progress:
         outcome = run_job(job, progress, executor)
     console.show(calibration_screen(outcome, job), args.verbosity)
     return REFUSED if outcome.fit.verdict.is_refused and not job.force else 0

@@ -77,6 +77,17 @@ def show_progress(title: str) -> Iterator[Progress | None]:
         yield update
 
 
+def print_progress(phase: str, step: int, total: int) -> None:
+    """Print the phase of the work as a line for a program, such as `progress: robust weights 3/30`.
+
+    Args:
+        phase: Name of the phase.
+        step: Number of its step.
+        total: Largest number of steps.
+    """
+    print_lines(f"progress: {phase} {step}/{total}")
+
+
 @contextmanager
 def progress_bar(title: str, total: int, n_done: int = 0) -> Iterator[Callable[[int], None]]:
     """Show a progress bar; nothing is shown if stderr is not a terminal.

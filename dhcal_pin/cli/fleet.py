@@ -181,7 +181,7 @@ def _real_path(folder: str, path: str) -> str:
 
 def _output_paths(job: Job) -> list[str]:
     """List the files that a job writes."""
-    paths = (job.output, sidecar_path(job.output), job.map, job.curves, job.json, job.residuals, *job.report)
+    paths = (sidecar_path(job.output), *job.output_paths)
     return [path for path in paths if path]
 
 

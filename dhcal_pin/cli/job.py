@@ -195,6 +195,14 @@ class Job:
             "is_output": True,
         },
     )
+    scene: str | None = field(
+        default=None,
+        metadata={
+            "metavar": "SCENE.html",
+            "help": "write the 3-D scene of the nominal and the calibrated robot (.html)",
+            "is_output": True,
+        },
+    )
     map: str | None = field(
         default=None,
         metadata={
@@ -220,6 +228,11 @@ class Job:
             value = getattr(args, option.name)
             values[option.name] = tuple(value) if isinstance(value, list) else value
         return cls(**values)
+
+    @property
+    def output_paths(self) -> tuple[str | None, ...]:
+        """Paths that the options name for outputs; the sidecar is beside the first one."""
+        return (self.output, self.scene, self.map, self.curves, self.json, self.residuals, *self.report)
 
     def command(self, names: Mapping[str, str]) -> str:
         """Format the command line of this job without the options that only name outputs.

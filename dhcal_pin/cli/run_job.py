@@ -32,7 +32,7 @@ from ..estimation.parameters import select_parameters
 from ..estimation.robust import ZERO_WEIGHT
 from ..exceptions import InvalidArgumentError
 from ..io.measurement_files import MeasurementFile, read_measurement_file
-from ..io.robot import read_robot, urdf_files
+from ..io.robot import read_robot, robot_name, urdf_files
 from ..io.settings import parse_payload, read_bounds, read_priors
 from ..io.sidecar import read_instrument, sidecar_path
 from ..io.tabular import csv_text
@@ -179,6 +179,11 @@ def run_job(
 
         contents[job.map] = workspace_map.map_content(job.map, fit, fit.holdout, fit.instruments)
         files["map"] = job.map
+    if job.scene and is_kept:
+        from ..visualization import scene  # lazy import: only for scenes
+
+        contents[job.scene] = scene.scene_html(fit.nominal_refitted, fit, title=robot_name(job.robot))
+        files["scene"] = job.scene
     if job.curves and is_kept:
         corrections = joint_corrections(fit.chain)
         contents[job.curves] = csv_text(correction_columns(corrections))
@@ -266,9 +271,7 @@ def _checked_inputs(job: Job) -> list[str]:
     require_urdf_ending(job.output)
     require_writable_outputs([job.json, job.residuals, *job.report], inputs)
     protected = [*measured, *settings] if job.in_place else inputs
-    outputs = [job.output, sidecar_path(job.output), job.map, job.curves, job.json, job.residuals]
-    outputs += job.report
-    require_writable_outputs(outputs, protected)
+    require_writable_outputs([sidecar_path(job.output), *job.output_paths], protected)
     if job.report:
         from ..report import html  # lazy import: only for reports
 

@@ -1,25 +1,21 @@
 """Server process of a live scene: the MeshCat server on the loopback address, until its parent ends.
 
 The server of MeshCat listens on every address and answers everyone. This one receives commands through a
-socket file in a folder that only this user can open. It answers browsers on this computer that know its
-address, which contains a random token, and that ask for the loopback address: a page of another site cannot
-reach it through a name that resolves to this computer (DNS rebinding). `python -m
-dhcal_pin.visualization.live_server ADDRESS` prints the address of the page as its first line.
+socket file in a folder that only this user can open, and answers the browsers that `loopback` admits. `python
+-m dhcal_pin.visualization.live_server ADDRESS` prints the address of the page as its first line.
 """
 
 from __future__ import annotations
 
 import re
-import secrets
 import sys
 from functools import partial
 
 import tornado.web
 from meshcat.servers.zmqserver import VIEWER_ROOT, WebSocketHandler, ZMQWebSocketBridge
 
-LOOPBACK = "127.0.0.1"
-# Names of the loopback address that a browser may ask for.
-_HOSTS = rf"({re.escape(LOOPBACK)}|localhost)"
+from ..loopback import LOOPBACK, local_application, new_token
+
 _SCRIPT = "main.min.js"
 # As the page of MeshCat, but the connection has the token.
 _PAGE = f"""<!DOCTYPE html>
@@ -45,15 +41,13 @@ class _PageHandler(tornado.web.RequestHandler):
 
 class _LocalBridge(ZMQWebSocketBridge):
     def make_app(self) -> tornado.web.Application:
-        self.token = secrets.token_urlsafe(16)
-        root = f"/{re.escape(self.token)}"
-        app = tornado.web.Application()
-        app.add_handlers(
-            _HOSTS,
+        self.token = new_token()
+        app = local_application(
+            self.token,
             [
-                (f"{root}/", _PageHandler),
-                (f"{root}/({re.escape(_SCRIPT)})", tornado.web.StaticFileHandler, {"path": VIEWER_ROOT}),
-                (f"{root}/socket", WebSocketHandler, {"bridge": self}),
+                ("", _PageHandler),
+                (f"({re.escape(_SCRIPT)})", tornado.web.StaticFileHandler, {"path": VIEWER_ROOT}),
+                ("socket", WebSocketHandler, {"bridge": self}),
             ],
         )
         app.listen = partial(app.listen, address=LOOPBACK)

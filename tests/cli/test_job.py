@@ -43,6 +43,7 @@ VALUES = {
     "json": '"r.json"',
     "curves": '"curves.csv"',
     "residuals": '"residuals.csv"',
+    "scene": '"scene.html"',
     "map": '"map.csv"',
 }
 ARGUMENTS = (
@@ -51,7 +52,7 @@ ARGUMENTS = (
     "--fix d2 --free d3 --holdout 0.3 --method gn --loss tukey --priors none --bounds bounds.toml "
     "--instrument known.toml --payload 5kg --max-iterations 7 --seed 3 --in-place --world-joint "
     "--tool-frame tcp --force --report r.html --report r.md --json r.json --curves curves.csv "
-    "--residuals residuals.csv --map map.csv"
+    "--residuals residuals.csv --scene scene.html --map map.csv"
 )
 
 
@@ -83,9 +84,9 @@ def test_command_parses_to_the_same_job():
     job = job_of(ARGUMENTS)
     text = job.command({"arm.urdf": "robots/arm.urdf"})
     outputs = "-o out.urdf --in-place --report r.html --report r.md --json r.json --map map.csv "
-    outputs += "--curves curves.csv --residuals residuals.csv"
+    outputs += "--curves curves.csv --residuals residuals.csv --scene scene.html"
     assert job_of(f"{text.replace('robots/', '').removeprefix('dhcal ')} {outputs}") == job
-    flags = {"-o", "--in-place", "--report", "--json", "--curves", "--residuals", "--map"}
+    flags = {"-o", "--in-place", "--report", "--json", "--curves", "--residuals", "--scene", "--map"}
     assert not flags & set(text.split())
 
 

@@ -1,0 +1,368 @@
+// The page keeps the files. Each request sends them with the options; the answer is one JSON message per line.
+"use strict";
+
+const LIMIT = Number(document.documentElement.dataset.limit);
+const ROLES = { robot: "Robot", data: "Measurements", columns: "Column map", beside: "Sidecar or other" };
+const ROBOT = /\.(urdf|dh\.toml|dh\.csv|ya?ml)$/i;
+// Pause before the files are checked again after a change [ms].
+const CHECK_DELAY = 300;
+
+const files = new Map();  // name -> { file, role }
+const mends = [];         // changes of the measurements that a refused calibration named
+const links = [];         // addresses of results in memory
+let checking = null, running = null, timer = 0;
+
+const $ = id => document.getElementById(id);
+
+// Creates an element with properties and children; texts are never interpreted as HTML.
+function element(name, properties = {}, ...children) {
+  const out = Object.assign(document.createElement(name), properties);
+  out.append(...children.filter(child => child !== null));
+  return out;
+}
+
+function list(texts) {
+  return texts.length ? element("ul", {}, ...texts.map(text => element("li", {}, text))) : null;
+}
+
+// A wide table scrolls in a box that the keyboard can reach.
+function table(caption, header, rows) {
+  const cell = (name, text, scope) => element(name, scope ? { scope } : {}, text);
+  return element("div", { className: "scroll", tabIndex: 0, role: "region", ariaLabel: caption },
+    element("table", {}, element("caption", {}, caption),
+      element("thead", {}, element("tr", {}, ...header.map(text => cell("th", text, "col")))),
+      element("tbody", {}, ...rows.map(row => element("tr", {}, ...row.map((text, i) => cell(i ? "td" : "th", text, i ? "" : "row")))))));
+}
+
+function showError(id, text) {
+  $(id).textContent = text;
+  $(id).hidden = !text;
+}
+
+const megabytes = bytes => bytes < 1e5 ? `${Math.max(1, Math.round(bytes / 1e3))} kB` : `${(bytes / 1e6).toFixed(1)} MB`;
+const named = role => [...files].filter(([, entry]) => entry.role === role).map(([name]) => name);
+
+// --- files -----------------------------------------------------------------------------------------
+
+function roleOf(name) {
+  if (/\.calibration\.toml$/i.test(name)) return "beside";
+  if (ROBOT.test(name)) return "robot";
+  return /\.toml$/i.test(name) ? "columns" : "data";
+}
+
+// There is one robot and one column map: a new one replaces the other.
+function setRole(name, role) {
+  if (role === "robot" || role === "columns") {
+    for (const [other, entry] of files) if (other !== name && entry.role === role) files.delete(other);
+  }
+  files.get(name).role = role;
+}
+
+function addFiles(added) {
+  const total = [...files.values()].reduce((sum, { file }) => sum + file.size, 0);
+  const size = [...added].reduce((sum, file) => sum + file.size, total);
+  if (size > LIMIT) {
+    showError("file-error", `The files have ${megabytes(size)}; at most ${megabytes(LIMIT)} are accepted (dhcal app --max-size).`);
+    return;
+  }
+  showError("file-error", "");
+  for (const file of added) {
+    files.set(file.name, { file, role: "beside" });
+    setRole(file.name, roleOf(file.name));
+  }
+  filesChanged();
+}
+
+function filesChanged() {
+  mends.length = 0;
+  clearResult();
+  showMends();
+  showFiles();
+  showLinks();
+  showHoldoutFiles();
+  check();
+}
+
+function showFiles() {
+  $("files").replaceChildren(...[...files].map(([name, { file, role }]) => {
+    const use = element("select", { ariaLabel: `Use of ${name}` },
+      ...Object.entries(ROLES).map(([value, text]) => element("option", { value, selected: value === role }, text)));
+    use.onchange = () => { setRole(name, use.value); filesChanged(); };
+    const remove = element("button", { type: "button", ariaLabel: `Remove ${name}` }, "Remove");
+    remove.onclick = () => { files.delete(name); filesChanged(); $("picker").focus(); };
+    return element("li", {}, element("span", { className: "name" }, name),
+      element("span", { className: "size" }, megabytes(file.size)), use, remove);
+  }));
+}
+
+// Suggests the links of the URDF as tip.
+async function showLinks() {
+  const [robot] = named("robot");
+  $("tip").disabled = !!robot && !/\.urdf$/i.test(robot);
+  let names = [];
+  if (robot && !$("tip").disabled) {
+    const text = await files.get(robot).file.text();
+    const xml = new DOMParser().parseFromString(text, "application/xml");
+    names = [...xml.querySelectorAll("robot > link")].map(link => link.getAttribute("name")).filter(Boolean);
+  }
+  $("links").replaceChildren(...names.map(value => element("option", { value })));
+}
+
+// A measurement file can be the hold-out if another one is left for the fit.
+function showHoldoutFiles() {
+  const before = $("holdout").value, data = named("data");
+  for (const option of $("holdout").querySelectorAll("option[data-file]")) option.remove();
+  if (data.length > 1) {
+    $("holdout").append(...data.map(value => {
+      const option = element("option", { value }, `the file ${value}, not fitted`);
+      option.dataset.file = "";
+      return option;
+    }));
+  }
+  $("holdout").value = before;
+  if ($("holdout").selectedIndex < 0) $("holdout").selectedIndex = 0;
+}
+
+// --- requests --------------------------------------------------------------------------------------
+
+function form(request) {
+  const out = new FormData();
+  const [robot] = named("robot"), [columns] = named("columns");
+  const options = { robot: robot ?? "", columns: columns ?? "", tip: $("tip").disabled ? "" : $("tip").value.trim() };
+  out.append("request", JSON.stringify({ ...options, ...request }));
+  for (const [name, { file }] of files) out.append("file", file, name);
+  return out;
+}
+
+// Sends the files and passes each message of the answer on.
+async function send(operation, body, signal, onMessage) {
+  const response = await fetch(operation, { method: "POST", body, signal });
+  if (!response.ok) throw new Error((await response.text()).trim());
+  const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
+  let rest = "", last = {};
+  for (;;) {
+    const { done, value } = await reader.read();
+    if (done) break;
+    const lines = (rest + value).split("\n");
+    rest = lines.pop();
+    for (const line of lines) onMessage(last = JSON.parse(line));
+  }
+  if (!last.error && !last.result) throw new Error("the answer is incomplete; try again");
+}
+
+function failure(error) {
+  return error instanceof TypeError ? "The server does not answer; start dhcal app again." : error.message;
+}
+
+// --- check -----------------------------------------------------------------------------------------
+
+function updateButtons() {
+  const missing = [...(named("robot").length ? [] : ["a robot"]), ...(named("data").length ? [] : ["measurements"])];
+  $("cancel").hidden = $("progress").hidden = !running;
+  $("calibrate").disabled = !!running || missing.length > 0;
+  $("needed").textContent = running || !missing.length ? "" : `Add ${missing.join(" and ")}.`;
+}
+
+function check() {
+  clearTimeout(timer);
+  checking?.abort();
+  updateButtons();
+  if (!named("data").length) {
+    $("check").replaceChildren(element("p", { className: "hint" }, "The content of the files is shown here."));
+    return;
+  }
+  timer = setTimeout(inspect, CHECK_DELAY);
+}
+
+async function inspect() {
+  const controller = checking = new AbortController();
+  $("check").replaceChildren(element("p", { className: "hint" }, "Reading the files …"));
+  const show = message => {
+    if (controller.signal.aborted) return;
+    const cards = message.error ? [element("p", { className: "error" }, message.error)] : message.result.files.map(fileCard);
+    $("check").replaceChildren(...cards);
+  };
+  try {
+    await send("inspect", form({ data: named("data") }), controller.signal, show);
+  } catch (error) {
+    if (error.name !== "AbortError") show({ error: failure(error) });
+  }
+}
+
+const count = (number, noun) => `${number} ${noun}${number === 1 ? "" : "s"}`;
+
+function fileCard(file) {
+  const bad = Object.entries(file.bad_rows).map(([line, reason]) => `line ${line}: ${reason}`);
+  const warnings = [...file.warnings, ...bad.slice(0, 5), ...(bad.length > 5 ? [`${bad.length - 5} more rows cannot be used`] : [])];
+  const state = file.problem ? "problem" : warnings.length ? "warning" : "ok";
+  const facts = [file.kind, count(file.rows, "row"), file.configurations ? count(file.configurations, "configuration") : "", file.form];
+  const out = element("div", { className: `card ${state}` },
+    element("h3", {}, file.path), element("p", {}, facts.filter(Boolean).join(", ")),
+    file.problem ? element("p", {}, file.problem) : null, list(warnings), list(file.notes),
+    state === "ok" ? element("p", {}, "No problems found.") : null);
+  if (file.column_map.length) out.append(...proposedMap(file.column_map));
+  const rows = file.columns.map(column => [column.name, column.unit, column.role, short(column.minimum), short(column.maximum),
+    column.lower === null ? "" : `${short(column.lower)} to ${short(column.upper)}`,
+    column.coverage === null ? "" : `${Math.round(100 * column.coverage)} %`]);
+  out.append(element("details", {}, element("summary", {}, count(file.columns.length, "column")),
+    table(`Columns of ${file.path}`, ["column", "unit", "use", "smallest", "largest", "limits", "visited 5° bins"], rows)));
+  return out;
+}
+
+const short = value => value === null || value === undefined ? "" : String(Number(value.toPrecision(6)));
+
+// A column map that the check proposes can be edited and used.
+function proposedMap(lines) {
+  const text = element("textarea", { rows: 5, value: `${lines.join("\n")}\n`, spellcheck: false, id: "map-text" });
+  const use = element("button", { type: "button" }, "Use this column map");
+  use.onclick = () => addFiles([new File([text.value], "columns.toml", { type: "text/plain" })]);
+  return [element("label", { htmlFor: "map-text" }, "Proposed column map. Check the units and the order of the joints."), text, use];
+}
+
+// --- calibration -----------------------------------------------------------------------------------
+
+function showMends() {
+  $("mends").hidden = !mends.length;
+  const drop = element("button", { type: "button" }, "Undo");
+  drop.onclick = () => { mends.length = 0; showMends(); $("calibrate").focus(); };
+  $("mends").replaceChildren(element("div", { className: "card buttons" }, `The measurements are changed before the fit: ${mends.join(", ")}`, drop));
+}
+
+function setRunning(controller) {
+  running = controller;
+  updateButtons();
+  $("phase").textContent = "reading the files";
+}
+
+async function calibrate(force = false) {
+  const holdout = $("holdout"), isFile = holdout.selectedOptions[0].dataset.file !== undefined;
+  const request = {
+    data: named("data").filter(name => !isFile || name !== holdout.value),
+    parameters: $("parameters").value, holdout: holdout.value, "skip-bad-rows": $("skip-bad-rows").checked, mend: mends, force,
+  };
+  clearResult();
+  $("status").textContent = "The calibration is running.";
+  setRunning(new AbortController());
+  $("cancel").focus();
+  try {
+    await send("calibrate", form(request), running.signal, message => {
+      if (message.phase) showProgress(message);
+      else if (message.error) throw new Error(message.error);
+      else showResult(message);
+    });
+    $("status").textContent = "";
+  } catch (error) {
+    const cancelled = error.name === "AbortError";
+    $("status").textContent = cancelled ? "Cancelled. Nothing was kept." : "";
+    if (!cancelled) showError("run-error", failure(error));
+  }
+  const focused = document.activeElement === $("cancel");
+  setRunning(null);
+  if (!$("result").hidden) $("result").focus();
+  else if (focused) $("calibrate").focus();
+}
+
+function clearResult() {
+  for (const link of links.splice(0)) URL.revokeObjectURL(link);
+  $("result").hidden = true;
+  $("status").textContent = "";
+  showError("run-error", "");
+}
+
+function showProgress({ phase, step, total }) {
+  $("phase").textContent = total > 1 ? `${phase}, step ${step}` : phase;
+}
+
+// Rows of the accuracy table, the most important one first.
+function accuracies(result) {
+  const sets = [
+    [`${count(result.samples_holdout, "hold-out row")}`, "holdout_"], ["cross-validation", "cross_validated_"],
+    ["left-out regions of joint space", "holdout_region_"], [`${count(result.samples, "fitted row")}`, ""],
+  ];
+  const out = [];
+  for (const [judged, prefix] of sets) {
+    const before = result[`${prefix}before`], after = result[`${prefix}after`];
+    if (!before || !after || (prefix === "holdout_" && !result.samples_holdout)) continue;
+    const add = (quantity, key, format) => {
+      if (before[key] !== undefined && before[key] !== null) out.push([quantity, judged, format(before[key]), format(after[key])]);
+    };
+    add("position", "position_rms_m", value => `${digits(1e3 * value)} mm`);
+    add("orientation", "orientation_rms_rad", value => `${digits(1e3 * value)} mrad`);
+    add("residual", "residual_rms", value => before.unit === "m" ? `${digits(1e3 * value)} mm` : `${digits(value)} ${before.unit ?? ""}`);
+  }
+  return out;
+}
+
+const digits = value => value === 0 ? "0" : String(Number(value.toPrecision(value < 10 ? 2 : 3)));
+
+const VERDICTS = {
+  ok: "Verdict: ok", caution: "Verdict: caution", refused: "Verdict: refused. No robot is written.",
+  forced: "Verdict: refused. The robot is written all the same.",
+};
+
+function showResult({ result, status, screen, files: outputs }) {
+  const { verdict } = result, rows = accuracies(result), parts = [];
+  const isRefused = status === "refused";
+  const key = verdict.status === "refused" && !isRefused ? "forced" : verdict.status;
+  parts.push(element("div", { className: `card ${verdict.status}` }, element("p", { className: "verdict" }, VERDICTS[key]),
+    list(verdict.reasons), isRefused ? remedies(verdict.reasons) : null));
+  if (!isRefused && rows.length) {
+    const [quantity, judged, before, after] = rows[0];
+    const value = (name, text) => element("div", {}, element("dt", {}, name), element("dd", {}, text));
+    parts.push(element("h3", {}, `RMS ${quantity} error, ${judged}`),
+      element("dl", { className: "headline" }, value("before", before), value("after", after)));
+  }
+  for (const quantity of new Set(rows.map(([name]) => name))) {
+    const shown = rows.filter(([name]) => name === quantity).map(([, ...row]) => row);
+    parts.push(table(`RMS ${quantity} error`, ["judged on", "before", "after"], shown));
+  }
+  if (result.warnings.length) parts.push(element("div", { className: "card warning" }, element("h3", {}, "Warnings"), list(result.warnings)));
+  parts.push(element("h3", {}, "Files"), element("ul", { id: "downloads" }, ...outputs.map(downloadItem)));
+  parts.push(element("details", {}, element("summary", {}, "The same on the command line"),
+    element("pre", { tabIndex: 0 }, `${result.command} -o ${outputName(outputs)}`), element("pre", { tabIndex: 0 }, screen)));
+  $("result").replaceChildren(...parts);
+  $("result").hidden = false;
+}
+
+const outputName = outputs => outputs.find(({ name }) => name.endsWith(".urdf"))?.name ?? "calibrated.urdf";
+
+// Buttons for the remedies that the reasons name.
+function remedies(reasons) {
+  const keys = [...reasons.join(" ").matchAll(/--mend (\S+?)[.,;)]?(?=\s|$)/g)].map(match => match[1]).filter(key => !mends.includes(key));
+  const out = element("div", { className: "buttons" });
+  if (keys.length) {
+    const apply = element("button", { type: "button", className: "primary" }, "Apply the change and calibrate again");
+    apply.onclick = () => { mends.push(...keys); showMends(); calibrate(); };
+    out.append(apply);
+  }
+  const force = element("button", { type: "button" }, "Write the robot all the same");
+  force.onclick = () => calibrate(true);
+  out.append(force);
+  return out;
+}
+
+function downloadItem({ name, label, content }) {
+  const bytes = Uint8Array.from(atob(content), char => char.charCodeAt(0));
+  const type = name.endsWith(".html") ? "text/html" : "application/octet-stream";
+  const href = URL.createObjectURL(new Blob([bytes], { type }));
+  links.push(href);
+  const out = element("li", {}, element("span", { className: "label" }, label),
+    element("a", { href, download: name, ariaLabel: `Download ${name}` }, name));
+  if (type === "text/html") out.append(element("a", { href, target: "_blank", ariaLabel: `Open ${name} in a new tab` }, "Open"));
+  return out;
+}
+
+// --- events ----------------------------------------------------------------------------------------
+
+$("picker").onchange = event => { addFiles(event.target.files); event.target.value = ""; };
+for (const name of ["dragover", "dragleave", "drop"]) {
+  addEventListener(name, event => {
+    event.preventDefault();
+    $("drop").classList.toggle("over", name === "dragover");
+    if (name === "drop") addFiles(event.dataTransfer.files);
+  });
+}
+$("tip").onchange = check;
+$("options").onsubmit = event => event.preventDefault();
+$("calibrate").onclick = () => calibrate();
+$("cancel").onclick = () => running?.abort();

@@ -1,0 +1,176 @@
+"""Commands of `dhcal` in a process of their own, and what they tell.
+
+A crash or a lack of memory ends that process only, and it can be stopped at any time. Each function yields
+messages for the page, dictionaries that JSON can hold:
+
+- `{"phase": TEXT, "step": N, "total": N}`: progress;
+- `{"error": TEXT}`: one line that says what is wrong and what is expected; the last message;
+- `{"result": DOCUMENT, ...}`: the JSON document of the command; the last message. A calibration adds `status`
+  (`done` or `refused`), `screen` (what the command shows) and `files`: name, label and content in base64.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import json
+import os
+import re
+import signal
+import sys
+from collections.abc import AsyncGenerator, AsyncIterator, Sequence
+from contextlib import aclosing, asynccontextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from .upload import Upload
+
+# Module that is the command `dhcal`.
+_PROGRAM = f"{__name__.split('.')[0]}.cli"
+# Exit status of invalid input and of a refused calibration.
+_INVALID_INPUT, _REFUSED = 2, 3
+# Longest line that a command may print [bytes].
+_MAX_LINE_BYTES = 1 << 22
+_PROGRESS = re.compile(r"progress: (.*) (\d+)/(\d+)")
+_PREFIX = re.compile(r"^dhcal( \w+)?: ")
+_SEE_HELP = re.compile(r"; see dhcal \w+ --help$")
+_REPORT, _SCENE, _RESULT, _RESIDUALS = "report.html", "scene.html", "result.json", "residuals.csv"
+
+
+async def inspect(upload: Upload, folder: Path) -> AsyncGenerator[dict[str, Any], None]:
+    """Say what the measurement files contain.
+
+    Args:
+        upload: Files and options.
+        folder: Folder that contains the files.
+
+    Yields:
+        Messages; see the module.
+    """
+    kept = [word for word in upload.options if word.startswith(("--tip=", "--columns="))]
+    robot = [f"--robot={upload.robot}", *kept] if upload.robot else []
+    run = _Run(folder)
+    async with aclosing(run.lines("inspect", *upload.data, *robot, f"--json={_RESULT}")) as lines:
+        async for _ in lines:
+            pass
+    yield run.error() or {"result": _read_json(folder)}
+
+
+async def calibrate(upload: Upload, folder: Path) -> AsyncGenerator[dict[str, Any], None]:
+    """Calibrate the robot.
+
+    Args:
+        upload: Files and options.
+        folder: Folder that contains the files.
+
+    Yields:
+        Messages; see the module.
+    """
+    if not upload.robot:
+        yield {"error": "no robot file; add a URDF or a DH table"}
+        return
+    name = upload.robot_name
+    urdf = f"{name}_calibrated.urdf"
+    files = [f"--report={_REPORT}", f"--scene={_SCENE}", f"--json={_RESULT}", f"--residuals={_RESIDUALS}"]
+    words = [upload.robot, *upload.data, *upload.options, "-o", urdf, *files, "--progress=lines"]
+    run = _Run(folder)
+    screen = []
+    async with aclosing(run.lines("calibrate", *words)) as lines:
+        async for line in lines:
+            if match := _PROGRESS.fullmatch(line):
+                yield {"phase": match[1], "step": int(match[2]), "total": int(match[3])}
+            else:
+                screen.append(line)
+    if error := run.error(_REFUSED):
+        yield error
+        return
+    labels = {
+        urdf: "Corrected URDF",
+        f"{name}_calibrated.calibration.toml": "Sidecar: base, tool and joint errors",
+        _REPORT: "Report",
+        _SCENE: "3-D scene",
+        _RESIDUALS: "Residuals of all rows",
+        _RESULT: "All figures as JSON",
+    }
+    yield {
+        "result": _read_json(folder),
+        "status": "refused" if run.status == _REFUSED else "done",
+        "screen": "\n".join(screen),
+        "files": [
+            {"name": file, "label": label, "content": base64.b64encode((folder / file).read_bytes()).decode()}
+            for file, label in labels.items()
+            if (folder / file).exists()
+        ],
+    }
+
+
+def _read_json(folder: Path) -> Any:
+    """Read the JSON document of a command."""
+    return json.loads((folder / _RESULT).read_text(encoding="utf-8"))
+
+
+class _Run:
+    """One run of `dhcal` in a folder.
+
+    Attributes:
+        status: Exit status; None before the end.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._last_line = ""
+        self.status: int | None = None
+
+    async def lines(self, *words: str) -> AsyncGenerator[str, None]:
+        """Run a command and yield the lines that it prints on stderr; stop it if the caller stops.
+
+        Args:
+            *words: Words of the command line.
+
+        Yields:
+            Lines without their end.
+        """
+        async with _started(words, self._folder) as process:
+            assert process.stderr is not None
+            async for data in process.stderr:
+                line = data.decode(errors="replace").rstrip("\n")
+                self._last_line = line.strip() or self._last_line
+                yield line
+            self.status = await process.wait()
+
+    def error(self, *accepted: int) -> dict[str, str]:
+        """Describe the failure of the command.
+
+        Args:
+            *accepted: Exit status that is no failure, in addition to 0.
+
+        Returns:
+            Message for the page; empty if the command succeeded.
+        """
+        if self.status in (0, *accepted):
+            return {}
+        if self.status == _INVALID_INPUT:
+            return {"error": _SEE_HELP.sub("", _PREFIX.sub("", self._last_line))}
+        return {"error": f"the calculation ended unexpectedly (exit status {self.status}); try fewer samples"}
+
+
+@asynccontextmanager
+async def _started(words: Sequence[str], folder: Path) -> AsyncIterator[asyncio.subprocess.Process]:
+    """Start `dhcal` in a folder; at the end of the block it and all processes it started are stopped."""
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", _PROGRAM, *words),
+        cwd=folder,
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.DEVNULL,
+        stderr=asyncio.subprocess.PIPE,
+        limit=_MAX_LINE_BYTES,
+        # The command finds the same modules. A file of the folder cannot take the place of one.
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "PYTHONSAFEPATH": "1"},
+        start_new_session=True,
+    )
+    try:
+        yield process
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        await process.wait()

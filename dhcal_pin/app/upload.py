@@ -1,0 +1,123 @@
+"""Files and options that the page sends, checked before anything is written or started.
+
+The names of files and the values of options become words of a command line. A file name must therefore be a
+plain name, and a value is always joined to its option (`--tip=tool0`), so that none is taken for an option.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tornado.httputil
+
+from ..exceptions import InvalidArgumentError
+from ..messages import quote
+
+# Longest file name that all file systems accept [bytes].
+_MAX_NAME_BYTES = 255
+# Options with one text each, by the name of their field.
+_TEXT_OPTIONS = ("tip", "parameters", "holdout", "columns")
+# Options without a value.
+_SWITCHES = ("skip-bad-rows", "force")
+# Options with a list of texts.
+_LIST_OPTIONS = ("mend",)
+
+
+@dataclass(frozen=True)
+class Upload:
+    """Files and options of one request.
+
+    Attributes:
+        files: Content of each file, by name.
+        robot: Name of the robot file; empty if there is none.
+        data: Names of the measurement files.
+        options: Words of the command line.
+    """
+
+    files: Mapping[str, bytes]
+    robot: str
+    data: tuple[str, ...]
+    options: tuple[str, ...]
+
+    @classmethod
+    def from_form(cls, content_type: str, body: bytes) -> Upload:
+        """Read a form with files named `file` and a JSON object `request`.
+
+        Args:
+            content_type: Header of the form.
+            body: Content of the form.
+
+        Returns:
+            Checked upload.
+
+        Raises:
+            InvalidArgumentError: The form is malformed, a file name is not plain or occurs twice, or a file
+                or an option is unknown.
+        """
+        arguments: dict[str, list[bytes]] = {}
+        parts: dict[str, list[tornado.httputil.HTTPFile]] = {}
+        try:
+            tornado.httputil.parse_body_arguments(content_type, body, arguments, parts)
+            request = json.loads(arguments["request"][0])
+        except (ValueError, KeyError, RecursionError, tornado.httputil.HTTPInputError) as error:
+            raise InvalidArgumentError("the form is malformed; load the page again") from error
+        if not isinstance(request, dict):
+            raise InvalidArgumentError("the form is malformed; load the page again")
+        files: dict[str, bytes] = {}
+        for part in parts.get("file", []):
+            name = str(part["filename"])
+            _require_plain_name(name)
+            if name in files:
+                raise InvalidArgumentError(f"{quote(name)}: two files have this name; rename one of them")
+            files[name] = part["body"]
+        robot, data = request.pop("robot", ""), request.pop("data", [])
+        options = _option_words(request)
+        if not isinstance(data, list) or not data:
+            raise InvalidArgumentError("no measurement file; add at least one")
+        names = [*([robot] if robot else []), *data]
+        if unknown := [name for name in names if name not in files]:
+            raise InvalidArgumentError(f"{quote(unknown[0])}: the file is missing; add it again")
+        return cls(files, robot, tuple(data), options)
+
+    def save(self, folder: Path) -> None:
+        """Write the files.
+
+        Args:
+            folder: Empty folder.
+        """
+        for name, content in self.files.items():
+            (folder / name).write_bytes(content)
+
+    @property
+    def robot_name(self) -> str:
+        """Name of the robot: that of its file up to the first dot."""
+        return self.robot.split(".")[0]
+
+
+def _require_plain_name(name: str) -> None:
+    """Raise an error if a name could be a path, an option or no file name at all."""
+    is_plain = name.isprintable() and not set(name) & set("/\\:") and name[:1] not in ("", "-", ".")
+    if not is_plain or len(name.encode()) > _MAX_NAME_BYTES:
+        raise InvalidArgumentError(
+            f"{quote(name)}: unsuitable file name; expected one that begins with a letter or a digit and has "
+            "no slash and no colon"
+        )
+
+
+def _option_words(request: Mapping[str, Any]) -> tuple[str, ...]:
+    """Write options as words of a command line."""
+    words: list[str] = []
+    for name, value in request.items():
+        if name in _TEXT_OPTIONS and isinstance(value, str):
+            words += [f"--{name}={value}"] if value else []
+        elif name in _SWITCHES and isinstance(value, bool):
+            words += [f"--{name}"] if value else []
+        elif name in _LIST_OPTIONS and isinstance(value, list) and all(isinstance(v, str) for v in value):
+            words += [f"--{name}={v}" for v in value]
+        else:
+            raise InvalidArgumentError(f"{quote(name)}: unknown option or value; load the page again")
+    return tuple(words)

@@ -1,0 +1,58 @@
+"""`dhcal app`: serve a page on this computer that calibrates a robot from dropped files."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+
+from .options import NON_NEGATIVE_INTEGER, POSITIVE_INTEGER
+
+EXAMPLE = "dhcal app"
+_MEGABYTE = 10**6
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the arguments of `dhcal app`.
+
+    Args:
+        parser: Parser of the command.
+    """
+    parser.add_argument(
+        "--port",
+        metavar="N",
+        type=NON_NEGATIVE_INTEGER,
+        default=0,
+        help="port of the loopback address (default: any free one)",
+    )
+    parser.add_argument(
+        "--max-size",
+        metavar="MB",
+        type=POSITIVE_INTEGER,
+        default=100,
+        help="largest size of all files that are dropped together, in MB (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--no-browser", action="store_true", help="print the address only, and open no browser"
+    )
+
+
+def run(args: Namespace) -> int:
+    """Serve the page.
+
+    Args:
+        args: Parsed arguments.
+
+    Returns:
+        Exit status 0, after an interrupt.
+    """
+    import asyncio  # lazy import, as the following: slow to load
+
+    from ..app import serve
+    from . import console
+
+    def show_address(url: str) -> None:
+        console.print_lines(f"page at {url}; end with Ctrl-C")
+        if not args.no_browser:
+            console.open_url(url)
+
+    asyncio.run(serve(show_address, port=args.port, limit=args.max_size * _MEGABYTE))
+    return 0

@@ -1,0 +1,64 @@
+"""Web servers for the user of this computer only: on the loopback address, with a secret in the address.
+
+Every program and every web page on this computer can send requests to a port of the loopback address. A
+server of this module therefore answers a request only if
+
+- its path begins with a random token, which only the user's browser knows;
+- its `Host` header names the loopback address. A page of another site can make its own name resolve to this
+  computer (DNS rebinding); the browser then sends that name;
+- a request that changes something comes from a page of this server (`is_same_origin`).
+
+tornado compares the `Origin` header of web sockets with the `Host` header by itself.
+"""
+
+from __future__ import annotations
+
+import re
+import secrets
+from collections.abc import Sequence
+from typing import Any
+
+import tornado.httputil
+import tornado.web
+
+LOOPBACK = "127.0.0.1"
+# Names of the loopback address that a browser may ask for.
+_HOSTS = rf"({re.escape(LOOPBACK)}|localhost)"
+_TOKEN_BYTES = 16
+
+
+def new_token() -> str:
+    """Return a random text for the address of a server, different for each server."""
+    return secrets.token_urlsafe(_TOKEN_BYTES)
+
+
+def local_application(
+    token: str, handlers: Sequence[tuple[Any, ...]], **settings: Any
+) -> tornado.web.Application:
+    """Create an application that answers requests for the loopback address below a token only.
+
+    Args:
+        token: First part of every path.
+        handlers: Path behind `/TOKEN/` as a regular expression, handler and optionally its arguments.
+        **settings: Settings of the application.
+
+    Returns:
+        Application; every other request has the answer 404.
+    """
+    app = tornado.web.Application(**settings)
+    root = f"/{re.escape(token)}/"
+    app.add_handlers(_HOSTS, [(root + pattern, *rest) for pattern, *rest in handlers])
+    return app
+
+
+def is_same_origin(request: tornado.httputil.HTTPServerRequest) -> bool:
+    """Tell whether a page of this server has sent a request.
+
+    Args:
+        request: Request whose `Host` header was accepted.
+
+    Returns:
+        Whether the header `Origin` is the address of this server. Browsers send it with every request that is
+        not GET or HEAD.
+    """
+    return request.headers.get("Origin") == f"{request.protocol}://{request.host}"

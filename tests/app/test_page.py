@@ -1,0 +1,237 @@
+"""The page in a browser: files are dropped, checked and calibrated; keyboard, widths, colours."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pages import READY, VIEWPORT
+
+AXE = Path(sys.prefix) / "node_modules" / "axe-core" / "axe.min.js"
+WIDTHS = (390, 768, 1200)
+DROP = """([files]) => {
+  const data = new DataTransfer();
+  for (const [name, text] of files) data.items.add(new File([text], name));
+  dispatchEvent(new DragEvent("drop", { dataTransfer: data, cancelable: true }));
+}"""
+
+
+@contextmanager
+def opened(browser: Any, url: str) -> Iterator[Any]:
+    """The page in a browser of its own; it must not complain nor ask another server."""
+    context = browser.new_context(viewport=VIEWPORT)
+    context.set_default_timeout(120_000)
+    page = context.new_page()
+    complaints: list[str] = []
+    # The pages that it opens, too.
+    context.on("console", lambda message: complaints.append(message.text))
+    context.on("weberror", lambda error: complaints.append(str(error.error)))
+    context.on(
+        "request",
+        lambda request: request.url.startswith((url, "blob:", "data:")) or complaints.append(request.url),
+    )
+    page.goto(url)
+    yield page
+    context.close()
+    assert complaints == []
+
+
+@pytest.fixture
+def page(app, browser):
+    with opened(browser, app.url) as page:
+        yield page
+
+
+def drop(page: Any, *files: tuple[str, str]) -> None:
+    page.evaluate(DROP, [list(files)])
+
+
+def example_files(example: Path) -> list[tuple[str, str]]:
+    return [(name, (example / name).read_text()) for name in ("ur10.urdf", "laser.csv")]
+
+
+def download(page: Any, name: str) -> bytes:
+    with page.expect_download() as waiting:
+        page.click(f'[aria-label="Download {name}"]')
+    assert waiting.value.suggested_filename == name
+    return Path(waiting.value.path()).read_bytes()
+
+
+def wrong_sign(example: Path) -> str:
+    """The measurements with the other sign of the elbow."""
+    lines = [line for line in (example / "laser.csv").read_text().splitlines() if line[0] != "#"]
+    rows = [line.split(",") for line in lines]
+    for row in rows[1:]:
+        row[2] = str(-float(row[2]))
+    return "\n".join(map(",".join, rows))
+
+
+def test_dropped_files_end_in_the_robot_of_the_command_line(page, example):
+    drop(page, *example_files(example))
+    page.fill("#tip", "tool0")
+    page.wait_for_selector("#check .card.ok")
+    assert "position, 100 rows, 100 configurations" in page.inner_text("#check")
+    assert page.eval_on_selector_all("#links option", "them => them.map(it => it.value)").count("tool0") == 1
+    page.click("#calibrate")
+    page.wait_for_selector("#result:not([hidden])")
+    assert download(page, "ur10_calibrated.urdf") == (example / "ur10_calibrated.urdf").read_bytes()
+    assert download(page, "report.html") == (example / "report.html").read_bytes()
+    result = json.loads(download(page, "result.json"))
+    before, after = page.eval_on_selector_all(".headline dd", "them => them.map(it => it.textContent)")
+    assert float(before.split()[0]) == pytest.approx(
+        1e3 * result["holdout_before"]["position_rms_m"], rel=0.05
+    )
+    assert float(after.split()[0]) == pytest.approx(1e3 * result["holdout_after"]["position_rms_m"], rel=0.05)
+    assert "Verdict: ok" in page.inner_text("#result")
+    assert "dhcal calibrate ur10.urdf laser.csv --tip tool0 --holdout 0.3" in page.text_content("#result pre")
+    for name in ("report.html", "scene.html"):
+        with page.context.expect_page() as waiting:
+            page.click(f'[aria-label="Open {name} in a new tab"]')
+        waiting.value.wait_for_load_state()
+        if name == "scene.html":
+            waiting.value.wait_for_function(READY)
+        assert "ur10" in waiting.value.title()
+        waiting.value.close()
+
+
+def test_refusal_shows_the_remedy_and_applies_it(page, example):
+    urdf, _ = example_files(example)
+    drop(page, urdf, ("laser.csv", wrong_sign(example)))
+    page.fill("#tip", "tool0")
+    page.click("#calibrate")
+    page.wait_for_selector("#result .refused")
+    assert "The sign of joint elbow_joint is wrong" in page.inner_text("#result")
+    assert page.locator('#downloads a[download$=".urdf"]').count() == 0
+    page.click("text=Apply the change and calibrate again")
+    page.wait_for_selector("#result .card.ok")
+    assert "sign:elbow_joint" in page.inner_text("#mends")
+    # Other files start without the change.
+    drop(page, ("laser.csv", "x"))
+    assert page.is_hidden("#mends")
+    assert page.is_hidden("#result")
+
+
+def test_a_proposed_column_map_is_used(page, example):
+    lines = [line for line in (example / "laser.csv").read_text().splitlines() if line[0] != "#"]
+    header = "A1;A2;A3;A4;A5;A6;X pos;Y pos;Z pos"
+    rows = [";".join(line.split(",")[:9]).replace(".", ",") for line in lines[1:]]
+    urdf, _ = example_files(example)
+    drop(page, urdf, ("tracker.csv", "\n".join([header, *rows])))
+    page.wait_for_selector("#check .card.problem")
+    page.click("text=Use this column map")
+    page.wait_for_selector("#check .card.ok")
+    page.fill("#tip", "tool0")
+    page.click("#calibrate")
+    page.wait_for_selector("#result:not([hidden])")
+    assert "Verdict: ok" in page.inner_text("#result")
+    assert "--columns columns.toml" in page.text_content("#result pre")
+
+
+def test_errors_are_shown_as_one_line(page, example):
+    drop(page, *example_files(example))
+    page.fill("#tip", "nowhere")
+    page.click("#calibrate")
+    page.wait_for_selector("#run-error:not([hidden])")
+    assert "ur10.urdf: unknown link 'nowhere'" in page.inner_text("#run-error")
+    assert page.is_hidden("#result")
+    # The size is checked before anything is sent.
+    page.evaluate("document.documentElement.dataset.limit")
+    assert page.evaluate("LIMIT") == 100_000_000
+    page.evaluate("addFiles([{ name: 'big.csv', size: 1e9 }])")
+    assert "1000.0 MB; at most 100.0 MB" in page.inner_text("#file-error")
+
+
+def test_two_browsers_work_at_once_and_one_cancels(app, browser, example):
+    with opened(browser, app.url) as one, opened(browser, app.url) as other:
+        for page in (one, other):
+            drop(page, *example_files(example))
+            page.fill("#tip", "tool0")
+            page.wait_for_selector("#check .card.ok")
+        other.select_option("#parameters", "offset,base,tool")
+        one.click("#calibrate")
+        other.click("#calibrate")
+        other.wait_for_function("() => document.getElementById('phase').textContent !== 'reading the files'")
+        other.click("#cancel")
+        other.wait_for_selector("text=Cancelled. Nothing was kept.")
+        assert other.is_hidden("#result")
+        assert other.evaluate("document.activeElement.id") == "calibrate"
+        one.wait_for_selector("#result:not([hidden])")
+        assert download(one, "ur10_calibrated.urdf") == (example / "ur10_calibrated.urdf").read_bytes()
+        other.click("#calibrate")
+        other.wait_for_selector("#result:not([hidden])")
+        assert "offset" in other.text_content("#result pre")
+
+
+def test_the_keyboard_is_enough(page, example):
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.id") == "picker"
+    with page.expect_file_chooser() as waiting:
+        page.keyboard.press("Enter")
+    waiting.value.set_files([example / "ur10.urdf", example / "laser.csv"])
+    page.wait_for_selector("#check .card.ok")
+    visited = []
+    for _ in range(20):
+        page.keyboard.press("Tab")
+        visited.append(page.evaluate("document.activeElement.id || document.activeElement.ariaLabel || ''"))
+        if visited[-1] == "tip":
+            page.keyboard.type("tool0")
+        if visited[-1] == "calibrate":
+            break
+    assert [name for name in visited if name] == [
+        *("Use of ur10.urdf", "Remove ur10.urdf", "Use of laser.csv", "Remove laser.csv"),
+        *("tip", "parameters", "holdout", "skip-bad-rows", "calibrate"),
+    ]
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#result:not([hidden])")
+    assert page.evaluate("document.activeElement.id") == "result"
+
+
+def violations(page: Any) -> list[tuple[str, list[str]]]:
+    found = page.evaluate("() => axe.run(document)")["violations"]
+    return [(one["id"], [node["html"] for node in one["nodes"]]) for one in found]
+
+
+def test_every_state_is_accessible_at_every_width(page, example):
+    page.add_script_tag(path=str(AXE))
+
+    def check() -> None:
+        for width in WIDTHS:
+            page.set_viewport_size({"width": width, "height": 900})
+            for scheme in ("light", "dark"):
+                page.emulate_media(color_scheme=scheme)
+                assert violations(page) == [], (width, scheme)
+                assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+    check()
+    urdf, data = example_files(example)
+    drop(page, urdf, ("laser.csv", wrong_sign(example)))
+    page.fill("#tip", "tool0")
+    page.wait_for_selector("#check .card.warning")
+    page.click("#check summary")
+    page.click("#calibrate")
+    page.wait_for_selector("#result .refused")
+    check()
+    drop(page, data)
+    page.click("#calibrate")
+    check()  # while it runs
+    page.wait_for_selector("#result .card.ok")
+    page.wait_for_selector("#check .card.ok")
+    page.click("#result summary")
+    check()
+
+
+@pytest.mark.parametrize(
+    "value", ["", "offset,base,tool", "dh,base,tool", "placement,base,tool", "base,tool"]
+)
+def test_offered_parameter_sets_exist(page, value, sim_6dof):
+    from dhcal_pin.estimation.parameters import select_parameters
+
+    values = page.eval_on_selector_all("#parameters option", "them => them.map(it => it.value)")
+    assert value in values
+    assert len(values) == 5
+    assert select_parameters(sim_6dof, value or sim_6dof.parameters).parameters

@@ -1,0 +1,209 @@
+"""Requests to the server: results of the command line, who is refused, what stays behind."""
+
+from __future__ import annotations
+
+import base64
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+from urllib.parse import urlsplit
+
+import psutil
+import pytest
+from app_requests import example_form, form, post, start_app
+
+from dhcal_pin.app.upload import Upload
+from dhcal_pin.cli.main import main
+from dhcal_pin.exceptions import InvalidArgumentError
+
+
+def result_of(messages):
+    """The last message, which must be a result."""
+    assert "result" in messages[-1], messages[-1]
+    return messages[-1]
+
+
+def files_of(message):
+    return {file["name"]: base64.b64decode(file["content"]) for file in message["files"]}
+
+
+def test_the_robot_is_that_of_the_command_line(app, example):
+    body, headers = example_form(example)
+    status, messages = post(app, "calibrate", body, **headers)
+    assert status == 200
+    message = result_of(messages)
+    assert message["status"] == "done"
+    files = files_of(message)
+    for name in ("ur10_calibrated.urdf", "ur10_calibrated.calibration.toml", "report.html"):
+        assert files[name] == (example / name).read_bytes()
+    assert json.loads(files["result.json"]) == message["result"]
+    assert files["scene.html"].startswith(b"<!DOCTYPE html>")
+    phases = [one["phase"] for one in messages[:-1]]
+    assert {"fit", "robust weights", "accuracy and verdict"} <= set(phases)
+    assert app.contents() == []
+
+
+def test_inspection_is_that_of_the_command_line(app, example, monkeypatch, capsys):
+    body, headers = example_form(example)
+    _, messages = post(app, "inspect", body, **headers)
+    monkeypatch.chdir(example)
+    assert main("inspect laser.csv --robot ur10.urdf --tip tool0 --json -".split()) == 0
+    assert result_of(messages)["result"] == json.loads(capsys.readouterr().out)
+
+
+def test_refusal_names_the_remedy_and_the_remedy_works(app, example):
+    lines = [line for line in (example / "laser.csv").read_text().splitlines() if line[0] != "#"]
+    cells = [line.split(",") for line in lines]
+    for row in cells[1:]:
+        row[2] = str(-float(row[2]))
+    files = {
+        "ur10.urdf": (example / "ur10.urdf").read_bytes(),
+        "laser.csv": "\n".join(map(",".join, cells)).encode(),
+    }
+    request = {"robot": "ur10.urdf", "data": ["laser.csv"], "tip": "tool0"}
+    body, headers = form(files, request)
+    message = result_of(post(app, "calibrate", body, **headers)[1])
+    assert message["status"] == "refused"
+    assert "--mend sign:elbow_joint" in message["result"]["verdict"]["reasons"][0]
+    assert not any(name.endswith((".urdf", ".calibration.toml")) for name in files_of(message))
+    body, headers = form(files, request | {"mend": ["sign:elbow_joint"]})
+    message = result_of(post(app, "calibrate", body, **headers)[1])
+    assert message["result"]["verdict"]["status"] == "ok"
+    assert "ur10_calibrated.urdf" in files_of(message)
+
+
+@pytest.mark.parametrize(
+    ("request_changes", "words"),
+    [
+        ({"tip": "nowhere"}, "ur10.urdf: unknown link 'nowhere'"),
+        ({"holdout": "2"}, "holdout"),
+        ({"parameters": "magic"}, "'magic'"),
+        ({"columns": "missing.toml"}, "missing.toml"),
+        ({"data": []}, "no measurement file"),
+        ({"data": ["other.csv"]}, "other.csv"),
+        ({"robot": ""}, "no robot file"),
+        ({"output": "/tmp/x.urdf"}, "'output': unknown option"),
+        ({"tip": 3}, "'tip': unknown option or value"),
+    ],
+)
+def test_errors_are_one_line(app, example, request_changes, words):
+    body, headers = example_form(example, **request_changes)
+    status, messages = post(app, "calibrate", body, **headers)
+    assert status == 200
+    assert list(messages[-1]) == ["error"]
+    assert words in messages[-1]["error"]
+    assert "\n" not in messages[-1]["error"]
+    assert not messages[-1]["error"].startswith("dhcal")
+    assert app.contents() == []
+
+
+@pytest.mark.parametrize(
+    "name", ["../ur10.urdf", "a/b.urdf", "-o.urdf", ".hidden.urdf", "example:ur10", "a\\b.urdf", "x" * 300]
+)
+def test_file_names_cannot_be_paths_or_options(name):
+    body, headers = form({name: b"", "laser.csv": b""}, {"robot": name, "data": ["laser.csv"]})
+    with pytest.raises(InvalidArgumentError):
+        Upload.from_form(headers["Content-Type"], body)
+
+
+@pytest.mark.parametrize("body", [b"", b"--x\r\n\r\n[]\r\n--x--", b"\xff" * 100])
+def test_malformed_forms_are_one_line(app, body):
+    status, messages = post(app, "calibrate", body, Content_Type="multipart/form-data; boundary=x")
+    assert (status, messages) == (200, [{"error": "the form is malformed; load the page again"}])
+
+
+def test_only_the_own_page_of_this_computer_is_served(app, example):
+    body, headers = example_form(example)
+    parts = urlsplit(app.url)
+    origin = f"http://{parts.netloc}"
+    for other in (
+        "http://evil.example",
+        "null",
+        "",
+        f"https://{parts.netloc}",
+        f"http://127.0.0.1:{parts.port}1",
+    ):
+        assert post(app, "calibrate", body, Origin=other, **headers)[0] == 403, other
+    for host in ("evil.example", f"evil.example:{parts.port}", f"127.0.0.1.evil.example:{parts.port}"):
+        for its_origin in (origin, f"http://{host}"):
+            assert post(app, "calibrate", body, Host=host, Origin=its_origin, **headers)[0] == 404
+    for path in ("/", "/wrong/", parts.path[:-2] + "/", f"{parts.path}calibrate/"):
+        assert post(app, "calibrate", body, path=path, **headers)[0] == 404
+    assert app.contents() == []
+    listening = [
+        connection.laddr.ip
+        for connection in psutil.Process(app.process.pid).net_connections("inet")
+        if connection.status == psutil.CONN_LISTEN
+    ]
+    assert listening == ["127.0.0.1"]
+
+
+def wait_until(condition):
+    end = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def open_request(app, body, headers):
+    """Connection that has sent a calibration and received its first message."""
+    parts = urlsplit(app.url)
+    head = f"POST {parts.path}calibrate HTTP/1.1\r\nHost: {parts.netloc}\r\nOrigin: http://{parts.netloc}\r\n"
+    head += f"Content-Type: {headers['Content-Type']}\r\nContent-Length: {len(body)}\r\n\r\n"
+    connection = socket.create_connection((parts.hostname, parts.port), timeout=30)
+    connection.sendall(head.encode() + body)
+    assert b"200 OK" in connection.recv(1000)
+    return connection
+
+
+def test_a_cancelled_run_leaves_nothing(app, example):
+    body, headers = example_form(example)
+    server = psutil.Process(app.process.pid)
+    connection = open_request(app, body, headers)
+    assert app.contents()
+    assert server.children(recursive=True)
+    connection.close()
+    wait_until(lambda: not server.children(recursive=True) and app.contents() == [])
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_the_end_of_the_server_removes_everything(number, example, tmp_path):
+    app = start_app(tmp_path / "app")
+    body, headers = example_form(example)
+    connection = open_request(app, body, headers)
+    children = psutil.Process(app.process.pid).children(recursive=True)
+    assert children
+    assert app.stop(number) == 0
+    assert not psutil.wait_procs(children, timeout=10)[1]
+    assert list(app.folder.iterdir()) == []
+    connection.close()
+
+
+def test_large_files_are_refused_before_they_are_read(tmp_path):
+    app = start_app(tmp_path / "app", "--max-size", "1")
+    try:
+        body, headers = form(
+            {"a.urdf": b" " * 3_000_000, "a.csv": b""}, {"robot": "a.urdf", "data": ["a.csv"]}
+        )
+        try:
+            assert post(app, "calibrate", body, **headers)[0] == 400
+        except ConnectionError:
+            pass  # closed while the form was sent
+        assert app.contents() == []
+        body, headers = form({"a.urdf": b" " * 900_000, "a.csv": b""}, {"robot": "a.urdf", "data": ["a.csv"]})
+        assert post(app, "calibrate", body, **headers)[0] == 200
+    finally:
+        assert app.stop() == 0
+
+
+def test_a_port_in_use_is_one_line(app):
+    port = str(urlsplit(app.url).port)
+    for value in (port, "70000"):
+        words = [sys.executable, "-m", "dhcal_pin.cli", "app", "--no-browser", "--port", value]
+        run = subprocess.run(words, capture_output=True, text=True, timeout=30)
+        assert run.returncode == 2
+        assert run.stderr.startswith(f"dhcal: --port {value}: ")
+        assert run.stderr.count("\n") == 1
