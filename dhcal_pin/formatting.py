@@ -6,15 +6,18 @@ decimals are shown (rounding rule of the Particle Data Group).
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import jinja2
+    from markupsafe import Markup
 
 # SI unit -> (factor, text of the shown unit).
 RATE_UNITS = {"rad/Nm": (1e6, " µrad/Nm"), "rad/rad": (1e3, " mrad/rad"), "rad/m": (1e3, " mrad/m")}
@@ -28,6 +31,8 @@ DEFAULT_DECIMALS = 3
 MAX_DECIMALS = 6
 # Table cells with more characters get the CSS class "long", which allows line breaks.
 MAX_UNBROKEN_CHARS = 48
+# Tables of a page with more columns become lists on medium pages already.
+MAX_NARROW_COLUMNS = 6
 
 
 def significant_decimals(std: float) -> int:
@@ -120,7 +125,30 @@ def html_templates() -> jinja2.Environment:
         lstrip_blocks=True,
     )
     environment.globals["MAX_UNBROKEN_CHARS"] = MAX_UNBROKEN_CHARS
+    environment.globals["MAX_NARROW_COLUMNS"] = MAX_NARROW_COLUMNS
+    environment.globals["resource"] = _resource
     return environment
+
+
+def _resource(path: str) -> Markup:
+    """Return a style sheet or script of the package, which a template inserts unchanged."""
+    from markupsafe import Markup
+
+    return Markup((Path(__file__).parent / path).read_text("utf-8"))
+
+
+def json_for_html(content: Any) -> str:
+    """Format a document as compact JSON that can stand in a script element of a page.
+
+    Args:
+        content: JSON-compatible values.
+
+    Returns:
+        Text without the characters that could end the element.
+    """
+    text = json.dumps(content, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    # A file name need not be UTF-8. Python keeps its other bytes as surrogates, which become JSON escapes.
+    return text.replace("<", "\\u003c").encode(errors="backslashreplace").decode()
 
 
 def html_table(table: Table) -> str:

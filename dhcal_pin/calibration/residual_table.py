@@ -96,10 +96,15 @@ class ResidualTable:
             "outlier": self.is_outlier,
         }
 
+    @property
+    def file_order(self) -> Array:
+        """Indices (N,) that order the samples by file and line, as in a CSV file."""
+        numbers = {name: number for number, name in enumerate(dict.fromkeys(self.file.tolist()))}
+        return np.lexsort(np.array([self.line, [numbers[name] for name in self.file.tolist()]]))
+
     def file_columns(self) -> dict[str, list[Any]]:
         """Return the columns of a CSV file, ordered by file and line; a missing value is None."""
-        files = list(dict.fromkeys(self.file.tolist()))
-        order = np.lexsort(np.array([self.line, [files.index(name) for name in self.file.tolist()]]))
+        order = self.file_order
         columns = {name: values[order].tolist() for name, values in self.to_columns().items()}
         columns["outlier"] = [int(value) for value in columns["outlier"]]
         return {

@@ -11,8 +11,10 @@ from ..calibration.result import Result
 from ..diagnostics.curves import JointCurve, fitted_coverage, joint_curves
 from ..diagnostics.residuals import JointProfile, Outlier, find_outliers, joint_offset_profiles
 from ..diagnostics.workspace import WorkspacePrediction, predict_workspace
+from ..measurements.base import Measurement
 from ..robot.coverage import JointCoverage
 from .document import Provenance, short_names
+from .samples import Samples, result_samples
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +29,7 @@ class ReportContext:
         workspace: Predicted accuracy over the workspace.
         coverage: Values of each revolute joint that the fitted samples visited.
         joint_curves: Correction curves of the joints with harmonics.
+        samples: Fitted and held-out samples with their errors.
     """
 
     fit: Result
@@ -36,6 +39,7 @@ class ReportContext:
     workspace: WorkspacePrediction
     coverage: Sequence[JointCoverage]
     joint_curves: Sequence[JointCurve]
+    samples: Samples
 
     @classmethod
     def from_result(cls, fit: Result, source: Provenance) -> ReportContext:
@@ -57,17 +61,22 @@ class ReportContext:
             workspace=workspace,
             coverage=fitted_coverage(fit),
             joint_curves=joint_curves(fit),
+            samples=result_samples(
+                fit,
+                measurement_names(source.names, fit.data),
+                measurement_names(source.holdout_names, fit.holdout),
+            ).limited(),
         )
 
     @property
     def data_names(self) -> list[str]:
         """Name of each measurement of the fitted data."""
-        return _data_names(self.source.names, [item.kind for item in self.fit.data])
+        return measurement_names(self.source.names, self.fit.data)
 
     @property
     def holdout_names(self) -> list[str]:
         """Name of each measurement of the hold-out data."""
-        return _data_names(self.source.holdout_names, [item.kind for item in self.fit.holdout])
+        return measurement_names(self.source.holdout_names, self.fit.holdout)
 
     @property
     def comparisons(self) -> tuple[Comparison, ...]:
@@ -88,9 +97,17 @@ class ReportContext:
         return self.fit.chain.model.name or "robot"
 
 
-def _data_names(paths: Sequence[str], kinds: Sequence[str]) -> list[str]:
-    """Return the short names of files, or numbered kinds for data that do not come from files."""
-    if len(paths) == len(kinds):
+def measurement_names(paths: Sequence[str], data: Sequence[Measurement]) -> list[str]:
+    """Return short names of measurements.
+
+    Args:
+        paths: File of each measurement; none for data that do not come from files.
+        data: Measurements.
+
+    Returns:
+        Short names of the files, or numbered kinds.
+    """
+    if len(paths) == len(data):
         short = short_names(paths)
         return [short[path] for path in paths]
-    return [f"{kind} measurements {i}" for i, kind in enumerate(kinds, 1)]
+    return [f"{item.kind} measurements {i}" for i, item in enumerate(data, 1)]

@@ -119,6 +119,18 @@ def main_statistics(accuracy: Mapping[str, Any]) -> dict[str, Any]:
     return _select_keys(accuracy, _ACCURACY)
 
 
+def parameter_rows(fit: Result) -> list[dict[str, Any]]:
+    """Return the parameters as the JSON document lists them.
+
+    Args:
+        fit: Result of the calibration.
+
+    Returns:
+        Keys and values of each parameter, in SI units.
+    """
+    return [_select_keys(asdict(estimate), _PARAMETER) for estimate in fit.estimates]
+
+
 def result_to_dict(
     fit: Result,
     files: Mapping[str, str],
@@ -157,7 +169,7 @@ def result_to_dict(
         "holdout_after": main_statistics(holdout.after) if holdout else {},
         **generalization_to_dict(fit.generalization if is_calibration else None),
         "comparisons": [comparison.to_dict() for comparison in fit.comparisons],
-        "parameters": [_select_keys(asdict(estimate), _PARAMETER) for estimate in fit.estimates],
+        "parameters": parameter_rows(fit),
         "priors": {estimate.name: estimate.prior for estimate in fit.estimates if not estimate.fixed},
         "extension": fit.extension.to_dict() if fit.extension else None,
         "shrinkage_factor": fit.shrinkage_factor,

@@ -7,10 +7,11 @@ figures of the section in their order on the page.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 
@@ -26,12 +27,33 @@ from ..robot.chain import Chain
 from ..visualization import plots, scene
 from ..visualization.plots import SQUARE_PANEL, WIDE_PANEL
 from .context import ReportContext
+from .samples import ROLES, Samples, is_prismatic_joint
 
 # A joint whose errors are larger than this multiple of the joints' median gets a scale of its own. Errors
 # before the calibration are left out if they are larger than this multiple of those after it.
 MAX_SCALE_RATIO = 4.0
 # Displacement that the magnified errors should cause, relative to the size of the robot.
 DRAWN_DISPLACEMENT = 0.05
+# Largest number of triangles of the meshes of a scene in a report; they show the form of each link.
+MAX_SCENE_TRIANGLES = 20_000
+# Script of a scene that is part of a report.
+SCENE_LINK = Path(__file__).with_name("page") / "scene_link.js"
+
+
+@dataclass(frozen=True)
+class SamplePoints:
+    """Meaning of the coordinates of the dots of a figure.
+
+    A coordinate is "number", "joint:I" (position of joint I), "base:K" (component K of the tool position in
+    the base frame) or "error:GROUP".
+
+    Attributes:
+        x: Horizontal coordinate.
+        y: Vertical coordinate.
+    """
+
+    x: str
+    y: str
 
 
 @dataclass(frozen=True)
@@ -44,6 +66,8 @@ class Panel:
         description: What the figure shows, in words, for screen readers.
         plot: Function of `plots` with all its arguments except `ax`.
         size: Width and height [px].
+        points: What the dots of samples show, so that a reader can select them; None without such dots.
+        role: Role of the samples, if the figure shows the samples of one role only.
     """
 
     key: str
@@ -51,6 +75,8 @@ class Panel:
     description: str
     plot: Callable[..., object]
     size: tuple[float, float] = plots.PANEL
+    points: SamplePoints | None = None
+    role: str = ""
 
 
 @dataclass(frozen=True)
@@ -78,6 +104,7 @@ class FigureGroup:
         legend: Meaning of the colours.
         layout: Columns of panels on a wide page: "narrow" (three) or "wide" (two).
         scene: HTML page of a 3-D scene, shown on screens; the panels then appear in print only.
+        scene_title: What the scene shows, for screen readers.
     """
 
     panels: Sequence[Panel]
@@ -85,6 +112,7 @@ class FigureGroup:
     legend: Sequence[LegendEntry] = ()
     layout: str = "narrow"
     scene: str = ""
+    scene_title: str = "The robot before and after calibration, in three dimensions"
 
 
 def accuracy_figures(context: ReportContext) -> list[FigureGroup]:
@@ -97,24 +125,46 @@ def accuracy_figures(context: ReportContext) -> list[FigureGroup]:
         One group of figures.
     """
     fit, panels = context.fit, []
-    for role, data in (("hold-out", fit.holdout), ("fitted", fit.inliers)):
-        if not data:
-            continue
-        before = error_norms(compute_errors(fit.nominal_refitted, data))
-        after = error_norms(compute_errors(fit.chain, data, fit.instruments))
-        for group, errors in after.items():
-            quantity, unit = GROUP_LABELS[group], GROUP_UNITS[group]
-            caption = f"{_capitalized(quantity)}, {len(errors)} {role} samples"
-            rms = [_shown(float(np.sqrt(np.mean(norms**2))), unit) for norms in (before[group], errors)]
-            text = (
-                f"Histogram of the {quantity} of {len(errors)} {role} samples: RMS {rms[0]} before, "
-                f"{rms[1]} after."
-            )
-            plot = partial(plots.plot_error_histogram, before[group], errors, quantity=quantity, unit=unit)
-            key = f"histogram-{role}-{group}"
-            panels.append(Panel(key, caption, text, plot, WIDE_PANEL))
+    norms = {
+        role: [
+            error_norms(compute_errors(fit.nominal_refitted, data)),
+            error_norms(compute_errors(fit.chain, data, fit.instruments)),
+        ]
+        for role, data in (("hold-out", fit.holdout), ("fitted", fit.inliers))
+        if data
+    }
+    for group in GROUP_UNITS:
+        roles = {
+            role: (before[group], after[group]) for role, (before, after) in norms.items() if group in after
+        }
+        panels += histogram_panels(group, roles)
     legend = [LegendEntry(state, state, "area") for state in ("before", "after")]
     return [FigureGroup(panels, legend=legend, layout="wide")]
+
+
+def histogram_panels(group: str, errors: Mapping[str, tuple[Array, Array]]) -> list[Panel]:
+    """Draw histograms of the errors of samples of different roles, on the same horizontal axis.
+
+    Args:
+        group: Group of errors.
+        errors: Error norms before and after, (m,) each [m or rad], by role.
+
+    Returns:
+        One figure per role.
+    """
+    if not errors:
+        return []
+    quantity, unit = GROUP_LABELS[group], GROUP_UNITS[group]
+    bins = plots.histogram_edges(*(np.concatenate(side) for side in zip(*errors.values(), strict=True)))
+    panels = []
+    for role, (before, after) in errors.items():
+        rms = [_shown(float(np.sqrt(np.mean(norms**2))), unit) for norms in (before, after)]
+        count = f"{len(after)} {role} samples"
+        text = f"Histogram of the {quantity} of {count}: RMS {rms[0]} before, {rms[1]} after."
+        caption = f"{_capitalized(quantity)}, {count}"
+        plot = partial(plots.plot_error_histogram, before, after, quantity=quantity, unit=unit, bins=bins)
+        panels.append(Panel(f"histogram-{role}-{group}", caption, text, plot, WIDE_PANEL, role=role))
+    return panels
 
 
 def residual_figures(context: ReportContext) -> list[FigureGroup]:
@@ -126,7 +176,11 @@ def residual_figures(context: ReportContext) -> list[FigureGroup]:
     Returns:
         Groups of figures.
     """
-    groups = [_joint_offset_group(context), _joint_error_group(context), _sample_group(context)]
+    groups = [
+        _joint_offset_group(context),
+        joint_error_group(context.samples),
+        sample_group(context.samples),
+    ]
     return [group for group in groups if group.panels]
 
 
@@ -230,81 +284,75 @@ def joint_curve_figures(context: ReportContext) -> list[FigureGroup]:
     return [FigureGroup(panels, legend=legend, layout="wide")]
 
 
-def _joint_error_group(context: ReportContext) -> FigureGroup:
-    group = next(iter(context.fit.comparisons[0].after.groups))
-    quantity, panels = GROUP_LABELS[group], []
-    for i, profile in enumerate(context.joint_profiles):
-        text = (
-            f"{_capitalized(quantity)} of the samples after calibration over the position of {profile.name}."
-        )
+def joint_error_group(samples: Samples) -> FigureGroup:
+    """Draw the errors of samples over the positions of the joints.
+
+    Args:
+        samples: Samples with errors.
+
+    Returns:
+        Group of figures, one per joint; none if no sample belongs to a configuration.
+    """
+    group = next(iter(samples.errors))
+    quantity, errors, panels = GROUP_LABELS[group], samples.errors[group]["after"], []
+    is_shown = np.isfinite(errors) & np.isfinite(samples.q).all(1)
+    for i, joint in enumerate(samples.chain.joint_names if is_shown.any() else ()):
         plot = partial(
             plots.plot_errors_over_joint,
-            profile.values,
-            profile.error_norms,
-            joint=profile.name,
-            is_prismatic=profile.is_prismatic,
+            samples.q[is_shown, i],
+            errors[is_shown],
+            joint=joint,
+            is_prismatic=is_prismatic_joint(samples.chain, i),
             quantity=quantity,
             unit=GROUP_UNITS[group],
         )
-        panels.append(Panel(f"joint-{i}", profile.name, text, plot))
-    legend = [LegendEntry("sample", "sample", "dots"), LegendEntry("median", "after", "line")]
-    return FigureGroup(panels, f"{_capitalized(quantity)} over joint position, after calibration", legend)
+        text = f"{_capitalized(quantity)} of the samples after calibration over the position of {joint}."
+        points = SamplePoints(f"joint:{i}", f"error:{group}")
+        panels.append(Panel(f"joint-{i}", joint, text, plot, points=points))
+    legend = [LegendEntry("sample", "sample", "dots"), LegendEntry("median", "text", "line")]
+    return FigureGroup(panels, f"{_capitalized(quantity)} over joint position", legend)
 
 
-def _sample_group(context: ReportContext) -> FigureGroup:
-    samples, panels = _errors_by_sample(context), []
-    for group, roles in samples.items():
+def sample_group(samples: Samples) -> FigureGroup:
+    """Draw the errors of samples in the order of their files.
+
+    Args:
+        samples: Samples with errors.
+
+    Returns:
+        Group of figures, one per group of errors.
+    """
+    panels, roles = [], {}
+    for group in samples.errors:
+        by_role = _errors_by_role(samples, group)
+        if not by_role:
+            continue
+        roles |= dict.fromkeys(by_role)
         quantity, unit = GROUP_LABELS[group], GROUP_UNITS[group]
-        errors = np.concatenate([errors for _, errors in roles.values()])
+        errors = np.concatenate([errors for _, errors in by_role.values()])
         caption = f"{_capitalized(quantity)} by sample"
         largest = _shown(float(errors.max()), unit)
         text = f"{_capitalized(quantity)} of {len(errors)} samples after calibration; at most {largest}."
-        plot = partial(plots.plot_errors_by_sample, roles, quantity=quantity, unit=unit)
-        panels.append(Panel(f"sample-{group}", caption, text, plot, WIDE_PANEL))
-    roles = dict.fromkeys(role for group in samples.values() for role in group)
+        plot = partial(plots.plot_errors_by_sample, by_role, quantity=quantity, unit=unit)
+        points = SamplePoints("number", f"error:{group}")
+        panels.append(Panel(f"sample-{group}", caption, text, plot, WIDE_PANEL, points))
     legend = [LegendEntry(role, plots.sample_color(role, "hold-out" in roles), "dots") for role in roles]
-    return FigureGroup(panels, "Errors in the order of the files, after calibration", legend, "wide")
+    return FigureGroup(panels, "Errors in the order of the files", legend, "wide")
 
 
-def _errors_by_sample(context: ReportContext) -> dict[str, dict[str, tuple[Array, Array]]]:
-    """Return numbers and error norms of the samples by error group and role; rows continue over the files."""
-    fit = context.fit
-    data = [*fit.data, *fit.holdout]
-    names = [*context.data_names, *context.holdout_names]
-    last_rows: dict[str, int] = {}
-    for name, item in zip(names, data, strict=True):
-        last_rows[name] = max(last_rows.get(name, 0), int(item.rows.max()))
-    starts = dict(zip(last_rows, np.cumsum([0, *last_rows.values()]).tolist(), strict=False))
-    outliers = {(outlier.item, outlier.row) for outlier in context.outliers}
-    errors = [
-        *compute_errors(fit.chain, fit.data, fit.instruments),
-        *compute_errors(fit.chain, fit.holdout, fit.instruments),
-    ]
-    parts: dict[str, dict[str, list[tuple[Array, Array]]]] = {}
-    for i, (name, item, item_errors) in enumerate(zip(names, data, errors, strict=True)):
-        role = "fitted" if i < len(fit.data) else "hold-out"
-        is_outlier = np.array([(i, int(row)) in outliers for row in item.rows], bool)
-        for group, norms in error_norms([item_errors]).items():
-            by_role = parts.setdefault(group, {})
-            for key, chosen in ((role, ~is_outlier), ("outlier", is_outlier)):
-                if chosen.any():
-                    by_role.setdefault(key, []).append((starts[name] + item.rows[chosen], norms[chosen]))
-    return {
-        group: {
-            role: (
-                np.concatenate([numbers for numbers, _ in parts[group][role]]),
-                np.concatenate([norms for _, norms in parts[group][role]]),
-            )
-            for role in ("fitted", "hold-out", "outlier")
-            if role in parts[group]
-        }
-        for group in GROUP_UNITS
-        if group in parts
-    }
+def _errors_by_role(samples: Samples, group: str) -> dict[str, tuple[Array, Array]]:
+    """Return numbers and error norms of the samples by role; outliers are a role of their own."""
+    errors = samples.errors[group]["after"]
+    is_shown, roles = np.isfinite(errors), {}
+    for role in (*ROLES, "outlier"):
+        has_role = samples.is_outlier if role == "outlier" else (samples.role == role) & ~samples.is_outlier
+        if (chosen := is_shown & has_role).any():
+            roles[role] = (samples.number[chosen], errors[chosen])
+    return roles
 
 
 def workspace_figures(context: ReportContext) -> list[FigureGroup]:
-    """Draw maps of the predicted standard deviation of the tool position.
+    """Draw maps of the predicted standard deviation of the tool position, beside the measured errors.
 
     Args:
         context: Result and diagnostics.
@@ -312,14 +360,22 @@ def workspace_figures(context: ReportContext) -> list[FigureGroup]:
     Returns:
         One group of figures; none if nothing can be predicted.
     """
-    return workspace_maps(context.workspace)
+    samples = context.samples
+    errors = samples.errors.get("position", {}).get("after", np.full(len(samples), np.nan))
+    is_measured = np.isfinite(errors) & np.isfinite(samples.q).all(1)
+    poses = se3.inverse(samples.chain.base) @ samples.chain.poses(samples.q[is_measured])
+    return workspace_maps(context.workspace, poses[:, :3, 3], errors[is_measured])
 
 
-def workspace_maps(workspace: WorkspacePrediction) -> list[FigureGroup]:
-    """Draw maps of the predicted standard deviation of the tool position from above and from the side.
+def workspace_maps(workspace: WorkspacePrediction, points: Array, errors: Array) -> list[FigureGroup]:
+    """Draw maps of the predicted standard deviation of the tool position beside maps of measured errors.
+
+    All maps have the same colours, evenly spaced from zero.
 
     Args:
         workspace: Predictions over the workspace, and measured samples.
+        points: Tool positions of measured errors in the base frame, (m, 3) [m].
+        errors: Measured position errors, (m,) [m].
 
     Returns:
         One group of figures; none if nothing can be predicted.
@@ -329,20 +385,24 @@ def workspace_maps(workspace: WorkspacePrediction) -> list[FigureGroup]:
         return []
     panels = []
     median, p95 = (_shown(float(np.quantile(finite, q)), "m") for q in (0.5, 0.95))
-    for plane, caption in (("xy", "Seen from above"), ("xz", "Seen from the side")):
+    # A few large errors, outliers perhaps, do not set the scale.
+    levels = plots.std_levels(np.concatenate([workspace.std, _without_largest(errors)]))
+    region = np.concatenate([workspace.points, points])
+    for plane, view in (("xy", "from above"), ("xz", "from the side")):
+        plot = partial(plots.plot_position_std_map, plane=plane, levels=levels, region=region)
         text = (
             f"Map of the predicted standard deviation of the tool position over {plane[0]} and {plane[1]}: "
             f"median {median}, 95th percentile {p95}."
         )
-        plot = partial(
-            plots.plot_position_std_map,
-            workspace.points,
-            workspace.std,
-            plane=plane,
-            measured=workspace.measured,
-        )
-        panels.append(Panel(f"map-{plane}", caption, text, plot, SQUARE_PANEL))
-    edges = 1e3 * plots.std_levels(workspace.std)
+        predicted = partial(plot, workspace.points, workspace.std, measured=workspace.measured)
+        coordinates = SamplePoints(*(f"base:{'xyz'.index(axis)}" for axis in plane))
+        panels.append(Panel(f"map-{plane}", f"Predicted, {view}", text, predicted, SQUARE_PANEL, coordinates))
+        if len(errors):
+            rms = _shown(float(np.sqrt(np.mean(errors**2))), "m")
+            text = f"Map of the measured position errors over {plane[0]} and {plane[1]}: RMS {rms}."
+            measured = partial(plot, points, errors)
+            panels.append(Panel(f"errors-{plane}", f"Measured error, {view}", text, measured, SQUARE_PANEL))
+    edges = 1e3 * levels
     decimals = max(0, 1 - math.floor(math.log10(edges[1])))
     texts = [f"{low:.{decimals}f}–{high:.{decimals}f} mm" for low, high in pairwise(edges)]
     texts[-1] = f"above {edges[-2]:.{decimals}f} mm"
@@ -352,6 +412,11 @@ def workspace_maps(workspace: WorkspacePrediction) -> list[FigureGroup]:
     if len(workspace.measured):
         legend.append(LegendEntry("measured samples", "measured", "dots"))
     return [FigureGroup(panels, legend=legend, layout="wide")]
+
+
+def _without_largest(errors: Array) -> Array:
+    """Return the errors (m,) without the largest 5 %."""
+    return np.sort(errors)[: math.ceil(0.95 * len(errors))]
 
 
 def scene_figures(context: ReportContext) -> list[FigureGroup]:
@@ -382,8 +447,27 @@ def scene_figures(context: ReportContext) -> list[FigureGroup]:
         LegendEntry("calibrated", "after", "line"),
         LegendEntry("fitted samples", "sample", "dots"),
     ]
-    page = scene.scene_html(fit.nominal_refitted, fit, title=context.robot_name, magnification=magnification)
-    return [FigureGroup(panels, legend=legend, layout="wide", scene=page)]
+    page = scene.scene_html(
+        fit.nominal_refitted,
+        fit,
+        title=context.robot_name,
+        magnification=magnification,
+        triangles=MAX_SCENE_TRIANGLES,
+    )
+    return [FigureGroup(panels, legend=legend, layout="wide", scene=linked_scene(page))]
+
+
+def linked_scene(page: str) -> str:
+    """Add the script to the page of a scene that moves its arm to the samples that a report selects.
+
+    Args:
+        page: Page of a scene.
+
+    Returns:
+        The page for a report.
+    """
+    script = SCENE_LINK.read_text("utf-8")
+    return f"<script>\n{script}</script>\n</body>".join(page.rsplit("</body>", 1))
 
 
 def scene_magnification(context: ReportContext) -> float:

@@ -1,14 +1,14 @@
 """Report as one HTML page with figures, tables and the 3-D scene, which needs no network.
 
-`report.html` is the Jinja template of the page. All texts are escaped when they are inserted; only the
-figures are inserted unchanged.
+`page/report.html` is the Jinja template of the page; style sheet and scripts are beside it. All texts are
+escaped when they are inserted; only figures, style and scripts are inserted unchanged.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
 
 from .. import formatting
 from .._typing import PathLike
@@ -16,15 +16,16 @@ from ..calibration import summary
 from ..calibration.evaluation import Comparison
 from ..calibration.result import Result
 from ..calibration.summary import GROUP_LABELS, STATISTIC_LABELS
-from ..diagnostics.workspace import WorkspacePrediction
+from ..calibration.verdict import Verdict
 from ..exceptions import InvalidArgumentError
 from ..formatting import format_quantity
 from ..saving import write_files
 from ..visualization.plots import svg_panels
-from . import figures, sections
+from . import sections
 from .context import ReportContext
 from .document import Provenance
-from .figures import FigureGroup, Panel
+from .figures import Panel
+from .samples import Samples
 from .sections import Section
 
 
@@ -76,6 +77,35 @@ def _is_html(path: PathLike) -> bool:
     return os.fspath(path).lower().endswith((".html", ".htm"))
 
 
+@dataclass(frozen=True, eq=False)
+class Page:
+    """Content of a page: headline, sections and samples.
+
+    Attributes:
+        title: Title of the window.
+        heading: Heading above all sections.
+        sections: Sections; one without content is left out.
+        eyebrow: Line above the heading.
+        verdict: Verdict above the heading, if there is one.
+        values: CSS class, name and text of the most important figures.
+        details: CSS class, name and text of further figures.
+        remarks: Paragraphs below the figures.
+        warnings: What a reader must know before relying on the page.
+        samples: Samples that a reader can select, if there are any.
+    """
+
+    title: str
+    heading: str
+    sections: Sequence[Section]
+    eyebrow: str = ""
+    verdict: Verdict | None = None
+    values: Sequence[tuple[str, str, str]] = ()
+    details: Sequence[tuple[str, str, str]] = ()
+    remarks: Sequence[str] = ()
+    warnings: Sequence[str] = ()
+    samples: Samples | None = None
+
+
 def html_page(context: ReportContext) -> str:
     """Render the report as an HTML page.
 
@@ -85,44 +115,6 @@ def html_page(context: ReportContext) -> str:
     Returns:
         Text of the page; the same for the same input.
     """
-    shown = []
-    for section in sections.report_sections(context):
-        groups = section.figures(context) if section.figures else ()
-        if section.sentences or section.items or section.tables or groups:
-            shown.append((section, groups))
-    return _render(f"Calibration of {context.robot_name}", shown, _header(context))
-
-
-def map_page(title: str, workspace: WorkspacePrediction, sentences: Sequence[str]) -> str:
-    """Render a page with maps of the predicted accuracy.
-
-    Args:
-        title: Heading of the page.
-        workspace: Predictions over the workspace, and measured samples.
-        sentences: Paragraphs above the maps.
-
-    Returns:
-        Text of the page; the same for the same input.
-    """
-    return _render(title, [(Section("map", "", sentences), figures.workspace_maps(workspace))])
-
-
-def _render(
-    title: str,
-    shown: Sequence[tuple[Section, Sequence[FigureGroup]]],
-    header: dict[str, Any] | None = None,
-) -> str:
-    template = formatting.html_templates().get_template("report/report.html")
-    with svg_panels() as svg:
-
-        def draw(panel: Panel) -> str:
-            return svg.draw(panel.plot, panel.key, panel.caption, panel.description, panel.size)
-
-        return template.render(title=title, sections=shown, header=header, draw=draw)
-
-
-def _header(context: ReportContext) -> dict[str, Any]:
-    """Return what the template shows above the sections."""
     head = summary.headline(context.comparisons)
     best = head.comparison
     if best.title != "fitted":
@@ -139,15 +131,45 @@ def _header(context: ReportContext) -> dict[str, Any]:
     if best.before.groups[head.group].rms:
         change = "smaller" if head.percent_reduction >= 0 else "larger"
         values.append(("", change, f"{abs(head.percent_reduction):.0f} %"))
-    return {
-        "eyebrow": f"Calibration of {context.robot_name}{_origin(context)}",
-        "heading": heading,
-        "values": values,
-        "details": _details(best, head.group),
-        "verdict": context.fit.verdict,
-        "remarks": [*context.source.remarks, *context.generalization_lines],
-        "warnings": [*([note] if note else []), *sections.warnings(context)],
-    }
+    title = f"Calibration of {context.robot_name}"
+    return render_page(
+        Page(
+            title=title,
+            heading=heading,
+            sections=sections.report_sections(context),
+            eyebrow=f"{title}{_origin(context)}",
+            verdict=context.fit.verdict,
+            values=values,
+            details=_details(best, head.group),
+            remarks=[*context.source.remarks, *context.generalization_lines],
+            warnings=[*([note] if note else []), *sections.warnings(context)],
+            samples=context.samples,
+        )
+    )
+
+
+def render_page(page: Page) -> str:
+    """Render a page that contains everything it shows: style, scripts, figures and data.
+
+    Args:
+        page: Content of the page.
+
+    Returns:
+        Text of the page; the same for the same content.
+    """
+    shown = []
+    for section in page.sections:
+        groups = section.figures() if section.figures else ()
+        if section.sentences or section.items or section.tables or groups:
+            shown.append((section, groups))
+    data = formatting.json_for_html(page.samples.page_data()) if page.samples else ""
+    template = formatting.html_templates().get_template("report/page/report.html")
+    with svg_panels() as svg:
+
+        def draw(panel: Panel) -> str:
+            return svg.draw(panel.plot, panel.key, panel.caption, panel.description, panel.size)
+
+        return template.render(page=page, sections=shown, draw=draw, data=data)
 
 
 def _origin(context: ReportContext) -> str:

@@ -8,15 +8,19 @@ no bars.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from .. import formatting
 from ..calibration import summary
 from ..calibration.estimates import Estimate
+from ..calibration.evaluation import GROUP_UNITS
 from ..calibration.model_selection import trial_table
+from ..calibration.summary import GROUP_LABELS
 from ..diagnostics.curves import JointCurve, find_lattices
 from ..diagnostics.residuals import median_sigmas
 from ..estimation import robust
@@ -28,7 +32,13 @@ from . import figures
 from .context import ReportContext
 from .document import short_names, versions
 from .figures import FigureGroup
+from .samples import Samples, is_prismatic_joint
 
+# The page folds parameters that change by at most this multiple of their standard deviations and whose
+# standard deviations are at least this fraction of those before the measurement.
+MAX_ZERO_CHANGE, MIN_ZERO_RATIO = 0.01, 0.99
+# Samples with the largest errors that the table of samples lists without scripts.
+MAX_LISTED_SAMPLES = 20
 # A longer list of outliers is cut: the file as a whole is then more likely wrong than single rows.
 MAX_OUTLIERS = 40
 # Ranges of a joint that were not measured and are listed; the widest ones.
@@ -75,14 +85,31 @@ class BarColumn:
 
 
 @dataclass(frozen=True)
+class RowGroup:
+    """Rows of a table that belong together.
+
+    Attributes:
+        title: Heading above the rows.
+        rows: Indices of the rows.
+    """
+
+    title: str
+    rows: Sequence[int]
+
+
+@dataclass(frozen=True)
 class BarTable(Table):
-    """Table with additional columns of bars, which only the HTML page shows.
+    """Table with columns of bars and groups of rows, which only the HTML page shows.
 
     Attributes:
         bars: The additional columns.
+        groups: Groups of all rows; none if the rows are not grouped.
+        unchanged: Indices of rows that the page folds, as they report no change.
     """
 
     bars: Sequence[BarColumn] = ()
+    groups: Sequence[RowGroup] = ()
+    unchanged: Sequence[int] = ()
 
 
 @dataclass(frozen=True)
@@ -103,7 +130,7 @@ class Section:
     sentences: Sequence[str] = ()
     items: Sequence[str] = ()
     tables: Sequence[Table] = ()
-    figures: Callable[[ReportContext], Sequence[FigureGroup]] | None = None
+    figures: Callable[[], Sequence[FigureGroup]] | None = None
 
 
 def report_sections(context: ReportContext) -> list[Section]:
@@ -121,10 +148,11 @@ def report_sections(context: ReportContext) -> list[Section]:
         _transmission_section(context),
         _joint_section(context),
         _workspace_section(context),
-        Section("scene", "Nominal and calibrated robot", figures=figures.scene_figures),
+        Section("scene", "Nominal and calibrated robot", figures=partial(figures.scene_figures, context)),
         _parameter_section(context),
         _observability_section(context),
         _outlier_section(context),
+        samples_section(context.samples),
         _provenance_section(context),
     ]
 
@@ -178,7 +206,7 @@ def _accuracy_section(context: ReportContext) -> Section:
         "Accuracy",
         sentences,
         tables=[summary.accuracy_table(comparisons)],
-        figures=figures.accuracy_figures,
+        figures=partial(figures.accuracy_figures, context),
     )
 
 
@@ -186,7 +214,7 @@ def _residual_section(context: ReportContext) -> Section:
     key, title = "residuals", "Residual errors"
     profiles = context.joint_profiles
     if not profiles:
-        return Section(key, title, figures=figures.residual_figures)
+        return Section(key, title, figures=partial(figures.residual_figures, context))
     rows = []
     for profile in profiles:
         if not len(profile.centres):
@@ -201,7 +229,7 @@ def _residual_section(context: ReportContext) -> Section:
         )
     if not rows:
         sentences = ["There are too few samples to estimate joint errors over the range of the joints."]
-        return Section(key, title, sentences, figures=figures.residual_figures)
+        return Section(key, title, sentences, figures=partial(figures.residual_figures, context))
     role = "hold-out" if context.fit.holdout else "fitted"
     text = (
         "For each part of a joint's range, the table shows the error of that joint alone that best "
@@ -211,7 +239,7 @@ def _residual_section(context: ReportContext) -> Section:
     if unknown := [profile.name for profile in profiles if not len(profile.centres)]:
         text += f" No estimate for {', '.join(unknown)}: too few samples, or the joint hardly moves the tool."
     table = Table(["joint", "largest before", "largest after", "std", "at"], rows)
-    return Section(key, title, [text], tables=[table], figures=figures.residual_figures)
+    return Section(key, title, [text], tables=[table], figures=partial(figures.residual_figures, context))
 
 
 def _transmission_section(context: ReportContext) -> Section:
@@ -257,7 +285,12 @@ def _joint_section(context: ReportContext) -> Section:
     table = BarTable(header, rows, n_text_columns=2, bars=bars)
     tables = [table] if rows else []
     return Section(
-        "joints", title, sentences if rows else [], items, tables, figures=figures.joint_curve_figures
+        "joints",
+        title,
+        sentences if rows else [],
+        items,
+        tables,
+        figures=partial(figures.joint_curve_figures, context),
     )
 
 
@@ -331,7 +364,7 @@ def _workspace_section(context: ReportContext) -> Section:
         "Predicted accuracy in the workspace",
         sentences,
         tables=[Table(header, rows)],
-        figures=figures.workspace_figures,
+        figures=partial(figures.workspace_figures, context),
     )
 
 
@@ -356,7 +389,16 @@ def _parameter_section(context: ReportContext) -> Section:
             for row, e in zip(table.rows, estimates, strict=True)
         ]
         header, *rows = [[text for i, text in enumerate(row) if i not in hidden] for row in [header, *rows]]
-        tables.append(BarTable(header, rows, caption=title, bars=_estimate_bars(estimates)))
+        tables.append(
+            BarTable(
+                header,
+                rows,
+                caption=title,
+                bars=_estimate_bars(estimates),
+                groups=_estimate_groups(estimates),
+                unchanged=[i for i, e in enumerate(estimates) if _is_unchanged(e)],
+            )
+        )
     text = (
         "Observability is the fraction of a parameter that the measurements alone determine, from 0 "
         "(nothing) to 1 (all). Below 1, other parameters have partly the same effect on the measurements; "
@@ -370,6 +412,24 @@ def _parameter_section(context: ReportContext) -> Section:
         "column “moved” has the angle of the turn."
     )
     return Section("parameters", "Parameters", [text, summary.DEFINITION_TEXT, note], tables=tables)
+
+
+def _estimate_groups(estimates: Sequence[Estimate]) -> list[RowGroup]:
+    """Group the rows of parameters by the joint, frame or instrument that their names begin with."""
+    rows: dict[str, list[int]] = {}
+    for i, e in enumerate(estimates):
+        owner, dot, _ = e.name.partition(".")
+        # Names of Denavit-Hartenberg parameters end with the number of their row.
+        row = re.search(r"\d+$", e.name)
+        rows.setdefault(owner if dot else f"DH row {row[0]}" if row else "other", []).append(i)
+    return [RowGroup(title, numbers) for title, numbers in rows.items()]
+
+
+def _is_unchanged(e: Estimate) -> bool:
+    """Return whether a parameter keeps its nominal value because the measurements say nothing about it."""
+    if e.fixed or not math.isfinite(e.std):
+        return e.category == "robot" and e.change == 0
+    return abs(e.change) <= MAX_ZERO_CHANGE * e.std and e.posterior_to_prior_std >= MIN_ZERO_RATIO
 
 
 def _estimate_bars(estimates: Sequence[Estimate]) -> list[BarColumn]:
@@ -409,7 +469,13 @@ def _observability_section(context: ReportContext) -> Section:
         *(label_unobservable(text) for text in fit.unobservable),
         *(f"poorly identified: {text}" for text in fit.weakly_observable),
     ]
-    return Section("observability", "Observability", sentences, items, figures=figures.observability_figures)
+    return Section(
+        "observability",
+        "Observability",
+        sentences,
+        items,
+        figures=partial(figures.observability_figures, context),
+    )
 
 
 def _outlier_section(context: ReportContext) -> Section:
@@ -439,6 +505,52 @@ def _outlier_section(context: ReportContext) -> Section:
     items += [f"{name}: warning: {text}" for name, texts in context.source.warnings.items() for text in texts]
     table = Table(["file", "line", "error", "score"], rows)
     return Section("outliers", "Outliers", [text], items, [table] if rows else [])
+
+
+def samples_section(samples: Samples) -> Section:
+    """List the samples with the largest errors; scripts of the page make it a list of all samples.
+
+    Args:
+        samples: Samples of the page.
+
+    Returns:
+        The section.
+    """
+    groups = {
+        group: states["after"]
+        for group, states in samples.errors.items()
+        if np.isfinite(states["after"]).any()
+    }
+    largest = np.arange(len(samples))
+    text = "All samples."
+    if groups:
+        first = next(iter(groups.values()))
+        largest = np.argsort(-np.nan_to_num(first, nan=-1.0), kind="stable")
+        label = GROUP_LABELS[next(iter(groups))]
+        text = f"The {min(len(samples), MAX_LISTED_SAMPLES)} samples with the largest {label}."
+    shown = largest[:MAX_LISTED_SAMPLES]
+    joints = samples.chain.joint_names
+    rows = [
+        [
+            samples.file[i],
+            str(samples.line[i]),
+            samples.role[i] + (", outlier" if samples.is_outlier[i] else ""),
+            *(
+                format_quantity(
+                    float(samples.q[i, j]), "m" if is_prismatic_joint(samples.chain, j) else "rad"
+                )
+                for j in range(len(joints))
+            ),
+            *(
+                format_quantity(float(errors[i]), GROUP_UNITS[group], float(errors[i]) / 10, small=True)
+                for group, errors in groups.items()
+            ),
+        ]
+        for i in shown
+    ]
+    header = ["file", "line", "set", *joints, *(GROUP_LABELS[group] for group in groups)]
+    sentences = [text, *filter(None, [samples.note])]
+    return Section("samples", "Samples", sentences, tables=[Table(header, rows)] if rows else [])
 
 
 def _provenance_section(context: ReportContext) -> Section:

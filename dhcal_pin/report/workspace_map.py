@@ -6,16 +6,20 @@ A map is a CSV table with one row per cell of the workspace, or a page with two 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
+from .. import se3
 from ..calibration.evaluation import position_errors
 from ..diagnostics.workspace import WorkspaceMap, predict_workspace, workspace_map
 from ..estimation.uncertainty import Predictor
 from ..exceptions import InvalidArgumentError
 from ..io.tabular import csv_text
 from ..measurements.base import Measurement
-from .html import map_page
+from .figures import workspace_maps
+from .html import Page, render_page
+from .sections import Section
 
 
 def check_map_ending(path: str) -> None:
@@ -62,8 +66,10 @@ def map_content(
             f"At the {len(errors)} measured positions the RMS error is {rms[0]}, including the noise of the "
             f"instrument.{predicted}"
         )
+    points = (se3.inverse(model.chain.base) @ model.chain.poses(q))[:, :3, 3]
+    draw = partial(workspace_maps, predict_workspace(model, data), points, errors)
     title = f"Predicted accuracy of {model.chain.model.name or 'the robot'}"
-    return map_page(title, predict_workspace(model, data), sentences)
+    return render_page(Page(title, title, [Section("map", "", sentences, figures=draw)]))
 
 
 def map_text(workspace: WorkspaceMap) -> str:

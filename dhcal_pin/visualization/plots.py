@@ -71,6 +71,15 @@ SQUARE_PANEL = (420.0, 406.0)
 # Space around the axes of a panel for tick labels and axis labels [px].
 _LEFT, _RIGHT, _TOP, _BOTTOM = 50.0, 10.0, 10.0, 36.0
 
+# Class of the SVG group of an artist by its `gid`, for the scripts and styles of a page: dots and lines of
+# samples, states of a calibration, and the vertical axis.
+SVG_CLASSES = {
+    "samples": "samples",
+    "state-before": "state-before",
+    "state-after": "state-after",
+    "matplotlib.axis_2": "y-axis",
+}
+
 # Line style of the nominal robot: distinguishes it where colours do not.
 DASHED = (0, (2.5, 1.6))
 # Largest number of dots of one series.
@@ -138,7 +147,13 @@ _RC_PARAMS: Any = {
 
 # --- plots of a calibration -------------------------------------------------------------------------
 def plot_error_histogram(
-    before: Array, after: Array, ax: Axes | None = None, *, quantity: str = "position error", unit: str = "m"
+    before: Array,
+    after: Array,
+    ax: Axes | None = None,
+    *,
+    quantity: str = "position error",
+    unit: str = "m",
+    bins: tuple[Array, bool] | None = None,
 ) -> Axes:
     """Plot histograms of the errors before and after a calibration.
 
@@ -150,6 +165,8 @@ def plot_error_histogram(
         ax: Axes to draw into; a new figure if None.
         quantity: What the errors are, for the axis label.
         unit: SI unit of the errors.
+        bins: Edges of the bins [`unit`] and whether they are spaced logarithmically, so that several
+            histograms share an axis; from the data if None, see `histogram_edges`.
 
     Returns:
         The axes.
@@ -158,8 +175,8 @@ def plot_error_histogram(
 
     ax = _axes(ax)
     factor, unit_name = shown_unit(unit)
-    before, after = factor * np.asarray(before), factor * np.asarray(after)
-    edges, is_log = histogram_edges(before, after)
+    edges, is_log = bins or histogram_edges(np.asarray(before), np.asarray(after))
+    before, after, edges = factor * np.asarray(before), factor * np.asarray(after), factor * edges
     for state, values in (("before", before), ("after", after)):
         counts = np.histogram(np.clip(values, edges[0], edges[-1]), edges)[0]
         ax.stairs(
@@ -171,6 +188,7 @@ def plot_error_histogram(
             linewidth=1.5,
             linestyle=DASHED if state == "before" else "-",
             label=state,
+            gid=f"state-{state}",
         )
     if is_log:
         make_logarithmic(ax, "x")
@@ -286,7 +304,7 @@ def plot_errors_over_joint(
     if len(full) > 1:
         centres = 0.5 * (edges[:-1] + edges[1:])[full]
         medians = np.array([np.median(errors[part == k]) for k in full])
-        ax.plot(scale * centres, factor * medians, color=COLORS["after"], label="median")
+        ax.plot(scale * centres, factor * medians, color=COLORS["text"], label="median", gid="samples")
     ax.set(xlabel=f"{joint}, {angle}", ylabel=f"{quantity}, {unit_name}")
     ax.set_ylim(bottom=0.0)
     return ax
@@ -319,7 +337,7 @@ def plot_joint_offsets(
     factor, unit_name = shown_unit("m" if is_prismatic else "rad")
     ax.axhline(0.0, color=COLORS["text"], linewidth=1.0)
     for state, (value, std) in offsets.items():
-        ax.errorbar(
+        container = ax.errorbar(
             scale * centres,
             factor * value,
             yerr=2 * factor * std,
@@ -330,6 +348,8 @@ def plot_joint_offsets(
             markeredgewidth=0,
             label=state,
         )
+        for artist in container.get_children():
+            artist.set_gid(f"state-{state}")
     if limit is None:
         limit = max(float(np.max(np.abs(value) + 2 * std)) for value, std in offsets.values())
     half = 1.05 * factor * limit or 1.0
@@ -457,9 +477,16 @@ def plot_plan_curve(
 
 # --- plots of the workspace -------------------------------------------------------------------------
 def plot_position_std_map(
-    points: Array, std: Array, ax: Axes | None = None, *, plane: str = "xz", measured: Array | None = None
+    points: Array,
+    std: Array,
+    ax: Axes | None = None,
+    *,
+    plane: str = "xz",
+    measured: Array | None = None,
+    levels: Array | None = None,
+    region: Array | None = None,
 ) -> Axes:
-    """Plot a map of the predicted standard deviation of the tool position.
+    """Plot a map of the predicted standard deviation of the tool position, or of measured errors.
 
     A cell shows the RMS along the line of sight of the points in it and in its eight neighbours, so that a
     few points do not look like speckles.
@@ -470,21 +497,26 @@ def plot_position_std_map(
         ax: Axes to draw into; a new figure if None.
         plane: Horizontal and vertical coordinate: "xy", "xz" or "yz".
         measured: Measured tool positions in the base frame, shape (m, 3) [m].
+        levels: Edges between the colours [m], so that several maps share a scale; from `std` if None, see
+            `std_levels`.
+        region: Positions that the axes contain, shape (r, 3) [m], `points` among them; `points` if None.
 
     Returns:
         The axes.
     """
     ax = _axes(ax)
     columns = ["xyz".index(name) for name in plane]
-    corners, size, cell_std = _map_cells(points[:, columns], std)
-    level = np.searchsorted(std_levels(std)[1:-1], cell_std, side="right")
+    shown = (points if region is None else region)[:, columns]
+    corners, size, cell_std = _map_cells(points[:, columns], std, shown)
+    edges = std_levels(std) if levels is None else levels
+    level = np.searchsorted(edges[1:-1], cell_std, side="right")
     for k in range(N_LEVELS):
         _fill_cells(ax, corners[np.isfinite(cell_std) & (level == k)], size, COLORS[f"level-{k}"])
     _fill_cells(ax, corners[~np.isfinite(cell_std)], size, COLORS["unknown"])
     if measured is not None and len(measured):
         chosen = measured[evenly_spaced_indices(len(measured), _MAX_MAP_SAMPLES)][:, columns]
         plot_dots(ax, chosen[:, 0], chosen[:, 1], COLORS["measured"], 2.4, label="measured samples")
-    _show_plane(ax, points[:, columns], plane)
+    _show_plane(ax, shown, plane)
     return ax
 
 
@@ -506,10 +538,10 @@ def std_levels(std: Array) -> Array:
     return digit * math.ceil(step / digit - 1e-9) * np.arange(N_LEVELS + 1)
 
 
-def _map_cells(points: Array, std: Array) -> tuple[Array, float, Array]:
-    """Return lower corners (c, 2), side and pooled std (c,) of the cells that contain points (s, 2)."""
-    low = points.min(0)
-    size = float(np.ptp(points, axis=0).max()) / _MAP_CELLS or 1.0
+def _map_cells(points: Array, std: Array, region: Array) -> tuple[Array, float, Array]:
+    """Return lower corners (c, 2), side and pooled std (c,) of the cells of a region with points (s, 2)."""
+    low = region.min(0)
+    size = float(np.ptp(region, axis=0).max()) / _MAP_CELLS or 1.0
     cell = np.floor((points - low) / size).astype(int)
     is_known = np.isfinite(std)
     # Sums of squares, of known points and of all points, with a border of one cell for the neighbours.
@@ -771,8 +803,14 @@ class SvgPanels:
             SVG element with the role of an image; its colours are CSS variables.
         """
         figure = self._empty_figure(size)
-        plot(ax=figure.axes[0])
+        ax = figure.axes[0]
+        plot(ax=ax)
         root = _svg_tree(figure, key)
+        # The scripts of a page place marks with the frame [px] and the ranges of the axes.
+        width, height = size
+        frame = (_LEFT, _TOP, width - _RIGHT, height - _BOTTOM)
+        for name, numbers in (("frame", frame), ("x", ax.get_xlim()), ("y", ax.get_ylim())):
+            root.set(f"data-{name}", " ".join(f"{number:.9g}" for number in numbers))
         variables = {color: f"var(--{name})" for name, color in COLORS.items()}
         for element in root.iter():
             if style := element.get("style"):
@@ -868,7 +906,9 @@ def _svg_tree(figure: Figure, key: str) -> ElementTree.Element:
         element.text = (element.text or "").strip() or None
         element.tail = None
         if element.tag == "g":
-            element.attrib.pop("id", None)
+            name = element.attrib.pop("id", "")
+            if name in SVG_CLASSES:
+                element.set("class", SVG_CLASSES[name])
         if outline := element.get("d"):
             # A hundredth of a pixel is enough.
             outline = re.sub(r"(?<=\.\d\d)\d+", "", " ".join(outline.split()))
@@ -950,7 +990,16 @@ def plot_dots(ax: Axes, x: Array, y: Array, color: str, size: float, label: str)
         label: Text in the legend.
     """
     ax.plot(
-        x, y, "o", color=color, alpha=0.8, markersize=size, markeredgewidth=0, linestyle="none", label=label
+        x,
+        y,
+        "o",
+        color=color,
+        alpha=0.8,
+        markersize=size,
+        markeredgewidth=0,
+        linestyle="none",
+        label=label,
+        gid="samples",
     )
 
 
@@ -974,8 +1023,9 @@ def make_logarithmic(ax: Axes, name: Literal["x", "y"]) -> None:
 
 def _power_text(value: float) -> str:
     """Return the text of a tick; distant powers of ten with a superscript."""
-    if 0.999e-3 < value < 1e4:
-        return f"{value:g}"
     mantissa, exponent = f"{value:.0e}".split("e")
+    # "0.001" would reach the label of the axis.
+    if 0.999e-3 < value < 1e4 and (mantissa, exponent) != ("1", "-03"):
+        return f"{value:g}"
     superscript = str(int(exponent)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
     return f"10{superscript}" if mantissa == "1" else f"{mantissa}·10{superscript}"

@@ -66,7 +66,7 @@ def test_joint_correction_curves_of_joints_with_harmonics(sim_6dof, quick):
     assert [row[0] for row in filled] == [joint]
     assert all(text.endswith(("mrad", "µrad")) for text in filled[0][3:])
     assert section.figures is not None
-    (group,) = section.figures(context)
+    (group,) = section.figures()
     (panel,) = group.panels
     assert panel.caption == joint
     assert f"which are {filled[0][2]} bins" in panel.description

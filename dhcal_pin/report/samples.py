@@ -1,0 +1,255 @@
+"""Samples of a page: where they come from, the robot's pose and the errors.
+
+The scripts of the page draw, list and select these samples. Their poses are computed here, so that the page
+shows the same numbers as Python.
+
+Shapes: N samples in the order of their files and lines, n joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from .. import se3
+from .._typing import Array
+from ..calibration.evaluation import GROUP_UNITS
+from ..calibration.result import Result
+from ..calibration.summary import GROUP_LABELS
+from ..formatting import SMALL_UNITS, UNITS
+from ..io.tabular import csv_text
+from ..robot.chain import Chain
+from ..visualization.subsampling import evenly_spaced_indices
+from .document import parameter_rows
+
+# Largest number of samples that a page contains beside the outliers; more would make it large and slow.
+MAX_SAMPLES = 5000
+# Decimals of numbers in the page: positions, angles and errors in SI units.
+_POSE_DECIMALS, _ERROR_DECIMALS, _MAP_DECIMALS = 13, 10, 5
+# Roles of samples, in the order of their legend.
+ROLES = ("fitted", "hold-out", "measured", "planned")
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Samples that a reader can select on a page.
+
+    Attributes:
+        chain: Robot whose tool poses are shown.
+        file: File of each sample, (N,).
+        line: Line of each sample in its file, (N,).
+        number: Number of each sample; numbers continue over the files, (N,).
+        role: One of `ROLES` for each sample, (N,).
+        is_outlier: Whether each sample is an outlier, (N,).
+        q: Joint positions of its first configuration, (N, n) [rad or m]; NaN if it has none.
+        errors: Error norms by group and state ("before", "after"), (N,) each [m or rad]; NaN for samples
+            without this group.
+        downloads: Files to download from the page, by name.
+        note: Sentence about samples that the page does not contain; empty if it has all.
+    """
+
+    chain: Chain
+    file: Array
+    line: Array
+    number: Array
+    role: Array
+    is_outlier: Array
+    q: Array
+    errors: Mapping[str, Mapping[str, Array]]
+    downloads: Mapping[str, str] = field(default_factory=dict)
+    note: str = ""
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return len(self.line)
+
+    def limited(self) -> Samples:
+        """Return these samples, or all outliers and an even choice of the others if there are too many."""
+        if len(self) <= MAX_SAMPLES:
+            return self
+        chosen = np.union1d(evenly_spaced_indices(len(self), MAX_SAMPLES), np.flatnonzero(self.is_outlier))
+        note = f"The page contains {len(chosen)} of the {len(self)} samples; --residuals writes all of them."
+        errors = {
+            group: {state: values[chosen] for state, values in states.items()}
+            for group, states in self.errors.items()
+        }
+        return Samples(
+            chain=self.chain,
+            file=self.file[chosen],
+            line=self.line[chosen],
+            number=self.number[chosen],
+            role=self.role[chosen],
+            is_outlier=self.is_outlier[chosen],
+            q=self.q[chosen],
+            errors=errors,
+            downloads={name: text for name, text in self.downloads.items() if name != "residuals.csv"},
+            note=note,
+        )
+
+    def page_data(self) -> dict[str, Any]:
+        """Return what the scripts of the page read, as JSON-compatible values."""
+        files, file_index = np.unique(self.file.astype(str), return_inverse=True)
+        roles = [role for role in ROLES if role in self.role]
+        has_pose = np.isfinite(self.q).all(1)
+        poses = self.chain.poses(self.q[has_pose])
+        tool, base = np.full((len(self), 6), np.nan), np.full((len(self), 3), np.nan)
+        tool[has_pose, :3] = poses[:, :3, 3]
+        tool[has_pose, 3:] = se3.log3(poses[:, :3, :3])
+        base[has_pose] = (se3.inverse(self.chain.base) @ poses)[:, :3, 3]
+        return {
+            "joints": _joints(self.chain),
+            "groups": _groups(self.errors),
+            "files": files.tolist(),
+            "file": file_index.tolist(),
+            "line": self.line.tolist(),
+            "number": self.number.tolist(),
+            "roles": roles,
+            "role": [roles.index(role) for role in self.role],
+            "outlier": self.is_outlier.astype(int).tolist(),
+            "q": _columns(self.q, _POSE_DECIMALS),
+            "tool": _columns(tool, _POSE_DECIMALS),
+            "base": _columns(base, _MAP_DECIMALS),
+            "errors": {
+                group: {state: _values(values, _ERROR_DECIMALS) for state, values in states.items()}
+                for group, states in self.errors.items()
+            },
+            "downloads": dict(self.downloads),
+        }
+
+
+def is_prismatic_joint(chain: Chain, joint: int) -> bool:
+    """Return whether an independent joint of a chain is prismatic.
+
+    Args:
+        chain: The robot.
+        joint: Index of the joint.
+    """
+    return bool(chain.prismatic[np.flatnonzero(chain.mimic_matrix[:, joint])[0]])
+
+
+def _joints(chain: Chain) -> list[dict[str, Any]]:
+    """Return name and shown unit of each joint."""
+    joints = []
+    for i, name in enumerate(chain.joint_names):
+        factor, unit = UNITS["m" if is_prismatic_joint(chain, i) else "rad"]
+        joints.append({"name": name, "factor": factor, "unit": unit.strip()})
+    return joints
+
+
+def _groups(errors: Mapping[str, object]) -> list[dict[str, Any]]:
+    """Return key, label and shown unit of each group of errors."""
+    groups = []
+    for group in errors:
+        factor, unit = SMALL_UNITS[GROUP_UNITS[group]]
+        groups.append({"key": group, "label": GROUP_LABELS[group], "factor": factor, "unit": unit.strip()})
+    return groups
+
+
+def _columns(values: Array, decimals: int) -> list[list[float | None]]:
+    return [_values(column, decimals) for column in values.T]
+
+
+def _values(values: Array, decimals: int) -> list[float | None]:
+    """Round numbers; those that are not finite become None."""
+    rounded = np.round(values, decimals) + 0.0
+    return [value if np.isfinite(value) else None for value in rounded.tolist()]
+
+
+def first_configurations(data: Sequence[Any], n_joints: int) -> Array:
+    """Return the first configuration of each sample of measurements.
+
+    Args:
+        data: Measurements.
+        n_joints: Number of joints n.
+
+    Returns:
+        Joint positions (N, n) [rad or m]; NaN for samples without a configuration.
+    """
+    parts = [
+        item.q if item.configurations_per_row else np.full((len(item.rows), n_joints), np.nan)
+        for item in data
+    ]
+    return np.concatenate([np.empty((0, n_joints)), *parts])
+
+
+def sample_numbers(names: Sequence[str], data: Sequence[Any]) -> Array:
+    """Number the samples of files in a row: a file begins after the last line of the file before it.
+
+    Args:
+        names: File of each measurement.
+        data: Measurements.
+
+    Returns:
+        Numbers, (N,).
+    """
+    last_rows: dict[str, int] = {}
+    for name, item in zip(names, data, strict=True):
+        last_rows[name] = max(last_rows.get(name, 0), int(item.rows.max()))
+    starts = dict(zip(last_rows, np.cumsum([0, *last_rows.values()]).tolist(), strict=False))
+    return np.concatenate([starts[name] + item.rows for name, item in zip(names, data, strict=True)])
+
+
+def result_samples(fit: Result, data_names: Sequence[str], holdout_names: Sequence[str]) -> Samples:
+    """Collect the samples of a calibration.
+
+    Args:
+        fit: Result of the calibration.
+        data_names: Name of each fitted measurement.
+        holdout_names: Name of each held-out measurement.
+
+    Returns:
+        Fitted and held-out samples.
+    """
+    data, names = [*fit.data, *fit.holdout], [*data_names, *holdout_names]
+    table = fit.residuals
+    order = table.file_order
+    file = np.repeat(np.array(names, object), [len(item.rows) for item in data])[order]
+    errors = {
+        group: {"before": before[order], "after": after[order]}
+        for group, (before, after) in fit.error_norms.items()
+    }
+    return Samples(
+        chain=fit.chain,
+        file=file,
+        line=table.line[order],
+        number=sample_numbers(names, data)[order],
+        role=np.where(table.is_holdout, "hold-out", "fitted")[order],
+        is_outlier=table.is_outlier[order],
+        q=first_configurations(data, fit.chain.n_joints)[order],
+        errors={group: errors[group] for group in GROUP_UNITS if group in errors},
+        downloads={"residuals.csv": residuals_text(fit, file), "parameters.csv": parameters_text(fit)},
+    )
+
+
+def residuals_text(fit: Result, names: Array) -> str:
+    """Render the residuals of a calibration as CSV, as --residuals writes them.
+
+    Args:
+        fit: Result of the calibration.
+        names: Name of the file of each sample in the order of the CSV file, (N,); a page does not contain
+            the folders of the files.
+
+    Returns:
+        Text of the file.
+    """
+    return csv_text(fit.residuals.file_columns() | {"file": names.tolist()})
+
+
+def parameters_text(fit: Result) -> str:
+    """Render the parameters of a calibration as CSV, with the keys of the JSON document.
+
+    Args:
+        fit: Result of the calibration.
+
+    Returns:
+        Text of the file: one row per parameter, in SI units; a value that is not finite is empty.
+    """
+    rows = parameter_rows(fit)
+    return csv_text({key: [_cell(row[key]) for row in rows] for key in rows[0]} if rows else {})
+
+
+def _cell(value: Any) -> Any:
+    return None if isinstance(value, float) and not np.isfinite(value) else value
