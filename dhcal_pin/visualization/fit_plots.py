@@ -322,7 +322,7 @@ def plot_parameters(fit: Result, ax: Axes | None = None, *, count: int = MAX_PAR
     )
     ax.set_yticks(height, [names[i] for i in chosen])
     reach = float(np.max(np.abs(change[chosen]) + 2 * np.minimum(std[chosen], 1.5), initial=2.2))
-    ax.set(xlabel="correction relative to the standard deviation of the prior", xlim=(-reach, reach))
+    ax.set(xlabel="correction / standard deviation of the prior", xlim=(-reach, reach))
     ax.set_ylim(max(len(chosen), 1) - 0.4, -0.6)
     if len(chosen) < len(robot):
         ax.set_ylabel(f"{len(chosen)} largest of {len(robot)} corrections")
