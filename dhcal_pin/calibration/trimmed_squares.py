@@ -57,7 +57,7 @@ import numpy as np
 
 from .._typing import Array
 from ..estimation.problem import CHUNK_SIZE, Problem, chunk_residual, linearize_and_factor
-from ..estimation.qr import posterior_sqrt_covariance
+from ..estimation.qr import posterior_sqrt_covariance, rank
 from ..estimation.robust import (
     FAR_THRESHOLD,
     OUTLIER_THRESHOLD,
@@ -246,16 +246,16 @@ def find_good_samples(
     taken = [drawn[(drawn >= a) & (drawn < b)] - a for a, b in pairwise(starts)]
     part = problem.with_data([item.take(index) for item, index in zip(data, taken, strict=True)])
     system = linearize_and_factor(part, solution.x, small_angle=False)
-    root = posterior_sqrt_covariance(system, problem.weights)[0]
+    root, n_determined = posterior_sqrt_covariance(system, problem.weights)[0], rank(system.r)
     all_good = GoodSamples([np.ones(count) for count in counts], "reject_far")
     n_rows = sum(item.residual_dim * len(item.rows) for item in part.data)
-    if not 0 < 2 * root.shape[1] <= min(n_rows, 2 * MAX_COORDINATES):
+    if not (0 < 2 * n_determined <= n_rows and root.shape[1] <= MAX_COORDINATES):
         return all_good
     rows = _linearized_rows(part, solution.x, root)
     redundancy = n_rows / _independent_rows(rows, groups[drawn])
-    if 2 * root.shape[1] > n_rows / redundancy:
+    if 2 * n_determined > n_rows / redundancy:
         return all_good
-    core = _best_core(rows, _search(rows, groups[drawn]), redundancy)
+    core = _best_core(rows, _search(rows, groups[drawn], n_determined), redundancy)
     if core is None:
         return all_good
     n_far = np.sum(core.t > OUTLIER_THRESHOLD)
@@ -416,18 +416,19 @@ def _noise_class_name(index: int, item: Measurement, group: str, n_rows: int, u:
     return "angle" if group == "orientation" else "length"
 
 
-def _search(rows: _Rows, groups: Array) -> list[tuple[Array, Array]]:
+def _search(rows: _Rows, groups: Array, n_determined: int) -> list[tuple[Array, Array]]:
     """Search fits of least trimmed squares.
 
     Args:
         rows: Linearized rows.
         groups: Label of each sample's configuration, shape (m,).
+        n_determined: Number of directions that all samples determine.
 
     Returns:
         The best fits in their order: whether each sample is in the majority that agrees best, shape (m,), and
         noise scales of the classes, shape (c,).
     """
-    weights = _random_subsets(rows, groups)
+    weights = _random_subsets(rows, groups, n_determined)
     scales = np.ones((len(weights), len(rows.is_estimated)))
     objective = np.zeros(len(weights))
     for _ in range(N_FIRST_STEPS):
@@ -459,7 +460,7 @@ def _concentrate(rows: _Rows, weights: Array, scales: Array) -> tuple[Array, Arr
     return scales, is_chosen.astype(float), rows.objective(squares, is_chosen)
 
 
-def _random_subsets(rows: _Rows, groups: Array) -> Array:
+def _random_subsets(rows: _Rows, groups: Array, n_determined: int) -> Array:
     """Draw the subsets that the search starts from.
 
     Every second subset consists of whole configurations, every other pair is half as large as needed to
@@ -473,7 +474,7 @@ def _random_subsets(rows: _Rows, groups: Array) -> Array:
     work = len(rows.squares) * u * u
     n_starts = int(np.clip(MAX_MULTIPLICATIONS / work, MIN_STARTS, MAX_STARTS))
     rng = np.random.default_rng(0)
-    size = min(m, int(np.ceil(u * m / rows.counts.sum())) + 1)
+    size = min(m, int(np.ceil(n_determined * m / rows.counts.sum())) + 1)
     weights = np.zeros((n_starts, m))
     weights[0] = 1.0
     labels = np.unique(groups, return_inverse=True)[1]
