@@ -141,7 +141,8 @@ def _full_lines(blocks: Sequence[Block], width: int | None) -> list[Line]:
 def _shortened_lines(blocks: Sequence[Block], width: int, height: int) -> list[Line]:
     """Lay out blocks; leave out items, then empty lines, then more items, until they fit."""
     parts = [_part(block, width) for block in blocks]
-    counts = [len(part.items) for part in parts]
+    # An item has at least one line.
+    counts = [min(len(part.items), height) if part.block.noun else len(part.items) for part in parts]
     by_rank = sorted((part.block.rank, i) for i, part in enumerate(parts) if part.block.noun)
     has_spaces = True
     for is_last in (False, True):

@@ -30,6 +30,8 @@ from ..tabular import parse_number
 
 # Largest number of rows of a table. With more of them a calibration takes more than 20 s and 1 GB.
 MAX_ROWS = 200_000
+# Largest number of lines, or of runs of lines, that a message lists.
+MAX_LISTED_RUNS = 100
 
 
 @dataclass(frozen=True)
@@ -357,14 +359,16 @@ class _ColumnRows(Sequence[list[str]]):
 def format_lines(lines: Iterable[int]) -> str:
     """Return a list of line numbers as text, with consecutive ones joined.
 
+    After MAX_LISTED_RUNS numbers or runs of numbers, the text says how many lines follow.
+
     Args:
         lines: Line numbers in ascending order.
 
     >>> format_lines([2, 5, 6, 7, 11])
     '2, 5-7, 11'
     """
-    parts = []
-    for _, pairs in groupby(enumerate(lines), lambda pair: pair[1] - pair[0]):
-        run = [line for _, line in pairs]
-        parts.append(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}")
-    return ", ".join(parts)
+    groups = groupby(enumerate(lines), lambda pair: pair[1] - pair[0])
+    runs = [[line for _, line in pairs] for _, pairs in groups]
+    parts = [str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs[:MAX_LISTED_RUNS]]
+    n_more = sum(map(len, runs[MAX_LISTED_RUNS:]))
+    return ", ".join(parts) + f" and {n_more} more" * bool(n_more)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import zipfile
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from robots import write
 
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import read_toml
-from dhcal_pin.io.tables import read_table
+from dhcal_pin.io.tables import format_lines, read_table
 from dhcal_pin.io.tabular import csv_text, require_usable_names
 
 
@@ -108,3 +109,38 @@ def test_a_decimal_comma_between_commas_is_a_bad_row(tmp_path):
     assert table.lines == [2, 3, 5]
     with pytest.raises(DhcalError, match=r"a\.csv:4: 4 values for 3 columns, with commas .* decimal points"):
         table.require_good_rows()
+
+
+def test_a_list_of_many_lines_is_shortened():
+    assert format_lines(range(2, 40, 2)).endswith("36, 38")
+    text = format_lines([*range(1, 301, 3), 500, 501, 502, 600])
+    assert text.endswith("295, 298 and 4 more")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a,b\n" + "1,2\n" * 200_001, r"a\.csv: 200002 rows, more than 200000; keep one in 2 of them"),
+        ("a,b\n" + "1," * 10**6 + "\n", r"a\.csv:2: a line of 2000000 characters, more than 1048576"),
+    ],
+)
+def test_tables_that_are_too_large(tmp_path, text, words):
+    with pytest.raises(DhcalError, match=words):
+        read_table(write(tmp_path, "a.csv", text))
+
+
+def test_a_parquet_file_that_is_too_large(tmp_path):
+    pandas = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    pandas.DataFrame({"a": np.zeros(200_001)}).to_parquet(tmp_path / "a.parquet")
+    with pytest.raises(DhcalError, match=r"a\.parquet: 200001 rows, more than 200000"):
+        read_table(tmp_path / "a.parquet")
+
+
+def test_a_workbook_that_is_too_large(tmp_path):
+    """A file of 35 kB whose sheet has 33 MiB."""
+    with zipfile.ZipFile(tmp_path / "a.xlsx", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("xl/worksheets/sheet1.xml", b" " * (33 << 20))
+    pytest.importorskip("openpyxl")
+    with pytest.raises(DhcalError, match=r"a\.xlsx: a workbook of 33 MiB when unpacked, more than 32 MiB"):
+        read_table(tmp_path / "a.xlsx")
