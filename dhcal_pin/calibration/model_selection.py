@@ -23,14 +23,9 @@ questions are asked.
 2. How many independent samples do the measurements count for? The residuals of a real arm are correlated:
    they are errors of the model, equal in neighbouring configurations. N configurations then contain the
    information of N/T independent ones. The temperature T multiplies the variance of the residuals. It is 1
-   unless the measurements contradict that: regions of joint space are left out in turn, and
-
-       log p = -½·Σ_f m_f·(e_f²/(1 + v_f) + log(1 + v_f))
-
-   compares the held-out mean square e_f² of region f with its prediction, the variance v_f by the
-   uncertainty of the fit plus 1 for the noise, in units of the residual variance. If T = 1 + N/100 predicts
-   better than T = 1, or if the residuals of neighbouring configurations are correlated, the result is fitted
-   again with the design effect (Kish 1965) of N samples of the mean correlation ρ̄,
+   unless the residuals of neighbouring configurations are correlated, see
+   `identifiability.residual_correlation`. If they are, the result is fitted again with the design effect
+   (Kish 1965) of N samples of the mean correlation ρ̄,
 
        T = 1 + (N - 1)·ρ̄,    ρ̄ = mean of 0.015 + 0.15·exp(-d_ij²/2l²) over all pairs i ≠ j,
 
@@ -74,7 +69,7 @@ from ..estimation.qr import (
 from ..estimation.solver import minimize
 from ..exceptions import UnknownNameError
 from ..formatting import Table, format_fixed
-from ..measurements.base import Measurement
+from ..identifiability.residual_correlation import design_effect, find_residual_correlation
 from ..robot.error_families import COMPLIANCE, COUPLING, CURVES, FAMILIES, GAIN, HARMONICS
 from .cross_validation import FoldSystems, count_rows, factor_partition, select_columns, solve_columns
 from .partition import (
@@ -100,22 +95,8 @@ MIN_LOG_BAYES_FACTOR = 5.5
 N_FOLDS = 5
 # Smallest number of different configurations for a selection.
 MIN_CONFIGURATIONS = 2 * N_FOLDS
-# Correlation of the residuals of configurations that are far apart, what is added to it for near ones,
-# and the distance [rad] over which this falls.
-FAR_CORRELATION, NEAR_CORRELATION, CORRELATION_LENGTH = 0.015, 0.15, 0.5
-# Samples per unit of the temperature that is compared with 1.
-SAMPLES_PER_TESTED_TEMPERATURE = 100
-# Difference of the log predictive density per held-out row for which T = 1 is rejected. Simulated arms with
-# independent noise stay below 0.01 but for few samples; a real UR10 has 0.04 to 0.2.
-MIN_LOG_DENSITY_GAIN = 0.015
 # Name of this work for the user, and its steps: choose families, fit them, compare left-out regions.
 PHASE, _N_STEPS = "joint error families", 3
-# Correlation of neighbouring residuals for which T = 1 is rejected, in standard deviations.
-MAX_WHITE_CORRELATION = 4.0
-# Largest number of configurations of each measurement whose neighbours are compared.
-MAX_NEIGHBOURS = 2000
-# Squared distance of scaled joint values below which two configurations are the same.
-SAME_CONFIGURATION = 1e-10
 # Evidence iteration: largest number of rounds, and relative change of a width that ends it.
 MAX_EVIDENCE_ROUNDS = 20
 EVIDENCE_TOL = 0.05
@@ -537,12 +518,6 @@ class _RegionErrors:
     noise: float
 
     @property
-    def log_density(self) -> float:
-        """Log density of the held-out rows, up to a constant."""
-        total = 1 + self.variances
-        return float(-0.5 * np.sum(self.n_rows * (self.squares / total + np.log(total))))
-
-    @property
     def rms(self) -> float:
         """RMS of all held-out whitened rows."""
         return self.noise * float(np.sqrt(np.sum(self.n_rows * self.squares) / np.sum(self.n_rows)))
@@ -585,78 +560,6 @@ class _Regions:
         )
 
 
-def neighbour_correlation(problem: Problem, x: Array) -> float:
-    """Compute the correlation of the residuals of neighbouring configurations, in standard deviations.
-
-    With the residuals r_i and r_j of the pairs of samples that are nearest to each other in joint space,
-
-        z = Σ r_i·r_j / √(Σ (r_i·r_j)²),
-
-    which is standard normal for independent residuals.
-
-    Args:
-        problem: Problem with any measurements; kinds with two configurations per row are left out.
-        x: Its solution, (p,).
-
-    Returns:
-        z; 0 without a pair.
-    """
-    chain = problem.errors.at(x[: len(problem.errors.parameters)])
-    products = [np.empty(0)]
-    for item in problem.data:
-        if item.configurations_per_row != 1 or len(item.rows) < 2:
-            continue
-        item = item.take(np.s_[:: -(-len(item.rows) // MAX_NEIGHBOURS)])
-        values = problem.instrument_values_of(item, x)
-        residual = item.residual(chain.forward_kinematics(item.configurations()), values)
-        std = item.q.std(0)
-        q = item.q[:, std > 0] / std[std > 0]
-        distances = _squared_distances(q)
-        # Samples of the same configuration share the error of the robot, but also noise of the instrument.
-        distances[distances < SAME_CONFIGURATION] = np.inf
-        nearest = np.argmin(distances, 1)
-        pairs = np.unique(np.sort(np.stack([np.arange(len(q)), nearest]), 0), axis=1)
-        products.append(np.sum(residual[:, pairs[0]] * residual[:, pairs[1]], 0))
-    product = np.concatenate(products)
-    norm = float(np.linalg.norm(product))
-    return float(np.sum(product)) / norm if norm else 0.0
-
-
-def design_effect(data: Sequence[Measurement], is_prismatic: Array) -> float:
-    """Compute by how much the correlation of residuals enlarges the variance of a mean (Kish 1965).
-
-    Distances of revolute joints are chords of the unit circle; those of prismatic joints are in standard
-    deviations of the joint.
-
-    Args:
-        data: Measurements of any kinds.
-        is_prismatic: Whether each joint is prismatic, (n,).
-
-    Returns:
-        Number of configurations over the number of independent ones with the same information, at least 1.
-    """
-    q = different_configurations(data)[0]
-    n_configurations = len(q)
-    q = q[:: -(-n_configurations // MAX_NEIGHBOURS)] if n_configurations else q
-    if len(q) < 2:
-        return 1.0
-    turning, sliding = q[:, ~is_prismatic], q[:, is_prismatic]
-    std = sliding.std(0)
-    points = np.hstack([np.cos(turning), np.sin(turning), sliding[:, std > 0] / std[std > 0]])
-    near = np.exp(-0.5 * _squared_distances(points) / CORRELATION_LENGTH**2)
-    mean = (np.sum(near) - np.trace(near)) / (len(q) * (len(q) - 1))
-    return 1 + (n_configurations - 1) * (FAR_CORRELATION + NEAR_CORRELATION * float(mean))
-
-
-def _squared_distances(points: Array) -> Array:
-    """Return the squared distances (m, m) of points (m, n)."""
-    squares = np.sum(points**2, 1)
-    out = points @ (-2 * points.T)
-    out += squares
-    out += squares[:, None]
-    return out
-
-
 def extend(
     fit: Fit, families: Sequence[str], max_iterations: int, progress: Progress | None
 ) -> tuple[Fit, Extension]:
@@ -692,10 +595,9 @@ def extend(
     report(PHASE, 3, _N_STEPS)
     regions = _Regions(extended.problem, extended.solution.x, noise)
     temperature, scale, region_ratio = 1.0, 1.0, float("nan")
-    if regions:
-        correlation = neighbour_correlation(extended.problem, extended.solution.x)
-        if correlation >= MAX_WHITE_CORRELATION or not _is_independent(regions, n_configurations):
-            temperature = design_effect(fit.data, extended.problem.errors.chain.is_prismatic)
+    if regions and _are_residuals_correlated(extended, noise):
+        is_prismatic = extended.problem.errors.chain.is_prismatic
+        temperature = design_effect(different_configurations(fit.data)[0], is_prismatic)
     if not selected and temperature == 1:
         return fit, Extension(trials, n_configurations=n_configurations)
     if regions:
@@ -823,19 +725,19 @@ def _select_families(
     return tuple(sorted(trials, key=lambda trial: not trial.is_selected)), model, random_ratio
 
 
-def _is_independent(regions: _Regions, n_configurations: int) -> bool:
-    """Check whether the errors of left-out regions are those of independent samples.
+def _are_residuals_correlated(fit: Fit, noise: float) -> bool:
+    """Check whether neighbouring configurations share an error of the model.
 
     Args:
-        regions: Left-out regions.
-        n_configurations: Number of different configurations.
+        fit: Fit at temperature 1.
+        noise: Standard deviation of its whitened residuals.
 
     Returns:
-        Whether independent samples predict the errors as well as correlated ones.
+        Whether the residuals contradict independence.
     """
-    tested = regions.errors(1 + n_configurations / SAMPLES_PER_TESTED_TEMPERATURE)
-    gain = (tested.log_density - regions.errors(1.0).log_density) / np.sum(tested.n_rows)
-    return bool(gain < MIN_LOG_DENSITY_GAIN)
+    rows = TriangularSystem(fit.solution.system.rows / noise)
+    root = posterior_sqrt_covariance(rows, fit.problem.weights)[0]
+    return find_residual_correlation(fit.problem, fit.solution.x, root, noise, fit.weights).is_significant
 
 
 def family_hint(fit: Result) -> str:

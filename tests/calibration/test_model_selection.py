@@ -10,18 +10,12 @@ import pytest
 from robots import robot_file
 
 from dhcal_pin.calibration import Extension, calibrate
-from dhcal_pin.calibration.model_selection import (
-    CORRELATION_LENGTH,
-    FAR_CORRELATION,
-    MAX_HINT_SAMPLES,
-    NEAR_CORRELATION,
-    design_effect,
-    family_hint,
-)
+from dhcal_pin.calibration.model_selection import MAX_HINT_SAMPLES, family_hint
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.parameters import EXTENSIONS
 from dhcal_pin.exceptions import InvalidArgumentError, UnknownNameError
+from dhcal_pin.identifiability.residual_correlation import design_effect
 from dhcal_pin.io import measurement_text
 from dhcal_pin.measurements import Measurement, Noise, Pose, Position
 from dhcal_pin.robot import Chain
@@ -166,40 +160,12 @@ def test_residuals_that_are_errors_of_the_model_raise_the_temperature():
     poses[:, :3, 3] += np.exp(-0.5 * (distance / 1.5) ** 2) @ offsets
     fit = calibrate(arm, data.replace(poses=poses), "minimal,base,tool")
     assert fit.extension is not None
-    temperature = design_effect(fit.data, arm.is_prismatic)
+    temperature = design_effect(data.q, arm.is_prismatic)
     assert temperature > 2
     assert fit.extension.temperature == temperature
     assert fit.extension.effective_samples == pytest.approx(300 / temperature)
     assert fit.problem.temperature == temperature
     assert np.allclose(fit.problem.prior_weights * np.sqrt(temperature), fit.problem.weights)
-
-
-def test_design_effect_is_the_variance_of_a_mean_of_correlated_samples():
-    """Kish's design effect: variance of the mean of N samples over that of N independent ones."""
-    arm, data = simulated("minimal,base,tool", 0, 200)
-    distances = np.linalg.norm(np.exp(1j * data.q)[:, None] - np.exp(1j * data.q), axis=2)
-    covariance = FAR_CORRELATION + NEAR_CORRELATION * np.exp(-0.5 * (distances / CORRELATION_LENGTH) ** 2)
-    np.fill_diagonal(covariance, 1.0)
-    expected = covariance.sum() / 200**2 / (1 / 200)
-    assert design_effect([data], arm.is_prismatic) == pytest.approx(expected)
-
-
-def test_configurations_in_a_small_part_of_joint_space_count_for_fewer():
-    arm, data = simulated("minimal,base,tool", 0, 400)
-    near = data.replace(q=0.1 * data.q)
-    wide, narrow = (design_effect([item], arm.is_prismatic) for item in (data, near))
-    assert 1 < wide < 10
-    assert 3 * wide < narrow < 1 + 400 * (FAR_CORRELATION + NEAR_CORRELATION)
-    # The same configuration again is no further one.
-    half = data.take(np.s_[:200])
-    twice = half.replace(q=np.repeat(half.q[:100], 2, 0))
-    assert design_effect([twice], arm.is_prismatic) == design_effect(
-        [half.take(np.s_[:100])], arm.is_prismatic
-    )
-    # Many configurations are thinned.
-    _, many = simulated("minimal,base,tool", 0, 6000)
-    part = design_effect([many.take(np.s_[::3])], arm.is_prismatic)
-    assert design_effect([many], arm.is_prismatic) - 1 == pytest.approx(3 * (part - 1), rel=0.01)
 
 
 def extension_of(arm: Chain, data: Measurement, extend: str | list[str] | None = None) -> Extension:
