@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 # SI unit -> (factor, text of the shown unit).
 RATE_UNITS = {"rad/Nm": (1e6, " µrad/Nm"), "rad/rad": (1e3, " mrad/rad"), "rad/m": (1e3, " mrad/m")}
 # Shown units of values.
-UNITS = {"m": (1e3, " mm"), "rad": (180 / math.pi, "°"), **RATE_UNITS}
+UNITS = {"m": (1e3, " mm"), "rad": (180 / math.pi, "°"), "px": (1.0, " px"), **RATE_UNITS}
 # Shown units of changes and standard deviations.
-SMALL_UNITS = {"m": (1e3, " mm"), "rad": (1e3, " mrad"), **RATE_UNITS}
+SMALL_UNITS = {"m": (1e3, " mm"), "rad": (1e3, " mrad"), "px": (1.0, " px"), **RATE_UNITS}
 # Decimals of a value without standard deviation.
 DEFAULT_DECIMALS = 3
 # Largest number of decimals.

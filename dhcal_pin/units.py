@@ -16,8 +16,16 @@ from .exceptions import InvalidArgumentError
 # 606.8·0.001 is not. Micro has two code points in Unicode: U+00B5 and U+03BC.
 LENGTHS = {"m": 1.0, "cm": 1e2, "mm": 1e3, "um": 1e6, "\u00b5m": 1e6, "\u03bcm": 1e6, "in": 1 / 0.0254}
 ANGLES = {"rad": 1.0, "mrad": 1e3, "deg": 180.0 / np.pi}
+# Units of image coordinates.
+PIXELS = {"px": 1.0}
 # Units allowed for each content type of a column.
-UNITS: Mapping[str, Mapping[str, float]] = {"length": LENGTHS, "angle": ANGLES, "number": {}, "text": {}}
+UNITS: Mapping[str, Mapping[str, float]] = {
+    "length": LENGTHS,
+    "angle": ANGLES,
+    "pixel": PIXELS,
+    "number": {},
+    "text": {},
+}
 # Largest accepted length or angle [m or rad]; a larger value has the wrong unit.
 MAX_SI_VALUE = 1e6
 

@@ -32,7 +32,7 @@ from ..measurements.base import Measurement
 from ..robot.chain import Chain
 
 # Unit of each group of errors, in the order of importance.
-GROUP_UNITS = {"position": "m", "orientation": "rad", "residual": "m"}
+GROUP_UNITS = {"position": "m", "orientation": "rad", "residual": "m", "pixels": "px"}
 
 # Samples that a comparison judges.
 Title = Literal["hold-out", "region hold-out", "cross-validated", "fitted"]
@@ -55,7 +55,7 @@ class ErrorStatistics:
         p95: 95th percentile.
         max: Largest.
         axes_rms: RMS along each axis; None if the errors are not components along axes.
-        unit: Unit of all of these: "m" or "rad".
+        unit: Unit of all of these: "m", "rad" or "px".
     """
 
     samples: int
@@ -103,11 +103,13 @@ class Accuracy(Mapping[str, Any]):
         position: Of positions [m].
         orientation: Of orientations [rad].
         residual: Of other residuals, such as lengths and distances.
+        pixels: Of image coordinates [px]. Without other residuals their keys begin with "residual", too.
     """
 
     position: ErrorStatistics | None = None
     orientation: ErrorStatistics | None = None
     residual: ErrorStatistics | None = None
+    pixels: ErrorStatistics | None = None
 
     @classmethod
     def from_errors(cls, errors: Sequence[Mapping[str, Array]]) -> Accuracy:
@@ -138,14 +140,17 @@ class Accuracy(Mapping[str, Any]):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the flat keys and values of the JSON document, such as `position_rms_m`."""
-        endings = {"position": "_m", "orientation": "_rad", "residual": ""}
+        endings = {"position": "_m", "orientation": "_rad", "residual": "", "pixels": "_px"}
         out: dict[str, Any] = {}
         for group, statistics in self.groups.items():
-            out[f"{group}_samples"] = statistics.samples
+            prefix, ending = group, endings[group]
+            if group == "pixels" and self.residual is None:
+                prefix, ending = "residual", ""
+            out[f"{prefix}_samples"] = statistics.samples
             for key in ("rms", "rms_std", "mean", "p95", "max", "axes_rms"):
                 if (value := getattr(statistics, key)) is not None:
-                    out[f"{group}_{key}{endings[group]}"] = list(value) if key == "axes_rms" else value
-            if group == "residual":
+                    out[f"{prefix}_{key}{ending}"] = list(value) if key == "axes_rms" else value
+            if prefix == "residual":
                 out["unit"] = statistics.unit
         return out
 

@@ -41,6 +41,7 @@ from ..measurements.base import Measurement
 from ..parallel import SERIAL, TaskExecutor
 from ..robot.chain import BASE_FRAME, Chain
 from . import model_selection
+from .cameras import default_sets, held_values, split_sets
 from .cross_validation import leave_regions_out
 from .result import Result
 from .reweighting import Fit, reweight
@@ -79,8 +80,9 @@ def calibrate(
     Args:
         chain: Nominal robot.
         data: One measurement or several of any kinds.
-        parameters: Names of parameter sets, keys of `estimation.PARAMETER_SETS`; the chain's own default set
-            if not given.
+        parameters: Names of parameter sets, keys of `estimation.PARAMETER_SETS` and, for image coordinates,
+            of `calibration.cameras.RIG_SETS`; if not given, the chain's own default set, or for image
+            coordinates six errors per joint, cameras, boards and lenses.
         method: "lm" (Levenberg-Marquardt), or "gn" for the Gauss-Newton iteration of the paper, which weights
             metres and radians equally.
         priors: "default", "none", or standard deviations by parameter name or pattern on top of the default
@@ -129,9 +131,10 @@ def calibrate(
     for item in (*data, *holdout):
         chain.validated_q(item.configurations())
     priors = priors if priors is not None else ("none" if method == "gn" else "default")
-    errors = select_parameters(chain, parameters if parameters is not None else chain.parameters, fix, free)
+    robot_sets, rig_sets = split_sets(parameters if parameters is not None else default_sets(chain, data))
+    known = {**held_values(data, rig_sets), **_validated_known(data, known or {})}
+    errors = select_parameters(chain, robot_sets, fix, free) if robot_sets or free else ErrorModel(chain, ())
     families = _extension_families(extend, errors, method, priors)
-    known = _validated_known(data, known or {})
     errors = initialize_frames(errors, data, known, max_iterations)
     data = tuple(item.initialized(errors.chain) for item in data)
     problem = replace(make_problem(errors, data, prior_weights(errors, priors), known), executor=executor)

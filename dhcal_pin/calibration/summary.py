@@ -26,7 +26,12 @@ OUTLIER_RMS_RATIO = 0.9
 MIN_SHOWN_SHARE = 0.01
 
 # Groups of errors in words.
-GROUP_LABELS = {"position": "position error", "orientation": "orientation error", "residual": "residual"}
+GROUP_LABELS = {
+    "position": "position error",
+    "orientation": "orientation error",
+    "residual": "residual",
+    "pixels": "image error",
+}
 # Statistics in words, by the attribute of `ErrorStatistics`.
 STATISTIC_LABELS = {"mean": "mean", "rms": "RMS", "p95": "95th percentile", "max": "maximum"}
 

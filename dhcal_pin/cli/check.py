@@ -37,7 +37,7 @@ def run(args: Namespace) -> int:
     from .result_screens import crosscheck_screen
 
     require_writable_outputs([args.json], [args.robot])
-    rows = crosscheck(read_robot(args.robot, args.tip, package_dirs=args.package_dir))
+    rows = crosscheck(read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root))
     all_agree = all(row.agrees for row in rows)
     routes = [asdict(row) | {"agrees": row.agrees} for row in rows]
     write_outputs({}, args.json, {"agree": all_agree, "routes": routes})

@@ -132,7 +132,12 @@ def read_robots(args: Namespace) -> tuple[Chain, Chain]:
     from ..io.sidecar import read_tool
 
     nominal, calibrated = (
-        read_robot(path, None if has_dh_table(path) else args.tip, package_dirs=args.package_dir)
+        read_robot(
+            path,
+            None if has_dh_table(path) else args.tip,
+            package_dirs=args.package_dir,
+            root=None if has_dh_table(path) else args.root,
+        )
         for path in (args.nominal, args.calibrated)
     )
     if nominal.tip != calibrated.tip and args.tip is None:

@@ -100,5 +100,9 @@ def _convert_bag(args: Namespace) -> tuple[str, Sequence[str]]:
         raise InvalidArgumentError(f"{args.output}: a recording becomes a measurement file; expected .csv")
     if args.convention:
         raise InvalidArgumentError("--convention: a recording has none; omit it")
-    chain = read_robot(args.robot, args.tip, package_dirs=args.package_dir) if args.robot else None
+    chain = (
+        read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root)
+        if args.robot
+        else None
+    )
     return convert_bag(args.input, args.pose_topic, args.joint_topic, chain)

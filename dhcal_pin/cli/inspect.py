@@ -51,7 +51,11 @@ def run(args: Namespace) -> int:
     robots = [args.robot] if args.robot else []
     inputs = [*robots, *existing_sidecars(robots), *args.data, *([args.columns] if args.columns else [])]
     require_writable_outputs([args.json], inputs)
-    chain = read_robot(args.robot, args.tip, package_dirs=args.package_dir) if args.robot else None
+    chain = (
+        read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root)
+        if args.robot
+        else None
+    )
     inspections = [inspect_file(path, chain, args.columns) for path in args.data]
     robot = None
     if chain is not None:

@@ -30,7 +30,9 @@ from .options import (
     PACKAGE_DIR,
     PARAMETERS,
     POSITIVE_INTEGER,
+    RIG,
     ROBOT,
+    ROOT,
     SKIP_BAD_ROWS,
     TIP,
 )
@@ -74,8 +76,10 @@ class Job:
         }
     )
     tip: str | None = field(default=None, metadata=TIP)
+    root: str | None = field(default=None, metadata=ROOT)
     package_dir: tuple[str, ...] = field(default=(), metadata=PACKAGE_DIR)
     columns: str | None = field(default=None, metadata=COLUMNS)
+    rig: str | None = field(default=None, metadata=RIG)
     skip_bad_rows: bool = field(default=False, metadata=SKIP_BAD_ROWS)
     mend: tuple[str, ...] = field(default=(), metadata=MEND)
     parameters: str | None = field(default=None, metadata=PARAMETERS)

@@ -150,6 +150,14 @@ DATA: dict[str, Any] = {
     "help": "measurement files: text such as CSV, Excel, Parquet",
 }
 TIP: dict[str, Any] = {"metavar": "LINK", "help": "tip link of a URDF (default: the deepest leaf link)"}
+ROOT: dict[str, Any] = {
+    "metavar": "LINK",
+    "help": "link of a URDF where the chain begins, such as that of a camera (default: the root)",
+}
+RIG: dict[str, Any] = {
+    "metavar": "RIG.toml",
+    "help": "cameras and boards of image coordinates, columns u, v and corner",
+}
 PACKAGE_DIR: dict[str, Any] = {
     "metavar": "DIR",
     "help": "folder with the packages of meshes, or of one package; may be repeated (also searched: the "
@@ -187,12 +195,13 @@ SCHEDULER: dict[str, Any] = {
 
 
 def add_urdf_options(parser: argparse.ArgumentParser) -> None:
-    """Add --tip and --package-dir, the options of every command that reads a URDF.
+    """Add --tip, --root and --package-dir, the options of every command that reads a URDF.
 
     Args:
         parser: Parser of a command.
     """
     parser.add_argument("--tip", **TIP)
+    parser.add_argument("--root", **ROOT)
     parser.add_argument("--package-dir", action="append", default=[], **PACKAGE_DIR)
 
 

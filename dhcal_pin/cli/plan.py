@@ -184,7 +184,7 @@ def run(args: Namespace) -> int:
     require_writable_outputs([args.output, args.json, args.html, *args.export], inputs)
     for path in args.export:
         require_program_ending(path)
-    chain = read_robot(args.robot, args.tip, package_dirs=args.package_dir)
+    chain = read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root)
     space = _workspace_constraints(args)
     candidates: int | Array = args.candidates
     if args.candidates_from:

@@ -22,6 +22,7 @@ import numpy as np
 
 from .._typing import PathLike, Progress
 from ..calibration import model_selection, partition, procedure, summary
+from ..calibration.cameras import default_sets
 from ..calibration.cross_validation import leave_regions_out
 from ..calibration.model_selection import FULL_SET, is_restricted
 from ..calibration.result import Result
@@ -32,11 +33,13 @@ from ..estimation.parameters import select_parameters
 from ..estimation.robust import ZERO_WEIGHT
 from ..exceptions import InvalidArgumentError
 from ..io.measurement_files import MeasurementFile, read_measurement_file
+from ..io.rig_file import read_rig
 from ..io.robot import read_robot, robot_name, urdf_files
 from ..io.settings import parse_payload, read_bounds, read_priors
 from ..io.sidecar import read_instrument, sidecar_path
 from ..io.tabular import csv_text
 from ..measurements.base import Measurement
+from ..measurements.mounting import mount_rig
 from ..measurements.position import require_common_reference_target
 from ..parallel import SERIAL, TaskExecutor
 from ..plausibility.hypotheses import mend
@@ -116,11 +119,13 @@ def run_job(
         raised and no file is written.
     """
     inputs = _checked_inputs(job)
-    chain = read_robot(job.robot, job.tip, package_dirs=job.package_dir)
+    chain = read_robot(job.robot, job.tip, package_dirs=job.package_dir, root=job.root)
     if job.payload:
         chain = chain.with_payload(parse_payload(job.payload))
     sets = chain.parameters if job.parameters is None else job.parameters
     data = _read_data(chain, job, has_known_frames=not {"base", "tool"} & set(split_commas(sets)))
+    if job.parameters is None:
+        sets = default_sets(chain, list(data.fit.values()))
     restrictions: dict[str, Any] = {
         "bounds": read_bounds(job.bounds),
         "fix": split_commas(job.fix),
@@ -266,7 +271,7 @@ def _checked_inputs(job: Job) -> list[str]:
                 f"{path}: is given twice; name each measurement file once, to fit or as hold-out"
             )
     settings = [job.priors] if job.priors not in (None, "default", "none") else []
-    settings += [path for path in (job.bounds, job.instrument, job.columns) if path]
+    settings += [path for path in (job.bounds, job.instrument, job.columns, job.rig) if path]
     inputs = [job.robot, *existing_sidecars([job.robot]), *measured, *settings]
     require_urdf_ending(job.output)
     require_writable_outputs([job.json, job.residuals, *job.report], inputs)
@@ -312,8 +317,9 @@ def _read_data(chain: Chain, job: Job, has_known_frames: bool) -> _JobData:
     warnings: dict[str, list[str]] = {}
     notes: dict[str, list[str]] = {}
     by_file: dict[str, Measurement] = {}
+    rig = mount_rig(read_rig(job.rig), chain) if job.rig else None
     for path in [*job.data, *filter(None, [holdout_file])]:
-        read = read_measurement_file(path, chain, job.columns, skip_bad_rows=job.skip_bad_rows)
+        read = read_measurement_file(path, chain, job.columns, skip_bad_rows=job.skip_bad_rows, rig=rig)
         measured = _mended(chain, read, job.mend)
         by_file[path] = measured.data
         notes[path] = list(measured.notes)

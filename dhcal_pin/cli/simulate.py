@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING
 
@@ -9,6 +10,7 @@ from ..exceptions import InvalidArgumentError, UnknownNameError
 from .options import NON_NEGATIVE_INTEGER, POSITIVE_INTEGER, ROBOT, add_urdf_options
 
 if TYPE_CHECKING:
+    from .._typing import PathLike
     from ..robot import Chain
 
 EXAMPLE = "dhcal simulate arm.dh.toml --truth actual.dh.toml -m 50 --noise 0.1mm,0.01deg -o data.csv"
@@ -71,8 +73,9 @@ def run(args: Namespace) -> int:
     import numpy as np  # lazy import, as the following: they are slow to load
 
     from ..io import measurement_text, read_robot
+    from ..io.rig_file import rig_text
     from ..io.robot import has_dh_table
-    from ..measurements import KINDS, Noise
+    from ..measurements import KINDS, CameraCorners, Noise
     from ..robot.sampling import joint_range
     from ..units import parse_noise
     from . import console
@@ -87,9 +90,10 @@ def run(args: Namespace) -> int:
         raise InvalidArgumentError("--errors: not allowed with --truth, which is the robot with errors")
     if args.kind not in KINDS:
         raise UnknownNameError(f"--kind: unknown kind {args.kind!r}; choose from {', '.join(KINDS)}")
-    nominal = truth = read_robot(args.robot, args.tip)
+    nominal = truth = read_robot(args.robot, args.tip, root=args.root)
     if args.truth:
-        truth = read_robot(args.truth, None if has_dh_table(args.truth) else args.tip)
+        ends = (None, None) if has_dh_table(args.truth) else (args.tip, args.root)
+        truth = read_robot(args.truth, ends[0], root=ends[1])
         if truth.joint_names != nominal.joint_names:
             raise InvalidArgumentError(
                 f"{args.truth}: its joints are {', '.join(truth.joint_names)}; "
@@ -104,8 +108,13 @@ def run(args: Namespace) -> int:
     comment = (
         f"simulated {args.kind} of {args.truth or args.robot}{errors}, noise {args.noise}, seed {args.seed}"
     )
-    write_outputs({args.output: measurement_text(data, nominal, [comment])})
-    console.show(Screen([files_block([args.output])]), args.verbosity)
+    contents: dict[PathLike, str | bytes] = {args.output: measurement_text(data, nominal, [comment])}
+    if isinstance(data, CameraCorners):
+        rig_path = os.path.splitext(args.output)[0] + ".rig.toml"
+        require_writable_outputs([rig_path], [*robots, args.output])
+        contents[rig_path] = rig_text(data.rig.cameras, data.rig.boards)
+    write_outputs(contents)
+    console.show(Screen([files_block([str(path) for path in contents])]), args.verbosity)
     return 0
 
 

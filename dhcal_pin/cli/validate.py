@@ -84,7 +84,7 @@ def run(args: Namespace) -> int:
     robots = [args.robot, args.nominal] if args.nominal else [args.robot]
     inputs = [*robots, *args.data, *filter(None, (sidecar, args.columns)), *existing_sidecars(robots[1:])]
     require_writable_outputs([args.json, args.map], inputs)
-    chain = read_robot(args.robot, args.tip, sidecar, args.package_dir)
+    chain = read_robot(args.robot, args.tip, sidecar, args.package_dir, args.root)
     predictor = _predictor(chain, sidecar, args) if args.map else None
     files = [
         read_measurement_file(path, chain, args.columns, skip_bad_rows=args.skip_bad_rows)
@@ -151,7 +151,7 @@ def _nominal_accuracy(
     from ..diagnostics import fit_frames
     from ..io import read_robot
 
-    nominal = read_robot(args.nominal, args.tip, None, args.package_dir)
+    nominal = read_robot(args.nominal, args.tip, None, args.package_dir, args.root)
     if nominal.joint_names != chain.joint_names:
         raise InvalidArgumentError(
             f"{args.nominal}: joints {', '.join(nominal.joint_names)}; expected the joints of {args.robot}: "

@@ -90,7 +90,12 @@ def run(args: Namespace) -> int:
     page = args.html or os.path.join(tempfile.mkdtemp(prefix="dhcal-"), f"{robot_name(args.nominal)}.html")
     require_writable_outputs([page], [*robots, *sidecars, *args.data])
     chains = [
-        read_robot(path, None if has_dh_table(path) else args.tip, package_dirs=args.package_dir)
+        read_robot(
+            path,
+            None if has_dh_table(path) else args.tip,
+            package_dirs=args.package_dir,
+            root=None if has_dh_table(path) else args.root,
+        )
         for path in robots
     ]
     data = [read_measurements(path, chains[0]) for path in args.data]

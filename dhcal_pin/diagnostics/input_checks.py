@@ -255,7 +255,7 @@ def _check_lengths(chain: Chain, file: MeasurementFile) -> list[str]:
     out = _check_position_spread(chain, file, reach)
     data = file.data
     for name, quantity in data.columns.items():
-        if name not in file.values or quantity == "text":
+        if name not in file.values or quantity not in _MAX_SIGMA:
             continue
         values, unit = np.abs(file.values[name]), file.units.get(name, "")
         median, largest = float(np.median(values)), float(values.max())

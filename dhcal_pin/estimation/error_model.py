@@ -246,8 +246,10 @@ def frame_name(chain: Chain, error_frame: int) -> str:
         return f"link {chain.tip}"
     number, is_link = divmod(error_frame, 2)
     if number == 0:
-        return f"link {chain.urdf.root}"
+        return f"link {chain.root}"
     joint = chain.urdf.joint(chain.moving_joints[number - 1])
+    if number <= chain.n_reversed:
+        is_link = not is_link
     return f"link {joint.child}" if is_link else f"origin of {joint.name}"
 
 

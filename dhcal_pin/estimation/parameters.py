@@ -182,7 +182,7 @@ def placement(chain: Chain) -> list[ErrorParameter]:
     return [
         parameter
         for j, name in enumerate(chain.moving_joints)
-        for parameter in _frame_parameters(name, joint_frame(j + 1), LENGTH_PRIOR, ANGLE_PRIOR)
+        for parameter in _frame_parameters(name, chain.origin_frame(j + 1), LENGTH_PRIOR, ANGLE_PRIOR)
     ]
 
 
@@ -204,7 +204,7 @@ def minimal(chain: Chain) -> list[ErrorParameter]:
         zip(chain.moving_joints, chain.axes, chain.prismatic, strict=True)
     ):
         components = [abs(component) for component in axis.tolist()]
-        error_frame = joint_frame(j + 1)
+        error_frame = chain.origin_frame(j + 1)
         if abs(max(components) - 1) < AXIS_ALIGNMENT_TOL:
             along = components.index(max(components))
             parameters = [
@@ -241,7 +241,7 @@ def offset(chain: Chain) -> list[ErrorParameter]:
     ):
         unit, prior = ("m", LENGTH_PRIOR) if is_prismatic else ("rad", OFFSET_PRIOR)
         twist = _joint_twist(axis.tolist(), is_prismatic)
-        out.append(ErrorParameter(f"{name}.offset", unit, 0.0, joint_frame(j + 1), twist, prior))
+        out.append(ErrorParameter(f"{name}.offset", unit, 0.0, chain.origin_frame(j + 1), twist, prior))
     return out
 
 

@@ -17,6 +17,7 @@ from .._typing import Array, PathLike
 from ..formatting import Table, format_fixed
 from ..robot.chain import Chain
 from ..robot.urdf import UrdfJoint
+from ..robot.urdf_path import path_between
 from .robot_format import ConvertedRobot, RobotSource
 
 # Components of an origin, in the order of `se3.to_xyz_rpy`: metres, then radians.
@@ -39,7 +40,7 @@ def without_negligible_moves(chain: Chain) -> Chain:
     Returns:
         Chain with the nominal translation or rotation of each origin that moved by at most `MIN_MOVE`.
     """
-    nominal = Chain.from_urdf(chain.urdf, chain.tip).origins
+    nominal = chain.nominal().origins
     origins = chain.origins.copy()
     change = se3.inverse(nominal) @ origins
     same_position = np.linalg.norm(change[:, :3, 3], axis=1) <= MIN_MOVE
@@ -63,27 +64,33 @@ def joint_origins(chain: Chain) -> tuple[dict[str, Array], Array]:
         Origin in the parent link by joint name, shape (4, 4) each [m], for changed joints only; and the tool
         pose in the tip frame, shape (4, 4) [m].
     """
-    nominal = Chain.from_urdf(chain.urdf, chain.tip)
+    nominal = chain.nominal()
     changed: dict[str, Array] = {}
-    # Pose of the joint's parent link in the link of the previous moving joint.
-    parent, moving_index, last_fixed = np.eye(4), 0, None
-    for joint in chain.urdf.path(chain.tip):
-        if joint.type != "fixed":
-            new, old = chain.origins[moving_index], nominal.origins[moving_index]
-            if not np.array_equal(new, old):
-                changed[joint.name] = _changed_origin(joint, parent, new, old)
-            parent, moving_index, last_fixed = np.eye(4), moving_index + 1, None
-        else:
-            last_fixed = joint, parent
-            parent = parent @ joint.origin
+    pairs = zip(chain.moving_joints, chain.joint_placements, nominal.joint_placements, strict=True)
+    for name, new, old in pairs:
+        if not np.array_equal(new, old):
+            parent, _ = _fixed_part(chain, chain.urdf.joint(name).parent)
+            changed[name] = _changed_origin(chain.urdf.joint(name), parent, new, old)
     new, old = chain.origins[-1], nominal.origins[-1]
-    if np.array_equal(new, old):
+    if np.array_equal(new, old) or chain.n_reversed == len(chain.moving_joints):
         return changed, chain.tool
+    _, last_fixed = _fixed_part(chain, chain.tip)
     if last_fixed is None:
         return changed, se3.inverse(old) @ new @ chain.tool
-    joint, parent = last_fixed
-    changed[joint.name] = _changed_origin(joint, parent, new, old)
+    parent, _ = _fixed_part(chain, last_fixed.parent)
+    changed[last_fixed.name] = _changed_origin(last_fixed, parent, new, old)
     return changed, chain.tool
+
+
+def _fixed_part(chain: Chain, link: str) -> tuple[Array, UrdfJoint | None]:
+    """Return the pose of a link in the moving joint before it, and the last fixed joint between them."""
+    pose, last = np.eye(4), None
+    for joint in chain.urdf.path(link):
+        if joint.type == "fixed":
+            pose, last = pose @ joint.origin, joint
+        else:
+            pose, last = np.eye(4), None
+    return pose, last
 
 
 def _changed_origin(joint: UrdfJoint, parent: Array, new: Array, old: Array) -> Array:
@@ -119,7 +126,7 @@ def origin_table(chain: Chain) -> Table:
     """
     changed, _ = joint_origins(without_negligible_moves(chain))
     rows = []
-    for joint in chain.urdf.path(chain.tip):
+    for joint, _ in path_between(chain.urdf, chain.root, chain.tip):
         if joint.name not in changed:
             continue
         old, new = joint.origin, changed[joint.name]
@@ -153,7 +160,7 @@ def origins_text(chain: Chain) -> str:
     """
     changed, _ = joint_origins(without_negligible_moves(chain))
     lines = ["joint," + ",".join(f"{key}[{'m' if key in 'xyz' else 'rad'}]" for key in ORIGIN_KEYS)]
-    for joint in chain.urdf.path(chain.tip):
+    for joint, _ in path_between(chain.urdf, chain.root, chain.tip):
         origin = changed.get(joint.name, joint.origin)
         numbers = (*origin[:3, 3], *_rpy(joint, origin))
         lines.append(",".join([joint.name, *(repr(float(value) + 0.0) for value in numbers)]))

@@ -128,7 +128,11 @@ def has_dh_table(path: PathLike) -> bool:
 
 
 def _read(
-    path: PathLike, tip: str | None, sidecar: PathLike | None, package_dirs: Sequence[PathLike] = ()
+    path: PathLike,
+    tip: str | None,
+    sidecar: PathLike | None,
+    package_dirs: Sequence[PathLike] = (),
+    root: str | None = None,
 ) -> tuple[Chain, DHTable | None]:
     """Read the chain of a robot file and its sidecar, and its DH table if it has one."""
     path, folders = resolve_robot_path(path), validated_package_dirs(package_dirs)
@@ -136,14 +140,16 @@ def _read(
     robot_format = find_format(path)
     table = None
     if robot_format is None:
-        chain = Chain.from_urdf(replace(read_urdf(path), package_dirs=folders), tip)
+        chain = Chain.from_urdf(replace(read_urdf(path), package_dirs=folders), tip, root)
     elif robot_format.read_table is not None:
         if tip is not None:
             raise InvalidArgumentError(f"{os.fspath(path)}: a DH table has one tip; leave out --tip")
+        if root is not None:
+            raise InvalidArgumentError(f"{os.fspath(path)}: a DH table has one root; leave out --root")
         table = robot_format.read_table(path)
         chain = Chain.from_dh(table, robot_name(path))
     elif robot_format.read_urdf is not None:
-        chain = Chain.from_urdf(replace(robot_format.read_urdf(path), package_dirs=folders), tip)
+        chain = Chain.from_urdf(replace(robot_format.read_urdf(path), package_dirs=folders), tip, root)
     else:
         readable = ", ".join(_endings(other for other in FORMATS if other.is_readable))
         raise FileFormatError(
@@ -158,6 +164,7 @@ def read_robot(
     tip: str | None = None,
     sidecar: PathLike | None = None,
     package_dirs: Sequence[PathLike] = (),
+    root: str | None = None,
 ) -> Chain:
     """Read a robot and its sidecar.
 
@@ -167,12 +174,13 @@ def read_robot(
         tip: Tip link of a URDF; the deepest leaf if None.
         sidecar: Sidecar to read in place of the one beside the robot.
         package_dirs: Folders in which packages with meshes are searched first.
+        root: Link of a URDF where the chain begins; the root of the URDF if None.
 
     Returns:
-        The chain from the base link to the tip. A file that is missing or invalid, and a tip given for a DH
+        The chain from the root to the tip. A file that is missing or invalid, and a tip given for a DH
         table, raise a `DhcalError`.
     """
-    return _read(path, tip, sidecar, package_dirs)[0]
+    return _read(path, tip, sidecar, package_dirs, root)[0]
 
 
 def convert_robot(
@@ -241,7 +249,7 @@ def urdf_files(
     chain = without_negligible_moves(chain)
     origins, tool = joint_origins(chain)
     data = with_origins(chain.urdf, origins)
-    parsed = Chain.from_urdf(parse_urdf(data, os.fspath(path)), chain.tip)
+    parsed = Chain.from_urdf(parse_urdf(data, os.fspath(path)), chain.tip, chain.root)
     written = replace(parsed, base=chain.base, tool=tool, payload=chain.payload)
     if chain.transmission is not None:
         # The torque of gravity on the joints follows from the masses of the written URDF.

@@ -7,9 +7,11 @@ part of the joint space measurements cover.
 """
 
 from .base import InstrumentParameter, Measurement, Noise
+from .camera import CameraCorners
 from .contact import PlaneContact, PointContact, PointDistance, SphereContact
 from .length import Distance, Wires
 from .measured_region import MeasuredRegion
+from .mounting import MountedRig, mount_rig
 from .pose import Pose, RelativePose
 from .position import MultiTargetPosition, Position, PositionComponents
 
@@ -28,15 +30,18 @@ KINDS: dict[str, type[Measurement]] = {
         PlaneContact,
         SphereContact,
         RelativePose,
+        CameraCorners,
     )
 }
 
 __all__ = [
     "KINDS",
+    "CameraCorners",
     "Distance",
     "InstrumentParameter",
     "MeasuredRegion",
     "Measurement",
+    "MountedRig",
     "MultiTargetPosition",
     "Noise",
     "PlaneContact",
@@ -48,4 +53,5 @@ __all__ = [
     "RelativePose",
     "SphereContact",
     "Wires",
+    "mount_rig",
 ]

@@ -35,6 +35,7 @@ from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from ..robot.chain import Chain
 from .columns import Column, common_text, file_columns, stack_columns, stack_sigmas
+from .mounting import MountedRig
 
 # Standard deviations [m], [rad] of measurements that state none: a millimetre weighs as much as a
 # milliradian.
@@ -51,7 +52,7 @@ class InstrumentParameter:
 
     Attributes:
         name: Name that users see. Measurements share the parameters that have the same name.
-        unit: "m" or "rad".
+        unit: "m", "rad", "px" or "1".
         nominal: Initial value; NaN if another measurement has to provide it.
         prior: Prior standard deviation of the difference from `nominal`, in `unit`.
         is_local: Whether the value only has a meaning for the measurement object that initialized it.
@@ -104,7 +105,7 @@ class Measurement(ABC):
     kind: ClassVar[str]
     # Columns of files, except those of the joints.
     COLUMNS: ClassVar[tuple[Column, ...]]
-    # Quantity of each column of files, standard deviations included: "length", "angle" or "text".
+    # Quantity of each column of files, standard deviations included: "length", "angle", "pixel" or "text".
     columns: ClassVar[Mapping[str, str]]
     # A file is of this kind if it has all columns of one of these sets.
     required_columns: ClassVar[tuple[frozenset[str], ...]]
@@ -263,8 +264,8 @@ class Measurement(ABC):
             u: Values of the instrument parameters, (s,).
 
         Returns:
-            "position" (m, 3) [m], "orientation" (m, 3) [rad], or other names (m, ·) [m]. Reports show errors
-            of other names as "residual" in metres.
+            "position" (m, 3) [m], "orientation" (m, 3) [rad], "pixels" (m, 2) [px], or other names (m, ·)
+            [m]. Reports show errors of other names as "residual" in metres.
         """
 
     def positions(self) -> Array:
@@ -289,12 +290,15 @@ class Measurement(ABC):
 
     # ------------------------------------------------------------------------------------------- files
     @classmethod
-    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> Self:
+    def from_columns(
+        cls, q: Sequence[Array], values: Mapping[str, Any], rig: MountedRig | None = None
+    ) -> Self:
         """Return the measurements of a file.
 
         Args:
             q: Joint positions of each configuration, (m, n) [rad or m].
-            values: Columns by name: numbers (m,) in m or rad, or texts.
+            values: Columns by name: numbers (m,) in m, rad or px, or texts.
+            rig: Cameras and boards on the chain; not used by other instruments.
         """
         return cls(*q[: cls.configurations_per_row], **cls._arguments(values))  # pyright: ignore[reportCallIssue]
 

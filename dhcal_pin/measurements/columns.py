@@ -60,7 +60,7 @@ class Column:
 
     Attributes:
         name: Name in the header, without the unit.
-        quantity: "length" [m], "angle" [rad] or "text".
+        quantity: "length" [m], "angle" [rad], "pixel" [px] or "text".
         argument: Argument of the kind's constructor that the column fills. Several numeric columns with the
             same argument are stacked, (m, k).
         is_implied: Whether the value is zero by definition, so that files have only its standard deviation.
@@ -69,7 +69,7 @@ class Column:
     """
 
     name: str
-    quantity: Literal["length", "angle", "text"]
+    quantity: Literal["length", "angle", "pixel", "text"]
     argument: str = ""
     is_implied: bool = False
     is_common: bool = False
@@ -117,6 +117,19 @@ def angle_columns(argument: str, *names: str) -> tuple[Column, ...]:
         One column per name.
     """
     return tuple(Column(name, "angle", argument) for name in names)
+
+
+def pixel_columns(argument: str, *names: str) -> tuple[Column, ...]:
+    """Declare columns of image coordinates that fill one argument of the constructor.
+
+    Args:
+        argument: Name of the constructor's argument.
+        *names: Names of the columns.
+
+    Returns:
+        One column per name.
+    """
+    return tuple(Column(name, "pixel", argument) for name in names)
 
 
 def text_column(argument: str, name: str, is_common: bool = False) -> tuple[Column, ...]:

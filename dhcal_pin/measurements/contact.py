@@ -24,6 +24,7 @@ from ..robot.inverse_kinematics import position_task, solve_within_limits
 from .base import POINT_PRIOR, InstrumentParameter, Noise, point_parameters
 from .columns import instrument_range, length_columns, point_distance_range, text_column
 from .length import MIN_DIVISOR, norm_and_direction
+from .mounting import MountedRig
 from .position import PointMeasurement
 from .trilateration import locate_point
 from .validation import encode_labels, validated_array, validated_joint_positions
@@ -161,12 +162,15 @@ class PointDistance(PointMeasurement):
         self._initialize(label=label.reshape(-1, 2), names=names)
 
     @classmethod
-    def from_columns(cls, q: Sequence[Array], values: Mapping[str, Any]) -> Self:
+    def from_columns(
+        cls, q: Sequence[Array], values: Mapping[str, Any], rig: MountedRig | None = None
+    ) -> Self:
         """Return the distances of a file.
 
         Args:
             q: Joint positions of any values, (m, n).
             values: Columns by name.
+            rig: Not used.
         """
         arguments = cls._arguments(values)
         pairs = list(zip(arguments.pop("point_a"), arguments.pop("point_b"), strict=True))

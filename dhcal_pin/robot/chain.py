@@ -1,4 +1,4 @@
-"""Serial kinematic chains: the path from the root of a robot to a tip link, for many samples at once.
+"""Serial kinematic chains: the path from one link of a robot to another, for many samples at once.
 
 The chain has n independent joints, the columns of the joint positions q, and k moving joints (k > n only with
 mimic joints). Its bodies are numbered 0 (the base link) to k (behind the last moving joint). The tool pose in
@@ -8,11 +8,15 @@ the measuring frame is
 
 with the base B, the constant link transforms L_j and the motion Z(q_j) about or along the z axis of joint j.
 
+The path begins at the root of the URDF, or at another link if the robot looks at itself. It then passes some
+joints from child to parent; see `urdf_path`.
+
 Errors act at *error frames*, as right perturbations M ← M·exp(ξ) by a twist ξ = [v, ω]. Their indices are
 
     0 base · 1 link 0 · 2 joint 1 · 3 link 1 · 4 joint 2 · … · 2k joint k · 2k+1 link k · 2k+2 tip · 2k+3 tool
 
 where `joint j` is the origin of that joint before its motion and `link j` is the frame after the motion.
+For a joint that is passed from child to parent, `link j` is the origin of that joint in the URDF.
 `base` is the pose of the base link in the measuring frame. `tool` is the pose of the measured point in the
 tip frame. A perturbation of `base` or `tool` stays outside the robot; every other one changes a joint origin
 of the URDF.
@@ -52,6 +56,7 @@ from .urdf_path import (
     default_tip,
     find_moving_joints,
     independent_joints,
+    joint_placements,
     placements,
 )
 
@@ -87,7 +92,7 @@ def link_frame(j: int) -> int:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Chain:
-    """Kinematic chain from the root link of a robot to a tip link.
+    """Kinematic chain from the root link of a robot, or from another link, to a tip link.
 
     Attributes:
         urdf: URDF file of the robot.
@@ -107,6 +112,8 @@ class Chain:
         parameters: Parameter sets that a calibration estimates by default.
         transmission: Transmission errors of the independent joints; None for ideal joints.
         payload: Point mass at the tip that loads compliant joints.
+        first_link: Name of the link where the chain begins; empty for the root of the URDF.
+        n_reversed: Number of joints at the begin of the chain that are passed from child to parent.
     """
 
     urdf: Urdf
@@ -125,10 +132,14 @@ class Chain:
     parameters: str = "minimal,base,tool"
     transmission: Transmission | None = None
     payload: Payload | None = None
+    first_link: str = ""
+    n_reversed: int = 0
 
     @classmethod
-    def from_urdf(cls, source: str | os.PathLike[str] | Urdf, tip: str | None = None) -> Chain:
-        """Build the chain from the root link to a tip link of a URDF.
+    def from_urdf(
+        cls, source: str | os.PathLike[str] | Urdf, tip: str | None = None, root: str | None = None
+    ) -> Chain:
+        """Build the chain from the root link, or from another link, to a tip link of a URDF.
 
         A `DhcalError` names file and line if the URDF is invalid, the tip is unknown or ambiguous, or no
         joint moves.
@@ -136,6 +147,7 @@ class Chain:
         Args:
             source: Path of a URDF file, or a file that was already read.
             tip: Name of the tip link; by default the leaf behind the most moving joints.
+            root: Name of the link where the chain begins; by default the root of the URDF.
 
         Returns:
             Chain with identity base and tool.
@@ -147,11 +159,13 @@ class Chain:
             raise InvalidArgumentError(f"source has type {type(source).__name__}; expected a path or a Urdf")
         urdf = source if isinstance(source, Urdf) else read_urdf(source)
         tip = tip if tip is not None else default_tip(urdf)
-        joints = find_moving_joints(urdf, tip)
+        first_link = urdf.root if root is None else root
+        path = find_moving_joints(urdf, tip, first_link)
+        joints, is_reversed = [joint for joint, _ in path], [is_up for _, is_up in path]
         names, mimic_matrix, mimic_offset = independent_joints(urdf, [joint.name for joint in joints])
         independent = [urdf.joint(name) for name in names]
         model = build_model(urdf)
-        origins, axes = placements(model, tip, [joint.name for joint in joints])
+        origins, axes = placements(model, first_link, tip, [joint.name for joint in joints], is_reversed)
         return cls(
             urdf=urdf,
             tip=tip,
@@ -164,6 +178,8 @@ class Chain:
             mimic_offset=mimic_offset,
             lower=np.array([joint.lower for joint in independent]),
             upper=np.array([joint.upper for joint in independent]),
+            first_link="" if first_link == urdf.root else first_link,
+            n_reversed=sum(is_reversed),
         )
 
     @classmethod
@@ -194,6 +210,31 @@ class Chain:
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
     @property
+    def root(self) -> str:
+        """Name of the link where the chain begins."""
+        return self.first_link or self.urdf.root
+
+    @property
+    def is_reversed(self) -> list[bool]:
+        """Whether each moving joint is passed from child to parent, (k,)."""
+        return [j < self.n_reversed for j in range(len(self.moving_joints))]
+
+    def nominal(self) -> Chain:
+        """Return the chain between the same links as the URDF describes it, with identity base and tool."""
+        return Chain.from_urdf(self.urdf, self.tip, self.root)
+
+    def origin_frame(self, j: int) -> int:
+        """Return the index of the error frame at the origin of a joint in the URDF.
+
+        Args:
+            j: Number of the moving joint, 1 to k.
+
+        Returns:
+            Frame before the motion of the joint; after it, if the joint is passed from child to parent.
+        """
+        return link_frame(j) if j <= self.n_reversed else joint_frame(j)
+
+    @property
     def n_joints(self) -> int:
         """Number n of independent joints, the columns of q."""
         return len(self.joint_names)
@@ -217,14 +258,22 @@ class Chain:
     def model(self) -> pin.Model:
         """Pinocchio model of the whole robot with the joint origins, tip frame and payload of this chain."""
         model = build_model(self.urdf)
-        for name, origin in zip(self.moving_joints, self.origins[:-1], strict=True):
-            model.jointPlacements[model.getJointId(name)] = pin.SE3(origin)
+        for name, placement in zip(self.moving_joints, self.joint_placements, strict=True):
+            model.jointPlacements[model.getJointId(name)] = pin.SE3(placement)
         tip = model.frames[model.getFrameId(self.tip, pin.FrameType.BODY)]
-        tip.placement = pin.SE3(self.origins[-1])
+        if self.n_reversed < len(self.moving_joints):
+            tip.placement = pin.SE3(self.origins[-1])
         if self.payload:
             inertia = pin.Inertia(self.payload.mass, np.array(self.payload.centre), np.zeros((3, 3)))
             model.appendBodyToJoint(tip.parentJoint, inertia, tip.placement)
         return model
+
+    @property
+    def joint_placements(self) -> list[Array]:
+        """Pose (4, 4) of each moving joint in the moving joint before it, towards the root of the URDF."""
+        return joint_placements(
+            build_model(self.urdf), self.tip, self.moving_joints, self.is_reversed, self.origins
+        )
 
     @cached_property
     def frame_id(self) -> int:
@@ -415,15 +464,31 @@ class Chain:
             raise UnknownNameError(
                 f"{self.urdf.source}: unknown link {quote(link)}; {suggest_names(link, self.urdf.links)}"
             )
-        # Links behind the tip move with it if its origin was changed, so the poses are those of the URDF.
-        model = build_model(self.urdf)
-        frame, tip = (model.frames[model.getFrameId(name, pin.FrameType.BODY)] for name in (link, self.tip))
-        if frame.parentJoint != tip.parentJoint:
+        pose = self.fixed_pose(self.tip, link)
+        if pose is None:
             raise InvalidArgumentError(
                 f"{self.urdf.source}: a joint moves {quote(link)} against the tip {quote(self.tip)}; "
                 "expected a link that is fixed to the tip"
             )
-        return (tip.placement.inverse() * frame.placement).homogeneous
+        return pose
+
+    def fixed_pose(self, link: str, other: str) -> Array | None:
+        """Return the constant pose of a link in another one.
+
+        Links behind the tip move with it if its origin was changed, so the poses are those of the URDF.
+
+        Args:
+            link: Name of the link in which the pose counts.
+            other: Name of the link whose pose is wanted.
+
+        Returns:
+            Pose, shape (4, 4) [m]; None if a joint moves one against the other.
+        """
+        model = build_model(self.urdf)
+        own, wanted = (model.frames[model.getFrameId(name, pin.FrameType.BODY)] for name in (link, other))
+        if own.parentJoint != wanted.parentJoint:
+            return None
+        return (own.placement.inverse() * wanted.placement).homogeneous
 
     def poses(self, q: ArrayLike) -> Array:
         """Compute tool poses.

@@ -1,4 +1,13 @@
-"""The path through a URDF from the root to a tip: moving joints, independent joints, and joint frames.
+"""The path through a URDF from a link to a tip: moving joints, independent joints, and joint frames.
+
+The path begins at the root of the URDF, or at any other link. From another link it leads up to the last link
+that both ends have in common, through *reversed* joints, from child to parent, and then down to the tip. A
+reversed joint moves about its negative axis. With the pose M of each joint in the moving joint before it
+towards the root of the URDF, the constant transforms of the path are
+
+    M of the next joint        between two joints that are not reversed,
+    M⁻¹ of the joint before    between two reversed joints,
+    M⁻¹·M                      at the turn.
 
 The values of the k moving joints follow from those of the n independent joints by the mimic rules of the
 URDF, composed along chains of mimics:
@@ -11,6 +20,7 @@ moving joint.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -80,21 +90,42 @@ def default_tip(urdf: Urdf) -> str:
     return tied[0]
 
 
-def find_moving_joints(urdf: Urdf, tip: str) -> list[UrdfJoint]:
-    """Find the joints that move between the root and a tip.
+def path_between(urdf: Urdf, root: str, tip: str) -> list[tuple[UrdfJoint, bool]]:
+    """Find the joints on the path from one link to another.
+
+    Args:
+        urdf: File of the robot.
+        root: Name of the first link.
+        tip: Name of the last link.
+
+    Returns:
+        Joints in the order of the path, each with whether it is passed from child to parent.
+    """
+    up, down = urdf.path(root), urdf.path(tip)
+    n_common = 0
+    while n_common < min(len(up), len(down)) and up[n_common].name == down[n_common].name:
+        n_common += 1
+    reversed_part = [(joint, True) for joint in reversed(up[n_common:])]
+    return reversed_part + [(joint, False) for joint in down[n_common:]]
+
+
+def find_moving_joints(urdf: Urdf, tip: str, root: str) -> list[tuple[UrdfJoint, bool]]:
+    """Find the joints that move between a link and a tip.
 
     Args:
         urdf: File of the robot.
         tip: Name of the tip link.
+        root: Name of the first link.
 
     Returns:
-        Revolute, continuous and prismatic joints in the order from root to tip.
+        Revolute, continuous and prismatic joints in the order of the path, each with whether it is passed
+        from child to parent.
 
     Raises:
         DhcalError: No joint moves, too many do, or one has more than one degree of freedom.
     """
-    joints = [joint for joint in urdf.path(tip) if joint.type != "fixed"]
-    for joint in joints:
+    joints = [(joint, up) for joint, up in path_between(urdf, root, tip) if joint.type != "fixed"]
+    for joint, _ in joints:
         if joint.type in ("floating", "planar"):
             raise DhcalError(
                 f"{urdf.source}:{joint.line}: joint {joint.name!r} is {joint.type}; expected revolute, "
@@ -103,12 +134,12 @@ def find_moving_joints(urdf: Urdf, tip: str) -> list[UrdfJoint]:
             )
     if not joints:
         raise DhcalError(
-            f"{urdf.source}: no moving joint between {urdf.root!r} and {tip!r}; "
+            f"{urdf.source}: no moving joint between {root!r} and {tip!r}; "
             "choose a tip behind moving joints, --tip"
         )
     if len(joints) > _MAX_MOVING_JOINTS:
         raise DhcalError(
-            f"{urdf.source}: {len(joints)} moving joints between {urdf.root!r} and {tip!r}; "
+            f"{urdf.source}: {len(joints)} moving joints between {root!r} and {tip!r}; "
             f"at most {_MAX_MOVING_JOINTS} are accepted: choose a tip closer to the root, --tip"
         )
     return joints
@@ -151,30 +182,72 @@ def independent_joints(urdf: Urdf, moving: list[str]) -> tuple[list[str], Array,
     return names, mimic_matrix, np.array([offset for _, _, offset in rules])
 
 
-def placements(model: pin.Model, tip: str, moving: list[str]) -> tuple[Array, Array]:
-    """Return the joint origins and axes of a path in Pinocchio's model.
+def placements(
+    model: pin.Model, root: str, tip: str, moving: Sequence[str], is_reversed: Sequence[bool]
+) -> tuple[Array, Array]:
+    """Return the constant transforms and axes of a path in Pinocchio's model.
 
     Args:
         model: Model of the whole robot.
+        root: Name of the first link.
         tip: Name of the tip link.
         moving: Names of the k moving joints.
+        is_reversed: Whether each joint is passed from child to parent, (k,).
 
     Returns:
         Pose of each moving joint in the moving joint before it, then the tip, shape (k+1, 4, 4) [m], and unit
-        axes, shape (k, 3).
+        axes, shape (k, 3); those of reversed joints are negative.
     """
     origins, axes = [], []
-    for name in moving:
+    before = se3.inverse(_frame_placement(model, root))
+    for name, is_up in zip(moving, is_reversed, strict=True):
         index = model.getJointId(name)
-        origins.append(model.jointPlacements[index].homogeneous)
+        placement = model.jointPlacements[index].homogeneous
+        origins.append(before if is_up else before @ placement)
+        before = se3.inverse(placement) if is_up else np.eye(4)
         joint = model.joints[index]
         data = joint.createData()
         joint.calc(data, pin.neutral(model))
         subspace = np.asarray(data.S).reshape(6)
-        axes.append(subspace[:3] if np.any(subspace[:3]) else subspace[3:])
-    frame = model.frames[model.getFrameId(tip, pin.FrameType.BODY)]
-    origins.append(frame.placement.homogeneous)
+        axis = subspace[:3] if np.any(subspace[:3]) else subspace[3:]
+        axes.append(-axis if is_up else axis)
+    origins.append(before @ _frame_placement(model, tip))
     return np.array(origins), np.array(axes)
+
+
+def joint_placements(
+    model: pin.Model, tip: str, moving: Sequence[str], is_reversed: Sequence[bool], origins: Array
+) -> list[Array]:
+    """Compute the poses of joints in the moving joints before them from the transforms of a path.
+
+    At the turn of the path, the first joint that is not reversed takes up the whole change.
+
+    Args:
+        model: Nominal model of the whole robot.
+        tip: Name of the tip link.
+        moving: Names of the k moving joints.
+        is_reversed: Whether each joint is passed from child to parent, (k,).
+        origins: Constant transforms of the path, shape (k+1, 4, 4) [m].
+
+    Returns:
+        Pose of each joint, shape (4, 4) [m] each, in the order of the path.
+    """
+    nominal = [model.jointPlacements[model.getJointId(name)].homogeneous for name in moving]
+    out = []
+    for i, is_up in enumerate(is_reversed):
+        if not is_up:
+            turns = i > 0 and is_reversed[i - 1]
+            out.append(nominal[i - 1] @ origins[i] if turns else origins[i])
+        elif i + 1 < len(moving):
+            out.append(se3.inverse(origins[i + 1]) if is_reversed[i + 1] else nominal[i])
+        else:
+            out.append(_frame_placement(model, tip) @ se3.inverse(origins[i + 1]))
+    return out
+
+
+def _frame_placement(model: pin.Model, link: str) -> Array:
+    """Return the pose of a link in its moving joint, (4, 4)."""
+    return model.frames[model.getFrameId(link, pin.FrameType.BODY)].placement.homogeneous
 
 
 @lru_cache(maxsize=256)

@@ -205,7 +205,8 @@ def test_repr_is_short_and_names_kind_and_samples(kind, sim_6dof):
         data = kind.simulate(sim_6dof, np.zeros((5, 6)) + 0.3, noise, np.random.default_rng(0))
         text = repr(data)
         assert text.startswith(f"{kind.__name__}({len(data.rows)} samples, ")
-        assert ("sigma 0.1 mm" in text) == data.has_stated_sigma
+        unit = "px" if kind.kind == "camera" else "mm"
+        assert (f"sigma 0.1 {unit}" in text) == data.has_stated_sigma
         assert len(text) < 80
 
 
@@ -224,7 +225,7 @@ def test_file_round_trip_is_exact(kind, sim_6dof_actual, tmp_path):
         data = kind.simulate(sim_6dof_actual, q, noise, np.random.default_rng(0))
         path = tmp_path / "data.csv"
         path.write_text(measurement_text(data, sim_6dof_actual, ["a comment"]))
-        again = read_measurements(path, sim_6dof_actual)
+        again = read_measurements(path, sim_6dof_actual, rig=getattr(data, "rig", None))
         assert type(again) is kind
         assert again.has_stated_sigma == data.has_stated_sigma
         np.testing.assert_array_equal(again.configurations(), data.configurations())
@@ -243,7 +244,8 @@ def test_simulated_file_calibrates(kind, tmp_path, monkeypatch):
     nominal, actual = str(URDF / "sim_6dof.dh.toml"), str(URDF / "sim_6dof_actual.dh.toml")
     assert main(["simulate", nominal, "--truth", actual, "-m", "40", "--kind", kind.kind, "-o", "d.csv",
                  "--noise", "0.1mm,0.01deg"]) == 0  # fmt: skip
-    assert main(["calibrate", nominal, "d.csv", "-o", "o.urdf", "--json", "r.json"]) == 0
+    rig = ["--rig", "d.rig.toml"] if Path("d.rig.toml").exists() else []
+    assert main(["calibrate", nominal, "d.csv", *rig, "-o", "o.urdf", "--json", "r.json"]) == 0
     result = json.loads(Path("r.json").read_text())
     assert result["converged"]
     for key in ("position_rms_m", "residual_rms"):

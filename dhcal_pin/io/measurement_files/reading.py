@@ -24,6 +24,7 @@ from ... import se3
 from ..._typing import Array, PathLike
 from ...exceptions import DhcalError, FileFormatError
 from ...measurements.base import Measurement
+from ...measurements.mounting import MountedRig
 from ...robot.chain import Chain
 from ...units import LENGTHS, UNITS
 from ..tables import Column, DataTable, format_lines, read_table
@@ -81,7 +82,12 @@ class MeasurementFile:
 
 
 def read_measurements(
-    source: PathLike | Any, chain: Chain, columns: PathLike | None = None, *, skip_bad_rows: bool = False
+    source: PathLike | Any,
+    chain: Chain,
+    columns: PathLike | None = None,
+    *,
+    skip_bad_rows: bool = False,
+    rig: MountedRig | None = None,
 ) -> Measurement:
     """Read all samples of a measurement file.
 
@@ -91,15 +97,21 @@ def read_measurements(
         columns: Column map for a file of another maker.
         skip_bad_rows: Whether rows without a number or a name in a column are skipped; otherwise they are an
             error.
+        rig: Cameras and boards of image coordinates, on the chain.
 
     Returns:
         Samples of the kind that the columns select.
     """
-    return read_measurement_file(source, chain, columns, skip_bad_rows=skip_bad_rows).data
+    return read_measurement_file(source, chain, columns, skip_bad_rows=skip_bad_rows, rig=rig).data
 
 
 def read_measurement_file(
-    source: PathLike | Any, chain: Chain, columns: PathLike | None = None, *, skip_bad_rows: bool = False
+    source: PathLike | Any,
+    chain: Chain,
+    columns: PathLike | None = None,
+    *,
+    skip_bad_rows: bool = False,
+    rig: MountedRig | None = None,
 ) -> MeasurementFile:
     """Read a measurement file with its division into fitted and held-out samples.
 
@@ -109,12 +121,13 @@ def read_measurement_file(
         columns: Column map for a file of another maker.
         skip_bad_rows: Whether rows without a number or a name in a column are skipped; otherwise they are an
             error.
+        rig: Cameras and boards of image coordinates, on the chain.
 
     Returns:
         Content of the file.
     """
     check_joint_names(chain)
-    return parse_measurements(open_measurement_table(source, chain, columns), chain, skip_bad_rows)
+    return parse_measurements(open_measurement_table(source, chain, columns), chain, skip_bad_rows, rig)
 
 
 def open_measurement_table(source: PathLike | Any, chain: Chain, columns: PathLike | None) -> DataTable:
@@ -136,13 +149,16 @@ def open_measurement_table(source: PathLike | Any, chain: Chain, columns: PathLi
     return read_mapped_table(source, read_map(columns, chain), known_columns(chain))
 
 
-def parse_measurements(table: DataTable, chain: Chain, skip_bad_rows: bool = False) -> MeasurementFile:
+def parse_measurements(
+    table: DataTable, chain: Chain, skip_bad_rows: bool = False, rig: MountedRig | None = None
+) -> MeasurementFile:
     """Parse the samples of a table.
 
     Args:
         table: Table of a measurement file, or of a part of one.
         chain: Robot that was measured.
         skip_bad_rows: Whether rows without a number or a name in a column are skipped.
+        rig: Cameras and boards of image coordinates, on the chain.
 
     Returns:
         Content of the table.
@@ -160,7 +176,7 @@ def parse_measurements(table: DataTable, chain: Chain, skip_bad_rows: bool = Fal
     values = parse_values(table, kind)
     _require_all_sigmas(table, kind, values)
     q = [parse_joint_positions(table, chain, prefix) for prefix in prefixes]
-    data = build_measurement(table, kind, q or [np.zeros((len(table.lines), chain.n_joints))], values)
+    data = build_measurement(table, kind, q or [np.zeros((len(table.lines), chain.n_joints))], values, rig)
     is_holdout = _parse_holdout_mask(table)
     return MeasurementFile(
         source=table.source,
@@ -228,7 +244,11 @@ def _usable_rows(
 
 
 def build_measurement(
-    table: DataTable, kind: type[Measurement], q: Sequence[Array], values: Mapping[str, Any]
+    table: DataTable,
+    kind: type[Measurement],
+    q: Sequence[Array],
+    values: Mapping[str, Any],
+    rig: MountedRig | None = None,
 ) -> Measurement:
     """Build the samples with their file and lines, and put the name of the file in front of an error.
 
@@ -237,6 +257,7 @@ def build_measurement(
         kind: Measurement kind.
         q: Joint positions of each configuration, (m, n) [rad or m].
         values: Columns by name, (m,) each.
+        rig: Cameras and boards of image coordinates, on the chain.
 
     Returns:
         The samples.
@@ -245,7 +266,7 @@ def build_measurement(
         FileFormatError: The values contradict each other.
     """
     try:
-        data = kind.from_columns(q, values)
+        data = kind.from_columns(q, values, rig)
     except DhcalError as error:
         raise FileFormatError(f"{table.source}: {error}") from None
     return data.replace(rows=np.array(table.lines), source=table.source)

@@ -39,7 +39,7 @@ def measurement_text(data: Measurement, chain: Chain, comments: Sequence[str] = 
 
 
 def value_columns(data: Measurement) -> dict[str, list[Any]]:
-    """Return the columns of measured values and standard deviations, in metres and radians.
+    """Return the columns of measured values and standard deviations, in metres, radians and pixels.
 
     Args:
         data: Samples to write.
@@ -49,7 +49,7 @@ def value_columns(data: Measurement) -> dict[str, list[Any]]:
     """
     columns: dict[str, list[Any]] = {}
     for name, values in data.to_columns().items():
-        unit = {"length": "[m]", "angle": "[rad]", "text": ""}[data.columns[name]]
+        unit = {"length": "[m]", "angle": "[rad]", "pixel": "[px]", "text": ""}[data.columns[name]]
         columns[name + unit] = list(values) if unit == "" else values.tolist()
     return columns
 

@@ -1,0 +1,9 @@
+"""Calibration from images: parameter sets of cameras and boards, jitter, and stages that protect the arm.
+
+A calibration from images estimates cameras, boards and lenses together with the robot. This package says
+which of these parameters are unknown, and in which order they are freed.
+"""
+
+from .sets import RIG_SETS, default_sets, held_values, split_sets
+
+__all__ = ["RIG_SETS", "default_sets", "held_values", "split_sets"]

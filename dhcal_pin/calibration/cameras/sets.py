@@ -1,0 +1,76 @@
+"""Parameter sets of a rig: which parameters of cameras and boards are unknown.
+
+They are named together with the sets of the robot, as in `placement,camera,board,intrinsics`. A set that is
+not named is held at the values of the rig; parameters without such a value are estimated in any case.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from ...exceptions import InvalidArgumentError
+from ...measurements.base import Measurement
+from ...measurements.camera import CameraCorners
+from ...robot.chain import Chain
+
+# Parameter sets of a rig by name, with one line for help texts.
+RIG_SETS = {
+    "camera": "pose of each camera of the rig in its link",
+    "board": "pose of each board of the rig in its link",
+    "intrinsics": "focal lengths, image centre and distortion of each camera, unless the rig fixes them",
+}
+# Sets that are estimated by default from image coordinates.
+DEFAULT_SETS = "placement,offset,camera,board,intrinsics"
+
+
+def split_sets(parameters: str | Iterable[str]) -> tuple[list[str], list[str]]:
+    """Separate the sets of the rig from those of the robot.
+
+    Args:
+        parameters: Names of sets, comma-separated or one by one.
+
+    Returns:
+        Sets of the robot, and sets of the rig.
+    """
+    names = [s.strip() for s in parameters.split(",")] if isinstance(parameters, str) else list(parameters)
+    return [name for name in names if name not in RIG_SETS], [name for name in names if name in RIG_SETS]
+
+
+def default_sets(chain: Chain, data: Sequence[Measurement]) -> str:
+    """Return the parameter sets that are estimated by default.
+
+    Args:
+        chain: Robot.
+        data: Measurements.
+
+    Returns:
+        Sets of the chain; with image coordinates, those of robot and rig.
+    """
+    return DEFAULT_SETS if any(isinstance(item, CameraCorners) for item in data) else chain.parameters
+
+
+def held_values(data: Sequence[Measurement], sets: Sequence[str]) -> dict[str, float]:
+    """Find the parameters of cameras and boards that are held at the values of the rig.
+
+    Args:
+        data: Measurements.
+        sets: Names of the sets of the rig that are estimated.
+
+    Returns:
+        Values by parameter name [m, rad, px or 1].
+
+    Raises:
+        InvalidArgumentError: Sets of a rig are named without image coordinates.
+    """
+    images = [item for item in data if isinstance(item, CameraCorners)]
+    if sets and not images:
+        raise InvalidArgumentError(
+            f"parameter set {sets[0]!r} needs image coordinates; expected measurements with the columns u, v "
+            "and corner, and --rig RIG.toml"
+        )
+    return {
+        name: value
+        for item in images
+        for name, value in item.stated_values.items()
+        if item.set_of(name) not in sets
+    }

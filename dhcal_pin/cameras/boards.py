@@ -1,0 +1,79 @@
+"""Boards: flat targets with corners at known positions, or any rigid set of points.
+
+The frame of a flat board has its origin at the outer corner of the first square or tag, x along a row, y
+along a column, and z = 0. Corners are numbered row by row, as OpenCV does:
+
+- `checkerboard` and `charuco`: the (columns - 1)·(rows - 1) inner corners of the squares; x grows first;
+- `aprilgrid`: four corners per tag, tag by tag, each in the order of OpenCV: top left, top right, bottom
+  right, bottom left;
+- `points`: the points as they are listed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .._typing import Array
+
+# Kinds of boards in rig files.
+BOARD_TYPES = ("checkerboard", "charuco", "aprilgrid", "points")
+
+
+@dataclass(frozen=True, eq=False)
+class Board:
+    """Board of a rig.
+
+    Attributes:
+        name: Name of the board.
+        link: Link that carries it, "world" or "tip".
+        type: One of `BOARD_TYPES`.
+        columns: Number of squares or tags along x; 0 for points.
+        rows: Number of squares or tags along y; 0 for points.
+        square: Side of a square [m]; for an aprilgrid, of a tag.
+        marker: Side of a marker of a ChArUco board [m].
+        spacing: Gap between two tags of an aprilgrid [m].
+        dictionary: Name of the dictionary of the markers.
+        is_legacy: Whether a ChArUco board begins with a black square although it has an even number of rows.
+        listed_points: Points of the type "points", shape (c, 3) [m].
+        has_free_points: Whether the positions of the corners are estimated.
+        pose: First guess of its pose in the link, shape (4, 4) [m]; None without one.
+    """
+
+    name: str
+    link: str
+    type: str
+    columns: int = 0
+    rows: int = 0
+    square: float = 0.0
+    marker: float = 0.0
+    spacing: float = 0.0
+    dictionary: str = ""
+    is_legacy: bool = False
+    listed_points: Array = field(default_factory=lambda: np.empty((0, 3)))
+    has_free_points: bool = False
+    pose: Array | None = None
+
+    @property
+    def points(self) -> Array:
+        """Positions of the corners in the frame of the board, shape (c, 3) [m]."""
+        if self.type == "points":
+            return self.listed_points
+        if self.type == "aprilgrid":
+            pitch = self.square + self.spacing
+            corners = self.square * np.array([[0.0, 0.0], [1, 0], [1, 1], [0, 1]])
+            origins = pitch * _grid(self.columns, self.rows)
+            return _flat((origins[:, None] + corners).reshape(-1, 2))
+        return _flat(self.square * (1 + _grid(self.columns - 1, self.rows - 1)))
+
+
+def _grid(columns: int, rows: int) -> Array:
+    """Return the whole-numbered points of a grid row by row, (rows·columns, 2)."""
+    y, x = np.mgrid[:rows, :columns]
+    return np.stack([x.ravel(), y.ravel()], -1).astype(float)
+
+
+def _flat(points: Array) -> Array:
+    """Append z = 0 to points (c, 2)."""
+    return np.pad(points, ((0, 0), (0, 1)))

@@ -1,0 +1,67 @@
+"""Rigs: the cameras and boards of a set-up and the links of the robot that carry them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .._typing import Array
+from .boards import Board
+from .lens import LENSES, Lens
+
+# Links of a rig file that are not links of the robot.
+WORLD, TIP = "world", "tip"
+# How the intrinsics of a camera are treated.
+INTRINSICS_CHOICES = ("fixed", "prior", "free")
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """Camera of a rig.
+
+    Attributes:
+        name: Name of the camera.
+        link: Link that carries it, "world" or "tip".
+        lens: Lens model.
+        width: Width of its images [px].
+        height: Height of its images [px].
+        values: Values of the lens, shape (s,) [px and 1]; fx, fy, cx, cy are NaN if they are not known.
+        intrinsics: "fixed", "prior" or "free".
+        pose: First guess of its pose in the link, shape (4, 4) [m]; None without one.
+    """
+
+    name: str
+    link: str
+    width: int
+    height: int
+    values: Array
+    lens: Lens = field(default_factory=lambda: LENSES["pinhole"])
+    intrinsics: str = "prior"
+    pose: Array | None = None
+
+    @property
+    def has_intrinsics(self) -> bool:
+        """Whether focal lengths and image centre are known."""
+        return bool(np.isfinite(self.values).all())
+
+    @property
+    def image_centre(self) -> Array:
+        """Centre of the image, shape (2,) [px]."""
+        return 0.5 * np.array([self.width - 1, self.height - 1])
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Cameras and boards of a set-up.
+
+    Attributes:
+        cameras: Cameras by name.
+        boards: Boards by name.
+        source: Name of the file; empty for a rig from Python.
+    """
+
+    cameras: Mapping[str, Camera]
+    boards: Mapping[str, Board]
+    source: str = ""

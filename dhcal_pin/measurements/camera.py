@@ -1,0 +1,698 @@
+"""Image coordinates of the corners of boards that cameras see while the robot stands still.
+
+One end of the chain carries the camera and the other one the board. With the pose G of the tool in the
+measuring frame, the pose C of the camera and B of the board in the frames of their ends, and a corner p of
+the board, the corner is in the frame of the camera at
+
+    X = C⁻¹·G·B·p      for a camera that stands still and a board that moves with the tool,
+    X = C⁻¹·G⁻¹·B·p    for a camera that moves with the tool and a board that stands still,
+
+and in the image at h = lens(X). The instrument parameters are the positions and rotation vectors of all
+cameras and boards in their links, the values of the lenses that are not fixed, and the corners of boards
+whose points are not fixed.
+
+All corners of one image share the error of the arm in that configuration: a displacement d of the tool, which
+is called jitter. Its distribution is normal with given standard deviations. It is marginalized: with the
+derivative A (2c, 6) of the c whitened corners of the image by d in units of its standard deviations, their
+covariance is I + A·Aᵀ, and residuals and Jacobians are multiplied by its inverse square root,
+
+    (I + A·Aᵀ)^(-1/2) = I - U·diag(1 - 1/√(1 + s²))·Uᵀ,    A = U·diag(s)·Vᵀ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .. import se3
+from .._kernels.types import FrameBatch, ObservationMatrix
+from .._typing import Array
+from ..cameras.boards import Board
+from ..cameras.rig import WORLD, Camera, Rig
+from ..exceptions import InvalidArgumentError
+from ..robot.chain import Chain
+from .base import POINT_PRIOR, InstrumentParameter, Measurement, Noise, format_sigma
+from .camera_start import first_values
+from .columns import pixel_columns, text_column
+from .mounting import MountedRig, mount_rig
+from .validation import validated_array, validated_joint_positions, validated_sigma
+
+# Standard deviation [px] of image coordinates that state none.
+PIXEL_SIGMA = 1.0
+# Prior standard deviation of the rotation of a camera or a board [rad]: any.
+ROTATION_PRIOR = 10.0
+# Prior standard deviations of focal lengths and image centre [px], and of distortion coefficients [1].
+PIXEL_PRIORS = {"prior": 50.0, "free": 1e5}
+DISTORTION_PRIORS = {"prior": 0.3, "free": 1e2}
+# Prior standard deviation of the corners of a board [m].
+BOARD_POINT_PRIOR = 1e-3
+# Names of the components of a pose.
+POSE_NAMES = ("x", "y", "z", "rx", "ry", "rz")
+# Name of the corners of boards among the parameter sets.
+POINTS_SET = "points"
+
+# Rows and velocity components of the terms: each image coordinate by all six velocities of the tool.
+_TERMS = (np.repeat([0, 1], 6), np.tile(np.arange(6), 2))
+# Set-up of simulations: distance of the cameras from the robot as a multiple of its reach, image scale [px/m]
+# at the robot, and half the diagonals of the board [m].
+_DISTANCE, _SCALE, _BOARD_SIZE = 1.5, 1000.0, 0.3
+
+
+def pose_parameters(prefix: str, pose: Array | None) -> list[InstrumentParameter]:
+    """Build the six parameters of the pose of a camera or a board.
+
+    Args:
+        prefix: First part of the names, such as `camera_wrist`.
+        pose: First guess, shape (4, 4) [m]; None if there is none.
+
+    Returns:
+        Position [m] and rotation vector [rad]; NaN without a guess.
+    """
+    values = np.full(6, np.nan)
+    if pose is not None:
+        values = np.concatenate([pose[:3, 3], se3.log3(pose[:3, :3])])
+    return [
+        InstrumentParameter(
+            f"{prefix}.{name}",
+            "m" if i < 3 else "rad",
+            float(value),
+            POINT_PRIOR if i < 3 else ROTATION_PRIOR,
+        )
+        for i, (name, value) in enumerate(zip(POSE_NAMES, values, strict=True))
+    ]
+
+
+def camera_parameters(camera: Camera) -> list[InstrumentParameter]:
+    """Build the parameters of a camera: its pose, and its lens unless that is fixed.
+
+    Args:
+        camera: Camera of a rig.
+
+    Returns:
+        Parameters in the order of u.
+    """
+    out = pose_parameters(f"camera_{camera.name}", camera.pose)
+    if camera.intrinsics != "fixed":
+        for i, (name, value) in enumerate(zip(camera.lens.names, camera.values, strict=True)):
+            priors = PIXEL_PRIORS if i < 4 else DISTORTION_PRIORS
+            unit = "px" if i < 4 else "1"
+            out.append(
+                InstrumentParameter(
+                    f"camera_{camera.name}.{name}", unit, float(value), priors[camera.intrinsics]
+                )
+            )
+    return out
+
+
+def board_parameters(board: Board) -> list[InstrumentParameter]:
+    """Build the parameters of a board: its pose, and its corners if they are not fixed.
+
+    Args:
+        board: Board of a rig.
+
+    Returns:
+        Parameters in the order of u.
+    """
+    out = pose_parameters(f"board_{board.name}", board.pose)
+    if board.has_free_points:
+        out += [
+            InstrumentParameter(f"board_{board.name}.p{i}{axis}", "m", float(value), BOARD_POINT_PRIOR)
+            for i, point in enumerate(board.points)
+            for axis, value in zip("xyz", point, strict=True)
+        ]
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class _Projection:
+    """Model of all corners at one state, and what its derivatives are made of.
+
+    Attributes:
+        pixels: Image coordinates, (2, m) [px].
+        by_velocity: Derivative by the velocity of the tool, (2, 6, m).
+        by_camera: Derivative by position and rotation vector of the camera, (2, 6, m).
+        by_board: Derivative by position and rotation vector of the board, (2, 6, m).
+        by_point: Derivative by the corner in its board, (2, 3, m).
+        by_lens: Derivative by the values of the lens of each camera, (2, s, m) for the samples of the camera.
+        depth: Depth of the corners in front of the camera, (m,) [m].
+    """
+
+    pixels: Array
+    by_velocity: Array
+    by_camera: Array
+    by_board: Array
+    by_point: Array
+    by_lens: list[Array]
+    depth: Array
+
+
+@dataclass(frozen=True, eq=False, init=False, repr=False)
+class CameraCorners(Measurement):
+    """Image coordinates of board corners; one sample is one corner in one image.
+
+    Attributes:
+        rig: Cameras and boards on the chain.
+        values: Image coordinates, (m, 2) [px].
+        sigma: Standard deviations, (m, 2) [px].
+        camera: Number of each sample's camera in the rig, (m,).
+        board: Number of each sample's board, (m,).
+        corner: Number of each sample's corner on its board, (m,).
+        jitter: Derivative of the image coordinates by the displacement of the tool, in units of its standard
+            deviations, (m, 2, 6) [px]; zero without jitter.
+    """
+
+    rig: MountedRig
+    values: Array
+    sigma: Array
+    camera: Array
+    board: Array
+    corner: Array
+    jitter: Array
+
+    kind = "camera"
+    residual_groups: ClassVar = {"pixels": slice(0, 2)}
+    COLUMNS = (
+        pixel_columns("pixels", "u", "v")
+        + text_column("corner", "corner")
+        + text_column("camera", "camera")
+        + text_column("board", "board")
+    )
+    required_columns = (frozenset(("u", "v", "corner")),)
+    sample_fields = (*Measurement.sample_fields, "values", "sigma", "camera", "board", "corner", "jitter")
+
+    def __init__(
+        self,
+        q: ArrayLike,
+        pixels: ArrayLike,
+        corner: Sequence[int] | Sequence[str] | Array,
+        rig: MountedRig,
+        camera: Sequence[str] | None = None,
+        board: Sequence[str] | None = None,
+        sigma: ArrayLike | None = None,
+    ) -> None:
+        """Check and store image coordinates.
+
+        Args:
+            q: Joint positions, (m, n) [rad or m].
+            pixels: Image coordinates u to the right and v down, (m, 2) [px].
+            corner: Number of each corner on its board, (m,).
+            rig: Cameras and boards on the chain.
+            camera: Name of each sample's camera, (m,); not needed if there is only one.
+            board: Name of each sample's board, (m,); not needed if there is only one.
+            sigma: Standard deviations, one number or (m, 2) [px]; estimated with the fit if None.
+        """
+        q = validated_joint_positions(q, "CameraCorners")
+        m = len(q)
+        camera_index = _numbers(camera, [c.name for c in rig.cameras], m, "camera")
+        board_index = _numbers(board, [b.name for b in rig.boards], m, "board")
+        values = validated_array(pixels, (m, 2), "CameraCorners: pixels", "pair of image coordinates")
+        self._initialize(
+            q=q,
+            rows=np.arange(1, m + 1),
+            source="",
+            rig=rig,
+            values=values,
+            sigma=validated_sigma(PIXEL_SIGMA if sigma is None else sigma, (m, 2), "CameraCorners: sigma"),
+            camera=camera_index,
+            board=board_index,
+            corner=_corner_numbers(corner, rig, board_index),
+            jitter=np.zeros((m, 2, 6)),
+            has_stated_sigma=sigma is not None,
+            instrument_parameters=_all_parameters(rig),
+        )
+        _require_opposite_ends(self)
+        _require_inside_images(self)
+
+    @classmethod
+    def from_columns(
+        cls, q: Sequence[Array], values: Mapping[str, Any], rig: MountedRig | None = None
+    ) -> Self:
+        """Return the measurements of a file.
+
+        Args:
+            q: Joint positions, (m, n) [rad or m].
+            values: Columns by name.
+            rig: Cameras and boards on the chain.
+
+        Raises:
+            InvalidArgumentError: There is no rig.
+        """
+        if rig is None:
+            raise InvalidArgumentError(
+                "image coordinates need the cameras and boards of a rig; give --rig RIG.toml"
+            )
+        return cls(q[0], rig=rig, **cls._arguments(values))
+
+    def with_rig(self, rig: MountedRig) -> Self:
+        """Return a copy with other properties of the same cameras and boards.
+
+        Values of parameters that both rigs have are kept.
+
+        Args:
+            rig: Rig with the same names, links and lenses.
+        """
+        known = {p.name: p.nominal for p in self.instrument_parameters}
+        parameters = tuple(
+            replace(p, nominal=known[p.name]) if np.isfinite(known.get(p.name, np.nan)) else p
+            for p in _all_parameters(rig)
+        )
+        return self.replace(rig=rig, instrument_parameters=parameters)
+
+    def with_values(self, values: Mapping[str, float]) -> Self:
+        """Return a copy whose instrument parameters start from given values.
+
+        Args:
+            values: Values by name [m, rad, px or 1]; parameters without one keep theirs.
+        """
+        parameters = tuple(
+            replace(p, nominal=float(values.get(p.name, p.nominal))) for p in self.instrument_parameters
+        )
+        return self.replace(instrument_parameters=parameters)
+
+    @property
+    def stated_values(self) -> dict[str, float]:
+        """Values of the parameters of poses and lenses that the rig states, by name [m, rad, px or 1]."""
+        return {
+            p.name: p.nominal
+            for p in _all_parameters(self.rig)
+            if np.isfinite(p.nominal) and self.set_of(p.name) != POINTS_SET
+        }
+
+    def set_of(self, name: str) -> str:
+        """Return the parameter set of an instrument parameter.
+
+        Args:
+            name: Name such as `camera_wrist.fx`.
+
+        Returns:
+            "camera" or "board" for a component of a pose, "intrinsics" for a value of a lens, "points" for a
+            coordinate of a corner.
+        """
+        entry, _, component = name.rpartition(".")
+        kind = entry.partition("_")[0]
+        if component in POSE_NAMES:
+            return kind
+        return "intrinsics" if kind == "camera" else POINTS_SET
+
+    def with_jitter(self, jitter: Array) -> Self:
+        """Return a copy with another jitter, shape (m, 2, 6) [px]."""
+        return self.replace(jitter=jitter)
+
+    def description(self) -> list[str]:
+        """Return what `repr` says besides the number of samples."""
+        count = self.n_images
+        images = f"{count} image{'' if count == 1 else 's'}"
+        return [
+            images,
+            format_sigma((self.sigma, 1.0, "px")) if self.has_stated_sigma else "sigma not stated",
+        ]
+
+    @property
+    def n_images(self) -> int:
+        """Number of images."""
+        return int(self.image.max(initial=-1)) + 1
+
+    @cached_property
+    def image(self) -> Array:
+        """Number of each sample's image, (m,): samples of one configuration and one camera."""
+        keys = np.column_stack([self.q, self.camera])
+        return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
+
+    @property
+    def residual_dim(self) -> int:
+        """Number of residuals per sample: u and v."""
+        return 2
+
+    @property
+    def residual_names(self) -> tuple[str, ...]:
+        """Names of the residuals of a sample."""
+        return ("pixels_u", "pixels_v")
+
+    @cached_property
+    def _weights(self) -> Array:
+        """1 / sigma, (2, m)."""
+        return 1 / np.ascontiguousarray(self.sigma.T)
+
+    # ------------------------------------------------------------------------------------------- model
+    def _split(self, u: Array) -> tuple[list[Array], list[Array]]:
+        """Split u into the parameters of each camera and of each board."""
+        sizes = [len(camera_parameters(c)) for c in self.rig.cameras]
+        sizes += [len(board_parameters(b)) for b in self.rig.boards]
+        parts = np.split(u, np.cumsum(sizes)[:-1])
+        return parts[: len(self.rig.cameras)], parts[len(self.rig.cameras) :]
+
+    def lens_values(self, u: Array) -> list[Array]:
+        """Return the values of the lens of each camera.
+
+        Args:
+            u: Values of the instrument parameters, (s,).
+        """
+        parts = self._split(u)[0]
+        return [
+            part[6:] if camera.intrinsics != "fixed" else camera.values
+            for camera, part in zip(self.rig.cameras, parts, strict=True)
+        ]
+
+    def points(self, u: Array) -> list[Array]:
+        """Return the corners of each board in its frame, (c, 3) [m] each.
+
+        Args:
+            u: Values of the instrument parameters, (s,).
+        """
+        parts = self._split(u)[1]
+        return [
+            part[6:].reshape(-1, 3) if board.has_free_points else board.points
+            for board, part in zip(self.rig.boards, parts, strict=True)
+        ]
+
+    def _project(self, frames: FrameBatch, u: Array) -> _Projection:
+        """Project all corners."""
+        m = len(self.rows)
+        camera_parts, board_parts = self._split(u)
+        mounts = self.rig.camera_mounts
+        camera_poses, camera_turns = _end_poses(camera_parts, mounts)
+        board_poses, board_turns = _end_poses(board_parts, self.rig.board_mounts)
+        points = np.zeros((3, m))
+        for number, corners in enumerate(self.points(u)):
+            of_board = self.board == number
+            points[:, of_board] = corners[self.corner[of_board]].T
+        moves = np.array([mount.moves for mount in mounts], bool)[self.camera]
+        tool = frames.tool
+        r_camera = camera_poses[self.camera, :3, :3].transpose(1, 2, 0)
+        r_board = board_poses[self.board, :3, :3].transpose(1, 2, 0)
+        turned = _rotate(r_board, points)
+        on_end = turned + board_poses[self.board, :3, 3].T
+        # Rotation of the tool [columns are axes], and of the link of the board in the link of the camera.
+        r_tool = tool[:3].swapaxes(0, 1)
+        r_between = np.where(moves, r_tool.swapaxes(0, 1), r_tool)
+        # The corner in the frame of the camera's end.
+        lever = np.where(moves, on_end - tool[3], _rotate(r_tool, on_end))
+        in_end = np.where(moves, _rotate(r_between, on_end - tool[3]), lever + tool[3])
+        arm = in_end - camera_poses[self.camera, :3, 3].T
+        local = _rotate(r_camera.swapaxes(0, 1), arm)
+        to_camera = r_camera.swapaxes(0, 1)
+        # Axes of the measuring frame in the camera, with the sign of the motion of the corner.
+        measuring = np.where(moves, -_product(to_camera, r_between), to_camera)
+        board_axes = _product(to_camera, r_between)
+        pixels, by_local, by_lens = np.empty((2, m)), np.empty((2, 3, m)), []
+        for number, (camera, values) in enumerate(zip(self.rig.cameras, self.lens_values(u), strict=True)):
+            of_camera = self.camera == number
+            found = camera.lens.project(local[:, of_camera], values)
+            pixels[:, of_camera], by_local[:, :, of_camera] = found[:2]
+            by_lens.append(found[2])
+        by_position = -_product(by_local, to_camera)
+        # d = R_cᵀ·[arm]×·Jl·δ for a change δ of the rotation vector of the camera in its end.
+        camera_rotation = _product(-_cross(by_position, arm), camera_turns[self.camera].transpose(1, 2, 0))
+        link_axes = camera_poses_of_links(mounts)[self.camera].transpose(1, 2, 0)
+        by_end = _product(by_local, board_axes)
+        board_rotation = _product(-_cross(by_end, turned), board_turns[self.board].transpose(1, 2, 0))
+        board_links = camera_poses_of_links(self.rig.board_mounts)[self.board].transpose(1, 2, 0)
+        by_linear = _product(by_local, measuring)
+        return _Projection(
+            pixels,
+            np.concatenate([by_linear, -_cross(by_linear, lever)], 1),
+            np.concatenate([_product(by_position, link_axes), camera_rotation], 1),
+            np.concatenate([_product(by_end, board_links), board_rotation], 1),
+            _product(by_end, r_board),
+            by_lens,
+            local[2],
+        )
+
+    @cached_property
+    def _jitter_bases(self) -> list[tuple[Array, Array, Array]]:
+        """Samples, basis U (2c, 6) and factors 1 - 1/√(1 + s²) of each image with jitter."""
+        out: list[tuple[Array, Array, Array]] = []
+        if not self.jitter.any():
+            return out
+        whitened = self.jitter.transpose(1, 0, 2) * self._weights[:, :, None]
+        _, group = np.unique(self.q, axis=0, return_inverse=True)
+        order = np.argsort(group.reshape(-1), kind="stable")
+        ends = np.cumsum(np.bincount(group.reshape(-1)))
+        for samples in np.split(order, ends[:-1]):
+            u, s, _ = np.linalg.svd(whitened[:, samples].reshape(-1, 6), full_matrices=False)
+            out.append((samples, u, 1 - 1 / np.sqrt(1 + s**2)))
+        return out
+
+    def _whiten(self, rows: Array) -> Array:
+        """Divide rows (..., 2, m) by sigma, and remove what the jitter explains."""
+        rows = rows * self._weights
+        for samples, basis, factors in self._jitter_bases:
+            part = rows[..., samples].reshape(*rows.shape[:-2], -1)
+            part = part - ((part @ basis) * factors) @ basis.T
+            rows[..., samples] = part.reshape(*rows.shape[:-1], len(samples))
+        return rows
+
+    def residual(self, frames: FrameBatch, u: Array) -> Array:
+        """Return the whitened residuals (2, m)."""
+        return self._whiten(self.values.T - self._project(frames, u).pixels)
+
+    def observation_matrix(self, frames: FrameBatch, u: Array, residual: Array) -> ObservationMatrix:
+        """Return the derivatives of both image coordinates by all velocities of the tool."""
+        rows = self._whiten(self._project(frames, u).by_velocity.swapaxes(0, 1))
+        return ObservationMatrix(*_TERMS, rows.swapaxes(0, 1).reshape(12, -1))
+
+    def instrument_jacobian(self, frames: FrameBatch, u: Array) -> Array:
+        """Return the derivatives (s, 2, m) of the whitened model with respect to u."""
+        found, m = self._project(frames, u), len(self.rows)
+        out = np.zeros((len(self.instrument_parameters), 2, m))
+        start = 0
+        for number, camera in enumerate(self.rig.cameras):
+            of_camera = np.flatnonzero(self.camera == number)
+            out[start : start + 6, :, of_camera] = found.by_camera[:, :, of_camera].swapaxes(0, 1)
+            start += 6
+            if camera.intrinsics != "fixed":
+                size = len(camera.values)
+                out[start : start + size, :, of_camera] = found.by_lens[number].swapaxes(0, 1)
+                start += size
+        for number, board in enumerate(self.rig.boards):
+            of_board = np.flatnonzero(self.board == number)
+            out[start : start + 6, :, of_board] = found.by_board[:, :, of_board].swapaxes(0, 1)
+            start += 6
+            if board.has_free_points:
+                for axis in range(3):
+                    columns = start + 3 * self.corner[of_board] + axis
+                    out[columns, :, of_board] = found.by_point[:, axis, of_board].T
+                start += 3 * len(board.points)
+        return self._whiten(out)
+
+    def small_angle(self, frames: FrameBatch, u: Array) -> tuple[Array, ObservationMatrix]:
+        """Return the exact residuals and observation matrix, as there is no measured rotation in them."""
+        residual = self.residual(frames, u)
+        return residual, self.observation_matrix(frames, u, residual)
+
+    def errors(self, frames: FrameBatch, u: Array) -> dict[str, Array]:
+        """Return the errors "pixels" (m, 2) [px]."""
+        return {"pixels": self.values - self._project(frames, u).pixels.T}
+
+    def displacement_derivative(self, frames: FrameBatch, u: Array) -> Array:
+        """Return the derivative of the image coordinates by a displacement of the tool.
+
+        Args:
+            frames: Frames of the chain at `configurations()`.
+            u: Values of the instrument parameters, (s,).
+
+        Returns:
+            Derivatives by [v, ω] in axes of the measuring frame, (m, 2, 6) [px/m and px/rad].
+        """
+        return self._project(frames, u).by_velocity.transpose(2, 0, 1)
+
+    def initialized(self, chain: Chain) -> Self:
+        """Return a copy with first values of all parameters that have none, from the images themselves."""
+        if all(np.isfinite(p.nominal) for p in self.instrument_parameters):
+            return self
+        return self.with_values(first_values(self, chain))
+
+    def with_scaled_sigma(self, scales: Mapping[str, float]) -> Self:
+        """Return a copy with multiplied standard deviations."""
+        return self.replace(sigma=self.sigma * scales["pixels"])
+
+    def with_weights(self, weights: Array) -> Self:
+        """Return a copy with standard deviations divided by the square roots of the weights (m,)."""
+        return self.replace(sigma=self.sigma / np.sqrt(weights)[:, None])
+
+    # ------------------------------------------------------------------------------------------- files
+    def _columns_and_sigmas(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        values = {
+            "u": self.values[:, 0],
+            "v": self.values[:, 1],
+            "corner": [str(number) for number in self.corner],
+            "camera": [self.rig.cameras[number].name for number in self.camera],
+            "board": [self.rig.boards[number].name for number in self.board],
+        }
+        return values, {"sigma_u": self.sigma[:, 0], "sigma_v": self.sigma[:, 1]}
+
+    @classmethod
+    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> CameraCorners:
+        """Return images of six points on the tool, by two cameras in turn that look at the robot.
+
+        The cameras have a scale of one pixel per millimetre at the robot: noise of a millimetre is noise of a
+        pixel. The place of the points on the tool is known, that of the cameras is not.
+        """
+        q = chain.validated_q(q)
+        rig = mount_rig(simulated_rig(chain, q), chain)
+        corner = np.tile(np.arange(6), len(q))
+        camera = [rig.cameras[i % 2].name for i in range(len(q)) for _ in range(6)]
+        sigma = _SCALE * noise.position
+        exact = cls(np.repeat(q, 6, 0), np.full((len(corner), 2), 2048.0), corner, rig, camera)
+        u = np.array([parameter.nominal for parameter in exact.instrument_parameters])
+        pixels = exact._project(chain.forward_kinematics(exact.q), u).pixels.T
+        pixels = pixels + sigma * rng.standard_normal(pixels.shape)
+        without_guess = tuple(replace(camera, pose=None) for camera in rig.cameras)
+        return cls(exact.q, pixels, corner, replace(rig, cameras=without_guess), camera, None, sigma or None)
+
+
+def simulated_rig(chain: Chain, q: Array) -> Rig:
+    """Return two fixed cameras that look at the tool from two sides, and six points on the tool.
+
+    Args:
+        chain: Robot.
+        q: Joint positions that are simulated, (m, n) [rad or m].
+
+    Returns:
+        Rig with the poses of the cameras and the board.
+    """
+    tools = chain.poses(q)[:, :3, 3] if len(q) else np.zeros((1, 3))
+    centre = tools.mean(0)
+    distance = _DISTANCE * max(1.0, float(np.abs(tools - centre).max()))
+    values = np.array([_SCALE * distance, _SCALE * distance, 2047.5, 2047.5, 0, 0, 0, 0, 0])
+    cameras = {}
+    for name, direction in (("left", [1.0, 0.2, 0.1]), ("right", [-0.1, 1.0, 0.3])):
+        forward = np.array(direction) / np.linalg.norm(direction)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        pose = se3.transform(
+            np.column_stack([right, np.cross(forward, right), forward]), centre - distance * forward
+        )
+        cameras[name] = Camera(name, WORLD, 4096, 4096, values, intrinsics="fixed", pose=pose)
+    points = _BOARD_SIZE * np.array(
+        [[1, 0.1, 0], [-1, 0, 0.2], [0.1, 1, -0.1], [0, -1, 0.1], [0.2, 0.1, 1], [0, 0.2, -1]]
+    )
+    board = Board("target", "tip", "points", listed_points=points, pose=np.eye(4))
+    return Rig(cameras, {"target": board})
+
+
+def camera_poses_of_links(mounts: Sequence[Any]) -> Array:
+    """Return the rotations of the links of mounts in the frames of their ends.
+
+    Args:
+        mounts: Mounts of cameras or boards.
+
+    Returns:
+        Rotations, shape (c, 3, 3).
+    """
+    return np.array([mount.link_pose[:3, :3] for mount in mounts])
+
+
+def _end_poses(parts: Sequence[Array], mounts: Sequence[Any]) -> tuple[Array, Array]:
+    """Return poses in the frames of the ends (c, 4, 4), and their derivatives by rotation vectors (c, 3, 3).
+
+    A change δ of the rotation vector turns the pose by exp([L·δ]×), in axes of the end, with L = R_link·Jl.
+    """
+    poses, turns = np.empty((len(parts), 4, 4)), np.empty((len(parts), 3, 3))
+    for i, (part, mount) in enumerate(zip(parts, mounts, strict=True)):
+        poses[i] = mount.link_pose @ se3.transform(se3.exp3(part[3:6]), part[:3])
+        turns[i] = mount.link_pose[:3, :3] @ left_jacobian(part[3:6])
+    return poses, turns
+
+
+def left_jacobian(rotvec: Array) -> Array:
+    """Compute the left Jacobian of SO(3): exp(φ + δ) = exp(Jl·δ)·exp(φ) to first order.
+
+    Args:
+        rotvec: Rotation vector φ, shape (3,) [rad].
+
+    Returns:
+        Matrix Jl, shape (3, 3).
+    """
+    _, second, third = se3.exp_coefficients(np.asarray(np.linalg.norm(rotvec)))
+    k = se3.skew(rotvec)
+    return np.eye(3) + second * k + third * (k @ k)
+
+
+def _rotate(rotations: Array, vectors: Array) -> Array:
+    """Return R·v of rotations (3, 3, m) and vectors (3, m)."""
+    return np.einsum("ijm,jm->im", rotations, vectors)
+
+
+def _product(a: Array, b: Array) -> Array:
+    """Return the products of matrices (i, j, m) and (j, k, m)."""
+    return np.einsum("ijm,jkm->ikm", a, b)
+
+
+def _cross(rows: Array, vectors: Array) -> Array:
+    """Return rows·[v]× of rows (i, 3, m) and vectors (3, m)."""
+    return np.cross(rows, vectors[None], axis=1)
+
+
+def _all_parameters(rig: MountedRig) -> tuple[InstrumentParameter, ...]:
+    """Return the parameters of all cameras, then of all boards."""
+    cameras = [parameter for camera in rig.cameras for parameter in camera_parameters(camera)]
+    return (*cameras, *(parameter for board in rig.boards for parameter in board_parameters(board)))
+
+
+def _numbers(names: Sequence[str] | None, known: Sequence[str], m: int, what: str) -> Array:
+    """Return the number (m,) of each sample's camera or board."""
+    if names is None:
+        if len(known) != 1:
+            raise InvalidArgumentError(
+                f"the rig has {len(known)} entries [{what}.NAME]; expected a column {what!r} that names one "
+                "per row"
+            )
+        return np.zeros(m, int)
+    if len(names) != m:
+        raise InvalidArgumentError(f"CameraCorners: {what} has {len(names)} names for {m} samples")
+    numbers = {name: i for i, name in enumerate(known)}
+    for name in names:
+        if name not in numbers:
+            raise InvalidArgumentError(
+                f"column {what!r}: {name!r} is not in the rig; choose from {', '.join(known)}"
+            )
+    return np.array([numbers[name] for name in names], int)
+
+
+def _corner_numbers(corner: Sequence[Any] | Array, rig: MountedRig, board: Array) -> Array:
+    """Return the numbers (m,) of the corners after a check that the boards have them."""
+    if len(corner) != len(board):
+        raise InvalidArgumentError(
+            f"CameraCorners: corner has {len(corner)} numbers for {len(board)} samples"
+        )
+    counts = [len(each.points) for each in rig.boards]
+    out = np.empty(len(board), int)
+    for i, (value, number) in enumerate(zip(corner, board.tolist(), strict=True)):
+        text = str(value).strip()
+        if not text.isdecimal() or int(text) >= counts[number]:
+            raise InvalidArgumentError(
+                f"column 'corner': {text!r} is not a corner of board {rig.boards[number].name!r}; expected a "
+                f"whole number from 0 to {counts[number] - 1}"
+            )
+        out[i] = int(text)
+    return out
+
+
+def _require_opposite_ends(item: CameraCorners) -> None:
+    """Raise an error if a camera sees a board that does not move against it."""
+    for camera, board in np.unique(np.stack([item.camera, item.board], 1), axis=0):
+        if item.rig.camera_mounts[camera].moves == item.rig.board_mounts[board].moves:
+            raise InvalidArgumentError(
+                f"camera {item.rig.cameras[camera].name!r} sees board {item.rig.boards[board].name!r}, which "
+                "no joint moves against it; expected one on the moving end of the robot and the other one not"
+            )
+
+
+def _require_inside_images(item: CameraCorners) -> None:
+    """Raise an error if a corner lies far outside the images that the rig states."""
+    sizes = np.array([[camera.width, camera.height] for camera in item.rig.cameras])[item.camera]
+    outside = np.any((item.values < -0.5 * sizes) | (item.values > 1.5 * sizes), 1)
+    if outside.any():
+        first = int(np.flatnonzero(outside)[0])
+        camera = item.rig.cameras[item.camera[first]]
+        u, v = item.values[first]
+        raise InvalidArgumentError(
+            f"sample {first + 1} of camera {camera.name!r}: u = {u:.6g}, v = {v:.6g} px is far outside its "
+            f"images of {camera.width} x {camera.height} px; check width and height in the rig file"
+        )

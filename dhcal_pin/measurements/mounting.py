@@ -1,0 +1,93 @@
+"""Mounting of a rig: which cameras and boards move with the tip of a chain, and which stand still.
+
+A chain has two ends: the measuring frame and the tool. Every camera and board of a rig is fixed to one of
+them, directly or by a link that no joint moves against it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .._typing import Array
+from ..cameras.boards import Board
+from ..cameras.rig import TIP, WORLD, Camera, Rig
+from ..exceptions import InvalidArgumentError
+from ..robot.chain import Chain
+
+
+@dataclass(frozen=True, eq=False)
+class Mount:
+    """How a camera or a board is fixed to a chain.
+
+    Attributes:
+        moves: Whether it moves with the tool; otherwise it is fixed in the measuring frame.
+        link_pose: Pose of its link in the tool frame or in the measuring frame, shape (4, 4) [m].
+    """
+
+    moves: bool
+    link_pose: Array
+
+
+@dataclass(frozen=True, eq=False)
+class MountedRig:
+    """Rig on a chain.
+
+    Attributes:
+        cameras: Cameras in the order of their numbers.
+        boards: Boards in the order of their numbers.
+        camera_mounts: Mount of each camera.
+        board_mounts: Mount of each board.
+        source: Name of the rig file; empty for a rig from Python.
+    """
+
+    cameras: tuple[Camera, ...]
+    boards: tuple[Board, ...]
+    camera_mounts: tuple[Mount, ...]
+    board_mounts: tuple[Mount, ...]
+    source: str = ""
+
+
+def mount_rig(rig: Rig, chain: Chain) -> MountedRig:
+    """Find the end of the chain that each camera and board of a rig is fixed to.
+
+    Args:
+        rig: Cameras and boards.
+        chain: Chain whose ends carry them.
+
+    Returns:
+        Mounted rig.
+
+    Raises:
+        InvalidArgumentError: A joint moves a link against both ends, or a link is unknown.
+    """
+    where = f"{rig.source}: " if rig.source else ""
+    return MountedRig(
+        tuple(rig.cameras.values()),
+        tuple(rig.boards.values()),
+        tuple(_mount(f"{where}[camera.{c.name}]", c.link, chain) for c in rig.cameras.values()),
+        tuple(_mount(f"{where}[board.{b.name}]", b.link, chain) for b in rig.boards.values()),
+        rig.source,
+    )
+
+
+def _mount(where: str, link: str, chain: Chain) -> Mount:
+    """Return the mount of a link."""
+    if link == TIP:
+        return Mount(True, np.eye(4))
+    if link == WORLD and WORLD not in chain.urdf.links:
+        return Mount(False, np.eye(4))
+    if link not in chain.urdf.links:
+        raise InvalidArgumentError(
+            f'{where}: link = "{link}" is not a link of {chain.urdf.source}; expected a link of the robot, '
+            '"world" or "tip"'
+        )
+    if (pose := chain.fixed_pose(chain.tip, link)) is not None:
+        return Mount(True, pose)
+    if (pose := chain.fixed_pose(chain.root, link)) is not None:
+        return Mount(False, pose)
+    raise InvalidArgumentError(
+        f'{where}: a joint moves link = "{link}" against {chain.root!r} and against {chain.tip!r}; expected '
+        "a link that is fixed to one of these ends of the chain: choose them with --root and --tip"
+    )

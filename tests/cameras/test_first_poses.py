@@ -1,0 +1,84 @@
+"""First poses and intrinsics in closed form are exact for exact images."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dhcal_pin import se3
+from dhcal_pin.cameras import LENSES, Board, estimate_intrinsics, estimate_pose, solve_hand_eye
+from dhcal_pin.exceptions import NotObservableError
+
+CHECKERBOARD = Board("b", "world", "checkerboard", columns=8, rows=6, square=0.03).points
+
+
+def random_pose(rng, angle=0.6):
+    return se3.transform(
+        se3.exp3(rng.uniform(-angle, angle, 3)), [*rng.uniform(-0.1, 0.1, 2), rng.uniform(0.5, 0.9)]
+    )
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_pose_of_a_flat_board(seed):
+    rng = np.random.default_rng(seed)
+    pose = random_pose(rng)
+    local = CHECKERBOARD @ pose[:3, :3].T + pose[:3, 3]
+    estimate = estimate_pose(CHECKERBOARD, local[:, :2] / local[:, 2:])
+    assert estimate is not None
+    found, rms = estimate
+    np.testing.assert_allclose(found, pose, atol=1e-7)
+    assert rms < 1e-9
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_pose_of_points_that_are_not_flat(seed):
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-0.2, 0.2, (7, 3))
+    pose = random_pose(rng, 2.0)
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    estimate = estimate_pose(points, local[:, :2] / local[:, 2:])
+    assert estimate is not None
+    np.testing.assert_allclose(estimate[0], pose, atol=1e-7)
+
+
+def test_too_few_points_or_points_in_a_line_have_no_pose():
+    line = np.outer(np.arange(5.0), [0.01, 0.02, 0])
+    assert estimate_pose(line, line[:, :2]) is None
+    assert estimate_pose(CHECKERBOARD[:3], CHECKERBOARD[:3, :2]) is None
+
+
+def test_hand_eye_is_exact():
+    rng = np.random.default_rng(0)
+    camera, board = (se3.exp6(rng.uniform(-2, 2, 6)) for _ in range(2))
+    links = se3.exp6(rng.uniform(-1.5, 1.5, (6, 6)))
+    found = solve_hand_eye(links, se3.inverse(camera) @ links @ board, "camera 'c' and board 'b'")
+    np.testing.assert_allclose(found[0], camera, atol=1e-10)
+    np.testing.assert_allclose(found[1], board, atol=1e-10)
+
+
+def test_rotations_about_one_axis_are_refused():
+    rng = np.random.default_rng(0)
+    links = se3.transform(se3.exp3(np.outer(rng.uniform(-1, 1, 8), [0, 0, 1])), rng.uniform(-1, 1, (8, 3)))
+    with pytest.raises(NotObservableError, match=r"one axis only.*non-parallel axes"):
+        solve_hand_eye(links, links, "camera 'c' and board 'b'")
+
+
+def views(rng, count):
+    values = np.array([640.0, 660.0, 650.0, 350.0, 0, 0, 0, 0, 0])
+    out = []
+    for _ in range(count):
+        pose = random_pose(rng)
+        local = CHECKERBOARD @ pose[:3, :3].T + pose[:3, 3]
+        out.append((CHECKERBOARD[:, :2], LENSES["pinhole"].project(local.T, values)[0].T))
+    return values, out
+
+
+def test_intrinsics_from_views_of_a_board():
+    values, seen = views(np.random.default_rng(1), 6)
+    np.testing.assert_allclose(estimate_intrinsics(seen, 1280, 720, "c"), values[:4], rtol=1e-6)
+
+
+def test_intrinsics_need_three_views():
+    _, seen = views(np.random.default_rng(1), 2)
+    with pytest.raises(NotObservableError, match="2 images of a flat board; expected at least 3"):
+        estimate_intrinsics(seen, 1280, 720, "c")
