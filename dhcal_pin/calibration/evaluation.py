@@ -237,8 +237,12 @@ def compute_errors(
     Returns:
         Errors of each measurement by the name that its kind gives them, arrays of shape (m, ·) [m or rad].
     """
-    data = [item.initialized(chain) for item in data]
-    values = fit_instrument_parameters(chain, data, known or {})
+    known = known or {}
+    data = [
+        item if all(p.name in known for p in item.instrument_parameters) else item.initialized(chain)
+        for item in data
+    ]
+    values = fit_instrument_parameters(chain, data, known)
     return [
         item.errors(
             chain.forward_kinematics(item.configurations()),

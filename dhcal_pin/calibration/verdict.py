@@ -38,9 +38,11 @@ MIN_MOTION = 1e-3
 # above the first, measurements and robot are to be checked; above the second, no manufacturing error is so
 # large. Errors of up to 2 degrees and 10 mm in every joint reach 10.
 MAX_USUAL_DISPLACEMENT, MAX_DISPLACEMENT = 12.0, 16.0
-# Errors after the fit: positions relative to the size of the workspace, rotations [rad]. Above the first,
-# measurements and robot are to be checked; above the second, they do not belong together.
-MAX_USUAL_ERROR, MAX_ERROR = (0.02, 0.1), (0.05, 0.3)
+# Errors after the fit by their unit: lengths relative to the size of the workspace, rotations [rad], image
+# coordinates [px]. Above the first, measurements and robot are to be checked; above the second, they do not
+# belong together.
+MAX_USUAL_ERROR = {"m": 0.02, "rad": 0.1, "px": 10.0}
+MAX_ERROR = {"m": 0.05, "rad": 0.3, "px": 50.0}
 # Base or tool should be estimated if that alone reduces the RMS error of the nominal robot below this share.
 MAX_FRAME_RATIO = 1 / 3
 # Largest number of iterations of such a fit.
@@ -191,15 +193,14 @@ def _implausible_correction(fit: Result) -> list[Finding]:
 def _implausible_errors(fit: Result) -> list[Finding]:
     """Refuse a robot that does not fit the measurements after the calibration either."""
     for group, after in fit.comparisons[-1].after.groups.items():
-        is_angle = group == "orientation"
-        error = after.rms / (1.0 if is_angle else workspace_radius(fit.chain))
-        if error <= MAX_USUAL_ERROR[is_angle]:
+        error = after.rms / (workspace_radius(fit.chain) if after.unit == "m" else 1.0)
+        if error <= MAX_USUAL_ERROR[after.unit]:
             continue
         rms = format_quantity(after.rms, after.unit, after.rms_std, small=True)
         text = f"The fit leaves an RMS {GROUP_LABELS[group]} of {rms}"
         # With fewer parameters than the robot has errors, the robot is better than before, but not good.
         is_restricted = fit.diagnosis.is_explained and not _missing_frames(fit)
-        status: Status = "refused" if error > MAX_ERROR[is_angle] and not is_restricted else "caution"
+        status: Status = "refused" if error > MAX_ERROR[after.unit] and not is_restricted else "caution"
         return [Finding(status, f"{text}. {_plausible_cause(fit)}")]
     return []
 

@@ -35,6 +35,8 @@ _MIN_RADIANS_AS_DEG, _MAX_RADIANS_AS_DEG = 1.0, 2 * np.pi
 _MIN_SPREAD_RATIO = 5.0
 # A joint may exceed its limits by this much without a warning [rad or m]; controllers round.
 _LIMIT_SLACK = 1e-3
+# Largest median error of image coordinates after a fit that gets no warning [px].
+_MAX_CALIBRATED_PX = 10.0
 # Larger standard deviations mean a wrong unit: no instrument is so coarse [m], [rad].
 _MAX_SIGMA = {"length": 0.05, "angle": 0.2}
 # Positions that spread farther than this factor times the reach mean a wrong unit.
@@ -142,7 +144,7 @@ def poorly_fitted_files(
         Warnings by file, one sentence each; empty lists for well fitted files.
     """
     _, reach = reach_sphere(chain)
-    limits = {"orientation": _MAX_CALIBRATED_RAD}
+    limits = {"orientation": _MAX_CALIBRATED_RAD, "pixels": _MAX_CALIBRATED_PX}
     out: dict[str, list[str]] = {path: [] for path in data}
     for (path, item), all_errors in zip(
         data.items(), compute_errors(chain, list(data.values()), known), strict=True
@@ -157,7 +159,10 @@ def poorly_fitted_files(
             median = float(np.median(np.linalg.norm(errors, axis=1)))
             if median <= limits.get(group, _MAX_RELATIVE_MISFIT * reach):
                 continue
-            size = f"{np.rad2deg(median):.3g} deg" if group == "orientation" else f"{1e3 * median:.3g} mm"
+            unit, factor = {"orientation": ("deg", 180 / np.pi), "pixels": ("px", 1.0)}.get(
+                group, ("mm", 1e3)
+            )
+            size = f"{factor * median:.3g} {unit}"
             text = (
                 f"after the fit, the median {group} error is {size}; check the robot, the tip and the columns"
             )

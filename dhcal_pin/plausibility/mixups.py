@@ -16,6 +16,7 @@ import numpy as np
 
 from ..formatting import format_quantity
 from ..measurements.base import Measurement
+from ..measurements.camera import CameraCorners
 from ..robot.chain import Chain
 from .evidence import Evidence, fit_evidence
 from .hypotheses import Hypothesis, RowShift, list_hypotheses
@@ -100,7 +101,8 @@ def diagnose_mixups(chain: Chain, data: Sequence[Measurement]) -> Diagnosis:
     """Look for a mistake in measurements that explains why they do not fit the robot.
 
     A mistake may be in all measurements or in one of several. Contacts with planes and spheres are left out:
-    a robot with other errors can touch an unknown surface exactly, whatever the mistake is.
+    a robot with other errors can touch an unknown surface exactly, whatever the mistake is. So are image
+    coordinates, which the mistakes listed here do not concern.
 
     Args:
         chain: Nominal robot; its base and tool are ignored.
@@ -110,6 +112,7 @@ def diagnose_mixups(chain: Chain, data: Sequence[Measurement]) -> Diagnosis:
         The diagnosis; without hypotheses if the measurements fit the robot, or if none is decisive.
     """
     items = [item for item in data if item.configurations_per_row and not _is_surface_contact(item)]
+    items = [item for item in items if not isinstance(item, CameraCorners)]
     items = sorted(items, key=lambda item: -len(item.rows))[:_MAX_ITEMS]
     if not items:
         return Diagnosis(NO_EVIDENCE)

@@ -33,7 +33,8 @@ def assert_fits(err):
 def test_calibrations_of_all_kinds(run, robot_folder, kind):
     arm = URDF / "experiment.dh.toml"
     stdout_of(run("simulate", arm, "--errors", "1mm,0.3deg", "-m", 40, "--kind", kind, "-o", "k.csv"))
-    status, _, err = run("calibrate", arm, "k.csv", "-o", "o.urdf", "--extend", "none", "--force")
+    rig = ["--rig", "k.rig.toml"] if Path("k.rig.toml").exists() else []
+    status, _, err = run("calibrate", arm, "k.csv", *rig, "-o", "o.urdf", "--extend", "none", "--force")
     assert status == 0, err
     assert_fits(err)
     lines = err.splitlines()

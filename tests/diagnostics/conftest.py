@@ -10,6 +10,7 @@ from robots import robot_file
 
 from dhcal_pin.diagnostics import find_input_warnings
 from dhcal_pin.io import read_measurement_file
+from dhcal_pin.measurements import MountedRig
 from dhcal_pin.robot import Chain
 
 
@@ -22,9 +23,9 @@ def ur10() -> Chain:
 def warnings_of(tmp_path: Path) -> Callable[[Chain, str], list[str]]:
     """Return a function from a robot and the text of a file to the warnings."""
 
-    def find(chain: Chain, text: str) -> list[str]:
+    def find(chain: Chain, text: str, rig: MountedRig | None = None) -> list[str]:
         path = tmp_path / "data.csv"
         path.write_text(text)
-        return find_input_warnings(chain, read_measurement_file(path, chain))
+        return find_input_warnings(chain, read_measurement_file(path, chain, rig=rig))
 
     return find

@@ -175,7 +175,7 @@ def test_simulated_files_give_no_warnings(warnings_of, ur10, sim_6dof, kind):
         data = KINDS[kind].simulate(chain, q, noise, rng)
         configurations = data.configurations()
         assert wrap_into_limits(chain, configurations)[1].all()
-        assert warnings_of(chain, measurement_text(data, chain)) == []
+        assert warnings_of(chain, measurement_text(data, chain), getattr(data, "rig", None)) == []
 
 
 @pytest.mark.parametrize("command", ["calibrate", "validate"])
