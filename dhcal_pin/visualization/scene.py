@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 
 from .. import se3
 from .._typing import Array, PathLike
@@ -35,11 +36,15 @@ from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from ..robot.sampling import WorkspaceConstraints
 from ..robot.transmission import GravityLoads
+from .measured_samples import SETS, drawn_samples, measured_samples, sets_of
 from .meshes import obstacle_shapes, rows, visuals_of
 from .subsampling import evenly_spaced_indices
+from .uncertainty_cells import UncertaintyCells, uncertainty_cells
 
 # Largest number of measured points and of configurations to play; more would make the page slow.
 MAX_POINTS = 2000
+# Samples with the largest residuals, which are always among these points.
+N_LARGEST = 200
 # Largest number of ellipsoids; more would hide each other.
 MAX_ELLIPSOIDS = 400
 # Largest number of triangles of all meshes; more would make the page large and slow.
@@ -88,8 +93,8 @@ def scene_html(
     Args:
         nominal: Nominal robot; transparent beside the calibrated one, solid if alone.
         calibrated: Calibrated robot with the same joints, or the result of the calibration. With a result,
-            the nominal robot has the base and tool that fit the same measurements, these measurements are
-            shown, and ellipsoids show one standard deviation of the tool position.
+            the nominal robot has the base and tool that fit the same measurements, these measurements and
+            the held-out ones are shown, and ellipsoids show one standard deviation of the tool position.
         q: Joint positions to play, shape (m, n) [rad or m]; by default those of the measurements.
         measurements: Measurements; positions among them are drawn with arrows from the modelled positions.
         known: Values of instrument parameters by name, as in `Result.instruments`; by default their initial
@@ -113,15 +118,21 @@ def scene_html(
         )
     if triangles < MIN_TRIANGLES:
         raise InvalidArgumentError(f"{triangles} triangles: expected at least {MIN_TRIANGLES}")
+    nominal_known = known
+    sets = None
     if isinstance(calibrated, Result):
         predictor = predictor or calibrated
-        measurements = calibrated.data if measurements is None else measurements
-        known = calibrated.instruments if known is None else known
+        if measurements is None:
+            measurements = [*calibrated.data, *calibrated.holdout]
+            sets = sets_of(calibrated)
+        if known is None:
+            known, nominal_known = calibrated.instruments, calibrated.nominal_instruments
         nominal = replace(
             nominal, base=calibrated.nominal_refitted.base, tool=calibrated.nominal_refitted.tool
         )
         calibrated = calibrated.chain
     measurements = measurements or ()
+    sets = [np.zeros(len(item.rows), int) for item in measurements] if sets is None else sets
     shown = nominal if calibrated is None else calibrated
     tree = kinematic_tree(nominal, shown)
     visuals = visuals_of(nominal, tree["bodies"], package_dirs, triangles)
@@ -132,11 +143,13 @@ def scene_html(
     parts = [item.configurations() for item in measurements if item.configurations_per_row]
     played = [q] if q is not None else parts
     configurations = np.concatenate([np.empty((0, nominal.n_joints)), *map(nominal.validated_q, played)])
-    samples, points, residuals = _measured_points(shown, measurements, known or {})
-    drawn = evenly_spaced_indices(len(samples), MAX_POINTS)
+    arms = (with_shared_frames(nominal, shown), shown)
+    measured = measured_samples(arms, measurements, (nominal_known or {}, known or {}), sets)
+    drawn = measured.take(drawn_samples(measured, MAX_POINTS, N_LARGEST))
     notes = [visuals.note]
-    if len(drawn) < len(samples):
-        notes.append(f"{len(drawn)} of {len(samples)} measured points are drawn.")
+    if len(drawn) < len(measured):
+        notes.append(f"{len(drawn)} of {len(measured)} measured points are drawn.")
+    cells = uncertainty_cells(predictor) if predictor else None
     ellipsoids = _ellipsoids(predictor, configurations) if predictor else []
     if predictor and len(configurations) and not ellipsoids:
         notes.append("No ellipsoids: the measurements do not determine the uncertainty of the tool position.")
@@ -147,7 +160,7 @@ def scene_html(
         "has_calibrated": calibrated is not None,
         "magnification": magnification,
         "max_magnification": MAX_MAGNIFICATION,
-        "joints": _sliders(nominal, np.concatenate([configurations, samples])),
+        "joints": _sliders(nominal, np.concatenate([configurations, measured.q])),
         "configurations": (
             configurations
             if preview
@@ -156,10 +169,16 @@ def scene_html(
         "stops": [int(i) for i in preview.stops] if preview else [],
         "obstacles": obstacles,
         "floor": (preview.workspace.floor if preview else None) or 0.0,
-        "samples": samples[drawn].tolist(),
-        "points": np.round((points[drawn] - base[:3, 3]) @ base[:3, :3], 9).tolist(),
-        "residuals": np.round(residuals[drawn] @ base[:3, :3], 9).tolist(),
+        "samples": drawn.q.tolist(),
+        "points": np.round((drawn.points - base[:3, 3]) @ base[:3, :3], 9).tolist(),
+        "residuals": np.round(drawn.residuals @ base[:3, :3], 9).tolist(),
+        "nominal_residuals": np.round(drawn.nominal_residuals @ base[:3, :3], 9).tolist(),
+        "set_names": SETS,
+        "sets": drawn.sets.tolist(),
+        "files": drawn.files.tolist(),
+        "lines": drawn.lines.tolist(),
         "ellipsoids": ellipsoids,
+        "cells": _cells_data(cells) if cells else None,
         "shapes": visuals.shapes,
         "meshes": [mesh.encoded() for mesh in (*visuals.meshes, *obstacle_meshes)],
         **tree,
@@ -246,6 +265,7 @@ def kinematic_tree(nominal: Chain, calibrated: Chain) -> dict[str, Any]:
     Body 0 is the base link, body i the link after joint i of the Pinocchio model, and the last two are tip
     and tool. A body has these keys:
 
+    - `name`: name of the link, or "tool" for the measured point.
     - `parent`: number of its parent; -1 for the base link.
     - `placement`: nominal pose in the parent (upper three rows).
     - `twist`: twist from the nominal to the calibrated placement.
@@ -271,18 +291,22 @@ def kinematic_tree(nominal: Chain, calibrated: Chain) -> dict[str, Any]:
     drawn = with_shared_frames(nominal, calibrated)
     model, n_moving = nominal.model, len(nominal.moving_joints)
     joint_ids = [model.getJointId(name) for name in nominal.moving_joints]
-    bodies = [_body(-1, se3.inverse(calibrated.base) @ drawn.base, np.eye(4))]
+    names = _link_names(model)
+    bodies = [_body(names[0], -1, se3.inverse(calibrated.base) @ drawn.base, np.eye(4))]
     bodies += [
-        _body(parent, placement.homogeneous, placement.homogeneous)
-        for parent, placement in zip(list(model.parents)[1:], list(model.jointPlacements)[1:], strict=True)
+        _body(name, parent, placement.homogeneous, placement.homogeneous)
+        for name, parent, placement in zip(
+            names[1:], list(model.parents)[1:], list(model.jointPlacements)[1:], strict=True
+        )
     ]
     for j, i in enumerate(joint_ids):
-        bodies[i] = _body(int(model.parents[i]), nominal.origins[j], calibrated.origins[j]) | {
+        bodies[i] = _body(names[i], int(model.parents[i]), nominal.origins[j], calibrated.origins[j]) | {
             "axes": [nominal.axes[j].tolist(), calibrated.axes[j].tolist()],
             **_joint_input(nominal, j),
         }
-    bodies.append(_body(joint_ids[-1], nominal.origins[n_moving], calibrated.origins[n_moving]))
-    bodies.append(_body(len(bodies) - 1, drawn.tool, calibrated.tool))
+    tip = nominal.origins[n_moving], calibrated.origins[n_moving]
+    bodies.append(_body(nominal.tip, joint_ids[-1], *tip))
+    bodies.append(_body("tool", len(bodies) - 1, drawn.tool, calibrated.tool))
     return {
         "bodies": bodies,
         "base_in_measuring_frame": rows(calibrated.base),
@@ -290,10 +314,19 @@ def kinematic_tree(nominal: Chain, calibrated: Chain) -> dict[str, Any]:
     }
 
 
-def _body(parent: int, placement: Array, calibrated: Array) -> dict[str, Any]:
+def _link_names(model: pin.Model) -> list[str]:
+    """Return the name of the link whose frame each joint moves: the first one; the joint's without a link."""
+    names = list(model.names)
+    for frame in reversed(list(model.frames)):
+        if frame.type == pin.FrameType.BODY and frame.placement.isIdentity():
+            names[frame.parentJoint] = frame.name
+    return names
+
+
+def _body(name: str, parent: int, placement: Array, calibrated: Array) -> dict[str, Any]:
     is_same = np.array_equal(placement, calibrated)
     twist = np.zeros(6) if is_same else se3.log6(se3.inverse(placement) @ calibrated)
-    return {"parent": int(parent), "placement": rows(placement), "twist": twist.tolist()}
+    return {"name": name, "parent": int(parent), "placement": rows(placement), "twist": twist.tolist()}
 
 
 def _joint_input(chain: Chain, j: int) -> dict[str, Any]:
@@ -370,19 +403,13 @@ def _sliders(chain: Chain, configurations: Array) -> list[dict[str, Any]]:
     return [dict(zip(keys, values, strict=True)) for values in zip(*columns, strict=True)]
 
 
-def _measured_points(
-    chain: Chain, measurements: Sequence[Measurement], known: Mapping[str, float]
-) -> tuple[Array, Array, Array]:
-    """Return joint positions (m, n), measured positions and residuals (m, 3) in the measuring frame."""
-    q, points, residuals = [np.empty((0, chain.n_joints))], [np.empty((0, 3))], [np.empty((0, 3))]
-    for item in measurements:
-        if len(item.positions()):
-            parameters = item.initialized(chain).instrument_parameters
-            values = np.array([known.get(parameter.name, parameter.nominal) for parameter in parameters])
-            q.append(chain.validated_q(item.q))
-            points.append(item.positions())
-            residuals.append(item.errors(chain.forward_kinematics(item.q), values)["position"])
-    return np.concatenate(q), np.concatenate(points), np.concatenate(residuals)
+def _cells_data(cells: UncertaintyCells) -> dict[str, Any]:
+    """Return the cells for the page."""
+    return {
+        "size": cells.size,
+        "index": cells.index.tolist(),
+        "std": np.round(cells.std, 9).tolist(),
+    }
 
 
 def _ellipsoids(model: Predictor, configurations: Array) -> list[dict[str, Any]]:

@@ -37,6 +37,13 @@ def test_the_scene_lives_in_a_saved_notebook_and_in_its_html(browser, tmp_path):
     frame = next(frame for frame in page.frames if frame.parent_frame)
     frame.wait_for_function(READY)
     assert frame.evaluate("dhcal.scene.points.length") == 12
+    # The frame is high enough for all sliders.
+    height = frame.evaluate("innerHeight")
+    boxes = frame.locator("#joints input").evaluate_all(
+        "them => them.map(it => it.getBoundingClientRect().bottom)"
+    )
+    assert len(boxes) == 6
+    assert max(boxes) <= height
     before = frame.evaluate(LOOK)
     assert before["calibrated"] > 200
     assert before["nominal"] > 15

@@ -1,0 +1,152 @@
+"""Measured positions that a scene draws, with their residuals before and after the calibration.
+
+A residual is the vector from the modelled to the measured point, in the measuring frame. Kinds without
+positions, such as lengths, have none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .._typing import Array
+from ..calibration.result import Result
+from ..measurements.base import Measurement
+from ..robot.chain import Chain
+from .subsampling import evenly_spaced_indices
+
+# Names of the sets of samples; `MeasuredSamples.sets` contains their indices.
+SETS = ("fitted", "held out", "outliers")
+FITTED, HELD_OUT, OUTLIER = range(3)
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredSamples:
+    """Measured positions of m samples.
+
+    Attributes:
+        q: Joint positions, (m, n) [rad or m].
+        points: Measured positions in the measuring frame, (m, 3) [m].
+        residuals: Residuals of the calibrated robot, (m, 3) [m].
+        nominal_residuals: Residuals of the nominal robot, (m, 3) [m].
+        sets: Index into `SETS`, (m,).
+        files: Name of the file of each sample, (m,); empty for samples from Python.
+        lines: Line in the file, (m,); the number of the sample, from 1, if it has no file.
+    """
+
+    q: Array
+    points: Array
+    residuals: Array
+    nominal_residuals: Array
+    sets: Array
+    files: Array
+    lines: Array
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return len(self.lines)
+
+    def take(self, index: Array) -> MeasuredSamples:
+        """Return some of the samples.
+
+        Args:
+            index: Numbers of the samples.
+
+        Returns:
+            These samples.
+        """
+        return MeasuredSamples(**{name: values[index] for name, values in vars(self).items()})
+
+
+def sets_of(fit: Result) -> list[Array]:
+    """Return the set of each sample of the fitted and the held-out measurements of a result.
+
+    Args:
+        fit: Result of a calibration.
+
+    Returns:
+        Index into `SETS` for each sample, one array for each of `fit.data` and `fit.holdout`.
+    """
+    fitted = [
+        np.where(np.isin(item.rows, rows), OUTLIER, FITTED)
+        for item, rows in zip(fit.data, fit.outliers, strict=True)
+    ]
+    return [*fitted, *(np.full(len(item.rows), HELD_OUT) for item in fit.holdout)]
+
+
+def measured_samples(
+    arms: tuple[Chain, Chain],
+    measurements: Sequence[Measurement],
+    known: tuple[Mapping[str, float], Mapping[str, float]],
+    sets: Sequence[Array],
+) -> MeasuredSamples:
+    """Collect the measured positions and their residuals.
+
+    Args:
+        arms: Nominal and calibrated robot.
+        measurements: Measurements.
+        known: Values of instrument parameters by name that belong to each robot; others have their initial
+            values.
+        sets: Index into `SETS` for each sample of each measurement.
+
+    Returns:
+        Samples with measured positions.
+    """
+    n = arms[0].n_joints
+    parts: dict[str, list[Array]] = {
+        "q": [np.empty((0, n))],
+        "points": [np.empty((0, 3))],
+        "residuals": [np.empty((0, 3))],
+        "nominal_residuals": [np.empty((0, 3))],
+        "sets": [np.empty(0, int)],
+        "files": [np.empty(0, object)],
+        "lines": [np.empty(0, int)],
+    }
+    for item, item_sets in zip(measurements, sets, strict=True):
+        if not len(item.positions()):
+            continue
+        before, after = (
+            _position_residuals(chain, item, values) for chain, values in zip(arms, known, strict=True)
+        )
+        columns = (
+            arms[0].validated_q(item.q),
+            item.positions(),
+            after,
+            before,
+            item_sets,
+            np.full(len(item.rows), Path(item.source).name, object),
+            item.rows,
+        )
+        for part, column in zip(parts.values(), columns, strict=True):
+            part.append(column)
+    return MeasuredSamples(**{name: np.concatenate(part) for name, part in parts.items()})
+
+
+def _position_residuals(chain: Chain, item: Measurement, known: Mapping[str, float]) -> Array:
+    """Return the vectors from modelled to measured points, (m, 3) [m]."""
+    parameters = item.initialized(chain).instrument_parameters
+    values = np.array([known.get(parameter.name, parameter.nominal) for parameter in parameters])
+    return item.errors(chain.forward_kinematics(item.q), values)["position"]
+
+
+def drawn_samples(samples: MeasuredSamples, limit: int, n_largest: int) -> Array:
+    """Choose samples to draw: those with the largest residuals, and others spread evenly over the files.
+
+    Args:
+        samples: All samples.
+        limit: Largest number of samples.
+        n_largest: Number of samples with the largest residuals that are always drawn.
+
+    Returns:
+        Increasing numbers of the samples; all of them if there are at most `limit`.
+    """
+    if len(samples) <= limit:
+        return np.arange(len(samples))
+    order = np.argsort(-np.linalg.norm(samples.residuals, axis=1), kind="stable")
+    others = np.sort(order[n_largest:])
+    return np.sort(
+        np.concatenate([order[:n_largest], others[evenly_spaced_indices(len(others), limit - n_largest)]])
+    )

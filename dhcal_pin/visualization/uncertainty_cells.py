@@ -1,0 +1,71 @@
+"""Predicted uncertainty of the tool position by cells of the workspace, for the scene.
+
+Configurations are drawn evenly from the joint ranges. The value of a cell is
+
+    std = √(mean of std_i² over the configurations i whose tool point lies in the cell)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .. import se3
+from .._typing import Array
+from ..estimation.uncertainty import Predictor
+from ..robot.sampling import joint_range
+
+# Configurations that are drawn; a cell of a robot with six joints contains about ten of them.
+N_CONFIGURATIONS = 6000
+# Cells along the largest extent of the workspace, at least.
+MIN_CELLS = 10
+# Lengths that a cell may have, times a power of ten.
+_ROUND = np.array([1.0, 2.0, 5.0, 10.0])
+
+
+@dataclass(frozen=True, eq=False)
+class UncertaintyCells:
+    """Cells that the tool reaches.
+
+    Attributes:
+        size: Side of a cell [m]; 1, 2 or 5 times a power of ten.
+        index: Integer coordinates, (c, 3): cell i contains the points p with floor(p / size) = index[i], in
+            the frame of the base link.
+        std: Predicted standard deviation of the tool position, (c,) [m].
+    """
+
+    size: float
+    index: Array
+    std: Array
+
+
+def uncertainty_cells(predictor: Predictor) -> UncertaintyCells:
+    """Predict the uncertainty of the tool position by cells.
+
+    Args:
+        predictor: Calibrated robot with uncertainty.
+
+    Returns:
+        Cells whose uncertainty the measurements determine.
+    """
+    chain = predictor.chain
+    q = np.random.default_rng(0).uniform(*joint_range(chain), (N_CONFIGURATIONS, chain.n_joints))
+    prediction = predictor.predict(q)
+    base = se3.inverse(chain.base)
+    points = prediction.poses[:, :3, 3] @ base[:3, :3].T + base[:3, 3]
+    variances = prediction.position_std**2
+    is_finite = np.isfinite(variances)
+    points, variances = points[is_finite], variances[is_finite]
+    if not len(points):
+        return UncertaintyCells(1.0, np.empty((0, 3), int), np.empty(0))
+    size = _round_length(float(np.ptp(points, axis=0).max()) / MIN_CELLS)
+    cells, index = np.unique(np.floor(points / size).astype(int), axis=0, return_inverse=True)
+    index = index.reshape(-1)
+    return UncertaintyCells(size, cells, np.sqrt(np.bincount(index, variances) / np.bincount(index)))
+
+
+def _round_length(length: float) -> float:
+    """Round a length down to 1, 2 or 5 times a power of ten."""
+    power = 10.0 ** np.floor(np.log10(max(length, 1e-3)))
+    return float(power * _ROUND[np.searchsorted(_ROUND, max(length, 1e-3) / power * (1 + 1e-9)) - 1])
