@@ -23,6 +23,9 @@ h smallest squared residuals. The search follows FAST-LTS (Rousseeuw & Van Dries
 
        ½·ν_g·log(s_g²) + Σ_b ½·n_b·log(b²)        against        ½·ν₀·log(s₀²)
 
+   Degrees of freedom are rows minus the effective number of coordinates that the data, not the priors,
+   determine.
+
    All samples are good unless the left side is smaller and there is at least one clear outlier.
 
 Outliers by mistakes are set apart from good samples. If errors of all sizes occur instead, the model is
@@ -130,6 +133,11 @@ class _Rows:
     def n_samples(self) -> int:
         """Number m of samples."""
         return int(self.sample.max()) + 1
+
+    @property
+    def n_determined(self) -> float:
+        """Effective number of coordinates that all data determine; the priors determine the others."""
+        return len(self.prior_right) - float(np.trace(self.information))
 
     def solve(self, weights: Array, scales: Array) -> Array:
         """Fit weighted samples.
@@ -569,8 +577,8 @@ def _log_likelihood(rows: _Rows, is_good: Array, scales: Array, redundancy: floa
         The negative logarithm; infinite if the good samples have no more rows than unknowns.
     """
     squares = rows.residual_squares(rows.solve(is_good[None].astype(float), scales[None]))[0]
-    u, fitted, total = len(rows.prior_right), is_good[rows.sample], 0.0
-    freedom = 1 - u * redundancy / rows.counts[fitted].sum()
+    fitted, total = is_good[rows.sample], 0.0
+    freedom = 1 - rows.n_determined * redundancy / rows.counts[fitted].sum()
     if not freedom > 0:
         return np.inf
     for i in range(len(scales)):

@@ -1,0 +1,153 @@
+"""Mutation score: how many small errors in the code the tests notice.
+
+Each mutant is a copy of the package with one changed expression. The tests of its module run on it until the
+first one fails: the file of that module, or the files of its folder if it has none. A mutant that survives is
+printed with its place; either a test is missing, or the change has no effect that matters.
+
+    python tests/mutation_score.py --mutants 400 --minutes 60 --seed 0
+
+The run is long and not part of continuous integration. Mutants are drawn at random from the modules of
+`PACKAGES`, weighted by their numbers of expressions.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import copy
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+# Packages whose modules are changed.
+PACKAGES = ("estimation", "identifiability", "calibration", "measurements", "robot", "io", "_kernels")
+# Seconds after which a run of tests ends, and its exit status then. Such a mutant does not count.
+TIMEOUT, OUT_OF_TIME = 300, 124
+COMPARISONS = {
+    ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
+}  # fmt: skip
+OPERATORS = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.Pow: ast.Mult}
+
+
+def _changes(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield changed copies of an expression or a statement."""
+    new = copy.deepcopy(node)
+    if isinstance(new, ast.Compare) and type(new.ops[0]) in COMPARISONS:
+        new.ops[0] = COMPARISONS[type(new.ops[0])]()
+        yield new
+    elif isinstance(new, ast.BinOp) and type(new.op) in OPERATORS and not isinstance(new.left, ast.JoinedStr):
+        new.op = OPERATORS[type(new.op)]()
+        yield new
+    elif isinstance(new, ast.UnaryOp) and isinstance(new.op, ast.USub | ast.Not):
+        yield new.operand
+    elif isinstance(new, ast.BoolOp):
+        new.op = ast.Or() if isinstance(new.op, ast.And) else ast.And()
+        yield new
+    elif isinstance(new, ast.Constant) and isinstance(new.value, bool):
+        yield ast.Constant(not new.value)
+    elif isinstance(new, ast.Constant) and isinstance(new.value, int):
+        yield ast.Constant(new.value + 1)
+    elif isinstance(new, ast.Constant) and isinstance(new.value, float):
+        yield ast.Constant(10 * new.value if new.value else 1.0)
+    elif isinstance(new, ast.IfExp):
+        yield new.body
+    elif isinstance(new, ast.If | ast.While):
+        new.test = ast.UnaryOp(ast.Not(), new.test)
+        yield new
+
+
+def _is_annotation_or_text(parent: ast.AST, field: str) -> bool:
+    return field in ("annotation", "returns", "decorator_list") or isinstance(parent, ast.JoinedStr)
+
+
+def mutants(source: str) -> list[tuple[int, int]]:
+    """Return the line of each possible mutant and its number, which `mutate` takes."""
+    return [(line, number) for number, (line, *_) in enumerate(_places(ast.parse(source)))]
+
+
+def _places(tree: ast.AST) -> Iterator[tuple[int, ast.AST, str, int | None, ast.AST]]:
+    """Yield line, parent, field, index in the field and new node of each mutant, in a fixed order."""
+    for parent in ast.walk(tree):
+        for field, value in ast.iter_fields(parent):
+            if _is_annotation_or_text(parent, field):
+                continue
+            for index, node in enumerate(value) if isinstance(value, list) else [(None, value)]:
+                if isinstance(node, ast.AST):
+                    for new in _changes(node):
+                        yield getattr(node, "lineno", 0), parent, field, index, new
+
+
+def mutate(source: str, number: int) -> tuple[str, str]:
+    """Return the source of a mutant, and what is changed."""
+    tree = ast.parse(source)
+    line, parent, field, index, new = list(_places(tree))[number]
+    value = getattr(parent, field)
+    old = ast.unparse(value if index is None else value[index]).split("\n")[0]
+    ast.copy_location(new, value if index is None else value[index])
+    if index is None:
+        setattr(parent, field, new)
+    else:
+        value[index] = new
+    return ast.unparse(
+        ast.fix_missing_locations(tree)
+    ), f"{line}: {old}  ->  {ast.unparse(new).splitlines()[0]}"
+
+
+def tests_of(module: Path) -> list[str]:
+    """Return the tests of a module: its own file, or those of its folder if it has none."""
+    folder = ROOT / "tests" / module.parent.relative_to(ROOT / "dhcal_pin")
+    while not folder.is_dir():
+        folder = folder.parent
+    own = folder / f"test_{module.stem}.py"
+    return [str(own.relative_to(ROOT) if own.exists() else folder.relative_to(ROOT))]
+
+
+def main() -> None:
+    """Run mutants until their number or the time is reached, and print the score and the survivors."""
+    parser = argparse.ArgumentParser(description="Compute the mutation score.")
+    parser.add_argument("--mutants", type=int, default=400)
+    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    modules = [path for name in PACKAGES for path in (ROOT / "dhcal_pin" / name).rglob("*.py")]
+    population = [(path, *each) for path in modules for each in mutants(path.read_text())]
+    chosen = random.Random(options.seed).sample(population, min(options.mutants, len(population)))
+    end, n_killed, survivors = time.monotonic() + 60 * options.minutes, 0, []
+    with tempfile.TemporaryDirectory() as folder:
+        for name in ("dhcal_pin", "tests", "urdf", "pyproject.toml"):
+            copied = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
+            copied(ROOT / name, Path(folder) / name)
+        environment = os.environ | {"PYTHONPATH": folder, "PYTHONDONTWRITEBYTECODE": "1"}
+        pytest = [sys.executable, "-m", "pytest", "-q", "-x", "-m", "not slow", "-p", "no:cacheprovider"]
+        for path, _, number in chosen:
+            if time.monotonic() > end:
+                break
+            source = path.read_text()
+            changed, what = mutate(source, number)
+            copied = Path(folder) / path.relative_to(ROOT)
+            copied.write_text(changed)
+            status = subprocess.run(
+                ["timeout", str(TIMEOUT), *pytest, *tests_of(path)], cwd=folder, env=environment,
+                capture_output=True, check=False,
+            ).returncode  # fmt: skip
+            copied.write_text(source)
+            if status == OUT_OF_TIME:
+                print("out of time", f"{path.relative_to(ROOT)}:{what}", flush=True)
+                continue
+            n_killed += status != 0
+            if not status:
+                survivors.append(f"{path.relative_to(ROOT)}:{what}")
+                print("survived", survivors[-1], flush=True)
+    total = n_killed + len(survivors)
+    print(f"{n_killed} of {total} mutants killed, {len(population)} possible")
+
+
+if __name__ == "__main__":
+    main()
