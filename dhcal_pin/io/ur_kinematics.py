@@ -126,9 +126,14 @@ def read_ur_kinematics(path: PathLike) -> DHTable:
     try:
         # The base loader returns scalars as texts. Other loaders convert 1:30 to 90, and leave 1e-5 a text.
         document = yaml.load(read_text(path, max_bytes=_MAX_BYTES), yaml.BaseLoader)
-    except (yaml.YAMLError, RecursionError) as error:
-        reason = "nested too deeply" if isinstance(error, RecursionError) else " ".join(str(error).split())
-        raise FileFormatError(f"{source}: not YAML: {reason}; correct that line") from None
+    except yaml.MarkedYAMLError as error:
+        line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
+        raise FileFormatError(f"{source}: not YAML: {line}{error.problem}; correct that line") from None
+    except yaml.YAMLError as error:
+        reason = " ".join(str(error).splitlines()[:1])
+        raise FileFormatError(f"{source}: not YAML: {reason}; remove it") from None
+    except RecursionError:
+        raise FileFormatError(f"{source}: not YAML: nested too deeply; correct the file") from None
     content = document.get("kinematics") if isinstance(document, dict) else None
     origins = []
     for name in UR_JOINTS.values():

@@ -62,6 +62,22 @@ def test_text_that_is_no_yaml(assert_refused, text):
 
 
 @pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a: 1\nb: 2: 3\n", "not YAML: line 2: mapping values are not allowed here; correct that line"),
+        ("a: 1\nb: [\n", "not YAML: line 3: expected the node content"),
+        (
+            "a: \x1b\n",
+            "not YAML: unacceptable character #x001b: special characters are not allowed; remove it",
+        ),
+    ],
+)
+def test_the_message_about_yaml_has_one_line_number(assert_refused, text, words):
+    Path("k.yaml").write_text(text)
+    assert_refused([f"k.yaml: {words}"], "convert", "k.yaml", "o.urdf")
+
+
+@pytest.mark.parametrize(
     ("old", "new", "words"),
     [
         ('unit = "deg"', 'unit = ["rad", ["m"], "rad"]', ["[joints]", "unit ['m']", "text in quotes"]),
@@ -176,3 +192,17 @@ def test_a_file_name_that_is_not_utf_8(run, robot_folder, options):
     Path(options[1]).read_text(encoding="utf-8")
     assert run("view", names[1], names[2], "--html", "v.html")[0] == 0
     assert run("simulate", names[1], "-m", "5", "-o", "s.csv")[0] == 0
+
+
+def test_names_that_a_spreadsheet_or_a_browser_would_execute(run, robot_folder):
+    """The name of a job in the summary, and the name of a file in the report."""
+    shutil.copy("data.csv", "<script>alert(1)<")
+    Path("a.fleet.toml").write_text(
+        '[[job]]\nname = "=cmd|\' /C calc\'!A0"\nrobot = "arm.urdf"\ndata = "<script>alert(1)<"\n'
+        'output = "o.urdf"\nreport = "r.md"\n'
+    )
+    assert run("calibrate", "a.fleet.toml", "-o", "s.csv")[0] == 0
+    assert Path("s.csv").read_text().splitlines()[1].startswith("'=cmd|' /C calc'!A0,")
+    report = Path("r.md").read_text()
+    assert r"\<script\>" in report or "&lt;script" in report
+    assert "<script" not in report.replace(r"\<script", "")

@@ -113,7 +113,7 @@ def test_rows_that_cannot_be_used_are_listed_with_their_lines(run, robot_folder)
         assert file["bad_rows"] == {
             "5": "column 'x': 'nan' is not a finite number",
             "10": "column 'joint_1' is empty",
-            "16": "1 values for 6 columns, with commas between them and decimal points",
+            "16": "1 value for 6 columns, with commas between them and decimal points",
         }
         assert file["rows"] == 20
         err = run("inspect", "data.csv", *options)[2]

@@ -200,7 +200,8 @@ def _open_bag(source: str) -> Iterator[AnyReader]:
         raise
     # A damaged recording raises errors of many types, such as those of its decompressor or database.
     except Exception as error:
-        reason = str(error) or type(error).__name__
+        # Only those of rosbags itself are meant for users.
+        reason = str(error) if type(error).__module__.startswith("rosbags") else "it is damaged"
         raise FileFormatError(f"{source}: not a readable recording: {reason}; record it again") from error
 
 

@@ -202,7 +202,10 @@ def _divide_rows(
             good.append((line_number, text))
         elif count >= 0:
             hint = " and decimal points" if separator == "," else ""
-            bad[line_number] = f"{count} values for {width} columns, with {name} between them{hint}"
+            values, columns = (
+                f"{n} {word}{'s' * (n != 1)}" for n, word in ((count, "value"), (width, "column"))
+            )
+            bad[line_number] = f"{values} for {columns}, with {name} between them{hint}"
     return good, dict(sorted(bad.items()))
 
 

@@ -19,7 +19,7 @@ from dhcal_pin.io.tabular import csv_text, require_usable_names
 
 def test_an_unbalanced_quote_affects_its_row_only(tmp_path):
     path = write(tmp_path, "a.csv", 'a,b\n1,2\n"3,4\n5,6\n')
-    with pytest.raises(DhcalError, match=r"a\.csv:3: 1 values for 2 columns"):
+    with pytest.raises(DhcalError, match=r"a\.csv:3: 1 value for 2 columns"):
         read_table(path).require_good_rows()
 
 
