@@ -181,6 +181,23 @@ class Job:
             "is_output": True,
         },
     )
+    certificate: str | None = field(
+        default=None,
+        metadata={
+            "metavar": "C.html",
+            "help": "write a certificate for quality records, to print or save as PDF (.html)",
+            "is_output": True,
+        },
+    )
+    meta: tuple[str, ...] = field(
+        default=(),
+        metadata={
+            "metavar": "KEY=VALUE",
+            "help": "fact for the certificate: robot, serial, controller, instrument, temperature, location, "
+            "date, operator or any other; may be repeated",
+            "is_output": True,
+        },
+    )
     json: str | None = field(default=None, metadata={**JSON, "is_output": True})
     curves: str | None = field(
         default=None,
@@ -236,7 +253,16 @@ class Job:
     @property
     def output_paths(self) -> tuple[str | None, ...]:
         """Paths that the options name for outputs; the sidecar is beside the first one."""
-        return (self.output, self.scene, self.map, self.curves, self.json, self.residuals, *self.report)
+        return (
+            self.output,
+            self.scene,
+            self.map,
+            self.curves,
+            self.json,
+            self.residuals,
+            self.certificate,
+            *self.report,
+        )
 
     def command(self, names: Mapping[str, str]) -> str:
         """Format the command line of this job without the options that only name outputs.

@@ -149,6 +149,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     add_motion_options(parser, "deg")
     parser.add_argument("--html", metavar="FILE", help="page with a preview of the poses and the moves")
+    parser.add_argument("--report", metavar="R.html", help="write a report with the poses (.html)")
     parser.add_argument("--json", **JSON)
 
 
@@ -169,6 +170,7 @@ def run(args: Namespace) -> int:
     from ..planning import plan
     from ..programs import program_text, require_program_ending
     from ..report.document import file_digests, versions
+    from ..report.html import check_html_ending
     from ..units import parse_noise
     from . import console
     from .outputs import existing_sidecars, require_writable_outputs, write_outputs
@@ -181,7 +183,9 @@ def run(args: Namespace) -> int:
     ]
     priors = [args.priors] if args.priors not in (None, "default") else []
     inputs = [args.robot, *existing_sidecars([args.robot]), *files, *priors]
-    require_writable_outputs([args.output, args.json, args.html, *args.export], inputs)
+    require_writable_outputs([args.output, args.json, args.html, args.report, *args.export], inputs)
+    if args.report:
+        check_html_ending(args.report, "the report of a plan")
     for path in args.export:
         require_program_ending(path)
     chain = read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root)
@@ -231,6 +235,23 @@ def run(args: Namespace) -> int:
         contents[path] = program_text(_program(result, chain), path)
     if args.html:
         contents[args.html] = _preview(result, chain, space, args)
+    if args.report:
+        from ..io.robot import robot_name  # lazy import, as the following: only for reports
+        from ..report.plan_page import PlanReport, plan_page
+
+        contents[args.report] = plan_page(
+            PlanReport(
+                plan=result,
+                chain=chain,
+                name=robot_name(args.robot),
+                file=os.path.basename(args.output),
+                first_line=text.count("\n") - len(result.q) + 1,
+                text=text,
+                moves=moves,
+                scene=_preview(result, chain, space, args),
+                inputs=document["inputs"],
+            )
+        )
     write_outputs(contents, args.json, document)
     console.show(plan_screen(result, moves, contents), args.verbosity)
     return 0
@@ -441,7 +462,8 @@ def _plan_document(result: Plan, args: Namespace) -> dict[str, Any]:
         "notes": list(result.notes),
         "files": {"poses": args.output}
         | ({"json": path} if path else {})
-        | ({"html": args.html} if args.html else {}),
+        | ({"html": args.html} if args.html else {})
+        | ({"report": args.report} if args.report else {}),
     }
 
 

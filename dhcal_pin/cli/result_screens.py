@@ -79,7 +79,7 @@ def validation_screen(
     remarks: Sequence[str],
     notes: Sequence[str],
     warnings: Mapping[str, Sequence[str]],
-    files: Iterable[str],
+    files: Mapping[str, str],
 ) -> Screen:
     """Describe the accuracy of a model on measurements.
 
@@ -89,7 +89,7 @@ def validation_screen(
         remarks: Sentences on the figures.
         notes: What of the input is not used.
         warnings: Warnings by file.
-        files: Files that were written.
+        files: Paths of the files that were written, by what they are.
 
     Returns:
         The screen.
@@ -108,7 +108,7 @@ def validation_screen(
         Block(remarks, noun="remark", rank=1, has_space=True),
         notes_block(notes),
         warnings_block(warnings),
-        files_block(f"map: {path}" for path in files),
+        files_block(f"{kind}: {path}" for kind, path in files.items()),
     ]
     return Screen(blocks)
 

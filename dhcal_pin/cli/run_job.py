@@ -208,6 +208,12 @@ def run_job(
         from ..report import html  # lazy import: only for reports
 
         contents |= html.report_files(fit, job.report, source)
+    if job.certificate and is_kept:
+        from ..report import certificate  # lazy import: only for certificates
+
+        meta = certificate.parse_meta(job.meta)
+        contents[job.certificate] = certificate.certificate_page(fit, meta, source)
+        files["certificate"] = job.certificate
     outliers = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))
     zero_weight = (
         item.rows[weight <= ZERO_WEIGHT] for item, weight in zip(fit.data, fit.weights, strict=True)
@@ -274,7 +280,7 @@ def _checked_inputs(job: Job) -> list[str]:
     settings += [path for path in (job.bounds, job.instrument, job.columns, job.rig) if path]
     inputs = [job.robot, *existing_sidecars([job.robot]), *measured, *settings]
     require_urdf_ending(job.output)
-    require_writable_outputs([job.json, job.residuals, *job.report], inputs)
+    require_writable_outputs([job.json, job.residuals, *job.report, job.certificate], inputs)
     protected = [*measured, *settings] if job.in_place else inputs
     require_writable_outputs([sidecar_path(job.output), *job.output_paths], protected)
     if job.report:
@@ -282,6 +288,13 @@ def _checked_inputs(job: Job) -> list[str]:
 
         for path in job.report:
             html.check_ending(path)
+    if job.certificate:
+        from ..report import certificate, html  # lazy import: only for certificates
+
+        html.check_html_ending(job.certificate, "a certificate")
+        certificate.parse_meta(job.meta)
+    elif job.meta:
+        raise InvalidArgumentError("--meta: needs --certificate, the file that shows it")
     if job.map:
         from ..report import workspace_map  # lazy import: only for maps
 

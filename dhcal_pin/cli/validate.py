@@ -52,6 +52,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="write the predicted position uncertainty and the measured errors over the workspace (.csv or "
         ".html)",
     )
+    parser.add_argument("--report", metavar="R.html", help="write a report (.html)")
     parser.add_argument("--json", **JSON)
 
 
@@ -75,6 +76,7 @@ def run(args: Namespace) -> int:
     )
     from ..measurements.position import require_common_reference_target
     from ..report.document import file_digests, main_statistics, result_to_dict, validation_to_dict
+    from ..report.html import check_html_ending
     from ..report.workspace_map import map_content
     from . import console
     from .outputs import existing_sidecars, json_path, require_writable_outputs, write_outputs
@@ -83,7 +85,9 @@ def run(args: Namespace) -> int:
     sidecar = args.sidecar or existing_sidecar(args.robot)
     robots = [args.robot, args.nominal] if args.nominal else [args.robot]
     inputs = [*robots, *args.data, *filter(None, (sidecar, args.columns)), *existing_sidecars(robots[1:])]
-    require_writable_outputs([args.json, args.map], inputs)
+    require_writable_outputs([args.json, args.map, args.report], inputs)
+    if args.report:
+        check_html_ending(args.report, "the report of a validation")
     chain = read_robot(args.robot, args.tip, sidecar, args.package_dir, args.root)
     predictor = _predictor(chain, sidecar, args) if args.map else None
     files = [
@@ -106,8 +110,9 @@ def run(args: Namespace) -> int:
         document = validation_to_dict(chain, data, file_digests(inputs), known)
     document["before"] = main_statistics(given)
     remarks: list[str] = []
+    reference = None
     if args.nominal:
-        nominal, remarks = _nominal_accuracy(chain, data, known, args)
+        nominal, reference, remarks = _nominal_accuracy(chain, data, known, args)
         document["before"] = main_statistics(nominal)
         accuracies = {"nominal": nominal, "calibrated": list(accuracies.values())[-1]}
     warnings = {file.source: _input_warnings(chain, file, args.fit_frames) for file in files}
@@ -124,14 +129,35 @@ def run(args: Namespace) -> int:
     if predictor:
         document["files"]["map"] = args.map
         contents[args.map] = map_content(args.map, predictor, data, known)
+    remarks += extrapolation.sentences if extrapolation else ()
+    if args.report:
+        from ..io.robot import robot_name  # lazy import, as the following: only for reports
+        from ..report.validation import Validation, validation_page
+
+        document["files"]["report"] = args.report
+        contents[args.report] = validation_page(
+            Validation(
+                robot_name(args.robot),
+                chain,
+                data,
+                known,
+                args.data,
+                accuracies,
+                reference,
+                remarks,
+                document["warnings"][len(notes) :],
+                notes,
+                file_digests(inputs),
+            )
+        )
     write_outputs(contents, args.json, document)
     screen = validation_screen(
         f"{args.robot}: accuracy on {document['samples']} samples",
         accuracies,
-        [*remarks, *(extrapolation.sentences if extrapolation else ())],
+        remarks,
         notes,
         warnings,
-        contents,
+        {kind: file for kind, file in document["files"].items() if kind != "json"},
     )
     console.show(screen, args.verbosity)
     return 0
@@ -139,11 +165,12 @@ def run(args: Namespace) -> int:
 
 def _nominal_accuracy(
     chain: Chain, data: Sequence[Measurement], known: Mapping[str, float], args: Namespace
-) -> tuple[Accuracy, list[str]]:
+) -> tuple[Accuracy, tuple[Chain, Mapping[str, float]], list[str]]:
     """Compute the accuracy of the nominal robot; fit its base and tool if the calibrated robot has others.
 
     Returns:
-        The accuracy, and a note if base or tool were fitted.
+        The accuracy, the nominal robot with its instrument parameters, and a note if base or tool were
+        fitted.
     """
     import numpy as np  # lazy import, as the following
 
@@ -160,10 +187,10 @@ def _nominal_accuracy(
     pairs = {"base": (nominal.base, chain.base), "tool": (nominal.tool, chain.tool)}
     others = [name for name, (a, b) in pairs.items() if not np.allclose(a, b, rtol=0, atol=FRAMES_TOL)]
     if not others:
-        return accuracy(nominal, data, known), []
+        return accuracy(nominal, data, known), (nominal, known), []
     fit = fit_frames(nominal, data, known, ",".join(others))
     note = f"nominal: {' and '.join(others)} fitted to these measurements"
-    return fit.comparisons[-1].after, [note]
+    return fit.comparisons[-1].after, (fit.chain, {**known, **fit.instruments}), [note]
 
 
 def _input_warnings(chain: Chain, file: MeasurementFile, has_unknown_frames: bool) -> list[str]:

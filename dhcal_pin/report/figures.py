@@ -296,6 +296,7 @@ def joint_error_group(samples: Samples) -> FigureGroup:
     group = next(iter(samples.errors))
     quantity, errors, panels = GROUP_LABELS[group], samples.errors[group]["after"], []
     is_shown = np.isfinite(errors) & np.isfinite(samples.q).all(1)
+    state = _shown_state(samples, group)
     for i, joint in enumerate(samples.chain.joint_names if is_shown.any() else ()):
         plot = partial(
             plots.plot_errors_over_joint,
@@ -306,7 +307,7 @@ def joint_error_group(samples: Samples) -> FigureGroup:
             quantity=quantity,
             unit=GROUP_UNITS[group],
         )
-        text = f"{_capitalized(quantity)} of the samples after calibration over the position of {joint}."
+        text = f"{_capitalized(quantity)} of the samples{state} over the position of {joint}."
         points = SamplePoints(f"joint:{i}", f"error:{group}")
         panels.append(Panel(f"joint-{i}", joint, text, plot, points=points))
     legend = [LegendEntry("sample", "sample", "dots"), LegendEntry("median", "text", "line")]
@@ -332,12 +333,18 @@ def sample_group(samples: Samples) -> FigureGroup:
         errors = np.concatenate([errors for _, errors in by_role.values()])
         caption = f"{_capitalized(quantity)} by sample"
         largest = _shown(float(errors.max()), unit)
-        text = f"{_capitalized(quantity)} of {len(errors)} samples after calibration; at most {largest}."
+        state = _shown_state(samples, group)
+        text = f"{_capitalized(quantity)} of {len(errors)} samples{state}; at most {largest}."
         plot = partial(plots.plot_errors_by_sample, by_role, quantity=quantity, unit=unit)
         points = SamplePoints("number", f"error:{group}")
         panels.append(Panel(f"sample-{group}", caption, text, plot, WIDE_PANEL, points))
     legend = [LegendEntry(role, plots.sample_color(role, "hold-out" in roles), "dots") for role in roles]
     return FigureGroup(panels, "Errors in the order of the files", legend, "wide")
+
+
+def _shown_state(samples: Samples, group: str) -> str:
+    """Return which errors the figures show until a reader chooses others, as a part of a sentence."""
+    return " after calibration" if "before" in samples.errors[group] else ""
 
 
 def _errors_by_role(samples: Samples, group: str) -> dict[str, tuple[Array, Array]]:

@@ -73,6 +73,20 @@ def check_ending(path: PathLike) -> None:
         raise InvalidArgumentError(f"{os.fspath(path)}: unknown ending; write a report as .html or .md")
 
 
+def check_html_ending(path: PathLike, content: str) -> None:
+    """Raise an error if a path is not that of an HTML file.
+
+    Args:
+        path: Path of a page.
+        content: What the page contains, such as "a certificate".
+
+    Raises:
+        InvalidArgumentError: The ending is unknown.
+    """
+    if not _is_html(path):
+        raise InvalidArgumentError(f"{os.fspath(path)}: unknown ending; write {content} as .html")
+
+
 def _is_html(path: PathLike) -> bool:
     return os.fspath(path).lower().endswith((".html", ".htm"))
 

@@ -507,11 +507,12 @@ def _outlier_section(context: ReportContext) -> Section:
     return Section("outliers", "Outliers", [text], items, [table] if rows else [])
 
 
-def samples_section(samples: Samples) -> Section:
+def samples_section(samples: Samples, title: str = "Samples") -> Section:
     """List the samples with the largest errors; scripts of the page make it a list of all samples.
 
     Args:
         samples: Samples of the page.
+        title: Heading of the section.
 
     Returns:
         The section.
@@ -522,7 +523,7 @@ def samples_section(samples: Samples) -> Section:
         if np.isfinite(states["after"]).any()
     }
     largest = np.arange(len(samples))
-    text = "All samples."
+    text = f"The first {min(len(samples), MAX_LISTED_SAMPLES)} of {len(samples)}."
     if groups:
         first = next(iter(groups.values()))
         largest = np.argsort(-np.nan_to_num(first, nan=-1.0), kind="stable")
@@ -550,7 +551,7 @@ def samples_section(samples: Samples) -> Section:
     ]
     header = ["file", "line", "set", *joints, *(GROUP_LABELS[group] for group in groups)]
     sentences = [text, *filter(None, [samples.note])]
-    return Section("samples", "Samples", sentences, tables=[Table(header, rows)] if rows else [])
+    return Section("samples", title, sentences, tables=[Table(header, rows)] if rows else [])
 
 
 def _provenance_section(context: ReportContext) -> Section:

@@ -132,5 +132,4 @@ if (source) {
   const announce = createTooltip(selection.samples);
   for (const plot of document.querySelectorAll(".plot[data-x]")) new SamplePlot(plot, selection, announce);
   addEventListener("keydown", event => { if (event.key === "Escape" && selection.current !== null) selection.update({ current: null, chosen: null }); });
-  window.dhcalReport = { selection };
 }

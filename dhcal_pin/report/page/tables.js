@@ -116,7 +116,7 @@ class SampleTable {
     box.before(tools);
     box.replaceChildren(this.table);
     box.ariaLabel = "List of samples";
-    section.querySelector("p").textContent = "Click a row, or a dot of a plot, to move the robot of the scene to that sample.";
+    section.querySelector("p").textContent = "Click a row, or a dot of a plot, to move the robot of the scene there.";
     this.body.addEventListener("click", event => {
       const row = event.target.closest("tr");
       if (row) selection.update({ current: Number(row.dataset.sample) });

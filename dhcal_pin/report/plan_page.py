@@ -1,0 +1,182 @@
+"""Page of a plan: the poses to measure, and the accuracy to expect."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+
+from .. import se3
+from ..formatting import Table
+from ..planning.planner import Plan
+from ..robot.chain import Chain
+from ..robot.coverage import joint_coverage
+from ..visualization import plots
+from . import figures
+from .document import short_names, versions
+from .figures import FigureGroup, Panel, SamplePoints
+from .html import Page, render_page
+from .samples import Samples
+from .sections import BarColumn, BarTable, Section, ShareBar, samples_section
+
+
+@dataclass(frozen=True, eq=False)
+class PlanReport:
+    """Plan and what its page shows beside it.
+
+    Attributes:
+        plan: Plan.
+        chain: Robot.
+        name: Name of the robot.
+        file: Name of the file with the poses.
+        first_line: Line of the first pose in this file.
+        text: Content of this file.
+        moves: Sentences on the moves between the poses.
+        scene: Page of a 3-D scene with the poses.
+        inputs: SHA-256 of each input file by path.
+    """
+
+    plan: Plan
+    chain: Chain
+    name: str
+    file: str
+    first_line: int
+    text: str
+    moves: Sequence[str]
+    scene: str
+    inputs: Mapping[str, str] = field(default_factory=dict)
+
+
+def plan_page(report: PlanReport) -> str:
+    """Render the page of a plan.
+
+    Args:
+        report: Plan and what its page shows beside it.
+
+    Returns:
+        Text of the page; the same for the same input.
+    """
+    plan, count = report.plan, len(report.plan.q)
+    samples = Samples(
+        chain=report.chain,
+        file=np.full(count, report.file, object),
+        line=report.first_line + np.arange(count),
+        number=1 + np.arange(count),
+        role=np.full(count, "planned"),
+        is_outlier=np.zeros(count, bool),
+        q=plan.q,
+        errors={},
+        downloads={"poses.csv": report.text},
+    )
+    noise = plan.information.noise
+    percent = 100 * (1 - plan.relative_error)
+    return render_page(
+        Page(
+            title=f"Poses for {report.name}",
+            heading=f"{count} poses to measure",
+            sections=_sections(report, samples),
+            eyebrow=f"Plan for {report.name}",
+            values=[
+                ("before", "random poses, predicted RMS", f"{1e3 * plan.random_error:.3f} mm"),
+                ("after", "planned poses, predicted RMS", f"{1e3 * plan.error:.3f} mm"),
+                ("", "lower" if percent >= 0 else "higher", f"{abs(percent):.0f} %"),
+            ],
+            details=[
+                ("", "criterion", plan.criterion),
+                ("", "standard deviation of a position", f"{1e3 * noise.position:.3g} mm"),
+                ("", "of an orientation", f"{np.degrees(noise.rotation):.3g}°"),
+            ],
+            remarks=[*report.moves, *plan.notes],
+            samples=samples,
+        )
+    )
+
+
+def _sections(report: PlanReport, samples: Samples) -> list[Section]:
+    """Return the sections of the page."""
+    plan = report.plan
+    size = (
+        f"Diminishing returns beyond {plan.recommended_size} poses (less than 1 % per ten)."
+        if plan.recommended_size
+        else f"No diminishing returns up to {plan.sizes[-1]} poses (still at least 1 % per ten)."
+    )
+    short = short_names(list(report.inputs))
+    digests = [[short[path], digest] for path, digest in report.inputs.items()]
+    return [
+        Section(
+            "error",
+            "Predicted accuracy",
+            [
+                "RMS position error over the task after the calibration, over the number of poses. Errors "
+                "that the model lacks come in addition.",
+                size,
+            ],
+            figures=partial(_curve_figures, plan),
+        ),
+        Section(
+            "joints",
+            "Joint values",
+            ["A bin of a turn is 5° wide and counts as visited if one pose lies in it."],
+            tables=[_coverage_table(report)],
+        ),
+        Section("scene", "Robot and poses", figures=partial(_pose_figures, report, samples)),
+        samples_section(samples, "Poses"),
+        Section(
+            "provenance",
+            "Provenance",
+            tables=[
+                Table(["file", "SHA-256"], digests, n_text_columns=2),
+                Table(["software", "version"], [list(pair) for pair in versions().items()], n_text_columns=2),
+            ],
+        ),
+    ]
+
+
+def _curve_figures(plan: Plan) -> list[FigureGroup]:
+    """Draw the predicted error over the number of poses."""
+    text = (
+        f"Predicted RMS position error over the number of poses: {1e3 * plan.error:.3f} mm for {len(plan.q)} "
+        f"planned poses, {1e3 * plan.random_error:.3f} mm for as many random ones."
+    )
+    plot = partial(
+        plots.plot_plan_curve,
+        (plan.sizes, plan.errors),
+        (plan.random_sizes, plan.random_errors),
+        (len(plan.q), plan.error),
+        plan.recommended_size,
+    )
+    return [
+        FigureGroup([Panel("curve", "Predicted position error", text, plot, (640.0, 320.0))], layout="full")
+    ]
+
+
+def _coverage_table(report: PlanReport) -> BarTable:
+    """Return the range of each joint and how much of a turn the poses visit."""
+    coverage = {one.joint: one for one in joint_coverage(report.chain, report.plan.q)}
+    rows, bars = [], []
+    for i, joint in enumerate(report.chain.joint_names):
+        low, high = report.plan.q[:, i].min(), report.plan.q[:, i].max()
+        one = coverage.get(joint)
+        factor, unit, decimals = (np.degrees(1.0), "°", 1) if one else (1e3, " mm", 1)
+        bins = f"{one.n_visited} of {one.n_in_range}" if one else ""
+        rows.append([joint, *(f"{factor * value:.{decimals}f}{unit}" for value in (low, high)), bins])
+        bars.append(ShareBar(one.share) if one else None)
+    return BarTable(["joint", "lowest", "highest", "bins visited"], rows, bars=[BarColumn("share", bars)])
+
+
+def _pose_figures(report: PlanReport, samples: Samples) -> list[FigureGroup]:
+    """Draw the tool positions of the poses, and the robot in 3-D."""
+    poses = se3.inverse(report.chain.base) @ report.chain.poses(samples.q)
+    panels = []
+    for plane, view in (("xy", "from above"), ("xz", "from the side")):
+        plot = partial(plots.plot_arms, {}, plane=plane, samples=poses[:, :3, 3])
+        text = f"Tool positions of {len(samples)} poses over {plane[0]} and {plane[1]} in the base frame."
+        points = SamplePoints(*(f"base:{'xyz'.index(axis)}" for axis in plane))
+        panels.append(Panel(f"poses-{plane}", f"Tool, {view}", text, plot, plots.SQUARE_PANEL, points))
+    title = "The robot and the poses to measure, in three dimensions"
+    return [
+        FigureGroup((), scene=figures.linked_scene(report.scene), scene_title=title),
+        FigureGroup(panels, "Tool positions", layout="wide"),
+    ]

@@ -1,0 +1,219 @@
+"""Page of a validation: the accuracy of a robot on measurements, beside that of its nominal model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+
+from .._typing import Array
+from ..calibration.evaluation import GROUP_UNITS, Accuracy, compute_errors, error_norms
+from ..calibration.summary import GROUP_LABELS, STATISTIC_LABELS
+from ..formatting import Table, format_quantity
+from ..measurements.base import Measurement
+from ..robot.chain import Chain
+from ..visualization import scene
+from . import figures
+from .context import measurement_names
+from .document import short_names, versions
+from .figures import FigureGroup, LegendEntry
+from .html import Page, render_page
+from .samples import Samples, first_configurations, sample_numbers
+from .sections import Section, samples_section
+
+
+@dataclass(frozen=True, eq=False)
+class Validation:
+    """Accuracy of a robot on measurements.
+
+    Attributes:
+        name: Name of the robot.
+        chain: Robot, with the base and tool that it was judged with.
+        data: Measurements.
+        known: Values of their instrument parameters by name [m or rad]; others are fitted to the data.
+        paths: File of each measurement.
+        accuracies: Accuracy by the name of the model; the last one is that of `chain`.
+        reference: Nominal robot and the instrument parameters it was judged with, if there is one.
+        remarks: Sentences on the figures.
+        warnings: What a reader must know before relying on the figures.
+        notes: What of the input is not used.
+        inputs: SHA-256 of each input file by path.
+    """
+
+    name: str
+    chain: Chain
+    data: Sequence[Measurement]
+    known: Mapping[str, float]
+    paths: Sequence[str]
+    accuracies: Mapping[str, Accuracy]
+    reference: tuple[Chain, Mapping[str, float]] | None = None
+    remarks: Sequence[str] = ()
+    warnings: Sequence[str] = ()
+    notes: Sequence[str] = ()
+    inputs: Mapping[str, str] = field(default_factory=dict)
+
+
+def validation_page(validation: Validation) -> str:
+    """Render the page of a validation.
+
+    Args:
+        validation: Accuracy of a robot on measurements.
+
+    Returns:
+        Text of the page; the same for the same input.
+    """
+    samples = _samples(validation)
+    group, statistics = next(iter(list(validation.accuracies.values())[-1].groups.items()))
+    values = [
+        ("before" if i + 1 < len(validation.accuracies) else "after", f"{name}, RMS", _rms(accuracy, group))
+        for i, (name, accuracy) in enumerate(validation.accuracies.items())
+    ]
+    details = [
+        ("", STATISTIC_LABELS[key], _quantity(getattr(statistics, key), statistics.unit, statistics.rms_std))
+        for key in ("mean", "p95", "max")
+    ]
+    count = len(samples)
+    return render_page(
+        Page(
+            title=f"Validation of {validation.name}",
+            heading=f"{GROUP_LABELS[group].capitalize()} on {count} {'sample' if count == 1 else 'samples'}",
+            sections=_sections(validation, samples.limited()),
+            eyebrow=f"Validation of {validation.name}",
+            values=values,
+            details=details,
+            remarks=validation.remarks,
+            warnings=validation.warnings,
+            samples=samples.limited(),
+        )
+    )
+
+
+def _samples(validation: Validation) -> Samples:
+    """Collect the samples of a validation."""
+    data, chain = validation.data, validation.chain
+    names = measurement_names(validation.paths, data)
+    counts = [len(item.rows) for item in data]
+    errors = {"after": _norms(chain, data, validation.known)}
+    if validation.reference:
+        errors = {"before": _norms(validation.reference[0], data, validation.reference[1])} | errors
+    return Samples(
+        chain=chain,
+        file=np.repeat(np.array(names, object), counts),
+        line=np.concatenate([item.rows for item in data]),
+        number=sample_numbers(names, data),
+        role=np.full(sum(counts), "measured"),
+        is_outlier=np.zeros(sum(counts), bool),
+        q=first_configurations(data, chain.n_joints),
+        errors={
+            group: {state: norms[group] for state, norms in errors.items()}
+            for group in GROUP_UNITS
+            if group in errors["after"]
+        },
+    )
+
+
+def _norms(chain: Chain, data: Sequence[Measurement], known: Mapping[str, float]) -> dict[str, Array]:
+    """Return the error norms of all samples by group, (N,) each; NaN for samples without this group."""
+    parts = [
+        (len(item.rows), error_norms([errors]))
+        for item, errors in zip(data, compute_errors(chain, data, known), strict=True)
+    ]
+    groups = {group for _, norms in parts for group in norms}
+    return {
+        group: np.concatenate([norms.get(group, np.full(count, np.nan)) for count, norms in parts])
+        for group in groups
+    }
+
+
+def _sections(validation: Validation, samples: Samples) -> list[Section]:
+    """Return the sections of the page."""
+    return [
+        Section(
+            "accuracy",
+            "Accuracy",
+            tables=[_accuracy_table(validation.accuracies)],
+            figures=partial(_histograms, samples),
+        ),
+        Section("residuals", "Residual errors", figures=partial(_residual_figures, samples)),
+        Section("scene", "Robot and measurements", figures=partial(_scene_figures, validation)),
+        samples_section(samples),
+        Section("notes", "Data that are not used", items=validation.notes),
+        Section("provenance", "Provenance", tables=_provenance_tables(validation)),
+    ]
+
+
+def _accuracy_table(accuracies: Mapping[str, Accuracy]) -> Table:
+    """Return one row per model and group of errors."""
+    rows = [
+        [
+            name,
+            GROUP_LABELS[group],
+            *(_quantity(getattr(each, key), each.unit, each.rms_std) for key in STATISTIC_LABELS),
+        ]
+        for name, accuracy in accuracies.items()
+        for group, each in accuracy.groups.items()
+    ]
+    return Table(["robot", "error", *STATISTIC_LABELS.values()], rows, n_text_columns=2)
+
+
+def _histograms(samples: Samples) -> list[FigureGroup]:
+    """Draw histograms of the errors, if there is a nominal robot to compare with."""
+    panels = []
+    for group, states in samples.errors.items():
+        if "before" in states:
+            is_shown = np.isfinite(states["after"])
+            panels += figures.histogram_panels(
+                group, {"measured": (states["before"][is_shown], states["after"][is_shown])}
+            )
+    legend = [
+        LegendEntry(text, state, "area") for state, text in (("before", "nominal"), ("after", "calibrated"))
+    ]
+    return [FigureGroup(panels, legend=legend, layout="wide")] if panels else []
+
+
+def _residual_figures(samples: Samples) -> list[FigureGroup]:
+    groups = [figures.joint_error_group(samples), figures.sample_group(samples)]
+    return [group for group in groups if group.panels]
+
+
+def _scene_figures(validation: Validation) -> list[FigureGroup]:
+    """Draw the robot with the measurements in 3-D."""
+    nominal = validation.reference[0] if validation.reference else validation.chain
+    page = scene.scene_html(
+        nominal,
+        validation.chain if validation.reference else None,
+        measurements=validation.data,
+        known=validation.known,
+        title=validation.name,
+        triangles=figures.MAX_SCENE_TRIANGLES,
+    )
+    title = "The robot and the measurements, in three dimensions"
+    return [FigureGroup((), scene=figures.linked_scene(page), scene_title=title)]
+
+
+def _provenance_tables(validation: Validation) -> list[Table]:
+    short = short_names(list(validation.inputs))
+    names = measurement_names(validation.paths, validation.data)
+    return [
+        Table(
+            ["data", "kind", "samples"],
+            [
+                [name, item.kind, str(len(item.rows))]
+                for name, item in zip(names, validation.data, strict=True)
+            ],
+            n_text_columns=2,
+        ),
+        Table(["file", "SHA-256"], [[short[p], d] for p, d in validation.inputs.items()], n_text_columns=2),
+        Table(["software", "version"], [list(pair) for pair in versions().items()], n_text_columns=2),
+    ]
+
+
+def _rms(accuracy: Accuracy, group: str) -> str:
+    statistics = accuracy.groups[group]
+    return _quantity(statistics.rms, statistics.unit, statistics.rms_std)
+
+
+def _quantity(value: float, unit: str, std: float) -> str:
+    return format_quantity(value, unit, std, small=True)
