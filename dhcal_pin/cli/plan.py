@@ -237,7 +237,7 @@ def run(args: Namespace) -> int:
         contents[args.html] = _preview(result, chain, space, args)
     if args.report:
         from ..io.robot import robot_name  # lazy import, as the following: only for reports
-        from ..report.plan_page import PlanReport, plan_page
+        from ..report.plan import PlanReport, plan_page
 
         contents[args.report] = plan_page(
             PlanReport(

@@ -8,7 +8,7 @@ from .document import result_to_dict as result_to_dict
 from .document import validation_to_dict as validation_to_dict
 from .html import report_files as report_files
 from .html import write_report as write_report
-from .plan_page import PlanReport as PlanReport
-from .plan_page import plan_page as plan_page
+from .plan import PlanReport as PlanReport
+from .plan import plan_page as plan_page
 from .validation import Validation as Validation
 from .validation import validation_page as validation_page
