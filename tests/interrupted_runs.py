@@ -102,6 +102,8 @@ class Interruption:
 
     def _in_child(self, function: Callable[[], int], kill_after: float = 0, number: int = 0) -> int:
         """Run a function in a child process, wait for all processes it started, and return its status."""
+        # A child that is killed at once says nothing.
+        Path("stderr").write_text("")
         child = os.fork()
         if not child:
             os.setsid()

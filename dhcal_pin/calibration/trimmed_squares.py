@@ -67,7 +67,6 @@ from ..estimation.robust import (
     REJECTION_THRESHOLD,
     ZERO_WEIGHT,
     is_chi_square,
-    standardize_mean_squares,
     standardize_ratios,
     standardized_residuals,
 )
@@ -299,12 +298,8 @@ def _looks_like_noise(problem: Problem, x: Array, groups: Array) -> bool:
         for rows in item.residual_groups.values():
             k = np.arange(len(residual))[rows].size
             mean_squares = np.mean(residual[rows] ** 2, 0)
-            t = (
-                standardize_ratios(mean_squares, k)
-                if item.has_stated_sigma
-                else standardize_mean_squares(mean_squares, k)
-            )
-            if t.max() > OUTLIER_THRESHOLD or not is_chi_square(mean_squares, k, not item.has_stated_sigma):
+            t = standardize_ratios(mean_squares, k)
+            if t.max() > OUTLIER_THRESHOLD or not is_chi_square(mean_squares, k):
                 return False
     return True
 

@@ -184,21 +184,19 @@ def standardize_ratios(ratios: Array, k: int) -> Array:
     return (np.cbrt(ratios) - (1 - 2 / (9 * k))) / np.sqrt(2 / (9 * k))
 
 
-def is_chi_square(mean_squares: Array, k: int, is_scaled: bool) -> bool:
+def is_chi_square(mean_squares: Array, k: int) -> bool:
     """Return whether mean squares of residuals follow the distribution χ²_k/k (Pearson's test).
 
     Args:
-        mean_squares: Mean square of the k residuals of each sample, shape (m,).
+        mean_squares: Mean square of the k whitened residuals of each sample, shape (m,).
         k: Number of residuals per sample.
-        is_scaled: Whether the distribution is scaled so that the means agree.
 
     Returns:
         Whether the counts in equally likely parts of the distribution are as expected.
     """
     from scipy.special import gammaincinv  # lazy import: slow
 
-    mean = mean_squares.mean() if is_scaled else 1.0
-    bounds = mean * gammaincinv(k / 2, np.arange(1, N_PARTS) / N_PARTS) * 2 / k
+    bounds = gammaincinv(k / 2, np.arange(1, N_PARTS) / N_PARTS) * 2 / k
     counts = np.bincount(np.searchsorted(bounds, mean_squares), minlength=N_PARTS)
     expected = len(mean_squares) / N_PARTS
     return bool(np.sum((counts - expected) ** 2) / expected <= MAX_PARTS_CHI_SQUARE)
