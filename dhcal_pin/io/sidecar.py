@@ -81,6 +81,7 @@ from ..robot.transmission import (
 )
 from ..robot.urdf import Urdf, parse_urdf, suggest_names
 from ..saving import complete_interrupted_save
+from .tabular import MAX_SIDECAR_BYTES
 from .toml_table import TomlTable, is_number, pose_content, read_pose
 
 # Heaviest payload [kg] and farthest centre [m]; beyond them the unit is wrong.
@@ -158,7 +159,7 @@ def with_sidecar(chain: Chain, path: PathLike) -> Chain:
     Raises:
         FileFormatError: The sidecar is invalid, or its payload is carried by another tip.
     """
-    table = TomlTable.read(path)
+    table = TomlTable.read(path, MAX_SIDECAR_BYTES)
     tip = table.text("tip", chain.tip)
     if tip not in chain.urdf.links:
         raise UnknownNameError(
@@ -199,7 +200,7 @@ def read_tool(path: PathLike) -> Array:
     Raises:
         FileFormatError: The file has neither.
     """
-    table = TomlTable.read(path)
+    table = TomlTable.read(path, MAX_SIDECAR_BYTES)
     if "tool" in table:
         return read_pose(table.table("tool"))
     if "xyz_m" not in table and "rotvec_rad" not in table:
@@ -336,7 +337,7 @@ def read_instrument(path: PathLike) -> dict[str, float]:
     Returns:
         Values of instrument parameters by name [m or rad]; empty without the table.
     """
-    table = TomlTable.read(path).table("instrument")
+    table = TomlTable.read(path, MAX_SIDECAR_BYTES).table("instrument")
     return {name: table.number(name) for name in table.keys()}
 
 
@@ -353,7 +354,7 @@ def read_uncertainty(path: PathLike, chain: Chain) -> Uncertainty | None:
     Raises:
         UnknownNameError: A term is unknown.
     """
-    document = TomlTable.read(path)
+    document = TomlTable.read(path, MAX_SIDECAR_BYTES)
     if "uncertainty" not in document:
         return None
     table = document.table("uncertainty")
@@ -394,7 +395,7 @@ def read_measured_region(path: PathLike, chain: Chain) -> MeasuredRegion | None:
     Raises:
         FileFormatError: The table is invalid or belongs to a robot with other joints.
     """
-    document = TomlTable.read(path)
+    document = TomlTable.read(path, MAX_SIDECAR_BYTES)
     if "measured" not in document:
         return None
     table = document.table("measured")

@@ -19,8 +19,9 @@ from ..messages import escape_control_characters, quote
 _RESERVED_CHARACTERS = frozenset(",;[]#\"'")
 # First characters of a cell that spreadsheets execute as a formula.
 _FORMULA_STARTS = ("=", "+", "-", "@")
-# Largest text file, and largest TOML file [byte]. The uncertainty of 64 joints takes half of the latter.
-MAX_TEXT_BYTES, MAX_TOML_BYTES = 64 << 20, 16 << 20
+# Largest text file, largest TOML file that a user writes, and largest sidecar [byte]. The uncertainty of 64
+# joints takes 8 MiB.
+MAX_TEXT_BYTES, MAX_TOML_BYTES, MAX_SIDECAR_BYTES = 64 << 20, 1 << 20, 12 << 20
 # Valid TOML that is refused: the pattern of each case, and what a message says.
 _REFUSED_TOML = {
     # `tomllib` takes quadratic time for dotted keys.
@@ -54,7 +55,7 @@ def read_text(path: PathLike, encoding: str = "utf-8", max_bytes: int = MAX_TEXT
         raise FileFormatError(f"{path}: cannot read it: {reason}; give the path of a file") from error
     if len(data) > max_bytes:
         raise FileFormatError(
-            f"{path}: the file is larger than {max_bytes / (1 << 20):g} MiB; check the path or split the file"
+            f"{path}: the file is larger than {max_bytes / (1 << 20):g} MiB; check the path or shorten the file"
         )
     try:
         return data.decode(encoding).removeprefix("\ufeff")
@@ -64,11 +65,12 @@ def read_text(path: PathLike, encoding: str = "utf-8", max_bytes: int = MAX_TEXT
         raise FileFormatError(f"{path}: {where} is not {name}; save the file as {name}") from error
 
 
-def read_toml(path: PathLike) -> dict[str, Any]:
+def read_toml(path: PathLike, max_bytes: int = MAX_TOML_BYTES) -> dict[str, Any]:
     """Read a TOML file.
 
     Args:
         path: Path of the file.
+        max_bytes: Largest size of the file [byte].
 
     Returns:
         Its top-level table.
@@ -76,7 +78,7 @@ def read_toml(path: PathLike) -> dict[str, Any]:
     Raises:
         FileFormatError: The file cannot be read, is too large or is not TOML.
     """
-    text = read_text(path, max_bytes=MAX_TOML_BYTES)
+    text = read_text(path, max_bytes=max_bytes)
     for pattern, problem in _REFUSED_TOML.items():
         if match := re.search(pattern, text):
             line = text.count("\n", 0, match.start()) + 1

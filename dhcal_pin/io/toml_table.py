@@ -24,7 +24,7 @@ from .. import se3
 from .._typing import Array, PathLike
 from ..exceptions import FileFormatError
 from ..messages import quote
-from .tabular import read_toml
+from .tabular import MAX_TOML_BYTES, read_toml
 
 T = TypeVar("T", str, int, bool)
 
@@ -64,16 +64,17 @@ class TomlTable:
         self._known_keys: dict[str, None] = {}
 
     @classmethod
-    def read(cls, path: PathLike) -> TomlTable:
+    def read(cls, path: PathLike, max_bytes: int = MAX_TOML_BYTES) -> TomlTable:
         """Read the top level of a TOML file.
 
         Args:
             path: Path of the file.
+            max_bytes: Largest size of the file [byte].
 
         Returns:
             The table of all top-level keys.
         """
-        return cls(path, read_toml(path))
+        return cls(path, read_toml(path, max_bytes))
 
     @property
     def where(self) -> str:

@@ -167,6 +167,14 @@ def test_deep_toml(assert_refused, text):
     assert time.perf_counter() - start < 5
 
 
+@pytest.mark.parametrize("option", ["--priors", "--bounds", "--columns", "--instrument"])
+def test_large_toml(assert_refused, option):
+    """A file of 16 MiB took 15 s and 1.2 GB."""
+    limit = 12 if option == "--instrument" else 1
+    Path("large.toml").write_text("a = 1\n" * ((limit << 20) // 6 + 1))
+    assert_refused([f"large.toml: the file is larger than {limit} MiB"], *CALIBRATE, option, "large.toml")
+
+
 def test_zero_bytes_in_the_paths_of_a_manifest(assert_refused):
     Path("a.fleet.toml").write_text('[[job]]\nrobot = "a\\u0000.urdf"\ndata = "d.csv"\noutput = "o.urdf"\n')
     assert_refused(["a.fleet.toml: line 2: a zero character"], "calibrate", "a.fleet.toml", "-o", "s.csv")
