@@ -55,7 +55,7 @@ def read_text(path: PathLike, encoding: str = "utf-8", max_bytes: int = MAX_TEXT
         raise FileFormatError(f"{path}: cannot read it: {reason}; give the path of a file") from error
     if len(data) > max_bytes:
         raise FileFormatError(
-            f"{path}: the file is larger than {max_bytes / (1 << 20):g} MiB; check the path or shorten the file"
+            f"{path}: the file is larger than {max_bytes >> 20} MiB; check the path or shorten the file"
         )
     try:
         return data.decode(encoding).removeprefix("\ufeff")
