@@ -13,7 +13,15 @@ class FileFormatError(DhcalError):
 
 
 class UnknownNameError(DhcalError):
-    """A parameter, parameter set, measurement kind, joint, link, column or option is unknown."""
+    """A parameter, parameter set, measurement kind, joint, link, column or option is unknown.
+
+    Attributes:
+        argument: Argument of `calibrate` that the name is from; empty if it is not one that files contain.
+    """
+
+    def __init__(self, message: str, argument: str = ""):
+        super().__init__(message)
+        self.argument = argument
 
 
 class InvalidArgumentError(DhcalError):

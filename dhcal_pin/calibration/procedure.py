@@ -203,7 +203,7 @@ def _validated_known(data: tuple[Measurement, ...], known: Mapping[str, float]) 
     for name, value in known.items():
         if name not in names:
             choice = f"choose from {', '.join(names)}" if names else "these measurements have none"
-            raise UnknownNameError(f"known {name!r}: unknown instrument parameter; {choice}")
+            raise UnknownNameError(f"known {name!r}: unknown instrument parameter; {choice}", "known")
         if not np.isfinite(value):
             raise InvalidArgumentError(f"known {name!r}: {value} is not a finite number; expected m or rad")
     return known
@@ -218,7 +218,9 @@ def _bounds(problem: Problem, bounds: Mapping[str, tuple[float, float]]) -> Arra
         bounded = [p for p in robot if fnmatch.fnmatchcase(p.name, pattern)]
         if not bounded:
             choices = ", ".join(fold_harmonics(p.name for p in robot))
-            raise UnknownNameError(f"bounds for {pattern!r}: no such parameter; choose from {choices}")
+            raise UnknownNameError(
+                f"bounds for {pattern!r}: no such parameter; choose from {choices}", "bounds"
+            )
         for p in bounded:
             if not low <= p.nominal <= high:
                 raise InvalidArgumentError(

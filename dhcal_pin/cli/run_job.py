@@ -31,7 +31,7 @@ from ..diagnostics.input_checks import find_value_warnings, poorly_fitted_files
 from ..diagnostics.reachability import UnreachableRow, find_unreachable_rows
 from ..estimation.parameters import select_parameters
 from ..estimation.robust import ZERO_WEIGHT
-from ..exceptions import InvalidArgumentError
+from ..exceptions import FileFormatError, InvalidArgumentError, UnknownNameError
 from ..io.measurement_files import MeasurementFile, read_measurement_file
 from ..io.rig_file import read_rig
 from ..io.robot import read_robot, robot_name, urdf_files
@@ -141,16 +141,21 @@ def run_job(
     }
     measurements = list(data.fit.values())
     extend = None if job.extend == "auto" else job.extend
-    fit = procedure.calibrate(
-        chain,
-        measurements,
-        sets,
-        method=job.method,
-        extend=extend,
-        progress=progress,
-        **restrictions,
-        **options,
-    )
+    try:
+        fit = procedure.calibrate(
+            chain,
+            measurements,
+            sets,
+            method=job.method,
+            extend=extend,
+            progress=progress,
+            **restrictions,
+            **options,
+        )
+    except UnknownNameError as error:
+        sources = {"bounds": job.bounds, "priors": job.priors, "known": job.instrument}
+        path = sources.get(error.argument)
+        raise FileFormatError(f"{path}: {error}") if path else error from None
     if job.holdout == REGION:
         without_holdout = restrictions | options | {"holdout": (), "extend": extend}
         fit = leave_regions_out(

@@ -73,7 +73,9 @@ def prior_weights(errors: ErrorModel, priors: Priors) -> Array:
         matches = [i for i, name in enumerate(names) if fnmatch.fnmatchcase(name, pattern)]
         if not matches:
             choices = ", ".join(fold_harmonics(names))
-            raise UnknownNameError(f"prior for {pattern!r}: no such parameter; choose from {choices}")
+            raise UnknownNameError(
+                f"prior for {pattern!r}: no such parameter; choose from {choices}", "priors"
+            )
         if not MIN_PRIOR_STD <= value <= MAX_PRIOR_STD:
             raise InvalidArgumentError(
                 f"prior for {pattern!r}: {value} must be positive, from {MIN_PRIOR_STD:g} to "

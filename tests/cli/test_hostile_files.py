@@ -175,6 +175,19 @@ def test_large_toml(assert_refused, option):
     assert_refused([f"large.toml: the file is larger than {limit} MiB"], *CALIBRATE, option, "large.toml")
 
 
+@pytest.mark.parametrize(
+    ("option", "text", "words"),
+    [
+        ("--priors", "zz = 0.1", "names.toml: prior for 'zz': no such parameter; choose from theta1"),
+        ("--bounds", "zz = [0, 1]", "names.toml: bounds for 'zz': no such parameter; choose from theta1"),
+        ("--instrument", "[instrument]\nzz = 1", "names.toml: known 'zz': unknown instrument parameter"),
+    ],
+)
+def test_unknown_names_are_named_with_their_file(assert_refused, option, text, words):
+    Path("names.toml").write_text(text)
+    assert_refused([words], *CALIBRATE, option, "names.toml")
+
+
 def test_zero_bytes_in_the_paths_of_a_manifest(assert_refused):
     Path("a.fleet.toml").write_text('[[job]]\nrobot = "a\\u0000.urdf"\ndata = "d.csv"\noutput = "o.urdf"\n')
     assert_refused(["a.fleet.toml: line 2: a zero character"], "calibrate", "a.fleet.toml", "-o", "s.csv")
