@@ -392,8 +392,9 @@ def workspace_maps(workspace: WorkspacePrediction, points: Array, errors: Array)
         return []
     panels = []
     median, p95 = (_shown(float(np.quantile(finite, q)), "m") for q in (0.5, 0.95))
-    # A few large errors, outliers perhaps, do not set the scale.
-    levels = plots.std_levels(np.concatenate([workspace.std, _without_largest(errors)]))
+    # Both sorts of maps fit into the scale, except for a few large errors, which may be outliers.
+    both = plots.std_levels(workspace.std), plots.std_levels(_without_largest(errors))
+    levels = max(both, key=lambda edges: edges[-1])
     region = np.concatenate([workspace.points, points])
     for plane, view in (("xy", "from above"), ("xz", "from the side")):
         plot = partial(plots.plot_position_std_map, plane=plane, levels=levels, region=region)
