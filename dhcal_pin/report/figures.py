@@ -35,7 +35,7 @@ MAX_SCALE_RATIO = 4.0
 # Displacement that the magnified errors should cause, relative to the size of the robot.
 DRAWN_DISPLACEMENT = 0.05
 # Largest number of triangles of the meshes of a scene in a report; they show the form of each link.
-MAX_SCENE_TRIANGLES = 20_000
+MAX_SCENE_TRIANGLES = 15_000
 # Script of a scene that is part of a report.
 SCENE_LINK = Path(__file__).with_name("page") / "scene_link.js"
 

@@ -28,7 +28,7 @@ from .document import parameter_rows
 # Largest number of samples that a page contains beside the outliers; more would make it large and slow.
 MAX_SAMPLES = 5000
 # Decimals of numbers in the page: positions, angles and errors in SI units.
-_POSE_DECIMALS, _ERROR_DECIMALS, _MAP_DECIMALS = 13, 10, 5
+_POSE_DECIMALS, _ERROR_DECIMALS, _MAP_DECIMALS = 12, 9, 5
 # Roles of samples, in the order of their legend.
 ROLES = ("fitted", "hold-out", "measured", "planned")
 

@@ -35,7 +35,9 @@ def check_in_browser(browser: Any, path: Path, headings: list[str], tool: np.nda
     page.on("request", lambda request: requests.append(request.url))
     page.goto(path.as_uri())
     assert page.locator("main h2").all_inner_texts() == headings
-    page.locator("#samples tbody button").first.click()
+    line = page_data(path)["line"][0]
+    page.locator("#samples input[type=search]").fill(f":{line}")
+    page.get_by_role("button", name=f"Select line {line}", exact=True).click()
     shown = page.locator(".tool-position data").evaluate_all("all => all.map(d => d.value)")
     page.close()
     assert np.abs(np.array(shown, float) - tool).max() < 1e-9

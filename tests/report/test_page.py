@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from robots import missing
+from robots import missing, robot_file
 
 from dhcal_pin import se3
 from dhcal_pin.calibration import Result, calibrate, split
 from dhcal_pin.io import csv_text
 from dhcal_pin.measurements import Noise, Pose
 from dhcal_pin.report import Provenance, result_to_dict, write_report
+from dhcal_pin.robot import Chain
 
 AXE = Path(sys.prefix) / "node_modules" / "axe-core" / "axe.min.js"
 NAME = "a & <b>.csv"
@@ -187,12 +188,18 @@ def test_dragging_selects_samples_in_all_plots_and_in_the_list(page, fit):
 def test_tables_are_sorted_and_filtered(page, fit):
     section = page.locator("#samples")
     heading = section.locator("thead button", has_text="position error after")
-    heading.click()
-    heading.click()
-    assert heading.locator("xpath=..").get_attribute("aria-sort") == "descending"
-    order = np.argsort(-fit.error_norms["position"][1])
-    lines = section.locator("tbody th").all_inner_texts()
-    assert lines == [str(line) for line in fit.residuals.line[order][: len(lines)]]
+    order = np.argsort(fit.error_norms["position"][1])
+    # Largest errors first; then the order of the file; then smallest errors first.
+    for state, expected in (
+        ("descending", fit.residuals.line[order[::-1]]),
+        (None, np.sort(fit.residuals.line)),
+        ("ascending", fit.residuals.line[order]),
+    ):
+        assert heading.locator("xpath=..").get_attribute("aria-sort") == state
+        lines = section.locator("tbody th").all_inner_texts()
+        assert len(lines) == 25
+        assert lines == [str(line) for line in expected[: len(lines)]]
+        heading.click()
     section.locator("input[type=search]").fill("hold-out")
     assert section.locator("output").inner_text() == "1–12 of 12 samples"
 
@@ -329,3 +336,18 @@ def test_every_section_is_printed(open_page):
         title for title in titles if title.decode() in headings
     ]
     page.close()
+
+
+def test_the_report_of_1500_samples_takes_at_most_3_megabytes(tmp_path):
+    # The links of this robot have detailed meshes.
+    robot = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    rng = np.random.default_rng(0)
+    data = Pose.simulate(robot, rng.uniform(-3, 3, (1500, 6)), Noise(1e-4, 1e-4), rng)
+    fitted, held_out = split([data], 0.3, 0)
+    path = tmp_path / "report.html"
+    write_report(calibrate(robot, fitted, "minimal,base,tool", holdout=held_out, extend="none"), path)
+    page = path.read_text("utf-8")
+    assert (
+        len(json.loads(re.findall(r'id="samples-data"[^>]*>(.*?)</script>', page, re.S)[0])["line"]) == 1500
+    )
+    assert 1e6 < path.stat().st_size <= 3e6

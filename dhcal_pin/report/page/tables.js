@@ -116,7 +116,14 @@ class SampleTable {
     box.before(tools);
     box.replaceChildren(this.table);
     box.ariaLabel = "List of samples";
-    section.querySelector("p").textContent = "Click a row, or a dot of a plot, to move the robot of the scene there.";
+    // The largest errors come first, in print as well.
+    const first = this.columns.findIndex(([title]) => /(after|error|residual), m/.test(title));
+    if (first >= 0) {
+      this.sorting = [first, -1];
+      header.cells[first].setAttribute("aria-sort", "descending");
+    }
+    section.querySelector("p").replaceChildren(first >= 0 ? "Largest errors first. " : "",
+      element("span", { className: "script" }, "Click a row, or a dot of a plot, to move the robot of the scene there."));
     this.body.addEventListener("click", event => {
       const row = event.target.closest("tr");
       if (row) selection.update({ current: Number(row.dataset.sample) });
