@@ -6,7 +6,9 @@ figures of the section in their order on the page.
 
 from __future__ import annotations
 
+import base64
 import math
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -35,7 +37,7 @@ MAX_SCALE_RATIO = 4.0
 # Displacement that the magnified errors should cause, relative to the size of the robot.
 DRAWN_DISPLACEMENT = 0.05
 # Largest number of triangles of the meshes of a scene in a report; they show the form of each link.
-MAX_SCENE_TRIANGLES = 15_000
+MAX_SCENE_TRIANGLES = 30_000
 # Script of a scene that is part of a report.
 SCENE_LINK = Path(__file__).with_name("page") / "scene_link.js"
 
@@ -103,7 +105,8 @@ class FigureGroup:
         title: Heading of the group; may be empty.
         legend: Meaning of the colours.
         layout: Columns of panels on a wide page: "narrow" (three) or "wide" (two).
-        scene: HTML page of a 3-D scene, shown on screens; the panels then appear in print only.
+        scene: Page of a 3-D scene as `packed_scene` returns it, shown on screens; the panels then appear in
+            print only.
         scene_title: What the scene shows, for screen readers.
     """
 
@@ -462,20 +465,21 @@ def scene_figures(context: ReportContext) -> list[FigureGroup]:
         magnification=magnification,
         triangles=MAX_SCENE_TRIANGLES,
     )
-    return [FigureGroup(panels, legend=legend, layout="wide", scene=linked_scene(page))]
+    return [FigureGroup(panels, legend=legend, layout="wide", scene=packed_scene(page))]
 
 
-def linked_scene(page: str) -> str:
-    """Add the script to the page of a scene that moves its arm to the samples that a report selects.
+def packed_scene(page: str) -> str:
+    """Compress the page of a scene, with the script that moves its arm to the samples that a report selects.
 
     Args:
         page: Page of a scene.
 
     Returns:
-        The page for a report.
+        The page in zlib format as Base64, which the scripts of the report unpack when it is needed.
     """
     script = SCENE_LINK.read_text("utf-8")
-    return f"<script>\n{script}</script>\n</body>".join(page.rsplit("</body>", 1))
+    linked = f"<script>\n{script}</script>\n</body>".join(page.rsplit("</body>", 1))
+    return base64.b64encode(zlib.compress(linked.encode(errors="backslashreplace"), 9)).decode()
 
 
 def scene_magnification(context: ReportContext) -> float:

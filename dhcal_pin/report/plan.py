@@ -177,6 +177,6 @@ def _pose_figures(report: PlanReport, samples: Samples) -> list[FigureGroup]:
         panels.append(Panel(f"poses-{plane}", f"Tool, {view}", text, plot, plots.SQUARE_PANEL, points))
     title = "The robot and the poses to measure, in three dimensions"
     return [
-        FigureGroup((), scene=figures.linked_scene(report.scene), scene_title=title),
+        FigureGroup((), scene=figures.packed_scene(report.scene), scene_title=title),
         FigureGroup(panels, "Tool positions", layout="wide"),
     ]

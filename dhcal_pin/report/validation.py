@@ -190,7 +190,7 @@ def _scene_figures(validation: Validation) -> list[FigureGroup]:
         triangles=figures.MAX_SCENE_TRIANGLES,
     )
     title = "The robot and the measurements, in three dimensions"
-    return [FigureGroup((), scene=figures.linked_scene(page), scene_title=title)]
+    return [FigureGroup((), scene=figures.packed_scene(page), scene_title=title)]
 
 
 def _provenance_tables(validation: Validation) -> list[Table]:

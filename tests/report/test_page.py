@@ -298,6 +298,9 @@ def test_everything_is_there_without_scripts(open_page, path):
     assert page.locator("#samples tbody tr").count() == 20
     assert page.locator(f"{POSITION_PLOT} .samples").count() > 1
     assert not page.locator(".script").count()
+    # Drawings replace the scene.
+    assert page.locator("#arm-xz-t").count() == 1
+    assert page.locator(".paper svg").first.is_visible()
     page.close()
 
 
@@ -307,7 +310,7 @@ def test_the_page_is_accessible_and_fits(browser, path, scheme, width):
     if not AXE.exists():
         missing("axe-core")
     without_scene = path.with_name("without_scene.html")
-    without_scene.write_text(re.sub('srcdoc="[^"]*"', 'srcdoc=""', path.read_text("utf-8")), "utf-8")
+    without_scene.write_text(re.sub('data-scene="[^"]*"', 'data-scene=""', path.read_text("utf-8")), "utf-8")
     page = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme, bypass_csp=True)
     page.goto(without_scene.as_uri())
     page.locator("#samples tbody button").first.click()

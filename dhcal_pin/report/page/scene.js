@@ -6,6 +6,8 @@ class SceneLink {
     this.frame = box.querySelector("iframe");
     this.isReady = false;
     this.wanted = null;
+    this.packed = this.frame.dataset.scene;
+    this.frame.removeAttribute("data-scene");
     addEventListener("message", ({ source, data }) => {
       if (source !== this.frame.contentWindow || !data?.dhcal) return;
       this.isReady = true;
@@ -17,6 +19,7 @@ class SceneLink {
       this.dock(i !== null && selection.samples.hasPose(i));
       if (i !== null && selection.samples.hasPose(i)) this.move(selection.samples.configuration(i));
     });
+    new IntersectionObserver(([entry]) => { if (entry.isIntersecting) this.load(); }, { rootMargin: "300px" }).observe(box);
     // In its own place the scene is larger; it goes back there when that place is in view.
     new IntersectionObserver(([entry]) => {
       this.isInView = entry.isIntersecting;
@@ -29,8 +32,15 @@ class SceneLink {
   }
   move(q) {
     this.wanted = q;
-    this.frame.loading = "eager";
+    this.load();
     if (this.isReady) this.send();
+  }
+  /** Unpacks the page of the scene when it is needed. */
+  async load() {
+    if (!this.packed) return;
+    const bytes = Uint8Array.from(atob(this.packed), character => character.charCodeAt(0));
+    this.packed = null;
+    this.frame.srcdoc = await new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"))).text();
   }
   send() {
     this.frame.contentWindow.postMessage({ q: this.wanted }, "*");
