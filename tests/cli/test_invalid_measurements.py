@@ -71,7 +71,7 @@ DATA = {
         "\n".join([*LINES[:3], "1,2,3,4,5,6,7"]),
         ["data.csv:4:", "7 values", "6 columns", "point"],
     ),
-    "stray quote": ("\n".join([*LINES[:3], '"1,2,3,4,5,6']), ["data.csv:4:", "1 values", "6 columns"]),
+    "stray quote": ("\n".join([*LINES[:3], '"1,2,3,4,5,6']), ["data.csv:4:", "1 value for", "6 columns"]),
     **{
         f"cell {cell!r}": ("\n".join([*LINES[:3], f"# note\n1,2,3,4,{cell},6"]), ["data.csv:5:", "'y'", word])
         for cell, word in [

@@ -254,6 +254,6 @@ def find_kind(table: DataTable) -> type[Measurement]:
         raise FileFormatError(
             f"{table.header_location}: column {unrelated[0]!r} does not go with "
             f"{', '.join(sorted(present & set(kind.columns)))}; "
-            f"a {kind.kind} file has {', '.join(kind.columns)}"
+            f"a file of kind {kind.kind} has {', '.join(kind.columns)}"
         )
     return kind
