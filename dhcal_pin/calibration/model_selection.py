@@ -31,8 +31,16 @@ questions are asked.
 
    with the distance d_ij of two configurations and l = 0.5 rad. Configurations in a small part of joint space
    thus count as fewer independent ones than as many that are far apart, and no number of them counts as more
-   than 67. Predicted standard deviations of the tool are scaled such that they agree with the errors of the
-   left-out regions.
+   than 67. Predicted variances of the tool are the sum of two parts. The residuals are errors of the model,
+   which other configurations have as well: their variance is one part. The other is that of the uncertain
+   parameters, scaled by c such that both contain the errors e_f of three of four left-out regions f of joint
+   space,
+
+       e_f² <= 1 + c²·v_f,
+
+   with the variance v_f of their prediction by the parameters, in units of the residual variance. The
+   accuracy varies more between regions than the parameters predict; the mean would be too small for a region
+   that was not measured.
 
 Without a supported family, and with T = 1, the fit is exactly that of the geometry.
 
@@ -108,6 +116,8 @@ MIN_PRIOR_WIDTH = 1e-3
 SCREENED_ROWS_PER_UNKNOWN = 2
 # Highest line of white residuals, as a square in standard deviations, and largest excess of the sum of all.
 MAX_WHITE_LINE, SCREENING_SIGMAS = 20.0, 3.0
+# Share of the left-out regions whose errors predicted standard deviations contain.
+REGION_QUANTILE = 0.75
 # Limits of the scale of predicted standard deviations.
 MIN_PREDICTION_SCALE, MAX_PREDICTION_SCALE = 0.3, 3.0
 # Largest ratio of the errors with and without a family for which a hint is given.
@@ -518,6 +528,15 @@ class _RegionErrors:
     noise: float
 
     @property
+    def prediction_scale(self) -> float:
+        """Factor to standard deviations by the uncertainty of the fit that most held-out errors agree with.
+
+        Each held-out row also has the variance 1 of the residuals.
+        """
+        excess = np.quantile((self.squares - 1) / self.variances, REGION_QUANTILE)
+        return float(np.sqrt(max(excess, 0.0)))
+
+    @property
     def rms(self) -> float:
         """RMS of all held-out whitened rows."""
         return self.noise * float(np.sqrt(np.sum(self.n_rows * self.squares) / np.sum(self.n_rows)))
@@ -605,8 +624,7 @@ def extend(
         geometry = _Regions(fit.problem, fit.solution.x, _noise(fit))
         region_ratio = errors.rms / geometry.errors(1.0).rms
         if temperature > 1:
-            ratio = float(np.sqrt(np.median(errors.squares / errors.variances)))
-            scale = float(np.clip(ratio, MIN_PREDICTION_SCALE, MAX_PREDICTION_SCALE))
+            scale = float(np.clip(errors.prediction_scale, MIN_PREDICTION_SCALE, MAX_PREDICTION_SCALE))
     extension = Extension(trials, temperature, n_configurations, scale, random_ratio, region_ratio)
     problem = extended.problem
     n_groups = sum(len(item.residual_groups) for item in problem.data)
@@ -617,10 +635,11 @@ def extend(
     solution = minimize(problem, "lm", start.x, max_iterations, warm_start=start, loose=True)
     extended = replace(extended, problem=problem, solution=solution)
     # Outliers were found already: the last robust stage decides which of them are rejected.
-    if fit.stage == robust.KEPT:
+    stage = _rejection_stage(extended) if fit.stage == robust.REJECTED else fit.stage
+    if stage == robust.KEPT:
         extended = replace(extended, weights=fit.weights)
     groups = PriorGroups.none()
-    return reweight(extended, (fit.stage,), groups, max_iterations, progress, effective_parameters), extension
+    return reweight(extended, (stage,), groups, max_iterations, progress, effective_parameters), extension
 
 
 def _ignore(phase: str, step: int, total: int) -> None:
@@ -674,6 +693,23 @@ def _outlier_weights(problem: Problem, x: Array, previous: Sequence[Array]) -> t
         is_outlier = robust.standardized_residuals(residual, None, w > 0.5) > robust.OUTLIER_THRESHOLD
         weights.append(np.where(is_outlier, robust.ZERO_WEIGHT, 1.0))
     return tuple(weights)
+
+
+def _rejection_stage(fit: Fit) -> str:
+    """Return the robust stage for outliers that were set apart from the other samples before an extension.
+
+    Residuals that only the geometry leaves may look like outliers. They then have all sizes with the
+    families, too.
+    """
+    problem = fit.problem
+    chain = problem.errors.at(fit.solution.x[: len(problem.errors.parameters)])
+    t = [np.empty(0)]
+    for item, w in zip(problem.data, fit.weights, strict=True):
+        item = item.with_weights(1 / w)
+        values = problem.instrument_values_of(item, fit.solution.x)
+        residual = item.residual(chain.forward_kinematics(item.configurations()), values)
+        t.append(robust.standardized_residuals(residual, None, w > 0.5))
+    return robust.rejection_stage(np.concatenate(t))
 
 
 def _noise(fit: Fit) -> float:

@@ -56,6 +56,7 @@ from .cross_validation import (
 )
 from .estimates import Estimate, make_estimates
 from .evaluation import (
+    GROUP_UNITS,
     Accuracy,
     Comparison,
     PairedErrors,
@@ -378,13 +379,29 @@ class Result(ResultPlots):
             scale * root[:robot],
             unbounded[:robot],
             self.problem.temperature,
+            self._model_std if self.problem.temperature > 1 else (0.0, 0.0),
         )
+
+    @property
+    def _model_std(self) -> tuple[float, float]:
+        """Standard deviation of the residuals of the inliers per axis, of lengths [m] and of angles [rad]."""
+        squares: dict[str, list[Array]] = {"m": [], "rad": []}
+        for errors in compute_errors(self.chain, self.inliers, self.instruments):
+            for name, values in errors.items():
+                squares.get(GROUP_UNITS[error_group(name)], []).append(np.ravel(values) ** 2)
+        n_rows = sum(count for _, _, count in self._row_counts)
+        per_freedom = n_rows / self.degrees_of_freedom if self.degrees_of_freedom else 1.0
+        length, angle = (
+            float(np.sqrt(per_freedom * np.mean(np.concatenate(parts)))) if parts else 0.0
+            for parts in squares.values()
+        )
+        return length, angle
 
     def predict(self, q: Array) -> Prediction:
         """Predict tool poses and their covariance.
 
-        The covariance of the identified errors is propagated to the tool to first order. Noise of a future
-        measurement is not included.
+        The covariance of the identified errors is propagated to the tool to first order. Where residuals are
+        correlated, errors that the model lacks are added. Noise of a future measurement is not included.
 
         Args:
             q: Joint positions, (m, n) [rad or m].

@@ -62,11 +62,14 @@ from .._typing import Array
 from ..estimation.problem import CHUNK_SIZE, Problem, chunk_residual, linearize_and_factor
 from ..estimation.qr import posterior_sqrt_covariance, rank
 from ..estimation.robust import (
+    FAR_REJECTED,
     FAR_THRESHOLD,
     OUTLIER_THRESHOLD,
+    REJECTED,
     REJECTION_THRESHOLD,
     ZERO_WEIGHT,
     is_chi_square,
+    rejection_stage,
     standardize_ratios,
     standardized_residuals,
 )
@@ -86,8 +89,6 @@ MAX_STARTS, MIN_STARTS, MAX_MULTIPLICATIONS = 600, 60, 3e7
 N_FIRST_STEPS, MAX_LAST_STEPS = 2, 20
 # Number of fits that are iterated until their samples do not change.
 N_BEST = 8
-# Outliers are set apart if at most this many samples per outlier lie between the thresholds, plus one.
-MAX_BETWEEN = 0.2
 # Standardized residual above which a sample does not extend the good ones: one good sample in a thousand.
 STRICT_THRESHOLD = 3.0
 # Largest number of extensions of the good samples.
@@ -247,14 +248,14 @@ def find_good_samples(
     """
     counts = [len(item.rows) for item in data]
     if _looks_like_noise(problem.with_data(data), solution.x, groups):
-        return GoodSamples([np.ones(count) for count in counts], "reject_far")
+        return GoodSamples([np.ones(count) for count in counts], FAR_REJECTED)
     drawn = _draw_samples(sum(counts))
     starts = np.cumsum([0, *counts])
     taken = [drawn[(drawn >= a) & (drawn < b)] - a for a, b in pairwise(starts)]
     part = problem.with_data([item.take(index) for item, index in zip(data, taken, strict=True)])
     system = linearize_and_factor(part, solution.x, small_angle=False)
     root, n_determined = posterior_sqrt_covariance(system, problem.weights)[0], rank(system.r)
-    all_good = GoodSamples([np.ones(count) for count in counts], "reject_far")
+    all_good = GoodSamples([np.ones(count) for count in counts], FAR_REJECTED)
     n_rows = sum(item.residual_dim * len(item.rows) for item in part.data)
     if not (0 < 2 * n_determined <= n_rows and root.shape[1] <= MAX_COORDINATES):
         return all_good
@@ -265,10 +266,8 @@ def find_good_samples(
     core = _best_core(rows, _search(rows, groups[drawn], n_determined), redundancy)
     if core is None:
         return all_good
-    n_far = np.sum(core.t > OUTLIER_THRESHOLD)
-    n_between = np.sum((core.t > REJECTION_THRESHOLD) & (core.t <= OUTLIER_THRESHOLD))
-    is_apart = n_between <= MAX_BETWEEN * n_far + 1
-    stage, threshold = ("reject", REJECTION_THRESHOLD) if is_apart else ("reject_far", FAR_THRESHOLD)
+    stage = rejection_stage(core.t)
+    threshold = REJECTION_THRESHOLD if stage == REJECTED else FAR_THRESHOLD
     if len(drawn) < len(groups):
         x = solution.x + root @ core.y
         return GoodSamples(_judge(problem.with_data(data), x, rows, core.scales, threshold), stage)

@@ -58,6 +58,11 @@ FAR_THRESHOLD = 12.0
 # Number of equally likely parts of the distribution of squares, and largest χ² of the counts in them. It is
 # exceeded by two in a hundred sets of good samples.
 N_PARTS, MAX_PARTS_CHI_SQUARE = 10, 20.0
+# Stages that reject outliers that are set apart from all other samples, and only those that are very far off.
+REJECTED, FAR_REJECTED = "reject", "reject_far"
+# Outliers are set apart if at most this many samples per outlier lie between the thresholds, plus one.
+MAX_BETWEEN = 0.2
+
 # Smallest variance of a whitened residual, relative to its noise; below it the fit reproduces the sample.
 MIN_VARIANCE = 1e-3
 # Stages without a weight function: search for good samples, which chooses the last stage
@@ -94,8 +99,8 @@ def _tukey(t: Array) -> Array:
 # Weight function of each stage, and the standardized residual above which its weight is zero. Without that
 # limit every outlier keeps a constant influence: with 10 % outliers the error is about 25 % larger.
 WEIGHT_FUNCTIONS: dict[str, tuple[Callable[[Array], Array], float]] = {
-    "reject": (_uniform, REJECTION_THRESHOLD),
-    "reject_far": (_uniform, FAR_THRESHOLD),
+    REJECTED: (_uniform, REJECTION_THRESHOLD),
+    FAR_REJECTED: (_uniform, FAR_THRESHOLD),
     "huber": (_huber, OUTLIER_THRESHOLD),
     "cauchy": (_cauchy, OUTLIER_THRESHOLD),
     "tukey": (_tukey, OUTLIER_THRESHOLD),
@@ -200,6 +205,20 @@ def is_chi_square(mean_squares: Array, k: int) -> bool:
     counts = np.bincount(np.searchsorted(bounds, mean_squares), minlength=N_PARTS)
     expected = len(mean_squares) / N_PARTS
     return bool(np.sum((counts - expected) ** 2) / expected <= MAX_PARTS_CHI_SQUARE)
+
+
+def rejection_stage(t: Array) -> str:
+    """Choose the stage that rejects outliers, by whether they are set apart from all other samples.
+
+    Args:
+        t: Standardized residuals of shape (m,).
+
+    Returns:
+        `REJECTED` if they are, `FAR_REJECTED` if residuals of all sizes occur.
+    """
+    n_far = np.sum(t > OUTLIER_THRESHOLD)
+    n_between = np.sum((t > REJECTION_THRESHOLD) & (t <= OUTLIER_THRESHOLD))
+    return REJECTED if n_between <= MAX_BETWEEN * n_far + 1 else FAR_REJECTED
 
 
 def sample_weights(t: Array, stage: str) -> Array:

@@ -11,6 +11,11 @@ twist [v, ω] is, to first order,
 
     C(q) = (J·A·S)·(J·A·S)ᵀ
 
+Where the residuals are errors of the model, which other configurations have as well, their variance per axis
+is added, σ_v² for positions and σ_ω² for orientations:
+
+    C(q) = (J·A·S)·(J·A·S)ᵀ + diag(σ_v², σ_v², σ_v², σ_ω², σ_ω², σ_ω²)
+
 Noise of future measurements is not included. Directions that neither data nor priors determine are stored
 separately; a tool component that depends on them has infinite variance.
 
@@ -94,6 +99,8 @@ class Uncertainty:
         sqrt_covariance: Square root of the covariance, shape (6(k+1)+e, r).
         unbounded_directions: Directions that neither data nor priors determine, shape (6(k+1)+e, h).
         temperature: Factor on the variance of correlated residuals that the covariance contains.
+        model_std: Standard deviation of the errors that the model lacks, per axis, of the position [m] and of
+            the orientation [rad] of the tool.
     """
 
     chain: Chain
@@ -101,6 +108,7 @@ class Uncertainty:
     sqrt_covariance: Array
     unbounded_directions: Array
     temperature: float = 1.0
+    model_std: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
     def from_errors(
@@ -111,6 +119,7 @@ class Uncertainty:
         sqrt_covariance: Array,
         unbounded_directions: Array,
         temperature: float = 1.0,
+        model_std: tuple[float, float] = (0.0, 0.0),
     ) -> Uncertainty:
         """Transform the covariance of identified parameters.
 
@@ -121,6 +130,7 @@ class Uncertainty:
             sqrt_covariance: Square root of the parameters' covariance, shape (p, r).
             unbounded_directions: Undetermined directions of the parameters, shape (p, h).
             temperature: Factor on the variance of correlated residuals that the covariance contains.
+            model_std: Standard deviations of errors that the model lacks [m, rad].
 
         Returns:
             Uncertainty of the calibrated chain.
@@ -136,7 +146,9 @@ class Uncertainty:
             "pij,pj->pi", link_from_body[bodies[:n_geometric]], twists[:n_geometric]
         )
         rows = np.concatenate([body_twists.reshape(6 * n_bodies, -1), np.eye(len(bodies))[n_geometric:]])
-        return cls(chain, entries, rows @ sqrt_covariance, rows @ unbounded_directions, temperature)
+        return cls(
+            chain, entries, rows @ sqrt_covariance, rows @ unbounded_directions, temperature, model_std
+        )
 
     def of_parameters(self, errors: ErrorModel, scale: Array) -> tuple[Array, Array]:
         """Compute the covariance of further parameters of the calibrated chain.
@@ -182,7 +194,7 @@ class Uncertainty:
             q: Joint positions of shape (m, n) [rad or m].
 
         Returns:
-            Calibrated tool poses with the covariance of the identified errors.
+            Calibrated tool poses with the covariance of the identified errors and of those the model lacks.
         """
         frames = self.chain.forward_kinematics(q)
         jacobian = self._tool_jacobian(frames)
@@ -190,7 +202,7 @@ class Uncertainty:
             np.tensordot(jacobian, part, (0, 0)).swapaxes(0, 1)
             for part in (self.sqrt_covariance, self.unbounded_directions)
         )
-        covariance = root @ np.swapaxes(root, 1, 2)
+        covariance = root @ np.swapaxes(root, 1, 2) + np.diag(np.repeat(np.square(self.model_std), 3))
         samples, components = np.nonzero(np.sum(undetermined**2, -1) > UNBOUNDED_TOL)
         covariance[samples, components, components] = np.inf
         return Prediction(frames.poses(), covariance)

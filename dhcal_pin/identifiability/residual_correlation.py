@@ -16,7 +16,8 @@ residuals,
     Q    = rᵀ·K·r,    E[Q] = tr(K·V) = -tr(Gᵀ·K·G),    Var[Q] = 2·tr(K·V·K·V),
     z    = (Q - E[Q])/√Var[Q],
 
-and one step from λ = 0 to the maximum of the likelihood is λ = 2·(Q - E[Q])/Var[Q].
+and one step from λ = 0 to the maximum of the likelihood is λ = 2·(Q - E[Q])/Var[Q]. For many samples V = I is
+used: this lowers z, as the fit takes up a part of what neighbours share.
 
 Shapes: m samples, k residuals per sample, r columns of S, n joints.
 
@@ -40,10 +41,10 @@ from ..estimation.problem import Chunk, Problem
 LENGTHS = (0.25, 0.5, 1.0, 2.0)
 # z of white residuals stays below; the largest of four lengths exceeds it once in ten thousand fits.
 MAX_WHITE_Z = 4.0
-# Largest number of samples of each measurement whose residuals are compared.
-MAX_SAMPLES = 300
-# Largest number of configurations whose distances give the design effect.
+# Largest number of configurations of each measurement whose distances are computed.
 MAX_CONFIGURATIONS = 2000
+# Largest number of products with which the effect of the fit on Q is computed.
+MAX_PRODUCTS = 3e8
 # Squared distance below which two configurations are the same.
 SAME_CONFIGURATION = 1e-10
 # Correlation of the residuals of configurations that are far apart, what is added to it for near ones,
@@ -85,16 +86,21 @@ def find_residual_correlation(
     Returns:
         The correlation; 0 without samples to compare.
     """
-    linearization = problem.linearize(x)
+    linearization, chain = problem.linearize(x), problem.errors.at(x[: len(problem.errors.parameters)])
     excess, variance = np.zeros(len(LENGTHS)), np.zeros(len(LENGTHS))
     quadratic = np.zeros((len(LENGTHS), root.shape[1], root.shape[1]))
     for item, w in zip(problem.data, weights, strict=True):
         chosen = np.flatnonzero(w > 0.5)
         if item.configurations_per_row != 1 or len(chosen) < 2:
             continue
-        part = item.take(chosen[:: -(-len(chosen) // MAX_SAMPLES)])
-        rows = linearization.rows(Chunk(part, problem.errors.chain)) / noise
-        effect, residual = np.tensordot(root, rows[:-1], (0, 0)), rows[-1]
+        part = item.take(chosen[:: -(-len(chosen) // MAX_CONFIGURATIONS)])
+        if len(part.rows) ** 2 * part.residual_dim * root.shape[1] <= MAX_PRODUCTS:
+            rows = linearization.rows(Chunk(part, problem.errors.chain)) / noise
+            effect, residual = np.tensordot(root, rows[:-1], (0, 0)), rows[-1]
+        else:
+            values = problem.instrument_values_of(part, x)
+            residual = part.residual(chain.forward_kinematics(part.configurations()), values) / noise
+            effect = np.empty((0, *residual.shape))
         distances = _squared_distances(_points(part.q, problem.errors.chain.is_prismatic))
         for i, length in enumerate(LENGTHS):
             kernel = np.exp(-0.5 * distances / length**2)
@@ -103,8 +109,8 @@ def find_residual_correlation(
             product = effect @ kernel
             excess[i] += np.sum(residual @ kernel * residual)
             variance[i] += 2 * (len(residual) * np.sum(kernel**2) - 2 * np.sum(product**2))
-            size = len(effect)
-            quadratic[i] += product.reshape(size, -1) @ effect.reshape(size, -1).T
+            if len(effect):
+                quadratic[i] += product.reshape(len(effect), -1) @ effect.reshape(len(effect), -1).T
     excess += np.trace(quadratic, axis1=1, axis2=2)
     variance += 2 * np.sum(quadratic * np.swapaxes(quadratic, 1, 2), (1, 2))
     is_known = variance > 0

@@ -31,6 +31,8 @@ The sidecar of `arm.urdf` is the TOML file `arm.calibration.toml` beside it:
     sqrt_covariance = "..."            # rows of little-endian doubles in base64
     unbounded_directions = "..."
     temperature = 75.8                 # factor on the variance of the residuals that the covariance contains
+    model_std_m = 1.1e-4               # errors that the model lacks: of the position, per axis
+    model_std_rad = 1e-4               # the same of the orientation
 
     [manifest]
     urdf_sha256 = "..."                # hash of the URDF that this file was written with
@@ -363,6 +365,7 @@ def read_uncertainty(path: PathLike, chain: Chain) -> Uncertainty | None:
         key: table.get(key, expected="base64 text") for key in ("sqrt_covariance", "unbounded_directions")
     }
     temperature = table.number("temperature", 1.0, at_least=1)
+    model_std = (table.number("model_std_m", 0.0, at_least=0), table.number("model_std_rad", 0.0, at_least=0))
     table.finish()
     if joints != list(chain.moving_joints):
         raise table.error("joints", f"expected the joints of this robot: {', '.join(chain.moving_joints)}")
@@ -379,7 +382,7 @@ def read_uncertainty(path: PathLike, chain: Chain) -> Uncertainty | None:
     entries = np.array([indices[name] for name in terms], int)
     if terms and chain.transmission is None:
         chain = chain.with_transmission(Transmission.zero(chain.loads))
-    return Uncertainty(chain, entries, sqrt_covariance, unbounded_directions, temperature)
+    return Uncertainty(chain, entries, sqrt_covariance, unbounded_directions, temperature, model_std)
 
 
 def read_measured_region(path: PathLike, chain: Chain) -> MeasuredRegion | None:
@@ -523,6 +526,8 @@ def _uncertainty_content(uncertainty: Uncertainty | None) -> dict[str, Any]:
         "sqrt_covariance": _encode_rows(uncertainty.sqrt_covariance),
         "unbounded_directions": _encode_rows(uncertainty.unbounded_directions),
         "temperature": uncertainty.temperature,
+        "model_std_m": uncertainty.model_std[0],
+        "model_std_rad": uncertainty.model_std[1],
     }
 
 

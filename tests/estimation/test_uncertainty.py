@@ -19,7 +19,7 @@ from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import measurement_text, read_measurements
 from dhcal_pin.io.dh_file import read_dh
 from dhcal_pin.io.robot import read_robot, write_urdf
-from dhcal_pin.io.sidecar import read_uncertainty, sidecar_path
+from dhcal_pin.io.sidecar import read_uncertainty, sidecar_path, sidecar_text
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.measurements.position import Position
@@ -88,6 +88,22 @@ def test_predictions_from_a_file_agree_with_those_of_the_fit(ur10, tmp_path, set
     wanted = covariance_by_differences(fit, q[:20])
     gap = np.abs(mine.covariance[:20] - wanted) / (size[:20, :, None] * size[:20, None])
     assert gap.max() < 1e-4
+
+
+def test_errors_that_the_model_lacks_are_added_and_kept_in_the_sidecar(ur10, tmp_path):
+    plain = fitted(ur10, "minimal,base,tool").uncertainty
+    with_model = replace(plain, model_std=(2e-4, 3e-4))
+    q = np.random.default_rng(1).uniform(-3, 3, (20, 6))
+    added = with_model.predict(q).covariance - plain.predict(q).covariance
+    expected = np.diag([4e-8, 4e-8, 4e-8, 9e-8, 9e-8, 9e-8])
+    np.testing.assert_allclose(added, np.tile(expected, (20, 1, 1)), atol=1e-15)
+    urdf = robot_file("ur_description/urdf/ur10_robot.urdf").read_bytes()
+    text = sidecar_text(plain.chain, np.eye(4), urdf, uncertainty=with_model)
+    assert text is not None
+    (tmp_path / "arm.calibration.toml").write_text(text)
+    known = read_uncertainty(tmp_path / "arm.calibration.toml", plain.chain)
+    assert known is not None
+    assert known.model_std == (2e-4, 3e-4)
 
 
 def test_undetermined_directions_have_infinite_variance(sim_6dof, tmp_path):

@@ -1,0 +1,110 @@
+"""Predicted errors of the tool: 95 % intervals hold with and without errors that the model lacks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from robots import DATA, MAPS, missing, robot_file
+
+from dhcal_pin import se3
+from dhcal_pin.calibration import Result, blocked_folds, calibrate
+from dhcal_pin.estimation import select_parameters
+from dhcal_pin.io import read_measurements
+from dhcal_pin.measurements import Pose
+from dhcal_pin.robot import Chain
+
+SETS = "minimal,base,tool"
+# Noise of positions [m]; of rotations it is twice that [rad].
+NOISE = 5e-5
+
+
+def simulated(seed: int, m: int, size: float) -> tuple[Chain, Pose, Pose]:
+    """Simulate a UR10 with geometric errors and a smooth error of the model in position and orientation.
+
+    Args:
+        seed: Seed.
+        m: Number of measured configurations.
+        size: Standard deviation of the smooth error per axis [m and rad]; its correlation length is 3 rad.
+
+    Returns:
+        Nominal chain, measured poses, and true poses at further configurations.
+    """
+    rng = np.random.default_rng(seed)
+    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    errors = select_parameters(arm, SETS)
+    truth = errors.at(rng.normal(size=len(errors.parameters)) * np.minimum(errors.priors, 0.1))
+    directions, phases = rng.normal(size=(6, 400)) / 3, rng.uniform(0, 2 * np.pi, 400)
+    amplitudes = size * np.sqrt(2 / 400) * rng.normal(size=(400, 6))
+
+    def poses(q: np.ndarray, noise: float) -> Pose:
+        offsets = np.cos(q @ directions + phases) @ amplitudes
+        offsets += noise * rng.normal(size=offsets.shape) * [1, 1, 1, 2, 2, 2]
+        out = truth.poses(q).copy()
+        out[:, :3, 3] += offsets[:, :3]
+        out[:, :3, :3] = se3.exp3(offsets[:, 3:]) @ out[:, :3, :3]
+        return Pose(q, out)
+
+    return arm, poses(rng.uniform(-2.5, 2.5, (m, 6)), NOISE), poses(rng.uniform(-2.5, 2.5, (300, 6)), 0.0)
+
+
+def position_errors(fit: Result, data: Pose) -> tuple[np.ndarray, np.ndarray]:
+    """Return the components of position errors and their predicted standard deviations, (m, 3) each."""
+    prediction = fit.predict(data.q)
+    std = np.sqrt(np.einsum("mii->mi", prediction.covariance)[:, :3])
+    return data.positions() - prediction.poses[:, :3, 3], std
+
+
+def covered_share(error: np.ndarray, std: np.ndarray) -> float:
+    """Return the share of errors in their 95 % interval."""
+    return float(np.mean(np.abs(error) < 1.96 * std))
+
+
+@pytest.mark.parametrize(
+    ("seeds", "bounds"),
+    [(3, (0.88, 0.99)), pytest.param(40, (0.93, 0.97), marks=pytest.mark.slow)],
+)
+@pytest.mark.parametrize(("m", "size"), [(40, 0.0), (100, 0.0), (40, 3e-4), (100, 3e-4)])
+def test_intervals_hold_in_simulations(m, size, seeds, bounds):
+    shares = []
+    for seed in range(seeds):
+        arm, data, truth = simulated(seed, m, size)
+        fit = calibrate(arm, data, SETS)
+        assert fit.extension is not None
+        assert (fit.extension.temperature > 1) == (size > 0)
+        assert (fit.uncertainty.model_std[0] > 0) == (size > 0)
+        shares.append(covered_share(*position_errors(fit, truth)))
+    assert bounds[0] <= np.mean(shares) <= bounds[1]
+
+
+@pytest.mark.slow
+def test_deciles_of_predicted_errors_are_those_of_actual_errors():
+    """Tenths of the configurations by predicted error: predicted and actual RMS agree within 15 %."""
+    predicted, actual = [], []
+    for seed in range(20):
+        arm, data, truth = simulated(seed, 60, 3e-4)
+        error, std = position_errors(calibrate(arm, data, SETS), truth)
+        predicted.append(np.sum(std**2, 1))
+        actual.append(np.sum(error**2, 1))
+    order = np.argsort(np.concatenate(predicted))
+    for part in np.array_split(order, 10):
+        ratio = np.sqrt(np.mean(np.concatenate(actual)[part]) / np.mean(np.concatenate(predicted)[part]))
+        assert 0.85 <= ratio <= 1.15
+
+
+SERIES = {"B": "Series_B/measurements_joint_configurations.csv", "D": "Series_D/measurements_iso_cubes.csv"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("series", SERIES)
+def test_intervals_hold_on_left_out_regions_of_real_arms(series):
+    """95 % intervals of positions contain 90 to 98 % of the measured ones in regions that were left out."""
+    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    path = DATA / "ipa_ur10" / SERIES[series]
+    if not path.exists():
+        missing(f"measurements at {path}")
+    data = read_measurements(path, arm, columns=MAPS / "ipa_ur10.toml")
+    shares = []
+    for (mask,) in blocked_folds(data):
+        error, std = position_errors(calibrate(arm, data.take(~mask), SETS), data.take(mask))
+        shares.append(covered_share(error, std))
+    assert 0.9 <= np.mean(shares) <= 0.98
