@@ -10,7 +10,7 @@ from dhcal_pin import se3
 from dhcal_pin.calibration import Result, blocked_folds, calibrate
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.io import read_measurements
-from dhcal_pin.measurements import Pose
+from dhcal_pin.measurements import Measurement, Pose
 from dhcal_pin.robot import Chain
 
 SETS = "minimal,base,tool"
@@ -47,7 +47,7 @@ def simulated(seed: int, m: int, size: float) -> tuple[Chain, Pose, Pose]:
     return arm, poses(rng.uniform(-2.5, 2.5, (m, 6)), NOISE), poses(rng.uniform(-2.5, 2.5, (300, 6)), 0.0)
 
 
-def position_errors(fit: Result, data: Pose) -> tuple[np.ndarray, np.ndarray]:
+def position_errors(fit: Result, data: Measurement) -> tuple[np.ndarray, np.ndarray]:
     """Return the components of position errors and their predicted standard deviations, (m, 3) each."""
     prediction = fit.predict(data.q)
     std = np.sqrt(np.einsum("mii->mi", prediction.covariance)[:, :3])
