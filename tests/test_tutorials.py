@@ -207,8 +207,11 @@ def test_every_check_belongs_to_a_cell():
 
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
 def test_cells_are_for_the_learner(notebook):
-    """No cell contains a check, and no cell needs files that do not ship with the notebooks."""
-    for _, source in code_cells(notebook):
+    """No cell contains a check or needs files that do not ship with the notebooks; figures are shown."""
+    cells = code_cells(notebook)
+    # Jupyter shows figures once pyplot is imported, or after this line.
+    assert re.search(r"matplotlib inline|import matplotlib.pyplot", cells[0][1])
+    for _, source in cells:
         assert not re.search(r"^\s*assert\b", source, re.MULTILINE)
         assert "../" not in source
 
