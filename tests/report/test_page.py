@@ -26,7 +26,8 @@ from dhcal_pin.robot import Chain
 AXE = Path(sys.prefix) / "node_modules" / "axe-core" / "axe.min.js"
 NAME = "a & <b>.csv"
 # Names of the tables that are wider than the page.
-CUT_OFF = "[...document.querySelectorAll('.scroll')].filter(e => e.scrollWidth > e.clientWidth).map(e => e.ariaLabel)"
+CUT_OFF = """[...document.querySelectorAll('.scroll')]
+  .filter(box => box.scrollWidth > box.clientWidth).map(box => box.ariaLabel)"""
 POSITION_PLOT = ".plot[data-x=number][data-y='error:position']"
 
 
