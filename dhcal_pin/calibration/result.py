@@ -42,7 +42,9 @@ from ..exceptions import DhcalError
 from ..identifiability import explanations, observability
 from ..measurements.arguments import as_measurements
 from ..measurements.base import InstrumentParameter, Measurement
+from ..measurements.camera import CameraCorners
 from ..measurements.measured_region import MeasuredRegion
+from ..measurements.mounting import MountedRig
 from ..plausibility.mixups import Diagnosis, diagnose_mixups
 from ..result_plots import ResultPlots
 from ..robot.chain import Chain
@@ -490,6 +492,14 @@ class Result(ResultPlots):
         """Values of the instrument parameters that hold for other measurements, too, by name [m or rad]."""
         local = {parameter.name for parameter in self.problem.instrument_parameters if parameter.is_local}
         return {name: value for name, value in self.instruments.items() if name not in local}
+
+    @property
+    def rig(self) -> MountedRig | None:
+        """Cameras and boards with their estimated poses and lenses; None without image coordinates."""
+        for item in self.data:
+            if isinstance(item, CameraCorners):
+                return item.solved_rig(self.instruments)
+        return None
 
     @cached_property
     def comparisons(self) -> tuple[Comparison, ...]:

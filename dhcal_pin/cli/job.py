@@ -169,6 +169,23 @@ class Job:
             "help": "write the tool pose into the URDF, as a link of this name fixed to the tip",
         },
     )
+    camera_frame: str | None = field(
+        default=None,
+        metadata={
+            "metavar": "NAME",
+            "help": "write the pose of the camera into the URDF, as a link of this name fixed to the link "
+            "that carries it; with several cameras, NAME_CAMERA each",
+        },
+    )
+    camera_files: str | None = field(
+        default=None,
+        metadata={
+            "metavar": "PREFIX",
+            "help": "write each camera for other programs: PREFIX_CAMERA.camera_info.yaml (ROS), "
+            ".opencv.yaml and .handeye.yaml (transform from its link)",
+            "is_output": True,
+        },
+    )
     force: bool = field(
         default=False,
         metadata={"help": "write the corrected robot even if the calibration is refused"},

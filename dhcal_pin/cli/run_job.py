@@ -20,18 +20,20 @@ from typing import Any
 
 import numpy as np
 
-from .._typing import PathLike, Progress
+from .._typing import Array, PathLike, Progress
 from ..calibration import model_selection, partition, procedure, summary
 from ..calibration.cameras import default_sets
 from ..calibration.cross_validation import leave_regions_out
 from ..calibration.model_selection import FULL_SET, is_restricted
 from ..calibration.result import Result
+from ..cameras.rig import TIP, Camera
 from ..diagnostics.curves import find_lattices
 from ..diagnostics.input_checks import find_value_warnings, poorly_fitted_files
 from ..diagnostics.reachability import UnreachableRow, find_unreachable_rows
 from ..estimation.parameters import select_parameters
 from ..estimation.robust import ZERO_WEIGHT
 from ..exceptions import FileFormatError, InvalidArgumentError, UnknownNameError
+from ..io.camera_files import camera_files
 from ..io.measurement_files import MeasurementFile, read_measurement_file
 from ..io.rig_file import read_rig
 from ..io.robot import read_robot, robot_name, urdf_files
@@ -436,11 +438,46 @@ def _robot_files(fit: Result, job: Job) -> dict[PathLike, str | bytes]:
             data = urdf_edit.with_world(data, chain.base)
         if job.tool_frame:
             data = urdf_edit.with_tool_frame(data, chain.tip, job.tool_frame, chain.tool)
+        for name, (parent, pose) in camera_frames.items():
+            data = urdf_edit.with_fixed_frame(data, parent, name, pose, "--camera-frame")
         return data
 
-    return urdf_files(
-        written, job.output, fit.transferable_instruments, fit.uncertainty, fit.measured_region, edit
+    camera_frames = _camera_frames(fit, job) if job.camera_frame else {}
+    contents = urdf_files(
+        written,
+        job.output,
+        fit.transferable_instruments,
+        fit.uncertainty,
+        fit.measured_region,
+        edit,
+        fit.rig,
     )
+    if job.camera_files and fit.rig:
+        for camera in fit.rig.cameras:
+            contents |= camera_files(camera, f"{job.camera_files}_{camera.name}", _parent_link(fit, camera))
+    return contents
+
+
+def _camera_frames(fit: Result, job: Job) -> dict[str, tuple[str, Array]]:
+    """Return the parent link and the pose (4, 4) of each camera by the name of its new link."""
+    if fit.rig is None:
+        raise InvalidArgumentError(
+            "--camera-frame: the measurements have no camera; expected image coordinates and --rig"
+        )
+    out = {}
+    for camera in fit.rig.cameras:
+        name = job.camera_frame if len(fit.rig.cameras) == 1 else f"{job.camera_frame}_{camera.name}"
+        assert name is not None
+        assert camera.pose is not None
+        out[name] = _parent_link(fit, camera), camera.pose
+    return out
+
+
+def _parent_link(fit: Result, camera: Camera) -> str:
+    """Return the link of the URDF that carries a camera."""
+    if camera.link in fit.chain.urdf.links:
+        return camera.link
+    return fit.chain.tip if camera.link == TIP else fit.chain.root
 
 
 def _provenance(

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from ..exceptions import InvalidArgumentError
-from .options import COLUMNS, DATA, FIT_FRAMES, JSON, ROBOT, SKIP_BAD_ROWS, add_urdf_options
+from .options import COLUMNS, DATA, FIT_FRAMES, JSON, RIG, ROBOT, SKIP_BAD_ROWS, add_urdf_options
 
 if TYPE_CHECKING:
     from ..calibration import Accuracy
@@ -32,6 +32,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("data", **DATA)
     add_urdf_options(parser)
     parser.add_argument("--columns", **COLUMNS)
+    parser.add_argument("--rig", **RIG)
     parser.add_argument("--skip-bad-rows", action="store_true", **SKIP_BAD_ROWS)
     parser.add_argument(
         "--sidecar",
@@ -74,6 +75,8 @@ def run(args: Namespace) -> int:
         read_measurement_file,
         read_robot,
     )
+    from ..io.rig_file import read_rig
+    from ..measurements.mounting import mount_rig
     from ..measurements.position import require_common_reference_target
     from ..report.document import file_digests, main_statistics, result_to_dict, validation_to_dict
     from ..report.html import check_html_ending
@@ -84,14 +87,16 @@ def run(args: Namespace) -> int:
 
     sidecar = args.sidecar or existing_sidecar(args.robot)
     robots = [args.robot, args.nominal] if args.nominal else [args.robot]
-    inputs = [*robots, *args.data, *filter(None, (sidecar, args.columns)), *existing_sidecars(robots[1:])]
+    given = filter(None, (sidecar, args.columns, args.rig))
+    inputs = [*robots, *args.data, *given, *existing_sidecars(robots[1:])]
     require_writable_outputs([args.json, args.map, args.report], inputs)
     if args.report:
         check_html_ending(args.report, "the report of a validation")
     chain = read_robot(args.robot, args.tip, sidecar, args.package_dir, args.root)
+    rig = mount_rig(read_rig(args.rig), chain) if args.rig else None
     predictor = _predictor(chain, sidecar, args) if args.map else None
     files = [
-        read_measurement_file(path, chain, args.columns, skip_bad_rows=args.skip_bad_rows)
+        read_measurement_file(path, chain, args.columns, skip_bad_rows=args.skip_bad_rows, rig=rig)
         for path in args.data
     ]
     data = [file.data for file in files]

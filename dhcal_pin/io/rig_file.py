@@ -185,6 +185,19 @@ def rig_text(cameras: Sequence[Camera], boards: Sequence[Board]) -> str:
     """
     import tomli_w  # lazy import: only for writing
 
+    return tomli_w.dumps(rig_content(cameras, boards))
+
+
+def rig_content(cameras: Sequence[Camera], boards: Sequence[Board]) -> dict[str, Any]:
+    """Return the tables of a rig file.
+
+    Args:
+        cameras: Cameras.
+        boards: Boards.
+
+    Returns:
+        Tables `camera` and `board`, each with one table per name.
+    """
     content: dict[str, Any] = {"camera": {}, "board": {}}
     for camera in cameras:
         entry: dict[str, Any] = {
@@ -215,7 +228,7 @@ def rig_text(cameras: Sequence[Camera], boards: Sequence[Board]) -> str:
         if board.has_free_points:
             entry["points"] = "prior"
         content["board"][board.name] = entry | _pose_entry(board.pose)
-    return tomli_w.dumps(content)
+    return content
 
 
 def _pose_entry(pose: Array | None) -> dict[str, list[float]]:

@@ -19,6 +19,7 @@ from .._typing import PathLike
 from ..estimation.uncertainty import Uncertainty
 from ..exceptions import DhcalError, FileFormatError, InvalidArgumentError, RefusedCalibrationError
 from ..measurements.measured_region import MeasuredRegion
+from ..measurements.mounting import MountedRig
 from ..messages import escape_control_characters
 from ..robot.chain import Chain
 from ..robot.dh import Convention, DHTable
@@ -224,6 +225,7 @@ def urdf_files(
     uncertainty: Uncertainty | None = None,
     measured_region: MeasuredRegion | None = None,
     edit: Callable[[bytes], bytes] = lambda data: data,
+    rig: MountedRig | None = None,
 ) -> dict[PathLike, str | bytes]:
     """Return the contents of a calibrated URDF and its sidecar, without writing them.
 
@@ -239,6 +241,7 @@ def urdf_files(
         uncertainty: Uncertainty of the calibrated robot.
         measured_region: Region of joint space that was measured for the calibration.
         edit: Last change of the URDF, such as more links; the sidecar contains the hash of the result.
+        rig: Cameras and boards with their estimated poses and lenses.
 
     Returns:
         Contents by path.
@@ -266,7 +269,9 @@ def urdf_files(
     data = edit(data)
     contents: dict[PathLike, str | bytes] = {path: data}
     is_replaced = existing_sidecar(path) is not None
-    sidecar = sidecar_text(chain, tool, data, instrument, uncertainty, measured_region, required=is_replaced)
+    sidecar = sidecar_text(
+        chain, tool, data, instrument, uncertainty, measured_region, rig, required=is_replaced
+    )
     if sidecar is not None:
         contents[sidecar_path(path)] = sidecar
     return contents
@@ -314,6 +319,11 @@ class CalibratedRobot(Protocol):
         """Region of joint space that was measured for the calibration."""
         ...
 
+    @property
+    def rig(self) -> MountedRig | None:
+        """Cameras and boards with their estimated poses and lenses."""
+        ...
+
 
 def write_urdf(fit: CalibratedRobot | Chain, path: PathLike, force: bool = False) -> None:
     """Write a calibrated URDF and its sidecar.
@@ -343,5 +353,12 @@ def write_urdf(fit: CalibratedRobot | Chain, path: PathLike, force: bool = False
     if isinstance(fit, Chain):
         contents = urdf_files(chain, path)
     else:
-        contents = urdf_files(chain, path, fit.transferable_instruments, fit.uncertainty, fit.measured_region)
+        contents = urdf_files(
+            chain,
+            path,
+            fit.transferable_instruments,
+            fit.uncertainty,
+            fit.measured_region,
+            rig=fit.rig,
+        )
     write_files(contents)

@@ -71,6 +71,7 @@ from ..estimation.parameters import PARAMETER_SETS, fold_harmonics
 from ..estimation.uncertainty import Uncertainty
 from ..exceptions import FileFormatError, UnknownNameError
 from ..measurements.measured_region import MeasuredRegion
+from ..measurements.mounting import MountedRig
 from ..messages import quote
 from ..robot.chain import Chain
 from ..robot.error_families import FAMILIES
@@ -83,6 +84,7 @@ from ..robot.transmission import (
 )
 from ..robot.urdf import Urdf, parse_urdf, suggest_names
 from ..saving import complete_interrupted_save
+from .rig_file import rig_content
 from .tabular import MAX_SIDECAR_BYTES
 from .toml_table import TomlTable, is_number, pose_content, read_pose
 
@@ -172,8 +174,9 @@ def with_sidecar(chain: Chain, path: PathLike) -> Chain:
     joints = table.table("joint") if "joint" in table else None
     if "manifest" in table:
         _check_manifest(table.table("manifest"), chain.urdf, tip)
-    # `read_instrument`, `read_uncertainty` and `read_measured_region` read these tables.
-    for key in ("instrument", "uncertainty", "measured"):
+    # `read_instrument`, `read_uncertainty` and `read_measured_region` read these tables; those of cameras and
+    # boards are for people, and for rig files.
+    for key in ("instrument", "uncertainty", "measured", "camera", "board"):
         table.get(key, {})
     table.finish()
     if tip != chain.tip:
@@ -449,6 +452,7 @@ def sidecar_text(
     instrument: Mapping[str, float] | None = None,
     uncertainty: Uncertainty | None = None,
     measured_region: MeasuredRegion | None = None,
+    rig: MountedRig | None = None,
     *,
     required: bool = False,
 ) -> str | None:
@@ -461,6 +465,7 @@ def sidecar_text(
         instrument: Instrument parameters by name [m or rad].
         uncertainty: Uncertainty of the robot.
         measured_region: Region of joint space that was measured.
+        rig: Cameras and boards with their estimated poses and lenses.
         required: Return the text even if the URDF alone holds everything.
 
     Returns:
@@ -472,6 +477,7 @@ def sidecar_text(
         "instrument": {name: float(value) for name, value in (instrument or {}).items()},
         "uncertainty": _uncertainty_content(uncertainty),
         "measured": _measured_content(chain, measured_region),
+        **(rig_content(rig.cameras, rig.boards) if rig else {}),
     }
     tables = {key: table for key, table in tables.items() if table}
     has_frames = not all(np.array_equal(pose, np.eye(4)) for pose in (chain.base, tool))

@@ -299,6 +299,26 @@ class CameraCorners(Measurement):
             return kind
         return "intrinsics" if kind == "camera" else POINTS_SET
 
+    def solved_rig(self, values: Mapping[str, float]) -> MountedRig:
+        """Return the rig with estimated poses, lenses and corners.
+
+        Args:
+            values: Values of all instrument parameters by name [m, rad, px or 1].
+        """
+        u = np.array([values[p.name] for p in self.instrument_parameters])
+        parts = self._split(u)
+        poses = [[se3.transform(se3.exp3(part[3:6]), part[:3]) for part in group] for group in parts]
+        lenses, points = self.lens_values(u), self.points(u)
+        cameras = tuple(
+            replace(camera, pose=pose, values=lens)
+            for camera, pose, lens in zip(self.rig.cameras, poses[0], lenses, strict=True)
+        )
+        boards = tuple(
+            replace(board, pose=pose, listed_points=corners)
+            for board, pose, corners in zip(self.rig.boards, poses[1], points, strict=True)
+        )
+        return replace(self.rig, cameras=cameras, boards=boards)
+
     def with_jitter(self, jitter: Array) -> Self:
         """Return a copy with another jitter, shape (m, 2, 6) [px]."""
         return self.replace(jitter=jitter)

@@ -118,14 +118,32 @@ def with_tool_frame(data: bytes, tip: str, name: str, tool: Array) -> bytes:
     Raises:
         InvalidArgumentError: A link or a joint already has that name.
     """
+    return with_fixed_frame(data, tip, name, tool, "--tool-frame")
+
+
+def with_fixed_frame(data: bytes, parent: str, name: str, pose: Array, option: str) -> bytes:
+    """Return the bytes of a URDF with one more link that is fixed to another one.
+
+    Args:
+        data: Bytes of a valid URDF.
+        parent: Name of the link that carries the new one.
+        name: Name of the new link; the joint is called NAME_joint.
+        pose: Pose of the new link in its parent, shape (4, 4) [m].
+        option: Option that asks for it, for messages.
+
+    Returns:
+        Bytes of the edited file.
+
+    Raises:
+        InvalidArgumentError: A link or a joint already has that name.
+    """
     urdf = parse_urdf(data, "the calibrated URDF")
     joint = f"{name}_joint"
     if name in urdf.links or joint in {other.name for other in urdf.joints}:
         raise InvalidArgumentError(
-            f"--tool-frame {name}: the URDF already has a link {name!r} or a joint {joint!r}; "
-            "choose another name"
+            f"{option} {name}: the URDF already has a link {name!r} or a joint {joint!r}; choose another name"
         )
-    return _with_fixed_link(data, name, joint, tip, name, tool)
+    return _with_fixed_link(data, name, joint, parent, name, pose)
 
 
 def _attribute_spans(data: bytes, start: int) -> tuple[dict[bytes, tuple[int, int]], int, bytes]:
