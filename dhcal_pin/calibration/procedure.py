@@ -41,8 +41,9 @@ from ..measurements.base import Measurement
 from ..parallel import SERIAL, TaskExecutor
 from ..robot.chain import BASE_FRAME, Chain
 from . import model_selection
-from .cameras import default_sets, held_values, split_sets
+from .cameras import apply_gate, default_sets, has_images, held_values, split_sets
 from .cross_validation import leave_regions_out
+from .model_selection import Extension
 from .result import Result
 from .reweighting import Fit, reweight
 from .shrinkage import compute_shrinkage_factor
@@ -149,6 +150,11 @@ def calibrate(
     if method == "lm":
         groups = PriorGroups.from_expected(errors, problem.weights, has_default_prior(errors, priors))
         fit = reweight(fit, robust.LOSSES[loss].stages, groups, max_iterations, progress)
+        if has_images(data) and priors != "none":
+            fit, gate = apply_gate(fit, groups, max_iterations)
+            extension = Extension(temperature=gate.temperature, n_configurations=gate.n_configurations)
+            result = _make_result(fit, 1.0, holdout, method)
+            return replace(result, extension=extension, input_warnings=gate.warnings)
         shrinkage_factor = compute_shrinkage_factor(fit.problem, fit.solution, groups.groups())
     result = _make_result(fit, shrinkage_factor, holdout, method)
     # Residuals of mixed-up measurements say nothing about other errors.

@@ -168,7 +168,9 @@ def run_job(
     if progress:
         progress("accuracy and verdict", 1, 1)
     fit = replace(
-        fit, input_warnings=tuple(f"{p}: {text}" for p, texts in data.warnings.items() for text in texts)
+        fit,
+        input_warnings=fit.input_warnings
+        + tuple(f"{p}: {text}" for p, texts in data.warnings.items() for text in texts),
     )
     fit = fit.accepted
     # More parameters are not suggested if the choice was deliberate, or if the columns may be mixed up.

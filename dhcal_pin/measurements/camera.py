@@ -391,6 +391,14 @@ class CameraCorners(Measurement):
         ]
 
     def _project(self, frames: FrameBatch, u: Array) -> _Projection:
+        """Project all corners; the last result is kept, as residuals and both Jacobians need it."""
+        last = self.__dict__.get("_last_projection")
+        if last is None or last[0] is not frames or not np.array_equal(last[1], u):
+            last = frames, u.copy(), self._compute_projection(frames, u)
+            self.__dict__["_last_projection"] = last
+        return last[2]
+
+    def _compute_projection(self, frames: FrameBatch, u: Array) -> _Projection:
         """Project all corners."""
         m = len(self.rows)
         camera_parts, board_parts = self._split(u)
@@ -445,16 +453,21 @@ class CameraCorners(Measurement):
 
     @cached_property
     def _jitter_bases(self) -> list[tuple[Array, Array, Array]]:
-        """Samples, basis U (2c, 6) and factors 1 - 1/√(1 + s²) of each image with jitter."""
+        """Images with jitter by their number c of corners.
+
+        Samples (g, c), basis U (g, 2c, 6) and factors 1 - 1/√(1 + s²) (g, 6) of the g images with c corners.
+        """
         out: list[tuple[Array, Array, Array]] = []
         if not self.jitter.any():
             return out
         whitened = self.jitter.transpose(1, 0, 2) * self._weights[:, :, None]
-        _, group = np.unique(self.q, axis=0, return_inverse=True)
-        order = np.argsort(group.reshape(-1), kind="stable")
-        ends = np.cumsum(np.bincount(group.reshape(-1)))
-        for samples in np.split(order, ends[:-1]):
-            u, s, _ = np.linalg.svd(whitened[:, samples].reshape(-1, 6), full_matrices=False)
+        group = np.unique(self.q, axis=0, return_inverse=True)[1].reshape(-1)
+        order, counts = np.argsort(group, kind="stable"), np.bincount(group)
+        images = np.split(order, np.cumsum(counts)[:-1])
+        for count in np.unique(counts):
+            samples = np.array([image for image in images if len(image) == count])
+            stacked = whitened[:, samples].swapaxes(0, 1).reshape(len(samples), -1, 6)
+            u, s, _ = np.linalg.svd(stacked, full_matrices=False)
             out.append((samples, u, 1 - 1 / np.sqrt(1 + s**2)))
         return out
 
@@ -462,9 +475,10 @@ class CameraCorners(Measurement):
         """Divide rows (..., 2, m) by sigma, and remove what the jitter explains."""
         rows = rows * self._weights
         for samples, basis, factors in self._jitter_bases:
-            part = rows[..., samples].reshape(*rows.shape[:-2], -1)
-            part = part - ((part @ basis) * factors) @ basis.T
-            rows[..., samples] = part.reshape(*rows.shape[:-1], len(samples))
+            part = rows[..., samples].swapaxes(-3, -2)
+            flat = part.reshape(*part.shape[:-2], -1)[..., None]
+            explained = basis @ (factors[..., None] * (basis.swapaxes(-1, -2) @ flat))
+            rows[..., samples] -= explained.reshape(part.shape).swapaxes(-3, -2)
         return rows
 
     def residual(self, frames: FrameBatch, u: Array) -> Array:

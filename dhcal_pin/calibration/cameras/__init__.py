@@ -4,6 +4,7 @@ A calibration from images estimates cameras, boards and lenses together with the
 which of these parameters are unknown, and in which order they are freed.
 """
 
-from .sets import RIG_SETS, default_sets, held_values, split_sets
+from .gate import apply_gate
+from .sets import RIG_SETS, default_sets, has_images, held_values, split_sets
 
-__all__ = ["RIG_SETS", "default_sets", "held_values", "split_sets"]
+__all__ = ["RIG_SETS", "apply_gate", "default_sets", "has_images", "held_values", "split_sets"]

@@ -36,6 +36,15 @@ def split_sets(parameters: str | Iterable[str]) -> tuple[list[str], list[str]]:
     return [name for name in names if name not in RIG_SETS], [name for name in names if name in RIG_SETS]
 
 
+def has_images(data: Sequence[Measurement]) -> bool:
+    """Return whether there are image coordinates among measurements.
+
+    Args:
+        data: Measurements.
+    """
+    return any(isinstance(item, CameraCorners) for item in data)
+
+
 def default_sets(chain: Chain, data: Sequence[Measurement]) -> str:
     """Return the parameter sets that are estimated by default.
 
@@ -46,7 +55,7 @@ def default_sets(chain: Chain, data: Sequence[Measurement]) -> str:
     Returns:
         Sets of the chain; with image coordinates, those of robot and rig.
     """
-    return DEFAULT_SETS if any(isinstance(item, CameraCorners) for item in data) else chain.parameters
+    return DEFAULT_SETS if has_images(data) else chain.parameters
 
 
 def held_values(data: Sequence[Measurement], sets: Sequence[str]) -> dict[str, float]:

@@ -1,0 +1,140 @@
+"""Size of the displacement that all corners of one image share.
+
+The scatter of the corners within an image, after the displacement of the tool that explains the image best,
+shows the noise of the corners. What the images still differ by is an error of the arm in each configuration.
+It is modelled as a random displacement [v, ω] of the tool, v ~ N(0, a²) and ω ~ N(0, b²) in each axis; see
+`measurements.camera`. Its standard deviations a and b follow by expectation and maximization (Dempster, Laird
+and Rubin 1977). With the whitened derivative A_i of image i by a displacement, its whitened residuals r_i and
+D = diag(a², a², a², b², b², b²):
+
+    C_i = (D⁻¹ + A_iᵀ·A_i)⁻¹,    m_i = C_i·A_iᵀ·r_i,    a² ← mean of m_v² + C_vv,    b² ← mean of m_ω² + C_ωω.
+
+Reference: A. Dempster, N. Laird and D. Rubin, Maximum Likelihood from Incomplete Data via the EM Algorithm,
+J. Royal Statistical Society B 39, 1977.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..._typing import Array
+from ...estimation.problem import Problem
+from ...measurements.base import Measurement
+from ...measurements.camera import CameraCorners
+
+# First standard deviations of the displacement [m], [rad], and smallest ones.
+FIRST_STD = (1e-3, 1e-3)
+MIN_STD = 1e-7
+# Iterations, and relative change that ends them.
+_N_ITERATIONS, _RTOL = 200, 1e-3
+# Smallest noise of a detected corner [px].
+MIN_NOISE = 0.1
+
+
+@dataclass(frozen=True)
+class Jitter:
+    """Noise of corners and displacement of images.
+
+    Attributes:
+        noise: Standard deviation of an image coordinate, relative to the stated or placeholder one.
+        position: Standard deviation of the displacement of the tool along each axis [m].
+        rotation: Standard deviation of its rotation about each axis [rad].
+    """
+
+    noise: float
+    position: float
+    rotation: float
+
+
+def estimate_jitter(problem: Problem, x: Array, data: Sequence[Measurement], n_determined: float) -> Jitter:
+    """Estimate the noise of corners and the displacement of images from the residuals of a fit.
+
+    Args:
+        problem: Problem that was solved.
+        x: Its solution, (p,).
+        data: Measurements with the standard deviations of the corners, without jitter.
+        n_determined: Number of parameters that the data determine.
+
+    Returns:
+        Standard deviations; stated ones of corners are kept.
+    """
+    chain = problem.errors.at(x[: len(problem.errors.parameters)])
+    images: list[tuple[Array, Array]] = []
+    is_stated = True
+    for item in data:
+        if not isinstance(item, CameraCorners):
+            continue
+        plain = item.with_jitter(np.zeros_like(item.jitter))
+        frames = chain.forward_kinematics(plain.configurations())
+        u = problem.instrument_values_of(plain, x)
+        residual = plain.residual(frames, u)
+        derivative = plain.displacement_derivative(frames, u) / plain.sigma[:, :, None]
+        label = np.unique(plain.q, axis=0, return_inverse=True)[1].reshape(-1)
+        is_stated = is_stated and item.has_stated_sigma
+        for number in range(label.max() + 1):
+            samples = label == number
+            images.append((residual.T[samples].ravel(), derivative[samples].reshape(-1, 6)))
+    noise = 1.0 if is_stated else _scatter(images)
+    return _maximize_likelihood([(r / noise, a / noise) for r, a in images], noise, n_determined)
+
+
+def _scatter(images: Sequence[tuple[Array, Array]]) -> float:
+    """Return the standard deviation of whitened residuals that no displacement explains."""
+    squares = freedom = 0.0
+    for residual, derivative in images:
+        basis = np.linalg.svd(derivative, full_matrices=False)[0]
+        squares += float(residual @ residual - np.sum((basis.T @ residual) ** 2))
+        freedom += max(len(residual) - basis.shape[1], 0)
+    return max(float(np.sqrt(squares / freedom)), MIN_NOISE) if freedom else 1.0
+
+
+def _maximize_likelihood(images: Sequence[tuple[Array, Array]], noise: float, n_determined: float) -> Jitter:
+    """Return the standard deviations of the displacement of greatest likelihood."""
+    position, rotation = FIRST_STD
+    # The fit has absorbed a part of the displacements: that of the parameters among six per image.
+    n_displacements = 6 * len(images)
+    share = max(1 - n_determined / n_displacements, 0.2)
+    information = [a.T @ a for _, a in images]
+    projected = [a.T @ r for r, a in images]
+    for _ in range(_N_ITERATIONS):
+        precision = np.diag(1 / np.array([position] * 3 + [rotation] * 3) ** 2)
+        squares = np.zeros(6)
+        for product, right in zip(information, projected, strict=True):
+            covariance = np.linalg.inv(precision + product)
+            squares += (covariance @ right) ** 2 / share + np.diag(covariance)
+        squares /= len(images)
+        updated = max(np.sqrt(squares[:3].mean()), MIN_STD), max(np.sqrt(squares[3:].mean()), MIN_STD)
+        change = max(abs(np.log(updated[0] / position)), abs(np.log(updated[1] / rotation)))
+        position, rotation = float(updated[0]), float(updated[1])
+        if change < _RTOL:
+            break
+    return Jitter(noise, position, rotation)
+
+
+def with_jitter(
+    problem: Problem, x: Array, data: Sequence[Measurement], jitter: Jitter
+) -> tuple[Measurement, ...]:
+    """Give image coordinates the noise and the jitter that were estimated.
+
+    Args:
+        problem: Problem whose model gives the derivatives by the displacement.
+        x: Its solution, (p,).
+        data: Measurements with the standard deviations of the corners.
+        jitter: Standard deviations.
+
+    Returns:
+        Measurements; those that are no image coordinates are unchanged.
+    """
+    chain = problem.errors.at(x[: len(problem.errors.parameters)])
+    std = np.array([jitter.position] * 3 + [jitter.rotation] * 3)
+    out: list[Measurement] = []
+    for item in data:
+        if isinstance(item, CameraCorners):
+            frames = chain.forward_kinematics(item.configurations())
+            derivative = item.displacement_derivative(frames, problem.instrument_values_of(item, x))
+            item = item.with_scaled_sigma({"pixels": jitter.noise}).with_jitter(derivative * std)
+        out.append(item)
+    return tuple(out)

@@ -1,0 +1,272 @@
+"""Corners of a board in images, by OpenCV.
+
+Boards are printed in several layouts that look alike: with rows and columns exchanged, and ChArUco boards
+with an even number of rows in the legacy pattern, too. A detector with the wrong layout finds nothing and
+does not say why. `find_layout` therefore tries all of them. Corners keep the numbers of the board as the rig
+states it: a board with exchanged rows and columns is the same set of points, turned by a quarter.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from .._typing import Array, PathLike
+from ..cameras.boards import Board
+from ..exceptions import FileFormatError, InvalidArgumentError, UnknownNameError
+
+# Number of images in which the layouts of a board are compared.
+N_LAYOUT_IMAGES = 8
+# Smallest number of corners of an image that is used.
+MIN_CORNERS = 4
+# Sharpness below which an image is blurred: standard deviation of the Laplacian over that of the brightness.
+MIN_SHARPNESS = 0.05
+# Share of white pixels around the board above which an image is saturated.
+MAX_WHITE, WHITE = 0.5, 254
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Layout in which a board was printed.
+
+    Attributes:
+        is_exchanged: Whether rows and columns are exchanged.
+        is_legacy: Whether a ChArUco board has the legacy pattern.
+    """
+
+    is_exchanged: bool = False
+    is_legacy: bool = False
+
+    def describe(self, board: Board) -> str:
+        """Return what differs from the board of the rig; empty if nothing does.
+
+        Args:
+            board: Board of the rig.
+
+        Returns:
+            Text such as "columns = 7, rows = 5".
+        """
+        parts = []
+        if self.is_exchanged:
+            parts.append(f"columns = {board.rows}, rows = {board.columns}")
+        if self.is_legacy != board.is_legacy:
+            parts.append(f"legacy = {str(self.is_legacy).lower()}")
+        return ", ".join(parts)
+
+
+@dataclass(frozen=True, eq=False)
+class DetectedImage:
+    """Corners that were found in an image.
+
+    Attributes:
+        path: Path of the image.
+        corner: Numbers of the corners on the board of the rig, (c,).
+        pixels: Image coordinates, (c, 2) [px].
+        problem: Why the image is not used, such as "no board found"; empty if it is.
+    """
+
+    path: str
+    corner: Array
+    pixels: Array
+    problem: str = ""
+
+
+def require_opencv() -> ModuleType:
+    """Return the module of OpenCV.
+
+    Raises:
+        InvalidArgumentError: It is not installed.
+    """
+    try:
+        import cv2  # lazy import: an optional extra
+    except ImportError:
+        raise InvalidArgumentError(
+            "boards in images need OpenCV, which is not installed; run: pip install 'dhcal-pin[camera]'"
+        ) from None
+    return cv2
+
+
+def read_image(path: PathLike) -> Array:
+    """Read an image as grey values.
+
+    Args:
+        path: Image file of any format that OpenCV reads.
+
+    Returns:
+        Grey values, shape (height, width), 8 bit.
+
+    Raises:
+        FileFormatError: The file cannot be read.
+    """
+    cv2 = require_opencv()
+    data = np.fromfile(path, np.uint8) if os.path.isfile(path) else np.empty(0, np.uint8)
+    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
+    if image is None:
+        raise FileFormatError(f"{os.fspath(path)}: is no image that can be read; expected PNG, JPEG or TIFF")
+    return image
+
+
+def layouts_of(board: Board) -> list[Layout]:
+    """Return all layouts in which a board may have been printed, that of the rig first.
+
+    Args:
+        board: Board of the rig.
+    """
+    exchanged = [False] if board.columns == board.rows else [False, True]
+    legacy = [board.is_legacy, not board.is_legacy] if board.type == "charuco" else [False]
+    return [Layout(turn, old) for turn in exchanged for old in legacy]
+
+
+def find_layout(board: Board, images: Sequence[Array]) -> Layout:
+    """Find the layout of a board that shows the most corners in some images.
+
+    Args:
+        board: Board of the rig.
+        images: Grey values, shape (height, width) each.
+
+    Returns:
+        The layout; that of the rig if no layout shows more.
+    """
+    layouts = layouts_of(board)
+    if len(layouts) == 1:
+        return layouts[0]
+    step = max(1, len(images) // N_LAYOUT_IMAGES)
+    counts = [sum(len(_find(board, layout, image)[0]) for image in images[::step]) for layout in layouts]
+    return layouts[int(np.argmax(counts))]
+
+
+def detect_corners(board: Board, layout: Layout, path: str, size: tuple[int, int]) -> DetectedImage:
+    """Find the corners of a board in an image file.
+
+    Args:
+        board: Board of the rig.
+        layout: Layout in which it was printed.
+        path: Image file.
+        size: Width and height that the rig states [px].
+
+    Returns:
+        Corners, or why the image is not used.
+
+    Raises:
+        FileFormatError: The image has another size.
+    """
+    image = read_image(path)
+    if image.shape[::-1] != size:
+        raise FileFormatError(
+            f"{path}: has {image.shape[1]} x {image.shape[0]} px; the rig file states {size[0]} x {size[1]} px"
+        )
+    corner, pixels = _find(board, layout, image)
+    problem = ""
+    if not len(corner):
+        problem = "no board found"
+    elif len(corner) < MIN_CORNERS:
+        problem = f"{len(corner)} corners found; at least {MIN_CORNERS} are needed"
+    else:
+        problem = _quality_problem(image, pixels)
+    return DetectedImage(path, corner, pixels, problem)
+
+
+def _quality_problem(image: Array, pixels: Array) -> str:
+    """Return "blurred" or "saturated", or an empty text, for the part of an image around corners (c, 2)."""
+    cv2 = require_opencv()
+    low = np.maximum(np.floor(pixels.min(0)).astype(int), 0)
+    high = np.ceil(pixels.max(0)).astype(int) + 1
+    part = image[low[1] : high[1], low[0] : high[0]]
+    if np.mean(part >= WHITE) > MAX_WHITE:
+        return "saturated: more than half of the board is white; expose shorter"
+    contrast = float(part.std())
+    if contrast == 0 or float(cv2.Laplacian(part, cv2.CV_64F).std()) < MIN_SHARPNESS * contrast:
+        return "blurred"
+    return ""
+
+
+def _find(board: Board, layout: Layout, image: Array) -> tuple[Array, Array]:
+    """Return the numbers (c,) and image coordinates (c, 2) of the corners of a board in an image."""
+    columns, rows = (board.columns, board.rows)
+    if layout.is_exchanged:
+        columns, rows = rows, columns
+    finders = {"charuco": _find_charuco, "checkerboard": _find_checkerboard, "aprilgrid": _find_aprilgrid}
+    if board.type not in finders:
+        raise InvalidArgumentError(
+            f"board {board.name!r} has the type {board.type!r}, which cannot be detected; choose from "
+            f"{', '.join(finders)}"
+        )
+    printed = replace(board, columns=columns, rows=rows, is_legacy=layout.is_legacy)
+    corner, pixels = finders[board.type](printed, image)
+    if layout.is_exchanged and len(corner):
+        corner = _numbers_on_the_rig(board, printed, corner)
+    return corner, pixels
+
+
+def _numbers_on_the_rig(board: Board, printed: Board, corner: Array) -> Array:
+    """Return the numbers of corners on the board of the rig, which is the printed one turned by a quarter."""
+    if board.type == "aprilgrid":
+        tag, number = np.divmod(corner, 4)
+        y, x = np.divmod(tag, printed.columns)
+        # The corners of a tag turn with it.
+        return 4 * ((printed.columns - 1 - x) * board.columns + y) + (number + 3) % 4
+    y, x = np.divmod(corner, printed.columns - 1)
+    return (printed.columns - 2 - x) * (board.columns - 1) + y
+
+
+def marker_dictionary(board: Board) -> Any:
+    """Return the dictionary of a board's markers."""
+    aruco = require_opencv().aruco
+    known = [name for name in dir(aruco) if name.startswith("DICT_")]
+    matches = {name.upper(): name for name in known}
+    if board.dictionary.upper() not in matches:
+        raise UnknownNameError(
+            f"board {board.name!r}: dictionary {board.dictionary!r} is unknown; choose from {', '.join(known)}"
+        )
+    return aruco.getPredefinedDictionary(getattr(aruco, matches[board.dictionary.upper()]))
+
+
+def charuco_board(board: Board) -> Any:
+    """Return a ChArUco board as OpenCV describes it.
+
+    Args:
+        board: Board of the type "charuco".
+    """
+    aruco = require_opencv().aruco
+    out = aruco.CharucoBoard((board.columns, board.rows), board.square, board.marker, marker_dictionary(board))
+    out.setLegacyPattern(board.is_legacy)
+    return out
+
+
+def _found(corner: Any, pixels: Any) -> tuple[Array, Array]:
+    """Return detected corners as arrays (c,) and (c, 2); empty if there are none."""
+    if corner is None or len(corner) == 0:
+        return np.empty(0, int), np.empty((0, 2))
+    return np.asarray(corner, int).ravel(), np.asarray(pixels, float).reshape(-1, 2)
+
+
+def _find_charuco(board: Board, image: Array) -> tuple[Array, Array]:
+    """Find the inner corners of a ChArUco board."""
+    pixels, corner, _, _ = require_opencv().aruco.CharucoDetector(charuco_board(board)).detectBoard(image)
+    return _found(corner, pixels)
+
+
+def _find_checkerboard(board: Board, image: Array) -> tuple[Array, Array]:
+    """Find all inner corners of a checkerboard."""
+    cv2 = require_opencv()
+    flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+    found, pixels = cv2.findChessboardCornersSB(image, (board.columns - 1, board.rows - 1), flags=flags)
+    return _found(np.arange((board.columns - 1) * (board.rows - 1)) if found else None, pixels)
+
+
+def _find_aprilgrid(board: Board, image: Array) -> tuple[Array, Array]:
+    """Find the four corners of each tag of an AprilGrid."""
+    aruco = require_opencv().aruco
+    parameters = aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
+    pixels, tags, _ = aruco.ArucoDetector(marker_dictionary(board), parameters).detectMarkers(image)
+    if tags is None:
+        return _found(None, None)
+    on_board = [i for i, tag in enumerate(tags.ravel()) if tag < board.columns * board.rows]
+    corner = [4 * int(tags.ravel()[i]) + k for i in on_board for k in range(4)]
+    return _found(corner, [pixels[i].reshape(4, 2) for i in on_board])

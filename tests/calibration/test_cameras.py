@@ -1,0 +1,82 @@
+"""Images may change the arm as far as they show that it is wrong; hand-eye calibration alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from robots import URDF
+
+import dhcal_pin as dh
+from dhcal_pin.calibration.cameras.gate import cluster_folds
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.measurements import CameraCorners, Noise
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return dh.Chain.from_dh(dh.read_dh(URDF / "sim_6dof.dh.toml"))
+
+
+def shape_error(chain, truth, q):
+    """Return the RMS error of distances between tool points, which do not depend on the base [m]."""
+    found, wanted = (each.poses(q)[:, :3, 3] for each in (chain, truth))
+    pairs = np.triu_indices(len(q), 1)
+    lengths = [np.linalg.norm(points[pairs[0]] - points[pairs[1]], axis=1) for points in (found, wanted)]
+    return np.sqrt(np.mean((lengths[0] - lengths[1]) ** 2))
+
+
+def images_of(truth, m, rng, spread=2.5):
+    q = rng.uniform(-spread, spread, (m, truth.n_joints))
+    return CameraCorners.simulate(truth, q, Noise(2e-4), rng)
+
+
+def test_an_arm_that_is_wrong_by_millimetres_is_corrected(arm):
+    rng = np.random.default_rng(0)
+    errors = dh.select_parameters(arm, "placement")
+    truth = errors.at(np.array([1e-3 if p.unit == "m" else 3e-3 for p in errors.parameters])
+                      * rng.normal(size=len(errors.parameters)))  # fmt: skip
+    # The place of the board on the tool is known: otherwise an error of the last joint is not observable.
+    fit = dh.calibrate(arm, images_of(truth, 40, rng), "placement,camera")
+    q = rng.uniform(-2.5, 2.5, (60, 6))
+    nominal, calibrated = shape_error(arm, truth, q), shape_error(fit.chain, truth, q)
+    assert nominal > 2e-3
+    assert calibrated < nominal / 5
+    assert not any("do not show that the arm is wrong" in text for text in fit.input_warnings)
+
+
+def test_an_arm_with_errors_of_another_kind_is_kept(arm):
+    """Periodic joint errors in a narrow region: errors of links would fit, and would be wrong elsewhere."""
+    rng = np.random.default_rng(1)
+    errors = dh.select_parameters(arm, "harmonics")
+    truth = errors.at(5e-4 * rng.normal(size=len(errors.parameters)))
+    fit = dh.calibrate(arm, images_of(truth, 25, rng, 0.4), "placement,camera")
+    q = rng.uniform(-2.5, 2.5, (60, 6))
+    assert any("do not show that the arm is wrong" in text for text in fit.input_warnings)
+    assert shape_error(fit.chain, truth, q) < 1.1 * shape_error(arm, truth, q)
+
+
+def test_hand_eye_alone_keeps_the_arm(arm):
+    rng = np.random.default_rng(2)
+    fit = dh.calibrate(arm, images_of(arm, 15, rng), "camera,board")
+    assert fit.errors.parameters == ()
+    np.testing.assert_array_equal(fit.chain.origins, arm.origins)
+    assert fit.comparisons[-1].after["residual_rms"] < 0.35
+    truth = fit.data[0].rig.boards[0].pose
+    assert fit.rig is not None
+    assert fit.rig.boards[0].pose is not None
+    assert np.abs(fit.rig.boards[0].pose - truth).max() < 1e-3
+
+
+def test_sets_of_a_rig_need_images(arm):
+    q = np.random.default_rng(0).uniform(-1, 1, (20, 6))
+    with pytest.raises(DhcalError, match=r"parameter set 'camera' needs image coordinates"):
+        dh.calibrate(arm, dh.Pose(q, arm.poses(q)), "minimal,camera")
+
+
+def test_clusters_hold_out_every_image_once(arm):
+    data = images_of(arm, 40, np.random.default_rng(3))
+    folds = cluster_folds([data])
+    assert len(folds) == 5
+    np.testing.assert_array_equal(np.sum([fold[0] for fold in folds], 0), 1)
+    for (mask,) in folds:
+        assert all(len(set(mask[data.image == number])) == 1 for number in range(data.n_images))
