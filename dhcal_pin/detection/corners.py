@@ -18,6 +18,7 @@ import numpy as np
 
 from .._typing import Array, PathLike
 from ..cameras.boards import Board
+from ..cameras.pose_from_points import direct_linear_transform
 from ..exceptions import FileFormatError, InvalidArgumentError, UnknownNameError
 
 # Number of images in which the layouts of a board are compared.
@@ -158,7 +159,8 @@ def detect_corners(board: Board, layout: Layout, path: str, size: tuple[int, int
     image = read_image(path)
     if image.shape[::-1] != size:
         raise FileFormatError(
-            f"{path}: has {image.shape[1]} x {image.shape[0]} px; the rig file states {size[0]} x {size[1]} px"
+            f"{path}: has {image.shape[1]} x {image.shape[0]} px; the rig file states {size[0]} x {size[1]} "
+            "px"
         )
     corner, pixels = _find(board, layout, image)
     problem = ""
@@ -221,7 +223,8 @@ def marker_dictionary(board: Board) -> Any:
     matches = {name.upper(): name for name in known}
     if board.dictionary.upper() not in matches:
         raise UnknownNameError(
-            f"board {board.name!r}: dictionary {board.dictionary!r} is unknown; choose from {', '.join(known)}"
+            f"board {board.name!r}: dictionary {board.dictionary!r} is unknown; choose from "
+            f"{', '.join(known)}"
         )
     return aruco.getPredefinedDictionary(getattr(aruco, matches[board.dictionary.upper()]))
 
@@ -233,7 +236,9 @@ def charuco_board(board: Board) -> Any:
         board: Board of the type "charuco".
     """
     aruco = require_opencv().aruco
-    out = aruco.CharucoBoard((board.columns, board.rows), board.square, board.marker, marker_dictionary(board))
+    out = aruco.CharucoBoard(
+        (board.columns, board.rows), board.square, board.marker, marker_dictionary(board)
+    )
     out.setLegacyPattern(board.is_legacy)
     return out
 
@@ -256,7 +261,26 @@ def _find_checkerboard(board: Board, image: Array) -> tuple[Array, Array]:
     cv2 = require_opencv()
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
     found, pixels = cv2.findChessboardCornersSB(image, (board.columns - 1, board.rows - 1), flags=flags)
-    return _found(np.arange((board.columns - 1) * (board.rows - 1)) if found else None, pixels)
+    if not found:
+        return _found(None, None)
+    corners = pixels.reshape(-1, 2).astype(float)
+    if _first_square_is_white(board, image, corners):
+        corners = corners[::-1]
+    return _found(np.arange(len(corners)), corners)
+
+
+def _first_square_is_white(board: Board, image: Array, corners: Array) -> bool:
+    """Return whether corners (c, 2) are numbered from the wrong end: the first square of a board is black.
+
+    The board looks the same from both ends if the sum of its columns and rows is even.
+    """
+    homography = direct_linear_transform(board.points[:, :2] / board.square, corners)
+    y, x = np.mgrid[1 : board.rows - 1, 1 : board.columns - 1].reshape(2, -1)
+    centres = np.stack([x + 0.5, y + 0.5, np.ones(len(x))]).T @ homography.T
+    u, v = np.round(centres[:, :2] / centres[:, 2:]).astype(int).T
+    grey = image[np.clip(v, 0, image.shape[0] - 1), np.clip(u, 0, image.shape[1] - 1)]
+    is_black = (x + y) % 2 == 0
+    return bool(grey[is_black].mean() > grey[~is_black].mean())
 
 
 def _find_aprilgrid(board: Board, image: Array) -> tuple[Array, Array]:

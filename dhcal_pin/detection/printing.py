@@ -9,7 +9,7 @@ import numpy as np
 from .._typing import Array
 from ..cameras.boards import Board
 from ..exceptions import InvalidArgumentError
-from .corners import marker_dictionary, charuco_board
+from .corners import charuco_board, marker_dictionary
 
 # Points of a PDF per metre, and white margin around a board [m].
 _POINTS_PER_METRE = 72 / 0.0254
