@@ -100,7 +100,7 @@ def test_corners_of_drawn_boards(board, tmp_path):
     assert layout.describe(board) == "" or board.rows % 2
     assert len(found.corner) == len(board.points)
     error = found.pixels - wanted[found.corner]
-    assert np.sqrt(np.mean(error**2)) < (0.3 if board.type == "aprilgrid" else 0.06)
+    assert np.sqrt(np.mean(error**2)) < {"checkerboard": 0.06, "charuco": 0.1, "aprilgrid": 0.3}[board.type]
 
 
 def test_images_that_are_not_used_are_named(tmp_path):
