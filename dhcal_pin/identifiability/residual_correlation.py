@@ -38,9 +38,11 @@ from .._typing import Array
 from ..estimation.problem import Chunk, Problem
 
 # Distances l over which model errors are looked for [rad].
-LENGTHS = (0.25, 0.5, 1.0, 2.0)
-# z of white residuals stays below; the largest of four lengths exceeds it once in ten thousand fits.
+LENGTHS = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0, 2.0)
+# z of white residuals stays below; the largest of seven lengths exceeds it once in four thousand fits.
 MAX_WHITE_Z = 4.0
+# Smallest number (Σ k_ij)²/Σ k_ij² of pairs at a length; z of fewer is far from normal.
+MIN_PAIRS = 30
 # Largest number of configurations of each measurement whose distances are computed.
 MAX_CONFIGURATIONS = 2000
 # Largest number of products with which the effect of the fit on Q is computed.
@@ -106,6 +108,8 @@ def find_residual_correlation(
             kernel = np.exp(-0.5 * distances / length**2)
             # Samples of the same configuration may also share noise of the instrument.
             kernel[distances < SAME_CONFIGURATION] = 0.0
+            if np.sum(kernel) ** 2 <= MIN_PAIRS * np.sum(kernel**2):
+                continue
             product = effect @ kernel
             excess[i] += np.sum(residual @ kernel * residual)
             variance[i] += 2 * (len(residual) * np.sum(kernel**2) - 2 * np.sum(product**2))
