@@ -118,8 +118,8 @@ SCREENED_ROWS_PER_UNKNOWN = 2
 MAX_WHITE_LINE, SCREENING_SIGMAS = 20.0, 3.0
 # Share of the left-out regions whose errors predicted standard deviations contain.
 REGION_QUANTILE = 0.75
-# Limits of the scale of predicted standard deviations. Regions that are left out lie nearer to the others than
-# the rest of the workspace does; they may hardly lower a prediction.
+# Limits of the scale of predicted standard deviations. Regions that are left out lie nearer to the others
+# than the rest of the workspace does; they may hardly lower a prediction.
 MIN_PREDICTION_SCALE, MAX_PREDICTION_SCALE = 0.85, 3.0
 # Largest ratio of the errors with and without a family for which a hint is given.
 MAX_HINT_RATIO = 0.9
