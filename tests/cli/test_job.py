@@ -18,8 +18,10 @@ VALUES = {
     "data": '["a.csv", "b.csv"]',
     "output": '"out.urdf"',
     "tip": '"tool0"',
+    "root": '"link0"',
     "package_dir": '["meshes", "more"]',
     "columns": '"map.toml"',
+    "rig": '"rig.toml"',
     "skip_bad_rows": "true",
     "mend": '["sign:a", "rows:above"]',
     "parameters": '"dh"',
@@ -38,8 +40,12 @@ VALUES = {
     "in_place": "true",
     "world_joint": "true",
     "tool_frame": '"tcp"',
+    "camera_frame": '"eye"',
+    "camera_files": '"cam"',
     "force": "true",
     "report": '["r.html", "r.md"]',
+    "certificate": '"c.html"',
+    "meta": '["meta.toml"]',
     "json": '"r.json"',
     "curves": '"curves.csv"',
     "residuals": '"residuals.csv"',
@@ -47,12 +53,13 @@ VALUES = {
     "map": '"map.csv"',
 }
 ARGUMENTS = (
-    "calibrate arm.urdf a.csv b.csv -o out.urdf --tip tool0 --package-dir meshes --package-dir more "
-    "--columns map.toml --skip-bad-rows --mend sign:a --mend rows:above --parameters dh --extend gain "
-    "--fix d2 --free d3 --holdout 0.3 --method gn --loss tukey --priors none --bounds bounds.toml "
-    "--instrument known.toml --payload 5kg --max-iterations 7 --seed 3 --in-place --world-joint "
-    "--tool-frame tcp --force --report r.html --report r.md --json r.json --curves curves.csv "
-    "--residuals residuals.csv --scene scene.html --map map.csv"
+    "calibrate arm.urdf a.csv b.csv -o out.urdf --tip tool0 --root link0 --package-dir meshes "
+    "--package-dir more --columns map.toml --rig rig.toml --skip-bad-rows --mend sign:a --mend rows:above "
+    "--parameters dh --extend gain --fix d2 --free d3 --holdout 0.3 --method gn --loss tukey "
+    "--priors none --bounds bounds.toml --instrument known.toml --payload 5kg --max-iterations 7 --seed 3 "
+    "--in-place --world-joint --tool-frame tcp --camera-frame eye --camera-files cam --force "
+    "--report r.html --report r.md --certificate c.html --meta meta.toml --json r.json "
+    "--curves curves.csv --residuals residuals.csv --scene scene.html --map map.csv"
 )
 
 
@@ -84,7 +91,8 @@ def test_command_parses_to_the_same_job():
     job = job_of(ARGUMENTS)
     text = job.command({"arm.urdf": "robots/arm.urdf"})
     outputs = "-o out.urdf --in-place --report r.html --report r.md --json r.json --map map.csv "
-    outputs += "--curves curves.csv --residuals residuals.csv --scene scene.html"
+    outputs += "--curves curves.csv --residuals residuals.csv --scene scene.html --camera-files cam "
+    outputs += "--certificate c.html --meta meta.toml"
     assert job_of(f"{text.replace('robots/', '').removeprefix('dhcal ')} {outputs}") == job
     flags = {"-o", "--in-place", "--report", "--json", "--curves", "--residuals", "--scene", "--map"}
     assert not flags & set(text.split())
