@@ -58,7 +58,7 @@ def main() -> int:
     Returns:
         Exit status: 1 if a ratio has grown too much, else 0.
     """
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
     parser.add_argument("--write", action="store_true", help="write the ratios as the new baseline")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:

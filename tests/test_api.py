@@ -10,14 +10,16 @@ and describe the change in CHANGELOG.md.
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import dhcal_pin
 
 SNAPSHOT = Path(__file__).with_name("api.txt")
 
 
-def parameters(value: object) -> str:
+def parameters(value: Callable[..., Any]) -> str:
     """Write the parameters of a function without their types; a default is shown as `=…`."""
     words = []
     for name, parameter in inspect.signature(value).parameters.items():
