@@ -70,6 +70,8 @@ def group_by_configuration(q: Array, tolerance: float = CONFIGURATION_TOL) -> Ar
         near = near[np.abs(rows[near + offset] - rows[near]).max(1) <= tolerance]
         first.append(near)
         second.append(near + offset)
+    if len(rows) == m and not any(map(len, first)):
+        return np.arange(m)
     labels = np.empty(m, int)
     labels[order] = _connect(len(rows), first, second)[np.cumsum(is_new) - 1]
     return _by_first_appearance(labels)
@@ -89,6 +91,8 @@ def _connect(count: int, first: Sequence[Array], second: Sequence[Array]) -> Arr
 
 def _by_first_appearance(labels: Array) -> Array:
     """Number labels (m,) from 0 in the order of their first appearance."""
+    if np.array_equal(labels, np.arange(len(labels))):
+        return labels
     _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
     return np.argsort(np.argsort(first))[inverse]
 
@@ -131,7 +135,8 @@ def configuration_groups(data: Sequence[Measurement]) -> Array:
         samples = np.concatenate([np.arange(starts[i], starts[i + 1]) for i in chosen])
         # The label of a group is the number of its first sample.
         groups = group_by_configuration(np.concatenate(rows))
-        labels[samples] = samples[np.unique(groups, return_index=True)[1][groups]]
+        is_first = np.diff(np.maximum.accumulate(groups), prepend=-1) > 0
+        labels[samples] = samples[np.flatnonzero(is_first)[groups]]
     return _by_first_appearance(labels)
 
 
