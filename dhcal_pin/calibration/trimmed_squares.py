@@ -21,7 +21,9 @@ h smallest squared residuals. The search follows FAST-LTS (Rousseeuw & Van Dries
    scale and each bad block b has its own: with ν₀ and ν_g degrees of freedom of fits to all and to the good
    samples, mean squares s₀² and s_g², and n_b rows of a bad block with mean square b²,
 
-       ½·ν_g·log(s_g²) + Σ_b ½·n_b·log(b²)        against        ½·ν₀·log(s₀²)
+       ½·ν_g·log(s_g²) + Σ_b ½·n_b·log(b²) + log C        against        ½·ν₀·log(s₀²)
+
+   C is the number of ways to choose as many good samples.
 
    Degrees of freedom are rows minus the effective number of coordinates that the data, not the priors,
    determine.
@@ -51,6 +53,7 @@ References:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -559,7 +562,7 @@ def _extend(rows: _Rows, is_good: Array, scales: Array, redundancy: float) -> _C
 
 
 def _log_likelihood(rows: _Rows, is_good: Array, scales: Array, redundancy: float) -> float:
-    """Compute the negative logarithm of the likelihood of a set of good samples, see the module docstring.
+    """Compute the negative logarithm of the likelihood of a choice of good samples, see the module docstring.
 
     Args:
         rows: Linearized rows.
@@ -582,7 +585,15 @@ def _log_likelihood(rows: _Rows, is_good: Array, scales: Array, redundancy: floa
             total += 0.5 * n_rows * np.log(max(squares[members].sum() / n_rows, MIN_SCALE**2))
     bad = rows.counts[~fitted]
     total += float(np.sum(0.5 * bad * np.log(np.fmax(squares[~fitted] / bad, MIN_SCALE**2))))
-    return float(total)
+    return float(total) + _log_choices(len(is_good), int(is_good.sum()))
+
+
+def _log_choices(m: int, n_good: int) -> float:
+    """Return the logarithm of the number of ways to choose the good ones of m samples.
+
+    The best of many choices fits better than a single one by chance.
+    """
+    return math.lgamma(m + 1) - math.lgamma(n_good + 1) - math.lgamma(m - n_good + 1)
 
 
 def _standardized(rows: _Rows, y: Array, scales: Array, is_fitted: Array, covariance: Array) -> Array:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from robots import joint_sample, measured_arm, with_random_frames
+from robots import joint_sample, measured_arm, robot_file, with_random_frames
 
 from dhcal_pin.calibration import calibrate, trimmed_squares
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.initialization import align
 from dhcal_pin.measurements import Noise, PointContact, Pose, Position, Wires
+from dhcal_pin.robot import Chain
 
 SIGMA = 1e-4
 KINDS = {kind.kind: kind for kind in (Pose, Position, Wires, PointContact)}
@@ -139,6 +140,18 @@ def test_without_outliers_the_digits_are_those_of_least_squares(kind):
             ]
             np.testing.assert_array_equal(fits[0].x, fits[1].x)
             assert np.all(fits[0].weights[0] == 1)
+
+
+def test_few_good_samples_are_all_kept():
+    """The best of many choices of samples fits better by chance, which is no reason to reject the others."""
+    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    errors = select_parameters(arm, "minimal,base,tool")
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        actual = errors.at(np.minimum(errors.priors, 0.1) * rng.normal(size=len(errors.parameters)))
+        data = Pose.simulate(actual, rng.uniform(-2.5, 2.5, (20, 6)), Noise(5e-5, 1e-4), rng)
+        fit = calibrate(arm, without_sigma(data), "minimal,base,tool", extend="none")
+        assert all((weights == 1).all() for weights in fit.weights), seed
 
 
 def test_samples_of_one_configuration_may_be_wrong_together_or_alone():
