@@ -18,7 +18,9 @@ from .screen import Block, Screen, list_first
 
 if TYPE_CHECKING:
     from .._typing import Array
+    from ..cameras.rig import Rig
     from ..compensation import Compensation
+    from ..detection import BoardDetection
     from ..io import TargetPoses
     from ..paper.jacobian_check import Agreement
     from ..planning import Plan
@@ -111,6 +113,41 @@ def validation_screen(
         files_block(f"{kind}: {path}" for kind, path in files.items()),
     ]
     return Screen(blocks)
+
+
+def detection_screen(rig: Rig, detections: Sequence[BoardDetection], output: str) -> Screen:
+    """Describe which corners were found in images.
+
+    Args:
+        rig: Cameras and boards.
+        detections: Corners by board.
+        output: File that was written.
+
+    Returns:
+        The screen.
+    """
+    found, warnings = [], []
+    for detection in detections:
+        n_corners = sum(len(image.corner) for image in detection.used)
+        found.append(
+            f"board {detection.board.name}: {n_corners} corners in {len(detection.used)} of "
+            f"{len(detection.images)} images"
+        )
+        if difference := detection.layout.describe(detection.board):
+            warnings.append(
+                f"board {detection.board.name} was printed with {difference}; write so in {rig.source}"
+            )
+        if len(detections) == 1:
+            warnings += [
+                f"{image.path}: not used, {image.problem}" for image in detection.images if image.problem
+            ]
+    return Screen(
+        [
+            Block(found, is_verdict=True),
+            Block([f"warning: {text}" for text in warnings], "yellow", noun="warning", rank=2),
+            files_block([output]),
+        ]
+    )
 
 
 # --- inspect ---------------------------------------------------------------------------------------

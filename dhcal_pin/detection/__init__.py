@@ -2,18 +2,24 @@
 
 `detect_corners` finds the corners of a board in images with OpenCV, which the extra `camera` installs. A
 board that was printed with rows and columns exchanged, or in the older layout of OpenCV, is found, too.
+`detect_boards` does so for all images of a camera.
 `board_pdf` draws a board at its true scale.
 """
 
 from .corners import DetectedImage, Layout, detect_corners, find_layout, read_image
+from .images import BoardDetection, corner_columns, detect_boards, image_files
 from .printing import black_rectangles, board_pdf
 
 __all__ = [
+    "BoardDetection",
     "DetectedImage",
     "Layout",
     "black_rectangles",
     "board_pdf",
+    "corner_columns",
+    "detect_boards",
     "detect_corners",
     "find_layout",
+    "image_files",
     "read_image",
 ]

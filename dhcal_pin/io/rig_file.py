@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from .._typing import Array, PathLike
 from ..cameras.boards import BOARD_TYPES, Board
 from ..cameras.lens import FOCAL_AND_CENTRE, LENSES
 from ..cameras.rig import INTRINSICS_CHOICES, Camera, Rig
-from ..exceptions import FileFormatError
+from ..exceptions import FileFormatError, InvalidArgumentError, UnknownNameError
 from .toml_table import TomlTable, is_number, pose_content, read_pose
 
 # Largest number of squares or tags along a side, and of pixels along a side of an image.
@@ -21,6 +21,8 @@ _MAX_COUNT, _MAX_PIXELS = 1000, 100_000
 _MAX_MM = 1e5
 # Keys of a pose.
 _POSE_KEYS = ("xyz_m", "rotvec_rad")
+
+Entry = TypeVar("Entry", Camera, Board)
 
 
 def read_rig(path: PathLike) -> Rig:
@@ -50,6 +52,36 @@ def read_rig(path: PathLike) -> Rig:
         {board.name: board for board in boards},
         os.fspath(path),
     )
+
+
+def only_entry(entries: Mapping[str, Entry], name: str | None, kind: str, source: PathLike) -> Entry:
+    """Return a camera or a board of a rig by name, or the only one.
+
+    Args:
+        entries: Cameras or boards by name.
+        name: Name; None for the only one.
+        kind: "camera" or "board", for messages.
+        source: Path of the rig file, for messages.
+
+    Returns:
+        The camera or the board.
+
+    Raises:
+        InvalidArgumentError: There are several, and none is named.
+        UnknownNameError: The name is unknown.
+    """
+    if name is None and len(entries) == 1:
+        return next(iter(entries.values()))
+    if name is None:
+        raise InvalidArgumentError(
+            f"{os.fspath(source)}: has several entries [{kind}.NAME]; choose one with --{kind}: "
+            f"{', '.join(entries)}"
+        )
+    if name not in entries:
+        raise UnknownNameError(
+            f"--{kind} {name}: {os.fspath(source)} has no [{kind}.{name}]; choose from {', '.join(entries)}"
+        )
+    return entries[name]
 
 
 def _name(table: TomlTable) -> str:

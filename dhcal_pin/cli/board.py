@@ -1,0 +1,48 @@
+"""`dhcal board`: draw a board to print, at its true scale."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+
+from .options import RIG
+
+EXAMPLE = "dhcal board rig.toml -o board.pdf"
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the arguments of `dhcal board`.
+
+    Args:
+        parser: Parser of the command.
+    """
+    parser.add_argument("rig", metavar=RIG["metavar"], help="rig file with the board")
+    parser.add_argument(
+        "--board", metavar="NAME", help="board of the rig file; only needed if it has several"
+    )
+    parser.add_argument("-o", "--output", metavar="board.pdf", required=True, help="page to write")
+
+
+def run(args: Namespace) -> int:
+    """Draw a board.
+
+    Args:
+        args: Parsed arguments.
+
+    Returns:
+        Exit status 0.
+    """
+    from ..detection import board_pdf  # lazy import, as the following
+    from ..io.rig_file import only_entry, read_rig
+    from . import console
+    from .outputs import require_writable_outputs, write_outputs
+    from .result_screens import files_block
+    from .screen import Screen
+
+    require_writable_outputs([args.output], [args.rig])
+    rig = read_rig(args.rig)
+    board = only_entry(rig.boards, args.board, "board", args.rig)
+    write_outputs({args.output: board_pdf(board)})
+    advice = "Print it at 100 %, without fitting it to the page, and measure a square afterwards."
+    console.show(Screen([files_block([args.output])]), args.verbosity)
+    console.print_lines(advice)
+    return 0

@@ -1,0 +1,151 @@
+"""Boards in many images: the files, the detection in several threads, and the table of corners."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._typing import PathLike
+from ..cameras.boards import Board
+from ..cameras.rig import Camera, Rig
+from ..exceptions import FileFormatError, InvalidArgumentError
+from .corners import N_LAYOUT_IMAGES, DetectedImage, Layout, detect_corners, find_layout, read_image
+
+# Endings of image files in a folder.
+ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm")
+
+
+@dataclass(frozen=True, eq=False)
+class BoardDetection:
+    """Corners of one board in all images.
+
+    Attributes:
+        board: Board of the rig.
+        layout: Layout in which it was printed.
+        images: Result of each image, in the order of the files.
+    """
+
+    board: Board
+    layout: Layout
+    images: Sequence[DetectedImage]
+
+    @property
+    def used(self) -> list[DetectedImage]:
+        """Images in which the board was found."""
+        return [image for image in self.images if not image.problem]
+
+
+def image_files(paths: Sequence[PathLike]) -> list[str]:
+    """List image files, those of folders by name.
+
+    Args:
+        paths: Image files and folders.
+
+    Returns:
+        Paths of the files.
+
+    Raises:
+        InvalidArgumentError: A folder has no images, or a name comes twice.
+    """
+    files: list[str] = []
+    for path in map(os.fspath, paths):
+        if os.path.isdir(path):
+            found = sorted(str(file) for file in Path(path).iterdir() if file.suffix.lower() in ENDINGS)
+            if not found:
+                raise InvalidArgumentError(f"{path}: no images in this folder; expected {', '.join(ENDINGS)}")
+            files += found
+        else:
+            files.append(path)
+    names = [os.path.basename(file) for file in files]
+    if repeated := sorted({name for name in names if names.count(name) > 1}):
+        raise InvalidArgumentError(f"{repeated[0]}: two images have this name; give each its own")
+    return files
+
+
+def detect_boards(
+    rig: Rig, camera: Camera, paths: Sequence[str], on_progress: Callable[[int], None]
+) -> list[BoardDetection]:
+    """Find the corners of all boards of a rig in the images of one camera.
+
+    Args:
+        rig: Cameras and boards.
+        camera: Camera that took the images.
+        paths: Image files.
+        on_progress: Called with the number of searches done, at most one per board and image.
+
+    Returns:
+        Corners by board.
+
+    Raises:
+        FileFormatError: An image cannot be read or has another size, or no image shows a board.
+    """
+    boards = [board for board in rig.boards.values() if board.type != "points"]
+    if not boards:
+        raise FileFormatError(f"{rig.source}: all boards are sets of points, which cannot be detected")
+    size, out, n_done = (camera.width, camera.height), [], 0
+    step = max(1, len(paths) // N_LAYOUT_IMAGES)
+    some = [read_image(path) for path in paths[::step]]
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        for board in boards:
+            layout = find_layout(board, some)
+            images = []
+            # OpenCV works without the lock of the interpreter.
+            for image in threads.map(lambda path: detect_corners(board, layout, path, size), paths):  # noqa: B023
+                images.append(image)
+                n_done += 1
+                on_progress(n_done)
+            out.append(BoardDetection(board, layout, images))
+    if not any(detection.used for detection in out):
+        raise FileFormatError(
+            f"{paths[0]}: no board found in any of {len(paths)} images; check type, columns, rows and "
+            f"dictionary of the boards in {rig.source}"
+        )
+    return out
+
+
+def corner_columns(
+    rig: Rig,
+    camera: Camera,
+    detections: Sequence[BoardDetection],
+    joints: Mapping[str, Mapping[str, str]] | None = None,
+) -> dict[str, list[Any]]:
+    """Arrange corners as the columns of a measurement file, one row per corner.
+
+    Args:
+        rig: Cameras and boards.
+        camera: Camera that took the images.
+        detections: Corners by board.
+        joints: Cells of the joint columns by header, by the name of the image; None without joint values.
+
+    Returns:
+        Columns by header. Columns for the camera and the board exist only where the rig has several.
+    """
+    rows = [
+        (image, detection.board.name, number, pixels)
+        for detection in detections
+        for image in detection.used
+        for number, pixels in zip(image.corner.tolist(), np.round(image.pixels, 4).tolist(), strict=True)
+    ]
+    order = {image.path: i for i, image in enumerate(detections[0].images)}
+    rows.sort(key=lambda row: order[row[0].path])
+    names = [os.path.basename(image.path) for image, *_ in rows]
+    columns: dict[str, list[Any]] = {}
+    if joints:
+        headers = next(iter(joints.values()))
+        columns = {header: [joints[name][header] for name in names] for header in headers}
+    columns |= {
+        "u[px]": [pixels[0] for *_, pixels in rows],
+        "v[px]": [pixels[1] for *_, pixels in rows],
+        "corner": [number for _, _, number, _ in rows],
+    }
+    if len(rig.cameras) > 1:
+        columns["camera"] = [camera.name] * len(rows)
+    if len(rig.boards) > 1:
+        columns["board"] = [board for _, board, _, _ in rows]
+    return columns | {"image": names}

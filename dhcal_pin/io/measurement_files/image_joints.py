@@ -1,0 +1,61 @@
+"""Joint values of images: a table with a column of file names and one column per joint."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+
+from ..._typing import PathLike
+from ...exceptions import FileFormatError
+from ..tables import read_table
+
+IMAGE = "image"
+
+
+def read_image_joints(path: PathLike, images: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Read the joint values that belong to images.
+
+    Args:
+        path: Table with the column `image`, file names with or without folder and ending, and one column per
+            joint with its unit, such as `elbow_joint[deg]`.
+        images: Paths of the images.
+
+    Returns:
+        Cells of the joint columns by header, for the name of each image.
+
+    Raises:
+        FileFormatError: The column is missing, or an image has no row or several.
+    """
+    table = read_table(path)
+    headers = [header.strip() for header in table.headers]
+    if IMAGE not in headers:
+        raise FileFormatError(
+            f"{table.header_location}: no column `{IMAGE}`; expected the file names of the images"
+        )
+    index = headers.index(IMAGE)
+    rows: dict[str, int] = {}
+    for row, cells in enumerate(table.cells):
+        stem = _stem(cells[index])
+        if stem in rows:
+            raise FileFormatError(
+                f"{table.source}:{table.lines[row]}: image {cells[index]!r} has a row already, line "
+                f"{table.lines[rows[stem]]}"
+            )
+        rows[stem] = row
+    missing = [image for image in images if _stem(image) not in rows]
+    if missing:
+        more = f" and of {len(missing) - 1} more images" if len(missing) > 1 else ""
+        raise FileFormatError(f"{table.source}: no joint values of {os.path.basename(missing[0])}{more}")
+    return {
+        os.path.basename(image): {
+            header: table.cells[rows[_stem(image)]][i].strip()
+            for i, header in enumerate(headers)
+            if i != index
+        }
+        for image in images
+    }
+
+
+def _stem(name: str) -> str:
+    """Return the name of a file without folder and ending."""
+    return os.path.splitext(os.path.basename(name.strip()))[0]

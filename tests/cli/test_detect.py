@@ -1,0 +1,108 @@
+"""Tests of `dhcal detect` and `dhcal board`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import stdout_of, unfolded
+from robots import DATA, missing
+
+pytest.importorskip("cv2")
+
+RIG = """[camera.fixed]
+link = "world"
+width = 1600
+height = 1200
+[board.target]
+link = "tip"
+type = "charuco"
+columns = {columns}
+rows = {rows}
+square_mm = 36.195
+marker_mm = 18.256
+dictionary = "DICT_6X6_250"
+"""
+
+
+@pytest.fixture
+def photographs(robot_folder):
+    """Folder with photographs of a board of 5 x 7 squares, and a rig file."""
+    folder = DATA / "charuco_images" / "images"
+    if not folder.exists():
+        missing(f"images at {folder}")
+    Path("rig.toml").write_text(RIG.format(columns=5, rows=7))
+    return folder
+
+
+def rows_of(path):
+    lines = [line for line in Path(path).read_text().splitlines() if not line.startswith("#")]
+    return [dict(zip(lines[0].split(","), line.split(","), strict=True)) for line in lines[1:]]
+
+
+def test_corners_of_photographs_with_joint_values(run, photographs):
+    names = sorted(path.name for path in photographs.iterdir())
+    table = [
+        "image,joint_1[deg],joint_2[deg]",
+        *(f"{Path(name).stem},{i},{-i}" for i, name in enumerate(names)),
+    ]
+    Path("joints.csv").write_text("\n".join(table))
+    command = ("detect", photographs, "--rig", "rig.toml", "--joints", "joints.csv", "-o", "corners.csv")
+    status, _, err = run(*command)
+    assert status == 0, err
+    assert f"board target: 309 corners in {len(names)} of {len(names)} images" in unfolded(err)
+    rows = rows_of("corners.csv")
+    assert len(rows) == 309
+    for row in rows:
+        assert names[int(row["joint_1[deg]"])] == row["image"]
+        assert 0 <= float(row["u[px]"]) < 1600
+        assert 0 <= float(row["v[px]"]) < 1200
+        assert 0 <= int(row["corner"]) < 24
+
+
+def test_exchanged_rows_and_columns_are_named(run, photographs):
+    stdout_of(run("detect", photographs, "--rig", "rig.toml", "-o", "right.csv"))
+    Path("rig.toml").write_text(RIG.format(columns=7, rows=5))
+    status, _, err = run("detect", photographs, "--rig", "rig.toml", "-o", "corners.csv")
+    assert status == 0
+    assert "was printed with columns = 5, rows = 7" in unfolded(err)
+    # The same corners, under the numbers of the other board.
+    pixels = [
+        np.array([[float(r["u[px]"]), float(r["v[px]"])] for r in rows_of(name)])
+        for name in ("right.csv", "corners.csv")
+    ]
+    assert len(pixels[1]) == 309
+    np.testing.assert_allclose(*(each[np.lexsort(each.T)] for each in pixels))
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ("image,joint_1[deg]\nother,1\n", ["joints.csv", "no joint values of"]),
+        ("name,joint_1[deg]\nother,1\n", ["joints.csv", "no column `image`"]),
+        ("image,joint_1[deg]\nother,1\nother.png,2\n", ["joints.csv:3", "has a row already, line 2"]),
+    ],
+)
+def test_wrong_joint_values_are_refused(assert_refused, photographs, table, words):
+    Path("joints.csv").write_text(table)
+    command = ("detect", photographs, "--rig", "rig.toml", "--joints", "joints.csv", "-o", "corners.csv")
+    assert_refused(words, *command)
+
+
+def test_images_of_another_size_and_folders_without_images_are_refused(assert_refused, photographs):
+    Path("rig.toml").write_text(RIG.format(columns=5, rows=7).replace("1600", "800"))
+    assert_refused(["1600 x 1200", "800"], "detect", photographs, "--rig", "rig.toml", "-o", "corners.csv")
+    Path("empty").mkdir()
+    assert_refused(["empty", "no images"], "detect", "empty", "--rig", "rig.toml", "-o", "corners.csv")
+    assert_refused(
+        ["--camera other", "choose from fixed"],
+        *("detect", photographs, "--rig", "rig.toml", "--camera", "other", "-o", "corners.csv"),
+    )
+
+
+def test_board_is_drawn_at_its_true_scale(run, photographs):
+    assert run("board", "rig.toml", "-o", "board.pdf")[0] == 0
+    box = Path("board.pdf").read_bytes().split(b"/MediaBox [0 0 ")[1].split(b"]")[0].split()
+    wanted = np.array([5, 7]) * 36.195 + 20
+    np.testing.assert_allclose(np.array(box, float) * 25.4 / 72, wanted, atol=1e-3)
