@@ -32,7 +32,10 @@ import dhcal_pin
 from dhcal_pin.cli import main
 from dhcal_pin.cli.job import Job
 from dhcal_pin.estimation import parameters
+from dhcal_pin.io import measurement_text
+from dhcal_pin.io.rig_file import rig_text
 from dhcal_pin.io.tables import sources
+from dhcal_pin.measurements import CameraCorners
 from dhcal_pin.studies.grid import Setting
 
 DOCS = ROOT / "docs"
@@ -81,9 +84,22 @@ def examples(tmp_path_factory):
         header = lines[0].split(",")
         rows = np.array([line.split(",") for line in lines[1:]], float)
         _write_foreign_file(header, rows)
+        _write_images()
         rows[:, [name.startswith("elbow_joint") for name in header]] *= -1
         np.savetxt("wrong_sign.csv", rows, delimiter=",", header=lines[0], comments="")
     return folder
+
+
+def _write_images() -> None:
+    """Write image coordinates of points on the tool of a UR10 with errors, and their rig file."""
+    arm = dhcal_pin.Chain.from_urdf("ur10.urdf", tip="tool0")
+    errors = parameters.select_parameters(arm, "placement")
+    rng = np.random.default_rng(0)
+    sizes = np.array([1e-3 if parameter.unit == "m" else 3e-3 for parameter in errors.parameters])
+    actual = errors.at(sizes * rng.normal(size=len(sizes)))
+    data = CameraCorners.simulate(actual, rng.uniform(-2, 2, (30, 6)), dhcal_pin.Noise(2e-4), rng)
+    Path("corners.csv").write_text(measurement_text(data, actual))
+    Path("rig.toml").write_text(rig_text(data.rig.cameras, data.rig.boards))
 
 
 def _write_foreign_file(header: list[str], rows: np.ndarray) -> None:
@@ -191,6 +207,7 @@ def test_files_of_a_run_follow_the_schemas(examples, tmp_path, monkeypatch):
     documents = {
         "result": [json.loads(Path(name).read_text()) for name in ("out.json", "validation.json")],
         "sidecar": [tomllib.loads(Path("out.calibration.toml").read_text())],
+        "rig": [tomllib.loads(Path("rig.toml").read_text())],
         "dh": [tomllib.loads(Path(name).read_text()) for name in ("ur10.dh.toml", "arm.dh.toml")],
         "column_map": [tomllib.loads(path.read_text()) for path in (ROOT / "tests" / "maps").glob("*.toml")],
     }
