@@ -92,6 +92,9 @@ from .reweighting import Fit, reweight, with_sigma_scales
 if TYPE_CHECKING:
     from .result import Result
 
+# Whitened residuals of exact data are smaller, as their standard deviations have a lower limit. They are
+# rounding errors, whose correlation says nothing about the model.
+MIN_NOISE = 1e-3
 # Families of low order in the order in which they are tried, and the smallest relative improvement of the
 # cross-validated squared error for which each is added. Eccentricity and elasticity have a physical cause in
 # every arm and hold outside the measured region; the others have to improve the error noticeably.
@@ -772,6 +775,8 @@ def _are_residuals_correlated(fit: Fit, noise: float) -> bool:
     Returns:
         Whether the residuals contradict independence.
     """
+    if noise < MIN_NOISE:
+        return False
     rows = TriangularSystem(fit.solution.system.rows / noise)
     root = posterior_sqrt_covariance(rows, fit.problem.weights)[0]
     return find_residual_correlation(fit.problem, fit.solution.x, root, noise, fit.weights).is_significant

@@ -291,7 +291,7 @@ def _checked_inputs(job: Job) -> list[str]:
     require_urdf_ending(job.output)
     require_writable_outputs([job.json, job.residuals, *job.report, job.certificate], inputs)
     protected = [*measured, *settings] if job.in_place else inputs
-    require_writable_outputs([sidecar_path(job.output), *job.output_paths], protected)
+    require_writable_outputs([*job.output_paths, sidecar_path(job.output)], protected)
     if job.report:
         from ..report import html  # lazy import: only for reports
 
