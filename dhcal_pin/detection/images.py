@@ -54,7 +54,7 @@ def image_files(paths: Sequence[PathLike]) -> list[str]:
         InvalidArgumentError: A folder has no images, or a name comes twice.
     """
     files: list[str] = []
-    for path in map(os.fspath, paths):
+    for path in [os.fspath(path) for path in paths]:
         if os.path.isdir(path):
             found = sorted(str(file) for file in Path(path).iterdir() if file.suffix.lower() in ENDINGS)
             if not found:

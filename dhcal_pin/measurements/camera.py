@@ -392,10 +392,10 @@ class CameraCorners(Measurement):
 
     def _project(self, frames: FrameBatch, u: Array) -> _Projection:
         """Project all corners; the last result is kept, as residuals and both Jacobians need it."""
-        last = self.__dict__.get("_last_projection")
+        last = getattr(self, "_last_projection", None)
         if last is None or last[0] is not frames or not np.array_equal(last[1], u):
             last = frames, u.copy(), self._compute_projection(frames, u)
-            self.__dict__["_last_projection"] = last
+            object.__setattr__(self, "_last_projection", last)
         return last[2]
 
     def _compute_projection(self, frames: FrameBatch, u: Array) -> _Projection:

@@ -73,7 +73,8 @@ def test_exchanged_rows_and_columns_are_named(run, photographs):
         for name in ("right.csv", "corners.csv")
     ]
     assert len(pixels[1]) == 309
-    np.testing.assert_allclose(*(each[np.lexsort(each.T)] for each in pixels))
+    first, second = (each[np.lexsort(each.T)] for each in pixels)
+    np.testing.assert_allclose(first, second)
 
 
 @pytest.mark.parametrize(

@@ -53,8 +53,8 @@ def drawing(board, tmp_path, noise=2.0):
     for left, top, w, h in rectangles + np.array([margin, margin, 0, 0]):
         low, high = np.round([[left, top], [left + w, top + h]] * np.array(scale)).astype(int)
         sheet[low[1] : high[1], low[0] : high[0]] = 20
-    corners = np.float32([[0, 0], [sheet.shape[1], 0], sheet.shape[1::-1], [0, sheet.shape[0]]])
-    image_corners = np.float32([[170, 120], [1130, 90], [1080, 850], [220, 780]])
+    corners = np.array([[0, 0], [sheet.shape[1], 0], sheet.shape[1::-1], [0, sheet.shape[0]]], np.float32)
+    image_corners = np.array([[170, 120], [1130, 90], [1080, 850], [220, 780]], np.float32)
     homography = cv2.getPerspectiveTransform(corners, image_corners)
     # Pixel centres are whole numbers, in the sheet, too. The mean of 4 x 4 pixels lies between them.
     shift = np.array([[1, 0, -0.375], [0, 1, -0.375], [0, 0, 1.0]])
