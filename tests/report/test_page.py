@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import re
@@ -103,10 +104,16 @@ def dot(page: Any, plot: Any, x: float, y: float) -> tuple[float, float]:
 
 
 def wait_for(page: Any, expression: str) -> None:
-    """Wait until an expression of the page is true; the page forbids what Playwright's own function does."""
+    """Wait until an expression of the page is true; the page forbids what Playwright's own function does.
+
+    A frame that is being loaded cannot evaluate anything yet.
+    """
+    from playwright.sync_api import Error  # lazy import: only where a browser is
+
     for _ in range(600):
-        if page.evaluate(expression):
-            return
+        with contextlib.suppress(Error):
+            if page.evaluate(expression):
+                return
         time.sleep(0.1)
     raise AssertionError(f"not true within a minute: {expression}")
 
