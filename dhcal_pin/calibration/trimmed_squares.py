@@ -79,8 +79,8 @@ from ..estimation.robust import (
 from ..estimation.solver import SolverResult
 from ..measurements.base import Measurement
 
-# The search is only skipped with at least so many rows per unknown, where the rows of one configuration count
-# once, and so many samples of each measurement.
+# Smallest number of rows per unknown, and of samples of each measurement, with which the search may be
+# skipped. The rows of one configuration count once.
 MIN_ROWS_PER_UNKNOWN, MIN_TESTED_SAMPLES = 30, 100
 # Largest number of samples that take part in the search.
 MAX_SAMPLES = 200

@@ -1,7 +1,7 @@
 """Certificate: one or two printed pages about a calibration, for quality records.
 
-`page/certificate.html` is the Jinja template. The certificate has no date of its own: what the calibration
-does not know, such as the serial number, the instrument, the operator and the date, is given as metadata.
+`page/certificate.html` is the Jinja template. The user states as metadata what the
+calibration does not know: serial number, instrument, operator and date.
 """
 
 from __future__ import annotations
