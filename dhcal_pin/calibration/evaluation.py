@@ -32,7 +32,7 @@ from ..measurements.base import Measurement
 from ..robot.chain import Chain
 
 # Unit of each group of errors, in the order of importance.
-GROUP_UNITS = {"position": "m", "orientation": "rad", "residual": "m", "pixels": "px"}
+GROUP_UNITS = {"position": "m", "orientation": "rad", "residual": "m", "pixels": "px", "board": "m"}
 
 # Samples that a comparison judges.
 Title = Literal["hold-out", "region hold-out", "cross-validated", "fitted"]
@@ -104,12 +104,15 @@ class Accuracy(Mapping[str, Any]):
         orientation: Of orientations [rad].
         residual: Of other residuals, such as lengths and distances.
         pixels: Of image coordinates [px]. Without other residuals their keys begin with "residual", too.
+        board: Of the corners of boards, seen from the camera: smallest displacements that explain the errors
+            in the image [m].
     """
 
     position: ErrorStatistics | None = None
     orientation: ErrorStatistics | None = None
     residual: ErrorStatistics | None = None
     pixels: ErrorStatistics | None = None
+    board: ErrorStatistics | None = None
 
     @classmethod
     def from_errors(cls, errors: Sequence[Mapping[str, Array]]) -> Accuracy:
@@ -140,7 +143,7 @@ class Accuracy(Mapping[str, Any]):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the flat keys and values of the JSON document, such as `position_rms_m`."""
-        endings = {"position": "_m", "orientation": "_rad", "residual": "", "pixels": "_px"}
+        endings = {"position": "_m", "orientation": "_rad", "residual": "", "pixels": "_px", "board": "_m"}
         out: dict[str, Any] = {}
         for group, statistics in self.groups.items():
             prefix, ending = group, endings[group]

@@ -151,10 +151,10 @@ def calibrate(
         groups = PriorGroups.from_expected(errors, problem.weights, has_default_prior(errors, priors))
         fit = reweight(fit, robust.LOSSES[loss].stages, groups, max_iterations, progress)
         if has_images(data) and priors != "none":
-            fit, gate = apply_gate(fit, groups, max_iterations)
+            fit, gate, stages = apply_gate(fit, groups, max_iterations)
             extension = Extension(temperature=gate.temperature, n_configurations=gate.n_configurations)
             result = _make_result(fit, 1.0, holdout, method)
-            return replace(result, extension=extension, input_warnings=gate.warnings)
+            return replace(result, extension=extension, input_warnings=gate.warnings, camera_stages=stages)
         shrinkage_factor = compute_shrinkage_factor(fit.problem, fit.solution, groups.groups())
     result = _make_result(fit, shrinkage_factor, holdout, method)
     # Residuals of mixed-up measurements say nothing about other errors.

@@ -130,8 +130,8 @@ def residual_table(fit: Result) -> ResidualTable:
     units: dict[str, str] = {}
     for start, item, (errors, _) in zip(starts, data, residuals, strict=False):
         names = iter(item.residual_names)
-        for group, values in errors.items():
-            for column in values.T:
+        for group in item.residual_groups:
+            for column in errors[group].T:
                 name = next(names)
                 units[name] = GROUP_UNITS[error_group(group)]
                 into = components.setdefault(name, np.full(starts[-1], np.nan))

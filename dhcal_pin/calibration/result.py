@@ -49,6 +49,7 @@ from ..plausibility.mixups import Diagnosis, diagnose_mixups
 from ..result_plots import ResultPlots
 from ..robot.chain import Chain
 from . import summary
+from .cameras.stages import Stage
 from .cross_validation import (
     FoldComparison,
     Generalization,
@@ -113,6 +114,8 @@ class Result(ResultPlots):
             if there were none, see `leave_regions_out`.
         extension: Families of joint errors that were added, and how much the samples count; None if nothing
             was tried.
+        camera_stages: Unknowns of a calibration from images that were freed in turn, and what each group of
+            them improved; empty without images.
     """
 
     errors: ErrorModel
@@ -129,6 +132,7 @@ class Result(ResultPlots):
     extension: Extension | None = None
     input_warnings: tuple[str, ...] = ()
     decision: Verdict | None = None
+    camera_stages: tuple[Stage, ...] = ()
 
     @property
     def model(self) -> pin.Model:

@@ -31,6 +31,7 @@ GROUP_LABELS = {
     "orientation": "orientation error",
     "residual": "residual",
     "pixels": "image error",
+    "board": "error at the board",
 }
 # Statistics in words, by the attribute of `ErrorStatistics`.
 STATISTIC_LABELS = {"mean": "mean", "rms": "RMS", "p95": "95th percentile", "max": "maximum"}

@@ -139,6 +139,7 @@ class _Projection:
         by_board: Derivative by position and rotation vector of the board, (2, 6, m).
         by_point: Derivative by the corner in its board, (2, 3, m).
         by_lens: Derivative by the values of the lens of each camera, (2, s, m) for the samples of the camera.
+        by_local: Derivative by the corner in the frame of the camera, (2, 3, m) [px/m].
         depth: Depth of the corners in front of the camera, (m,) [m].
     """
 
@@ -148,6 +149,7 @@ class _Projection:
     by_board: Array
     by_point: Array
     by_lens: list[Array]
+    by_local: Array
     depth: Array
 
 
@@ -448,6 +450,7 @@ class CameraCorners(Measurement):
             np.concatenate([_product(by_end, board_links), board_rotation], 1),
             _product(by_end, r_board),
             by_lens,
+            by_local,
             local[2],
         )
 
@@ -520,8 +523,17 @@ class CameraCorners(Measurement):
         return residual, self.observation_matrix(frames, u, residual)
 
     def errors(self, frames: FrameBatch, u: Array) -> dict[str, Array]:
-        """Return the errors "pixels" (m, 2) [px]."""
-        return {"pixels": self.values - self._project(frames, u).pixels.T}
+        """Return the errors "pixels" (m, 2) [px] and "board" (m, 3) [m].
+
+        The error at the board is the smallest displacement of the corner, in axes of the camera, that
+        explains the error e in the image to first order: Bᵀ·(B·Bᵀ)⁻¹·e with the derivative B of the image.
+        """
+        found = self._project(frames, u)
+        pixels = self.values - found.pixels.T
+        by_local = found.by_local.transpose(2, 0, 1)
+        products = by_local @ by_local.swapaxes(1, 2)
+        board = by_local.swapaxes(1, 2) @ np.linalg.solve(products, pixels[..., None])
+        return {"pixels": pixels, "board": board[..., 0]}
 
     def displacement_derivative(self, frames: FrameBatch, u: Array) -> Array:
         """Return the derivative of the image coordinates by a displacement of the tool.

@@ -99,7 +99,9 @@ def short_names(paths: Sequence[PathLike]) -> dict[str, str]:
 
 
 # Keys of an accuracy and of a parameter; further values are under `comparisons` and `priors`.
-_ACCURACY = "position_rms_m position_max_m orientation_rms_rad residual_rms residual_max unit".split()
+_ACCURACY = (
+    "position_rms_m position_max_m orientation_rms_rad residual_rms residual_max unit board_rms_m board_max_m"
+).split()
 _PARAMETER = "name unit nominal value std observability posterior_to_prior_std fixed frame direction".split()
 
 
@@ -172,6 +174,7 @@ def result_to_dict(
         "parameters": parameter_rows(fit),
         "priors": {estimate.name: estimate.prior for estimate in fit.estimates if not estimate.fixed},
         "extension": fit.extension.to_dict() if fit.extension else None,
+        "camera_stages": [stage.to_dict() for stage in fit.camera_stages],
         "shrinkage_factor": fit.shrinkage_factor,
         "shrinkage_notes": fit.shrinkage_notes,
         "unobservable": fit.unobservable,

@@ -6,5 +6,16 @@ which of these parameters are unknown, and in which order they are freed.
 
 from .gate import apply_gate
 from .sets import RIG_SETS, default_sets, has_images, held_values, split_sets
+from .stages import STAGES, ImageError, Stage
 
-__all__ = ["RIG_SETS", "apply_gate", "default_sets", "has_images", "held_values", "split_sets"]
+__all__ = [
+    "RIG_SETS",
+    "STAGES",
+    "ImageError",
+    "Stage",
+    "apply_gate",
+    "default_sets",
+    "has_images",
+    "held_values",
+    "split_sets",
+]

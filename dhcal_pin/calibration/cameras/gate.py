@@ -16,7 +16,7 @@ predict the left-out clusters better.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,13 +29,15 @@ from ...estimation.qr import TriangularSystem, append_priors, posterior_sqrt_cov
 from ...estimation.solver import minimize
 from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners
-from ..cross_validation import factor_partition, solve_columns
-from ..partition import Fold, configuration_groups, different_configurations
+from ..partition import Fold, configuration_groups, different_configurations, k_fold
 from ..reweighting import Fit
 from .jitter import Jitter, estimate_jitter, with_jitter
+from .stages import Stage, fitted_error, held_out_error
 
 # Number of clusters of joint space that are left out in turn.
 N_CLUSTERS = 5
+# Number of folds of random images.
+N_IMAGE_FOLDS = 5
 # Configurations per unit of the temperature with an open and with a closed gate.
 OPEN_SAMPLES, CLOSED_SAMPLES = 20, 5
 # Largest ratio of the errors for which the arm is demonstrably wrong.
@@ -68,6 +70,16 @@ class Gate:
     def is_open(self) -> bool:
         """Whether the arm is demonstrably wrong."""
         return self.ratio < MAX_OPEN_RATIO
+
+    @property
+    def sentence(self) -> str:
+        """Why the arm is corrected in full, or only as far as the priors of greatest evidence allow."""
+        if self.is_open:
+            return (
+                "The arm is demonstrably wrong: estimating it changes the error of left-out parts of joint "
+                f"space by the factor {self.ratio:.2f}."
+            )
+        return self.warnings[0]
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -107,7 +119,7 @@ def fit_with_jitter(fit: Fit, max_iterations: int) -> tuple[Fit, Jitter]:
     ), jitter
 
 
-def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int) -> tuple[Fit, Gate]:
+def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int) -> tuple[Fit, Gate, tuple[Stage, ...]]:
     """Fit arm, cameras and boards as far as the images show that the arm is wrong.
 
     Args:
@@ -116,8 +128,14 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int) -> tuple[Fit,
         max_iterations: Largest number of iterations of one solution.
 
     Returns:
-        The final fit, and the gate.
+        The final fit, the gate, and the accuracy of each stage.
     """
+    final, gate = _gated(fit, groups, max_iterations)
+    return final, gate, _stages(fit, final, gate, max_iterations)
+
+
+def _gated(fit: Fit, groups: PriorGroups, max_iterations: int) -> tuple[Fit, Gate]:
+    """Return the final fit, and the gate."""
     expected = fit.problem.weights.copy()
     expected[groups.members] = groups.expected_weights[groups.group_index]
     n_configurations = len(np.unique(configuration_groups(fit.data)))
@@ -168,11 +186,11 @@ def _trial(
 ) -> _Trial:
     """Judge a model of the noise on left-out clusters."""
     closed = _with_evidence(fit, groups, expected, temperature, max_iterations)
-    if len(folds) < 2:
+    error = held_out_error(closed, folds)
+    nominal = held_out_error(_without_arm(fit, max_iterations), folds)
+    if error is None or nominal is None:
         return _Trial(fit, jitter, closed, float("nan"), float("nan"))
-    error = held_out_rms(closed, fit.data, folds)
-    nominal = held_out_rms(_without_arm(fit, max_iterations), fit.data, folds)
-    return _Trial(fit, jitter, closed, error, error / nominal)
+    return _Trial(fit, jitter, closed, error.pixels, error.pixels / nominal.pixels)
 
 
 def _solve(fit: Fit, problem: Problem, temperature: float, max_iterations: int) -> Fit:
@@ -202,18 +220,47 @@ def _with_evidence(
     return _solve(fit, fit.problem.with_prior_weights(weights), temperature, max_iterations)
 
 
-def _without_arm(fit: Fit, max_iterations: int) -> Fit:
-    """Fit cameras and boards with the nominal arm."""
+def _without_arm(fit: Fit, max_iterations: int, held: Collection[str] = ()) -> Fit:
+    """Fit cameras and boards with the nominal arm; the parameter sets `held` keep their first values."""
     problem = fit.problem
     robot = len(problem.errors.parameters)
+    values = {
+        p.name: p.nominal
+        for item in problem.data
+        if isinstance(item, CameraCorners)
+        for p in item.instrument_parameters
+        if item.set_of(p.name) in held
+    }
+    is_free = np.array([p.name not in values for p in problem.instrument_parameters], bool)
     plain = replace(
         problem,
         errors=ErrorModel(problem.errors.chain, ()),
-        weights=problem.weights[robot:],
+        weights=problem.weights[robot:][is_free],
+        known=values | dict(problem.known),
         bounds=None,
     )
-    solution = minimize(plain, "lm", fit.solution.x[robot:], max_iterations, loose=True)
+    solution = minimize(plain, "lm", fit.solution.x[robot:][is_free], max_iterations, loose=True)
     return replace(fit, problem=plain, solution=solution)
+
+
+def _stages(fit: Fit, final: Fit, gate: Gate, max_iterations: int) -> tuple[Stage, ...]:
+    """Judge the stages of a calibration: frames, intrinsics, arm."""
+    folds = cluster_folds(fit.data)
+    images = k_fold(fit.data, N_IMAGE_FOLDS) if folds else ()
+
+    def judged(name: str, each: Fit, is_kept: bool, reason: str) -> Stage:
+        n_unknowns = len(each.problem.weights)
+        errors = fitted_error(each), held_out_error(each, images), held_out_error(each, folds)
+        return Stage(name, is_kept, n_unknowns, *errors, reason)
+
+    frames = _without_arm(fit, max_iterations, ("intrinsics",))
+    out = [judged("frames", frames, True, "Poses of cameras and boards are always estimated.")]
+    lenses = _without_arm(fit, max_iterations)
+    if len(lenses.problem.weights) > len(frames.problem.weights):
+        out.append(judged("intrinsics", lenses, True, "The rig does not fix them."))
+    if final.problem.errors.parameters:
+        out.append(judged("arm", final, gate.is_open, gate.sentence))
+    return tuple(out)
 
 
 def cluster_folds(data: Sequence[Measurement]) -> tuple[Fold, ...]:
@@ -254,29 +301,3 @@ def _far_points(points: Array) -> list[int]:
         distance = np.min([np.sum((points - points[i]) ** 2, 1) for i in chosen], 0)
         chosen.append(int(np.argmax(distance)))
     return chosen
-
-
-def held_out_rms(fit: Fit, data: Sequence[Measurement], folds: Sequence[Fold]) -> float:
-    """Compute the error of image coordinates under fits of the other images.
-
-    Args:
-        fit: Fit of all images.
-        data: Measurements without weights.
-        folds: Disjoint folds.
-
-    Returns:
-        RMS of all held-out image coordinates that are not outliers [px].
-    """
-    problem, x = fit.problem, fit.solution.x
-    robot, columns = len(problem.errors.parameters), np.ones(len(x), bool)
-    squares = count = 0.0
-    for fold, systems in zip(folds, factor_partition(problem, x, folds), strict=True):
-        step, _ = solve_columns(systems.fitted, problem.weights, x, columns)
-        chain = problem.errors.at((x + step)[:robot])
-        for item, mask, weights in zip(data, fold, fit.weights, strict=True):
-            if isinstance(item, CameraCorners):
-                part = item.take(mask & (weights > 0.5))
-                u = problem.instrument_values_of(part, x + step)
-                errors = part.errors(chain.forward_kinematics(part.configurations()), u)["pixels"]
-                squares, count = squares + float(np.sum(errors**2)), count + errors.size
-    return float(np.sqrt(squares / max(count, 1.0)))

@@ -1,0 +1,130 @@
+"""Stages of a calibration from images: which unknowns were freed in turn, and what each of them improved.
+
+Unknowns are freed in the order of `STAGES`. Each stage is judged on images that its fit did not see: on
+random ones, and on whole regions of joint space. Random images lie between fitted ones, and a wrong model
+may predict them well. Regions show whether the model holds elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from ..._typing import Array
+from ...measurements.base import Measurement
+from ...measurements.camera import CameraCorners
+from ..cross_validation import factor_partition, solve_columns
+from ..partition import Fold
+from ..reweighting import Fit
+
+# Stages in their order: exchanged axes of the intrinsics, poses of cameras and boards, lenses, corners of the
+# boards, errors of the arm.
+STAGES = ("axis order", "frames", "intrinsics", "target points", "arm")
+
+
+@dataclass(frozen=True)
+class ImageError:
+    """Error of corners in images.
+
+    Attributes:
+        pixels: RMS distance between the measured and the modelled corner in the image [px].
+        distance: RMS distance of the corner from the line of sight through its measured image, at the
+            board [m].
+        n_corners: Number of corners.
+    """
+
+    pixels: float
+    distance: float
+    n_corners: int
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Accuracy after one more group of unknowns was freed.
+
+    Attributes:
+        name: One of `STAGES`.
+        is_kept: Whether the unknowns of this stage are free in the result.
+        n_unknowns: Number of unknowns of the fit of this stage.
+        fitted: Error of the fitted images.
+        by_image: Error of random images that were held out; None if there are too few.
+        by_region: Error of regions of joint space that were held out; None if there are too few images.
+        reason: Sentence that says why the unknowns are free or held.
+    """
+
+    name: str
+    is_kept: bool
+    n_unknowns: int
+    fitted: ImageError
+    by_image: ImageError | None
+    by_region: ImageError | None
+    reason: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content for the JSON document."""
+        keys = {"pixels": "residual_rms_px", "distance": "board_rms_m", "n_corners": "corners"}
+        out = {"stage": self.name, "kept": self.is_kept, "unknowns": self.n_unknowns, "reason": self.reason}
+        for name in ("fitted", "by_image", "by_region"):
+            error = getattr(self, name)
+            out[name] = error and {keys[key]: value for key, value in asdict(error).items()}
+        return out
+
+
+def fitted_error(fit: Fit) -> ImageError:
+    """Compute the error of the fitted images that are not outliers.
+
+    Args:
+        fit: Fit.
+
+    Returns:
+        The error.
+    """
+    return _image_error(fit, [(fit.solution.x, [np.ones(len(item.rows), bool) for item in fit.data])])
+
+
+def held_out_error(fit: Fit, folds: Sequence[Fold]) -> ImageError | None:
+    """Compute the error of images under fits of the other images, by one step from the fit of all.
+
+    Args:
+        fit: Fit of all images.
+        folds: Disjoint folds.
+
+    Returns:
+        Error of all held-out corners that are not outliers; None with fewer than two folds.
+    """
+    if len(folds) < 2:
+        return None
+    problem, x = fit.problem, fit.solution.x
+    columns = np.ones(len(x), bool)
+    systems = factor_partition(problem, x, folds)
+    return _image_error(
+        fit,
+        [
+            (x + solve_columns(system.fitted, problem.weights, x, columns)[0], fold)
+            for fold, system in zip(folds, systems, strict=True)
+        ],
+    )
+
+
+def _image_error(fit: Fit, parts: Sequence[tuple[Array, Sequence[Array]]]) -> ImageError:
+    """Compute the error of parts of the images, each at its own solution x (p,)."""
+    problem, squares, distances, count = fit.problem, 0.0, 0.0, 0
+    for x, fold in parts:
+        chain = problem.errors.at(x[: len(problem.errors.parameters)])
+        for item, mask, weights in zip(fit.data, fold, fit.weights, strict=True):
+            if isinstance(item, CameraCorners):
+                errors = _errors(item, mask & (weights > 0.5), problem.instrument_values_of(item, x), chain)
+                squares += float(np.sum(errors["pixels"] ** 2))
+                distances += float(np.sum(errors["board"] ** 2))
+                count += len(errors["pixels"])
+    count = max(count, 1)
+    return ImageError(float(np.sqrt(squares / count)), float(np.sqrt(distances / count)), count)
+
+
+def _errors(item: Measurement, mask: Array, u: Array, chain: Any) -> dict[str, Array]:
+    """Return the errors of some samples of a measurement."""
+    part = item.take(mask)
+    return part.errors(chain.forward_kinematics(part.configurations()), u)
