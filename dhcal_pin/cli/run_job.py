@@ -45,7 +45,7 @@ from ..measurements.mounting import mount_rig
 from ..measurements.position import require_common_reference_target
 from ..parallel import SERIAL, TaskExecutor
 from ..plausibility.hypotheses import mend
-from ..report.document import Provenance, file_digests, result_to_dict, short_names
+from ..report.document import Provenance, content_digests, file_digests, result_to_dict, short_names
 from ..robot import urdf_edit
 from ..robot.chain import Chain
 from ..robot.correction_table import correction_columns, joint_corrections
@@ -186,7 +186,8 @@ def run_job(
 
     # A refused robot must not reach a controller; JSON and report explain why it was refused.
     is_kept = job.force or not fit.verdict.is_refused
-    contents = _robot_files(fit, job) if is_kept else {}
+    robot_contents = _robot_files(fit, job) if is_kept else {}
+    contents = dict(robot_contents)
     files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
     if job.map and is_kept:
         from ..report import workspace_map  # lazy import: only for maps
@@ -212,7 +213,7 @@ def run_job(
     files |= {
         "report" if number == 1 else f"report_{number}": path for number, path in enumerate(job.report, 1)
     }
-    source = _provenance(job, sets, data, inputs, hint)
+    source = _provenance(job, sets, data, inputs, robot_contents, hint)
     if job.report:
         from ..report import html  # lazy import: only for reports
 
@@ -487,6 +488,7 @@ def _provenance(
     sets: str,
     data: _JobData,
     inputs: Sequence[str],
+    robot_contents: Mapping[PathLike, str | bytes],
     hint: str,
 ) -> Provenance:
     """Describe files, command and settings for the report."""
@@ -503,6 +505,7 @@ def _provenance(
     return Provenance(
         command=job.command(names),
         inputs=file_digests(inputs),
+        outputs=content_digests(robot_contents),
         names=list(data.fit),
         holdout_names=[path for path, _ in data.holdout],
         settings=settings,

@@ -142,7 +142,8 @@ def _records(fit: Result, source: Provenance) -> list[tuple[str, str]]:
     ]
     if source.command:
         records.append(("Command", source.command))
-    short = short_names(list(source.inputs))
-    records += [(f"SHA-256 of {short[path]}", digest) for path, digest in source.inputs.items()]
+    for digests, role in ((source.inputs, "input"), (source.outputs, "result")):
+        short = short_names(list(digests))
+        records += [(f"SHA-256 of the {role} {short[path]}", digest) for path, digest in digests.items()]
     records.append(("Software", ", ".join(f"{name} {version}" for name, version in versions().items())))
     return records

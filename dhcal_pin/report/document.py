@@ -33,6 +33,7 @@ class Provenance:
     Attributes:
         command: Command line, without the paths of the outputs.
         inputs: SHA-256 of each input file by path.
+        outputs: SHA-256 of each file of the calibrated robot by path.
         names: File of each measurement of the fitted data; empty for data from Python.
         holdout_names: File of each measurement of the hold-out data.
         settings: Further choices as text, by name.
@@ -46,6 +47,7 @@ class Provenance:
 
     command: str = ""
     inputs: Mapping[str, str] = field(default_factory=dict)
+    outputs: Mapping[str, str] = field(default_factory=dict)
     names: Sequence[str] = ()
     holdout_names: Sequence[str] = ()
     settings: Mapping[str, str] = field(default_factory=dict)
@@ -67,6 +69,21 @@ def file_digests(paths: Sequence[PathLike]) -> dict[str, str]:
         Hexadecimal digests by path.
     """
     return {str(path): hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in paths}
+
+
+def content_digests(contents: Mapping[PathLike, str | bytes]) -> dict[str, str]:
+    """Compute the SHA-256 of files that are not written yet.
+
+    Args:
+        contents: Content by path; texts are written in UTF-8.
+
+    Returns:
+        Hexadecimal digests by path.
+    """
+    return {
+        str(path): hashlib.sha256(content if isinstance(content, bytes) else content.encode()).hexdigest()
+        for path, content in contents.items()
+    }
 
 
 def versions() -> dict[str, str]:

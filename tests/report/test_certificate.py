@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import sys
@@ -91,6 +92,11 @@ def test_the_command_writes_it(tmp_path, monkeypatch):
     assert "2026-03-01" in shown
     for digest in document["inputs"].values():
         assert digest in shown
+    for name in ("out.urdf", "out.calibration.toml"):
+        assert (
+            f"SHA-256 of the result {name} {hashlib.sha256(Path(name).read_bytes()).hexdigest()}"
+            in " ".join(shown.split())
+        )
     assert str(tmp_path) not in shown
 
 
