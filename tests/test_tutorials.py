@@ -171,7 +171,7 @@ def check_04_06(n: Any) -> None:
 
 
 def check_04_08(n: Any) -> None:
-    ratio = np.sqrt(np.mean(np.square(n.honest)))
+    ratio = np.sqrt(np.mean(np.square(n.ratios)))
     assert 0.85 < ratio < 1.15
     assert np.median(n.found["planned"]) < 0.8 * np.median(n.found["at random"])
     assert abs(np.median(n.found["planned"]) / (1e3 * n.plan.error) - 1) < 0.2
