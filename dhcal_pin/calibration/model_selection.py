@@ -94,7 +94,7 @@ if TYPE_CHECKING:
 
 # Whitened residuals of exact data are smaller, as their standard deviations have a lower limit. They are
 # rounding errors, whose correlation says nothing about the model.
-MIN_NOISE = 1e-3
+MIN_CORRELATED_NOISE = 0.02
 # Families of low order in the order in which they are tried, and the smallest relative improvement of the
 # cross-validated squared error for which each is added. Eccentricity and elasticity have a physical cause in
 # every arm and hold outside the measured region; the others have to improve the error noticeably.
@@ -112,7 +112,7 @@ PHASE, _N_STEPS = "joint error families", 3
 MAX_EVIDENCE_ROUNDS = 20
 EVIDENCE_TOL = 0.05
 # Smallest noise, as a fraction of the residuals of the geometry; families explain no more of them.
-MIN_NOISE = 0.02
+MIN_NOISE_RATIO = 0.02
 # Narrowest prior of a family, as a fraction of the expected one.
 MIN_PRIOR_WIDTH = 1e-3
 # From this number of rows per line on, curves are tried only if lines stand out of the spectrum.
@@ -325,7 +325,7 @@ class _Candidates:
         reduced, n_rows = select_columns(self.system, columns), count_rows(self.problem)
         family, x, expected = self.family[columns], self.x[columns], self.problem.weights[columns]
         noise = float(np.sqrt(self.system.cost / n_rows))
-        smallest = MIN_NOISE * noise
+        smallest = MIN_NOISE_RATIO * noise
         rounds = 0
         while True:
             weights = self.weights(widths)[columns]
@@ -616,14 +616,13 @@ def extend(
     report(PHASE, 2, _N_STEPS)
     extended, noise = _fit_selected(fit, selected, model, max_iterations) if selected else (fit, _noise(fit))
     report(PHASE, 3, _N_STEPS)
-    regions = _Regions(extended.problem, extended.solution.x, noise)
     temperature, scale, region_ratio = 1.0, 1.0, float("nan")
-    if regions and _are_residuals_correlated(extended, noise):
+    if _are_residuals_correlated(extended, noise):
         is_prismatic = extended.problem.errors.chain.is_prismatic
         temperature = design_effect(different_configurations(fit.data)[0], is_prismatic)
     if not selected and temperature == 1:
         return fit, Extension(trials, n_configurations=n_configurations)
-    if regions:
+    if regions := _Regions(extended.problem, extended.solution.x, noise):
         errors = regions.errors(temperature)
         geometry = _Regions(fit.problem, fit.solution.x, _noise(fit))
         region_ratio = errors.rms / geometry.errors(1.0).rms
@@ -643,7 +642,10 @@ def extend(
     if stage == robust.KEPT:
         extended = replace(extended, weights=fit.weights)
     groups = PriorGroups.none()
-    return reweight(extended, (stage,), groups, max_iterations, progress, effective_parameters), extension
+    final = reweight(
+        extended, (stage,), groups, max_iterations, progress, effective_parameters, loose=False
+    )
+    return final, extension
 
 
 def _ignore(phase: str, step: int, total: int) -> None:
@@ -775,7 +777,7 @@ def _are_residuals_correlated(fit: Fit, noise: float) -> bool:
     Returns:
         Whether the residuals contradict independence.
     """
-    if noise < MIN_NOISE:
+    if noise < MIN_CORRELATED_NOISE:
         return False
     rows = TriangularSystem(fit.solution.system.rows / noise)
     root = posterior_sqrt_covariance(rows, fit.problem.weights)[0]

@@ -126,6 +126,7 @@ def reweight(
     max_iterations: int,
     progress: Progress | None,
     count_determined: CountDetermined = observable_directions,
+    loose: bool = True,
 ) -> Fit:
     """Solve a problem again until noise scales, prior widths and robust weights have settled.
 
@@ -136,6 +137,7 @@ def reweight(
         max_iterations: Largest number of iterations of one solution.
         progress: Called with the name of the phase, the number of its step and the largest number of steps.
         count_determined: Function that returns the number of parameters that the data determine.
+        loose: Whether early rounds solve loosely. Rounds that start near the solution need fewer full solutions.
 
     Returns:
         The fit of the last round.
@@ -145,7 +147,8 @@ def reweight(
     for rounds_left in reversed(range(MAX_ROUNDS)):
         if progress:
             progress(PHASE, MAX_ROUNDS - rounds_left, MAX_ROUNDS)
-        state = _next_round(state, groups, expected, rounds_left, max_iterations, count_determined)
+        loose = loose and rounds_left > 1
+        state = _next_round(state, groups, expected, max_iterations, count_determined, loose)
         if state.is_done:
             break
     return replace(state.fit, stage=state.stages[-1])
@@ -155,9 +158,9 @@ def _next_round(
     state: ReweightState,
     groups: PriorGroups,
     expected: Array,
-    rounds_left: int,
     max_iterations: int,
     count_determined: CountDetermined,
+    loose: bool,
 ) -> ReweightState:
     """Estimate scales, priors and weights from the current solution, and solve again if they changed."""
     fit, stage = state.fit, state.stages[0]
@@ -182,7 +185,7 @@ def _next_round(
         return replace(state, stages=state.stages[1:], weight_change=WeightChange())
     if has_settled and state.is_final:
         return replace(state, is_done=True)
-    is_final = has_settled or rounds_left < 2
+    is_final = has_settled or not loose
     if has_settled or all(new is old for new, old in zip(weighted, problem.data, strict=True)):
         # The rows are the same: continue the previous iteration with the new priors.
         problem = problem.with_prior_weights(priors)

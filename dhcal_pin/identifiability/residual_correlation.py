@@ -31,14 +31,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from .._typing import Array
 from ..estimation.problem import Chunk, Problem
 
-# Distances l over which model errors are looked for [rad].
-LENGTHS = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0, 2.0)
+# Distances l over which model errors are looked for, each half the one before [rad].
+LENGTHS = tuple(2.0**-i for i in range(-1, 6))
 # z of white residuals stays below; the largest of seven lengths exceeds it once in four thousand fits.
 MAX_WHITE_Z = 4.0
 # Smallest number (Σ k_ij)²/Σ k_ij² of pairs at a length; z of fewer is far from normal.
@@ -46,7 +47,9 @@ MIN_PAIRS = 30
 # Largest number of configurations of each measurement whose distances are computed.
 MAX_CONFIGURATIONS = 2000
 # Largest number of products with which the effect of the fit on Q is computed.
-MAX_PRODUCTS = 3e8
+MAX_PRODUCTS = 1e8
+# Number of configurations whose distances from all others are in memory at a time.
+BLOCK_SIZE = 128
 # Squared distance below which two configurations are the same.
 SAME_CONFIGURATION = 1e-10
 # Correlation of the residuals of configurations that are far apart, what is added to it for near ones,
@@ -103,18 +106,11 @@ def find_residual_correlation(
             values = problem.instrument_values_of(part, x)
             residual = part.residual(chain.forward_kinematics(part.configurations()), values) / noise
             effect = np.empty((0, *residual.shape))
-        distances = _squared_distances(_points(part.q, problem.errors.chain.is_prismatic))
-        for i, length in enumerate(LENGTHS):
-            kernel = np.exp(-0.5 * distances / length**2)
-            # Samples of the same configuration may also share noise of the instrument.
-            kernel[distances < SAME_CONFIGURATION] = 0.0
-            if np.sum(kernel) ** 2 <= MIN_PAIRS * np.sum(kernel**2):
-                continue
-            product = effect @ kernel
-            excess[i] += np.sum(residual @ kernel * residual)
-            variance[i] += 2 * (len(residual) * np.sum(kernel**2) - 2 * np.sum(product**2))
-            if len(effect):
-                quadratic[i] += product.reshape(len(effect), -1) @ effect.reshape(len(effect), -1).T
+        scores = _score_terms(_points(part.q, problem.errors.chain.is_prismatic), residual, effect)
+        excess += scores.excess
+        variance += scores.variance
+        if len(effect):
+            quadratic += scores.quadratic
     excess += np.trace(quadratic, axis1=1, axis2=2)
     variance += 2 * np.sum(quadratic * np.swapaxes(quadratic, 1, 2), (1, 2))
     is_known = variance > 0
@@ -123,6 +119,52 @@ def find_residual_correlation(
     z = np.where(is_known, excess / np.sqrt(np.where(is_known, variance, 1.0)), -np.inf)
     best = int(np.argmax(z))
     return ResidualCorrelation(float(z[best]), float(np.clip(2 * excess[best] / variance[best], 0.0, 1.0)))
+
+
+class _ScoreTerms(NamedTuple):
+    """Terms of the score of one measurement at each length: rᵀ·K·r, 2·tr(K·K) - 4·tr(GᵀKKG), and GᵀKG."""
+
+    excess: Array
+    variance: Array
+    quadratic: Array
+
+
+def _score_terms(points: Array, residual: Array, effect: Array) -> _ScoreTerms:
+    """Compute the terms of the score at each length; 0 where too few pairs are near.
+
+    Args:
+        points: Points whose distances are those of the configurations, (m, d).
+        residual: Whitened residuals, (k, m).
+        effect: Rows G of the samples, (r, k, m); none to use V = I.
+
+    Returns:
+        The terms, (l,), (l,) and (l, r, r).
+    """
+    n_columns, n_components, m = effect.shape
+    excess, variance, sums, squares = np.zeros((4, len(LENGTHS)))
+    quadratic = np.zeros((len(LENGTHS), n_columns, n_columns))
+    for start in range(0, m, BLOCK_SIZE):
+        block = np.s_[start : start + BLOCK_SIZE]
+        distances = _squared_distances(points[block], points)
+        kernel = np.exp(distances * (-0.5 / LENGTHS[0] ** 2))
+        # Samples of the same configuration may also share noise of the instrument.
+        kernel[distances < SAME_CONFIGURATION] = 0.0
+        for i in range(len(LENGTHS)):
+            if i:
+                # Half the length is the fourth power.
+                np.multiply(kernel, kernel, kernel)
+                np.multiply(kernel, kernel, kernel)
+            square = float(np.vdot(kernel, kernel))
+            sums[i] += np.sum(kernel)
+            squares[i] += square
+            excess[i] += np.vdot(residual[:, block], residual @ kernel.T)
+            variance[i] += 2 * n_components * square
+            if n_columns:
+                product = effect @ kernel.T
+                variance[i] -= 4 * np.vdot(product, product)
+                quadratic[i] += np.tensordot(product, effect[..., block], ((1, 2), (1, 2)))
+    has_pairs = sums**2 > MIN_PAIRS * squares
+    return _ScoreTerms(excess * has_pairs, variance * has_pairs, quadratic * has_pairs[:, None, None])
 
 
 def design_effect(q: Array, is_prismatic: Array) -> float:
@@ -139,7 +181,8 @@ def design_effect(q: Array, is_prismatic: Array) -> float:
     q = q[:: -(-n_configurations // MAX_CONFIGURATIONS)] if n_configurations else q
     if len(q) < 2:
         return 1.0
-    near = np.exp(-0.5 * _squared_distances(_points(q, is_prismatic)) / CORRELATION_LENGTH**2)
+    points = _points(q, is_prismatic)
+    near = np.exp(-0.5 * _squared_distances(points, points) / CORRELATION_LENGTH**2)
     mean = (np.sum(near) - np.trace(near)) / (len(q) * (len(q) - 1))
     return 1 + (n_configurations - 1) * (FAR_CORRELATION + NEAR_CORRELATION * float(mean))
 
@@ -151,10 +194,9 @@ def _points(q: Array, is_prismatic: Array) -> Array:
     return np.hstack([np.cos(turning), np.sin(turning), sliding[:, std > 0] / std[std > 0]])
 
 
-def _squared_distances(points: Array) -> Array:
-    """Return the squared distances (m, m) of points (m, n)."""
-    squares = np.sum(points**2, 1)
-    out = points @ (-2 * points.T)
-    out += squares
-    out += squares[:, None]
+def _squared_distances(points: Array, others: Array) -> Array:
+    """Return the squared distances (b, m) of points (b, d) from others (m, d)."""
+    out = points @ (-2 * others.T)
+    out += np.sum(others**2, 1)
+    out += np.sum(points**2, 1)[:, None]
     return out
