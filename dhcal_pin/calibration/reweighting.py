@@ -137,7 +137,7 @@ def reweight(
         max_iterations: Largest number of iterations of one solution.
         progress: Called with the name of the phase, the number of its step and the largest number of steps.
         count_determined: Function that returns the number of parameters that the data determine.
-        loose: Whether early rounds solve loosely. Rounds that start near the solution need fewer full solutions.
+        loose: Whether early rounds solve loosely. This takes more rounds, each of fewer iterations.
 
     Returns:
         The fit of the last round.
