@@ -8,6 +8,7 @@ shown with their outputs:
     jupyter nbconvert --to notebook --execute --output-dir docs/_build/notebooks notebooks/*.ipynb
 """
 
+import os
 import sys
 from importlib import metadata
 from pathlib import Path
@@ -41,6 +42,8 @@ nb_execution_mode = "off"
 default_role = "py:obj"
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
+# Names of types that would be shown as the long unions that they stand for.
+autodoc_type_aliases = {"Array": "Array", "ArrayLike": "ArrayLike"}
 python_use_unqualified_type_names = True
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
@@ -53,9 +56,15 @@ html_static_path = ["_static"]
 html_css_files = ["custom.css"]
 html_copy_source = False
 html_show_sourcelink = False
-html_theme_options = {
-    "source_repository": "https://github.com/dhcal-pin/dhcal_pin/",
-    "source_branch": "main",
-    "source_directory": "docs/",
-}
+# GitHub Actions state the address of the repository; pages of other builds have no link to their source.
+if repository := os.environ.get("GITHUB_REPOSITORY"):
+    html_theme_options = {
+        "source_repository": f"{os.environ['GITHUB_SERVER_URL']}/{repository}/",
+        "source_branch": "main",
+        "source_directory": "docs/",
+    }
 copybutton_prompt_text = "$ "
+
+# sphinx-build -b linkcheck: links to other sites, which .github/workflows/links.yml checks every week.
+linkcheck_timeout = 20
+linkcheck_retries = 3
