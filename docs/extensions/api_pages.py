@@ -27,10 +27,7 @@ _TOP_ORDER = (
     "calibration io measurements robot planning compensation report visualization diagnostics estimation "
     "paper exceptions"
 ).split()
-# Types as Sphinx writes them, and as they are shown.
-_ANY = r"~?(?:typing\.)?Any"
-_SHAPE, _DTYPE = rf"tuple\[{_ANY}, \.\.\.\]", rf"~?(?:numpy\.)?dtype\[{_ANY}\]"
-_ARRAY = re.compile(rf"~?(?:numpy\.)?ndarray\[{_SHAPE}, {_DTYPE}\]")
+# Types as Sphinx writes them; they are shown without their modules.
 _QUALIFIED = re.compile(r"~?\b(?:[a-z_]\w*\.)+(?=\w)")
 # Symbols that reStructuredText would read as markup.
 _BARS = re.compile(r"(?<![`\\])\|")
@@ -151,12 +148,25 @@ def _escape(lines: list[str]) -> list[str]:
 
 
 def _escape_docstring(app: Sphinx, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:
-    lines[:] = [_TRAILING_UNDERSCORE.sub(r"\\_", _BARS.sub(r"\\|", line)) for line in lines]
+    lines[:] = _escape_all(lines)
+
+
+def _escape_all(lines: list[str]) -> list[str]:
+    """Escape bars and trailing underscores."""
+    return [_TRAILING_UNDERSCORE.sub(r"\\_", _BARS.sub(r"\\|", line)) for line in lines]
+
+
+def _keep_property_docstring(
+    app: Sphinx, what: str, name: str, value: Any, options: Any, lines: list[str]
+) -> None:
+    """Restore the docstring of a property: Napoleon takes the words before its first colon for a type."""
+    if what == "property":
+        lines[:] = [*_escape_all((inspect.getdoc(value) or "").splitlines()), ""]
 
 
 def _shorten(text: str | None) -> str | None:
     """Shorten the types of a signature."""
-    return text and _QUALIFIED.sub("", _ARRAY.sub("Array", text))
+    return text and _QUALIFIED.sub("", text)
 
 
 def _shorten_signature(
@@ -176,5 +186,6 @@ def setup(app: Sphinx) -> dict[str, Any]:
     """
     app.connect("builder-inited", write_pages)
     app.connect("autodoc-process-docstring", _escape_docstring, priority=100)
+    app.connect("autodoc-process-docstring", _keep_property_docstring, priority=900)
     app.connect("autodoc-process-signature", _shorten_signature)
     return {"parallel_read_safe": True}
