@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+
 import numpy as np
 import pytest
 from robots import DATA, missing
@@ -10,6 +12,7 @@ import dhcal_pin as dh
 from dhcal_pin import se3
 from dhcal_pin.calibration.evaluation import compute_errors
 from dhcal_pin.cameras import Board, Camera, Rig
+from dhcal_pin.ros_packages import resolve_robot_path
 
 # Corners of a virtual board of 3 x 3 points, 80 mm apart, at the middle of the real board [m].
 CORNERS = 0.08 * np.array([[x, y, 0.0] for y in (-1, 0, 1) for x in (-1, 0, 1)]) + [-0.25, 0.25, 0]
@@ -66,3 +69,47 @@ def test_franka_on_the_other_side_of_joint_space(franka):
         fit = dh.calibrate(arm, images.take(fitted), extend="none", loss="linear")
         rms.append(image_rms(fit, images.take(~fitted))[1])
     assert np.sqrt(np.mean(np.square(rms))) <= 1.20
+
+
+def read_tags(path, side, chain):
+    """Return joint values (m, n) and poses (m, 4, 4) of the tag of one hand in the camera."""
+    with path.open(newline="") as file:
+        (_, *names), *rows = csv.reader(file)
+    count = len(names)
+    rows = [row for row in rows if row[1 + count] == side]
+    joints = np.array([row[1 : 1 + count] for row in rows], float)
+    tags = np.array([row[2 + count : 9 + count] for row in rows], float)
+    q = joints[:, [names.index(name) for name in chain.joint_names]]
+    x, y, z, w = tags[:, 3:].T
+    rotations = se3.quaternion_to_matrix(np.stack([w, x, y, z], 1))
+    return q, se3.transform(rotations, tags[:, :3])
+
+
+@pytest.mark.parametrize(
+    ("side", "parameters", "limit"),
+    [
+        ("left", "offset", 16.8),
+        ("left", "minimal", 16.4),
+        ("right", "offset", 12.8),
+        ("right", "minimal", 12.8),
+    ],
+)
+def test_talos_looks_at_its_hands(side, parameters, limit):
+    """Neither end of the path is the root; half of the poses are held out, 20 times. Limits in mm."""
+    path = DATA / "talos_apriltag/measurements-pyrene-20200901-2.csv"
+    if not path.exists():
+        missing(f"measurements at {path}")
+    robot = resolve_robot_path("example:talos_full_v2")
+    chain = dh.Chain.from_urdf(robot, tip=f"gripper_{side}_base_link", root="head_2_link")
+    data = dh.Pose(*read_tags(path, f"{side}_gripper", chain))
+    assert len(data.rows) == {"left": 26, "right": 53}[side]
+    rng, rms = np.random.default_rng(0), []
+    for _ in range(20):
+        order = rng.permutation(len(data.rows))
+        fitted, held_out = data.take(order[: len(order) // 2]), data.take(order[len(order) // 2 :])
+        fit = dh.calibrate(chain, fitted, f"{parameters},base,tool", extend="none", loss="linear")
+        cases = ((fit.nominal_refitted, fit.nominal_instruments), (fit.chain, fit.instruments))
+        rms.append([1e3 * dh.accuracy(arm, held_out, known)["position_rms_m"] for arm, known in cases])
+    nominal, calibrated = np.median(rms, 0)
+    assert nominal > 19
+    assert calibrated <= limit
