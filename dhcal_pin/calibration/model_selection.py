@@ -32,8 +32,8 @@ questions are asked.
    with the distance d_ij of two configurations and l = 0.5 rad. Configurations in a small part of joint space
    thus count as fewer independent ones than as many that are far apart, and no number of them counts as more
    than 67. Predicted variances of the tool are the sum of two parts. The residuals are errors of the model,
-   which other configurations have as well: their variance is one part. The other is that of the uncertain
-   parameters, scaled by c such that both contain the errors e_f of three of four left-out regions f of joint
+   which other configurations have as well: their variance, without the noise of the instrument where it is
+   stated, is one part. The other is that of the uncertain parameters, scaled by c such that both contain the errors e_f of three of four left-out regions f of joint
    space,
 
        e_f² <= 1 + c²·v_f,

@@ -88,6 +88,9 @@ MAX_LEAVE_ONE_OUT = 10
 MAX_REFIT_ITERATIONS = 100
 # Rows left over by no more than this fraction of all count as none: rounding.
 MIN_FREEDOM_RATIO = 1e-6
+# Smallest share of the variance of correlated residuals that the model lacks. Stated standard deviations of an
+# instrument may be too large.
+MIN_MODEL_SHARE = 0.5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -390,13 +393,26 @@ class Result(ResultPlots):
 
     @property
     def _model_std(self) -> tuple[float, float]:
-        """Standard deviation of the residuals of the inliers per axis, of lengths [m] and of angles [rad]."""
+        """Standard deviation of what the model lacks, per axis, of lengths [m] and of angles [rad].
+
+        It is that of the residuals of the inliers, without the noise of the instrument where it is stated.
+        """
         squares: dict[str, list[Array]] = {"m": [], "rad": []}
-        for errors in compute_errors(self.chain, self.inliers, self.instruments):
-            for name, values in errors.items():
-                squares.get(GROUP_UNITS[error_group(name)], []).append(np.ravel(values) ** 2)
         n_rows = sum(count for _, _, count in self._row_counts)
         per_freedom = n_rows / self.degrees_of_freedom if self.degrees_of_freedom else 1.0
+        for item, errors in zip(
+            self.inliers, compute_errors(self.chain, self.inliers, self.instruments), strict=True
+        ):
+            whitened = item.residual(
+                self.chain.forward_kinematics(item.configurations()),
+                np.array([self.instruments[parameter.name] for parameter in item.instrument_parameters]),
+            )
+            for name, rows in item.residual_groups.items():
+                share = 1.0
+                if item.has_stated_sigma:
+                    noise = 1 / (per_freedom * max(float(np.mean(whitened[rows] ** 2)), 1.0))
+                    share = max(1 - noise, MIN_MODEL_SHARE)
+                squares.get(GROUP_UNITS[error_group(name)], []).append(share * np.ravel(errors[name]) ** 2)
         length, angle = (
             float(np.sqrt(per_freedom * np.mean(np.concatenate(parts)))) if parts else 0.0
             for parts in squares.values()

@@ -76,6 +76,21 @@ def test_intervals_hold_in_simulations(m, size, seeds, bounds):
     assert bounds[0] <= np.mean(shares) <= bounds[1]
 
 
+@pytest.mark.parametrize("seeds", [3, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("m", [40, 100])
+def test_stated_noise_of_the_instrument_is_not_counted_as_an_error_of_the_model(m, seeds):
+    """The smooth error is only twice the noise. Predictions without noise would be 12 % too wide with it."""
+    shares, sizes = [], []
+    for seed in range(seeds):
+        arm, data, truth = simulated(seed, m, 2 * NOISE)
+        stated = Pose(data.q, data.poses, sigma=NOISE, rotation_sigma=2 * NOISE)
+        with_noise, without = (calibrate(arm, item, SETS) for item in (data, stated))
+        shares.append(covered_share(*position_errors(without, truth)))
+        sizes.append(without.uncertainty.model_std[0] ** 2 - with_noise.uncertainty.model_std[0] ** 2)
+    assert -np.mean(sizes) == pytest.approx(NOISE**2, rel=0.4)
+    assert (0.88 if seeds < 20 else 0.93) <= np.mean(shares) <= (0.99 if seeds < 20 else 0.97)
+
+
 @pytest.mark.slow
 def test_deciles_of_predicted_errors_are_those_of_actual_errors():
     """Tenths of the configurations by predicted error: predicted and actual RMS agree within 15 %."""
