@@ -33,8 +33,8 @@ questions are asked.
    thus count as fewer independent ones than as many that are far apart, and no number of them counts as more
    than 67. Predicted variances of the tool are the sum of two parts. The residuals are errors of the model,
    which other configurations have as well: their variance, without the noise of the instrument where it is
-   stated, is one part. The other is that of the uncertain parameters, scaled by c such that both contain the errors e_f of three of four left-out regions f of joint
-   space,
+   stated, is one part. The other is that of the uncertain parameters, scaled by c such that both contain the
+   errors e_f of three of four left-out regions f of joint space,
 
        e_f² <= 1 + c²·v_f,
 

@@ -88,8 +88,8 @@ MAX_LEAVE_ONE_OUT = 10
 MAX_REFIT_ITERATIONS = 100
 # Rows left over by no more than this fraction of all count as none: rounding.
 MIN_FREEDOM_RATIO = 1e-6
-# Smallest share of the variance of correlated residuals that the model lacks. Stated standard deviations of an
-# instrument may be too large.
+# Smallest share of the variance of correlated residuals that counts as an error of the model. Stated standard
+# deviations of an instrument may be too large.
 MIN_MODEL_SHARE = 0.5
 
 
