@@ -39,8 +39,10 @@ MIN_DEPTH = 1e-6
 FOCAL_AND_CENTRE = ("fx", "fy", "cx", "cy")
 # Tangent of the angle below which the fisheye model uses its limit on the axis.
 _NEAR_AXIS = 1e-8
-# Iterations of the inversion of a distortion.
+# Largest number of iterations of the inversion of a distortion.
 _N_INVERSIONS = 20
+# Largest step that ends it, in image coordinates X/Z, Y/Z.
+_INVERSION_TOLERANCE = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +108,8 @@ class Lens:
                 found, derivative, _ = self.distort(plane, values[4:])
                 step = np.linalg.solve(derivative.transpose(2, 0, 1), (distorted - found).T[..., None])
                 plane = plane + step[..., 0].T
+                if np.abs(step).max(initial=0.0) < _INVERSION_TOLERANCE:
+                    break
             is_inverse = np.abs(self.distort(plane, values[4:])[0] - distorted).max(0) < 1e-6
         return np.where(is_inverse, plane, distorted)
 

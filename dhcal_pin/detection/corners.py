@@ -11,7 +11,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,9 @@ from .._typing import Array, PathLike
 from ..cameras.boards import Board
 from ..cameras.pose_from_points import direct_linear_transform
 from ..exceptions import FileFormatError, InvalidArgumentError, UnknownNameError
+from .opencv import require_opencv
+from .symmetry import are_symmetric
+from .tag_edges import refine_by_edges
 
 # Number of images in which the layouts of a board are compared.
 N_LAYOUT_IMAGES = 8
@@ -75,21 +77,6 @@ class DetectedImage:
     corner: Array
     pixels: Array
     problem: str = ""
-
-
-def require_opencv() -> ModuleType:
-    """Return the module of OpenCV.
-
-    Raises:
-        InvalidArgumentError: It is not installed.
-    """
-    try:
-        import cv2  # lazy import: an optional extra
-    except ImportError:
-        raise InvalidArgumentError(
-            "boards in images need OpenCV, which is not installed; run: pip install 'dhcal-pin[camera]'"
-        ) from None
-    return cv2
 
 
 def read_image(path: PathLike) -> Array:
@@ -252,8 +239,12 @@ def _found(corner: Any, pixels: Any) -> tuple[Array, Array]:
 
 def _find_charuco(board: Board, image: Array) -> tuple[Array, Array]:
     """Find the inner corners of a ChArUco board."""
-    pixels, corner, _, _ = require_opencv().aruco.CharucoDetector(charuco_board(board)).detectBoard(image)
-    return _found(corner, pixels)
+    found, numbers, _, _ = require_opencv().aruco.CharucoDetector(charuco_board(board)).detectBoard(image)
+    corner, pixels = _found(numbers, found)
+    # A corner is placed where its neighbours say it is, also where something covers it.
+    gap = 0.5 * (board.square - board.marker) / board.square
+    is_visible = are_symmetric(image, board.points[corner, :2] / board.square, pixels, gap)
+    return corner[is_visible], pixels[is_visible]
 
 
 def _find_checkerboard(board: Board, image: Array) -> tuple[Array, Array]:
@@ -284,13 +275,18 @@ def _first_square_is_white(board: Board, image: Array, corners: Array) -> bool:
 
 
 def _find_aprilgrid(board: Board, image: Array) -> tuple[Array, Array]:
-    """Find the four corners of each tag of an AprilGrid."""
+    """Find the four corners of each tag of an AprilGrid that is wholly visible."""
     aruco = require_opencv().aruco
-    parameters = aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
-    pixels, tags, _ = aruco.ArucoDetector(marker_dictionary(board), parameters).detectMarkers(image)
+    dictionary = marker_dictionary(board)
+    found, tags, _ = aruco.ArucoDetector(dictionary).detectMarkers(image)
     if tags is None:
         return _found(None, None)
-    on_board = [i for i, tag in enumerate(tags.ravel()) if tag < board.columns * board.rows]
-    corner = [4 * int(tags.ravel()[i]) + k for i in on_board for k in range(4)]
-    return _found(corner, [pixels[i].reshape(4, 2) for i in on_board])
+    corner, pixels = [], []
+    for tag, outline in zip(tags.ravel().tolist(), found, strict=True):
+        if tag >= board.columns * board.rows:
+            continue
+        refined = refine_by_edges(image, outline.reshape(4, 2).astype(float), dictionary.markerSize + 2)
+        if refined is not None:
+            corner += range(4 * tag, 4 * tag + 4)
+            pixels.append(refined)
+    return _found(corner, pixels)

@@ -6,8 +6,18 @@ import numpy as np
 import pytest
 from robots import DATA, missing
 
-from dhcal_pin.cameras import Board
-from dhcal_pin.detection import black_rectangles, board_pdf, detect_corners, find_layout, read_image
+from dhcal_pin import se3
+from dhcal_pin.cameras import Board, Camera
+from dhcal_pin.detection import (
+    ImageQuality,
+    Layout,
+    black_rectangles,
+    board_pdf,
+    detect_corners,
+    find_layout,
+    read_image,
+    render_images,
+)
 from dhcal_pin.exceptions import DhcalError
 
 cv2 = pytest.importorskip("cv2")
@@ -45,36 +55,6 @@ def test_all_corners_of_photographs(columns, rows, wanted):
             assert np.abs(mapped[:, :2] / mapped[:, 2:] - image.pixels).max() < 6
 
 
-def drawing(board, tmp_path, noise=2.0):
-    """Render a board under a known homography with blur and noise; return the path and the homography."""
-    rectangles, (width, height) = black_rectangles(board)
-    scale, margin = 12000.0, 0.02
-    sheet = np.full((int((height + 2 * margin) * scale), int((width + 2 * margin) * scale)), 235, np.uint8)
-    for left, top, w, h in rectangles + np.array([margin, margin, 0, 0]):
-        low, high = np.round([[left, top], [left + w, top + h]] * np.array(scale)).astype(int)
-        sheet[low[1] : high[1], low[0] : high[0]] = 20
-    corners = np.array([[0, 0], [sheet.shape[1], 0], sheet.shape[1::-1], [0, sheet.shape[0]]], np.float32)
-    image_corners = np.array([[170, 120], [1130, 90], [1080, 850], [220, 780]], np.float32)
-    homography = cv2.getPerspectiveTransform(corners, image_corners)
-    # Pixel centres are whole numbers, in the sheet, too. The mean of 4 x 4 pixels lies between them.
-    shift = np.array([[1, 0, -0.375], [0, 1, -0.375], [0, 0, 1.0]])
-    large = cv2.warpPerspective(
-        sheet,
-        np.diag([4, 4, 1.0]) @ homography,
-        (4 * SIZE[0], 4 * SIZE[1]),
-        borderValue=235,
-        flags=cv2.INTER_AREA,
-    )
-    image = cv2.resize(large, SIZE, interpolation=cv2.INTER_AREA)
-    image = cv2.GaussianBlur(image, (0, 0), 0.8).astype(float)
-    image += noise * np.random.default_rng(0).standard_normal(image.shape)
-    path = str(tmp_path / "board.png")
-    cv2.imwrite(path, np.clip(image, 0, 255).astype(np.uint8))
-    points = np.column_stack([(board.points[:, :2] + margin) * scale - 0.5, np.ones(len(board.points))])
-    mapped = points @ (shift @ homography).T
-    return path, mapped[:, :2] / mapped[:, 2:]
-
-
 BOARDS = [
     CHARUCO,
     Board("c", "tip", "checkerboard", columns=8, rows=5, square=0.03),
@@ -91,16 +71,78 @@ BOARDS = [
 ]
 
 
+CAMERA = Camera("c", "world", *SIZE, np.array([1100.0, 1110, 640, 470, -0.1, 0.05, 0.001, -0.001, 0]))
+
+
+def views(board, count, rng):
+    """Return poses of a board in a camera: turned by up to 40 degrees about any axis, 0.4 to 0.8 m away."""
+    poses = []
+    for _ in range(count):
+        axis = rng.normal(size=3)
+        rotation = se3.exp3(axis / np.linalg.norm(axis) * rng.uniform(0.05, 0.7))
+        depth = rng.uniform(0.4, 0.8)
+        centre = depth * np.array([rng.uniform(-0.12, 0.12), rng.uniform(-0.08, 0.08), 1])
+        poses.append(se3.transform(rotation, centre - rotation @ board.points.mean(0)))
+    return poses
+
+
+def projected(board, pose):
+    """Return the image coordinates of all corners by OpenCV."""
+    fx, fy, cx, cy = CAMERA.values[:4]
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    rotation, translation = cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3]
+    return cv2.projectPoints(board.points, rotation, translation, matrix, CAMERA.values[4:])[0].reshape(-1, 2)
+
+
+@pytest.mark.parametrize(("blur", "noise"), [(0.7, 2.0), (1.2, 4.0)])
 @pytest.mark.parametrize("board", BOARDS, ids=lambda board: board.type)
-def test_corners_of_drawn_boards(board, tmp_path):
-    path, wanted = drawing(board, tmp_path)
-    layout = find_layout(board, [read_image(path)])
-    found = detect_corners(board, layout, path, SIZE)
-    assert found.problem == ""
-    assert layout.describe(board) == "" or board.rows % 2
-    assert len(found.corner) == len(board.points)
-    error = found.pixels - wanted[found.corner]
-    assert np.sqrt(np.mean(error**2)) < {"checkerboard": 0.06, "charuco": 0.1, "aprilgrid": 0.3}[board.type]
+def test_corners_of_rendered_boards(board, blur, noise, tmp_path):
+    rng, path, errors = np.random.default_rng(1), str(tmp_path / "board.png"), []
+    poses = views(board, 2, rng)
+    images = render_images(CAMERA, [[(board, pose)] for pose in poses], rng, ImageQuality(blur, noise))
+    for pose, image in zip(poses, images, strict=True):
+        cv2.imwrite(path, image)
+        layout = find_layout(board, [image])
+        assert layout.describe(board) == "" or board.rows % 2
+        found = detect_corners(board, layout, path, SIZE)
+        assert found.problem == ""
+        assert len(found.corner) >= 0.95 * len(board.points)
+        errors.append(found.pixels - projected(board, pose)[found.corner])
+    assert np.sqrt(np.mean(np.concatenate(errors) ** 2)) < 0.05
+
+
+@pytest.mark.parametrize("board", [BOARDS[0], BOARDS[2]], ids=lambda board: board.type)
+def test_corners_of_boards_that_are_partly_covered(board, tmp_path):
+    """What covers a part of a board moves no corner: those at its edge are left out."""
+    rng, path = np.random.default_rng(2), str(tmp_path / "board.png")
+    poses = views(board, 2, rng)
+    images = render_images(CAMERA, [[(board, pose)] for pose in poses], rng)
+    for pose, image in zip(poses, images, strict=True):
+        exact = projected(board, pose)
+        cover = exact[len(exact) // 2] + np.array([[-10, -15], [35, -50], [300, 200], [100, 300]])
+        cv2.fillPoly(image, [cover.astype(np.int32)], int(rng.integers(255)))
+        cv2.imwrite(path, image)
+        found = detect_corners(board, Layout(), path, SIZE)
+        assert 0.2 * len(exact) < len(found.corner) < 0.9 * len(exact)
+        errors = found.pixels - exact[found.corner]
+        assert np.sqrt(np.mean(errors**2)) < 0.05
+        assert np.abs(errors).max() < 0.3
+
+
+def test_rendered_boards_hide_each_other_and_show_one_side(tmp_path):
+    """The nearer of two boards is seen, and the back of a board is not."""
+    board = BOARDS[1]
+    near, far = (se3.translation([0, 0, depth]) @ views(board, 1, np.random.default_rng(0))[0]
+                 for depth in (0.0, 0.5))  # fmt: skip
+    quality = ImageQuality(0.0, 0.0)
+    alone, both = render_images(
+        CAMERA, [[(board, near)], [(board, far), (board, near)]], np.random.default_rng(0), quality
+    )
+    u, v = np.round(projected(board, near)[0]).astype(int)
+    np.testing.assert_array_equal(alone[v - 3 : v + 4, u - 3 : u + 4], both[v - 3 : v + 4, u - 3 : u + 4])
+    back = near @ se3.transform(se3.exp3([np.pi, 0, 0]), [0, 0.15, 0])
+    (image,) = render_images(CAMERA, [[(board, back)]], np.random.default_rng(0), quality)
+    assert image.min() == image.max()
 
 
 def test_images_that_are_not_used_are_named(tmp_path):

@@ -1,0 +1,170 @@
+"""Rendered images of boards, for tests and for trying out a set-up without a camera.
+
+Every pixel is the mean of its area. A pixel that an edge of the print crosses is the mean of a grid of points
+within it: the line of sight of each point meets the plane of the board, whose edges are exact there. Pixel
+centres are whole numbers, as in OpenCV. Blur and noise of a real camera are added last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .. import se3
+from .._typing import Array
+from ..cameras.boards import Board
+from ..cameras.rig import Camera
+from .opencv import require_opencv
+from .printing import MARGIN, black_rectangles
+
+# Grey values of print, paper and background.
+BLACK, WHITE, BACKGROUND = 25.0, 230.0, 120.0
+# Smallest cosine between a line of sight and the plane of a board, measured from its normal.
+_MIN_COSINE = 1e-3
+
+
+@dataclass(frozen=True)
+class ImageQuality:
+    """How a rendered image differs from an ideal one.
+
+    Attributes:
+        blur: Standard deviation of the blur [px].
+        noise: Standard deviation of the noise of the grey values, which go from 0 to 255.
+        n_points: Number of points per pixel along each axis.
+    """
+
+    blur: float = 0.7
+    noise: float = 2.0
+    n_points: int = 6
+
+
+@dataclass(frozen=True, eq=False)
+class _Print:
+    """Print of a flat board as a table of grey values between edges.
+
+    Attributes:
+        x: Edges along x, increasing [m].
+        y: Edges along y, increasing [m].
+        grey: Grey values between them, shape (len(y) + 1, len(x) + 1); NaN outside the paper.
+    """
+
+    x: Array
+    y: Array
+    grey: Array
+
+    def at(self, x: Array, y: Array) -> Array:
+        """Return the grey values of points of the board's plane [m]."""
+        return self.grey[np.searchsorted(self.y, y), np.searchsorted(self.x, x)]
+
+
+def _print_of(board: Board) -> _Print:
+    """Return the print of a board."""
+    rectangles, size = black_rectangles(board)
+    left, top, width, height = rectangles.T
+    low = [np.round(edge, 9) for edge in (left, top)]
+    high = [np.round(edge, 9) for edge in (left + width, top + height)]
+    x, y = (
+        np.unique(np.concatenate([[-MARGIN, side + MARGIN], a, b]))
+        for a, b, side in zip(low, high, size, strict=True)
+    )
+    grey = np.full((len(y) + 1, len(x) + 1), np.nan)
+    grey[1:-1, 1:-1] = WHITE
+    columns = [np.searchsorted(x, edge) + 1 for edge in (low[0], high[0])]
+    rows = [np.searchsorted(y, edge) + 1 for edge in (low[1], high[1])]
+    for i in range(len(rectangles)):
+        grey[rows[0][i] : rows[1][i], columns[0][i] : columns[1][i]] = BLACK
+    return _Print(x, y, grey)
+
+
+def render_images(
+    camera: Camera,
+    views: Iterable[Sequence[tuple[Board, Array]]],
+    rng: np.random.Generator,
+    quality: ImageQuality | None = None,
+) -> Iterator[Array]:
+    """Render images of boards by one camera.
+
+    Args:
+        camera: Camera with known intrinsics.
+        views: Flat boards of each image, each with its pose in the frame of the camera, shape (4, 4) [m].
+        rng: Random numbers of the noise.
+        quality: Blur and noise; the default ones if None.
+
+    Yields:
+        Grey values of each image, shape (height, width), 8 bit.
+    """
+    quality = quality or ImageQuality()
+    sight = _sight_of_pixel_corners(camera)
+    for boards in views:
+        image = _ideal_image(sight, boards, quality.n_points)
+        if quality.blur:
+            image = require_opencv().GaussianBlur(image, (0, 0), quality.blur)
+        image = image + quality.noise * rng.standard_normal(image.shape)
+        yield np.clip(np.round(image), 0, 255).astype(np.uint8)
+
+
+def _sight_of_pixel_corners(camera: Camera) -> Array:
+    """Return the lines of sight X/Z, Y/Z of the corners of all pixels, (2, height + 1, width + 1)."""
+    v, u = np.mgrid[: camera.height + 1, : camera.width + 1] - 0.5
+    plane = camera.lens.normalize(np.stack([u.ravel(), v.ravel()]), camera.values)
+    return plane.reshape(2, *u.shape)
+
+
+def _ideal_image(sight: Array, boards: Sequence[tuple[Board, Array]], n: int) -> Array:
+    """Return the mean grey values of all pixels, (height, width), from n·n points per pixel at the edges."""
+    shape = sight.shape[1] - 1, sight.shape[2] - 1
+    flat = sight.reshape(2, -1)
+    image, nearest = np.full(shape, BACKGROUND), np.full(shape, np.inf)
+    has_edges = np.zeros(shape, bool)
+    sheets = [(_print_of(board), se3.inverse(pose)) for board, pose in boards]
+    for sheet, inverse in sheets:
+        depth, points = _hits(flat, inverse)
+        cells = np.stack([np.searchsorted(sheet.y, points[1]), np.searchsorted(sheet.x, points[0])])
+        cells = np.where(np.isfinite(depth), cells, 0).reshape(2, *sight.shape[1:])
+        corners = np.stack([cells[:, :-1, :-1], cells[:, 1:, :-1], cells[:, :-1, 1:], cells[:, 1:, 1:]])
+        has_edges |= np.any(corners.min(0) != corners.max(0), 0)
+        grey = sheet.grey[corners[0, 0], corners[0, 1]]
+        depth = depth.reshape(sight.shape[1:])[:-1, :-1]
+        is_seen = np.isfinite(grey) & (depth < nearest)
+        image[is_seen], nearest[is_seen] = grey[is_seen], depth[is_seen]
+    rows, columns = np.nonzero(has_edges)
+    quads = [sight[:, rows + i, columns + j] for i in (0, 1) for j in (0, 1)]
+    offsets = (np.arange(n) + 0.5) / n
+    total = np.zeros(len(rows))
+    for b in offsets:
+        for a in offsets:
+            weights = ((1 - b) * (1 - a), (1 - b) * a, b * (1 - a), b * a)
+            total += _grey_values(sum(w * quad for w, quad in zip(weights, quads, strict=True)), sheets)
+    image[rows, columns] = total / n**2
+    return image
+
+
+def _hits(sight: Array, inverse: Array) -> tuple[Array, Array]:
+    """Return where lines of sight (2, m) meet the plane of a board.
+
+    Args:
+        sight: Lines X/Z, Y/Z in the camera, (2, m).
+        inverse: Pose of the camera in the board, (4, 4) [m].
+
+    Returns:
+        Depths in the camera, (m,) [m], infinite without a hit of the printed side, and points x, y on the
+        board, (2, m) [m].
+    """
+    direction = inverse[:3, :2] @ sight + inverse[:3, 2:3]
+    is_hit = (direction[2] > _MIN_COSINE) & (inverse[2, 3] < 0)
+    depth = np.where(is_hit, -inverse[2, 3] / np.where(is_hit, direction[2], 1.0), np.inf)
+    points = inverse[:2, 3:4] + np.where(is_hit, depth, 0.0) * direction[:2]
+    return depth, points
+
+
+def _grey_values(sight: Array, sheets: Sequence[tuple[_Print, Array]]) -> Array:
+    """Return the grey values (m,) along lines of sight (2, m); the nearest board hides the others."""
+    out, nearest = np.full(sight.shape[1], BACKGROUND), np.full(sight.shape[1], np.inf)
+    for sheet, inverse in sheets:
+        depth, points = _hits(sight, inverse)
+        grey = sheet.at(points[0], points[1])
+        is_seen = np.isfinite(grey) & (depth < nearest)
+        out[is_seen], nearest[is_seen] = grey[is_seen], depth[is_seen]
+    return out
