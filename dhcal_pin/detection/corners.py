@@ -19,8 +19,8 @@ from .._typing import Array, PathLike
 from ..cameras.boards import Board
 from ..cameras.pose_from_points import direct_linear_transform
 from ..exceptions import FileFormatError, InvalidArgumentError, UnknownNameError
+from .crossings import refine_crossings
 from .opencv import require_opencv
-from .symmetry import are_symmetric
 from .tag_edges import refine_by_edges
 
 # Number of images in which the layouts of a board are compared.
@@ -241,9 +241,9 @@ def _find_charuco(board: Board, image: Array) -> tuple[Array, Array]:
     """Find the inner corners of a ChArUco board."""
     found, numbers, _, _ = require_opencv().aruco.CharucoDetector(charuco_board(board)).detectBoard(image)
     corner, pixels = _found(numbers, found)
-    # A corner is placed where its neighbours say it is, also where something covers it.
+    # Corners are placed between the markers, also where something covers them.
     gap = 0.5 * (board.square - board.marker) / board.square
-    is_visible = are_symmetric(image, board.points[corner, :2] / board.square, pixels, gap)
+    pixels, is_visible = refine_crossings(image, board.points[corner, :2] / board.square, pixels, gap)
     return corner[is_visible], pixels[is_visible]
 
 

@@ -30,13 +30,13 @@ class ImageQuality:
     """How a rendered image differs from an ideal one.
 
     Attributes:
-        blur: Standard deviation of the blur [px].
-        noise: Standard deviation of the noise of the grey values, which go from 0 to 255.
+        blur_std: Standard deviation of the blur [px].
+        noise_std: Standard deviation of the noise of the grey values, which go from 0 to 255.
         n_points: Number of points per pixel along each axis.
     """
 
-    blur: float = 0.7
-    noise: float = 2.0
+    blur_std: float = 0.7
+    noise_std: float = 2.0
     n_points: int = 6
 
 
@@ -99,9 +99,9 @@ def render_images(
     sight = _sight_of_pixel_corners(camera)
     for boards in views:
         image = _ideal_image(sight, boards, quality.n_points)
-        if quality.blur:
-            image = require_opencv().GaussianBlur(image, (0, 0), quality.blur)
-        image = image + quality.noise * rng.standard_normal(image.shape)
+        if quality.blur_std:
+            image = require_opencv().GaussianBlur(image, (0, 0), quality.blur_std)
+        image = image + quality.noise_std * rng.standard_normal(image.shape)
         yield np.clip(np.round(image), 0, 255).astype(np.uint8)
 
 
@@ -130,13 +130,13 @@ def _ideal_image(sight: Array, boards: Sequence[tuple[Board, Array]], n: int) ->
         is_seen = np.isfinite(grey) & (depth < nearest)
         image[is_seen], nearest[is_seen] = grey[is_seen], depth[is_seen]
     rows, columns = np.nonzero(has_edges)
-    quads = [sight[:, rows + i, columns + j] for i in (0, 1) for j in (0, 1)]
+    quads = np.array([sight[:, rows + i, columns + j] for i in (0, 1) for j in (0, 1)])
     offsets = (np.arange(n) + 0.5) / n
     total = np.zeros(len(rows))
     for b in offsets:
         for a in offsets:
             weights = ((1 - b) * (1 - a), (1 - b) * a, b * (1 - a), b * a)
-            total += _grey_values(sum(w * quad for w, quad in zip(weights, quads, strict=True)), sheets)
+            total += _grey_values(np.einsum("q,qip->ip", weights, quads), sheets)
     image[rows, columns] = total / n**2
     return image
 

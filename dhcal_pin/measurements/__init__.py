@@ -7,6 +7,7 @@ part of the joint space measurements cover.
 """
 
 from .base import InstrumentParameter, Measurement, Noise
+from .board_view import ViewLimits, is_board_in_view, project_board
 from .camera import CameraCorners
 from .contact import PlaneContact, PointContact, PointDistance, SphereContact
 from .length import Distance, Wires
@@ -52,6 +53,9 @@ __all__ = [
     "PositionComponents",
     "RelativePose",
     "SphereContact",
+    "ViewLimits",
     "Wires",
+    "is_board_in_view",
     "mount_rig",
+    "project_board",
 ]

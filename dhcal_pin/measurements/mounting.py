@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .. import se3
 from .._typing import Array
 from ..cameras.boards import Board
 from ..cameras.rig import TIP, WORLD, Camera, Rig
@@ -47,6 +48,54 @@ class MountedRig:
     camera_mounts: tuple[Mount, ...]
     board_mounts: tuple[Mount, ...]
     source: str = ""
+
+    def camera_in_end(self, camera: int) -> Array:
+        """Return the pose of a camera in the frame of its end, shape (4, 4) [m].
+
+        Args:
+            camera: Number of a camera whose pose is known.
+        """
+        return self.camera_mounts[camera].link_pose @ _stated_pose(self.cameras[camera])
+
+    def board_in_end(self, board: int) -> Array:
+        """Return the pose of a board in the frame of its end, shape (4, 4) [m].
+
+        Args:
+            board: Number of a board whose pose is known.
+        """
+        return self.board_mounts[board].link_pose @ _stated_pose(self.boards[board])
+
+    def board_in_camera(self, camera: int, board: int, tools: Array) -> Array:
+        """Compute poses of a board in a camera.
+
+        Args:
+            camera: Number of the camera.
+            board: Number of the board.
+            tools: Poses of the tool in the measuring frame, shape (m, 4, 4) [m].
+
+        Returns:
+            Poses, shape (m, 4, 4) [m].
+
+        Raises:
+            InvalidArgumentError: The rig does not state one of the poses, or both move together.
+        """
+        moves = self.camera_mounts[camera].moves
+        if moves == self.board_mounts[board].moves:
+            raise InvalidArgumentError(
+                f"no joint moves board {self.boards[board].name!r} against camera "
+                f"{self.cameras[camera].name!r}; expected one of them on the tool"
+            )
+        between = se3.inverse(tools) if moves else tools
+        return se3.inverse(self.camera_in_end(camera)) @ between @ self.board_in_end(board)
+
+
+def _stated_pose(entry: Camera | Board) -> Array:
+    """Return the pose of a camera or a board in its link, (4, 4) [m], if the rig states it."""
+    if entry.pose is None:
+        raise InvalidArgumentError(
+            f"the pose of {entry.name!r} in its link is not known; expected xyz_m and rotvec_rad in the rig"
+        )
+    return entry.pose
 
 
 def mount_rig(rig: Rig, chain: Chain) -> MountedRig:

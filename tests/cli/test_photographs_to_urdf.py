@@ -1,0 +1,92 @@
+"""From image files to a calibrated URDF: rendered images by a camera on the wrist of a wrong arm."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import unfolded
+
+import dhcal_pin as dh
+from dhcal_pin import se3
+from dhcal_pin.cameras import Board, Camera, Rig
+from dhcal_pin.detection import ImageQuality, render_images
+from dhcal_pin.io.rig_file import rig_text
+from dhcal_pin.measurements import ViewLimits, is_board_in_view
+from dhcal_pin.robot.sampling import joint_range
+
+cv2 = pytest.importorskip("cv2")
+
+N_IMAGES = 50
+CAMERA = Camera(
+    "wrist", "tip", 800, 600, np.array([762.0, 765, 402, 298, -0.12, 0.06, 0.001, -0.0005, 0]),
+    pose=se3.transform(se3.exp3([0.02, -0.03, 0.8]), [0.03, 0.05, 0.02]),
+)  # fmt: skip
+BOARD = Board(
+    "table", "world", "charuco", columns=9, rows=7, square=0.03, marker=0.022, dictionary="DICT_5X5_100",
+    pose=se3.transform(se3.exp3([np.pi, 0, 0]) @ se3.exp3([0.02, 0.03, 0.5]), [0.75, 0.1, 0.02]),
+)  # fmt: skip
+
+
+@pytest.fixture
+def simulated(robot_folder):
+    """Render images with an arm that is wrong by millimetres, and write them with all other inputs.
+
+    Returns the nominal arm, the true one, and joint positions in view that have no image.
+    """
+    arm = dh.read_robot("example:ur10", tip="tool0")
+    rng = np.random.default_rng(0)
+    rig = dh.mount_rig(Rig({"wrist": CAMERA}, {"table": BOARD}), arm)
+    low, high = joint_range(arm)
+    q = rng.uniform(low, high, (400_000, 6))
+    tools = arm.poses(q)
+    is_seen = is_board_in_view(rig, 0, 0, tools, ViewLimits(0.3, 0.8))
+    q = q[is_seen & (tools[:, 2, 3] > 0.1)]
+    errors = dh.select_parameters(arm, "placement")
+    scale = np.array([1e-3 if p.unit == "m" else 2e-3 for p in errors.parameters])
+    truth = errors.at(scale * rng.normal(size=len(scale)))
+    measured = q[:N_IMAGES]
+    poses = rig.board_in_camera(0, 0, truth.poses(measured))
+    images = render_images(CAMERA, [[(BOARD, pose)] for pose in poses], rng, ImageQuality(0.7, 2.0, 4))
+    Path("images").mkdir()
+    rows = ["image," + ",".join(f"{name}[deg]" for name in arm.joint_names)]
+    for i, (image, position) in enumerate(zip(images, np.degrees(measured), strict=True)):
+        # A finger of the gripper covers a part of every third image.
+        if i % 3 == 0:
+            cv2.fillPoly(image, [np.array([[330, 600], [400, 330], [470, 600]])], 60)
+        cv2.imwrite(f"images/{i:02d}.png", image)
+        rows.append(f"{i:02d}.png," + ",".join(map(repr, position.tolist())))
+    Path("joints.csv").write_text("\n".join(rows))
+    guess = replace(CAMERA, pose=None, values=np.array([720.0, 720, 399.5, 299.5, 0, 0, 0, 0, 0]))
+    Path("rig.toml").write_text(rig_text([guess], [replace(BOARD, pose=None)]))
+    return arm, truth, q[N_IMAGES:]
+
+
+def distances(points):
+    """Return the distances between all pairs of points (m, 3)."""
+    first, second = np.triu_indices(len(points), 1)
+    return np.linalg.norm(points[first] - points[second], axis=1)
+
+
+def test_from_photographs_to_a_calibrated_urdf(run, simulated):
+    """The camera's positions in space, by the written URDF, are right to 0.05 mm where the board is seen."""
+    arm, truth, q = simulated
+    status, _, err = run(
+        "detect", "images", "--rig", "rig.toml", "--joints", "joints.csv", "-o", "corners.csv"
+    )
+    assert status == 0, err
+    status, _, err = run(
+        *("calibrate", "example:ur10", "corners.csv", "--rig", "rig.toml", "--tip", "tool0"),
+        *("-o", "arm.urdf", "--camera-frame", "camera_link"),
+    )
+    assert status == 0, err
+    camera = CAMERA.pose
+    exact = distances((truth.poses(q) @ camera)[:, :3, 3])
+    nominal = distances((arm.poses(q) @ camera)[:, :3, 3])
+    found = distances(dh.read_robot("arm.urdf", tip="camera_link").poses(q)[:, :3, 3])
+    assert len(q) > 50
+    assert np.sqrt(np.mean((nominal - exact) ** 2)) > 2e-3
+    assert np.sqrt(np.mean((found - exact) ** 2)) < 0.05e-3
+    assert "px" in unfolded(err)
