@@ -101,7 +101,11 @@ def progress_bar(title: str, total: int, n_done: int = 0) -> Iterator[Callable[[
         Callback with the number of tasks done.
     """
     console = _console()
-    with ProgressBar(console=console, disable=not console.is_terminal) as bar:
+    if not console.is_terminal:
+        # A disabled bar of older versions of rich prints an empty line.
+        yield lambda count: None
+        return
+    with ProgressBar(console=console) as bar:
         # The bar reads markup such as [bold] in its description.
         task = bar.add_task(escape(escape_control_characters(title)), total=total, completed=n_done)
         yield lambda count: bar.update(task, completed=count)
