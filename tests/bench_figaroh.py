@@ -1,6 +1,6 @@
 """A whole calibration by figaroh, in the environment where it is installed.
 
-Run by `bench_table.py` in a folder that holds robot.urdf, fit.csv, holdout.csv and task.yaml; prints JSON
+Run by `bench_rivals.py` in a folder that holds robot.urdf, fit.csv, holdout.csv and task.yaml; prints JSON
 with CPU seconds and the RMS distance in metres on the held-out poses.
 """
 

@@ -1,11 +1,15 @@
 """Accuracy on public measurements of real robots: the table of the README and of the documentation.
 
-    python tests/bench_public.py [--data DIR]
+    python tests/bench_public.py [--data DIR] [--alone]
 
 Each series is calibrated by `dhcal calibrate` with its defaults, once with a random half held out and once
 with the regions of joint space left out (`--holdout region`). "Nominal" is the error of the robot as
 designed, with base and tool fitted to the same samples. The folder DIR has the layout of shared/data beside
 the project. A series that is absent is left out.
+
+figaroh and pybotics calibrate the same half and are judged by the same other half, where they can: both need
+poses or positions of a robot with revolute joints, figaroh also a URDF. `--alone` leaves them out. pybotics
+starts from the base and the tool that fit the nominal robot, because it does not find them.
 """
 
 from __future__ import annotations
@@ -18,7 +22,15 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+import bench_rivals
 from robots import DATA, MAPS
+
+from dhcal_pin.calibration import split
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.io import read_robot
+from dhcal_pin.io.measurement_files import read_measurement_file
+from dhcal_pin.measurements.pose import Pose
+from dhcal_pin.robot.chain import extract_dh_table
 
 
 @dataclass(frozen=True)
@@ -79,7 +91,7 @@ SERIES = (
 )
 
 
-def calibrate(series: Series, data: Path, holdout: str) -> dict:
+def run_command(series: Series, data: Path, holdout: str) -> dict:
     """Calibrate a robot by the command line.
 
     Args:
@@ -101,6 +113,38 @@ def calibrate(series: Series, data: Path, holdout: str) -> dict:
         return json.loads(Path(folder, "out.json").read_text(encoding="utf-8"))
 
 
+def rivals(series: Series, data: Path) -> list[float | None]:
+    """Return the RMS position errors [m] of figaroh and pybotics on the half that is held out.
+
+    Args:
+        series: Measurements of the robot.
+        data: Folder of all series.
+
+    Returns:
+        Errors; None where a program cannot calibrate the series.
+    """
+    options = dict(zip(series.options[::2], series.options[1::2], strict=True))
+    is_example = series.robot.startswith("example:")
+    chain = read_robot(series.robot if is_example else data / series.robot, options.get("--tip"))
+    if chain.prismatic.any():
+        return [None, None]
+    files = sorted(data.glob(series.files))
+    measured = [read_measurement_file(path, chain, options.get("--columns")).fit for path in files]
+    if len(measured) != 1 or not isinstance(measured[0], Pose):
+        return [None, None]
+    (fit,), (held,) = split(measured, 0.5)
+    assert isinstance(fit, Pose)
+    assert isinstance(held, Pose)
+    is_urdf = is_example or series.robot.endswith(".urdf")
+    by_figaroh = bench_rivals.figaroh(chain, fit, held) if is_urdf else None
+    started = calibrate(chain, fit, "base,tool", extend="none").chain
+    table = extract_dh_table(chain, "modified").table
+    halves = [(part.q, part.poses[:, :3, 3]) for part in (fit, held)]
+    frames = (started.base @ table.base, table.tool @ started.tool)
+    by_pybotics = bench_rivals.pybotics(table, halves[0], halves[1], frames)
+    return [found and found["holdout"] for found in (by_figaroh, by_pybotics)]
+
+
 def millimetres(accuracy: dict | None) -> str:
     """Format the RMS error of an accuracy; a dash if it is unknown."""
     value = (accuracy or {}).get("position_rms_m", (accuracy or {}).get("residual_rms"))
@@ -113,16 +157,22 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--data", type=Path, default=DATA, metavar="DIR", help="folder of the measurements")
-    data = parser.parse_args().data
-    print("| arm | instrument | samples | nominal | calibrated | held out | regions left out |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
+    parser.add_argument("--alone", action="store_true", help="without figaroh and pybotics")
+    args = parser.parse_args()
+    data = args.data
+    header = "arm, instrument, samples, nominal, calibrated, held out, regions left out".split(", ")
+    header += [] if args.alone else ["figaroh, held out", "pybotics, held out"]
+    print(f"| {' | '.join(header)} |")
+    print(f"| {' | '.join('---' for _ in header)} |")
     for series in SERIES:
         if not list(data.glob(series.files)):
             continue
-        half, regions = (calibrate(series, data, holdout) for holdout in ("0.5", "region"))
+        half, regions = (run_command(series, data, holdout) for holdout in ("0.5", "region"))
         cells = [series.arm, series.instrument, str(half["samples"] + half["samples_holdout"])]
         cells += map(millimetres, (half["holdout_before"], half["after"], half["holdout_after"]))
         cells.append(millimetres(regions["holdout_region_after"]))
+        if not args.alone:
+            cells += [f"{1e3 * error:.2f}" if error is not None else "–" for error in rivals(series, data)]
         print(f"| {' | '.join(cells)} |", flush=True)
 
 

@@ -1,13 +1,15 @@
 """A whole calibration by pybotics, in the environment where it is installed.
 
-Run by `bench_table.py` in a folder that holds arm.csv, fit.csv and holdout.csv; prints JSON with CPU seconds
-and the RMS distance in metres on the held-out positions.
+Run by `bench_rivals.py` in a folder that holds arm.csv, fit.csv and holdout.csv; prints JSON with CPU seconds
+and the RMS distance in metres on the held-out positions. With a file frames.csv, the initial poses (4, 4) of
+base and tool, both are unknown, too.
 """
 
 from __future__ import annotations
 
 import json
 import time
+from pathlib import Path
 
 import numpy as np
 from pybotics.kinematic_chain import MDHKinematicChain  # pyright: ignore[reportMissingImports]
@@ -25,8 +27,12 @@ def main() -> None:
     robot = Robot(MDHKinematicChain(np.loadtxt("arm.csv", delimiter=",")))
     fit, held = (np.loadtxt(name, delimiter=",") for name in ("fit.csv", "holdout.csv"))
     joints = len(robot)
+    if are_frames_unknown := Path("frames.csv").exists():
+        robot.world_frame, robot.tool.matrix = np.loadtxt("frames.csv", delimiter=",").reshape(2, 4, 4)
     start = time.process_time()
-    handler = OptimizationHandler(robot, kinematic_chain_mask=True)
+    handler = OptimizationHandler(
+        robot, kinematic_chain_mask=True, tool_mask=are_frames_unknown, world_mask=are_frames_unknown
+    )
     vector = handler.generate_optimization_vector()
     found, _ = leastsq(optimize_accuracy, vector, args=(handler, fit[:, :joints], fit[:, joints:]))
     spent = time.process_time() - start

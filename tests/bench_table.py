@@ -14,14 +14,12 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_name] = "1"
 
 import argparse
-import json
 import shutil
 import subprocess
 import sys
 import sysconfig
 import tempfile
 import time
-import venv
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -30,9 +28,10 @@ from typing import Any
 import bench_batch
 import bench_calibration
 import bench_kernel
+import bench_rivals
 import numpy as np
-import pinocchio as pin
 from bench_common import Row, clocked, measured, robots, serial
+from bench_rivals import HERE, environment, spoken
 from robots import robot_file
 
 from dhcal_pin.calibration.procedure import calibrate
@@ -42,29 +41,7 @@ from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.position import Position
 from dhcal_pin.robot.chain import Chain
 
-HERE = Path(__file__).resolve().parent
-CACHE = Path(tempfile.gettempdir()) / "dhcal-bench"
 UR10 = "ur_description/urdf/ur10_robot.urdf"
-
-
-def environment(package: str) -> Path | None:
-    """The Python of an environment with a package from PyPI, or None if it does not install."""
-    folder = CACHE / package
-    python = folder / "bin" / "python"
-    if not (folder / "ready").exists():
-        venv.create(folder, with_pip=True, clear=True)
-        if subprocess.run([python, "-m", "pip", "install", "-q", package], check=False).returncode:
-            return None
-        (folder / "ready").touch()
-    return python
-
-
-def spoken(command: list, folder: Path, **environ: str) -> object:
-    """The JSON in the last line that a command prints."""
-    done = subprocess.run(
-        command, cwd=folder, env=os.environ | environ, capture_output=True, text=True, check=True
-    )
-    return json.loads(done.stdout.strip().splitlines()[-1])
 
 
 def against_ceres(m: int, repeats: int) -> list[Row]:
@@ -94,22 +71,11 @@ def against_ceres(m: int, repeats: int) -> list[Row]:
 
 def against_figaroh(m: int, repeats: int) -> list[Row]:
     """Figaroh on a UR10 in a frame that nobody gave, and both errors on 200 poses held out."""
-    if (python := environment("figaroh")) is None:
-        return []
     chain, sets = robots()["UR10, minimal,base,tool"]
     _, _, data = measured(chain, sets, m + 200)
     fit, held = data.take(np.s_[:m]), data.take(np.s_[m:])
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        shutil.copy(robot_file(UR10), folder / "robot.urdf")
-        for file, part in (("fit.csv", fit), ("holdout.csv", held)):
-            rpy = np.array([pin.rpy.matrixToRpy(pose[:3, :3]) for pose in part.poses])
-            head = ",".join(["x1", "y1", "z1", "phix1", "phiy1", "phiz1", *chain.joint_names])
-            rows = np.hstack([part.poses[:, :3, 3], rpy, part.q])
-            np.savetxt(folder / file, rows, "%.17g", ",", header=head, comments="")
-        command = [python, HERE / "bench_figaroh.py", chain.urdf.root, chain.tip, str(m)]
-        found = spoken(command, folder, PYTHONPATH="")
-    assert isinstance(found, dict)
+    if (found := bench_rivals.figaroh(chain, fit, held)) is None:
+        return []
     (ours,) = clocked([lambda: calibrate(chain, fit, sets)], repeats)
     mine = 1e3 * calibrate(chain, fit, sets).validate(held)["position_rms_m"]
     other = 1e3 * found["holdout"]
@@ -119,8 +85,6 @@ def against_figaroh(m: int, repeats: int) -> list[Row]:
 
 def against_pybotics(m: int, repeats: int) -> list[Row]:
     """Pybotics on positions of an arm whose modified DH parameters are unknown; both errors held out."""
-    if (python := environment("pybotics")) is None:
-        return []
     rng = np.random.default_rng(0)
     table = replace(serial(6), convention="modified")
     chain = Chain.from_dh(table)
@@ -128,14 +92,9 @@ def against_pybotics(m: int, repeats: int) -> list[Row]:
     real = errors.at(1e-3 * rng.standard_normal(len(errors.parameters)))
     data = Position.simulate(real, rng.uniform(-2.5, 2.5, (m + 200, 6)), Noise(1e-4), rng)
     fit, held = data.take(np.s_[:m]), data.take(np.s_[m:])
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        rows = np.stack([table.alpha, table.a, table.theta, table.d], 1)
-        np.savetxt(folder / "arm.csv", rows, "%.17g", ",")
-        for file, part in (("fit.csv", fit), ("holdout.csv", held)):
-            np.savetxt(folder / file, np.hstack([part.q, part.values]), "%.17g", ",")
-        found = spoken([python, HERE / "bench_pybotics.py"], folder, PYTHONPATH="")
-    assert isinstance(found, dict)
+    found = bench_rivals.pybotics(table, (fit.q, fit.values), (held.q, held.values), None)
+    if found is None:
+        return []
     (ours,) = clocked([lambda: calibrate(chain, fit, "modified-dh")], repeats)
     mine = 1e3 * calibrate(chain, fit, "modified-dh").validate(held)["position_rms_m"]
     other = 1e3 * found["holdout"]
