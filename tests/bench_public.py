@@ -142,7 +142,7 @@ def rivals(series: Series, data: Path) -> list[float | None]:
     halves = [(part.q, part.poses[:, :3, 3]) for part in (fit, held)]
     frames = (started.base @ table.base, table.tool @ started.tool)
     by_pybotics = bench_rivals.pybotics(table, halves[0], halves[1], frames)
-    return [found and found["holdout"] for found in (by_figaroh, by_pybotics)]
+    return [found["holdout"] if found else None for found in (by_figaroh, by_pybotics)]
 
 
 def millimetres(accuracy: dict | None) -> str:
