@@ -43,7 +43,7 @@ default_role = "py:obj"
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 # Names of types that would be shown as the long unions that they stand for.
-autodoc_type_aliases = {"Array": "Array", "ArrayLike": "ArrayLike"}
+autodoc_type_aliases = {"Array": "Array", "ArrayLike": "ArrayLike", "Fold": "tuple[Array, ...]"}
 python_use_unqualified_type_names = True
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sphinx.application import Sphinx
+from sphinx.util.inspect import TypeAliasForwardRef
 
 import dhcal_pin
 
@@ -184,6 +185,8 @@ def setup(app: Sphinx) -> dict[str, Any]:
     Returns:
         Properties of the extension.
     """
+    # Within other types, Sphinx writes the names of `autodoc_type_aliases` by their repr.
+    TypeAliasForwardRef.__repr__ = lambda alias: alias.name
     app.connect("builder-inited", write_pages)
     app.connect("autodoc-process-docstring", _escape_docstring, priority=100)
     app.connect("autodoc-process-docstring", _keep_property_docstring, priority=900)
