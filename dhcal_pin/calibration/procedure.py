@@ -154,7 +154,9 @@ def calibrate(
             fit, gate, stages = apply_gate(fit, groups, max_iterations)
             extension = Extension(temperature=gate.temperature, n_configurations=gate.n_configurations)
             result = _make_result(fit, 1.0, holdout, method)
-            return replace(result, extension=extension, input_warnings=gate.warnings, camera_stages=stages)
+            is_kept = bool(errors.parameters) and not gate.is_open
+            warnings = (gate.sentence,) if is_kept else ()
+            return replace(result, extension=extension, input_warnings=warnings, camera_stages=stages)
         shrinkage_factor = compute_shrinkage_factor(fit.problem, fit.solution, groups.groups())
     result = _make_result(fit, shrinkage_factor, holdout, method)
     # Residuals of mixed-up measurements say nothing about other errors.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from camera_setups import ARMS, simulate, wrong_arm
 from robots import URDF
 
 import dhcal_pin as dh
@@ -53,6 +54,56 @@ def test_an_arm_with_errors_of_another_kind_is_kept(arm):
     q = rng.uniform(-2.5, 2.5, (60, 6))
     assert any("do not show that the arm is wrong" in text for text in fit.input_warnings)
     assert shape_error(fit.chain, truth, q) < 1.1 * shape_error(arm, truth, q)
+
+
+def error_elsewhere(chain, truth, seed):
+    """Return the RMS position error over the joint space after a fit of base and tool [m]."""
+    rng = np.random.default_rng(seed)
+    q = rng.uniform(np.maximum(chain.lower, -2.5), np.minimum(chain.upper, 2.5), (60, chain.n_joints))
+    data = dh.Pose(q, truth.poses(q))
+    fit = dh.calibrate(chain, data, "base,tool", priors="none", extend="none", loss="linear")
+    return dh.accuracy(fit.chain, data)["position_rms_m"]
+
+
+@pytest.mark.parametrize(("name", "is_on_wrist"), [("ur10", True), ("panda", False), ("xarm7", True)])
+def test_an_arm_that_is_wrong_by_3_mm_is_freed(name, is_on_wrist):
+    rng = np.random.default_rng(4)
+    chain = ARMS[name]()
+    truth = wrong_arm(chain, 3e-3, rng)
+    setup = simulate(chain, truth, rng, is_on_wrist=is_on_wrist, n_images=50, sigma=0.2)
+    fit = dh.calibrate(chain, setup.images, loss="linear")
+    assert fit.camera_stages[-1].is_kept
+    assert error_elsewhere(fit.chain, truth, 0) < error_elsewhere(chain, truth, 0) / 5
+
+
+@pytest.mark.parametrize(
+    ("name", "seed", "spread"),
+    [
+        ("ur10", 0, 0.25),
+        ("panda", 5, 0.5),
+        ("xarm7", 2, 0.25),
+        ("ur10", 120, 0.3),
+        ("panda", 109, 0.3),
+        pytest.param("ur10", 8, 0.4, marks=pytest.mark.slow),
+        pytest.param("panda", 9, 0.3, marks=pytest.mark.slow),
+        pytest.param("xarm7", 10, 0.6, marks=pytest.mark.slow),
+    ],
+)
+def test_periodic_errors_and_compliance_do_not_free_the_arm(name, seed, spread):
+    """Errors of links imitate them: the images fit better, and the arm would be worse elsewhere."""
+    rng = np.random.default_rng(seed)
+    chain = ARMS[name]()
+    errors = dh.select_parameters(chain, "harmonics,compliance")
+    std = np.array([3e-5 if "compliance" in p.name else 7e-4 for p in errors.parameters])
+    truth = errors.at(std * rng.standard_normal(len(std)))
+    setup = simulate(chain, truth, rng, is_on_wrist=seed % 2 == 0, n_images=40, sigma=0.2, spread=spread)
+    fit = dh.calibrate(chain, setup.images, loss="linear")
+    frames, *_, arm = fit.camera_stages
+    assert arm.fitted.pixels < frames.fitted.pixels
+    assert not arm.is_kept
+    assert "do not show that the arm is wrong" in arm.reason
+    assert arm.reason in fit.input_warnings
+    assert error_elsewhere(fit.chain, truth, 0) < 1.05 * error_elsewhere(chain, truth, 0)
 
 
 def test_hand_eye_alone_keeps_the_arm(arm):

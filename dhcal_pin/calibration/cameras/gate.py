@@ -1,17 +1,23 @@
-"""Gate: how far images may change the arm.
+"""Gate: whether images may change the arm.
 
 Images of a small part of joint space can be fitted better by a wrong arm. Their error on random held-out
 images falls then, too. The arm is therefore judged on images of left-out clusters of joint space. With N
-different configurations and the temperature T = 1 + N/5 of the residuals, r is the error of their image
-coordinates with the arm estimated, as a fraction of that with the nominal arm.
+different configurations, r is the error of their image coordinates with the arm estimated, as a fraction of
+that with the nominal arm. For r, the residuals have the temperature T = 1 + N/5, and the widths of the priors
+of the arm are those of greatest evidence at T, however narrow.
 
-- r < 0.5: the arm is demonstrably wrong. It is estimated at T = 1 + N/20 with the prior widths of greatest
-  evidence at T = 1, which are never below the default ones.
-- Otherwise: the widths of its priors are those of greatest evidence at T = 1 + N/5, however narrow, and a
-  warning says that the correction holds inside the measured region only.
+- r < 0.5 if the arm's errors explain the images up to the noise of the corners, and r < 0.25 if not: the arm
+  is demonstrably wrong. It is estimated at T = 1 + N/20 with the prior widths of greatest evidence at T = 1,
+  which are never below the default ones.
+- Otherwise the nominal arm is kept. Errors of another kind, such as periodic ones of the joints, can be
+  imitated by errors of the links where images were taken, with a ratio of 0.3 to 0.5, but not elsewhere.
 
-In both cases the corners of an image share a displacement of the arm (`jitter`), unless independent corners
-predict the left-out clusters better.
+The corners of an image share a displacement of the arm (`jitter`), unless independent corners predict the
+left-out clusters better. Then T is larger by the number of image coordinates per component of the
+displacement of an image.
+
+The temperature protects the arm from errors that the model lacks. If a shared displacement does not raise the
+likelihood of the images after the arm was estimated, the model lacks nothing, and T = 1.
 """
 
 from __future__ import annotations
@@ -40,8 +46,9 @@ N_CLUSTERS = 5
 N_IMAGE_FOLDS = 5
 # Configurations per unit of the temperature with an open and with a closed gate.
 OPEN_SAMPLES, CLOSED_SAMPLES = 20, 5
-# Largest ratio of the errors for which the arm is demonstrably wrong.
-MAX_OPEN_RATIO = 0.5
+# Largest ratio of the errors for which the arm is demonstrably wrong: if its errors explain the images up to
+# the noise of the corners, and if the model lacks other errors, which errors of the links then imitate.
+MAX_COMPLETE_RATIO, MAX_INCOMPLETE_RATIO = 0.5, 0.25
 # Narrowest and widest prior with a closed gate, as a fraction of the default one.
 MIN_WIDTH, MAX_WIDTH = 1e-3, 1e2
 # Rounds of jitter and solution, and of the evidence.
@@ -59,37 +66,44 @@ class Gate:
         jitter: Noise of corners and displacement of images.
         temperature: Temperature of the residuals in the final fit.
         n_configurations: Number of different configurations.
+        is_right: Whether the corners of an image share no displacement with the nominal arm.
+        is_complete: Whether they share none with the estimated arm.
     """
 
     ratio: float
     jitter: Jitter
     temperature: float
     n_configurations: int
+    is_right: bool
+    is_complete: bool
 
     @property
     def is_open(self) -> bool:
         """Whether the arm is demonstrably wrong."""
-        return self.ratio < MAX_OPEN_RATIO
+        return self.ratio < self.max_ratio and not self.is_right
+
+    @property
+    def max_ratio(self) -> float:
+        """Largest ratio for which the arm is demonstrably wrong."""
+        return MAX_COMPLETE_RATIO if self.is_complete else MAX_INCOMPLETE_RATIO
 
     @property
     def sentence(self) -> str:
-        """Why the arm is corrected in full, or only as far as the priors of greatest evidence allow."""
+        """Why the arm is estimated or kept."""
+        left_out = "estimating it changes the error of left-out parts of joint space by the factor"
         if self.is_open:
+            return f"The arm is demonstrably wrong: {left_out} {self.ratio:.2f}."
+        start = "The nominal arm is kept, as the images do not show that the arm is wrong:"
+        if self.is_right:
+            return f"{start} the noise of the corners explains them with the nominal arm."
+        if np.isnan(self.ratio):
             return (
-                "The arm is demonstrably wrong: estimating it changes the error of left-out parts of joint "
-                f"space by the factor {self.ratio:.2f}."
+                f"{start} {self.n_configurations} configurations are too few to leave out parts of joint "
+                f"space; expected at least {2 * N_CLUSTERS}."
             )
-        return self.warnings[0]
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """One sentence if the arm is not demonstrably wrong."""
-        if self.is_open:
-            return ()
         return (
-            "The images do not show that the arm is wrong: estimating it changes the error of left-out "
-            f"parts of joint space by the factor {self.ratio:.2f}. Its correction holds inside the measured "
-            "region only.",
+            f"{start} {left_out} {self.ratio:.2f}, not below {self.max_ratio}. Take images in a larger part "
+            "of joint space."
         )
 
 
@@ -108,7 +122,7 @@ def fit_with_jitter(fit: Fit, max_iterations: int) -> tuple[Fit, Jitter]:
     jitter = Jitter(1.0, 0.0, 0.0)
     for _ in range(_N_JITTER_ROUNDS):
         n_determined = effective_parameters(problem, solution)
-        jitter = estimate_jitter(problem, solution.x, fit.data, n_determined)
+        jitter = estimate_jitter(problem, solution.x, fit.data, fit.weights, n_determined)
         data = with_jitter(problem, solution.x, fit.data, jitter)
         weighted = [item.with_weights(w) for item, w in zip(data, fit.weights, strict=True)]
         problem = replace(problem, data=tuple(weighted))
@@ -130,67 +144,133 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int) -> tuple[Fit,
     Returns:
         The final fit, the gate, and the accuracy of each stage.
     """
-    final, gate = _gated(fit, groups, max_iterations)
-    return final, gate, _stages(fit, final, gate, max_iterations)
+    final, with_arm, gate = _gated(fit, groups, max_iterations)
+    return final, gate, _stages(fit, with_arm, gate, max_iterations)
 
 
-def _gated(fit: Fit, groups: PriorGroups, max_iterations: int) -> tuple[Fit, Gate]:
-    """Return the final fit, and the gate."""
-    expected = fit.problem.weights.copy()
-    expected[groups.members] = groups.expected_weights[groups.group_index]
+def _gated(fit: Fit, groups: PriorGroups, max_iterations: int) -> tuple[Fit, Fit, Gate]:
+    """Return the final fit, the fit with the arm estimated, and the gate."""
     n_configurations = len(np.unique(configuration_groups(fit.data)))
     folds = cluster_folds(fit.problem.data)
-    temperature = 1 + n_configurations / CLOSED_SAMPLES
-    models = [(fit, Jitter(1.0, 0.0, 0.0)), fit_with_jitter(fit, max_iterations)]
+    nominal = _without_arm(fit, max_iterations)
+    is_right = not residual_jitter(nominal).is_significant
+    kept = _independent(nominal)
+    if not is_right:
+        kept = _best((kept, _shared(nominal, max_iterations)), folds)
+    kept = replace(kept, fit=_solve(kept.fit, kept.fit.problem, 1.0, max_iterations))
+    if not fit.problem.errors.parameters:
+        gate = Gate(float("nan"), kept.jitter, 1.0, n_configurations, is_right, is_right)
+        return kept.fit, kept.fit, gate
+    shared = _shared(fit, max_iterations)
+    is_complete = not shared.jitter.is_significant
+    # If the images share no displacement, their corners are independent, and none of them counts as too many.
+    share = 1.0 if is_complete else rows_per_displacement(fit.data)
+    models = [(_independent(fit), share)] if is_complete else [(_independent(fit), share), (shared, 1.0)]
     trials = [
-        _trial(model, jitter, groups, expected, temperature, folds, max_iterations)
-        for model, jitter in models
+        _trial(model, groups, factor * temperature(n_configurations, CLOSED_SAMPLES), folds, max_iterations)
+        for model, factor in models
     ]
-    # Without clusters the corners of an image are never taken for independent.
     best = min(trials, key=lambda trial: trial.error) if len(folds) > 1 else trials[-1]
-    gate = Gate(best.ratio, best.jitter, temperature, n_configurations)
+    gate = Gate(best.ratio, best.model.jitter, 1.0, n_configurations, is_right, is_complete)
     if not gate.is_open:
-        return best.closed, gate
-    temperature = 1 + n_configurations / OPEN_SAMPLES
-    opened = _solve(best.fit, best.fit.problem, temperature, max_iterations)
-    return opened, replace(gate, temperature=temperature)
+        return kept.fit, best.closed, replace(gate, jitter=kept.jitter)
+    opened_at = 1.0
+    if not is_complete:
+        factor = 1.0 if best.model is shared else share
+        opened_at = factor * temperature(n_configurations, OPEN_SAMPLES)
+    opened = _solve(best.model.fit, best.model.fit.problem, opened_at, max_iterations)
+    return opened, opened, replace(gate, temperature=opened_at)
+
+
+@dataclass(frozen=True, eq=False)
+class _Model:
+    """Fit at temperature 1 with independent corners, or with jitter."""
+
+    fit: Fit
+    jitter: Jitter
+
+
+def _independent(fit: Fit) -> _Model:
+    """Return a fit of independent corners."""
+    return _Model(fit, Jitter(1.0, 0.0, 0.0))
+
+
+def _shared(fit: Fit, max_iterations: int) -> _Model:
+    """Fit again with a displacement that the corners of an image share."""
+    return _Model(*fit_with_jitter(fit, max_iterations))
+
+
+def _best(models: Sequence[_Model], folds: Sequence[Fold]) -> _Model:
+    """Return the model that predicts left-out clusters best, the last one without clusters."""
+    errors = [held_out_error(model.fit, folds) for model in models]
+    known = [(error.pixels, i) for i, error in enumerate(errors) if error is not None]
+    return models[min(known)[1]] if known else models[-1]
+
+
+def temperature(n_configurations: int, samples: int) -> float:
+    """Return the temperature of configurations with errors of the arm that the model lacks.
+
+    Args:
+        n_configurations: Number of different configurations.
+        samples: Configurations per unit of the temperature.
+    """
+    return 1 + n_configurations / samples
+
+
+def rows_per_displacement(data: Sequence[Measurement]) -> float:
+    """Return the number of image coordinates per component of the displacement of an image, at least 1.
+
+    Corners that share a displacement contain six independent values per image, however many they are. If
+    they are taken for independent, they count as too many by this factor.
+
+    Args:
+        data: Measurements.
+    """
+    images = [item for item in data if isinstance(item, CameraCorners)]
+    n_configurations = len(np.unique(configuration_groups(images)))
+    return max(sum(2 * len(item.rows) for item in images) / (6 * n_configurations), 1.0)
+
+
+def residual_jitter(fit: Fit) -> Jitter:
+    """Estimate the displacement of images from the residuals of a fit of independent corners.
+
+    Args:
+        fit: Fit.
+
+    Returns:
+        Its size.
+    """
+    n_determined = effective_parameters(fit.problem, fit.solution)
+    return estimate_jitter(fit.problem, fit.solution.x, fit.data, fit.weights, n_determined)
 
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """Fits with independent corners, or with jitter.
+    """Arm estimated with independent corners, or with jitter, as the gate judges it.
 
     Attributes:
-        fit: Fit at temperature 1.
-        jitter: Noise of corners and displacement of images.
-        closed: Fit for a closed gate.
+        model: Fit at temperature 1.
+        closed: Fit with the prior widths of greatest evidence at the temperature of the gate.
         error: Error of left-out clusters with that fit [px]; NaN without clusters.
         ratio: The same as a fraction of the error with the nominal arm.
     """
 
-    fit: Fit
-    jitter: Jitter
+    model: _Model
     closed: Fit
     error: float
     ratio: float
 
 
 def _trial(
-    fit: Fit,
-    jitter: Jitter,
-    groups: PriorGroups,
-    expected: Array,
-    temperature: float,
-    folds: Sequence[Fold],
-    max_iterations: int,
+    model: _Model, groups: PriorGroups, temperature: float, folds: Sequence[Fold], max_iterations: int
 ) -> _Trial:
     """Judge a model of the noise on left-out clusters."""
-    closed = _with_evidence(fit, groups, expected, temperature, max_iterations)
+    closed = _with_evidence(model.fit, groups, temperature, max_iterations)
     error = held_out_error(closed, folds)
-    nominal = held_out_error(_without_arm(fit, max_iterations), folds)
+    nominal = held_out_error(_without_arm(model.fit, max_iterations), folds)
     if error is None or nominal is None:
-        return _Trial(fit, jitter, closed, float("nan"), float("nan"))
-    return _Trial(fit, jitter, closed, error.pixels, error.pixels / nominal.pixels)
+        return _Trial(model, closed, float("nan"), float("nan"))
+    return _Trial(model, closed, error.pixels, error.pixels / nominal.pixels)
 
 
 def _solve(fit: Fit, problem: Problem, temperature: float, max_iterations: int) -> Fit:
@@ -200,10 +280,10 @@ def _solve(fit: Fit, problem: Problem, temperature: float, max_iterations: int) 
     return replace(fit, problem=problem, solution=solution, previous_iterations=fit.iterations)
 
 
-def _with_evidence(
-    fit: Fit, groups: PriorGroups, expected: Array, temperature: float, max_iterations: int
-) -> Fit:
+def _with_evidence(fit: Fit, groups: PriorGroups, temperature: float, max_iterations: int) -> Fit:
     """Fit with the prior widths of greatest evidence at a temperature, however narrow."""
+    expected = fit.problem.weights.copy()
+    expected[groups.members] = groups.expected_weights[groups.group_index]
     weights = expected.copy()
     system, x = fit.solution.system, fit.solution.x
     rows = TriangularSystem(system.rows / np.sqrt(temperature))
@@ -243,7 +323,7 @@ def _without_arm(fit: Fit, max_iterations: int, held: Collection[str] = ()) -> F
     return replace(fit, problem=plain, solution=solution)
 
 
-def _stages(fit: Fit, final: Fit, gate: Gate, max_iterations: int) -> tuple[Stage, ...]:
+def _stages(fit: Fit, with_arm: Fit, gate: Gate, max_iterations: int) -> tuple[Stage, ...]:
     """Judge the stages of a calibration: frames, intrinsics, arm."""
     folds = cluster_folds(fit.data)
     images = k_fold(fit.data, N_IMAGE_FOLDS) if folds else ()
@@ -258,8 +338,8 @@ def _stages(fit: Fit, final: Fit, gate: Gate, max_iterations: int) -> tuple[Stag
     lenses = _without_arm(fit, max_iterations)
     if len(lenses.problem.weights) > len(frames.problem.weights):
         out.append(judged("intrinsics", lenses, True, "The rig does not fix them."))
-    if final.problem.errors.parameters:
-        out.append(judged("arm", final, gate.is_open, gate.sentence))
+    if with_arm.problem.errors.parameters:
+        out.append(judged("arm", with_arm, gate.is_open, gate.sentence))
     return tuple(out)
 
 

@@ -9,6 +9,8 @@ D = diag(a², a², a², b², b², b²):
 
     C_i = (D⁻¹ + A_iᵀ·A_i)⁻¹,    m_i = C_i·A_iᵀ·r_i,    a² ← mean of m_v² + C_vv,    b² ← mean of m_ω² + C_ωω.
 
+Whether the images show a displacement at all is said by the ratio of the likelihoods with it and without it.
+
 Reference: A. Dempster, N. Laird and D. Rubin, Maximum Likelihood from Incomplete Data via the EM Algorithm,
 J. Royal Statistical Society B 39, 1977.
 """
@@ -16,7 +18,7 @@ J. Royal Statistical Society B 39, 1977.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,8 +32,10 @@ FIRST_STD = (1e-3, 1e-3)
 MIN_STD = 1e-7
 # Iterations, and relative change that ends them.
 _N_ITERATIONS, _RTOL = 200, 1e-3
-# Smallest noise of a detected corner [px].
+# Smallest noise of a detected corner, relative to the placeholder of 1 px.
 MIN_NOISE = 0.1
+# Logarithm of the ratio of the likelihoods from which images show a displacement.
+MIN_LOG_LIKELIHOOD_RATIO = 5.5
 
 
 @dataclass(frozen=True)
@@ -42,20 +46,35 @@ class Jitter:
         noise: Standard deviation of an image coordinate, relative to the stated or placeholder one.
         position: Standard deviation of the displacement of the tool along each axis [m].
         rotation: Standard deviation of its rotation about each axis [rad].
+        log_likelihood_ratio: Logarithm of the likelihood with the displacement over that without it, where
+            the noise explains all residuals.
     """
 
     noise: float
     position: float
     rotation: float
+    log_likelihood_ratio: float = 0.0
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether the images show a displacement: an error of the arm that the model lacks."""
+        return self.log_likelihood_ratio > MIN_LOG_LIKELIHOOD_RATIO
 
 
-def estimate_jitter(problem: Problem, x: Array, data: Sequence[Measurement], n_determined: float) -> Jitter:
+def estimate_jitter(
+    problem: Problem,
+    x: Array,
+    data: Sequence[Measurement],
+    weights: Sequence[Array],
+    n_determined: float,
+) -> Jitter:
     """Estimate the noise of corners and the displacement of images from the residuals of a fit.
 
     Args:
         problem: Problem that was solved.
         x: Its solution, (p,).
         data: Measurements with the standard deviations of the corners, without jitter.
+        weights: Robust weight of each sample, one array of shape (m,) per measurement.
         n_determined: Number of parameters that the data determine.
 
     Returns:
@@ -64,10 +83,11 @@ def estimate_jitter(problem: Problem, x: Array, data: Sequence[Measurement], n_d
     chain = problem.errors.at(x[: len(problem.errors.parameters)])
     images: list[tuple[Array, Array]] = []
     is_stated = True
-    for item in data:
+    for item, weight in zip(data, weights, strict=True):
         if not isinstance(item, CameraCorners):
             continue
-        plain = item.with_jitter(np.zeros_like(item.jitter))
+        inliers = item.take(weight > 0.5)
+        plain = inliers.with_jitter(np.zeros_like(inliers.jitter))
         frames = chain.forward_kinematics(plain.configurations())
         u = problem.instrument_values_of(plain, x)
         residual = plain.residual(frames, u)
@@ -78,7 +98,28 @@ def estimate_jitter(problem: Problem, x: Array, data: Sequence[Measurement], n_d
             samples = label == number
             images.append((residual.T[samples].ravel(), derivative[samples].reshape(-1, 6)))
     noise = 1.0 if is_stated else _scatter(images)
-    return _maximize_likelihood([(r / noise, a / noise) for r, a in images], noise, n_determined)
+    scaled = [(r / noise, a / noise) for r, a in images]
+    jitter = _maximize_likelihood(scaled, noise, n_determined)
+    # Without a displacement the noise is that of all residuals.
+    n_rows = sum(len(r) for r, _ in scaled)
+    squares = sum(float(r @ r) for r, _ in scaled)
+    ratio = _log_likelihood(scaled, jitter)
+    if not is_stated:
+        variance = squares / max(n_rows - n_determined, 1.0)
+        ratio += 0.5 * (n_rows - n_determined) * (np.log(variance) + 1) - 0.5 * squares
+    return replace(jitter, log_likelihood_ratio=float(ratio))
+
+
+def _log_likelihood(images: Sequence[tuple[Array, Array]], jitter: Jitter) -> float:
+    """Return the logarithm of the likelihood of a displacement over that of none with the same noise."""
+    std = np.array([jitter.position] * 3 + [jitter.rotation] * 3)
+    out = 0.0
+    for residual, derivative in images:
+        scaled = derivative * std
+        precision = np.eye(6) + scaled.T @ scaled
+        right = scaled.T @ residual
+        out += 0.5 * float(right @ np.linalg.solve(precision, right)) - 0.5 * np.linalg.slogdet(precision)[1]
+    return out
 
 
 def _scatter(images: Sequence[tuple[Array, Array]]) -> float:
