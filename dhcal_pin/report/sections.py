@@ -28,7 +28,7 @@ from ..formatting import Table, format_fixed, format_quantity
 from ..identifiability import label_unobservable
 from ..io.origins_file import origin_table
 from ..robot.chain import BASE_FRAME
-from . import figures
+from . import figures, images
 from .context import ReportContext
 from .document import short_names, versions
 from .figures import FigureGroup
@@ -144,6 +144,7 @@ def report_sections(context: ReportContext) -> list[Section]:
     """
     return [
         _accuracy_section(context),
+        _image_section(context),
         _residual_section(context),
         _transmission_section(context),
         _joint_section(context),
@@ -208,6 +209,24 @@ def _accuracy_section(context: ReportContext) -> Section:
         tables=[summary.accuracy_table(comparisons)],
         figures=partial(figures.accuracy_figures, context),
     )
+
+
+def _image_section(context: ReportContext) -> Section:
+    key, title = "images", "Images"
+    if not images.has_images(context):
+        return Section(key, title)
+    stages, sentences, items = context.fit.camera_stages, [], []
+    tables: list[Table] = []
+    if stages:
+        sentences.append(
+            "Unknowns are freed in stages. Each stage is judged on images that its fit did not see: random "
+            "ones, and whole regions of joint space. An error in mm is the distance of a corner of the board "
+            "from the line of sight through its image."
+        )
+        items = [f"{stage.name}: {stage.reason}" for stage in stages if stage.reason]
+        tables.append(images.stage_table(stages))
+    tables.append(images.image_table(context))
+    return Section(key, title, sentences, items, tables, partial(images.image_figures, context))
 
 
 def _residual_section(context: ReportContext) -> Section:

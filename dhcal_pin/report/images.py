@@ -1,0 +1,224 @@
+"""Section of the report on images: the stages of the calibration, and the errors of corners in the images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from .._typing import Array
+from ..calibration.cameras import ImageError, Stage
+from ..calibration.evaluation import compute_errors
+from ..cameras.rig import Camera
+from ..formatting import Table, format_fixed
+from ..measurements.camera import CameraCorners
+from ..visualization import image_plots
+from .context import ReportContext
+from .figures import FigureGroup, LegendEntry, Panel
+
+# Images of the table, and of the figures of single images: those with the largest errors.
+MAX_LISTED_IMAGES, MAX_DRAWN_IMAGES = 10, 6
+# Part of the width of an image that a large error should take, and the percentile of a large error.
+_DRAWN_PART, _LARGE_PERCENTILE = 0.06, 95.0
+# Width of the figure of a camera and of an image, and space that its labels take beside and below it [px].
+_WIDTH, _NARROW, _BESIDE, _BELOW = 420.0, 320.0, 60.0, 46.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Image:
+    """Corners of one image.
+
+    Attributes:
+        number: Number in the report, from 1.
+        source: Name of the file and lines of its rows.
+        camera: Camera that took it.
+        role: "fitted" or "hold-out".
+        pixels: Measured corners, (c, 2) [px].
+        before: Errors with the nominal arm, (c, 2) [px].
+        after: Errors after the calibration, (c, 2) [px].
+        distance: Errors at the board after the calibration, (c,) [m].
+    """
+
+    number: int
+    source: str
+    camera: Camera
+    role: str
+    pixels: Array
+    before: Array
+    after: Array
+    distance: Array
+
+    @property
+    def rms(self) -> float:
+        """RMS distance in the image after the calibration [px]."""
+        return _rms(self.after)
+
+
+def _rms(errors: Array) -> float:
+    """Return the RMS length of errors (c, d)."""
+    return float(np.sqrt(np.mean(np.sum(errors**2, 1))))
+
+
+def has_images(context: ReportContext) -> bool:
+    """Return whether a result comes from images.
+
+    Args:
+        context: Result and diagnostics.
+    """
+    return any(isinstance(item, CameraCorners) for item in context.fit.data)
+
+
+def stage_table(stages: Sequence[Stage]) -> Table:
+    """Return the accuracy after each stage of a calibration from images.
+
+    Args:
+        stages: Stages in their order.
+
+    Returns:
+        Table with the errors in the image and at the board.
+    """
+
+    def cells(error: ImageError | None) -> list[str]:
+        if error is None:
+            return ["", ""]
+        return [f"{error.pixels:.3g}", f"{1e3 * error.distance:.3g}"]
+
+    rows = [
+        [stage.name, "free" if stage.is_kept else "limited", str(stage.n_unknowns)]
+        + [cell for error in (stage.fitted, stage.by_image, stage.by_region) for cell in cells(error)]
+        for stage in stages
+    ]
+    errors = [
+        f"{name}, {unit}"
+        for name in ("fitted", "left-out images", "left-out regions")
+        for unit in ("px", "mm")
+    ]
+    return Table(["stage", "in the result", "unknowns", *errors], rows, n_text_columns=2)
+
+
+def image_table(context: ReportContext) -> Table:
+    """Return the images with the largest errors.
+
+    Args:
+        context: Result and diagnostics.
+    """
+    images = sorted(_images(context), key=lambda image: -image.rms)[:MAX_LISTED_IMAGES]
+    rows = [
+        [
+            str(image.number),
+            image.source,
+            image.camera.name,
+            image.role,
+            str(len(image.pixels)),
+            f"{_rms(image.before):.3g}",
+            f"{image.rms:.3g}",
+            format_fixed(1e3 * float(np.sqrt(np.mean(image.distance**2))), 3),
+        ]
+        for image in images
+    ]
+    header = ["image", "lines", "camera", "samples", "corners", "before, px", "after, px", "after, mm"]
+    return Table(header, rows, n_text_columns=4)
+
+
+def _images(context: ReportContext) -> list[_Image]:
+    """Return all images, fitted ones first."""
+    fit, out = context.fit, []
+    parts = (
+        ("fitted", context.data_names, fit.data),
+        ("hold-out", context.holdout_names, fit.holdout),
+    )
+    for role, names, data in parts:
+        for name, item in zip(names, data, strict=True):
+            if not isinstance(item, CameraCorners):
+                continue
+            before = compute_errors(fit.nominal_refitted, [item], fit.nominal_instruments)[0]
+            after = compute_errors(fit.chain, [item], fit.instruments)[0]
+            first = np.unique(item.image, return_index=True)[1]
+            for label in np.argsort(first):
+                samples = np.flatnonzero(item.image == label)
+                lines = item.rows[samples]
+                out.append(
+                    _Image(
+                        number=len(out) + 1,
+                        source=f"{name}, {lines.min()}-{lines.max()}",
+                        camera=item.rig.cameras[item.camera[samples[0]]],
+                        role=role,
+                        pixels=item.values[samples],
+                        before=before["pixels"][samples],
+                        after=after["pixels"][samples],
+                        distance=np.linalg.norm(after["board"][samples].reshape(len(samples), -1), axis=1),
+                    )
+                )
+    return out
+
+
+def image_figures(context: ReportContext) -> list[FigureGroup]:
+    """Draw the errors of corners over the images of each camera, of each image, and of the worst images.
+
+    Args:
+        context: Result and diagnostics.
+
+    Returns:
+        Groups of figures.
+    """
+    images = _images(context)
+    before, after = (np.array([_rms(e) for e in side]) for side in
+                     ([i.before for i in images], [i.after for i in images]))  # fmt: skip
+    text = (
+        f"RMS error of the corners of {len(images)} images: median {np.median(before):.3g} px before, "
+        f"{np.median(after):.3g} px after."
+    )
+    plot = partial(image_plots.plot_image_errors, before, after)
+    legend = [LegendEntry(state, state, "dots") for state in ("before", "after")]
+    groups = [
+        FigureGroup(
+            [Panel("image-errors", "Error of each image", text, plot)], "Images", legend=legend, layout="wide"
+        )
+    ]
+    by_camera = {image.camera.name: image.camera for image in images}
+    legend = [LegendEntry("corner", "sample", "dots"), LegendEntry("error", "after", "line")]
+    panels = []
+    for number, (name, camera) in enumerate(by_camera.items()):
+        chosen = [image for image in images if image.camera.name == name]
+        pixels, errors = (np.concatenate([getattr(i, key) for i in chosen]) for key in ("pixels", "after"))
+        panels.append(_reprojection_panel(f"reprojection-{number}", f"Camera {name}", camera, pixels, errors))
+    groups.append(FigureGroup(panels, "Errors of all corners", legend=legend, layout="wide"))
+    worst = sorted(images, key=lambda image: -image.rms)[:MAX_DRAWN_IMAGES]
+    panels = [
+        _reprojection_panel(
+            f"image-{image.number}",
+            f"Image {image.number}: {image.rms:.3g} px",
+            image.camera,
+            image.pixels,
+            image.after,
+            _NARROW,
+        )
+        for image in worst
+    ]
+    groups.append(FigureGroup(panels, "Images with the largest errors", legend=legend))
+    return groups
+
+
+def _reprojection_panel(
+    key: str, title: str, camera: Camera, pixels: Array, errors: Array, width: float = _WIDTH
+) -> Panel:
+    """Return the figure of corners of a camera with their errors."""
+    large = max(float(np.percentile(np.linalg.norm(errors, axis=1), _LARGE_PERCENTILE)), 1e-9)
+    magnification = _round_down(_DRAWN_PART * camera.width / large)
+    text = (
+        f"{len(pixels)} corners in an image plane of {camera.width} x {camera.height} px, RMS error "
+        f"{_rms(errors):.3g} px, drawn {magnification:g} times larger."
+    )
+    plot = partial(
+        image_plots.plot_reprojection, pixels, errors, (camera.width, camera.height), magnification
+    )
+    height = (width - _BESIDE) * camera.height / camera.width + _BELOW
+    return Panel(key, f"{title}, errors × {magnification:g}", text, plot, (width, height))
+
+
+def _round_down(value: float) -> float:
+    """Return the largest number 1, 2 or 5 times a power of ten below a value."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(power * max(step for step in (1, 2, 5) if step * power <= value * (1 + 1e-9)))

@@ -1,0 +1,79 @@
+"""Section of the report on images: stages, errors of each image, and errors over the image plane."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from dhcal_pin.calibration import calibrate
+from dhcal_pin.calibration.evaluation import compute_errors
+from dhcal_pin.estimation import select_parameters
+from dhcal_pin.measurements import CameraCorners, Noise
+from dhcal_pin.report import Provenance, ReportContext
+from dhcal_pin.report.document import json_text, result_to_dict
+from dhcal_pin.report.html import html_page
+from dhcal_pin.report.images import image_figures, image_table, stage_table
+from dhcal_pin.report.sections import report_sections
+from dhcal_pin.visualization.image_plots import plot_reprojection
+
+
+@pytest.fixture(scope="module")
+def result(sim_6dof):
+    rng = np.random.default_rng(0)
+    errors = select_parameters(sim_6dof, "placement")
+    scale = np.array([1e-3 if p.unit == "m" else 3e-3 for p in errors.parameters])
+    truth = errors.at(scale * rng.normal(size=len(scale)))
+    images = CameraCorners.simulate(truth, rng.uniform(-2.5, 2.5, (35, 6)), Noise(2e-4), rng)
+    is_fitted = images.image < 30
+    return calibrate(sim_6dof, images.take(is_fitted), "placement,camera", holdout=images.take(~is_fitted))
+
+
+def test_stages_are_those_of_the_json(result):
+    table = stage_table(result.camera_stages)
+    stages = json.loads(json_text(result_to_dict(result, {}, {})))["camera_stages"]
+    assert [row[0] for row in table.rows] == [stage["stage"] for stage in stages]
+    for row, stage in zip(table.rows, stages, strict=True):
+        assert float(row[3]) == pytest.approx(stage["fitted"]["residual_rms_px"], rel=0.01)
+        assert float(row[8]) == pytest.approx(1e3 * stage["by_region"]["board_rms_m"], rel=0.01)
+
+
+def test_images_with_the_largest_errors_are_listed(result, quick):
+    table = image_table(ReportContext.from_result(result, Provenance(names=["corners.csv"])))
+    shown = [float(row[6]) for row in table.rows]
+    assert shown == sorted(shown, reverse=True)
+    rms = []
+    for item in (*result.data, *result.holdout):
+        squares = compute_errors(result.chain, [item], result.instruments)[0]["pixels"] ** 2
+        rms += [np.sqrt(squares[item.image == i].sum(1).mean()) for i in range(item.n_images)]
+    np.testing.assert_allclose(shown, sorted(rms, reverse=True)[: len(shown)], rtol=0.01)
+    assert all(row[1].startswith("corners.csv, ") for row in table.rows if row[3] == "fitted")
+
+
+def test_page_shows_each_camera_and_the_worst_images(result, quick):
+    context = ReportContext.from_result(result, Provenance())
+    page = html_page(context)
+    assert '<section id="images"' in page
+    for panel in (panel for group in image_figures(context) for panel in group.panels):
+        assert f'aria-labelledby="{panel.key}-t' in page
+    assert all(f"Camera {name}, errors" in page for name in ("left", "right"))
+
+
+def test_results_without_images_have_no_such_section(fit, quick):
+    section = next(
+        s for s in report_sections(ReportContext.from_result(fit, Provenance())) if s.key == "images"
+    )
+    assert not (section.sentences)
+    assert not (section.tables)
+    assert not (section.figures)
+
+
+def test_errors_are_drawn_from_the_measured_corner_to_the_modelled_one():
+    pixels, errors = np.array([[100.0, 50], [300, 200]]), np.array([[0.1, 0], [0, -0.2]])
+    ax = plot_reprojection(pixels, errors, (640, 480), 100)
+    x, y = ax.lines[0].get_data()
+    np.testing.assert_allclose(np.stack([x, y], 1)[:2], [[100, 50], [90, 50]])
+    np.testing.assert_allclose(np.stack([x, y], 1)[3:5], [[300, 200], [300, 220]])
+    # v grows downwards.
+    assert ax.get_ylim()[0] > ax.get_ylim()[1]
