@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -108,3 +109,18 @@ LIVE_FIND = """(arm, body) => {
   const world = viewer.scene_tree.find(["meshcat"]).object.matrixWorld.clone().invert();
   return world.multiply(node.matrixWorld).elements;
 }"""
+
+
+def wait_for(page: Any, expression: str) -> None:
+    """Wait until an expression of the page is true; the page forbids what Playwright's own function does.
+
+    A frame that is being loaded cannot evaluate anything yet.
+    """
+    from playwright.sync_api import Error  # lazy import: only where a browser is
+
+    for _ in range(600):
+        with suppress(Error):
+            if page.evaluate(expression):
+                return
+        time.sleep(0.1)
+    raise AssertionError(f"not true within a minute: {expression}")

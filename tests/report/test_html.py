@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pages import READY, wait_for
 from robots import URDF, missing
 
 from dhcal_pin.calibration import accuracy, calibrate
@@ -162,11 +163,7 @@ def test_the_page_needs_no_network_and_its_scene_is_ready(browser, page_file):
     page.goto(page_file.as_uri())
     page.locator("iframe").scroll_into_view_if_needed()
     frame = page.frames[1]
-    for _ in range(600):
-        if frame.evaluate("window.dhcal !== undefined && window.dhcal.ready === true"):
-            break
-        page.wait_for_timeout(100)
-    assert frame.evaluate("dhcal.ready")
+    wait_for(frame, READY)
     page.close()
     assert not messages
     assert all(url.startswith(("file:", "data:", "about:")) for url in requests), requests

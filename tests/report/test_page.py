@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import json
 import re
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +13,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from pages import wait_for
 from robots import missing, robot_file
 
 from dhcal_pin import se3
@@ -101,21 +100,6 @@ def dot(page: Any, plot: Any, x: float, y: float) -> tuple[float, float]:
     scale = box["width"] / float(plot.locator("svg").get_attribute("viewBox").split()[2])
     px = left + (x - low) / (high - low) * (right - left)
     return box["x"] + scale * px, box["y"] + scale * (start + slope * y)
-
-
-def wait_for(page: Any, expression: str) -> None:
-    """Wait until an expression of the page is true; the page forbids what Playwright's own function does.
-
-    A frame that is being loaded cannot evaluate anything yet.
-    """
-    from playwright.sync_api import Error  # lazy import: only where a browser is
-
-    for _ in range(600):
-        with contextlib.suppress(Error):
-            if page.evaluate(expression):
-                return
-        time.sleep(0.1)
-    raise AssertionError(f"not true within a minute: {expression}")
 
 
 def test_hovering_a_dot_shows_line_joints_and_error(page, fit):
