@@ -46,10 +46,15 @@ class Setup:
     sigma: float
 
 
-def true_lens(rng: np.random.Generator, model: str) -> np.ndarray:
+def true_lens(rng: np.random.Generator, model: str, aspect: float) -> np.ndarray:
     """Return the values of a lens with distortion."""
     focal = rng.uniform(800, 1300)
-    head = [focal, focal * rng.uniform(0.995, 1.005), 639.5 + rng.normal(0, 10), 479.5 + rng.normal(0, 10)]
+    head = [
+        focal,
+        aspect * focal * rng.uniform(0.995, 1.005),
+        639.5 + rng.normal(0, 10),
+        479.5 + rng.normal(0, 10),
+    ]
     if model == "fisheye":
         return np.array([*head, *rng.normal(0, [0.03, 0.01, 0.005, 0.002])])
     return np.array([*head, rng.uniform(-0.25, 0.15), rng.normal(0, 0.05), *rng.normal(0, 1e-3, 2), 0.0])
@@ -96,6 +101,7 @@ def simulate(
     n_cameras: int = 1,
     n_boards: int = 1,
     intrinsics_error: float = 0.05,
+    aspect: float = 1.0,
 ) -> Setup:
     """Simulate images of boards by cameras that stand still or are on the wrist.
 
@@ -113,6 +119,7 @@ def simulate(
         n_cameras: Number of cameras.
         n_boards: Number of boards.
         intrinsics_error: Relative error of the focal lengths and the image centre in the rig file.
+        aspect: Ratio of the focal lengths.
 
     Returns:
         The set-up.
@@ -141,7 +148,7 @@ def simulate(
         side = tool[:3, :3] @ side
         position = tool[:3, 3] + side if is_on_wrist else seen + 0.7 * tool[:3, 2] + 3 * side
         camera_poses.append(look_at(position, seen, rng.uniform(-3, 3)))
-        lenses.append(true_lens(rng, model))
+        lenses.append(true_lens(rng, model, aspect))
         wrong = lenses[-1].copy()
         wrong[:2] *= 1 + intrinsics_error * rng.choice([-1, 1])
         wrong[2:4] += intrinsics_error * rng.uniform(-1, 1, 2) * [639.5, 479.5]
@@ -172,7 +179,7 @@ def simulate(
     if len(rows) < n_images:
         return simulate(chain, truth, rng, is_on_wrist=is_on_wrist, n_images=n_images, sigma=sigma,
                         spread=spread, model=model, n_cameras=n_cameras, n_boards=n_boards,
-                        intrinsics_error=intrinsics_error)  # fmt: skip
+                        intrinsics_error=intrinsics_error, aspect=aspect)  # fmt: skip
     q, camera, board, corner, pixels = (np.concatenate(each) for each in zip(*rows, strict=True))
     names = [f"camera{i}" for i in camera], [f"board{i}" for i in board]
     noisy = pixels + sigma * rng.standard_normal(pixels.shape)
@@ -192,6 +199,8 @@ def visible_corners(truth: Chain, rig: MountedRig, q: np.ndarray) -> list[tuple[
         found = []
         for c, camera in enumerate(rig.cameras):
             for b, board in enumerate(rig.boards):
+                assert camera.pose is not None
+                assert board.pose is not None
                 camera_pose = tool @ camera.pose if rig.camera_mounts[c].moves else camera.pose
                 board_pose = tool @ board.pose if rig.board_mounts[b].moves else board.pose
                 local = inverse(camera_pose) @ board_pose

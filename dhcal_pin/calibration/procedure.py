@@ -41,7 +41,16 @@ from ..measurements.base import Measurement
 from ..parallel import SERIAL, TaskExecutor
 from ..robot.chain import BASE_FRAME, Chain
 from . import model_selection
-from .cameras import apply_gate, default_sets, has_images, held_values, split_sets
+from .cameras import (
+    apply_gate,
+    axis_stages,
+    default_sets,
+    exchange_axes,
+    has_images,
+    held_values,
+    reorder,
+    split_sets,
+)
 from .cross_validation import leave_regions_out
 from .model_selection import Extension
 from .result import Result
@@ -133,6 +142,8 @@ def calibrate(
         chain.validated_q(item.configurations())
     priors = priors if priors is not None else ("none" if method == "gn" else "default")
     robot_sets, rig_sets = split_sets(parameters if parameters is not None else default_sets(chain, data))
+    data, exchanges = exchange_axes(chain, data)
+    holdout = reorder(holdout, exchanges)
     known = {**held_values(data, rig_sets), **_validated_known(data, known or {})}
     errors = select_parameters(chain, robot_sets, fix, free) if robot_sets or free else ErrorModel(chain, ())
     families = _extension_families(extend, errors, method, priors)
@@ -154,9 +165,14 @@ def calibrate(
             fit, gate, stages = apply_gate(fit, groups, max_iterations)
             extension = Extension(temperature=gate.temperature, n_configurations=gate.n_configurations)
             result = _make_result(fit, 1.0, holdout, method)
-            is_kept = bool(errors.parameters) and not gate.is_open
-            warnings = (gate.sentence,) if is_kept else ()
-            return replace(result, extension=extension, input_warnings=warnings, camera_stages=stages)
+            warnings = [exchange.sentence for exchange in exchanges]
+            warnings += [gate.sentence] if errors.parameters and not gate.is_open else []
+            return replace(
+                result,
+                extension=extension,
+                input_warnings=tuple(warnings),
+                camera_stages=(*axis_stages(exchanges), *stages),
+            )
         shrinkage_factor = compute_shrinkage_factor(fit.problem, fit.solution, groups.groups())
     result = _make_result(fit, shrinkage_factor, holdout, method)
     # Residuals of mixed-up measurements say nothing about other errors.

@@ -738,7 +738,10 @@ def _require_inside_images(item: CameraCorners) -> None:
         first = int(np.flatnonzero(outside)[0])
         camera = item.rig.cameras[item.camera[first]]
         u, v = item.values[first]
+        of_camera = item.camera == item.camera[first]
+        is_exchanged = np.all(item.values[of_camera] <= [camera.height, camera.width])
+        hint = "width and height are exchanged" if is_exchanged else "check width and height"
         raise InvalidArgumentError(
             f"sample {first + 1} of camera {camera.name!r}: u = {u:.6g}, v = {v:.6g} px is far outside its "
-            f"images of {camera.width} x {camera.height} px; check width and height in the rig file"
+            f"images of {camera.width} x {camera.height} px; {hint} in the rig file"
         )

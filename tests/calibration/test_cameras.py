@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from camera_setups import ARMS, simulate, wrong_arm
@@ -104,6 +106,56 @@ def test_periodic_errors_and_compliance_do_not_free_the_arm(name, seed, spread):
     assert "do not show that the arm is wrong" in arm.reason
     assert arm.reason in fit.input_warnings
     assert error_elsewhere(fit.chain, truth, 0) < 1.05 * error_elsewhere(chain, truth, 0)
+
+
+@pytest.mark.parametrize("intrinsics", ["fixed", "prior"])
+@pytest.mark.parametrize(
+    ("order", "what"),
+    [([0, 1, 3, 2], "cx and cy"), ([1, 0, 2, 3], "fx and fy"), ([1, 0, 3, 2], "fx and fy, and cx and cy")],
+)
+def test_exchanged_axes_of_the_intrinsics_are_named(intrinsics, order, what):
+    rng = np.random.default_rng(6)
+    chain = ARMS["ur10"]()
+    truth = wrong_arm(chain, 1e-3, rng)
+    setup = simulate(chain, truth, rng, is_on_wrist=True, n_images=20, sigma=0.2, aspect=1.1)
+    lens = setup.exact.rig.cameras[0].values
+    stated = np.concatenate([lens[order], lens[4:]])
+    images, held_out = (
+        setup.images.take(part) for part in (setup.images.image < 15, setup.images.image >= 15)
+    )
+    fits = []
+    for values in (lens, stated):
+        camera = replace(images.rig.cameras[0], values=values, intrinsics=intrinsics)
+        data = [
+            dh.CameraCorners(item.q, item.values, item.corner, replace(item.rig, cameras=(camera,)))
+            for item in (images, held_out)
+        ]
+        fits.append(dh.calibrate(chain, data[0], "camera,board,intrinsics", holdout=data[1], loss="linear"))
+    right, exchanged = fits
+    assert not any("exchanged" in text for text in right.input_warnings)
+    assert any(f"camera 'camera0': {what} are exchanged" in text for text in exchanged.input_warnings)
+    stage = exchanged.camera_stages[0]
+    assert stage.name == "axis order"
+    assert stage.fitted.pixels > 2 * exchanged.camera_stages[1].fitted.pixels
+    for title in (0, -1):
+        rms = [fit.comparisons[title].after["residual_rms"] for fit in fits]
+        assert rms[0] == pytest.approx(rms[1], rel=1e-3)
+
+
+def test_exchanged_width_and_height_are_named():
+    rng = np.random.default_rng(7)
+    chain = ARMS["ur10"]()
+    setup = simulate(chain, chain, rng, is_on_wrist=True, n_images=15, sigma=0.2)
+    camera = replace(setup.images.rig.cameras[0], width=960, height=1280)
+    rig = replace(setup.images.rig, cameras=(camera,))
+    data = dh.CameraCorners(setup.images.q, setup.images.values, setup.images.corner, rig)
+    fit = dh.calibrate(chain, data, "camera,board,intrinsics", loss="linear")
+    assert any("width and height are exchanged" in text for text in fit.input_warnings)
+    # Images of 1280 x 480 pixels: exchanged, most corners are far outside.
+    upper = setup.images.take(setup.images.values[:, 1] < 480)
+    rig = replace(rig, cameras=(replace(camera, width=480, height=1280),))
+    with pytest.raises(DhcalError, match="width and height are exchanged"):
+        dh.CameraCorners(upper.q, upper.values, upper.corner, rig)
 
 
 def test_hand_eye_alone_keeps_the_arm(arm):

@@ -4,6 +4,7 @@ A calibration from images estimates cameras, boards and lenses together with the
 which of these parameters are unknown, and in which order they are freed.
 """
 
+from .axis_order import axis_stages, exchange_axes, reorder
 from .gate import apply_gate
 from .sets import RIG_SETS, default_sets, has_images, held_values, split_sets
 from .stages import STAGES, ImageError, Stage
@@ -14,8 +15,11 @@ __all__ = [
     "ImageError",
     "Stage",
     "apply_gate",
+    "axis_stages",
     "default_sets",
+    "exchange_axes",
     "has_images",
     "held_values",
+    "reorder",
     "split_sets",
 ]

@@ -90,9 +90,9 @@ class Gate:
     @property
     def sentence(self) -> str:
         """Why the arm is estimated or kept."""
-        left_out = "estimating it changes the error of left-out parts of joint space by the factor"
+        effect = "estimating it changes the error of left-out parts of joint space by the factor"
         if self.is_open:
-            return f"The arm is demonstrably wrong: {left_out} {self.ratio:.2f}."
+            return f"The arm is demonstrably wrong: {effect} {self.ratio:.2f}."
         start = "The nominal arm is kept, as the images do not show that the arm is wrong:"
         if self.is_right:
             return f"{start} the noise of the corners explains them with the nominal arm."
@@ -102,7 +102,7 @@ class Gate:
                 f"space; expected at least {2 * N_CLUSTERS}."
             )
         return (
-            f"{start} {left_out} {self.ratio:.2f}, not below {self.max_ratio}. Take images in a larger part "
+            f"{start} {effect} {self.ratio:.2f}, not below {self.max_ratio}. Take images in a larger part "
             "of joint space."
         )
 

@@ -1,0 +1,228 @@
+"""Exchanged axes of intrinsics: fx with fy, or cx with cy, or width with height.
+
+Programs differ in the order in which they write image axes. Exchanged values look like an error of the arm of
+many pixels, and no prior of the intrinsics reaches the right ones. Each camera is therefore calibrated alone,
+with the nominal arm and fixed intrinsics, as they are stated and in every other order. Another order is taken
+if it explains the images far better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..._typing import Array
+from ...estimation.error_model import ErrorModel
+from ...estimation.problem import Problem, merge_instrument_parameters
+from ...estimation.solver import minimize
+from ...exceptions import DhcalError
+from ...measurements.base import Measurement
+from ...measurements.camera import CameraCorners
+from ...robot.chain import Chain
+from ..reweighting import Fit
+from .stages import ImageError, Stage, fitted_error
+
+# Orders of fx, fy, cx, cy besides the stated one, with their names.
+ORDERS = {
+    "fx and fy": [1, 0, 2, 3],
+    "cx and cy": [0, 1, 3, 2],
+    "fx and fy, and cx and cy": [1, 0, 3, 2],
+}
+# Smallest change of a value that is tried [px].
+MIN_CHANGE = 5.0
+# Error of stated intrinsics below which nothing is tried [px], and largest ratio of the errors for which
+# another order is taken.
+GOOD_ERROR, MAX_RATIO = 2.0, 0.5
+# Largest number of iterations of one solution, and of corners of a camera that are compared.
+_MAX_ITERATIONS, _MAX_CORNERS = 30, 2000
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """Values of a camera that are exchanged in the rig.
+
+    Attributes:
+        camera: Name of the camera.
+        what: What is exchanged.
+        stated: Error with the values as they are stated.
+        exchanged: Error with the exchanged values; None if it is the size of the images.
+        unknowns: Number of unknowns of the comparison.
+    """
+
+    camera: str
+    what: str
+    stated: ImageError | None
+    exchanged: ImageError | None
+    unknowns: int = 0
+
+    @property
+    def sentence(self) -> str:
+        """What is exchanged, how it was found, and what to do about it."""
+        start = f"camera {self.camera!r}: {self.what} are exchanged in the rig file"
+        if self.stated is None or self.exchanged is None:
+            return f"{start}: corners lie outside its images, and inside if they are exchanged. Correct them."
+        return (
+            f"{start}: with fixed intrinsics the images differ by {self.stated.pixels:.3g} px as stated, and "
+            f"by {self.exchanged.pixels:.3g} px if they are exchanged. The exchanged values are used; "
+            "correct them."
+        )
+
+
+def exchange_axes(
+    chain: Chain, data: Sequence[Measurement]
+) -> tuple[tuple[Measurement, ...], tuple[Exchange, ...]]:
+    """Find exchanged values of cameras, and put intrinsics into the order that explains the images.
+
+    Args:
+        chain: Nominal robot.
+        data: Measurements of any kinds.
+
+    Returns:
+        The measurements with the right intrinsics, and what was exchanged.
+    """
+    out = tuple(data)
+    found: list[Exchange] = []
+    names = dict.fromkeys(
+        camera.name for item in data if isinstance(item, CameraCorners) for camera in item.rig.cameras
+    )
+    for name in names:
+        parts = [part for item in data if (part := _images_of(item, name)) is not None]
+        if _is_size_exchanged(parts, name):
+            found.append(Exchange(name, "width and height", None, None))
+        best = _best_order(chain, parts, name)
+        if best is not None:
+            exchange, order = best
+            found.append(exchange)
+            out = tuple(
+                _reordered(item, name, order) if isinstance(item, CameraCorners) else item for item in out
+            )
+    return out, tuple(found)
+
+
+def reorder(data: Sequence[Measurement], exchanges: Sequence[Exchange]) -> tuple[Measurement, ...]:
+    """Exchange the same values of the cameras of other measurements.
+
+    Args:
+        data: Measurements of any kinds.
+        exchanges: What is exchanged.
+
+    Returns:
+        The measurements.
+    """
+    out = tuple(data)
+    for exchange in exchanges:
+        if exchange.what in ORDERS:
+            out = tuple(
+                _reordered(item, exchange.camera, ORDERS[exchange.what])
+                if isinstance(item, CameraCorners)
+                else item
+                for item in out
+            )
+    return out
+
+
+def axis_stages(exchanges: Sequence[Exchange]) -> tuple[Stage, ...]:
+    """Return the stages of exchanged intrinsics: their errors are those of the values as they are stated.
+
+    Args:
+        exchanges: What is exchanged.
+    """
+    return tuple(
+        Stage("axis order", True, each.unknowns, each.stated, None, None, each.sentence)
+        for each in exchanges
+        if each.stated is not None
+    )
+
+
+def _images_of(item: Measurement, name: str) -> CameraCorners | None:
+    """Return the images of one camera; None if there are none."""
+    if not isinstance(item, CameraCorners):
+        return None
+    numbers = [i for i, camera in enumerate(item.rig.cameras) if camera.name == name]
+    mask = np.isin(item.camera, numbers)
+    return item.take(mask) if mask.any() else None
+
+
+def _is_size_exchanged(parts: Sequence[CameraCorners], name: str) -> bool:
+    """Return whether corners lie outside the images, and all inside if width and height are exchanged."""
+    values = np.concatenate([np.empty((0, 2)), *(part.values for part in parts)])
+    for part in parts:
+        camera = next(camera for camera in part.rig.cameras if camera.name == name)
+        size = np.array([camera.width, camera.height])
+        return bool(np.any(values > size)) and bool(np.all(values <= size[::-1]))
+    return False
+
+
+def _best_order(chain: Chain, parts: Sequence[CameraCorners], name: str) -> tuple[Exchange, list[int]] | None:
+    """Return the order of the intrinsics that explains the images of a camera far better."""
+    cameras = [camera for part in parts for camera in part.rig.cameras if camera.name == name]
+    if not cameras or not cameras[0].has_intrinsics:
+        return None
+    values = cameras[0].values[:4]
+    orders = {
+        what: order
+        for what, order in ORDERS.items()
+        if np.all(np.abs(values[order] - values)[np.array(order) != np.arange(4)] > MIN_CHANGE)
+    }
+    if not orders:
+        return None
+    stated = _frames_error(chain, parts)
+    if stated is None or stated[0].pixels < GOOD_ERROR:
+        return None
+    errors = {
+        what: found[0]
+        for what, order in orders.items()
+        if (found := _frames_error(chain, [_reordered(part, name, order) for part in parts])) is not None
+    }
+    if not errors:
+        return None
+    what = min(errors, key=lambda each: errors[each].pixels)
+    if errors[what].pixels > MAX_RATIO * stated[0].pixels:
+        return None
+    return Exchange(name, what, stated[0], errors[what], stated[1]), orders[what]
+
+
+def _frames_error(chain: Chain, parts: Sequence[CameraCorners]) -> tuple[ImageError, int] | None:
+    """Return the error of images with fixed intrinsics and the nominal arm, and the number of unknowns.
+
+    None if the images do not determine the poses.
+    """
+    try:
+        data = tuple(_thinned(part).initialized(chain) for part in parts)
+    except DhcalError:
+        return None
+    known = {
+        p.name: p.nominal
+        for item in data
+        for p in item.instrument_parameters
+        if item.set_of(p.name) not in ("camera", "board")
+    }
+    unknown = [p for p in merge_instrument_parameters(data) if p.name not in known]
+    weights: Array = np.array([1 / p.prior for p in unknown])
+    problem = Problem(ErrorModel(chain, ()), data, weights, known)
+    solution = minimize(problem, "lm", None, _MAX_ITERATIONS, loose=True)
+    fit = Fit(data, problem, solution, tuple(np.ones(len(item.rows)) for item in data))
+    return fitted_error(fit), len(unknown)
+
+
+def _thinned(item: CameraCorners) -> CameraCorners:
+    """Return images with a limited number of corners."""
+    if len(item.rows) <= _MAX_CORNERS:
+        return item
+    n_kept = max(1, item.n_images * _MAX_CORNERS // len(item.rows))
+    chosen = np.unique(np.linspace(0, item.n_images - 1, max(n_kept, 10)).astype(int))
+    return item.take(np.isin(item.image, chosen))
+
+
+def _reordered(item: CameraCorners, name: str, order: Sequence[int]) -> CameraCorners:
+    """Return a measurement with another order of fx, fy, cx, cy of a camera."""
+    cameras, values = [], {}
+    for camera in item.rig.cameras:
+        if camera.name == name:
+            lens = np.concatenate([camera.values[list(order)], camera.values[4:]])
+            values = {f"camera_{name}.{key}": v for key, v in zip(camera.lens.names, lens, strict=True)}
+            camera = replace(camera, values=lens)
+        cameras.append(camera)
+    return item.with_rig(replace(item.rig, cameras=tuple(cameras))).with_values(values)
