@@ -186,6 +186,25 @@ def check_04_13(n: Any) -> None:
     assert n.planned < 1.15 * n.every
 
 
+def check_05_09(n: Any) -> None:
+    assert len(n.found[0].used) == 40
+    assert sum(n.n_corners) > 1400
+
+
+def check_05_15(n: Any) -> None:
+    assert [stage.name for stage in n.fit.camera_stages][-1] == "arm"
+    assert n.by_region < 0.15
+
+
+def check_05_19(n: Any) -> None:
+    assert np.sqrt(np.mean(n.nominal**2)) > 2
+    assert np.sqrt(np.mean(n.calibrated**2)) < 0.1
+
+
+def check_05_21(n: Any) -> None:
+    assert np.allclose(n.again.poses(n.q_other), n.fit.chain.poses(n.q_other), atol=1e-9)
+
+
 CHECKS: dict[str, Callable[[Any], None]] = {
     name.removeprefix("check_").replace("_", "-"): value
     for name, value in list(globals().items())
