@@ -19,23 +19,27 @@ import shlex
 import shutil
 import textwrap
 import tomllib
-from dataclasses import fields
+from dataclasses import fields, replace
 from importlib import import_module
 from pathlib import Path
 
 import jsonschema
 import numpy as np
 import pytest
+from camera_setups import visible_corners, wrong_arm
 from robots import ROOT
 
 import dhcal_pin
+from dhcal_pin import se3
+from dhcal_pin.cameras import Rig
 from dhcal_pin.cli import main
 from dhcal_pin.cli.job import Job
 from dhcal_pin.estimation import parameters
 from dhcal_pin.io import measurement_text
-from dhcal_pin.io.rig_file import rig_text
+from dhcal_pin.io.rig_file import read_rig
 from dhcal_pin.io.tables import sources
 from dhcal_pin.measurements import CameraCorners
+from dhcal_pin.measurements.mounting import mount_rig
 from dhcal_pin.studies.grid import Setting
 
 DOCS = ROOT / "docs"
@@ -91,15 +95,29 @@ def examples(tmp_path_factory):
 
 
 def _write_images() -> None:
-    """Write image coordinates of points on the tool of a UR10 with errors, and their rig file."""
-    arm = dhcal_pin.Chain.from_urdf("ur10.urdf", tip="tool0")
-    errors = parameters.select_parameters(arm, "placement")
+    """Write the rig file of the guide to cameras, and 60 images of its board by a UR10 with errors."""
+    guide = (ROOT / "docs" / "howto" / "camera.md").read_text(encoding="utf-8")
+    Path("charuco_rig.toml").write_text(re.search(r"```toml\n(# file: .*?)```", guide, re.DOTALL)[1])
     rng = np.random.default_rng(0)
-    sizes = np.array([1e-3 if parameter.unit == "m" else 3e-3 for parameter in errors.parameters])
-    actual = errors.at(sizes * rng.normal(size=len(sizes)))
-    data = CameraCorners.simulate(actual, rng.uniform(-2, 2, (30, 6)), dhcal_pin.Noise(2e-4), rng)
-    Path("corners.csv").write_text(measurement_text(data, actual))
-    Path("rig.toml").write_text(rig_text(data.rig.cameras, data.rig.boards))
+    arm = dhcal_pin.Chain.from_urdf("ur10.urdf", tip="tool0")
+    actual = wrong_arm(arm, 1e-3, rng)
+    rig = read_rig("charuco_rig.toml")
+    (camera,), (board,) = rig.cameras.values(), rig.boards.values()
+    home = np.array([0.4, -1.2, 1.4, -1.6, -1.5, 0.3])
+    tool = actual.poses(home[None])[0]
+    mounted = se3.transform(se3.exp3(np.array([0.1, -0.1, 0.5])), np.array([0.05, 0.0, 0.03]))
+    middle = se3.transform(se3.exp3(np.array([0.2, 0.1, 0.0])), np.array([0.0, 0.0, 0.4]))
+    corner = se3.transform(np.eye(3), -board.points.mean(0))
+    values = camera.values * np.array([1.03, 1.03, 1.01, 0.99, *[1.0] * (len(camera.values) - 4)])
+    placed = Rig(
+        {camera.name: replace(camera, pose=mounted, values=values)},
+        {board.name: replace(board, pose=tool @ mounted @ middle @ corner)},
+    )
+    rows = visible_corners(actual, mount_rig(placed, arm), home + 0.35 * rng.standard_normal((400, 6)))
+    q, _, _, corners, pixels = (np.concatenate(each) for each in zip(*rows[:60], strict=True))
+    pixels = pixels + 0.1 * rng.standard_normal(pixels.shape)
+    images = CameraCorners(q, pixels, corners, mount_rig(rig, arm))
+    Path("corners.csv").write_text(measurement_text(images, arm))
 
 
 def _write_foreign_file(header: list[str], rows: np.ndarray) -> None:
@@ -207,7 +225,7 @@ def test_files_of_a_run_follow_the_schemas(examples, tmp_path, monkeypatch):
     documents = {
         "result": [json.loads(Path(name).read_text()) for name in ("out.json", "validation.json")],
         "sidecar": [tomllib.loads(Path("out.calibration.toml").read_text())],
-        "rig": [tomllib.loads(Path("rig.toml").read_text())],
+        "rig": [tomllib.loads(Path("charuco_rig.toml").read_text())],
         "dh": [tomllib.loads(Path(name).read_text()) for name in ("ur10.dh.toml", "arm.dh.toml")],
         "column_map": [tomllib.loads(path.read_text()) for path in (ROOT / "tests" / "maps").glob("*.toml")],
     }
