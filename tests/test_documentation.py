@@ -96,8 +96,8 @@ def examples(tmp_path_factory):
 
 def _write_images() -> None:
     """Write the rig file of the guide to cameras, and 60 images of its board by a UR10 with errors."""
-    guide = (ROOT / "docs" / "howto" / "camera.md").read_text(encoding="utf-8")
-    Path("charuco_rig.toml").write_text(re.search(r"```toml\n(# file: .*?)```", guide, re.DOTALL)[1])
+    texts = [text for _, text, _ in blocks(ROOT / "docs" / "howto" / "camera.md")]
+    Path("charuco_rig.toml").write_text(next(text for text in texts if text.startswith("# file:")))
     rng = np.random.default_rng(0)
     arm = dhcal_pin.Chain.from_urdf("ur10.urdf", tip="tool0")
     actual = wrong_arm(arm, 1e-3, rng)
