@@ -1,0 +1,76 @@
+"""Derivatives of image coordinates by every unknown agree with differences of sixth order to 1e-7."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from camera_setups import ARMS, simulate
+
+import dhcal_pin as dh
+from dhcal_pin.estimation.problem import Problem
+
+# Weights of f(x + k·h) - f(x - k·h), k = 1, 2, 3, in the derivative of sixth order (Fornberg 1988).
+WEIGHTS = np.array([3 / 4, -3 / 20, 1 / 60])
+# Steps of the differences by the unit of an unknown: [m], [rad], [px] and coefficients of distortion [1].
+STEPS = {"m": 1e-3, "rad": 2e-3, "px": 1.0, "1": 1e-2, "rad/Nm": 1e-5}
+
+
+def setting(name, model, *, is_on_wrist, seed):
+    """Return a problem with all unknowns of arm, cameras, boards, lenses and corners, away from zero."""
+    rng = np.random.default_rng(seed)
+    chain = ARMS[name]()
+    setup = simulate(
+        chain,
+        chain,
+        rng,
+        is_on_wrist=is_on_wrist,
+        n_images=6,
+        sigma=0.2,
+        model=model,
+        n_cameras=2,
+        n_boards=2,
+    )
+    rig = setup.exact.rig
+    boards = tuple(replace(board, has_free_points=True) for board in rig.boards)
+    images = setup.exact.with_rig(replace(rig, boards=boards))
+    images = images.take(rng.permutation(len(images.rows))[:120])
+    images = images.with_jitter(rng.normal(0, 0.1, images.jitter.shape))
+    errors = dh.select_parameters(chain, "placement,offset,gain,harmonics,compliance")
+    problem = Problem(errors, (images,), np.zeros(len(errors.parameters) + len(images.instrument_parameters)))
+    units = [p.unit for p in (*errors.parameters, *problem.instrument_parameters)]
+    size = np.array([{"px": 1.0, "1": 1e-3, "rad/Nm": 1e-6}.get(unit, 1e-3) for unit in units])
+    return problem, units, size * rng.standard_normal(len(size))
+
+
+@pytest.mark.parametrize(
+    ("name", "model", "is_on_wrist"),
+    [
+        ("ur10", "pinhole", True),
+        ("panda", "fisheye", False),
+        pytest.param("xarm7", "pinhole", False, marks=pytest.mark.slow),
+        pytest.param("ur10", "fisheye", True, marks=pytest.mark.slow),
+    ],
+)
+def test_derivatives_of_every_unknown(name, model, is_on_wrist):
+    problem, units, x = setting(name, model, is_on_wrist=is_on_wrist, seed=3)
+    (chunk,) = problem.chunks
+
+    def residual(at):
+        frames = chunk.frames(problem.errors.at(at[: len(problem.errors.parameters)]))
+        return chunk.data.residual(frames, problem.instrument_values_of(chunk.data, at))
+
+    jacobian = problem.linearize(x).rows(chunk)[:-1].copy()
+    n_checked = 0
+    for k, unit in enumerate(units):
+        step = STEPS[unit] * np.eye(len(x))[k]
+        slope = (
+            sum(w * (residual(x + i * step) - residual(x - i * step)) for i, w in enumerate(WEIGHTS, 1))
+            / STEPS[unit]
+        )
+        largest = np.abs(jacobian[k]).max()
+        np.testing.assert_allclose(jacobian[k], -slope, atol=1e-7 * largest, err_msg=str(k))
+        n_checked += largest > 0
+    # Corners that are not seen in the drawn samples, and joints without gravity torque, have no effect.
+    assert n_checked > 0.6 * len(x)
