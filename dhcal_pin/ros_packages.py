@@ -24,6 +24,8 @@ from .exceptions import InvalidArgumentError, UnknownNameError
 EXAMPLE_PREFIX = "example:"
 # Distribution that holds these robots, and its share folder in the installation.
 _DISTRIBUTION, _SHARE = "example-robot-data", "cmeel.prefix/share"
+# Largest mesh [byte]. The largest one of example-robot-data has 27 MiB.
+MAX_MESH_BYTES = 32 << 20
 # End of the file names of arms, which is not part of their names: ur10_robot.urdf is the ur10.
 _ROBOT_SUFFIX = "_robot"
 
@@ -121,6 +123,26 @@ def validated_package_dirs(folders: Iterable[PathLike]) -> tuple[str, ...]:
                 f"{path}: no such folder; name a folder that contains packages with meshes"
             )
     return paths
+
+
+def is_mesh_too_large(mesh: str, folders: Iterable[PathLike]) -> bool:
+    """Return whether a mesh is larger than `MAX_MESH_BYTES`.
+
+    Pinocchio takes about 25 times the size of a mesh in memory.
+
+    Args:
+        mesh: File name of the mesh in the URDF.
+        folders: Folders of `mesh_folders`; those of environment variables are added.
+
+    Returns:
+        True if a file that the name can mean is too large.
+    """
+    path = mesh.rpartition("://")[2]
+    variables = "ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH"
+    more = [folder for name in variables for folder in os.environ.get(name, "").split(os.pathsep) if folder]
+    places = [*folders, *more, *(os.path.join(folder, "share") for folder in more)]
+    found = (file for file in (path, *(os.path.join(folder, path) for folder in places)))
+    return any(os.path.isfile(file) and os.path.getsize(file) > MAX_MESH_BYTES for file in found)
 
 
 def mesh_remedy(mesh: str) -> str:

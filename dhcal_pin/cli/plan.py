@@ -34,6 +34,9 @@ EXAMPLE = "dhcal plan ur10.urdf -n 40 --tip tool0 --sigma 0.1mm,0.01deg -o poses
 # Standard deviation of a laser tracker and a precise robot, used without --sigma and --data.
 _DEFAULT_SIGMA = "0.1mm,0.01deg"
 
+# Largest number of candidates and of configurations of a task.
+_MAX_CONFIGURATIONS = 50_000
+
 # Decimals of joint positions in degrees and millimetres: 0.36 arc seconds.
 _DEGREE_DECIMALS = 4
 
@@ -193,6 +196,9 @@ def run(args: Namespace) -> int:
     candidates: int | Array = args.candidates
     if args.candidates_from:
         candidates = read_configurations(args.candidates_from, chain, args.columns)
+        _require_few(args.candidates_from, len(candidates))
+    else:
+        _require_few("--candidates", args.candidates)
     data = [read_measurement_file(path, chain, args.columns).data for path in args.data or []]
     # The uncertainty of an earlier calibration would count twice beside its data, and replaces the priors.
     sidecar = None if args.data or args.priors else existing_sidecar(args.robot)
@@ -401,6 +407,14 @@ def _parse_points(text: str, option: str, example: str, count: int, expected: st
     return np.array(re.findall(_NUMBER, match[1]), float).reshape(count, 3) / LENGTHS[match[2]]
 
 
+def _require_few(source: str, count: int) -> None:
+    """Require configurations that fit into the memory."""
+    if count > _MAX_CONFIGURATIONS:
+        raise InvalidArgumentError(
+            f"{source}: {count} configurations, more than {_MAX_CONFIGURATIONS}; give fewer"
+        )
+
+
 def read_task(path: PathLike, chain: Chain) -> Array:
     """Read the configurations where the accuracy matters.
 
@@ -420,8 +434,9 @@ def read_task(path: PathLike, chain: Chain) -> Array:
     from ..io import read_configurations, read_targets
     from ..io.tables import read_table
 
-    columns = read_table(path).columns
-    if any(name in columns for name in chain.joint_names):
+    table = read_table(path)
+    _require_few(os.fspath(path), len(table.lines))
+    if any(name in table.columns for name in chain.joint_names):
         return read_configurations(path, chain)
     targets = read_targets(path, chain)
     result = compensate(chain, chain, targets.values)

@@ -9,6 +9,7 @@ states it: a board with exchanged rows and columns is the same set of points, tu
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,10 +20,15 @@ from .._typing import Array, PathLike
 from ..cameras.boards import Board
 from ..cameras.pose_from_points import direct_linear_transform
 from ..exceptions import FileFormatError, InvalidArgumentError, UnknownNameError
+from ..native_output import discard_native_messages
 from .crossings import refine_crossings
 from .opencv import require_opencv
 from .tag_edges import refine_by_edges
 
+# Largest size of an image file [byte], and largest image [pixels].
+MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS = 64 << 20, 50_000_000
+# What a message says of a file without an image.
+_NO_IMAGE = "is no image that can be read; expected PNG, JPEG or TIFF"
 # Number of images in which the layouts of a board are compared.
 N_LAYOUT_IMAGES = 8
 # Smallest number of corners of an image that is used.
@@ -83,20 +89,50 @@ def read_image(path: PathLike) -> Array:
     """Read an image as grey values.
 
     Args:
-        path: Image file of any format that OpenCV reads.
+        path: Image file of a format that OpenCV and Pillow read.
 
     Returns:
         Grey values, shape (height, width), 8 bit.
 
     Raises:
-        FileFormatError: The file cannot be read.
+        FileFormatError: The file cannot be read, or the image is too large.
     """
     cv2 = require_opencv()
-    data = np.fromfile(path, np.uint8) if os.path.isfile(path) else np.empty(0, np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
+    _require_few_pixels(path)
+    with discard_native_messages():
+        image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
     if image is None:
-        raise FileFormatError(f"{os.fspath(path)}: is no image that can be read; expected PNG, JPEG or TIFF")
+        raise FileFormatError(f"{os.fspath(path)}: {_NO_IMAGE}")
     return image
+
+
+def _require_few_pixels(path: PathLike) -> None:
+    """Require an image that fits into the memory. A small file can hold many pixels of one colour."""
+    from PIL import Image  # lazy import: an optional extra
+
+    source = os.fspath(path)
+    size = os.path.getsize(path) if os.path.isfile(path) else 0
+    if size > MAX_IMAGE_BYTES:
+        raise FileFormatError(
+            f"{source}: the file is larger than {MAX_IMAGE_BYTES >> 20} MiB; save the image as PNG or JPEG"
+        )
+    try:
+        with warnings.catch_warnings():
+            # Pillow warns about large images.
+            warnings.simplefilter("ignore")
+            # Only the header is read.
+            with Image.open(path) as image:
+                width, height = image.size
+    except Image.DecompressionBombError:
+        width = height = MAX_IMAGE_PIXELS
+    # Damaged headers raise errors of many types, such as those of `struct`.
+    except Exception as error:
+        raise FileFormatError(f"{source}: {_NO_IMAGE}") from error
+    if width * height > MAX_IMAGE_PIXELS:
+        raise FileFormatError(
+            f"{source}: has more than {MAX_IMAGE_PIXELS // 10**6} million pixels; reduce the images, and "
+            "give the rig file their new size"
+        )
 
 
 def layouts_of(board: Board) -> list[Layout]:

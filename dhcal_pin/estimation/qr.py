@@ -337,6 +337,7 @@ def posterior_sqrt_covariance(system: TriangularSystem, weights: Array) -> tuple
     # What the priors add to the observable directions after the unobservable ones are eliminated.
     priors = weights[:, None] * observable
     rows = np.concatenate([np.diag(s[:n_observable]), priors - left @ (left.T @ priors)])
-    data_root = lapack.dtrtri(np.linalg.qr(rows)[1])[0]
+    # LAPACK prints a complaint about an empty matrix.
+    data_root = lapack.dtrtri(np.linalg.qr(rows)[1])[0] if n_observable else np.empty((0, 0))
     root = np.concatenate([(observable - prior_root @ (left.T @ priors)) @ data_root, prior_root], 1)
     return root, unobservable @ np.delete(yt, np.flatnonzero(has_prior), 0).T

@@ -50,6 +50,8 @@ _LIMITS = {"lower": -math.inf, "upper": math.inf}
 _JOINT_TYPES = ("revolute", "prismatic")
 # Largest entry of a table [m or rad]; a larger one has the wrong unit.
 _MAX_ENTRY = 1e4
+# Largest number of joints.
+_MAX_JOINTS = 250
 
 # Name, type and numbers of a joint.
 _Row = tuple[str, str, dict[str, float]]
@@ -196,6 +198,11 @@ def _build_table(
     source: str, convention: str, columns: Mapping[str, list[Any]], poses: Mapping[str, Array]
 ) -> DHTable:
     """Check the ranges of all entries and build the table."""
+    if len(columns["name"]) > _MAX_JOINTS:
+        raise FileFormatError(
+            f"{source}: {len(columns['name'])} joints, more than {_MAX_JOINTS}; check that the file is a DH "
+            "table"
+        )
     for row, name in enumerate(columns["name"]):
         where = f"{source}: joint {name!r}"
         for key in (*_UNITS, *_LIMITS):

@@ -55,7 +55,7 @@ def read_text(path: PathLike, encoding: str = "utf-8", max_bytes: int = MAX_TEXT
         raise FileFormatError(f"{path}: cannot read it: {reason}; give the path of a file") from error
     if len(data) > max_bytes:
         raise FileFormatError(
-            f"{path}: the file is larger than {max_bytes >> 20} MiB; check the path or shorten the file"
+            f"{path}: the file is larger than {size_text(max_bytes)}; check the path or shorten the file"
         )
     try:
         return data.decode(encoding).removeprefix("\ufeff")
@@ -63,6 +63,15 @@ def read_text(path: PathLike, encoding: str = "utf-8", max_bytes: int = MAX_TEXT
         name = encoding.upper()
         where = f"byte {error.start}" if isinstance(error, UnicodeDecodeError) else "the text"
         raise FileFormatError(f"{path}: {where} is not {name}; save the file as {name}") from error
+
+
+def size_text(size: int) -> str:
+    """Return a size in MiB, or in KiB below one MiB.
+
+    Args:
+        size: Size [byte].
+    """
+    return f"{size >> 20} MiB" if size >> 20 else f"{size >> 10} KiB"
 
 
 def read_toml(path: PathLike, max_bytes: int = MAX_TOML_BYTES) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
+from xml.etree import ElementTree
 
 import coal
 import numpy as np
@@ -29,7 +30,7 @@ from .. import se3
 from .._typing import Array
 from ..exceptions import FileFormatError
 from ..native_output import discard_native_messages
-from ..ros_packages import mesh_remedy
+from ..ros_packages import MAX_MESH_BYTES, is_mesh_too_large, mesh_remedy
 from .chain import Chain
 from .urdf import Urdf
 from .urdf_path import build_model
@@ -228,12 +229,15 @@ def obstacles_from_urdf(urdf: Urdf) -> list[Obstacle]:
 
 def _load_geometry(urdf: Urdf, model: pin.Model) -> tuple[Any, str]:
     """Load the collision shapes of a URDF; None with the reason if there are none."""
-    text = urdf.data.decode("utf-8-sig")
+    text, folders = urdf.data.decode("utf-8-sig"), urdf.mesh_folders()
+    for mesh in ElementTree.fromstring(text).iterfind("link/collision/geometry/mesh"):
+        if is_mesh_too_large(name := mesh.get("filename", ""), folders):
+            return None, f"the mesh {name} is larger than {MAX_MESH_BYTES >> 20} MiB"
     try:
         with warnings.catch_warnings(), discard_native_messages():
             warnings.simplefilter("ignore")
             geometry = pin.buildGeomFromUrdfString(
-                model, text, pin.GeometryType.COLLISION, package_dirs=urdf.mesh_folders()
+                model, text, pin.GeometryType.COLLISION, package_dirs=folders
             )
     except (ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())

@@ -20,6 +20,8 @@ from ..saving import is_stream
 from .grid import StudyGrid
 from .runner import MEASURE_UNITS
 
+# Longest line [byte]; that of a block has some kilobytes.
+_MAX_LINE_BYTES = 1 << 20
 # Results of one block: one row per calibration.
 Block = list[list[float]]
 
@@ -83,26 +85,30 @@ def open_journal(path: str, study: StudyGrid) -> Iterator[StudyJournal]:
             f"{path}: cannot write there: {error.strerror}; choose another place"
         ) from error
     try:
-        with open(descriptor, "rb", closefd=False) as file:
-            data = file.read()
-        header, *lines = data.split(b"\n")
-        if lines and header != study.digest.encode():
-            raise FileFormatError(
-                f"{path}: belongs to another study or to other robots; finish that study, or remove the file"
-            )
+        header = f"{study.digest}\n".encode()
         blocks: list[Block] = []
-        size = len(header) + 1
-        # The last line is empty, or incomplete if the process was killed.
-        for line in lines[:-1][: len(study.tasks())]:
-            block = _parse_block(line)
-            if block is None:
-                break
-            blocks.append(block)
-            size += len(line) + 1
+        size = 0
+        with open(descriptor, "rb", closefd=False) as file:
+            found = file.readline(len(header))
+            # A header without its end is that of a process that was killed.
+            if found != header and (found.endswith(b"\n") or len(found) == len(header)):
+                raise FileFormatError(
+                    f"{path}: belongs to another study or to other robots; finish that study, or remove the "
+                    "file"
+                )
+            if found == header:
+                size = len(header)
+                for _, _, count in study.tasks():
+                    line = file.readline(_MAX_LINE_BYTES)
+                    block = _parse_block(line, count)
+                    if block is None:
+                        break
+                    blocks.append(block)
+                    size += len(line)
         journal = StudyJournal(path, descriptor, blocks)
-        os.ftruncate(descriptor, size if lines else 0)
+        os.ftruncate(descriptor, size)
         os.lseek(descriptor, 0, os.SEEK_END)
-        if not lines:
+        if not size:
             journal._write(study.digest)
         yield journal
     finally:
@@ -130,18 +136,20 @@ def _open_locked(path: str) -> int:
         os.close(descriptor)
 
 
-def _parse_block(line: bytes) -> Block | None:
-    """Parse the results of one block; None if the line is damaged."""
+def _parse_block(line: bytes, count: int) -> Block | None:
+    """Parse the results of a block of some calibrations; None if the line is damaged or incomplete."""
+    if not line.endswith(b"\n"):
+        return None
     try:
         block = json.loads(line)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
-    return block if isinstance(block, list) and block and all(map(_is_row, block)) else None
+    return block if isinstance(block, list) and len(block) == count and all(map(_is_row, block)) else None
 
 
 def _is_row(row: Any) -> bool:
     return (
         isinstance(row, list)
         and len(row) == len(MEASURE_UNITS)
-        and all(isinstance(value, int | float) for value in row)
+        and all(isinstance(value, float) for value in row)
     )

@@ -31,7 +31,7 @@ from ..native_output import discard_native_messages
 from ..robot.chain import Chain
 from ..robot.collision import FLOOR, Obstacle
 from ..robot.dh_urdf import MATERIALS
-from ..ros_packages import mesh_remedy
+from ..ros_packages import MAX_MESH_BYTES, is_mesh_too_large, mesh_remedy
 
 # Steps of the grid of vertices along the longest side of a mesh: 0.1 mm on most links.
 GRID = 8000
@@ -125,11 +125,13 @@ def rows(pose: Array) -> list[float]:
 def _load_visuals(
     model: pin.Model, text: str, folders: Sequence[str]
 ) -> tuple[Sequence[pin.GeometryObject], dict[str, list[str]]]:
-    """Return the visual objects, and by link the file names of meshes that are missing or unreadable."""
-    if (objects := _load_geometry(model, text, folders)) is not None:
+    """Return the visual objects, and by link the file names of meshes that cannot be used."""
+    robot = ElementTree.fromstring(text)
+    names = (mesh.get("filename", "") for mesh in robot.iterfind("link/visual/geometry/mesh"))
+    too_large = {name for name in names if is_mesh_too_large(name, folders)}
+    if not too_large and (objects := _load_geometry(model, text, folders)) is not None:
         return objects, {}
     # Pinocchio rejects the whole URDF if one mesh is missing, so each mesh is loaded in a robot of one link.
-    robot = ElementTree.fromstring(text)
     missing: dict[str, list[str]] = {}
     for link in robot.findall("link"):
         for visual in link.findall("visual"):
@@ -137,9 +139,9 @@ def _load_visuals(
             single = ElementTree.Element("robot", name="single")
             ElementTree.SubElement(single, "link", name="single").append(visual)
             single_text = ElementTree.tostring(single, "unicode")
-            if not _can_load(single_text, folders):
+            name = "a shape" if mesh is None else mesh.get("filename", "")
+            if name in too_large or not _can_load(single_text, folders):
                 link.remove(visual)
-                name = "a shape" if mesh is None else mesh.get("filename", "")
                 missing.setdefault(link.get("name", ""), []).append(name)
     return _load_geometry(model, ElementTree.tostring(robot, "unicode"), folders) or [], missing
 
@@ -182,7 +184,8 @@ def _missing_meshes_note(missing: dict[str, list[str]]) -> str:
     more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
     remedy = mesh_remedy(next(name for files in missing.values() for name in files))
     return (
-        f"Drawn as rods, because meshes are missing or unreadable: {', '.join(names[:MAX_NAMED])}{more}. "
+        f"Drawn as rods, because meshes are missing, unreadable or larger than {MAX_MESH_BYTES >> 20} MiB: "
+        f"{', '.join(names[:MAX_NAMED])}{more}. "
         f"{remedy[0].upper()}{remedy[1:]}."
     )
 

@@ -182,6 +182,28 @@ def test_invalid_recordings(run, folder):
         assert words in err
 
 
+def test_the_time_of_a_pose_does_not_grow_with_the_recording(run, folder, arm, monkeypatch):
+    """`AnyReader.topics` goes through all messages; for each message it would take a third of the time."""
+    from rosbags.highlevel import AnyReader
+
+    count, topics = [], AnyReader.topics.fget
+    assert topics is not None
+    monkeypatch.setattr(AnyReader, "topics", property(lambda self: count.append(1) or topics(self)))
+    write_bag(folder / "arm.bag", Recording(arm, stops(arm, 5)))
+    stdout_of(run("convert", "arm.bag", "data.csv", "--pose-topic", POSES))
+    assert 0 < len(count) < 10
+
+
+@pytest.mark.parametrize(("old", "new"), [("message_count:", "message_count;"), ("starting_time", "start")])
+def test_a_damaged_description_of_a_recording_can_be_made_again(run, folder, arm, old, new):
+    metadata = write_bag(folder / "arm_ros2", Recording(arm, stops(arm, 2))) / "metadata.yaml"
+    assert old in metadata.read_text()
+    metadata.write_text(metadata.read_text().replace(old, new))
+    status, out, err = run("convert", "arm_ros2", "data.csv", "--pose-topic", POSES)
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert "metadata.yaml is damaged; make it again with ros2 bag reindex arm_ros2" in err
+
+
 def test_rosbags_is_optional(run, folder, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "rosbags.highlevel", None)
     Path("arm.bag").write_bytes(b"")

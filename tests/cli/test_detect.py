@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -100,6 +101,19 @@ def test_images_of_another_size_and_folders_without_images_are_refused(assert_re
         ["--camera other", "choose from fixed"],
         *("detect", photographs, "--rig", "rig.toml", "--camera", "other", "-o", "corners.csv"),
     )
+
+
+def test_images_that_take_too_much_memory_are_refused(assert_refused, photographs):
+    """A file of 100 kB can hold 10⁸ pixels."""
+    cv2 = pytest.importorskip("cv2")
+    command = ("--rig", "rig.toml", "-o", "corners.csv")
+    cv2.imwrite("large.png", np.zeros((10_000, 10_000), np.uint8))
+    assert_refused(["large.png", "more than 50 million pixels"], "detect", "large.png", *command)
+    Path("long.png").write_bytes(Path("large.png").read_bytes())
+    os.truncate("long.png", (64 << 20) + 1)
+    assert_refused(["long.png", "larger than 64 MiB"], "detect", "long.png", *command)
+    Path("broken.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"\0" * 1000)
+    assert_refused(["broken.png", "is no image"], "detect", "broken.png", *command)
 
 
 def test_board_is_drawn_at_its_true_scale(run, photographs):

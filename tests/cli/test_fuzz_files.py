@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 LENIENT = [HealthCheck.too_slow, HealthCheck.data_too_large]
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.name}-{len(case.data)}")
+@pytest.mark.parametrize("case", CASES, ids=repr)
 def test_unchanged_files_are_read(case):
     heard = set()
     survive(case, case.data, heard)

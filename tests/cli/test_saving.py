@@ -244,7 +244,12 @@ def test_a_full_disk_in_a_study(run, study, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "text", ["", "1234", "{digest}", "{digest}\n[[1, 2]]\n", "{digest}\n[]\n5\n", "{digest}\nx\n"]
+    "text",
+    [
+        *("", "1234", "{digest}", "{digest}\n[[1, 2]]\n", "{digest}\n[]\n5\n", "{digest}\nx\n"),
+        *("{digest}\n" + "[" * 100_000 + "\n", "{digest}\n" + "[" * 3_000_000),
+        "{digest}\n[[" + ", ".join(["9" * 400] * 10) + "]]\n",
+    ],
 )
 def test_a_damaged_journal_is_continued(run, study, text):
     Path("s.csv.part").write_text(text.replace("{digest}", study.digest))

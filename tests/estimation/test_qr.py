@@ -158,3 +158,12 @@ def test_a_batch_of_systems_agrees_with_the_single_one(rank):
         np.testing.assert_allclose(
             damped.solve()[i], qr.pseudo_inverse(wanted.r, wanted.z), rtol=1e-9, atol=1e-12
         )
+
+
+def test_without_data_the_covariance_is_that_of_the_priors(capfd):
+    """Also LAPACK, which prints to standard output itself, says nothing."""
+    sigma = np.array([1e-3, 2.0, 5e-9])
+    root, unbounded = qr.posterior_sqrt_covariance(TriangularSystem(np.zeros((4, 4))), 1 / sigma)
+    np.testing.assert_allclose(root @ root.T, np.diag(sigma**2), rtol=1e-12, atol=1e-30)
+    assert unbounded.shape == (3, 0)
+    assert capfd.readouterr() == ("", "")

@@ -128,6 +128,10 @@ def change(old: str, new: str) -> tuple[str, str]:
         (change("a = 325.0", 'a = "325"'), ["'shoulder'", "a = '325'", "finite"]),
         (change("a = 325.0", f"a = 1{'0' * 400}"), ["'shoulder'", "finite"]),
         (change("a = 325.0", f"a = 1{'0' * 5000}"), ["not TOML"]),
+        (
+            change("[[joint]]", "[[joint]]\ntheta = 0\nd = 1\na = 1\nalpha = 0\n" * 249 + "[[joint]]"),
+            ["251 joints, more than 250"],
+        ),
         (change("a = 325.0", "a = 3.25e9"), ["'shoulder'", "a is 3.25e+06 m", "unit"]),
         (change("upper = 0.0", "upper = nan"), ["'lift'", "upper = nan", "finite"]),
         (change("upper = 0.0", "upper = -300.0"), ["'lift'", "lower is above upper", "swap"]),

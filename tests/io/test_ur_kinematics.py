@@ -169,6 +169,13 @@ def test_invalid_files_are_an_error_of_one_line(text, tmp_path):
     assert "\n" not in str(caught.value)
 
 
+def test_a_large_file_is_refused_with_its_limit(tmp_path):
+    path = tmp_path / "k.yaml"
+    path.write_text("x: 1\n" * 30_000)
+    with pytest.raises(DhcalError, match=r"k\.yaml: the file is larger than 128 KiB"):
+        read_ur_kinematics(path)
+
+
 def test_convert_writes_and_reads_ur_kinematics(tmp_path):
     table, yaml_file, urdf = (str(tmp_path / name) for name in ("a.dh.toml", "k.yaml", "b.urdf"))
     Path(table).write_text(dh_text(ur10(factory()), table))

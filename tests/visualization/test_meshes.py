@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 
 import numpy as np
@@ -11,8 +12,11 @@ from robots import robot_file
 from scipy.spatial import cKDTree
 from urdf_mutations import joint, robot
 
+from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.robot.chain import Chain
+from dhcal_pin.robot.collision import obstacles_from_urdf
 from dhcal_pin.robot.urdf import parse_urdf
+from dhcal_pin.ros_packages import MAX_MESH_BYTES
 from dhcal_pin.visualization.meshes import GRID, Mesh, Visuals, allocate_triangles, visuals_of
 from dhcal_pin.visualization.scene import MAX_TRIANGLES, kinematic_tree, scene_html
 
@@ -143,12 +147,32 @@ def test_a_mesh_that_is_not_finite_is_drawn_as_a_rod(tmp_path, content, capfd):
         f'<link name="a">{visual.format("bad")}</link><link name="b">{visual.format("good")}</link>' + joint()
     )
     visuals = looked(Chain.from_urdf(parse_urdf(text, str(tmp_path / "arm.urdf"))))
-    assert visuals.note.startswith("Drawn as rods, because meshes are missing or unreadable: bad.stl (a)")
+    assert visuals.note.startswith(
+        "Drawn as rods, because meshes are missing, unreadable or larger than 32 MiB: bad.stl (a)"
+    )
     assert len(visuals.meshes) == 1
     # Link b is the tip.
     assert {shape["body"] for shape in visuals.shapes} == {0, 2}
     # Coal reports a mesh with NaN on stderr.
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("name", ["big.stl", "package://cell/big.stl"])
+def test_a_mesh_that_would_take_too_much_memory_is_drawn_as_a_rod(tmp_path, name):
+    """A sound mesh is not loaded for the picture, and not for the check of collisions, if it is too large."""
+    package = tmp_path / "cell"
+    package.mkdir()
+    (package / "big.stl").write_bytes(stl(TRIANGLE))
+    os.truncate(package / "big.stl", MAX_MESH_BYTES + 1)
+    shape = f'<geometry><mesh filename="{name}"/></geometry>'
+    link = f'<link name="a"><visual>{shape}</visual><collision>{shape}</collision></link><link name="b"/>'
+    file = package if name == "big.stl" else tmp_path
+    urdf = parse_urdf(robot(link + joint()), str(file / "arm.urdf"))
+    assert "larger than 32 MiB: big.stl (a)" in looked(Chain.from_urdf(urdf)).note
+    with pytest.raises(DhcalError, match=f"arm.urdf: the mesh {name} is larger than 32 MiB"):
+        obstacles_from_urdf(urdf)
+    os.truncate(package / "big.stl", len(stl(TRIANGLE)))
+    assert len(looked(Chain.from_urdf(urdf)).meshes) == 1
 
 
 @pytest.mark.parametrize("limit", [0, 1, 2, 10])

@@ -202,6 +202,10 @@ def _open_bag(source: str) -> Iterator[AnyReader]:
     except Exception as error:
         # Only those of rosbags itself are meant for users.
         reason = str(error) if type(error).__module__.startswith("rosbags") else "it is damaged"
+        if "metadata" in reason:
+            raise FileFormatError(
+                f"{source}: its metadata.yaml is damaged; make it again with ros2 bag reindex {source}"
+            ) from error
         raise FileFormatError(f"{source}: not a readable recording: {reason}; record it again") from error
 
 
@@ -288,9 +292,11 @@ def _read_joints(reader: AnyReader, source: str, topic: str, chain: Chain | None
 def _read_poses(reader: AnyReader, source: str, spec: str) -> _RecordedPoses:
     """Read positions or poses."""
     topic, _, child = spec.partition(_FRAME_SEPARATOR)
+    # The property makes a new dictionary of all topics each time.
+    message_type = reader.topics[topic].msgtype or ""
     times, positions, quaternions, frame = [], [], [], ""
     for recorded, message in _messages(reader, topic):
-        for sample in _samples_of(reader.topics[topic].msgtype or "", message, child):
+        for sample in _samples_of(message_type, message, child):
             point, quaternion = sample.position, sample.quaternion
             # Some trackers send NaN while they do not see the target.
             if not np.isfinite((point.x, point.y, point.z)).all():

@@ -55,6 +55,8 @@ def read_spreadsheet(path: PathLike, layout: TextLayout) -> DataTable:
                 for sheet in workbook.worksheets
             }
             workbook.close()
+    except FileFormatError:  # also a ValueError
+        raise
     except OSError as error:
         raise FileFormatError(
             f"{source}: cannot read it: {error.strerror or error}; give the path of a file"

@@ -82,7 +82,8 @@ def read_text_table(path: PathLike, layout: TextLayout) -> DataTable:
         FileFormatError: The file is too large, or has no table; see `parse_lines`.
     """
     source, text = os.fspath(path), read_text(path, layout.encoding)
-    require_few_rows(source, text.count("\n"))
+    # One of the lines is the header.
+    require_few_rows(source, text.count("\n") - 1)
     lines = text.splitlines()
     longest = max(range(len(lines)), key=lambda i: len(lines[i]), default=None)
     if longest is not None and len(lines[longest]) > MAX_LINE_LENGTH:

@@ -120,7 +120,7 @@ def test_a_list_of_many_lines_is_shortened():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("a,b\n" + "1,2\n" * 200_001, r"a\.csv: 200002 rows, more than 200000; keep one in 2 of them"),
+        ("a,b\n" + "1,2\n" * 200_001, r"a\.csv: 200001 rows, more than 200000; keep one in 2 of them"),
         ("a,b\n" + "1," * 10**6 + "\n", r"a\.csv:2: a line of 2000000 characters, more than 1048576"),
     ],
 )
@@ -142,5 +142,7 @@ def test_a_workbook_that_is_too_large(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.xlsx", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("xl/worksheets/sheet1.xml", b" " * (33 << 20))
     pytest.importorskip("openpyxl")
-    with pytest.raises(DhcalError, match=r"a\.xlsx: a workbook of 33 MiB when unpacked, more than 32 MiB"):
+    with pytest.raises(
+        DhcalError, match=r"^[^:]*a\.xlsx: a workbook of 33 MiB when unpacked, more than 32 MiB"
+    ):
         read_table(tmp_path / "a.xlsx")
