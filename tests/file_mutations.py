@@ -341,7 +341,11 @@ WEIGHTED = [
 EXAMPLES = {"case": st.sampled_from(WEIGHTED), "mutations": st.lists(MUTATION, min_size=1, max_size=4)}
 
 
-def mutated(data: bytes, mutations: Sequence[tuple[str, str, float, float, int, str]]) -> bytes:
+# Grain, kind, two places, size and text of a mutation.
+Mutation = tuple[str, str, float, float, int, str]
+
+
+def mutated(data: bytes, mutations: Sequence[Mutation]) -> bytes:
     """Return bytes after some mutations."""
     for grain, what, at, to, size, text in mutations:
         token = text.encode(errors="surrogatepass")
@@ -482,33 +486,43 @@ def assert_units_of_header(data: bytes) -> None:
     np.testing.assert_allclose(found, expected[:, order], rtol=1e-12)
 
 
-def _run(number: str, minutes: str, path: str) -> None:
-    """Try mutations for some minutes, and append the outcome to a file."""
-    end, heard, count, wrong = time.monotonic() + 60 * float(minutes), set[str](), 0, list[str]()
+def _try_hundred(number: int) -> dict[str, object]:
+    """Try a hundred mutations; return their number, what was wrong, and the messages."""
+    heard, wrong, count = set[str](), list[str](), 0
 
-    def attempt(case: Case, mutations: Sequence[tuple[str, str, float, float, int, str]]) -> None:
+    @seed(number)
+    @settings(
+        max_examples=100,
+        deadline=None,
+        database=None,
+        phases=[Phase.generate],
+        suppress_health_check=[
+            HealthCheck.too_slow,
+            HealthCheck.data_too_large,
+            HealthCheck.large_base_example,
+        ],
+    )
+    @given(**EXAMPLES)
+    def attempt(case: Case, mutations: Sequence[Mutation]) -> None:
         nonlocal count
-        if time.monotonic() > end:
-            return
         count += 1
         try:
             survive(case, mutated(case.data, mutations), heard)
         except Exception:
             wrong.append(f"{case} {mutations}\n{traceback.format_exc()}")
-            print(wrong[-1], file=sys.stderr, flush=True)
 
-    part = 0
+    attempt()
+    return {"seed": number, "cases": count, "wrong": wrong, "heard": sorted(heard)}
+
+
+def _run(number: str, minutes: str, path: str) -> None:
+    """Try mutations for some minutes, and append the outcome of every hundred to a file."""
+    end, part = time.monotonic() + 60 * float(minutes), 0
     while time.monotonic() < end:
         part += 1
-        once = settings(
-            max_examples=300, deadline=None, database=None, phases=[Phase.generate],
-            suppress_health_check=list(HealthCheck),
-        )  # fmt: skip
-        seed(int(number) * 10_000 + part)(once(given(**EXAMPLES)(attempt)))()
-    with open(path, "a") as file:
-        file.write(
-            json.dumps({"seed": number, "cases": count, "wrong": wrong, "heard": sorted(heard)}) + "\n"
-        )
+        outcome = _try_hundred(int(number) * 10_000 + part)
+        with open(path, "a") as file:
+            file.write(json.dumps(outcome) + "\n")
 
 
 if __name__ == "__main__":

@@ -252,14 +252,17 @@ def main(folder: str, command: str, name: str, n_steps: str, n_times: str, seed:
     root.mkdir(parents=True, exist_ok=True)
     interruption = Interruption(root, command)
     left = []
-    if int(n_steps):
-        steps = interruption.saving_steps()
-        left += [interruption.interrupt_at_step(rng.randrange(steps), number) for _ in range(int(n_steps))]
+    steps = interruption.saving_steps() if int(n_steps) else 0
+    for _ in range(int(n_steps)):
+        left.append(interruption.interrupt_at_step(rng.randrange(steps), number))
+        print(left[-1], flush=True)
     interruption.reset()
     start = time.perf_counter()
     interruption._run_alone()
     duration = time.perf_counter() - start
-    left += [interruption.interrupt_after(rng.uniform(0, duration), number) for _ in range(int(n_times))]
+    for _ in range(int(n_times)):
+        left.append(interruption.interrupt_after(rng.uniform(0, duration), number))
+        print(left[-1], flush=True)
     print(json.dumps({key: left.count(key) for key in ("old", "mixed", "new")}))
 
 
