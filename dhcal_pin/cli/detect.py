@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from argparse import ArgumentParser, Namespace
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
-from .options import RIG
+from ..exceptions import InvalidArgumentError
+from .options import POSITIVE_INTEGER, RIG
+
+if TYPE_CHECKING:
+    from .._typing import PathLike
+    from ..detection import BoardDetection
 
 EXAMPLE = "dhcal detect images --rig rig.toml --joints joints.csv -o corners.csv"
 
@@ -21,12 +29,27 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     parser.add_argument(
         "--joints",
-        metavar="JOINTS.csv",
-        help="joint values of each image: a column `image` with the file names, and one column per joint; "
-        "without it the output has no joint values",
+        metavar="FILE",
+        help="joint values of each image: a table with a column `image` with the file names and one column "
+        "per joint, or a recording (.bag, .mcap, or the folder of a ROS 2 bag) if the names of the images "
+        "are times such as 1700000000.25.png; without it the output has no joint values",
+    )
+    parser.add_argument(
+        "--joint-topic",
+        metavar="TOPIC",
+        help="topic of the joint positions in the recording (default: the only one, or /joint_states)",
     )
     parser.add_argument(
         "--camera", metavar="NAME", help="camera of the rig file; only needed if it has several"
+    )
+    parser.add_argument(
+        "--overlay", metavar="DIR", help="folder for pictures of the images with the corners that were found"
+    )
+    parser.add_argument(
+        "--jobs",
+        metavar="N",
+        type=POSITIVE_INTEGER,
+        help="images that are searched at the same time (default: one per processor)",
     )
     parser.add_argument(
         "-o", "--output", metavar="corners.csv", required=True, help="image coordinates to write"
@@ -43,23 +66,61 @@ def run(args: Namespace) -> int:
         Exit status 0.
     """
     from ..detection import corner_columns, detect_boards, image_files  # lazy import, as the following
-    from ..io.measurement_files import read_image_joints
     from ..io.rig_file import only_entry, read_rig
     from ..io.tabular import csv_text
     from . import console
     from .outputs import require_writable_outputs, write_outputs
     from .result_screens import detection_screen
 
-    inputs = [args.rig, *([args.joints] if args.joints else [])]
+    # A recording of ROS 2 is a folder.
+    files = [args.joints] if args.joints and os.path.isfile(args.joints) else []
     paths = image_files(args.images)
-    require_writable_outputs([args.output], [*inputs, *paths])
+    require_writable_outputs([args.output], [args.rig, *files, *paths])
     rig = read_rig(args.rig)
     camera = only_entry(rig.cameras, args.camera, "camera", args.rig)
-    joints = read_image_joints(args.joints, paths) if args.joints else None
+    joints, notes = _joints(args, paths)
     with console.progress_bar("finding boards", len(paths) * len(rig.boards)) as on_progress:
-        detections = detect_boards(rig, camera, paths, on_progress)
+        detections = detect_boards(rig, camera, paths, on_progress, args.jobs)
     columns = corner_columns(rig, camera, detections, joints)
     comments = [f"corners of boards in images of camera {camera.name}, found by dhcal detect"]
-    write_outputs({args.output: csv_text(columns, comments)})
-    console.show(detection_screen(rig, detections, args.output), args.verbosity)
+    contents: dict[PathLike, str | bytes] = {args.output: csv_text(columns, comments)}
+    if args.overlay:
+        contents |= _overlays(args.overlay, detections, paths)
+    write_outputs(contents)
+    written = [args.output, *([f"{args.overlay} ({len(paths)} pictures)"] if args.overlay else [])]
+    console.show(detection_screen(rig, detections, notes, written), args.verbosity)
     return 0
+
+
+def _joints(args: Namespace, paths: Sequence[str]) -> tuple[dict[str, dict[str, str]] | None, list[str]]:
+    """Return the joint values of the images, and notes on them."""
+    from ..io.measurement_files import read_image_joints, read_recorded_joints  # lazy import: slow to load
+    from ..io.measurement_files.bag import is_bag
+
+    is_recording = bool(args.joints) and is_bag(args.joints)
+    if args.joint_topic and not is_recording:
+        raise InvalidArgumentError("--joint-topic: needs --joints with a recording; omit it")
+    if is_recording:
+        recorded = read_recorded_joints(args.joints, paths, args.joint_topic)
+        return recorded.joints, [f"{args.joints}: {text}" for text in recorded.notes]
+    return (read_image_joints(args.joints, paths) if args.joints else None), []
+
+
+def _overlays(
+    folder: str, detections: Sequence[BoardDetection], paths: Sequence[str]
+) -> Mapping[PathLike, str | bytes]:
+    """Return the pictures of --overlay, whose folder is created."""
+    from ..detection import overlay_files  # lazy import, as the following: they load OpenCV
+    from .outputs import require_writable_outputs
+
+    if os.path.exists(folder) and not os.path.isdir(folder):
+        raise InvalidArgumentError(f"--overlay {folder}: is a file; expected a folder")
+    pictures: dict[PathLike, str | bytes] = {}
+    pictures.update(overlay_files(folder, detections))
+    if len(pictures) < len(paths):
+        raise InvalidArgumentError(
+            f"--overlay {folder}: two images have the same name but for the ending; rename one of them"
+        )
+    os.makedirs(folder, exist_ok=True)
+    require_writable_outputs([os.fspath(path) for path in pictures], paths)
+    return pictures

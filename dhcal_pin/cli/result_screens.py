@@ -115,18 +115,23 @@ def validation_screen(
     return Screen(blocks)
 
 
-def detection_screen(rig: Rig, detections: Sequence[BoardDetection], output: str) -> Screen:
+def detection_screen(
+    rig: Rig, detections: Sequence[BoardDetection], notes: Sequence[str], files: Sequence[str]
+) -> Screen:
     """Describe which corners were found in images.
 
     Args:
         rig: Cameras and boards.
         detections: Corners by board.
-        output: File that was written.
+        notes: Warnings about the joint values.
+        files: Files that were written.
 
     Returns:
         The screen.
     """
-    found, warnings = [], []
+    from ..detection import unused_images  # lazy import: only this command needs it
+
+    found, warnings = [], list(notes)
     for detection in detections:
         n_corners = sum(len(image.corner) for image in detection.used)
         found.append(
@@ -137,15 +142,12 @@ def detection_screen(rig: Rig, detections: Sequence[BoardDetection], output: str
             warnings.append(
                 f"board {detection.board.name} was printed with {difference}; write so in {rig.source}"
             )
-        if len(detections) == 1:
-            warnings += [
-                f"{image.path}: not used, {image.problem}" for image in detection.images if image.problem
-            ]
+    warnings += [f"{path}: not used, {problem}" for path, problem in unused_images(detections)]
     return Screen(
         [
             Block(found, is_verdict=True),
             Block([f"warning: {text}" for text in warnings], "yellow", noun="warning", rank=2),
-            files_block([output]),
+            files_block(files),
         ]
     )
 

@@ -8,7 +8,8 @@ camera is at hand.
 """
 
 from .corners import DetectedImage, Layout, detect_corners, find_layout, read_image
-from .images import BoardDetection, corner_columns, detect_boards, image_files
+from .images import BoardDetection, corner_columns, detect_boards, image_files, unused_images
+from .overlays import overlay_files
 from .printing import black_rectangles, board_pdf
 from .rendering import ImageQuality, render_images
 
@@ -24,6 +25,8 @@ __all__ = [
     "detect_corners",
     "find_layout",
     "image_files",
+    "overlay_files",
     "read_image",
     "render_images",
+    "unused_images",
 ]

@@ -29,8 +29,8 @@ from .tag_edges import refine_by_edges
 MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS = 64 << 20, 50_000_000
 # What a message says of a file without an image.
 _NO_IMAGE = "is no image that can be read; expected PNG, JPEG or TIFF"
-# Number of images in which the layouts of a board are compared.
-N_LAYOUT_IMAGES = 8
+# Problem of an image without a board.
+NO_BOARD = "no board found"
 # Smallest number of corners of an image that is used.
 MIN_CORNERS = 4
 # Sharpness below which an image is blurred: standard deviation of the Laplacian over that of the brightness.
@@ -159,8 +159,7 @@ def find_layout(board: Board, images: Sequence[Array]) -> Layout:
     layouts = layouts_of(board)
     if len(layouts) == 1:
         return layouts[0]
-    step = max(1, len(images) // N_LAYOUT_IMAGES)
-    counts = [sum(len(_find(board, layout, image)[0]) for image in images[::step]) for layout in layouts]
+    counts = [sum(len(_find(board, layout, image)[0]) for image in images) for layout in layouts]
     return layouts[int(np.argmax(counts))]
 
 
@@ -188,7 +187,7 @@ def detect_corners(board: Board, layout: Layout, path: str, size: tuple[int, int
     corner, pixels = _find(board, layout, image)
     problem = ""
     if not len(corner):
-        problem = "no board found"
+        problem = NO_BOARD
     elif len(corner) < MIN_CORNERS:
         problem = f"{len(corner)} corners found; at least {MIN_CORNERS} are needed"
     else:

@@ -15,8 +15,10 @@ from .._typing import PathLike
 from ..cameras.boards import Board
 from ..cameras.rig import Camera, Rig
 from ..exceptions import FileFormatError, InvalidArgumentError
-from .corners import N_LAYOUT_IMAGES, DetectedImage, Layout, detect_corners, find_layout, read_image
+from .corners import NO_BOARD, DetectedImage, Layout, detect_corners, find_layout, read_image
 
+# Number of images in which the layouts of a board are compared.
+N_LAYOUT_IMAGES = 8
 # Endings of image files in a folder.
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm")
 
@@ -69,7 +71,11 @@ def image_files(paths: Sequence[PathLike]) -> list[str]:
 
 
 def detect_boards(
-    rig: Rig, camera: Camera, paths: Sequence[str], on_progress: Callable[[int], None]
+    rig: Rig,
+    camera: Camera,
+    paths: Sequence[str],
+    on_progress: Callable[[int], None],
+    jobs: int | None = None,
 ) -> list[BoardDetection]:
     """Find the corners of all boards of a rig in the images of one camera.
 
@@ -78,6 +84,7 @@ def detect_boards(
         camera: Camera that took the images.
         paths: Image files.
         on_progress: Called with the number of searches done, at most one per board and image.
+        jobs: Number of images that are searched at the same time; one per processor if None.
 
     Returns:
         Corners by board.
@@ -91,7 +98,7 @@ def detect_boards(
     size, out, n_done = (camera.width, camera.height), [], 0
     step = max(1, len(paths) // N_LAYOUT_IMAGES)
     some = [read_image(path) for path in paths[::step]]
-    with ThreadPoolExecutor(os.cpu_count()) as threads:
+    with ThreadPoolExecutor(jobs or os.cpu_count()) as threads:
         for board in boards:
             layout = find_layout(board, some)
             images = []
@@ -106,6 +113,31 @@ def detect_boards(
             f"{paths[0]}: no board found in any of {len(paths)} images; check type, columns, rows and "
             f"dictionary of the boards in {rig.source}"
         )
+    return out
+
+
+def unused_images(detections: Sequence[BoardDetection]) -> list[tuple[str, str]]:
+    """Find images that are not used, for one board or for all.
+
+    Args:
+        detections: Corners by board.
+
+    Returns:
+        Path of each image and why it is not used. That a board is not in an image is no problem if another
+        one is.
+    """
+    out = []
+    for images in zip(*(detection.images for detection in detections), strict=True):
+        problems = {
+            detection.board.name: image.problem
+            for detection, image in zip(detections, images, strict=True)
+            if image.problem and image.problem != NO_BOARD
+        }
+        if problems:
+            texts = [f"board {name}: {text}" for name, text in problems.items()]
+            out.append((images[0].path, "; ".join(texts if len(detections) > 1 else problems.values())))
+        elif all(image.problem for image in images):
+            out.append((images[0].path, NO_BOARD))
     return out
 
 

@@ -52,7 +52,7 @@ class _PoseSample(NamedTuple):
     quaternion: Any
 
 
-class _RecordedJoints(NamedTuple):
+class RecordedJoints(NamedTuple):
     """Joint positions with two times of each message [s], columns of (k, 2): its header, its recording."""
 
     names: tuple[str, ...]
@@ -155,6 +155,25 @@ def convert_bag(
     if stops.n_without_poses:
         notes.append(f"left out {_count_stops(stops.n_without_poses)} without a pose")
     return ConvertedBag(_stops_text(stops, joints.names, chain, [f"{source}: {notes[0]}", *notes[1:]]), notes)
+
+
+def read_bag_joints(path: PathLike, joint_topic: str | None = None) -> RecordedJoints:
+    """Read all joint positions of a recording.
+
+    Args:
+        path: Recording.
+        joint_topic: Topic of the joint positions; if None the only one of its type, or `/joint_states`.
+
+    Returns:
+        Joint positions with their times.
+
+    Raises:
+        InvalidArgumentError: The topic is missing; the message names the candidates.
+        FileFormatError: The recording cannot be read.
+    """
+    source = os.fspath(path)
+    with _open_bag(source) as reader:
+        return _read_joints(reader, source, _choose_joint_topic(reader, source, joint_topic), None)
 
 
 def _count_stops(count: int) -> str:
@@ -260,7 +279,7 @@ def _stamp(header: Any) -> float:
     return header.stamp.sec + header.stamp.nanosec * _NANO
 
 
-def _read_joints(reader: AnyReader, source: str, topic: str, chain: Chain | None) -> _RecordedJoints:
+def _read_joints(reader: AnyReader, source: str, topic: str, chain: Chain | None) -> RecordedJoints:
     """Read the joint positions, of the robot's joints only if it is known."""
     times, rows = [], []
     current: dict[str, float] = {}
@@ -284,7 +303,7 @@ def _read_joints(reader: AnyReader, source: str, topic: str, chain: Chain | None
     complete = [i for i, row in enumerate(rows) if len(row) == len(names) and np.isfinite(row).all()]
     if not complete:
         raise FileFormatError(f"{source}: {topic} has no finite joint positions")
-    return _RecordedJoints(
+    return RecordedJoints(
         names, np.array([times[i] for i in complete]), np.array([rows[i] for i in complete])
     )
 
@@ -336,7 +355,7 @@ def _have_common_times(first: Array, second: Array) -> bool:
     return is_set and bool(first.min() <= second.max() and second.min() <= first.max())
 
 
-def _in_order(joints: _RecordedJoints, poses: _RecordedPoses, clock: int) -> tuple[JointSeries, PoseSeries]:
+def _in_order(joints: RecordedJoints, poses: _RecordedPoses, clock: int) -> tuple[JointSeries, PoseSeries]:
     """Return the series in the order of one clock, without repeated times."""
     joint_times, i = np.unique(joints.times[:, clock], return_index=True)
     pose_times, j = np.unique(poses.times[:, clock], return_index=True)

@@ -1,0 +1,116 @@
+"""Joint values of images from a recording, by the times in the names of the images."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..._typing import Array, PathLike
+from ...exceptions import FileFormatError
+from .bag import read_bag_joints
+
+# Time around an image within which the robot should stand still [s], and largest change of a joint [rad].
+STILL_TIME, MAX_CHANGE = 0.1, 1e-3
+# Smallest number for which a time without fraction counts milli-, micro- or nanoseconds, and their seconds.
+_SUBDIVISIONS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
+# A time in a name: seconds with a fraction behind a point or with nanoseconds behind an underscore, or a
+# whole number.
+_TIME = re.compile(r"(\d{9,})(?:\.(\d+)|_(\d{9}))?(?!.*\d{9})")
+
+
+class RecordedImages(NamedTuple):
+    """Joint values of images.
+
+    Attributes:
+        joints: Cells of the joint columns by header, for the name of each image.
+        notes: Sentences on images during which the robot moved.
+    """
+
+    joints: dict[str, dict[str, str]]
+    notes: list[str]
+
+
+def image_time(name: str) -> float | None:
+    """Return the time in the name of an image [s].
+
+    Args:
+        name: Name such as `1700000000.25.png`, `left_1700000000_250000000.png` or `1700000000250000000.png`.
+
+    Returns:
+        Time; None without one.
+
+    >>> image_time("left_1700000000_250000000.png")
+    1700000000.25
+    """
+    stem = os.path.splitext(os.path.basename(name))[0]
+    match = _TIME.search(stem)
+    if match is None:
+        return None
+    whole, fraction, nanoseconds = match.groups()
+    if fraction or nanoseconds:
+        return float(f"{whole}.{fraction or nanoseconds}")
+    value = float(whole)
+    return value * next((factor for least, factor in _SUBDIVISIONS if value >= least), 1.0)
+
+
+def read_recorded_joints(
+    path: PathLike, images: Sequence[str], joint_topic: str | None = None
+) -> RecordedImages:
+    """Read the joint values at the times of images from a recording.
+
+    Args:
+        path: Recording of ROS 1, ROS 2 or MCAP.
+        images: Paths of the images, with their times in the names.
+        joint_topic: Topic of the joint positions; if None the only one, or `/joint_states`.
+
+    Returns:
+        Joint values in radians, and notes. Prismatic joints are not recognized.
+
+    Raises:
+        FileFormatError: A name has no time, or the recording has no joint values at that time.
+    """
+    source, times = os.fspath(path), np.empty(len(images))
+    for i, image in enumerate(images):
+        time = image_time(image)
+        if time is None:
+            raise FileFormatError(
+                f"{image}: no time in the name; expected seconds or nanoseconds such as 1700000000.25.png to "
+                f"find the joint values in {source}"
+            )
+        times[i] = time
+    recorded = read_bag_joints(path, joint_topic)
+    # The clock of the headers or of the recording: that in which more of the images were taken.
+    inside = (times[:, None] >= recorded.times.min(0)) & (times[:, None] <= recorded.times.max(0))
+    clock = int(np.argmax(inside.sum(0)))
+    if not inside[:, clock].all():
+        first = int(np.flatnonzero(~inside[:, clock])[0])
+        low, high = recorded.times[:, clock].min(), recorded.times[:, clock].max()
+        raise FileFormatError(
+            f"{images[first]}: time {times[first]:.3f} s is not in {source}, whose joint values are from "
+            f"{low:.3f} to {high:.3f} s"
+        )
+    order = np.argsort(recorded.times[:, clock], kind="stable")
+    when, q = recorded.times[order, clock], recorded.q[order]
+    joints, moving = {}, []
+    for image, time in zip(images, times.tolist(), strict=True):
+        values = np.array([np.interp(time, when, column) for column in q.T])
+        if _change(when, q, time) > MAX_CHANGE:
+            moving.append(os.path.basename(image))
+        joints[os.path.basename(image)] = {
+            f"{name}[rad]": repr(value) for name, value in zip(recorded.names, values.tolist(), strict=True)
+        }
+    notes = []
+    if moving:
+        more = f" and {len(moving) - 1} more images" if len(moving) > 1 else ""
+        notes.append(f"the robot moved at the time of {moving[0]}{more}; take images while it stands still")
+    return RecordedImages(joints, notes)
+
+
+def _change(when: Array, q: Array, time: float) -> float:
+    """Return the largest change of a joint around a time [rad]."""
+    near = q[np.abs(when - time) <= STILL_TIME]
+    return float(np.ptp(near, axis=0).max()) if len(near) else 0.0

@@ -1,0 +1,139 @@
+"""`dhcal detect` with joint values from a recording, several boards, and pictures of the corners."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import unfolded
+from recordings import Recording, write_bag
+from robots import paper
+
+from dhcal_pin import se3
+from dhcal_pin.cameras import Board, Camera
+from dhcal_pin.detection import read_image, render_images
+from dhcal_pin.io.measurement_files.image_times import image_time
+from dhcal_pin.io.rig_file import rig_text
+from dhcal_pin.io.tabular import csv_text
+from dhcal_pin.robot import Chain
+
+cv2 = pytest.importorskip("cv2")
+
+CAMERA = Camera("fixed", "world", 320, 240, np.array([300.0, 300, 160, 120, 0, 0, 0, 0, 0]))
+BOARDS = [
+    Board("left", "tip", "checkerboard", columns=5, rows=4, square=0.03),
+    Board("right", "tip", "charuco", columns=4, rows=3, square=0.05, marker=0.036, dictionary="DICT_4X4_50"),
+]
+POSES = [se3.translation([-0.16, -0.05, 0.4]), se3.translation([0.01, -0.07, 0.45])]
+START = 1.7e9
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("rig.toml").write_text(rig_text([CAMERA], BOARDS))
+    Path("images").mkdir()
+    return tmp_path
+
+
+def render(*names_and_boards):
+    """Write images of some boards."""
+    views = [[(BOARDS[i], POSES[i]) for i in boards] for _, boards in names_and_boards]
+    images = render_images(CAMERA, views, np.random.default_rng(0))
+    for (name, _), image in zip(names_and_boards, images, strict=True):
+        cv2.imwrite(f"images/{name}", image)
+
+
+def rows_of(path):
+    lines = [line for line in Path(path).read_text().splitlines() if not line.startswith("#")]
+    return [dict(zip(lines[0].split(","), line.split(","), strict=True)) for line in lines[1:]]
+
+
+def detect(*args):
+    return "detect", "images", "--rig", "rig.toml", *args, "-o", "corners.csv"
+
+
+def test_several_boards_and_pictures_of_their_corners(run, folder):
+    """An image with one of two boards is used; one without any is named. Pictures have colours at corners."""
+    render(("both.png", [0, 1]), ("one.png", [0]), ("none.png", []))
+    status, _, err = run(*detect("--overlay", "pictures", "--jobs", "2"))
+    assert status == 0, err
+    text = unfolded(err)
+    assert "board left: 24 corners in 2 of 3 images" in text
+    assert "board right: 6 corners in 1 of 3 images" in text
+    assert "none.png: not used, no board found" in text
+    assert "images/one.png: not used" not in text
+    assert sorted(path.name for path in Path("pictures").iterdir()) == ["both.png", "none.png", "one.png"]
+    picture = cv2.imread("pictures/both.png").astype(int)
+    is_colored = np.ptp(picture, axis=2) > 60
+    for row in rows_of("corners.csv"):
+        if row["image"] == "both.png":
+            u, v = round(float(row["u[px]"])), round(float(row["v[px]"]))
+            assert is_colored[v - 5 : v + 6, u - 5 : u + 6].any()
+    # The images themselves are not changed.
+    np.testing.assert_array_equal(np.ptp(cv2.imread("images/both.png"), axis=2), 0)
+    assert read_image("images/both.png").shape == (240, 320)
+
+
+@pytest.mark.parametrize("name", ["arm.bag", "arm_ros2"])
+def test_joint_values_of_a_recording_by_the_times_of_the_images(run, folder, name):
+    arm = Chain.from_dh(paper("sim_6dof"))
+    stops = np.random.default_rng(3).uniform(-1, 1, (3, 6))
+    recording = Recording(arm, stops, start=START)
+    write_bag(folder / name, recording)
+    # At the first and the second stop, in two notations, and during the motion between them.
+    render(
+        ("1700000000.75.png", [0]), ("1700000003450000000.png", [0]), ("left_1700000002_100000000.png", [0])
+    )
+    status, _, err = run(*detect("--joints", name))
+    assert status == 0, err
+    assert "the robot moved at the time of left_1700000002_100000000.png" in unfolded(err)
+    rows = rows_of("corners.csv")
+    for image, q in (("1700000000.75.png", stops[0]), ("1700000003450000000.png", stops[1])):
+        (values,) = {
+            tuple(row[f"{j}[rad]"] for j in arm.joint_names) for row in rows if row["image"] == image
+        }
+        np.testing.assert_allclose(np.array(values, float), q, atol=1e-6)
+    moving = recording.joint_positions(np.array([2.1]))[0]
+    values = next(row for row in rows if row["image"].startswith("left_"))
+    found = [float(values[f"{j}[rad]"]) for j in arm.joint_names]
+    np.testing.assert_allclose(found, moving, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("image", "words"),
+    [("first.png", ["first.png", "no time in the name"]), ("1600000000.5.png", ["is not in arm.bag"])],
+)
+def test_images_without_joint_values_in_the_recording_are_refused(run, folder, image, words):
+    arm = Chain.from_dh(paper("sim_6dof"))
+    write_bag(folder / "arm.bag", Recording(arm, np.zeros((1, 6)), start=START))
+    render((image, [0]))
+    status, _, err = run(*detect("--joints", "arm.bag"))
+    assert status == 2
+    assert all(word in err for word in words)
+    assert not Path("corners.csv").exists()
+
+
+def test_topic_of_joints_needs_a_recording(run, folder):
+    render(("1.png", [0]))
+    Path("joints.csv").write_text(csv_text({"image": ["1.png"], "a[rad]": [0.5]}))
+    status, _, err = run(*detect("--joints", "joints.csv", "--joint-topic", "/joint_states"))
+    assert status == 2
+    assert "--joint-topic: needs --joints with a recording" in err
+
+
+@pytest.mark.parametrize(
+    ("name", "time"),
+    [
+        ("1700000000.png", 1.7e9),
+        ("1700000000.25.jpg", 1700000000.25),
+        ("cam0_1700000000_250000000.png", 1700000000.25),
+        ("1700000000250000000.png", 1700000000.25),
+        ("1700000000250000.png", 1700000000.25),
+        ("1700000000250.png", 1700000000.25),
+        ("image_12.png", None),
+    ],
+)
+def test_times_in_names(name, time):
+    assert image_time(name) == (None if time is None else pytest.approx(time, abs=1e-6))
