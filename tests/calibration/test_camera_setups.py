@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from camera_setups import random_setup
+from camera_setups import ARMS, random_setup, simulate
 
 import dhcal_pin as dh
+from dhcal_pin import select_parameters
 from dhcal_pin.calibration.evaluation import compute_errors
+from dhcal_pin.estimation.qr import posterior_sqrt_covariance
 
 
 def image_rms(fit, data):
@@ -36,3 +38,72 @@ def test_setups_converge_without_a_guess(seed):
 @pytest.mark.parametrize("seed", range(24, 200))
 def test_all_setups_converge_without_a_guess(seed):
     converges(seed)
+
+
+def true_values(setup, truth_errors, fit):
+    """Return the true value of each parameter of a fit, in its order."""
+    exact = setup.exact
+    instruments = dict(zip((p.name for p in exact.instrument_parameters), exact_values(exact), strict=True))
+    arm = dict(zip((p.name for p in fit.errors.parameters), truth_errors, strict=False))
+    nominal = {p.name: p.nominal for p in fit.problem.instrument_parameters}
+    return np.array(
+        [arm[p.name] if p.name in arm else instruments[p.name] - nominal[p.name] for p in fit.parameters]
+    )
+
+
+def exact_values(item):
+    """Return the true values of all instrument parameters."""
+    return np.array([p.nominal for p in item.instrument_parameters])
+
+
+def statistics(seed, *, is_arm_free):
+    """Calibrate two thirds of the images of a set-up.
+
+    Returns:
+        Errors of all parameters in standard deviations, squared errors of held-out image coordinates, and
+        their predicted variances by the Cramér-Rao bound, averages in units of the noise.
+    """
+    rng = np.random.default_rng(1000 + seed)
+    chain = list(ARMS.values())[seed % len(ARMS)]()
+    errors = select_parameters(chain, "placement,offset")
+    std = np.array([2e-3 if p.unit == "m" else 6e-3 for p in errors.parameters])
+    x = std * rng.standard_normal(len(std)) if is_arm_free else np.zeros(len(std))
+    truth = errors.at(x) if is_arm_free else chain
+    setup = simulate(chain, truth, rng, is_on_wrist=seed // 4 % 2 == 0, n_images=60, sigma=0.2,
+                     n_cameras=1 + seed // 2 % 2, n_boards=1 + seed % 2)  # fmt: skip
+    labels = np.unique(setup.images.q, axis=0, return_inverse=True)[1].reshape(-1)
+    is_fitted = labels % 3 != 0
+    sets = "placement,offset,camera,board,intrinsics" if is_arm_free else "camera,board,intrinsics"
+    fit = dh.calibrate(chain, setup.images.take(is_fitted), sets, extend="none", loss="linear")
+    values = true_values(setup, x, fit)
+    held_out = setup.images.take(~is_fitted)
+    pixels = compute_errors(fit.chain, [held_out], fit.instruments)[0]["pixels"]
+    own = held_out.with_values({p.name: p.nominal for p in fit.data[0].instrument_parameters})
+    other = fit.problem.with_data([own])
+    model = other.linearize(fit.x)
+    rows = np.concatenate([model.rows(chunk)[:-1].copy() for chunk in other.chunks], 2)
+    root = posterior_sqrt_covariance(fit.solution.system, fit.problem.weights)[0]
+    # Whitened rows of the fit are in units of its noise; those of the other images have the sigma of 1 px.
+    variance = np.sum(np.tensordot(root, rows, (0, 0)) ** 2, 0)
+    return (fit.x - values) / fit.std, np.mean(pixels**2), setup.sigma**2 + np.mean(variance)
+
+
+def check_statistics(seeds, coverage, *, is_arm_free):
+    """Compare intervals of 95 % with the truth, and held-out images with the Cramér-Rao prediction."""
+    scores, squares, predicted = zip(
+        *(statistics(seed, is_arm_free=is_arm_free) for seed in seeds), strict=True
+    )
+    share = np.mean(np.abs(np.concatenate(scores)) < 1.96)
+    assert coverage[0] < share < coverage[1]
+    assert np.sqrt(np.mean(np.divide(squares, predicted))) == pytest.approx(1, abs=0.05)
+
+
+def test_cameras_and_boards_are_as_uncertain_as_predicted():
+    """The bounds are wide, as the parameters of a few set-ups are correlated."""
+    check_statistics(range(5), (0.88, 1.0), is_arm_free=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("is_arm_free", "least"), [(False, 0.93), (True, 0.92)])
+def test_intervals_cover_the_truth(is_arm_free, least):
+    check_statistics(range(32), (least, 0.97), is_arm_free=is_arm_free)

@@ -158,6 +158,38 @@ def test_exchanged_width_and_height_are_named():
         dh.CameraCorners(upper.q, upper.values, upper.corner, rig)
 
 
+@pytest.mark.parametrize("has_free_points", [False, True])
+def test_stages_show_a_board_that_is_not_as_stated(has_free_points):
+    """Corners are 1 mm beside the stated ones: left-out regions show it, and free corners are found."""
+    rng = np.random.default_rng(8)
+    chain = ARMS["ur10"]()
+    setup = simulate(chain, chain, rng, is_on_wrist=False, n_images=40, sigma=0.1)
+    stated = setup.images.rig.boards[0]
+    points = stated.points + rng.normal(0, 1e-3, stated.points.shape)
+    board = replace(stated, type="points", listed_points=points, has_free_points=has_free_points)
+    rig = replace(setup.images.rig, boards=(board,))
+    data = dh.CameraCorners(setup.images.q, setup.images.values, setup.images.corner, rig)
+    fit = dh.calibrate(chain, data, loss="linear")
+    assert [stage.name for stage in fit.camera_stages] == ["frames", "intrinsics", "target points", "arm"]
+    _, stated_points, free_points, arm = fit.camera_stages
+    assert free_points.is_kept == has_free_points
+    assert stated_points.by_region is not None
+    assert free_points.by_region is not None
+    assert free_points.by_region.pixels < 0.5 * stated_points.by_region.pixels
+    assert free_points.by_region.distance < 0.5 * stated_points.by_region.distance
+    assert not arm.is_kept
+    if has_free_points:
+        assert fit.rig is not None
+        # Distances between corners do not depend on the pose of the board.
+        seen = np.unique(data.corner)
+        found, wanted = fit.rig.boards[0].points[seen], stated.points[seen]
+        pairs = np.triu_indices(len(seen), 1)
+        errors = [
+            np.linalg.norm(each[pairs[0]] - each[pairs[1]], axis=1) for each in (found, wanted, points[seen])
+        ]
+        assert np.std(errors[0] - errors[1]) < 0.2 * np.std(errors[2] - errors[1])
+
+
 def test_hand_eye_alone_keeps_the_arm(arm):
     rng = np.random.default_rng(2)
     fit = dh.calibrate(arm, images_of(arm, 15, rng), "camera,board")

@@ -34,7 +34,7 @@ from ...estimation.problem import Problem
 from ...estimation.qr import TriangularSystem, append_priors, posterior_sqrt_covariance, pseudo_inverse
 from ...estimation.solver import minimize
 from ...measurements.base import Measurement
-from ...measurements.camera import CameraCorners
+from ...measurements.camera import POINTS_SET, CameraCorners
 from ..partition import Fold, configuration_groups, different_configurations, k_fold
 from ..reweighting import Fit
 from .jitter import Jitter, estimate_jitter, with_jitter
@@ -44,6 +44,8 @@ from .stages import Stage, fitted_error, held_out_error
 N_CLUSTERS = 5
 # Number of folds of random images.
 N_IMAGE_FOLDS = 5
+# Largest number of corners of all boards that are estimated to judge whether boards are as stated.
+MAX_POINTS = 150
 # Configurations per unit of the temperature with an open and with a closed gate.
 OPEN_SAMPLES, CLOSED_SAMPLES = 20, 5
 # Largest ratio of the errors for which the arm is demonstrably wrong: if its errors explain the images up to
@@ -324,7 +326,7 @@ def _without_arm(fit: Fit, max_iterations: int, held: Collection[str] = ()) -> F
 
 
 def _stages(fit: Fit, with_arm: Fit, gate: Gate, max_iterations: int) -> tuple[Stage, ...]:
-    """Judge the stages of a calibration: frames, intrinsics, arm."""
+    """Judge the stages of a calibration: frames, intrinsics, target points, arm."""
     folds = cluster_folds(fit.data)
     images = k_fold(fit.data, N_IMAGE_FOLDS) if folds else ()
 
@@ -333,14 +335,73 @@ def _stages(fit: Fit, with_arm: Fit, gate: Gate, max_iterations: int) -> tuple[S
         errors = fitted_error(each), held_out_error(each, images), held_out_error(each, folds)
         return Stage(name, is_kept, n_unknowns, *errors, reason)
 
-    frames = _without_arm(fit, max_iterations, ("intrinsics",))
+    frames = _without_arm(fit, max_iterations, ("intrinsics", POINTS_SET))
     out = [judged("frames", frames, True, "Poses of cameras and boards are always estimated.")]
-    lenses = _without_arm(fit, max_iterations)
+    lenses = _without_arm(fit, max_iterations, (POINTS_SET,))
     if len(lenses.problem.weights) > len(frames.problem.weights):
-        out.append(judged("intrinsics", lenses, True, "The rig does not fix them."))
+        stage = judged("intrinsics", lenses, True, "The rig does not fix them.")
+        out.append(replace(stage, reason=f"{stage.reason} {_change(out[-1], stage)}".strip()))
+    points = _without_arm(fit, max_iterations)
+    has_points = len(points.problem.weights) > len(lenses.problem.weights)
+    if not has_points and _count_corners(fit.data) <= MAX_POINTS:
+        points = _without_arm(_with_points(fit), max_iterations)
+    if len(points.problem.weights) > len(lenses.problem.weights):
+        reason = (
+            "The rig leaves them free."
+            if has_points
+            else 'The rig fixes them; `points = "prior"` frees them.'
+        )
+        stage = judged("target points", points, has_points, reason)
+        out.append(replace(stage, reason=f"{stage.reason} {_change(out[-1], stage)}".strip()))
     if with_arm.problem.errors.parameters:
         out.append(judged("arm", with_arm, gate.is_open, gate.sentence))
     return tuple(out)
+
+
+def _change(before: Stage, after: Stage) -> str:
+    """Say by which factor a stage changes the error of left-out regions; empty if that is unknown."""
+    if before.by_region is None or after.by_region is None or not before.by_region.pixels:
+        return ""
+    factor = after.by_region.pixels / before.by_region.pixels
+    return f"Estimating them changes the error of left-out parts of joint space by the factor {factor:.2f}."
+
+
+def _count_corners(data: Sequence[Measurement]) -> int:
+    """Return the number of corners of all boards."""
+    boards = {
+        board.name: len(board.points)
+        for item in data
+        if isinstance(item, CameraCorners)
+        for board in item.rig.boards
+    }
+    return sum(boards.values())
+
+
+def _with_points(fit: Fit) -> Fit:
+    """Return a fit whose corners of boards are further unknowns, at their first values and not yet solved."""
+    problem, robot = fit.problem, len(fit.problem.errors.parameters)
+    names = [p.name for p in problem.instrument_parameters]
+    weights = dict(zip(names, problem.weights[robot:].tolist(), strict=True))
+    values = dict(zip(names, fit.solution.x[robot:].tolist(), strict=True))
+    data = tuple(_free_points(item) for item in problem.data)
+    freed = replace(problem, data=data)
+    parameters = freed.instrument_parameters
+    own = [weights.get(p.name, np.sqrt(problem.temperature) / p.prior) for p in parameters]
+    x = [values.get(p.name, 0.0) for p in parameters]
+    return replace(
+        fit,
+        data=tuple(_free_points(item) for item in fit.data),
+        problem=replace(freed, weights=np.concatenate([problem.weights[:robot], own])),
+        solution=replace(fit.solution, x=np.concatenate([fit.solution.x[:robot], x])),
+    )
+
+
+def _free_points(item: Measurement) -> Measurement:
+    """Return image coordinates with the corners of all boards as unknowns."""
+    if not isinstance(item, CameraCorners):
+        return item
+    boards = tuple(replace(board, has_free_points=True) for board in item.rig.boards)
+    return item.with_rig(replace(item.rig, boards=boards))
 
 
 def cluster_folds(data: Sequence[Measurement]) -> tuple[Fold, ...]:
