@@ -35,6 +35,7 @@ from ..estimation.parameters import EXTENSIONS, fold_harmonics, select_parameter
 from ..estimation.priors import PriorGroups, Priors, has_default_prior, prior_weights
 from ..estimation.problem import Problem, merge_instrument_parameters
 from ..estimation.solver import METHODS, minimize
+from ..estimation.trimmed_squares import find_initial_outliers
 from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..measurements.arguments import as_measurements, require_chain
 from ..measurements.base import Measurement
@@ -147,15 +148,11 @@ def calibrate(
     known = {**held_values(data, rig_sets), **_validated_known(data, known or {})}
     errors = select_parameters(chain, robot_sets, fix, free) if robot_sets or free else ErrorModel(chain, ())
     families = _extension_families(extend, errors, method, priors)
-    errors = initialize_frames(errors, data, known, max_iterations)
-    data = tuple(item.initialized(errors.chain) for item in data)
+    is_robust = method == "lm" and loss != "linear"
+    errors, data, weights = _initialize(errors, data, known, max_iterations, is_robust)
     problem = replace(make_problem(errors, data, prior_weights(errors, priors), known), executor=executor)
     if bounds:
         problem = replace(problem, bounds=_bounds(problem, bounds))
-    weights = [np.ones(len(item.rows)) for item in data]
-    if method == "lm" and loss != "linear":
-        is_gross = gross_outliers(errors.chain, data)
-        weights = [np.where(each, robust.ZERO_WEIGHT, 1.0) for each in is_gross]
     fit = _solve(problem, weights, method, max_iterations, progress)
     shrinkage_factor = 1.0
     if method == "lm":
@@ -180,6 +177,45 @@ def calibrate(
         return result
     fit, extension = model_selection.extend(fit, families, max_iterations, progress)
     return replace(_make_result(fit, shrinkage_factor, holdout, method), extension=extension)
+
+
+def _initialize(
+    errors: ErrorModel,
+    data: tuple[Measurement, ...],
+    known: Mapping[str, float],
+    max_iterations: int,
+    is_robust: bool,
+) -> tuple[ErrorModel, tuple[Measurement, ...], list[Array]]:
+    """Initialize base, tool and instruments.
+
+    Args:
+        errors: Nominal chain and its unknown parameters.
+        data: Measurements.
+        known: Values of instrument parameters by name [m or rad].
+        max_iterations: Largest number of iterations of each fit.
+        is_robust: Whether to find gross outliers and initialize without them.
+
+    Returns:
+        Parameters on the chain with these frames, initialized measurements, and first weights of each
+        measurement's samples, shape (m,) each.
+    """
+    started = initialize_frames(errors, data, known, max_iterations)
+    items = tuple(item.initialized(started.chain) for item in data)
+    weights = [np.ones(len(item.rows)) for item in data]
+    if not is_robust:
+        return started, items, weights
+    if all(len(item.positions()) == len(item.rows) for item in data):
+        is_gross = gross_outliers(started.chain, data)
+    else:
+        has_positions = any(len(item.positions()) for item in data)
+        is_gross = find_initial_outliers(started if has_positions else errors, data, known)
+        if any(each.any() for each in is_gross):
+            kept = tuple(item.take(~each) for item, each in zip(data, is_gross, strict=True))
+            started = initialize_frames(errors, kept, known, max_iterations)
+            items = tuple(
+                item.initialized_from(started.chain, ~each) for item, each in zip(data, is_gross, strict=True)
+            )
+    return started, items, [np.where(each, robust.ZERO_WEIGHT, 1.0) for each in is_gross]
 
 
 def _check_options(

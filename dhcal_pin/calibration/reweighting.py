@@ -14,7 +14,7 @@ The least-squares problem depends on three sets of numbers that are not known be
 2. The widths of the default priors, from the evidence procedure (MacKay 1992), see `estimation.priors`.
 3. The weight of each sample under a robust loss, from iteratively reweighted least squares, see
    `estimation.robust`; loss "auto" starts from the samples that a majority agrees with, see
-   `trimmed_squares`.
+   `good_samples`.
 
 Each round estimates all three from the current solution and solves the problem again, starting from it.
 Early rounds solve loosely. The rounds end when none of the numbers changes by more than 1 % and the last
@@ -41,8 +41,8 @@ from ..estimation.problem import Problem
 from ..estimation.robust import WeightChange, studentized_residuals
 from ..estimation.solver import SolverResult, minimize
 from ..measurements.base import Measurement
+from .good_samples import find_good_samples
 from .partition import configuration_groups
-from .trimmed_squares import find_good_samples
 
 # Smallest scale of a standard deviation: a nanometre or a nanoradian for a placeholder of 1 mm or 1 mrad.
 MIN_SIGMA_SCALE = 1e-6

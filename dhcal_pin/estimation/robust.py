@@ -66,7 +66,7 @@ MAX_BETWEEN = 0.2
 # Smallest variance of a whitened residual, relative to its noise; below it the fit reproduces the sample.
 MIN_VARIANCE = 1e-3
 # Stages without a weight function: search for good samples, which chooses the last stage
-# (`calibration.trimmed_squares`), and unchanged weights.
+# (`calibration.good_samples`), and unchanged weights.
 TRIMMED, KEPT = "trimmed", "kept"
 # Ratio of successive weight changes above which the weights oscillate.
 OSCILLATION_RATIO = 0.8

@@ -215,6 +215,17 @@ class Measurement(ABC):
         """
         return self
 
+    def initialized_from(self, chain: Chain, is_used: Array) -> Self:
+        """Return a copy with initial values of the instrument parameters from a part of the samples.
+
+        Args:
+            chain: Robot whose tool poses the initial values are fitted to.
+            is_used: Whether each sample is used, (m,).
+        """
+        part = self.take(is_used).initialized(chain)
+        common = [field.name for field in fields(self) if field.name not in self.sample_fields]
+        return self.replace(**{name: getattr(part, name) for name in common})
+
     @abstractmethod
     def residual(self, frames: FrameBatch, u: Array) -> Array:
         """Return the whitened residuals (k, m); `residual_groups` names the rows.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from robots import joint_sample, measured_arm, robot_file, with_random_frames
 
-from dhcal_pin.calibration import calibrate, trimmed_squares
+from dhcal_pin.calibration import calibrate, good_samples
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.initialization import align
 from dhcal_pin.measurements import Noise, PointContact, Pose, Position, Wires
@@ -215,8 +215,8 @@ def test_residuals_that_look_like_noise_need_no_search(monkeypatch):
     chain = measured_arm("slide")
     data = Pose.simulate(chain, joint_sample(chain, 1000, rng), Noise(SIGMA, SIGMA), rng)
     searches = []
-    search = trimmed_squares._search
-    monkeypatch.setattr(trimmed_squares, "_search", lambda *args: searches.append(1) or search(*args))
+    search = good_samples.search_majorities
+    monkeypatch.setattr(good_samples, "search_majorities", lambda *args: searches.append(1) or search(*args))
     for item in (data, without_sigma(data)):
         fits = [
             calibrate(chain, item, "minimal,base,tool", extend="none", loss=loss)

@@ -1,0 +1,177 @@
+"""Find gross outliers before the first fit, for measurements of any kind.
+
+A wrong length or a contact with another object is up to half a metre off. A least-squares start from all
+samples then places base, tool and instruments far from their actual poses, where neither the model nor its
+linearization says which samples are wrong. The start is therefore searched with the nominal robot:
+
+1. Initialize the instruments from all samples and from random subsets of configurations. The start with the
+   smallest median of the residuals is used.
+2. Linearize the model in the unknowns of base, tool and instruments, and search the majority that agrees best
+   (`search`).
+3. Fit this majority with the nonlinear model. Repeat steps 2 and 3 there until the majority is the same.
+
+A sample is an outlier if its residual is a large multiple of the median. Smaller outliers are left to the
+search after the fit of the robot: nominal robots have errors of millimetres themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+import numpy as np
+
+from ..._kernels.types import FrameBatch
+from ..._typing import Array
+from ...exceptions import DhcalError
+from ...measurements.base import Measurement
+from ...robot.chain import Chain
+from ..error_model import ErrorModel
+from ..problem import (
+    CHUNK_SIZE,
+    Problem,
+    chunk_residual,
+    linearize_and_factor,
+    merge_instrument_parameters,
+)
+from ..qr import posterior_sqrt_covariance, rank
+from ..solver import minimize
+from .search import linearize_rows, search_majorities
+
+# Largest number of samples of each measurement that the search uses.
+MAX_SAMPLES = 200
+# Number of random subsets that the instruments are initialized from, and their smallest number of
+# configurations.
+N_STARTS, MIN_CONFIGURATIONS = 40, 4
+# Largest number of linearizations, and of iterations of the fit after each.
+MAX_LINEARIZATIONS, MAX_ITERATIONS = 10, 30
+# Smallest ratio of the residual of an outlier to the median of all.
+MIN_RATIO = 10.0
+# Smallest median of whitened residuals; exact data have none.
+MIN_MEDIAN = 1e-6
+
+
+def find_initial_outliers(
+    errors: ErrorModel, data: Sequence[Measurement], known: Mapping[str, float]
+) -> list[Array]:
+    """Find samples that are so far from the nominal robot that a fit must begin without them.
+
+    Args:
+        errors: Nominal chain and its unknown parameters.
+        data: Measurements of any kinds.
+        known: Values of instrument parameters by name [m or rad].
+
+    Returns:
+        Whether each sample is an outlier, shape (m,) for each measurement; False for all samples if they are
+        too few to judge each other.
+    """
+    all_good = [np.zeros(len(item.rows), bool) for item in data]
+    frames = errors.only_frames() or ErrorModel(errors.chain, ())
+    drawn = [_draw_configurations(item) for item in data]
+    parts = [item.take(mask) for item, mask in zip(data, drawn, strict=True)]
+    starts = [_initialize_instruments(frames.chain, part) for part in parts]
+    parameters = [p for p in merge_instrument_parameters(starts) if p.name not in known]
+    weights = np.concatenate([1 / frames.priors, [1 / parameter.prior for parameter in parameters]])
+    problem = Problem(frames, tuple(starts), weights, known)
+    x = _fit_majority(problem)
+    if x is None:
+        return all_good
+    full = problem.with_data(
+        [
+            start.replace(**{name: getattr(item, name) for name in item.sample_fields})
+            for start, item in zip(starts, data, strict=True)
+        ]
+    )
+    chain = frames.at(x[: len(frames.parameters)])
+    chunks = full.map_chunks(partial(chunk_residual, chain, full.instruments(x)))
+    out = []
+    for item in full.data:
+        residuals = [next(chunks) for _ in range(0, len(item.rows), CHUNK_SIZE)]
+        residual = np.concatenate([np.empty((item.residual_dim, 0)), *residuals], 1)
+        is_outlier = np.zeros(len(item.rows), bool)
+        for rows in item.residual_groups.values():
+            distances = np.linalg.norm(residual[rows], axis=0)
+            if len(distances):
+                is_outlier |= distances > MIN_RATIO * max(float(np.median(distances)), MIN_MEDIAN)
+        out.append(is_outlier)
+    return out
+
+
+def _draw_configurations(item: Measurement) -> Array:
+    """Draw samples of whole configurations at random, at most about MAX_SAMPLES; return their mask (m,)."""
+    m = len(item.rows)
+    if m <= MAX_SAMPLES:
+        return np.ones(m, bool)
+    labels = _configurations(item)
+    order = np.random.default_rng(0).permutation(labels.max() + 1)
+    counts = np.cumsum(np.bincount(labels)[order])
+    return np.isin(labels, order[: max(1, int(np.searchsorted(counts, MAX_SAMPLES, "right")))])
+
+
+def _configurations(item: Measurement) -> Array:
+    """Label the samples of a measurement by their configuration, shape (m,)."""
+    if not len(item.rows):
+        return np.zeros(0, int)
+    q = item.configurations().reshape(-1, len(item.rows), item.configurations().shape[1])
+    return np.unique(np.concatenate(list(q), 1), axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def _initialize_instruments(chain: Chain, item: Measurement) -> Measurement:
+    """Initialize the instrument of a measurement from the subset whose start most samples agree with."""
+    best = item.initialized(chain)
+    if not item.instrument_parameters or not len(item.rows):
+        return best
+    frames = chain.forward_kinematics(item.configurations())
+    labels = _configurations(item)
+    n_labels = int(labels.max()) + 1
+    rows_per_label = item.residual_dim * len(labels) / n_labels
+    least = int(np.ceil(len(item.instrument_parameters) / rows_per_label)) + 1
+    rng = np.random.default_rng(0)
+    best_misfit = _median_square(best, frames)
+    for i in range(N_STARTS):
+        size = max(MIN_CONFIGURATIONS, least if i % 2 else 2 * least)
+        if size >= n_labels:
+            break
+        subset = np.isin(labels, rng.permutation(n_labels)[:size])
+        try:
+            start = item.initialized_from(chain, subset)
+        except DhcalError:
+            # The subset does not determine the instrument.
+            continue
+        misfit = _median_square(start, frames)
+        if misfit < best_misfit:
+            best, best_misfit = start, misfit
+    return best
+
+
+def _median_square(item: Measurement, frames: FrameBatch) -> float:
+    """Return the median of the squared whitened residuals of the samples; infinite if it is undefined."""
+    u = np.array([parameter.nominal for parameter in item.instrument_parameters])
+    median = float(np.median(np.sum(item.residual(frames, u) ** 2, 0)))
+    return median if np.isfinite(median) else np.inf
+
+
+def _fit_majority(problem: Problem) -> Array | None:
+    """Fit the majority that agrees best; return the solution (p+s,), None if the samples are too few."""
+    x = np.zeros(len(problem.weights))
+    n_rows = sum(item.residual_dim * len(item.rows) for item in problem.data)
+    groups, last = [], 0
+    for item in problem.data:
+        groups.append(_configurations(item) + last)
+        last += int(groups[-1].max(initial=-1)) + 1
+    bounds = np.cumsum([len(item.rows) for item in problem.data])[:-1]
+    previous = np.empty(0)
+    for _ in range(MAX_LINEARIZATIONS):
+        system = linearize_and_factor(problem, x, small_angle=False)
+        n_determined = rank(system.r)
+        if not 0 < 2 * n_determined <= n_rows:
+            return None
+        rows = linearize_rows(problem, x, posterior_sqrt_covariance(system, problem.weights)[0])
+        majority = search_majorities(rows, np.concatenate(groups), n_determined)[0][0]
+        if np.array_equal(majority, previous):
+            break
+        previous = majority
+        masks = np.split(majority, bounds)
+        chosen = problem.with_data([item.take(m) for item, m in zip(problem.data, masks, strict=True)])
+        x = minimize(chosen, "lm", x, MAX_ITERATIONS, loose=True).x
+    return x
