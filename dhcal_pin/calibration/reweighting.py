@@ -175,6 +175,9 @@ def _next_round(
     elif stage in robust.WEIGHT_FUNCTIONS:
         residuals = studentized_residuals(problem, solution, weighted, weights)
         weights, change = robust.update_weights(weights, residuals, stage, state.weight_change)
+        weights = [
+            robust.reject_groups(w, t, item) for w, t, item in zip(weights, residuals, fit.data, strict=True)
+        ]
     if any((w != 1).any() for w in weights):
         weighted = tuple(item.with_weights(w) for item, w in zip(weighted, weights, strict=True))
     priors = update_prior_scales(problem, solution, groups)

@@ -24,6 +24,9 @@ FLATNESS = 1e-3
 MIN_FLAT_POINTS, MIN_POINTS = 4, 6
 # Steps of the refinement, and the first damping.
 _N_STEPS, _DAMPING = 30, 1e-3
+# Number of random subsets, distance relative to the size of the image of the board that is never too large,
+# and distance of a wrong point as a multiple of the median.
+_N_SUBSETS, _GOOD_RATIO, _OUTLIER_RATIO = 60, 0.01, 5.0
 # Relative change of the cost that ends the refinement.
 _COST_RTOL = 1e-10
 
@@ -67,6 +70,47 @@ def direct_linear_transform(source: Array, target: Array) -> Array:
     )
     solution = np.linalg.svd(rows)[2][-1].reshape(3, -1)
     return np.linalg.solve(normalize_target, solution @ normalize_source)
+
+
+def agreeing_points(points: Array, image: Array) -> Array:
+    """Find the image points that agree with a projective map of most points (least median of squares).
+
+    Args:
+        points: Points in their own frame, shape (m, 3) [m].
+        image: Image points in any unit, shape (m, 2).
+
+    Returns:
+        Whether each point agrees, shape (m,); all of them if one map fits them all or they are too few.
+    """
+    everything = np.ones(len(points), bool)
+    if len(points) <= MIN_FLAT_POINTS:
+        return everything
+    centre = points.mean(0)
+    _, extent, axes = np.linalg.svd(points - centre)
+    is_flat = extent[2] <= FLATNESS * extent[0]
+    least = MIN_FLAT_POINTS if is_flat else MIN_POINTS
+    if extent[1] <= FLATNESS * extent[0] or len(points) <= least:
+        return everything
+    source = ((points - centre) @ axes.T)[:, : 2 if is_flat else 3]
+    limit = _GOOD_RATIO * float(np.median(np.linalg.norm(image - np.median(image, 0), axis=1)))
+    if np.sqrt(np.mean(_transfer_distances(source, image, everything) ** 2)) <= limit:
+        return everything
+    rng = np.random.default_rng(0)
+    fits = [
+        _transfer_distances(source, image, rng.permutation(len(points))[:least]) for _ in range(_N_SUBSETS)
+    ]
+    best = min(fits, key=lambda distances: float(np.median(distances)))
+    is_agreeing = best <= max(_OUTLIER_RATIO * float(np.median(best)), limit)
+    return is_agreeing if is_agreeing.sum() > least else everything
+
+
+def _transfer_distances(source: Array, image: Array, chosen: Array) -> Array:
+    """Return the distances (m,) of image points from the projective map that fits the chosen points."""
+    matrix = direct_linear_transform(source[chosen], image[chosen])
+    mapped = np.column_stack([source, np.ones(len(source))]) @ matrix.T
+    with np.errstate(all="ignore"):
+        distances = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - image, axis=1)
+    return np.where(np.isfinite(distances), distances, np.inf)
 
 
 def estimate_pose(points: Array, image: Array) -> tuple[Array, float] | None:

@@ -63,6 +63,8 @@ REJECTED, FAR_REJECTED = "reject", "reject_far"
 # Outliers are set apart if at most this many samples per outlier lie between the thresholds, plus one.
 MAX_BETWEEN = 0.2
 
+# Ratio of the standard deviation of a normal distribution to its median absolute deviation.
+MAD_TO_STD = 1.4826
 # Smallest variance of a whitened residual, relative to its noise; below it the fit reproduces the sample.
 MIN_VARIANCE = 1e-3
 # Stages without a weight function: search for good samples, which chooses the last stage
@@ -233,6 +235,39 @@ def sample_weights(t: Array, stage: str) -> Array:
     """
     weight_function, cutoff = WEIGHT_FUNCTIONS[stage]
     return np.maximum(np.where(t > cutoff, 0.0, weight_function(t)), ZERO_WEIGHT)
+
+
+def reject_groups(weights: Array, t: Array, item: Measurement) -> Array:
+    """Reject all samples of each group that is wrong as a whole, such as an image of another configuration.
+
+    Some of its samples are rejected then, and the residuals of the others are larger than in other groups.
+    Good groups differ, too, where their samples share an error of the arm. The spread of all groups is
+    therefore estimated by the median absolute deviation.
+
+    Args:
+        weights: Weights of the samples of a measurement, shape (m,).
+        t: Their standardized residuals, shape (m,).
+        item: The measurement.
+
+    Returns:
+        Weights of shape (m,), ZERO_WEIGHT in all samples of wrong groups.
+    """
+    is_kept = weights > ZERO_WEIGHT
+    if is_kept.all():
+        return weights
+    k, labels = item.residual_dim, item.sample_groups
+    n_kept = np.bincount(labels, is_kept)
+    is_judged = n_kept > 0
+    # Inverse of `standardize_ratios`.
+    ratios = np.fmax(t * np.sqrt(2 / (9 * k)) + 1 - 2 / (9 * k), 0.0) ** 3
+    means = np.bincount(labels, ratios * is_kept)[is_judged] / n_kept[is_judged]
+    scores = standardize_ratios(means, k * n_kept[is_judged])
+    deviations = scores - np.median(scores)
+    spread = max(1.0, MAD_TO_STD * float(np.median(np.abs(deviations))))
+    is_wrong = np.zeros(len(n_kept), bool)
+    is_wrong[is_judged] = deviations > REJECTION_THRESHOLD * spread
+    is_wrong &= n_kept < np.bincount(labels)
+    return np.where(is_wrong[labels], ZERO_WEIGHT, weights)
 
 
 @dataclass(frozen=True, eq=False)

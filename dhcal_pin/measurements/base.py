@@ -207,6 +207,17 @@ class Measurement(ABC):
         """Return the joint positions (c·m, n) of all samples, one configuration after the other."""
         return self.q
 
+    @property
+    def sample_groups(self) -> Array:
+        """Label of the group of each sample, (m,): samples that are often wrong together.
+
+        These are the samples of one configuration.
+        """
+        if not len(self.rows):
+            return np.zeros(0, int)
+        parts = np.split(self.configurations(), max(self.configurations_per_row, 1))
+        return np.unique(np.concatenate(parts, 1), axis=0, return_inverse=True)[1].reshape(-1)
+
     def initialized(self, chain: Chain) -> Self:
         """Return a copy with initial values of the instrument parameters.
 

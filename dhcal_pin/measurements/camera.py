@@ -346,6 +346,11 @@ class CameraCorners(Measurement):
         return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
 
     @property
+    def sample_groups(self) -> Array:
+        """Number of each sample's image, (m,): a wrong image is wrong in all its corners."""
+        return self.image
+
+    @property
     def residual_dim(self) -> int:
         """Number of residuals per sample: u and v."""
         return 2

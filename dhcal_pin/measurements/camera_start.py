@@ -21,7 +21,7 @@ from .._typing import Array
 from ..cameras.boards import Board
 from ..cameras.hand_eye import mean_pose, solve_hand_eye
 from ..cameras.intrinsics import estimate_intrinsics
-from ..cameras.pose_from_points import FLATNESS, estimate_pose
+from ..cameras.pose_from_points import FLATNESS, agreeing_points, estimate_pose
 from ..cameras.rig import Camera
 from ..exceptions import NotObservableError
 from ..robot.chain import Chain
@@ -84,11 +84,18 @@ def _stated_poses(entries: Sequence[Camera] | Sequence[Board], mounts: Sequence[
 
 
 def _images(item: CameraCorners) -> list[Array]:
-    """Return the samples of each image of one board."""
+    """Return the samples of each image of one board, without those that disagree with most others."""
     keys = np.column_stack([item.image, item.board])
     label = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
     order = np.argsort(label, kind="stable")
-    return np.split(order, np.cumsum(np.bincount(label))[:-1])
+    images = np.split(order, np.cumsum(np.bincount(label))[:-1])
+    return [samples[_agreeing(item, samples)] for samples in images if len(samples)]
+
+
+def _agreeing(item: CameraCorners, samples: Array) -> Array:
+    """Return which samples of an image of one board belong to the same view of the board."""
+    board = item.rig.boards[item.board[samples[0]]]
+    return agreeing_points(board.points[item.corner[samples]], item.values[samples])
 
 
 def _flat_views(item: CameraCorners, camera: int) -> list[tuple[Array, Array]]:

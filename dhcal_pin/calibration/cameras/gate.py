@@ -32,6 +32,7 @@ from ...estimation.error_model import ErrorModel
 from ...estimation.priors import PriorGroups, effective_parameters
 from ...estimation.problem import Problem
 from ...estimation.qr import TriangularSystem, append_priors, posterior_sqrt_covariance, pseudo_inverse
+from ...estimation.robust import ZERO_WEIGHT
 from ...estimation.solver import minimize
 from ...measurements.base import Measurement
 from ...measurements.camera import POINTS_SET, CameraCorners
@@ -152,7 +153,8 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int) -> tuple[Fit,
 
 def _gated(fit: Fit, groups: PriorGroups, max_iterations: int) -> tuple[Fit, Fit, Gate]:
     """Return the final fit, the fit with the arm estimated, and the gate."""
-    n_configurations = len(np.unique(configuration_groups(fit.data)))
+    is_good = np.concatenate([weights > ZERO_WEIGHT for weights in fit.weights])
+    n_configurations = len(np.unique(configuration_groups(fit.data)[is_good]))
     folds = cluster_folds(fit.problem.data)
     nominal = _without_arm(fit, max_iterations)
     is_right = not residual_jitter(nominal).is_significant

@@ -84,7 +84,7 @@ def estimate_jitter(
     images: list[tuple[Array, Array]] = []
     is_stated = True
     for item, weight in zip(data, weights, strict=True):
-        if not isinstance(item, CameraCorners):
+        if not isinstance(item, CameraCorners) or not (weight > 0.5).any():
             continue
         inliers = item.take(weight > 0.5)
         plain = inliers.with_jitter(np.zeros_like(inliers.jitter))

@@ -67,7 +67,7 @@ def find_initial_outliers(
     """
     all_good = [np.zeros(len(item.rows), bool) for item in data]
     frames = errors.only_frames() or ErrorModel(errors.chain, ())
-    drawn = [_draw_configurations(item) for item in data]
+    drawn = [_draw_groups(item) for item in data]
     parts = [item.take(mask) for item, mask in zip(data, drawn, strict=True)]
     starts = [_initialize_instruments(frames.chain, part) for part in parts]
     parameters = [p for p in merge_instrument_parameters(starts) if p.name not in known]
@@ -97,23 +97,15 @@ def find_initial_outliers(
     return out
 
 
-def _draw_configurations(item: Measurement) -> Array:
-    """Draw samples of whole configurations at random, at most about MAX_SAMPLES; return their mask (m,)."""
+def _draw_groups(item: Measurement) -> Array:
+    """Draw samples of whole groups at random, at most about MAX_SAMPLES; return their mask (m,)."""
     m = len(item.rows)
     if m <= MAX_SAMPLES:
         return np.ones(m, bool)
-    labels = _configurations(item)
+    labels = item.sample_groups
     order = np.random.default_rng(0).permutation(labels.max() + 1)
     counts = np.cumsum(np.bincount(labels)[order])
     return np.isin(labels, order[: max(1, int(np.searchsorted(counts, MAX_SAMPLES, "right")))])
-
-
-def _configurations(item: Measurement) -> Array:
-    """Label the samples of a measurement by their configuration, shape (m,)."""
-    if not len(item.rows):
-        return np.zeros(0, int)
-    q = item.configurations().reshape(-1, len(item.rows), item.configurations().shape[1])
-    return np.unique(np.concatenate(list(q), 1), axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def _initialize_instruments(chain: Chain, item: Measurement) -> Measurement:
@@ -122,7 +114,7 @@ def _initialize_instruments(chain: Chain, item: Measurement) -> Measurement:
     if not item.instrument_parameters or not len(item.rows):
         return best
     frames = chain.forward_kinematics(item.configurations())
-    labels = _configurations(item)
+    labels = item.sample_groups
     n_labels = int(labels.max()) + 1
     rows_per_label = item.residual_dim * len(labels) / n_labels
     least = int(np.ceil(len(item.instrument_parameters) / rows_per_label)) + 1
@@ -157,7 +149,7 @@ def _fit_majority(problem: Problem) -> Array | None:
     n_rows = sum(item.residual_dim * len(item.rows) for item in problem.data)
     groups, last = [], 0
     for item in problem.data:
-        groups.append(_configurations(item) + last)
+        groups.append(item.sample_groups + last)
         last += int(groups[-1].max(initial=-1)) + 1
     bounds = np.cumsum([len(item.rows) for item in problem.data])[:-1]
     previous = np.empty(0)

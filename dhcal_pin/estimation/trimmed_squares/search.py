@@ -108,14 +108,29 @@ class LinearizedRows:
         return np.linalg.solve(information, right[..., None])[..., 0]
 
     def total_information(self, weights: Array, scales: Array) -> Array:
-        """Compute the information of weighted samples and priors, shape (a, u, u); see `solve`."""
+        """Compute the information of weighted samples and priors; see `solve`.
+
+        Args:
+            weights: Weights of the samples in each fit, shape (a, m).
+            scales: Noise scales of the classes in each fit, shape (a, c).
+
+        Returns:
+            Information matrices, shape (a, u, u).
+        """
         u = len(self.prior_right)
         block_weights = weights[:, self.sample] / scales[:, self.noise_class] ** 2
         information = (block_weights @ self.gram).reshape(-1, u, u) + self.information
         return information + MIN_INFORMATION * np.eye(u)
 
     def residual_squares(self, y: Array) -> Array:
-        """Compute the sum of squared residuals of each block, shape (a, b), at solutions of shape (a, u)."""
+        """Compute the sum of squared residuals of each block.
+
+        Args:
+            y: Solutions, shape (a, u).
+
+        Returns:
+            Sums, shape (a, b).
+        """
         products = np.einsum("au,av->auv", y, y).reshape(len(y), -1)
         return np.fmax(self.squares - 2 * y @ self.right.T + products @ self.gram.T, 0.0)
 
@@ -142,7 +157,15 @@ class LinearizedRows:
         return scales
 
     def distances(self, squares: Array, scales: Array) -> Array:
-        """Compute the sum of squared residuals of each sample relative to the noise, shape (a, m)."""
+        """Compute the sum of squared residuals of each sample relative to the noise.
+
+        Args:
+            squares: Sums of squared residuals of the blocks, shape (a, b).
+            scales: Noise scales of the classes, shape (a, c).
+
+        Returns:
+            Sums, shape (a, m).
+        """
         scaled = squares / scales[:, self.noise_class] ** 2
         order = np.argsort(self.sample, kind="stable")
         first = np.searchsorted(self.sample[order], np.arange(self.n_samples))
