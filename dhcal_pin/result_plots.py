@@ -230,7 +230,7 @@ class ResultPlots:
             *fit.verdict.reasons,
             headline(fit.comparisons).text,
             *generalization_lines(fit.generalization, fit.comparisons),
-            f"{count} parameters from {fit.n_samples} samples; {fit.rank} combinations are identifiable; "
+            f"{count} parameters from {fit.sample_count}; {fit.rank} combinations are identifiable; "
             f"{'converged' if fit.converged else 'NOT converged'} after {fit.iterations} iterations.",
         ]
         largest = sorted(

@@ -605,26 +605,29 @@ def extend(
         raise UnknownNameError(
             f"unknown extension {unknown[0]!r}; choose from {', '.join(EXTENSIONS)}, or auto or none"
         )
-    n_configurations = len(np.unique(configuration_groups(fit.data)))
+    judged = fit.without_rejected()
+    n_configurations = len(np.unique(configuration_groups(judged.data)))
     missing = _missing_parameters(fit.problem.errors, families)
-    if n_configurations < MIN_CONFIGURATIONS or not _noise(fit) > 0:
+    if n_configurations < MIN_CONFIGURATIONS or not _noise(judged) > 0:
         return fit, Extension(n_configurations=n_configurations)
     report = progress or _ignore
     report(PHASE, 1, _N_STEPS)
-    trials, model, random_ratio = _select_families(fit, missing)
+    trials, model, random_ratio = _select_families(judged, missing)
     selected = {name: missing[name] for name in model.widths}
     report(PHASE, 2, _N_STEPS)
-    extended, noise = _fit_selected(fit, selected, model, max_iterations) if selected else (fit, _noise(fit))
+    extended, noise = fit, _noise(judged)
+    if selected:
+        extended, noise = _fit_selected(fit, selected, model, max_iterations)
     report(PHASE, 3, _N_STEPS)
     temperature, scale, region_ratio = 1.0, 1.0, float("nan")
     if _are_residuals_correlated(extended, noise):
         is_prismatic = extended.problem.errors.chain.is_prismatic
-        temperature = design_effect(different_configurations(fit.data)[0], is_prismatic)
+        temperature = design_effect(different_configurations(judged.data)[0], is_prismatic)
     if not selected and temperature == 1:
         return fit, Extension(trials, n_configurations=n_configurations)
-    if regions := _Regions(extended.problem, extended.solution.x, noise):
+    if regions := _Regions(extended.without_rejected().problem, extended.solution.x, noise):
         errors = regions.errors(temperature)
-        geometry = _Regions(fit.problem, fit.solution.x, _noise(fit))
+        geometry = _Regions(judged.problem, fit.solution.x, _noise(judged))
         region_ratio = errors.rms / geometry.errors(1.0).rms
         if temperature > 1:
             scale = float(np.clip(errors.prediction_scale, MIN_PREDICTION_SCALE, MAX_PREDICTION_SCALE))
@@ -677,11 +680,13 @@ def _fit_selected(
     problem = problem.with_data([item.with_weights(w) for item, w in zip(problem.data, trimmed, strict=True)])
     selected_problem = problem.with_prior_weights(selected_problem.weights)
     solution = minimize(selected_problem, "lm", solution.x, max_iterations, loose=True)
-    # `_Candidates` divides the expected weights of its problem by the widths.
-    model = _Candidates(problem, solution.x, family, solution.system).maximize_evidence(model.widths)
-    problem = problem.with_prior_weights(_prior_weights(problem, family, model.widths))
     weights = tuple(np.maximum(a * b, robust.ZERO_WEIGHT) for a, b in zip(fit.weights, trimmed, strict=True))
-    return Fit(fit.data, problem, solution, weights, fit.iterations, fit.stage), model.noise
+    fitted = Fit(fit.data, problem, solution, weights, fit.iterations, fit.stage)
+    # `_Candidates` divides the expected weights of its problem by the widths.
+    judged = fitted.without_rejected().problem
+    model = _Candidates(judged, solution.x, family, solution.system).maximize_evidence(model.widths)
+    problem = problem.with_prior_weights(_prior_weights(problem, family, model.widths))
+    return replace(fitted, problem=problem), model.noise
 
 
 def _outlier_weights(problem: Problem, x: Array, previous: Sequence[Array]) -> tuple[Array, ...]:
@@ -795,7 +800,8 @@ def family_hint(fit: Result) -> str:
     Returns:
         One sentence; empty without a significant family.
     """
-    data = [item.take(np.s_[:: max(1, -(-len(item.rows) // MAX_HINT_SAMPLES))]) for item in fit.problem.data]
+    data = [item.take(w > robust.ZERO_WEIGHT) for item, w in zip(fit.problem.data, fit.weights, strict=True)]
+    data = [item.take(np.s_[:: max(1, -(-len(item.rows) // MAX_HINT_SAMPLES))]) for item in data]
     missing = _missing_parameters(fit.errors, [name for name in EXTENSIONS if name != CURVES])
     problem, x, family = _with_families(replace(fit.problem, data=tuple(data)), fit.x, missing)
     system, n_rows = linearize_and_factor(problem, x, small_angle=False), count_rows(problem)

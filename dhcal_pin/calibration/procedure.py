@@ -170,7 +170,9 @@ def calibrate(
                 input_warnings=tuple(warnings),
                 camera_stages=(*axis_stages(exchanges), *stages),
             )
-        shrinkage_factor = compute_shrinkage_factor(fit.problem, fit.solution, groups.groups())
+        shrinkage_factor = compute_shrinkage_factor(
+            fit.without_rejected().problem, fit.solution, groups.groups()
+        )
     result = _make_result(fit, shrinkage_factor, holdout, method)
     # Residuals of mixed-up measurements say nothing about other errors.
     if not families or shrinkage_factor < 1 or result.diagnosis.hypotheses:

@@ -188,8 +188,19 @@ class Result(ResultPlots):
 
     @property
     def n_samples(self) -> int:
-        """Number of fitted samples."""
+        """Number of fitted samples, rejected ones included."""
         return sum(len(d.rows) for d in self.data)
+
+    @property
+    def n_inliers(self) -> int:
+        """Number of fitted samples without rejected ones."""
+        return sum(len(item.rows) for item in self.inliers)
+
+    @property
+    def sample_count(self) -> str:
+        """Number of samples that the fit used, such as "60 samples" or "57 of 60 samples"."""
+        used = "" if self.n_inliers == self.n_samples else f"{self.n_inliers} of "
+        return f"{used}{self.n_samples} samples"
 
     @property
     def rank(self) -> int:
@@ -204,7 +215,7 @@ class Result(ResultPlots):
     @property
     def observability_indices(self) -> dict[str, float]:
         """Observability indices O1 to O5; see `identifiability.observability_indices`."""
-        return observability.observability_indices(self.solution.system.r, self.n_samples)
+        return observability.observability_indices(self.solution.system.r, self.n_inliers)
 
     @cached_property
     def unobservable(self) -> list[str]:
@@ -632,7 +643,7 @@ class Result(ResultPlots):
         head = summary.headline(self.comparisons)
         label = summary.GROUP_LABELS[head.group]
         return (
-            f"Result({len(self.parameters)} parameters, {self.n_samples} samples, "
+            f"Result({len(self.parameters)} parameters, {self.sample_count}, "
             f"RMS {label} {head.before} before, {head.after} after, {head.comparison.title})"
         )
 

@@ -84,6 +84,20 @@ class Fit:
         """Number of iterations of all solutions."""
         return self.previous_iterations + self.solution.iterations
 
+    def without_rejected(self) -> Fit:
+        """Return the fit without rejected samples, which are not evidence of the noise."""
+        masks = [w > robust.ZERO_WEIGHT for w in self.weights]
+        if all(mask.all() for mask in masks):
+            return self
+        return replace(
+            self,
+            data=tuple(item.take(mask) for item, mask in zip(self.data, masks, strict=True)),
+            problem=self.problem.with_data(
+                [item.take(mask) for item, mask in zip(self.problem.data, masks, strict=True)]
+            ),
+            weights=tuple(w[mask] for w, mask in zip(self.weights, masks, strict=True)),
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class ReweightState:

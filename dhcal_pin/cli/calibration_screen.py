@@ -234,7 +234,7 @@ def _details(fit: Result) -> list[Block]:
         Block(definition_table(fit.estimates), has_space=True),
         Block(
             [
-                f"{state} after {fit.iterations} iterations; {fit.n_samples} samples; "
+                f"{state} after {fit.iterations} iterations; {fit.sample_count}; "
                 f"rank {fit.rank} of {len(fit.parameters)}; condition {fit.condition:.3g}",
                 *(text for text in fit.unobservable if text.startswith(EXPECTED)),
             ],

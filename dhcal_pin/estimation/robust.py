@@ -352,11 +352,16 @@ def studentized_residuals(
     if n_rows <= n_unknowns and n_rows <= qr.rank(solution.system.r):
         return [np.zeros(len(item.rows)) for item in data]
     chain = problem.errors.at(solution.x[: len(problem.errors.parameters)])
-    chunks = problem.with_data(data).map_chunks(
+    # Residuals of one image are whitened together. Rejected ones must not contribute to the others.
+    weighted = [
+        item if np.all(w == 1) else item.with_weights(w) for item, w in zip(data, weights, strict=True)
+    ]
+    chunks = problem.with_data(weighted).map_chunks(
         partial(chunk_residual, chain, problem.instruments(solution.x))
     )
     residuals = [
-        np.concatenate([np.empty((item.residual_dim, 0)), *_chunks_of(chunks, item)], 1) for item in data
+        np.concatenate([np.empty((item.residual_dim, 0)), *_chunks_of(chunks, item)], 1) / np.sqrt(w)
+        for item, w in zip(data, weights, strict=True)
     ]
     covariances = (
         residual_covariances(problem, solution, weights)

@@ -171,7 +171,7 @@ def warnings(context: ReportContext) -> list[str]:
     texts += summary.regressions(context.comparisons)
     if not np.isfinite(fit.unit_weight_std):
         texts.append(
-            f"{fit.n_samples} samples determine {fit.rank} directions in parameter space and leave no "
+            f"{fit.sample_count} determine {fit.rank} directions in parameter space and leave no "
             "redundancy; the measurement noise and the parameter uncertainties cannot be estimated."
         )
     if context.outliers:

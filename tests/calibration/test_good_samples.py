@@ -2,18 +2,37 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from robots import joint_sample, measured_arm, robot_file, with_random_frames
 
 from dhcal_pin.calibration import calibrate, good_samples
+from dhcal_pin.cameras.boards import Board
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.initialization import align
-from dhcal_pin.measurements import Noise, PointContact, Pose, Position, Wires
+from dhcal_pin.estimation.robust import ZERO_WEIGHT
+from dhcal_pin.estimation.trimmed_squares import find_initial_outliers
+from dhcal_pin.measurements import (
+    CameraCorners,
+    Noise,
+    PlaneContact,
+    PointContact,
+    Pose,
+    Position,
+    SphereContact,
+    Wires,
+)
+from dhcal_pin.measurements.camera import simulated_rig
+from dhcal_pin.measurements.mounting import mount_rig
 from dhcal_pin.robot import Chain
 
 SIGMA = 1e-4
 KINDS = {kind.kind: kind for kind in (Pose, Position, Wires, PointContact)}
+CONTACTS = (PointContact, PlaneContact, SphereContact)
+# Number of corners of the board, and pixels per metre at the robot.
+N_CORNERS, SCALE = 20, 1000.0
 
 
 def without_sigma(data):
@@ -22,7 +41,48 @@ def without_sigma(data):
         return Pose(data.q, data.poses)
     if isinstance(data, PointContact):
         return PointContact(data.q, [data.names[i] for i in data.label]).replace(values=data.values)
+    if isinstance(data, PlaneContact):
+        return PlaneContact(data.q).replace(values=data.values)
+    if isinstance(data, SphereContact):
+        return SphereContact(data.q, data.values[:, 0])
+    if isinstance(data, CameraCorners):
+        return data.replace(sigma=np.ones_like(data.sigma), has_stated_sigma=False)
     return type(data)(data.q, data.values)
+
+
+def half_a_metre_off(data, bad, is_clustered, rng):
+    """Move the given samples by about half a metre or 500 pixels, all alike if they are clustered."""
+    jump = rng.normal(size=(1 if is_clustered else len(bad), 3))
+    if isinstance(data, CameraCorners):
+        jump = jump[:, :2]
+    jump = np.broadcast_to(0.5 * jump / np.linalg.norm(jump, axis=1)[:, None], (len(bad), jump.shape[1]))
+    if isinstance(data, CameraCorners):
+        return moved(data, bad, SCALE * jump)
+    if not isinstance(data, CONTACTS):
+        return moved(data, bad, jump)
+    # The tool touches something else.
+    q = data.q.copy()
+    q[bad] += 0.4 * rng.normal(size=(1 if is_clustered else len(bad), q.shape[1]))
+    return data.replace(q=q)
+
+
+def images_of_a_flat_board(actual, q, rng):
+    """Return images of a board of 20 corners on the tool, by two cameras in turn."""
+    rig = simulated_rig(actual, q)
+    grid = np.stack(np.meshgrid(np.arange(5), np.arange(4), [0.0], indexing="ij"), -1).reshape(-1, 3)
+    points = 0.06 * (grid - grid.mean(0))
+    board = Board("target", "tip", "points", listed_points=points, pose=np.eye(4))
+    rig = mount_rig(replace(rig, boards={"target": board}), actual)
+    names = [rig.cameras[i % 2].name for i in range(len(q)) for _ in range(N_CORNERS)]
+    corner, repeated = np.tile(np.arange(N_CORNERS), len(q)), np.repeat(q, N_CORNERS, axis=0)
+    blank = CameraCorners(
+        repeated, np.full((len(corner), 2), 2048.0), corner, rig, names, None, SCALE * SIGMA
+    )
+    values = np.array([parameter.nominal for parameter in blank.instrument_parameters])
+    exact = blank.values - blank.errors(actual.forward_kinematics(blank.q), values)["pixels"]
+    unknown = replace(rig, cameras=tuple(replace(camera, pose=None) for camera in rig.cameras))
+    noisy = exact + SCALE * SIGMA * rng.normal(size=exact.shape)
+    return CameraCorners(repeated, noisy, corner, unknown, names, None, SCALE * SIGMA)
 
 
 def with_outliers(data, bad, is_clustered, rng):
@@ -51,7 +111,7 @@ def moved(data, bad, jump):
 def tool_error(fit, actual, q):
     """Return the RMS position error after alignment, and scaling if contacts do not determine the scale."""
     found, true = fit.chain.poses(q)[:, :3, 3], actual.poses(q)[:, :3, 3]
-    if isinstance(fit.data[0], PointContact):
+    if not fit.data[0].has_length_scale:
         found = found * np.linalg.norm(true - true.mean(0)) / np.linalg.norm(found - found.mean(0))
     return align(found, true)[1]
 
@@ -229,6 +289,80 @@ def test_residuals_that_look_like_noise_need_no_search(monkeypatch):
     fit = calibrate(chain, data.replace(poses=wrong), "minimal,base,tool", extend="none")
     assert searches
     assert fit.outliers[0].tolist() == [8]
+
+
+@pytest.mark.parametrize("is_clustered", [False, True])
+@pytest.mark.parametrize("kind", [Wires, PointContact, PlaneContact, SphereContact])
+def test_half_a_metre_in_lengths_and_contacts(kind, is_clustered):
+    """A least-squares start places base, tool and instruments where nothing says which samples are wrong."""
+    rng = np.random.default_rng([2, is_clustered])
+    chain = measured_arm("slide")
+    errors = select_parameters(chain, "minimal,base,tool")
+    sizes = [1e-3 if p.unit == "m" else 2e-3 for p in errors.parameters]
+    actual = errors.at(rng.normal(size=len(sizes)) * sizes)
+    clean = kind.simulate(actual, joint_sample(chain, 60, rng), Noise(SIGMA), rng)
+    # Four of the 15 contacts with each of the four points.
+    bad = np.sort(4 * rng.permutation(15)[:4, None] + np.arange(4), axis=None)
+    good = np.setdiff1d(np.arange(60), bad)
+    dirty = half_a_metre_off(clean, bad, is_clustered, rng)
+    q = joint_sample(chain, 200, rng)
+    for is_stated in (False, True):
+        items = (
+            (dirty, clean.take(good))
+            if is_stated
+            else (without_sigma(dirty), without_sigma(clean.take(good)))
+        )
+        fit = calibrate(chain, items[0], "minimal,base,tool", extend="none")
+        expected = calibrate(chain, items[1], "minimal,base,tool", extend="none", loss="linear")
+        assert np.isin(bad + 1, fit.outliers[0]).all()
+        assert np.setdiff1d(fit.outliers[0], bad + 1).size == 0
+        assert tool_error(fit, actual, q) <= 1.10 * tool_error(expected, actual, q)
+
+
+@pytest.mark.parametrize("is_by_image", [False, True])
+def test_wrong_corners_and_wrong_images(is_by_image):
+    """A quarter of the corners, or of the images with all their corners."""
+    rng = np.random.default_rng(3)
+    chain = measured_arm("slide")
+    errors = select_parameters(chain, "minimal")
+    sizes = [1e-3 if p.unit == "m" else 2e-3 for p in errors.parameters]
+    actual = errors.at(rng.normal(size=len(sizes)) * sizes)
+    q = joint_sample(chain, 30, rng)
+    clean = images_of_a_flat_board(actual, q, rng)
+    m = len(clean.rows)
+    if is_by_image:
+        images = np.sort(rng.permutation(30)[:8])
+        bad = (N_CORNERS * images[:, None] + np.arange(N_CORNERS)).ravel()
+        wrong = q.copy()
+        wrong[images, 1] += rng.choice([-0.2, -0.02, 0.02, 0.2], len(images))
+        dirty = clean.replace(q=np.repeat(wrong, N_CORNERS, axis=0))
+    else:
+        bad = np.sort(rng.permutation(m)[: m // 4])
+        dirty = half_a_metre_off(clean, bad, False, rng)
+    good = np.setdiff1d(np.arange(m), bad)
+    fit = calibrate(chain, without_sigma(dirty), "minimal,camera", extend="none")
+    expected = calibrate(chain, clean.take(good), "minimal,camera", extend="none", loss="linear")
+    assert np.isin(bad + 1, fit.outliers[0]).all()
+    assert np.setdiff1d(fit.outliers[0], bad + 1).size <= 0.01 * len(good)
+    q = joint_sample(chain, 200, rng)
+    assert tool_error(fit, actual, q) <= 1.10 * tool_error(expected, actual, q)
+    assert fit.sample_count == f"{m - np.sum(fit.weights[0] <= ZERO_WEIGHT)} of {m} samples"
+
+
+@pytest.mark.parametrize("kind", [*CONTACTS, Wires])
+def test_the_robust_start_keeps_the_digits_of_clean_data(kind):
+    rng = np.random.default_rng(8)
+    chain = measured_arm("slide")
+    data = kind.simulate(chain, joint_sample(chain, 40, rng), Noise(SIGMA, SIGMA), rng)
+    assert not any(
+        is_outlier.any()
+        for is_outlier in find_initial_outliers(select_parameters(chain, "minimal,base,tool"), [data], {})
+    )
+    fits = [
+        calibrate(chain, without_sigma(data), "minimal,base,tool", extend="none", loss=loss)
+        for loss in ("auto", "linear")
+    ]
+    np.testing.assert_array_equal(fits[0].x, fits[1].x)
 
 
 @pytest.mark.parametrize("is_clustered", [False, True])

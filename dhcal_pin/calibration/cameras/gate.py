@@ -168,7 +168,7 @@ def _gated(fit: Fit, groups: PriorGroups, max_iterations: int) -> tuple[Fit, Fit
     shared = _shared(fit, max_iterations)
     is_complete = not shared.jitter.is_significant
     # If the images share no displacement, their corners are independent, and none of them counts as too many.
-    share = 1.0 if is_complete else rows_per_displacement(fit.data)
+    share = 1.0 if is_complete else rows_per_displacement(fit.without_rejected().data)
     models = [(_independent(fit), share)] if is_complete else [(_independent(fit), share), (shared, 1.0)]
     trials = [
         _trial(model, groups, factor * temperature(n_configurations, CLOSED_SAMPLES), folds, max_iterations)
