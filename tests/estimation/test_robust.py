@@ -14,8 +14,10 @@ from dhcal_pin.estimation.robust import (
     KEPT,
     TRIMMED,
     WEIGHT_FUNCTIONS,
+    ZERO_WEIGHT,
     WeightChange,
     is_chi_square,
+    reject_groups,
     residual_covariances,
     standardized_residuals,
     update_weights,
@@ -197,6 +199,41 @@ def test_losses_name_their_stages_and_have_help_texts_of_one_line():
         assert set(loss.stages) <= {*WEIGHT_FUNCTIONS, TRIMMED, KEPT}
         assert 0 < len(loss.help) < 100
         assert "\n" not in loss.help
+
+
+def test_a_wrong_group_is_rejected_as_a_whole(sim_6dof_actual):
+    """Of 40 groups of ten samples, one is wrong as a whole, and another one has two wrong samples."""
+    rng = np.random.default_rng(0)
+    q = np.repeat(rng.uniform(-3, 3, (40, 6)), 10, axis=0)
+    data = Position.simulate(sim_6dof_actual, q, Noise(1e-4), rng)
+    residual = rng.normal(size=(3, 400))
+    residual[:, :10] += 3.0
+    residual[:, [20, 21]] += 100.0
+    t = standardized_residuals(residual)
+    weights = np.where(t > 3.5, ZERO_WEIGHT, 1.0)
+    assert 0 < np.sum(weights[:10] <= ZERO_WEIGHT) < 10
+    rejected = np.flatnonzero(reject_groups(weights, t, data) <= ZERO_WEIGHT)
+    np.testing.assert_array_equal(rejected, [*range(10), 20, 21])
+    # Groups in which no sample is rejected are kept, whatever their residuals are.
+    assert reject_groups(np.ones(400), t, data).all()
+
+
+def test_rejected_samples_are_no_evidence(sim_6dof, sim_6dof_actual):
+    """Noise, families, temperature and indices are those of a fit of the good samples alone."""
+    _, dirty, bad = with_outliers(Position, sim_6dof_actual, 5, m=80, fraction=0.3)
+    good = dirty.take(np.setdiff1d(np.arange(80), bad - 1))
+    fit, expected = (calibrate(sim_6dof, data, "dh", priors={"*": 1e-2}) for data in (dirty, good))
+    np.testing.assert_array_equal(fit.outliers[0], bad)
+    assert fit.sample_count == "56 of 80 samples"
+    assert expected.sample_count == "56 samples"
+    assert fit.extension.n_configurations == expected.extension.n_configurations
+    assert fit.extension.temperature == pytest.approx(expected.extension.temperature, rel=1e-6)
+    for found, wanted in zip(fit.extension.trials, expected.extension.trials, strict=True):
+        assert found.family == wanted.family
+        assert found.log_bayes_factor == pytest.approx(wanted.log_bayes_factor, rel=1e-3, abs=1e-2)
+    for name, value in expected.observability_indices.items():
+        assert fit.observability_indices[name] == pytest.approx(value, rel=1e-4), name
+    assert fit.unit_weight_std == pytest.approx(expected.unit_weight_std, rel=1e-4)
 
 
 @pytest.mark.parametrize("slope", [-0.5, -1.0, -2.0, -4.0, -7.0])
