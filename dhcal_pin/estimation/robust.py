@@ -178,12 +178,12 @@ def standardize_mean_squares(mean_squares: Array, k: int, is_good: Array | None 
     return standardize_ratios(mean_squares / scale, k)
 
 
-def standardize_ratios(ratios: Array, k: int) -> Array:
+def standardize_ratios(ratios: Array, k: int | Array) -> Array:
     """Transform mean squares of residuals relative to the noise to standardized residuals t.
 
     Args:
         ratios: Mean square of the k residuals of each sample over the variance of good ones, shape (m,).
-        k: Number of residuals per sample.
+        k: Number of residuals per sample, one for all or shape (m,).
 
     Returns:
         Standardized residuals of shape (m,).

@@ -369,7 +369,7 @@ def test_wrong_corners_and_wrong_images(is_by_image):
 def test_wrong_corners_and_images_in_many_trials(fraction, is_by_image):
     trials = [image_trial(fraction, is_by_image, seed)[0] for seed in range(10)]
     assert np.median([each[0] for each in trials]) <= (1.25 if fraction > 0.3 else 1.10)
-    _, n_found, n_bad, n_false, n_good = np.sum(trials, 0)
+    _, n_found, n_bad, n_false, n_good = np.sum(np.array(trials, float), 0)
     assert n_found >= 0.99 * n_bad
     assert n_false <= 0.01 * n_good
 

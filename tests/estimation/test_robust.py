@@ -226,6 +226,8 @@ def test_rejected_samples_are_no_evidence(sim_6dof, sim_6dof_actual):
     np.testing.assert_array_equal(fit.outliers[0], bad)
     assert fit.sample_count == "56 of 80 samples"
     assert expected.sample_count == "56 samples"
+    assert fit.extension
+    assert expected.extension
     assert fit.extension.n_configurations == expected.extension.n_configurations
     assert fit.extension.temperature == pytest.approx(expected.extension.temperature, rel=1e-6)
     for found, wanted in zip(fit.extension.trials, expected.extension.trials, strict=True):
