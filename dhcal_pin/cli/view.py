@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ..exceptions import InvalidArgumentError
-from .options import FIT_FRAMES, POSITIVE_INTEGER, ROBOT, add_urdf_options
+from .options import FIT_FRAMES, POSITIVE_INTEGER, RIG, ROBOT, add_urdf_options
 
 if TYPE_CHECKING:
-    from ..measurements import Measurement
+    from ..measurements import Measurement, MountedRig
     from ..robot import Chain
 
 EXAMPLE = "dhcal view ur10.urdf ur10_calibrated.urdf --tip tool0 --data laser.csv --html scene.html"
@@ -28,6 +28,14 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("calibrated", metavar="CALIBRATED.urdf", nargs="?", help="the same robot, calibrated")
     parser.add_argument(
         "--data", metavar="DATA", nargs="+", default=[], help="measurement CSV files to draw and play"
+    )
+    parser.add_argument(
+        "--rig",
+        **RIG
+        | {
+            "help": "cameras and boards to draw, with their poses (default: those of the calibrated robot); "
+            "needed to play image coordinates"
+        },
     )
     parser.add_argument(
         "--html", metavar="FILE", help="page to write (default: a temporary file, opened in the browser)"
@@ -88,7 +96,7 @@ def run(args: Namespace) -> int:
     robots = [args.nominal, *([args.calibrated] if args.calibrated else [])]
     sidecars = existing_sidecars(robots)
     page = args.html or os.path.join(tempfile.mkdtemp(prefix="dhcal-"), f"{robot_name(args.nominal)}.html")
-    require_writable_outputs([page], [*robots, *sidecars, *args.data])
+    require_writable_outputs([page], [*robots, *sidecars, *args.data, *([args.rig] if args.rig else [])])
     chains = [
         read_robot(
             path,
@@ -98,8 +106,9 @@ def run(args: Namespace) -> int:
         )
         for path in robots
     ]
-    data = [read_measurements(path, chains[0]) for path in args.data]
     sidecar = existing_sidecar(robots[-1])
+    rig = _rig(args.rig, sidecar, chains[-1])
+    data = [read_measurements(path, chains[0], rig=rig) for path in args.data]
     known = read_instrument(sidecar) if sidecar else {}
     predictor = read_uncertainty(sidecar, chains[-1]) if sidecar and len(chains) > 1 else None
     warnings = {}
@@ -113,6 +122,7 @@ def run(args: Namespace) -> int:
         return _serve_live(chains, data, args)
     text = scene.scene_html(
         *chains,
+        rig=rig,
         measurements=data,
         known=known,
         predictor=predictor,
@@ -125,6 +135,18 @@ def run(args: Namespace) -> int:
     if args.open or not args.html:
         console.open_page(page)
     return 0
+
+
+def _rig(path: str | None, sidecar: str | None, chain: Chain) -> MountedRig | None:
+    """Return the rig of a file, with poses of the sidecar where it has none, or that of the sidecar."""
+    from ..io.rig_file import read_calibrated_rig, read_rig, with_poses_of  # lazy import, as the following
+    from ..measurements import mount_rig
+
+    calibrated = read_calibrated_rig(sidecar) if sidecar else None
+    rig = read_rig(path) if path else calibrated
+    if rig is not None and calibrated is not None:
+        rig = with_poses_of(rig, calibrated)
+    return mount_rig(rig, chain) if rig else None
 
 
 def _serve_live(chains: Sequence[Chain], data: Sequence[Measurement], args: Namespace) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -13,6 +14,7 @@ from ..cameras.boards import BOARD_TYPES, Board
 from ..cameras.lens import FOCAL_AND_CENTRE, LENSES
 from ..cameras.rig import INTRINSICS_CHOICES, Camera, Rig
 from ..exceptions import FileFormatError, InvalidArgumentError, UnknownNameError
+from .tabular import MAX_SIDECAR_BYTES
 from .toml_table import TomlTable, is_number, pose_content, read_pose
 
 # Largest number of squares or tags along a side, and of pixels along a side of an image.
@@ -38,19 +40,51 @@ def read_rig(path: PathLike) -> Rig:
         FileFormatError: There is no camera or no board.
     """
     table = TomlTable.read(path)
-    entries = {}
-    for kind in ("camera", "board"):
-        outer = table.table(kind)
-        entries[kind] = [outer.table(name) for name in outer.keys()]
-        if not entries[kind]:
-            raise FileFormatError(f"{os.fspath(path)}: no [{kind}.NAME] table; expected at least one")
+    rig = _read_tables(table)
     table.finish()
-    cameras = [_read_camera(entry) for entry in entries["camera"]]
-    boards = [_read_board(entry) for entry in entries["board"]]
+    for kind, entries in (("camera", rig.cameras), ("board", rig.boards)):
+        if not entries:
+            raise FileFormatError(f"{os.fspath(path)}: no [{kind}.NAME] table; expected at least one")
+    return rig
+
+
+def read_calibrated_rig(path: PathLike) -> Rig | None:
+    """Read the cameras and boards of the sidecar of a calibrated robot.
+
+    Args:
+        path: Sidecar.
+
+    Returns:
+        The rig with the estimated poses; None if the robot was not calibrated with a camera.
+    """
+    rig = _read_tables(TomlTable.read(path, MAX_SIDECAR_BYTES))
+    return rig if rig.cameras and rig.boards else None
+
+
+def _read_tables(table: TomlTable) -> Rig:
+    """Return the cameras and boards of a rig file or of a sidecar."""
+    groups = [table.table(kind) for kind in ("camera", "board")]
+    cameras, boards = ([group.table(name) for name in group.keys()] for group in groups)
     return Rig(
-        {camera.name: camera for camera in cameras},
-        {board.name: board for board in boards},
-        os.fspath(path),
+        {camera.name: camera for camera in map(_read_camera, cameras)},
+        {board.name: board for board in map(_read_board, boards)},
+        os.fspath(table.path),
+    )
+
+
+def with_poses_of(rig: Rig, other: Rig) -> Rig:
+    """Return a rig whose entries without a pose have those of the same names in another rig.
+
+    Args:
+        rig: Cameras and boards.
+        other: Rig with poses and intrinsics, such as that of a sidecar.
+    """
+    return replace(
+        rig,
+        cameras={
+            name: other.cameras.get(name, e) if e.pose is None else e for name, e in rig.cameras.items()
+        },
+        boards={name: other.boards.get(name, e) if e.pose is None else e for name, e in rig.boards.items()},
     )
 
 

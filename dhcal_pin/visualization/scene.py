@@ -33,11 +33,13 @@ from ..calibration.result import Result
 from ..estimation.uncertainty import Predictor
 from ..exceptions import InvalidArgumentError
 from ..measurements.base import Measurement
+from ..measurements.mounting import MountedRig
 from ..robot.chain import Chain
 from ..robot.sampling import WorkspaceConstraints
 from ..robot.transmission import GravityLoads
 from .measured_samples import SETS, drawn_samples, measured_samples, sets_of
 from .meshes import obstacle_shapes, rows, visuals_of
+from .rig_lines import rig_lines
 from .subsampling import evenly_spaced_indices
 from .uncertainty_cells import UncertaintyCells, uncertainty_cells
 
@@ -83,6 +85,7 @@ def scene_html(
     known: Mapping[str, float] | None = None,
     predictor: Predictor | None = None,
     preview: Preview | None = None,
+    rig: MountedRig | None = None,
     title: str = "Robot calibration",
     package_dirs: Sequence[PathLike] | None = None,
     magnification: float = 1.0,
@@ -101,6 +104,8 @@ def scene_html(
             values.
         predictor: Source of the uncertainty of the tool position; by default the result.
         preview: Poses to play in place of `q`, drawn with the path of the tool, floor and obstacles.
+        rig: Cameras and boards whose poses are known, drawn as lines with the lines of sight to the boards;
+            by default those of the result.
         title: Heading of the page.
         package_dirs: Folders that contain the meshes of the URDF; by default those of `ros_packages`.
         magnification: Initial magnification of errors, from 1 to `MAX_MAGNIFICATION`.
@@ -121,7 +126,7 @@ def scene_html(
     nominal_known = known
     sets = None
     if isinstance(calibrated, Result):
-        predictor = predictor or calibrated
+        predictor, rig = predictor or calibrated, rig or calibrated.rig
         if measurements is None:
             measurements = [*calibrated.data, *calibrated.holdout]
             sets = sets_of(calibrated)
@@ -177,6 +182,7 @@ def scene_html(
         "sets": drawn.sets.tolist(),
         "files": drawn.files.tolist(),
         "lines": drawn.lines.tolist(),
+        "rig": rig_lines(rig, base, _reach(shown)) if rig else {"parts": [], "rays": []},
         "ellipsoids": ellipsoids,
         "cells": _cells_data(cells) if cells else None,
         "shapes": visuals.shapes,
@@ -191,6 +197,11 @@ def scene_html(
     }
     marks = "|".join(map(re.escape, replacements))
     return re.sub(marks, lambda mark: replacements[mark[0]], PAGE.read_text("utf-8"))
+
+
+def _reach(chain: Chain) -> float:
+    """Return the sum of the lengths of the links [m]."""
+    return float(np.linalg.norm(chain.origins[:, :3, 3], axis=1).sum())
 
 
 @dataclass(frozen=True)
