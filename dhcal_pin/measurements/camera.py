@@ -36,7 +36,8 @@ from ..cameras.boards import Board
 from ..cameras.rig import WORLD, Camera, Rig
 from ..exceptions import InvalidArgumentError
 from ..robot.chain import Chain
-from .base import POINT_PRIOR, InstrumentParameter, Measurement, Noise, format_sigma
+from .base import Measurement, Noise, format_sigma
+from .camera_parameters import POINTS_SET, POSE_NAMES, board_parameters, camera_parameters, rig_parameters
 from .camera_start import first_values
 from .columns import pixel_columns, text_column
 from .mounting import MountedRig, mount_rig
@@ -44,88 +45,11 @@ from .validation import validated_array, validated_joint_positions, validated_si
 
 # Standard deviation [px] of image coordinates that state none.
 PIXEL_SIGMA = 1.0
-# Prior standard deviation of the rotation of a camera or a board [rad]: any.
-ROTATION_PRIOR = 10.0
-# Prior standard deviations of focal lengths and image centre [px], and of distortion coefficients [1].
-PIXEL_PRIORS = {"prior": 50.0, "free": 1e5}
-DISTORTION_PRIORS = {"prior": 0.3, "free": 1e2}
-# Prior standard deviation of the corners of a board [m].
-BOARD_POINT_PRIOR = 1e-3
-# Names of the components of a pose.
-POSE_NAMES = ("x", "y", "z", "rx", "ry", "rz")
-# Name of the corners of boards among the parameter sets.
-POINTS_SET = "points"
-
 # Rows and velocity components of the terms: each image coordinate by all six velocities of the tool.
 _TERMS = (np.repeat([0, 1], 6), np.tile(np.arange(6), 2))
 # Set-up of simulations: distance of the cameras from the robot as a multiple of its reach, image scale [px/m]
 # at the robot, and half the diagonals of the board [m].
 _DISTANCE, _SCALE, _BOARD_SIZE = 1.5, 1000.0, 0.3
-
-
-def pose_parameters(prefix: str, pose: Array | None) -> list[InstrumentParameter]:
-    """Build the six parameters of the pose of a camera or a board.
-
-    Args:
-        prefix: First part of the names, such as `camera_wrist`.
-        pose: First guess, shape (4, 4) [m]; None if there is none.
-
-    Returns:
-        Position [m] and rotation vector [rad]; NaN without a guess.
-    """
-    values = np.full(6, np.nan)
-    if pose is not None:
-        values = np.concatenate([pose[:3, 3], se3.log3(pose[:3, :3])])
-    return [
-        InstrumentParameter(
-            f"{prefix}.{name}",
-            "m" if i < 3 else "rad",
-            float(value),
-            POINT_PRIOR if i < 3 else ROTATION_PRIOR,
-        )
-        for i, (name, value) in enumerate(zip(POSE_NAMES, values, strict=True))
-    ]
-
-
-def camera_parameters(camera: Camera) -> list[InstrumentParameter]:
-    """Build the parameters of a camera: its pose, and its lens unless that is fixed.
-
-    Args:
-        camera: Camera of a rig.
-
-    Returns:
-        Parameters in the order of u.
-    """
-    out = pose_parameters(f"camera_{camera.name}", camera.pose)
-    if camera.intrinsics != "fixed":
-        for i, (name, value) in enumerate(zip(camera.lens.names, camera.values, strict=True)):
-            priors = PIXEL_PRIORS if i < 4 else DISTORTION_PRIORS
-            unit = "px" if i < 4 else "1"
-            out.append(
-                InstrumentParameter(
-                    f"camera_{camera.name}.{name}", unit, float(value), priors[camera.intrinsics]
-                )
-            )
-    return out
-
-
-def board_parameters(board: Board) -> list[InstrumentParameter]:
-    """Build the parameters of a board: its pose, and its corners if they are not fixed.
-
-    Args:
-        board: Board of a rig.
-
-    Returns:
-        Parameters in the order of u.
-    """
-    out = pose_parameters(f"board_{board.name}", board.pose)
-    if board.has_free_points:
-        out += [
-            InstrumentParameter(f"board_{board.name}.p{i}{axis}", "m", float(value), BOARD_POINT_PRIOR)
-            for i, point in enumerate(board.points)
-            for axis, value in zip("xyz", point, strict=True)
-        ]
-    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,7 +149,7 @@ class CameraCorners(Measurement):
             corner=_corner_numbers(corner, rig, board_index),
             jitter=np.zeros((m, 2, 6)),
             has_stated_sigma=sigma is not None,
-            instrument_parameters=_all_parameters(rig),
+            instrument_parameters=rig_parameters(rig),
         )
         _require_opposite_ends(self)
         _require_inside_images(self)
@@ -261,7 +185,7 @@ class CameraCorners(Measurement):
         known = {p.name: p.nominal for p in self.instrument_parameters}
         parameters = tuple(
             replace(p, nominal=known[p.name]) if np.isfinite(known.get(p.name, np.nan)) else p
-            for p in _all_parameters(rig)
+            for p in rig_parameters(rig)
         )
         return self.replace(rig=rig, instrument_parameters=parameters)
 
@@ -281,7 +205,7 @@ class CameraCorners(Measurement):
         """Values of the parameters of poses and lenses that the rig states, by name [m, rad, px or 1]."""
         return {
             p.name: p.nominal
-            for p in _all_parameters(self.rig)
+            for p in rig_parameters(self.rig)
             if np.isfinite(p.nominal) and self.set_of(p.name) != POINTS_SET
         }
 
@@ -678,12 +602,6 @@ def _product(a: Array, b: Array) -> Array:
 def _cross(rows: Array, vectors: Array) -> Array:
     """Return rows·[v]× of rows (i, 3, m) and vectors (3, m)."""
     return np.cross(rows, vectors[None], axis=1)
-
-
-def _all_parameters(rig: MountedRig) -> tuple[InstrumentParameter, ...]:
-    """Return the parameters of all cameras, then of all boards."""
-    cameras = [parameter for camera in rig.cameras for parameter in camera_parameters(camera)]
-    return (*cameras, *(parameter for board in rig.boards for parameter in board_parameters(board)))
 
 
 def _numbers(names: Sequence[str] | None, known: Sequence[str], m: int, what: str) -> Array:

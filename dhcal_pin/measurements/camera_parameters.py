@@ -1,0 +1,102 @@
+"""Unknowns of cameras and boards: poses, lenses and corners, with their names, first values and priors."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .. import se3
+from .._typing import Array
+from ..cameras.boards import Board
+from ..cameras.rig import Camera
+from .base import POINT_PRIOR, InstrumentParameter
+from .mounting import MountedRig
+
+# Prior standard deviation of the rotation of a camera or a board [rad]: any.
+ROTATION_PRIOR = 10.0
+# Prior standard deviations of focal lengths and image centre [px], and of distortion coefficients [1].
+PIXEL_PRIORS = {"prior": 50.0, "free": 1e5}
+DISTORTION_PRIORS = {"prior": 0.3, "free": 1e2}
+# Prior standard deviation of the corners of a board [m].
+BOARD_POINT_PRIOR = 1e-3
+# Names of the components of a pose.
+POSE_NAMES = ("x", "y", "z", "rx", "ry", "rz")
+# Name of the corners of boards among the parameter sets.
+POINTS_SET = "points"
+
+
+def pose_parameters(prefix: str, pose: Array | None) -> list[InstrumentParameter]:
+    """Build the six parameters of the pose of a camera or a board.
+
+    Args:
+        prefix: First part of the names, such as `camera_wrist`.
+        pose: First guess, shape (4, 4) [m]; None if there is none.
+
+    Returns:
+        Position [m] and rotation vector [rad]; NaN without a guess.
+    """
+    values = np.full(6, np.nan)
+    if pose is not None:
+        values = np.concatenate([pose[:3, 3], se3.log3(pose[:3, :3])])
+    return [
+        InstrumentParameter(
+            f"{prefix}.{name}",
+            "m" if i < 3 else "rad",
+            float(value),
+            POINT_PRIOR if i < 3 else ROTATION_PRIOR,
+        )
+        for i, (name, value) in enumerate(zip(POSE_NAMES, values, strict=True))
+    ]
+
+
+def camera_parameters(camera: Camera) -> list[InstrumentParameter]:
+    """Build the parameters of a camera: its pose, and its lens unless that is fixed.
+
+    Args:
+        camera: Camera of a rig.
+
+    Returns:
+        Parameters in the order of u.
+    """
+    out = pose_parameters(f"camera_{camera.name}", camera.pose)
+    if camera.intrinsics != "fixed":
+        for i, (name, value) in enumerate(zip(camera.lens.names, camera.values, strict=True)):
+            priors = PIXEL_PRIORS if i < 4 else DISTORTION_PRIORS
+            unit = "px" if i < 4 else "1"
+            out.append(
+                InstrumentParameter(
+                    f"camera_{camera.name}.{name}", unit, float(value), priors[camera.intrinsics]
+                )
+            )
+    return out
+
+
+def board_parameters(board: Board) -> list[InstrumentParameter]:
+    """Build the parameters of a board: its pose, and its corners if they are not fixed.
+
+    Args:
+        board: Board of a rig.
+
+    Returns:
+        Parameters in the order of u.
+    """
+    out = pose_parameters(f"board_{board.name}", board.pose)
+    if board.has_free_points:
+        out += [
+            InstrumentParameter(f"board_{board.name}.p{i}{axis}", "m", float(value), BOARD_POINT_PRIOR)
+            for i, point in enumerate(board.points)
+            for axis, value in zip("xyz", point, strict=True)
+        ]
+    return out
+
+
+def rig_parameters(rig: MountedRig) -> tuple[InstrumentParameter, ...]:
+    """Build the parameters of all cameras, then of all boards.
+
+    Args:
+        rig: Cameras and boards on a chain.
+
+    Returns:
+        Parameters in the order of u.
+    """
+    cameras = [parameter for camera in rig.cameras for parameter in camera_parameters(camera)]
+    return (*cameras, *(parameter for board in rig.boards for parameter in board_parameters(board)))
