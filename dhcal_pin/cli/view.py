@@ -31,11 +31,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     parser.add_argument(
         "--rig",
-        **RIG
-        | {
-            "help": "cameras and boards to draw, with their poses (default: those of the calibrated robot); "
-            "needed to play image coordinates"
-        },
+        metavar=RIG["metavar"],
+        help="cameras and boards to draw, with their poses (default: those of the calibrated robot); needed "
+        "to play image coordinates",
     )
     parser.add_argument(
         "--html", metavar="FILE", help="page to write (default: a temporary file, opened in the browser)"

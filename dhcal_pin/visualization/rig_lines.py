@@ -47,10 +47,10 @@ def rig_lines(rig: MountedRig, base: Array, size: float) -> dict[str, Any]:
     parts, anchors = [], []
     for name, moves, pose, segments, points in (*cameras, *boards):
         # The page draws in the frame of the base link.
-        placed = pose if moves else se3.inverse(base) @ pose
-        ends = segments.reshape(-1, 3) @ placed[:3, :3].T + placed[:3, 3]
+        in_frame = pose if moves else se3.inverse(base) @ pose
+        ends = segments.reshape(-1, 3) @ in_frame[:3, :3].T + in_frame[:3, 3]
         parts.append({"name": name, "moves": bool(moves), "segments": np.round(ends, 6).tolist()})
-        anchors.append(np.round(points @ placed[:3, :3].T + placed[:3, 3], 6))
+        anchors.append(np.round(points @ in_frame[:3, :3].T + in_frame[:3, 3], 6))
     rays = [
         {
             "camera": i,
