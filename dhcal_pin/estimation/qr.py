@@ -320,6 +320,8 @@ def posterior_sqrt_covariance(system: TriangularSystem, weights: Array) -> tuple
         Square root S of the covariance, shape (p, r), and an orthonormal basis of the directions that neither
         data nor priors determine, shape (p, p-r).
     """
+    if not len(weights):
+        return np.empty((0, 0)), np.empty((0, 0))
     full = append_priors(system, weights, 0.0).r
     if _is_well_conditioned(full):
         return lapack.dtrtri(full)[0], np.empty((len(weights), 0))

@@ -190,6 +190,21 @@ def test_stages_show_a_board_that_is_not_as_stated(has_free_points):
         assert np.std(errors[0] - errors[1]) < 0.2 * np.std(errors[2] - errors[1])
 
 
+def test_a_known_rig_judges_the_arm_alone():
+    """All poses and lenses are held at the values of the rig: without the arm nothing is unknown."""
+    rng = np.random.default_rng(9)
+    chain = ARMS["ur10"]()
+    truth = wrong_arm(chain, 3e-3, rng)
+    setup = simulate(chain, truth, rng, is_on_wrist=False, n_images=40, sigma=0.2)
+    data = setup.images.replace(rig=setup.exact.rig, instrument_parameters=setup.exact.instrument_parameters)
+    fit = dh.calibrate(chain, data, "placement", loss="linear")
+    assert [stage.name for stage in fit.camera_stages][-1] == "arm"
+    assert fit.camera_stages[-1].is_kept
+    assert fit.comparisons[-1].after["residual_rms"] < 0.3
+    kept = dh.calibrate(chain, data, "board", loss="linear")
+    assert kept.errors.parameters == ()
+
+
 def test_hand_eye_alone_keeps_the_arm(arm):
     rng = np.random.default_rng(2)
     fit = dh.calibrate(arm, images_of(arm, 15, rng), "camera,board")
