@@ -1,13 +1,14 @@
 """Mutation score: how many small errors in the code the tests notice.
 
 Each mutant is a copy of the package with one changed expression. The tests of its module run on it until the
-first one fails: the file of that module, or the files of its folder if it has none. A mutant that survives is
-printed with its place; either a test is missing, or the change has no effect that matters.
+first one fails: the file of that module if it has one, then its folder. A mutant that survives is printed with
+its place; either a test is missing, or the change has no effect that matters.
 
-    python tests/mutation_score.py --mutants 400 --minutes 60 --seed 0
+    python tests/mutation_score.py --mutants 400 --minutes 60 --seed 0 --results score.jsonl
 
-The run is long and not part of continuous integration. Mutants are drawn at random from the modules of
-`PACKAGES`, weighted by their numbers of expressions.
+The run is long and not part of continuous integration. Each outcome is appended to the file of results; a run
+with the same file and seed goes on where the last one has ended. Mutants are drawn at random from the modules
+of `PACKAGES`, weighted by their numbers of expressions.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from __future__ import annotations
 import argparse
 import ast
 import copy
+import json
 import os
 import random
 import shutil
@@ -30,6 +32,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("estimation", "identifiability", "calibration", "measurements", "robot", "io", "_kernels")
 # Seconds after which a run of tests ends, and its exit status then. Such a mutant does not count.
 TIMEOUT, OUT_OF_TIME = 300, 124
+# Outcome by the exit status of the tests; with any other status the mutant is killed.
+OUTCOMES = {0: "survived", OUT_OF_TIME: "out of time"}
 COMPARISONS = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
 }  # fmt: skip
@@ -101,12 +105,12 @@ def mutate(source: str, number: int) -> tuple[str, str]:
 
 
 def tests_of(module: Path) -> list[str]:
-    """Return the tests of a module: its own file, or those of its folder if it has none."""
+    """Return the tests of a module: its own file if it has one, and its folder."""
     folder = ROOT / "tests" / module.parent.relative_to(ROOT / "dhcal_pin")
     while not folder.is_dir():
         folder = folder.parent
     own = folder / f"test_{module.stem}.py"
-    return [str(own.relative_to(ROOT) if own.exists() else folder.relative_to(ROOT))]
+    return [str(path.relative_to(ROOT)) for path in (own, folder) if path.exists()]
 
 
 def main() -> None:
@@ -115,11 +119,14 @@ def main() -> None:
     parser.add_argument("--mutants", type=int, default=400)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--results", type=Path, required=True)
     options = parser.parse_args()
+    known = [json.loads(line) for line in _lines(options.results)]
+    decided = {each["mutant"]: each["outcome"] for each in known}
     modules = [path for name in PACKAGES for path in (ROOT / "dhcal_pin" / name).rglob("*.py")]
     population = [(path, *each) for path in modules for each in mutants(path.read_text())]
     chosen = random.Random(options.seed).sample(population, min(options.mutants, len(population)))
-    end, n_killed, survivors = time.monotonic() + 60 * options.minutes, 0, []
+    end = time.monotonic() + 60 * options.minutes
     with tempfile.TemporaryDirectory() as folder:
         for name in ("dhcal_pin", "tests", "urdf", "pyproject.toml"):
             copied = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
@@ -131,22 +138,33 @@ def main() -> None:
                 break
             source = path.read_text()
             changed, what = mutate(source, number)
+            mutant = f"{path.relative_to(ROOT)}:{what}"
+            if mutant in decided:
+                continue
             copied = Path(folder) / path.relative_to(ROOT)
             copied.write_text(changed)
-            status = subprocess.run(
-                ["timeout", str(TIMEOUT), *pytest, *tests_of(path)], cwd=folder, env=environment,
-                capture_output=True, check=False,
-            ).returncode  # fmt: skip
+            status = 0
+            for tests in tests_of(path):
+                words = ["timeout", str(TIMEOUT), *pytest, tests]
+                if not status:
+                    status = subprocess.run(
+                        words, cwd=folder, env=environment, capture_output=True, check=False
+                    ).returncode
             copied.write_text(source)
-            if status == OUT_OF_TIME:
-                print("out of time", f"{path.relative_to(ROOT)}:{what}", flush=True)
-                continue
-            n_killed += status != 0
-            if not status:
-                survivors.append(f"{path.relative_to(ROOT)}:{what}")
-                print("survived", survivors[-1], flush=True)
-    total = n_killed + len(survivors)
-    print(f"{n_killed} of {total} mutants killed, {len(population)} possible")
+            outcome = OUTCOMES.get(status, "killed")
+            decided[mutant] = outcome
+            with options.results.open("a") as file:
+                file.write(json.dumps({"mutant": mutant, "outcome": outcome}) + "\n")
+    outcomes = list(decided.values())
+    for mutant, outcome in decided.items():
+        if outcome != "killed":
+            print(f"{outcome}: {mutant}")
+    total = len(outcomes) - outcomes.count(OUTCOMES[OUT_OF_TIME])
+    print(f"{outcomes.count('killed')} of {total} mutants killed, {len(population)} possible")
+
+
+def _lines(path: Path) -> list[str]:
+    return path.read_text().splitlines() if path.exists() else []
 
 
 if __name__ == "__main__":
