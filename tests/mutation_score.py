@@ -1,8 +1,8 @@
 """Mutation score: how many small errors in the code the tests notice.
 
 Each mutant is a copy of the package with one changed expression. The tests of its module run on it until the
-first one fails: the file of that module if it has one, then its folder. A mutant that survives is printed with
-its place; either a test is missing, or the change has no effect that matters.
+first one fails: the file of that module if it has one, then its folder. A mutant that survives is printed
+with its place; either a test is missing, or the change has no effect that matters.
 
     python tests/mutation_score.py --mutants 400 --minutes 60 --seed 0 --results score.jsonl
 
