@@ -86,7 +86,7 @@ def stage_table(stages: Sequence[Stage]) -> Table:
         return [f"{error.pixels:.3g}", f"{1e3 * error.distance:.3g}"]
 
     rows = [
-        [stage.name, "free" if stage.is_kept else "limited", str(stage.n_unknowns)]
+        [stage.name, "yes" if stage.is_kept else "no", str(stage.n_unknowns)]
         + [cell for error in (stage.fitted, stage.by_image, stage.by_region) for cell in cells(error)]
         for stage in stages
     ]
@@ -95,7 +95,7 @@ def stage_table(stages: Sequence[Stage]) -> Table:
         for name in ("fitted", "left-out images", "left-out regions")
         for unit in ("px", "mm")
     ]
-    return Table(["stage", "in the result", "unknowns", *errors], rows, n_text_columns=2)
+    return Table(["stage", "free in the result", "unknowns", *errors], rows, n_text_columns=2)
 
 
 def image_table(context: ReportContext) -> Table:
