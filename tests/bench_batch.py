@@ -10,11 +10,10 @@ import time
 
 import numpy as np
 import pinocchio as pin
-from bench_common import Row, clocked
+from bench_common import Row, clocked, fit_geometry
 from robots import paper
 from scipy.optimize import least_squares
 
-from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.estimation.batch import BatchProblem, BatchResult, solve_batch
 from dhcal_pin.estimation.batch_chains import ChainBatch
 from dhcal_pin.estimation.parameters import select_parameters
@@ -78,7 +77,7 @@ def rows(repeats: int) -> list[Row]:
 
     def singles() -> None:
         for item in data[:FEW]:
-            calibrate(NOMINAL, item, "dh", priors="none")
+            fit_geometry(NOMINAL, item, "dh", priors="none")
 
     def slow() -> None:
         for item in data[:SLOW]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from bench_common import Row, clocked, measured, robots
+from bench_common import Row, clocked, fit_geometry, measured, robots
 from scipy.optimize import least_squares
 
 from dhcal_pin.calibration.procedure import calibrate
@@ -78,7 +78,7 @@ def against_scipy(m: int, repeats: int) -> list[Row]:
     """Scipy's least_squares from the same start, by differences through Pinocchio and by our Jacobian."""
     out = []
     for name, chain, sets, data in cases(m):
-        fit = calibrate(chain, data, sets)
+        fit = fit_geometry(chain, data, sets)
         # The rivals are given the placed frames for nothing, and the priors that the fit ended with.
         problem = fit.problem
         slow = by_pinocchio(problem.errors, data, problem.weights)
@@ -89,7 +89,7 @@ def against_scipy(m: int, repeats: int) -> list[Row]:
         def scipy(way: str, residual: Callable, *jacobian: Any, start=start, found=found) -> None:
             found[way] = least_squares(residual, start, *jacobian, x_scale="jac").x
 
-        mine = partial(calibrate, chain, data, sets)
+        mine = partial(fit_geometry, chain, data, sets)
         for way, functions, times, wanted in (
             ("differences through Pinocchio", (slow,), repeats, "≥ 80"),
             ("our Jacobian", (residual, jacobian), 5 * repeats, "≥ 4"),

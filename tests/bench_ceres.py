@@ -15,9 +15,8 @@ from functools import partial
 import numpy as np
 import pyceres  # pyright: ignore[reportMissingImports]
 from bench_calibration import analytic, cases
-from bench_common import clocked
+from bench_common import clocked, fit_geometry
 
-from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.estimation.problem import Problem
 from dhcal_pin.estimation.solver import levenberg_marquardt
 
@@ -76,11 +75,11 @@ def main(m: int, repeats: int) -> None:
     """Prints [name, our whole calibration, our loop alone, Ceres by samples and by one block] of each arm."""
     out = []
     for name, chain, sets, data in cases(m):
-        fit = calibrate(chain, data, sets)
+        fit = fit_geometry(chain, data, sets)
         residual, jacobian = analytic(fit.problem)
         start, fresh = np.zeros(len(fit.x)), replace(fit.problem)
         ways = [
-            partial(calibrate, chain, data, sets),
+            partial(fit_geometry, chain, data, sets),
             partial(alone, fresh, start),
             # A reading's rows lie m apart; the priors' come last.
             partial(

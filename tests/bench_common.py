@@ -5,15 +5,18 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from robots import paper, robot_file
 
 from dhcal_pin import se3
+from dhcal_pin.calibration.procedure import calibrate
+from dhcal_pin.calibration.result import Result
 from dhcal_pin.estimation.error_model import ErrorModel
 from dhcal_pin.estimation.parameters import select_parameters
 from dhcal_pin.estimation.problem import Problem
-from dhcal_pin.measurements.base import Noise
+from dhcal_pin.measurements.base import Measurement, Noise
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.robot.chain import Chain
 from dhcal_pin.robot.dh import DHTable
@@ -28,6 +31,11 @@ class Row:
     theirs: float
     ratio: float
     wanted: str
+
+
+def fit_geometry(chain: Chain, data: Measurement, sets: str, **options: Any) -> Result:
+    """Calibrate the geometry by least squares, as other programs do; no outliers, no joint errors."""
+    return calibrate(chain, data, sets, extend="none", loss="linear", **options)
 
 
 def clocked(ways: Sequence[Callable[[], object]], repeats: int, turn: float = 5e-3) -> list[float]:

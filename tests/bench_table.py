@@ -30,11 +30,10 @@ import bench_calibration
 import bench_kernel
 import bench_rivals
 import numpy as np
-from bench_common import Row, clocked, measured, robots, serial
+from bench_common import Row, clocked, fit_geometry, measured, robots, serial
 from bench_rivals import HERE, environment, spoken
 from robots import robot_file
 
-from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.estimation.parameters import select_parameters
 from dhcal_pin.io import measurement_text
 from dhcal_pin.measurements.base import Noise
@@ -76,8 +75,8 @@ def against_figaroh(m: int, repeats: int) -> list[Row]:
     fit, held = data.take(np.s_[:m]), data.take(np.s_[m:])
     if (found := bench_rivals.figaroh(chain, fit, held)) is None:
         return []
-    (ours,) = clocked([lambda: calibrate(chain, fit, sets)], repeats)
-    mine = 1e3 * calibrate(chain, fit, sets).validate(held)["position_rms_m"]
+    (ours,) = clocked([lambda: fit_geometry(chain, fit, sets)], repeats)
+    mine = 1e3 * fit_geometry(chain, fit, sets).validate(held)["position_rms_m"]
     other = 1e3 * found["holdout"]
     what = f"calibration: figaroh, UR10, m={m} (held out {mine:.3f} mm, figaroh {other:.3f} mm)"
     return [Row(what, ours, found["seconds"], found["seconds"] / ours, "≥ 100")]
@@ -95,8 +94,8 @@ def against_pybotics(m: int, repeats: int) -> list[Row]:
     found = bench_rivals.pybotics(table, (fit.q, fit.values), (held.q, held.values), None)
     if found is None:
         return []
-    (ours,) = clocked([lambda: calibrate(chain, fit, "modified-dh")], repeats)
-    mine = 1e3 * calibrate(chain, fit, "modified-dh").validate(held)["position_rms_m"]
+    (ours,) = clocked([lambda: fit_geometry(chain, fit, "modified-dh")], repeats)
+    mine = 1e3 * fit_geometry(chain, fit, "modified-dh").validate(held)["position_rms_m"]
     other = 1e3 * found["holdout"]
     what = f"calibration: pybotics, modified DH, m={m} (held out {mine:.3f} mm, pybotics {other:.3f} mm)"
     return [Row(what, ours, found["seconds"], found["seconds"] / ours, "≥ 100")]
