@@ -7,9 +7,9 @@ part of the joint space measurements cover.
 """
 
 from .base import InstrumentParameter, Measurement, Noise
-from .board_view import ViewLimits, is_board_in_view, project_board
 from .camera import CameraCorners
 from .contact import PlaneContact, PointContact, PointDistance, SphereContact
+from .images import ViewLimits, is_board_in_view, project_board
 from .length import Distance, Wires
 from .measured_region import MeasuredRegion
 from .mounting import MountedRig, mount_rig

@@ -37,9 +37,15 @@ from ..cameras.rig import WORLD, Camera, Rig
 from ..exceptions import InvalidArgumentError
 from ..robot.chain import Chain
 from .base import Measurement, Noise, format_sigma
-from .camera_parameters import POINTS_SET, POSE_NAMES, board_parameters, camera_parameters, rig_parameters
-from .camera_start import first_values
 from .columns import pixel_columns, text_column
+from .images.camera_parameters import (
+    POINTS_SET,
+    POSE_NAMES,
+    board_parameters,
+    camera_parameters,
+    rig_parameters,
+)
+from .images.camera_start import first_values
 from .mounting import MountedRig, mount_rig
 from .validation import validated_array, validated_joint_positions, validated_sigma
 

@@ -36,7 +36,7 @@ from ...estimation.robust import ZERO_WEIGHT
 from ...estimation.solver import minimize
 from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners
-from ...measurements.camera_parameters import POINTS_SET
+from ...measurements.images.camera_parameters import POINTS_SET
 from ..partition import Fold, configuration_groups, different_configurations, k_fold
 from ..reweighting import Fit
 from .jitter import Jitter, estimate_jitter, with_jitter

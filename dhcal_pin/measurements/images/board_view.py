@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .._typing import Array
-from .mounting import MountedRig
+from ..._typing import Array
+from ..mounting import MountedRig
 
 
 @dataclass(frozen=True)

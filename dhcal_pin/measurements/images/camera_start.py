@@ -16,19 +16,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .. import se3
-from .._typing import Array
-from ..cameras.boards import Board
-from ..cameras.hand_eye import mean_pose, solve_hand_eye
-from ..cameras.intrinsics import estimate_intrinsics
-from ..cameras.pose_from_points import FLATNESS, agreeing_points, estimate_pose
-from ..cameras.rig import Camera
-from ..exceptions import NotObservableError
-from ..robot.chain import Chain
-from .mounting import Mount
+from ... import se3
+from ..._typing import Array
+from ...cameras.boards import Board
+from ...cameras.hand_eye import mean_pose, solve_hand_eye
+from ...cameras.intrinsics import estimate_intrinsics
+from ...cameras.pose_from_points import FLATNESS, agreeing_points, estimate_pose
+from ...cameras.rig import Camera
+from ...exceptions import NotObservableError
+from ...robot.chain import Chain
+from ..mounting import Mount
 
 if TYPE_CHECKING:
-    from .camera import CameraCorners
+    from ..camera import CameraCorners
 
 # Largest RMS distance in the image, X/Z and Y/Z, of a pose that is used, as a multiple of the median one.
 _MAX_RATIO = 5.0

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from .. import se3
-from .._typing import Array
-from ..cameras.boards import Board
-from ..cameras.rig import Camera
-from .base import POINT_PRIOR, InstrumentParameter
-from .mounting import MountedRig
+from ... import se3
+from ..._typing import Array
+from ...cameras.boards import Board
+from ...cameras.rig import Camera
+from ..base import POINT_PRIOR, InstrumentParameter
+from ..mounting import MountedRig
 
 # Prior standard deviation of the rotation of a camera or a board [rad]: any.
 ROTATION_PRIOR = 10.0
