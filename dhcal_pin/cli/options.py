@@ -267,9 +267,11 @@ def _described(entries: Mapping[str, Any]) -> str:
 
 
 def _parameter_sets() -> str:
-    from ..estimation.parameters import PARAMETER_SETS  # lazy import: loads Pinocchio
+    from ..calibration.cameras import DEFAULT_SETS, RIG_SETS  # lazy import: loads Pinocchio
+    from ..estimation.parameters import PARAMETER_SETS
 
-    return _described(PARAMETER_SETS)
+    images = "; ".join(f"{name} ({text})" for name, text in RIG_SETS.items())
+    return f"{_described(PARAMETER_SETS)}; with --rig, where the default is {DEFAULT_SETS}: {images}"
 
 
 def _error_families() -> str:

@@ -34,9 +34,6 @@ EXAMPLE = "dhcal plan ur10.urdf -n 40 --tip tool0 --sigma 0.1mm,0.01deg -o poses
 # Standard deviation of a laser tracker and a precise robot, used without --sigma and --data.
 _DEFAULT_SIGMA = "0.1mm,0.01deg"
 
-# Largest number of candidates and of configurations of a task.
-_MAX_CONFIGURATIONS = 50_000
-
 # Decimals of joint positions in degrees and millimetres: 0.36 arc seconds.
 _DEGREE_DECIMALS = 4
 
@@ -197,8 +194,6 @@ def run(args: Namespace) -> int:
     if args.candidates_from:
         candidates = read_configurations(args.candidates_from, chain, args.columns)
         _require_few(args.candidates_from, len(candidates))
-    else:
-        _require_few("--candidates", args.candidates)
     data = [read_measurement_file(path, chain, args.columns).data for path in args.data or []]
     # The uncertainty of an earlier calibration would count twice beside its data, and replaces the priors.
     sidecar = None if args.data or args.priors else existing_sidecar(args.robot)
@@ -409,9 +404,11 @@ def _parse_points(text: str, option: str, example: str, count: int, expected: st
 
 def _require_few(source: str, count: int) -> None:
     """Require configurations that fit into the memory."""
-    if count > _MAX_CONFIGURATIONS:
+    from ..planning.planner import MAX_CANDIDATES  # lazy import: slow to load
+
+    if count > MAX_CANDIDATES:
         raise InvalidArgumentError(
-            f"{source}: {count} configurations, more than {_MAX_CONFIGURATIONS}; give fewer"
+            f"{source}: {count} configurations, more than {MAX_CANDIDATES}; give fewer"
         )
 
 

@@ -55,7 +55,7 @@ N_TASK_SAMPLES = 300
 # Random plans per number of poses, numbers of poses, and smallest number of poses that they are drawn from.
 N_RANDOM_PLANS, N_RANDOM_SIZES, MIN_RANDOM_POSES = 200, 6, 600
 # Largest number of candidates; more need too much memory and do not improve the plan.
-MAX_CANDIDATES = 10**6
+MAX_CANDIDATES = 50_000
 # Smallest distance of two poses, in the units of `scale_joint_units`: the effects that no model describes are
 # similar at closer poses. If random poses are closer, their median distance is used.
 MIN_DISTANCE_RAD = np.deg2rad(20.0)

@@ -131,7 +131,7 @@ def bin_indices(values: Array) -> Array:
     Returns:
         Indices into `BIN_CENTRES`, in the shape of the values.
     """
-    return (np.rint(values / BIN_WIDTH_RAD).astype(int) + N_BINS // 2) % N_BINS
+    return np.mod(np.rint(values / BIN_WIDTH_RAD) + N_BINS // 2, N_BINS).astype(int)
 
 
 def joint_coverage(chain: Chain, q: Array) -> tuple[JointCoverage, ...]:

@@ -50,6 +50,14 @@ def test_scatter_around_a_multiple_of_five_degrees_is_in_one_bin():
     assert np.all(bin_indices(values) == bin_indices(np.deg2rad(np.array([35 - 360]))))
 
 
+def test_any_finite_value_has_a_bin():
+    """The product with a whole number of turns is exact for these values."""
+    turns = np.array([0.0, 2.0**20, -(2.0**20), 1e17, -1e300])
+    bins = bin_indices(BIN_WIDTH_RAD * N_BINS * turns)
+    assert np.all((bins >= 0) & (bins < N_BINS))
+    assert len(set(bins[:3].tolist())) == 1
+
+
 def test_repeated_configurations_count_once():
     q = np.repeat(np.random.default_rng(0).uniform(-2, 2, (20, 6)), 3, axis=0)
     assert all(coverage.counts.sum() == 20 for coverage in joint_coverage(arm(), q))

@@ -6,10 +6,11 @@ which of these parameters are unknown, and in which order they are freed.
 
 from .axis_order import axis_stages, exchange_axes, reorder
 from .gate import apply_gate
-from .sets import RIG_SETS, default_sets, has_images, held_values, split_sets
+from .sets import DEFAULT_SETS, RIG_SETS, default_sets, has_images, held_values, split_sets
 from .stages import STAGES, ImageError, Stage
 
 __all__ = [
+    "DEFAULT_SETS",
     "RIG_SETS",
     "STAGES",
     "ImageError",
