@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import tomllib
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
@@ -188,6 +189,14 @@ def test_exported_names_exist_and_hide_no_module(folder):
     assert exported or folder.name == "cli"
     assert [name for name in exported if not hasattr(package, name)] == []
     assert set(exported) & {path.stem for path in folder.glob("*.py")} == set()
+
+
+def test_every_package_is_installed():
+    """An editable installation works without this list, an installed wheel does not."""
+    settings = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8"))
+    folders = {path.parent.relative_to(PACKAGE.parent) for path in PACKAGE.rglob("__init__.py")}
+    expected = {".".join(folder.parts) for folder in folders}
+    assert set(settings["tool"]["setuptools"]["packages"]) == expected | {"dhcal_pin.data"}
 
 
 def test_the_top_level_lists_its_public_names_only():
