@@ -1,7 +1,7 @@
 """Find the samples that a majority agrees with, whatever the others are.
 
 With many outliers, a fit to all samples lies between good and bad ones. Its residuals are then large for all
-samples, and outliers hide behind each other. The good samples are found in three steps:
+samples, and their sizes do not show which samples are wrong. The good samples are found in three steps:
 
 1. Linearize the rows at the solution, and search the majorities of samples that agree best
    (`estimation.trimmed_squares.search`).
@@ -40,15 +40,14 @@ y, a fits.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import pairwise
 
 import numpy as np
 
 from .._typing import Array
-from ..estimation.problem import CHUNK_SIZE, Problem, chunk_residual, linearize_and_factor
+from ..estimation.problem import Problem, linearize_and_factor, whitened_residuals
 from ..estimation.qr import posterior_sqrt_covariance, rank
 from ..estimation.robust import (
     FAR_REJECTED,
@@ -155,7 +154,7 @@ def _looks_like_noise(problem: Problem, x: Array, groups: Array) -> bool:
     )
     if n_rows < MIN_ROWS_PER_UNKNOWN * len(x) or min(np.diff(starts)) < MIN_TESTED_SAMPLES:
         return False
-    for item, residual in zip(problem.data, _residuals(problem, x), strict=True):
+    for item, residual in zip(problem.data, whitened_residuals(problem, x), strict=True):
         for rows in item.residual_groups.values():
             k = np.arange(len(residual))[rows].size
             mean_squares = np.mean(residual[rows] ** 2, 0)
@@ -163,15 +162,6 @@ def _looks_like_noise(problem: Problem, x: Array, groups: Array) -> bool:
             if t.max() > OUTLIER_THRESHOLD or not is_chi_square(mean_squares, k):
                 return False
     return True
-
-
-def _residuals(problem: Problem, x: Array) -> Iterator[Array]:
-    """Yield the whitened residuals of each measurement, shape (k, m) each."""
-    chain = problem.errors.at(x[: len(problem.errors.parameters)])
-    chunks = problem.map_chunks(partial(chunk_residual, chain, problem.instruments(x)))
-    for item in problem.data:
-        parts = [next(chunks) for _ in range(0, len(item.rows), CHUNK_SIZE)]
-        yield np.concatenate([np.empty((item.residual_dim, 0)), *parts], 1)
 
 
 def _judge(problem: Problem, x: Array, rows: LinearizedRows, scales: Array, threshold: float) -> list[Array]:
@@ -188,7 +178,7 @@ def _judge(problem: Problem, x: Array, rows: LinearizedRows, scales: Array, thre
         Weights of each measurement's samples, shape (m,) each: 1 for good samples, ZERO_WEIGHT for others.
     """
     weights = []
-    for residual, classes in zip(_residuals(problem, x), rows.row_classes, strict=True):
+    for residual, classes in zip(whitened_residuals(problem, x), rows.row_classes, strict=True):
         residual = residual / scales[classes][:, None]
         t = standardize_ratios(np.mean(residual**2, 0), len(residual))
         weights.append(np.where(t > threshold, ZERO_WEIGHT, 1.0))

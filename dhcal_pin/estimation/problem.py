@@ -441,3 +441,20 @@ def linearize_and_factor(problem: Problem, x: Array, small_angle: bool) -> Trian
     return combine_r_factors(
         problem.map_chunks(partial(_chunk_r_factor, problem.linearize(x), small_angle)), len(x)
     )
+
+
+def whitened_residuals(problem: Problem, x: Array) -> Iterator[Array]:
+    """Yield the whitened residuals of each measurement.
+
+    Args:
+        problem: Problem.
+        x: Unknowns, (p,).
+
+    Yields:
+        Residuals, (k, m) for each measurement.
+    """
+    chain = problem.errors.at(x[: len(problem.errors.parameters)])
+    chunks = problem.map_chunks(partial(chunk_residual, chain, problem.instruments(x)))
+    for item in problem.data:
+        parts = [next(chunks) for _ in range(0, len(item.rows), CHUNK_SIZE)]
+        yield np.concatenate([np.empty((item.residual_dim, 0)), *parts], 1)

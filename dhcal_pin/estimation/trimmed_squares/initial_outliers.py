@@ -17,7 +17,6 @@ search after the fit of the robot: nominal robots have errors of millimetres the
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 
 import numpy as np
 
@@ -27,13 +26,7 @@ from ...exceptions import DhcalError
 from ...measurements.base import Measurement
 from ...robot.chain import Chain
 from ..error_model import ErrorModel
-from ..problem import (
-    CHUNK_SIZE,
-    Problem,
-    chunk_residual,
-    linearize_and_factor,
-    merge_instrument_parameters,
-)
+from ..problem import Problem, linearize_and_factor, merge_instrument_parameters, whitened_residuals
 from ..qr import posterior_sqrt_covariance, rank
 from ..solver import minimize
 from .search import linearize_rows, search_majorities
@@ -82,12 +75,8 @@ def find_initial_outliers(
             for start, item in zip(starts, data, strict=True)
         ]
     )
-    chain = frames.at(x[: len(frames.parameters)])
-    chunks = full.map_chunks(partial(chunk_residual, chain, full.instruments(x)))
     out = []
-    for item in full.data:
-        residuals = [next(chunks) for _ in range(0, len(item.rows), CHUNK_SIZE)]
-        residual = np.concatenate([np.empty((item.residual_dim, 0)), *residuals], 1)
+    for item, residual in zip(full.data, whitened_residuals(full, x), strict=True):
         is_outlier = np.zeros(len(item.rows), bool)
         for rows in item.residual_groups.values():
             distances = np.linalg.norm(residual[rows], axis=0)
