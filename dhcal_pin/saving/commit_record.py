@@ -58,15 +58,19 @@ class CommitRecord:
             return None
         try:
             with open(path, encoding="utf-8") as file:
-                record = cls(**json.load(file))
+                content = json.load(file)
+        except FileNotFoundError:  # another run has just completed the commit
+            return None
+        except (OSError, ValueError) as error:
+            raise FileFormatError(f"{path}: cannot be read: {error}; remove this file") from error
+        try:
+            record = cls(**content)
             names = [name for pair in record.renames for name in pair]
             is_valid = all(_is_name(name) for name in (*names, *record.removals))
             is_valid &= all(_TEMPORARY.fullmatch(temporary) for temporary, _ in record.renames)
             is_valid &= len(record.folders) > 0 and all(map(os.path.isabs, record.folders))
-        except FileNotFoundError:  # another run has just completed the commit
-            return None
-        except (OSError, ValueError, TypeError) as error:
-            raise FileFormatError(f"{path}: cannot be read: {error}; remove this file") from error
+        except (TypeError, ValueError):
+            is_valid = False
         if not is_valid:
             raise FileFormatError(f"{path}: is not a record of saved files; remove this file")
         return record

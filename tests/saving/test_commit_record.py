@@ -71,12 +71,18 @@ def test_a_record_does_nothing_in_folders_without_records(victim):
     assert not (folder / RECORD_NAME).exists()
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"token": 1}', "\x00", '{"a": 1}'])
-def test_other_files_with_the_name_of_a_record_are_named(tmp_path, text):
+NO_JSON = [(text, "cannot be read") for text in ("", "{", "\x00")]
+NO_RECORD = [(text, "is not a record") for text in ("[]", "{}", '{"token": 1}', '{"a": 1}', "5")]
+
+
+@pytest.mark.parametrize(("text", "said"), NO_JSON + NO_RECORD)
+def test_other_files_with_the_name_of_a_record_are_named(tmp_path, text, said):
     (tmp_path / RECORD_NAME).write_text(text)
-    with pytest.raises(DhcalError, match=r"\.dhcal-save\.json: .*remove this file"):
+    message = rf"^\S*/\.dhcal-save\.json: {said}.*; remove this file$"
+    with pytest.raises(DhcalError, match=message) as caught:
         complete_interrupted_save(tmp_path / "robot.urdf")
-    with pytest.raises(DhcalError, match=r"\.dhcal-save\.json: .*remove this file"):
+    assert "__init__" not in str(caught.value)
+    with pytest.raises(DhcalError, match=message):
         write_files({tmp_path / "a": "", tmp_path / "b": ""})
 
 
