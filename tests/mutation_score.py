@@ -1,14 +1,15 @@
 """Mutation score: how many small errors in the code the tests notice.
 
-Each mutant is a copy of the package with one changed expression. The tests of its module run on it until the
-first one fails: the file of that module if it has one, then its folder. A mutant that survives is printed
-with its place; either a test is missing, or the change has no effect that matters.
+Each mutant is a copy of the package with one changed expression. The tests that execute its statement run on
+it until the first one fails, the fast ones first. A mutant that survives is printed with its place; either a
+test is missing, or the change has no effect that matters.
 
     python tests/mutation_score.py --mutants 400 --minutes 60 --seed 0 --results score.jsonl
 
-The run is long and not part of continuous integration. Each outcome is appended to the file of results; a run
-with the same file and seed goes on where the last one has ended. Mutants are drawn at random from the modules
-of `PACKAGES`, weighted by their numbers of expressions.
+The run is long and not part of continuous integration. It starts with one run of the tests that records which
+lines each of them executes (`score.lines` and `score.times`). Each outcome is appended to the file of
+results; a run with the same file and seed goes on where the last one has ended. Mutants are drawn at random
+from the modules of `PACKAGES`, weighted by their numbers of expressions.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import copy
 import json
 import os
 import random
+import re
 import shutil
 import subprocess
 import sys
@@ -27,11 +29,17 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from coverage import CoverageData
+
 ROOT = Path(__file__).resolve().parents[1]
 # Packages whose modules are changed.
 PACKAGES = ("estimation", "identifiability", "calibration", "measurements", "robot", "io", "_kernels")
+# Tests that execute much of the package within this process, apart from the files of `tests` itself.
+FOLDERS = (*PACKAGES, "cameras", "diagnostics", "paper", "planning", "plausibility")
+# Largest sum of the durations of the tests that run on a mutant [s].
+MAX_DURATION = 120
 # Seconds after which a run of tests ends, and its exit status then. Such a mutant does not count.
-TIMEOUT, OUT_OF_TIME = 300, 124
+TIMEOUT, OUT_OF_TIME = 600, 124
 # Outcome by the exit status of the tests; with any other status the mutant is killed.
 OUTCOMES = {0: "survived", OUT_OF_TIME: "out of time"}
 COMPARISONS = {
@@ -104,13 +112,72 @@ def mutate(source: str, number: int) -> tuple[str, str]:
     ), f"{line}: {old}  ->  {ast.unparse(new).splitlines()[0]}"
 
 
-def tests_of(module: Path) -> list[str]:
-    """Return the tests of a module: its own file if it has one, and its folder."""
-    folder = ROOT / "tests" / module.parent.relative_to(ROOT / "dhcal_pin")
-    while not folder.is_dir():
-        folder = folder.parent
-    own = folder / f"test_{module.stem}.py"
-    return [str(path.relative_to(ROOT)) for path in (own, folder) if path.exists()]
+class ExecutedLines:
+    """Tests that execute each line of the package, and their durations.
+
+    Attributes:
+        lines: Data of the package coverage, with one context per test.
+        seconds: Duration of each test [s].
+    """
+
+    def __init__(self, results: Path):
+        lines, times = results.with_suffix(".lines"), results.with_suffix(".times")
+        if not times.exists():
+            _record(lines, times)
+        self.lines = CoverageData(str(lines))
+        self.lines.read()
+        found = re.findall(r"^([\d.]+)s call +(tests/.*?) *$", times.read_text(), re.MULTILINE)
+        self.seconds = {test: float(duration) for duration, test in found}
+
+    def tests_of(self, module: Path, line: int) -> list[str]:
+        """Return the tests that execute a line, the fast ones first, up to `MAX_DURATION`.
+
+        The lines of definitions are executed when a module is loaded. They get the tests of the whole module.
+        """
+        tests_by_line = self.lines.contexts_by_lineno(str(module))
+        executed = [set(tests_by_line.get(each, ())) for each in _lines_of_statement(module, line)]
+        tests = set().union(*executed) - {""}
+        if any("" in each for each in executed) or not tests:
+            tests = set().union(*tests_by_line.values()) - {""}
+        names = {test.rsplit("|", 1)[0] for test in tests}
+        chosen, total = [], 0.0
+        for name in sorted(names, key=lambda name: (self.seconds.get(name, 0.0), name)):
+            total += self.seconds.get(name, 0.0)
+            if total > MAX_DURATION:
+                break
+            chosen.append(name)
+        return chosen
+
+
+def _record(lines: Path, times: Path) -> None:
+    """Run the tests once, and write the lines that each of them executes and their durations."""
+    tests = [f"tests/{name}" for name in FOLDERS] + [
+        str(path.relative_to(ROOT)) for path in ROOT.glob("tests/test_*.py")
+    ]
+    options = ["-q", "-vv", "-m", "not slow", "--durations=0", "-p", "no:cacheprovider"]
+    options += ["--cov=dhcal_pin", "--cov-context=test", "--cov-report="]
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", *options, *tests],
+        cwd=ROOT,
+        env=os.environ | {"COVERAGE_FILE": str(lines.resolve())},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    times.write_text(done.stdout)
+
+
+def _lines_of_statement(module: Path, line: int) -> range:
+    """Return the lines of the innermost statement around a line, without those of its body."""
+    statements = [
+        node
+        for node in ast.walk(ast.parse(module.read_text()))
+        if isinstance(node, ast.stmt) and node.lineno <= line <= (node.end_lineno or node.lineno)
+    ]
+    innermost = max(statements, key=lambda node: node.lineno)
+    body = getattr(innermost, "body", None)
+    last = body[0].lineno - 1 if body else innermost.end_lineno or line
+    return range(innermost.lineno, max(last, innermost.lineno) + 1)
 
 
 def main() -> None:
@@ -126,6 +193,7 @@ def main() -> None:
     modules = [path for name in PACKAGES for path in (ROOT / "dhcal_pin" / name).rglob("*.py")]
     population = [(path, *each) for path in modules for each in mutants(path.read_text())]
     chosen = random.Random(options.seed).sample(population, min(options.mutants, len(population)))
+    executed = ExecutedLines(options.results)
     end = time.monotonic() + 60 * options.minutes
     with tempfile.TemporaryDirectory() as folder:
         for name in ("dhcal_pin", "tests", "urdf", "pyproject.toml"):
@@ -133,7 +201,8 @@ def main() -> None:
             copied(ROOT / name, Path(folder) / name)
         environment = os.environ | {"PYTHONPATH": folder, "PYTHONDONTWRITEBYTECODE": "1"}
         pytest = [sys.executable, "-m", "pytest", "-q", "-x", "-m", "not slow", "-p", "no:cacheprovider"]
-        for path, _, number in chosen:
+        chosen_tests = Path(folder) / "chosen_tests"
+        for path, line, number in chosen:
             if time.monotonic() > end:
                 break
             source = path.read_text()
@@ -143,13 +212,11 @@ def main() -> None:
                 continue
             copied = Path(folder) / path.relative_to(ROOT)
             copied.write_text(changed)
-            status = 0
-            for tests in tests_of(path):
-                words = ["timeout", str(TIMEOUT), *pytest, tests]
-                if not status:
-                    status = subprocess.run(
-                        words, cwd=folder, env=environment, capture_output=True, check=False
-                    ).returncode
+            chosen_tests.write_text("\n".join(executed.tests_of(path, line)))
+            words = ["timeout", str(TIMEOUT), *pytest, f"@{chosen_tests}"]
+            status = subprocess.run(
+                words, cwd=folder, env=environment, capture_output=True, check=False
+            ).returncode
             copied.write_text(source)
             outcome = OUTCOMES.get(status, "killed")
             decided[mutant] = outcome
