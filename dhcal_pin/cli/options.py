@@ -213,7 +213,7 @@ def add_verbosity_options(parser: argparse.ArgumentParser) -> None:
     """
     group = parser.add_mutually_exclusive_group()
     for name, text in (
-        ("quiet", "show the verdict only"),
+        ("quiet", "show the verdict or the final result only"),
         ("verbose", "show all tables, notes and warnings (default: one screen)"),
     ):
         group.add_argument(
