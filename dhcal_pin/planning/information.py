@@ -259,7 +259,6 @@ class Information:
         if prior_uncertainty is not None:
             # Replace the prior rows of the robot parameters.
             rows = _information_rows(*prior_uncertainty.of_parameters(errors, sigma[: len(x)]))
-            stacked[len(data_factor) :, : len(x)] = 0.0
             stacked[len(data_factor) : len(data_factor) + len(x), : len(x)] = rows
         return cls(
             errors=errors,

@@ -56,6 +56,16 @@ def test_region_is_scaled_by_the_spread_of_each_joint():
     assert region.excess(q + step).max(0) == pytest.approx([0, 0, 0, 0, 0, 0.5], abs=0.02)
 
 
+def test_a_joint_that_stands_still_is_measured_in_milliradians():
+    """Its values differ by 1 µrad only; a step of 2 mrad is then not 2,000 spreads away."""
+    q = uniform(np.random.default_rng(0), 100)
+    q[:, 5] = 1e-6 * np.random.default_rng(1).normal(size=100)
+    region = MeasuredRegion.from_configurations(q, REVOLUTE)
+    step = np.zeros(6)
+    step[5] = 2e-3
+    assert region.distances(region.configurations + step) == pytest.approx(2.0, rel=0.01)
+
+
 def test_distances_are_euclidean_and_periodic_for_revolute_joints():
     rng = np.random.default_rng(0)
     is_prismatic = np.array([False, True, False, False, False, False])
