@@ -17,6 +17,7 @@ from .options import (
     NON_NEGATIVE_INTEGER,
     PARAMETERS,
     POSITIVE_INTEGER,
+    RIG,
     ROBOT,
     add_motion_options,
     add_urdf_options,
@@ -25,7 +26,8 @@ from .options import (
 
 if TYPE_CHECKING:
     from .._typing import Array, PathLike
-    from ..planning import Plan
+    from ..measurements import MountedRig, Noise
+    from ..planning import Plan, PlannedImages
     from ..programs import Program
     from ..robot import Chain, Obstacle, WorkspaceConstraints
 
@@ -33,6 +35,8 @@ EXAMPLE = "dhcal plan ur10.urdf -n 40 --tip tool0 --sigma 0.1mm,0.01deg -o poses
 
 # Standard deviation of a laser tracker and a precise robot, used without --sigma and --data.
 _DEFAULT_SIGMA = "0.1mm,0.01deg"
+# Standard deviation of detected corners and the same robot, used with --rig.
+_DEFAULT_IMAGE_SIGMA = "0.3px,0.1mm,0.01deg"
 
 # Decimals of joint positions in degrees and millimetres: 0.36 arc seconds.
 _DEGREE_DECIMALS = 4
@@ -66,9 +70,37 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     parser.add_argument(
         "--sigma",
-        metavar="LENGTH[,ANGLE]",
+        metavar="[PIXELS,]LENGTH[,ANGLE]",
         help="standard deviation per axis of instrument and robot repeatability (default: as in --data, else "
-        f"{_DEFAULT_SIGMA})",
+        f"{_DEFAULT_SIGMA}); with --rig, of corners in the image and of the robot (default: "
+        f"{_DEFAULT_IMAGE_SIGMA})",
+    )
+    parser.add_argument(
+        "--rig",
+        metavar=RIG["metavar"],
+        help="plan images by these cameras of these boards, with approximate poses and intrinsics; poses "
+        "that are missing are those of a calibrated robot, or are estimated from --data",
+    )
+    parser.add_argument(
+        "--distance",
+        metavar="MIN:MAXUNIT",
+        help="with --rig: distance of the middle of a board from the camera at which images are sharp, such "
+        "as 300:900mm (default: from the size of the board in the image)",
+    )
+    parser.add_argument(
+        "--angle",
+        metavar="ANGLE",
+        default="60deg",
+        help="with --rig: largest angle between the normal of a board and the line of sight (default: "
+        "%(default)s)",
+    )
+    parser.add_argument(
+        "--corners",
+        metavar="SHARE",
+        type=float,
+        default=1.0,
+        help="with --rig: smallest share of the corners of a board that is in the image (default: "
+        "%(default)g)",
     )
     parser.add_argument(
         "--criterion",
@@ -111,9 +143,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--floor",
         metavar="HEIGHT|none",
-        default="0mm",
-        help="height of the floor above the root link, which the robot stays above (default: %(default)s); "
-        "none for a robot without a floor, such as one on a ceiling",
+        help="height of the floor above the root link, which the robot stays above (default: 0mm; none with "
+        "--root); none for a robot without a floor, such as one on a ceiling",
     )
     parser.add_argument(
         "--obstacle",
@@ -167,7 +198,7 @@ def run(args: Namespace) -> int:
     from ..io import configurations_text, read_configurations, read_measurement_file, read_priors, read_robot
     from ..io.sidecar import existing_sidecar, read_instrument, read_uncertainty
     from ..measurements import Noise
-    from ..planning import plan
+    from ..planning import plan, with_measured_poses
     from ..programs import program_text, require_program_ending
     from ..report.document import file_digests, versions
     from ..report.html import check_html_ending
@@ -181,6 +212,8 @@ def run(args: Namespace) -> int:
         *filter(None, (args.candidates_from, args.task, args.columns, args.instrument)),
         *filter(_is_scene, args.obstacle),
     ]
+    if args.rig:
+        files.append(args.rig)
     priors = [args.priors] if args.priors not in (None, "default") else []
     inputs = [args.robot, *existing_sidecars([args.robot]), *files, *priors]
     require_writable_outputs([args.output, args.json, args.html, args.report, *args.export], inputs)
@@ -191,20 +224,33 @@ def run(args: Namespace) -> int:
     chain = read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root)
     space = _workspace_constraints(args)
     candidates: int | Array = args.candidates
+    rows = np.zeros(0, int)
     if args.candidates_from:
         candidates = read_configurations(args.candidates_from, chain, args.columns)
+        rows = np.arange(len(candidates))
+        if args.rig:
+            # A table of image coordinates has one row per corner.
+            rows = np.sort(np.unique(candidates, axis=0, return_index=True)[1])
+        candidates = candidates[rows]
         _require_few(args.candidates_from, len(candidates))
-    data = [read_measurement_file(path, chain, args.columns).data for path in args.data or []]
+    rig = _mounted_rig(args.rig, args.robot, chain) if args.rig else None
+    data = [read_measurement_file(path, chain, args.columns, rig=rig).data for path in args.data or []]
     # The uncertainty of an earlier calibration would count twice beside its data, and replaces the priors.
     sidecar = None if args.data or args.priors else existing_sidecar(args.robot)
     prior_uncertainty = read_uncertainty(sidecar, chain) if sidecar else None
-    sigma = args.sigma or (None if any(item.kind == args.kind for item in data) else _DEFAULT_SIGMA)
+    images = None
+    if rig is not None:
+        images, noise = _planned_images(args, with_measured_poses(rig, chain, data))
+    elif args.sigma or not any(item.kind == args.kind for item in data):
+        noise = Noise(*parse_noise(args.sigma or _DEFAULT_SIGMA, "--sigma"))
+    else:
+        noise = None
     with console.show_progress(f"choosing {args.count} poses") as progress:
         result = plan(
             chain,
             args.count,
             kind=args.kind,
-            noise=Noise(*parse_noise(sigma, "--sigma")) if sigma else None,
+            noise=noise,
             parameters=args.parameters,
             priors=read_priors(args.priors) or "default",
             fix=split_commas(args.fix),
@@ -213,6 +259,7 @@ def run(args: Namespace) -> int:
             data=data,
             known=read_instrument(args.instrument) if args.instrument else None,
             prior_uncertainty=prior_uncertainty,
+            images=images,
             task=read_task(args.task, chain) if args.task else None,
             candidates=candidates,
             space=space,
@@ -222,12 +269,14 @@ def run(args: Namespace) -> int:
         )
     noise = result.information.noise
     moves = move_texts(result)
+    chosen_rows = None if result.index is None else (rows[result.index] + 1).tolist()
+    document = _plan_document(result, args, chosen_rows)
+    pixels = f"{images.sigma:.4g} px, " if images else ""
     comments = [
-        f"{args.count} poses to measure ({args.kind}, criterion {result.criterion}), as a short tour",
+        f"{args.count} poses to measure ({document['kind']}, criterion {result.criterion}), as a short tour",
         f"predicted position error {1e3 * result.error:.4g} mm RMS with standard deviation "
-        f"{1e3 * noise.position:.4g} mm, {np.degrees(noise.rotation):.4g} deg",
+        f"{pixels}{1e3 * noise.position:.4g} mm, {np.degrees(noise.rotation):.4g} deg",
     ]
-    document = _plan_document(result, args)
     document |= {"inputs": file_digests(inputs), "versions": versions()}
     decimals = _DEGREE_DECIMALS if args.joint_units == "deg" else None
     text = configurations_text(result.q, chain, [*comments, *moves], args.joint_units, decimals)
@@ -256,6 +305,70 @@ def run(args: Namespace) -> int:
     write_outputs(contents, args.json, document)
     console.show(plan_screen(result, moves, contents), args.verbosity)
     return 0
+
+
+def _mounted_rig(path: str, robot: str, chain: Chain) -> MountedRig:
+    """Return the rig of a file, with the poses of a calibrated robot where it has none."""
+    from ..io.rig_file import read_calibrated_rig, read_rig, with_poses_of  # lazy import, as the following
+    from ..io.sidecar import existing_sidecar
+    from ..measurements import mount_rig
+
+    rig, sidecar = read_rig(path), existing_sidecar(robot)
+    calibrated = read_calibrated_rig(sidecar) if sidecar else None
+    return mount_rig(with_poses_of(rig, calibrated) if calibrated else rig, chain)
+
+
+def _planned_images(args: Namespace, rig: MountedRig) -> tuple[PlannedImages, Noise]:
+    """Return the images to plan and the noise of the robot, from the options that need --rig."""
+    from ..measurements import Noise  # lazy import, as the following: they are slow to load
+    from ..planning import PlannedImages
+    from ..units import parse_noise
+
+    pixels, *others = (args.sigma or _DEFAULT_IMAGE_SIGMA).split(",")
+    match = re.fullmatch(rf"\s*({_NUMBER})\s*px\s*", pixels)
+    if not match or float(match[1]) <= 0:
+        raise InvalidArgumentError(
+            f"--sigma {args.sigma}: expected pixels above zero first, such as {_DEFAULT_IMAGE_SIGMA}"
+        )
+    noise = Noise(*parse_noise(",".join(others), "--sigma")) if others else Noise()
+    distance = _parse_distances(args.distance) if args.distance else None
+    angle = _parse_angle(args.angle, "--angle", 90.0)
+    if not 0 < args.corners <= 1:
+        raise InvalidArgumentError(f"--corners {args.corners:g}: expected a share above 0 and at most 1")
+    return PlannedImages(rig, float(match[1]), distance, angle, args.corners), noise
+
+
+def _parse_distances(text: str) -> tuple[float, float]:
+    """Parse the smallest and the largest distance of a board [m]."""
+    from ..units import LENGTHS  # lazy import: slow to load
+
+    match = re.fullmatch(rf"\s*({_NUMBER})\s*:\s*({_NUMBER})\s*([a-zµμ]+)\s*", text)
+    if not match or match[3] not in LENGTHS:
+        raise InvalidArgumentError(
+            f"--distance {text}: expected the smallest and the largest distance with a unit, such as "
+            "300:900mm"
+        )
+    low, high = (float(match[i]) / LENGTHS[match[3]] for i in (1, 2))
+    if not 0 <= low < high:
+        raise InvalidArgumentError(
+            f"--distance {text}: the first distance must be at least 0 and less than the second"
+        )
+    return low, high
+
+
+def _parse_angle(text: str, option: str, largest: float, what: str = "angle") -> float:
+    """Parse an angle above zero and at most some degrees [rad]."""
+    import numpy as np  # lazy import, as the following: they are slow to load
+
+    from ..units import ANGLES
+
+    match = re.fullmatch(rf"\s*({_NUMBER})\s*(rad|deg)\s*", text)
+    angle = float(match[1]) / ANGLES[match[2]] if match else 0.0
+    if not 0 < angle <= np.deg2rad(largest):
+        raise InvalidArgumentError(
+            f"{option} {text}: invalid {what}; expected at most {largest:g}deg, such as 30deg"
+        )
+    return angle
 
 
 def move_texts(result: Plan) -> list[str]:
@@ -338,10 +451,12 @@ def _obstacles(args: Namespace) -> list[Obstacle]:
     return obstacles
 
 
-def _floor(text: str) -> float | None:
+def _floor(text: str | None, root: str | None) -> float | None:
     """Parse the height of the floor [m]; None without a floor."""
     from ..units import LENGTHS  # lazy import: slow to load
 
+    # The height counts from the first link, which may be the head of the robot.
+    text = text or ("none" if root else "0mm")
     if text == "none":
         return None
     match = re.fullmatch(rf"\s*({_NUMBER})\s*([a-zµμ]+)\s*", text)
@@ -367,7 +482,6 @@ def _workspace_constraints(args: Namespace) -> WorkspaceConstraints:
     import numpy as np  # lazy import, as the following: they are slow to load
 
     from ..robot import WorkspaceConstraints
-    from ..units import ANGLES
 
     box = _parse_box(args.box, "--box") if args.box else None
     instrument = None
@@ -375,15 +489,8 @@ def _workspace_constraints(args: Namespace) -> WorkspaceConstraints:
         instrument = _parse_points(args.visible_from, "--visible-from", "3000,0,1200mm", 1)[0]
     if args.cone and instrument is None:
         raise InvalidArgumentError("--cone: needs --visible-from, the position of the instrument")
-    cone = np.pi
-    if args.cone:
-        match = re.fullmatch(rf"\s*({_NUMBER})\s*(rad|deg)\s*", args.cone)
-        cone = float(match[1]) / ANGLES[match[2]] if match else 0.0
-        if not 0 < cone <= np.pi:
-            raise InvalidArgumentError(
-                f"--cone {args.cone}: invalid half angle; expected at most 180deg, such as 30deg"
-            )
-    return WorkspaceConstraints(box, instrument, cone, _floor(args.floor), _obstacles(args))
+    cone = _parse_angle(args.cone, "--cone", 180.0, "half angle") if args.cone else np.pi
+    return WorkspaceConstraints(box, instrument, cone, _floor(args.floor, args.root), _obstacles(args))
 
 
 def _parse_points(text: str, option: str, example: str, count: int, expected: str = "x,y,z") -> Array:
@@ -445,7 +552,7 @@ def read_task(path: PathLike, chain: Chain) -> Array:
     return result.q
 
 
-def _plan_document(result: Plan, args: Namespace) -> dict[str, Any]:
+def _plan_document(result: Plan, args: Namespace, chosen_rows: list[int] | None) -> dict[str, Any]:
     """Create the JSON document of a plan, in SI units."""
     from .outputs import json_path  # lazy import: loads Pinocchio
 
@@ -453,11 +560,11 @@ def _plan_document(result: Plan, args: Namespace) -> dict[str, Any]:
     path = json_path(args.json)
     return {
         "poses": len(result.q),
-        "kind": args.kind,
+        "kind": "camera" if result.views else args.kind,
         "criterion": result.criterion,
         "sigma_position_m": noise.position,
         "sigma_orientation_rad": noise.rotation,
-        "rows": None if result.index is None else (result.index + 1).tolist(),
+        "rows": chosen_rows,
         "log_det": result.log_det,
         "predicted_position_rms_m": result.error,
         "random_position_rms_m": result.random_error,
@@ -471,6 +578,17 @@ def _plan_document(result: Plan, args: Namespace) -> dict[str, Any]:
         ],
         "way_points": {str(i): way.tolist() for i, way in enumerate(result.ways, 1) if len(way)},
         "blocked_moves": [i for i, is_free in enumerate(result.is_way_free, 1) if not is_free],
+        "views": [
+            {
+                "camera": one.camera,
+                "images": one.n_images,
+                "covered_share": one.covered_share,
+                "distance_min_m": one.distances[0],
+                "distance_max_m": one.distances[1],
+                "angle_max_rad": one.max_angle,
+            }
+            for one in result.views
+        ],
         "notes": list(result.notes),
         "files": {"poses": args.output}
         | ({"json": path} if path else {})

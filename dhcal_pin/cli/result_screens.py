@@ -317,6 +317,17 @@ def plan_screen(plan: Plan, moves: Sequence[str], files: Iterable[object]) -> Sc
         for one in plan.curves
     ]
     curve_table = Table(["poses", "bins filled", "curve std, µrad"], curves, n_text_columns=0)
+    views = [
+        [
+            one.camera,
+            str(one.n_images),
+            f"{1e3 * one.distances[0]:.0f} to {1e3 * one.distances[1]:.0f}",
+            f"{np.degrees(one.max_angle):.0f}°",
+            f"{100 * one.covered_share:.0f} %",
+        ]
+        for one in plan.views
+    ]
+    view_table = Table(["camera", "images", "distance, mm", "angle up to", "image covered"], views)
     is_free = all(plan.is_way_free)
     return Screen(
         [
@@ -331,6 +342,14 @@ def plan_screen(plan: Plan, moves: Sequence[str], files: Iterable[object]) -> Sc
                 curve_table,
                 title="joint correction curves, RMS of all joints",
                 noun="number of poses",
+                rank=4,
+                n_kept=2,
+                has_space=True,
+            ),
+            Block(
+                view_table,
+                title="images of the boards",
+                noun="camera",
                 rank=4,
                 n_kept=2,
                 has_space=True,

@@ -6,3 +6,6 @@ from .information import plannable_kinds as plannable_kinds
 from .planner import CRITERIA as CRITERIA
 from .planner import Plan as Plan
 from .planner import plan as plan
+from .views import CameraViews as CameraViews
+from .views import PlannedImages as PlannedImages
+from .views import with_measured_poses as with_measured_poses

@@ -14,24 +14,28 @@ the R factor of all J_t, divided by the square root of their number.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
 from .._typing import Array
+from ..calibration.cameras import DEFAULT_SETS, held_values, split_sets
 from ..calibration.procedure import calibrate
 from ..estimation import qr
 from ..estimation.error_model import ErrorModel
+from ..estimation.initialization import make_problem
 from ..estimation.parameters import PARAMETER_SETS, select_parameters
 from ..estimation.priors import Priors, prior_weights
-from ..estimation.problem import linearize_and_factor
+from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.uncertainty import Uncertainty
 from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..measurements import KINDS
-from ..measurements.base import Measurement, Noise, whitened_jacobian
+from ..measurements.base import Measurement, Noise
 from ..robot.chain import Chain
 from .exchange import compute_sqrt_covariance
+from .instruments import CameraInstrument, Instrument, PresentModel, SimulatedInstrument
+from .views import PlannedImages
 
 # Configurations at which initial values of instrument parameters are computed.
 _N_PLACEMENT_SAMPLES = 200
@@ -53,8 +57,7 @@ class Information:
     Attributes:
         errors: Error model of the robot.
         x: Present values of the robot parameters, shape (p,) [m or rad].
-        kind: Kind of measurement.
-        noise: Standard deviations of a measurement [m, rad].
+        instrument: Source of the measurements.
         instrument_values: Values of the kind's instrument parameters, shape (s,).
         instrument_columns: Column of each of them among the unknowns, -1 if it is known, shape (s,).
         prior_sigma: Prior standard deviations of the unknowns, shape (p+s',) [m or rad].
@@ -65,8 +68,7 @@ class Information:
 
     errors: ErrorModel
     x: Array
-    kind: type[Measurement]
-    noise: Noise
+    instrument: Instrument
     instrument_values: Array
     instrument_columns: Array
     prior_sigma: Array
@@ -75,14 +77,19 @@ class Information:
     fitted: Array
 
     @cached_property
-    def _derivative(self) -> tuple[Chain, Array, Array]:
-        """Chain at x, bodies and twists of its errors."""
-        return self.errors.derivative(self.x)
+    def _model(self) -> PresentModel:
+        """Robot and instrument at the present values of their parameters."""
+        return PresentModel(*self.errors.derivative(self.x), self.instrument_values)
 
     @property
     def chain(self) -> Chain:
         """Robot at the present values of its parameters."""
-        return self._derivative[0]
+        return self._model.chain
+
+    @property
+    def noise(self) -> Noise:
+        """Standard deviations that measurements of different configurations do not share [m, rad]."""
+        return self.instrument.noise
 
     def rows(self, q: Array) -> Array:
         """Compute the whitened Jacobian rows of measurements.
@@ -93,18 +100,14 @@ class Information:
         Returns:
             Rows of k residuals, shape (p+s', k, m).
         """
-        chain, bodies, twists = self._derivative
-        data = self.kind.simulate(chain, q, self.noise, np.random.default_rng(0))
-        frames = chain.forward_kinematics(q)
-        jacobian = chain.tool_jacobian(frames, bodies, twists)
-        whitened = whitened_jacobian(
-            data, frames, jacobian, self.instrument_values, data.residual(frames, self.instrument_values)
-        )
-        out = np.zeros((len(self.prior_sigma), *whitened.shape[1:]))
-        out[: len(whitened)] = whitened
+        return self._of_unknowns(*self.instrument.jacobians(self._model, q))
+
+    def _of_unknowns(self, by_errors: Array, by_instrument: Array) -> Array:
+        """Return the derivative (p+s', k, m) by the unknowns in units of their prior standard deviations."""
+        out = np.zeros((len(self.prior_sigma), *by_errors.shape[1:]))
+        out[: len(by_errors)] = by_errors
         is_unknown = self.instrument_columns >= 0
-        instrument_jacobian = data.instrument_jacobian(frames, self.instrument_values)
-        out[self.instrument_columns[is_unknown]] = instrument_jacobian[is_unknown]
+        out[self.instrument_columns[is_unknown]] = by_instrument[is_unknown]
         return out * self.prior_sigma[:, None, None]
 
     def task_combinations(self, q: Array) -> Array:
@@ -116,11 +119,9 @@ class Information:
         Returns:
             Combinations W, shape (p+s', w) [m].
         """
-        chain, bodies, twists = self._derivative
-        jacobian = chain.tool_jacobian(chain.forward_kinematics(q), bodies, twists)[:, :3]
-        out = np.zeros((len(self.prior_sigma), 3 * len(q)))
-        out[: len(jacobian)] = jacobian.reshape(len(jacobian), -1)
-        return np.asarray(np.linalg.qr((out * self.prior_sigma[:, None]).T / np.sqrt(len(q)), mode="r")).T
+        found = self._of_unknowns(*self.instrument.displacements(self._model, q))
+        rows = found.reshape(len(found), -1).T / np.sqrt(len(q))
+        return np.asarray(np.linalg.qr(rows, mode="r")).T
 
     def without_omitted(self) -> Information:
         """Return the knowledge about the fitted unknowns alone, as if the omitted ones were zero.
@@ -184,6 +185,7 @@ class Information:
         known: Mapping[str, float] | None = None,
         omitted_sets: Sequence[str] = (),
         prior_uncertainty: Uncertainty | None = None,
+        images: PlannedImages | None = None,
     ) -> Information:
         """Collect the knowledge before measuring from priors, existing measurements or a calibration.
 
@@ -202,6 +204,7 @@ class Information:
                 in `parameters`.
             prior_uncertainty: Uncertainty of the calibration that made the chain. It replaces the priors of
                 the parameters that the calibration estimated.
+            images: Cameras and boards of the kind "camera"; existing measurements are images by them.
 
         Returns:
             Knowledge about all unknowns.
@@ -209,44 +212,28 @@ class Information:
         Raises:
             InvalidArgumentError: Priors or standard deviations are missing.
         """
-        maker = _plannable_kind(kind)
         if priors == "none":
             raise InvalidArgumentError(
                 "priors 'none': a plan needs priors; choose default, or standard deviations by name"
             )
-        errors = select_parameters(
-            chain, parameters if parameters is not None else chain.parameters, fix, free
+        if images is None:
+            known_before = _before_measuring(
+                chain, q, kind, noise, parameters, priors, fix, free, data, known or {}
+            )
+        else:
+            known_before = _before_images(
+                chain, q, images, noise, parameters, priors, fix, free, data, known or {}
+            )
+        problem, values, template = known_before.problem, known_before.values, known_before.template
+        errors, x, sigma, fitted = _add_parameter_sets(
+            known_before.errors, known_before.x, known_before.sigma, omitted_sets
         )
-        sigma, x = 1 / prior_weights(errors, priors), np.zeros(len(errors.parameters))
-        fit, values = None, dict(known or {})
-        if data:
-            fit = calibrate(
-                chain, data, parameters, priors=priors, fix=fix, free=free, known=known, extend="none"
-            )
-            errors, x = fit.errors, fit.x[: len(x)]
-            sigma, values = 1 / fit.problem.prior_weights, values | fit.instruments
-            noise = noise or _sigma_of(fit.problem.data, kind)
-        if noise is None:
-            raise InvalidArgumentError(
-                f"kind {kind!r}: the standard deviation is unknown; give one, for example 0.1mm,0.01deg"
-            )
-        errors, x, sigma, fitted = _add_parameter_sets(errors, x, sigma, omitted_sets)
         # Column of each instrument parameter by name, and R factor of the existing measurements.
         columns, r = {}, np.zeros((0, len(sigma)))
-        if fit is not None:
-            instrument_parameters = fit.problem.instrument_parameters
-            columns = {parameter.name: len(x) + i for i, parameter in enumerate(instrument_parameters)}
-            x_all = np.concatenate([x, fit.x[len(fit.x) - len(columns) :]])
-            r = linearize_and_factor(replace(fit.problem, errors=errors), x_all, small_angle=False).r
-        model = errors.at(x)
-        template = maker.simulate(
-            model, q[:_N_PLACEMENT_SAMPLES], noise, np.random.default_rng(0)
-        ).initialized(model)
-        if not template.has_stated_sigma:
-            example = "0.1mm,0.01deg" if "orientation" in maker.residual_groups else "0.1mm"
-            raise InvalidArgumentError(
-                f"kind {kind!r}: standard deviations must be above zero; give them, for example {example}"
-            )
+        if problem is not None:
+            columns = {p.name: len(x) + i for i, p in enumerate(problem.instrument_parameters)}
+            x_all = np.concatenate([x, known_before.differences])
+            r = linearize_and_factor(replace(problem, errors=errors), x_all, small_angle=False).r
         instrument_columns = []
         for parameter in template.instrument_parameters:
             if parameter.name not in values:
@@ -263,8 +250,7 @@ class Information:
         return cls(
             errors=errors,
             x=x,
-            kind=maker,
-            noise=noise,
+            instrument=known_before.instrument,
             instrument_values=np.array(
                 [
                     values.get(parameter.name, parameter.nominal)
@@ -277,6 +263,102 @@ class Information:
             data_factor=data_factor,
             fitted=fitted,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class _Before:
+    """Robot, instrument and existing measurements before a plan.
+
+    Attributes:
+        errors: Error model of the robot.
+        x: Present values of its parameters, shape (p,) [m or rad].
+        sigma: Prior standard deviations of these and of the unknowns in `differences`.
+        instrument: Source of the measurements.
+        template: Measurements with initial values of the instrument parameters.
+        values: Values of instrument parameters that are known, or estimated from the existing measurements.
+        problem: Least-squares problem of the existing measurements; None without any.
+        differences: Its estimated instrument parameters less their initial values.
+    """
+
+    errors: ErrorModel
+    x: Array
+    sigma: Array
+    instrument: Instrument
+    template: Measurement
+    values: dict[str, float]
+    problem: Problem | None = None
+    differences: Array = field(default_factory=lambda: np.zeros(0))
+
+
+def _before_measuring(
+    chain: Chain,
+    q: Array,
+    kind: str,
+    noise: Noise | None,
+    parameters: str | None,
+    priors: Priors,
+    fix: Sequence[str],
+    free: Sequence[str],
+    data: Sequence[Measurement],
+    known: Mapping[str, float],
+) -> _Before:
+    """Return what is known before measurements of a kind; see `Information.from_prior`."""
+    maker = _plannable_kind(kind)
+    errors = select_parameters(chain, parameters if parameters is not None else chain.parameters, fix, free)
+    x, sigma = np.zeros(len(errors.parameters)), 1 / prior_weights(errors, priors)
+    fit = None
+    if data:
+        fit = calibrate(
+            chain, data, parameters, priors=priors, fix=fix, free=free, known=known, extend="none"
+        )
+        errors, x, sigma = fit.errors, fit.x[: len(x)], 1 / fit.problem.prior_weights
+        noise = noise or _sigma_of(fit.problem.data, kind)
+    if noise is None:
+        raise InvalidArgumentError(
+            f"kind {kind!r}: the standard deviation is unknown; give one, for example 0.1mm,0.01deg"
+        )
+    instrument = SimulatedInstrument(maker, noise)
+    template = instrument.template(errors.at(x), q[:_N_PLACEMENT_SAMPLES])
+    if not template.has_stated_sigma:
+        example = "0.1mm,0.01deg" if "orientation" in maker.residual_groups else "0.1mm"
+        raise InvalidArgumentError(
+            f"kind {kind!r}: standard deviations must be above zero; give them, for example {example}"
+        )
+    if fit is None:
+        return _Before(errors, x, sigma, instrument, template, dict(known))
+    values = dict(known) | fit.instruments
+    return _Before(errors, x, sigma, instrument, template, values, fit.problem, fit.x[len(x) :])
+
+
+def _before_images(
+    chain: Chain,
+    q: Array,
+    images: PlannedImages,
+    noise: Noise | None,
+    parameters: str | None,
+    priors: Priors,
+    fix: Sequence[str],
+    free: Sequence[str],
+    data: Sequence[Measurement],
+    known: Mapping[str, float],
+) -> _Before:
+    """Return what is known before images; see `Information.from_prior`.
+
+    Existing images are linearized at the nominal robot: a plan does not depend on their measured values.
+    """
+    robot_sets, rig_sets = split_sets(parameters if parameters is not None else DEFAULT_SETS)
+    errors = select_parameters(chain, robot_sets, fix, free) if robot_sets or free else ErrorModel(chain, ())
+    x, weights = np.zeros(len(errors.parameters)), prior_weights(errors, priors)
+    instrument = CameraInstrument(images, noise or Noise())
+    template = instrument.template(chain, q)
+    values = held_values([template], rig_sets) | dict(known)
+    if not data:
+        return _Before(errors, x, 1 / weights, instrument, template, values)
+    existing = tuple(instrument.existing(item, chain) for item in data)
+    problem = make_problem(errors, existing, weights, values)
+    differences = np.zeros(len(problem.instrument_parameters))
+    values = problem.instruments(np.concatenate([x, differences]))
+    return _Before(errors, x, 1 / problem.prior_weights, instrument, template, values, problem, differences)
 
 
 def _information_rows(sqrt_covariance: Array, unbounded_directions: Array) -> Array:

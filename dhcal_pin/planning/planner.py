@@ -28,6 +28,7 @@ from ..estimation.priors import Priors
 from ..estimation.uncertainty import Uncertainty
 from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..measurements.base import Measurement, Noise
+from ..measurements.camera import CameraCorners
 from ..robot.chain import Chain
 from ..robot.collision import CollisionChecker
 from ..robot.error_families import COMPLIANCE, CURVES, GAIN, HARMONICS
@@ -44,6 +45,8 @@ from .exchange import (
 from .information import Information, add_joint_scatter
 from .refinement import DesignGoal, refine
 from .tour import find_tour
+from .view_sampler import ViewSampler
+from .views import CameraViews, PlannedImages, summarize_views
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -100,6 +103,7 @@ class Plan:
         ways: Way points before each pose, shapes (w, dof) [rad or m]; most are empty.
         is_way_free: Whether the moves to each pose are free of collisions, see `tour`; true for the first.
             Empty if there is nothing to collide with.
+        views: Planned images of each camera; empty for other kinds of measurement.
     """
 
     q: Array
@@ -116,6 +120,7 @@ class Plan:
     curves: tuple[CurvePrediction, ...] = ()
     ways: tuple[Array, ...] = ()
     is_way_free: tuple[bool, ...] = ()
+    views: tuple[CameraViews, ...] = ()
 
     @cached_property
     def log_det(self) -> float:
@@ -187,6 +192,7 @@ def plan(
     data: Sequence[Measurement] = (),
     known: Mapping[str, float] | None = None,
     prior_uncertainty: Uncertainty | None = None,
+    images: PlannedImages | None = None,
     task: Array | None = None,
     candidates: int | Array = 5000,
     space: WorkspaceConstraints | None = None,
@@ -217,6 +223,8 @@ def plan(
         data: Existing measurements to complement.
         known: Values of known instrument parameters, as in `calibrate`.
         prior_uncertainty: Uncertainty of the calibration that made the chain; it replaces the priors.
+        images: Cameras, boards and limits of their views, for images in place of another kind; `noise` is
+            then the scatter of the tool from configuration to configuration.
         task: Joint positions where the tool must be accurate, shape (m, n) [rad or m]; None for the given
             candidates, or for the whole joint space.
         candidates: Number of candidates to draw, or joint positions to choose from, shape (m, n) [rad or m].
@@ -246,12 +254,15 @@ def plan(
     margin = margin or Noise(MARGIN_LENGTH, MARGIN_ANGLE)
     space = space or WorkspaceConstraints()
     sampler, notes = None, []
+    kind = kind if images is None else CameraCorners.kind
     if isinstance(candidates, int):
-        sampler = ConfigurationSampler.from_chain(chain, space, margin.rotation, margin.position)
+        everywhere = ConfigurationSampler.from_chain(chain, space, margin.rotation, margin.position)
+        sampler = everywhere if images is None else ViewSampler.from_sampler(everywhere, images)
         q = sampler.draw(candidates, rng)
         notes += [sampler.collision.note] if sampler.collision.note else []
+        notes += [sampler.note] if isinstance(sampler, ViewSampler) and sampler.note else []
         task_q = (
-            replace(sampler, workspace=WorkspaceConstraints(floor=space.floor)).draw(N_TASK_SAMPLES, rng)
+            replace(everywhere, workspace=WorkspaceConstraints(floor=space.floor)).draw(N_TASK_SAMPLES, rng)
             if task is None
             else chain.validated_q(task)
         )
@@ -271,7 +282,7 @@ def plan(
                 "revolute joint"
             )
     full_information = Information.from_prior(
-        chain, q, kind, noise, sets, priors, fix, free, data, known, omitted_sets, prior_uncertainty
+        chain, q, kind, noise, sets, priors, fix, free, data, known, omitted_sets, prior_uncertainty, images
     )
     information = full_information.without_omitted()
     coordinates = scale_joint_units(chain, q)
@@ -288,6 +299,9 @@ def plan(
         _always_feasible if sampler is None else lambda i: sampler.is_feasible(q[i]),
         bin_columns,
     )
+    if images is not None and sampler is None:
+        visible = images.visible_corners(chain.poses(q))
+        candidate_set.infeasible[:] = ~np.any([corners.any(1) for corners in visible], 0)
     every_nth = np.arange(0, len(q), max(1, len(q) // N_TASK_SAMPLES))
     observable = information.observable_directions(
         candidate_set.rows_of(every_nth)[..., full_information.fitted]
@@ -336,7 +350,19 @@ def plan(
     curves = ()
     if fills_bins:
         curve_information = Information.from_prior(
-            chain, q, kind, noise, parameters, priors, fix, free, data, known, (CURVES,), prior_uncertainty
+            chain,
+            q,
+            kind,
+            noise,
+            parameters,
+            priors,
+            fix,
+            free,
+            data,
+            known,
+            (CURVES,),
+            prior_uncertainty,
+            images,
         )
         plans = _plans_of_sizes(goal, candidate_set, q, greedy, refined)
         measured = np.concatenate([q[:0], *(item.configurations() for item in data)])
@@ -360,11 +386,12 @@ def plan(
         errors=errors,
         random_sizes=random_sizes,
         random_errors=random_errors,
-        recommended_size=_recommended_size(sizes, errors, information.noise.position),
+        recommended_size=_recommended_size(sizes, errors, information.instrument.position_sigma),
         notes=tuple(notes),
         curves=curves,
         ways=tour.ways,
         is_way_free=() if checker.geometry is None else tour.is_way_free,
+        views=() if images is None else summarize_views(images, chain.poses(tour.q)),
     )
 
 

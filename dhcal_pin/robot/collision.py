@@ -8,7 +8,7 @@ Floor and obstacles stand still in the frame of the root link. They are checked 
 chain moves, with a clearance. A robot without collision geometry is represented by thin capsules between its
 joints. The first link may stand on the floor or on an obstacle: such a pair is not checked if it collides at
 the neutral configuration and in the middle of the limits. A line of sight is a thin capsule between
-instrument and tool.
+instrument and tool. The view of a camera is the convex hull of its centre and the corners that it sees.
 """
 
 from __future__ import annotations
@@ -199,6 +199,97 @@ class CollisionChecker:
             for i, item in enumerate(self.geometry.geometryObjects)
             if item.parentJoint < last_joint and item.name != FLOOR
         )
+
+    def shapes_on_end(self, is_tip: bool) -> frozenset[int]:
+        """Return the shapes of the robot that no joint of the chain moves against its tip, or its begin.
+
+        Args:
+            is_tip: Whether the end is the tip.
+
+        Returns:
+            Numbers of the shapes.
+        """
+        if self.geometry is None:
+            return frozenset()
+        chain, model = self.chain, self.chain.model
+        moving = {model.getJointId(name) for name in chain.moving_joints}
+        link = chain.tip if is_tip else chain.root
+        joint = model.frames[model.getFrameId(link, pin.FrameType.BODY)].parentJoint
+        movers = moving & set(model.supports[joint])
+        items = self.geometry.geometryObjects[: self.n_robot_shapes]
+        return frozenset(
+            i for i, item in enumerate(items) if moving & set(model.supports[item.parentJoint]) == movers
+        )
+
+    def shapes_on_line(self, q: Array, start: Array, end: Array) -> frozenset[int]:
+        """Return the shapes of robot and obstacles that touch the line between two points.
+
+        Args:
+            q: Joint positions, shape (n,) [rad or m].
+            start: First point in the frame of the first link of the chain, shape (3,) [m].
+            end: Second point, shape (3,) [m].
+
+        Returns:
+            Numbers of the shapes.
+        """
+        length = float(np.linalg.norm(end - start))
+        rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), (end - start) / length).matrix()
+        line = coal.Capsule(SIGHT_DIAMETER / 2, length)
+        return self._touched(q, line, se3.transform(rotation, (start + end) / 2))
+
+    def is_view_free(self, q: Array, eye: Array, points: Array, ignored: frozenset[int]) -> bool:
+        """Return whether robot and obstacles leave the view from a point to others free.
+
+        The view is the convex hull of all points. The floor is ignored, because a board may lie on it.
+
+        Args:
+            q: Joint positions, shape (n,) [rad or m].
+            eye: Centre of the camera in the frame of the first link of the chain, shape (3,) [m].
+            points: Points that are seen from it, shape (c, 3) [m].
+            ignored: Numbers of shapes that are ignored.
+
+        Returns:
+            Whether the view is free; True if there is nothing to check.
+        """
+        if self.geometry is None:
+            return True
+        hull = _convex_hull(np.concatenate([eye[None], points]))
+        return self._touched(q, hull, np.eye(4)) <= ignored
+
+    def _touched(self, q: Array, shape: Any, pose: Array) -> frozenset[int]:
+        """Return the shapes but the floor that touch a shape at a pose (4, 4) in the first link's frame."""
+        if self.geometry is None:
+            return frozenset()
+        data, shapes = self._data
+        model = self.chain.model
+        pin.updateGeometryPlacements(
+            model, data, self.geometry, shapes, self.chain.configurations(q[None])[0]
+        )
+        frame = model.frames[model.getFrameId(self.chain.root, pin.FrameType.BODY)]
+        shape_pose = (data.oMi[frame.parentJoint] * frame.placement).homogeneous @ pose
+        coal_pose = coal.Transform3s(shape_pose[:3, :3], shape_pose[:3, 3])
+        return frozenset(
+            i
+            for i, item in enumerate(self.geometry.geometryObjects)
+            if item.name != FLOOR
+            and coal.collide(
+                shape,
+                coal_pose,
+                item.geometry,
+                coal.Transform3s(shapes.oMg[i].rotation, shapes.oMg[i].translation),
+                coal.CollisionRequest(),
+                coal.CollisionResult(),
+            )
+        )
+
+
+def _convex_hull(points: Array) -> Any:
+    """Create the convex hull of points (c, 3), each as thick as a line of sight, so that it has a volume."""
+    axes = SIGHT_DIAMETER / 2 * np.concatenate([np.eye(3), -np.eye(3)])
+    vertices = coal.StdVec_Vec3s()
+    for point in (points[:, None] + axes).reshape(-1, 3):
+        vertices.append(point)
+    return coal.ConvexBase.convexHull(vertices, True, "Qt")
 
 
 def obstacles_from_urdf(urdf: Urdf) -> list[Obstacle]:

@@ -48,6 +48,35 @@ def project_board(rig: MountedRig, camera: int, board: int, poses: Array) -> tup
     return pixels.reshape(len(poses), len(points), 2), local[..., 2]
 
 
+def visible_corners(rig: MountedRig, camera: int, board: int, poses: Array, limits: ViewLimits) -> Array:
+    """Return which corners of a board a camera sees.
+
+    Args:
+        rig: Cameras with known intrinsics, and boards.
+        camera: Number of the camera.
+        board: Number of the board.
+        poses: Poses of the board in the camera, shape (m, 4, 4) [m].
+        limits: Limits of the view.
+
+    Returns:
+        Whether each corner is in the image, shape (m, c); no corner of a board that is not in view.
+    """
+    middle = poses[:, :3, :3] @ rig.boards[board].points.mean(0) + poses[:, :3, 3]
+    distance = np.linalg.norm(middle, axis=1)
+    # The z axis of a flat board points away from its printed side.
+    along = np.einsum("mi,mi->m", poses[:, :3, 2], middle)
+    in_view = (distance >= limits.min_distance) & (distance <= limits.max_distance) & (middle[:, 2] > 0)
+    if rig.boards[board].type != "points":
+        in_view &= along >= np.cos(limits.max_angle) * distance
+    near = np.flatnonzero(in_view)
+    pixels, depth = project_board(rig, camera, board, poses[near])
+    last = np.array([rig.cameras[camera].width, rig.cameras[camera].height]) - 1 - limits.margin
+    is_inside = np.all((pixels >= limits.margin) & (pixels <= last), 2) & (depth > 0)
+    out = np.zeros((len(poses), is_inside.shape[1]), bool)
+    out[near] = is_inside & (is_inside.mean(1) >= limits.min_share)[:, None]
+    return out
+
+
 def is_board_in_view(
     rig: MountedRig, camera: int, board: int, tools: Array, limits: ViewLimits | None = None
 ) -> Array:
@@ -63,18 +92,5 @@ def is_board_in_view(
     Returns:
         Whether the board is in view, shape (m,).
     """
-    limits = limits or ViewLimits()
     poses = rig.board_in_camera(camera, board, tools)
-    middle = poses[:, :3, :3] @ rig.boards[board].points.mean(0) + poses[:, :3, 3]
-    distance = np.linalg.norm(middle, axis=1)
-    # The z axis of a flat board points away from its printed side.
-    along = np.einsum("mi,mi->m", poses[:, :3, 2], middle)
-    out = (distance >= limits.min_distance) & (distance <= limits.max_distance) & (middle[:, 2] > 0)
-    if rig.boards[board].type != "points":
-        out &= along >= np.cos(limits.max_angle) * distance
-    near = np.flatnonzero(out)
-    pixels, depth = project_board(rig, camera, board, poses[near])
-    last = np.array([rig.cameras[camera].width, rig.cameras[camera].height]) - 1 - limits.margin
-    is_inside = np.all((pixels >= limits.margin) & (pixels <= last), 2) & (depth > 0)
-    out[near] = is_inside.mean(1) >= limits.min_share
-    return out
+    return np.any(visible_corners(rig, camera, board, poses, limits or ViewLimits()), 1)

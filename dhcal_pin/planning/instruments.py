@@ -1,0 +1,390 @@
+"""Instruments of a plan: what a measurement anywhere says about errors of robot and instrument.
+
+An instrument returns the whitened Jacobian A(q) of one measurement with respect to p errors of the robot and
+s parameters of the instrument, and the displacement of its measured point that these cause anywhere.
+
+The rows of an image are reduced. The c corners of a board in an image depend on the unknowns only by the pose
+of the board in the camera and the l values of the lens. The columns of A therefore lie in the space of 6 + l
+columns B (2c, 6+l), and with the QR decomposition B = Q·R the rows QᵀA say the same as A:
+
+    (QᵀA)ᵀ(QᵀA) = AᵀA.
+
+Shapes: m configurations, n joints, k rows of a measurement.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from .. import se3
+from .._typing import Array
+from ..exceptions import InvalidArgumentError
+from ..measurements.base import Measurement, Noise, whitened_jacobian
+from ..measurements.camera import CameraCorners, left_jacobian
+from ..measurements.images import rig_parameters
+from ..robot.chain import Chain
+from .views import PlannedImages
+
+# Configurations whose images are computed at once.
+_CHUNK = 200
+
+
+@dataclass(frozen=True, eq=False)
+class PresentModel:
+    """Robot and instrument at the present values of their parameters.
+
+    Attributes:
+        chain: Robot.
+        bodies: Bodies of its p errors, shape (p,).
+        twists: Twists of its errors, shape (p, 6).
+        values: Values of the s instrument parameters, shape (s,) [m, rad, px or 1].
+    """
+
+    chain: Chain
+    bodies: Array
+    twists: Array
+    values: Array
+
+
+class Instrument(Protocol):
+    """Source of the measurements that are planned."""
+
+    @property
+    def noise(self) -> Noise:
+        """Standard deviations that measurements of different configurations do not share [m, rad]."""
+        ...
+
+    @property
+    def position_sigma(self) -> float:
+        """Standard deviation along each axis of a position by this instrument [m]."""
+        ...
+
+    def template(self, chain: Chain, q: Array) -> Measurement:
+        """Return measurements whose instrument parameters have initial values.
+
+        Args:
+            chain: Robot.
+            q: Joint positions, shape (m, n) [rad or m].
+
+        Returns:
+            Measurements.
+        """
+        ...
+
+    def jacobians(self, model: PresentModel, q: Array) -> tuple[Array, Array]:
+        """Compute the whitened Jacobian of measurements.
+
+        Args:
+            model: Robot and instrument.
+            q: Joint positions, shape (m, n) [rad or m].
+
+        Returns:
+            Derivatives by the errors, shape (p, k, m), and by the instrument parameters, shape (s, k, m).
+        """
+        ...
+
+    def displacements(self, model: PresentModel, q: Array) -> tuple[Array, Array]:
+        """Compute displacements of the measured points.
+
+        Args:
+            model: Robot and instrument.
+            q: Joint positions, shape (m, n) [rad or m].
+
+        Returns:
+            Derivatives of d coordinates by the errors, shape (p, d, m), and by the instrument parameters,
+            shape (s, d, m) [m]. The sum of their squares is the mean square over the measured points.
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedInstrument:
+    """Instrument of a kind of measurement, in a sensible place.
+
+    Attributes:
+        kind: Kind of measurement.
+        noise: Standard deviations of a measurement [m, rad].
+    """
+
+    kind: type[Measurement]
+    noise: Noise
+
+    @property
+    def position_sigma(self) -> float:
+        """Standard deviation along each axis of a position [m]."""
+        return self.noise.position
+
+    def template(self, chain: Chain, q: Array) -> Measurement:
+        """Return measurements whose instrument parameters have initial values.
+
+        Args:
+            chain: Robot.
+            q: Joint positions, shape (m, n) [rad or m].
+
+        Returns:
+            Measurements.
+        """
+        return self.kind.simulate(chain, q, self.noise, np.random.default_rng(0)).initialized(chain)
+
+    def jacobians(self, model: PresentModel, q: Array) -> tuple[Array, Array]:
+        """Compute the whitened Jacobian of measurements.
+
+        Args:
+            model: Robot and instrument.
+            q: Joint positions, shape (m, n) [rad or m].
+
+        Returns:
+            Derivatives by the errors, shape (p, k, m), and by the instrument parameters, shape (s, k, m).
+        """
+        chain, u = model.chain, model.values
+        data = self.kind.simulate(chain, q, self.noise, np.random.default_rng(0))
+        frames = chain.forward_kinematics(q)
+        jacobian = chain.tool_jacobian(frames, model.bodies, model.twists)
+        by_errors = whitened_jacobian(data, frames, jacobian, u, data.residual(frames, u))
+        return by_errors, data.instrument_jacobian(frames, u)
+
+    def displacements(self, model: PresentModel, q: Array) -> tuple[Array, Array]:
+        """Compute displacements of the tool point in the measuring frame.
+
+        Args:
+            model: Robot and instrument.
+            q: Joint positions, shape (m, n) [rad or m].
+
+        Returns:
+            Derivatives by the errors, shape (p, 3, m), and by the instrument parameters, shape (s, 3, m) [m].
+        """
+        frames = model.chain.forward_kinematics(q)
+        jacobian = model.chain.tool_jacobian(frames, model.bodies, model.twists)[:, :3]
+        return jacobian, np.zeros((len(model.values), 3, len(q)))
+
+
+@dataclass(frozen=True, eq=False)
+class CameraInstrument:
+    """Cameras that see boards; a measurement is all images of one configuration.
+
+    Attributes:
+        images: Cameras, boards, and limits of their views.
+        noise: Standard deviations of the displacement of the tool that all corners of a configuration share.
+    """
+
+    images: PlannedImages
+    noise: Noise
+
+    @property
+    def position_sigma(self) -> float:
+        """Standard deviation across the line of sight of a corner, at the middle distance [m]."""
+        sizes = []
+        for camera, board in self.images.pairs:
+            limits, values = self.images.limits(camera, board), self.images.rig.cameras[camera].values
+            sizes.append(0.5 * (limits.min_distance + limits.max_distance) / values[:2].mean())
+        return float(np.hypot(self.noise.position, self.images.sigma * np.mean(sizes)))
+
+    def template(self, chain: Chain, q: Array) -> CameraCorners:
+        """Return all corners at the first configuration, in view or not.
+
+        Args:
+            chain: Robot.
+            q: Joint positions, shape (m, n) [rad or m].
+
+        Returns:
+            Image coordinates whose values mean nothing.
+        """
+        return self._corners.replace(q=np.repeat(q[:1], len(self._corners.rows), 0))
+
+    @cached_property
+    def _corners(self) -> CameraCorners:
+        """All corners of all pairs of a camera and a board in one configuration, without joint values."""
+        rig = self.images.rig
+        # The corners are taken as known: their errors do not depend on the choice of poses.
+        boards = tuple(replace(board, has_free_points=False) for board in rig.boards)
+        pairs = [(c, b, len(boards[b].points)) for c, b in self.images.pairs]
+        count = sum(size for *_, size in pairs)
+        corners = CameraCorners(
+            np.zeros((count, 1)),
+            np.concatenate([np.tile(rig.cameras[c].image_centre, (size, 1)) for c, _, size in pairs]),
+            np.concatenate([np.arange(size) for *_, size in pairs]),
+            replace(rig, boards=boards),
+            [rig.cameras[c].name for c, _, size in pairs for _ in range(size)],
+            [rig.boards[b].name for _, b, size in pairs for _ in range(size)],
+            self.images.sigma,
+        )
+        return corners.replace(instrument_parameters=rig_parameters(corners.rig))
+
+    def images_of(self, chain: Chain, q: Array) -> CameraCorners:
+        """Return the corners of all images of configurations, with infinite standard deviation out of view.
+
+        Args:
+            chain: Robot.
+            q: Joint positions, shape (m, n) [rad or m].
+
+        Returns:
+            The c corners of all pairs of a camera and a board, configuration by configuration.
+        """
+        one, m = self._corners, len(q)
+        visible = np.concatenate(self.images.visible_corners(chain.poses(q)), 1).reshape(-1)
+        tiled = {name: np.tile(getattr(one, name), m) for name in ("camera", "board", "corner")}
+        return one.replace(
+            q=np.repeat(q, len(one.rows), 0),
+            rows=np.arange(len(visible)),
+            values=np.tile(one.values, (m, 1)),
+            sigma=np.where(visible[:, None], self.images.sigma, np.inf) * np.ones(2),
+            jitter=np.zeros((len(visible), 2, 6)),
+            **tiled,
+        )
+
+    def existing(self, item: Measurement, chain: Chain) -> CameraCorners:
+        """Return existing images as this instrument would measure them.
+
+        Args:
+            item: Image coordinates by the cameras of this instrument.
+            chain: Robot.
+
+        Returns:
+            Image coordinates with the noise and the initial values of this instrument.
+
+        Raises:
+            InvalidArgumentError: The measurements are no image coordinates.
+        """
+        if not isinstance(item, CameraCorners):
+            raise InvalidArgumentError(
+                f"{item.source or item.kind}: a plan of images complements images; expected the columns u, v "
+                "and corner"
+            )
+        item = item.replace(
+            rig=self._corners.rig,
+            instrument_parameters=self._corners.instrument_parameters,
+            sigma=np.full_like(item.sigma, self.images.sigma),
+            has_stated_sigma=True,
+        )
+        return self.with_shared_noise(item, chain, np.array([p.nominal for p in item.instrument_parameters]))
+
+    def with_shared_noise(self, item: CameraCorners, chain: Chain, u: Array) -> CameraCorners:
+        """Return image coordinates whose corners share a displacement of the tool.
+
+        Args:
+            item: Image coordinates.
+            chain: Robot.
+            u: Values of the instrument parameters, shape (s,).
+
+        Returns:
+            Image coordinates with jitter.
+        """
+        std = np.array([self.noise.position] * 3 + [self.noise.rotation] * 3)
+        return item.with_jitter(item.displacement_derivative(chain.forward_kinematics(item.q), u) * std)
+
+    def jacobians(self, model: PresentModel, q: Array) -> tuple[Array, Array]:
+        """Compute the whitened and reduced Jacobian of images.
+
+        Args:
+            model: Robot and instrument.
+            q: Joint positions, shape (m, n) [rad or m].
+
+        Returns:
+            Derivatives by the errors, shape (p, k, m), and by the instrument parameters, shape (s, k, m).
+        """
+        starts = range(0, max(len(q), 1), _CHUNK)
+        parts = [self._reduced_jacobian(model, q[start : start + _CHUNK]) for start in starts]
+        both = np.concatenate(parts).transpose(2, 1, 0)
+        return both[: len(model.bodies)], both[len(model.bodies) :]
+
+    def _reduced_jacobian(self, model: PresentModel, q: Array) -> Array:
+        """Compute the reduced rows (m, k, p+s) of images of a few configurations."""
+        chain, u = model.chain, model.values
+        m, n_corners = len(q), len(self._corners.rows)
+        plain = self.images_of(chain, q)
+        frames = chain.forward_kinematics(plain.q)
+        by_instrument = plain.instrument_jacobian(frames, u)
+        basis = self._basis(by_instrument.reshape(len(u), 2, m, n_corners))
+        data = self.with_shared_noise(plain, chain, u)
+        jacobian = chain.tool_jacobian(frames, model.bodies, model.twists)
+        by_errors = whitened_jacobian(data, frames, jacobian, u, data.residual(frames, u))
+        rows = np.concatenate([by_errors, data.instrument_jacobian(frames, u)])
+        rows = rows.reshape(-1, 2, m, n_corners).transpose(2, 1, 3, 0).reshape(m, 2 * n_corners, -1)
+        return np.linalg.qr(basis)[0].swapaxes(1, 2) @ rows
+
+    def _basis(self, by_instrument: Array) -> Array:
+        """Return columns (m, 2c, b) that span those of every Jacobian, from derivatives (s, 2, m, c)."""
+        names = [parameter.name for parameter in self._corners.instrument_parameters]
+        rig, corners, blocks = self._corners.rig, self._corners, []
+        for camera, board in self.images.pairs:
+            prefixes = (f"camera_{rig.cameras[camera].name}.", f"board_{rig.boards[board].name}.")
+            is_pose = [name.startswith(prefixes[1]) for name in names]
+            is_lens = [
+                name.startswith(prefixes[0]) and corners.set_of(name) == "intrinsics" for name in names
+            ]
+            of_pair = (corners.camera == camera) & (corners.board == board)
+            blocks.append(by_instrument[np.logical_or(is_pose, is_lens)] * of_pair)
+        columns = np.concatenate(blocks)
+        return columns.transpose(2, 1, 3, 0).reshape(columns.shape[2], -1, len(columns))
+
+    def displacements(self, model: PresentModel, q: Array) -> tuple[Array, Array]:
+        """Compute displacements between cameras and boards.
+
+        The measured point is the middle of a board on the tool, in the frame of a camera that stands still;
+        or a point in front of a camera on the tool, in the frame of a board that stands still.
+
+        Args:
+            model: Robot and instrument.
+            q: Joint positions, shape (m, n) [rad or m].
+
+        Returns:
+            Derivatives by the errors, shape (p, d, m), and by the instrument parameters, shape (s, d, m) [m],
+            with d three times the number of pairs of a camera and a board.
+        """
+        u, frames = model.values, model.chain.forward_kinematics(q)
+        jacobian = model.chain.tool_jacobian(frames, model.bodies, model.twists)
+        tools, names = frames.poses(), [p.name for p in self._corners.instrument_parameters]
+        by_errors, by_instrument = [], []
+        for pair in self.images.pairs:
+            ends = self._ends(*pair)
+            (moving, moving_link, columns, point), (fixed, fixed_link, fixed_columns, _) = ends
+            on_tool = moving[:3, :3] @ point + moving[:3, 3]
+            lever = np.einsum("mij,j->mi", tools[:, :3, :3], on_tool)
+            by_errors.append(jacobian[:, :3] + np.cross(jacobian[:, 3:], lever.T[None], axis=1))
+            part = np.zeros((len(u), 3, len(q)))
+            start, other = names.index(columns), names.index(fixed_columns)
+            by_pose = np.concatenate(
+                [
+                    moving_link,
+                    -se3.skew(moving[:3, :3] @ point) @ moving_link @ left_jacobian(u[start + 3 : start + 6]),
+                ],
+                1,
+            )
+            part[start : start + 6] = np.einsum("mij,jk->kim", tools[:, :3, :3], by_pose)
+            arm = tools[:, :3, 3] + lever - fixed[:3, 3]
+            turn = fixed_link @ left_jacobian(u[other + 3 : other + 6])
+            part[other : other + 3] = -fixed_link.T[:, :, None]
+            part[other + 3 : other + 6] = np.einsum("mij,jk->kim", se3.skew(arm), turn)
+            by_instrument.append(part)
+        scale = 1 / np.sqrt(len(self.images.pairs))
+        return scale * np.concatenate(by_errors, 1), scale * np.concatenate(by_instrument, 1)
+
+    def _ends(self, camera: int, board: int) -> Sequence[tuple[Array, Array, str, Array]]:
+        """Return the moving and the standing end of a pair.
+
+        Returns:
+            For each, the pose (4, 4) of camera or board in the frame of its end, the rotation (3, 3) of its
+            link there, the name of the first parameter of its pose, and the measured point (3,) in its frame.
+        """
+        rig, limits = self.images.rig, self.images.limits(camera, board)
+        depth = 0.5 * (limits.min_distance + limits.max_distance)
+        ends = [
+            (
+                rig.camera_in_end(camera),
+                rig.camera_mounts[camera].link_pose[:3, :3],
+                f"camera_{rig.cameras[camera].name}.x",
+                np.array([0.0, 0.0, depth]),
+            ),
+            (
+                rig.board_in_end(board),
+                rig.board_mounts[board].link_pose[:3, :3],
+                f"board_{rig.boards[board].name}.x",
+                rig.boards[board].points.mean(0),
+            ),
+        ]
+        return ends if rig.camera_mounts[camera].moves else ends[::-1]

@@ -1,0 +1,211 @@
+"""Configurations in which cameras see boards.
+
+Random joint positions hardly ever have a board in view. Candidates therefore come from random views
+(`views`): inverse kinematics from a random start brings the camera, or the board, to a view. Only the result
+is tested: a robot with few joints that misses the drawn view may have the board in view all the same.
+
+A view is hidden if a shape of the robot or an obstacle touches the convex hull of the centre of the camera
+and the corners in view. If a shape that moves with the camera is right in front of it, or one that moves
+with the board in front of that, every view would be hidden: the pose in the rig is a guess, or the camera is
+inside of a housing. All shapes that move with it are ignored then, and a note says so.
+
+Shapes: m configurations, n joints.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from .. import se3
+from .._typing import Array
+from ..exceptions import InvalidArgumentError
+from ..robot.inverse_kinematics import characteristic_length, pose_task, solve_ik, wrap_into_limits
+from ..robot.sampling import ConfigurationSampler
+from .views import PlannedImages, draw_views
+
+# Steps of the inverse kinematics, and configurations that are solved at once.
+_IK_STEPS, _BATCH = 40, 1000
+# Rounds of draws per batch of configurations, and rounds without any board in view before giving up.
+_MAX_ROUNDS, _MAX_EMPTY_ROUNDS = 60, 3
+# Part of the line of sight next to the board that is not checked: the board has a thickness.
+_BOARD_SHARE = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class ViewSampler(ConfigurationSampler):
+    """Sampler of configurations in which a camera sees a board.
+
+    Attributes:
+        images: Cameras and boards.
+    """
+
+    images: PlannedImages
+
+    @classmethod
+    def from_sampler(cls, sampler: ConfigurationSampler, images: PlannedImages) -> ViewSampler:
+        """Restrict a sampler to configurations in which a camera sees a board.
+
+        Args:
+            sampler: Sampler.
+            images: Cameras and boards.
+
+        Returns:
+            Sampler.
+        """
+        return cls(sampler.chain, sampler.workspace, sampler.low, sampler.high, sampler.collision, images)
+
+    def in_workspace(self, q: Array) -> Array:
+        """Return in which configurations the tool is in the workspace and a board is in view.
+
+        Args:
+            q: Joint positions, shape (m, n) [rad or m].
+
+        Returns:
+            Whether the constraints are satisfied, shape (m,).
+        """
+        inside = super().in_workspace(q)
+        near = np.flatnonzero(inside)
+        visible = self.images.visible_corners(self.chain.poses(q[near]))
+        inside[near] = np.any([corners.any(1) for corners in visible], 0)
+        return inside
+
+    def draw(self, count: int, rng: np.random.Generator) -> Array:
+        """Draw joint positions in which a board is in view; collisions and hidden views are not checked.
+
+        Args:
+            count: Number of configurations.
+            rng: Random generator.
+
+        Returns:
+            Joint positions, shape (count, n) [rad or m].
+
+        Raises:
+            InvalidArgumentError: Too few configurations have a board in view.
+        """
+        out = np.empty((0, self.chain.n_joints))
+        for number in range(_MAX_ROUNDS * -(-count // _BATCH)):
+            start = rng.uniform(self.low, self.high, (_BATCH, self.chain.n_joints))
+            q = self._bring_into_view(start, rng)
+            out = np.concatenate([out, q[self.in_workspace(q)]])
+            if len(out) >= count:
+                return out[:count]
+            if not len(out) and number + 1 == _MAX_EMPTY_ROUNDS:
+                break
+        raise InvalidArgumentError(
+            "no camera can see a board in any pose of the robot; check links and poses in the rig file, and "
+            "the limits of distance, angle, workspace and floor"
+            if not len(out)
+            else f"only {len(out)} poses with a board in view were found; expected {count}: relax the limits "
+            "of distance and angle, or use fewer candidates"
+        )
+
+    def perturb(self, q: Array, step: float, count: int, rng: np.random.Generator) -> Array:
+        """Draw configurations around given ones; those without a board in view are brought to a view.
+
+        Args:
+            q: Joint positions, shape (m, n) [rad or m].
+            step: Standard deviation as a fraction of the joint range.
+            count: Number of configurations around each of q.
+            rng: Random generator.
+
+        Returns:
+            Joint positions, shape (m·count, n) [rad or m].
+        """
+        out = super().perturb(q, step, count, rng)
+        lost = np.flatnonzero(~self.in_workspace(out))
+        if lost.size:
+            out[lost] = self._bring_into_view(out[lost], rng)
+        return out
+
+    def is_feasible(self, q: Array) -> bool:
+        """Return whether a configuration has no collision, and no board in view is hidden.
+
+        Args:
+            q: Joint positions, shape (n,) [rad or m].
+
+        Returns:
+            Whether the robot can take images in this configuration.
+        """
+        return super().is_feasible(q) and not self._is_hidden(q)
+
+    def _bring_into_view(self, start: Array, rng: np.random.Generator) -> Array:
+        """Move joint positions (m, n) towards random views, by inverse kinematics."""
+        rig, pairs = self.images.rig, self.images.pairs
+        targets, chosen = np.empty((len(start), 4, 4)), rng.integers(len(pairs), size=len(start))
+        for number, (camera, board) in enumerate(pairs):
+            rows = np.flatnonzero(chosen == number)
+            if not rows.size:
+                continue
+            views = draw_views(rig, camera, board, self.images.limits(camera, board), len(rows), rng)
+            camera_pose, board_pose = rig.camera_in_end(camera), rig.board_in_end(board)
+            if rig.camera_mounts[camera].moves:
+                targets[rows] = board_pose @ se3.inverse(views) @ se3.inverse(camera_pose)
+            else:
+                targets[rows] = camera_pose @ views @ se3.inverse(board_pose)
+        task = pose_task(targets, characteristic_length(self.chain))
+        q, _ = solve_ik(self.chain, task, start, _IK_STEPS)
+        q, _ = wrap_into_limits(replace(self.chain, lower=self.low, upper=self.high), q)
+        return np.clip(q, self.low, self.high)
+
+    def _is_hidden(self, q: Array) -> bool:
+        """Return whether the robot or an obstacle hides a board that is in view at q, shape (n,)."""
+        rig, tools, images = self.images.rig, self.chain.poses(q[None]), self.images
+        for pair, visible in zip(images.pairs, images.visible_corners(tools), strict=True):
+            if not visible.any():
+                continue
+            eye, board = self._in_first_link(tools[0], *pair)
+            points = rig.boards[pair[1]].points[visible[0]] @ board[:3, :3].T + board[:3, 3]
+            ignored = frozenset().union(*self._blocking[pair].values())
+            near_board = eye[:3, 3] + (1 - _BOARD_SHARE) * (points - eye[:3, 3])
+            if not self.collision.is_view_free(q, eye[:3, 3], near_board, ignored):
+                return True
+        return False
+
+    def _in_first_link(self, tool: Array, camera: int, board: int) -> tuple[Array, Array]:
+        """Return the poses (4, 4) of a camera and a board in the frame of the first link."""
+        rig, from_measuring = self.images.rig, se3.inverse(self.chain.base)
+        poses = []
+        for mount, pose in (
+            (rig.camera_mounts[camera], rig.camera_in_end(camera)),
+            (rig.board_mounts[board], rig.board_in_end(board)),
+        ):
+            poses.append(from_measuring @ (tool @ pose if mount.moves else pose))
+        return poses[0], poses[1]
+
+    @property
+    def note(self) -> str:
+        """What is not checked and why, or an empty text."""
+        names = sorted({name for shapes in self._blocking.values() for name in shapes})
+        if self.collision.geometry is None:
+            return "whether the robot hides a board is not checked: there is no collision geometry"
+        if not names:
+            return ""
+        return (
+            f"whether the link of {' and '.join(names)} hides a board is not checked: it would hide every "
+            "view; check the pose in the rig"
+        )
+
+    @cached_property
+    def _blocking(self) -> dict[tuple[int, int], dict[str, frozenset[int]]]:
+        """Shapes that move with a camera or a board and hide every view, by pair and by its name."""
+        rig, q = self.images.rig, 0.5 * (self.low + self.high)
+        tool, out = self.chain.poses(q[None])[0], {}
+        for camera, board in self.images.pairs:
+            eye, plate = self._in_first_link(tool, camera, board)
+            limits, is_camera_on_tip = self.images.limits(camera, board), rig.camera_mounts[camera].moves
+            length = 0.5 * (limits.min_distance + limits.max_distance)
+            # From the camera along its optical axis, and from the middle of a flat board towards the camera.
+            lines = {f"camera {rig.cameras[camera].name!r}": (is_camera_on_tip, eye[:3, 3], eye[:3, 2])}
+            if rig.boards[board].type != "points":
+                middle = plate[:3, :3] @ rig.boards[board].points.mean(0) + plate[:3, 3]
+                start = middle - _BOARD_SHARE * length * plate[:3, 2]
+                lines[f"board {rig.boards[board].name!r}"] = (not is_camera_on_tip, start, -plate[:3, 2])
+            blocking = out[camera, board] = {}
+            for name, (is_tip, start, axis) in lines.items():
+                shapes = self.collision.shapes_on_end(is_tip)
+                if shapes & self.collision.shapes_on_line(q, start, start + length * axis):
+                    blocking[name] = shapes
+        return out

@@ -1,0 +1,273 @@
+"""Views of boards: limits of a useful view, random views, and how planned views fill the images.
+
+A view is the pose of a board in a camera. It is described by the distance of the middle of the board, the
+angle between the normal of the board and the line of sight, the azimuth and the roll about the line of sight
+and the normal, and the place of the middle of the board in the image.
+
+Shapes: m configurations, c corners of a board.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from .. import se3
+from .._typing import Array
+from ..calibration.procedure import calibrate
+from ..cameras.boards import Board
+from ..exceptions import InvalidArgumentError
+from ..measurements.base import Measurement
+from ..measurements.camera import CameraCorners
+from ..measurements.images import ViewLimits, project_board, visible_corners
+from ..measurements.mounting import MountedRig
+from ..robot.chain import Chain
+
+# Default limits: smallest size in the image of a square, and of a marker, whose pattern needs more pixels, at
+# the largest distance [px], and distance of corners from the edge of the image, as a share of its width.
+MIN_SQUARE_PX, MIN_MARKER_PX, MARGIN_SHARE = 20.0, 40.0, 0.02
+# Default limit of the angle between the normal of a board and the line of sight [rad].
+MAX_VIEW_ANGLE = np.deg2rad(60.0)
+# Views that are drawn at once, rounds of draws, and rounds without any view in the image before giving up.
+_BATCH, _MAX_ROUNDS, _MAX_EMPTY_ROUNDS = 1000, 200, 20
+# Cells of an image along u and v, in which corners are counted.
+_N_CELLS = (10, 10)
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedImages:
+    """Cameras, boards and images that a plan is for.
+
+    Attributes:
+        rig: Cameras and boards whose poses and intrinsics are known approximately.
+        sigma: Standard deviation of an image coordinate [px].
+        distance: Smallest and largest distance of the middle of a board from the camera [m]; by default any
+            distance at which the board fits into the image and its squares and markers are large enough.
+        max_angle: Largest angle between the normal of a board and the line of sight [rad].
+        min_share: Smallest share of the corners of a board in the image.
+        margin: Distance of the corners from the edge of the image [px]; by default `MARGIN_SHARE` of its
+            width.
+    """
+
+    rig: MountedRig
+    sigma: float = 0.3
+    distance: tuple[float, float] | None = None
+    max_angle: float = MAX_VIEW_ANGLE
+    min_share: float = 1.0
+    margin: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check that poses and intrinsics are known."""
+        rig, where = self.rig, f"{self.rig.source}: " if self.rig.source else ""
+        for kind, entries in (("camera", rig.cameras), ("board", rig.boards)):
+            for entry in entries:
+                if entry.pose is None:
+                    raise InvalidArgumentError(
+                        f"{where}[{kind}.{entry.name}] has no pose; expected an approximate one in its link, "
+                        "xyz_m and rotvec_rad, or images to estimate it from (--data)"
+                    )
+        for camera in rig.cameras:
+            if not camera.has_intrinsics:
+                raise InvalidArgumentError(
+                    f"{where}[camera.{camera.name}] has no fx, fy, cx, cy; expected approximate values"
+                )
+        if not self.pairs:
+            raise InvalidArgumentError(
+                f"{where}no joint moves a board against a camera; expected one of them on the tool, the "
+                "other one not"
+            )
+
+    @cached_property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Numbers of cameras and boards that move against each other."""
+        return [
+            (camera, board)
+            for camera, camera_mount in enumerate(self.rig.camera_mounts)
+            for board, board_mount in enumerate(self.rig.board_mounts)
+            if camera_mount.moves != board_mount.moves
+        ]
+
+    def limits(self, camera: int, board: int) -> ViewLimits:
+        """Return the limits of a view.
+
+        Args:
+            camera: Number of the camera.
+            board: Number of the board.
+
+        Returns:
+            Limits.
+        """
+        entry = self.rig.cameras[camera]
+        low, high = self.distance or (0.0, _largest_distance(entry.values, self.rig.boards[board]))
+        margin = MARGIN_SHARE * entry.width if self.margin is None else self.margin
+        return ViewLimits(low, high, self.max_angle, self.min_share, margin)
+
+    def visible_corners(self, tools: Array) -> list[Array]:
+        """Return which corners are in view.
+
+        Args:
+            tools: Poses of the tool in the measuring frame, shape (m, 4, 4) [m].
+
+        Returns:
+            For each of `pairs`, whether each corner is in view, shape (m, c).
+        """
+        return [
+            visible_corners(self.rig, *pair, self.rig.board_in_camera(*pair, tools), self.limits(*pair))
+            for pair in self.pairs
+        ]
+
+
+def _largest_distance(values: Array, board: Board) -> float:
+    """Return the distance [m] at which the details of a board have their smallest size in the image."""
+    focal = float(values[:2].min())
+    if board.type == "points":
+        distances = np.linalg.norm(board.points[:, None] - board.points[None], axis=2)
+        np.fill_diagonal(distances, np.inf)
+        return focal * float(np.median(distances.min(1))) / MIN_SQUARE_PX
+    if board.type == "checkerboard":
+        return focal * board.square / MIN_SQUARE_PX
+    return focal * (board.marker or board.square) / MIN_MARKER_PX
+
+
+def with_measured_poses(rig: MountedRig, chain: Chain, data: Sequence[Measurement]) -> MountedRig:
+    """Return a rig whose missing poses and intrinsics are estimated from images.
+
+    Args:
+        rig: Cameras and boards.
+        chain: Nominal robot.
+        data: Measurements; those that are no image coordinates are ignored.
+
+    Returns:
+        The rig; without images, or with all poses and intrinsics known, as it is.
+    """
+    images = [item for item in data if isinstance(item, CameraCorners)]
+    is_known = all(entry.pose is not None for entry in (*rig.cameras, *rig.boards))
+    if not images or (is_known and all(camera.has_intrinsics for camera in rig.cameras)):
+        return rig
+    fit = calibrate(chain, images, "camera,board,intrinsics", extend="none")
+    return fit.rig or rig
+
+
+def draw_views(
+    rig: MountedRig, camera: int, board: int, limits: ViewLimits, count: int, rng: np.random.Generator
+) -> Array:
+    """Draw poses of a board in a camera in which the board is in view.
+
+    Args:
+        rig: Cameras with known intrinsics, and boards.
+        camera: Number of the camera.
+        board: Number of the board.
+        limits: Limits of the view.
+        count: Number of poses.
+        rng: Random generator.
+
+    Returns:
+        Poses, shape (count, 4, 4) [m].
+
+    Raises:
+        InvalidArgumentError: The board does not fit into the image within the limits.
+    """
+    entry, target = rig.cameras[camera], rig.boards[board]
+    middle = target.points.mean(0)
+    out = np.empty((0, 4, 4))
+    for number in range(_MAX_ROUNDS):
+        pixels = rng.uniform(0, 1, (2, _BATCH)) * [[entry.width - 1], [entry.height - 1]]
+        plane = entry.lens.normalize(pixels, entry.values)
+        sight = np.concatenate([plane, np.ones((1, _BATCH))])
+        sight /= np.linalg.norm(sight, axis=0)
+        distance = rng.uniform(limits.min_distance, limits.max_distance, _BATCH)
+        largest = np.pi if target.type == "points" else limits.max_angle
+        tilt, azimuth, roll = rng.uniform([[0], [0], [0]], [[largest], [2 * np.pi], [2 * np.pi]], (3, _BATCH))
+        zero = np.zeros(_BATCH)
+        rotations = (
+            _towards(sight.T)
+            @ se3.exp3(np.stack([zero, zero, azimuth], 1))
+            @ se3.exp3(np.stack([tilt, zero, zero], 1))
+            @ se3.exp3(np.stack([zero, zero, roll], 1))
+        )
+        poses = se3.transform(rotations, (distance * sight).T - rotations @ middle)
+        out = np.concatenate([out, poses[visible_corners(rig, camera, board, poses, limits).any(1)]])
+        if len(out) >= count:
+            return out[:count]
+        if not len(out) and number == _MAX_EMPTY_ROUNDS:
+            break
+    raise InvalidArgumentError(
+        f"board {target.name!r} does not fit into the image of camera {entry.name!r} at a distance of "
+        f"{1e3 * limits.min_distance:.4g} to {1e3 * limits.max_distance:.4g} mm; expected other distances, "
+        "or a smaller share of the corners"
+    )
+
+
+def _towards(directions: Array) -> Array:
+    """Return rotations (m, 3, 3) whose z axes are unit vectors (m, 3)."""
+    z = np.array([0.0, 0.0, 1.0])
+    axis = np.cross(z, directions)
+    sine = np.linalg.norm(axis, axis=1, keepdims=True)
+    angle = np.arctan2(sine, directions[:, 2:])
+    return se3.exp3(axis * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 0.0))
+
+
+@dataclass(frozen=True)
+class CameraViews:
+    """Planned images of a camera.
+
+    Attributes:
+        camera: Name of the camera.
+        n_images: Number of configurations in which it sees a board.
+        covered_share: Share of the 10 x 10 cells of its image in which there is at least one corner.
+        distances: Smallest and largest distance of the middle of a board [m]; NaN without images.
+        max_angle: Largest angle between the normal of a board and the line of sight [rad].
+    """
+
+    camera: str
+    n_images: int
+    covered_share: float
+    distances: tuple[float, float]
+    max_angle: float
+
+
+def summarize_views(images: PlannedImages, tools: Array) -> tuple[CameraViews, ...]:
+    """Describe how the images of a plan fill the image planes.
+
+    Args:
+        images: Cameras and boards.
+        tools: Poses of the tool in the measuring frame, shape (m, 4, 4) [m].
+
+    Returns:
+        One description per camera that can see a board.
+    """
+    rig, visible = images.rig, images.visible_corners(tools)
+    out = []
+    for number in dict.fromkeys(camera for camera, _ in images.pairs):
+        camera = rig.cameras[number]
+        cells, has_image = np.zeros(_N_CELLS, bool), np.zeros(len(tools), bool)
+        distances, angles = [np.empty(0)], [np.zeros(1)]
+        for pair, corners in zip(images.pairs, visible, strict=True):
+            if pair[0] != number:
+                continue
+            poses = rig.board_in_camera(*pair, tools)
+            pixels, _ = project_board(rig, *pair, poses)
+            u, v = ((pixels[corners] + 0.5) / [camera.width, camera.height] * _N_CELLS).astype(int).T
+            cells[u, v] = True
+            in_view = corners.any(1)
+            has_image |= in_view
+            middle = poses[in_view, :3, :3] @ rig.boards[pair[1]].points.mean(0) + poses[in_view, :3, 3]
+            distance = np.linalg.norm(middle, axis=1)
+            distances.append(distance)
+            if rig.boards[pair[1]].type != "points":
+                along = np.einsum("mi,mi->m", poses[in_view, :3, 2], middle)
+                angles.append(np.arccos(np.clip(along / distance, -1, 1)))
+        all_distances = np.concatenate(distances) if has_image.any() else np.full(1, np.nan)
+        out.append(
+            CameraViews(
+                camera.name,
+                int(has_image.sum()),
+                float(cells.mean()),
+                (float(all_distances.min()), float(all_distances.max())),
+                float(np.concatenate(angles).max()),
+            )
+        )
+    return tuple(out)

@@ -1,0 +1,256 @@
+"""Plans of images: views by OpenCV, rows by the solver, displacements by differences, hidden boards."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dhcal_pin import Chain, se3
+from dhcal_pin.cameras import LENSES, Board, Camera, Rig
+from dhcal_pin.estimation import linearize_and_factor
+from dhcal_pin.estimation.initialization import make_problem
+from dhcal_pin.estimation.priors import prior_weights
+from dhcal_pin.io import read_robot
+from dhcal_pin.measurements import CameraCorners, Noise, mount_rig, project_board
+from dhcal_pin.measurements.mounting import MountedRig
+from dhcal_pin.planning import Information, PlannedImages, plan
+from dhcal_pin.planning.instruments import CameraInstrument
+from dhcal_pin.planning.view_sampler import ViewSampler
+from dhcal_pin.planning.views import draw_views
+from dhcal_pin.robot.sampling import ConfigurationSampler, WorkspaceConstraints, joint_range
+from dhcal_pin.robot.urdf import parse_urdf
+
+cv2 = pytest.importorskip("cv2")
+
+NOISE = Noise(1e-4, 1.7e-4)
+FLOOR = WorkspaceConstraints(floor=0.0)
+PINHOLE = np.array([1000.0, 990, 630, 470, -0.1, 0.05, 1e-3, -5e-4, 0])
+FISHEYE = np.array([600.0, 605, 630, 470, 0.02, -0.01, 0.003, 0])
+FLIP = np.diag([1.0, -1.0, -1.0])
+
+
+def charuco(link: str, pose, name: str = "plate") -> Board:
+    """Return a board whose printed side looks along the negative z axis of its frame."""
+    return Board(name, link, "charuco", columns=7, rows=5, square=0.03, marker=0.022,
+                 dictionary="DICT_5X5_100", pose=pose)  # fmt: skip
+
+
+def setup(name: str) -> tuple[Chain, MountedRig]:
+    """Return a robot and a rig by the name of the robot and the link of the camera."""
+    arm_name, where = name.split("-")
+    tip = {
+        "ur10": "tool0",
+        "panda": "panda_link8",
+        "xarm7": "link_eef",
+        "talos_full_v2": "gripper_left_base_link",
+    }
+    root = "head_2_link" if arm_name == "talos_full_v2" else None
+    arm = read_robot(f"example:{arm_name}", tip=tip[arm_name], root=root)
+    if where == "wrist":
+        camera = Camera("wrist", "tip", 1280, 960, PINHOLE,
+                        pose=se3.transform(se3.exp3([0.05, 0.02, 0.4]), [0.08, 0.01, 0.04]))  # fmt: skip
+        board = charuco("world", se3.transform(FLIP @ se3.exp3([0.02, 0.03, 0.5]), [0.45, -0.1, 0.02]))
+    elif where == "fisheye":
+        camera = Camera("wrist", "tip", 1280, 960, FISHEYE, LENSES["fisheye"],
+                        pose=se3.transform(np.eye(3), [0.08, 0.01, 0.04]))  # fmt: skip
+        board = charuco("world", se3.transform(FLIP, [0.45, -0.1, 0.02]))
+    elif where == "fixed":
+        axes = np.column_stack([[0, 1, 0], [0, 0, -1], [-1, 0, 0]])
+        camera = Camera("eye", "world", 1280, 960, PINHOLE, pose=se3.transform(axes, [1.1, 0, 0.5]))
+        board = charuco("tip", se3.transform(FLIP, [-0.09, 0.06, 0.15]))
+    else:
+        # A camera of the head looks at a board in the hand.
+        camera = Camera("eye", "rgbd_rgb_optical_frame", 1280, 960, PINHOLE, pose=np.eye(4))
+        board = charuco("tip", se3.transform(se3.exp3([0, -np.pi / 2, 0]), [0.03, -0.075, -0.355]))
+    return arm, mount_rig(Rig({camera.name: camera}, {board.name: board}), arm)
+
+
+def sampler(arm: Chain, images: PlannedImages, space: WorkspaceConstraints = FLOOR) -> ViewSampler:
+    return ViewSampler.from_sampler(ConfigurationSampler.from_chain(arm, space, 0.03, 0.005), images)
+
+
+def opencv_view(arm: Chain, rig: MountedRig, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Project all corners by OpenCV and Pinocchio's own forward kinematics.
+
+    Returns:
+        Pixels (m, c, 2), distances of the middle of the board (m,) [m], angles of view (m,) [rad].
+    """
+    import pinocchio as pin
+
+    model, (camera,), (board,) = arm.model, rig.cameras, rig.boards
+    data, pixels, distances, angles = model.createData(), [], [], []
+
+    def link_pose(link):
+        name = {"tip": arm.tip, "world": arm.root}.get(link, link)
+        return data.oMf[model.getFrameId(name)].homogeneous
+
+    for configuration in arm.configurations(q):
+        pin.framesForwardKinematics(model, data, configuration)
+        view = np.linalg.inv(link_pose(camera.link) @ camera.pose) @ link_pose(board.link) @ board.pose
+        focal, (cx, cy), distortion = camera.values[:2], camera.values[2:4], camera.values[4:]
+        matrix = np.array([[focal[0], 0, cx], [0, focal[1], cy], [0, 0, 1]])
+        rotvec, position = cv2.Rodrigues(view[:3, :3])[0], view[:3, 3].copy()
+        project = cv2.fisheye.projectPoints if camera.lens.name == "fisheye" else cv2.projectPoints
+        pixels.append(project(board.points[None], rotvec, position, matrix, distortion)[0].reshape(-1, 2))
+        middle = view[:3, :3] @ board.points.mean(0) + view[:3, 3]
+        distances.append(np.linalg.norm(middle))
+        angles.append(np.arccos(view[:3, 2] @ middle / distances[-1]))
+    return np.array(pixels), np.array(distances), np.array(angles)
+
+
+@pytest.mark.parametrize("name", ["ur10-wrist", "panda-fixed", "xarm7-fisheye", "talos_full_v2-head"])
+def test_every_planned_pose_has_the_board_in_view(name):
+    arm, rig = setup(name)
+    images = PlannedImages(rig, distance=(0.2, 0.8), max_angle=np.deg2rad(50), margin=30.0)
+    space = WorkspaceConstraints() if name == "talos_full_v2-head" else FLOOR
+    found = plan(arm, 12, noise=NOISE, images=images, candidates=150, space=space)
+    pixels, distances, angles = opencv_view(arm, rig, found.q)
+    assert np.all((pixels >= 30) & (pixels <= [1249, 929]))
+    assert np.all((distances >= 0.2) & (distances <= 0.8))
+    assert np.all(angles <= np.deg2rad(50) + 1e-9)
+    (views,) = found.views
+    assert views.n_images == 12
+    assert views.distances == pytest.approx((distances.min(), distances.max()))
+    assert views.max_angle == pytest.approx(angles.max())
+    cells = {(int(10 * (u + 0.5) / 1280), int(10 * (v + 0.5) / 960)) for u, v in pixels.reshape(-1, 2)}
+    assert views.covered_share == pytest.approx(len(cells) / 100)
+    assert np.all((found.q >= arm.lower) & (found.q <= arm.upper))
+
+
+def test_rows_are_those_of_the_solver():
+    """The reduced rows contain the information that a calibration of the same images has."""
+    arm, rig = setup("ur10-wrist")
+    images = PlannedImages(rig, min_share=0.6)
+    q = sampler(arm, images).draw(6, np.random.default_rng(0))
+    information = Information.from_prior(arm, q, "camera", NOISE, images=images)
+    rows = information.rows(q)
+    poses = rig.board_in_camera(0, 0, arm.poses(q))
+    pixels, _ = project_board(rig, 0, 0, poses)
+    (visible,) = images.visible_corners(arm.poses(q))
+    assert 0 < (~visible).sum() < visible.sum()
+    image, corner = np.nonzero(visible)
+    data = CameraCorners(q[image], pixels[image, corner], corner, rig, sigma=images.sigma)
+    u = np.array([p.nominal for p in data.instrument_parameters])
+    std = np.array([NOISE.position] * 3 + [NOISE.rotation] * 3)
+    data = data.with_jitter(data.displacement_derivative(arm.forward_kinematics(data.q), u) * std)
+    problem = make_problem(information.errors, (data,), prior_weights(information.errors, "default"), {})
+    r = linearize_and_factor(problem, np.zeros(len(information.prior_sigma)), small_angle=False).r
+    scaled = r * information.prior_sigma
+    flat = rows.reshape(len(rows), -1).T
+    assert rows.shape[1] == 6 + 9
+    assert np.allclose(
+        flat.T @ flat, scaled.T @ scaled, rtol=1e-8, atol=1e-8 * np.abs(scaled.T @ scaled).max()
+    )
+
+
+@pytest.mark.parametrize("name", ["ur10-wrist", "panda-fixed"])
+def test_displacements_are_derivatives(name):
+    """The measured point moves by as much as differences of the model say, in the frame of the other end."""
+    arm, rig = setup(name)
+    q = np.random.default_rng(1).uniform(*joint_range(arm), (3, arm.n_joints))
+    images = PlannedImages(rig)
+    information = Information.from_prior(arm, q, "camera", NOISE, images=images)
+    instrument = information.instrument
+    assert isinstance(instrument, CameraInstrument)
+    by_errors, by_instrument = instrument.displacements(information._model, q)
+    is_wrist, limits = rig.camera_mounts[0].moves, images.limits(0, 0)
+    names = [p.name for p in instrument.template(arm, q).instrument_parameters]
+    values = dict(zip(names, information.instrument_values.tolist(), strict=True))
+
+    def point(chain, changed):
+        solved = instrument.template(arm, q).solved_rig(changed)
+        view = solved.board_in_camera(0, 0, chain.poses(q))
+        if is_wrist:
+            depth = 0.5 * (limits.min_distance + limits.max_distance)
+            local = se3.inverse(view) @ [0, 0, depth, 1]
+            frame = solved.board_in_end(0)
+        else:
+            local = view @ [*rig.boards[0].points.mean(0), 1]
+            frame = solved.camera_in_end(0)
+        return local[:, :3], frame[:3, :3]
+
+    nominal, axes = point(arm, values)
+    step = 1e-6
+    x = np.zeros(len(information.errors.parameters))
+    for i in range(0, len(x), 5):
+        x[i] = step
+        moved, _ = point(information.errors.at(x), values)
+        assert np.allclose((moved - nominal) @ axes.T / step, by_errors[i].T, atol=2e-5)
+        x[i] = 0.0
+    for i, parameter in enumerate(names):
+        moved, _ = point(arm, values | {parameter: values[parameter] + step})
+        assert np.allclose((moved - nominal) @ axes.T / step, by_instrument[i].T, atol=2e-5)
+
+
+def turntable(plate: str) -> Chain:
+    """Return a vertical slide with the tip, and a plate at a height of 0.5 m that a second joint turns."""
+    text = f"""<robot name="r"><link name="base"/><link name="arm">{plate}</link><link name="slide"/>
+    <link name="hand"/><link name="tip"/>
+    <joint name="turn" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
+      <limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
+    <joint name="counter" type="revolute"><parent link="arm"/><child link="slide"/><axis xyz="0 0 1"/>
+      <limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
+    <joint name="tilt" type="revolute"><parent link="slide"/><child link="hand"/><axis xyz="1 0 0"/>
+      <origin xyz="0.4 0 0.1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+    <joint name="tip" type="fixed"><parent link="hand"/><child link="tip"/></joint></robot>"""
+    return Chain.from_urdf(parse_urdf(text.encode(), "r.urdf"), "tip")
+
+
+PLATE = """<collision><origin xyz="0.4 0 0.5"/><geometry><box size="0.2 0.2 0.01"/></geometry></collision>"""
+
+
+@pytest.mark.parametrize("plate", [PLATE, ""])
+def test_a_plate_of_the_robot_hides_the_board(plate):
+    """The board is below the camera; the plate is between them unless it is turned away."""
+    chain = turntable(plate)
+    camera = Camera("eye", "world", 1280, 960, PINHOLE, pose=se3.transform(FLIP, [0.4, 0, 1.0]))
+    board = charuco("tip", se3.transform(FLIP, [-0.105, 0.075, 0]))
+    images = PlannedImages(mount_rig(Rig({"eye": camera}, {"plate": board}), chain), distance=(0.2, 1.2))
+    views = sampler(chain, images, WorkspaceConstraints())
+    turns = np.linspace(-2, 2, 81)
+    q = np.column_stack([turns, -turns, 0 * turns])
+    assert views.in_workspace(q).all()
+    is_feasible = np.array([views.is_feasible(each) for each in q])
+    # Beyond a quarter turn the plate is far away; at a twentieth it is between camera and board.
+    assert is_feasible[np.abs(turns) > 1.2].all()
+    assert is_feasible[np.abs(turns) < 0.3].all() == (not plate)
+    if plate:
+        assert not is_feasible[np.abs(turns) < 0.3].any()
+
+
+def test_the_link_that_carries_the_camera_does_not_hide_the_board():
+    """A camera inside of the shape of its own link sees all the same, and a note says so."""
+    arm, rig = setup("panda-wrist")
+    inside = replace(rig.cameras[0], pose=se3.transform(np.eye(3), [0, 0, 0.05]))
+    views = sampler(arm, PlannedImages(replace(rig, cameras=(inside,))))
+    q = views.draw(50, np.random.default_rng(0))
+    beside = sampler(arm, PlannedImages(rig))
+    assert beside.note == ""
+    assert "link of camera 'wrist'" in views.note
+    assert np.mean([views.is_feasible(each) for each in q]) > 0.3
+
+
+def test_drawn_views_fill_the_limits():
+    _, rig = setup("ur10-wrist")
+    limits = PlannedImages(rig).limits(0, 0)
+    views = draw_views(rig, 0, 0, limits, 500, np.random.default_rng(0))
+    middle = views[:, :3, :3] @ rig.boards[0].points.mean(0) + views[:, :3, 3]
+    distance = np.linalg.norm(middle, axis=1)
+    angle = np.degrees(np.arccos(np.einsum("mi,mi->m", views[:, :3, 2], middle) / distance))
+    assert distance.max() <= limits.max_distance < 1.05 * distance.max()
+    assert angle.max() <= 60 < 1.05 * angle.max()
+    # Rolls are uniform on the circle.
+    roll = np.arctan2(views[:, 1, 0], views[:, 0, 0])
+    assert np.abs(np.exp(1j * roll).mean()) < 0.15
+
+
+def test_planned_images_turn_about_axes_that_are_not_parallel():
+    """Without rotations about two axes the pose of the camera would not be determined."""
+    arm, rig = setup("ur10-wrist")
+    found = plan(arm, 6, noise=NOISE, images=PlannedImages(rig), candidates=200, space=FLOOR)
+    rotations = arm.poses(found.q)[:, :3, :3]
+    axes = se3.log3(np.swapaxes(rotations[:1], 1, 2) @ rotations[1:])
+    spread = np.linalg.svd(axes, compute_uv=False)
+    assert spread[1] > np.deg2rad(30)
