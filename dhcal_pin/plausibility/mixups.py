@@ -2,9 +2,10 @@
 
 First, the evidence of the measurements as they were read is computed. If they fit a robot with small errors,
 no hypothesis is tried. Otherwise each hypothesis changes the same samples, and its evidence is computed in
-the same way. A hypothesis is decisive if its evidence exceeds that of the file by the factor exp(15). Several
-hypotheses can describe the same change of the data, such as the sign of a joint and the zeros of two others;
-all of them are reported.
+the same way. A hypothesis is left out if it moves the nominal robot much farther from the measured positions
+than it is from them as they were read: undoing a mistake takes its error away and adds none. A hypothesis is
+decisive if its evidence exceeds that of the file by the factor exp(15). Several hypotheses can describe the
+same change of the data, such as the sign of a joint and the zeros of two others; all of them are reported.
 """
 
 from __future__ import annotations
@@ -36,6 +37,9 @@ _MAX_LOG_TIE = 3.0
 _MIN_ROWS_PER_UNKNOWN, _N_FRAME_UNKNOWNS = 2, 12
 # Positions this many times farther from the centre than the median are wrong by themselves.
 _MAX_DISTANCE_RATIO = 8.0
+# A hypothesis is left out if the nominal robot misses the positions by more than this multiple of what it
+# misses them by as they were read, and this is only known with so many rows for each unknown.
+_MAX_DISTANCE_GROWTH, _MIN_ROWS_PER_FRAME_UNKNOWN = 3.0, 4
 # A shift of the rows is tried if at least this share of the samples has a neighbouring row.
 _MIN_SHIFTED_SHARE = 0.25
 # Largest number of measurements that are examined, those with the most samples.
@@ -142,9 +146,10 @@ def _diagnose(chain: Chain, data: Sequence[Measurement]) -> Diagnosis:
     if not is_suspicious(before):
         return Diagnosis(before)
     scored: list[tuple[Hypothesis, Evidence, float]] = []
+    largest = _MAX_DISTANCE_GROWTH * nominal_distance(chain, samples)
     for hypothesis in list_hypotheses(chain, samples):
         changed = _apply(hypothesis, samples, neighbourhood)
-        if changed is not None:
+        if changed is not None and nominal_distance(chain, changed) <= largest:
             after = fit_evidence(chain, changed)
             log = after.log * _count(samples) / _count(changed) + hypothesis.log_jacobian(samples)
             scored.append((hypothesis, after, log))
@@ -171,6 +176,43 @@ def leaves_residuals(evidence: Evidence) -> bool:
         evidence: Evidence of the measurements as they were read.
     """
     return evidence.length_scale > _SUSPICIOUS_LENGTH or evidence.angle_scale > _SUSPICIOUS_ANGLE
+
+
+def nominal_distance(chain: Chain, data: Sequence[Measurement]) -> float:
+    """Compute how far the nominal robot is from measured positions, with any base, target and unit of length.
+
+    A position p of a target at t in the tip frame, which has the rotation R and the position p_tip, fulfils
+
+        A·p + b - R·t = p_tip
+
+    with A = Q/f for the orientation Q of the instrument and a unit of length f. All elements of A, b and t
+    are free here, which makes the equation linear and the distance too small rather than too large.
+
+    Args:
+        chain: Nominal robot; its base and tool are ignored.
+        data: Measurements of any kinds.
+
+    Returns:
+        RMS distance in the lengths of the robot [m]; 0 if there are no or few measured positions.
+    """
+    arm = chain.with_base_and_tool(np.eye(4), np.eye(4))
+    squares, counts = [0.0], [0]
+    for item in data:
+        p = item.positions()
+        if item.configurations_per_row != 1 or len(p) != len(item.rows):
+            continue
+        tip = arm.poses(item.configurations())
+        directions = np.broadcast_to(np.eye(3), (len(p), 3, 3))
+        rows = np.concatenate(
+            [*(p[:, [i], None] * directions for i in range(3)), directions, -tip[:, :3, :3]], 2
+        ).reshape(3 * len(p), -1)
+        if len(rows) < _MIN_ROWS_PER_FRAME_UNKNOWN * rows.shape[1]:
+            continue
+        target = tip[:, :3, 3].ravel()
+        error = target - rows @ np.linalg.lstsq(rows, target, rcond=None)[0]
+        squares.append(float(error @ error))
+        counts.append(len(p))
+    return float(np.sqrt(sum(squares) / max(sum(counts), 1)))
 
 
 def _count(data: Sequence[Measurement]) -> int:

@@ -8,8 +8,11 @@ from measurement_files import frames, joint_positions, real_ur10
 from robots import robot_file
 
 from dhcal_pin import se3
+from dhcal_pin.calibration import calibrate
+from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import Distance, Noise, PointContact, Pose, Position, Wires
-from dhcal_pin.plausibility import diagnose_mixups, list_hypotheses, mend
+from dhcal_pin.plausibility import diagnose_mixups, fit_evidence, list_hypotheses, mend, mixups
+from dhcal_pin.plausibility.mixups import nominal_distance
 from dhcal_pin.robot import Chain
 
 
@@ -161,6 +164,39 @@ def test_other_instruments_show_mixed_up_joints(ur10, kind):
     wrong = with_joints(data, flipped(2))
     assert "sign:elbow_joint" in [hypothesis.key for hypothesis in diagnose_mixups(ur10, [wrong]).hypotheses]
     assert not diagnose_mixups(ur10, [data]).hypotheses
+
+
+@pytest.mark.parametrize("kind", [Pose, Position])
+def test_distance_of_the_nominal_robot_is_that_of_its_errors(ur10, kind):
+    """Frames and units of the instrument do not count; the free frames can only lower the distance."""
+    data = measured(kind)
+    distance = nominal_distance(ur10, [data])
+    fitted = calibrate(ur10, data, "base,tool", loss="linear", extend="none")
+    most = np.sqrt(np.mean(np.sum((fitted.chain.poses(data.q)[:, :3, 3] - data.positions()) ** 2, 1)))
+    assert 0.5 * most < distance < 1.01 * most
+    assert nominal_distance(ur10, [with_positions(data, lambda p: 1e3 * p)]) == pytest.approx(distance)
+    assert nominal_distance(real_ur10(), [data]) < 3e-4
+    assert nominal_distance(ur10, [data.take(np.s_[:12])]) == 0
+    assert nominal_distance(ur10, [measured(Wires)]) == 0
+
+
+def test_hypotheses_that_add_errors_are_not_tried(ur10, monkeypatch):
+    """Measurements of a robot with large joint errors are suspicious; most hypotheses make them far worse."""
+    arm, rng = real_ur10(), np.random.default_rng(0)
+    errors = select_parameters(arm, "harmonics")
+    truth = errors.at(4e-3 * rng.normal(size=len(errors.parameters)))
+    data = Pose.simulate(truth, 0.4 * joint_positions(arm, 60), Noise(1e-4, 1e-4), rng)
+    calls = []
+
+    def counted(*arguments):
+        calls.append(arguments)
+        return fit_evidence(*arguments)
+
+    monkeypatch.setattr(mixups, "fit_evidence", counted)
+    found = diagnose_mixups(ur10, [data])
+    assert found.is_suspicious
+    assert not found.hypotheses
+    assert len(calls) < 0.5 * len(list(list_hypotheses(ur10, [data])))
 
 
 def test_the_file_of_a_mistake_is_named(ur10):
