@@ -169,15 +169,17 @@ def _record(lines: Path, times: Path) -> None:
 
 def _lines_of_statement(module: Path, line: int) -> range:
     """Return the lines of the innermost statement around a line, without those of its body."""
-    statements = [
-        node
-        for node in ast.walk(ast.parse(module.read_text()))
-        if isinstance(node, ast.stmt) and node.lineno <= line <= (node.end_lineno or node.lineno)
-    ]
-    innermost = max(statements, key=lambda node: node.lineno)
+    statements = [node for node in ast.walk(ast.parse(module.read_text())) if isinstance(node, ast.stmt)]
+    around = [node for node in statements if _first_line(node) <= line <= (node.end_lineno or node.lineno)]
+    innermost = max(around, key=_first_line)
     body = getattr(innermost, "body", None)
     last = body[0].lineno - 1 if body else innermost.end_lineno or line
-    return range(innermost.lineno, max(last, innermost.lineno) + 1)
+    return range(_first_line(innermost), max(last, innermost.lineno) + 1)
+
+
+def _first_line(node: ast.stmt) -> int:
+    """Return the first line of a statement, that of its first decorator if it has any."""
+    return min([node.lineno, *(each.lineno for each in getattr(node, "decorator_list", ()))])
 
 
 def main() -> None:
