@@ -85,6 +85,18 @@ def test_way_points_lead_over_the_wall():
     assert_free([start, *way, end])
 
 
+def test_way_points_are_within_two_turns_where_a_joint_has_no_limits():
+    """Random configurations of an unlimited range would be too far away to lead anywhere."""
+    checker = checker_of(WALL)
+    start, end = np.array([0.2, -0.5]), np.array([0.2, 0.5])
+    low, high = np.array([0.1, -np.inf]), np.array([1.1, np.inf])
+    for seed in range(5):
+        way = find_way(checker, start, end, low, high, np.random.default_rng(seed))
+        assert len(way) >= 1
+        assert np.abs(way[:, 1]).max() <= 2 * np.pi
+        assert_free([start, *way, end])
+
+
 def test_no_way_is_found_where_there_is_none():
     checker = checker_of((WALL[0], (1.0, 0.05, 3.0)))
     low, high = np.array([0.1, -1.0]), np.array([1.1, 1.0])
