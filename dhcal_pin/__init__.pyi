@@ -43,6 +43,7 @@ from .paper.factors import error_factors as error_factors
 from .paper.jacobian_check import crosscheck as crosscheck
 from .planning.planner import Plan as Plan
 from .planning.planner import plan as plan
+from .planning.views import PlannedImages as PlannedImages
 from .report.certificate import write_certificate as write_certificate
 from .report.document import Provenance as Provenance
 from .report.html import write_report as write_report

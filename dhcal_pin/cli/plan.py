@@ -65,8 +65,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--kind",
         metavar="KIND",
-        default="pose",
-        help="kind of measurement (default: %(default)s): {plannable_kinds}",
+        help="kind of measurement (default: pose; camera with --rig): {plannable_kinds}",
     )
     parser.add_argument(
         "--sigma",
@@ -90,17 +89,13 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--angle",
         metavar="ANGLE",
-        default="60deg",
-        help="with --rig: largest angle between the normal of a board and the line of sight (default: "
-        "%(default)s)",
+        help="with --rig: largest angle between the normal of a board and the line of sight (default: 60deg)",
     )
     parser.add_argument(
         "--corners",
         metavar="SHARE",
         type=float,
-        default=1.0,
-        help="with --rig: smallest share of the corners of a board that is in the image (default: "
-        "%(default)g)",
+        help="with --rig: smallest share of the corners of a board that is in the image (default: 1)",
     )
     parser.add_argument(
         "--criterion",
@@ -207,6 +202,7 @@ def run(args: Namespace) -> int:
     from .outputs import existing_sidecars, require_writable_outputs, write_outputs
     from .result_screens import plan_screen
 
+    kind = _kind(args)
     files = [
         *(args.data or []),
         *filter(None, (args.candidates_from, args.task, args.columns, args.instrument)),
@@ -241,7 +237,7 @@ def run(args: Namespace) -> int:
     images = None
     if rig is not None:
         images, noise = _planned_images(args, with_measured_poses(rig, chain, data))
-    elif args.sigma or not any(item.kind == args.kind for item in data):
+    elif args.sigma or not any(item.kind == kind for item in data):
         noise = Noise(*parse_noise(args.sigma or _DEFAULT_SIGMA, "--sigma"))
     else:
         noise = None
@@ -249,7 +245,7 @@ def run(args: Namespace) -> int:
         result = plan(
             chain,
             args.count,
-            kind=args.kind,
+            kind=kind,
             noise=noise,
             parameters=args.parameters,
             priors=read_priors(args.priors) or "default",
@@ -270,10 +266,10 @@ def run(args: Namespace) -> int:
     noise = result.information.noise
     moves = move_texts(result)
     chosen_rows = None if result.index is None else (rows[result.index] + 1).tolist()
-    document = _plan_document(result, args, chosen_rows)
+    document = _plan_document(result, args, kind, chosen_rows)
     pixels = f"{images.sigma:.4g} px, " if images else ""
     comments = [
-        f"{args.count} poses to measure ({document['kind']}, criterion {result.criterion}), as a short tour",
+        f"{args.count} poses to measure ({kind}, criterion {result.criterion}), as a short tour",
         f"predicted position error {1e3 * result.error:.4g} mm RMS with standard deviation "
         f"{pixels}{1e3 * noise.position:.4g} mm, {np.degrees(noise.rotation):.4g} deg",
     ]
@@ -284,7 +280,7 @@ def run(args: Namespace) -> int:
     for path in args.export:
         contents[path] = program_text(_program(result, chain), path)
     if args.html:
-        contents[args.html] = _preview(result, chain, space, args)
+        contents[args.html] = _preview(result, chain, space, args, images)
     if args.report:
         from ..io.robot import robot_name  # lazy import, as the following: only for reports
         from ..report.plan import PlanReport, plan_page
@@ -298,13 +294,28 @@ def run(args: Namespace) -> int:
                 first_line=text.count("\n") - len(result.q) + 1,
                 text=text,
                 moves=moves,
-                scene=_preview(result, chain, space, args),
+                scene=_preview(result, chain, space, args, images),
                 inputs=document["inputs"],
+                pixel_sigma=images.sigma if images else np.nan,
             )
         )
     write_outputs(contents, args.json, document)
     console.show(plan_screen(result, moves, contents), args.verbosity)
     return 0
+
+
+def _kind(args: Namespace) -> str:
+    """Return the kind of measurement, after a check of the options that need --rig or exclude it."""
+    if args.rig:
+        if args.kind not in (None, "camera"):
+            raise InvalidArgumentError(f"--kind {args.kind}: not allowed with --rig, which plans images")
+        return "camera"
+    if args.kind == "camera":
+        raise InvalidArgumentError("--kind camera: needs --rig, the file with cameras and boards")
+    for option in ("distance", "angle", "corners"):
+        if getattr(args, option) is not None:
+            raise InvalidArgumentError(f"--{option}: needs --rig, the file with cameras and boards")
+    return args.kind or "pose"
 
 
 def _mounted_rig(path: str, robot: str, chain: Chain) -> MountedRig:
@@ -332,10 +343,14 @@ def _planned_images(args: Namespace, rig: MountedRig) -> tuple[PlannedImages, No
         )
     noise = Noise(*parse_noise(",".join(others), "--sigma")) if others else Noise()
     distance = _parse_distances(args.distance) if args.distance else None
-    angle = _parse_angle(args.angle, "--angle", 90.0)
-    if not 0 < args.corners <= 1:
-        raise InvalidArgumentError(f"--corners {args.corners:g}: expected a share above 0 and at most 1")
-    return PlannedImages(rig, float(match[1]), distance, angle, args.corners), noise
+    options: dict[str, Any] = {"sigma": float(match[1]), "distance": distance}
+    if args.angle:
+        options["max_angle"] = _parse_angle(args.angle, "--angle", 90.0)
+    if args.corners is not None:
+        if not 0 < args.corners <= 1:
+            raise InvalidArgumentError(f"--corners {args.corners:g}: expected a share above 0 and at most 1")
+        options["min_share"] = args.corners
+    return PlannedImages(rig, **options), noise
 
 
 def _parse_distances(text: str) -> tuple[float, float]:
@@ -415,8 +430,10 @@ def _program(result: Plan, chain: Chain) -> Program:
     return Program(chain, "poses to measure, by dhcal plan", warning, stops)
 
 
-def _preview(result: Plan, chain: Chain, space: WorkspaceConstraints, args: Namespace) -> str:
-    """Return the page that shows the poses, the path, floor and obstacles."""
+def _preview(
+    result: Plan, chain: Chain, space: WorkspaceConstraints, args: Namespace, images: PlannedImages | None
+) -> str:
+    """Return the page that shows the poses, the path, cameras and boards, floor and obstacles."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
     from ..io.robot import robot_name
@@ -427,6 +444,7 @@ def _preview(result: Plan, chain: Chain, space: WorkspaceConstraints, args: Name
     return scene_html(
         chain,
         preview=Preview(np.concatenate(path), stops.tolist(), space),
+        rig=images.rig if images else None,
         title=f"{len(result.q)} poses for {robot_name(args.robot)}",
     )
 
@@ -552,7 +570,7 @@ def read_task(path: PathLike, chain: Chain) -> Array:
     return result.q
 
 
-def _plan_document(result: Plan, args: Namespace, chosen_rows: list[int] | None) -> dict[str, Any]:
+def _plan_document(result: Plan, args: Namespace, kind: str, chosen_rows: list[int] | None) -> dict[str, Any]:
     """Create the JSON document of a plan, in SI units."""
     from .outputs import json_path  # lazy import: loads Pinocchio
 
@@ -560,7 +578,7 @@ def _plan_document(result: Plan, args: Namespace, chosen_rows: list[int] | None)
     path = json_path(args.json)
     return {
         "poses": len(result.q),
-        "kind": "camera" if result.views else args.kind,
+        "kind": kind,
         "criterion": result.criterion,
         "sigma_position_m": noise.position,
         "sigma_orientation_rad": noise.rotation,
@@ -583,9 +601,9 @@ def _plan_document(result: Plan, args: Namespace, chosen_rows: list[int] | None)
                 "camera": one.camera,
                 "images": one.n_images,
                 "covered_share": one.covered_share,
-                "distance_min_m": one.distances[0],
-                "distance_max_m": one.distances[1],
-                "angle_max_rad": one.max_angle,
+                "distance_min_m": _or_null(one.distances[0]),
+                "distance_max_m": _or_null(one.distances[1]),
+                "angle_max_rad": _or_null(one.max_angle),
             }
             for one in result.views
         ],
@@ -595,6 +613,11 @@ def _plan_document(result: Plan, args: Namespace, chosen_rows: list[int] | None)
         | ({"html": args.html} if args.html else {})
         | ({"report": args.report} if args.report else {}),
     }
+
+
+def _or_null(value: float) -> float | None:
+    """Return a number, or None in place of NaN."""
+    return value if value == value else None
 
 
 def _curve(sizes: Array, errors: Array) -> list[dict[str, float]]:

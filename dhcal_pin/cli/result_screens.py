@@ -13,6 +13,7 @@ from ..calibration.summary import GROUP_LABELS, STATISTIC_LABELS
 from ..diagnostics.inspection import FileInspection, column_table
 from ..formatting import Table, format_quantity
 from ..io.tables import format_lines
+from ..planning.views import views_table
 from ..report.document import short_names
 from .screen import Block, Screen, list_first
 
@@ -317,23 +318,14 @@ def plan_screen(plan: Plan, moves: Sequence[str], files: Iterable[object]) -> Sc
         for one in plan.curves
     ]
     curve_table = Table(["poses", "bins filled", "curve std, µrad"], curves, n_text_columns=0)
-    views = [
-        [
-            one.camera,
-            str(one.n_images),
-            f"{1e3 * one.distances[0]:.0f} to {1e3 * one.distances[1]:.0f}",
-            f"{np.degrees(one.max_angle):.0f}°",
-            f"{100 * one.covered_share:.0f} %",
-        ]
-        for one in plan.views
-    ]
-    view_table = Table(["camera", "images", "distance, mm", "angle up to", "image covered"], views)
     is_free = all(plan.is_way_free)
     return Screen(
         [
             Block(
                 table,
-                title="predicted RMS position error over the task",
+                title="predicted RMS error between camera and board"
+                if plan.views
+                else "predicted RMS position error over the task",
                 noun="number of poses",
                 rank=4,
                 n_kept=4,
@@ -347,7 +339,7 @@ def plan_screen(plan: Plan, moves: Sequence[str], files: Iterable[object]) -> Sc
                 has_space=True,
             ),
             Block(
-                view_table,
+                views_table(plan.views),
                 title="images of the boards",
                 noun="camera",
                 rank=4,

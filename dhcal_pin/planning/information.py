@@ -400,7 +400,7 @@ def _add_parameter_sets(
     indices = {parameter.name: i for i, parameter in enumerate(errors.parameters)}
     new = [p for name in sets for p in PARAMETER_SETS[name](errors.chain) if p.name not in indices]
     extended = errors.with_parameters(new)
-    old_index = np.array([indices.get(parameter.name, -1) for parameter in extended.parameters])
+    old_index = np.array([indices.get(parameter.name, -1) for parameter in extended.parameters], int)
     is_new = old_index < 0
     priors = np.where(is_new, extended.priors, sigma[old_index])
     fitted = np.concatenate([~is_new, np.full(len(sigma) - len(x), True)])

@@ -304,7 +304,8 @@ class CameraInstrument:
         jacobian = chain.tool_jacobian(frames, model.bodies, model.twists)
         by_errors = whitened_jacobian(data, frames, jacobian, u, data.residual(frames, u))
         rows = np.concatenate([by_errors, data.instrument_jacobian(frames, u)])
-        rows = rows.reshape(-1, 2, m, n_corners).transpose(2, 1, 3, 0).reshape(m, 2 * n_corners, -1)
+        rows = rows.reshape(len(rows), 2, m, n_corners).transpose(2, 1, 3, 0)
+        rows = rows.reshape(m, 2 * n_corners, rows.shape[-1])
         return np.linalg.qr(basis)[0].swapaxes(1, 2) @ rows
 
     def _basis(self, by_instrument: Array) -> Array:
@@ -319,8 +320,8 @@ class CameraInstrument:
             ]
             of_pair = (corners.camera == camera) & (corners.board == board)
             blocks.append(by_instrument[np.logical_or(is_pose, is_lens)] * of_pair)
-        columns = np.concatenate(blocks)
-        return columns.transpose(2, 1, 3, 0).reshape(columns.shape[2], -1, len(columns))
+        columns = np.concatenate(blocks).transpose(2, 1, 3, 0)
+        return columns.reshape(len(columns), 2 * len(corners.rows), columns.shape[-1])
 
     def displacements(self, model: PresentModel, q: Array) -> tuple[Array, Array]:
         """Compute displacements between cameras and boards.

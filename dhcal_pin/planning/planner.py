@@ -75,6 +75,8 @@ PHASES = (
     "predicting errors",
     "path",
 )
+# A measurement of one configuration says at most as much about the geometry as the pose of the tool.
+MAX_POSE_COMPONENTS = 6
 # Numbers of poses for which the knowledge of the joint correction curves is predicted.
 CURVE_SIZES = (50, 100, 200)
 
@@ -335,9 +337,10 @@ def plan(
             candidate_set, prior_factor, count - len(greedy), goal.criterion, greedy, existing
         )
     if len(greedy) < count:
+        condition = "" if images is None else "; a board must be in view, and nothing may hide it"
         raise InvalidArgumentError(
             f"only {len(greedy)} of {len(q)} candidates are feasible; expected at least {count}: "
-            "relax the constraints or use more candidates"
+            f"relax the constraints or use more candidates{condition}"
         )
     next(phases)
     selected = improve_by_exchange(candidate_set, prior_factor, greedy, goal.criterion, existing)
@@ -566,7 +569,8 @@ def _error_curve(
     information, prior_factor = goal.full_information, goal.full_information.prior_factor
     plan_rows, count = information.rows(refined), len(refined)
     n_known = qr.rank(goal.information.data_factor)
-    smallest = min(count, max(1, -(-(goal.n_observable - n_known) // plan_rows.shape[1])))
+    n_rows = min(plan_rows.shape[1], MAX_POSE_COMPONENTS)
+    smallest = min(count, max(1, -(-(goal.n_observable - n_known) // n_rows)))
     sizes = np.unique(
         np.rint([smallest, 1.4 * smallest, 2 * smallest, np.sqrt(2 * smallest * count)]).astype(int)
     )

@@ -94,12 +94,15 @@ class ViewSampler(ConfigurationSampler):
                 return out[:count]
             if not len(out) and number + 1 == _MAX_EMPTY_ROUNDS:
                 break
+        if not len(out):
+            raise InvalidArgumentError(
+                f"{self.images.where}no camera can see a board in any pose of the robot; check links and "
+                "poses (the z axis of a board points away from its printed side), and the limits of distance "
+                "and workspace"
+            )
         raise InvalidArgumentError(
-            "no camera can see a board in any pose of the robot; check links and poses in the rig file, and "
-            "the limits of distance, angle, workspace and floor"
-            if not len(out)
-            else f"only {len(out)} poses with a board in view were found; expected {count}: relax the limits "
-            "of distance and angle, or use fewer candidates"
+            f"{self.images.where}only {len(out)} poses with a board in view were found; expected {count}: "
+            "relax the limits of distance and workspace, or use fewer candidates"
         )
 
     def perturb(self, q: Array, step: float, count: int, rng: np.random.Generator) -> Array:
@@ -154,7 +157,7 @@ class ViewSampler(ConfigurationSampler):
         """Return whether the robot or an obstacle hides a board that is in view at q, shape (n,)."""
         rig, tools, images = self.images.rig, self.chain.poses(q[None]), self.images
         for pair, visible in zip(images.pairs, images.visible_corners(tools), strict=True):
-            if not visible.any():
+            if not visible.any() or pair not in self._blocking:
                 continue
             eye, board = self._in_first_link(tools[0], *pair)
             points = rig.boards[pair[1]].points[visible[0]] @ board[:3, :3].T + board[:3, 3]
@@ -178,31 +181,42 @@ class ViewSampler(ConfigurationSampler):
     @property
     def note(self) -> str:
         """What is not checked and why, or an empty text."""
-        names = sorted({name for shapes in self._blocking.values() for name in shapes})
         if self.collision.geometry is None:
             return "whether the robot hides a board is not checked: there is no collision geometry"
-        if not names:
-            return ""
-        return (
-            f"whether the link of {' and '.join(names)} hides a board is not checked: it would hide every "
-            "view; check the pose in the rig"
-        )
+        texts = [
+            f"whether the robot hides points of {board.name!r} is not checked"
+            for board in self.images.rig.boards
+            if board.type == "points"
+        ]
+        names = sorted({name for shapes in self._blocking.values() for name in shapes})
+        if names:
+            texts.append(
+                f"whether the link of {' and '.join(names)} hides a board is not checked: it would hide "
+                "every view; check the pose in the rig"
+            )
+        return "; ".join(texts)
 
     @cached_property
     def _blocking(self) -> dict[tuple[int, int], dict[str, frozenset[int]]]:
-        """Shapes that move with a camera or a board and hide every view, by pair and by its name."""
+        """Shapes that move with a camera or a board and hide every view, by pair and by its name.
+
+        Points that are not on a flat board may be all around their link: such pairs are missing.
+        """
         rig, q = self.images.rig, 0.5 * (self.low + self.high)
         tool, out = self.chain.poses(q[None])[0], {}
         for camera, board in self.images.pairs:
+            if rig.boards[board].type == "points":
+                continue
             eye, plate = self._in_first_link(tool, camera, board)
             limits, is_camera_on_tip = self.images.limits(camera, board), rig.camera_mounts[camera].moves
             length = 0.5 * (limits.min_distance + limits.max_distance)
-            # From the camera along its optical axis, and from the middle of a flat board towards the camera.
-            lines = {f"camera {rig.cameras[camera].name!r}": (is_camera_on_tip, eye[:3, 3], eye[:3, 2])}
-            if rig.boards[board].type != "points":
-                middle = plate[:3, :3] @ rig.boards[board].points.mean(0) + plate[:3, 3]
-                start = middle - _BOARD_SHARE * length * plate[:3, 2]
-                lines[f"board {rig.boards[board].name!r}"] = (not is_camera_on_tip, start, -plate[:3, 2])
+            # From the camera along its optical axis, and from the middle of the board towards the camera.
+            middle = plate[:3, :3] @ rig.boards[board].points.mean(0) + plate[:3, 3]
+            start = middle - _BOARD_SHARE * length * plate[:3, 2]
+            lines = {
+                f"camera {rig.cameras[camera].name!r}": (is_camera_on_tip, eye[:3, 3], eye[:3, 2]),
+                f"board {rig.boards[board].name!r}": (not is_camera_on_tip, start, -plate[:3, 2]),
+            }
             blocking = out[camera, board] = {}
             for name, (is_tip, start, axis) in lines.items():
                 shapes = self.collision.shapes_on_end(is_tip)

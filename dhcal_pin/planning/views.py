@@ -19,16 +19,20 @@ from .. import se3
 from .._typing import Array
 from ..calibration.procedure import calibrate
 from ..cameras.boards import Board
+from ..cameras.rig import Camera
 from ..exceptions import InvalidArgumentError
+from ..formatting import Table
 from ..measurements.base import Measurement
 from ..measurements.camera import CameraCorners
 from ..measurements.images import ViewLimits, project_board, visible_corners
 from ..measurements.mounting import MountedRig
 from ..robot.chain import Chain
 
-# Default limits: smallest size in the image of a square, and of a marker, whose pattern needs more pixels, at
-# the largest distance [px], and distance of corners from the edge of the image, as a share of its width.
-MIN_SQUARE_PX, MIN_MARKER_PX, MARGIN_SHARE = 20.0, 40.0, 0.02
+# Default limits: smallest size in the image of a square, of a marker, whose pattern needs more pixels [px],
+# and of the board, as a share of the width of the image; all for a board that faces the camera.
+MIN_SQUARE_PX, MIN_MARKER_PX, MIN_BOARD_SHARE = 20.0, 40.0, 0.1
+# Default distance of corners from the edge of the image, as a share of its width.
+MARGIN_SHARE = 0.02
 # Default limit of the angle between the normal of a board and the line of sight [rad].
 MAX_VIEW_ANGLE = np.deg2rad(60.0)
 # Views that are drawn at once, rounds of draws, and rounds without any view in the image before giving up.
@@ -61,7 +65,7 @@ class PlannedImages:
 
     def __post_init__(self) -> None:
         """Check that poses and intrinsics are known."""
-        rig, where = self.rig, f"{self.rig.source}: " if self.rig.source else ""
+        rig, where = self.rig, self.where
         for kind, entries in (("camera", rig.cameras), ("board", rig.boards)):
             for entry in entries:
                 if entry.pose is None:
@@ -79,6 +83,11 @@ class PlannedImages:
                 f"{where}no joint moves a board against a camera; expected one of them on the tool, the "
                 "other one not"
             )
+
+    @property
+    def where(self) -> str:
+        """Begin of messages: the name of the rig file, if there is one."""
+        return f"{self.rig.source}: " if self.rig.source else ""
 
     @cached_property
     def pairs(self) -> list[tuple[int, int]]:
@@ -101,7 +110,7 @@ class PlannedImages:
             Limits.
         """
         entry = self.rig.cameras[camera]
-        low, high = self.distance or (0.0, _largest_distance(entry.values, self.rig.boards[board]))
+        low, high = self.distance or _default_distances(entry, self.rig.boards[board])
         margin = MARGIN_SHARE * entry.width if self.margin is None else self.margin
         return ViewLimits(low, high, self.max_angle, self.min_share, margin)
 
@@ -120,16 +129,23 @@ class PlannedImages:
         ]
 
 
-def _largest_distance(values: Array, board: Board) -> float:
-    """Return the distance [m] at which the details of a board have their smallest size in the image."""
-    focal = float(values[:2].min())
+def _default_distances(camera: Camera, board: Board) -> tuple[float, float]:
+    """Return the smallest and the largest useful distance [m].
+
+    Nearer, the board does not fit into the image; farther, its details or the board itself are too small.
+    """
+    focal, points = float(camera.values[:2].min()), board.points
+    size = float(np.linalg.norm(np.ptp(points, axis=0)))
     if board.type == "points":
-        distances = np.linalg.norm(board.points[:, None] - board.points[None], axis=2)
+        distances = np.linalg.norm(points[:, None] - points[None], axis=2)
         np.fill_diagonal(distances, np.inf)
-        return focal * float(np.median(distances.min(1))) / MIN_SQUARE_PX
-    if board.type == "checkerboard":
-        return focal * board.square / MIN_SQUARE_PX
-    return focal * (board.marker or board.square) / MIN_MARKER_PX
+        detail = float(np.median(distances.min(1))) / MIN_SQUARE_PX
+    elif board.type == "checkerboard":
+        detail = board.square / MIN_SQUARE_PX
+    else:
+        detail = (board.marker or board.square) / MIN_MARKER_PX
+    fitting = focal * size / camera.width
+    return 0.5 * fitting, min(focal * detail, fitting / MIN_BOARD_SHARE)
 
 
 def with_measured_poses(rig: MountedRig, chain: Chain, data: Sequence[Measurement]) -> MountedRig:
@@ -219,7 +235,8 @@ class CameraViews:
         n_images: Number of configurations in which it sees a board.
         covered_share: Share of the 10 x 10 cells of its image in which there is at least one corner.
         distances: Smallest and largest distance of the middle of a board [m]; NaN without images.
-        max_angle: Largest angle between the normal of a board and the line of sight [rad].
+        max_angle: Largest angle between the normal of a board and the line of sight [rad]; NaN for points
+            that are not on a board.
     """
 
     camera: str
@@ -227,6 +244,28 @@ class CameraViews:
     covered_share: float
     distances: tuple[float, float]
     max_angle: float
+
+
+def views_table(views: Sequence[CameraViews]) -> Table:
+    """Build the table of the planned images of each camera.
+
+    Args:
+        views: Planned images.
+
+    Returns:
+        Table; without rows if there are none.
+    """
+    rows = [
+        [
+            one.camera,
+            str(one.n_images),
+            f"{1e3 * one.distances[0]:.0f} to {1e3 * one.distances[1]:.0f}" if one.n_images else "",
+            f"{np.degrees(one.max_angle):.0f}°" if np.isfinite(one.max_angle) else "",
+            f"{100 * one.covered_share:.0f} %",
+        ]
+        for one in views
+    ]
+    return Table(["camera", "images", "distance, mm", "angle up to", "image covered"], rows)
 
 
 def summarize_views(images: PlannedImages, tools: Array) -> tuple[CameraViews, ...]:
@@ -244,7 +283,7 @@ def summarize_views(images: PlannedImages, tools: Array) -> tuple[CameraViews, .
     for number in dict.fromkeys(camera for camera, _ in images.pairs):
         camera = rig.cameras[number]
         cells, has_image = np.zeros(_N_CELLS, bool), np.zeros(len(tools), bool)
-        distances, angles = [np.empty(0)], [np.zeros(1)]
+        distances, angles = [np.empty(0)], [np.empty(0)]
         for pair, corners in zip(images.pairs, visible, strict=True):
             if pair[0] != number:
                 continue
@@ -260,14 +299,16 @@ def summarize_views(images: PlannedImages, tools: Array) -> tuple[CameraViews, .
             if rig.boards[pair[1]].type != "points":
                 along = np.einsum("mi,mi->m", poses[in_view, :3, 2], middle)
                 angles.append(np.arccos(np.clip(along / distance, -1, 1)))
-        all_distances = np.concatenate(distances) if has_image.any() else np.full(1, np.nan)
+        missing = np.full(1, np.nan)
+        all_distances = np.concatenate(distances) if has_image.any() else missing
+        all_angles = np.concatenate(angles)
         out.append(
             CameraViews(
                 camera.name,
                 int(has_image.sum()),
                 float(cells.mean()),
                 (float(all_distances.min()), float(all_distances.max())),
-                float(np.concatenate(angles).max()),
+                float((all_angles if all_angles.size else missing).max()),
             )
         )
     return tuple(out)

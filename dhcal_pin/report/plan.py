@@ -11,6 +11,7 @@ import numpy as np
 from .. import se3
 from ..formatting import Table
 from ..planning.planner import Plan
+from ..planning.views import views_table
 from ..robot.chain import Chain
 from ..robot.coverage import joint_coverage
 from ..visualization import plots
@@ -36,6 +37,7 @@ class PlanReport:
         moves: Sentences on the moves between the poses.
         scene: Page of a 3-D scene with the poses.
         inputs: SHA-256 of each input file by path.
+        pixel_sigma: Standard deviation of the corners of planned images [px].
     """
 
     plan: Plan
@@ -47,6 +49,7 @@ class PlanReport:
     moves: Sequence[str]
     scene: str
     inputs: Mapping[str, str] = field(default_factory=dict)
+    pixel_sigma: float = float("nan")
 
 
 def plan_page(report: PlanReport) -> str:
@@ -87,6 +90,7 @@ def plan_page(report: PlanReport) -> str:
                 ("", "criterion", plan.criterion),
                 ("", "standard deviation of a position", f"{1e3 * noise.position:.3g} mm"),
                 ("", "of an orientation", f"{np.degrees(noise.rotation):.3g}°"),
+                *([("", "of a corner", f"{report.pixel_sigma:.3g} px")] if plan.views else []),
             ],
             remarks=[*report.moves, *plan.notes],
             samples=samples,
@@ -121,6 +125,7 @@ def _sections(report: PlanReport, samples: Samples) -> list[Section]:
             ["A bin of a turn is 5° wide and counts as visited if one pose lies in it."],
             tables=[_coverage_table(report)],
         ),
+        *_views_sections(plan),
         Section("scene", "Robot and poses", figures=partial(_pose_figures, report, samples)),
         samples_section(samples, "Poses"),
         Section(
@@ -132,6 +137,17 @@ def _sections(report: PlanReport, samples: Samples) -> list[Section]:
             ],
         ),
     ]
+
+
+def _views_sections(plan: Plan) -> list[Section]:
+    """Return the section with the planned images, if there are any."""
+    if not plan.views:
+        return []
+    text = (
+        "Distance of the middle of the board from the camera, angle between the normal of the board and the "
+        "line of sight, and the share of the 10 x 10 cells of the image in which there is a corner."
+    )
+    return [Section("images", "Images of the boards", [text], tables=[views_table(plan.views)])]
 
 
 def _curve_figures(plan: Plan) -> list[FigureGroup]:
