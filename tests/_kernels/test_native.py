@@ -91,6 +91,18 @@ def test_batched_r_factors_equal_single_ones():
         )
 
 
+@pytest.mark.parametrize("kernels", [native, qr])
+@pytest.mark.parametrize("p", [1, 2, 9])
+def test_a_diagonal_block_adds_the_products_of_its_rows(kernels, p):
+    rng = np.random.default_rng(p)
+    r = np.triu(rng.standard_normal((p + 1, p + 1)))
+    diagonal, target = rng.uniform(1, 2, p), rng.standard_normal(p)
+    rows = np.column_stack([np.diag(diagonal), target])
+    found = kernels.append_diagonal(r, diagonal, target)
+    np.testing.assert_allclose(found.T @ found, r.T @ r + rows.T @ rows, atol=1e-12)
+    np.testing.assert_array_equal(np.tril(found, -1), 0)
+
+
 @pytest.mark.parametrize("size", [0.0, 1e-100, 1e-12, 1.0, 1e100])
 def test_r_factor_of_any_magnitude(size):
     rows = size * np.random.default_rng(0).standard_normal((5, 2, 200))
