@@ -98,6 +98,12 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="with --rig: smallest share of the corners of a board that is in the image (default: 1)",
     )
     parser.add_argument(
+        "--border",
+        metavar="PIXELS",
+        help="with --rig: distance of the corners from the edge of the image, such as 60px; more if the "
+        "poses of camera and board are uncertain (default: 2 %% of the width)",
+    )
+    parser.add_argument(
         "--criterion",
         metavar="C",
         default="D",
@@ -312,7 +318,7 @@ def _kind(args: Namespace) -> str:
         return "camera"
     if args.kind == "camera":
         raise InvalidArgumentError("--kind camera: needs --rig, the file with cameras and boards")
-    for option in ("distance", "angle", "corners"):
+    for option in ("distance", "angle", "corners", "border"):
         if getattr(args, option) is not None:
             raise InvalidArgumentError(f"--{option}: needs --rig, the file with cameras and boards")
     return args.kind or "pose"
@@ -336,21 +342,27 @@ def _planned_images(args: Namespace, rig: MountedRig) -> tuple[PlannedImages, No
     from ..units import parse_noise
 
     pixels, *others = (args.sigma or _DEFAULT_IMAGE_SIGMA).split(",")
-    match = re.fullmatch(rf"\s*({_NUMBER})\s*px\s*", pixels)
-    if not match or float(match[1]) <= 0:
-        raise InvalidArgumentError(
-            f"--sigma {args.sigma}: expected pixels above zero first, such as {_DEFAULT_IMAGE_SIGMA}"
-        )
+    sigma = _parse_pixels(pixels, "--sigma", f"pixels above zero first, such as {_DEFAULT_IMAGE_SIGMA}")
     noise = Noise(*parse_noise(",".join(others), "--sigma")) if others else Noise()
     distance = _parse_distances(args.distance) if args.distance else None
-    options: dict[str, Any] = {"sigma": float(match[1]), "distance": distance}
+    options: dict[str, Any] = {"sigma": sigma, "distance": distance}
     if args.angle:
         options["max_angle"] = _parse_angle(args.angle, "--angle", 90.0)
     if args.corners is not None:
         if not 0 < args.corners <= 1:
             raise InvalidArgumentError(f"--corners {args.corners:g}: expected a share above 0 and at most 1")
         options["min_share"] = args.corners
+    if args.border:
+        options["margin"] = _parse_pixels(args.border, "--border")
     return PlannedImages(rig, **options), noise
+
+
+def _parse_pixels(text: str, option: str, expected: str = "pixels above zero, such as 60px") -> float:
+    """Parse a positive number of pixels."""
+    match = re.fullmatch(rf"\s*({_NUMBER})\s*px\s*", text)
+    if not match or float(match[1]) <= 0:
+        raise InvalidArgumentError(f"{option} {text}: expected {expected}")
+    return float(match[1])
 
 
 def _parse_distances(text: str) -> tuple[float, float]:

@@ -105,6 +105,8 @@ def test_missing_poses_are_estimated_from_images(run):
         (("", ""), ("--distance", "300mm"), "such as 300:900mm"),
         (("", ""), ("--angle", "0deg"), "--angle 0deg: invalid angle"),
         (("", ""), ("--corners", "1.5"), "--corners 1.5: expected a share above 0 and at most 1"),
+        (("", ""), ("--border", "60"), "--border 60: expected pixels above zero, such as 60px"),
+        (("", ""), ("--border", "500px"), "does not fit into the image"),
         (("", ""), ("--sigma", "0.1mm"), "--sigma 0.1mm: expected pixels above zero first"),
         (("", ""), ("--sigma", "0.3px,1deg,2deg"), "second angle"),
         (("", ""), ("--kind", "position"), "--kind position: not allowed with --rig"),

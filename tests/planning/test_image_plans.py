@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from dhcal_pin import Chain, se3
+from dhcal_pin.calibration import calibrate
 from dhcal_pin.cameras import LENSES, Board, Camera, Rig
-from dhcal_pin.estimation import linearize_and_factor
+from dhcal_pin.estimation import linearize_and_factor, select_parameters
 from dhcal_pin.estimation.initialization import make_problem
 from dhcal_pin.estimation.priors import prior_weights
 from dhcal_pin.io import read_robot
@@ -254,3 +255,101 @@ def test_planned_images_turn_about_axes_that_are_not_parallel():
     axes = se3.log3(np.swapaxes(rotations[:1], 1, 2) @ rotations[1:])
     spread = np.linalg.svd(axes, compute_uv=False)
     assert spread[1] > np.deg2rad(30)
+
+
+def images_at(arm: Chain, rig: MountedRig, q: np.ndarray, sigma: float, rng=None) -> CameraCorners:
+    """Return images with scatter of the tool and noise of the corners; without a generator, exact ones."""
+    tools = arm.poses(q)
+    if rng is not None:
+        scatter = se3.exp6(rng.normal(0, 1, (len(q), 6)) * ([NOISE.position] * 3 + [NOISE.rotation] * 3))
+        tools = tools @ scatter
+    pixels, depth = project_board(rig, 0, 0, rig.board_in_camera(0, 0, tools))
+    size = [rig.cameras[0].width, rig.cameras[0].height]
+    image, corner = np.nonzero(np.all((pixels >= 0) & (pixels < size), 2) & (depth > 0))
+    pixels = pixels[image, corner]
+    if rng is not None:
+        pixels = pixels + sigma * rng.standard_normal(pixels.shape)
+    return CameraCorners(q[image], pixels, corner, rig, sigma=sigma)
+
+
+def test_predicted_error_is_that_of_the_solver():
+    """Errors drawn from the covariance of the solver move the board in the camera as much as predicted.
+
+    The plan is better than random images by the same measure.
+    """
+    arm, rig = setup("ur10-fixed")
+    images = PlannedImages(rig)
+    task = np.random.default_rng(5).uniform(*joint_range(arm), (40, arm.n_joints))
+    found = plan(arm, 15, noise=NOISE, images=images, candidates=120, space=FLOOR, task=task)
+    views = sampler(arm, images)
+    drawn = views.draw(120, np.random.default_rng(7))
+    random = np.array([q for q in drawn if views.is_feasible(q)])[:15]
+    errors, nominal = found.information.errors, rig.board_in_camera(0, 0, arm.poses(task))
+    middle, rng = np.array([*rig.boards[0].points.mean(0), 1.0]), np.random.default_rng(6)
+    std = np.array([NOISE.position] * 3 + [NOISE.rotation] * 3)
+    measured = []
+    for q in (found.q, random):
+        data = images_at(arm, rig, q, images.sigma)
+        u = np.array([p.nominal for p in data.instrument_parameters])
+        data = data.with_jitter(data.displacement_derivative(arm.forward_kinematics(data.q), u) * std)
+        problem = make_problem(errors, (data,), prior_weights(errors, "default"), {})
+        x = np.zeros(len(problem.weights))
+        r = linearize_and_factor(problem, x, small_angle=False).r
+        r = np.linalg.qr(np.concatenate([r, np.diag(problem.weights)]), mode="r")
+        squares = []
+        for _ in range(80):
+            drawn_x = 0.1 * np.linalg.solve(r, rng.standard_normal(len(x)))
+            solved = data.solved_rig(problem.instruments(drawn_x))
+            moved = solved.board_in_camera(0, 0, errors.at(drawn_x[: len(errors.parameters)]).poses(task))
+            squares.append(np.mean(np.sum(((moved - nominal) @ middle) ** 2, 1)))
+        measured.append(10 * np.sqrt(np.mean(squares)))
+    assert measured[0] == pytest.approx(found.error, rel=0.15)
+    assert measured[1] == pytest.approx(found.expected_error(random), rel=0.15)
+    assert measured[0] < 0.8 * measured[1]
+
+
+def errors_elsewhere(name: str, seed: int, q: np.ndarray) -> float:
+    """Return the RMS error of the board in the camera in other views after a calibration [m].
+
+    The arm has errors of 1 mm and 2 mrad per link, the rig of 5 mm and 10 mrad, the lens of 2 %.
+    """
+    arm, rig = setup(name)
+    rng = np.random.default_rng(seed)
+    errors = select_parameters(arm, "placement")
+    std = np.array([1e-3 if p.unit == "m" else 2e-3 for p in errors.parameters])
+    truth = errors.at(std * rng.standard_normal(len(std)))
+    moved = [entry.pose @ se3.exp6(rng.normal(0, 1, 6) * ([5e-3] * 3 + [1e-2] * 3))
+             for entry in (*rig.cameras, *rig.boards)]  # fmt: skip
+    values = rig.cameras[0].values * (1 + 0.02 * rng.standard_normal(len(rig.cameras[0].values)))
+    true_rig = replace(
+        rig,
+        cameras=(replace(rig.cameras[0], pose=moved[0], values=values),),
+        boards=(replace(rig.boards[0], pose=moved[1]),),
+    )
+    others = sampler(arm, PlannedImages(rig)).draw(300, rng)
+    fit = calibrate(arm, images_at(truth, true_rig, q, 0.3, rng).with_rig(rig))
+    assert fit.rig is not None
+    middle = np.array([*rig.boards[0].points.mean(0), 1.0])
+    exact = true_rig.board_in_camera(0, 0, truth.poses(others)) @ middle
+    estimated = fit.rig.board_in_camera(0, 0, fit.chain.poses(others)) @ middle
+    return float(np.sqrt(np.mean(np.sum((exact - estimated) ** 2, 1))))
+
+
+def ratio_to_random(name: str, seeds: range, count: int, candidates: int) -> float:
+    """Return the geometric mean over seeds of the error after planned images over that after random ones."""
+    arm, rig = setup(name)
+    images, ratios = PlannedImages(rig), []
+    views = sampler(arm, images)
+    for seed in seeds:
+        found = plan(arm, count, noise=NOISE, images=images, candidates=candidates, space=FLOOR, seed=seed)
+        drawn = views.draw(8 * count, np.random.default_rng(1000 + seed))
+        random = np.array([q for q in drawn if views.is_feasible(q)])[:count]
+        assert len(random) == count
+        ratios.append(errors_elsewhere(name, seed, found.q) / errors_elsewhere(name, seed, random))
+    return float(np.exp(np.mean(np.log(ratios))))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ur10-wrist", "panda-wrist", "ur10-fixed", "panda-fixed"])
+def test_planned_images_calibrate_better_than_random_ones(name):
+    assert ratio_to_random(name, range(4), 30, 600) < 0.8
