@@ -19,17 +19,19 @@ def level(times):
     return np.interp(times, corners, np.stack([np.roll(LEVELS, 1), LEVELS], -1).ravel())
 
 
-def series(offset=0.0, pose_rate=30.0, end=18.0):
+def series(offset=0.0, pose_rate=30.0, end=18.0, start=0.0):
     times = np.arange(0, end, 0.01)
     q = np.stack([level(times), 0 * times], -1)
     pose_times = np.arange(0.003, end, 1 / pose_rate)
     positions = np.stack([np.cos(level(pose_times)), np.sin(level(pose_times)), 0 * pose_times], -1)
-    return JointSeries(("a", "b"), times, q), PoseSeries(pose_times + offset, positions, None, "world")
+    joints = JointSeries(("a", "b"), start + times, q)
+    return joints, PoseSeries(start + pose_times + offset, positions, None, "world")
 
 
+@pytest.mark.parametrize("start", [0.0, 1.7e9])
 @pytest.mark.parametrize("offset", [0.0, 0.05, -2.0])
-def test_stops_are_found(offset):
-    stops = find_stops(*series(offset))
+def test_stops_are_found(offset, start):
+    stops = find_stops(*series(offset, start=start))
     np.testing.assert_allclose(stops.q[:, 0], LEVELS, atol=1e-12)
     np.testing.assert_allclose(stops.positions[:, 0], np.cos(LEVELS), atol=1e-12)
     assert stops.clock_offset == pytest.approx(offset, abs=0.03)
