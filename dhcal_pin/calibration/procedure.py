@@ -46,7 +46,9 @@ from .cameras import (
     apply_gate,
     axis_stages,
     default_sets,
+    diagnose_hand_eye,
     exchange_axes,
+    has_arm,
     has_images,
     held_values,
     reorder,
@@ -159,11 +161,16 @@ def calibrate(
         groups = PriorGroups.from_expected(errors, problem.weights, has_default_prior(errors, priors))
         fit = reweight(fit, robust.LOSSES[loss].stages, groups, max_iterations, progress)
         if has_images(data) and priors != "none":
-            fit, gate, stages = apply_gate(fit, groups, max_iterations)
+            ungated = fit
+            fit, gate, stages = apply_gate(ungated, groups, max_iterations)
             extension = Extension(temperature=gate.temperature, n_configurations=gate.n_configurations)
             result = _make_result(fit, 1.0, holdout, method)
             warnings = [exchange.sentence for exchange in exchanges]
-            warnings += [gate.sentence] if errors.parameters and not gate.is_open else []
+            is_hand_eye = not has_arm(errors)
+            warnings += [gate.sentence] if not (is_hand_eye or gate.is_open) else []
+            if is_hand_eye:
+                diagnosis = diagnose_hand_eye(ungated, result.pose_std, holdout)
+                result = replace(result, hand_eye=diagnosis)
             return replace(
                 result,
                 extension=extension,

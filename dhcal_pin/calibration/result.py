@@ -49,6 +49,7 @@ from ..plausibility.mixups import Diagnosis, diagnose_mixups
 from ..result_plots import ResultPlots
 from ..robot.chain import Chain
 from . import summary
+from .cameras.diagnosis import HandEyeDiagnosis
 from .cameras.stages import Stage
 from .cross_validation import (
     FoldComparison,
@@ -119,6 +120,8 @@ class Result(ResultPlots):
             was tried.
         camera_stages: Unknowns of a calibration from images that were freed in turn, and what each group of
             them improved; empty without images.
+        hand_eye: Error of a hand-eye calibration and its likely cause; None if the arm is calibrated along,
+            without images, and with fewer than five configurations.
     """
 
     errors: ErrorModel
@@ -136,6 +139,7 @@ class Result(ResultPlots):
     input_warnings: tuple[str, ...] = ()
     decision: Verdict | None = None
     camera_stages: tuple[Stage, ...] = ()
+    hand_eye: HandEyeDiagnosis | None = None
 
     @property
     def model(self) -> pin.Model:
@@ -531,6 +535,26 @@ class Result(ResultPlots):
             if isinstance(item, CameraCorners):
                 return item.solved_rig(self.instruments)
         return None
+
+    @property
+    def pose_std(self) -> float:
+        """Largest standard deviation of the position of a camera or a board in its link [m].
+
+        It is that along the worst direction; 0 if all of these positions are known, or if they cannot be told
+        apart from an unknown base or tool.
+        """
+        if self.errors.only_frames():
+            return 0.0
+        index = {p.name: i for i, p in enumerate(self.parameters)}
+        largest = 0.0
+        for name in index:
+            entry, _, component = name.rpartition(".")
+            if component == "x" and entry.startswith(("camera_", "board_")):
+                position = [index[f"{entry}.{axis}"] for axis in "xyz"]
+                block = self.covariance[np.ix_(position, position)]
+                is_known = np.isfinite(block).all()
+                largest = max(largest, float(np.linalg.eigvalsh(block)[-1]) if is_known else np.inf)
+        return float(np.sqrt(largest))
 
     @cached_property
     def comparisons(self) -> tuple[Comparison, ...]:

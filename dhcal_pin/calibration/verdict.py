@@ -130,7 +130,8 @@ def judge(fit: Result) -> Verdict:
         findings += [
             *_convergence(fit),
             *_implausible_correction(fit),
-            *_implausible_errors(fit),
+            *(_implausible_errors(fit) or _hand_eye_error(fit)),
+            *_hand_eye_images(fit),
             *_held_out_errors(fit),
             *_few_measurements(fit),
             *_outliers(fit),
@@ -205,6 +206,18 @@ def _implausible_errors(fit: Result) -> list[Finding]:
     return []
 
 
+def _hand_eye_error(fit: Result) -> list[Finding]:
+    """Advise caution if noise does not explain the error of a hand-eye calibration, and name the cause."""
+    if fit.hand_eye is None or fit.hand_eye.is_noise:
+        return []
+    return [Finding("caution", f"{fit.hand_eye.error_sentence}{fit.hand_eye.likely}")]
+
+
+def _hand_eye_images(fit: Result) -> list[Finding]:
+    """Advise caution if the images of a hand-eye calibration are too similar, or some do not fit."""
+    return [Finding("caution", text) for text in (fit.hand_eye.image_sentences if fit.hand_eye else [])]
+
+
 def _describe(size: CorrectionSize) -> str:
     """Describe the size of a correction, to be read after "the correction"."""
     unit = "rad" if size.is_angle else "m"
@@ -230,6 +243,8 @@ def _missing_frames(fit: Result) -> list[str]:
 
 def _plausible_cause(fit: Result) -> str:
     """Name the most plausible cause of an implausible result."""
+    if fit.hand_eye is not None and fit.hand_eye.causes:
+        return f"{fit.hand_eye.error_sentence}{fit.hand_eye.likely}"
     if fit.diagnosis.is_explained:
         if missing := _missing_frames(fit):
             verb = "are" if len(missing) > 1 else "is"
@@ -286,7 +301,9 @@ def _few_measurements(fit: Result) -> list[Finding]:
 def _outliers(fit: Result) -> list[Finding]:
     """Advise caution if many samples are outliers."""
     n_outliers = sum(map(len, fit.outliers))
-    if n_outliers <= MAX_OUTLIER_SHARE * fit.n_samples:
+    # Images that differ because of a wrong lens or a wrong arm are no outliers.
+    is_explained = fit.hand_eye is not None and bool(fit.hand_eye.causes)
+    if is_explained or n_outliers <= MAX_OUTLIER_SHARE * fit.n_samples:
         return []
     share = f"{100 * n_outliers / fit.n_samples:.0f} %"
     text = f"{n_outliers} of {fit.n_samples} samples ({share}) are outliers. Check the measurements"

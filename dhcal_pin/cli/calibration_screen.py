@@ -63,6 +63,7 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
         Block(_robot_lines(fit, names[job.robot], outcome.document["settings"]["parameters"])),
         Block(_data_lines(outcome, names), noun="file", rank=7),
         *_accuracy_blocks(fit),
+        _hand_eye_block(fit),
         _correction_block(fit),
         Block(unidentified, "yellow", noun="note on parameters", rank=0, n_kept=0, has_space=True),
         Block(notes, noun="note on the files", rank=1),
@@ -189,6 +190,13 @@ def _accuracy_rows(comparison: Comparison | None, place: str) -> Iterator[list[s
             for side in (comparison.before.groups[group], after)
         ]
         yield [f"{group} {place}", judged, *cells]
+
+
+def _hand_eye_block(fit: Result) -> Block:
+    """Describe the error of a hand-eye calibration, and what each possible cause explains of it."""
+    if fit.hand_eye is None:
+        return Block([])
+    return Block(fit.hand_eye.table, noun="cause", rank=5, n_kept=3, has_space=True)
 
 
 def _correction_block(fit: Result) -> Block:

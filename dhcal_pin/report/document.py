@@ -192,6 +192,7 @@ def result_to_dict(
         "priors": {estimate.name: estimate.prior for estimate in fit.estimates if not estimate.fixed},
         "extension": fit.extension.to_dict() if fit.extension else None,
         "camera_stages": [stage.to_dict() for stage in fit.camera_stages],
+        "hand_eye": fit.hand_eye.to_dict() if fit.hand_eye else None,
         "shrinkage_factor": fit.shrinkage_factor,
         "shrinkage_notes": fit.shrinkage_notes,
         "unobservable": fit.unobservable,

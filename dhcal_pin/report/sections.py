@@ -225,6 +225,16 @@ def _image_section(context: ReportContext) -> Section:
         )
         items = [f"{stage.name}: {stage.reason}" for stage in stages if stage.reason]
         tables.append(images.stage_table(stages))
+    hand_eye = context.fit.hand_eye
+    if hand_eye is not None:
+        likely = "" if hand_eye.is_noise else hand_eye.likely
+        sentences += [f"{hand_eye.error_sentence}{likely}", *hand_eye.image_sentences]
+        if hand_eye.trials:
+            sentences.append(
+                "The table of causes shows the error of left-out images if one thing more than the poses is "
+                "estimated."
+            )
+        tables.append(hand_eye.table)
     tables.append(images.image_table(context))
     return Section(key, title, sentences, items, tables, partial(images.image_figures, context))
 

@@ -5,7 +5,8 @@ which of these parameters are unknown, and in which order they are freed.
 """
 
 from .axis_order import axis_stages, exchange_axes, reorder
-from .gate import apply_gate
+from .diagnosis import HandEyeDiagnosis, diagnose_hand_eye
+from .gate import apply_gate, has_arm
 from .sets import DEFAULT_SETS, RIG_SETS, default_sets, has_images, held_values, split_sets
 from .stages import STAGES, ImageError, Stage
 
@@ -13,12 +14,15 @@ __all__ = [
     "DEFAULT_SETS",
     "RIG_SETS",
     "STAGES",
+    "HandEyeDiagnosis",
     "ImageError",
     "Stage",
     "apply_gate",
     "axis_stages",
     "default_sets",
+    "diagnose_hand_eye",
     "exchange_axes",
+    "has_arm",
     "has_images",
     "held_values",
     "reorder",

@@ -40,14 +40,13 @@ from ...measurements.images.camera_parameters import POINTS_SET
 from ..partition import Fold, configuration_groups, different_configurations, k_fold
 from ..reweighting import Fit
 from .jitter import Jitter, estimate_jitter, with_jitter
+from .sets import MAX_POINTS, count_corners
 from .stages import Stage, fitted_error, held_out_error
 
 # Number of clusters of joint space that are left out in turn.
 N_CLUSTERS = 5
 # Number of folds of random images.
 N_IMAGE_FOLDS = 5
-# Largest number of corners of all boards that are estimated to judge whether boards are as stated.
-MAX_POINTS = 150
 # Configurations per unit of the temperature with an open and with a closed gate.
 OPEN_SAMPLES, CLOSED_SAMPLES = 20, 5
 # Largest ratio of the errors for which the arm is demonstrably wrong: if its errors explain the images up to
@@ -163,7 +162,7 @@ def _gated(fit: Fit, groups: PriorGroups, max_iterations: int) -> tuple[Fit, Fit
     if not is_right:
         kept = _best((kept, _shared(nominal, max_iterations)), folds)
     kept = replace(kept, fit=_solve(kept.fit, kept.fit.problem, 1.0, max_iterations))
-    if not fit.problem.errors.parameters:
+    if not has_arm(fit.problem.errors):
         gate = Gate(float("nan"), kept.jitter, 1.0, n_configurations, is_right, is_right)
         return kept.fit, kept.fit, gate
     shared = _shared(fit, max_iterations)
@@ -306,9 +305,9 @@ def _with_evidence(fit: Fit, groups: PriorGroups, temperature: float, max_iterat
 
 
 def _without_arm(fit: Fit, max_iterations: int, held: Collection[str] = ()) -> Fit:
-    """Fit cameras and boards with the nominal arm; the parameter sets `held` keep their first values."""
+    """Fit poses and lenses with the nominal arm; the parameter sets `held` keep their first values."""
     problem = fit.problem
-    robot = len(problem.errors.parameters)
+    errors = nominal_arm(problem.errors)
     values = {
         p.name: p.nominal
         for item in problem.data
@@ -316,16 +315,40 @@ def _without_arm(fit: Fit, max_iterations: int, held: Collection[str] = ()) -> F
         for p in item.instrument_parameters
         if item.set_of(p.name) in held
     }
-    is_free = np.array([p.name not in values for p in problem.instrument_parameters], bool)
+    is_free = np.array(
+        [
+            *(p in errors.parameters for p in problem.errors.parameters),
+            *(p.name not in values for p in problem.instrument_parameters),
+        ],
+        bool,
+    )
     plain = replace(
         problem,
-        errors=ErrorModel(problem.errors.chain, ()),
-        weights=problem.weights[robot:][is_free],
+        errors=errors,
+        weights=problem.weights[is_free],
         known=values | dict(problem.known),
         bounds=None,
     )
-    solution = minimize(plain, "lm", fit.solution.x[robot:][is_free], max_iterations, loose=True)
+    solution = minimize(plain, "lm", fit.solution.x[is_free], max_iterations, loose=True)
     return replace(fit, problem=plain, solution=solution)
+
+
+def nominal_arm(errors: ErrorModel) -> ErrorModel:
+    """Return the model of the nominal arm, with the unknowns of base and tool alone.
+
+    Args:
+        errors: Nominal chain and its unknown parameters.
+    """
+    return errors.only_frames() or ErrorModel(errors.chain, ())
+
+
+def has_arm(errors: ErrorModel) -> bool:
+    """Return whether the arm itself has unknown parameters, besides base and tool.
+
+    Args:
+        errors: Nominal chain and its unknown parameters.
+    """
+    return len(errors.parameters) > len(nominal_arm(errors).parameters)
 
 
 def _stages(fit: Fit, with_arm: Fit, gate: Gate, max_iterations: int) -> tuple[Stage, ...]:
@@ -346,7 +369,7 @@ def _stages(fit: Fit, with_arm: Fit, gate: Gate, max_iterations: int) -> tuple[S
         out.append(replace(stage, reason=f"{stage.reason} {_change(out[-1], stage)}".strip()))
     points = _without_arm(fit, max_iterations)
     has_points = len(points.problem.weights) > len(lenses.problem.weights)
-    if not has_points and _count_corners(fit.data) <= MAX_POINTS:
+    if not has_points and count_corners(fit.data) <= MAX_POINTS:
         points = _without_arm(_with_points(fit), max_iterations)
     if len(points.problem.weights) > len(lenses.problem.weights):
         reason = (
@@ -356,7 +379,7 @@ def _stages(fit: Fit, with_arm: Fit, gate: Gate, max_iterations: int) -> tuple[S
         )
         stage = judged("target points", points, has_points, reason)
         out.append(replace(stage, reason=f"{stage.reason} {_change(out[-1], stage)}".strip()))
-    if with_arm.problem.errors.parameters:
+    if has_arm(with_arm.problem.errors):
         out.append(judged("arm", with_arm, gate.is_open, gate.sentence))
     return tuple(out)
 
@@ -367,17 +390,6 @@ def _change(before: Stage, after: Stage) -> str:
         return ""
     factor = after.by_region.pixels / before.by_region.pixels
     return f"Estimating them changes the error of left-out parts of joint space by the factor {factor:.2f}."
-
-
-def _count_corners(data: Sequence[Measurement]) -> int:
-    """Return the number of corners of all boards."""
-    boards = {
-        board.name: len(board.points)
-        for item in data
-        if isinstance(item, CameraCorners)
-        for board in item.rig.boards
-    }
-    return sum(boards.values())
 
 
 def _with_points(fit: Fit) -> Fit:

@@ -21,6 +21,8 @@ RIG_SETS = {
 }
 # Sets that are estimated by default from image coordinates.
 DEFAULT_SETS = "placement,offset,camera,board,intrinsics"
+# Largest number of corners of all boards that are estimated to judge whether boards are as stated.
+MAX_POINTS = 150
 
 
 def split_sets(parameters: str | Iterable[str]) -> tuple[list[str], list[str]]:
@@ -83,3 +85,18 @@ def held_values(data: Sequence[Measurement], sets: Sequence[str]) -> dict[str, f
         for name, value in item.stated_values.items()
         if item.set_of(name) not in sets
     }
+
+
+def count_corners(data: Sequence[Measurement]) -> int:
+    """Return the number of corners of all boards.
+
+    Args:
+        data: Measurements.
+    """
+    boards = {
+        board.name: len(board.points)
+        for item in data
+        if isinstance(item, CameraCorners)
+        for board in item.rig.boards
+    }
+    return sum(boards.values())

@@ -1,0 +1,273 @@
+"""Models of what can be wrong with a hand-eye calibration: arm, board, lens, or pairing of the images.
+
+A hand-eye calibration holds the arm, the boards and the lenses, and estimates poses only. Each cause frees or
+changes one of them:
+
+- `pairing`: an image belongs to the joint values of another row, earlier or later by a number of rows, or to
+  values between two rows;
+- `board size`: all lengths of a board have one factor;
+- `lens`: focal lengths, image centre and distortion differ from those of the rig;
+- `board corners`: each corner of a board is displaced;
+- `joint offsets`: the zeros of the joints differ from the nominal ones;
+- `arm geometry`: joint offsets and all link frames differ from the nominal ones.
+
+Causes can be combined. The model of some causes is fitted to the same images as that of none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ..._typing import Array
+from ...estimation.error_model import ErrorModel
+from ...estimation.initialization import make_problem
+from ...estimation.parameters import select_parameters
+from ...estimation.priors import PriorGroups
+from ...estimation.robust import KEPT
+from ...estimation.solver import minimize
+from ...exceptions import DhcalError
+from ...measurements.base import Measurement
+from ...measurements.camera import CameraCorners
+from ..reweighting import Fit, reweight
+
+# Causes, and parameter sets of those of the arm. Those with fewer unknowns come first.
+PAIRING, SIZE, LENS, CORNERS, OFFSETS, GEOMETRY = (
+    "pairing",
+    "board size",
+    "lens",
+    "board corners",
+    "joint offsets",
+    "arm geometry",
+)
+ARM_SETS = {OFFSETS: "offset", GEOMETRY: "placement,offset"}
+# First step of the logarithm of the size of a board, and largest one.
+SIZE_STEP, MAX_SIZE_STEP = 0.01, 0.15
+# Shifts of the joint values that are tried first [rows].
+SHIFTS = (-2.0, -1.0, -0.5, -0.2, -0.1, -0.05, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
+# A first shift goes on if it reduces the cost below this fraction.
+MAX_SHIFT_COST = 0.7
+_SHIFT_STEP = 0.02
+# A shift that differs less from a whole number is one [rows].
+MAX_WHOLE_DIFFERENCE = 0.1
+# Rounds and accuracy of the search for a size [1] or a shift [rows].
+_N_ROUNDS, _TOLERANCE = 8, 1e-5
+# Largest number of iterations of one solution.
+_MAX_ITERATIONS = 40
+
+
+@dataclass(frozen=True)
+class Causes:
+    """Combination of causes.
+
+    Attributes:
+        arm: Parameter sets of the arm that are estimated; empty for the nominal arm.
+        has_lens: Whether the values of the lenses are estimated.
+        has_points: Whether the corners of the boards are estimated.
+        sizes: Size of each board relative to the stated one, by name.
+        shift: Number of rows by which the joint values are shifted; 0.5 is the mean of two rows.
+    """
+
+    arm: str = ""
+    has_lens: bool = False
+    has_points: bool = False
+    sizes: Mapping[str, float] = field(default_factory=dict)
+    shift: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class HandEyeData:
+    """What all models of one hand-eye calibration share.
+
+    Attributes:
+        errors: Nominal chain; base and tool are its only parameters, if any.
+        data: Measurements with their own standard deviations, first values and no outliers.
+        known: Values of parameters that the calibration holds, by name [m, rad, px or 1].
+        sequence: Joint values of all images in the order of the file, held-out ones included, (k, n).
+    """
+
+    errors: ErrorModel
+    data: tuple[Measurement, ...]
+    known: Mapping[str, float]
+    sequence: Array
+
+
+def apply_causes(hand_eye: HandEyeData, causes: Causes, item: CameraCorners) -> CameraCorners:
+    """Return images with the rig and the joint values of some causes.
+
+    Args:
+        hand_eye: Images and what is held.
+        causes: Causes.
+        item: Images; those without joint values after a shift are left out.
+    """
+    cameras, boards = item.rig.cameras, item.rig.boards
+    if causes.has_lens:
+        cameras = tuple(
+            replace(camera, intrinsics="prior") if camera.intrinsics == "fixed" else camera
+            for camera in cameras
+        )
+    if causes.sizes:
+        boards = tuple(
+            replace(board, type="points", listed_points=causes.sizes.get(board.name, 1.0) * board.points)
+            for board in boards
+        )
+    if causes.has_points:
+        boards = tuple(replace(board, has_free_points=True) for board in boards)
+    if cameras is not item.rig.cameras or boards is not item.rig.boards:
+        item = item.with_rig(replace(item.rig, cameras=cameras, boards=boards))
+    return _shifted(item, hand_eye.sequence, causes.shift) if causes.shift else item
+
+
+def fit_causes(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float] | None = None) -> Fit:
+    """Fit the model of some causes; noise and the sizes of the arm's errors are estimated.
+
+    Args:
+        hand_eye: Images and what is held.
+        causes: Causes of the model.
+        start: First values of cameras and boards by name; from the images themselves if None.
+
+    Returns:
+        The fit.
+    """
+    fit = _first_fit(hand_eye, causes, start)
+    errors = fit.problem.errors
+    has_default = np.ones(len(errors.parameters), bool)
+    groups = PriorGroups.from_expected(errors, fit.problem.weights, has_default)
+    return reweight(fit, (KEPT,), groups, _MAX_ITERATIONS, None)
+
+
+def _first_fit(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float] | None = None) -> Fit:
+    """Fit the model of some causes with the stated or placeholder noise."""
+    errors = hand_eye.errors
+    if causes.arm:
+        arm = select_parameters(errors.chain, causes.arm)
+        # Parameters are in the order of their frames.
+        parameters = sorted((*errors.parameters, *arm.parameters), key=lambda p: p.error_frame)
+        errors = replace(arm, parameters=tuple(parameters))
+    data = tuple(
+        apply_causes(hand_eye, causes, item) if isinstance(item, CameraCorners) else item
+        for item in hand_eye.data
+    )
+    known = dict(hand_eye.known)
+    if causes.has_lens:
+        freed = {name for item in data if isinstance(item, CameraCorners) for name in _lens_names(item)}
+        known = {name: value for name, value in known.items() if name not in freed}
+    if start is None:
+        data = tuple(_without_poses(item, known).initialized(errors.chain) for item in data)
+    weights = np.array([1 / p.prior for p in errors.parameters])
+    problem = make_problem(errors, data, weights, known)
+    priors = np.array([1 / p.prior for p in problem.instrument_parameters])
+    problem = replace(problem, weights=np.concatenate([weights, priors]))
+    first = start or {}
+    x = [first.get(p.name, p.nominal) - p.nominal for p in problem.instrument_parameters]
+    x = np.concatenate([np.zeros(len(weights)), x])
+    solution = minimize(problem, "lm", x, _MAX_ITERATIONS, loose=True)
+    return Fit(data, problem, solution, tuple(np.ones(len(item.rows)) for item in data))
+
+
+def _lens_names(item: CameraCorners) -> list[str]:
+    """Return the names of the parameters of lenses."""
+    return [p.name for p in item.instrument_parameters if item.set_of(p.name) == "intrinsics"]
+
+
+def _without_poses(item: Measurement, known: Mapping[str, float]) -> Measurement:
+    """Return images without first values of the poses that are estimated."""
+    if not isinstance(item, CameraCorners):
+        return item
+    names = [p.name for p in item.instrument_parameters if item.set_of(p.name) in ("camera", "board")]
+    return item.with_values({name: np.nan for name in names if name not in known})
+
+
+def _shifted(item: CameraCorners, sequence: Array, shift: float) -> CameraCorners:
+    """Return images with the joint values of other rows; images without such a row are left out."""
+    number = np.array([int(np.argmin(np.abs(sequence - q).max(1))) for q in item.q])
+    place = number + shift
+    low = np.clip(np.floor(place).astype(int), 0, len(sequence) - 2)
+    part = (place - low)[:, None]
+    q = (1 - part) * sequence[low] + part * sequence[low + 1]
+    return item.replace(q=q).take((place >= 0) & (place <= len(sequence) - 1))
+
+
+def file_sequence(data: Sequence[Measurement]) -> Array:
+    """Return the joint values of all images in the order of the rows of their file.
+
+    Args:
+        data: Measurements, fitted and held out.
+
+    Returns:
+        Joint values, (k, n) [rad or m].
+    """
+    images = [item for item in data if isinstance(item, CameraCorners)]
+    q = np.concatenate([item.q for item in images])
+    rows = np.concatenate([item.rows for item in images])
+    q = q[np.argsort(rows, kind="stable")]
+    is_new = np.ones(len(q), bool)
+    is_new[1:] = np.any(q[1:] != q[:-1], 1)
+    return q[is_new]
+
+
+# ------------------------------------------------------------------------------------ sizes and shifts
+def find_sizes(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float]) -> dict[str, float]:
+    """Find the size of each board that fits the images best."""
+    names = [b.name for item in hand_eye.data if isinstance(item, CameraCorners) for b in item.rig.boards]
+    sizes = dict.fromkeys(dict.fromkeys(names), 1.0) | dict(causes.sizes)
+    for name in sizes:
+
+        def cost(log_size: float, name: str = name) -> float:
+            own = sizes | {name: float(np.exp(log_size))}
+            return _cost(hand_eye, replace(causes, sizes=own), start)
+
+        found = _minimum(cost, float(np.log(sizes[name])), SIZE_STEP, MAX_SIZE_STEP)
+        sizes[name] = float(np.exp(found))
+    return sizes
+
+
+def find_shift(hand_eye: HandEyeData, causes: Causes) -> float:
+    """Find the shift of the joint values that fits the images best; 0 if none fits far better."""
+    if len(hand_eye.sequence) < 4:
+        return 0.0
+    costs = {shift: _cost(hand_eye, replace(causes, shift=shift), None) for shift in (0.0, *SHIFTS)}
+    best = min(costs, key=lambda shift: costs[shift])
+    if not best or costs[best] > MAX_SHIFT_COST * costs[0.0]:
+        return 0.0
+    found = _minimum(
+        lambda shift: _cost(hand_eye, replace(causes, shift=shift), None), best, _SHIFT_STEP, 0.5
+    )
+    return best if best.is_integer() and abs(found - best) < MAX_WHOLE_DIFFERENCE else found
+
+
+def _cost(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float] | None) -> float:
+    """Return the mean cost of a sample in the fit of a model; infinite without a fit."""
+    try:
+        fit = _first_fit(hand_eye, causes, start)
+    except DhcalError:
+        return np.inf
+    return fit.solution.system.cost / sum(len(item.rows) for item in fit.data)
+
+
+def _minimum(cost: Callable[[float], float], start: float, step: float, max_step: float) -> float:
+    """Return the minimum of a function by parabolas through three of its values."""
+    x, middle = start, cost(start)
+    for _ in range(_N_ROUNDS):
+        left, right = cost(x - step), cost(x + step)
+        curvature = left - 2 * middle + right
+        move = 0.5 * step * (left - right) / curvature if curvature > 0 else np.sign(left - right) * max_step
+        move = float(np.clip(move, -max_step, max_step))
+        value = cost(x + move)
+        if not value < middle:
+            candidates = {x - step: left, x + step: right}
+            other = min(candidates, key=lambda each: candidates[each])
+            if candidates[other] < middle:
+                move, value = other - x, candidates[other]
+            else:
+                step *= 0.25
+                if step < _TOLERANCE:
+                    break
+                continue
+        x, middle = x + move, value
+        if abs(move) < _TOLERANCE:
+            break
+        step = min(step, max(abs(move), _TOLERANCE))
+    return x

@@ -1,0 +1,578 @@
+"""Likely cause of the error that a hand-eye calibration leaves.
+
+Images of a right arm, a right board and a right lens differ from the model by the noise of the corners. If
+the error of left-out images is more than `MAX_NOISE_RATIO` times that noise, something else is wrong. Each
+cause of `causes` is then estimated in addition, and judged on left-out images. The cause with the smallest
+error is the likely one; if several reach nearly the same error, the one with the fewest unknowns is named
+first, and the others with it. The next causes are tried on top of it, as long as the error exceeds the noise.
+
+The noise is the scatter of the corners within an image, or the smallest error that any cause leaves. Corners
+of one image that are all displaced together, and by no cause that was tried, are an error of the arm of
+another kind, or images with wrong joint values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ... import se3
+from ..._typing import Array
+from ...cameras.rig import Camera
+from ...estimation.robust import ZERO_WEIGHT
+from ...exceptions import DhcalError
+from ...formatting import Table, format_quantity
+from ...measurements.base import Measurement
+from ...measurements.camera import CameraCorners
+from ...plausibility.displacement import measure_correction
+from ..partition import configuration_groups, k_fold
+from ..reweighting import Fit
+from .causes import (
+    ARM_SETS,
+    CORNERS,
+    GEOMETRY,
+    LENS,
+    OFFSETS,
+    PAIRING,
+    SIZE,
+    Causes,
+    HandEyeData,
+    apply_causes,
+    file_sequence,
+    find_shift,
+    find_sizes,
+    fit_causes,
+)
+from .gate import residual_jitter
+from .sets import MAX_POINTS, count_corners
+from .stages import ImageError, fitted_error, held_out_error
+
+# Displacements that all corners of an image share and that no cause explains.
+DISPLACEMENT = "displaced images"
+# An error of left-out images above this multiple of the noise is not noise.
+MAX_NOISE_RATIO = 2.0
+# A cause is likely if it reduces the error of left-out images below this share, and as likely as the best one
+# up to this ratio of their errors.
+MAX_ERROR_SHARE, MAX_TIE_RATIO = 0.8, 1.15
+# Errors of images above this are those of wrong joint values rather than of arm, board or lens [px].
+LARGE_ERROR = 10.0
+# Correction of the arm in multiples of manufacturing errors above which the arm is no plausible cause.
+MAX_ARM_CORRECTION = 6.0
+# The error of left-out images is that of one step of the fit. Above this multiple of the error of fitted
+# images the step is too long, and the latter is used.
+MAX_LEFT_OUT_RATIO = 3.0
+# Share of rejected corners above which all corners are examined, too.
+MAX_REJECTED_SHARE = 0.03
+# Images with errors above this multiple of that of the others are wrong.
+MIN_WRONG_RATIO = 5.0
+# Number of folds, smallest number of configurations, and largest number of causes.
+N_FOLDS, MIN_CONFIGURATIONS, MAX_CAUSES = 5, 5, 3
+# RMS rotation about the second axis [rad] below which an error of the arm displaces the camera far more than
+# the images show.
+MIN_ROTATION = np.deg2rad(8.0)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One cause that was estimated along.
+
+    Attributes:
+        cause: Name of the cause.
+        error: Error of left-out images.
+        text: What differs, and by how much.
+        remedy: What to do about it.
+    """
+
+    cause: str
+    error: ImageError
+    text: str
+    remedy: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content for the JSON document."""
+        return {
+            "cause": self.cause,
+            "residual_rms_px": self.error.pixels,
+            "board_rms_m": self.error.distance,
+            "text": self.text,
+            "remedy": self.remedy,
+        }
+
+
+@dataclass(frozen=True)
+class HandEyeDiagnosis:
+    """Error of a hand-eye calibration and its likely cause.
+
+    Attributes:
+        error: Error of left-out images with the poses alone.
+        noise: Part of it that noise of the corners explains.
+        causes: Likely causes, the most important one first; the error of each is that with the ones before.
+        alternatives: Causes that explain the images as well as the first one.
+        trials: All causes that were tried alone.
+        rotation: RMS rotation of the tool about the axis with the second largest rotation [rad].
+        position_std: Largest standard deviation of the position of a camera or a board [m].
+        n_wrong_images: Number of images that do not fit the others, and are left out.
+    """
+
+    error: ImageError
+    noise: ImageError
+    causes: tuple[Trial, ...]
+    alternatives: tuple[Trial, ...]
+    trials: tuple[Trial, ...]
+    rotation: float
+    position_std: float
+    n_wrong_images: int
+
+    @property
+    def is_noise(self) -> bool:
+        """Whether noise of the corners explains the error."""
+        return self.error.pixels <= MAX_NOISE_RATIO * self.noise.pixels
+
+    @property
+    def has_few_rotations(self) -> bool:
+        """Whether the tool turned too little about a second axis to determine the poses."""
+        return self.rotation < MIN_ROTATION
+
+    @property
+    def table(self) -> Table:
+        """Errors of left-out images with the poses alone, of noise, and with each cause estimated, too."""
+        rows = [
+            ["poses only", _px(self.error.pixels), _mm(self.error.distance)],
+            ["noise of the corners", _px(self.noise.pixels), _mm(self.noise.distance)],
+        ]
+        for trial in sorted(self.trials, key=lambda each: each.error.pixels):
+            rows.append([f"{trial.cause}, too", _px(trial.error.pixels), _mm(trial.error.distance)])
+        return Table(["estimated", "left-out images", "at the board"], rows)
+
+    @property
+    def image_sentences(self) -> list[str]:
+        """What is wrong with the choice of the images, one finding each."""
+        out = []
+        if self.has_few_rotations:
+            out.append(
+                f"Too few rotations: the tool turned by {np.degrees(self.rotation):.2g}° (RMS) about a "
+                "second axis. An error of the arm of 1 mm displaces the camera by up to "
+                f"{1 / self.rotation:.2g} mm, and the images do not show it. Add images that are turned by "
+                "30° or more about two axes that are not parallel."
+            )
+        if self.n_wrong_images == 1:
+            out.append(
+                "One image does not fit the others and is left out: check its joint values, and that the "
+                "robot stood still."
+            )
+        elif self.n_wrong_images:
+            out.append(
+                f"{self.n_wrong_images} images do not fit the others and are left out: check their joint "
+                "values, and that the robot stood still."
+            )
+        return out
+
+    @property
+    def error_sentence(self) -> str:
+        """Error of left-out images and noise, in millimetres and in pixels."""
+        return (
+            f"Error of left-out images: {_mm(self.error.distance)} at the board ({_px(self.error.pixels)}); "
+            f"noise of the corners explains {_mm(self.noise.distance)} ({_px(self.noise.pixels)})."
+        )
+
+    @property
+    def likely(self) -> str:
+        """Likely cause, causes that cannot be told apart from it, and what to do; with a space before."""
+        if not self.causes:
+            return " No cause that was tried explains it: check the images, the board and the joint values."
+        parts = []
+        for number, trial in enumerate(self.causes):
+            start = "Likely cause" if not number else "In addition"
+            parts.append(f" {start}: {trial.text}.")
+            if trial.cause != DISPLACEMENT:
+                parts.append(f" If that is estimated, too, {_mm(trial.error.distance)} remain.")
+        first = self.causes[0]
+        if self.alternatives:
+            others = " or ".join(f"{trial.text} ({_mm(trial.error.distance)})" for trial in self.alternatives)
+            parts.append(f" Cannot be told apart from: {others}.")
+        parts.append(f" {first.remedy}")
+        return "".join(parts)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content for the JSON document."""
+        return {
+            "error": _error_dict(self.error),
+            "noise": _error_dict(self.noise),
+            "is_noise": self.is_noise,
+            "causes": [trial.to_dict() for trial in self.causes],
+            "alternatives": [trial.cause for trial in self.alternatives],
+            "trials": [trial.to_dict() for trial in self.trials],
+            "second_rotation_rad": self.rotation,
+            "position_std_m": self.position_std,
+            "wrong_images": self.n_wrong_images,
+            "text": self.error_sentence + ("" if self.is_noise else self.likely),
+        }
+
+
+def _mm(value: float) -> str:
+    """Format a length [m] in millimetres."""
+    return format_quantity(value, "m", 0.1 * value, small=True)
+
+
+def _px(value: float) -> str:
+    """Format a number of pixels."""
+    return format_quantity(value, "px", 0.1 * value)
+
+
+def _error_dict(error: ImageError) -> dict[str, Any]:
+    """Return an error for the JSON document."""
+    return {"residual_rms_px": error.pixels, "board_rms_m": error.distance, "corners": error.n_corners}
+
+
+# ---------------------------------------------------------------------------------------------- diagnosis
+def diagnose_hand_eye(
+    fit: Fit, position_std: float, holdout: Sequence[Measurement] = ()
+) -> HandEyeDiagnosis | None:
+    """Find the likely cause of the error that a hand-eye calibration leaves.
+
+    Args:
+        fit: Fit of poses with the nominal arm; base and tool are the only parameters of the robot, if any.
+        position_std: Largest standard deviation of the position of a camera or a board [m].
+        holdout: Held-out images, for the order of all images.
+
+    Returns:
+        The diagnosis; None with fewer than five configurations, which cannot be left out.
+    """
+    inliers = _search(fit, fit.without_rejected().data, holdout)
+    if inliers is None:
+        return None
+    found = inliers
+    rejected = np.concatenate([weights <= ZERO_WEIGHT for weights in fit.weights])
+    if rejected.mean() > MAX_REJECTED_SHARE:
+        # A wrong model makes outliers of right corners. A cause that explains them all is the cause.
+        whole = _search(fit, fit.data, holdout)
+        if whole is not None and whole.causes and whole.remaining <= MAX_NOISE_RATIO * inliers.base.noise:
+            found = whole
+    base, noise = found.base, found.noise
+    share = min(noise / base.error.pixels, 1.0) if base.error.pixels else 1.0
+    return HandEyeDiagnosis(
+        base.error,
+        ImageError(share * base.error.pixels, share * base.error.distance, base.error.n_corners),
+        found.causes,
+        found.alternatives,
+        found.trials,
+        second_rotation(fit, found.hand_eye.data),
+        position_std,
+        sum(
+            _count_wrong_images(found.hand_eye, found.last, item, weights)
+            for item, weights in zip(fit.data, fit.weights, strict=True)
+        ),
+    )
+
+
+def _search(fit: Fit, data: Sequence[Measurement], holdout: Sequence[Measurement]) -> _Search | None:
+    """Search the causes in some of the samples of a fit; None if they have too few configurations."""
+    # The scatter within an image is the noise, whatever is stated.
+    data = tuple(item.replace(has_stated_sigma=False) for item in data if len(item.rows))
+    if int(configuration_groups(data).max(initial=-1)) + 1 < MIN_CONFIGURATIONS:
+        return None
+    sequence = file_sequence([*fit.data, *holdout])
+    hand_eye = HandEyeData(fit.problem.errors, data, fit.problem.known, sequence)
+    base = _State.of(hand_eye, Causes(), fit.problem.instruments(fit.solution.x))
+    fitted = fitted_error(base.fit)
+    if base.error.pixels > MAX_LEFT_OUT_RATIO * fitted.pixels:
+        base = replace(base, error=fitted)
+    return _Search(hand_eye, base, *_find_causes(hand_eye, base))
+
+
+def _count_wrong_images(hand_eye: HandEyeData, state: _State, item: Measurement, weights: Array) -> int:
+    """Return the number of images whose corners were all rejected, and that the causes do not explain."""
+    if not isinstance(item, CameraCorners):
+        return 0
+    is_rejected = (np.bincount(item.image, weights > 0.5, item.n_images) == 0)[item.image]
+    rejected = apply_causes(hand_eye, state.causes, item.take(is_rejected))
+    errors = state.fit.problem.errors
+    chain = errors.at(state.fit.solution.x[: len(errors.parameters)])
+    u = np.array([state.values[p.name] for p in rejected.instrument_parameters])
+    pixels = rejected.errors(chain.forward_kinematics(rejected.q), u)["pixels"]
+    squares = np.bincount(rejected.image, np.sum(pixels**2, 1)) / np.bincount(rejected.image)
+    return int(np.sum(np.sqrt(squares) > MIN_WRONG_RATIO * state.error.pixels))
+
+
+def second_rotation(fit: Fit, data: Sequence[Measurement]) -> float:
+    """Return the RMS rotation of the tool about the axis with the second largest rotation [rad].
+
+    Args:
+        fit: Fit of the nominal arm.
+        data: Images.
+    """
+    q = np.unique(np.concatenate([item.q for item in data if isinstance(item, CameraCorners)]), axis=0)
+    rotations = fit.problem.errors.chain.poses(q)[:, :3, :3]
+    mean = se3.nearest_rotation(rotations.mean(0))
+    turns = np.array([se3.log3(mean.T @ rotation) for rotation in rotations])
+    return float(np.linalg.svd(turns, compute_uv=False)[1] / np.sqrt(len(turns)))
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Fit of a combination of causes, with the error of left-out images and the noise of its corners [px]."""
+
+    causes: Causes
+    fit: Fit
+    error: ImageError
+    noise: float
+    is_displaced: bool
+
+    @classmethod
+    def of(cls, hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float] | None) -> _State:
+        """Fit a combination of causes."""
+        fit = fit_causes(hand_eye, causes, start)
+        error = held_out_error(fit, k_fold(fit.data, N_FOLDS))
+        assert error is not None
+        jitter = residual_jitter(fit)
+        sigma = np.concatenate([item.sigma for item in fit.data if isinstance(item, CameraCorners)])
+        noise = jitter.noise * float(np.sqrt(np.mean(np.sum(sigma**2, 1))))
+        return cls(causes, fit, error, noise, jitter.is_significant)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Values of the parameters of cameras and boards by name."""
+        return self.fit.problem.instruments(self.fit.solution.x)
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """Images, fit of the poses alone, and what `_find_causes` returns."""
+
+    hand_eye: HandEyeData
+    base: _State
+    causes: tuple[Trial, ...]
+    alternatives: tuple[Trial, ...]
+    trials: tuple[Trial, ...]
+    last: _State
+
+    @property
+    def remaining(self) -> float:
+        """Error of left-out images with all causes [px]."""
+        return min(self.base.error.pixels, self.last.error.pixels)
+
+    @property
+    def noise(self) -> float:
+        """Scatter within an image, or the smallest error of left-out images [px]."""
+        return min([self.base.noise, *(trial.error.pixels for trial in (*self.trials, *self.causes))])
+
+
+def _find_causes(
+    hand_eye: HandEyeData, base: _State
+) -> tuple[tuple[Trial, ...], tuple[Trial, ...], tuple[Trial, ...], _State]:
+    """Return the likely causes in turn, causes like the first one, trials of each alone, and the last fit."""
+    state = base
+    found: list[Trial] = []
+    alternatives: tuple[Trial, ...] = ()
+    alone: tuple[Trial, ...] = ()
+    while len(found) < MAX_CAUSES:
+        states = _try_causes(hand_eye, state)
+        trials = {name: _trial(hand_eye, name, each) for name, each in states.items()}
+        if state is base:
+            alone = tuple(trials.values())
+        least = min((each.error.pixels for each in states.values()), default=np.inf)
+        noise = min(state.noise, least)
+        if state.error.pixels <= MAX_NOISE_RATIO * noise:
+            break
+        if least > MAX_ERROR_SHARE * state.error.pixels:
+            if state.is_displaced and state.error.pixels > MAX_NOISE_RATIO * state.noise:
+                found.append(_displacement(state))
+            break
+        equal = [name for name, each in states.items() if each.error.pixels <= MAX_TIE_RATIO * least]
+        plausible = [name for name in equal if _is_plausible(name, states[name])] or equal
+        first = plausible[0]
+        found.append(trials[first])
+        if state is base:
+            alternatives = tuple(trials[name] for name in plausible[1:] if not _contains(name, first))
+        state = states[first]
+    return tuple(found), alternatives, alone, state
+
+
+def _contains(name: str, first: str) -> bool:
+    """Return whether a cause contains another one, and is no alternative to it."""
+    return (first, name) in ((SIZE, CORNERS), (OFFSETS, GEOMETRY))
+
+
+def _is_plausible(name: str, state: _State) -> bool:
+    """Return whether errors of the arm are not far larger than manufacturing errors."""
+    if name not in ARM_SETS:
+        return True
+    errors = state.fit.problem.errors
+    chain = errors.at(state.fit.solution.x[: len(errors.parameters)])
+    return measure_correction(errors, chain).ratio < MAX_ARM_CORRECTION
+
+
+def _try_causes(hand_eye: HandEyeData, state: _State) -> dict[str, _State]:
+    """Fit each further cause on top of those of a state, those with few unknowns first."""
+    causes, start, out = state.causes, state.values, {}
+    is_large = state.error.pixels > LARGE_ERROR
+
+    def attempt(name: str, more: Causes, values: Mapping[str, float] | None = start) -> None:
+        try:
+            out[name] = _State.of(hand_eye, more, values)
+        except (DhcalError, np.linalg.LinAlgError):
+            return
+
+    if is_large and not causes.shift and (shift := find_shift(hand_eye, causes)):
+        attempt(PAIRING, replace(causes, shift=shift), None)
+        if PAIRING in out and out[PAIRING].error.pixels < MAX_ERROR_SHARE * state.error.pixels:
+            return out
+    if not causes.sizes:
+        attempt(SIZE, replace(causes, sizes=find_sizes(hand_eye, causes, start)))
+    if not causes.has_lens:
+        attempt(LENS, replace(causes, has_lens=True))
+    if not causes.has_points and count_corners(hand_eye.data) <= MAX_POINTS:
+        attempt(CORNERS, replace(causes, has_points=True))
+    for name, sets in ARM_SETS.items():
+        if len(sets) > len(causes.arm):
+            attempt(name, replace(causes, arm=sets))
+    least = min((each.error.pixels for each in out.values()), default=np.inf)
+    is_explained = min(least, state.error.pixels) <= MAX_NOISE_RATIO * state.noise
+    if not is_large and not causes.shift and not is_explained and (shift := find_shift(hand_eye, causes)):
+        attempt(PAIRING, replace(causes, shift=shift), None)
+    return out
+
+
+# ---------------------------------------------------------------------------------------------- texts
+def _trial(hand_eye: HandEyeData, name: str, state: _State) -> Trial:
+    """Describe a cause with what was estimated."""
+    text, remedy = {
+        PAIRING: _pairing_text,
+        SIZE: _size_text,
+        LENS: _lens_text,
+        CORNERS: _corner_text,
+        OFFSETS: _arm_text,
+        GEOMETRY: _arm_text,
+    }[name](hand_eye, state)
+    return Trial(name, state.error, text, remedy)
+
+
+def _displacement(state: _State) -> Trial:
+    """Describe displaced images that no cause explains."""
+    text = (
+        "all corners of an image are displaced together: errors of the arm of another kind (deflection, "
+        "backlash, periodic errors), a robot that had not stopped, or images with wrong joint values"
+    )
+    remedy = "Check the joint values of each image, and wait until the arm stands still; take more images."
+    return Trial(DISPLACEMENT, state.error, text, remedy)
+
+
+def _pairing_text(_: HandEyeData, state: _State) -> tuple[str, str]:
+    """Describe a shift of the joint values."""
+    shift = state.causes.shift
+    side = "before" if shift < 0 else "after"
+    if abs(shift - round(shift)) < 0.05 and round(shift):
+        count = abs(round(shift))
+        rows = f"{count} rows" if count > 1 else "one row"
+        return (
+            f"the pairing: each image belongs to the joint values {rows} {side} its own",
+            "Correct the table of joint values.",
+        )
+    return (
+        f"the pairing: each image belongs to joint values {abs(shift):.2g} rows {side} its own, a time "
+        "offset between camera and robot",
+        "Synchronize the clocks, or let the robot stop for each image.",
+    )
+
+
+def _size_text(hand_eye: HandEyeData, state: _State) -> tuple[str, str]:
+    """Describe boards whose size differs most."""
+    name = max(state.causes.sizes, key=lambda each: abs(np.log(state.causes.sizes[each])))
+    size = state.causes.sizes[name]
+    square = next(b.square for b in _rig(hand_eye.data).boards if b.name == name)
+    lengths = f": squares of {1e3 * size * square:.4g} mm, not {1e3 * square:.4g} mm" if square else ""
+    return (
+        f"the size of board {name!r}, {100 * abs(size - 1):.2g} % {'larger' if size > 1 else 'smaller'} than "
+        f"stated{lengths}",
+        "Measure the board with a ruler over its whole length, and correct its size in the rig file.",
+    )
+
+
+def _lens_text(hand_eye: HandEyeData, state: _State) -> tuple[str, str]:
+    """Describe the lenses, and by how much the change of each displaces the corners."""
+    values, texts = state.values, []
+    item = _images(hand_eye.data)
+    for number, camera in enumerate(item.rig.cameras):
+        found = np.array([values[f"camera_{camera.name}.{name}"] for name in camera.lens.names])
+        if not camera.has_intrinsics:
+            continue
+        rays = camera.lens.normalize(item.values[item.camera == number].T, found)
+        parts = []
+        for names, chosen in (("fx, fy", [0, 1]), ("cx, cy", [2, 3]), ("distortion", range(4, len(found)))):
+            other = found.copy()
+            other[chosen] = camera.values[chosen]
+            moved = np.sqrt(np.mean((_project(camera, rays, other) - _project(camera, rays, found)) ** 2))
+            parts.append((moved, names, chosen))
+        moved, names, chosen = max(parts)
+        change = ""
+        if names != "distortion":
+            before, after = (", ".join(f"{v:.0f}" for v in each[chosen]) for each in (camera.values, found))
+            change = f": {after} px, not {before} px"
+        texts.append(f"{names} of camera {camera.name!r}{change}")
+    return (
+        f"the lens, above all {' and '.join(texts)}" if texts else "the lens",
+        'Add intrinsics to --parameters, with intrinsics = "prior" in the rig file, or calibrate the camera '
+        "first.",
+    )
+
+
+def _project(camera: Camera, rays: Array, values: Array) -> Array:
+    """Return the image coordinates (2, m) of directions (2, m) with other values of the lens."""
+    return camera.lens.project(np.concatenate([rays, np.ones((1, rays.shape[1]))]), values)[0]
+
+
+def _corner_text(hand_eye: HandEyeData, state: _State) -> tuple[str, str]:
+    """Describe the board whose corners are displaced most."""
+    largest = ("", 0.0, 0.0)
+    item = _images(state.fit.data)
+    u = np.array([state.values[p.name] for p in item.instrument_parameters])
+    for number, (board, found) in enumerate(zip(_rig(hand_eye.data).boards, item.points(u), strict=True)):
+        seen = np.unique(item.corner[item.board == number])
+        if len(seen) < 3:
+            continue
+        moved = _without_rigid_motion(found[seen], board.points[seen])
+        rms = float(np.sqrt(np.mean(np.sum(moved**2, 1))))
+        if rms > largest[1]:
+            largest = board.name, rms, float(np.sqrt(np.mean(moved[:, 2] ** 2)))
+    name, rms, normal = largest
+    shape = ", mostly out of its plane: it is not flat" if normal**2 > 0.5 * rms**2 else ""
+    return (
+        f"the corners of board {name!r}, {_mm(rms)} (RMS) beside the stated places{shape}",
+        'Use a flat and stiff board, or estimate its corners: points = "prior" in the rig file.',
+    )
+
+
+def _without_rigid_motion(found: Array, stated: Array) -> Array:
+    """Return the differences of points (c, 3) after the best rigid motion, in the axes of the stated ones."""
+    a, b = found - found.mean(0), stated - stated.mean(0)
+    rotation = se3.nearest_rotation(b.T @ a)
+    return a @ rotation.T - b
+
+
+def _arm_text(_: HandEyeData, state: _State) -> tuple[str, str]:
+    """Describe the errors of the arm."""
+    errors = state.fit.problem.errors
+    x = state.fit.solution.x[: len(errors.parameters)]
+    remedy = "Calibrate the arm, too: leave out --parameters."
+    if state.causes.arm == ARM_SETS[OFFSETS]:
+        offsets = {p.name: v for p, v in zip(errors.parameters, x, strict=True) if p.name.endswith("offset")}
+        name = max(offsets, key=lambda each: abs(offsets[each]))
+        largest = format_quantity(offsets[name], "rad", 0.03 * abs(offsets[name]))
+        return f"the arm: its joint offsets, {name} {largest}", remedy
+    moved = measure_correction(errors, errors.at(x))
+    size = format_quantity(moved.displacement, "rad" if moved.is_angle else "m", 0.03 * moved.displacement)
+    what = "the tool" if moved.frame == "tool" else f"the axis of {moved.frame}"
+    return f"the arm: its geometry or joint offsets, which move {what} by {size} (RMS)", remedy
+
+
+def _images(data: Sequence[Measurement]) -> CameraCorners:
+    """Return the first image coordinates among measurements."""
+    return next(item for item in data if isinstance(item, CameraCorners))
+
+
+def _rig(data: Sequence[Measurement]) -> Any:
+    """Return the rig of the first image coordinates among measurements."""
+    return _images(data).rig

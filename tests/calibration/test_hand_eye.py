@@ -1,0 +1,196 @@
+"""A hand-eye calibration names the likely cause of its error: each fault alone, and nothing wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hand_eye_setups import faulty_setup
+
+import dhcal_pin as dh
+from dhcal_pin.measurements import CameraCorners
+from dhcal_pin.report.document import json_text, result_to_dict
+
+# Cause that should be named for each fault.
+CAUSES = {
+    "arm": "arm geometry",
+    "offsets": "joint offsets",
+    "size": "board size",
+    "warped": "board corners",
+    "corners": "board corners",
+    "focal": "lens",
+    "centre": "lens",
+    "distortion": "lens",
+    "lag": "pairing",
+    "rows": "pairing",
+}
+
+
+def hand_eye(name, fault, seed, is_on_wrist, sets="camera,board", loss="linear", **options):
+    """Calibrate the poses of a set-up with one fault."""
+    chain, images, _ = faulty_setup(name, fault, seed, is_on_wrist=is_on_wrist, **options)
+    return dh.calibrate(chain, images, sets, loss=loss)
+
+
+def check_cause(fit, fault):
+    """Check that the cause of a fault is named, as the reason of caution, with the error in millimetres."""
+    found = fit.hand_eye
+    assert [cause.cause for cause in found.causes][:1] == [CAUSES[fault]]
+    assert not found.is_noise
+    assert found.causes[0].error.pixels < 0.5 * found.error.pixels
+    assert fit.verdict.status != "ok"
+    (reason,) = (text for text in fit.verdict.reasons if "Likely cause" in text)
+    assert found.causes[0].text in reason
+    assert found.causes[0].remedy in reason
+    assert "mm at the board" in reason
+
+
+@pytest.mark.parametrize(
+    ("name", "fault", "seed", "is_on_wrist"),
+    [
+        ("ur10", "arm", 21, True),
+        ("panda", "offsets", 22, False),
+        ("panda", "size", 23, True),
+        ("ur10", "warped", 24, False),
+        ("xarm7", "focal", 25, False),
+        ("panda", "distortion", 26, True),
+        ("ur10", "lag", 27, True),
+    ],
+)
+def test_the_cause_of_a_fault_is_named(name, fault, seed, is_on_wrist):
+    check_cause(hand_eye(name, fault, seed, is_on_wrist, n_images=25), fault)
+
+
+def test_rejected_corners_do_not_hide_a_bent_board():
+    """The corners at the ends of the board disagree with the majority; they are right."""
+    check_cause(hand_eye("panda", "warped", 11, True, loss="auto", n_images=20), "warped")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [31, 32, 33])
+@pytest.mark.parametrize("is_on_wrist", [True, False])
+@pytest.mark.parametrize("name", ["ur10", "panda", "xarm7"])
+@pytest.mark.parametrize("fault", CAUSES)
+def test_the_cause_of_every_fault_is_named(name, fault, seed, is_on_wrist):
+    check_cause(hand_eye(name, fault, seed, is_on_wrist), fault)
+
+
+def check_nothing(fit):
+    """Check that a right hand-eye calibration has no cause."""
+    assert fit.verdict.status == "ok"
+    assert fit.hand_eye.is_noise
+    assert fit.hand_eye.causes == ()
+    assert fit.hand_eye.noise.distance == pytest.approx(fit.hand_eye.error.distance, rel=0.1)
+
+
+@pytest.mark.parametrize(("name", "is_on_wrist"), [("ur10", True), ("panda", False)])
+def test_noise_has_no_cause(name, is_on_wrist):
+    check_nothing(hand_eye(name, "nothing", 41, is_on_wrist, n_images=20))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(42, 47))
+@pytest.mark.parametrize("is_on_wrist", [True, False])
+@pytest.mark.parametrize("name", ["ur10", "panda", "xarm7", "paper"])
+def test_noise_never_has_a_cause(name, is_on_wrist, seed):
+    check_nothing(hand_eye(name, "nothing", seed, is_on_wrist))
+
+
+def test_figures_of_the_causes_are_true():
+    """The size of a board and the focal length are those of the simulation."""
+    chain, images, setup = faulty_setup("ur10", "size", 51, is_on_wrist=True, n_images=20)
+    found = dh.calibrate(chain, images, "camera,board", loss="linear").hand_eye
+    assert found is not None
+    size = 1e3 * setup.images.rig.boards[0].square * 0.97, 1e3 * setup.images.rig.boards[0].square * 1.03
+    text = found.causes[0].text
+    assert any(f"squares of {each:.3g}"[:14] in text for each in size)
+    chain, images, setup = faulty_setup("ur10", "focal", 52, is_on_wrist=True, n_images=20)
+    found = dh.calibrate(chain, images, "camera,board", loss="linear").hand_eye
+    assert found is not None
+    value = float(found.causes[0].text.split(": ")[1].split(",")[0])
+    assert value == pytest.approx(setup.exact.rig.cameras[0].values[0], rel=2e-3)
+
+
+def test_two_faults_are_named_in_turn():
+    """The lens and the arm are wrong: the poses alone, the lens alone and the arm alone leave an error."""
+    chain, images, setup = faulty_setup("ur10", "arm", 53, is_on_wrist=False)
+    camera = images.rig.cameras[0]
+    values = camera.values.copy()
+    values[2:4] += 40
+    rig = dh.mount_rig(
+        dh.cameras.Rig(
+            {camera.name: dh.cameras.Camera(camera.name, camera.link, 1280, 960, values, camera.lens)},
+            {board.name: board for board in images.rig.boards},
+        ),
+        chain,
+    )
+    data = CameraCorners(images.q, images.values, images.corner, rig)
+    found = dh.calibrate(chain, data, "camera,board", loss="linear").hand_eye
+    assert found is not None
+    assert {cause.cause for cause in found.causes} == {"lens", "arm geometry"}
+    assert found.causes[-1].error.pixels < 2.5 * setup.sigma
+
+
+def test_images_with_wrong_joint_values_are_counted():
+    chain, images, _ = faulty_setup("panda", "nothing", 54, is_on_wrist=True, n_images=24)
+    q = np.unique(images.q, axis=0)
+    swapped = images.q.copy()
+    for first, second in ((3, 17), (8, 20)):
+        swapped[np.all(images.q == q[first], 1)] = q[second]
+        swapped[np.all(images.q == q[second], 1)] = q[first]
+    data = CameraCorners(swapped, images.values, images.corner, images.rig)
+    fit = dh.calibrate(chain, data, "camera,board")
+    assert fit.hand_eye is not None
+    assert fit.hand_eye.n_wrong_images == 4
+    assert any("4 images do not fit the others" in text for text in fit.verdict.reasons)
+    assert fit.hand_eye.is_noise
+
+
+def test_similar_rotations_are_named():
+    """An arm that is wrong and turns little: the camera is wrong by more than the images show."""
+    chain, images, setup = faulty_setup(
+        "panda", "arm", 55, is_on_wrist=True, n_images=20, severity=0.5, spread=0.06
+    )
+    fit = dh.calibrate(chain, images, "camera,board", loss="linear")
+    assert fit.hand_eye is not None
+    assert fit.rig is not None
+    found, true = fit.rig.cameras[0].pose, setup.exact.rig.cameras[0].pose
+    assert found is not None
+    assert true is not None
+    assert np.linalg.norm(found[:3, 3] - true[:3, 3]) > 5 * fit.hand_eye.error.distance
+    assert fit.hand_eye.has_few_rotations
+    assert any("turned by 30° or more" in text for text in fit.verdict.reasons)
+
+
+@pytest.mark.parametrize("sets", ["base,tool,camera", "camera", "base,camera,board"])
+def test_other_names_of_the_poses(sets):
+    """Base and tool move camera and board along: the error and its cause are the same."""
+    found, alone = (
+        hand_eye("ur10", "arm", 56, True, names, n_images=20).hand_eye for names in (sets, "camera,board")
+    )
+    assert found is not None
+    assert alone is not None
+    assert found.error.pixels == pytest.approx(alone.error.pixels, rel=0.05)
+    assert found.causes[0].cause == "arm geometry"
+    assert not found.has_few_rotations
+
+
+def test_a_calibrated_arm_has_no_hand_eye_diagnosis():
+    chain, images, _ = faulty_setup("ur10", "arm", 57, is_on_wrist=True, n_images=20)
+    fit = dh.calibrate(chain, images, loss="linear")
+    assert fit.hand_eye is None
+    assert result_to_dict(fit, {}, {})["hand_eye"] is None
+
+
+def test_four_images_cannot_be_left_out():
+    chain, images, _ = faulty_setup("ur10", "nothing", 58, is_on_wrist=True, n_images=20)
+    fit = dh.calibrate(chain, images.take(images.image < 4), "camera,board", loss="linear")
+    assert fit.hand_eye is None
+
+
+def test_document_names_the_cause():
+    fit = hand_eye("ur10", "focal", 59, True, n_images=20)
+    document = result_to_dict(fit, {}, {})["hand_eye"]
+    assert document["causes"][0]["cause"] == "lens"
+    assert document["error"]["board_rms_m"] > 2 * document["noise"]["board_rms_m"]
+    assert document["text"] in fit.verdict.reasons
+    assert "Infinity" not in json_text(document)
