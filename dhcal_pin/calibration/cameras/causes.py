@@ -101,6 +101,9 @@ def apply_causes(hand_eye: HandEyeData, causes: Causes, item: CameraCorners) -> 
         hand_eye: Images and what is held.
         causes: Causes.
         item: Images; those without joint values after a shift are left out.
+
+    Returns:
+        The images.
     """
     cameras, boards = item.rig.cameras, item.rig.boards
     if causes.has_lens:
@@ -210,7 +213,16 @@ def file_sequence(data: Sequence[Measurement]) -> Array:
 
 # ------------------------------------------------------------------------------------ sizes and shifts
 def find_sizes(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float]) -> dict[str, float]:
-    """Find the size of each board that fits the images best."""
+    """Find the size of each board that fits the images best.
+
+    Args:
+        hand_eye: Images and what is held.
+        causes: Other causes of the model.
+        start: First values of cameras and boards by name.
+
+    Returns:
+        Size relative to the stated one by name of the board.
+    """
     names = [b.name for item in hand_eye.data if isinstance(item, CameraCorners) for b in item.rig.boards]
     sizes = dict.fromkeys(dict.fromkeys(names), 1.0) | dict(causes.sizes)
     for name in sizes:
@@ -225,7 +237,15 @@ def find_sizes(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float]
 
 
 def find_shift(hand_eye: HandEyeData, causes: Causes) -> float:
-    """Find the shift of the joint values that fits the images best; 0 if none fits far better."""
+    """Find the shift of the joint values that fits the images best.
+
+    Args:
+        hand_eye: Images and what is held.
+        causes: Other causes of the model.
+
+    Returns:
+        Number of rows; 0 if no shift fits far better.
+    """
     if len(hand_eye.sequence) < 4:
         return 0.0
     costs = {shift: _cost(hand_eye, replace(causes, shift=shift), None) for shift in (0.0, *SHIFTS)}

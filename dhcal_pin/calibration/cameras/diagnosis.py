@@ -303,6 +303,9 @@ def second_rotation(fit: Fit, data: Sequence[Measurement]) -> float:
     Args:
         fit: Fit of the nominal arm.
         data: Images.
+
+    Returns:
+        The rotation.
     """
     q = np.unique(np.concatenate([item.q for item in data if isinstance(item, CameraCorners)]), axis=0)
     rotations = fit.problem.errors.chain.poses(q)[:, :3, :3]
@@ -530,10 +533,10 @@ def _corner_text(hand_eye: HandEyeData, state: _State) -> tuple[str, str]:
     item = _images(state.fit.data)
     u = np.array([state.values[p.name] for p in item.instrument_parameters])
     for number, (board, found) in enumerate(zip(_rig(hand_eye.data).boards, item.points(u), strict=True)):
-        seen = np.unique(item.corner[item.board == number])
-        if len(seen) < 3:
+        observed = np.unique(item.corner[item.board == number])
+        if len(observed) < 3:
             continue
-        moved = _without_rigid_motion(found[seen], board.points[seen])
+        moved = _without_rigid_motion(found[observed], board.points[observed])
         rms = float(np.sqrt(np.mean(np.sum(moved**2, 1))))
         if rms > largest[1]:
             largest = board.name, rms, float(np.sqrt(np.mean(moved[:, 2] ** 2)))
