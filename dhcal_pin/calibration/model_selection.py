@@ -17,6 +17,9 @@ questions are asked.
    - the squared error of random folds falls by more than `MIN_IMPROVEMENT` of the family. Folds are random,
      not regions of joint space, as fast periodic errors are visible between neighbouring configurations only.
 
+   Correction curves of high order are tried only on top of those of low order. The screening of the lines
+   of the residuals spares most trials of curves that are not there.
+
    If a family is supported, eccentricity and elasticity are added in any case. Their priors shrink them where
    the measurements do not determine them. The model is then fitted by iteration.
 
@@ -33,14 +36,13 @@ questions are asked.
    thus count as fewer independent ones than as many that are far apart, and no number of them counts as more
    than 67. Predicted variances of the tool are the sum of two parts. The residuals are errors of the model,
    which other configurations have as well: their variance, without the noise of the instrument where it is
-   stated, is one part. The other is that of the uncertain parameters, scaled by c such that both contain the
-   errors e_f of three of four left-out regions f of joint space,
+   stated, is one part. The other is that of the uncertain parameters, scaled by c such that both together are
+   the mean squared errors of left-out regions f of joint space,
 
-       e_f² <= 1 + c²·v_f,
+       Σ m_f·e_f² = Σ m_f·(1 + c²·v_f),
 
-   with the variance v_f of their prediction by the parameters, in units of the residual variance. The
-   accuracy varies more between regions than the parameters predict; the mean would be too small for a region
-   that was not measured.
+   with the number m_f of held-out rows, the mean square e_f² of their errors and the variance v_f of their
+   prediction by the parameters, both in units of the residual variance.
 
 Without a supported family, and with T = 1, the fit is exactly that of the geometry.
 
@@ -64,7 +66,7 @@ import numpy as np
 from .._typing import Array, Progress
 from ..estimation import robust
 from ..estimation.error_model import ErrorModel, ErrorParameter
-from ..estimation.parameters import CURVE_ORDERS, EXTENSIONS, PARAMETER_SETS
+from ..estimation.parameters import CURVE_ORDERS, EXTENSIONS, FINE_CURVE_ORDERS, PARAMETER_SETS
 from ..estimation.priors import PriorGroups, effective_parameters
 from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.qr import (
@@ -78,7 +80,7 @@ from ..estimation.solver import minimize
 from ..exceptions import UnknownNameError
 from ..formatting import Table, format_fixed
 from ..identifiability.residual_correlation import design_effect, find_residual_correlation
-from ..robot.error_families import COMPLIANCE, COUPLING, CURVES, FAMILIES, GAIN, HARMONICS
+from ..robot.error_families import COMPLIANCE, COUPLING, CURVES, FAMILIES, FINE_CURVES, GAIN, HARMONICS
 from .cross_validation import FoldSystems, count_rows, factor_partition, select_columns, solve_columns
 from .partition import (
     configuration_groups,
@@ -99,7 +101,9 @@ MIN_CORRELATED_NOISE = 0.02
 # cross-validated squared error for which each is added. Eccentricity and elasticity have a physical cause in
 # every arm and hold outside the measured region; the others have to improve the error noticeably.
 TIERS = ((HARMONICS, COMPLIANCE), (GAIN, COUPLING))
-MIN_IMPROVEMENT = {HARMONICS: 0.0, COMPLIANCE: 0.0, GAIN: 0.1, COUPLING: 0.1, CURVES: 0.02}
+MIN_IMPROVEMENT = {HARMONICS: 0.0, COMPLIANCE: 0.0, GAIN: 0.1, COUPLING: 0.1, CURVES: 0.02, FINE_CURVES: 0.02}
+# Families of correction curves and the orders of their harmonics, each tried on top of the one before.
+CURVE_FAMILIES = {CURVES: CURVE_ORDERS, FINE_CURVES: FINE_CURVE_ORDERS}
 # Smallest rise of the log evidence for which a family is added: odds of 250 to 1.
 MIN_LOG_BAYES_FACTOR = 5.5
 # Number of random folds.
@@ -119,11 +123,9 @@ MIN_PRIOR_WIDTH = 1e-3
 SCREENED_ROWS_PER_UNKNOWN = 2
 # Highest line of white residuals, as a square in standard deviations, and largest excess of the sum of all.
 MAX_WHITE_LINE, SCREENING_SIGMAS = 20.0, 3.0
-# Share of the left-out regions whose errors predicted standard deviations contain.
-REGION_QUANTILE = 0.75
 # Limits of the scale of predicted standard deviations. Regions that are left out lie nearer to the others
 # than the rest of the workspace does; they may hardly lower a prediction.
-MIN_PREDICTION_SCALE, MAX_PREDICTION_SCALE = 0.85, 3.0
+MIN_PREDICTION_SCALE, MAX_PREDICTION_SCALE = 0.8, 3.0
 # Largest ratio of the errors with and without a family for which a hint is given.
 MAX_HINT_RATIO = 0.9
 # Smallest number of rows that must remain per parameter of a family for a hint.
@@ -458,7 +460,7 @@ def _select(candidates: _Candidates, names: Sequence[str], model: _Model) -> tup
         remaining.remove(best.family)
 
 
-def _may_have_curves(fit: Fit) -> bool:
+def _may_have_curves(problem: Problem, x: Array, orders: range) -> bool:
     """Check whether lines stand out of the spectrum of the residuals over the joint values.
 
     The check costs far less than a trial of the curves. With the whitened column a of a joint, the residuals
@@ -466,32 +468,34 @@ def _may_have_curves(fit: Fit) -> bool:
 
         z² = (Σ a·r·sin kq)² / Σ |a|²·sin² kq,    and the same with the cosine,
 
-    are distributed as χ²_1, or smaller where the geometry has taken up a part.
+    are distributed as χ²_1, or smaller where the fit has taken up a part.
 
     Args:
-        fit: Fit without curves.
+        problem: Problem without these curves.
+        x: Its solution, (p,).
+        orders: Orders of the harmonics of the curves.
 
     Returns:
         Whether the highest line or the sum of all exceeds what white residuals have; always true for few
         rows, and for measurements with two configurations per row.
     """
-    problem, robot = fit.problem, len(fit.problem.errors.parameters)
-    chain = problem.errors.at(fit.solution.x[:robot])
+    robot = len(problem.errors.parameters)
+    chain = problem.errors.at(x[:robot])
     first = [p for p in PARAMETER_SETS[HARMONICS](chain) if p.name.endswith(("sin1", "cos1"))]
-    n_lines = len(first) * (CURVE_ORDERS.stop - CURVE_ORDERS.start)
+    n_lines = len(first) * len(orders)
     n_rows = count_rows(problem)
     is_single = all(item.configurations_per_row == 1 for item in problem.data)
     if n_rows < SCREENED_ROWS_PER_UNKNOWN * n_lines or not is_single:
         return True
     # The columns of sin q and cos q give the column a = a·sin q·sin q + a·cos q·cos q of each joint.
     errors = ErrorModel(chain, ()).with_parameters(first)
-    instruments = fit.solution.x[robot:]
+    instruments = x[robot:]
     spectrum = replace(problem, errors=errors, weights=np.zeros(len(first) + len(instruments)), bounds=None)
     linearization = spectrum.linearize(np.concatenate([np.zeros(len(first)), instruments]))
     joints = [chain.joint_names.index(p.name.rsplit(".", 1)[0]) for p in errors.parameters]
     # Σ a·r·exp(ikq) and Σ |a|²·exp(2ikq) of each order k and joint, and Σ |a|².
-    lines = np.zeros((2, len(CURVE_ORDERS), chain.n_joints), complex)
-    sizes = np.zeros(chain.n_joints)
+    lines = np.zeros((2, len(orders), chain.n_joints), complex)
+    sizes, cost = np.zeros(chain.n_joints), 0.0
     for chunk in spectrum.chunks:
         rows, q = linearization.rows(chunk), chunk.data.q.T
         products = np.einsum("pkm,km->pm", rows[: len(first)], rows[-1])
@@ -502,16 +506,16 @@ def _may_have_curves(fit: Fit) -> bool:
             both[0, joint] += products[row] * function(q[joint])
             both[1, joint] += squares[row]
         sizes += np.sum(both[1], 1)
+        cost += float(np.vdot(rows[-1], rows[-1]))
         turn = np.exp(1j * q)
-        wave = turn**CURVE_ORDERS.start
-        for index in range(len(CURVE_ORDERS)):
+        wave = turn**orders.start
+        for index in range(len(orders)):
             lines[0, index] += np.einsum("jm,jm->j", both[0], wave)
             lines[1, index] += np.einsum("jm,jm,jm->j", both[1], wave, wave)
             wave *= turn
     squares = np.stack([sizes - lines[1].real, sizes + lines[1].real]) / 2
-    variance = fit.solution.system.cost / n_rows
     products = np.stack([lines[0].imag, lines[0].real])
-    z2 = products**2 / np.maximum(squares * variance, np.finfo(float).tiny)
+    z2 = products**2 / np.maximum(squares * cost / n_rows, np.finfo(float).tiny)
     return bool(z2.max() > MAX_WHITE_LINE or z2.sum() > n_lines + SCREENING_SIGMAS * np.sqrt(2 * n_lines))
 
 
@@ -533,11 +537,11 @@ class _RegionErrors:
 
     @property
     def prediction_scale(self) -> float:
-        """Factor to standard deviations by the uncertainty of the fit that most held-out errors agree with.
+        """Factor to standard deviations by the uncertainty of the fit that the held-out errors agree with.
 
         Each held-out row also has the variance 1 of the residuals.
         """
-        excess = np.quantile((self.squares - 1) / self.variances, REGION_QUANTILE)
+        excess = np.sum(self.n_rows * (self.squares - 1)) / np.sum(self.n_rows * self.variances)
         return float(np.sqrt(max(excess, 0.0)))
 
     @property
@@ -742,13 +746,14 @@ def _select_families(
     """
     trials: list[FamilyTrial] = []
     model, random_ratio = _Model({}, _noise(fit), float("nan"), {}), float("nan")
-    low_order = {name: parameters for name, parameters in missing.items() if name != CURVES}
-    stages: list[tuple[dict[str, list[ErrorParameter]], tuple[tuple[str, ...], ...]]] = []
-    if low_order:
-        stages.append((low_order, TIERS))
-    if CURVES in missing and _may_have_curves(fit):
-        stages.append(({CURVES: missing[CURVES]}, ((CURVES,),)))
+    problem, x = fit.problem, fit.solution.x
+    low_order = tuple(name for name in missing if name not in CURVE_FAMILIES)
+    stages = [(low_order, TIERS)] if low_order else []
+    stages += [((name,), ((name,),)) for name in CURVE_FAMILIES if name in missing]
     for added, tiers in stages:
+        orders = CURVE_FAMILIES.get(added[0])
+        if orders and not _may_have_curves(problem, x, orders):
+            break
         families = {name: ps for name, ps in missing.items() if name in (*model.widths, *added, *TIERS[0])}
         candidates = _Candidates.with_folds(*_with_families(fit.problem, fit.solution.x, families))
         model = candidates.maximize_evidence(model.widths)
@@ -767,6 +772,10 @@ def _select_families(
             ]
             geometry = candidates.cv_error(candidates.maximize_evidence({}))
             random_ratio = candidates.cv_error(model) / geometry if geometry else 1.0
+        if orders and added[0] not in model.widths:
+            break
+        problem = candidates.problem
+        x = np.array([model.values.get(name, 0.0) for name in _unknown_names(problem)])
     return tuple(sorted(trials, key=lambda trial: not trial.is_selected)), model, random_ratio
 
 
@@ -802,7 +811,7 @@ def family_hint(fit: Result) -> str:
     """
     data = [item.take(w > robust.ZERO_WEIGHT) for item, w in zip(fit.problem.data, fit.weights, strict=True)]
     data = [item.take(np.s_[:: max(1, -(-len(item.rows) // MAX_HINT_SAMPLES))]) for item in data]
-    missing = _missing_parameters(fit.errors, [name for name in EXTENSIONS if name != CURVES])
+    missing = _missing_parameters(fit.errors, [name for name in EXTENSIONS if name not in CURVE_FAMILIES])
     problem, x, family = _with_families(replace(fit.problem, data=tuple(data)), fit.x, missing)
     system, n_rows = linearize_and_factor(problem, x, small_angle=False), count_rows(problem)
     cost_before, best = solve_columns(system, problem.weights, x, family == "")[1], (MAX_HINT_RATIO, "")

@@ -99,11 +99,12 @@ def find_lattices(fit: Result) -> list[str]:
     """
     n = fit.chain.n_joints
     _, indices, _ = split_coefficients(np.arange(n_coefficients(n)), n)
-    is_estimated = np.isin(indices[CURVE_ORDERS[0] - 1 :], fit.uncertainty.entries).any((0, 1))
-    estimated = {fit.chain.joint_names[i] for i in np.flatnonzero(is_estimated)}
+    orders, joints = np.nonzero(np.isin(indices, fit.uncertainty.entries).any(1))
+    estimated = {fit.chain.joint_names[i] for i in joints[orders + 1 >= CURVE_ORDERS.start]}
     if not estimated:
         return []
-    return lattice_warnings([c for c in fitted_coverage(fit) if c.joint in estimated], MAX_CURVE_ORDER)
+    highest = int(orders.max()) + 1
+    return lattice_warnings([c for c in fitted_coverage(fit) if c.joint in estimated], highest)
 
 
 def _curve_std(uncertainty: Uncertainty, joint: int, waves: Array) -> Array:

@@ -168,12 +168,15 @@ class Uncertainty:
         chain, bodies, twists = errors.derivative(np.zeros(len(scale)))
         effects = chain.tool_jacobian(chain.forward_kinematics(q), bodies, twists) * scale[:, None, None]
         inverse = np.linalg.pinv(effects.reshape(len(scale), -1).T, rcond=RANK_RTOL)
-        own_effects = self._tool_jacobian(self.chain.forward_kinematics(q))
-        parameters_from_own = inverse @ own_effects.reshape(len(self.sqrt_covariance), -1).T
-        return parameters_from_own @ self.sqrt_covariance, parameters_from_own @ self.unbounded_directions
+        frames = self.chain.forward_kinematics(q)
+        root, undetermined = (
+            inverse @ self._tool_twists(frames, part).transpose(1, 0, 2).reshape(inverse.shape[1], -1)
+            for part in (self.sqrt_covariance, self.unbounded_directions)
+        )
+        return root, undetermined
 
-    def _tool_jacobian(self, frames: FrameBatch) -> Array:
-        """Compute the tool twist per unit of each body twist and coefficient, shape (6(k+1)+e, 6, m)."""
+    def _tool_twists(self, frames: FrameBatch, directions: Array) -> Array:
+        """Compute the tool twists (m, 6, c) of directions (6(k+1)+e, c) in body twists and coefficients."""
         chain, n_bodies = self.chain, len(self.chain.moving_joints) + 1
         carry = np.tile(np.eye(4), (n_bodies, 1, 1))
         carry[0] = se3.inverse(chain.base)
@@ -181,11 +184,19 @@ class Uncertainty:
         bodies, twists = twists_in_bodies(
             chain, error_frames, np.tile(np.eye(6), (n_bodies, 1)), carry.repeat(6, 0)
         )
-        return chain.tool_jacobian(
-            frames,
-            np.concatenate([bodies, n_bodies + self.entries]),
-            np.pad(twists, ((0, len(self.entries)), (0, 0))),
-        )
+        out = np.tensordot(chain.tool_jacobian(frames, bodies, twists), directions[: len(bodies)], (0, 0))
+        out = out.swapaxes(0, 1)
+        if not len(self.entries):
+            return out
+        # All coefficients of a joint share the twist of its motion.
+        by_joint = chain.joint_jacobian(frames)
+        joints, terms = chain.transmission_terms(frames, self.entries)
+        angles = np.zeros((len(out), len(by_joint), directions.shape[1]))
+        for joint in set(joints):
+            moving = np.flatnonzero(np.array(joints) == joint)
+            angles[:, joint] = np.stack([terms[i] for i in moving], 1) @ directions[len(bodies) + moving]
+        out += by_joint.transpose(2, 1, 0) @ angles
+        return out
 
     def predict(self, q: Array) -> Prediction:
         """Predict tool poses and their covariance.
@@ -197,10 +208,8 @@ class Uncertainty:
             Calibrated tool poses with the covariance of the identified errors and of those the model lacks.
         """
         frames = self.chain.forward_kinematics(q)
-        jacobian = self._tool_jacobian(frames)
         root, undetermined = (
-            np.tensordot(jacobian, part, (0, 0)).swapaxes(0, 1)
-            for part in (self.sqrt_covariance, self.unbounded_directions)
+            self._tool_twists(frames, part) for part in (self.sqrt_covariance, self.unbounded_directions)
         )
         covariance = root @ np.swapaxes(root, 1, 2) + np.diag(np.repeat(np.square(self.model_std), 3))
         samples, components = np.nonzero(np.sum(undetermined**2, -1) > UNBOUNDED_TOL)

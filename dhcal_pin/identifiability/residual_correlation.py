@@ -16,8 +16,10 @@ residuals,
     Q    = rᵀ·K·r,    E[Q] = tr(K·V) = -tr(Gᵀ·K·G),    Var[Q] = 2·tr(K·V·K·V),
     z    = (Q - E[Q])/√Var[Q],
 
-and one step from λ = 0 to the maximum of the likelihood is λ = 2·(Q - E[Q])/Var[Q]. For many samples V = I is
-used: this lowers z, as the fit takes up a part of what neighbours share.
+and one step from λ = 0 to the maximum of the likelihood is λ = 2·(Q - E[Q])/Var[Q]. A z far below 0 also
+contradicts independent noise: a fit with many unknowns takes up more of errors that neighbours share than of
+noise, and leaves less than nothing of them. For many samples V = I is used: this lowers z, so that only a z
+far above 0 counts.
 
 Shapes: m samples, k residuals per sample, r columns of S, n joints.
 
@@ -40,14 +42,14 @@ from ..estimation.problem import Chunk, Problem
 
 # Distances l over which model errors are looked for, each half the one before [rad].
 LENGTHS = tuple(2.0**-i for i in range(-1, 6))
-# z of white residuals stays below; the largest of seven lengths exceeds it once in four thousand fits.
-MAX_WHITE_Z = 4.0
+# |z| of white residuals stays below; the largest of seven lengths exceeds it once in a thousand fits at most.
+MAX_WHITE_Z = 4.5
 # Smallest number (Σ k_ij)²/Σ k_ij² of pairs at a length; z of fewer is far from normal.
 MIN_PAIRS = 30
 # Largest number of configurations of each measurement whose distances are computed.
 MAX_CONFIGURATIONS = 2000
 # Largest number of products with which the effect of the fit on Q is computed.
-MAX_PRODUCTS = 1e8
+MAX_PRODUCTS = 3e8
 # Number of configurations whose distances from all others are in memory at a time.
 BLOCK_SIZE = 128
 # Squared distance below which two configurations are the same.
@@ -62,7 +64,7 @@ class ResidualCorrelation:
     """Correlation of the residuals of a fit between configurations.
 
     Attributes:
-        z: Largest score of the lengths, standard normal for independent residuals.
+        z: Score of the length at which it is farthest from 0, standard normal for independent residuals.
         share: Share λ of the variance of the residuals that neighbours share, 0 to 1.
     """
 
@@ -72,7 +74,7 @@ class ResidualCorrelation:
     @property
     def is_significant(self) -> bool:
         """Whether the residuals contradict independence."""
-        return self.z > MAX_WHITE_Z
+        return abs(self.z) > MAX_WHITE_Z
 
 
 def find_residual_correlation(
@@ -92,7 +94,7 @@ def find_residual_correlation(
         The correlation; 0 without samples to compare.
     """
     linearization, chain = problem.linearize(x), problem.errors.at(x[: len(problem.errors.parameters)])
-    excess, variance = np.zeros(len(LENGTHS)), np.zeros(len(LENGTHS))
+    excess, variance, is_exact = np.zeros(len(LENGTHS)), np.zeros(len(LENGTHS)), True
     quadratic = np.zeros((len(LENGTHS), root.shape[1], root.shape[1]))
     for item, w in zip(problem.data, weights, strict=True):
         chosen = np.flatnonzero(w > 0.5)
@@ -105,7 +107,7 @@ def find_residual_correlation(
         else:
             values = problem.instrument_values_of(part, x)
             residual = part.residual(chain.forward_kinematics(part.configurations()), values) / noise
-            effect = np.empty((0, *residual.shape))
+            effect, is_exact = np.empty((0, *residual.shape)), False
         scores = _score_terms(_points(part.q, problem.errors.chain.is_prismatic), residual, effect)
         excess += scores.excess
         variance += scores.variance
@@ -116,9 +118,12 @@ def find_residual_correlation(
     is_known = variance > 0
     if not is_known.any():
         return ResidualCorrelation(0.0, 0.0)
-    z = np.where(is_known, excess / np.sqrt(np.where(is_known, variance, 1.0)), -np.inf)
-    best = int(np.argmax(z))
-    return ResidualCorrelation(float(z[best]), float(np.clip(2 * excess[best] / variance[best], 0.0, 1.0)))
+    z = np.where(is_known, excess / np.sqrt(np.where(is_known, variance, 1.0)), 0.0)
+    if not is_exact:
+        z = np.maximum(z, 0.0)
+    best = int(np.argmax(np.abs(z)))
+    share = 2 * excess[best] / variance[best] if is_known[best] else 0.0
+    return ResidualCorrelation(float(z[best]), float(np.clip(share, 0.0, 1.0)))
 
 
 class _ScoreTerms(NamedTuple):

@@ -31,7 +31,7 @@ from ..measurements.base import Measurement, Noise
 from ..measurements.camera import CameraCorners
 from ..robot.chain import Chain
 from ..robot.collision import CollisionChecker
-from ..robot.error_families import COMPLIANCE, CURVES, GAIN, HARMONICS
+from ..robot.error_families import COMPLIANCE, CURVES, FINE_CURVES, GAIN, HARMONICS
 from ..robot.sampling import ConfigurationSampler, WorkspaceConstraints, limits_with_margin, scale_joint_units
 from .criteria import AOptimality, BiasVarianceCriterion, Criterion, DOptimality, EOptimality
 from .curve_prediction import CurvePrediction, predict_curves
@@ -502,7 +502,7 @@ def _without_curves(sets: str) -> str:
     """Return names of parameter sets without that of the curves, unless there is no other."""
     # The bins determine the curves. As unknowns of the criterion, their hundreds of coefficients would make
     # the selection slow without making it better.
-    others = [name for name in sets.split(",") if name.strip() != CURVES]
+    others = [name for name in sets.split(",") if name.strip() not in (CURVES, FINE_CURVES)]
     return ",".join(others) or sets
 
 

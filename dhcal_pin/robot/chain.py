@@ -531,15 +531,27 @@ class Chain:
 
         All coefficients of a joint share the twist of its motion, which each one scales by its own term.
         """
+        by_joint = self.joint_jacobian(frames)
+        for joint, term, column in zip(*self.transmission_terms(frames, entries), out, strict=True):
+            np.multiply(by_joint[joint], term, out=column)
+
+    def transmission_terms(self, frames: FrameBatch, entries: Array) -> tuple[list[int], list[Array]]:
+        """Return what transmission coefficients scale.
+
+        Args:
+            frames: Frames of this chain at m samples.
+            entries: Entries of the transmission coefficients, shape (e,).
+
+        Returns:
+            The independent joint that each coefficient moves, and by how much per unit of it, (m,) each.
+        """
         assert self.transmission is not None
         assert frames.terms is not None
-        by_joint, terms = self.joint_jacobian(frames), frames.terms
-        transmission = self.transmission.evaluating(entries)
+        terms, transmission = frames.terms, self.transmission.evaluating(entries)
         if transmission is not self.transmission:
             terms = transmission.terms(terms[0])
-        located = (indices.tolist() for indices in transmission.locate(entries))
-        for joint, term, source, column in zip(*located, out, strict=True):
-            np.multiply(by_joint[joint], terms[term, source], out=column)
+        joints, numbers, sources = (indices.tolist() for indices in transmission.locate(entries))
+        return joints, [terms[term, source] for term, source in zip(numbers, sources, strict=True)]
 
     def joint_jacobian(self, frames: FrameBatch) -> Array:
         """Compute the geometric Jacobian with respect to the actual positions of the independent joints.

@@ -24,8 +24,8 @@ class ErrorFamily:
     requirement: str
 
 
-GAIN, HARMONICS, CURVES = "gain", "harmonics", "curves"
-COMPLIANCE, COUPLING = "compliance", "coupling"
+GAIN, COMPLIANCE, COUPLING = "gain", "compliance", "coupling"
+HARMONICS, CURVES, FINE_CURVES = "harmonics", "curves", "fine-curves"
 
 FAMILIES = {
     family.name: family
@@ -33,6 +33,7 @@ FAMILIES = {
         ErrorFamily(GAIN, "gear ratio errors", "a moving joint"),
         ErrorFamily(HARMONICS, "gear eccentricity", "a revolute joint"),
         ErrorFamily(CURVES, "joint correction curves", "a revolute joint"),
+        ErrorFamily(FINE_CURVES, "joint correction curves of high order", "a revolute joint"),
         ErrorFamily(
             COMPLIANCE,
             "joint elasticity under gravity",

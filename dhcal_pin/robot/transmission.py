@@ -29,8 +29,8 @@ import pinocchio as pin
 
 from .._typing import Array
 
-# Highest order of the harmonics: 32 periods per turn of a joint.
-MAX_CURVE_ORDER = 32
+# Highest order of the harmonics: 64 periods per turn of a joint.
+MAX_CURVE_ORDER = 64
 
 # Maximum number of cached torque arrays, one per array of joint positions. A full cache is emptied.
 MAX_CACHED_TORQUES = 256

@@ -74,7 +74,8 @@ def test_geometric_errors_alone_are_fitted_as_without_extension(seed):
     fit, geometry = calibrate(arm, data), calibrate(arm, data, extend="none")
     assert fit.extension is not None
     assert fit.extension.families == ()
-    assert {trial.family for trial in fit.extension.trials} == set(EXTENSIONS)
+    # Curves of high order are tried only on top of those of low order.
+    assert {trial.family for trial in fit.extension.trials} == set(EXTENSIONS) - {"fine-curves"}
     assert fit.extension.temperature == 1
     assert np.array_equal(fit.x, geometry.x)
     assert np.array_equal(fit.std, geometry.std)
@@ -131,6 +132,27 @@ def joint_errors(chain: Chain, q: np.ndarray) -> np.ndarray:
     return chain.actual_positions(q.T)[0] - q.T
 
 
+@pytest.mark.parametrize("has_fine_lines", [True, False])
+def test_curves_of_high_order_have_a_prior_width_of_their_own(has_fine_lines):
+    """Lines of order 40 and 55 that are a fifth of those of low order; without them their curves stay out."""
+    arm, truth, data = with_curves(0, 220)
+    if has_fine_lines:
+        errors = select_parameters(truth, "fine-curves")
+        is_line = [p.name.endswith(("sin40", "cos55")) for p in errors.parameters]
+        truth = errors.at(2e-5 * np.array(is_line))
+        data = Pose.simulate(truth, data.q, Noise(2e-5, 4e-5), np.random.default_rng(0))
+    fit = calibrate(arm, data)
+    assert fit.extension is not None
+    assert ("fine-curves" in fit.extension.families) == has_fine_lines
+    if has_fine_lines:
+        widths = {trial.family: trial.prior_width for trial in fit.extension.trials}
+        assert widths["fine-curves"] < 0.3 * widths["curves"]
+        without = calibrate(arm, data, extend="harmonics,compliance,curves")
+        q = np.random.default_rng(1).uniform(-2.5, 2.5, (300, 6))
+        offsets = [one.chain.poses(q)[:, :3, 3] - truth.poses(q)[:, :3, 3] for one in (fit, without)]
+        assert np.std(offsets[0]) < 0.9 * np.std(offsets[1])
+
+
 @pytest.mark.parametrize("seeds", [1, pytest.param(20, marks=pytest.mark.slow)])
 def test_recovered_curves_are_within_their_bands(seeds):
     """Differences of the error of a joint between visited positions: 95 % lie within their 95 % interval."""
@@ -140,6 +162,7 @@ def test_recovered_curves_are_within_their_bands(seeds):
         fit = calibrate(arm, data, "minimal,base,tool")
         assert fit.extension is not None
         assert {"curves", "compliance"} <= set(fit.extension.families)
+        assert "fine-curves" not in fit.extension.families
         assert fit.extension.temperature == 1
         # Positions of the tool depend on the curves of all joints; frames and geometry are part of it.
         q = data.q[np.random.default_rng(seed).permutation(len(data.q))[:100]]

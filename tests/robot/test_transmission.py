@@ -37,7 +37,7 @@ def test_actual_positions_follow_the_formula():
     """By a fresh Pinocchio model and plain arithmetic, a joint at a time."""
     rng = np.random.default_rng(0)
     plain = ur10()
-    arm, x = drawn(plain, "gain,harmonics,curves,compliance,coupling", rng)
+    arm, x = drawn(plain, "gain,harmonics,curves,fine-curves,compliance,coupling", rng)
     model = pin.buildModelFromUrdf(str(robot_file("ur_description/urdf/ur10_robot.urdf")))
     data = model.createData()
     q = rng.uniform(-2, 2, (10, 6))
@@ -47,7 +47,7 @@ def test_actual_positions_follow_the_formula():
         for i, name in enumerate(plain.joint_names):
             v = row[i]
             found[i] += x[f"{name}.gain"] * v
-            for k in range(1, 33):
+            for k in range(1, MAX_CURVE_ORDER + 1):
                 found[i] += x[f"{name}.sin{k}"] * np.sin(k * v) + x[f"{name}.cos{k}"] * np.cos(k * v)
             found[i] += x.get(f"{name}.compliance", 0.0) * torque[i]
             found[i] += sum(x[f"{name}.{o}"] * row[j] for j, o in enumerate(plain.joint_names) if j != i)
@@ -76,10 +76,10 @@ def test_every_coefficient_is_a_parameter_of_one_set():
     sets = [PARAMETER_SETS[name](ur10()) for name in FAMILIES]
     indices = [p.coefficient_index for parameters in sets for p in parameters]
     assert len(set(indices)) == len(indices)
-    assert [len(parameters) for parameters in sets[:3]] == [6, 6 * 2 * 2, 6 * 2 * 30]
+    assert [len(parameters) for parameters in sets[:4]] == [6, 6 * 2 * 2, 6 * 2 * 30, 6 * 2 * 32]
     assert len(sets[-1]) == 6 * 5
     assert set(indices) < set(range(n_coefficients(6)))
-    assert n_coefficients(6) == len(indices) + 6 - len(sets[3])
+    assert n_coefficients(6) == len(indices) + 6 - len(sets[4])
 
 
 MIMIC = """<robot name="r"><link name="base"/><link name="a"/><link name="b"/>
@@ -122,13 +122,13 @@ def test_derivatives_by_the_highest_harmonics_agree_with_finite_differences(robo
     """At any coefficients, and at a transmission that does not evaluate these orders itself."""
     arm = ur10() if robot == "ur10" else Chain.from_urdf(parse_urdf(MIMIC.encode(), "mimic.urdf"))
     rng, step = np.random.default_rng(4), 1e-6
-    errors = select_parameters(arm, "curves")
+    errors = select_parameters(arm, "curves,fine-curves")
     q = rng.uniform(-2, 2, (5, arm.n_joints))
     for x in (np.zeros(len(errors.parameters)), 1e-2 * rng.normal(size=len(errors.parameters))):
         chain, bodies, twists = errors.derivative(x)
         velocities = chain.tool_jacobian(chain.forward_kinematics(q), bodies, twists)
         for i, parameter in enumerate(errors.parameters):
-            if parameter.name.endswith(("sin32", "cos32", "sin17")):
+            if parameter.name.endswith(("sin64", "cos64", "sin17")):
                 change = step * np.eye(len(x))[i]
                 moved = errors.at(x + change).poses(q) - errors.at(x - change).poses(q)
                 np.testing.assert_allclose(velocities[i, :3].T, moved[:, :3, 3] / (2 * step), atol=1e-9)
@@ -144,10 +144,10 @@ def test_single_harmonics_are_fixed_and_freed():
     errors = select_parameters(ur10(), "curves", fix=["elbow_joint.cos32", "elbow_joint.sin3"])
     assert len(errors.parameters) == 6 * 60 - 2
     assert [p.name for p in errors.fixed] == ["elbow_joint.sin3", "elbow_joint.cos32"]
-    with pytest.raises(DhcalError, match=r"cannot free 'elbow_joint.sin33': no such parameter") as caught:
-        select_parameters(ur10(), "base", free=["elbow_joint.sin33"])
-    # The choices name the 384 harmonics by joint.
-    assert "elbow_joint.sin1 ... cos32 (64 harmonics), wrist_1_joint.sin1" in str(caught.value)
+    with pytest.raises(DhcalError, match=r"cannot free 'elbow_joint.sin65': no such parameter") as caught:
+        select_parameters(ur10(), "base", free=["elbow_joint.sin65"])
+    # The choices name the 768 harmonics by joint.
+    assert "elbow_joint.sin1 ... cos64 (128 harmonics), wrist_1_joint.sin1" in str(caught.value)
 
 
 def test_empty_sets_are_refused_with_their_requirement(sim_6dof):
@@ -175,7 +175,7 @@ def test_batches_refuse_transmission_errors():
 
 def test_sidecar_preserves_the_robot(tmp_path):
     rng = np.random.default_rng(1)
-    arm, x = drawn(ur10(), "minimal,base,tool,gain,harmonics,curves,compliance,coupling", rng)
+    arm, x = drawn(ur10(), "minimal,base,tool,gain,harmonics,curves,fine-curves,compliance,coupling", rng)
     x = {name: float(value) for name, value in x.items()}
     write_urdf(arm, tmp_path / "out.urdf")
     q = rng.uniform(-2, 2, (20, 6))
@@ -208,8 +208,8 @@ def test_sidecar_preserves_the_robot(tmp_path):
         ),
         ("[joint.elbow_joint]\nharmonics = 1", r"harmonics = 1; expected a list"),
         ("[joint.elbow_joint]\nharmonics = [[1, nan, 0.0]]", r"entry \[1, nan, 0.0\]; expected \[order"),
-        ("[joint.elbow_joint]\nharmonics = [[33, 0.0, 0.0]]", "an order from 1 to 32"),
-        ("[joint.elbow_joint]\nharmonics = [[1.0, 0.0, 0.0]]", "an order from 1 to 32"),
+        ("[joint.elbow_joint]\nharmonics = [[65, 0.0, 0.0]]", "an order from 1 to 64"),
+        ("[joint.elbow_joint]\nharmonics = [[1.0, 0.0, 0.0]]", "an order from 1 to 64"),
         ("[joint.elbow_joint]\nharmonics = [1, 0.0, 0.0]", "entry 1; expected"),
         (
             "[joint.elbow_joint]\nharmonics = [[3, 0.1, 0.0], [3, 0.0, 0.0]]",
