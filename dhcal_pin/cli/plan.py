@@ -35,6 +35,8 @@ EXAMPLE = "dhcal plan ur10.urdf -n 40 --tip tool0 --sigma 0.1mm,0.01deg -o poses
 
 # Standard deviation of a laser tracker and a precise robot, used without --sigma and --data.
 _DEFAULT_SIGMA = "0.1mm,0.01deg"
+# Random candidates; images have more rows each, and more of their candidates are good.
+_N_CANDIDATES, _N_IMAGE_CANDIDATES = 5000, 2000
 # Standard deviation of detected corners and the same robot, used with --rig.
 _DEFAULT_IMAGE_SIGMA = "0.3px,0.1mm,0.01deg"
 
@@ -131,9 +133,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--candidates",
         type=POSITIVE_INTEGER,
-        default=5000,
         metavar="N",
-        help="number of random candidates (default: %(default)s)",
+        help=f"number of random candidates (default: {_N_CANDIDATES}; {_N_IMAGE_CANDIDATES} with --rig)",
     )
     parser.add_argument(
         "--from", dest="candidates_from", metavar="FILE", help="choose from the joint values in a file"
@@ -225,7 +226,7 @@ def run(args: Namespace) -> int:
         require_program_ending(path)
     chain = read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root)
     space = _workspace_constraints(args)
-    candidates: int | Array = args.candidates
+    candidates: int | Array = args.candidates or (_N_IMAGE_CANDIDATES if args.rig else _N_CANDIDATES)
     rows = np.zeros(0, int)
     if args.candidates_from:
         candidates = read_configurations(args.candidates_from, chain, args.columns)

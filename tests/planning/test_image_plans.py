@@ -309,9 +309,10 @@ def test_predicted_error_is_that_of_the_solver():
 
 
 def errors_elsewhere(name: str, seed: int, q: np.ndarray) -> float:
-    """Return the RMS error of the board in the camera in other views after a calibration [m].
+    """Return the RMS error between camera and board over the joint space after a calibration [m].
 
-    The arm has errors of 1 mm and 2 mrad per link, the rig of 5 mm and 10 mrad, the lens of 2 %.
+    It is that of the board in a camera that stands still, or of a point in front of a camera on the tool. The
+    arm has errors of 1 mm and 2 mrad per link, the rig of 5 mm and 10 mrad, the lens of 2 %.
     """
     arm, rig = setup(name)
     rng = np.random.default_rng(seed)
@@ -326,12 +327,15 @@ def errors_elsewhere(name: str, seed: int, q: np.ndarray) -> float:
         cameras=(replace(rig.cameras[0], pose=moved[0], values=values),),
         boards=(replace(rig.boards[0], pose=moved[1]),),
     )
-    others = sampler(arm, PlannedImages(rig)).draw(300, rng)
+    others = rng.uniform(*joint_range(arm), (300, arm.n_joints))
     fit = calibrate(arm, images_at(truth, true_rig, q, 0.3, rng).with_rig(rig))
     assert fit.rig is not None
-    middle = np.array([*rig.boards[0].points.mean(0), 1.0])
-    exact = true_rig.board_in_camera(0, 0, truth.poses(others)) @ middle
-    estimated = fit.rig.board_in_camera(0, 0, fit.chain.poses(others)) @ middle
+    exact = true_rig.board_in_camera(0, 0, truth.poses(others))
+    estimated = fit.rig.board_in_camera(0, 0, fit.chain.poses(others))
+    point = np.array([*rig.boards[0].points.mean(0), 1.0])
+    if rig.camera_mounts[0].moves:
+        exact, estimated, point = se3.inverse(exact), se3.inverse(estimated), np.array([0, 0, 0.3, 1.0])
+    exact, estimated = exact @ point, estimated @ point
     return float(np.sqrt(np.mean(np.sum((exact - estimated) ** 2, 1))))
 
 
@@ -350,6 +354,8 @@ def ratio_to_random(name: str, seeds: range, count: int, candidates: int) -> flo
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["ur10-wrist", "panda-wrist", "ur10-fixed", "panda-fixed"])
-def test_planned_images_calibrate_better_than_random_ones(name):
-    assert ratio_to_random(name, range(4), 30, 600) < 0.8
+def test_planned_images_calibrate_better_than_random_ones():
+    """The geometric mean over four set-ups with two arms each is clearly below one."""
+    names = ("ur10-wrist", "panda-wrist", "ur10-fixed", "panda-fixed")
+    ratios = [ratio_to_random(name, range(2), 24, 300) for name in names]
+    assert np.exp(np.mean(np.log(ratios))) < 0.8
