@@ -43,6 +43,7 @@ from ..parallel import SERIAL, TaskExecutor
 from ..robot.chain import BASE_FRAME, Chain
 from . import model_selection
 from .cameras import (
+    DEFAULT_SETS,
     apply_gate,
     axis_stages,
     default_sets,
@@ -110,7 +111,8 @@ def calibrate(
             Method "gn" always weights all samples equally.
         extend: Families of joint errors that are added where the measurements support them: "auto" for all,
             "none", or names of `estimation.EXTENSIONS`; see `model_selection`. The default is "auto", but
-            "none" for method "gn", without priors, and where only base and tool are unknown.
+            "none" for method "gn", without priors, where only base and tool are unknown, and for image
+            coordinates, whose families are named among the parameters.
         bounds: Lowest and highest values by name or pattern of the robot's parameters [m or rad]; base and
             tool have no bounds.
         max_iterations: Largest number of iterations of one solution.
@@ -150,6 +152,11 @@ def calibrate(
     known = {**held_values(data, rig_sets), **_validated_known(data, known or {})}
     errors = select_parameters(chain, robot_sets, fix, free) if robot_sets or free else ErrorModel(chain, ())
     families = _extension_families(extend, errors, method, priors)
+    if has_images(data) and families and extend not in (None, "auto"):
+        raise InvalidArgumentError(
+            f"extend {','.join(families)!r}: families of joint errors are not selected from images; name "
+            f"them among the parameters, as in {DEFAULT_SETS.replace('offset', f'offset,{families[0]}', 1)}"
+        )
     is_robust = method == "lm" and loss != "linear"
     errors, data, weights = _initialize(errors, data, known, max_iterations, is_robust)
     problem = replace(make_problem(errors, data, prior_weights(errors, priors), known), executor=executor)

@@ -223,6 +223,39 @@ def test_sets_of_a_rig_need_images(arm):
         dh.calibrate(arm, dh.Pose(q, arm.poses(q)), "minimal,camera")
 
 
+@pytest.mark.slow
+def test_a_long_series_of_images_shows_periodic_errors_and_compliance():
+    """Links alone do not explain 200 images; with harmonics, compliance and curves the gate opens."""
+    rng = np.random.default_rng(3)
+    chain = ARMS["ur10"]()
+    errors = dh.select_parameters(chain, "placement,compliance,curves,harmonics")
+    std = {"m": 1e-3, "rad": 2e-3}
+    sizes = [
+        5e-5
+        if p.name.endswith("compliance")
+        else 3e-4
+        if p.name.rpartition(".")[2][:3] in ("sin", "cos")
+        else std[p.unit]
+        for p in errors.parameters
+    ]
+    truth = errors.at(np.array(sizes) * rng.standard_normal(len(sizes)))
+    setup = simulate(chain, truth, rng, is_on_wrist=False, n_images=200, sigma=0.2, spread=0.7)
+    sets = "placement,offset,harmonics,compliance,curves,camera,board,intrinsics"
+    fit = dh.calibrate(chain, setup.images, sets, loss="linear")
+    assert fit.camera_stages[-1].is_kept
+    assert error_elsewhere(fit.chain, truth, 0) < 0.5 * error_elsewhere(chain, truth, 0)
+    links = dh.calibrate(chain, setup.images, loss="linear")
+    assert not links.camera_stages[-1].is_kept
+
+
+def test_families_are_not_selected_from_images(arm):
+    data = images_of(arm, 10, np.random.default_rng(0))
+    with pytest.raises(
+        DhcalError, match=r"extend 'compliance': families .* placement,offset,compliance,camera"
+    ):
+        dh.calibrate(arm, data, "placement,camera", extend="compliance")
+
+
 def test_clusters_hold_out_every_image_once(arm):
     data = images_of(arm, 40, np.random.default_rng(3))
     folds = cluster_folds([data])
