@@ -48,8 +48,9 @@ MAX_WHITE_Z = 4.5
 MIN_PAIRS = 30
 # Largest number of configurations of each measurement whose distances are computed.
 MAX_CONFIGURATIONS = 2000
-# Largest number of products with which the effect of the fit on Q is computed.
-MAX_PRODUCTS = 3e8
+# Largest number of products with which the effect of the fit on Q is computed. It is this many times larger
+# for a fit with as many unknowns as residuals, whose effect is large.
+MAX_PRODUCTS, MORE_PRODUCTS = 1e8, 10.0
 # Number of configurations whose distances from all others are in memory at a time.
 BLOCK_SIZE = 128
 # Squared distance below which two configurations are the same.
@@ -101,7 +102,9 @@ def find_residual_correlation(
         if item.configurations_per_row != 1 or len(chosen) < 2:
             continue
         part = item.take(chosen[:: -(-len(chosen) // MAX_CONFIGURATIONS)])
-        if len(part.rows) ** 2 * part.residual_dim * root.shape[1] <= MAX_PRODUCTS:
+        n_residuals, n_columns = len(part.rows) * part.residual_dim, root.shape[1]
+        effort = MAX_PRODUCTS * max(1.0, MORE_PRODUCTS * n_columns / n_residuals)
+        if len(part.rows) * n_residuals * n_columns <= effort:
             rows = linearization.rows(Chunk(part, problem.errors.chain)) / noise
             effect, residual = np.tensordot(root, rows[:-1], (0, 0)), rows[-1]
         else:
