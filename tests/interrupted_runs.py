@@ -6,6 +6,7 @@ N_TIMES SEED` interrupts the command at so many instructions of its saving and a
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import io
 import json
@@ -24,6 +25,7 @@ from command_line import positions_csv
 from robots import URDF
 from signal_steps import SignalAtStep, count_steps
 
+from dhcal_pin.cli import main as main_of_cli
 from dhcal_pin.cli import outputs
 from dhcal_pin.cli.main import main as dhcal
 
@@ -112,6 +114,7 @@ class Interruption:
         """Run a function in a child process, wait for all processes it started, and return its status."""
         # A child that is killed at once says nothing.
         Path("stderr").write_text("")
+        begun, has_begun = os.pipe()
         child = os.fork()
         if not child:
             os.setsid()
@@ -121,15 +124,23 @@ class Interruption:
             sys.stderr = os.fdopen(2, "w", closefd=False)
             status = 99
             try:
+                _announce_start(has_begun)
                 status = function()
+                signal.signal(signal.SIGINT, signal.SIG_IGN)
+            except KeyboardInterrupt:
+                # After the end of the command; one that does not handle an interrupt leaves status 99.
+                signal.signal(signal.SIGINT, signal.SIG_IGN)
             finally:
                 sys.stderr.flush()
                 os._exit(status)
         if kill_after:
+            os.read(begun, 1)
             time.sleep(kill_after)
             # As a terminal does, for the command and its workers.
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(child, number) if number == signal.SIGINT else os.kill(child, number)
+        os.close(begun)
+        os.close(has_begun)
         status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         while any(_session(process) == child for process in psutil.process_iter()):
             time.sleep(0.01)
@@ -231,6 +242,17 @@ def _session(process: psutil.Process) -> int:
         return os.getsid(process.pid) if process.status() != psutil.STATUS_ZOMBIE else 0
     except (psutil.NoSuchProcess, ProcessLookupError):
         return 0
+
+
+def _announce_start(pipe: int) -> None:
+    """Write a byte to a pipe as soon as a command has begun and can be interrupted."""
+    build_parser = main_of_cli.build_parser
+
+    def announce() -> argparse.ArgumentParser:
+        os.write(pipe, b".")
+        return build_parser()
+
+    main_of_cli.build_parser = announce
 
 
 def _replace_write_outputs(function: Callable[..., object]) -> None:

@@ -145,12 +145,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         refused, 130 interrupted.
     """
     try:
+        if (outputs := _outputs_module()) is not None:
+            outputs.forget_written_files()
         args = build_parser().parse_args(argv)
         # The matrices are small: more BLAS threads only wait. BLAS reads these when NumPy is loaded.
         for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
             os.environ.setdefault(name, "1")
-        if (outputs := _outputs_module()) is not None:
-            outputs.forget_written_files()
         return args.run(args)
     except DhcalError as error:
         print(f"dhcal: {message_line(error)}", file=sys.stderr)
