@@ -105,7 +105,11 @@ class LinearizedRows:
         """
         information = self.total_information(weights, scales)
         right = (weights[:, self.sample] / scales[:, self.noise_class] ** 2) @ self.right + self.prior_right
-        return np.linalg.solve(information, right[..., None])[..., 0]
+        try:
+            return np.linalg.solve(information, right[..., None])[..., 0]
+        except np.linalg.LinAlgError:
+            # Rounding makes the information of samples that contradict each other singular.
+            return (np.linalg.pinv(information, hermitian=True) @ right[..., None])[..., 0]
 
     def total_information(self, weights: Array, scales: Array) -> Array:
         """Compute the information of weighted samples and priors; see `solve`.
