@@ -176,8 +176,8 @@ def test_validate_writes_the_map_as_html_and_refuses_invalid_options(calibrated,
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ('sqrt_covariance = """', 'sqrt_covariance = """!', "is not base64 text"),
-        ('sqrt_covariance = """', 'sqrt_covariance = """\nAAAA', "does not hold 42 rows"),
+        ("sqrt_covariance = '''", "sqrt_covariance = '''!", "is not base64 text"),
+        ("sqrt_covariance = '''", "sqrt_covariance = '''\nAAAA", "does not hold 42 rows"),
         ('"joint_1"', '"shoulder"', "expected the joints of this robot"),
         ("terms = []", 'terms = ["elbow.play"]', "elbow.play"),
         ("terms = []", "", "terms is missing"),
