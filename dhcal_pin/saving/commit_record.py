@@ -63,16 +63,17 @@ class CommitRecord:
             return None
         except (OSError, ValueError) as error:
             raise FileFormatError(f"{path}: cannot be read: {error}; remove this file") from error
+        no_record = FileFormatError(f"{path}: is not a record of saved files; remove this file")
         try:
             record = cls(**content)
             names = [name for pair in record.renames for name in pair]
             is_valid = all(_is_name(name) for name in (*names, *record.removals))
             is_valid &= all(_TEMPORARY.fullmatch(temporary) for temporary, _ in record.renames)
             is_valid &= len(record.folders) > 0 and all(map(os.path.isabs, record.folders))
-        except (TypeError, ValueError):
-            is_valid = False
+        except (TypeError, ValueError) as error:
+            raise no_record from error
         if not is_valid:
-            raise FileFormatError(f"{path}: is not a record of saved files; remove this file")
+            raise no_record
         return record
 
     def text(self) -> str:
