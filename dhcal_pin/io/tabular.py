@@ -19,9 +19,9 @@ from ..messages import escape_control_characters, quote
 _RESERVED_CHARACTERS = frozenset(",;[]#\"'")
 # First characters of a cell that spreadsheets execute as a formula.
 _FORMULA_STARTS = ("=", "+", "-", "@")
-# Largest text file, largest TOML file that a user writes, and largest sidecar [byte]. The uncertainty of 64
-# joints takes 8 MiB.
-MAX_TEXT_BYTES, MAX_TOML_BYTES, MAX_SIDECAR_BYTES = 64 << 20, 1 << 20, 12 << 20
+# Largest text file, largest TOML file that a user writes, and largest sidecar [byte]. The uncertainty of the
+# correction curves of 11 joints takes 21 MiB, that of the geometry of 64 joints 8 MiB.
+MAX_TEXT_BYTES, MAX_TOML_BYTES, MAX_SIDECAR_BYTES = 64 << 20, 1 << 20, 24 << 20
 # Valid TOML that is refused: the pattern of each case, and what a message says.
 _REFUSED_TOML = {
     # `tomllib` takes quadratic time for dotted keys.
