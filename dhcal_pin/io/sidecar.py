@@ -492,7 +492,7 @@ def sidecar_text(
     frames = {"base": pose_content(chain.base), "tool": pose_content(tool)}
     content = {"tip": chain.tip, **frames, "manifest": _manifest_content(urdf, chain.tip), **tables}
     text = tomli_w.dumps(content, multiline_strings=True)
-    # Texts in single quotes have no escapes, which makes them ten times as fast to read.
+    # Texts in single quotes have no escapes, which makes them faster to read.
     text = _BASE64_LINES.sub(r"'''\n\1'''", text)
     # tomli_w writes each number on a line of its own; one line per harmonic is easier to read.
     return header + _HARMONIC_LINES.sub(r"    [\1, \2, \3]", text)

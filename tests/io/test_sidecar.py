@@ -94,7 +94,7 @@ def test_numbers_are_read_back_bit_identical(tmp_path, scara):
     for name in ("lower", "upper", "spread", "configurations", "radius", "reach", "is_prismatic"):
         np.testing.assert_array_equal(getattr(region_again, name), getattr(region, name))
     assert side.read_text().startswith("# ")
-    # No escapes: these texts are read ten times as fast.
+    # Texts without escapes are read faster.
     assert "sqrt_covariance = '''\n" in side.read_text()
 
 
