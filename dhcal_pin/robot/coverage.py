@@ -131,7 +131,9 @@ def bin_indices(values: Array) -> Array:
     Returns:
         Indices into `BIN_CENTRES`, in the shape of the values.
     """
-    return np.mod(np.rint(values / BIN_WIDTH_RAD) + N_BINS // 2, N_BINS).astype(int)
+    # Whole turns are removed first: a value of 1e308 overflows if it is divided by the width.
+    within_turn = np.fmod(values, 2 * np.pi)
+    return np.mod(np.rint(within_turn / BIN_WIDTH_RAD) + N_BINS // 2, N_BINS).astype(int)
 
 
 def joint_coverage(chain: Chain, q: Array) -> tuple[JointCoverage, ...]:
@@ -144,7 +146,10 @@ def joint_coverage(chain: Chain, q: Array) -> tuple[JointCoverage, ...]:
     Returns:
         Coverage of each revolute joint, in the order of the chain.
     """
-    _, first = np.unique(np.rint(q / _SAME_CONFIGURATION), axis=0, return_index=True)
+    # Quotients that overflow count as one value.
+    with np.errstate(over="ignore"):
+        rounded = np.rint(q / _SAME_CONFIGURATION)
+    _, first = np.unique(rounded, axis=0, return_index=True)
     different = q[np.sort(first)]
     out = []
     for i in np.flatnonzero(~chain.is_prismatic):

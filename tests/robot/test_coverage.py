@@ -56,6 +56,16 @@ def test_any_finite_value_has_a_bin():
     bins = bin_indices(BIN_WIDTH_RAD * N_BINS * turns)
     assert np.all((bins >= 0) & (bins < N_BINS))
     assert len(set(bins[:3].tolist())) == 1
+    # Divided by the width of a bin, these are infinite.
+    bins = bin_indices(np.array([1.7e308, -1.7e308]))
+    assert np.all((bins >= 0) & (bins < N_BINS))
+
+
+def test_coverage_of_values_near_the_largest_number(recwarn):
+    q = np.zeros((3, 6))
+    q[1, 0], q[2, 0] = 1.7e308, -1.7e308
+    assert [int(one.counts.sum()) for one in joint_coverage(arm(), q)] == [3] * 6
+    assert not recwarn.list
 
 
 def test_repeated_configurations_count_once():
