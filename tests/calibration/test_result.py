@@ -13,6 +13,7 @@ from dhcal_pin import se3
 from dhcal_pin.calibration import accuracy, calibrate, k_fold
 from dhcal_pin.estimation import Problem, linearize_and_factor, select_parameters
 from dhcal_pin.estimation.qr import posterior_sqrt_covariance
+from dhcal_pin.estimation.solver import next_iterate
 from dhcal_pin.measurements import Noise, Pose, Position
 from dhcal_pin.robot import Chain
 
@@ -149,6 +150,7 @@ def test_exact_data_do_not_determine_unobservable_directions(sim_6dof, sim_6dof_
     assert not np.isinf(fit.std).any()
     # A damped step is negligible before the undamped one is. Undamped steps then follow at once.
     assert fit.iterations <= 10
+    np.testing.assert_allclose(next_iterate(fit.problem, fit.solution), fit.solution.x, atol=1e-9)
 
 
 def test_contradicted_standard_deviations_are_scaled_without_the_priors(sim_6dof, sim_6dof_actual):
