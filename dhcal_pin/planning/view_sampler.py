@@ -2,12 +2,12 @@
 
 Random joint positions hardly ever have a board in view. Candidates therefore come from random views
 (`views`): inverse kinematics from a random start brings the camera, or the board, to a view. Only the result
-is tested: a robot with few joints that misses the drawn view may have the board in view all the same.
+is tested: a robot with few joints may miss the drawn view and still have the board in view.
 
 A view is hidden if a shape of the robot or an obstacle touches the convex hull of the centre of the camera
-and the corners in view. If a shape that moves with the camera is right in front of it, or one that moves
-with the board in front of that, every view would be hidden: the pose in the rig is a guess, or the camera is
-inside of a housing. All shapes that move with it are ignored then, and a note says so.
+and the corners in view. A shape that moves with the camera may cover it in every pose, because the pose in
+the rig is approximate, or because the camera is in a housing. All shapes that move with the camera are then
+ignored, and a note says so. The same holds for the board.
 
 Shapes: m configurations, n joints.
 """

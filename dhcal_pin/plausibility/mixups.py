@@ -37,8 +37,8 @@ _MAX_LOG_TIE = 3.0
 _MIN_ROWS_PER_UNKNOWN, _N_FRAME_UNKNOWNS = 2, 12
 # Positions this many times farther from the centre than the median are wrong by themselves.
 _MAX_DISTANCE_RATIO = 8.0
-# A hypothesis is left out if the nominal robot misses the positions by more than this multiple of what it
-# misses them by as they were read, and this is only known with so many rows for each unknown.
+# A hypothesis is left out if it increases the distance of the nominal robot from the positions by more than
+# this factor. The distance is computed if there are at least this many rows per unknown of the frames.
 _MAX_DISTANCE_GROWTH, _MIN_ROWS_PER_FRAME_UNKNOWN = 3.0, 4
 # A shift of the rows is tried if at least this share of the samples has a neighbouring row.
 _MIN_SHIFTED_SHARE = 0.25
