@@ -170,9 +170,16 @@ def test_deep_toml(assert_refused, text):
 @pytest.mark.parametrize("option", ["--priors", "--bounds", "--columns", "--instrument"])
 def test_large_toml(assert_refused, option):
     """A file of 16 MiB took 15 s and 1.2 GB."""
-    limit = 12 if option == "--instrument" else 1
+    limit = 24 if option == "--instrument" else 1
     Path("large.toml").write_text("a = 1\n" * ((limit << 20) // 6 + 1))
     assert_refused([f"large.toml: the file is larger than {limit} MiB"], *CALIBRATE, option, "large.toml")
+
+
+def test_large_sidecar_without_arrays(assert_refused):
+    """A sidecar of 24 MiB with other content than encoded arrays took 20 s."""
+    Path("large.toml").write_text("\n".join(f"a{i} = 1" for i in range(1 << 17)))
+    words = ["large.toml: more than 1 MiB besides arrays in base64"]
+    assert_refused(words, *CALIBRATE, "--instrument", "large.toml")
 
 
 @pytest.mark.parametrize(
