@@ -363,6 +363,14 @@ def test_wrong_corners_and_wrong_images(is_by_image):
     assert n_good * 0.99 <= n_used <= n_good
 
 
+def test_wrong_images_are_judged_by_all_images():
+    """All corners of ten images, as many samples as the search uses, contain a majority of wrong ones."""
+    (ratio, n_found, n_bad, n_false, n_good), _ = image_trial(0.4, True, 4)
+    assert ratio <= 1.25
+    assert n_found == n_bad
+    assert n_false <= 0.01 * n_good
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("is_by_image", [False, True])
 @pytest.mark.parametrize("fraction", [0.05, 0.1, 0.2, 0.3, 0.4])

@@ -31,8 +31,10 @@ from ..qr import posterior_sqrt_covariance, rank
 from ..solver import minimize
 from .search import linearize_rows, search_majorities
 
-# Largest number of samples of each measurement that the search uses.
-MAX_SAMPLES = 200
+# Approximate number of samples of each measurement that the search uses, and the smallest number of them from
+# each group, such as an image. Samples of one group are often wrong together, so that a few samples of many
+# groups tell more than all samples of a few.
+MAX_SAMPLES, MIN_PER_GROUP = 200, 4
 # Number of random subsets that the instruments are initialized from, and their smallest number of
 # configurations.
 N_STARTS, MIN_CONFIGURATIONS = 40, 4
@@ -60,13 +62,12 @@ def find_initial_outliers(
     """
     all_good = [np.zeros(len(item.rows), bool) for item in data]
     frames = errors.only_frames() or ErrorModel(errors.chain, ())
-    drawn = [_draw_groups(item) for item in data]
-    parts = [item.take(mask) for item, mask in zip(data, drawn, strict=True)]
+    parts = [item.take(_draw_groups(item)) for item in data]
     starts = [_initialize_instruments(frames.chain, part) for part in parts]
     parameters = [p for p in merge_instrument_parameters(starts) if p.name not in known]
     weights = np.concatenate([1 / frames.priors, [1 / parameter.prior for parameter in parameters]])
     problem = Problem(frames, tuple(starts), weights, known)
-    x = _fit_majority(problem)
+    x = _fit_majority(problem.with_data([start.take(_thin_groups(start)) for start in starts]))
     if x is None:
         return all_good
     full = problem.with_data(
@@ -87,14 +88,23 @@ def find_initial_outliers(
 
 
 def _draw_groups(item: Measurement) -> Array:
-    """Draw samples of whole groups at random, at most about MAX_SAMPLES; return their mask (m,)."""
-    m = len(item.rows)
-    if m <= MAX_SAMPLES:
-        return np.ones(m, bool)
+    """Draw whole groups at random if there are more than the search uses; return the mask of samples (m,)."""
     labels = item.sample_groups
-    order = np.random.default_rng(0).permutation(labels.max() + 1)
-    counts = np.cumsum(np.bincount(labels)[order])
-    return np.isin(labels, order[: max(1, int(np.searchsorted(counts, MAX_SAMPLES, "right")))])
+    n_groups, m = int(labels.max(initial=-1)) + 1, len(labels)
+    n_drawn = MAX_SAMPLES // max(1, min(MIN_PER_GROUP, m // max(n_groups, 1)))
+    return np.isin(labels, np.random.default_rng(0).permutation(n_groups)[:n_drawn])
+
+
+def _thin_groups(item: Measurement) -> Array:
+    """Draw as many samples of each group at random, in all about MAX_SAMPLES; return their mask (m,)."""
+    labels = item.sample_groups
+    n_groups, m = int(labels.max(initial=-1)) + 1, len(labels)
+    order = np.random.default_rng(0).permutation(m)
+    order = order[np.argsort(labels[order], kind="stable")]
+    first = np.searchsorted(labels[order], np.arange(n_groups))
+    is_drawn = np.zeros(m, bool)
+    is_drawn[order[np.arange(m) - first[labels[order]] < -(-MAX_SAMPLES // max(n_groups, 1))]] = True
+    return is_drawn
 
 
 def _initialize_instruments(chain: Chain, item: Measurement) -> Measurement:
