@@ -279,7 +279,9 @@ def _validated_known(data: tuple[Measurement, ...], known: Mapping[str, float]) 
     for name, value in known.items():
         if name not in names:
             choice = f"choose from {', '.join(names)}" if names else "these measurements have none"
-            raise UnknownNameError(f"known {name!r}: unknown instrument parameter; {choice}", "known")
+            raise UnknownNameError(
+                f"known value of {name!r}: no such instrument parameter; {choice}", "known"
+            )
         if not np.isfinite(value):
             raise InvalidArgumentError(f"known {name!r}: {value} is not a finite number; expected m or rad")
     return known

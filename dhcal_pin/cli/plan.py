@@ -565,7 +565,7 @@ def read_task(path: PathLike, chain: Chain) -> Array:
     """
     import numpy as np  # lazy import, as the following: they are slow to load
 
-    from ..compensation import compensate
+    from ..compensation import LIMITS, compensate
     from ..io import read_configurations, read_targets
     from ..io.tables import read_table
 
@@ -576,9 +576,10 @@ def read_task(path: PathLike, chain: Chain) -> Array:
     targets = read_targets(path, chain)
     result = compensate(chain, chain, targets.values)
     if (failed := np.flatnonzero(~result.reached)).size:
+        is_limited = result.status[failed[0]] == LIMITS
+        problem = "within reach only beyond the joint limits" if is_limited else "out of reach"
         raise InvalidArgumentError(
-            f"{targets.source}: target {failed[0] + 1} is out of reach ({result.status[failed[0]]}); "
-            "correct or remove it"
+            f"{targets.source}: target {failed[0] + 1} is {problem}; correct or remove it"
         )
     return result.q
 

@@ -105,8 +105,9 @@ def read_toml(path: PathLike, max_bytes: int = MAX_TOML_BYTES) -> dict[str, Any]
         return _parse_toml(text)
     # Integers with too many digits raise ValueError; brackets nested too deeply raise RecursionError.
     except (ValueError, RecursionError) as error:
-        reason = "nested too deeply" if isinstance(error, RecursionError) else error
-        raise FileFormatError(f"{path}: not TOML: {reason}; correct that line") from error
+        reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)
+        where = "that line" if "(at line" in reason else "the file"
+        raise FileFormatError(f"{path}: not TOML: {reason}; correct {where}") from error
 
 
 @lru_cache(maxsize=2)

@@ -206,7 +206,7 @@ def common_text(texts: Sequence[str], where: str) -> str:
     distinct = sorted(set(texts))
     if len(distinct) != 1:
         raise InvalidArgumentError(
-            f"column {where!r}: has the names {', '.join(distinct)}; expected one name per file, "
+            f"column {where!r} has the names {', '.join(distinct)}; expected one name per file: "
             "split the file by name"
         )
     return distinct[0]

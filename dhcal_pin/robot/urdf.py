@@ -400,7 +400,8 @@ def parse_numbers(tag: UrdfTag, key: str, count: int) -> list[float]:
     words = [word for word in tag.attributes[key].split(" ") if word]
     if len(words) != count:
         noun = "number" if len(words) == 1 else "numbers"
-        raise tag.error(f"{key} has {len(words)} {noun}; expected {count}, separated by spaces")
+        separated = ", separated by spaces" if count > 1 else ""
+        raise tag.error(f"{key} has {len(words)} {noun}; expected {count}{separated}")
     for word in words:
         if not _NUMBER.fullmatch(word) or not math.isfinite(float(word)):
             raise tag.error(f"{key} has {quote(word)}; expected a finite number such as 0.25 or -1e-3")

@@ -62,7 +62,8 @@ class CommitRecord:
         except FileNotFoundError:  # another run has just completed the commit
             return None
         except (OSError, ValueError) as error:
-            raise FileFormatError(f"{path}: cannot be read: {error}; remove this file") from error
+            reason = error.strerror if isinstance(error, OSError) else "it is damaged"
+            raise FileFormatError(f"{path}: cannot be read: {reason}; remove this file") from error
         no_record = FileFormatError(f"{path}: is not a record of saved files; remove this file")
         try:
             record = cls(**content)

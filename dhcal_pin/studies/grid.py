@@ -29,6 +29,7 @@ from ..io.shipped_files import shipped_file
 from ..io.toml_table import TomlTable
 from ..measurements import KINDS
 from ..measurements.base import Noise
+from ..messages import quote
 from ..planning.planner import plan
 from ..robot.chain import Chain
 from ..robot.sampling import joint_range
@@ -293,12 +294,13 @@ def _validated(setting: Setting, where: str) -> Setting:
     ):
         if getattr(setting, key) not in known:
             raise FileFormatError(
-                f"{where}: unknown {key} {getattr(setting, key)!r}; choose from {', '.join(known)}"
+                f"{where}: unknown {key} {quote(getattr(setting, key))}; choose from {', '.join(known)}"
             )
     for key, minimum in (("poses", 1), ("iterations", 0)):
         if not minimum <= getattr(setting, key) <= _MAX_COUNT:
             raise FileFormatError(
-                f"{where}: {key} = {getattr(setting, key)}; expected a number from {minimum} to {_MAX_COUNT}"
+                f"{where}: {key} = {getattr(setting, key)}; expected a whole number from "
+                f"{minimum} to {_MAX_COUNT}"
             )
     if setting.resample_each_iteration and setting.pose_selection == PLANNED:
         raise FileFormatError(

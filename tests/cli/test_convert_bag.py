@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -170,6 +171,7 @@ def test_invalid_recordings(run, folder):
         status, out, err = run("convert", name, "data.csv", "--pose-topic", POSES)
         assert (status, out, err.count("\n")) == (2, "", 1)
         assert f"{name}: {words}" in err
+        assert not re.search(r"\(['\"]|\.;", err)
     for arguments, words in (
         (("none.bag", "data.csv"), "none.bag: cannot read it"),
         (("broken.bag", "data.urdf"), "data.urdf: a recording becomes a measurement file; expected .csv"),

@@ -187,7 +187,11 @@ def test_large_sidecar_without_arrays(assert_refused):
     [
         ("--priors", "zz = 0.1", "names.toml: prior for 'zz': no such parameter; choose from theta1"),
         ("--bounds", "zz = [0, 1]", "names.toml: bounds for 'zz': no such parameter; choose from theta1"),
-        ("--instrument", "[instrument]\nzz = 1", "names.toml: known 'zz': unknown instrument parameter"),
+        (
+            "--instrument",
+            "[instrument]\nzz = 1",
+            "names.toml: known value of 'zz': no such instrument parameter",
+        ),
     ],
 )
 def test_unknown_names_are_named_with_their_file(assert_refused, option, text, words):

@@ -66,6 +66,14 @@ DATA = {
         with_column("point", ["a", "b"]),
         ["data.csv:1:", "'point' does not go with"],
     ),
+    "half a pair of points": (
+        "joint_1[deg],joint_2[deg],joint_3[deg],point_b,distance[mm]\n1,2,3,a,100\n",
+        [
+            "data.csv:1:",
+            "'point_b' does not go with distance",
+            "one of kind point_distance needs point_a, too",
+        ],
+    ),
     "row too short": ("\n".join([*LINES[:3], "1,2,3"]), ["data.csv:4:", "3 values", "6 columns"]),
     "row too long": (
         "\n".join([*LINES[:3], "1,2,3,4,5,6,7"]),

@@ -71,7 +71,7 @@ def test_a_record_does_nothing_in_folders_without_records(victim):
     assert not (folder / RECORD_NAME).exists()
 
 
-NO_JSON = [(text, "cannot be read") for text in ("", "{", "\x00")]
+NO_JSON = [(text, "cannot be read: it is damaged") for text in ("", "{", "\x00")]
 NO_RECORD = [(text, "is not a record") for text in ("[]", "{}", '{"token": 1}', '{"a": 1}', "5")]
 
 

@@ -16,10 +16,11 @@ from dhcal_pin.studies import read_study
         (("poses = 12", "pose = 12"), "unknown key 'pose'; choose from robot, tip, truth"),
         (("poses = 12", "poses = 'many'"), "poses = 'many'; expected a whole number"),
         (("poses = 12", "poses = []"), "expected at least one value"),
-        (("poses = 12", "poses = 0"), "poses = 0; expected a number from 1"),
+        (("poses = 12", "poses = 0"), "poses = 0; expected a whole number from 1"),
         (("seeds = 120", "seeds = -1"), "seeds = -1; expected a whole number"),
         (("seeds = 120", "sedes = 120"), "unknown key 'sedes'"),
         (('"pose", "position"', '"gps"'), "unknown kind 'gps'; choose from pose, position"),
+        (('"pose", "position"', f'"{"g" * 400}"'), r"unknown kind 'g{57}\.\.\.'; choose from pose, position"),
         (
             ("poses = 12", "pose_selection = 'best'"),
             "unknown pose_selection 'best'; choose from random, corner, planned",

@@ -9,6 +9,7 @@ a measurement file, see `standstills`.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -225,7 +226,14 @@ def _open_bag(source: str) -> Iterator[AnyReader]:
             raise FileFormatError(
                 f"{source}: its metadata.yaml is damaged; make it again with ros2 bag reindex {source}"
             ) from error
-        raise FileFormatError(f"{source}: not a readable recording: {reason}; record it again") from error
+        raise FileFormatError(
+            f"{source}: not a readable recording: {_sentence(reason)}; copy it again, or record it again"
+        ) from error
+
+
+def _sentence(reason: str) -> str:
+    """Return the first part of a message of rosbags, without the tuple of another error and the full stop."""
+    return re.sub(r"""\(["'](.*?)["'],\)""", r"\1", reason).partition(";")[0].rstrip(".")
 
 
 def _choose_joint_topic(reader: AnyReader, source: str, wanted: str | None) -> str:
@@ -296,7 +304,8 @@ def _read_joints(reader: AnyReader, source: str, topic: str, chain: Chain | None
     if not rows or names is None:
         problem = "has no joint positions"
         if missing := [name for name in wanted or () if name not in current]:
-            problem = f"has no joint {missing[0]!r}; its joints are {', '.join(current) or 'none'}"
+            named = f"its joints are {', '.join(current)}" if current else "it names no joints"
+            problem = f"has no joint {missing[0]!r}; {named}"
         raise FileFormatError(f"{source}: {topic} {problem}")
     require_usable_names(names, f"{source}: {topic}")
     # The first messages may lack the joints of another driver.

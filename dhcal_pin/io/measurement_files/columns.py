@@ -251,9 +251,15 @@ def find_kind(table: DataTable) -> type[Measurement]:
         )
     kind = max(candidates, key=lambda candidate: candidate[:2])[2]
     if unrelated := sorted(present - set(kind.columns)):
+        others = "".join(
+            f"; one of kind {other.kind} needs {', '.join(missing)}, too"
+            for other in KINDS.values()
+            if present <= set(other.columns)
+            and (missing := min((sorted(each - present) for each in other.required_columns), key=len))
+        )
         raise FileFormatError(
             f"{table.header_location}: column {unrelated[0]!r} does not go with "
             f"{', '.join(sorted(present & set(kind.columns)))}; "
-            f"a file of kind {kind.kind} has {', '.join(kind.columns)}"
+            f"a file of kind {kind.kind} has {', '.join(kind.columns)}{others}"
         )
     return kind

@@ -66,7 +66,7 @@ def read_targets(path: PathLike, chain: Chain) -> TargetPoses:
     kind = find_kind(table)
     if kind not in (Pose, Position):
         raise FileFormatError(
-            f"{table.header_location}: the columns are those of a {kind.kind} measurement; targets have "
+            f"{table.header_location}: the columns are those of kind {kind.kind}; targets have "
             "x[mm],y[mm],z[mm], with or without qw,qx,qy,qz or rx[rad],ry[rad],rz[rad]"
         )
     has_joints = bool(set(chain.joint_names) & set(table.columns))

@@ -220,7 +220,8 @@ ROTATION = '[rotation]\nconvention = "euler"\naxes = "XYZ"\nframe = "intrinsic"\
 @pytest.mark.parametrize(
     ("how", "words"),
     [
-        ("a =", ["map.toml", "not TOML"]),
+        ("a =", ["map.toml", "not TOML", "(at end of document); correct the file"]),
+        ("a = 1\nb c", ["map.toml", "not TOML", "(at line 2, column 3); correct that line"]),
         ("seperator = ';'\n" + MAP, ["unknown key 'seperator'", "choose from separator"]),
         (swap('separator = ";"', 'separator = "|"'), ["separator = '|'", '"tab"']),
         (swap("skip = 2", 'skip = "two"'), ["skip = 'two'", "skip = 2"]),
