@@ -7,12 +7,16 @@
    board that a known camera sees, by the mean over its images.
 
 A pose that is stated in the rig is used as it is.
+
+The pose of a board in an image depends on that image alone. It is remembered, as a robust start estimates
+first values from many subsets of the same images.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -34,6 +38,23 @@ if TYPE_CHECKING:
 _MAX_RATIO = 5.0
 # RMS distance that is never too large: half a percent of the focal length.
 _GOOD_RMS = 5e-3
+# Largest number of images that are remembered.
+_MAX_REMEMBERED = 2000
+
+_R = TypeVar("_R")
+
+
+def _remember(function: Callable[[Array, Array], _R]) -> Callable[[Array, Array], _R]:
+    """Remember the results of a function of points (m, 3) and image coordinates (m, 2)."""
+
+    @lru_cache(_MAX_REMEMBERED)
+    def of_bytes(points: bytes, image: bytes) -> _R:
+        return function(np.frombuffer(points).reshape(-1, 3), np.frombuffer(image).reshape(-1, 2))
+
+    return lambda points, image: of_bytes(points.tobytes(), image.tobytes())
+
+
+_agreeing_points, _estimate_pose = _remember(agreeing_points), _remember(estimate_pose)
 
 
 def first_values(item: CameraCorners, chain: Chain) -> dict[str, float]:
@@ -95,7 +116,7 @@ def _images(item: CameraCorners) -> list[Array]:
 def _agreeing(item: CameraCorners, samples: Array) -> Array:
     """Return which samples of an image of one board belong to the same view of the board."""
     board = item.rig.boards[item.board[samples[0]]]
-    return agreeing_points(board.points[item.corner[samples]], item.values[samples])
+    return _agreeing_points(board.points[item.corner[samples]], item.values[samples])
 
 
 def _flat_views(item: CameraCorners, camera: int) -> list[tuple[Array, Array]]:
@@ -124,7 +145,7 @@ def _board_poses(item: CameraCorners, lenses: list[Array], chain: Chain) -> _Pai
         camera, board = int(item.camera[samples[0]]), int(item.board[samples[0]])
         points = item.rig.boards[board].points[item.corner[samples]]
         image = item.rig.cameras[camera].lens.normalize(item.values[samples].T, lenses[camera]).T
-        estimate = estimate_pose(points, image)
+        estimate = _estimate_pose(points, image)
         if estimate is not None and np.isfinite(estimate[1]):
             tool = chain.poses(item.q[samples[:1]])[0]
             link = se3.inverse(tool) if item.rig.camera_mounts[camera].moves else tool
