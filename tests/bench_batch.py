@@ -14,8 +14,7 @@ from bench_common import Row, clocked, fit_geometry
 from robots import paper
 from scipy.optimize import least_squares
 
-from dhcal_pin.estimation.batch import BatchProblem, BatchResult, solve_batch
-from dhcal_pin.estimation.batch_chains import ChainBatch
+from dhcal_pin.estimation.batch import BatchProblem, BatchResult, ChainBatch, solve_batch
 from dhcal_pin.estimation.parameters import select_parameters
 from dhcal_pin.measurements.base import Noise, concatenate
 from dhcal_pin.measurements.pose import Pose

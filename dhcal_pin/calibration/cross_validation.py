@@ -33,13 +33,9 @@ from scipy.linalg import lstsq
 
 from .._typing import Array, Progress
 from ..estimation import qr, robust
-from ..estimation.problem import Problem, linearize_and_factor
-from ..estimation.qr import (
-    TriangularSystem,
-    append_priors,
-    merge_r_factors,
-    posterior_sqrt_covariance,
-)
+from ..estimation.normal_equations import NormalEquations
+from ..estimation.problem import Problem, has_structure, linearize_and_factor, normal_equations
+from ..estimation.qr import TriangularSystem, merge_r_factors
 from ..exceptions import InvalidArgumentError, NotObservableError
 from ..measurements.base import Measurement
 from ..measurements.measured_region import MIN_SPREAD, MeasuredRegion, draw_joint_space
@@ -88,7 +84,7 @@ class FoldSystems:
     @property
     def is_unobserved(self) -> Array:
         """Unknowns that no fitted row depends on, such as a point that only held-out samples touch, (p,)."""
-        return np.logical_not(self.fitted.r.any(0))
+        return self.fitted.is_unobserved
 
     def error(self, weights: Array, x: Array, columns: Array) -> float:
         """Compute the RMS of the held-out whitened rows under the fit of the other rows.
@@ -103,8 +99,13 @@ class FoldSystems:
         Returns:
             The RMS in standard deviations.
         """
-        step, _ = solve_columns(self.fitted, weights, x, columns)
-        residual = self._without_own_unknowns(self.held_out.z - self.held_out.r[:, columns] @ step, columns)
+        step = np.zeros(len(x))
+        step[columns] = solve_columns(self.fitted, weights, x, columns)[0]
+        own = self._own_unknowns(columns)
+        if not own.size:
+            return float(np.sqrt(self.held_out.squared_error(step) / self.n_rows))
+        residual = self.held_out.z - self.held_out.r @ step
+        residual -= own @ (own.T @ residual)
         return float(np.sqrt((residual @ residual + self.held_out.min_cost) / self.n_rows))
 
     def prediction_std(self, weights: Array, columns: Array) -> float:
@@ -120,36 +121,23 @@ class FoldSystems:
         known = columns & ~self.is_unobserved
         if not known.any():
             return 0.0
-        rows = self._without_own_unknowns(self.held_out.r[:, known], columns)
-        reduced = select_columns(self.fitted, known)
-        root, unbounded = posterior_sqrt_covariance(reduced, weights[known])
+        root, unbounded = self.fitted.select(known).sqrt_covariance(weights[known])
+        own = self._own_unknowns(columns)
+        if known.all() and not unbounded.size:
+            return float(np.sqrt(self.held_out.predicted_variance(root) / self.n_rows))
+        rows = self.held_out.r[:, known]
+        rows = rows - own @ (own.T @ rows) if own.size else rows
         if np.linalg.norm(rows @ unbounded) > _UNBOUNDED_TOL * np.linalg.norm(rows):
             return np.inf
         return float(np.linalg.norm(rows @ root) / np.sqrt(self.n_rows))
 
-    def _without_own_unknowns(self, rows: Array, columns: Array) -> Array:
-        """Remove from held-out rows what unknowns explain that only the held-out rows depend on."""
-        own = self.held_out.r[:, columns & self.is_unobserved]
-        own = own[:, own.any(0)]
-        if not own.size:
-            return rows
-        basis = np.linalg.qr(own)[0]
-        return rows - basis @ (basis.T @ rows)
-
-
-def select_columns(system: TriangularSystem, columns: Array) -> TriangularSystem:
-    """Compute the triangular system of some of the unknowns, the others held.
-
-    Args:
-        system: System of p unknowns.
-        columns: Mask of the unknowns that stay, (p,).
-
-    Returns:
-        The system; the given one if all stay.
-    """
-    if columns.all():
-        return system
-    return TriangularSystem(merge_r_factors([system.rows[:, np.append(columns, True)]]))
+    def _own_unknowns(self, columns: Array) -> Array:
+        """Return an orthonormal basis of the held-out rows that only unknowns of their own explain."""
+        own = columns & self.is_unobserved
+        if not own.any():
+            return np.empty((0, 0))
+        rows = self.held_out.r[:, own]
+        return np.linalg.qr(rows[:, rows.any(0)])[0]
 
 
 def solve_columns(system: TriangularSystem, weights: Array, x: Array, columns: Array) -> tuple[Array, float]:
@@ -169,9 +157,7 @@ def solve_columns(system: TriangularSystem, weights: Array, x: Array, columns: A
     """
     prior = weights[columns]
     if prior.all():
-        reduced = select_columns(system, columns)
-        with_priors = append_priors(reduced, prior, x[columns])
-        return qr.pseudo_inverse(with_priors.r, with_priors.z), with_priors.min_cost
+        return system.select(columns).solve(prior, x[columns])
     a = np.concatenate([system.r[:, columns], np.diag(prior)])
     b = np.concatenate([system.z, -prior * x[columns]])
     solution = lstsq(a, b, lapack_driver="gelsy", check_finite=False)
@@ -201,20 +187,28 @@ def factor_partition(problem: Problem, x: Array, folds: Sequence[Fold]) -> tuple
         The systems of each fold.
     """
     rest = tuple(~np.any(masks, 0) for masks in zip(*folds, strict=True))
-    systems: list[TriangularSystem] = []
-    counts: list[int] = []
-    for masks in (*folds, rest):
-        part = problem.with_data([item.take(mask) for item, mask in zip(problem.data, masks, strict=True)])
-        counts.append(count_rows(part))
-        if counts[-1]:
-            systems.append(linearize_and_factor(part, x, small_angle=False))
+    parts = [
+        problem.with_data([item.take(mask) for item, mask in zip(problem.data, masks, strict=True)])
+        for masks in (*folds, rest)
+    ]
+    counts = [count_rows(part) for part in parts]
+    parts = [part for part, n_rows in zip(parts, counts, strict=True) if n_rows]
+    if has_structure(problem):
+        equations = [normal_equations(part, x).products for part in parts]
+        total = np.sum(equations, 0)
+        systems = [(NormalEquations(total - one), NormalEquations(one)) for one in equations]
+    else:
+        factors = [linearize_and_factor(part, x, small_angle=False).rows for part in parts]
+        systems = [
+            (
+                TriangularSystem(merge_r_factors([other for other in factors if other is not one])),
+                TriangularSystem(one),
+            )
+            for one in factors[: len(folds)]
+        ]
     return tuple(
-        FoldSystems(
-            TriangularSystem(merge_r_factors([other.rows for other in systems if other is not held_out])),
-            held_out,
-            n_rows,
-        )
-        for held_out, n_rows in zip(systems, counts[: len(folds)], strict=False)
+        FoldSystems(fitted, held_out, n_rows)
+        for (fitted, held_out), n_rows in zip(systems, counts[: len(folds)], strict=False)
     )
 
 

@@ -69,19 +69,13 @@ from ..estimation.error_model import ErrorModel, ErrorParameter
 from ..estimation.parameters import CURVE_ORDERS, EXTENSIONS, FINE_CURVE_ORDERS, PARAMETER_SETS
 from ..estimation.priors import PriorGroups, effective_parameters
 from ..estimation.problem import Problem, linearize_and_factor
-from ..estimation.qr import (
-    TriangularSystem,
-    append_priors,
-    merge_r_factors,
-    posterior_sqrt_covariance,
-    pseudo_inverse,
-)
+from ..estimation.qr import TriangularSystem, pseudo_inverse
 from ..estimation.solver import minimize
 from ..exceptions import UnknownNameError
 from ..formatting import Table, format_fixed
 from ..identifiability.residual_correlation import design_effect, find_residual_correlation
 from ..robot.error_families import COMPLIANCE, COUPLING, CURVES, FAMILIES, FINE_CURVES, GAIN, HARMONICS
-from .cross_validation import FoldSystems, count_rows, factor_partition, select_columns, solve_columns
+from .cross_validation import FoldSystems, count_rows, factor_partition, solve_columns
 from .partition import (
     configuration_groups,
     contact_groups,
@@ -303,7 +297,7 @@ class _Candidates:
     def with_folds(cls, problem: Problem, x: Array, family: Array) -> _Candidates:
         """Factor the data in random folds."""
         folds = factor_partition(problem, x, k_fold(problem.data, N_FOLDS))
-        system = TriangularSystem(merge_r_factors([fold.held_out.rows for fold in folds]))
+        system = folds[0].fitted.merged(folds[0].held_out)
         return cls(problem, x, family, system, folds)
 
     def weights(self, widths: Mapping[str, float]) -> Array:
@@ -324,19 +318,19 @@ class _Candidates:
             The model.
         """
         columns = self.columns(widths)
-        reduced, n_rows = select_columns(self.system, columns), count_rows(self.problem)
+        reduced, n_rows = self.system.select(columns), count_rows(self.problem)
         family, x, expected = self.family[columns], self.x[columns], self.problem.weights[columns]
         noise = float(np.sqrt(self.system.cost / n_rows))
         smallest = MIN_NOISE_RATIO * noise
         rounds = 0
         while True:
             weights = self.weights(widths)[columns]
-            rows = TriangularSystem(reduced.rows / noise)
-            posterior = append_priors(rows, weights, x)
-            root = posterior_sqrt_covariance(rows, weights)[0]
+            rows = reduced.scaled(1 / noise)
+            posterior = rows.with_priors(weights, x)
+            root = rows.sqrt_covariance(weights)[0]
             determined = 1 - np.einsum("ij,ij->i", root, root) * weights**2
             step = pseudo_inverse(posterior.r, posterior.z)
-            misfit = rows.min_cost + float(np.sum((rows.r @ step - rows.z) ** 2))
+            misfit = rows.squared_error(step)
             updated_noise = noise * float(np.sqrt(misfit / max(n_rows - np.sum(determined), 1.0)))
             updated_noise = max(updated_noise, smallest)
             updated = {name: _best_width(x + step, determined, expected, family == name) for name in widths}
@@ -641,7 +635,7 @@ def extend(
     problem = problem.with_data(with_sigma_scales(problem.data, np.full(n_groups, noise)))
     problem = problem.at_temperature(temperature)
     # The rows are divided by the noise; they are not linearized again.
-    start = replace(extended.solution, system=TriangularSystem(extended.solution.system.rows / noise))
+    start = replace(extended.solution, system=extended.solution.system.scaled(1 / noise))
     solution = minimize(problem, "lm", start.x, max_iterations, warm_start=start, loose=True)
     extended = replace(extended, problem=problem, solution=solution)
     # Outliers were found already: the last robust stage decides which of them are rejected.
@@ -681,9 +675,12 @@ def _fit_selected(
     selected_problem = problem.with_prior_weights(_prior_weights(problem, family, model.widths))
     solution = minimize(selected_problem, "lm", x, max_iterations, loose=True)
     trimmed = _outlier_weights(problem, solution.x, fit.weights)
-    problem = problem.with_data([item.with_weights(w) for item, w in zip(problem.data, trimmed, strict=True)])
-    selected_problem = problem.with_prior_weights(selected_problem.weights)
-    solution = minimize(selected_problem, "lm", solution.x, max_iterations, loose=True)
+    if any((w < 1).any() for w in trimmed):
+        problem = problem.with_data(
+            [item.with_weights(w) for item, w in zip(problem.data, trimmed, strict=True)]
+        )
+        selected_problem = problem.with_prior_weights(selected_problem.weights)
+        solution = minimize(selected_problem, "lm", solution.x, max_iterations, loose=True)
     weights = tuple(np.maximum(a * b, robust.ZERO_WEIGHT) for a, b in zip(fit.weights, trimmed, strict=True))
     fitted = Fit(fit.data, problem, solution, weights, fit.iterations, fit.stage)
     # `_Candidates` divides the expected weights of its problem by the widths.
@@ -791,8 +788,7 @@ def _are_residuals_correlated(fit: Fit, noise: float) -> bool:
     """
     if noise < MIN_CORRELATED_NOISE:
         return False
-    rows = TriangularSystem(fit.solution.system.rows / noise)
-    root = posterior_sqrt_covariance(rows, fit.problem.weights)[0]
+    root = fit.solution.system.scaled(1 / noise).sqrt_covariance(fit.problem.weights)[0]
     return find_residual_correlation(fit.problem, fit.solution.x, root, noise, fit.weights).is_significant
 
 

@@ -33,7 +33,12 @@ from ..estimation.error_model import ErrorModel
 from ..estimation.initialization import fit_frames, gross_outliers, initialize_frames, make_problem
 from ..estimation.parameters import EXTENSIONS, fold_harmonics, select_parameters
 from ..estimation.priors import PriorGroups, Priors, has_default_prior, prior_weights
-from ..estimation.problem import Problem, merge_instrument_parameters
+from ..estimation.problem import (
+    Problem,
+    UnfactoredSystem,
+    has_structure,
+    merge_instrument_parameters,
+)
 from ..estimation.solver import METHODS, minimize
 from ..estimation.trimmed_squares import find_initial_outliers
 from ..exceptions import InvalidArgumentError, UnknownNameError
@@ -342,6 +347,10 @@ def _make_result(
 ) -> Result:
     """Apply the shrinkage factor to the solution of a fit and build the result."""
     problem, errors = fit.problem, fit.problem.errors
+    solution = replace(fit.solution, iterations=fit.iterations)
+    if has_structure(problem):
+        # Rank and null space need the R factor of the rows.
+        solution = replace(solution, system=UnfactoredSystem(problem, solution.x))
     x = shrinkage_factor * fit.solution.x
     if shrinkage_factor:
         calibrated = errors.at(x[: len(errors.parameters)]).with_current_loads()
@@ -354,7 +363,7 @@ def _make_result(
         data=fit.data,
         holdout=holdout,
         problem=problem,
-        solution=replace(fit.solution, iterations=fit.iterations),
+        solution=solution,
         method=method,
         weights=fit.weights,
         shrinkage_factor=shrinkage_factor,

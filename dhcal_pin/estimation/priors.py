@@ -33,7 +33,6 @@ from ..robot.chain import BASE_FRAME
 from .error_model import ErrorModel
 from .parameters import fold_harmonics
 from .problem import Problem
-from .qr import posterior_sqrt_covariance
 from .solver import SolverResult
 
 Priors = Literal["default", "none"] | Mapping[str, float]
@@ -170,7 +169,7 @@ def effective_parameters(problem: Problem, solution: SolverResult) -> float:
         γ = ‖R·S‖² = r - ‖W·S‖², with a square root S of the covariance, r columns, and prior weights W: 1 per
         parameter that the data determine, 0 per parameter that its prior determines.
     """
-    root = posterior_sqrt_covariance(solution.system, problem.weights)[0]
+    root = solution.system.sqrt_covariance(problem.weights)[0]
     return root.shape[1] - float(np.einsum("ij,ij,i->", root, root, problem.weights**2))
 
 
@@ -189,7 +188,7 @@ def update_prior_scales(problem: Problem, solution: SolverResult, groups: PriorG
     if not len(members):
         return weights
     expected = groups.expected_weights
-    root = posterior_sqrt_covariance(solution.system, problem.weights)[0][members]
+    root = solution.system.sqrt_covariance(problem.weights)[0][members]
     # γ: fraction of each parameter that the data determine.
     determined = np.fmax(0.0, 1 - np.einsum("ij,ij->i", root, root) * problem.weights[members] ** 2)
     squares = np.bincount(group_index, solution.x[members] ** 2) * expected**2

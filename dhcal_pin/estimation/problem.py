@@ -24,7 +24,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property, partial, reduce
 from typing import Any, TypeVar
 
 import numpy as np
@@ -37,6 +37,7 @@ from ..measurements.base import InstrumentParameter, Measurement
 from ..parallel import SERIAL, TaskExecutor
 from ..robot.chain import Chain
 from .error_model import ErrorModel
+from .normal_equations import NormalEquations
 from .qr import TriangularSystem, combine_r_factors, sum_of_squares
 from .scale_gauge import ScaleGauge, normalize_by_scale
 
@@ -338,6 +339,59 @@ class Linearization:
         bodies, twists = self.bodies[:n_geometric], self.twists[None, :n_geometric]
         return factor_jacobian(frames.columns, frames.tool[3], bodies, twists, observation, filled)[0]
 
+    def structured_rows(self, chunk: Chunk) -> StructuredRows:
+        """Compute the whitened rows [J | r] of a chunk, the transmission columns as products.
+
+        Args:
+            chunk: Samples of one configuration per row, of a measurement with a length scale.
+
+        Returns:
+            The rows.
+        """
+        frames = chunk.frames(self.chain)
+        first = int(np.searchsorted(self.bodies, len(frames.columns)))
+        entries = self.bodies[first:] - len(frames.columns)
+        columns = {name: column - len(entries) for name, column in self.instrument_columns.items()}
+        other = replace(
+            self,
+            bodies=self.bodies[:first],
+            twists=self.twists[:first],
+            instrument_columns=columns,
+            gauge_rates=self.gauge_rates[:first],
+        )
+        residual_dim, m = chunk.data.residual_dim, len(chunk.data.rows)
+        dense = np.empty((other._n_columns, residual_dim, m))
+        observation = other._fill(dense, chunk, frames, False)
+        motions = self.chain.joint_jacobian(frames)
+        joint_rows = np.empty((len(motions), residual_dim, m))
+        apply_observation_matrix(motions, observation, joint_rows)
+        joints, terms = self.chain.transmission_terms(frames, entries)
+        by_joint = np.argsort(joints, kind="stable")
+        starts = np.unique(np.sort(joints), return_index=True)
+        ends = [*starts[1][1:].tolist(), len(entries)]
+        blocks = tuple(
+            (joint, slice(start, end))
+            for joint, start, end in zip(starts[0].tolist(), starts[1].tolist(), ends, strict=True)
+        )
+        dense_columns = np.delete(np.arange(self._n_columns), first + np.arange(len(entries)))
+        columns = np.concatenate([dense_columns, first + by_joint])
+        return StructuredRows(dense, joint_rows, np.array([terms[i] for i in by_joint]), blocks, columns)
+
+    def row_covariances(self, chunk: Chunk, root: Array) -> Array:
+        """Compute the covariance of the whitened rows of each sample that uncertain unknowns cause.
+
+        Args:
+            chunk: Samples.
+            root: Square root S of the covariance of the unknowns, shape (p+s, d).
+
+        Returns:
+            J·S·Sᵀ·Jᵀ of each sample, shape (m, k, k).
+        """
+        if _is_structured(chunk.data) and len(self.bodies) > MANY_COLUMNS:
+            return self.structured_rows(chunk).covariances(root @ root.T)
+        rows = np.tensordot(root, self.rows(chunk)[:-1], (0, 0))
+        return np.einsum("rim,rjm->mij", rows, rows)
+
     def rows(self, chunk: Chunk) -> Array:
         """Compute the whitened rows [J | r] of a chunk.
 
@@ -379,6 +433,71 @@ class Linearization:
         if not data.has_length_scale:
             normalize_by_scale(block, self.arm_scale, self.gauge_rates, data.residual_groups.get("position"))
         return observation
+
+
+@dataclass(frozen=True, eq=False)
+class StructuredRows:
+    """Whitened rows [J | r] of m samples of k residuals, whose transmission columns are not multiplied out.
+
+    A transmission coefficient moves one joint, in proportion to a term of the configuration. Its column is
+    the column of that joint times the term.
+
+    Attributes:
+        dense: The c other columns, the last one r, shape (c, k, m).
+        joint_rows: Columns of the motion of each joint, shape (n, k, m).
+        terms: Term of each of the e coefficients, sorted by joint, shape (e, m).
+        blocks: Each joint that coefficients move, with its part of the terms.
+        columns: Column of [J | r] of each dense column, then of each coefficient, shape (c+e,).
+    """
+
+    dense: Array
+    joint_rows: Array
+    terms: Array
+    blocks: tuple[tuple[int, slice], ...]
+    columns: Array
+
+    def products(self) -> Array:
+        """Compute the inner products [J | r]ᵀ·[J | r], shape (c+e, c+e)."""
+        c = len(self.dense)
+        out = np.empty((len(self.columns),) * 2)
+        # Views of the products by kind of column: dense, and coefficients.
+        flat, of_terms = self.dense.reshape(c, -1), out[c:, c:]
+        out[:c, :c] = flat @ flat.T
+        for i, (joint, block) in enumerate(self.blocks):
+            beside = np.einsum("ckm,km->cm", self.dense, self.joint_rows[joint]) @ self.terms[block].T
+            out[:c, c:][:, block], out[c:, :c][block] = beside, beside.T
+            for other_joint, other in self.blocks[: i + 1]:
+                common = np.einsum("km,km->m", self.joint_rows[joint], self.joint_rows[other_joint])
+                part = (self.terms[block] * common) @ self.terms[other].T
+                of_terms[block, other], of_terms[other, block] = part, part.T
+        order = np.argsort(self.columns)
+        return out[np.ix_(order, order)]
+
+    def covariances(self, covariance: Array) -> Array:
+        """Compute the covariance of the rows of each sample that uncertain unknowns cause.
+
+        Args:
+            covariance: Covariance C of the unknowns, shape (c+e-1, c+e-1).
+
+        Returns:
+            J·C·Jᵀ of each sample, shape (m, k, k).
+        """
+        c, dense = len(self.dense), self.dense[:-1]
+        dense_columns, coefficients = self.columns[: c - 1], self.columns[c:]
+        of_dense = covariance[np.ix_(dense_columns, dense_columns)]
+        beside = covariance[np.ix_(dense_columns, coefficients)]
+        of_terms = covariance[np.ix_(coefficients, coefficients)]
+        out = np.einsum("ckm,clm->mkl", dense, np.tensordot(of_dense, dense, 1))
+        for i, (joint, block) in enumerate(self.blocks):
+            terms = self.terms[block]
+            # Half of the effect of this joint together with the dense columns and the joints before it.
+            half = np.einsum("ckm,cm->km", dense, beside[:, block] @ terms)
+            for other_joint, other in self.blocks[: i + 1]:
+                share = np.einsum("em,em->m", terms, of_terms[block, other] @ self.terms[other])
+                half += (0.5 if other == block else 1.0) * share * self.joint_rows[other_joint]
+            product = np.einsum("km,lm->mkl", half, self.joint_rows[joint])
+            out += product + product.swapaxes(1, 2)
+        return out
 
 
 def chunk_residual(chain: Chain, instruments: Mapping[str, float], chunk: Chunk) -> Array:
@@ -441,6 +560,94 @@ def linearize_and_factor(problem: Problem, x: Array, small_angle: bool) -> Trian
     return combine_r_factors(
         problem.map_chunks(partial(_chunk_r_factor, problem.linearize(x), small_angle)), len(x)
     )
+
+
+class UnfactoredSystem(TriangularSystem):
+    """Triangular system of all data, without priors, that is computed when it is first needed.
+
+    Attributes:
+        problem: Problem in p robot errors and s instrument parameters.
+        x: Unknowns of shape (p+s,).
+    """
+
+    problem: Problem
+    x: Array
+
+    def __init__(self, problem: Problem, x: Array):
+        """Store the problem.
+
+        Args:
+            problem: Problem in p robot errors and s instrument parameters.
+            x: Unknowns of shape (p+s,).
+        """
+        vars(self).update(problem=problem, x=x)
+
+    @cached_property
+    def rows(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """[R z; 0 ρ], upper triangular, shape (p+s+1, p+s+1)."""
+        return linearize_and_factor(self.problem, self.x, small_angle=False).rows
+
+
+def has_structure(problem: Problem) -> bool:
+    """Check whether the normal equations of a problem take much less time than the R factor of its rows.
+
+    They are accurate if all unknowns have priors. There are many transmission coefficients, more rows than
+    unknowns, and one configuration per row.
+
+    Args:
+        problem: Problem.
+
+    Returns:
+        Whether `linear_system` computes the normal equations.
+    """
+    n_coefficients = sum(parameter.coefficient_index is not None for parameter in problem.errors.parameters)
+    n_rows = sum(item.residual_dim * len(item.rows) for item in problem.data)
+    return (
+        n_coefficients > MANY_COLUMNS
+        and n_rows > 2 * len(problem.weights)
+        and not problem.instrument_parameters
+        and bool(problem.weights.all())
+        and all(map(_is_structured, problem.data))
+    )
+
+
+def _is_structured(item: Measurement) -> bool:
+    """Check whether transmission columns of a measurement are those of joints times terms."""
+    return item.configurations_per_row == 1 and item.has_length_scale
+
+
+def linear_system(problem: Problem, x: Array) -> TriangularSystem:
+    """Compute the system of all data, without priors, in the form that takes less time.
+
+    Args:
+        problem: Problem in p robot errors and s instrument parameters.
+        x: Unknowns of shape (p+s,).
+
+    Returns:
+        System at x.
+    """
+    if has_structure(problem):
+        return normal_equations(problem, x)
+    return linearize_and_factor(problem, x, small_angle=False)
+
+
+def normal_equations(problem: Problem, x: Array) -> NormalEquations:
+    """Compute the normal equations of all data, without priors.
+
+    Args:
+        problem: Problem with structure, see `has_structure`, or some of its samples.
+        x: Unknowns of shape (p+s,).
+
+    Returns:
+        Normal equations at x.
+    """
+    parts = problem.map_chunks(partial(_chunk_products, problem.linearize(x)))
+    return NormalEquations(reduce(np.add, parts))
+
+
+def _chunk_products(linearization: Linearization, chunk: Chunk) -> Array:
+    """Compute the inner products of a chunk; a module-level function can be sent to another process."""
+    return linearization.structured_rows(chunk).products()
 
 
 def whitened_residuals(problem: Problem, x: Array) -> Iterator[Array]:

@@ -28,7 +28,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import lapack
+from scipy.linalg import lapack, svd
 
 from .._kernels import append_diagonal, r_factor
 from .._typing import Array
@@ -40,6 +40,23 @@ RANK_RTOL = 1e-9
 # A triangular matrix whose reciprocal condition number exceeds this value has no singular value near
 # RANK_RTOL: the estimated condition may be wrong by a factor of the matrix size.
 WELL_CONDITIONED = 1e3 * RANK_RTOL
+
+
+def singular_value_decomposition(a: Array) -> tuple[Array, Array, Array]:
+    """Compute the singular value decomposition of a matrix.
+
+    Args:
+        a: Matrix of shape (n, p).
+
+    Returns:
+        U, shape (n, n), the singular values, largest first, and Vᵀ, shape (p, p).
+    """
+    try:
+        u, s, vt = np.linalg.svd(a)
+        return u, s, vt
+    except np.linalg.LinAlgError:
+        # The divide and conquer method does not converge for some matrices of a wide range of values.
+        return svd(a, lapack_driver="gesvd")
 
 
 def singular_values(r: Array) -> Array:
@@ -63,7 +80,7 @@ def row_space(r: Array) -> Array:
     Returns:
         Basis of shape (rank, p).
     """
-    _, s, vt = np.linalg.svd(r)
+    _, s, vt = singular_value_decomposition(r)
     return vt[: int(np.sum(s > RANK_RTOL * s[0]))] if s.size and s[0] > 0 else vt[:0]
 
 
@@ -102,7 +119,7 @@ def null_space(r: Array) -> Array:
     Returns:
         Basis of shape (p, d), d = p - rank.
     """
-    return np.linalg.svd(r)[2][rank(r) :].T
+    return singular_value_decomposition(r)[2][rank(r) :].T
 
 
 def sum_of_squares(a: Array) -> float:
@@ -133,7 +150,7 @@ def euclidean_norm(a: Array) -> float:
 class TriangularSystem:
     """R factor of the whitened rows [J | r] at one x: ‖J·δ - r‖² = ‖R·δ - z‖² + min_cost.
 
-    `batch_qr.TriangularSystemBatch` is the same for b problems. It has the members `r`, `z`, `min_cost`,
+    `batch.TriangularSystemBatch` is the same for b problems. It has the members `r`, `z`, `min_cost`,
     `cost`, `roundoff`, `residual_change` and `predicted_reduction`, too, with a leading axis b. The classes
     are separate because a single system is solved by LAPACK's triangular routines, which NumPy does not offer
     for stacks: a damped step with p = 24 takes seven times as long in a stack of one.
@@ -168,6 +185,104 @@ class TriangularSystem:
     def roundoff(self) -> float:
         """Rounding error of the rows, EPS_MODEL·‖R‖."""
         return EPS_MODEL * euclidean_norm(self.r)
+
+    @property
+    def is_unobserved(self) -> Array:
+        """Unknowns that no row depends on, (p,)."""
+        return np.logical_not(self.r.any(0))
+
+    def scaled(self, factor: float) -> TriangularSystem:
+        """Return the system of the rows times a factor.
+
+        Args:
+            factor: Factor of all rows.
+
+        Returns:
+            The system.
+        """
+        return TriangularSystem(factor * self.rows)
+
+    def merged(self, other: TriangularSystem) -> TriangularSystem:
+        """Compute the system of the rows of two systems of the same unknowns.
+
+        Args:
+            other: System of other rows.
+
+        Returns:
+            The system.
+        """
+        return TriangularSystem(merge_r_factors([self.rows, other.rows]))
+
+    def select(self, columns: Array) -> TriangularSystem:
+        """Compute the system of some of the unknowns, the others held.
+
+        Args:
+            columns: Mask of the unknowns that stay, (p,).
+
+        Returns:
+            The system; the given one if all stay.
+        """
+        if columns.all():
+            return self
+        return TriangularSystem(merge_r_factors([self.rows[:, np.append(columns, True)]]))
+
+    def with_priors(self, weights: Array, x: Array | float) -> TriangularSystem:
+        """Append the prior rows, see `append_priors`.
+
+        Args:
+            weights: Reciprocal prior standard deviations 1/σ of shape (p,); zero without a prior.
+            x: Current values of shape (p,), or 0 [m and rad].
+
+        Returns:
+            System of data and priors.
+        """
+        return append_priors(self, weights, x)
+
+    def solve(self, weights: Array, x: Array | float) -> tuple[Array, float]:
+        """Compute the best step with priors.
+
+        Args:
+            weights: Reciprocal prior standard deviations 1/σ of shape (p,); zero without a prior.
+            x: Current values of shape (p,), or 0 [m and rad].
+
+        Returns:
+            Step δ of shape (p,) [m and rad], and the cost of rows and priors after it.
+        """
+        posterior = self.with_priors(weights, x)
+        return pseudo_inverse(posterior.r, posterior.z), posterior.min_cost
+
+    def sqrt_covariance(self, weights: Array) -> tuple[Array, Array]:
+        """Compute a square root of the covariance of data and priors, see `posterior_sqrt_covariance`.
+
+        Args:
+            weights: Reciprocal prior standard deviations 1/σ of shape (p,); zero without a prior.
+
+        Returns:
+            Square root, shape (p, r), and the directions that neither determines, shape (p, p-r).
+        """
+        return posterior_sqrt_covariance(self, weights)
+
+    def squared_error(self, step: Array) -> float:
+        """Compute the cost after a step.
+
+        Args:
+            step: Step δ of shape (p,) [m and rad].
+
+        Returns:
+            ‖R·δ - z‖² + min_cost.
+        """
+        return sum_of_squares(self.z - self.r @ step) + self.min_cost
+
+    def predicted_variance(self, root: Array) -> float:
+        """Compute the variance of all rows that uncertain unknowns cause.
+
+        Args:
+            root: Square root S of the covariance of the unknowns, shape (p, r).
+
+        Returns:
+            ‖R·S‖², the trace of R·S·Sᵀ·Rᵀ.
+        """
+        return sum_of_squares(self.r @ root)
 
     def residual_change(self, step: Array) -> Array:
         """Compute the change of the rows by a step, up to a rotation.
@@ -329,11 +444,11 @@ def posterior_sqrt_covariance(system: TriangularSystem, weights: Array) -> tuple
     scale = np.linalg.norm(full, axis=0)
     if weights.all() and _is_well_conditioned(full / scale):
         return lapack.dtrtri(full / scale)[0] / scale[:, None], np.empty((len(weights), 0))
-    _, s, vt = np.linalg.svd(system.r)
+    _, s, vt = singular_value_decomposition(system.r)
     n_observable = int(np.sum(s > RANK_RTOL * s[0]))
     observable, unobservable = vt[:n_observable].T, vt[n_observable:].T
     # Priors within the unobservable directions: W·unobservable = left·diag(t)·yt.
-    left, t, yt = np.linalg.svd(weights[:, None] * unobservable)
+    left, t, yt = singular_value_decomposition(weights[:, None] * unobservable)
     has_prior = t > RANK_RTOL * weights.max(initial=0.0)
     left, prior_root = left[:, : len(t)][:, has_prior], unobservable @ (yt[has_prior].T / t[has_prior])
     # What the priors add to the observable directions after the unobservable ones are eliminated.

@@ -42,8 +42,7 @@ from .._typing import Array
 from ..measurements.base import Measurement
 from . import qr
 from .priors import effective_parameters
-from .problem import CHUNK_SIZE, Chunk, Linearization, Problem, chunk_residual, linearize_and_factor
-from .qr import posterior_sqrt_covariance
+from .problem import CHUNK_SIZE, Chunk, Linearization, Problem, chunk_residual, linear_system
 from .solver import SolverResult
 
 # Standardized residual above which a sample is an outlier: one good sample in three million exceeds it.
@@ -401,8 +400,8 @@ def residual_covariances(problem: Problem, solution: SolverResult, weights: Sequ
     if solution.converged:
         # The system was linearized one step earlier, where other directions may be unobservable. With the
         # wide priors of frames and instruments its covariance would then not fit these rows.
-        system = linearize_and_factor(problem, solution.x, small_angle=False)
-    root = posterior_sqrt_covariance(system, problem.weights)[0]
+        system = linear_system(problem, solution.x)
+    root = system.sqrt_covariance(problem.weights)[0]
     chunks = problem.map_chunks(partial(_prediction_covariance, problem.linearize(solution.x), root))
     out = []
     for item, weight in zip(problem.data, weights, strict=True):
@@ -415,5 +414,4 @@ def residual_covariances(problem: Problem, solution: SolverResult, weights: Sequ
 
 def _prediction_covariance(linearization: Linearization, root: Array, chunk: Chunk) -> Array:
     """Compute w_i·J_i·C·J_iᵀ of each sample of a chunk, shape (m, k, k), from a square root of C."""
-    rows = np.tensordot(root, linearization.rows(chunk)[:-1], (0, 0))
-    return np.einsum("rim,rjm->mij", rows, rows)
+    return linearization.row_covariances(chunk, root)

@@ -45,7 +45,7 @@ import numpy as np
 from .._typing import Array
 from ..exceptions import ConvergenceError, UnknownNameError
 from . import solver_rules as rules
-from .problem import Problem, linearize_and_factor
+from .problem import Problem, linear_system, linearize_and_factor
 from .qr import (
     TriangularSystem,
     append_priors,
@@ -166,7 +166,7 @@ def next_iterate(problem: Problem, solution: SolverResult) -> Array:
     Returns:
         Point of shape (p,) [m and rad].
     """
-    system = append_priors(solution.system, problem.weights, solution.x)
+    system = solution.system.with_priors(problem.weights, solution.x)
     return solution.x + bounded_step(problem, system, solution.x)
 
 
@@ -238,8 +238,8 @@ def _undamped_steps(problem: Problem, x: Array, cost: float) -> tuple[Array, flo
     """Try a series of undamped steps, also uphill; return its end and the cost there if that is lower."""
     end, end_cost = x, math.inf
     for _ in range(rules.N_UNDAMPED_STEPS):
-        data = linearize_and_factor(problem, end, small_angle=False)
-        trial = end + bounded_step(problem, append_priors(data, problem.weights, end), end)
+        system = linear_system(problem, end).with_priors(problem.weights, end)
+        trial = end + bounded_step(problem, system, end)
         if has_diverged(trial):
             break
         end, end_cost = trial, problem.cost(trial)
@@ -272,11 +272,11 @@ def levenberg_marquardt(
     damping, scale, last_change = state.damping, state.scale, state.last_change
     iterates, iteration = (list(warm_start.iterates), warm_start.iterations) if warm_start else ([x], 0)
     growth, converged, last_undamped = rules.INITIAL_GROWTH, False, 0
-    system = warm_start.system if warm_start else linearize_and_factor(problem, x, small_angle=False)
+    system = warm_start.system if warm_start else linear_system(problem, x)
     cost = _cost(problem, system, x)
     while iteration < max_iterations and not converged and damping <= rules.MAX_DAMPING:
         start, accepted_system = x, None
-        undamped = append_priors(system, problem.weights, x)
+        undamped = system.with_priors(problem.weights, x)
         scale = np.maximum(scale, np.sqrt(np.einsum("ij,ij->j", undamped.r, undamped.r)))
         damping_scale = np.where(scale > 0, scale, 1.0)
         roundoff, residual_norm = undamped.roundoff, math.sqrt(cost)
@@ -305,7 +305,7 @@ def levenberg_marquardt(
                 trial_cost = max(cost - predicted, 0.0)
             elif not is_negligible and growth == rules.INITIAL_GROWTH:
                 # First trial of the iteration: the next iteration needs its linearization.
-                trial_system = linearize_and_factor(problem, x + step, small_angle=False)
+                trial_system = linear_system(problem, x + step)
                 trial_cost = _cost(problem, trial_system, x + step)
             else:
                 trial_cost = problem.cost(x + step)
@@ -341,7 +341,7 @@ def levenberg_marquardt(
             # The model is linear over a negligible step.
             system = system.recentered(x - start)
         elif x is not start:
-            system = accepted_system or linearize_and_factor(problem, x, small_angle=False)
+            system = accepted_system or linear_system(problem, x)
     state = DampingState(damping, scale, last_change)
     return SolverResult(x, system, iteration, converged, np.array(iterates), state)
 

@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .._typing import Array, PathLike
-from ..estimation.batch import BatchProblem
-from ..estimation.batch_chains import ChainBatch
+from ..estimation.batch import BatchProblem, ChainBatch
 from ..estimation.parameters import select_parameters
 from ..estimation.solver import METHODS
 from ..exceptions import DhcalError, FileFormatError

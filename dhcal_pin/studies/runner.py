@@ -19,8 +19,7 @@ import numpy as np
 
 from .. import se3
 from .._typing import Array
-from ..estimation.batch import BatchProblem, solve_batch
-from ..estimation.batch_chains import ChainBatch
+from ..estimation.batch import BatchProblem, ChainBatch, solve_batch
 from ..estimation.parameters import select_parameters
 from ..measurements import KINDS
 from ..measurements.base import Noise, concatenate

@@ -9,7 +9,7 @@ from robots import paper, random_joints, random_table
 from dhcal_pin._kernels import kinematics
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.estimation import BatchProblem, Problem, minimize, select_parameters, solve_batch
-from dhcal_pin.estimation.batch_chains import ChainBatch
+from dhcal_pin.estimation.batch import ChainBatch
 from dhcal_pin.estimation.qr import row_space
 from dhcal_pin.exceptions import DhcalError, InvalidArgumentError, UnknownNameError
 from dhcal_pin.measurements import KINDS, Noise, Pose, Position, Wires

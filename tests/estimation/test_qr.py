@@ -11,12 +11,12 @@ from dhcal_pin._kernels import qr as numpy_qr
 from dhcal_pin.estimation import (
     Problem,
     TriangularSystem,
-    batch_qr,
     linearize_and_factor,
     problem,
     qr,
     select_parameters,
 )
+from dhcal_pin.estimation.batch import TriangularSystemBatch
 from dhcal_pin.estimation.problem import CHUNK_SIZE
 from dhcal_pin.measurements import Noise, Pose
 from dhcal_pin.measurements.base import whitened_jacobian
@@ -140,7 +140,7 @@ def test_a_batch_of_systems_agrees_with_the_single_one(rank):
     rows = np.concatenate([rows, rng.normal(size=(4, 5, 1))], 2)
     rows = np.concatenate([rows, np.zeros((4, 1, 6))], 1)
     rows[:, 5, 5] = rng.normal(size=4)
-    batch = batch_qr.TriangularSystemBatch.from_r_factors(rows.copy())
+    batch = TriangularSystemBatch.from_r_factors(rows.copy())
     diagonal = rng.uniform(0.1, 1, (4, 5))
     steps, damped = batch.solve(), batch.with_damping(diagonal)
     changes = batch.residual_change(steps)
@@ -167,3 +167,17 @@ def test_without_data_the_covariance_is_that_of_the_priors(capfd):
     np.testing.assert_allclose(root @ root.T, np.diag(sigma**2), rtol=1e-12, atol=1e-30)
     assert unbounded.shape == (3, 0)
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_decomposition_that_does_not_converge_is_tried_another_way(monkeypatch):
+    """A matrix of 408 columns with values up to 5e18 was one."""
+    r = np.triu(np.random.default_rng(0).standard_normal((5, 5)))
+    r[-1] = 0
+    expected = qr.null_space(r)
+
+    def fail(*args, **kwargs):
+        raise np.linalg.LinAlgError("SVD did not converge")
+
+    monkeypatch.setattr(np.linalg, "svd", fail)
+    found = qr.null_space(r)
+    np.testing.assert_allclose(np.abs(found.T @ expected), [[1.0]], atol=1e-12)

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .._kernels import r_factors
-from .._typing import Array
-from .qr import RANK_RTOL
-from .solver_rules import EPS_MODEL, step_is_negligible
+from ..._kernels import r_factors
+from ..._typing import Array
+from ..qr import RANK_RTOL
+from ..solver_rules import EPS_MODEL, step_is_negligible
 
 # Largest estimated condition number at which R is solved without a singular value decomposition. The margin
 # of 1000 to the rank cut covers the error of the estimate.

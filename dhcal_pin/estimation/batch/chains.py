@@ -25,14 +25,14 @@ from functools import cached_property
 
 import numpy as np
 
-from .. import se3
-from .._kernels import cos_sin
-from .._kernels.types import FrameBatch
-from .._typing import Array
-from ..exceptions import InvalidArgumentError
-from ..robot.chain import BASE_FRAME, Chain
-from ..robot.error_families import FAMILIES
-from .error_model import ErrorModel
+from ... import se3
+from ..._kernels import cos_sin
+from ..._kernels.types import FrameBatch
+from ..._typing import Array
+from ...exceptions import InvalidArgumentError
+from ...robot.chain import BASE_FRAME, Chain
+from ...robot.error_families import FAMILIES
+from ..error_model import ErrorModel
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,18 +19,18 @@ from functools import cached_property
 
 import numpy as np
 
-from .._kernels import factor_jacobian
-from .._typing import Array
-from ..exceptions import InvalidArgumentError, UnknownNameError
-from ..measurements.base import Measurement, concatenate
-from ..parallel import SERIAL, TaskExecutor
-from . import solver_rules as rules
-from .batch_chains import ChainBatch
-from .batch_qr import TriangularSystemBatch
-from .error_model import ErrorModel
-from .qr import RANK_RTOL
-from .solver_rules import step_is_negligible
-from .uncertainty import UNBOUNDED_TOL
+from ..._kernels import factor_jacobian
+from ..._typing import Array
+from ...exceptions import InvalidArgumentError, UnknownNameError
+from ...measurements.base import Measurement, concatenate
+from ...parallel import SERIAL, TaskExecutor
+from .. import solver_rules as rules
+from ..error_model import ErrorModel
+from ..qr import RANK_RTOL
+from ..solver_rules import step_is_negligible
+from ..uncertainty import UNBOUNDED_TOL
+from .chains import ChainBatch
+from .qr import TriangularSystemBatch
 
 # Number of problems that are solved together; their arrays fit into the cache of a core.
 BLOCK_SIZE = 250

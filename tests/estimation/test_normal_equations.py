@@ -1,0 +1,145 @@
+"""Normal equations of correction curves: against the plain rows, and against the R factor of the rows."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+from robots import measured_arm, random_joints, random_table
+
+import dhcal_pin.calibration.cross_validation as cross_validation
+import dhcal_pin.estimation.problem as problem_module
+from dhcal_pin import Chain, calibrate
+from dhcal_pin.estimation import Problem, TriangularSystem, linearize_and_factor, select_parameters
+from dhcal_pin.estimation.problem import UnfactoredSystem, has_structure, normal_equations
+from dhcal_pin.measurements import Noise, Pose, Position
+
+SETS = "minimal,base,tool,gain,coupling,compliance,harmonics,curves"
+
+
+def curved_problem(kind=Pose, m=300, seed=0, sets=SETS):
+    """Return a problem of a UR5 with errors of all kinds, and a point near its solution."""
+    rng = np.random.default_rng(seed)
+    arm = measured_arm("ur5")
+    errors = select_parameters(arm, sets)
+    x = np.minimum(errors.priors, 1e-3) * rng.standard_normal(len(errors.parameters))
+    data = kind.simulate(errors.at(x), rng.uniform(-2.5, 2.5, (m, 6)), Noise(5e-5, 1e-4), rng)
+    return Problem(errors, (data,), 1 / errors.priors), 0.9 * x
+
+
+def plain_rows(problem, x):
+    """Return the whitened rows [J | r] of all samples, shape (p+1, k, m)."""
+    linearization = problem.linearize(x)
+    return np.concatenate([linearization.rows(chunk) for chunk in problem.chunks], 2)
+
+
+def assert_same_products(problem, x):
+    rows = plain_rows(problem, x).reshape(len(x) + 1, -1)
+    expected = rows @ rows.T
+    scale = np.sqrt(np.diag(expected))
+    scale[scale == 0] = 1.0
+    found = normal_equations(problem, x).products
+    np.testing.assert_allclose(found / scale / scale[:, None], expected / scale / scale[:, None], atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", [Pose, Position])
+@pytest.mark.parametrize("m", [300, 2100])
+def test_products_are_those_of_the_plain_rows(kind, m):
+    """With one chunk of samples and with two."""
+    assert_same_products(*curved_problem(kind, m))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_products_of_random_arms(seed):
+    """Revolute and prismatic joints, and coefficients of some of the joints only."""
+    rng = np.random.default_rng(seed)
+    table = random_table(rng)
+    arm = Chain.from_dh(table)
+    errors = select_parameters(arm, "dh,gain,coupling,harmonics")
+    kept = [p for p in errors.parameters if p.coefficient_index is None or rng.uniform() < 0.5]
+    errors = type(errors)(arm, tuple(kept))
+    x = 1e-3 * rng.standard_normal(len(kept))
+    data = Pose.simulate(arm, random_joints(rng, table, 40), Noise(1e-4, 1e-4), rng)
+    assert_same_products(Problem(errors, (data,), np.ones(len(kept))), x)
+
+
+@pytest.mark.parametrize("kind", [Pose, Position])
+def test_covariances_of_the_rows(kind):
+    problem, x = curved_problem(kind, 30)
+    rng = np.random.default_rng(1)
+    root = problem.errors.priors[:, None] * rng.standard_normal((len(x), 50))
+    rows = np.tensordot(root, plain_rows(problem, x)[:-1], (0, 0))
+    expected = np.einsum("rim,rjm->mij", rows, rows)
+    (chunk,) = problem.chunks
+    found = problem.linearize(x).structured_rows(chunk).covariances(root @ root.T)
+    np.testing.assert_allclose(found, expected, atol=1e-10 * np.abs(expected).max())
+
+
+def test_each_member_agrees_with_the_triangular_system():
+    problem, x = curved_problem()
+    weights, rng = problem.weights, np.random.default_rng(0)
+    system, triangular = normal_equations(problem, x), linearize_and_factor(problem, x, small_angle=False)
+    assert has_structure(problem)
+    assert system.cost == pytest.approx(triangular.cost, rel=1e-12)
+    columns = rng.uniform(size=len(x)) < 0.7
+    other_problem, _ = curved_problem(seed=1)
+    others = normal_equations(other_problem, x), linearize_and_factor(other_problem, x, small_angle=False)
+    step = triangular.solve(weights, x)[0]
+    pairs = [
+        (system, triangular, weights, x),
+        (system.scaled(3.0), triangular.scaled(3.0), weights, x),
+        (system.select(columns), triangular.select(columns), weights[columns], x[columns]),
+        (system.merged(others[0]), triangular.merged(others[1]), weights, x),
+        (system.recentered(0.5 * step), triangular.recentered(0.5 * step), weights, x),
+    ]
+    for normal, reference, w, at in pairs:
+        delta, cost = normal.solve(w, at)
+        expected, expected_cost = reference.solve(w, at)
+        std = np.linalg.norm(reference.sqrt_covariance(w)[0], axis=1)
+        np.testing.assert_allclose(delta / std, expected / std, atol=1e-5)
+        assert cost == pytest.approx(expected_cost, rel=1e-9)
+        np.testing.assert_allclose(np.linalg.norm(normal.sqrt_covariance(w)[0], axis=1), std, rtol=1e-7)
+        both = normal.with_priors(w, at), reference.with_priors(w, at)
+        np.testing.assert_allclose(*(np.abs(np.diag(each.r)) for each in both), rtol=1e-7)
+        assert both[0].cost == pytest.approx(both[1].cost, rel=1e-9)
+        assert normal.squared_error(delta) == pytest.approx(reference.squared_error(delta), rel=1e-9)
+        root = reference.sqrt_covariance(w)[0]
+        found = normal.predicted_variance(normal.sqrt_covariance(w)[0])
+        assert found == pytest.approx(reference.predicted_variance(root), rel=1e-7)
+
+
+def test_samples_that_determine_few_unknowns():
+    """Ten poses for 443 unknowns: the priors decide on the others."""
+    problem, x = curved_problem(m=10)
+    assert not has_structure(problem)
+    system, triangular = normal_equations(problem, x), linearize_and_factor(problem, x, small_angle=False)
+    root, expected = (each.sqrt_covariance(problem.weights)[0] for each in (system, triangular))
+    np.testing.assert_allclose(np.linalg.norm(root, axis=1), np.linalg.norm(expected, axis=1), rtol=1e-6)
+    assert triangular.merged(system).cost == pytest.approx(2 * triangular.cost, rel=1e-9)
+
+
+def test_calibration_is_the_same_with_the_r_factor_of_the_rows(monkeypatch):
+    """The sets have 421 unknowns; the rows of 220 poses are three times as many."""
+    problem, _ = curved_problem(m=220, sets="minimal,base,tool,compliance,harmonics,curves")
+    arm, data = problem.errors.chain, problem.data
+    fit = calibrate(arm, data)
+    for module in (problem_module, cross_validation):
+        monkeypatch.setattr(module, "has_structure", lambda problem: False)
+    reference = calibrate(arm, data)
+    assert fit.extension is not None
+    assert reference.extension is not None
+    assert "curves" in fit.extension.families
+    assert fit.extension.families == reference.extension.families
+    assert fit.extension.temperature == reference.extension.temperature
+    assert fit.extension.region_ratio == pytest.approx(reference.extension.region_ratio, rel=1e-6)
+    np.testing.assert_allclose(fit.x / reference.std, reference.x / reference.std, atol=1e-5)
+
+
+def test_the_system_of_a_result_is_the_r_factor_of_the_rows():
+    """It is computed when it is needed, and in another process, too."""
+    problem, x = curved_problem()
+    system = pickle.loads(pickle.dumps(UnfactoredSystem(problem, x)))
+    assert isinstance(system, TriangularSystem)
+    expected = linearize_and_factor(problem, x, small_angle=False)
+    np.testing.assert_array_equal(system.rows, expected.rows)
