@@ -206,7 +206,7 @@ class Result(ResultPlots):
         used = "" if self.n_inliers == self.n_samples else f"{self.n_inliers} of "
         return f"{used}{self.n_samples} samples"
 
-    @property
+    @cached_property
     def rank(self) -> int:
         """Number of observable directions in parameter space, without priors."""
         return qr.rank(self.solution.system.r)

@@ -93,7 +93,8 @@ def rank(r: Array) -> int:
     Returns:
         Number of singular values above RANK_RTOL times the largest.
     """
-    return len(row_space(r))
+    s = singular_values(r)
+    return int(np.sum(s > RANK_RTOL * s[0])) if s.size else 0
 
 
 def condition(r: Array) -> float:

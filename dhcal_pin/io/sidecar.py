@@ -96,8 +96,8 @@ _MAX_COEFFICIENT = 1e6
 _FORMER_HARMONIC_KEYS = ("sin_rad", "cos_rad", "sin2_rad", "cos2_rad")
 # Entry of `harmonics` as tomli_w writes it.
 _HARMONIC_LINES = re.compile(r"^ {4}\[\n +(\d+),\n +(\S+),\n +(\S+),\n {4}\]", re.MULTILINE)
-# Base64 text as tomli_w writes it.
-_BASE64_LINES = re.compile(r'"""\n([A-Za-z0-9+/=\n]*)"""')
+# Lines of base64 text, and the number of such a text as tomli_w writes it.
+_BASE64_LINES, _TEXT_NUMBER = re.compile(r"[A-Za-z0-9+/=\n]*\n"), re.compile(r'"""\n(\d+)\n"""')
 # Decimals of the numbers [m or rad] that the hash of the joints depends on.
 _DIGEST_DECIMALS = 12
 # Length of the lines of base64 text [characters].
@@ -491,11 +491,25 @@ def sidecar_text(
     header += _MEASURED_HEADER if "measured" in tables else ""
     frames = {"base": pose_content(chain.base), "tool": pose_content(tool)}
     content = {"tip": chain.tip, **frames, "manifest": _manifest_content(urdf, chain.tip), **tables}
-    text = tomli_w.dumps(content, multiline_strings=True)
-    # Texts in single quotes have no escapes, which makes them faster to read.
-    text = _BASE64_LINES.sub(r"'''\n\1'''", text)
     # tomli_w writes each number on a line of its own; one line per harmonic is easier to read.
-    return header + _HARMONIC_LINES.sub(r"    [\1, \2, \3]", text)
+    return header + _HARMONIC_LINES.sub(r"    [\1, \2, \3]", _toml_text(content))
+
+
+def _toml_text(content: dict[str, Any]) -> str:
+    """Return TOML text; base64 texts are inserted at the end, as tomli_w takes half a minute for 7 MB."""
+    inserted: list[str] = []
+
+    def with_numbers(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: with_numbers(each) for key, each in value.items()}
+        if isinstance(value, str) and _BASE64_LINES.fullmatch(value):
+            inserted.append(value)
+            return f"{len(inserted) - 1}\n"
+        return value
+
+    text = tomli_w.dumps(with_numbers(content), multiline_strings=True)
+    # Texts in single quotes have no escapes, which makes them faster to read.
+    return _TEXT_NUMBER.sub(lambda match: f"'''\n{inserted[int(match[1])]}'''", text)
 
 
 def _payload_content(payload: Payload | None) -> dict[str, Any]:
