@@ -69,7 +69,7 @@ from ..estimation.error_model import ErrorModel, ErrorParameter
 from ..estimation.parameters import CURVE_ORDERS, EXTENSIONS, FINE_CURVE_ORDERS, PARAMETER_SETS
 from ..estimation.priors import PriorGroups, effective_parameters
 from ..estimation.problem import Problem, linearize_and_factor
-from ..estimation.qr import TriangularSystem, pseudo_inverse
+from ..estimation.qr import TriangularSystem
 from ..estimation.solver import minimize
 from ..exceptions import UnknownNameError
 from ..formatting import Table, format_fixed
@@ -326,10 +326,9 @@ class _Candidates:
         while True:
             weights = self.weights(widths)[columns]
             rows = reduced.scaled(1 / noise)
-            posterior = rows.with_priors(weights, x)
             root = rows.sqrt_covariance(weights)[0]
             determined = 1 - np.einsum("ij,ij->i", root, root) * weights**2
-            step = pseudo_inverse(posterior.r, posterior.z)
+            step, _ = rows.solve(weights, x)
             misfit = rows.squared_error(step)
             updated_noise = noise * float(np.sqrt(misfit / max(n_rows - np.sum(determined), 1.0)))
             updated_noise = max(updated_noise, smallest)
@@ -339,6 +338,7 @@ class _Candidates:
             if np.abs(changes).max() < EVIDENCE_TOL or rounds == MAX_EVIDENCE_ROUNDS:
                 break
             widths, noise = updated, updated_noise
+        posterior = rows.with_priors(weights, x)
         log_det = np.sum(np.log(np.abs(np.diag(posterior.r)))) - np.sum(np.log(weights[weights > 0]))
         log_evidence = -0.5 * posterior.min_cost - float(log_det) - n_rows * np.log(noise)
         names = np.array(_unknown_names(self.problem))[columns]

@@ -171,7 +171,9 @@ class NormalEquations(TriangularSystem):
             shape (p, 0).
         """
         root, scale = self._decompose(weights)
-        return lapack.dtrtri(root)[0] / scale[:, None], np.empty((len(weights), 0))
+        if "_inverse_root" not in vars(self):
+            vars(self)["_inverse_root"] = lapack.dtrtri(root)[0] / scale[:, None]
+        return vars(self)["_inverse_root"], np.empty((len(weights), 0))
 
     def _decompose(self, weights: Array) -> tuple[Array, Array]:
         """Decompose JᵀJ + W² = D·RᵀR·D; the last result is kept for the covariance of the same solution.
@@ -195,6 +197,7 @@ class NormalEquations(TriangularSystem):
             root, info = lapack.dpotrf(matrix.T, overwrite_a=1)
         assert info == 0
         vars(self)["_decomposition"] = weights, root, scale
+        vars(self).pop("_inverse_root", None)
         return root, scale
 
     def predicted_variance(self, root: Array) -> float:

@@ -377,21 +377,6 @@ class Linearization:
         columns = np.concatenate([dense_columns, first + by_joint])
         return StructuredRows(dense, joint_rows, np.array([terms[i] for i in by_joint]), blocks, columns)
 
-    def row_covariances(self, chunk: Chunk, root: Array) -> Array:
-        """Compute the covariance of the whitened rows of each sample that uncertain unknowns cause.
-
-        Args:
-            chunk: Samples.
-            root: Square root S of the covariance of the unknowns, shape (p+s, d).
-
-        Returns:
-            J·S·Sᵀ·Jᵀ of each sample, shape (m, k, k).
-        """
-        if _is_structured(chunk.data) and len(self.bodies) > MANY_COLUMNS:
-            return self.structured_rows(chunk).covariances(root @ root.T)
-        rows = np.tensordot(root, self.rows(chunk)[:-1], (0, 0))
-        return np.einsum("rim,rjm->mij", rows, rows)
-
     def rows(self, chunk: Chunk) -> Array:
         """Compute the whitened rows [J | r] of a chunk.
 
@@ -468,6 +453,10 @@ class StructuredRows:
             out[:c, c:][:, block], out[c:, :c][block] = beside, beside.T
             for other_joint, other in self.blocks[: i + 1]:
                 common = np.einsum("km,km->m", self.joint_rows[joint], self.joint_rows[other_joint])
+                if other == block:
+                    weighted = self.terms[block] * np.sqrt(common)
+                    of_terms[block, block] = weighted @ weighted.T
+                    continue
                 part = (self.terms[block] * common) @ self.terms[other].T
                 of_terms[block, other], of_terms[other, block] = part, part.T
         order = np.argsort(self.columns)

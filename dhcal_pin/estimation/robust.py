@@ -42,7 +42,15 @@ from .._typing import Array
 from ..measurements.base import Measurement
 from . import qr
 from .priors import effective_parameters
-from .problem import CHUNK_SIZE, Chunk, Linearization, Problem, chunk_residual, linear_system
+from .problem import (
+    CHUNK_SIZE,
+    Chunk,
+    Linearization,
+    Problem,
+    chunk_residual,
+    has_structure,
+    linear_system,
+)
 from .solver import SolverResult
 
 # Standardized residual above which a sample is an outlier: one good sample in three million exceeds it.
@@ -402,7 +410,11 @@ def residual_covariances(problem: Problem, solution: SolverResult, weights: Sequ
         # wide priors of frames and instruments its covariance would then not fit these rows.
         system = linear_system(problem, solution.x)
     root = system.sqrt_covariance(problem.weights)[0]
-    chunks = problem.map_chunks(partial(_prediction_covariance, problem.linearize(solution.x), root))
+    model = problem.linearize(solution.x)
+    if has_structure(problem):
+        chunks = problem.map_chunks(partial(_structured_covariance, model, root @ root.T))
+    else:
+        chunks = problem.map_chunks(partial(_prediction_covariance, model, root))
     out = []
     for item, weight in zip(problem.data, weights, strict=True):
         parts = [np.empty((0, item.residual_dim, item.residual_dim)), *_chunks_of(chunks, item)]
@@ -414,4 +426,10 @@ def residual_covariances(problem: Problem, solution: SolverResult, weights: Sequ
 
 def _prediction_covariance(linearization: Linearization, root: Array, chunk: Chunk) -> Array:
     """Compute w_i·J_i·C·J_iᵀ of each sample of a chunk, shape (m, k, k), from a square root of C."""
-    return linearization.row_covariances(chunk, root)
+    rows = np.tensordot(root, linearization.rows(chunk)[:-1], (0, 0))
+    return np.einsum("rim,rjm->mij", rows, rows)
+
+
+def _structured_covariance(linearization: Linearization, covariance: Array, chunk: Chunk) -> Array:
+    """Compute the same, shape (m, k, k), from C (p, p) and rows whose columns have a structure."""
+    return linearization.structured_rows(chunk).covariances(covariance)
