@@ -11,8 +11,9 @@ computation through the upper triangular factor of their QR decomposition:
 - More rows: the QR decomposition of the stacked factors [R₁; R₂] is that of all rows. Chunks of samples
   therefore merge in any number, and prior rows δ/σ = -x/σ are appended in the same way.
 
-This is the square root information filter (Bierman 1977). JᵀJ is never formed: it squares the condition,
-and at condition 1e7 its inverse is wrong in the third digit (Golub & Van Loan 2013, section 5.3).
+This is the square root information filter (Bierman 1977). JᵀJ is not formed: it squares the condition,
+and at condition 1e7 its inverse is wrong in the third digit (Golub & Van Loan 2013, section 5.3). The
+exception are hundreds of unknowns that all have priors, see `normal_equations`.
 
 Columns of J count in metres and radians; the ranks and conditions refer to those units.
 
