@@ -47,6 +47,38 @@ ZERO_STD_RTOL = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
+class PlannedCalibration:
+    """Calibration whose measurements are planned; the options are those of `calibrate`.
+
+    Attributes:
+        chain: Nominal robot.
+        kind: Name in `KINDS`; "camera" with `images`.
+        noise: Standard deviations of a measurement [m, rad]; None for those of the existing measurements.
+        parameters: Parameter sets; None for those of the chain, or for images the default ones.
+        priors: Prior standard deviations.
+        fix: Parameters to fix.
+        free: Parameters to free.
+        data: Existing measurements.
+        known: Values of known instrument parameters.
+        prior_uncertainty: Uncertainty of the calibration that made the chain. It replaces the priors of the
+            parameters that the calibration estimated.
+        images: Cameras and boards of the kind "camera"; existing measurements are images by them.
+    """
+
+    chain: Chain
+    kind: str
+    noise: Noise | None
+    parameters: str | None = None
+    priors: Priors = "default"
+    fix: Sequence[str] = ()
+    free: Sequence[str] = ()
+    data: Sequence[Measurement] = ()
+    known: Mapping[str, float] = field(default_factory=dict)
+    prior_uncertainty: Uncertainty | None = None
+    images: PlannedImages | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class Information:
     """Knowledge before a measurement, and the information of measurements at any configurations.
 
@@ -172,39 +204,15 @@ class Information:
 
     @classmethod
     def from_prior(
-        cls,
-        chain: Chain,
-        q: Array,
-        kind: str,
-        noise: Noise | None,
-        parameters: str | None = None,
-        priors: Priors = "default",
-        fix: Sequence[str] = (),
-        free: Sequence[str] = (),
-        data: Sequence[Measurement] = (),
-        known: Mapping[str, float] | None = None,
-        omitted_sets: Sequence[str] = (),
-        prior_uncertainty: Uncertainty | None = None,
-        images: PlannedImages | None = None,
+        cls, planned: PlannedCalibration, q: Array, omitted_sets: Sequence[str] = ()
     ) -> Information:
         """Collect the knowledge before measuring from priors, existing measurements or a calibration.
 
         Args:
-            chain: Nominal robot.
+            planned: Calibration that is planned.
             q: Joint positions similar to those that will be measured, shape (m, n) [rad or m].
-            kind: Name in `KINDS`.
-            noise: Standard deviations of a measurement [m, rad]; None for those of the existing measurements.
-            parameters: Parameter sets, as in `calibrate`.
-            priors: Prior standard deviations, as in `calibrate`.
-            fix: Parameters to fix, as in `calibrate`.
-            free: Parameters to free, as in `calibrate`.
-            data: Existing measurements.
-            known: Values of known instrument parameters, as in `calibrate`.
             omitted_sets: Sets whose parameters the robot has, and which the fit takes as zero unless they are
-                in `parameters`.
-            prior_uncertainty: Uncertainty of the calibration that made the chain. It replaces the priors of
-                the parameters that the calibration estimated.
-            images: Cameras and boards of the kind "camera"; existing measurements are images by them.
+                among those of the calibration.
 
         Returns:
             Knowledge about all unknowns.
@@ -212,18 +220,15 @@ class Information:
         Raises:
             InvalidArgumentError: Priors or standard deviations are missing.
         """
-        if priors == "none":
+        if planned.priors == "none":
             raise InvalidArgumentError(
                 "priors 'none': a plan needs priors; choose default, or standard deviations by name"
             )
-        if images is None:
-            known_before = _before_measuring(
-                chain, q, kind, noise, parameters, priors, fix, free, data, known or {}
-            )
-        else:
-            known_before = _before_images(
-                chain, q, images, noise, parameters, priors, fix, free, data, known or {}
-            )
+        known_before = (
+            _before_measuring(planned, q)
+            if planned.images is None
+            else _before_images(planned, planned.images, q)
+        )
         problem, values, template = known_before.problem, known_before.values, known_before.template
         errors, x, sigma, fitted = _add_parameter_sets(
             known_before.errors, known_before.x, known_before.sigma, omitted_sets
@@ -243,9 +248,9 @@ class Information:
         data_factor = np.zeros((len(r), len(sigma)))
         data_factor[:, : r.shape[1]] = r * sigma[: r.shape[1]]
         stacked = np.concatenate([data_factor, np.eye(len(sigma))])
-        if prior_uncertainty is not None:
+        if planned.prior_uncertainty is not None:
             # Replace the prior rows of the robot parameters.
-            rows = _information_rows(*prior_uncertainty.of_parameters(errors, sigma[: len(x)]))
+            rows = _information_rows(*planned.prior_uncertainty.of_parameters(errors, sigma[: len(x)]))
             stacked[len(data_factor) : len(data_factor) + len(x), : len(x)] = rows
         return cls(
             errors=errors,
@@ -290,26 +295,24 @@ class _Before:
     differences: Array = field(default_factory=lambda: np.zeros(0))
 
 
-def _before_measuring(
-    chain: Chain,
-    q: Array,
-    kind: str,
-    noise: Noise | None,
-    parameters: str | None,
-    priors: Priors,
-    fix: Sequence[str],
-    free: Sequence[str],
-    data: Sequence[Measurement],
-    known: Mapping[str, float],
-) -> _Before:
-    """Return what is known before measurements of a kind; see `Information.from_prior`."""
+def _before_measuring(planned: PlannedCalibration, q: Array) -> _Before:
+    """Return what is known before measurements of a kind at configurations like q, shape (m, n)."""
+    chain, kind, noise, known = planned.chain, planned.kind, planned.noise, planned.known
     maker = _plannable_kind(kind)
-    errors = select_parameters(chain, parameters if parameters is not None else chain.parameters, fix, free)
-    x, sigma = np.zeros(len(errors.parameters)), 1 / prior_weights(errors, priors)
+    sets = planned.parameters if planned.parameters is not None else chain.parameters
+    errors = select_parameters(chain, sets, planned.fix, planned.free)
+    x, sigma = np.zeros(len(errors.parameters)), 1 / prior_weights(errors, planned.priors)
     fit = None
-    if data:
+    if planned.data:
         fit = calibrate(
-            chain, data, parameters, priors=priors, fix=fix, free=free, known=known, extend="none"
+            chain,
+            planned.data,
+            planned.parameters,
+            priors=planned.priors,
+            fix=planned.fix,
+            free=planned.free,
+            known=known,
+            extend="none",
         )
         errors, x, sigma = fit.errors, fit.x[: len(x)], 1 / fit.problem.prior_weights
         noise = noise or _sigma_of(fit.problem.data, kind)
@@ -330,31 +333,23 @@ def _before_measuring(
     return _Before(errors, x, sigma, instrument, template, values, fit.problem, fit.x[len(x) :])
 
 
-def _before_images(
-    chain: Chain,
-    q: Array,
-    images: PlannedImages,
-    noise: Noise | None,
-    parameters: str | None,
-    priors: Priors,
-    fix: Sequence[str],
-    free: Sequence[str],
-    data: Sequence[Measurement],
-    known: Mapping[str, float],
-) -> _Before:
-    """Return what is known before images; see `Information.from_prior`.
+def _before_images(planned: PlannedCalibration, images: PlannedImages, q: Array) -> _Before:
+    """Return what is known before images at configurations like q, shape (m, n).
 
     Existing images are linearized at the nominal robot: a plan does not depend on their measured values.
     """
-    robot_sets, rig_sets = split_sets(parameters if parameters is not None else DEFAULT_SETS)
-    errors = select_parameters(chain, robot_sets, fix, free) if robot_sets or free else ErrorModel(chain, ())
-    x, weights = np.zeros(len(errors.parameters)), prior_weights(errors, priors)
-    instrument = CameraInstrument(images, noise or Noise())
+    chain = planned.chain
+    robot_sets, rig_sets = split_sets(planned.parameters if planned.parameters is not None else DEFAULT_SETS)
+    errors = ErrorModel(chain, ())
+    if robot_sets or planned.free:
+        errors = select_parameters(chain, robot_sets, planned.fix, planned.free)
+    x, weights = np.zeros(len(errors.parameters)), prior_weights(errors, planned.priors)
+    instrument = CameraInstrument(images, planned.noise or Noise())
     template = instrument.template(chain, q)
-    values = held_values([template], rig_sets) | dict(known)
-    if not data:
+    values = held_values([template], rig_sets) | dict(planned.known)
+    if not planned.data:
         return _Before(errors, x, 1 / weights, instrument, template, values)
-    existing = tuple(instrument.existing(item, chain) for item in data)
+    existing = tuple(instrument.existing(item, chain) for item in planned.data)
     problem = make_problem(errors, existing, weights, values)
     differences = np.zeros(len(problem.instrument_parameters))
     values = problem.instruments(np.concatenate([x, differences]))

@@ -42,7 +42,7 @@ from .exchange import (
     improve_by_exchange,
     select_greedily,
 )
-from .information import Information, add_joint_scatter
+from .information import Information, PlannedCalibration, add_joint_scatter
 from .refinement import DesignGoal, refine
 from .tour import find_tour
 from .view_sampler import ViewSampler
@@ -283,9 +283,10 @@ def plan(
                 f"criterion {criterion!r}: only revolute joints have correction curves, and the robot has no "
                 "revolute joint"
             )
-    full_information = Information.from_prior(
-        chain, q, kind, noise, sets, priors, fix, free, data, known, omitted_sets, prior_uncertainty, images
+    planned = PlannedCalibration(
+        chain, kind, noise, sets, priors, fix, free, data, known or {}, prior_uncertainty, images
     )
+    full_information = Information.from_prior(planned, q, omitted_sets)
     information = full_information.without_omitted()
     coordinates = scale_joint_units(chain, q)
     existing = np.concatenate(
@@ -352,21 +353,7 @@ def plan(
     next(phases)
     curves = ()
     if fills_bins:
-        curve_information = Information.from_prior(
-            chain,
-            q,
-            kind,
-            noise,
-            parameters,
-            priors,
-            fix,
-            free,
-            data,
-            known,
-            (CURVES,),
-            prior_uncertainty,
-            images,
-        )
+        curve_information = Information.from_prior(replace(planned, parameters=parameters), q, (CURVES,))
         plans = _plans_of_sizes(goal, candidate_set, q, greedy, refined)
         measured = np.concatenate([q[:0], *(item.configurations() for item in data)])
         curves = predict_curves(curve_information, plans, measured, q[~candidate_set.infeasible])

@@ -16,7 +16,7 @@ from dhcal_pin.estimation.priors import prior_weights
 from dhcal_pin.io import read_robot
 from dhcal_pin.measurements import CameraCorners, Noise, mount_rig, project_board
 from dhcal_pin.measurements.mounting import MountedRig
-from dhcal_pin.planning import Information, PlannedImages, plan
+from dhcal_pin.planning import Information, PlannedCalibration, PlannedImages, plan
 from dhcal_pin.planning.instruments import CameraInstrument
 from dhcal_pin.planning.view_sampler import ViewSampler
 from dhcal_pin.planning.views import draw_views
@@ -125,7 +125,7 @@ def test_rows_are_those_of_the_solver():
     arm, rig = setup("ur10-wrist")
     images = PlannedImages(rig, min_share=0.6)
     q = sampler(arm, images).draw(6, np.random.default_rng(0))
-    information = Information.from_prior(arm, q, "camera", NOISE, images=images)
+    information = Information.from_prior(PlannedCalibration(arm, "camera", NOISE, images=images), q)
     rows = information.rows(q)
     poses = rig.board_in_camera(0, 0, arm.poses(q))
     pixels, _ = project_board(rig, 0, 0, poses)
@@ -152,7 +152,7 @@ def test_displacements_are_derivatives(name):
     arm, rig = setup(name)
     q = np.random.default_rng(1).uniform(*joint_range(arm), (3, arm.n_joints))
     images = PlannedImages(rig)
-    information = Information.from_prior(arm, q, "camera", NOISE, images=images)
+    information = Information.from_prior(PlannedCalibration(arm, "camera", NOISE, images=images), q)
     instrument = information.instrument
     assert isinstance(instrument, CameraInstrument)
     by_errors, by_instrument = instrument.displacements(information._model, q)

@@ -15,7 +15,7 @@ from dhcal_pin.estimation.qr import append_priors
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import read_robot, read_uncertainty, write_urdf
 from dhcal_pin.measurements import KINDS, Noise
-from dhcal_pin.planning import Information, plan
+from dhcal_pin.planning import Information, PlannedCalibration, plan
 from dhcal_pin.planning.criteria import DOptimality
 from dhcal_pin.planning.exchange import (
     CandidateSet,
@@ -289,22 +289,28 @@ def test_uncertainty_of_a_calibrated_robot_replaces_its_measurements(tmp_path):
     beside = plan(chain, 10, parameters=SETS, data=[old], **options)
     found = plan(calibrated, 10, parameters=SETS, prior_uncertainty=prior_uncertainty, **options)
     assert found.error == pytest.approx(beside.error, rel=0.03)
-    none = Information.from_prior(calibrated, task, "pose", NOISE, SETS, prior_uncertainty=prior_uncertainty)
+    none = Information.from_prior(
+        PlannedCalibration(calibrated, "pose", NOISE, SETS, prior_uncertainty=prior_uncertainty), task
+    )
     before = np.sqrt(np.mean(calibrate(chain, old, SETS).predict(task).position_std ** 2))
     empty = np.zeros((0, 6, len(none.prior_sigma)))
     assert none.predict_error(empty, none.task_combinations(task)) == pytest.approx(before, rel=1e-6)
     assert found.error < 0.5 * before
     # Six parameters per joint give the same error; parameters that were not estimated keep their prior.
     wide = Information.from_prior(
-        calibrated, task, "pose", NOISE, "placement,base,tool", prior_uncertainty=prior_uncertainty
+        PlannedCalibration(
+            calibrated, "pose", NOISE, "placement,base,tool", prior_uncertainty=prior_uncertainty
+        ),
+        task,
     )
     empty = np.zeros((0, 6, len(wide.prior_sigma)))
     assert wide.predict_error(empty, wide.task_combinations(task)) == pytest.approx(before, rel=1e-6)
     gain = Information.from_prior(
-        calibrated, task, "pose", NOISE, f"{SETS},gain", prior_uncertainty=prior_uncertainty
+        PlannedCalibration(calibrated, "pose", NOISE, f"{SETS},gain", prior_uncertainty=prior_uncertainty),
+        task,
     )
     empty = np.zeros((0, 6, len(gain.prior_sigma)))
-    prior = Information.from_prior(calibrated, task, "pose", NOISE, "gain")
+    prior = Information.from_prior(PlannedCalibration(calibrated, "pose", NOISE, "gain"), task)
     alone = prior.predict_error(np.zeros((0, 6, 6)), prior.task_combinations(task))
     assert gain.predict_error(empty, gain.task_combinations(task)) == pytest.approx(
         np.hypot(before, alone), rel=0.01
