@@ -1,12 +1,17 @@
-"""Focal lengths and image centre from several views of a flat board (Zhang 2000).
+"""Focal lengths and image centre from several views of a board.
 
-Each homography H = λ·K·[r1 r2 t] of a view gives two linear equations in ω = K⁻ᵀ·K⁻¹, because the columns
-r1 and r2 are orthonormal:
+Two methods give estimates; the one whose poses of the board leave the smaller error in the images is taken.
 
-    h1ᵀ·ω·h2 = 0,    h1ᵀ·ω·h1 = h2ᵀ·ω·h2.
+1. Views of a flat board (Zhang 2000). Each homography H = λ·K·[r1 r2 t] of a view gives two linear equations
+   in ω = K⁻ᵀ·K⁻¹, because the columns r1 and r2 are orthonormal:
 
-Without skew ω has five unknowns up to a factor, so three views determine it. If the result is not plausible,
-the centre of the image is taken as image centre, and only the focal length is estimated.
+       h1ᵀ·ω·h2 = 0,    h1ᵀ·ω·h1 = h2ᵀ·ω·h2.
+
+   Without skew ω has five unknowns up to a factor, so three views determine it. If the result is not
+   plausible, the centre of the image is taken as image centre, and only the focal length is estimated.
+2. Views of any board. The pose of the board in each view is estimated for many focal lengths, with the centre
+   of the image as image centre. The focal length with the smallest error in the images is taken if half of it
+   and twice of it explain the images significantly worse.
 
 Reference: Z. Zhang, A Flexible New Technique for Camera Calibration, IEEE PAMI 22, 2000.
 """
@@ -19,7 +24,8 @@ import numpy as np
 
 from .._typing import Array
 from ..exceptions import NotObservableError
-from .pose_from_points import direct_linear_transform
+from .pose_from_points import FLATNESS, direct_linear_transform, estimate_pose
+from .rig import Camera
 
 # Smallest number of views.
 MIN_VIEWS = 3
@@ -27,18 +33,24 @@ MIN_VIEWS = 3
 MIN_FOCAL, MAX_FOCAL, MAX_ASPECT = 0.2, 20.0, 1.5
 # Largest plausible distance of the image centre from the middle, as a fraction of the side of the image.
 MAX_SHIFT = 0.25
+# Focal lengths that are tried first, as multiples of the larger side of the image; twice or half of each is
+# among them. Each refinement halves their distance.
+_FOCAL_LENGTHS = MIN_FOCAL * 2 ** np.arange(0, 6.5, 0.5)
+_N_REFINEMENTS = 4
+# Largest number of views for which poses are estimated.
+_MAX_VIEWS = 12
+# Smallest increase of the sum of squares at half and at twice the focal length, in variances of the noise.
+_MIN_INCREASE = 25.0
 
 
 def estimate_intrinsics(
-    views: Sequence[tuple[Array, Array]], width: int, height: int, camera: str
+    views: Sequence[tuple[Array, Array]], camera: Camera
 ) -> tuple[float, float, float, float]:
     """Estimate the focal lengths and the image centre of a camera without distortion.
 
     Args:
-        views: Flat points, shape (m, 2) [m], and their pixels, shape (m, 2), of each view.
-        width: Width of the images [px].
-        height: Height of the images [px].
-        camera: Name of the camera, for messages.
+        views: Points of a board, shape (m, 3) [m], and their pixels, shape (m, 2), of each view.
+        camera: Camera: its lens model, the size of its images and its name.
 
     Returns:
         fx, fy, cx, cy [px].
@@ -46,27 +58,92 @@ def estimate_intrinsics(
     Raises:
         NotObservableError: There are too few views, or they do not determine the focal length.
     """
-    homographies = [direct_linear_transform(points, pixels) for points, pixels in views if len(points) >= 4]
-    if len(homographies) < MIN_VIEWS:
+    views = [view for view in views if len(view[0]) >= 4]
+    if len(views) < MIN_VIEWS:
         raise NotObservableError(
-            f"camera {camera!r}: {len(homographies)} images of a flat board; expected at least {MIN_VIEWS} "
-            "for intrinsics that the rig file does not state"
+            f"camera {camera.name!r}: {len(views)} images of a board with at least 4 corners; expected at "
+            f"least {MIN_VIEWS} for intrinsics that the rig file does not state"
         )
+    chosen = np.unique(np.linspace(0, len(views) - 1, _MAX_VIEWS).astype(int))
+    some = [views[i] for i in chosen]
+    candidates = [each for each in (_from_homographies(views, camera), _search(some, camera)) if each]
+    if not candidates:
+        raise NotObservableError(
+            f"camera {camera.name!r}: the images do not determine its focal length; expected images of the "
+            "board tilted in different directions, or fx, fy, cx, cy in the rig file"
+        )
+    return min(candidates, key=lambda values: _square_sum(some, camera, values))
+
+
+def _square_sum(
+    views: Sequence[tuple[Array, Array]], camera: Camera, values: tuple[float, float, float, float]
+) -> float:
+    """Return the sum of squares of the errors in the images [px²] of the poses of the board in all views."""
+    lens = np.pad(values, (0, len(camera.values) - 4))
+    total = 0.0
+    for points, pixels in views:
+        estimate = estimate_pose(points, camera.lens.normalize(pixels.T, lens).T)
+        if estimate is not None:
+            pose = estimate[0]
+            local = pose[:3, :3] @ points.T + pose[:3, 3:4]
+            total += float(np.sum((camera.lens.project(local, lens)[0].T - pixels) ** 2))
+    return total
+
+
+def _search(views: Sequence[tuple[Array, Array]], camera: Camera) -> tuple[float, float, float, float] | None:
+    """Search the focal length with the smallest error in the images; None if others explain them as well."""
+    size = max(camera.width, camera.height)
+
+    def values(focal: float) -> tuple[float, float, float, float]:
+        return size * focal, size * focal, *camera.image_centre.tolist()
+
+    sums = np.array([_square_sum(views, camera, values(focal)) for focal in _FOCAL_LENGTHS])
+    best = int(np.argmin(sums))
+    if not 2 <= best < len(sums) - 2:
+        return None
+    n_rows = sum(2 * len(points) for points, _ in views)
+    variance = sums[best] / max(n_rows - 6 * len(views), 1)
+    if min(sums[best - 2], sums[best + 2]) - sums[best] < _MIN_INCREASE * variance:
+        return None
+    focal, least, ratio = float(_FOCAL_LENGTHS[best]), float(sums[best]), 2**0.5
+    for _ in range(_N_REFINEMENTS):
+        ratio **= 0.5
+        for trial in (focal / ratio, focal * ratio):
+            square_sum = _square_sum(views, camera, values(trial))
+            if square_sum < least:
+                focal, least = trial, square_sum
+    return values(focal)
+
+
+def _from_homographies(
+    views: Sequence[tuple[Array, Array]], camera: Camera
+) -> tuple[float, float, float, float] | None:
+    """Solve for the intrinsics from views of flat boards; None if they do not determine them."""
+    flat = [(plane, pixels) for points, pixels in views if (plane := _in_plane(points)) is not None]
+    if len(flat) < MIN_VIEWS:
+        return None
+    width, height = camera.width, camera.height
     # Pixels relative to the middle of the image, in units of its larger side.
     size = float(max(width, height))
     shift = np.array(
         [[1 / size, 0, -(width - 1) / 2 / size], [0, 1 / size, -(height - 1) / 2 / size], [0, 0, 1]]
     )
-    scaled = [shift @ homography for homography in homographies]
+    scaled = [shift @ direct_linear_transform(points, pixels) for points, pixels in flat]
     for estimate in (_with_centre, _without_centre):
         values = estimate(scaled)
         if values is not None and _is_plausible(values, width / size, height / size):
             fx, fy, cx, cy = values
             return size * fx, size * fy, size * cx + (width - 1) / 2, size * cy + (height - 1) / 2
-    raise NotObservableError(
-        f"camera {camera!r}: the images do not determine its focal length; expected images of the board "
-        "tilted in different directions, or fx, fy, cx, cy in the rig file"
-    )
+    return None
+
+
+def _in_plane(points: Array) -> Array | None:
+    """Return points (m, 3) in their plane, (m, 2); None if they are not flat or in one line."""
+    centred = points - points.mean(0)
+    _, extent, axes = np.linalg.svd(centred, full_matrices=False)
+    if extent[2] > FLATNESS * extent[0] or extent[1] <= FLATNESS * extent[0]:
+        return None
+    return centred @ axes[:2].T
 
 
 def _products(homography: Array, i: int, j: int) -> Array:

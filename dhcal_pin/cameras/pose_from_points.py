@@ -1,9 +1,10 @@
 """Poses of boards from single images (perspective-n-point), without a guess.
 
-1. The closed form gives a first pose: the direct linear transformation of a homography for flat boards, with
-   both of the poses that explain a flat board about equally well, or of a projection matrix for six or more
-   points that are not in one plane (Hartley and Zisserman 2004, sections 4.1 and 7.1).
-2. Gauss-Newton steps with damping minimize the distances in the image.
+1. Closed forms give first poses: the direct linear transformation of the homography of the plane nearest to
+   the points, with both of the poses that explain a flat board about equally well, and that of a projection
+   matrix for six or more points that are not in one plane (Hartley and Zisserman 2004, sections 4.1 and 7.1).
+   The projection matrix of points near a plane is hardly determined, so both forms are tried for them.
+2. Gauss-Newton steps with damping minimize the distances in the image. The best of these poses is taken.
 
 All image coordinates are undistorted, X/Z and Y/Z.
 
@@ -18,8 +19,9 @@ import numpy as np
 from .. import se3
 from .._typing import Array
 
-# Ratio of the smallest to the largest extent below which points count as flat.
-FLATNESS = 1e-3
+# Ratio of the smallest to the largest extent below which points count as flat, and as nearly flat: the
+# homography of the nearest plane then describes their image to about this part of its size.
+FLATNESS, NEAR_FLATNESS = 1e-3, 0.1
 # Smallest number of points of a flat and of another set.
 MIN_FLAT_POINTS, MIN_POINTS = 4, 6
 # Steps of the refinement, and the first damping.
@@ -68,7 +70,7 @@ def direct_linear_transform(source: Array, target: Array) -> Array:
             np.column_stack([zero, points, -image[:, 1:2] * points]),
         ]
     )
-    solution = np.linalg.svd(rows)[2][-1].reshape(3, -1)
+    solution = np.linalg.svd(rows, full_matrices=len(rows) < rows.shape[1])[2][-1].reshape(3, -1)
     return np.linalg.solve(normalize_target, solution @ normalize_source)
 
 
@@ -86,13 +88,14 @@ def agreeing_points(points: Array, image: Array) -> Array:
     if len(points) <= MIN_FLAT_POINTS:
         return everything
     centre = points.mean(0)
-    _, extent, axes = np.linalg.svd(points - centre)
-    is_flat = extent[2] <= FLATNESS * extent[0]
+    _, extent, axes = np.linalg.svd(points - centre, full_matrices=False)
+    is_flat = extent[2] <= NEAR_FLATNESS * extent[0]
     least = MIN_FLAT_POINTS if is_flat else MIN_POINTS
     if extent[1] <= FLATNESS * extent[0] or len(points) <= least:
         return everything
     source = ((points - centre) @ axes.T)[:, : 2 if is_flat else 3]
-    limit = _GOOD_RATIO * float(np.median(np.linalg.norm(image - np.median(image, 0), axis=1)))
+    ratio = _GOOD_RATIO + (extent[2] / extent[0] if is_flat else 0.0)
+    limit = ratio * float(np.median(np.linalg.norm(image - np.median(image, 0), axis=1)))
     if np.sqrt(np.mean(_transfer_distances(source, image, everything) ** 2)) <= limit:
         return everything
     rng = np.random.default_rng(0)
@@ -127,18 +130,18 @@ def estimate_pose(points: Array, image: Array) -> tuple[Array, float] | None:
     if len(points) < MIN_FLAT_POINTS:
         return None
     centre = points.mean(0)
-    _, extent, axes = np.linalg.svd(points - centre, full_matrices=True)
+    _, extent, axes = np.linalg.svd(points - centre, full_matrices=False)
     if extent[1] <= FLATNESS * extent[0]:
         return None
-    if extent[2] > FLATNESS * extent[0]:
-        if len(points) < MIN_POINTS:
-            return None
-        candidates = [_projection_pose(points, image)]
-    else:
-        axes[2] *= np.linalg.det(axes)
-        flat = (points - centre) @ axes.T
-        frame = se3.inverse(se3.transform(axes.T, centre))
-        candidates = [pose @ frame for pose in _flat_poses(flat[:, :2], image)]
+    is_flat = extent[2] <= FLATNESS * extent[0]
+    if not is_flat and len(points) < MIN_POINTS:
+        return None
+    axes[2] *= np.linalg.det(axes)
+    flat = (points - centre) @ axes.T
+    frame = se3.inverse(se3.transform(axes.T, centre))
+    candidates = [pose @ frame for pose in _flat_poses(flat[:, :2], image)]
+    if not is_flat:
+        candidates.append(_projection_pose(points, image))
     refined = [_refine(pose, points, image) for pose in candidates]
     return min(refined, key=lambda each: each[1])
 

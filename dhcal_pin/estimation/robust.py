@@ -74,6 +74,8 @@ MAX_BETWEEN = 0.2
 MAD_TO_STD = 1.4826
 # Smallest variance of a whitened residual, relative to its noise; below it the fit reproduces the sample.
 MIN_VARIANCE = 1e-3
+# Smallest ratio of two variances of the residuals of a sample that rounding errors leave.
+ROUNDING = 1e-12
 # Stages without a weight function: search for good samples, which chooses the last stage
 # (`calibration.good_samples`), and unchanged weights.
 TRIMMED, KEPT = "trimmed", "kept"
@@ -159,7 +161,8 @@ def standardized_residuals(
     if covariances is None:
         return standardize_mean_squares(np.sum(residual**2, 0) / k, k, is_good)
     # A residual that the fit makes zero for any measured value must not be divided by its variance.
-    regularized = covariances + MIN_VARIANCE * np.eye(k)
+    trace = np.trace(covariances, axis1=1, axis2=2)
+    regularized = covariances + np.fmax(MIN_VARIANCE, ROUNDING * trace)[:, None, None] * np.eye(k)
     return standardize_mean_squares(
         np.sum(residual.T * np.linalg.solve(regularized, residual.T[..., None])[..., 0], 1) / k, k, is_good
     )

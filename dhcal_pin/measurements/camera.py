@@ -45,7 +45,7 @@ from .images.camera_parameters import (
     camera_parameters,
     rig_parameters,
 )
-from .images.camera_start import first_values
+from .images.camera_start import BoardViews, estimate_views, first_values
 from .mounting import MountedRig, mount_rig
 from .validation import validated_array, validated_joint_positions, validated_sigma
 
@@ -487,6 +487,17 @@ class CameraCorners(Measurement):
         if all(np.isfinite(p.nominal) for p in self.instrument_parameters):
             return self
         return self.with_values(first_values(self, chain))
+
+    def initialized_from(self, chain: Chain, is_used: Array) -> Self:
+        """Return a copy with first values from some of the images."""
+        if all(np.isfinite(p.nominal) for p in self.instrument_parameters):
+            return self
+        return self.with_values(first_values(self, chain, is_used))
+
+    @cached_property
+    def board_views(self) -> BoardViews:
+        """Poses of the boards in the cameras, from each image alone."""
+        return estimate_views(self)
 
     def with_scaled_sigma(self, scales: Mapping[str, float]) -> Self:
         """Return a copy with multiplied standard deviations."""

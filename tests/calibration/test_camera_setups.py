@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import camera_setups
 import numpy as np
 import pytest
 from camera_setups import ARMS, random_setup, simulate
@@ -9,7 +12,9 @@ from camera_setups import ARMS, random_setup, simulate
 import dhcal_pin as dh
 from dhcal_pin import select_parameters
 from dhcal_pin.calibration.evaluation import compute_errors
+from dhcal_pin.cameras import Board
 from dhcal_pin.estimation.qr import posterior_sqrt_covariance
+from dhcal_pin.measurements import CameraCorners
 
 
 def image_rms(fit, data):
@@ -38,6 +43,34 @@ def test_setups_converge_without_a_guess(seed):
 @pytest.mark.parametrize("seed", range(24, 200))
 def test_all_setups_converge_without_a_guess(seed):
     converges(seed)
+
+
+@pytest.mark.parametrize(("depth", "is_lens_known"), [(1e-3, False), (5e-3, True)])
+def test_boards_of_points_near_a_plane_converge_without_a_guess(depth, is_lens_known, monkeypatch):
+    """Points of a board with a depth of some millimetres, with and without focal lengths in the rig."""
+
+    def board(rng, name, link):
+        points = rng.uniform(-0.1, 0.1, (16, 3)) * [1, 1, 5 * depth]
+        return Board(name, link, "points", listed_points=points)
+
+    monkeypatch.setattr(camera_setups, "make_board", board)
+    arm = ARMS["ur10"]()
+    setup = simulate(arm, arm, np.random.default_rng(5), is_on_wrist=True, n_images=15, sigma=0.2)
+    images, rig = setup.images, setup.images.rig
+    if not is_lens_known:
+        camera = replace(rig.cameras[0], values=np.array([np.nan] * 4 + [0.0] * 5))
+        images = CameraCorners(images.q, images.values, images.corner, replace(rig, cameras=(camera,)))
+    fit = dh.calibrate(arm, images, "camera,board,intrinsics", loss="linear")
+    assert image_rms(fit, images) < 1.1 * setup.sigma
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 8))])
+def test_few_images_of_two_cameras_and_two_boards_converge(seed):
+    """Images with many corners are more than the samples that the search for outliers draws."""
+    rng, arm = np.random.default_rng(seed), ARMS["ur10"]()
+    setup = simulate(arm, arm, rng, is_on_wrist=False, n_images=12, sigma=0.2, n_cameras=2, n_boards=2)
+    fit = dh.calibrate(arm, setup.images)
+    assert image_rms(fit, setup.images) < 1.1 * setup.sigma
 
 
 def true_values(setup, truth_errors, fit):

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from dhcal_pin import se3
-from dhcal_pin.cameras import LENSES, Board, estimate_intrinsics, estimate_pose, solve_hand_eye
+from dhcal_pin.cameras import LENSES, Board, Camera, estimate_intrinsics, estimate_pose, solve_hand_eye
+from dhcal_pin.cameras.pose_from_points import agreeing_points
 from dhcal_pin.exceptions import NotObservableError
 
+CAMERA = Camera("c", "world", 1280, 720, np.array([np.nan] * 4 + [0.0] * 5))
 CHECKERBOARD = Board("b", "world", "checkerboard", columns=8, rows=6, square=0.03).points
 
 
@@ -63,22 +65,72 @@ def test_rotations_about_one_axis_are_refused():
         solve_hand_eye(links, links, "camera 'c' and board 'b'")
 
 
-def views(rng, count):
+@pytest.mark.parametrize("count", [6, 8, 24])
+@pytest.mark.parametrize("depth", [0.0, 1e-4, 1e-3, 5e-3, 2e-2])
+def test_pose_of_points_near_a_plane(depth, count):
+    """The pose explains the image as well as the true one, and is near it, for any depth."""
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        points = rng.uniform(-0.1, 0.1, (count, 3)) * [1, 1, 5 * depth]
+        pose = random_pose(rng)
+        local = points @ pose[:3, :3].T + pose[:3, 3]
+        exact = local[:, :2] / local[:, 2:]
+        image = exact + 2e-4 * rng.standard_normal(exact.shape)
+        estimate = estimate_pose(points, image)
+        assert estimate is not None
+        assert estimate[1] <= np.sqrt(np.mean(np.sum((image - exact) ** 2, 1)))
+        assert np.linalg.norm(se3.log3(estimate[0][:3, :3].T @ pose[:3, :3])) < 0.1
+
+
+@pytest.mark.parametrize("depth", [0.0, 1e-3, 2e-2])
+def test_wrong_points_near_a_plane_do_not_agree(depth):
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        points = rng.uniform(-0.1, 0.1, (24, 3)) * [1, 1, 5 * depth]
+        pose = random_pose(rng)
+        local = points @ pose[:3, :3].T + pose[:3, 3]
+        image = local[:, :2] / local[:, 2:]
+        image[:3] += [0.2, 0.1]
+        agrees = agreeing_points(points, image)
+        assert not agrees[:3].any()
+        assert agrees[3:].mean() > 0.9
+
+
+def views(rng, count, points=CHECKERBOARD):
     values = np.array([640.0, 660.0, 650.0, 350.0, 0, 0, 0, 0, 0])
     out = []
     for _ in range(count):
         pose = random_pose(rng)
-        local = CHECKERBOARD @ pose[:3, :3].T + pose[:3, 3]
-        out.append((CHECKERBOARD[:, :2], LENSES["pinhole"].project(local.T, values)[0].T))
+        local = points @ pose[:3, :3].T + pose[:3, 3]
+        out.append((points, LENSES["pinhole"].project(local.T, values)[0].T))
     return values, out
 
 
 def test_intrinsics_from_views_of_a_board():
     values, seen = views(np.random.default_rng(1), 6)
-    np.testing.assert_allclose(estimate_intrinsics(seen, 1280, 720, "c"), values[:4], rtol=1e-6)
+    np.testing.assert_allclose(estimate_intrinsics(seen, CAMERA), values[:4], rtol=1e-6)
+
+
+@pytest.mark.parametrize("depth", [1e-3, 2e-2, 0.2])
+def test_focal_length_from_views_of_points_that_are_not_flat(depth):
+    """The image centre is taken for the middle of the image: the focal length is approximate."""
+    rng = np.random.default_rng(2)
+    values, seen = views(rng, 6, rng.uniform(-0.1, 0.1, (20, 3)) * [1, 1, 5 * depth])
+    np.testing.assert_allclose(estimate_intrinsics(seen, CAMERA)[:2], values[:2], rtol=0.1)
+
+
+def test_views_without_tilt_do_not_determine_the_focal_length():
+    points = CHECKERBOARD - CHECKERBOARD.mean(0)
+    rng = np.random.default_rng(0)
+    seen = [
+        (points, 640 / depth * points[:, :2] + [640, 360] + 0.1 * rng.standard_normal((len(points), 2)))
+        for depth in (0.5, 0.7, 0.9)
+    ]
+    with pytest.raises(NotObservableError, match="do not determine its focal length"):
+        estimate_intrinsics(seen, CAMERA)
 
 
 def test_intrinsics_need_three_views():
     _, seen = views(np.random.default_rng(1), 2)
-    with pytest.raises(NotObservableError, match="2 images of a flat board; expected at least 3"):
-        estimate_intrinsics(seen, 1280, 720, "c")
+    with pytest.raises(NotObservableError, match=r"2 images of a board .* expected at least 3"):
+        estimate_intrinsics(seen, CAMERA)

@@ -267,3 +267,11 @@ def test_pearsons_test_of_squares():
             assert not is_chi_square(mixture / mixture.mean(), k)
     # Pearson's statistic exceeds the limit in 1.8 % of the cases, 7.2 of 400.
     assert 380 <= np.sum(passed) <= 399
+
+
+def test_samples_whose_residuals_are_hardly_determined_have_standardized_residuals():
+    """A fit that leaves a direction of a sample undetermined makes its covariance singular in rounding."""
+    direction = np.array([0.6, 0.8])
+    covariances = np.eye(2) + 1e20 * np.outer(direction, direction) * np.ones((5, 1, 1))
+    t = standardized_residuals(np.arange(10.0).reshape(2, 5), covariances)
+    assert np.isfinite(t).all()

@@ -60,7 +60,7 @@ class LinearizedRows:
         row_classes: Class of each residual of each measurement, shape (k,) each.
         gram: Products BᵀB of each block, shape (b, u·u).
         right: Products Bᵀr of each block, shape (b, u).
-        squares: Products rᵀr of each block, shape (b,).
+        groups: Residuals of each measurement that make a block of each sample.
         counts: Number of rows of each block, shape (b,).
         sample: Sample of each block, shape (b,).
         noise_class: Class of each block, shape (b,); all numbers from 0 to c-1 occur.
@@ -74,7 +74,7 @@ class LinearizedRows:
     row_classes: tuple[Array, ...]
     gram: Array
     right: Array
-    squares: Array
+    groups: tuple[tuple[slice, ...], ...]
     counts: Array
     sample: Array
     noise_class: Array
@@ -135,8 +135,12 @@ class LinearizedRows:
         Returns:
             Sums, shape (a, b).
         """
-        products = np.einsum("au,av->auv", y, y).reshape(len(y), -1)
-        return np.fmax(self.squares - 2 * y @ self.right.T + products @ self.gram.T, 0.0)
+        out = []
+        for item, groups in zip(self.items, self.groups, strict=True):
+            residual = item[-1].ravel() - y @ item[:-1].reshape(y.shape[1], -1)
+            squares = residual.reshape(-1, *item.shape[1:]) ** 2
+            out += [squares[:, group].sum(1) for group in groups]
+        return np.concatenate(out, 1)
 
     def noise_scales(self, squares: Array, inliers: Array | None = None) -> Array:
         """Estimate the noise scale of each class by the median of its blocks.
@@ -230,7 +234,6 @@ def linearize_rows(problem: Problem, x: Array, root: Array) -> LinearizedRows:
                 (
                     np.einsum("ukm,vkm->muv", b, b, optimize=True).reshape(m, u * u),
                     np.einsum("ukm,km->mu", b, r),
-                    np.sum(r**2, 0),
                     np.full(m, len(r)),
                     first + np.arange(m),
                     np.full(m, classes[label]),
@@ -239,14 +242,14 @@ def linearize_rows(problem: Problem, x: Array, root: Array) -> LinearizedRows:
         items.append(rows)
         row_classes.append(row_class)
         first += m
-    gram, right, squares, counts, sample, noise_class = map(np.concatenate, zip(*blocks, strict=True))
+    gram, right, counts, sample, noise_class = map(np.concatenate, zip(*blocks, strict=True))
     prior = problem.weights[:, None] * root
     return LinearizedRows(
         tuple(items),
         tuple(row_classes),
         gram,
         right,
-        squares,
+        tuple(tuple(item.residual_groups.values()) if len(item.rows) else () for item in problem.data),
         counts,
         sample,
         noise_class,
@@ -345,7 +348,7 @@ def _random_subsets(rows: LinearizedRows, groups: Array, n_determined: int) -> A
         Weights of the samples, shape (a, m).
     """
     u, m = len(rows.prior_right), rows.n_samples
-    work = len(rows.squares) * u * u
+    work = len(rows.counts) * u * u
     n_starts = int(np.clip(MAX_MULTIPLICATIONS / work, MIN_STARTS, MAX_STARTS))
     rng = np.random.default_rng(0)
     size = min(m, int(np.ceil(n_determined * m / rows.counts.sum())) + 1)

@@ -60,13 +60,10 @@ def camera_parameters(camera: Camera) -> list[InstrumentParameter]:
     out = pose_parameters(f"camera_{camera.name}", camera.pose)
     if camera.intrinsics != "fixed":
         for i, (name, value) in enumerate(zip(camera.lens.names, camera.values, strict=True)):
-            priors = PIXEL_PRIORS if i < 4 else DISTORTION_PRIORS
-            unit = "px" if i < 4 else "1"
-            out.append(
-                InstrumentParameter(
-                    f"camera_{camera.name}.{name}", unit, float(value), priors[camera.intrinsics]
-                )
-            )
+            # Values that are estimated from the same images are no prior knowledge.
+            pixel_prior = PIXEL_PRIORS[camera.intrinsics if camera.has_intrinsics else "free"]
+            unit, prior = ("px", pixel_prior) if i < 4 else ("1", DISTORTION_PRIORS[camera.intrinsics])
+            out.append(InstrumentParameter(f"camera_{camera.name}.{name}", unit, float(value), prior))
     return out
 
 

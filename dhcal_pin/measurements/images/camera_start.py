@@ -1,6 +1,6 @@
 """First values of cameras and boards from the images alone, without a guess.
 
-1. Focal lengths and image centres that the rig does not state, from the views of flat boards (Zhang 2000).
+1. Focal lengths and image centres that the rig does not state, from the views of boards.
 2. The pose of each board in each image.
 3. The poses of cameras and boards on the robot, pair by pair: the pair of camera and board with the most
    images in closed form (Shah 2013); then every further camera that sees a known board, and every further
@@ -9,12 +9,13 @@
 A pose that is stated in the rig is used as it is.
 
 The pose of a board in an image depends on that image alone. It is remembered, as a robust start estimates
-first values from many subsets of the same images.
+first values from many subsets of the same images; so are the focal lengths of a measurement.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, TypeVar
 
@@ -25,7 +26,7 @@ from ..._typing import Array
 from ...cameras.boards import Board
 from ...cameras.hand_eye import mean_pose, solve_hand_eye
 from ...cameras.intrinsics import estimate_intrinsics
-from ...cameras.pose_from_points import FLATNESS, agreeing_points, estimate_pose
+from ...cameras.pose_from_points import agreeing_points, estimate_pose
 from ...cameras.rig import Camera
 from ...exceptions import NotObservableError
 from ...robot.chain import Chain
@@ -57,12 +58,72 @@ def _remember(function: Callable[[Array, Array], _R]) -> Callable[[Array, Array]
 _agreeing_points, _estimate_pose = _remember(agreeing_points), _remember(estimate_pose)
 
 
-def first_values(item: CameraCorners, chain: Chain) -> dict[str, float]:
+@dataclass(frozen=True, eq=False)
+class BoardViews:
+    """Boards in images, each from its image alone: the joint values have no influence.
+
+    Attributes:
+        lenses: Values of the lens of each camera, estimated if the rig does not state them.
+        sample: First sample of each view of a board, (v,).
+        poses: Pose of the board in the camera, (v, 4, 4) [m].
+        rms: RMS distance of its corners in the image, X/Z and Y/Z, (v,).
+    """
+
+    lenses: list[Array]
+    sample: Array
+    poses: Array
+    rms: Array
+
+
+def estimate_views(item: CameraCorners) -> BoardViews:
+    """Estimate the lenses that the rig does not state, and the pose of each board in each image.
+
+    Args:
+        item: Image coordinates.
+
+    Returns:
+        Views of boards whose corners determine a pose.
+
+    Raises:
+        NotObservableError: The images do not determine the focal length of a camera.
+    """
+    images = _images(item)
+    lenses = []
+    for number, camera in enumerate(item.rig.cameras):
+        lens = camera.values.copy()
+        if not camera.has_intrinsics:
+            views = [
+                (item.rig.boards[item.board[samples[0]]].points[item.corner[samples]], item.values[samples])
+                for samples in images
+                if item.camera[samples[0]] == number
+            ]
+            lens[:4] = estimate_intrinsics(views, camera)
+            lens[4:] = 0.0
+        lenses.append(lens)
+    found: list[tuple[int, Array, float]] = []
+    for samples in images:
+        camera = int(item.camera[samples[0]])
+        points = item.rig.boards[item.board[samples[0]]].points[item.corner[samples]]
+        plane = item.rig.cameras[camera].lens.normalize(item.values[samples].T, lenses[camera]).T
+        estimate = _estimate_pose(points, plane)
+        if estimate is not None and np.isfinite(estimate[1]):
+            found.append((int(samples[0]), *estimate))
+    return BoardViews(
+        lenses,
+        np.array([view[0] for view in found], int),
+        np.array([view[1] for view in found]).reshape(-1, 4, 4),
+        np.array([view[2] for view in found]),
+    )
+
+
+def first_values(item: CameraCorners, chain: Chain, is_used: Array | None = None) -> dict[str, float]:
     """Estimate the first values of all parameters of cameras and boards.
 
     Args:
         item: Image coordinates.
         chain: Nominal chain with base and tool.
+        is_used: Whether the poses are estimated from each sample, (m,); all or none of an image. All samples
+            if None.
 
     Returns:
         Values by parameter name [m, rad, px or 1].
@@ -70,22 +131,17 @@ def first_values(item: CameraCorners, chain: Chain) -> dict[str, float]:
     Raises:
         NotObservableError: The images do not determine a pose.
     """
+    used = np.ones(len(item.rows), bool) if is_used is None else is_used
     values: dict[str, float] = {}
-    lenses = []
-    for number, camera in enumerate(item.rig.cameras):
-        lens = camera.values.copy()
+    views = item.board_views
+    for camera, lens in zip(item.rig.cameras, views.lenses, strict=True):
         if not camera.has_intrinsics:
-            lens[:4] = estimate_intrinsics(
-                _flat_views(item, number), camera.width, camera.height, camera.name
-            )
-            lens[4:] = 0.0
             names = [f"camera_{camera.name}.{name}" for name in camera.lens.names]
             values |= dict(zip(names, lens.tolist(), strict=True))
-        lenses.append(lens)
-    pairs = _board_poses(item, lenses, chain)
+    pairs = _board_poses(item, views, chain, used)
     cameras = _stated_poses(item.rig.cameras, item.rig.camera_mounts)
     boards = _stated_poses(item.rig.boards, item.rig.board_mounts)
-    _locate(item, pairs, cameras, boards)
+    _locate(item, used, pairs, cameras, boards)
     for prefix, poses, entries, mounts in (
         ("camera", cameras, item.rig.cameras, item.rig.camera_mounts),
         ("board", boards, item.rig.boards, item.rig.board_mounts),
@@ -119,49 +175,33 @@ def _agreeing(item: CameraCorners, samples: Array) -> Array:
     return _agreeing_points(board.points[item.corner[samples]], item.values[samples])
 
 
-def _flat_views(item: CameraCorners, camera: int) -> list[tuple[Array, Array]]:
-    """Return points (c, 2) and pixels (c, 2) of each image of a flat board by a camera."""
-    out = []
-    for samples in _images(item):
-        if item.camera[samples[0]] != camera:
-            continue
-        points = item.rig.boards[item.board[samples[0]]].points[item.corner[samples]]
-        centred = points - points.mean(0)
-        _, extent, axes = np.linalg.svd(centred, full_matrices=False)
-        if len(extent) == 3 and extent[2] <= FLATNESS * extent[0] and extent[1] > FLATNESS * extent[0]:
-            out.append((centred @ axes[:2].T, item.values[samples]))
-    return out
-
-
 # Poses of the links against each other (i, 4, 4) and of the board in the camera (i, 4, 4) by numbers of
 # camera and board.
 _Pairs = dict[tuple[int, int], tuple[Array, Array]]
 
 
-def _board_poses(item: CameraCorners, lenses: list[Array], chain: Chain) -> _Pairs:
-    """Estimate the pose of each board in each image; badly fitting images are left out."""
-    found: dict[tuple[int, int], list[tuple[Array, Array, float]]] = {}
-    for samples in _images(item):
-        camera, board = int(item.camera[samples[0]]), int(item.board[samples[0]])
-        points = item.rig.boards[board].points[item.corner[samples]]
-        image = item.rig.cameras[camera].lens.normalize(item.values[samples].T, lenses[camera]).T
-        estimate = _estimate_pose(points, image)
-        if estimate is not None and np.isfinite(estimate[1]):
-            tool = chain.poses(item.q[samples[:1]])[0]
-            link = se3.inverse(tool) if item.rig.camera_mounts[camera].moves else tool
-            found.setdefault((camera, board), []).append((link, *estimate))
+def _board_poses(item: CameraCorners, views: BoardViews, chain: Chain, used: Array) -> _Pairs:
+    """Collect the views of each pair of camera and board in the used samples, without badly fitting ones."""
+    is_chosen = used[views.sample]
+    samples, poses, rms = views.sample[is_chosen], views.poses[is_chosen], views.rms[is_chosen]
+    tools = chain.poses(item.q[samples])
     out: _Pairs = {}
-    for pair, images in found.items():
-        rms = np.array([image[2] for image in images])
-        good = rms <= max(_MAX_RATIO * float(np.median(rms)), _GOOD_RMS)
-        out[pair] = (
-            np.array([image[0] for image, use in zip(images, good, strict=True) if use]),
-            np.array([image[1] for image, use in zip(images, good, strict=True) if use]),
-        )
+    pairs = np.stack([item.camera[samples], item.board[samples]], 1)
+    for camera, board in dict.fromkeys(map(tuple, pairs.tolist())):
+        of_pair = np.flatnonzero(np.all(pairs == [camera, board], 1))
+        good = of_pair[rms[of_pair] <= max(_MAX_RATIO * float(np.median(rms[of_pair])), _GOOD_RMS)]
+        moves = item.rig.camera_mounts[camera].moves
+        out[camera, board] = (se3.inverse(tools[good]) if moves else tools[good]), poses[good]
     return out
 
 
-def _locate(item: CameraCorners, pairs: _Pairs, cameras: dict[int, Array], boards: dict[int, Array]) -> None:
+def _locate(
+    item: CameraCorners,
+    used: Array,
+    pairs: _Pairs,
+    cameras: dict[int, Array],
+    boards: dict[int, Array],
+) -> None:
     """Fill in the poses of cameras and boards in the frames of their ends."""
     rest = dict(pairs)
     while rest:
@@ -181,8 +221,8 @@ def _locate(item: CameraCorners, pairs: _Pairs, cameras: dict[int, Array], board
     missing = [
         f"{what} {entries[number].name!r}"
         for what, entries, used, known in (
-            ("camera", item.rig.cameras, item.camera, cameras),
-            ("board", item.rig.boards, item.board, boards),
+            ("camera", item.rig.cameras, item.camera[used], cameras),
+            ("board", item.rig.boards, item.board[used], boards),
         )
         for number in np.unique(used).tolist()
         if number not in known
