@@ -12,6 +12,7 @@ from .options import POSITIVE_INTEGER, RIG
 
 if TYPE_CHECKING:
     from .._typing import PathLike
+    from ..cameras import Camera
     from ..detection import BoardDetection
 
 EXAMPLE = "dhcal detect images --rig rig.toml --joints joints.csv -o corners.csv"
@@ -43,7 +44,10 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--camera", metavar="NAME", help="camera of the rig file; only needed if it has several"
     )
     parser.add_argument(
-        "--overlay", metavar="DIR", help="folder for pictures of the images with the corners that were found"
+        "--overlay",
+        metavar="DIR",
+        help="folder for pictures of the images: circles are the corners that were found, crosses those "
+        "reprojected with the board pose of this image and the camera of the rig",
     )
     parser.add_argument(
         "--jobs",
@@ -85,7 +89,7 @@ def run(args: Namespace) -> int:
     comments = [f"corners of boards in images of camera {camera.name}, found by dhcal detect"]
     contents: dict[PathLike, str | bytes] = {args.output: csv_text(columns, comments)}
     if args.overlay:
-        contents |= _overlays(args.overlay, detections, paths)
+        contents |= _overlays(args.overlay, camera, detections, paths)
     write_outputs(contents)
     written = [args.output, *([f"{args.overlay} ({len(paths)} pictures)"] if args.overlay else [])]
     console.show(detection_screen(rig, detections, notes, written), args.verbosity)
@@ -107,7 +111,7 @@ def _joints(args: Namespace, paths: Sequence[str]) -> tuple[dict[str, dict[str, 
 
 
 def _overlays(
-    folder: str, detections: Sequence[BoardDetection], paths: Sequence[str]
+    folder: str, camera: Camera, detections: Sequence[BoardDetection], paths: Sequence[str]
 ) -> Mapping[PathLike, str | bytes]:
     """Return the pictures of --overlay, whose folder is created."""
     from ..detection import overlay_files  # lazy import, as the following: they load OpenCV
@@ -116,7 +120,7 @@ def _overlays(
     if os.path.exists(folder) and not os.path.isdir(folder):
         raise InvalidArgumentError(f"--overlay {folder}: is a file; expected a folder")
     pictures: dict[PathLike, str | bytes] = {}
-    pictures.update(overlay_files(folder, detections))
+    pictures.update(overlay_files(folder, camera, detections))
     if len(pictures) < len(paths):
         raise InvalidArgumentError(
             f"--overlay {folder}: two images have the same name but for the ending; rename one of them"

@@ -12,14 +12,17 @@ from .images import BoardDetection, corner_columns, detect_boards, image_files, 
 from .overlays import overlay_files
 from .printing import black_rectangles, board_pdf
 from .rendering import ImageQuality, render_images
+from .reprojection import Reprojection, camera_with_intrinsics, reproject_corners
 
 __all__ = [
     "BoardDetection",
     "DetectedImage",
     "ImageQuality",
     "Layout",
+    "Reprojection",
     "black_rectangles",
     "board_pdf",
+    "camera_with_intrinsics",
     "corner_columns",
     "detect_boards",
     "detect_corners",
@@ -28,5 +31,6 @@ __all__ = [
     "overlay_files",
     "read_image",
     "render_images",
+    "reproject_corners",
     "unused_images",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,16 @@ from robots import paper
 
 from dhcal_pin import se3
 from dhcal_pin.cameras import Board, Camera
-from dhcal_pin.detection import read_image, render_images
+from dhcal_pin.detection import (
+    BoardDetection,
+    DetectedImage,
+    Layout,
+    camera_with_intrinsics,
+    overlay_files,
+    read_image,
+    render_images,
+    reproject_corners,
+)
 from dhcal_pin.io.measurement_files.image_times import image_time
 from dhcal_pin.io.rig_file import rig_text
 from dhcal_pin.io.tabular import csv_text
@@ -74,6 +84,49 @@ def test_several_boards_and_pictures_of_their_corners(run, folder):
     # The images themselves are not changed.
     np.testing.assert_array_equal(np.ptp(cv2.imread("images/both.png"), axis=2), 0)
     assert read_image("images/both.png").shape == (240, 320)
+
+
+@pytest.mark.parametrize("has_intrinsics", [True, False])
+def test_reprojected_corners_are_those_of_the_true_pose(folder, has_intrinsics):
+    """Crosses are at the corners of the true pose, also at a corner that was not found."""
+    board = BOARDS[0]
+    poses = [
+        POSES[0] @ se3.exp6(np.array([0.0, 0, 0, *turn]))
+        for turn in ([0.4, 0, 0], [0, 0.5, 0], [-0.3, 0.3, 0])
+    ]
+    known = CAMERA if has_intrinsics else replace(CAMERA, values=np.array([np.nan] * 4 + [0.0] * 5))
+    exact, images = [], []
+    for number, pose in enumerate(poses):
+        local = board.points @ pose[:3, :3].T + pose[:3, 3]
+        exact.append(CAMERA.lens.project(local.T, CAMERA.values)[0].T)
+        cv2.imwrite(f"images/{number}.png", np.full((240, 320), 128, np.uint8))
+        corner = np.delete(np.arange(len(exact[-1])), 3)
+        images.append(DetectedImage(f"images/{number}.png", corner, exact[-1][corner]))
+    detection = BoardDetection(board, Layout(), images)
+    camera = camera_with_intrinsics(known, [detection])
+    assert camera is not None
+    for image, pixels in zip(images, exact, strict=True):
+        found = reproject_corners(camera, board, image)
+        assert found is not None
+        np.testing.assert_allclose(found.pixels, pixels, atol=1e-3)
+        assert found.rms < 1e-3
+    pictures = overlay_files("pictures", known, [detection])
+    picture = cv2.imdecode(np.frombuffer(pictures["pictures/0.png"], np.uint8), cv2.IMREAD_COLOR).astype(int)
+    is_cross = (picture[..., 0] > 150) & (picture[..., 2] < 110)
+    for u, v in np.round(exact[0]).astype(int):
+        assert is_cross[v - 2 : v + 3, u - 2 : u + 3].any()
+
+
+def test_a_wrong_corner_stands_out_from_the_reprojected_ones(folder):
+    board = BOARDS[0]
+    local = board.points @ POSES[0][:3, :3].T + POSES[0][:3, 3]
+    pixels = CAMERA.lens.project(local.T, CAMERA.values)[0].T
+    wrong = pixels.copy()
+    wrong[5] += [20.0, 0]
+    found = reproject_corners(CAMERA, board, DetectedImage("1.png", np.arange(len(wrong)), wrong))
+    assert found is not None
+    np.testing.assert_allclose(found.pixels, pixels, atol=1e-3)
+    assert found.rms == pytest.approx(20 / np.sqrt(len(wrong)), rel=1e-3)
 
 
 @pytest.mark.parametrize("name", ["arm.bag", "arm_ros2"])
