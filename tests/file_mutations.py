@@ -470,6 +470,8 @@ def survive(case: Case, data: bytes, heard: set[str] | None = None) -> None:
                 assert_units_of_header(data)
 
 
+# Largest value of a measurement file [m or rad].
+MAX_SI_VALUE = 1e6
 # Factors to metres and radians, from the definitions of the units.
 SI = {"m": 1, "mm": 1e-3, "cm": 1e-2, "um": 1e-6, "rad": 1, "deg": math.pi / 180, "mrad": 1e-3, "in": 0.0254}
 
@@ -493,10 +495,10 @@ def assert_units_of_header(data: bytes) -> None:
         table = np.array([[float(cell) for cell in row] for row in rows[1:]])
     except ValueError:
         return
-    # `inspect` accepts a table with such rows, and names them.
-    if not np.isfinite(table).all():
-        return
     expected = table * [SI[column[2]] for column in columns if column]
+    # `inspect` accepts a table with such rows, and names them.
+    if not np.all(np.abs(expected) <= MAX_SI_VALUE):
+        return
     measured = read_measurements("data.csv", read_robot("arm.urdf"))
     found = np.hstack([measured.q, measured.values])  # pyright: ignore
     order = [names.index(name) for name in ("joint_1", "joint_2", "joint_3", "x", "y", "z")]

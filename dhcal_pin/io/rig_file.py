@@ -20,7 +20,7 @@ from .toml_table import TomlTable, is_number, pose_content, read_pose
 # Largest number of squares or tags along a side, and of pixels along a side of an image.
 _MAX_COUNT, _MAX_PIXELS = 1000, 100_000
 # Largest side of a square and largest coordinate of a point [mm].
-_MAX_MM = 1e5
+_MAX_MM = 100_000
 # Keys of a pose.
 _POSE_KEYS = ("xyz_m", "rotvec_rad")
 
@@ -221,7 +221,8 @@ def _read_board(table: TomlTable) -> Board:
 
 def _millimetres(table: TomlTable, key: str) -> float:
     """Return a positive length in millimetres, in metres."""
-    return table.number(key, above=0.0, at_most=_MAX_MM, expected="a positive length in millimetres") / 1e3
+    expected = f"a length in millimetres above 0 and up to {_MAX_MM:g}"
+    return table.number(key, above=0.0, at_most=_MAX_MM, expected=expected) / 1e3
 
 
 def _listed_points(table: TomlTable) -> Array:

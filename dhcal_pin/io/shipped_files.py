@@ -5,6 +5,7 @@ They are in the folder `urdf` of the source tree, which is installed as the pack
 
 from __future__ import annotations
 
+import os
 from importlib import resources
 from pathlib import Path
 
@@ -30,7 +31,7 @@ def shipped_file(name: str) -> Path:
         UnknownNameError: No such file ships with the package.
     """
     for folder in _folders():
-        if (folder / name).is_file():
+        if os.path.isfile(folder / name):
             return folder / name
     raise UnknownNameError(f"{name}: no such file, and none that ships with dhcal-pin; check its name")
 

@@ -315,7 +315,7 @@ def _find_robot_file(name: str, path: PathLike) -> Path:
     if name.startswith(EXAMPLE_PREFIX):
         return Path(resolve_robot_path(name))
     in_folder = Path(path).resolve().parent / name
-    return in_folder if in_folder.exists() else shipped_file(name)
+    return in_folder if os.path.exists(in_folder) else shipped_file(name)
 
 
 def _require_runnable(case: Case, where: str) -> None:

@@ -10,6 +10,7 @@ import pytest
 from command_line import json_of, stdout_of, unfolded
 from recordings import JOINTS, POSES, Recording, write_bag
 from robots import URDF, paper
+from rosbags.rosbag1 import ReaderError
 
 from dhcal_pin import se3
 from dhcal_pin.io import measurement_text, read_measurements
@@ -182,6 +183,28 @@ def test_invalid_recordings(run, folder):
         status, out, err = run("convert", *arguments)
         assert (status, out, err.count("\n")) == (2, "", 1)
         assert words in err
+
+
+@pytest.mark.parametrize(
+    ("reason", "said"),
+    [
+        (
+            "Bag index looks damaged: ('Could not read uint32.',)",
+            "Bag index looks damaged: Could not read uint32",
+        ),
+        ("Rosbag2 version 91 not supported; please report issue.", "Rosbag2 version 91 not supported"),
+        (f"Could not parse: {'x' * 2000}", f"Could not parse: {'x' * 83}..."),
+    ],
+)
+def test_reasons_of_the_library_become_short_sentences(run, folder, arm, monkeypatch, reason, said):
+    write_bag(folder / "arm.bag", Recording(arm, stops(arm, 5)))
+
+    def fail(*args, **options):
+        raise ReaderError(reason)
+
+    monkeypatch.setattr("rosbags.highlevel.AnyReader.open", fail)
+    err = run("convert", "arm.bag", "x.csv", "--pose-topic", POSES)[2]
+    assert err == f"dhcal: arm.bag: not a readable recording: {said}; copy it again, or record it again\n"
 
 
 def test_the_time_of_a_pose_does_not_grow_with_the_recording(run, folder, arm, monkeypatch):

@@ -67,6 +67,7 @@ def test_text_reads_back(tmp_path):
         (CAMERA.replace("fy = 641.0\n", "") + BOARD, "without fy; expected all of fx, fy, cx, cy"),
         (CAMERA.replace("fx = 640.0", "fx = -1.0") + BOARD, "fx = -1.0; expected a number above 0"),
         (CAMERA + BOARD.replace("22.0", "33.0"), "marker_mm = 33.0; expected less than square_mm = 30"),
+        (CAMERA + BOARD.replace("22.0", "2e5"), "expected a length in millimetres above 0 and up to 100000"),
         (CAMERA + BOARD.replace("charuco", "chess"), 'choose from "checkerboard"'),
         (CAMERA + BOARD + "squares = 3\n", "unknown key 'squares'"),
         (CAMERA.replace("1280", "12.5") + BOARD, "width = 12.5; expected a whole number"),

@@ -36,6 +36,7 @@ from dhcal_pin.studies import read_study
         (('"pose", "position"', '"wires"'), r"kind = 'wires': wires: wire1.x is unknown"),
         (("0.5mm,0.1deg", "0.5"), "error_std '0.5': not a number with a unit"),
         (("sim_6dof.dh.toml", "none.urdf"), "none.urdf: no such file"),
+        (("sim_6dof.dh.toml", f"{'9' * 400}.urdf"), "9.urdf: no such file"),
         (("poses = 12", "truth = 'sim_3dof.dh.toml'"), "arm 2 has other joints"),
         (("poses = 12", "parameters = 'dh,tol'"), "unknown parameter set 'tol'"),
         (('robot = "sim_6dof.dh.toml"', ""), "robot is missing"),

@@ -38,6 +38,8 @@ _JOINT_STATE = "sensor_msgs/msg/JointState"
 _USUAL_JOINT_TOPIC = "/joint_states"
 # Separator between a topic of transforms and the child frame.
 _FRAME_SEPARATOR = ":"
+# Longest reason of rosbags that a message quotes [characters].
+_MAX_REASON_CHARS = 100
 # Messages of a topic of transforms that are searched for frames.
 _N_TRANSFORM_MESSAGES = 500
 # Smallest norm of a quaternion that is a rotation.
@@ -233,7 +235,8 @@ def _open_bag(source: str) -> Iterator[AnyReader]:
 
 def _sentence(reason: str) -> str:
     """Return the first part of a message of rosbags, without the tuple of another error and the full stop."""
-    return re.sub(r"""\(["'](.*?)["'],\)""", r"\1", reason).partition(";")[0].rstrip(".")
+    text = re.sub(r"""\(["'](.*?)["'],\)""", r"\1", reason).partition(";")[0].partition("\n")[0].rstrip(".")
+    return text if len(text) <= _MAX_REASON_CHARS else f"{text[:_MAX_REASON_CHARS]}..."
 
 
 def _choose_joint_topic(reader: AnyReader, source: str, wanted: str | None) -> str:

@@ -243,8 +243,8 @@ def _rule(
         raise FileFormatError(f"{table.where}: {name}: unit {quote(unit)}; expected a text in quotes")
     if content and (units or unit) and unit not in units:
         choices = ", ".join(f'"{choice}"' for choice in units if choice.isascii())
-        remedy = f"write unit = one of {choices}" if units else "leave the unit out"
-        raise UnknownNameError(f"{table.where}: {name}: unit {quote(unit)}; {remedy}")
+        remedy = f"choose from {choices}" if units else "leave the unit out"
+        raise UnknownNameError(f"{table.where}: {name}: unit = {quote(unit)}; {remedy}")
     if content == "text" and (scale, offset) != (1.0, 0.0):
         raise FileFormatError(f"{table.where}: {name}: is text; leave scale and offset out")
     return ColumnRule(name, content, unit, _source_column(table, source), scale, offset)

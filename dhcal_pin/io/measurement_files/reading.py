@@ -326,7 +326,7 @@ def parse_values(table: DataTable, kind: type[Measurement]) -> dict[str, Any]:
             )
         if content == "text" and "" in values[name]:
             raise FileFormatError(
-                f"{table.cell_location(values[name].index(''), name)}: is empty; write a name"
+                f"{table.cell_location(values[name].index(''), name)} is empty; correct or remove the row"
             )
     if set(QUATERNION) & set(table.columns):
         if set(ROTVEC) & set(table.columns):

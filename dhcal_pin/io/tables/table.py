@@ -286,7 +286,7 @@ class DataTable:
         for index in texts:
             for row, cells in enumerate(self.cells):
                 if not cells[index].strip():
-                    reasons.setdefault(row, f"{self.column_label(index)} is empty; write a name")
+                    reasons.setdefault(row, f"{self.column_label(index)} is empty")
         table = replace(self, numbers={**self.numbers, **values})
         if not reasons:
             return table
