@@ -14,7 +14,9 @@ The least-squares problem depends on three sets of numbers that are not known be
 2. The widths of the default priors, from the evidence procedure (MacKay 1992), see `estimation.priors`.
 3. The weight of each sample under a robust loss, from iteratively reweighted least squares, see
    `estimation.robust`; loss "auto" starts from the samples that a majority agrees with, see
-   `good_samples`.
+   `good_samples`. A solution that bad samples bent may be far from the one of the good samples, and its
+   prior widths are too large. The good samples are therefore solved from the nominal robot with the expected
+   widths, and searched again at that solution until they stay the same.
 
 Each round estimates all three from the current solution and solves the problem again, starting from it.
 Early rounds solve loosely. The rounds end when none of the numbers changes by more than 1 % and the last
@@ -48,6 +50,8 @@ from .partition import configuration_groups
 MIN_SIGMA_SCALE = 1e-6
 # Largest number of rounds.
 MAX_ROUNDS = 30
+# Largest number of searches for the good samples.
+MAX_SEARCHES = 4
 # Name of the rounds for the user.
 PHASE = "robust weights"
 # Rounds end when no scale, prior or weight changes by more than this fraction.
@@ -108,6 +112,7 @@ class ReweightState:
         scales: Scale of the standard deviation of each residual group, shape (g,).
         stages: Robust stages that are left, the current one first; see `robust.LOSSES`.
         weight_change: Change of the robust weights in the last round.
+        n_searches: Number of searches for the good samples.
         is_final: Whether the last solution was iterated to full convergence.
         is_done: Whether all numbers have settled.
     """
@@ -116,6 +121,7 @@ class ReweightState:
     scales: Array
     stages: tuple[str, ...]
     weight_change: WeightChange = field(default_factory=WeightChange)
+    n_searches: int = 0
     is_final: bool = False
     is_done: bool = False
 
@@ -184,8 +190,10 @@ def _next_round(
     if stage == robust.TRIMMED:
         found = find_good_samples(problem, solution, weighted, configuration_groups(fit.data))
         weights, change = found.weights, robust.weight_change(found.weights, fit.weights)
-        # The rounds go on with these weights, then with those of the nonlinear model.
-        state = replace(state, stages=(robust.KEPT, found.stage))
+        # The rounds go on with these weights, then with another search or with those of the nonlinear model.
+        n_searches = state.n_searches + 1
+        again = (robust.TRIMMED,) if change.size and n_searches < MAX_SEARCHES else ()
+        state = replace(state, stages=(robust.KEPT, *again, found.stage), n_searches=n_searches)
     elif stage in robust.WEIGHT_FUNCTIONS:
         residuals = studentized_residuals(problem, solution, weighted, weights)
         weights, change = robust.update_weights(weights, residuals, stage, state.weight_change)
@@ -194,7 +202,9 @@ def _next_round(
         ]
     if any((w != 1).any() for w in weights):
         weighted = tuple(item.with_weights(w) for item, w in zip(weighted, weights, strict=True))
-    priors = update_prior_scales(problem, solution, groups)
+    start, priors = solution.x, update_prior_scales(problem, solution, groups)
+    if stage == robust.TRIMMED and change.size:
+        start, priors = np.zeros_like(start), expected
     relative = np.log(scales / state.scales), (priors - problem.weights) / np.fmax(expected, MIN_WEIGHT)
     has_settled = max(change.size, *(np.abs(each).max(initial=0.0) for each in relative)) < CHANGE_TOL
     state = replace(state, fit=replace(fit, weights=tuple(weights)), weight_change=change)
@@ -211,7 +221,7 @@ def _next_round(
         problem = problem.with_data(weighted).with_prior_weights(priors)
         warm_start, previous_iterations = None, fit.iterations
         state = replace(state, scales=scales)
-    solution = minimize(problem, "lm", solution.x, max_iterations, warm_start=warm_start, loose=not is_final)
+    solution = minimize(problem, "lm", start, max_iterations, warm_start=warm_start, loose=not is_final)
     fit = replace(state.fit, problem=problem, solution=solution, previous_iterations=previous_iterations)
     return replace(state, fit=fit, is_final=is_final)
 
