@@ -101,7 +101,9 @@ def accuracy_table(comparisons: Sequence[Comparison]) -> Table:
                 statistics = side.groups[group]
                 decimals = significant_decimals(factor * statistics.rms_std)
                 values = [getattr(statistics, key) for key in STATISTIC_LABELS]
-                values += statistics.axes_rms or [math.nan] * 3
+                axes_rms = statistics.axes_rms or []
+                # Image coordinates have two axes.
+                values += [*axes_rms, *[math.nan] * (3 - len(axes_rms))]
                 cells = [format_fixed(factor * value, decimals) for value in values]
                 rows.append([f"{after.samples} {c.title}", f"{GROUP_LABELS[group]},{unit}", state, *cells])
     axes = [f"{axis}, RMS" for axis in "xyz"]

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from ..calibration.cameras import split_sets
 from ..calibration.estimates import Estimate
 from ..calibration.evaluation import Comparison
 from ..calibration.result import Result
@@ -108,6 +109,8 @@ def _robot_lines(fit: Result, robot: str, sets: str) -> list[str]:
     joints = f"{count} joints from {first} to {last}" if count > 1 else f"joint {first}"
     families = fit.extension.families if fit.extension else ()
     added = f"; joint errors added: {', '.join(families)}" if families else ""
+    if any(stage.name == "arm" and not stage.is_kept for stage in fit.camera_stages):
+        sets, added = ",".join(split_sets(sets)[1]), "; the arm is kept"
     return [
         f"{robot}: tip {fit.chain.tip}, {joints}",
         f"estimated: {sets.replace(',', ', ')} ({len(fit.parameters)} parameters){added}",

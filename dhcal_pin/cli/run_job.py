@@ -167,6 +167,7 @@ def run_job(
         )
     if progress:
         progress("accuracy and verdict", 1, 1)
+    on_images = fit.input_warnings
     fit = replace(
         fit,
         input_warnings=fit.input_warnings
@@ -182,7 +183,7 @@ def run_job(
         # A warning about the columns of a file already explains a poor fit.
         data.warnings[path] += texts if not data.warnings[path] else []
     hint = _family_hint(fit, data, sets, job)
-    data.warnings.setdefault(job.robot, []).extend(find_lattices(fit))
+    data.warnings.setdefault(job.robot, []).extend([*on_images, *find_lattices(fit)])
 
     # A refused robot must not reach a controller; JSON and report explain why it was refused.
     is_kept = job.force or not fit.verdict.is_refused

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -189,3 +190,24 @@ def test_a_shortened_list_counts_the_others():
     assert lines == [*numbers[: HEIGHT - 1], f"  {50 - HEIGHT + 1} more files; see --verbose"]
     everything = Screen([Block(numbers, noun="file")]).lines("verbose")
     assert [line.text for line in everything] == numbers
+
+
+@pytest.mark.parametrize(("errors", "is_kept"), [("0mm,0deg", True), ("3mm,1deg", False)])
+def test_images_of_a_right_and_of_a_wrong_arm(run, robot_folder, errors, is_kept):
+    arm = URDF / "experiment.dh.toml"
+    simulated = ("--kind", "camera", "--noise", "0.2mm", "-o", "k.csv")
+    stdout_of(run("simulate", arm, "--errors", errors, "-m", 30, *simulated))
+    command = ("calibrate", arm, "k.csv", "--rig", "k.rig.toml", "-o", "o.urdf", "--force")
+    status, _, err = run(*command, "--json", "r.json")
+    assert status == 0, err
+    assert_fits(err)
+    document = json.loads(Path("r.json").read_text())
+    assert document["camera_stages"][-1]["kept"] != is_kept
+    texts = " ".join(document["warnings"])
+    assert ("The nominal arm is kept" in texts) == is_kept
+    assert ("The nominal arm is kept" in unfolded(err)) == is_kept
+    assert ("; the arm is kept" in unfolded(err)) == is_kept
+    assert ("estimated: placement" in err) != is_kept
+    verbose = run(*command, "--verbose")[2]
+    assert "x, RMS" in verbose
+    assert "error at the board" in verbose
