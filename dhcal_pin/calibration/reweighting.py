@@ -192,8 +192,8 @@ def _next_round(
         weights, change = found.weights, robust.weight_change(found.weights, fit.weights)
         # The rounds go on with these weights, then with another search or with those of the nonlinear model.
         n_searches = state.n_searches + 1
-        again = (robust.TRIMMED,) if change.size and n_searches < MAX_SEARCHES else ()
-        state = replace(state, stages=(robust.KEPT, *again, found.stage), n_searches=n_searches)
+        next_search = (robust.TRIMMED,) if change.size and n_searches < MAX_SEARCHES else ()
+        state = replace(state, stages=(robust.KEPT, *next_search, found.stage), n_searches=n_searches)
     elif stage in robust.WEIGHT_FUNCTIONS:
         residuals = studentized_residuals(problem, solution, weighted, weights)
         weights, change = robust.update_weights(weights, residuals, stage, state.weight_change)
