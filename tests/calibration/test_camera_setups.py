@@ -25,13 +25,18 @@ def image_rms(fit, data):
 def converges(seed):
     """Calibrate a set-up without a guess; the residuals are the noise.
 
-    Arms that are wrong by 0.3 mm may be kept, as few images show that they are wrong.
+    Arms that are wrong by 0.3 mm may be kept, as few images show that they are wrong. The residuals are then
+    smaller than with the true cameras and boards on the nominal arm.
     """
     setup = random_setup(seed)
     fit = dh.calibrate(setup.nominal, setup.images, extend="none", loss="linear")
-    limit = 1.1 if fit.camera_stages[-1].is_kept or setup.truth is setup.nominal else 8.0
+    limit = 1.1 * setup.sigma
+    if not fit.camera_stages[-1].is_kept:
+        true_values = {p.name: p.nominal for p in setup.exact.instrument_parameters}
+        errors = compute_errors(setup.nominal, [setup.images], true_values)[0]["pixels"]
+        limit = max(limit, np.sqrt(np.mean(errors**2)))
     assert fit.solution.converged
-    assert image_rms(fit, setup.images) < limit * setup.sigma
+    assert image_rms(fit, setup.images) < limit
 
 
 @pytest.mark.parametrize("seed", [0, 5, 8, 13, 18, 23])
