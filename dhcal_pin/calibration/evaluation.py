@@ -241,6 +241,7 @@ def compute_errors(
         Errors of each measurement by the name that its kind gives them, arrays of shape (m, ·) [m or rad].
     """
     known = known or {}
+    data = [item.matched_to(known) for item in data]
     data = [
         item if all(p.name in known for p in item.instrument_parameters) else item.initialized(chain)
         for item in data

@@ -57,6 +57,7 @@ from .cameras import (
     has_arm,
     has_images,
     held_values,
+    judge_target_points,
     reorder,
     split_sets,
 )
@@ -173,8 +174,11 @@ def calibrate(
         groups = PriorGroups.from_expected(errors, problem.weights, has_default_prior(errors, priors))
         fit = reweight(fit, robust.LOSSES[loss].stages, groups, max_iterations, progress)
         if has_images(data) and priors != "none":
+            points = judge_target_points(fit, max_iterations)
+            if points is not None and points.is_kept:
+                fit = reweight(points.fit, robust.LOSSES[loss].stages, groups, max_iterations, progress)
             ungated = fit
-            fit, gate, stages = apply_gate(ungated, groups, max_iterations)
+            fit, gate, stages = apply_gate(ungated, groups, max_iterations, points)
             extension = Extension(temperature=gate.temperature, n_configurations=gate.n_configurations)
             result = _make_result(fit, 1.0, holdout, method)
             warnings = [exchange.sentence for exchange in exchanges]

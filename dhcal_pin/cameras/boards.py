@@ -38,6 +38,7 @@ class Board:
         is_legacy: Whether a ChArUco board begins with a black square although it has an even number of rows.
         listed_points: Points of the type "points", shape (c, 3) [m].
         has_free_points: Whether the positions of the corners are estimated.
+        has_exact_points: Whether they are exact, so that it is not tried to estimate them.
         pose: First guess of its pose in the link, shape (4, 4) [m]; None without one.
     """
 
@@ -53,6 +54,7 @@ class Board:
     is_legacy: bool = False
     listed_points: Array = field(default_factory=lambda: np.empty((0, 3)))
     has_free_points: bool = False
+    has_exact_points: bool = False
     pose: Array | None = None
 
     @property

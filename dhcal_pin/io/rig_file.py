@@ -179,11 +179,13 @@ def _count(table: TomlTable, key: str, at_most: int) -> int:
 def _read_board(table: TomlTable) -> Board:
     """Read a board."""
     kind = table.choice("type", BOARD_TYPES)
+    points = table.choice("points", ("auto", "fixed", "prior"), "auto")
     common: dict[str, Any] = {
         "name": _name(table),
         "link": table.text("link", expected='a link of the robot, "world" or "tip"'),
         "type": kind,
-        "has_free_points": table.choice("points", ("fixed", "prior"), "fixed") == "prior",
+        "has_free_points": points == "prior",
+        "has_exact_points": points == "fixed",
         "pose": _first_pose(table),
     }
     if kind == "points":
@@ -294,6 +296,8 @@ def rig_content(cameras: Sequence[Camera], boards: Sequence[Board]) -> dict[str,
             entry["dictionary"] = board.dictionary
         if board.has_free_points:
             entry["points"] = "prior"
+        if board.has_exact_points:
+            entry["points"] = "fixed"
         content["board"][board.name] = entry | _pose_entry(board.pose)
     return content
 

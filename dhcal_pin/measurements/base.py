@@ -237,6 +237,14 @@ class Measurement(ABC):
         common = [field.name for field in fields(self) if field.name not in self.sample_fields]
         return self.replace(**{name: getattr(part, name) for name in common})
 
+    def matched_to(self, known: Mapping[str, float]) -> Self:
+        """Return a copy with the unknowns of a calibration, where it decides which ones there are.
+
+        Args:
+            known: Values of instrument parameters of the calibration by name.
+        """
+        return self
+
     @abstractmethod
     def residual(self, frames: FrameBatch, u: Array) -> Array:
         """Return the whitened residuals (k, m); `residual_groups` names the rows.

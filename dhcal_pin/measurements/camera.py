@@ -206,6 +206,21 @@ class CameraCorners(Measurement):
         )
         return self.replace(instrument_parameters=parameters)
 
+    def matched_to(self, known: Mapping[str, float]) -> Self:
+        """Return a copy whose boards have free corners where the calibration estimated them."""
+        boards = tuple(
+            replace(board, has_free_points=f"board_{board.name}.p0x" in known)
+            if f"board_{board.name}.x" in known
+            else board
+            for board in self.rig.boards
+        )
+        if all(
+            new.has_free_points == old.has_free_points
+            for new, old in zip(boards, self.rig.boards, strict=True)
+        ):
+            return self
+        return self.with_rig(replace(self.rig, boards=boards))
+
     @property
     def stated_values(self) -> dict[str, float]:
         """Values of the parameters of poses and lenses that the rig states, by name [m, rad, px or 1]."""
@@ -246,7 +261,12 @@ class CameraCorners(Measurement):
             for camera, pose, lens in zip(self.rig.cameras, poses[0], lenses, strict=True)
         )
         boards = tuple(
-            replace(board, pose=pose, listed_points=corners)
+            replace(
+                board,
+                pose=pose,
+                type="points" if board.has_free_points else board.type,
+                listed_points=corners,
+            )
             for board, pose, corners in zip(self.rig.boards, poses[1], points, strict=True)
         )
         return replace(self.rig, cameras=cameras, boards=boards)

@@ -42,6 +42,7 @@ from ..reweighting import Fit
 from .jitter import Jitter, estimate_jitter, with_jitter
 from .sets import MAX_POINTS, count_corners
 from .stages import Stage, fitted_error, held_out_error
+from .target_points import TargetPoints, boards_of, try_target_points, with_free_points
 
 # Number of clusters of joint space that are left out in turn.
 N_CLUSTERS = 5
@@ -136,19 +137,39 @@ def fit_with_jitter(fit: Fit, max_iterations: int) -> tuple[Fit, Jitter]:
     ), jitter
 
 
-def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int) -> tuple[Fit, Gate, tuple[Stage, ...]]:
+def judge_target_points(fit: Fit, max_iterations: int) -> TargetPoints | None:
+    """Judge whether the corners of boards are where the rig states them; see `target_points`.
+
+    Args:
+        fit: Fit of independent corners at temperature 1 with the default priors, without outliers.
+        max_iterations: Largest number of iterations of one solution.
+
+    Returns:
+        The result; None without unknowns of the arm, or if nothing is to be judged.
+    """
+    if not has_arm(fit.problem.errors):
+        return None
+    clusters = cluster_folds(fit.data)
+    images = k_fold(fit.data, N_IMAGE_FOLDS) if clusters else ()
+    return try_target_points(fit, images, clusters, max_iterations)
+
+
+def apply_gate(
+    fit: Fit, groups: PriorGroups, max_iterations: int, points: TargetPoints | None = None
+) -> tuple[Fit, Gate, tuple[Stage, ...]]:
     """Fit arm, cameras and boards as far as the images show that the arm is wrong.
 
     Args:
         fit: Fit of independent corners at temperature 1 with the default priors, without outliers.
         groups: Parameters of the arm whose default priors share one scale.
         max_iterations: Largest number of iterations of one solution.
+        points: Why the corners of the boards are estimated or held; None if the rig says so.
 
     Returns:
         The final fit, the gate, and the accuracy of each stage.
     """
     final, with_arm, gate = _gated(fit, groups, max_iterations)
-    return final, gate, _stages(fit, with_arm, gate, max_iterations)
+    return final, gate, _stages(fit, with_arm, gate, points, max_iterations)
 
 
 def _gated(fit: Fit, groups: PriorGroups, max_iterations: int) -> tuple[Fit, Fit, Gate]:
@@ -351,7 +372,9 @@ def has_arm(errors: ErrorModel) -> bool:
     return len(errors.parameters) > len(nominal_arm(errors).parameters)
 
 
-def _stages(fit: Fit, with_arm: Fit, gate: Gate, max_iterations: int) -> tuple[Stage, ...]:
+def _stages(
+    fit: Fit, with_arm: Fit, gate: Gate, judged_points: TargetPoints | None, max_iterations: int
+) -> tuple[Stage, ...]:
     """Judge the stages of a calibration: frames, intrinsics, target points, arm."""
     folds = cluster_folds(fit.data)
     images = k_fold(fit.data, N_IMAGE_FOLDS) if folds else ()
@@ -370,15 +393,20 @@ def _stages(fit: Fit, with_arm: Fit, gate: Gate, max_iterations: int) -> tuple[S
     points = _without_arm(fit, max_iterations)
     has_points = len(points.problem.weights) > len(lenses.problem.weights)
     if not has_points and count_corners(fit.data) <= MAX_POINTS:
-        points = _without_arm(_with_points(fit), max_iterations)
+        points = _without_arm(
+            with_free_points(fit, [board.name for board in boards_of(fit.data)]), max_iterations
+        )
     if len(points.problem.weights) > len(lenses.problem.weights):
         reason = (
             "The rig leaves them free."
             if has_points
             else 'The rig fixes them; `points = "prior"` frees them.'
         )
-        stage = judged("target points", points, has_points, reason)
-        out.append(replace(stage, reason=f"{stage.reason} {_change(out[-1], stage)}".strip()))
+        if judged_points is not None:
+            out.append(judged("target points", points, has_points, judged_points.sentence))
+        else:
+            stage = judged("target points", points, has_points, reason)
+            out.append(replace(stage, reason=f"{stage.reason} {_change(out[-1], stage)}".strip()))
     if has_arm(with_arm.problem.errors):
         out.append(judged("arm", with_arm, gate.is_open, gate.sentence))
     return tuple(out)
@@ -390,33 +418,6 @@ def _change(before: Stage, after: Stage) -> str:
         return ""
     factor = after.by_region.pixels / before.by_region.pixels
     return f"Estimating them changes the error of left-out parts of joint space by the factor {factor:.2f}."
-
-
-def _with_points(fit: Fit) -> Fit:
-    """Return a fit whose corners of boards are further unknowns, at their first values and not yet solved."""
-    problem, robot = fit.problem, len(fit.problem.errors.parameters)
-    names = [p.name for p in problem.instrument_parameters]
-    weights = dict(zip(names, problem.weights[robot:].tolist(), strict=True))
-    values = dict(zip(names, fit.solution.x[robot:].tolist(), strict=True))
-    data = tuple(_free_points(item) for item in problem.data)
-    freed = replace(problem, data=data)
-    parameters = freed.instrument_parameters
-    own = [weights.get(p.name, np.sqrt(problem.temperature) / p.prior) for p in parameters]
-    x = [values.get(p.name, 0.0) for p in parameters]
-    return replace(
-        fit,
-        data=tuple(_free_points(item) for item in fit.data),
-        problem=replace(freed, weights=np.concatenate([problem.weights[:robot], own])),
-        solution=replace(fit.solution, x=np.concatenate([fit.solution.x[:robot], x])),
-    )
-
-
-def _free_points(item: Measurement) -> Measurement:
-    """Return image coordinates with the corners of all boards as unknowns."""
-    if not isinstance(item, CameraCorners):
-        return item
-    boards = tuple(replace(board, has_free_points=True) for board in item.rig.boards)
-    return item.with_rig(replace(item.rig, boards=boards))
 
 
 def cluster_folds(data: Sequence[Measurement]) -> tuple[Fold, ...]:
