@@ -159,7 +159,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--visible-from",
         metavar="X,Y,ZUNIT",
-        help="position of the instrument; its line of sight to the tool must be free",
+        help="position of the instrument in the measuring frame; its line of sight to the tool must be free",
     )
     parser.add_argument(
         "--cone",

@@ -168,37 +168,13 @@ class CollisionChecker:
 
         Args:
             q: Joint positions, shape (n,) [rad or m].
-            eye: Position of the instrument in the frame of the base link, shape (3,) [m].
-            point: Position of the measured point in the frame of the base link, shape (3,) [m].
+            eye: Position of the instrument in the frame of the first link of the chain, shape (3,) [m].
+            point: Position of the measured point in that frame, shape (3,) [m].
 
         Returns:
             Whether the line is free; True if there is nothing to check.
         """
-        if self.geometry is None:
-            return True
-        data, shapes = self._data
-        model = self.chain.model
-        pin.updateGeometryPlacements(
-            model, data, self.geometry, shapes, self.chain.configurations(q[None])[0]
-        )
-        last_joint = model.getJointId(self.chain.moving_joints[-1])
-        direction = point - eye
-        length = float(np.linalg.norm(direction))
-        rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), direction / length).matrix()
-        line = coal.Capsule(SIGHT_DIAMETER / 2, length)
-        line_pose = coal.Transform3s(rotation, (eye + point) / 2)
-        return not any(
-            coal.collide(
-                line,
-                line_pose,
-                item.geometry,
-                coal.Transform3s(shapes.oMg[i].rotation, shapes.oMg[i].translation),
-                coal.CollisionRequest(),
-                coal.CollisionResult(),
-            )
-            for i, item in enumerate(self.geometry.geometryObjects)
-            if item.parentJoint < last_joint and item.name != FLOOR
-        )
+        return self.shapes_on_line(q, eye, point) <= self.shapes_on_end(True)
 
     def shapes_on_end(self, is_tip: bool) -> frozenset[int]:
         """Return the shapes of the robot that no joint of the chain moves against its tip, or its begin.

@@ -87,6 +87,17 @@ def test_the_tool_is_checked_too():
     assert CollisionChecker.from_chain(arm(), [beyond]).is_collision_free(np.zeros(3))
 
 
+@pytest.mark.parametrize("height", [0.0, 0.3])
+def test_line_of_sight_counts_in_the_frame_of_the_chosen_root(height):
+    """Instrument and tool are given in the frame of the turret, 0.3 m above that of the obstacles."""
+    chain = Chain.from_urdf(arm().urdf, tip="tip", root="turret")
+    wall = Obstacle.box([1.4, -0.5, height - 0.1], [1.5, 0.5, height + 0.1])
+    checker = CollisionChecker.from_chain(chain, [wall])
+    eye, tip = np.array([2.0, 0.0, 0.0]), chain.poses(np.zeros((1, 2)))[0, :3, 3]
+    np.testing.assert_allclose(tip, [1.0, 0, 0], atol=1e-12)
+    assert checker.has_line_of_sight(np.zeros(2), eye, tip) == (height == 0)
+
+
 def test_obstacles_block_the_line_of_sight_and_the_floor_does_not():
     eye, point = np.array([3.0, 0, 0.3]), np.array([1.0, 0, 0.3])
     wall = Obstacle.box([1.9, -0.5, 0.0], [2.0, 0.5, 1.0])
