@@ -59,6 +59,7 @@ from .cameras import (
     held_values,
     judge_target_points,
     reorder,
+    seen_ranges_warning,
     split_sets,
 )
 from .cross_validation import leave_regions_out
@@ -183,7 +184,9 @@ def calibrate(
             result = _make_result(fit, 1.0, holdout, method)
             warnings = [exchange.sentence for exchange in exchanges]
             is_hand_eye = not has_arm(errors)
-            warnings += [gate.sentence] if not (is_hand_eye or gate.is_open) else []
+            if not is_hand_eye:
+                warning = seen_ranges_warning(chain, fit.data) if gate.is_open else gate.sentence
+                warnings += [warning] if warning else []
             if is_hand_eye:
                 diagnosis = diagnose_hand_eye(ungated, result.pose_std, holdout)
                 result = replace(result, hand_eye=diagnosis)

@@ -11,6 +11,7 @@ from camera_setups import ARMS, random_setup, simulate, wrong_arm
 from robots import URDF
 
 import dhcal_pin as dh
+from dhcal_pin.calibration.cameras import seen_ranges_warning
 from dhcal_pin.calibration.cameras.gate import cluster_folds
 from dhcal_pin.cameras import Board
 from dhcal_pin.exceptions import DhcalError
@@ -192,6 +193,23 @@ def test_stages_show_a_board_that_is_not_as_stated(choice):
             np.linalg.norm(each[pairs[0]] - each[pairs[1]], axis=1) for each in (found, wanted, points[seen])
         ]
         assert np.std(errors[0] - errors[1]) < 0.2 * np.std(errors[2] - errors[1])
+
+
+def test_an_arm_from_images_of_small_joint_ranges_has_a_warning():
+    """An arm that is wrong by 3 mm is estimated; joints that the images show in a small range are named."""
+    setup = random_setup(16)
+    fit = dh.calibrate(setup.nominal, setup.images, loss="linear")
+    assert fit.camera_stages[-1].is_kept
+    (warning,) = fit.input_warnings
+    q, chain = setup.images.q, setup.nominal
+    shares = (q.max(0) - q.min(0)) / (np.minimum(chain.upper, np.pi) - np.maximum(chain.lower, -np.pi))
+    least = int(np.argmin(shares))
+    assert shares[least] < 0.5
+    low, high = np.rad2deg([q[:, least].min(), q[:, least].max()])
+    assert f"{chain.joint_names[least]} {low:.0f}° to {high:.0f}°" in warning
+    assert f"{np.sum(shares < 0.5)} joints" in warning
+    everything = np.linspace(chain.lower, chain.upper, 10)
+    assert not seen_ranges_warning(chain, [setup.images.replace(q=everything[np.arange(len(q)) % 10])])
 
 
 def displaced(setup, std, seed):
