@@ -753,8 +753,8 @@ def _select_families(
             break
         families = {name: ps for name, ps in missing.items() if name in (*model.widths, *added, *TIERS[0])}
         candidates = _Candidates.with_folds(*_with_families(fit.problem, fit.solution.x, families))
-        # From the expected widths: the iteration does not leave a width near zero, which may have been the best
-        # one without the families that were added since.
+        # From the expected widths: the iteration does not leave a width near zero, which may have been the
+        # best one without the families that were added since.
         model = candidates.maximize_evidence(dict.fromkeys(model.widths, 1.0))
         for tier in tiers:
             more, model = _select(candidates, [name for name in tier if name in added], model)
