@@ -67,7 +67,7 @@ def test_wrong_types_are_named(function: Any, arguments: tuple[Any, ...], messag
         (
             {"known": {"wire1.x": 0.0}},
             UnknownNameError,
-            "known 'wire1.x': unknown .*; these measurements have none",
+            "known value of 'wire1.x': no such .*; these measurements have none",
         ),
         (
             {"holdout": "check.csv"},

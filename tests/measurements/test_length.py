@@ -75,7 +75,7 @@ def test_some_anchors_known_and_some_estimated(sim_6dof, sim_6dof_actual):
 
 def test_unknown_names_of_known_values_are_refused(sim_6dof):
     data, _ = wires(sim_6dof, 10)
-    with pytest.raises(DhcalError, match=r"known 'wire9.x'.*wire1.x, wire1.y"):
+    with pytest.raises(DhcalError, match=r"known value of 'wire9.x'.*wire1.x, wire1.y"):
         calibrate(sim_6dof, data, "dh", known={"wire9.x": 1.0})
 
 
