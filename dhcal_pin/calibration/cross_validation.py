@@ -34,7 +34,7 @@ from scipy.linalg import lstsq
 from .._typing import Array, Progress
 from ..estimation import qr, robust
 from ..estimation.normal_equations import NormalEquations
-from ..estimation.problem import Problem, has_structure, linearize_and_factor, normal_equations
+from ..estimation.problem import Problem, linearize_and_factor, normal_equations, uses_normal_equations
 from ..estimation.qr import TriangularSystem, merge_r_factors
 from ..exceptions import InvalidArgumentError, NotObservableError
 from ..measurements.base import Measurement
@@ -193,7 +193,7 @@ def factor_partition(problem: Problem, x: Array, folds: Sequence[Fold]) -> tuple
     ]
     counts = [count_rows(part) for part in parts]
     parts = [part for part, n_rows in zip(parts, counts, strict=True) if n_rows]
-    if has_structure(problem):
+    if uses_normal_equations(problem):
         equations = [normal_equations(part, x).products for part in parts]
         total = np.sum(equations, 0)
         systems = [(NormalEquations(total - one), NormalEquations(one)) for one in equations]

@@ -36,8 +36,8 @@ from ..estimation.priors import PriorGroups, Priors, has_default_prior, prior_we
 from ..estimation.problem import (
     Problem,
     UnfactoredSystem,
-    has_structure,
     merge_instrument_parameters,
+    uses_normal_equations,
 )
 from ..estimation.solver import METHODS, minimize
 from ..estimation.trimmed_squares import find_initial_outliers
@@ -355,7 +355,7 @@ def _make_result(
     """Apply the shrinkage factor to the solution of a fit and build the result."""
     problem, errors = fit.problem, fit.problem.errors
     solution = replace(fit.solution, iterations=fit.iterations)
-    if has_structure(problem):
+    if uses_normal_equations(problem):
         # Rank and null space need the R factor of the rows.
         solution = replace(solution, system=UnfactoredSystem(problem, solution.x))
     x = shrinkage_factor * fit.solution.x

@@ -82,18 +82,8 @@ class NormalEquations(TriangularSystem):
             return NormalEquations(self.products + other.products)
         return super().merged(other)
 
-    def select(self, columns: Array) -> NormalEquations:
-        """Return the system of some of the unknowns, the others held.
-
-        Args:
-            columns: Mask of the unknowns that stay, (p,).
-
-        Returns:
-            The system; the given one if all stay.
-        """
-        if columns.all():
-            return self
-        kept = np.flatnonzero(np.append(columns, True))
+    def _with_columns(self, kept: Array) -> NormalEquations:
+        """Return the system of some columns of [J | r], the last one included."""
         return NormalEquations(self.products[np.ix_(kept, kept)])
 
     def recentered(self, step: Array) -> NormalEquations:

@@ -577,7 +577,7 @@ class UnfactoredSystem(TriangularSystem):
         return linearize_and_factor(self.problem, self.x, small_angle=False).rows
 
 
-def has_structure(problem: Problem) -> bool:
+def uses_normal_equations(problem: Problem) -> bool:
     """Check whether the normal equations of a problem take much less time than the R factor of its rows.
 
     They are accurate if all unknowns have priors. There are many transmission coefficients, more rows than
@@ -615,7 +615,7 @@ def linear_system(problem: Problem, x: Array) -> TriangularSystem:
     Returns:
         System at x.
     """
-    if has_structure(problem):
+    if uses_normal_equations(problem):
         return normal_equations(problem, x)
     return linearize_and_factor(problem, x, small_angle=False)
 
@@ -624,7 +624,7 @@ def normal_equations(problem: Problem, x: Array) -> NormalEquations:
     """Compute the normal equations of all data, without priors.
 
     Args:
-        problem: Problem with structure, see `has_structure`, or some of its samples.
+        problem: Problem with structure, see `uses_normal_equations`, or some of its samples.
         x: Unknowns of shape (p+s,).
 
     Returns:

@@ -224,9 +224,11 @@ class TriangularSystem:
         Returns:
             The system; the given one if all stay.
         """
-        if columns.all():
-            return self
-        return TriangularSystem(merge_r_factors([self.rows[:, np.append(columns, True)]]))
+        return self if columns.all() else self._with_columns(np.flatnonzero(np.append(columns, True)))
+
+    def _with_columns(self, kept: Array) -> TriangularSystem:
+        """Compute the system of some columns of [J | r], the last one included."""
+        return TriangularSystem(merge_r_factors([self.rows[:, kept]]))
 
     def with_priors(self, weights: Array, x: Array | float) -> TriangularSystem:
         """Append the prior rows, see `append_priors`.

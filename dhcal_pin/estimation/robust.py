@@ -48,8 +48,8 @@ from .problem import (
     Linearization,
     Problem,
     chunk_residual,
-    has_structure,
     linear_system,
+    uses_normal_equations,
 )
 from .solver import SolverResult
 
@@ -414,7 +414,7 @@ def residual_covariances(problem: Problem, solution: SolverResult, weights: Sequ
         system = linear_system(problem, solution.x)
     root = system.sqrt_covariance(problem.weights)[0]
     model = problem.linearize(solution.x)
-    if has_structure(problem):
+    if uses_normal_equations(problem):
         chunks = problem.map_chunks(partial(_structured_covariance, model, root @ root.T))
     else:
         chunks = problem.map_chunks(partial(_prediction_covariance, model, root))

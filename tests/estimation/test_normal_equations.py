@@ -12,7 +12,7 @@ import dhcal_pin.calibration.cross_validation as cross_validation
 import dhcal_pin.estimation.problem as problem_module
 from dhcal_pin import Chain, calibrate
 from dhcal_pin.estimation import Problem, TriangularSystem, linearize_and_factor, select_parameters
-from dhcal_pin.estimation.problem import UnfactoredSystem, has_structure, normal_equations
+from dhcal_pin.estimation.problem import UnfactoredSystem, normal_equations, uses_normal_equations
 from dhcal_pin.measurements import Noise, Pose, Position
 
 SETS = "minimal,base,tool,gain,coupling,compliance,harmonics,curves"
@@ -80,7 +80,7 @@ def test_each_member_agrees_with_the_triangular_system():
     problem, x = curved_problem()
     weights, rng = problem.weights, np.random.default_rng(0)
     system, triangular = normal_equations(problem, x), linearize_and_factor(problem, x, small_angle=False)
-    assert has_structure(problem)
+    assert uses_normal_equations(problem)
     assert system.cost == pytest.approx(triangular.cost, rel=1e-12)
     columns = rng.uniform(size=len(x)) < 0.7
     other_problem, _ = curved_problem(seed=1)
@@ -112,7 +112,7 @@ def test_each_member_agrees_with_the_triangular_system():
 def test_samples_that_determine_few_unknowns():
     """Ten poses for 443 unknowns: the priors decide on the others."""
     problem, x = curved_problem(m=10)
-    assert not has_structure(problem)
+    assert not uses_normal_equations(problem)
     system, triangular = normal_equations(problem, x), linearize_and_factor(problem, x, small_angle=False)
     root, expected = (each.sqrt_covariance(problem.weights)[0] for each in (system, triangular))
     np.testing.assert_allclose(np.linalg.norm(root, axis=1), np.linalg.norm(expected, axis=1), rtol=1e-6)
@@ -125,7 +125,7 @@ def test_calibration_is_the_same_with_the_r_factor_of_the_rows(monkeypatch):
     arm, data = problem.errors.chain, problem.data
     fit = calibrate(arm, data)
     for module in (problem_module, cross_validation):
-        monkeypatch.setattr(module, "has_structure", lambda problem: False)
+        monkeypatch.setattr(module, "uses_normal_equations", lambda problem: False)
     reference = calibrate(arm, data)
     assert fit.extension is not None
     assert reference.extension is not None

@@ -31,7 +31,6 @@ from ..._typing import Array
 from ...estimation.error_model import ErrorModel
 from ...estimation.priors import PriorGroups, effective_parameters
 from ...estimation.problem import Problem
-from ...estimation.qr import TriangularSystem, append_priors, posterior_sqrt_covariance, pseudo_inverse
 from ...estimation.robust import ZERO_WEIGHT
 from ...estimation.solver import minimize
 from ...measurements.base import Measurement
@@ -311,12 +310,11 @@ def _with_evidence(fit: Fit, groups: PriorGroups, temperature: float, max_iterat
     expected[groups.members] = groups.expected_weights[groups.group_index]
     weights = expected.copy()
     system, x = fit.solution.system, fit.solution.x
-    rows = TriangularSystem(system.rows / np.sqrt(temperature))
+    rows = system.scaled(1 / np.sqrt(temperature))
     members, group_index = groups.members, groups.group_index
     for _ in range(_N_EVIDENCE_ROUNDS if len(members) else 0):
-        posterior = append_priors(rows, weights, x)
-        values = (x + pseudo_inverse(posterior.r, posterior.z))[members]
-        root = posterior_sqrt_covariance(rows, weights)[0][members]
+        values = (x + rows.solve(weights, x)[0])[members]
+        root = rows.sqrt_covariance(weights)[0][members]
         determined = np.fmax(1 - np.einsum("ij,ij->i", root, root) * weights[members] ** 2, 0.0)
         squares = np.bincount(group_index, (values * expected[members]) ** 2)
         count = np.fmax(np.bincount(group_index, determined), 1e-9)
