@@ -502,6 +502,18 @@ class CameraCorners(Measurement):
         """
         return self._project(frames, u).by_velocity.transpose(2, 0, 1)
 
+    def corner_derivative(self, frames: FrameBatch, u: Array) -> Array:
+        """Return the derivative of the image coordinates by a displacement of the corner.
+
+        Args:
+            frames: Frames of the chain at `configurations()`.
+            u: Values of the instrument parameters, (s,).
+
+        Returns:
+            Derivatives in axes of the camera, (m, 2, 3) [px/m].
+        """
+        return self._project(frames, u).by_local.transpose(2, 0, 1)
+
     def initialized(self, chain: Chain) -> Self:
         """Return a copy with first values of all parameters that have none, from the images themselves."""
         if all(np.isfinite(p.nominal) for p in self.instrument_parameters):

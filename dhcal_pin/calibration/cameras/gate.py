@@ -12,9 +12,9 @@ of the arm are those of greatest evidence at T, however narrow.
 - Otherwise the nominal arm is kept. Errors of another kind, such as periodic ones of the joints, can be
   imitated by errors of the links where images were taken, with a ratio of 0.3 to 0.5, but not elsewhere.
 
-The corners of an image share a displacement of the arm (`jitter`), unless independent corners predict the
-left-out clusters better. Then T is larger by the number of image coordinates per component of the
-displacement of an image.
+The corners of an image share a displacement of the arm (`jitter`), unless corners that are displaced
+independently (`corner_noise`) predict the left-out clusters better. Then T is larger by the number of image
+coordinates per component of the displacement of an image.
 
 The temperature protects the arm from errors that the model lacks. If a shared displacement does not raise the
 likelihood of the images after the arm was estimated, the model lacks nothing, and T = 1.
@@ -38,6 +38,7 @@ from ...measurements.camera import CameraCorners
 from ...measurements.images.camera_parameters import POINTS_SET
 from ..partition import Fold, configuration_groups, different_configurations, k_fold
 from ..reweighting import Fit
+from .corner_noise import fit_with_corner_noise
 from .jitter import Jitter, estimate_jitter, with_jitter
 from .sets import MAX_POINTS, count_corners
 from .stages import Stage, fitted_error, held_out_error
@@ -66,7 +67,6 @@ class Gate:
     Attributes:
         ratio: Error of left-out clusters with the arm estimated over that with the nominal arm; NaN if the
             images cannot be divided.
-        jitter: Noise of corners and displacement of images.
         temperature: Temperature of the residuals in the final fit.
         n_configurations: Number of different configurations.
         is_right: Whether the corners of an image share no displacement with the nominal arm.
@@ -74,7 +74,6 @@ class Gate:
     """
 
     ratio: float
-    jitter: Jitter
     temperature: float
     n_configurations: int
     is_right: bool
@@ -176,59 +175,42 @@ def _gated(fit: Fit, groups: PriorGroups, max_iterations: int) -> tuple[Fit, Fit
     is_good = np.concatenate([weights > ZERO_WEIGHT for weights in fit.weights])
     n_configurations = len(np.unique(configuration_groups(fit.data)[is_good]))
     folds = cluster_folds(fit.problem.data)
-    nominal = _without_arm(fit, max_iterations)
+    kept = nominal = _without_arm(fit, max_iterations)
     is_right = not residual_jitter(nominal).is_significant
-    kept = _independent(nominal)
     if not is_right:
-        kept = _best((kept, _shared(nominal, max_iterations)), folds)
-    kept = replace(kept, fit=_solve(kept.fit, kept.fit.problem, 1.0, max_iterations))
+        shared, _ = fit_with_jitter(nominal, max_iterations)
+        kept = _best((fit_with_corner_noise(nominal, max_iterations), shared), folds)
+    kept = _solve(kept, kept.problem, 1.0, max_iterations)
     if not has_arm(fit.problem.errors):
-        gate = Gate(float("nan"), kept.jitter, 1.0, n_configurations, is_right, is_right)
-        return kept.fit, kept.fit, gate
-    shared = _shared(fit, max_iterations)
-    is_complete = not shared.jitter.is_significant
+        return kept, kept, Gate(float("nan"), 1.0, n_configurations, is_right, is_right)
+    shared, jitter = fit_with_jitter(fit, max_iterations)
+    is_complete = not jitter.is_significant
     # If the images share no displacement, their corners are independent, and none of them counts as too many.
     share = 1.0 if is_complete else rows_per_displacement(fit.without_rejected().data)
-    models = [(_independent(fit), share)] if is_complete else [(_independent(fit), share), (shared, 1.0)]
+    models = [(fit, share)]
+    if not is_complete:
+        models = [(fit_with_corner_noise(fit, max_iterations), share), (shared, 1.0)]
     trials = [
         _trial(model, groups, factor * temperature(n_configurations, CLOSED_SAMPLES), folds, max_iterations)
         for model, factor in models
     ]
     best = min(trials, key=lambda trial: trial.error) if len(folds) > 1 else trials[-1]
-    gate = Gate(best.ratio, best.model.jitter, 1.0, n_configurations, is_right, is_complete)
+    gate = Gate(best.ratio, 1.0, n_configurations, is_right, is_complete)
     if not gate.is_open:
-        return kept.fit, best.closed, replace(gate, jitter=kept.jitter)
+        return kept, best.closed, gate
     opened_at = 1.0
     if not is_complete:
         factor = 1.0 if best.model is shared else share
         opened_at = factor * temperature(n_configurations, OPEN_SAMPLES)
-    opened = _solve(best.model.fit, best.model.fit.problem, opened_at, max_iterations)
+    opened = _solve(best.model, best.model.problem, opened_at, max_iterations)
     return opened, opened, replace(gate, temperature=opened_at)
 
 
-@dataclass(frozen=True, eq=False)
-class _Model:
-    """Fit at temperature 1 with independent corners, or with jitter."""
-
-    fit: Fit
-    jitter: Jitter
-
-
-def _independent(fit: Fit) -> _Model:
-    """Return a fit of independent corners."""
-    return _Model(fit, Jitter(1.0, 0.0, 0.0))
-
-
-def _shared(fit: Fit, max_iterations: int) -> _Model:
-    """Fit again with a displacement that the corners of an image share."""
-    return _Model(*fit_with_jitter(fit, max_iterations))
-
-
-def _best(models: Sequence[_Model], folds: Sequence[Fold]) -> _Model:
-    """Return the model that predicts left-out clusters best, the last one without clusters."""
-    errors = [held_out_error(model.fit, folds) for model in models]
+def _best(fits: Sequence[Fit], folds: Sequence[Fold]) -> Fit:
+    """Return the fit that predicts left-out clusters best, the last one without clusters."""
+    errors = [held_out_error(fit, folds) for fit in fits]
     known = [(error.pixels, i) for i, error in enumerate(errors) if error is not None]
-    return models[min(known)[1]] if known else models[-1]
+    return fits[min(known)[1]] if known else fits[-1]
 
 
 def temperature(n_configurations: int, samples: int) -> float:
@@ -270,7 +252,7 @@ def residual_jitter(fit: Fit) -> Jitter:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """Arm estimated with independent corners, or with jitter, as the gate judges it.
+    """Arm estimated with one model of the noise, as the gate judges it.
 
     Attributes:
         model: Fit at temperature 1.
@@ -279,19 +261,19 @@ class _Trial:
         ratio: The same as a fraction of the error with the nominal arm.
     """
 
-    model: _Model
+    model: Fit
     closed: Fit
     error: float
     ratio: float
 
 
 def _trial(
-    model: _Model, groups: PriorGroups, temperature: float, folds: Sequence[Fold], max_iterations: int
+    model: Fit, groups: PriorGroups, temperature: float, folds: Sequence[Fold], max_iterations: int
 ) -> _Trial:
     """Judge a model of the noise on left-out clusters."""
-    closed = _with_evidence(model.fit, groups, temperature, max_iterations)
+    closed = _with_evidence(model, groups, temperature, max_iterations)
     error = held_out_error(closed, folds)
-    nominal = held_out_error(_without_arm(model.fit, max_iterations), folds)
+    nominal = held_out_error(_without_arm(model, max_iterations), folds)
     if error is None or nominal is None:
         return _Trial(model, closed, float("nan"), float("nan"))
     return _Trial(model, closed, error.pixels, error.pixels / nominal.pixels)
