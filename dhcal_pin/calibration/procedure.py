@@ -167,6 +167,8 @@ def calibrate(
     is_robust = method == "lm" and loss != "linear"
     errors, data, weights = _initialize(errors, data, known, max_iterations, is_robust)
     problem = replace(make_problem(errors, data, prior_weights(errors, priors), known), executor=executor)
+    if priors == "none":
+        problem = problem.with_prior_weights(np.zeros(len(problem.weights)))
     if bounds:
         problem = replace(problem, bounds=_bounds(problem, bounds))
     fit = _solve(problem, weights, method, max_iterations, progress)

@@ -282,7 +282,7 @@ def make_problem(
 ) -> Problem:
     """Make the least-squares problem of a robot and its instruments.
 
-    Instrument parameters have wide priors of their own if the robot has any priors.
+    Instrument parameters have priors of their own.
 
     Args:
         errors: Nominal chain and its p unknown parameters.
@@ -300,7 +300,7 @@ def make_problem(
             if parameter.name not in known
         ]
     )
-    return Problem(errors, data, np.concatenate([weights, wide * np.any(weights)]), known)
+    return Problem(errors, data, np.concatenate([weights, wide]), known)
 
 
 def _fit_frames(

@@ -161,8 +161,6 @@ def _first_fit(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float]
         data = tuple(_without_poses(item, known).initialized(errors.chain) for item in data)
     weights = np.array([1 / p.prior for p in errors.parameters])
     problem = make_problem(errors, data, weights, known)
-    priors = np.array([1 / p.prior for p in problem.instrument_parameters])
-    problem = replace(problem, weights=np.concatenate([weights, priors]))
     first = start or {}
     x = [first.get(p.name, p.nominal) - p.nominal for p in problem.instrument_parameters]
     x = np.concatenate([np.zeros(len(weights)), x])
