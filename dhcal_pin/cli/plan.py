@@ -599,6 +599,7 @@ def _plan_document(result: Plan, args: Namespace, kind: str, chosen_rows: list[i
         "rows": chosen_rows,
         "log_det": result.log_det,
         "predicted_position_rms_m": result.error,
+        "predicted_position_rms_with_points_m": result.error_with_points,
         "random_position_rms_m": result.random_error,
         "relative_error": result.relative_error,
         "recommended_size": result.recommended_size,

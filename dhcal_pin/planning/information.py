@@ -13,7 +13,7 @@ the R factor of all J_t, divided by the square root of their number.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -76,6 +76,16 @@ class PlannedCalibration:
     known: Mapping[str, float] = field(default_factory=dict)
     prior_uncertainty: Uncertainty | None = None
     images: PlannedImages | None = None
+
+    def with_free_points(self, boards: Collection[str]) -> PlannedCalibration:
+        """Return a copy that estimates the corners of some boards, and takes those of all others as exact.
+
+        Args:
+            boards: Names of boards.
+        """
+        if self.images is None or set(self.images.free_boards) == set(boards):
+            return self
+        return replace(self, images=self.images.with_free_points(boards))
 
 
 @dataclass(frozen=True, eq=False)

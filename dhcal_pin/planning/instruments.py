@@ -9,12 +9,13 @@ columns B (2c, 6+l), and with the QR decomposition B = Q·R the rows QᵀA say t
 
     (QᵀA)ᵀ(QᵀA) = AᵀA.
 
+If corners are unknowns, too, their columns are not in this space, and all 2c rows are kept.
+
 Shapes: m configurations, n joints, k rows of a measurement.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -32,6 +33,8 @@ from .views import PlannedImages
 
 # Configurations whose images are computed at once.
 _CHUNK = 200
+# The same if corners are unknowns, of which there may be hundreds.
+_FREE_CHUNK = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,15 +203,13 @@ class CameraInstrument:
     def _corners(self) -> CameraCorners:
         """All corners of all pairs of a camera and a board in one configuration, without joint values."""
         rig = self.images.rig
-        # The corners are taken as known: their errors do not depend on the choice of poses.
-        boards = tuple(replace(board, has_free_points=False) for board in rig.boards)
-        pairs = [(c, b, len(boards[b].points)) for c, b in self.images.pairs]
+        pairs = [(c, b, len(rig.boards[b].points)) for c, b in self.images.pairs]
         count = sum(size for *_, size in pairs)
         corners = CameraCorners(
             np.zeros((count, 1)),
             np.concatenate([np.tile(rig.cameras[c].image_centre, (size, 1)) for c, _, size in pairs]),
             np.concatenate([np.arange(size) for *_, size in pairs]),
-            replace(rig, boards=boards),
+            rig,
             [rig.cameras[c].name for c, _, size in pairs for _ in range(size)],
             [rig.boards[b].name for _, b, size in pairs for _ in range(size)],
             self.images.sigma,
@@ -287,25 +288,28 @@ class CameraInstrument:
         Returns:
             Derivatives by the errors, shape (p, k, m), and by the instrument parameters, shape (s, k, m).
         """
-        starts = range(0, max(len(q), 1), _CHUNK)
-        parts = [self._reduced_jacobian(model, q[start : start + _CHUNK]) for start in starts]
+        size = _FREE_CHUNK if self.images.free_boards else _CHUNK
+        starts = range(0, max(len(q), 1), size)
+        parts = [self._reduced_jacobian(model, q[start : start + size]) for start in starts]
         both = np.concatenate(parts).transpose(2, 1, 0)
         return both[: len(model.bodies)], both[len(model.bodies) :]
 
     def _reduced_jacobian(self, model: PresentModel, q: Array) -> Array:
-        """Compute the reduced rows (m, k, p+s) of images of a few configurations."""
+        """Compute the rows (m, k, p+s) of images of a few configurations, reduced if no corner is unknown."""
         chain, u = model.chain, model.values
         m, n_corners = len(q), len(self._corners.rows)
         plain = self.images_of(chain, q)
         frames = chain.forward_kinematics(plain.q)
-        by_instrument = plain.instrument_jacobian(frames, u)
-        basis = self._basis(by_instrument.reshape(len(u), 2, m, n_corners))
         data = self.with_shared_noise(plain, chain, u)
         jacobian = chain.tool_jacobian(frames, model.bodies, model.twists)
         by_errors = whitened_jacobian(data, frames, jacobian, u, data.residual(frames, u))
         rows = np.concatenate([by_errors, data.instrument_jacobian(frames, u)])
         rows = rows.reshape(len(rows), 2, m, n_corners).transpose(2, 1, 3, 0)
         rows = rows.reshape(m, 2 * n_corners, rows.shape[-1])
+        if self.images.free_boards:
+            return rows
+        by_instrument = plain.instrument_jacobian(frames, u)
+        basis = self._basis(by_instrument.reshape(len(u), 2, m, n_corners))
         return np.linalg.qr(basis)[0].swapaxes(1, 2) @ rows
 
     def _basis(self, by_instrument: Array) -> Array:
@@ -327,7 +331,8 @@ class CameraInstrument:
         """Compute displacements between cameras and boards.
 
         The measured point is the middle of a board on the tool, in the frame of a camera that stands still;
-        or a point in front of a camera on the tool, in the frame of a board that stands still.
+        or a point in front of a camera on the tool, in the frame of a board that stands still. The frame of a
+        board is where its corners are: a motion that all of them share moves it.
 
         Args:
             model: Robot and instrument.
@@ -337,55 +342,84 @@ class CameraInstrument:
             Derivatives by the errors, shape (p, d, m), and by the instrument parameters, shape (s, d, m) [m],
             with d three times the number of pairs of a camera and a board.
         """
-        u, frames = model.values, model.chain.forward_kinematics(q)
+        frames = model.chain.forward_kinematics(q)
         jacobian = model.chain.tool_jacobian(frames, model.bodies, model.twists)
-        tools, names = frames.poses(), [p.name for p in self._corners.instrument_parameters]
-        by_errors, by_instrument = [], []
+        tools, by_errors, by_instrument = frames.poses(), [], []
         for pair in self.images.pairs:
-            ends = self._ends(*pair)
-            (moving, moving_link, columns, point), (fixed, fixed_link, fixed_columns, _) = ends
-            on_tool = moving[:3, :3] @ point + moving[:3, 3]
-            lever = np.einsum("mij,j->mi", tools[:, :3, :3], on_tool)
+            moving, fixed = self._ends(*pair, model.values)
+            offset = moving.pose[:3, :3] @ moving.point
+            lever = np.einsum("mij,j->mi", tools[:, :3, :3], offset + moving.pose[:3, 3])
             by_errors.append(jacobian[:, :3] + np.cross(jacobian[:, 3:], lever.T[None], axis=1))
-            part = np.zeros((len(u), 3, len(q)))
-            start, other = names.index(columns), names.index(fixed_columns)
-            by_pose = np.concatenate(
-                [
-                    moving_link,
-                    -se3.skew(moving[:3, :3] @ point) @ moving_link @ left_jacobian(u[start + 3 : start + 6]),
-                ],
-                1,
-            )
-            part[start : start + 6] = np.einsum("mij,jk->kim", tools[:, :3, :3], by_pose)
-            arm = tools[:, :3, 3] + lever - fixed[:3, 3]
-            turn = fixed_link @ left_jacobian(u[other + 3 : other + 6])
-            part[other : other + 3] = -fixed_link.T[:, :, None]
-            part[other + 3 : other + 6] = np.einsum("mij,jk->kim", se3.skew(arm), turn)
+            part = np.zeros((len(model.values), 3, len(q)))
+            on_tool = moving.linear - se3.skew(offset) @ moving.angular
+            part[moving.columns] = np.einsum("mij,jk->kim", tools[:, :3, :3], on_tool)
+            arm = tools[:, :3, 3] + lever - fixed.pose[:3, 3]
+            turned = np.einsum("mij,jk->kim", se3.skew(arm), fixed.angular)
+            part[fixed.columns] = turned - fixed.linear.T[:, :, None]
             by_instrument.append(part)
         scale = 1 / np.sqrt(len(self.images.pairs))
         return scale * np.concatenate(by_errors, 1), scale * np.concatenate(by_instrument, 1)
 
-    def _ends(self, camera: int, board: int) -> Sequence[tuple[Array, Array, str, Array]]:
-        """Return the moving and the standing end of a pair.
-
-        Returns:
-            For each, the pose (4, 4) of camera or board in the frame of its end, the rotation (3, 3) of its
-            link there, the name of the first parameter of its pose, and the measured point (3,) in its frame.
-        """
+    def _ends(self, camera: int, board: int, u: Array) -> tuple[_End, _End]:
+        """Return the moving and the standing one of a camera and a board."""
         rig, limits = self.images.rig, self.images.limits(camera, board)
+        names = [parameter.name for parameter in self._corners.instrument_parameters]
         depth = 0.5 * (limits.min_distance + limits.max_distance)
-        ends = [
-            (
-                rig.camera_in_end(camera),
-                rig.camera_mounts[camera].link_pose[:3, :3],
-                f"camera_{rig.cameras[camera].name}.x",
-                np.array([0.0, 0.0, depth]),
-            ),
-            (
-                rig.board_in_end(board),
-                rig.board_mounts[board].link_pose[:3, :3],
-                f"board_{rig.boards[board].name}.x",
-                rig.boards[board].points.mean(0),
-            ),
-        ]
-        return ends if rig.camera_mounts[camera].moves else ends[::-1]
+        points = rig.boards[board].points
+        eye = _End.of_pose(
+            rig.camera_in_end(camera),
+            rig.camera_mounts[camera].link_pose[:3, :3],
+            np.array([0.0, 0.0, depth]),
+            names.index(f"camera_{rig.cameras[camera].name}.x"),
+            u,
+        )
+        prefix = f"board_{rig.boards[board].name}."
+        plate = _End.of_pose(
+            rig.board_in_end(board),
+            rig.board_mounts[board].link_pose[:3, :3],
+            points.mean(0),
+            names.index(f"{prefix}x"),
+            u,
+        )
+        if rig.boards[board].has_free_points:
+            plate = plate.with_points(points, names.index(f"{prefix}p0x"))
+        return (eye, plate) if rig.camera_mounts[camera].moves else (plate, eye)
+
+
+@dataclass(frozen=True, eq=False)
+class _End:
+    """Camera or board at an end of the robot, and how k instrument parameters move it.
+
+    Attributes:
+        pose: Pose in the frame of the end, shape (4, 4) [m].
+        point: Measured point in its own frame, shape (3,) [m].
+        columns: Instrument parameters that move it, shape (k,).
+        linear: Derivatives of its position by them, in axes of the end, shape (3, k).
+        angular: Derivatives of its rotation by them, in axes of the end, shape (3, k).
+    """
+
+    pose: Array
+    point: Array
+    columns: Array
+    linear: Array
+    angular: Array
+
+    @classmethod
+    def of_pose(cls, pose: Array, link: Array, point: Array, first: int, u: Array) -> _End:
+        """Return an end that the parameters of its pose move; `first` is the first of these six."""
+        turn = link @ left_jacobian(u[first + 3 : first + 6])
+        zero = np.zeros((3, 3))
+        return cls(pose, point, first + np.arange(6), np.hstack([link, zero]), np.hstack([zero, turn]))
+
+    def with_points(self, points: Array, first: int) -> _End:
+        """Return an end that its corners move, too: by the motion nearest to their displacements."""
+        count = len(points)
+        motion = np.concatenate([np.tile(np.eye(3), (count, 1, 1)), -se3.skew(points)], 2)
+        by_points = np.linalg.pinv(motion.reshape(-1, 6))
+        rotation = self.pose[:3, :3]
+        return replace(
+            self,
+            columns=np.concatenate([self.columns, first + np.arange(3 * count)]),
+            linear=np.hstack([self.linear, rotation @ by_points[:3]]),
+            angular=np.hstack([self.angular, rotation @ by_points[3:]]),
+        )

@@ -23,12 +23,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .._typing import Array, Progress
+from ..calibration.cameras import judged_boards
 from ..estimation import qr
 from ..estimation.priors import Priors
 from ..estimation.uncertainty import Uncertainty
 from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..measurements.base import Measurement, Noise
-from ..measurements.camera import CameraCorners
 from ..robot.chain import Chain
 from ..robot.collision import CollisionChecker
 from ..robot.error_families import COMPLIANCE, CURVES, FINE_CURVES, GAIN, HARMONICS
@@ -44,9 +44,10 @@ from .exchange import (
 )
 from .information import Information, PlannedCalibration, add_joint_scatter
 from .refinement import DesignGoal, refine
+from .sources import ImageSource, ToolSource
+from .task_error import TaskError
 from .tour import find_tour
-from .view_sampler import ViewSampler
-from .views import CameraViews, PlannedImages, summarize_views
+from .views import CameraViews, PlannedImages
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -55,6 +56,8 @@ if TYPE_CHECKING:
 MARGIN_ANGLE, MARGIN_LENGTH = np.deg2rad(2.0), 5e-3
 # Configurations over which predicted errors are averaged if no task is given.
 N_TASK_SAMPLES = 300
+# Part of the task, relative to its norm, that may be unobservable without a note.
+UNOBSERVABLE_RTOL = 1e-6
 # Random plans per number of poses, numbers of poses, and smallest number of poses that they are drawn from.
 N_RANDOM_PLANS, N_RANDOM_SIZES, MIN_RANDOM_POSES = 200, 6, 600
 # Largest number of candidates; more need too much memory and do not improve the plan.
@@ -62,8 +65,6 @@ MAX_CANDIDATES = 50_000
 # Smallest distance of two poses, in the units of `scale_joint_units`: the effects that no model describes are
 # similar at closer poses. If random poses are closer, their median distance is used.
 MIN_DISTANCE_RAD = np.deg2rad(20.0)
-# Part of the task, relative to its norm, that may be unobservable without a note.
-UNOBSERVABLE_RTOL = 1e-6
 # Diminishing returns: this many more poses lower the error that a check shows by less than this fraction.
 EXTRA_POSES, MIN_EXTRA_GAIN = 10, 0.01
 # Phases of `plan`, in their order.
@@ -106,6 +107,8 @@ class Plan:
         is_way_free: Whether the moves to each pose are free of collisions, see `tour`; true for the first.
             Empty if there is nothing to collide with.
         views: Planned images of each camera; empty for other kinds of measurement.
+        error_with_points: Predicted RMS position error over the task if the calibration finds that corners of
+            boards are not where the rig states them, and estimates them [m]; None if it does not judge them.
     """
 
     q: Array
@@ -123,6 +126,7 @@ class Plan:
     ways: tuple[Array, ...] = ()
     is_way_free: tuple[bool, ...] = ()
     views: tuple[CameraViews, ...] = ()
+    error_with_points: float | None = None
 
     @cached_property
     def log_det(self) -> float:
@@ -256,13 +260,12 @@ def plan(
     margin = margin or Noise(MARGIN_LENGTH, MARGIN_ANGLE)
     space = space or WorkspaceConstraints()
     sampler, notes = None, []
-    kind = kind if images is None else CameraCorners.kind
+    source = ToolSource(kind) if images is None else ImageSource(images)
     if isinstance(candidates, int):
         everywhere = ConfigurationSampler.from_chain(chain, space, margin.rotation, margin.position)
-        sampler = everywhere if images is None else ViewSampler.from_sampler(everywhere, images)
+        sampler = source.restrict(everywhere)
         q = sampler.draw(candidates, rng)
-        notes += [sampler.collision.note] if sampler.collision.note else []
-        notes += [sampler.note] if isinstance(sampler, ViewSampler) and sampler.note else []
+        notes += sampler.notes
         task_q = (
             replace(everywhere, workspace=WorkspaceConstraints(floor=space.floor)).draw(N_TASK_SAMPLES, rng)
             if task is None
@@ -284,9 +287,12 @@ def plan(
                 "revolute joint"
             )
     planned = PlannedCalibration(
-        chain, kind, noise, sets, priors, fix, free, data, known or {}, prior_uncertainty, images
+        chain, source.kind, noise, sets, priors, fix, free, data, known or {}, prior_uncertainty, images
     )
-    full_information = Information.from_prior(planned, q, omitted_sets)
+    # Unknown corners of boards add many rows and columns, and the same error to all plans of one size. Poses
+    # are therefore chosen as if the corners were exact; the errors that are reported contain them.
+    exact = planned.with_free_points(())
+    full_information = Information.from_prior(exact, q, omitted_sets)
     information = full_information.without_omitted()
     coordinates = scale_joint_units(chain, q)
     existing = np.concatenate(
@@ -302,27 +308,29 @@ def plan(
         _always_feasible if sampler is None else lambda i: sampler.is_feasible(q[i]),
         bin_columns,
     )
-    if images is not None and sampler is None:
-        visible = images.visible_corners(chain.poses(q))
-        candidate_set.infeasible[:] = ~np.any([corners.any(1) for corners in visible], 0)
+    if sampler is None:
+        candidate_set.infeasible[:] = ~source.can_measure(chain.poses(q))
     every_nth = np.arange(0, len(q), max(1, len(q) // N_TASK_SAMPLES))
     observable = information.observable_directions(
         candidate_set.rows_of(every_nth)[..., full_information.fitted]
     )
-    all_combinations = information.task_combinations(task_q)
+    whole = TaskError.over(information, task_q)
     # Parts of the task error that no measurement of this kind determines, such as the base pose with wires of
     # unknown anchors, do not depend on the selection.
-    combinations = observable.T @ (observable @ all_combinations)
-    unobservable = np.linalg.norm(all_combinations - combinations)
-    if unobservable > UNOBSERVABLE_RTOL * np.linalg.norm(combinations):
+    ranking = whole.observable_part(observable)
+    # With unknown corners, the scale of robot and board together is such a part, but the priors limit it.
+    expected = ranking if exact is planned else TaskError.over(Information.from_prior(planned, q), task_q)
+    unobservable = np.linalg.norm(whole.combinations - ranking.combinations)
+    if unobservable > UNOBSERVABLE_RTOL * np.linalg.norm(ranking.combinations):
         notes.append(
-            f"the predicted error does not contain the base pose, which {kind} measurements do not determine"
+            f"the predicted error does not contain the base pose, which {source.kind} measurements do not "
+            "determine"
         )
     goal = DesignGoal(
-        information=information,
+        expected=expected,
+        ranking=ranking,
         full_information=full_information,
-        criterion=CRITERIA[main_criterion].create(observable, combinations, full_information, task_q),
-        task=combinations,
+        criterion=CRITERIA[main_criterion].create(observable, ranking.combinations, full_information, task_q),
         n_observable=len(observable),
         existing=existing,
         sampler=sampler,
@@ -338,10 +346,9 @@ def plan(
             candidate_set, prior_factor, count - len(greedy), goal.criterion, greedy, existing
         )
     if len(greedy) < count:
-        condition = "" if images is None else "; a board must be in view, and nothing may hide it"
         raise InvalidArgumentError(
             f"only {len(greedy)} of {len(q)} candidates are feasible; expected at least {count}: "
-            f"relax the constraints or use more candidates{condition}"
+            f"relax the constraints or use more candidates{source.condition}"
         )
     next(phases)
     selected = improve_by_exchange(candidate_set, prior_factor, greedy, goal.criterion, existing)
@@ -358,7 +365,7 @@ def plan(
         measured = np.concatenate([q[:0], *(item.configurations() for item in data)])
         curves = predict_curves(curve_information, plans, measured, q[~candidate_set.infeasible])
     sizes, errors = _error_curve(goal, candidate_set, q, greedy, selected, refined, rng)
-    random_sizes, random_errors = _random_errors(goal, candidate_set, sizes[sizes <= count], rng)
+    random_sizes, random_errors = _random_errors(goal, candidate_set, q, sizes[sizes <= count], rng)
     next(phases)
     checker = CollisionChecker.from_chain(chain, space.environment) if sampler is None else sampler.collision
     notes += [checker.note] if sampler is None and checker.note else []
@@ -366,23 +373,54 @@ def plan(
     # Given candidates stay as they are.
     can_turn = ~chain.is_prismatic & (sampler is not None)
     tour = find_tour(refined, checker, *limits, can_turn, rng)
+    error_with_points = _error_with_points(planned, q, task_q, refined)
+    if error_with_points is not None:
+        notes.append(
+            "the predicted error takes corners of boards as exact; if the calibration has to estimate them "
+            f'(points = "auto" in the rig), it is {1e3 * error_with_points:.4g} mm'
+        )
     return Plan(
         q=tour.q,
         index=selected[tour.order] if sampler is None else None,
         criterion=criterion,
-        information=information,
-        task=combinations,
+        information=expected.information,
+        task=expected.combinations,
         sizes=sizes,
         errors=errors,
         random_sizes=random_sizes,
         random_errors=random_errors,
-        recommended_size=_recommended_size(sizes, errors, information.instrument.position_sigma),
+        recommended_size=_recommended_size(sizes, errors, expected.information.instrument.position_sigma),
         notes=tuple(notes),
         curves=curves,
         ways=tour.ways,
         is_way_free=() if checker.geometry is None else tour.is_way_free,
-        views=() if images is None else summarize_views(images, chain.poses(tour.q)),
+        views=source.summarize(chain.poses(tour.q)),
+        error_with_points=error_with_points,
     )
+
+
+def _error_with_points(planned: PlannedCalibration, q: Array, task_q: Array, refined: Array) -> float | None:
+    """Predict the error of a plan if the calibration finds that corners of boards must be estimated.
+
+    Args:
+        planned: Calibration that is planned.
+        q: Joint positions of all candidates, shape (m, n) [rad or m].
+        task_q: Joint positions of the task, shape (t, n) [rad or m].
+        refined: Joint positions of the plan, shape (c, n) [rad or m].
+
+    Returns:
+        RMS position error [m]; None if the rig says for each board whether its corners are estimated, or if
+        the calibration does not judge them.
+    """
+    if planned.images is None:
+        return None
+    judged = judged_boards(planned.images.rig.boards)
+    if not judged:
+        return None
+    information = Information.from_prior(planned.with_free_points([*planned.images.free_boards, *judged]), q)
+    if not information.errors.parameters:
+        return None
+    return TaskError.over(information, task_q).after(refined)
 
 
 def _report_phases(progress: Progress | None) -> Iterator[None]:
@@ -555,14 +593,14 @@ def _error_curve(
     """
     information, prior_factor = goal.full_information, goal.full_information.prior_factor
     plan_rows, count = information.rows(refined), len(refined)
-    n_known = qr.rank(goal.information.data_factor)
+    n_known = qr.rank(goal.ranking.information.data_factor)
     n_rows = min(plan_rows.shape[1], MAX_POSE_COMPONENTS)
     smallest = min(count, max(1, -(-(goal.n_observable - n_known) // n_rows)))
     sizes = np.unique(
         np.rint([smallest, 1.4 * smallest, 2 * smallest, np.sqrt(2 * smallest * count)]).astype(int)
     )
     sizes = sizes[sizes < count]
-    smaller = []
+    errors = []
     for size in sizes:
         selection = improve_by_exchange(
             candidates, prior_factor, greedy[:size], goal.criterion, goal.existing, max_passes=1
@@ -570,9 +608,9 @@ def _error_curve(
         if goal.sampler is not None and size <= 2 * smallest:
             # With few redundant measurements, refinement lowers the error considerably.
             better = refine(goal, q[selection], goal.sampler, candidates.min_distance, rng)
-            smaller.append(information.rows(better).transpose(2, 1, 0))
+            errors.append(goal.expected.after(better))
         else:
-            smaller.append(candidates.rows_of(selection))
+            errors.append(goal.expected.after(q[selection]))
     sqrt_covariance = compute_sqrt_covariance(
         prior_factor, np.ascontiguousarray(plan_rows.transpose(2, 1, 0))
     )
@@ -594,21 +632,21 @@ def _error_curve(
         extended, prior_factor, max(count, EXTRA_POSES), goal.criterion, np.arange(count), goal.existing
     )
     larger_sizes = np.arange(count, len(order) + 1)
-    rows = [*smaller, *(extended.rows_of(order[:size]) for size in larger_sizes)]
-    errors = [goal.information.predict_error(r[..., information.fitted], goal.task) for r in rows]
+    errors += goal.expected.after_first(np.concatenate([refined, q[promising]])[order], larger_sizes)
     all_sizes = np.arange(smallest, len(order) + 1)
     log_errors = np.interp(np.log(all_sizes), np.log([*sizes, *larger_sizes]), np.log(errors))
     return all_sizes, np.exp(log_errors)
 
 
 def _random_errors(
-    goal: DesignGoal, candidates: CandidateSet, sizes: Array, rng: np.random.Generator
+    goal: DesignGoal, candidates: CandidateSet, q: Array, sizes: Array, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Predict the error of random poses for some numbers of poses.
 
     Args:
         goal: What to optimize.
         candidates: All candidates.
+        q: Their joint positions, shape (m, dof) [rad or m].
         sizes: Numbers of poses to choose from.
         rng: Random generator.
 
@@ -622,15 +660,18 @@ def _random_errors(
     feasible = [
         i for i in order[: 4 * n_poses] if not candidates.infeasible[i] and candidates.is_feasible(int(i))
     ][:n_poses]
-    rows = candidates.rows_of(np.array(feasible, int))[..., goal.full_information.fitted]
+    poses = np.array(feasible, int)
+    rows = candidates.rows_of(poses)[..., goal.full_information.fitted]
     selected_sizes = sizes[np.unique(np.linspace(0, len(sizes) - 1, N_RANDOM_SIZES).round().astype(int))]
 
-    def random_error(size: int) -> float:
-        selection = rng.permutation(len(rows))[:size]
-        return goal.information.predict_error(rows[selection], goal.task)
+    def median_error(size: int) -> float:
+        plans = [rng.permutation(len(rows))[:size] for _ in range(N_RANDOM_PLANS)]
+        information, combinations = goal.ranking.information, goal.ranking.combinations
+        errors = [information.predict_error(rows[plan], combinations) for plan in plans]
+        median = plans[int(np.argsort(errors)[N_RANDOM_PLANS // 2])]
+        return goal.expected.after(q[poses[median]])
 
-    errors = [np.median([random_error(size) for _ in range(N_RANDOM_PLANS)]) for size in selected_sizes]
-    return selected_sizes, np.array(errors)
+    return selected_sizes, np.array([median_error(size) for size in selected_sizes])
 
 
 def _recommended_size(sizes: Array, errors: Array, sigma: float) -> int | None:

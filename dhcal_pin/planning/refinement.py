@@ -16,6 +16,7 @@ from .bin_filling import filling_cost, filling_gains
 from .criteria import Criterion
 from .exchange import CandidateSet, compute_sqrt_covariance
 from .information import Information
+from .task_error import TaskError
 
 # Number of rounds.
 N_ROUNDS = 8
@@ -30,20 +31,20 @@ class DesignGoal:
     """Knowledge before the measurements, and what to optimize.
 
     Attributes:
-        information: Knowledge about the unknowns that the fit estimates.
-        full_information: Knowledge about these and about the unknowns that the fit omits.
+        expected: Error to expect over the task after the calibration.
+        ranking: Error by which plans are compared; it takes corners of boards as exact.
+        full_information: Knowledge of `ranking`, and about the unknowns that the fit omits.
         criterion: Optimality criterion on all unknowns.
-        task: Combinations whose variances sum to the mean squared position error over the task, shape (p, w).
-        n_observable: Number of observable directions.
+        n_observable: Number of directions that measurements observe.
         existing: Coordinates of existing measurements, shape (n, d).
         sampler: Feasible configurations; None if the candidates are given.
         bin_columns: Joints whose bins are filled evenly before the criterion decides, shape (j,).
     """
 
-    information: Information
+    expected: TaskError
+    ranking: TaskError
     full_information: Information
     criterion: Criterion
-    task: Array
     n_observable: int
     existing: Array
     sampler: ConfigurationSampler | None

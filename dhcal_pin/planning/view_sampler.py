@@ -23,7 +23,7 @@ from .. import se3
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from ..robot.inverse_kinematics import characteristic_length, pose_task, solve_ik, wrap_into_limits
-from ..robot.sampling import ConfigurationSampler
+from ..robot.sampling import ConfigurationSampler, collect_draws
 from .views import PlannedImages, draw_views
 
 # Steps of the inverse kinematics, and configurations that are solved at once.
@@ -68,8 +68,7 @@ class ViewSampler(ConfigurationSampler):
         """
         inside = super().in_workspace(q)
         near = np.flatnonzero(inside)
-        visible = self.images.visible_corners(self.chain.poses(q[near]))
-        inside[near] = np.any([corners.any(1) for corners in visible], 0)
+        inside[near] = self.images.in_view(self.chain.poses(q[near]))
         return inside
 
     def draw(self, count: int, rng: np.random.Generator) -> Array:
@@ -85,15 +84,15 @@ class ViewSampler(ConfigurationSampler):
         Raises:
             InvalidArgumentError: Too few configurations have a board in view.
         """
-        out = np.empty((0, self.chain.n_joints))
-        for number in range(_MAX_ROUNDS * -(-count // _BATCH)):
+
+        def drawn() -> Array:
             start = rng.uniform(self.low, self.high, (_BATCH, self.chain.n_joints))
             q = self._bring_into_view(start, rng)
-            out = np.concatenate([out, q[self.in_workspace(q)]])
-            if len(out) >= count:
-                return out[:count]
-            if not len(out) and number + 1 == _MAX_EMPTY_ROUNDS:
-                break
+            return q[self.in_workspace(q)]
+
+        out = collect_draws(drawn, count, _MAX_ROUNDS * -(-count // _BATCH), _MAX_EMPTY_ROUNDS)
+        if len(out) == count:
+            return out
         if not len(out):
             raise InvalidArgumentError(
                 f"{self.images.where}no camera can see a board in any pose of the robot; check links and "
@@ -179,10 +178,11 @@ class ViewSampler(ConfigurationSampler):
         return poses[0], poses[1]
 
     @property
-    def note(self) -> str:
-        """What is not checked and why, or an empty text."""
+    def notes(self) -> tuple[str, ...]:
+        """What is not checked and why."""
         if self.collision.geometry is None:
-            return "whether the robot hides a board is not checked: there is no collision geometry"
+            text = "whether the robot hides a board is not checked: there is no collision geometry"
+            return (*super().notes, text)
         texts = [
             f"whether the robot hides points of {board.name!r} is not checked"
             for board in self.images.rig.boards
@@ -194,7 +194,7 @@ class ViewSampler(ConfigurationSampler):
                 f"whether the link of {' and '.join(names)} hides a board is not checked: it would hide "
                 "every view; check the pose in the rig"
             )
-        return "; ".join(texts)
+        return (*super().notes, *texts)
 
     @cached_property
     def _blocking(self) -> dict[tuple[int, int], dict[str, frozenset[int]]]:

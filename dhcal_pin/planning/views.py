@@ -9,8 +9,8 @@ Shapes: m configurations, c corners of a board.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -27,6 +27,7 @@ from ..measurements.camera import CameraCorners
 from ..measurements.images import ViewLimits, project_board, visible_corners
 from ..measurements.mounting import MountedRig
 from ..robot.chain import Chain
+from ..robot.sampling import collect_draws
 
 # Default limits: smallest size in the image of a square, of a marker, whose pattern needs more pixels [px],
 # and of the board, as a share of the width of the image; all for a board that faces the camera.
@@ -84,6 +85,20 @@ class PlannedImages:
                 "other one not"
             )
 
+    def with_free_points(self, boards: Collection[str]) -> PlannedImages:
+        """Return a copy whose corners of some boards are unknowns.
+
+        Args:
+            boards: Names of the boards; the corners of all others are taken as exact.
+        """
+        changed = tuple(replace(board, has_free_points=board.name in boards) for board in self.rig.boards)
+        return replace(self, rig=replace(self.rig, boards=changed))
+
+    @property
+    def free_boards(self) -> list[str]:
+        """Names of the boards whose corners the calibration estimates."""
+        return [board.name for board in self.rig.boards if board.has_free_points]
+
     @property
     def where(self) -> str:
         """Begin of messages: the name of the rig file, if there is one."""
@@ -113,6 +128,14 @@ class PlannedImages:
         low, high = self.distance or _default_distances(entry, self.rig.boards[board])
         margin = MARGIN_SHARE * entry.width if self.margin is None else self.margin
         return ViewLimits(low, high, self.max_angle, self.min_share, margin)
+
+    def in_view(self, tools: Array) -> Array:
+        """Return in which poses of the tool a board is in view, shape (m,).
+
+        Args:
+            tools: Poses of the tool in the measuring frame, shape (m, 4, 4) [m].
+        """
+        return np.any([corners.any(1) for corners in self.visible_corners(tools)], 0)
 
     def visible_corners(self, tools: Array) -> list[Array]:
         """Return which corners are in view.
@@ -188,16 +211,16 @@ def draw_views(
     """
     entry, target = rig.cameras[camera], rig.boards[board]
     middle = target.points.mean(0)
-    out = np.empty((0, 4, 4))
-    for number in range(_MAX_ROUNDS):
+    largest = np.pi if target.type == "points" else limits.max_angle
+    zero = np.zeros(_BATCH)
+
+    def drawn() -> Array:
         pixels = rng.uniform(0, 1, (2, _BATCH)) * [[entry.width - 1], [entry.height - 1]]
         plane = entry.lens.normalize(pixels, entry.values)
         sight = np.concatenate([plane, np.ones((1, _BATCH))])
         sight /= np.linalg.norm(sight, axis=0)
         distance = rng.uniform(limits.min_distance, limits.max_distance, _BATCH)
-        largest = np.pi if target.type == "points" else limits.max_angle
         tilt, azimuth, roll = rng.uniform([[0], [0], [0]], [[largest], [2 * np.pi], [2 * np.pi]], (3, _BATCH))
-        zero = np.zeros(_BATCH)
         rotations = (
             _towards(sight.T)
             @ se3.exp3(np.stack([zero, zero, azimuth], 1))
@@ -205,16 +228,16 @@ def draw_views(
             @ se3.exp3(np.stack([zero, zero, roll], 1))
         )
         poses = se3.transform(rotations, (distance * sight).T - rotations @ middle)
-        out = np.concatenate([out, poses[visible_corners(rig, camera, board, poses, limits).any(1)]])
-        if len(out) >= count:
-            return out[:count]
-        if not len(out) and number == _MAX_EMPTY_ROUNDS:
-            break
-    raise InvalidArgumentError(
-        f"board {target.name!r} does not fit into the image of camera {entry.name!r} at a distance of "
-        f"{1e3 * limits.min_distance:.4g} to {1e3 * limits.max_distance:.4g} mm; expected other distances, "
-        "or a smaller share of the corners"
-    )
+        return poses[visible_corners(rig, camera, board, poses, limits).any(1)]
+
+    out = collect_draws(drawn, count, _MAX_ROUNDS, _MAX_EMPTY_ROUNDS)
+    if len(out) < count:
+        raise InvalidArgumentError(
+            f"{rig.source}: board {target.name!r} does not fit into the image of camera {entry.name!r} at a "
+            f"distance of {1e3 * limits.min_distance:.4g} to {1e3 * limits.max_distance:.4g} mm; expected "
+            "other distances, or a smaller share of the corners"
+        )
+    return out
 
 
 def _towards(directions: Array) -> Array:

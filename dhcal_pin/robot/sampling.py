@@ -11,7 +11,7 @@ Shapes: m samples, n joints.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -143,6 +143,11 @@ class ConfigurationSampler:
     high: Array
     collision: CollisionChecker
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is not checked and why."""
+        return (self.collision.note,) if self.collision.note else ()
+
     @classmethod
     def from_chain(
         cls, chain: Chain, workspace: WorkspaceConstraints, angle: float, length: float
@@ -190,16 +195,19 @@ class ConfigurationSampler:
         Raises:
             InvalidArgumentError: Too few configurations are in the workspace.
         """
-        out = np.empty((0, self.chain.n_joints))
-        for _ in range(MAX_DRAWS_PER_SAMPLE):
+
+        def drawn() -> Array:
             q = rng.uniform(self.low, self.high, (count, self.chain.n_joints))
-            out = np.concatenate([out, q[self.in_workspace(q)]])
-            if len(out) >= count:
-                return out[:count]
-        raise InvalidArgumentError(
-            f"only {len(out)} of {MAX_DRAWS_PER_SAMPLE * count} random configurations have the tool in the "
-            "workspace; widen the box or the view angle, lower the floor, or reduce the number of candidates"
-        )
+            return q[self.in_workspace(q)]
+
+        out = collect_draws(drawn, count, MAX_DRAWS_PER_SAMPLE, MAX_DRAWS_PER_SAMPLE)
+        if len(out) < count:
+            raise InvalidArgumentError(
+                f"only {len(out)} of {MAX_DRAWS_PER_SAMPLE * count} random configurations have the tool in "
+                "the workspace; widen the box or the view angle, lower the floor, or reduce the number of "
+                "candidates"
+            )
+        return out
 
     def perturb(self, q: Array, step: float, count: int, rng: np.random.Generator) -> Array:
         """Draw configurations around given ones, clipped to the joint range.
@@ -236,6 +244,27 @@ class ConfigurationSampler:
             for position in (self.workspace.instrument_position, point)
         )
         return self.collision.has_line_of_sight(q, eye, point)
+
+
+def collect_draws(draw: Callable[[], Array], count: int, max_rounds: int, max_empty_rounds: int) -> Array:
+    """Repeat random draws until enough of them were accepted.
+
+    Args:
+        draw: Draws once and returns what was accepted, shape (m, ...); m may differ from round to round.
+        count: Number of accepted draws.
+        max_rounds: Largest number of rounds.
+        max_empty_rounds: Number of rounds after which to give up if none of them accepted anything.
+
+    Returns:
+        Accepted draws, shape (count, ...), or fewer after the last round.
+    """
+    parts: list[Array] = []
+    for number in range(1, max_rounds + 1):
+        parts.append(draw())
+        n_accepted = sum(map(len, parts))
+        if n_accepted >= count or (not n_accepted and number >= max_empty_rounds):
+            break
+    return np.concatenate(parts)[:count]
 
 
 def scale_joint_units(chain: Chain, q: Array) -> Array:

@@ -68,6 +68,11 @@ def setup(name: str) -> tuple[Chain, MountedRig]:
     return arm, mount_rig(Rig({camera.name: camera}, {board.name: board}), arm)
 
 
+def with_points(rig: MountedRig, **changes) -> MountedRig:
+    """Return a rig whose board has other properties."""
+    return replace(rig, boards=(replace(rig.boards[0], **changes),))
+
+
 def sampler(arm: Chain, images: PlannedImages, space: WorkspaceConstraints = FLOOR) -> ViewSampler:
     return ViewSampler.from_sampler(ConfigurationSampler.from_chain(arm, space, 0.03, 0.005), images)
 
@@ -120,9 +125,11 @@ def test_every_planned_pose_has_the_board_in_view(name):
     assert np.all((found.q >= arm.lower) & (found.q <= arm.upper))
 
 
-def test_rows_are_those_of_the_solver():
-    """The reduced rows contain the information that a calibration of the same images has."""
+@pytest.mark.parametrize(("is_free", "n_rows"), [(False, 6 + 9), (True, 2 * 24)])
+def test_rows_are_those_of_the_solver(is_free, n_rows):
+    """The rows contain the information of a calibration of the same images; known corners reduce them."""
     arm, rig = setup("ur10-wrist")
+    rig = with_points(rig, has_free_points=is_free)
     images = PlannedImages(rig, min_share=0.6)
     q = sampler(arm, images).draw(6, np.random.default_rng(0))
     information = Information.from_prior(PlannedCalibration(arm, "camera", NOISE, images=images), q)
@@ -140,16 +147,31 @@ def test_rows_are_those_of_the_solver():
     r = linearize_and_factor(problem, np.zeros(len(information.prior_sigma)), small_angle=False).r
     scaled = r * information.prior_sigma
     flat = rows.reshape(len(rows), -1).T
-    assert rows.shape[1] == 6 + 9
+    assert rows.shape[1] == n_rows
     assert np.allclose(
         flat.T @ flat, scaled.T @ scaled, rtol=1e-8, atol=1e-8 * np.abs(scaled.T @ scaled).max()
     )
 
 
-@pytest.mark.parametrize("name", ["ur10-wrist", "panda-fixed"])
-def test_displacements_are_derivatives(name):
-    """The measured point moves by as much as differences of the model say, in the frame of the other end."""
+def frame_of(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Return the pose in which a board lies nearest to its corners (Kabsch)."""
+    middle, centre = points.mean(0), corners.mean(0)
+    u, _, vt = np.linalg.svd((corners - centre).T @ (points - middle))
+    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    return se3.transform(rotation, centre - rotation @ middle)
+
+
+@pytest.mark.parametrize(
+    ("name", "is_free"),
+    [("ur10-wrist", False), ("panda-fixed", False), ("ur10-wrist", True), ("panda-fixed", True)],
+)
+def test_displacements_are_derivatives(name, is_free):
+    """The measured point moves by as much as differences of the model say, in the frame of the other end.
+
+    A board of unknown corners is where its corners are.
+    """
     arm, rig = setup(name)
+    rig = with_points(rig, has_free_points=is_free)
     q = np.random.default_rng(1).uniform(*joint_range(arm), (3, arm.n_joints))
     images = PlannedImages(rig)
     information = Information.from_prior(PlannedCalibration(arm, "camera", NOISE, images=images), q)
@@ -162,6 +184,9 @@ def test_displacements_are_derivatives(name):
 
     def point(chain, changed):
         solved = instrument.template(arm, q).solved_rig(changed)
+        board = solved.boards[0]
+        moved = board.pose @ frame_of(rig.boards[0].points, board.points)
+        solved = with_points(solved, pose=moved, listed_points=rig.boards[0].points)
         view = solved.board_in_camera(0, 0, chain.poses(q))
         if is_wrist:
             depth = 0.5 * (limits.min_distance + limits.max_distance)
@@ -228,8 +253,9 @@ def test_the_link_that_carries_the_camera_does_not_hide_the_board():
     views = sampler(arm, PlannedImages(replace(rig, cameras=(inside,))))
     q = views.draw(50, np.random.default_rng(0))
     beside = sampler(arm, PlannedImages(rig))
-    assert beside.note == ""
-    assert "link of camera 'wrist'" in views.note
+    assert beside.notes == ()
+    (note,) = views.notes
+    assert "link of camera 'wrist'" in note
     assert np.mean([views.is_feasible(each) for each in q]) > 0.3
 
 
@@ -351,6 +377,93 @@ def ratio_to_random(name: str, seeds: range, count: int, candidates: int) -> flo
         assert len(random) == count
         ratios.append(errors_elsewhere(name, seed, found.q) / errors_elsewhere(name, seed, random))
     return float(np.exp(np.mean(np.log(ratios))))
+
+
+SETS = "camera,board,intrinsics"
+
+
+def small_board(rig: MountedRig) -> MountedRig:
+    """Return a rig with a board of twelve corners that are unknown."""
+    return with_points(rig, columns=5, rows=4, has_free_points=True)
+
+
+def corners_beside(rig: MountedRig, size: float, rng) -> MountedRig:
+    """Return a rig whose corners are beside the stated places."""
+    corners = rig.boards[0].points + size * rng.standard_normal(rig.boards[0].points.shape)
+    return with_points(rig, type="points", listed_points=corners)
+
+
+def test_unknown_corners_are_predicted_as_the_calibration_knows_them():
+    """Predicted standard deviations of all unknowns are those of a calibration at the planned poses."""
+    arm, rig = setup("ur10-wrist")
+    rig = small_board(rig)
+    found = plan(
+        arm, 10, noise=Noise(), parameters=SETS, images=PlannedImages(rig), candidates=150, space=FLOOR
+    )
+    information, rng = found.information, np.random.default_rng(3)
+    rows = information.rows(found.q).reshape(len(information.prior_sigma), -1).T
+    r = np.linalg.qr(np.concatenate([information.prior_factor, rows]), mode="r")
+    std = np.linalg.norm(np.linalg.inv(r), axis=1) * information.prior_sigma
+    exact = images_at(arm, corners_beside(rig, 1e-4, rng), found.q, 0.3)
+    data = exact.replace(values=exact.values + 0.3 * rng.standard_normal(exact.values.shape))
+    fit = calibrate(arm, data.with_rig(rig), SETS, loss="linear")
+    names = [p.name for p in information.instrument.template(arm, found.q).instrument_parameters]
+    assert len(names) == 12 + 9 + 3 * 12
+    predicted = dict(zip(names, std[information.instrument_columns], strict=True))
+    reached = dict(zip([p.name for p in fit.parameters], fit.std / fit.unit_weight_std, strict=True))
+    assert fit.unit_weight_std == pytest.approx(1, abs=0.1)
+    for name, value in predicted.items():
+        assert value == pytest.approx(reached[name], rel=0.05), name
+
+
+@pytest.mark.parametrize("seeds", [6, pytest.param(40, marks=pytest.mark.slow)])
+def test_predicted_error_contains_that_of_unknown_corners(seeds):
+    """Calibrations of boards whose corners are 1 mm beside the stated places err as predicted."""
+    arm, rig = setup("ur10-fixed")
+    rig = small_board(rig)
+    rng = np.random.default_rng(8)
+    task = rng.uniform(*joint_range(arm), (50, arm.n_joints))
+    options = {"noise": Noise(), "parameters": SETS, "candidates": 150, "space": FLOOR, "task": task}
+    found = plan(arm, 8, images=PlannedImages(rig), **options)
+    squares = []
+    for _ in range(seeds):
+        truth = corners_beside(rig, 1e-3, rng)
+        exact = images_at(arm, truth, found.q, 0.3)
+        data = exact.replace(values=exact.values + 0.3 * rng.standard_normal(exact.values.shape))
+        fit = calibrate(arm, data.with_rig(rig), SETS, loss="linear")
+        assert fit.rig is not None
+        middles = [
+            each.board_in_camera(0, 0, arm.poses(task)) @ [*each.boards[0].points.mean(0), 1.0]
+            for each in (truth, fit.rig)
+        ]
+        squares.append(np.mean(np.sum((middles[0] - middles[1]) ** 2, 1)))
+    reached = float(np.sqrt(np.mean(squares)))
+    exact_corners = plan(arm, 8, images=PlannedImages(with_points(rig, has_free_points=False)), **options)
+    # The error has about ten directions, so that its RMS over n calibrations has a standard deviation of
+    # 1/√(20·n).
+    assert found.error == pytest.approx(reached, rel=max(3 / np.sqrt(20 * seeds), 0.1))
+    assert exact_corners.error < found.error
+
+
+def test_plan_says_what_the_corners_of_a_board_cost_if_they_must_be_estimated():
+    """With `points = "auto"` the corners are exact in the plan; the error otherwise is stated beside it."""
+    arm, rig = setup("ur10-wrist")
+    rig = with_points(rig, columns=5, rows=4)
+    options = {"noise": NOISE, "candidates": 40, "space": FLOOR}
+    auto = plan(arm, 5, images=PlannedImages(rig), **options)
+    prior = plan(arm, 5, images=PlannedImages(with_points(rig, has_free_points=True)), **options)
+    fixed = plan(arm, 5, images=PlannedImages(with_points(rig, has_exact_points=True)), **options)
+    assert np.array_equal(auto.q, prior.q)
+    assert fixed.error == auto.error < prior.error
+    assert auto.error_with_points == pytest.approx(prior.error, rel=1e-6)
+    assert prior.error_with_points is None
+    assert fixed.error_with_points is None
+    # Corners are judged only with unknowns of the arm, and in small numbers.
+    hand_eye = plan(arm, 5, images=PlannedImages(rig), parameters=SETS, **options)
+    assert hand_eye.error_with_points is None
+    many = with_points(rig, columns=14, rows=13, square=0.01, marker=0.008)
+    large = plan(arm, 5, images=PlannedImages(many, distance=(0.3, 0.6)), **options)
+    assert large.error_with_points is None
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from .gate import apply_gate, has_arm, judge_target_points
 from .seen_ranges import seen_ranges_warning
 from .sets import DEFAULT_SETS, RIG_SETS, default_sets, has_images, held_values, split_sets
 from .stages import STAGES, ImageError, Stage
+from .target_points import judged_boards
 
 __all__ = [
     "DEFAULT_SETS",
@@ -27,6 +28,7 @@ __all__ = [
     "has_images",
     "held_values",
     "judge_target_points",
+    "judged_boards",
     "reorder",
     "seen_ranges_warning",
     "split_sets",

@@ -8,7 +8,7 @@ of left-out clusters of joint space to less than 0.9. Noise alone raises both er
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +19,7 @@ from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners
 from ..partition import Fold
 from ..reweighting import Fit
-from .sets import MAX_POINTS, count_corners
+from .sets import MAX_POINTS
 from .stages import held_out_error
 
 # Largest ratio of the errors of left-out images and clusters for which the corners are estimated.
@@ -71,10 +71,8 @@ def try_target_points(
         The result; None if the rig says how the corners are treated, they are too many, or the images cannot
         be divided.
     """
-    boards = boards_of(fit.data)
-    names = [board.name for board in boards if not board.has_exact_points]
-    is_said = all(board.has_free_points for board in boards if not board.has_exact_points)
-    if is_said or count_corners(fit.data) > MAX_POINTS or len(clusters) < 2:
+    names = judged_boards(boards_of(fit.data))
+    if not names or len(clusters) < 2:
         return None
     freed = with_free_points(fit, names)
     solution = minimize(freed.problem, "lm", freed.solution.x, max_iterations, loose=True)
@@ -86,6 +84,24 @@ def try_target_points(
             return None
         ratios.append(after.pixels / before.pixels)
     return TargetPoints(freed, *ratios)
+
+
+def judged_boards(boards: Iterable[Board]) -> list[str]:
+    """Find the boards whose corners are tried as further unknowns.
+
+    Args:
+        boards: Boards of a rig, or of several measurements with the same boards.
+
+    Returns:
+        Names of the boards whose corners the rig neither fixes nor leaves free; empty if all boards together
+        have too many corners.
+    """
+    by_name = {board.name: board for board in boards}
+    if sum(len(board.points) for board in by_name.values()) > MAX_POINTS:
+        return []
+    return [
+        name for name, board in by_name.items() if not board.has_free_points and not board.has_exact_points
+    ]
 
 
 def boards_of(data: Sequence[Measurement]) -> list[Board]:

@@ -1,0 +1,108 @@
+"""Sources of measurements: which configurations a plan may choose, for tools and for images.
+
+An image needs a board in view; other measurements of the tool can be taken in every configuration that the
+robot can take.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from .._typing import Array
+from ..measurements.camera import CameraCorners
+from ..robot.sampling import ConfigurationSampler
+from .view_sampler import ViewSampler
+from .views import CameraViews, PlannedImages, summarize_views
+
+
+class MeasurementSource(Protocol):
+    """What is measured in the configurations of a plan."""
+
+    @property
+    def kind(self) -> str:
+        """Name in `KINDS`."""
+        ...
+
+    @property
+    def condition(self) -> str:
+        """What a configuration needs beside the constraints of the robot, for messages."""
+        ...
+
+    def restrict(self, sampler: ConfigurationSampler) -> ConfigurationSampler:
+        """Restrict a sampler to configurations that can be measured.
+
+        Args:
+            sampler: Sampler of configurations that the robot can take.
+
+        Returns:
+            Sampler.
+        """
+        ...
+
+    def can_measure(self, tools: Array) -> Array:
+        """Return whether poses of the tool can be measured, shape (m,).
+
+        Args:
+            tools: Poses of the tool in the measuring frame, shape (m, 4, 4) [m].
+        """
+        ...
+
+    def summarize(self, tools: Array) -> tuple[CameraViews, ...]:
+        """Describe the images of a plan; empty for other kinds of measurement.
+
+        Args:
+            tools: Poses of the tool in the measuring frame, shape (m, 4, 4) [m].
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class ToolSource:
+    """Measurements of the tool that can be taken in every configuration.
+
+    Attributes:
+        kind: Name in `KINDS`.
+    """
+
+    kind: str
+    condition = ""
+
+    def restrict(self, sampler: ConfigurationSampler) -> ConfigurationSampler:
+        """Return the sampler itself; see `MeasurementSource.restrict`."""
+        return sampler
+
+    def can_measure(self, tools: Array) -> Array:
+        """Return true for all poses; see `MeasurementSource.can_measure`."""
+        return np.ones(len(tools), bool)
+
+    def summarize(self, tools: Array) -> tuple[CameraViews, ...]:
+        """Return nothing; see `MeasurementSource.summarize`."""
+        return ()
+
+
+@dataclass(frozen=True, eq=False)
+class ImageSource:
+    """Images of boards.
+
+    Attributes:
+        images: Cameras, boards and limits of their views.
+    """
+
+    images: PlannedImages
+    kind = CameraCorners.kind
+    condition = "; a board must be in view, and nothing may hide it"
+
+    def restrict(self, sampler: ConfigurationSampler) -> ConfigurationSampler:
+        """Restrict a sampler to views of a board; see `MeasurementSource.restrict`."""
+        return ViewSampler.from_sampler(sampler, self.images)
+
+    def can_measure(self, tools: Array) -> Array:
+        """Return where a board is in view; see `MeasurementSource.can_measure`."""
+        return self.images.in_view(tools)
+
+    def summarize(self, tools: Array) -> tuple[CameraViews, ...]:
+        """Describe the images of each camera; see `MeasurementSource.summarize`."""
+        return summarize_views(self.images, tools)

@@ -1,0 +1,81 @@
+"""Predicted position error over a task, after measurements at any configurations.
+
+Shapes: p unknowns, m configurations, n joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .._typing import Array
+from .information import Information
+
+
+@dataclass(frozen=True, eq=False)
+class TaskError:
+    """Position error over a task.
+
+    Attributes:
+        information: Knowledge before the measurements about the p unknowns.
+        combinations: Combinations of the unknowns whose variances sum to the mean squared position error,
+            shape (p, w) [m].
+    """
+
+    information: Information
+    combinations: Array
+
+    @classmethod
+    def over(cls, information: Information, task: Array) -> TaskError:
+        """Prepare the prediction over a task, with the parts of the error that only priors limit.
+
+        Args:
+            information: Knowledge before the measurements.
+            task: Joint positions of the task, shape (t, n) [rad or m].
+
+        Returns:
+            Position error over the task.
+        """
+        return cls(information, information.task_combinations(task))
+
+    def observable_part(self, observable: Array) -> TaskError:
+        """Return the part of the error that measurements determine.
+
+        Args:
+            observable: Orthonormal directions that measurements observe, shape (r, p).
+
+        Returns:
+            Position error over the task without any other part.
+        """
+        return replace(self, combinations=observable.T @ (observable @ self.combinations))
+
+    def after(self, q: Array) -> float:
+        """Predict the error after measurements.
+
+        Args:
+            q: Joint positions of the measurements, shape (m, n) [rad or m].
+
+        Returns:
+            RMS position error [m].
+        """
+        return self.after_first(q, [len(q)])[0]
+
+    def after_first(self, q: Array, sizes: Iterable[int]) -> list[float]:
+        """Predict the error after the first measurements of a sequence, for several numbers of them.
+
+        Args:
+            q: Joint positions of the measurements, shape (m, n) [rad or m].
+            sizes: Numbers of measurements, in ascending order.
+
+        Returns:
+            RMS position error for each number [m].
+        """
+        rows = self.information.rows(q).transpose(2, 1, 0)
+        r, done, out = self.information.prior_factor, 0, []
+        for size in sizes:
+            r = np.linalg.qr(np.concatenate([r, rows[done:size].reshape(-1, r.shape[1])]), mode="r")
+            done = size
+            out.append(float(np.linalg.norm(np.linalg.solve(r.T, self.combinations))))
+        return out
