@@ -181,7 +181,7 @@ def factor_partition(problem: Problem, x: Array, folds: Sequence[Fold]) -> tuple
     Args:
         problem: Problem with the samples of all folds.
         x: Point of the linearization, (p,).
-        folds: Folds of its measurements that have no sample in common.
+        folds: Folds of its measurements that have no sample in common, with at least one sample each.
 
     Returns:
         The systems of each fold.
@@ -190,9 +190,8 @@ def factor_partition(problem: Problem, x: Array, folds: Sequence[Fold]) -> tuple
     parts = [
         problem.with_data([item.take(mask) for item, mask in zip(problem.data, masks, strict=True)])
         for masks in (*folds, rest)
+        if np.any(np.concatenate(masks))
     ]
-    counts = [count_rows(part) for part in parts]
-    parts = [part for part, n_rows in zip(parts, counts, strict=True) if n_rows]
     if uses_normal_equations(problem):
         equations = [normal_equations(part, x).products for part in parts]
         total = np.sum(equations, 0)
@@ -207,8 +206,8 @@ def factor_partition(problem: Problem, x: Array, folds: Sequence[Fold]) -> tuple
             for one in factors[: len(folds)]
         ]
     return tuple(
-        FoldSystems(fitted, held_out, n_rows)
-        for (fitted, held_out), n_rows in zip(systems, counts[: len(folds)], strict=False)
+        FoldSystems(*system, count_rows(part))
+        for system, part in zip(systems[: len(folds)], parts[: len(folds)], strict=True)
     )
 
 
