@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ..calibration import Accuracy
     from ..estimation.uncertainty import Predictor
     from ..io import MeasurementFile
-    from ..measurements import Measurement
+    from ..measurements import Measurement, MountedRig
     from ..robot import Chain
 
 EXAMPLE = "dhcal validate ur10_calibrated.urdf other.csv --tip tool0 --nominal ur10.urdf --fit-frames"
@@ -75,8 +75,6 @@ def run(args: Namespace) -> int:
         read_measurement_file,
         read_robot,
     )
-    from ..io.rig_file import read_rig
-    from ..measurements.mounting import mount_rig
     from ..measurements.position import require_common_reference_target
     from ..report.document import file_digests, main_statistics, result_to_dict, validation_to_dict
     from ..report.html import check_html_ending
@@ -93,7 +91,7 @@ def run(args: Namespace) -> int:
     if args.report:
         check_html_ending(args.report, "the report of a validation")
     chain = read_robot(args.robot, args.tip, sidecar, args.package_dir, args.root)
-    rig = mount_rig(read_rig(args.rig), chain) if args.rig else None
+    rig, estimated = _mounted_rig(args.rig, sidecar, chain) if args.rig else (None, [])
     predictor = _predictor(chain, sidecar, args) if args.map else None
     files = [
         read_measurement_file(path, chain, args.columns, skip_bad_rows=args.skip_bad_rows, rig=rig)
@@ -114,6 +112,7 @@ def run(args: Namespace) -> int:
     else:
         document = validation_to_dict(chain, data, file_digests(inputs), known)
     document["before"] = main_statistics(given)
+    document["estimated_entries"] = estimated
     remarks: list[str] = []
     reference = None
     if args.nominal:
@@ -135,6 +134,11 @@ def run(args: Namespace) -> int:
         document["files"]["map"] = args.map
         contents[args.map] = map_content(args.map, predictor, data, known)
     remarks += extrapolation.sentences if extrapolation else ()
+    if estimated:
+        remarks.append(
+            f"Poses, lenses and corners of {', '.join(estimated)} are the estimates of the calibration "
+            f"({sidecar}), not those of {args.rig}."
+        )
     if args.report:
         from ..io.robot import robot_name  # lazy import, as the following: only for reports
         from ..report.validation import Validation, validation_page
@@ -166,6 +170,31 @@ def run(args: Namespace) -> int:
     )
     console.show(screen, args.verbosity)
     return 0
+
+
+def _mounted_rig(path: str, sidecar: str | None, chain: Chain) -> tuple[MountedRig, list[str]]:
+    """Read a rig whose entries have the estimates of a calibration.
+
+    Returns:
+        The rig, and the names of the entries with estimates, such as `camera.wrist`.
+    """
+    from ..io.rig_file import (
+        read_calibrated_rig,
+        read_rig,
+        with_estimates_of,
+    )  # lazy import, as the following
+    from ..measurements.mounting import mount_rig
+
+    rig = read_rig(path)
+    calibrated = read_calibrated_rig(sidecar) if sidecar else None
+    if calibrated is None:
+        return mount_rig(rig, chain), []
+    names = [
+        *(f"camera.{name}" for name in rig.cameras if name in calibrated.cameras),
+        *(f"board.{name}" for name in rig.boards if name in calibrated.boards),
+    ]
+    ends = {"world": chain.root, "tip": chain.tip}
+    return mount_rig(with_estimates_of(rig, calibrated, ends), chain), names
 
 
 def _nominal_accuracy(

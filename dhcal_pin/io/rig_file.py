@@ -84,8 +84,59 @@ def with_poses_of(rig: Rig, other: Rig) -> Rig:
         cameras={
             name: other.cameras.get(name, e) if e.pose is None else e for name, e in rig.cameras.items()
         },
-        boards={name: other.boards.get(name, e) if e.pose is None else e for name, e in rig.boards.items()},
+        boards={
+            # Estimated corners are a list of points, of which nothing says that they are printed on a plane.
+            name: replace(e, link=other.boards[name].link, pose=other.boards[name].pose)
+            if e.pose is None and name in other.boards
+            else e
+            for name, e in rig.boards.items()
+        },
     )
+
+
+def with_estimates_of(rig: Rig, calibrated: Rig, ends: Mapping[str, str]) -> Rig:
+    """Return a rig whose entries have the estimated poses, lenses and corners of the same names.
+
+    Args:
+        rig: Cameras and boards as a user states them.
+        calibrated: Rig of the sidecar of a calibrated robot.
+        ends: Names of the links "world" and "tip" of the robot.
+
+    Returns:
+        The rig; entries that the sidecar does not have are as they were.
+
+    Raises:
+        InvalidArgumentError: An entry is another camera or board than that of the same name in the sidecar.
+    """
+    pairs = [
+        ("camera", rig.cameras, calibrated.cameras, _camera_properties),
+        ("board", rig.boards, calibrated.boards, _board_properties),
+    ]
+    for kind, entries, others, properties in pairs:
+        for name in entries.keys() & others.keys():
+            stated, estimated = (properties(group[name], ends) for group in (entries, others))
+            for what, value in stated.items():
+                if value != estimated[what]:
+                    raise InvalidArgumentError(
+                        f"{rig.source}: [{kind}.{name}]: {what} {value}, but {estimated[what]} in "
+                        f"{calibrated.source}; expected the {kind} of the calibration, or another name"
+                    )
+    return replace(
+        rig,
+        cameras={name: calibrated.cameras.get(name, entry) for name, entry in rig.cameras.items()},
+        boards={name: calibrated.boards.get(name, entry) for name, entry in rig.boards.items()},
+    )
+
+
+def _camera_properties(camera: Camera, ends: Mapping[str, str]) -> dict[str, Any]:
+    """Return what the calibration of a camera does not change."""
+    size = f"{camera.width} x {camera.height} px"
+    return {"link": ends.get(camera.link, camera.link), "model": camera.lens.name, "images": size}
+
+
+def _board_properties(board: Board, ends: Mapping[str, str]) -> dict[str, Any]:
+    """Return what the calibration of a board does not change."""
+    return {"link": ends.get(board.link, board.link), "number of corners": len(board.points)}
 
 
 def only_entry(entries: Mapping[str, Entry], name: str | None, kind: str, source: PathLike) -> Entry:
@@ -292,7 +343,7 @@ def rig_content(cameras: Sequence[Camera], boards: Sequence[Board]) -> dict[str,
             entry |= {"marker_mm": 1e3 * board.marker, "legacy": board.is_legacy}
         if board.type == "aprilgrid":
             entry["spacing_mm"] = 1e3 * board.spacing
-        if board.dictionary:
+        if board.dictionary and board.type != "points":
             entry["dictionary"] = board.dictionary
         if board.has_free_points:
             entry["points"] = "prior"

@@ -1,0 +1,114 @@
+"""Command validate with images: the estimates of the calibration count, not the values of an old rig file."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import json_of, unfolded
+
+import dhcal_pin as dh
+from dhcal_pin import se3
+from dhcal_pin.cameras import Board, Camera, Rig
+from dhcal_pin.io.rig_file import read_calibrated_rig, rig_text
+from dhcal_pin.measurements import ViewLimits, is_board_in_view, mount_rig, project_board
+from dhcal_pin.robot.sampling import joint_range
+
+NOISE = 0.1
+CAMERA = Camera(
+    "wrist", "tip", 800, 600, np.array([762.0, 765, 402, 298, -0.12, 0.06, 0.001, -0.0005, 0]),
+    pose=se3.transform(se3.exp3([0.02, -0.03, 0.8]), [0.03, 0.05, 0.02]),
+)  # fmt: skip
+BOARD = Board(
+    "table", "world", "charuco", columns=5, rows=4, square=0.04, marker=0.03, dictionary="DICT_5X5_100",
+    pose=se3.transform(se3.exp3([np.pi, 0, 0]) @ se3.exp3([0.02, 0.03, 0.5]), [0.75, 0.1, 0.02]),
+)  # fmt: skip
+
+
+@pytest.fixture
+def calibrated(run, robot_folder):
+    """Calibrate a camera and a board whose corners are 1 mm beside the stated places; other images remain."""
+    arm = dh.read_robot("example:ur10", tip="tool0")
+    rng = np.random.default_rng(4)
+    corners = BOARD.points + rng.normal(0, 1e-3, BOARD.points.shape)
+    bent = replace(BOARD, type="points", listed_points=corners)
+    rig = mount_rig(Rig({"wrist": CAMERA}, {"table": bent}), arm)
+    q = rng.uniform(*joint_range(arm), (200_000, 6))
+    tools = arm.poses(q)
+    q = q[is_board_in_view(rig, 0, 0, tools, ViewLimits(0.3, 0.8)) & (tools[:, 2, 3] > 0.1)]
+    for name, rows in (("fitted.csv", q[:25]), ("other.csv", q[25:40])):
+        pixels, _ = project_board(rig, 0, 0, rig.board_in_camera(0, 0, arm.poses(rows)))
+        pixels += NOISE * rng.standard_normal(pixels.shape)
+        lines = [",".join(f"{joint}[rad]" for joint in arm.joint_names) + ",u[px],v[px],corner"]
+        for joints, image in zip(rows.tolist(), pixels.tolist(), strict=True):
+            lines += [",".join(map(repr, [*joints, *uv, i])) for i, uv in enumerate(image)]
+        Path(name).write_text("\n".join(lines))
+    write_rig("rig.toml", has_free_points=True)
+    status, _, err = run(
+        *("calibrate", "example:ur10", "fitted.csv", "--rig", "rig.toml", "--tip", "tool0"),
+        *("--parameters", "camera,board,intrinsics", "-o", "arm.urdf"),
+    )
+    assert status == 0, err
+    return corners
+
+
+def write_rig(path, camera=CAMERA, **changes):
+    """Write the rig of a user, without poses and with roughly known lens."""
+    values = np.array([720.0, 720, 399.5, 299.5, 0, 0, 0, 0, 0])
+    board = replace(BOARD, pose=None, **changes)
+    Path(path).write_text(rig_text([replace(camera, pose=None, values=values)], [board]))
+
+
+def test_estimates_of_the_calibration_replace_an_old_rig(run, calibrated):
+    """Lens and corners of the rig file are wrong; the error is the noise, whatever the rig says."""
+    rig = read_calibrated_rig("arm.calibration.toml")
+    assert rig is not None
+    points = rig.boards["table"].points
+    assert np.std(points - points.mean(0) - calibrated + calibrated.mean(0)) < 3e-4
+    fixed = replace(CAMERA, intrinsics="fixed")
+    for path, camera, changes in (
+        ("rig.toml", CAMERA, {"has_free_points": True}),
+        ("auto.toml", CAMERA, {}),
+        ("fixed.toml", fixed, {"has_exact_points": True, "square": 0.041}),
+    ):
+        write_rig(path, camera, **changes)
+        args = ("validate", "arm.urdf", "other.csv", "--tip", "tool0", "--rig", path)
+        document = json_of(run(*args, "--json", "-"))
+        assert document["after"]["residual_rms"] == pytest.approx(np.sqrt(2) * NOISE, rel=0.2)
+        assert document["estimated_entries"] == ["camera.wrist", "board.table"]
+        assert f"estimates of the calibration (arm.calibration.toml), not those of {path}" in unfolded(
+            run(*args)[2]
+        )
+
+
+def test_other_names_are_not_those_of_the_calibration(run, calibrated):
+    """The poses of a camera under another name are fitted to the images, with its corners as stated."""
+    write_rig("rig.toml", replace(CAMERA, name="new"), name="old")
+    document = json_of(
+        run("validate", "arm.urdf", "other.csv", "--tip", "tool0", "--rig", "rig.toml", "--json", "-")
+    )
+    assert document["estimated_entries"] == []
+    assert document["after"]["residual_rms"] > 5 * NOISE
+
+
+def test_another_board_of_the_same_name_is_refused(run, calibrated):
+    small = replace(CAMERA, width=640, height=480)
+    for camera, changes, message in (
+        (CAMERA, {"columns": 6}, "[board.table]: number of corners 15, but 12 in arm.calibration.toml"),
+        (CAMERA, {"link": "shoulder_link"}, "[board.table]: link shoulder_link, but world in"),
+        (small, {}, "[camera.wrist]: images 640 x 480 px, but 800 x 600 px in"),
+    ):
+        write_rig("rig.toml", camera, **changes)
+        status, _, err = run("validate", "arm.urdf", "other.csv", "--tip", "tool0", "--rig", "rig.toml")
+        assert status == 2
+        assert f"rig.toml: {message}" in unfolded(err)
+
+
+def test_a_plan_reads_the_sidecar_of_estimated_corners(run, calibrated):
+    """The pose is that of the calibration; the board is a printed one still, seen from its front."""
+    write_rig("rig.toml")
+    args = ("plan", "arm.urdf", "-n", "3", "--tip", "tool0", "--rig", "rig.toml", "--candidates", "20")
+    document = json_of(run(*args, "-o", "poses.csv", "--json", "-"))
+    assert document["views"][0]["angle_max_rad"] < np.deg2rad(60.1)
