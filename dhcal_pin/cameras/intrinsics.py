@@ -1,6 +1,7 @@
 """Focal lengths and image centre from several views of a board.
 
-Two methods give estimates; the one whose poses of the board leave the smaller error in the images is taken.
+Two methods give estimates. Each of them starts a fit of the whole lens with the images (`lens_fit`); the
+better fit is taken.
 
 1. Views of a flat board (Zhang 2000). Each homography H = λ·K·[r1 r2 t] of a view gives two linear equations
    in ω = K⁻ᵀ·K⁻¹, because the columns r1 and r2 are orthonormal:
@@ -24,7 +25,7 @@ import numpy as np
 
 from .._typing import Array
 from ..exceptions import NotObservableError
-from .pose_from_points import FLATNESS, direct_linear_transform, estimate_pose
+from .pose_from_points import FLATNESS, MIN_FLAT_POINTS, direct_linear_transform, estimate_poses
 from .rig import Camera
 
 # Smallest number of views.
@@ -53,26 +54,52 @@ def estimate_intrinsics(
         camera: Camera: its lens model, the size of its images and its name.
 
     Returns:
-        fx, fy, cx, cy [px].
+        fx, fy, cx, cy [px]; of both methods those whose poses of the board leave the smaller error in the
+        images.
 
     Raises:
         NotObservableError: There are too few views, or they do not determine the focal length.
     """
-    views = [view for view in views if len(view[0]) >= 4]
+    candidates = intrinsics_candidates(views, camera)
+    some = _drawn([view for view in views if len(view[0]) >= MIN_FLAT_POINTS])
+    return min(candidates, key=lambda values: _square_sum(some, camera, values))
+
+
+def intrinsics_candidates(
+    views: Sequence[tuple[Array, Array]], camera: Camera
+) -> list[tuple[float, float, float, float]]:
+    """Estimate the focal lengths and the image centre of a camera by each method that determines them.
+
+    Args:
+        views: Points of a board, shape (m, 3) [m], and their pixels, shape (m, 2), of each view.
+        camera: Camera: its lens model, the size of its images and its name.
+
+    Returns:
+        fx, fy, cx, cy [px] of each estimate, at least one.
+
+    Raises:
+        NotObservableError: There are too few views, or they do not determine the focal length.
+    """
+    views = [view for view in views if len(view[0]) >= MIN_FLAT_POINTS]
     if len(views) < MIN_VIEWS:
         raise NotObservableError(
             f"camera {camera.name!r}: {len(views)} images of a board with at least 4 corners; expected at "
             f"least {MIN_VIEWS} for intrinsics that the rig file does not state"
         )
-    chosen = np.unique(np.linspace(0, len(views) - 1, _MAX_VIEWS).astype(int))
-    some = [views[i] for i in chosen]
-    candidates = [each for each in (_from_homographies(views, camera), _search(some, camera)) if each]
+    candidates = [
+        each for each in (_from_homographies(views, camera), _search(_drawn(views), camera)) if each
+    ]
     if not candidates:
         raise NotObservableError(
             f"camera {camera.name!r}: the images do not determine its focal length; expected images of the "
             "board tilted in different directions, or fx, fy, cx, cy in the rig file"
         )
-    return min(candidates, key=lambda values: _square_sum(some, camera, values))
+    return candidates
+
+
+def _drawn(views: Sequence[tuple[Array, Array]]) -> list[tuple[Array, Array]]:
+    """Return at most as many views as poses are estimated for."""
+    return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, _MAX_VIEWS).astype(int))]
 
 
 def _square_sum(
@@ -80,9 +107,10 @@ def _square_sum(
 ) -> float:
     """Return the sum of squares of the errors in the images [px²] of the poses of the board in all views."""
     lens = np.pad(values, (0, len(camera.values) - 4))
+    plane = [camera.lens.normalize(pixels.T, lens).T for _, pixels in views]
+    poses = estimate_poses([(points, image) for (points, _), image in zip(views, plane, strict=True)])
     total = 0.0
-    for points, pixels in views:
-        estimate = estimate_pose(points, camera.lens.normalize(pixels.T, lens).T)
+    for (points, pixels), estimate in zip(views, poses, strict=True):
         if estimate is not None:
             pose = estimate[0]
             local = pose[:3, :3] @ points.T + pose[:3, 3:4]

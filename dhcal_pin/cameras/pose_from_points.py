@@ -4,7 +4,8 @@
    the points, with both of the poses that explain a flat board about equally well, and that of a projection
    matrix for six or more points that are not in one plane (Hartley and Zisserman 2004, sections 4.1 and 7.1).
    The projection matrix of points near a plane is hardly determined, so both forms are tried for them.
-2. Gauss-Newton steps with damping minimize the distances in the image. The best of these poses is taken.
+2. Gauss-Newton steps with damping minimize the distances in the image, for all images together. The best of
+   these poses is taken.
 
 All image coordinates are undistorted, X/Z and Y/Z.
 
@@ -13,6 +14,8 @@ Reference:
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -30,23 +33,26 @@ _N_STEPS, _DAMPING = 30, 1e-3
 # and distance of a wrong point as a multiple of the median.
 _N_SUBSETS, _GOOD_RATIO, _OUTLIER_RATIO = 60, 0.01, 5.0
 # Relative change of the cost that ends the refinement.
-_COST_RTOL = 1e-10
+_COST_RTOL = 1e-4
+# Smallest depth of a point in front of the camera [m].
+_MIN_DEPTH = 1e-6
 
 
 def normalizing_transform(points: Array) -> Array:
     """Compute the similarity that moves points to the origin and scales them to unit size.
 
     Args:
-        points: Points, shape (m, d).
+        points: Points, shape (..., m, d).
 
     Returns:
-        Homogeneous matrix, shape (d+1, d+1).
+        Homogeneous matrices, shape (..., d+1, d+1).
     """
-    d = points.shape[1]
-    centre = points.mean(0)
-    size = np.sqrt(np.mean(np.sum((points - centre) ** 2, 1)) / d) or 1.0
-    out = np.eye(d + 1) / size
-    out[:d, d], out[d, d] = -centre / size, 1.0
+    d = points.shape[-1]
+    centre = points.mean(-2)
+    size = np.sqrt(np.mean(np.sum((points - centre[..., None, :]) ** 2, -1), -1) / d)
+    size = np.where(size == 0, 1.0, size)
+    out = np.eye(d + 1) / size[..., None, None]
+    out[..., :d, d], out[..., d, d] = -centre / size[..., None], 1.0
     return out
 
 
@@ -54,24 +60,27 @@ def direct_linear_transform(source: Array, target: Array) -> Array:
     """Compute the projective map of points onto image points by the direct linear transformation.
 
     Args:
-        source: Points, shape (m, d).
-        target: Image points, shape (m, 2).
+        source: Points, shape (..., m, d).
+        target: Image points, shape (..., m, 2).
 
     Returns:
-        Matrix, shape (3, d+1), up to a factor.
+        Matrices, shape (..., 3, d+1), up to a factor.
     """
     normalize_source, normalize_target = normalizing_transform(source), normalizing_transform(target)
-    points = np.column_stack([source, np.ones(len(source))]) @ normalize_source.T
-    image = np.column_stack([target, np.ones(len(target))]) @ normalize_target.T
+    one = np.ones((*source.shape[:-1], 1))
+    points = np.concatenate([source, one], -1) @ normalize_source.swapaxes(-1, -2)
+    image = np.concatenate([target, one], -1) @ normalize_target.swapaxes(-1, -2)
     zero = np.zeros_like(points)
     rows = np.concatenate(
         [
-            np.column_stack([points, zero, -image[:, :1] * points]),
-            np.column_stack([zero, points, -image[:, 1:2] * points]),
-        ]
+            np.concatenate([points, zero, -image[..., :1] * points], -1),
+            np.concatenate([zero, points, -image[..., 1:2] * points], -1),
+        ],
+        -2,
     )
-    solution = np.linalg.svd(rows, full_matrices=len(rows) < rows.shape[1])[2][-1].reshape(3, -1)
-    return np.linalg.solve(normalize_target, solution @ normalize_source)
+    solution = np.linalg.svd(rows, full_matrices=rows.shape[-2] < rows.shape[-1])[2][..., -1, :]
+    matrix = solution.reshape(*rows.shape[:-2], 3, -1)
+    return np.linalg.solve(normalize_target, matrix @ normalize_source)
 
 
 def agreeing_points(points: Array, image: Array) -> Array:
@@ -96,23 +105,21 @@ def agreeing_points(points: Array, image: Array) -> Array:
     source = ((points - centre) @ axes.T)[:, : 2 if is_flat else 3]
     ratio = _GOOD_RATIO + (extent[2] / extent[0] if is_flat else 0.0)
     limit = ratio * float(np.median(np.linalg.norm(image - np.median(image, 0), axis=1)))
-    if np.sqrt(np.mean(_transfer_distances(source, image, everything) ** 2)) <= limit:
+    if np.sqrt(np.mean(_transfer_distances(source, image, np.arange(len(points))) ** 2)) <= limit:
         return everything
-    rng = np.random.default_rng(0)
-    fits = [
-        _transfer_distances(source, image, rng.permutation(len(points))[:least]) for _ in range(_N_SUBSETS)
-    ]
-    best = min(fits, key=lambda distances: float(np.median(distances)))
+    chosen = np.argsort(np.random.default_rng(0).random((_N_SUBSETS, len(points))), 1)[:, :least]
+    fits = _transfer_distances(source, image, chosen)
+    best = fits[np.argmin(np.median(fits, 1))]
     is_agreeing = best <= max(_OUTLIER_RATIO * float(np.median(best)), limit)
     return is_agreeing if is_agreeing.sum() > least else everything
 
 
 def _transfer_distances(source: Array, image: Array, chosen: Array) -> Array:
-    """Return the distances (m,) of image points from the projective map that fits the chosen points."""
-    matrix = direct_linear_transform(source[chosen], image[chosen])
-    mapped = np.column_stack([source, np.ones(len(source))]) @ matrix.T
+    """Return the distances (..., m) of image points from projective maps that fit chosen points (..., n)."""
+    matrices = direct_linear_transform(source[chosen], image[chosen])
+    mapped = np.column_stack([source, np.ones(len(source))]) @ matrices.swapaxes(-1, -2)
     with np.errstate(all="ignore"):
-        distances = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - image, axis=1)
+        distances = np.linalg.norm(mapped[..., :2] / mapped[..., 2:] - image, axis=-1)
     return np.where(np.isfinite(distances), distances, np.inf)
 
 
@@ -127,23 +134,55 @@ def estimate_pose(points: Array, image: Array) -> tuple[Array, float] | None:
         Pose of their frame in the camera, shape (4, 4) [m], and the RMS distance in the image; None if there
         are too few points.
     """
+    return estimate_poses([(points, image)])[0]
+
+
+def estimate_poses(
+    views: Sequence[tuple[Array, Array]], known: Sequence[Array | None] | None = None
+) -> list[tuple[Array, float] | None]:
+    """Estimate the pose of points in each of several images.
+
+    Args:
+        views: Points in their own frame, shape (m, 3) [m], and their undistorted image coordinates X/Z, Y/Z,
+            shape (m, 2), in each image.
+        known: Pose near that of each image, shape (4, 4) [m] each, which is tried with its mirror image
+            instead of closed forms; None where there is none.
+
+    Returns:
+        Pose of the points in the camera, shape (4, 4) [m], and the RMS distance in the image, for each image;
+        None where there are too few points.
+    """
+    candidates = [
+        _first_poses(*view) if pose is None else [pose, *_mirror(pose, view[0])]
+        for view, pose in zip(views, known or [None] * len(views), strict=True)
+    ]
+    view_of = [i for i, poses in enumerate(candidates) for _ in poses]
+    out: list[tuple[Array, float] | None] = [None] * len(views)
+    if view_of:
+        first = np.array([pose for poses in candidates for pose in poses])
+        poses, rms = _refine(first, [views[i] for i in view_of])
+        # The best pose of a view is stored last.
+        for i in np.argsort(-rms, kind="stable").tolist():
+            out[view_of[i]] = poses[i], float(rms[i])
+    return out
+
+
+def _first_poses(points: Array, image: Array) -> list[Array]:
+    """Return the closed-form poses of points (m, 3) in an image (m, 2); none if they are too few."""
     if len(points) < MIN_FLAT_POINTS:
-        return None
+        return []
     centre = points.mean(0)
     _, extent, axes = np.linalg.svd(points - centre, full_matrices=False)
     if extent[1] <= FLATNESS * extent[0]:
-        return None
+        return []
     is_flat = extent[2] <= FLATNESS * extent[0]
     if not is_flat and len(points) < MIN_POINTS:
-        return None
+        return []
     axes[2] *= np.linalg.det(axes)
     flat = (points - centre) @ axes.T
     frame = se3.inverse(se3.transform(axes.T, centre))
-    candidates = [pose @ frame for pose in _flat_poses(flat[:, :2], image)]
-    if not is_flat:
-        candidates.append(_projection_pose(points, image))
-    refined = [_refine(pose, points, image) for pose in candidates]
-    return min(refined, key=lambda each: each[1])
+    out = [pose @ frame for pose in _flat_poses(flat[:, :2], image)]
+    return out if is_flat else [*out, _projection_pose(points, image)]
 
 
 def _flat_poses(points: Array, image: Array) -> list[Array]:
@@ -155,16 +194,32 @@ def _flat_poses(points: Array, image: Array) -> list[Array]:
     x, y = homography[:, 0], homography[:, 1]
     rotation = se3.nearest_rotation(np.column_stack([x, y, np.cross(x, y)]))
     first = se3.transform(rotation, homography[:, 2])
-    # The line of sight to the board: a board tilted the other way about it looks nearly the same.
-    sight = homography[:, 2] / np.linalg.norm(homography[:, 2])
-    normal = rotation[:, 2]
+    return [first, *_mirror_plane(first)]
+
+
+def _mirror_plane(pose: Array) -> list[Array]:
+    """Return the mirror image in depth of the pose of a plane, whose origin is fixed; none without tilt.
+
+    A board that is tilted the other way about the line of sight looks nearly the same.
+    """
+    position = pose[:3, 3]
+    sight, normal = position / np.linalg.norm(position), pose[:3, 2]
     mirrored = 2 * (normal @ sight) * sight - normal
     axis = np.cross(normal, mirrored)
     sine = np.linalg.norm(axis)
     if sine < 1e-9:
-        return [first]
+        return []
     turn = se3.exp3(axis / sine * np.arctan2(sine, normal @ mirrored))
-    return [first, se3.transform(turn @ rotation, homography[:, 2])]
+    return [se3.transform(turn @ pose[:3, :3], position)]
+
+
+def _mirror(pose: Array, points: Array) -> list[Array]:
+    """Return the poses of points (m, 3) that mirror a pose (4, 4) in depth about their nearest plane."""
+    centre = points.mean(0)
+    axes = np.linalg.svd(points - centre, full_matrices=False)[2]
+    axes[2] *= np.linalg.det(axes)
+    plane = se3.transform(axes.T, centre)
+    return [mirrored @ se3.inverse(plane) for mirrored in _mirror_plane(pose @ plane)]
 
 
 def _projection_pose(points: Array, image: Array) -> Array:
@@ -174,39 +229,58 @@ def _projection_pose(points: Array, image: Array) -> Array:
     return se3.transform(se3.nearest_rotation(projection[:, :3]), projection[:, 3])
 
 
-def _residual(pose: Array, points: Array, image: Array) -> tuple[Array, Array]:
-    """Return residuals (2m,) and points in the camera frame (m, 3)."""
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    depth = np.maximum(local[:, 2], 1e-6)
-    return (image - local[:, :2] / depth[:, None]).ravel(), local
+def _residuals(poses: Array, points: Array, image: Array) -> tuple[Array, Array]:
+    """Return residuals (c, m, 2) and points in the camera frame (c, m, 3) of poses (c, 4, 4)."""
+    local = points @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]
+    depth = np.maximum(local[..., 2:], _MIN_DEPTH)
+    return image - local[..., :2] / depth, local
 
 
-def _refine(pose: Array, points: Array, image: Array) -> tuple[Array, float]:
-    """Minimize the distances in the image; return the pose and the RMS distance."""
-    damping = _DAMPING
-    residual, local = _residual(pose, points, image)
-    cost = float(residual @ residual)
+def _refine(poses: Array, views: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
+    """Minimize the distances in the image of each pose (c, 4, 4) in its view.
+
+    Returns:
+        Poses (c, 4, 4) and RMS distances (c,), infinite if points are behind the camera.
+    """
+    counts = np.array([len(points) for points, _ in views])
+    # Views are filled up with copies of their first points, which do not count.
+    index = [np.pad(np.arange(count), (0, counts.max() - count)) for count in counts]
+    points = np.array([view[0][i] for view, i in zip(views, index, strict=True)])
+    image = np.array([view[1][i] for view, i in zip(views, index, strict=True)])
+    presence = (np.arange(counts.max()) < counts[:, None])[..., None].astype(float)
+    poses = poses.copy()
+    residuals, local = _residuals(poses, points, image)
+    cost = np.sum(presence * residuals**2, (1, 2))
+    damping = np.full(len(poses), _DAMPING)
+    active = np.arange(len(poses))
     for _ in range(_N_STEPS):
-        depth = np.maximum(local[:, 2], 1e-6)
-        by_point = np.zeros((len(points), 2, 3))
-        by_point[:, 0, 0] = by_point[:, 1, 1] = 1 / depth
-        by_point[:, :, 2] = -local[:, :2] / depth[:, None] ** 2
-        # The pose moves by the twist [v, ω] in camera axes at the origin.
-        jacobian = np.concatenate([by_point, -by_point @ se3.skew(local)], 2).reshape(-1, 6)
-        scale = np.linalg.norm(jacobian, axis=0)
-        scale[scale == 0] = 1.0
-        rows = np.concatenate([jacobian / scale, np.sqrt(damping) * np.eye(6)])
-        step = np.linalg.lstsq(rows, np.concatenate([residual, np.zeros(6)]), rcond=None)[0] / scale
-        trial = se3.exp6(step) @ pose
-        trial_residual, trial_local = _residual(trial, points, image)
-        trial_cost = float(trial_residual @ trial_residual)
-        if trial_cost < cost:
-            is_done = cost - trial_cost < _COST_RTOL * cost
-            pose, residual, local, cost = trial, trial_residual, trial_local, trial_cost
-            damping *= 0.1
-            if is_done:
-                break
-        else:
-            damping *= 10
-    is_behind = bool(np.any(local[:, 2] <= 0))
-    return pose, np.inf if is_behind else float(np.sqrt(cost / len(points)))
+        normal, gradient = _normal_equations(residuals[active], local[active], presence[active])
+        scale = np.sqrt(np.maximum(np.einsum("cii->ci", normal), 1e-300))
+        normal = normal / (scale[:, :, None] * scale[:, None]) + damping[active, None, None] * np.eye(6)
+        step = np.linalg.solve(normal, (gradient / scale)[..., None])[..., 0] / scale
+        trial = se3.exp6(step) @ poses[active]
+        trial_residuals, trial_local = _residuals(trial, points[active], image[active])
+        trial_cost = np.sum(presence[active] * trial_residuals**2, (1, 2))
+        is_better = trial_cost < cost[active]
+        better = active[is_better]
+        # A Gauss-Newton step without damping reduces the cost by its product with the gradient.
+        is_done = np.einsum("ci,ci->c", step, gradient) < _COST_RTOL * cost[active]
+        poses[better], residuals[better] = trial[is_better], trial_residuals[is_better]
+        local[better], cost[better] = trial_local[is_better], trial_cost[is_better]
+        damping[active] *= np.where(is_better, 0.1, 10.0)
+        active = active[~is_done]
+        if not len(active):
+            break
+    is_behind = np.any(local[..., 2] <= 0, 1)
+    return poses, np.where(is_behind, np.inf, np.sqrt(cost / counts))
+
+
+def _normal_equations(residuals: Array, local: Array, presence: Array) -> tuple[Array, Array]:
+    """Return JᵀJ (c, 6, 6) and Jᵀr (c, 6) of poses that move by twists [v, ω] in camera axes."""
+    depth = np.maximum(local[..., 2], _MIN_DEPTH)
+    by_point = np.zeros((*local.shape[:2], 2, 3))
+    by_point[..., 0, 0] = by_point[..., 1, 1] = 1 / depth
+    by_point[..., 2] = -local[..., :2] / depth[..., None] ** 2
+    jacobian = np.concatenate([by_point, np.cross(local[:, :, None], by_point)], 3) * presence[..., None]
+    rows = jacobian.reshape(len(local), -1, 6)
+    return rows.swapaxes(1, 2) @ rows, (rows.swapaxes(1, 2) @ residuals.reshape(len(local), -1, 1))[..., 0]

@@ -1,15 +1,16 @@
 """First values of cameras and boards from the images alone, without a guess.
 
-1. Focal lengths and image centres that the rig does not state, from the views of boards.
-2. The pose of each board in each image.
-3. The poses of cameras and boards on the robot, pair by pair: the pair of camera and board with the most
+1. The lens of each camera and the pose of each board in each image, from its images alone
+   (`cameras.lens_fit`). With a wrong distortion many boards appear tilted the other way. The lens itself
+   is a first value only where the rig states no focal lengths.
+2. The poses of cameras and boards on the robot, pair by pair: the pair of camera and board with the most
    images in closed form (Shah 2013); then every further camera that sees a known board, and every further
    board that a known camera sees, by the mean over its images.
 
 A pose that is stated in the rig is used as it is.
 
-The pose of a board in an image depends on that image alone. It is remembered, as a robust start estimates
-first values from many subsets of the same images; so are the focal lengths of a measurement.
+The joint values have no influence on lenses and poses in images. They are remembered, as a robust start
+estimates first values from many subsets of the same images.
 """
 
 from __future__ import annotations
@@ -25,12 +26,15 @@ from ... import se3
 from ..._typing import Array
 from ...cameras.boards import Board
 from ...cameras.hand_eye import mean_pose, solve_hand_eye
-from ...cameras.intrinsics import estimate_intrinsics
-from ...cameras.pose_from_points import agreeing_points, estimate_pose
+from ...cameras.intrinsics import intrinsics_candidates
+from ...cameras.lens import FOCAL_AND_CENTRE
+from ...cameras.lens_fit import LensFit, fit_lens
+from ...cameras.pose_from_points import agreeing_points
 from ...cameras.rig import Camera
 from ...exceptions import NotObservableError
 from ...robot.chain import Chain
 from ..mounting import Mount
+from .camera_parameters import DISTORTION_PRIORS, PIXEL_PRIORS
 
 if TYPE_CHECKING:
     from ..camera import CameraCorners
@@ -39,8 +43,8 @@ if TYPE_CHECKING:
 _MAX_RATIO = 5.0
 # RMS distance that is never too large: half a percent of the focal length.
 _GOOD_RMS = 5e-3
-# Largest number of images that are remembered.
-_MAX_REMEMBERED = 2000
+# Largest number of images, and of fits of lenses, that are remembered.
+_MAX_REMEMBERED, _MAX_FITS = 2000, 32
 
 _R = TypeVar("_R")
 
@@ -55,7 +59,7 @@ def _remember(function: Callable[[Array, Array], _R]) -> Callable[[Array, Array]
     return lambda points, image: of_bytes(points.tobytes(), image.tobytes())
 
 
-_agreeing_points, _estimate_pose = _remember(agreeing_points), _remember(estimate_pose)
+_agreeing_points = _remember(agreeing_points)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +67,7 @@ class BoardViews:
     """Boards in images, each from its image alone: the joint values have no influence.
 
     Attributes:
-        lenses: Values of the lens of each camera, estimated if the rig does not state them.
+        lenses: Values of the lens of each camera.
         sample: First sample of each view of a board, (v,).
         poses: Pose of the board in the camera, (v, 4, 4) [m].
         rms: RMS distance of its corners in the image, X/Z and Y/Z, (v,).
@@ -76,7 +80,7 @@ class BoardViews:
 
 
 def estimate_views(item: CameraCorners) -> BoardViews:
-    """Estimate the lenses that the rig does not state, and the pose of each board in each image.
+    """Estimate the lens of each camera, and the pose of each board in each image.
 
     Args:
         item: Image coordinates.
@@ -88,32 +92,60 @@ def estimate_views(item: CameraCorners) -> BoardViews:
         NotObservableError: The images do not determine the focal length of a camera.
     """
     images = _images(item)
-    lenses = []
-    for number, camera in enumerate(item.rig.cameras):
-        lens = camera.values.copy()
-        if not camera.has_intrinsics:
-            views = [
-                (item.rig.boards[item.board[samples[0]]].points[item.corner[samples]], item.values[samples])
-                for samples in images
-                if item.camera[samples[0]] == number
-            ]
-            lens[:4] = estimate_intrinsics(views, camera)
-            lens[4:] = 0.0
-        lenses.append(lens)
+    lenses: list[Array] = []
     found: list[tuple[int, Array, float]] = []
-    for samples in images:
-        camera = int(item.camera[samples[0]])
-        points = item.rig.boards[item.board[samples[0]]].points[item.corner[samples]]
-        plane = item.rig.cameras[camera].lens.normalize(item.values[samples].T, lenses[camera]).T
-        estimate = _estimate_pose(points, plane)
-        if estimate is not None and np.isfinite(estimate[1]):
-            found.append((int(samples[0]), *estimate))
+    for number, camera in enumerate(item.rig.cameras):
+        own = [samples for samples in images if item.camera[samples[0]] == number]
+        fit = _fit_camera(
+            camera,
+            tuple(
+                (
+                    item.rig.boards[item.board[samples[0]]].points[item.corner[samples]].tobytes(),
+                    item.values[samples].tobytes(),
+                )
+                for samples in own
+            ),
+        )
+        lenses.append(fit.values)
+        found += [
+            (int(samples[0]), *estimate)
+            for samples, estimate in zip(own, fit.poses, strict=True)
+            if estimate is not None and np.isfinite(estimate[1])
+        ]
+    found.sort(key=lambda view: view[0])
     return BoardViews(
         lenses,
         np.array([view[0] for view in found], int),
         np.array([view[1] for view in found]).reshape(-1, 4, 4),
         np.array([view[2] for view in found]),
     )
+
+
+@lru_cache(_MAX_FITS)
+def _fit_camera(camera: Camera, content: tuple[tuple[bytes, bytes], ...]) -> LensFit:
+    """Fit the lens of a camera and the poses of boards to views: bytes of points and pixels."""
+    views = [
+        (np.frombuffer(points).reshape(-1, 3), np.frombuffer(pixels).reshape(-1, 2))
+        for points, pixels in content
+    ]
+    starts = [camera.values]
+    if not camera.has_intrinsics:
+        n_more = len(camera.values) - len(FOCAL_AND_CENTRE)
+        starts = [np.pad(each, (0, n_more)) for each in intrinsics_candidates(views, camera)]
+    fits = [fit_lens(views, camera.lens, start, _lens_widths(camera)) for start in starts]
+    return min(fits, key=lambda fit: fit.cost)
+
+
+def _lens_widths(camera: Camera) -> Array:
+    """Return the standard deviations of the first values of a lens, (s,) [px and 1]; 0 if they are fixed.
+
+    Few images determine a lens badly. It stays near stated values, even if the calibration leaves them free.
+    """
+    n_coefficients = len(camera.lens.coefficients)
+    if camera.intrinsics == "fixed":
+        return np.zeros(len(FOCAL_AND_CENTRE) + n_coefficients)
+    pixels = PIXEL_PRIORS["prior" if camera.has_intrinsics else "free"]
+    return np.repeat([pixels, DISTORTION_PRIORS["prior"]], [len(FOCAL_AND_CENTRE), n_coefficients])
 
 
 def first_values(item: CameraCorners, chain: Chain, is_used: Array | None = None) -> dict[str, float]:

@@ -1,0 +1,117 @@
+"""Lens and poses of boards from the images of a camera alone, against the truth and OpenCV."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dhcal_pin import se3
+from dhcal_pin.cameras import LENSES, Board
+from dhcal_pin.cameras.lens_fit import fit_lens
+from dhcal_pin.cameras.pose_from_points import estimate_pose, estimate_poses
+
+cv2 = pytest.importorskip("cv2")
+CHECKERBOARD = Board("b", "world", "checkerboard", columns=8, rows=6, square=0.03).points
+MIDDLE = CHECKERBOARD.mean(0)
+# True lenses with the values that a rig states, and standard deviations of these.
+TRUE = {
+    "pinhole": np.array([1040.0, 1050.0, 650.0, 490.0, -0.28, 0.08, 5e-4, -5e-4, 0.0]),
+    "fisheye": np.array([1040.0, 1050.0, 650.0, 490.0, -0.05, 0.01, 0.0, 0.0]),
+}
+STATED = np.array([1000.0, 1000.0, 639.5, 479.5])
+WIDTHS = {"stated": (50.0, 0.3), "free": (1e5, 1e2)}
+
+
+def stated_lens(model, widths):
+    """Return the values of a rig without distortion, and their standard deviations."""
+    n_coefficients = len(TRUE[model]) - 4
+    return np.pad(STATED, (0, n_coefficients)), np.repeat(WIDTHS[widths], [4, n_coefficients])
+
+
+def images(rng, model, count=25, sigma=0.2, tilt=0.35):
+    """Return poses of a little tilted board all over the image, and its views."""
+    poses, views = [], []
+    while len(views) < count:
+        turn = se3.exp3(np.array([*rng.normal(0, tilt, 2), rng.uniform(-3, 3)]))
+        position = np.array([*rng.uniform(-0.25, 0.25, 2), rng.uniform(0.5, 0.9)])
+        pose = se3.transform(turn, position - turn @ MIDDLE)
+        local = CHECKERBOARD @ pose[:3, :3].T + pose[:3, 3]
+        pixels = LENSES[model].project(local.T, TRUE[model])[0].T
+        if np.all((pixels > 0) & (pixels < [1280, 960])):
+            poses.append(pose)
+            views.append((CHECKERBOARD, pixels + sigma * rng.standard_normal(pixels.shape)))
+    return np.array(poses), views
+
+
+def angles(found, poses):
+    """Return the angles of found poses to the true ones [rad]."""
+    return np.array(
+        [
+            np.linalg.norm(se3.log3(each[0][:3, :3].T @ pose[:3, :3]))
+            for each, pose in zip(found, poses, strict=True)
+        ]
+    )
+
+
+@pytest.mark.parametrize("model", LENSES)
+@pytest.mark.parametrize("seed", range(5))
+def test_distorted_images_of_little_tilted_boards_give_the_right_poses(seed, model):
+    """With the lens of the rig, boards appear tilted the other way."""
+    poses, views = images(np.random.default_rng(seed), model)
+    values, std = stated_lens(model, "stated")
+    fit = fit_lens(views, LENSES[model], values, std)
+    np.testing.assert_allclose(fit.values[:4], TRUE[model][:4], atol=10)
+    assert angles(fit.poses, poses).max() < 0.05
+    if model == "pinhole":
+        assert angles(fit_lens(views, LENSES[model], values, 0 * std).poses, poses).max() > 0.2
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_exact_images_give_the_true_lens(model):
+    poses, views = images(np.random.default_rng(0), model, sigma=0.0)
+    fit = fit_lens(views, LENSES[model], *stated_lens(model, "free"))
+    np.testing.assert_allclose(fit.values[:4], TRUE[model][:4], atol=0.05)
+    assert angles(fit.poses, poses).max() < 1e-4
+
+
+def test_lens_agrees_with_opencv():
+    _, views = images(np.random.default_rng(1), "pinhole", sigma=0.3)
+    fit = fit_lens(views, LENSES["pinhole"], *stated_lens("pinhole", "free"))
+    points, pixels = ([view[i].astype(np.float32) for view in views] for i in range(2))
+    _, matrix, distortion, *_ = cv2.calibrateCamera(points, pixels, (1280, 960), None, None)
+    expected = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
+    np.testing.assert_allclose(fit.values[:4], expected, atol=0.3)
+    np.testing.assert_allclose(fit.values[4:8], distortion.ravel()[:4], atol=0.01)
+
+
+def test_values_without_width_are_held():
+    _, views = images(np.random.default_rng(2), "pinhole")
+    values, std = stated_lens("pinhole", "stated")
+    std[[2, 3, 8]] = 0.0
+    fit = fit_lens(views, LENSES["pinhole"], values, std)
+    np.testing.assert_array_equal(fit.values[[2, 3, 8]], values[[2, 3, 8]])
+    np.testing.assert_allclose(fit.values[4], TRUE["pinhole"][4], atol=0.05)
+
+
+def test_images_without_a_pose_are_left_out():
+    poses, views = images(np.random.default_rng(3), "pinhole")
+    views.insert(4, (CHECKERBOARD[:3], views[0][1][:3]))
+    fit = fit_lens(views, LENSES["pinhole"], *stated_lens("pinhole", "stated"))
+    assert fit.poses[4] is None
+    assert angles(fit.poses[:4] + fit.poses[5:], poses).max() < 0.05
+    assert fit_lens([], LENSES["pinhole"], *stated_lens("pinhole", "stated")).poses == []
+
+
+def test_poses_of_several_images_are_those_of_each():
+    rng = np.random.default_rng(4)
+    views = []
+    for count in (10, 14, 35, 35, 21):
+        points = rng.permutation(CHECKERBOARD)[:count]
+        local = points @ se3.exp3(rng.uniform(-0.6, 0.6, 3)).T + [0.05, -0.1, 0.7]
+        views.append((points, local[:, :2] / local[:, 2:] + 3e-4 * rng.standard_normal((count, 2))))
+    for view, found in zip(views, estimate_poses(views), strict=True):
+        alone = estimate_pose(*view)
+        assert alone is not None
+        assert found is not None
+        np.testing.assert_allclose(found[0], alone[0], atol=1e-6)
+        assert found[1] == pytest.approx(alone[1], rel=1e-6)
