@@ -28,6 +28,19 @@ class InvalidArgumentError(DhcalError):
     """An argument has a wrong type, shape or value, or arguments contradict each other."""
 
 
+class SampleError(InvalidArgumentError):
+    """A sample of measurements is invalid.
+
+    Attributes:
+        sample: Number of the sample, counted from 0.
+        problem: Message without the number, for readers of files, which know the line.
+    """
+
+    def __init__(self, sample: int, problem: str):
+        super().__init__(f"sample {sample + 1}: {problem}")
+        self.sample, self.problem = sample, problem
+
+
 class NotObservableError(DhcalError):
     """The measurements cannot determine what was asked for."""
 

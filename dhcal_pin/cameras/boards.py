@@ -40,6 +40,7 @@ class Board:
         has_free_points: Whether the positions of the corners are estimated.
         has_exact_points: Whether they are exact, so that it is not tried to estimate them.
         pose: First guess of its pose in the link, shape (4, 4) [m]; None without one.
+        source: File and table that describe it, for messages; empty for a board from Python.
     """
 
     name: str
@@ -56,6 +57,18 @@ class Board:
     has_free_points: bool = False
     has_exact_points: bool = False
     pose: Array | None = None
+    source: str = ""
+
+    @property
+    def where(self) -> str:
+        """Begin of messages about this board."""
+        return self.source or f"board {self.name!r}"
+
+    @property
+    def n_markers(self) -> int:
+        """Number of markers or tags of a printed board."""
+        n_squares = self.columns * self.rows
+        return {"charuco": n_squares // 2, "aprilgrid": n_squares}.get(self.type, 0)
 
     @property
     def points(self) -> Array:

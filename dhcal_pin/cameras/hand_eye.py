@@ -43,9 +43,9 @@ def solve_hand_eye(link_poses: Array, board_poses: Array, where: str) -> tuple[A
         NotObservableError: There are too few images, or the links turn about one axis only.
     """
     if len(link_poses) < MIN_IMAGES:
+        images = "usable image" if len(link_poses) == 1 else "usable images"
         raise NotObservableError(
-            f"{where}: {len(link_poses)} usable images; expected at least {MIN_IMAGES} at different joint "
-            "values"
+            f"{where}: {len(link_poses)} {images}; expected at least {MIN_IMAGES} at different joint values"
         )
     _require_two_axes(link_poses[:, :3, :3], where)
     a, p = link_poses[:, :3, :3], board_poses[:, :3, :3]

@@ -28,7 +28,7 @@ from .tag_edges import refine_by_edges
 # Largest size of an image file [byte], and largest image [pixels].
 MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS = 64 << 20, 50_000_000
 # What a message says of a file without an image.
-_NO_IMAGE = "is no image that can be read; expected PNG, JPEG or TIFF"
+_NO_IMAGE = "cannot be read as an image; expected PNG, JPEG or TIFF"
 # Problem of an image without a board.
 NO_BOARD = "no board found"
 # Smallest number of corners of an image that is used.
@@ -111,6 +111,8 @@ def _require_few_pixels(path: PathLike) -> None:
     from PIL import Image  # lazy import: an optional extra
 
     source = os.fspath(path)
+    if not os.path.exists(path):
+        raise FileFormatError(f"{source}: no such file; give images, or a folder of images")
     size = os.path.getsize(path) if os.path.isfile(path) else 0
     if size > MAX_IMAGE_BYTES:
         raise FileFormatError(
@@ -217,8 +219,7 @@ def _find(board: Board, layout: Layout, image: Array) -> tuple[Array, Array]:
     finders = {"charuco": _find_charuco, "checkerboard": _find_checkerboard, "aprilgrid": _find_aprilgrid}
     if board.type not in finders:
         raise InvalidArgumentError(
-            f"board {board.name!r} has the type {board.type!r}, which cannot be detected; choose from "
-            f"{', '.join(finders)}"
+            f"{board.where}: the type {board.type!r} cannot be detected; choose from {', '.join(finders)}"
         )
     printed = replace(board, columns=columns, rows=rows, is_legacy=layout.is_legacy)
     corner, pixels = finders[board.type](printed, image)
@@ -245,10 +246,15 @@ def marker_dictionary(board: Board) -> Any:
     matches = {name.upper(): name for name in known}
     if board.dictionary.upper() not in matches:
         raise UnknownNameError(
-            f"board {board.name!r}: dictionary {board.dictionary!r} is unknown; choose from "
-            f"{', '.join(known)}"
+            f"{board.where}: dictionary = {board.dictionary!r} is unknown; choose from {', '.join(known)}"
         )
-    return aruco.getPredefinedDictionary(getattr(aruco, matches[board.dictionary.upper()]))
+    out = aruco.getPredefinedDictionary(getattr(aruco, matches[board.dictionary.upper()]))
+    if board.n_markers > len(out.bytesList):
+        raise InvalidArgumentError(
+            f"{board.where}: {board.columns} x {board.rows} squares need {board.n_markers} markers, and "
+            f"{board.dictionary} has {len(out.bytesList)}; expected a larger dictionary or fewer squares"
+        )
+    return out
 
 
 def charuco_board(board: Board) -> Any:

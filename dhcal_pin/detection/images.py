@@ -94,7 +94,10 @@ def detect_boards(
     """
     boards = [board for board in rig.boards.values() if board.type != "points"]
     if not boards:
-        raise FileFormatError(f"{rig.source}: all boards are sets of points, which cannot be detected")
+        raise FileFormatError(
+            f"{rig.source}: all boards are sets of points, which cannot be found in images; expected a "
+            "printed board"
+        )
     size, out, n_done = (camera.width, camera.height), [], 0
     step = max(1, len(paths) // N_LAYOUT_IMAGES)
     some = [read_image(path) for path in paths[::step]]

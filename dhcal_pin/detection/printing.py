@@ -32,7 +32,7 @@ def black_rectangles(board: Board) -> tuple[Array, tuple[float, float]]:
         InvalidArgumentError: The board is a set of points.
     """
     if board.type == "points":
-        raise InvalidArgumentError(f"board {board.name!r} is a set of points; expected a board to print")
+        raise InvalidArgumentError(f"{board.where}: a set of points cannot be printed; expected another type")
     if board.type == "aprilgrid":
         pitch = board.square + board.spacing
         cells = [(pitch * x, pitch * y) for y in range(board.rows) for x in range(board.columns)]

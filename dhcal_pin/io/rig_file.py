@@ -64,6 +64,12 @@ def read_calibrated_rig(path: PathLike) -> Rig | None:
 def _read_tables(table: TomlTable) -> Rig:
     """Return the cameras and boards of a rig file or of a sidecar."""
     groups = [table.table(kind) for kind in ("camera", "board")]
+    for kind, group in zip(("camera", "board"), groups, strict=True):
+        for key in group.keys():
+            if not isinstance(group.get(key), dict):
+                raise FileFormatError(
+                    f"{group.where}: no name; expected a table [{kind}.NAME] with {key} and others"
+                )
     cameras, boards = ([group.table(name) for name in group.keys()] for group in groups)
     return Rig(
         {camera.name: camera for camera in map(_read_camera, cameras)},
@@ -238,6 +244,7 @@ def _read_board(table: TomlTable) -> Board:
         "has_free_points": points == "prior",
         "has_exact_points": points == "fixed",
         "pose": _first_pose(table),
+        "source": table.where,
     }
     if kind == "points":
         board = Board(**common, listed_points=_listed_points(table))

@@ -34,7 +34,7 @@ from .._kernels.types import FrameBatch, ObservationMatrix
 from .._typing import Array
 from ..cameras.boards import Board
 from ..cameras.rig import WORLD, Camera, Rig
-from ..exceptions import InvalidArgumentError
+from ..exceptions import InvalidArgumentError, NotObservableError, SampleError
 from ..robot.chain import Chain
 from .base import Measurement, Noise, format_sigma
 from .columns import pixel_columns, text_column
@@ -518,13 +518,21 @@ class CameraCorners(Measurement):
         """Return a copy with first values of all parameters that have none, from the images themselves."""
         if all(np.isfinite(p.nominal) for p in self.instrument_parameters):
             return self
-        return self.with_values(first_values(self, chain))
+        return self._with_first_values(chain)
 
     def initialized_from(self, chain: Chain, is_used: Array) -> Self:
         """Return a copy with first values from some of the images."""
         if all(np.isfinite(p.nominal) for p in self.instrument_parameters):
             return self
-        return self.with_values(first_values(self, chain, is_used))
+        return self._with_first_values(chain, is_used)
+
+    def _with_first_values(self, chain: Chain, is_used: Array | None = None) -> Self:
+        """Return a copy with first values; messages begin with the file of the images."""
+        try:
+            return self.with_values(first_values(self, chain, is_used))
+        except NotObservableError as error:
+            where = f"{self.source}: " if self.source else ""
+            raise NotObservableError(f"{where}{error}") from None
 
     @cached_property
     def board_views(self) -> BoardViews:
@@ -665,10 +673,10 @@ def _numbers(names: Sequence[str] | None, known: Sequence[str], m: int, what: st
     if len(names) != m:
         raise InvalidArgumentError(f"CameraCorners: {what} has {len(names)} names for {m} samples")
     numbers = {name: i for i, name in enumerate(known)}
-    for name in names:
+    for i, name in enumerate(names):
         if name not in numbers:
-            raise InvalidArgumentError(
-                f"column {what!r}: {name!r} is not in the rig; choose from {', '.join(known)}"
+            raise SampleError(
+                i, f"column {what!r}: {name!r} is not in the rig; choose from {', '.join(known)}"
             )
     return np.array([numbers[name] for name in names], int)
 
@@ -684,9 +692,10 @@ def _corner_numbers(corner: Sequence[Any] | Array, rig: MountedRig, board: Array
     for i, (value, number) in enumerate(zip(corner, board.tolist(), strict=True)):
         text = str(value).strip()
         if not text.isdecimal() or int(text) >= counts[number]:
-            raise InvalidArgumentError(
+            raise SampleError(
+                i,
                 f"column 'corner': {text!r} is not a corner of board {rig.boards[number].name!r}; expected a "
-                f"whole number from 0 to {counts[number] - 1}"
+                f"whole number from 0 to {counts[number] - 1}",
             )
         out[i] = int(text)
     return out
@@ -698,7 +707,8 @@ def _require_opposite_ends(item: CameraCorners) -> None:
         if item.rig.camera_mounts[camera].moves == item.rig.board_mounts[board].moves:
             raise InvalidArgumentError(
                 f"camera {item.rig.cameras[camera].name!r} sees board {item.rig.boards[board].name!r}, which "
-                "no joint moves against it; expected one on the moving end of the robot and the other one not"
+                "no joint moves against it; expected one on the moving end of the robot and the other one "
+                f"not: correct a link in {item.rig.source or 'the rig'}"
             )
 
 
@@ -713,7 +723,8 @@ def _require_inside_images(item: CameraCorners) -> None:
         of_camera = item.camera == item.camera[first]
         is_exchanged = np.all(item.values[of_camera] <= [camera.height, camera.width])
         hint = "width and height are exchanged" if is_exchanged else "check width and height"
-        raise InvalidArgumentError(
-            f"sample {first + 1} of camera {camera.name!r}: u = {u:.6g}, v = {v:.6g} px is far outside its "
-            f"images of {camera.width} x {camera.height} px; {hint} in the rig file"
+        raise SampleError(
+            first,
+            f"u = {u:.6g}, v = {v:.6g} px is far outside the images of camera {camera.name!r} of "
+            f"{camera.width} x {camera.height} px; {hint} in {item.rig.source or 'the rig'}",
         )

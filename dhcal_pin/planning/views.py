@@ -232,8 +232,9 @@ def draw_views(
 
     out = collect_draws(drawn, count, _MAX_ROUNDS, _MAX_EMPTY_ROUNDS)
     if len(out) < count:
+        where = f"{rig.source}: " if rig.source else ""
         raise InvalidArgumentError(
-            f"{rig.source}: board {target.name!r} does not fit into the image of camera {entry.name!r} at a "
+            f"{where}board {target.name!r} does not fit into the image of camera {entry.name!r} at a "
             f"distance of {1e3 * limits.min_distance:.4g} to {1e3 * limits.max_distance:.4g} mm; expected "
             "other distances, or a smaller share of the corners"
         )

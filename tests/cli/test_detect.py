@@ -113,7 +113,7 @@ def test_images_that_take_too_much_memory_are_refused(assert_refused, photograph
     os.truncate("long.png", (64 << 20) + 1)
     assert_refused(["long.png", "larger than 64 MiB"], "detect", "long.png", *command)
     Path("broken.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"\0" * 1000)
-    assert_refused(["broken.png", "is no image"], "detect", "broken.png", *command)
+    assert_refused(["broken.png", "cannot be read as an image"], "detect", "broken.png", *command)
 
 
 def test_board_is_drawn_at_its_true_scale(run, photographs):

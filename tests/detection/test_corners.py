@@ -152,7 +152,7 @@ def test_images_that_are_not_used_are_named(tmp_path):
     with pytest.raises(DhcalError, match=r"has 1280 x 960 px; the rig file states 640 x 480 px"):
         detect_corners(CHARUCO, find_layout(CHARUCO, []), empty, (640, 480))
     (tmp_path / "text.png").write_text("no image")
-    with pytest.raises(DhcalError, match="is no image that can be read"):
+    with pytest.raises(DhcalError, match="cannot be read as an image"):
         read_image(tmp_path / "text.png")
 
 

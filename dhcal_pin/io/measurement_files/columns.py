@@ -245,10 +245,12 @@ def find_kind(table: DataTable) -> type[Measurement]:
     ]
     if not candidates:
         incomplete = f"; {', '.join(sorted(present))} alone is not enough" if present else ""
-        raise FileFormatError(
-            f"{table.header_location}: no measured values{incomplete}; a position needs the columns "
-            "x[mm],y[mm],z[mm], a pose needs qw,qx,qy,qz in addition"
-        )
+        expected = "a position needs the columns x[mm],y[mm],z[mm], a pose needs qw,qx,qy,qz in addition"
+        possible = [other for other in KINDS.values() if present and present <= set(other.columns)]
+        if len(possible) == 1:
+            (missing, *_) = sorted((sorted(each - present) for each in possible[0].required_columns), key=len)
+            expected = f"kind {possible[0].kind} needs {', '.join(missing)}, too"
+        raise FileFormatError(f"{table.header_location}: no measured values{incomplete}; {expected}")
     kind = max(candidates, key=lambda candidate: candidate[:2])[2]
     if unrelated := sorted(present - set(kind.columns)):
         others = "".join(

@@ -22,7 +22,7 @@ import numpy as np
 
 from ... import se3
 from ..._typing import Array, PathLike
-from ...exceptions import DhcalError, FileFormatError
+from ...exceptions import DhcalError, FileFormatError, SampleError
 from ...measurements.base import Measurement
 from ...measurements.mounting import MountedRig
 from ...robot.chain import Chain
@@ -267,6 +267,9 @@ def build_measurement(
     """
     try:
         data = kind.from_columns(q, values, rig)
+    except SampleError as error:
+        line = int(table.lines[error.sample])
+        raise FileFormatError(f"{table.source}:{line}: {error.problem}") from None
     except DhcalError as error:
         raise FileFormatError(f"{table.source}: {error}") from None
     return data.replace(rows=np.array(table.lines), source=table.source)
