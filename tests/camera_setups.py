@@ -187,6 +187,59 @@ def simulate(
     return Setup(chain, truth, images, CameraCorners(q, pixels, corner, true_rig, *names), sigma)
 
 
+def polyhedron_setup(seed: int, *, point_error: float, n_images: int = 40, sigma: float = 0.5) -> Setup:
+    """Simulate two cameras that stand 2 m away from markers on the faces of an icosahedron on the tool.
+
+    Args:
+        seed: Seed.
+        point_error: Standard deviation of the true markers from those that the rig states [m].
+        n_images: Number of configurations.
+        sigma: Standard deviation of the noise [px].
+
+    Returns:
+        The set-up; about four markers face a camera.
+    """
+    rng, chain = np.random.default_rng(seed), ARMS["ur10"]()
+    golden = (1 + np.sqrt(5)) / 2
+    corners = np.array([[a, b, c] for a in (1, -1) for b in (1, -1) for c in (1, -1)], float)
+    ring = np.array([[0, a / golden, b * golden] for a in (1, -1) for b in (1, -1)])
+    normals = np.concatenate([corners, *(np.roll(ring, i, 1) for i in range(3))]) / np.sqrt(3)
+    stated = 0.07 * normals
+    true = stated + point_error * rng.standard_normal(stated.shape)
+    board_pose = transform(exp3(rng.normal(0, 0.5, 3)), rng.uniform(-0.05, 0.05, 3))
+    q = home_configuration(chain, rng) + rng.normal(0, 0.5, (n_images, chain.n_joints))
+    tools = chain.poses(q)
+    middle, width, height = tools[:, :3, 3].mean(0), 6000, 4000
+    size = np.array([width, height])
+    cameras, exact, rows = {}, {}, []
+    for i, direction in enumerate(([1, 0.3, 0.4], [0.3, 1, 0.5])):
+        position = middle + 2 * np.array(direction) / np.linalg.norm(direction)
+        pose, lens = look_at(position, middle, rng.normal(0, 0.1)), LENSES["pinhole"]
+        values = np.array([7000, 7010, *(size / 2 + rng.normal(0, 30, 2)), -0.05, 0.02, 1e-4, -1e-4, 0])
+        wrong = np.array([7140, 7150, *(size / 2), 0, 0, 0, 0, 0])
+        cameras[f"camera{i}"] = Camera(f"camera{i}", "world", width, height, wrong, lens)
+        exact[f"camera{i}"] = replace(cameras[f"camera{i}"], values=values, pose=pose)
+        for number, tool in enumerate(tools):
+            local = inverse(pose) @ tool @ board_pose
+            points = true @ local[:3, :3].T + local[:3, 3]
+            sights = -points / np.linalg.norm(points, axis=1)[:, None]
+            pixels = lens.project(points.T, values)[0].T
+            is_seen = np.sum(normals @ local[:3, :3].T * sights, 1) > 0.5
+            is_seen &= np.all((pixels > 0) & (pixels < size - 1), 1)
+            rows += [(number, i, corner, *pixels[corner]) for corner in np.flatnonzero(is_seen)]
+    table = np.array(rows)
+    number, camera, corner = table[:, :3].astype(int).T
+    names = [f"camera{i}" for i in camera]
+    board = Board("body", "tip", "points", listed_points=stated)
+    true_board = replace(board, listed_points=true, pose=board_pose)
+    rig, true_rig = (
+        mount_rig(Rig(each, {"body": one}), chain) for each, one in ((cameras, board), (exact, true_board))
+    )
+    noisy = table[:, 3:] + sigma * rng.standard_normal((len(table), 2))
+    images = CameraCorners(q[number], noisy, corner, rig, names)
+    return Setup(chain, chain, images, CameraCorners(q[number], table[:, 3:], corner, true_rig, names), sigma)
+
+
 def located(entry, pose, values=None):
     """Return a camera or a board at a pose."""
     return replace(entry, pose=pose) if values is None else replace(entry, pose=pose, values=values)

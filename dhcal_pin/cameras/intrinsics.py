@@ -25,7 +25,7 @@ import numpy as np
 
 from .._typing import Array
 from ..exceptions import NotObservableError
-from .pose_from_points import FLATNESS, MIN_FLAT_POINTS, direct_linear_transform, estimate_poses
+from .pose_from_points import FLATNESS, MIN_POINTS, direct_linear_transform, estimate_poses
 from .rig import Camera
 
 # Smallest number of views.
@@ -61,7 +61,7 @@ def estimate_intrinsics(
         NotObservableError: There are too few views, or they do not determine the focal length.
     """
     candidates = intrinsics_candidates(views, camera)
-    some = _drawn([view for view in views if len(view[0]) >= MIN_FLAT_POINTS])
+    some = _drawn([view for view in views if len(view[0]) >= MIN_POINTS])
     return min(candidates, key=lambda values: _square_sum(some, camera, values))
 
 
@@ -80,7 +80,7 @@ def intrinsics_candidates(
     Raises:
         NotObservableError: There are too few views, or they do not determine the focal length.
     """
-    views = [view for view in views if len(view[0]) >= MIN_FLAT_POINTS]
+    views = [view for view in views if len(view[0]) >= MIN_POINTS]
     if len(views) < MIN_VIEWS:
         raise NotObservableError(
             f"camera {camera.name!r}: {len(views)} images of a board with at least 4 corners; expected at "

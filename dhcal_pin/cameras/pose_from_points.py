@@ -3,14 +3,18 @@
 1. Closed forms give first poses: the direct linear transformation of the homography of the plane nearest to
    the points, with both of the poses that explain a flat board about equally well, and that of a projection
    matrix for six or more points that are not in one plane (Hartley and Zisserman 2004, sections 4.1 and 7.1).
-   The projection matrix of points near a plane is hardly determined, so both forms are tried for them.
+   The projection matrix of points near a plane, or far from the camera, is hardly determined. The scaled
+   orthographic projection of four or more points that are not in one plane is (DeMenthon and Davis 1995).
+   All forms that are possible are tried.
 2. Gauss-Newton steps with damping minimize the distances in the image, for all images together. The best of
    these poses is taken.
 
 All image coordinates are undistorted, X/Z and Y/Z.
 
-Reference:
+References:
     R. Hartley and A. Zisserman, Multiple View Geometry in Computer Vision, 2nd ed., Cambridge 2004.
+    D. DeMenthon and L. Davis, Model-Based Object Pose in 25 Lines of Code, International Journal of Computer
+    Vision 15, 1995.
 """
 
 from __future__ import annotations
@@ -25,10 +29,10 @@ from .._typing import Array
 # Ratio of the smallest to the largest extent below which points count as flat, and as nearly flat: the
 # homography of the nearest plane then describes their image to about this part of its size.
 FLATNESS, NEAR_FLATNESS = 1e-3, 0.1
-# Smallest number of points of a flat and of another set.
-MIN_FLAT_POINTS, MIN_POINTS = 4, 6
-# Steps of the refinement, and the first damping.
-_N_STEPS, _DAMPING = 30, 1e-3
+# Smallest number of points for a pose, and for a projection matrix.
+MIN_POINTS, MIN_PROJECTION_POINTS = 4, 6
+# Steps of the refinement, the first damping, and the smallest one, for poses that are hardly determined.
+_N_STEPS, _DAMPING, _MIN_DAMPING = 30, 1e-3, 1e-12
 # Number of random subsets, distance relative to the size of the image of the board that is never too large,
 # and distance of a wrong point as a multiple of the median.
 _N_SUBSETS, _GOOD_RATIO, _OUTLIER_RATIO = 60, 0.01, 5.0
@@ -91,16 +95,17 @@ def agreeing_points(points: Array, image: Array) -> Array:
         image: Image points in any unit, shape (m, 2).
 
     Returns:
-        Whether each point agrees, shape (m,); all of them if one map fits them all or they are too few.
+        Whether each point agrees, shape (m,); all of them if one map fits them all, or if the points that
+        determine a map are half of them or more.
     """
     everything = np.ones(len(points), bool)
-    if len(points) <= MIN_FLAT_POINTS:
+    if len(points) <= MIN_POINTS:
         return everything
     centre = points.mean(0)
     _, extent, axes = np.linalg.svd(points - centre, full_matrices=False)
     is_flat = extent[2] <= NEAR_FLATNESS * extent[0]
-    least = MIN_FLAT_POINTS if is_flat else MIN_POINTS
-    if extent[1] <= FLATNESS * extent[0] or len(points) <= least:
+    least = MIN_POINTS if is_flat else MIN_PROJECTION_POINTS
+    if extent[1] <= FLATNESS * extent[0] or len(points) <= 2 * least:
         return everything
     source = ((points - centre) @ axes.T)[:, : 2 if is_flat else 3]
     ratio = _GOOD_RATIO + (extent[2] / extent[0] if is_flat else 0.0)
@@ -169,20 +174,22 @@ def estimate_poses(
 
 def _first_poses(points: Array, image: Array) -> list[Array]:
     """Return the closed-form poses of points (m, 3) in an image (m, 2); none if they are too few."""
-    if len(points) < MIN_FLAT_POINTS:
+    if len(points) < MIN_POINTS:
         return []
     centre = points.mean(0)
     _, extent, axes = np.linalg.svd(points - centre, full_matrices=False)
     if extent[1] <= FLATNESS * extent[0]:
         return []
-    is_flat = extent[2] <= FLATNESS * extent[0]
-    if not is_flat and len(points) < MIN_POINTS:
-        return []
     axes[2] *= np.linalg.det(axes)
     flat = (points - centre) @ axes.T
     frame = se3.inverse(se3.transform(axes.T, centre))
     out = [pose @ frame for pose in _flat_poses(flat[:, :2], image)]
-    return out if is_flat else [*out, _projection_pose(points, image)]
+    if extent[2] <= FLATNESS * extent[0]:
+        return out
+    out.append(_orthographic_pose(points, image))
+    if len(points) >= MIN_PROJECTION_POINTS:
+        out += _projection_poses(points, image)
+    return out
 
 
 def _flat_poses(points: Array, image: Array) -> list[Array]:
@@ -205,12 +212,16 @@ def _mirror_plane(pose: Array) -> list[Array]:
     position = pose[:3, 3]
     sight, normal = position / np.linalg.norm(position), pose[:3, 2]
     mirrored = 2 * (normal @ sight) * sight - normal
-    axis = np.cross(normal, mirrored)
-    sine = np.linalg.norm(axis)
-    if sine < 1e-9:
+    if np.linalg.norm(mirrored - normal) < 1e-9:
         return []
-    turn = se3.exp3(axis / sine * np.arctan2(sine, normal @ mirrored))
-    return [se3.transform(turn @ pose[:3, :3], position)]
+    return [se3.transform(_turn_between(normal, mirrored) @ pose[:3, :3], position)]
+
+
+def _turn_between(start: Array, end: Array) -> Array:
+    """Return the rotation about the axis normal to both that turns a unit vector (3,) into another one."""
+    axis = np.cross(start, end)
+    sine = np.linalg.norm(axis)
+    return se3.exp3(axis / max(sine, 1e-300) * np.arctan2(sine, start @ end))
 
 
 def _mirror(pose: Array, points: Array) -> list[Array]:
@@ -222,11 +233,36 @@ def _mirror(pose: Array, points: Array) -> list[Array]:
     return [mirrored @ se3.inverse(plane) for mirrored in _mirror_plane(pose @ plane)]
 
 
-def _projection_pose(points: Array, image: Array) -> Array:
-    """Return the pose of points (m, 3) that are not flat from their projection matrix."""
+def _orthographic_pose(points: Array, image: Array) -> Array:
+    """Return the pose of points (m, 3) that are not flat from their scaled orthographic projection.
+
+    The projection is along the line of sight to the middle of the image points (m, 2).
+    """
+    sights = np.column_stack([image, np.ones(len(image))])
+    sights /= np.linalg.norm(sights, axis=1)[:, None]
+    axis = sights.mean(0) / np.linalg.norm(sights.mean(0))
+    turn = _turn_between(axis, np.array([0.0, 0.0, 1.0]))
+    turned = sights @ turn.T
+    plane = turned[:, :2] / turned[:, 2:]
+    centre, middle = points.mean(0), plane.mean(0)
+    affine = np.linalg.lstsq(points - centre, plane - middle, rcond=None)[0].T
+    left, scale, right = np.linalg.svd(affine, full_matrices=False)
+    rows = left @ right
+    depth = 1 / max(float(scale.mean()), 1e-300)
+    rotation = np.vstack([rows, np.cross(rows[0], rows[1])])
+    position = depth * np.append(middle, 1.0) - rotation @ centre
+    return se3.transform(turn.T @ rotation, turn.T @ position)
+
+
+def _projection_poses(points: Array, image: Array) -> list[Array]:
+    """Return the pose of points (m, 3) from their projection matrix; none if that is singular."""
     projection = direct_linear_transform(points, image)
-    projection /= np.cbrt(np.linalg.det(projection[:, :3]))
-    return se3.transform(se3.nearest_rotation(projection[:, :3]), projection[:, 3])
+    scale = np.cbrt(np.linalg.det(projection[:, :3]))
+    with np.errstate(all="ignore"):
+        projection = projection / scale
+    if not np.isfinite(projection).all():
+        return []
+    return [se3.transform(se3.nearest_rotation(projection[:, :3]), projection[:, 3])]
 
 
 def _residuals(poses: Array, points: Array, image: Array) -> tuple[Array, Array]:
@@ -267,7 +303,7 @@ def _refine(poses: Array, views: Sequence[tuple[Array, Array]]) -> tuple[Array, 
         is_done = np.einsum("ci,ci->c", step, gradient) < _COST_RTOL * cost[active]
         poses[better], residuals[better] = trial[is_better], trial_residuals[is_better]
         local[better], cost[better] = trial_local[is_better], trial_cost[is_better]
-        damping[active] *= np.where(is_better, 0.1, 10.0)
+        damping[active] = np.maximum(damping[active] * np.where(is_better, 0.1, 10.0), _MIN_DAMPING)
         active = active[~is_done]
         if not len(active):
             break

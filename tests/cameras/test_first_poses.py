@@ -43,6 +43,37 @@ def test_pose_of_points_that_are_not_flat(seed):
     np.testing.assert_allclose(estimate[0], pose, atol=1e-7)
 
 
+@pytest.mark.parametrize("count", [6, 8])
+@pytest.mark.parametrize("error", [0.0, 1e-3])
+def test_pose_of_a_small_body_far_from_the_camera(count, error):
+    """Points on a sphere of 7 cm in radius face a camera 0.3 to 3 m away, and are not quite in their places.
+
+    The errors turn the body by some degrees. Another minimum would be tens of degrees away.
+    """
+    rng, angles = np.random.default_rng(count), []
+    for _ in range(100):
+        depth = rng.uniform(0.3, 3)
+        pose = se3.transform(se3.exp3(rng.normal(0, 2, 3)), [*rng.uniform(-0.3, 0.3, 2) * depth, depth])
+        points = rng.standard_normal((40, 3))
+        points *= 0.07 / np.linalg.norm(points, axis=1)[:, None]
+        facing = np.argsort(points @ pose[:3, :3].T @ pose[:3, 3])[:count]
+        local = (points + error * rng.standard_normal(points.shape))[facing] @ pose[:3, :3].T + pose[:3, 3]
+        image = local[:, :2] / local[:, 2:] + 2e-4 * error / 1e-3 * rng.standard_normal((count, 2))
+        estimate = estimate_pose(points[facing], image)
+        assert estimate is not None
+        angles.append(np.linalg.norm(se3.log3(estimate[0][:3, :3].T @ pose[:3, :3])))
+    assert np.mean(np.array(angles) > 0.5) <= (0.1 if error else 0.0)
+
+
+def test_five_points_that_are_not_flat_have_a_pose():
+    points = 0.1 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0.5]])
+    pose = se3.transform(se3.exp3(np.array([0.4, -0.3, 1.0])), [0.1, -0.05, 0.8])
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    estimate = estimate_pose(points, local[:, :2] / local[:, 2:])
+    assert estimate is not None
+    np.testing.assert_allclose(estimate[0], pose, atol=1e-7)
+
+
 def test_too_few_points_or_points_in_a_line_have_no_pose():
     line = np.outer(np.arange(5.0), [0.01, 0.02, 0])
     assert estimate_pose(line, line[:, :2]) is None

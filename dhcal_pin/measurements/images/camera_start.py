@@ -261,6 +261,6 @@ def _locate(
     ]
     if missing:
         raise NotObservableError(
-            f"{missing[0]}: no image determines its pose; expected images with at least 4 corners of a flat "
-            "board that are not in one line, or 6 points that are not in one plane"
+            f"{missing[0]}: no image determines its pose; expected images with at least 4 corners of a board "
+            "that are not in one line"
         )
