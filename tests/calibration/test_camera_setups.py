@@ -81,7 +81,7 @@ def test_few_images_of_two_cameras_and_two_boards_converge(seed):
 @pytest.mark.parametrize(
     "seed", [3, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (0, 1, 2, *range(4, 12)))]
 )
-@pytest.mark.parametrize("point_error", [0.0, 5e-4])
+@pytest.mark.parametrize("point_error", [pytest.param(0.0, marks=pytest.mark.slow), 5e-4])
 def test_few_visible_markers_of_a_small_body_far_from_the_cameras_converge(seed, point_error):
     """Few images show the six markers that a projection matrix needs, and hardly any perspective."""
     setup = polyhedron_setup(seed, point_error=point_error)
