@@ -12,7 +12,7 @@ from dhcal_pin._kernels.work_arrays import work_array
 from dhcal_pin.estimation.error_model import ErrorModel
 from dhcal_pin.estimation.parameters import select_parameters
 from dhcal_pin.estimation.problem import CHUNK_SIZE, linearize_and_factor
-from dhcal_pin.estimation.qr import append_priors, pseudo_inverse
+from dhcal_pin.estimation.qr import pseudo_inverse
 from dhcal_pin.measurements.base import whitened_jacobian
 from dhcal_pin.robot.chain import Chain, link_frame
 
@@ -23,7 +23,7 @@ def iteration(chain: Chain, sets: str, m: int, repeats: int) -> tuple[float, flo
     none = np.empty(0)
 
     def ours() -> np.ndarray:
-        free = append_priors(linearize_and_factor(case, x, small_angle=False), case.weights, x)
+        free = linearize_and_factor(case, x, small_angle=False).with_priors(case.weights, x)
         return pseudo_inverse(free.r, free.z)
 
     (data,) = case.data

@@ -48,7 +48,7 @@ import numpy as np
 
 from .._typing import Array
 from ..estimation.problem import Problem, linearize_and_factor, whitened_residuals
-from ..estimation.qr import posterior_sqrt_covariance, rank
+from ..estimation.qr import rank
 from ..estimation.robust import (
     FAR_REJECTED,
     FAR_THRESHOLD,
@@ -115,7 +115,7 @@ def find_good_samples(
     taken = [drawn[(drawn >= a) & (drawn < b)] - a for a, b in pairwise(starts)]
     part = problem.with_data([item.take(index) for item, index in zip(data, taken, strict=True)])
     system = linearize_and_factor(part, solution.x, small_angle=False)
-    root, n_determined = posterior_sqrt_covariance(system, problem.weights)[0], rank(system.r)
+    root, n_determined = system.sqrt_covariance(problem.weights)[0], rank(system.r)
     all_good = GoodSamples([np.ones(count) for count in counts], FAR_REJECTED)
     n_rows = sum(item.residual_dim * len(item.rows) for item in part.data)
     if not (0 < 2 * n_determined <= n_rows and root.shape[1] <= MAX_COORDINATES):

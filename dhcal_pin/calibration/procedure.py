@@ -57,6 +57,7 @@ from .cameras import (
     has_arm,
     has_images,
     held_values,
+    judge_stages,
     judge_target_points,
     reorder,
     seen_ranges_warning,
@@ -181,7 +182,8 @@ def calibrate(
             if points is not None and points.is_kept:
                 fit = reweight(points.fit, robust.LOSSES[loss].stages, groups, max_iterations, progress)
             ungated = fit
-            fit, gate, stages = apply_gate(ungated, groups, max_iterations, points)
+            fit, with_arm, gate = apply_gate(ungated, groups, max_iterations)
+            stages = judge_stages(ungated, with_arm, gate, points, max_iterations)
             extension = Extension(temperature=gate.temperature, n_configurations=gate.n_configurations)
             result = _make_result(fit, 1.0, holdout, method)
             warnings = [exchange.sentence for exchange in exchanges]

@@ -35,7 +35,7 @@ from .._typing import Array
 from ..estimation import qr, robust
 from ..estimation.error_model import ErrorModel, ErrorParameter
 from ..estimation.problem import Problem, linearize_and_factor
-from ..estimation.qr import TriangularSystem, append_priors, posterior_sqrt_covariance
+from ..estimation.qr import TriangularSystem
 from ..estimation.solver import SolverResult, bounded_step, minimize, next_iterate
 from ..estimation.uncertainty import UNBOUNDED_TOL, Prediction, Uncertainty
 from ..exceptions import DhcalError
@@ -352,7 +352,7 @@ class Result(ResultPlots):
     @cached_property
     def _sqrt_covariance(self) -> tuple[Array, Array]:
         """Square root of the covariance (p, r) and unbounded directions (p, h), with sigmas as fitted."""
-        return posterior_sqrt_covariance(self.solution.system, self.problem.weights)
+        return self.solution.system.sqrt_covariance(self.problem.weights)
 
     @cached_property
     def _scaled_sqrt_covariance(self) -> tuple[Array, Array]:
@@ -363,9 +363,8 @@ class Result(ResultPlots):
             root = root * scale
         else:
             # Scale the measured rows only; priors are not measurements.
-            root, unbounded = posterior_sqrt_covariance(
-                TriangularSystem(system.rows / max(scale, MIN_SCALE)), self.problem.weights
-            )
+            scaled = TriangularSystem(system.rows / max(scale, MIN_SCALE))
+            root, unbounded = scaled.sqrt_covariance(self.problem.weights)
         # The variance of correlated residuals counts T times against the priors.
         root = root * np.sqrt(self.problem.temperature)
         # The part of the correction that was not applied is an error of its own.
@@ -701,7 +700,7 @@ class Result(ResultPlots):
             Whether the step changes them by less.
         """
         system = linearize_and_factor(self.problem, self.solution.x, small_angle=False)
-        with_priors = append_priors(system, self.problem.weights, self.solution.x)
+        with_priors = system.with_priors(self.problem.weights, self.solution.x)
         step = bounded_step(self.problem, with_priors, self.solution.x)
         return float(np.linalg.norm(with_priors.r @ step)) <= eps * np.sqrt(max(1, self.n_samples))
 

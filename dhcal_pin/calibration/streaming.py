@@ -22,7 +22,6 @@ from .._typing import Array
 from ..estimation import qr
 from ..estimation.priors import Priors
 from ..estimation.problem import Chunk, Problem
-from ..estimation.qr import posterior_sqrt_covariance
 from ..estimation.solver import IterationCallback, SolverResult, minimize
 from ..estimation.uncertainty import UNBOUNDED_TOL
 from ..exceptions import InvalidArgumentError
@@ -118,7 +117,7 @@ class StreamResult:
     @cached_property
     def std(self) -> Array:
         """Standard deviations of x, (p,) [m or rad]; infinite if neither data nor a prior determine it."""
-        root, unbounded = posterior_sqrt_covariance(self.solution.system, self.problem.weights)
+        root, unbounded = self.solution.system.sqrt_covariance(self.problem.weights)
         return np.where(np.sum(unbounded**2, 1) > UNBOUNDED_TOL, np.inf, np.linalg.norm(root, axis=1))
 
 

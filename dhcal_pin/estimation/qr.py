@@ -231,7 +231,7 @@ class TriangularSystem:
         return TriangularSystem(merge_r_factors([self.rows[:, kept]]))
 
     def with_priors(self, weights: Array, x: Array | float) -> TriangularSystem:
-        """Append the prior rows, see `append_priors`.
+        """Append the prior rows δ/σ = -x/σ.
 
         Args:
             weights: Reciprocal prior standard deviations 1/σ of shape (p,); zero without a prior.
@@ -240,7 +240,7 @@ class TriangularSystem:
         Returns:
             System of data and priors.
         """
-        return append_priors(self, weights, x)
+        return append_rows(self, weights, -(weights * x))
 
     def solve(self, weights: Array, x: Array | float) -> tuple[Array, float]:
         """Compute the best step with priors.
@@ -256,15 +256,43 @@ class TriangularSystem:
         return pseudo_inverse(posterior.r, posterior.z), posterior.min_cost
 
     def sqrt_covariance(self, weights: Array) -> tuple[Array, Array]:
-        """Compute a square root of the covariance of data and priors, see `posterior_sqrt_covariance`.
+        """Compute a square root of the covariance of data and priors together.
+
+        The covariance is C = S·Sᵀ = (RᵀR + W²)⁻¹, W = diag(weights), on the directions that data or priors
+        determine. Where [R; W] is ill-conditioned, parameter space is split by the rank of R: in the
+        observable directions data and priors count, in the others the priors alone. Exact data with tiny
+        standard deviations would otherwise hide the information of the priors.
 
         Args:
             weights: Reciprocal prior standard deviations 1/σ of shape (p,); zero without a prior.
 
         Returns:
-            Square root, shape (p, r), and the directions that neither determines, shape (p, p-r).
+            Square root S of the covariance, shape (p, r), and an orthonormal basis of the directions that
+            neither data nor priors determine, shape (p, p-r).
         """
-        return posterior_sqrt_covariance(self, weights)
+        if not len(weights):
+            return np.empty((0, 0)), np.empty((0, 0))
+        full = self.with_priors(weights, 0.0).r
+        if _is_well_conditioned(full):
+            return lapack.dtrtri(full)[0], np.empty((len(weights), 0))
+        # Unknowns of different units may alone cause the condition.
+        scale = np.linalg.norm(full, axis=0)
+        if weights.all() and _is_well_conditioned(full / scale):
+            return lapack.dtrtri(full / scale)[0] / scale[:, None], np.empty((len(weights), 0))
+        _, s, vt = singular_value_decomposition(self.r)
+        n_observable = int(np.sum(s > RANK_RTOL * s[0]))
+        observable, unobservable = vt[:n_observable].T, vt[n_observable:].T
+        # Priors within the unobservable directions: W·unobservable = left·diag(t)·yt.
+        left, t, yt = singular_value_decomposition(weights[:, None] * unobservable)
+        has_prior = t > RANK_RTOL * weights.max(initial=0.0)
+        left, prior_root = left[:, : len(t)][:, has_prior], unobservable @ (yt[has_prior].T / t[has_prior])
+        # What the priors add to the observable directions after the unobservable ones are eliminated.
+        priors = weights[:, None] * observable
+        rows = np.concatenate([np.diag(s[:n_observable]), priors - left @ (left.T @ priors)])
+        # LAPACK prints a complaint about an empty matrix.
+        data_root = lapack.dtrtri(np.linalg.qr(rows)[1])[0] if n_observable else np.empty((0, 0))
+        root = np.concatenate([(observable - prior_root @ (left.T @ priors)) @ data_root, prior_root], 1)
+        return root, unobservable @ np.delete(yt, np.flatnonzero(has_prior), 0).T
 
     def squared_error(self, step: Array) -> float:
         """Compute the cost after a step.
@@ -382,20 +410,6 @@ def append_rows(system: TriangularSystem, diagonal: Array, right: Array) -> Tria
     return TriangularSystem(append_diagonal(system.rows, diagonal, right)) if diagonal.any() else system
 
 
-def append_priors(system: TriangularSystem, weights: Array, x: Array | float) -> TriangularSystem:
-    """Append the prior rows δ/σ = -x/σ to a system.
-
-    Args:
-        system: System of the data at x.
-        weights: Reciprocal prior standard deviations 1/σ of shape (p,); zero without a prior.
-        x: Current values of shape (p,), or 0 [m and rad].
-
-    Returns:
-        System of data and priors.
-    """
-    return append_rows(system, weights, -(weights * x))
-
-
 def _is_well_conditioned(r: Array) -> bool:
     """Check that no singular value of R can be near the rank cut."""
     return bool(r.size) and lapack.dtrcon(r)[0] > WELL_CONDITIONED
@@ -421,44 +435,3 @@ def pseudo_inverse(r: Array, z: Array) -> Array:
     if scale.min(initial=np.inf) > RANK_RTOL * scale.max(initial=0.0) and _is_well_conditioned(r / scale):
         return lapack.dtrtrs(r / scale, z)[0] / scale
     return np.linalg.lstsq(r, z, rcond=RANK_RTOL)[0]
-
-
-def posterior_sqrt_covariance(system: TriangularSystem, weights: Array) -> tuple[Array, Array]:
-    """Compute a square root of the covariance of data and priors together.
-
-    The covariance is C = S·Sᵀ = (RᵀR + W²)⁻¹, W = diag(weights), on the directions that data or priors
-    determine. Where [R; W] is ill-conditioned, parameter space is split by the rank of R: in the observable
-    directions data and priors count, in the others the priors alone. Exact data with tiny standard deviations
-    would otherwise hide the information of the priors.
-
-    Args:
-        system: System of the data alone.
-        weights: Reciprocal prior standard deviations 1/σ of shape (p,); zero without a prior.
-
-    Returns:
-        Square root S of the covariance, shape (p, r), and an orthonormal basis of the directions that neither
-        data nor priors determine, shape (p, p-r).
-    """
-    if not len(weights):
-        return np.empty((0, 0)), np.empty((0, 0))
-    full = append_priors(system, weights, 0.0).r
-    if _is_well_conditioned(full):
-        return lapack.dtrtri(full)[0], np.empty((len(weights), 0))
-    # Unknowns of different units may alone cause the condition.
-    scale = np.linalg.norm(full, axis=0)
-    if weights.all() and _is_well_conditioned(full / scale):
-        return lapack.dtrtri(full / scale)[0] / scale[:, None], np.empty((len(weights), 0))
-    _, s, vt = singular_value_decomposition(system.r)
-    n_observable = int(np.sum(s > RANK_RTOL * s[0]))
-    observable, unobservable = vt[:n_observable].T, vt[n_observable:].T
-    # Priors within the unobservable directions: W·unobservable = left·diag(t)·yt.
-    left, t, yt = singular_value_decomposition(weights[:, None] * unobservable)
-    has_prior = t > RANK_RTOL * weights.max(initial=0.0)
-    left, prior_root = left[:, : len(t)][:, has_prior], unobservable @ (yt[has_prior].T / t[has_prior])
-    # What the priors add to the observable directions after the unobservable ones are eliminated.
-    priors = weights[:, None] * observable
-    rows = np.concatenate([np.diag(s[:n_observable]), priors - left @ (left.T @ priors)])
-    # LAPACK prints a complaint about an empty matrix.
-    data_root = lapack.dtrtri(np.linalg.qr(rows)[1])[0] if n_observable else np.empty((0, 0))
-    root = np.concatenate([(observable - prior_root @ (left.T @ priors)) @ data_root, prior_root], 1)
-    return root, unobservable @ np.delete(yt, np.flatnonzero(has_prior), 0).T

@@ -48,7 +48,6 @@ from . import solver_rules as rules
 from .problem import Problem, linear_system, linearize_and_factor
 from .qr import (
     TriangularSystem,
-    append_priors,
     append_rows,
     euclidean_norm,
     pseudo_inverse,
@@ -216,7 +215,7 @@ def gauss_newton(
     iterates, converged, iteration = [x], False, 0
     while iteration < max_iterations and not converged:
         data = linearize_and_factor(problem, x, small_angle=True)
-        system = append_priors(data, problem.weights, x)
+        system = data.with_priors(problem.weights, x)
         step = pseudo_inverse(system.r, system.z)
         cost = system.min_cost + float(system.z @ system.z)
         change = euclidean_norm(system.residual_change(step))

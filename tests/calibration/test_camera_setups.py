@@ -13,7 +13,6 @@ import dhcal_pin as dh
 from dhcal_pin import select_parameters
 from dhcal_pin.calibration.evaluation import compute_errors
 from dhcal_pin.cameras import Board
-from dhcal_pin.estimation.qr import posterior_sqrt_covariance
 from dhcal_pin.measurements import CameraCorners
 
 
@@ -154,7 +153,7 @@ def statistics(seed, *, is_arm_free):
     other = fit.problem.with_data([own])
     model = other.linearize(fit.x)
     rows = np.concatenate([model.rows(chunk)[:-1].copy() for chunk in other.chunks], 2)
-    root = posterior_sqrt_covariance(fit.solution.system, fit.problem.weights)[0]
+    root = fit.solution.system.sqrt_covariance(fit.problem.weights)[0]
     # Whitened rows of the fit are in units of its noise; those of the other images have the sigma of 1 px.
     variance = np.sum(np.tensordot(root, rows, (0, 0)) ** 2, 0)
     return (fit.x - values) / fit.std, np.mean(pixels**2), setup.sigma**2 + np.mean(variance)

@@ -12,7 +12,6 @@ from scipy.linalg import null_space
 from dhcal_pin import se3
 from dhcal_pin.calibration import accuracy, calibrate, k_fold
 from dhcal_pin.estimation import Problem, linearize_and_factor, select_parameters
-from dhcal_pin.estimation.qr import posterior_sqrt_covariance
 from dhcal_pin.estimation.solver import next_iterate
 from dhcal_pin.measurements import Noise, Pose, Position
 from dhcal_pin.robot import Chain
@@ -87,13 +86,11 @@ def test_standard_deviations_follow_students_t_distribution(sim_6dof, sim_6dof_a
     data = Pose.simulate(sim_6dof_actual, rng.uniform(-2.5, 2.5, (8, 6)), NOISE, rng)
     fit = calibrate(sim_6dof, Pose(data.q, data.poses), "dh", priors="none", loss="linear")
     assert fit.noise_degrees_of_freedom == pytest.approx(12)
-    normal = np.linalg.norm(posterior_sqrt_covariance(fit.solution.system, fit.problem.weights)[0], axis=1)
+    normal = np.linalg.norm(fit.solution.system.sqrt_covariance(fit.problem.weights)[0], axis=1)
     np.testing.assert_allclose(fit.std, 2.1788 / 1.95996 * fit.unit_weight_std * normal, rtol=1e-4)
     stated = calibrate(sim_6dof, data, "dh", priors="none")
     assert stated.noise_degrees_of_freedom == np.inf
-    normal = np.linalg.norm(
-        posterior_sqrt_covariance(stated.solution.system, stated.problem.weights)[0], axis=1
-    )
+    normal = np.linalg.norm(stated.solution.system.sqrt_covariance(stated.problem.weights)[0], axis=1)
     np.testing.assert_allclose(stated.std, normal, rtol=1e-12)
 
 
@@ -241,7 +238,7 @@ def run_trial(nominal: Chain, seed: int, totals: Totals):
     error = fit.chain.poses(q)[:, :3, 3] - truth.poses(q)[:, :3, 3]
     chain, bodies, twists = errors.derivative(x)
     jacobian = chain.tool_jacobian(chain.forward_kinematics(q), bodies, twists)[:, :3]
-    root = posterior_sqrt_covariance(system, problem.weights)[0]
+    root = system.sqrt_covariance(problem.weights)[0]
     totals.squares += np.mean(np.sum(error**2, 1))
     totals.bound += np.mean(np.sum(np.einsum("pim,pr->mir", jacobian, root) ** 2, (1, 2)))
     totals.claimed += np.mean(fit.predict(q).position_std ** 2)

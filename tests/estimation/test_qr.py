@@ -99,7 +99,7 @@ def test_priors_couple_observable_and_unobservable_directions(largest):
     rows = np.zeros((6, 6))
     rows[:2, :5] = np.linalg.qr(exact_rows, mode="r")
     weights = np.array([1.0, 0.3, 2.0, 0.7, 5.0])
-    root, unbounded = qr.posterior_sqrt_covariance(TriangularSystem(rows), weights)
+    root, unbounded = TriangularSystem(rows).sqrt_covariance(weights)
     assert unbounded.shape == (5, 0)
     with mpmath.workdps(60):
         information = mpmath.matrix(exact_rows.tolist()).T * mpmath.matrix(exact_rows.tolist())
@@ -119,7 +119,7 @@ def test_the_step_is_exact_at_condition_1e8():
     q = rng.uniform(-3, 3, (12, 6))
     data = Pose.simulate(errors.at(x + 1e-4 * rng.normal(size=24)), q, Noise(1e-4, 1e-4), rng)
     case = Problem(errors, (data,), np.zeros(24))
-    system = qr.append_priors(linearize_and_factor(case, x, small_angle=False), case.weights, x)
+    system = linearize_and_factor(case, x, small_angle=False).with_priors(case.weights, x)
     assert qr.rank(system.r) == 24
     assert 3e7 < qr.condition(system.r) < 3e8
     rows, residual = whitened_rows(errors, data, x)
@@ -163,7 +163,7 @@ def test_a_batch_of_systems_agrees_with_the_single_one(rank):
 def test_without_data_the_covariance_is_that_of_the_priors(capfd):
     """Also LAPACK, which prints to standard output itself, says nothing."""
     sigma = np.array([1e-3, 2.0, 5e-9])
-    root, unbounded = qr.posterior_sqrt_covariance(TriangularSystem(np.zeros((4, 4))), 1 / sigma)
+    root, unbounded = TriangularSystem(np.zeros((4, 4))).sqrt_covariance(1 / sigma)
     np.testing.assert_allclose(root @ root.T, np.diag(sigma**2), rtol=1e-12, atol=1e-30)
     assert unbounded.shape == (3, 0)
     assert capfd.readouterr() == ("", "")

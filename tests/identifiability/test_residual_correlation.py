@@ -9,7 +9,6 @@ from robots import robot_file
 from dhcal_pin.calibration import Result, calibrate
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.problem import Chunk
-from dhcal_pin.estimation.qr import posterior_sqrt_covariance
 from dhcal_pin.identifiability import residual_correlation
 from dhcal_pin.identifiability.residual_correlation import (
     CORRELATION_LENGTH,
@@ -54,13 +53,13 @@ def fitted(seed: int, m: int, kind: type[Measurement] = Pose, size: float = 0.0)
 
 def correlation_of(fit: Result) -> ResidualCorrelation:
     """Return the correlation of the residuals of a fit."""
-    root = posterior_sqrt_covariance(fit.solution.system, fit.problem.weights)[0]
+    root = fit.solution.system.sqrt_covariance(fit.problem.weights)[0]
     return find_residual_correlation(fit.problem, fit.solution.x, root, 1.0, fit.weights)
 
 
 def test_score_is_that_of_full_matrices():
     fit = fitted(0, 30, size=3e-4)
-    root = posterior_sqrt_covariance(fit.solution.system, fit.problem.weights)[0]
+    root = fit.solution.system.sqrt_covariance(fit.problem.weights)[0]
     item = fit.problem.data[0]
     rows = fit.problem.linearize(fit.solution.x).rows(Chunk(item, fit.problem.errors.chain))
     # The rows of one sample after the other.

@@ -11,7 +11,6 @@ from robots import paper, robot_file
 
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.estimation import Problem, linearize_and_factor, select_parameters
-from dhcal_pin.estimation.qr import append_priors
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import read_robot, read_uncertainty, write_urdf
 from dhcal_pin.measurements import KINDS, Noise
@@ -49,7 +48,7 @@ def log_det(chain: Chain, kind: str, q) -> float:
     zero = np.zeros(len(weights))
     data = KINDS[kind].simulate(chain, q, NOISE, np.random.default_rng(1))
     triangle = linearize_and_factor(Problem(errors, (data,), weights), zero, small_angle=False)
-    full = append_priors(triangle, weights, zero).r
+    full = triangle.with_priors(weights, zero).r
     return float(2 * np.sum(np.log(np.abs(np.diag(full)))) + 2 * np.sum(np.log(errors.priors)))
 
 

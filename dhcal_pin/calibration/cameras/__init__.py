@@ -6,7 +6,7 @@ which of these parameters are unknown, and in which order they are freed.
 
 from .axis_order import axis_stages, exchange_axes, reorder
 from .diagnosis import HandEyeDiagnosis, diagnose_hand_eye
-from .gate import apply_gate, has_arm, judge_target_points
+from .gate import apply_gate, has_arm, judge_stages, judge_target_points
 from .seen_ranges import seen_ranges_warning
 from .sets import DEFAULT_SETS, RIG_SETS, default_sets, has_images, held_values, split_sets
 from .stages import STAGES, ImageError, Stage
@@ -27,6 +27,7 @@ __all__ = [
     "has_arm",
     "has_images",
     "held_values",
+    "judge_stages",
     "judge_target_points",
     "judged_boards",
     "reorder",

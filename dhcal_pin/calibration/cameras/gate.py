@@ -152,26 +152,17 @@ def judge_target_points(fit: Fit, max_iterations: int) -> TargetPoints | None:
     return try_target_points(fit, images, clusters, max_iterations)
 
 
-def apply_gate(
-    fit: Fit, groups: PriorGroups, max_iterations: int, points: TargetPoints | None = None
-) -> tuple[Fit, Gate, tuple[Stage, ...]]:
+def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int) -> tuple[Fit, Fit, Gate]:
     """Fit arm, cameras and boards as far as the images show that the arm is wrong.
 
     Args:
         fit: Fit of independent corners at temperature 1 with the default priors, without outliers.
         groups: Parameters of the arm whose default priors share one scale.
         max_iterations: Largest number of iterations of one solution.
-        points: Why the corners of the boards are estimated or held; None if the rig says so.
 
     Returns:
-        The final fit, the gate, and the accuracy of each stage.
+        The final fit, the fit with the arm estimated, and the gate.
     """
-    final, with_arm, gate = _gated(fit, groups, max_iterations)
-    return final, gate, _stages(fit, with_arm, gate, points, max_iterations)
-
-
-def _gated(fit: Fit, groups: PriorGroups, max_iterations: int) -> tuple[Fit, Fit, Gate]:
-    """Return the final fit, the fit with the arm estimated, and the gate."""
     is_good = np.concatenate([weights > ZERO_WEIGHT for weights in fit.weights])
     n_configurations = len(np.unique(configuration_groups(fit.data)[is_good]))
     folds = cluster_folds(fit.problem.data)
@@ -352,10 +343,21 @@ def has_arm(errors: ErrorModel) -> bool:
     return len(errors.parameters) > len(nominal_arm(errors).parameters)
 
 
-def _stages(
+def judge_stages(
     fit: Fit, with_arm: Fit, gate: Gate, judged_points: TargetPoints | None, max_iterations: int
 ) -> tuple[Stage, ...]:
-    """Judge the stages of a calibration: frames, intrinsics, target points, arm."""
+    """Judge the stages of a calibration: frames, intrinsics, target points, arm.
+
+    Args:
+        fit: Fit to which the gate was applied.
+        with_arm: Fit with the arm estimated.
+        gate: Gate.
+        judged_points: Why the corners of the boards are estimated or held; None if the rig says so.
+        max_iterations: Largest number of iterations of one solution.
+
+    Returns:
+        Accuracy of each stage.
+    """
     folds = cluster_folds(fit.data)
     images = k_fold(fit.data, N_IMAGE_FOLDS) if folds else ()
 

@@ -27,7 +27,7 @@ from ...measurements.base import Measurement
 from ...robot.chain import Chain
 from ..error_model import ErrorModel
 from ..problem import Problem, linearize_and_factor, merge_instrument_parameters, whitened_residuals
-from ..qr import posterior_sqrt_covariance, rank
+from ..qr import rank
 from ..solver import minimize
 from .search import linearize_rows, search_majorities
 
@@ -157,7 +157,7 @@ def _fit_majority(problem: Problem) -> Array | None:
         n_determined = rank(system.r)
         if not 0 < 2 * n_determined <= n_rows:
             return None
-        rows = linearize_rows(problem, x, posterior_sqrt_covariance(system, problem.weights)[0])
+        rows = linearize_rows(problem, x, system.sqrt_covariance(problem.weights)[0])
         majority = search_majorities(rows, np.concatenate(groups), n_determined)[0][0]
         if np.array_equal(majority, previous):
             break
