@@ -25,7 +25,13 @@ import numpy as np
 
 from .._typing import Array
 from ..exceptions import NotObservableError
-from .pose_from_points import FLATNESS, MIN_POINTS, direct_linear_transform, estimate_poses
+from .pose_from_points import (
+    FLATNESS,
+    MIN_POINTS,
+    determines_homography,
+    direct_linear_transform,
+    estimate_poses,
+)
 from .rig import Camera
 
 # Smallest number of views.
@@ -61,6 +67,8 @@ def estimate_intrinsics(
         NotObservableError: There are too few views, or they do not determine the focal length.
     """
     candidates = intrinsics_candidates(views, camera)
+    if not candidates:
+        raise undetermined_focal_length(camera)
     some = _drawn([view for view in views if len(view[0]) >= MIN_POINTS])
     return min(candidates, key=lambda values: _square_sum(some, camera, values))
 
@@ -75,10 +83,10 @@ def intrinsics_candidates(
         camera: Camera: its lens model, the size of its images and its name.
 
     Returns:
-        fx, fy, cx, cy [px] of each estimate, at least one.
+        fx, fy, cx, cy [px] of each estimate; none if the views do not determine them without distortion.
 
     Raises:
-        NotObservableError: There are too few views, or they do not determine the focal length.
+        NotObservableError: There are too few views.
     """
     views = [view for view in views if len(view[0]) >= MIN_POINTS]
     if len(views) < MIN_VIEWS:
@@ -86,15 +94,23 @@ def intrinsics_candidates(
             f"camera {camera.name!r}: {len(views)} images of a board with at least 4 corners; expected at "
             f"least {MIN_VIEWS} for intrinsics that the rig file does not state"
         )
-    candidates = [
-        each for each in (_from_homographies(views, camera), _search(_drawn(views), camera)) if each
-    ]
-    if not candidates:
-        raise NotObservableError(
-            f"camera {camera.name!r}: the images do not determine its focal length; expected images of the "
-            "board tilted in different directions, or fx, fy, cx, cy in the rig file"
-        )
-    return candidates
+    found = _from_homographies(views, camera), _search(_drawn(views), camera)
+    return [each for each in found if each is not None]
+
+
+def undetermined_focal_length(camera: Camera) -> NotObservableError:
+    """Return the error of images that do not determine the focal length of a camera.
+
+    Args:
+        camera: Camera.
+
+    Returns:
+        The error.
+    """
+    return NotObservableError(
+        f"camera {camera.name!r}: the images do not determine its focal length; expected images of the "
+        "board tilted in different directions, or fx, fy, cx, cy in the rig file"
+    )
 
 
 def _drawn(views: Sequence[tuple[Array, Array]]) -> list[tuple[Array, Array]]:
@@ -110,11 +126,13 @@ def _square_sum(
     plane = [camera.lens.normalize(pixels.T, lens).T for _, pixels in views]
     poses = estimate_poses([(points, image) for (points, _), image in zip(views, plane, strict=True)])
     total = 0.0
-    for (points, pixels), estimate in zip(views, poses, strict=True):
-        if estimate is not None:
-            pose = estimate[0]
+    for (points, pixels), found in zip(views, poses, strict=True):
+        if found:
+            pose = found[0][0]
             local = pose[:3, :3] @ points.T + pose[:3, 3:4]
-            total += float(np.sum((camera.lens.project(local, lens)[0].T - pixels) ** 2))
+            error = float(np.sum((camera.lens.project(local, lens)[0].T - pixels) ** 2))
+            # A board behind the camera explains its image no better than a single point does.
+            total += min(error, float(np.sum((pixels - pixels.mean(0)) ** 2)))
     return total
 
 
@@ -166,12 +184,13 @@ def _from_homographies(
 
 
 def _in_plane(points: Array) -> Array | None:
-    """Return points (m, 3) in their plane, (m, 2); None if they are not flat or in one line."""
+    """Return points (m, 3) in their plane, (m, 2); None if they determine no homography."""
     centred = points - points.mean(0)
     _, extent, axes = np.linalg.svd(centred, full_matrices=False)
     if extent[2] > FLATNESS * extent[0] or extent[1] <= FLATNESS * extent[0]:
         return None
-    return centred @ axes[:2].T
+    plane = centred @ axes[:2].T
+    return plane if determines_homography(plane) else None
 
 
 def _products(homography: Array, i: int, j: int) -> Array:

@@ -106,8 +106,10 @@ class Lens:
         with np.errstate(all="ignore"):
             for _ in range(_N_INVERSIONS):
                 found, derivative, _ = self.distort(plane, values[4:])
-                step = np.linalg.solve(derivative.transpose(2, 0, 1), (distorted - found).T[..., None])
-                plane = plane + step[..., 0].T
+                (a, b), (c, d) = derivative
+                u, v = (distorted - found) / (a * d - b * c)
+                step = np.stack([d * u - b * v, a * v - c * u])
+                plane = plane + step
                 if np.abs(step).max(initial=0.0) < _INVERSION_TOLERANCE:
                     break
             is_inverse = np.abs(self.distort(plane, values[4:])[0] - distorted).max(0) < 1e-6

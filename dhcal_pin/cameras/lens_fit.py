@@ -29,8 +29,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from .._typing import Array
-from .lens import Lens
+from .intrinsics import intrinsics_candidates, undetermined_focal_length
+from .lens import FOCAL_AND_CENTRE, Lens
 from .pose_from_points import estimate_poses
+from .rig import Camera
 
 # Largest number of views that the lens is fitted to, and of trial steps.
 _MAX_VIEWS, _N_STEPS = 30, 20
@@ -40,6 +42,9 @@ _DAMPING, _POSE_DAMPING = 1e-3, 1e-9
 _COST_TOL = 0.5
 # Smallest standard deviation of the image coordinates [px], for exact images.
 _MIN_SIGMA = 1e-3
+# Focal lengths that are tried if no method determines one, as multiples of the larger side of the image, and
+# largest standard deviation of the found ones relative to their values.
+_FOCAL_LENGTHS, _MAX_FOCAL_STD = (0.35, 0.7, 1.4, 2.8, 5.6), 0.1
 # Smallest square of the norm of a column.
 _MIN_SQUARE = 1e-300
 
@@ -55,17 +60,22 @@ class LensFit:
 
     Attributes:
         values: Values of the lens, shape (s,) [px and 1].
-        poses: Pose of the board in the camera, shape (4, 4) [m], and the RMS distance of its corners in the
-            image, X/Z and Y/Z, of each view; None where the corners do not determine a pose.
+        poses: Poses of the board in the camera that explain each view, shape (4, 4) [m], with the RMS
+            distance of its corners in the image, X/Z and Y/Z, the smallest first; none where the corners do
+            not determine a pose.
         cost: Cost of the views that the lens was fitted to; NaN if it is held.
+        std: Standard deviations of the values after the fit, shape (s,); 0 if they are held.
     """
 
     values: Array
-    poses: list[Pose | None]
-    cost: float = float("nan")
+    poses: list[list[Pose]]
+    cost: float
+    std: Array
 
 
-def fit_lens(views: Sequence[View], lens: Lens, values: Array, std: Array) -> LensFit:
+def fit_lens(
+    views: Sequence[View], lens: Lens, values: Array, std: Array, *, repeats_errors: bool = False
+) -> LensFit:
     """Fit the lens of a camera and the poses of boards to its images.
 
     Args:
@@ -73,27 +83,61 @@ def fit_lens(views: Sequence[View], lens: Lens, values: Array, std: Array) -> Le
         lens: Lens model.
         values: First values of the lens, shape (s,) [px and 1].
         std: Their standard deviations, shape (s,); 0 for values that are held.
+        repeats_errors: Whether points are wrong, and so in every view. All views then count as one.
 
     Returns:
         The fit.
     """
-    poses = _choose_poses(views, lens, values, [None] * len(views))
-    usable = [(i, pose) for i, pose in enumerate(poses) if pose is not None and np.isfinite(pose[1])]
+    poses = _find_poses(views, lens, values, [None] * len(views))
+    usable = [(i, found[0]) for i, found in enumerate(poses) if found and np.isfinite(found[0][1])]
+    known = [found[0][0] if found else None for found in poses]
     if not usable or not std.any():
-        return LensFit(values, poses)
+        held = np.zeros(len(values))
+        return LensFit(values, _find_poses(views, lens, values, known), float("nan"), held)
     chosen = [usable[i] for i in np.unique(np.linspace(0, len(usable) - 1, _MAX_VIEWS).astype(int))]
-    problem = _LensProblem([views[i] for i, _ in chosen], lens, values, std)
-    values, moved, cost = problem.minimize([pose for _, pose in chosen])
-    known = [None if pose is None else pose[0] for pose in poses]
+    n_repeats = len(chosen) if repeats_errors else 1
+    problem = _LensProblem([views[i] for i, _ in chosen], lens, values, std, n_repeats)
+    values, moved, cost, widths = problem.minimize([pose for _, pose in chosen])
     for (i, _), pose in zip(chosen, moved, strict=True):
         known[i] = pose[0]
-    return LensFit(values, _choose_poses(views, lens, values, known), cost)
+    return LensFit(values, _find_poses(views, lens, values, known), cost, widths)
 
 
-def _choose_poses(
+def fit_unknown_lens(
+    views: Sequence[View], camera: Camera, std: Array, *, repeats_errors: bool = False
+) -> LensFit:
+    """Fit the lens of a camera whose focal lengths are not known.
+
+    Args:
+        views: Points of a board, shape (m, 3) [m], and their pixels, shape (m, 2), of each view.
+        camera: Camera: its lens model, the size of its images and its name.
+        std: Standard deviations of first values, shape (s,).
+        repeats_errors: As for `fit_lens`.
+
+    Returns:
+        The best fit from several first values.
+
+    Raises:
+        NotObservableError: There are too few views, or they do not determine the focal length.
+    """
+    candidates = intrinsics_candidates(views, camera)
+    size = max(camera.width, camera.height)
+    starts = candidates or [(size * each, size * each, *camera.image_centre) for each in _FOCAL_LENGTHS]
+    n_more = len(camera.values) - len(FOCAL_AND_CENTRE)
+    fits = [
+        fit_lens(views, camera.lens, np.pad(start, (0, n_more)), std, repeats_errors=repeats_errors)
+        for start in starts
+    ]
+    best = min(fits, key=lambda fit: fit.cost)
+    if not candidates and not np.all(best.std[:2] < _MAX_FOCAL_STD * best.values[:2]):
+        raise undetermined_focal_length(camera)
+    return best
+
+
+def _find_poses(
     views: Sequence[View], lens: Lens, values: Array, known: Sequence[Array | None]
-) -> list[Pose | None]:
-    """Estimate the pose of the board in each view with a lens, from its known pose if there is one."""
+) -> list[list[Pose]]:
+    """Estimate the poses of the board in each view with a lens, from its known pose if there is one."""
     if not views:
         return []
     plane = lens.normalize(np.concatenate([pixels for _, pixels in views]).T, values).T
@@ -110,23 +154,25 @@ class _LensProblem:
         lens: Lens model.
         first: Values of the rig, (s,).
         std: Their standard deviations, (s,); 0 for values that are held.
+        n_repeats: Number of views that count as one.
     """
 
     views: Sequence[View]
     lens: Lens
     first: Array
     std: Array
+    n_repeats: int
 
-    def minimize(self, poses: list[Pose]) -> tuple[Array, list[Pose], float]:
-        """Return the values of the lens (s,), the poses with it, and the cost after damped steps."""
+    def minimize(self, poses: list[Pose]) -> tuple[Array, list[Pose], float, Array]:
+        """Return values of the lens (s,), the poses with it, the cost, and standard deviations (s,)."""
         values, damping = self.first, _DAMPING
         rows = self._rows(values, poses)
         cost = self._cost(rows, values)
         step = self._step(rows, values, damping)
         for _ in range(_N_STEPS):
             trial = values + step
-            found = _choose_poses(self.views, self.lens, trial, [pose for pose, _ in poses])
-            trial_poses = [new or old for new, old in zip(found, poses, strict=True)]
+            found = _find_poses(self.views, self.lens, trial, [pose for pose, _ in poses])
+            trial_poses = [each[0] for each in found]
             trial_rows = self._rows(trial, trial_poses)
             trial_cost = self._cost(trial_rows, trial)
             is_better, is_done = trial_cost < cost, abs(cost - trial_cost) < _COST_TOL
@@ -136,7 +182,10 @@ class _LensProblem:
                 break
             damping *= 0.1 if is_better else 10.0
             step = self._step(rows, values, damping)
-        return values, poses, cost
+        widths = np.zeros(len(values))
+        normal, _, scale = self._normal_equations(rows, values)
+        widths[self.std > 0] = np.sqrt(np.abs(np.diag(np.linalg.pinv(normal)))) / scale
+        return values, poses, cost, widths
 
     def _rows(self, values: Array, poses: Sequence[Pose]) -> list[Array]:
         """Return derivatives by lens and pose, and errors, of the views, (2m, f + 7) each [px]."""
@@ -162,18 +211,26 @@ class _LensProblem:
         return [part.reshape(-1, part.shape[2]) for part in np.split(rows, ends[:-1])]
 
     def _variance(self, rows: list[Array]) -> float:
-        """Return the most likely variance of the image coordinates [px²]."""
+        """Return the most likely variance of the image coordinates, times the repeats [px²]."""
         squares = sum(float(part[:, -1] @ part[:, -1]) for part in rows)
-        return max(squares / sum(map(len, rows)), _MIN_SIGMA**2)
+        return max(squares / sum(map(len, rows)), _MIN_SIGMA**2) * self.n_repeats
 
     def _cost(self, rows: list[Array], values: Array) -> float:
         """Return the cost; not a number where the lens cannot be evaluated."""
         is_free = self.std > 0
         offsets = (values - self.first)[is_free] / self.std[is_free]
-        return sum(map(len, rows)) * float(np.log(self._variance(rows))) + float(offsets @ offsets)
+        n_rows = sum(map(len, rows)) / self.n_repeats
+        return n_rows * float(np.log(self._variance(rows))) + float(offsets @ offsets)
 
     def _step(self, rows: list[Array], values: Array, damping: float) -> Array:
         """Return the step of the values (s,) if the poses follow it."""
+        normal, gradient, scale = self._normal_equations(rows, values)
+        step = np.zeros(len(values))
+        step[self.std > 0] = np.linalg.solve(normal + damping * np.eye(len(scale)), gradient) / scale
+        return step
+
+    def _normal_equations(self, rows: list[Array], values: Array) -> tuple[Array, Array, Array]:
+        """Return matrix (f, f) and gradient (f,) of the scaled free values, and their scales (f,)."""
         is_free = self.std > 0
         weights = 1 / self.std[is_free] ** 2
         f = len(weights)
@@ -187,7 +244,4 @@ class _LensProblem:
         normal = products[:, :f, :f].sum(0) - followed[:, :f] + np.diag(weights)
         gradient = products[:, :f, -1].sum(0) - followed[:, f] - weights * (values - self.first)[is_free]
         scale = np.sqrt(np.einsum("vii->i", products[:, :f, :f]) + weights)
-        normal = normal / np.outer(scale, scale) + damping * np.eye(f)
-        step = np.zeros(len(values))
-        step[is_free] = np.linalg.solve(normal, gradient / scale) / scale
-        return step
+        return normal / np.outer(scale, scale), gradient / scale, scale

@@ -34,7 +34,7 @@ MIN_POINTS, MIN_PROJECTION_POINTS = 4, 6
 # Steps of the refinement, the first damping, and the smallest one, for poses that are hardly determined.
 _N_STEPS, _DAMPING, _MIN_DAMPING = 30, 1e-3, 1e-12
 # Number of random subsets, distance relative to the size of the image of the board that is never too large,
-# and distance of a wrong point as a multiple of the median.
+# and distance of a wrong point as a multiple of the largest distance in a majority.
 _N_SUBSETS, _GOOD_RATIO, _OUTLIER_RATIO = 60, 0.01, 5.0
 # Relative change of the cost that ends the refinement.
 _COST_RTOL = 1e-4
@@ -87,8 +87,34 @@ def direct_linear_transform(source: Array, target: Array) -> Array:
     return np.linalg.solve(normalize_target, matrix @ normalize_source)
 
 
+def determines_homography(points: Array) -> bool:
+    """Check that points of a plane determine its homography: no line contains all of them but one.
+
+    Args:
+        points: Points in the plane, shape (m, 2), not all of them in one line.
+
+    Returns:
+        Whether four of them have no three in one line.
+    """
+    if len(points) < MIN_POINTS:
+        return False
+    centred = points - points.mean(0)
+    along = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
+    low, high = int(np.argmin(along)), int(np.argmax(along))
+    limit = FLATNESS * (along[high] - along[low])
+    far = int(np.argmax(_line_distances(points, low, high)))
+    lines = ((low, high), (low, far), (far, high))
+    return all(np.sum(_line_distances(points, *line) > limit) > 1 for line in lines)
+
+
+def _line_distances(points: Array, first: int, second: int) -> Array:
+    """Return the distances (m,) of points (m, 2) from the line through two of them."""
+    x, y = (points[second] - points[first]) / np.linalg.norm(points[second] - points[first])
+    return np.abs((points - points[first]) @ [-y, x])
+
+
 def agreeing_points(points: Array, image: Array) -> Array:
-    """Find the image points that agree with a projective map of most points (least median of squares).
+    """Find the image points that agree with a projective map of most points (least quantile of squares).
 
     Args:
         points: Points in their own frame, shape (m, 3) [m].
@@ -114,8 +140,11 @@ def agreeing_points(points: Array, image: Array) -> Array:
         return everything
     chosen = np.argsort(np.random.default_rng(0).random((_N_SUBSETS, len(points))), 1)[:, :least]
     fits = _transfer_distances(source, image, chosen)
-    best = fits[np.argmin(np.median(fits, 1))]
-    is_agreeing = best <= max(_OUTLIER_RATIO * float(np.median(best)), limit)
+    # The map passes through the points that it is computed from: they do not count as a majority.
+    majority = (len(points) + least + 1) // 2
+    distances = np.partition(fits, majority - 1, 1)[:, majority - 1]
+    best = fits[np.argmin(distances)]
+    is_agreeing = best <= max(_OUTLIER_RATIO * float(distances.min()), limit)
     return is_agreeing if is_agreeing.sum() > least else everything
 
 
@@ -139,13 +168,14 @@ def estimate_pose(points: Array, image: Array) -> tuple[Array, float] | None:
         Pose of their frame in the camera, shape (4, 4) [m], and the RMS distance in the image; None if there
         are too few points.
     """
-    return estimate_poses([(points, image)])[0]
+    found = estimate_poses([(points, image)])[0]
+    return found[0] if found else None
 
 
 def estimate_poses(
     views: Sequence[tuple[Array, Array]], known: Sequence[Array | None] | None = None
-) -> list[tuple[Array, float] | None]:
-    """Estimate the pose of points in each of several images.
+) -> list[list[tuple[Array, float]]]:
+    """Estimate the poses of points that explain each of several images.
 
     Args:
         views: Points in their own frame, shape (m, 3) [m], and their undistorted image coordinates X/Z, Y/Z,
@@ -154,21 +184,20 @@ def estimate_poses(
             instead of closed forms; None where there is none.
 
     Returns:
-        Pose of the points in the camera, shape (4, 4) [m], and the RMS distance in the image, for each image;
-        None where there are too few points.
+        For each image the poses of the points in the camera, shape (4, 4) [m], with the RMS distance in the
+        image, the smallest first; none where there are too few points.
     """
     candidates = [
         _first_poses(*view) if pose is None else [pose, *_mirror(pose, view[0])]
         for view, pose in zip(views, known or [None] * len(views), strict=True)
     ]
     view_of = [i for i, poses in enumerate(candidates) for _ in poses]
-    out: list[tuple[Array, float] | None] = [None] * len(views)
+    out: list[list[tuple[Array, float]]] = [[] for _ in views]
     if view_of:
         first = np.array([pose for poses in candidates for pose in poses])
         poses, rms = _refine(first, [views[i] for i in view_of])
-        # The best pose of a view is stored last.
-        for i in np.argsort(-rms, kind="stable").tolist():
-            out[view_of[i]] = poses[i], float(rms[i])
+        for i in np.argsort(rms, kind="stable").tolist():
+            out[view_of[i]].append((poses[i], float(rms[i])))
     return out
 
 
@@ -182,9 +211,12 @@ def _first_poses(points: Array, image: Array) -> list[Array]:
         return []
     axes[2] *= np.linalg.det(axes)
     flat = (points - centre) @ axes.T
+    is_flat = extent[2] <= FLATNESS * extent[0]
+    if is_flat and not determines_homography(flat[:, :2]):
+        return []
     frame = se3.inverse(se3.transform(axes.T, centre))
     out = [pose @ frame for pose in _flat_poses(flat[:, :2], image)]
-    if extent[2] <= FLATNESS * extent[0]:
+    if is_flat:
         return out
     out.append(_orthographic_pose(points, image))
     if len(points) >= MIN_PROJECTION_POINTS:
@@ -294,9 +326,10 @@ def _refine(poses: Array, views: Sequence[tuple[Array, Array]]) -> tuple[Array, 
         scale = np.sqrt(np.maximum(np.einsum("cii->ci", normal), 1e-300))
         normal = normal / (scale[:, :, None] * scale[:, None]) + damping[active, None, None] * np.eye(6)
         step = np.linalg.solve(normal, (gradient / scale)[..., None])[..., 0] / scale
-        trial = se3.exp6(step) @ poses[active]
-        trial_residuals, trial_local = _residuals(trial, points[active], image[active])
-        trial_cost = np.sum(presence[active] * trial_residuals**2, (1, 2))
+        with np.errstate(all="ignore"):
+            trial = se3.exp6(step) @ poses[active]
+            trial_residuals, trial_local = _residuals(trial, points[active], image[active])
+            trial_cost = np.sum(presence[active] * trial_residuals**2, (1, 2))
         is_better = trial_cost < cost[active]
         better = active[is_better]
         # A Gauss-Newton step without damping reduces the cost by its product with the gradient.

@@ -7,7 +7,7 @@ from dataclasses import replace
 import camera_setups
 import numpy as np
 import pytest
-from camera_setups import ARMS, polyhedron_setup, random_setup, simulate
+from camera_setups import ARMS, polyhedron_setup, random_setup, simulate, wrong_arm
 
 import dhcal_pin as dh
 from dhcal_pin import select_parameters
@@ -65,6 +65,59 @@ def test_boards_of_points_near_a_plane_converge_without_a_guess(depth, is_lens_k
         camera = replace(rig.cameras[0], values=np.array([np.nan] * 4 + [0.0] * 5))
         images = CameraCorners(images.q, images.values, images.corner, replace(rig, cameras=(camera,)))
     fit = dh.calibrate(arm, images, "camera,board,intrinsics", loss="linear")
+    assert image_rms(fit, images) < 1.1 * setup.sigma
+
+
+@pytest.mark.parametrize("seed", [20, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(20))])
+def test_small_boards_of_wrong_points_converge(seed, monkeypatch):
+    """Eight points of a small board, flat or not, that are 1 to 3 mm from where the rig states them."""
+    error, depth = (1e-3, 2e-3, 3e-3)[seed // 2 % 3], (0.8, 0.1, 0.0)[seed % 3]
+
+    def board(rng, name, link):
+        points = rng.uniform(-0.06, 0.06, (8, 3)) * [1, 1, depth]
+        return Board(name, link, "points", listed_points=points)
+
+    monkeypatch.setattr(camera_setups, "make_board", board)
+    rng, arm = np.random.default_rng(6000 + seed), list(ARMS.values())[seed % 4]()
+    truth = wrong_arm(arm, (0.0, 3e-3)[seed // 6 % 2], rng)
+    n_images = int(rng.integers(12, 30))
+    is_on_wrist = seed // 4 % 2 == 0
+    setup = simulate(arm, truth, rng, is_on_wrist=is_on_wrist, n_images=n_images, sigma=0.2, spread=0.35)
+    exact = setup.images.rig.boards[0]
+    points = exact.points + error * rng.standard_normal(exact.points.shape)
+    stated = replace(exact, listed_points=points, has_free_points=True)
+    rig = replace(setup.images.rig, boards=(stated,))
+    images = CameraCorners(setup.images.q, setup.images.values, setup.images.corner, rig)
+    fit = dh.calibrate(arm, images, extend="none", loss="linear")
+    assert fit.solution.converged
+    assert image_rms(fit, images) < 1.1 * setup.sigma
+
+
+@pytest.mark.parametrize(
+    "seed", [50, 76, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(30))]
+)
+def test_strong_distortion_without_focal_lengths_converges(seed, monkeypatch):
+    true_lens = camera_setups.true_lens
+
+    def distorted(rng, model, aspect):
+        lens = true_lens(rng, model, aspect)
+        lens[4:6] = rng.uniform(-0.33, -0.27), rng.uniform(0.05, 0.12)
+        return lens
+
+    monkeypatch.setattr(camera_setups, "true_lens", distorted)
+    rng, arm = np.random.default_rng(4000 + seed), list(ARMS.values())[seed % 4]()
+    n_images, n_cameras = int(rng.integers(12, 50)), 1 + seed // 2 % 2
+    is_on_wrist = seed // 4 % 2 == 0
+    setup = simulate(
+        arm, arm, rng, is_on_wrist=is_on_wrist, n_images=n_images, sigma=0.2, n_cameras=n_cameras
+    )
+    images, rig = setup.images, setup.images.rig
+    unknown = np.array([np.nan] * 4 + [0.0] * 5)
+    cameras = tuple(replace(camera, values=unknown) for camera in rig.cameras)
+    names = [f"camera{i}" for i in images.camera], [f"board{i}" for i in images.board]
+    images = CameraCorners(images.q, images.values, images.corner, replace(rig, cameras=cameras), *names)
+    fit = dh.calibrate(arm, images, "camera,board,intrinsics", loss="linear")
+    assert fit.solution.converged
     assert image_rms(fit, images) < 1.1 * setup.sigma
 
 

@@ -7,7 +7,8 @@ import pytest
 
 from dhcal_pin import se3
 from dhcal_pin.cameras import LENSES, Board, Camera, estimate_intrinsics, estimate_pose, solve_hand_eye
-from dhcal_pin.cameras.pose_from_points import agreeing_points
+from dhcal_pin.cameras.hand_eye import choose_poses, mean_pose
+from dhcal_pin.cameras.pose_from_points import agreeing_points, determines_homography
 from dhcal_pin.exceptions import NotObservableError
 
 CAMERA = Camera("c", "world", 1280, 720, np.array([np.nan] * 4 + [0.0] * 5))
@@ -87,6 +88,47 @@ def test_hand_eye_is_exact():
     found = solve_hand_eye(links, se3.inverse(camera) @ links @ board, "camera 'c' and board 'b'")
     np.testing.assert_allclose(found[0], camera, atol=1e-10)
     np.testing.assert_allclose(found[1], board, atol=1e-10)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_poses_that_agree_are_chosen(seed):
+    """In six of ten images the board appears tilted the other way."""
+    rng = np.random.default_rng(seed)
+    camera, board = (se3.exp6(rng.uniform(-2, 2, 6)) for _ in range(2))
+    links = se3.exp6(rng.uniform(-1, 1, (25, 6)))
+    right = se3.inverse(camera) @ links @ board @ se3.exp6(0.03 * rng.standard_normal((25, 6)))
+    tilts = rng.choice([-1, 1], (25, 1)) * rng.uniform(0.5, 1.2, (25, 1))
+    wrong = right @ se3.exp6(np.pad(tilts, ((0, 0), (3, 2))) + 0.03 * rng.standard_normal((25, 6)))
+    is_right = (rng.random(25) < 0.4)[:, None, None]
+    candidates = np.stack([np.where(is_right, right, wrong), np.where(is_right, wrong, right)], 1)
+    np.testing.assert_array_equal(choose_poses(links, candidates), right)
+    found = mean_pose((se3.inverse(links) @ camera)[:, None] @ candidates)
+    np.testing.assert_allclose(found, board, atol=0.1)
+
+
+def test_a_line_and_one_more_point_determine_no_homography():
+    row = np.outer(np.arange(7.0), [0.03, 0.01])
+    assert not determines_homography(np.vstack([row, [[0.1, 0.2]]]))
+    assert not determines_homography(np.vstack([[[0.2, 0.3]], row]))
+    assert determines_homography(np.vstack([row, [[0.1, 0.2], [0.1, 0.3]]]))
+    points = np.pad(np.vstack([row, [[0.1, 0.2]]]), ((0, 0), (0, 1)))
+    assert estimate_pose(points, points[:, :2] + [0.1, 0.1]) is None
+
+
+@pytest.mark.parametrize("error", [1e-3, 2e-3, 3e-3])
+@pytest.mark.parametrize("depth", [0.0, 0.01, 0.1])
+def test_points_that_are_millimetres_off_still_give_a_pose(depth, error):
+    """All but one of eight points of a small board are kept, and they give a pose."""
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        points = rng.uniform(-0.06, 0.06, (8, 3)) * [1, 1, depth / 0.12]
+        pose = random_pose(rng)
+        local = points @ pose[:3, :3].T + pose[:3, 3]
+        stated = points + error * rng.standard_normal((8, 3))
+        image = local[:, :2] / local[:, 2:]
+        agrees = agreeing_points(stated, image)
+        assert agrees.sum() >= 6
+        assert estimate_pose(stated[agrees], image[agrees]) is not None
 
 
 def test_rotations_about_one_axis_are_refused():

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from dhcal_pin import se3
-from dhcal_pin.cameras import LENSES, Board
-from dhcal_pin.cameras.lens_fit import fit_lens
+from dhcal_pin.cameras import LENSES, Board, Camera
+from dhcal_pin.cameras.lens_fit import fit_lens, fit_unknown_lens
 from dhcal_pin.cameras.pose_from_points import estimate_pose, estimate_poses
+from dhcal_pin.exceptions import NotObservableError
 
 cv2 = pytest.importorskip("cv2")
 CHECKERBOARD = Board("b", "world", "checkerboard", columns=8, rows=6, square=0.03).points
@@ -47,7 +48,7 @@ def angles(found, poses):
     """Return the angles of found poses to the true ones [rad]."""
     return np.array(
         [
-            np.linalg.norm(se3.log3(each[0][:3, :3].T @ pose[:3, :3]))
+            np.linalg.norm(se3.log3(each[0][0][:3, :3].T @ pose[:3, :3]))
             for each, pose in zip(found, poses, strict=True)
         ]
     )
@@ -97,7 +98,7 @@ def test_images_without_a_pose_are_left_out():
     poses, views = images(np.random.default_rng(3), "pinhole")
     views.insert(4, (CHECKERBOARD[:3], views[0][1][:3]))
     fit = fit_lens(views, LENSES["pinhole"], *stated_lens("pinhole", "stated"))
-    assert fit.poses[4] is None
+    assert fit.poses[4] == []
     assert angles(fit.poses[:4] + fit.poses[5:], poses).max() < 0.05
     assert fit_lens([], LENSES["pinhole"], *stated_lens("pinhole", "stated")).poses == []
 
@@ -112,6 +113,51 @@ def test_poses_of_several_images_are_those_of_each():
     for view, found in zip(views, estimate_poses(views), strict=True):
         alone = estimate_pose(*view)
         assert alone is not None
-        assert found is not None
-        np.testing.assert_allclose(found[0], alone[0], atol=1e-6)
-        assert found[1] == pytest.approx(alone[1], rel=1e-6)
+        np.testing.assert_allclose(found[0][0], alone[0], atol=1e-6)
+        assert found[0][1] == pytest.approx(alone[1], rel=1e-6)
+
+
+def without_focal_lengths(model):
+    """Return a camera whose lens is not known, and standard deviations of first values."""
+    n_coefficients = len(TRUE[model]) - 4
+    values = np.repeat([np.nan, 0.0], [4, n_coefficients])
+    return Camera("c", "world", 1280, 960, values, LENSES[model]), np.repeat([1e5, 0.3], [4, n_coefficients])
+
+
+@pytest.mark.parametrize("model", LENSES)
+@pytest.mark.parametrize("seed", range(3))
+def test_unknown_lenses_are_found_with_their_distortion(seed, model):
+    poses, views = images(np.random.default_rng(seed), model)
+    fit = fit_unknown_lens(views, *without_focal_lengths(model))
+    np.testing.assert_allclose(fit.values[:4], TRUE[model][:4], atol=15)
+    assert np.all(np.abs(fit.values - TRUE[model])[:4] < 4 * fit.std[:4])
+    assert angles(fit.poses, poses).max() < 0.05
+
+
+def test_images_without_tilt_do_not_determine_an_unknown_lens():
+    rng = np.random.default_rng(0)
+    points = CHECKERBOARD - MIDDLE
+    views = [
+        (points, 1000 / depth * points[:, :2] + [640, 480] + 0.3 * rng.standard_normal((len(points), 2)))
+        for depth in (0.5, 0.7, 0.9)
+    ]
+    with pytest.raises(NotObservableError, match="do not determine its focal length"):
+        fit_unknown_lens(views, *without_focal_lengths("pinhole"))
+
+
+def test_wrong_points_do_not_change_the_lens():
+    """The same errors of the points in all views are no evidence of a lens."""
+    rng = np.random.default_rng(5)
+    _, views = images(rng, "pinhole")
+    chosen = np.array([0, 3, 6, 14, 20, 28, 31, 34])
+    stated = CHECKERBOARD[chosen] + 2e-3 * rng.standard_normal((8, 3))
+    views = [(stated, pixels[chosen]) for _, pixels in views]
+    values, std = stated_lens("pinhole", "stated")
+    errors = [
+        np.abs(
+            fit_lens(views, LENSES["pinhole"], values, std, repeats_errors=repeats).values - TRUE["pinhole"]
+        )
+        for repeats in (False, True)
+    ]
+    assert errors[1][2:4].max() < 30
+    assert errors[1][2:4].max() < 0.5 * errors[0][2:4].max()

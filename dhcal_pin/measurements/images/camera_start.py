@@ -25,10 +25,9 @@ import numpy as np
 from ... import se3
 from ..._typing import Array
 from ...cameras.boards import Board
-from ...cameras.hand_eye import mean_pose, solve_hand_eye
-from ...cameras.intrinsics import intrinsics_candidates
+from ...cameras.hand_eye import choose_poses, mean_pose, solve_hand_eye
 from ...cameras.lens import FOCAL_AND_CENTRE
-from ...cameras.lens_fit import LensFit, fit_lens
+from ...cameras.lens_fit import LensFit, fit_lens, fit_unknown_lens
 from ...cameras.pose_from_points import agreeing_points
 from ...cameras.rig import Camera
 from ...exceptions import NotObservableError
@@ -69,8 +68,9 @@ class BoardViews:
     Attributes:
         lenses: Values of the lens of each camera.
         sample: First sample of each view of a board, (v,).
-        poses: Pose of the board in the camera, (v, 4, 4) [m].
-        rms: RMS distance of its corners in the image, X/Z and Y/Z, (v,).
+        poses: Poses of the board in the camera that explain the image, the better one first, (v, 2, 4, 4)
+            [m]. Both are the same if there is only one.
+        rms: RMS distance of its corners in the image with the better one, X/Z and Y/Z, (v,).
     """
 
     lenses: list[Array]
@@ -96,44 +96,37 @@ def estimate_views(item: CameraCorners) -> BoardViews:
     found: list[tuple[int, Array, float]] = []
     for number, camera in enumerate(item.rig.cameras):
         own = [samples for samples in images if item.camera[samples[0]] == number]
-        fit = _fit_camera(
-            camera,
-            tuple(
-                (
-                    item.rig.boards[item.board[samples[0]]].points[item.corner[samples]].tobytes(),
-                    item.values[samples].tobytes(),
-                )
-                for samples in own
-            ),
+        boards = [item.rig.boards[item.board[samples[0]]] for samples in own]
+        views = tuple(
+            (board.points[item.corner[samples]].tobytes(), item.values[samples].tobytes())
+            for board, samples in zip(boards, own, strict=True)
         )
+        fit = _fit_camera(camera, views, any(board.has_free_points for board in boards))
         lenses.append(fit.values)
-        found += [
-            (int(samples[0]), *estimate)
-            for samples, estimate in zip(own, fit.poses, strict=True)
-            if estimate is not None and np.isfinite(estimate[1])
-        ]
+        for samples, poses in zip(own, fit.poses, strict=True):
+            if poses and np.isfinite(poses[0][1]):
+                both = [pose for pose, rms in poses[:2] if rms <= _MAX_RATIO * poses[0][1]]
+                found.append((int(samples[0]), np.array([both[0], both[-1]]), poses[0][1]))
     found.sort(key=lambda view: view[0])
     return BoardViews(
         lenses,
         np.array([view[0] for view in found], int),
-        np.array([view[1] for view in found]).reshape(-1, 4, 4),
+        np.array([view[1] for view in found]).reshape(-1, 2, 4, 4),
         np.array([view[2] for view in found]),
     )
 
 
 @lru_cache(_MAX_FITS)
-def _fit_camera(camera: Camera, content: tuple[tuple[bytes, bytes], ...]) -> LensFit:
+def _fit_camera(camera: Camera, content: tuple[tuple[bytes, bytes], ...], repeats_errors: bool) -> LensFit:
     """Fit the lens of a camera and the poses of boards to views: bytes of points and pixels."""
     views = [
         (np.frombuffer(points).reshape(-1, 3), np.frombuffer(pixels).reshape(-1, 2))
         for points, pixels in content
     ]
-    starts = [camera.values]
-    if not camera.has_intrinsics:
-        n_more = len(camera.values) - len(FOCAL_AND_CENTRE)
-        starts = [np.pad(each, (0, n_more)) for each in intrinsics_candidates(views, camera)]
-    fits = [fit_lens(views, camera.lens, start, _lens_widths(camera)) for start in starts]
-    return min(fits, key=lambda fit: fit.cost)
+    std = _lens_widths(camera)
+    if camera.has_intrinsics:
+        return fit_lens(views, camera.lens, camera.values, std, repeats_errors=repeats_errors)
+    return fit_unknown_lens(views, camera, std, repeats_errors=repeats_errors)
 
 
 def _lens_widths(camera: Camera) -> Array:
@@ -207,7 +200,7 @@ def _agreeing(item: CameraCorners, samples: Array) -> Array:
     return _agreeing_points(board.points[item.corner[samples]], item.values[samples])
 
 
-# Poses of the links against each other (i, 4, 4) and of the board in the camera (i, 4, 4) by numbers of
+# Poses of the links against each other (i, 4, 4) and of the board in the camera (i, 2, 4, 4) by numbers of
 # camera and board.
 _Pairs = dict[tuple[int, int], tuple[Array, Array]]
 
@@ -244,12 +237,13 @@ def _locate(
         if camera in cameras and board in boards:
             continue
         if camera in cameras:
-            boards[board] = mean_pose(se3.inverse(links) @ cameras[camera] @ poses)
+            boards[board] = mean_pose((se3.inverse(links) @ cameras[camera])[:, None] @ poses)
         elif board in boards:
-            cameras[camera] = mean_pose(links @ boards[board] @ se3.inverse(poses))
+            cameras[camera] = mean_pose((links @ boards[board])[:, None] @ se3.inverse(poses))
         else:
             names = f"camera {item.rig.cameras[camera].name!r} and board {item.rig.boards[board].name!r}"
-            cameras[camera], boards[board] = solve_hand_eye(links, poses, names)
+            chosen = choose_poses(links, poses)
+            cameras[camera], boards[board] = solve_hand_eye(links, chosen, names)
     missing = [
         f"{what} {entries[number].name!r}"
         for what, entries, used, known in (
