@@ -722,7 +722,9 @@ def _require_inside_images(item: CameraCorners) -> None:
         u, v = item.values[first]
         of_camera = item.camera == item.camera[first]
         is_exchanged = np.all(item.values[of_camera] <= [camera.height, camera.width])
-        hint = "width and height are exchanged" if is_exchanged else "check width and height"
+        hint = "check width and height"
+        if is_exchanged:
+            hint = "u and v are exchanged, or width and height are exchanged"
         raise SampleError(
             first,
             f"u = {u:.6g}, v = {v:.6g} px is far outside the images of camera {camera.name!r} of "

@@ -145,6 +145,30 @@ def test_exchanged_axes_of_the_intrinsics_are_named(intrinsics, order, what):
         assert rms[0] == pytest.approx(rms[1], rel=1e-3)
 
 
+@pytest.mark.parametrize("is_on_wrist", [True, False])
+def test_exchanged_image_coordinates_are_named(is_on_wrist):
+    """Rows and columns of an array of pixels are v and u; the hold-out images are exchanged, too."""
+    rng, chain = np.random.default_rng(8), ARMS["ur10"]()
+    truth = wrong_arm(chain, 1e-3, rng)
+    setup = simulate(chain, truth, rng, is_on_wrist=is_on_wrist, n_images=25, sigma=0.2)
+    camera = replace(setup.images.rig.cameras[0], width=1280, height=1280)
+    data = setup.images.with_rig(replace(setup.images.rig, cameras=(camera,)))
+    right, exchanged = (
+        dh.calibrate(
+            chain,
+            item.take(item.image < 20),
+            holdout=item.take(item.image >= 20),
+            extend="none",
+            loss="linear",
+        )
+        for item in (data, data.replace(values=data.values[:, ::-1]))
+    )
+    assert not any("exchanged" in text for text in right.input_warnings)
+    assert any("u and v are exchanged in the measurements" in text for text in exchanged.input_warnings)
+    rms = [fit.comparisons[0].after["residual_rms"] for fit in (right, exchanged)]
+    assert rms[0] == pytest.approx(rms[1], rel=1e-3)
+
+
 def test_exchanged_width_and_height_are_named():
     rng = np.random.default_rng(7)
     chain = ARMS["ur10"]()

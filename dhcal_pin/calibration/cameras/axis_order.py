@@ -1,9 +1,9 @@
-"""Exchanged axes of intrinsics: fx with fy, or cx with cy, or width with height.
+"""Exchanged axes of images: fx with fy, or cx with cy, or width with height, or u with v.
 
-Programs differ in the order in which they write image axes. Exchanged values look like an error of the arm of
-many pixels, and no prior of the intrinsics reaches the right ones. Each camera is therefore calibrated alone,
-with the nominal arm and fixed intrinsics, as they are stated and in every other order. Another order is taken
-if it explains the images far better.
+Programs differ in the order in which they write image axes, and rows and columns of an array are v and u.
+Exchanged values look like an error of the arm of many pixels, and no prior of the intrinsics reaches the
+right ones. Each camera is therefore calibrated alone, with the nominal arm and fixed intrinsics, as they are
+stated and in every other order. Another order is taken if it explains the images far better.
 """
 
 from __future__ import annotations
@@ -24,24 +24,40 @@ from ...robot.chain import Chain
 from ..reweighting import Fit
 from .stages import ImageError, Stage, fitted_error
 
-# Orders of fx, fy, cx, cy besides the stated one, with their names.
+
+@dataclass(frozen=True)
+class AxisOrder:
+    """Order of the values of a camera and of its image coordinates.
+
+    Attributes:
+        intrinsics: Order of fx, fy, cx, cy.
+        pixels: Order of u, v.
+    """
+
+    intrinsics: tuple[int, ...] = (0, 1, 2, 3)
+    pixels: tuple[int, ...] = (0, 1)
+
+
+# Orders besides the stated one, by what they exchange.
+U_AND_V = "u and v"
 ORDERS = {
-    "fx and fy": [1, 0, 2, 3],
-    "cx and cy": [0, 1, 3, 2],
-    "fx and fy, and cx and cy": [1, 0, 3, 2],
+    "fx and fy": AxisOrder((1, 0, 2, 3)),
+    "cx and cy": AxisOrder((0, 1, 3, 2)),
+    "fx and fy, and cx and cy": AxisOrder((1, 0, 3, 2)),
+    U_AND_V: AxisOrder(pixels=(1, 0)),
 }
 # Smallest change of a value that is tried [px].
 MIN_CHANGE = 5.0
-# Error of stated intrinsics below which nothing is tried [px], and largest ratio of the errors for which
-# another order is taken.
-GOOD_ERROR, MAX_RATIO = 2.0, 0.5
+# Error of stated values below which other intrinsics, and other image coordinates, are not tried [px]: images
+# with exchanged coordinates are mirror images. Largest ratio of the errors for which another order is taken.
+GOOD_ERROR, GOOD_MIRRORED_ERROR, MAX_RATIO = 2.0, 20.0, 0.5
 # Largest number of iterations of one solution, and of corners of a camera that are compared.
 _MAX_ITERATIONS, _MAX_CORNERS = 30, 2000
 
 
 @dataclass(frozen=True)
 class Exchange:
-    """Values of a camera that are exchanged in the rig.
+    """Values of a camera that are exchanged in the rig, or image coordinates in the measurements.
 
     Attributes:
         camera: Name of the camera.
@@ -60,7 +76,8 @@ class Exchange:
     @property
     def sentence(self) -> str:
         """What is exchanged, how it was found, and what to do about it."""
-        start = f"camera {self.camera!r}: {self.what} are exchanged in the rig file"
+        place = "measurements" if self.what == U_AND_V else "rig file"
+        start = f"camera {self.camera!r}: {self.what} are exchanged in the {place}"
         if self.stated is None or self.exchanged is None:
             return f"{start}: corners lie outside its images, and inside if they are exchanged. Correct them."
         return (
@@ -80,7 +97,7 @@ def exchange_axes(
         data: Measurements of any kinds.
 
     Returns:
-        The measurements with the right intrinsics, and what was exchanged.
+        The measurements in the right order, and what was exchanged.
     """
     out = tuple(data)
     found: list[Exchange] = []
@@ -88,21 +105,19 @@ def exchange_axes(
         camera.name for item in data if isinstance(item, CameraCorners) for camera in item.rig.cameras
     )
     for name in names:
-        parts = [part for item in data if (part := _images_of(item, name)) is not None]
-        if _is_size_exchanged(parts, name):
-            found.append(Exchange(name, "width and height", None, None))
-        best = _best_order(chain, parts, name)
+        best = _best_order(
+            chain, [part for item in data if (part := _images_of(item, name)) is not None], name
+        )
         if best is not None:
-            exchange, order = best
-            found.append(exchange)
-            out = tuple(
-                _reordered(item, name, order) if isinstance(item, CameraCorners) else item for item in out
-            )
+            found.append(best)
+            out = reorder(out, [best])
+        if _is_size_exchanged([part for item in out if (part := _images_of(item, name)) is not None], name):
+            found.append(Exchange(name, "width and height", None, None))
     return out, tuple(found)
 
 
 def reorder(data: Sequence[Measurement], exchanges: Sequence[Exchange]) -> tuple[Measurement, ...]:
-    """Exchange the same values of the cameras of other measurements.
+    """Exchange the same values of the cameras of measurements.
 
     Args:
         data: Measurements of any kinds.
@@ -155,33 +170,26 @@ def _is_size_exchanged(parts: Sequence[CameraCorners], name: str) -> bool:
     return False
 
 
-def _best_order(chain: Chain, parts: Sequence[CameraCorners], name: str) -> tuple[Exchange, list[int]] | None:
-    """Return the order of the intrinsics that explains the images of a camera far better."""
+def _best_order(chain: Chain, parts: Sequence[CameraCorners], name: str) -> Exchange | None:
+    """Return the exchange that explains the images of a camera far better."""
     cameras = [camera for part in parts for camera in part.rig.cameras if camera.name == name]
     if not cameras or not cameras[0].has_intrinsics:
-        return None
-    values = cameras[0].values[:4]
-    orders = {
-        what: order
-        for what, order in ORDERS.items()
-        if np.all(np.abs(values[order] - values)[np.array(order) != np.arange(4)] > MIN_CHANGE)
-    }
-    if not orders:
         return None
     stated = _frames_error(chain, parts)
     if stated is None or stated[0].pixels < GOOD_ERROR:
         return None
-    errors = {
-        what: found[0]
-        for what, order in orders.items()
-        if (found := _frames_error(chain, [_reordered(part, name, order) for part in parts])) is not None
-    }
-    if not errors:
+    values, errors = cameras[0].values[:4], {}
+    for what, order in ORDERS.items():
+        changed = [i for i, other in enumerate(order.intrinsics) if other != i]
+        is_tried = np.all(np.abs(values[list(order.intrinsics)] - values)[changed] > MIN_CHANGE)
+        if is_tried and (what != U_AND_V or stated[0].pixels > GOOD_MIRRORED_ERROR):
+            found = _frames_error(chain, [_reordered(part, name, order) for part in parts])
+            if found is not None:
+                errors[what] = found[0]
+    what = min(errors, key=lambda each: errors[each].pixels, default="")
+    if not what or errors[what].pixels > MAX_RATIO * stated[0].pixels:
         return None
-    what = min(errors, key=lambda each: errors[each].pixels)
-    if errors[what].pixels > MAX_RATIO * stated[0].pixels:
-        return None
-    return Exchange(name, what, stated[0], errors[what], stated[1]), orders[what]
+    return Exchange(name, what, stated[0], errors[what], stated[1])
 
 
 def _frames_error(chain: Chain, parts: Sequence[CameraCorners]) -> tuple[ImageError, int] | None:
@@ -216,13 +224,18 @@ def _thinned(item: CameraCorners) -> CameraCorners:
     return item.take(np.isin(item.image, chosen))
 
 
-def _reordered(item: CameraCorners, name: str, order: Sequence[int]) -> CameraCorners:
-    """Return a measurement with another order of fx, fy, cx, cy of a camera."""
+def _reordered(item: CameraCorners, name: str, order: AxisOrder) -> CameraCorners:
+    """Return a measurement with another order of the values of a camera."""
     cameras, values = [], {}
-    for camera in item.rig.cameras:
+    pixels, sigma = item.values.copy(), item.sigma.copy()
+    for number, camera in enumerate(item.rig.cameras):
         if camera.name == name:
-            lens = np.concatenate([camera.values[list(order)], camera.values[4:]])
+            of_camera = item.camera == number
+            pixels[of_camera] = pixels[of_camera][:, order.pixels]
+            sigma[of_camera] = sigma[of_camera][:, order.pixels]
+            lens = np.concatenate([camera.values[list(order.intrinsics)], camera.values[4:]])
             values = {f"camera_{name}.{key}": v for key, v in zip(camera.lens.names, lens, strict=True)}
             camera = replace(camera, values=lens)
         cameras.append(camera)
-    return item.with_rig(replace(item.rig, cameras=tuple(cameras))).with_values(values)
+    exchanged = item.replace(values=pixels, sigma=sigma)
+    return exchanged.with_rig(replace(item.rig, cameras=tuple(cameras))).with_values(values)
