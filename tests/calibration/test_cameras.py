@@ -328,6 +328,36 @@ def test_a_known_rig_judges_the_arm_alone():
     assert kept.errors.parameters == ()
 
 
+def test_few_held_out_images_do_not_discard_cameras_and_boards():
+    """Five images cannot show that the arm is better; the poses that were estimated must not be lost for it.
+
+    The rig states them to a centimetre only.
+    """
+    rng = np.random.default_rng(3)
+    chain = ARMS["ur10"]()
+    setup = simulate(chain, wrong_arm(chain, 3e-3, rng), rng, is_on_wrist=True, n_images=20, sigma=0.2)
+    exact, stated = setup.exact.rig, setup.images.rig
+    poses = [
+        entry.pose @ dh.se3.exp6(rng.normal(0, 1, 6) * ([1e-2] * 3 + [2e-2] * 3))
+        for entry in (exact.cameras[0], exact.boards[0])
+    ]
+    rig = replace(
+        stated,
+        cameras=(replace(stated.cameras[0], pose=poses[0]),),
+        boards=(replace(stated.boards[0], pose=poses[1]),),
+    )
+    data = setup.images.with_rig(rig)
+    fit = dh.calibrate(chain, data.take(data.image >= 5), holdout=data.take(data.image < 5), loss="linear")
+    assert fit.camera_stages[-1].is_kept
+    final = fit.accepted.comparisons[0].after["residual_rms"]
+    assert final < 0.6
+    assert fit.accepted.rig is not None
+    found, true = (each.cameras[0].pose for each in (fit.accepted.rig, exact))
+    assert found is not None
+    assert true is not None
+    assert np.abs(found - true).max() < 0.01
+
+
 def test_hand_eye_alone_keeps_the_arm(arm):
     rng = np.random.default_rng(2)
     fit = dh.calibrate(arm, images_of(arm, 15, rng), "camera,board")
