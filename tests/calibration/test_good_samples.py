@@ -14,6 +14,7 @@ from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.initialization import align
 from dhcal_pin.estimation.robust import ZERO_WEIGHT
 from dhcal_pin.estimation.trimmed_squares import find_initial_outliers
+from dhcal_pin.estimation.trimmed_squares.search import LinearizedRows
 from dhcal_pin.measurements import (
     CameraCorners,
     Noise,
@@ -440,3 +441,27 @@ def test_outliers_of_half_a_metre_do_not_spoil_the_start(kind, is_clustered):
         assert len(fit.outliers[0]) <= len(bad) + 1
         q = joint_sample(chain, 200, rng)
         assert tool_error(fit, chain, q) <= 1.3 * tool_error(expected, chain, q), seed
+
+
+def test_a_class_of_noise_without_inliers_takes_the_scale_of_all_its_samples():
+    """Random subsets of several instruments can reject all samples of one of them."""
+    empty = np.empty((0, 0))
+    rows = LinearizedRows(
+        (),
+        (),
+        empty,
+        empty,
+        (),
+        counts=np.full(6, 3.0),
+        sample=np.arange(6),
+        noise_class=np.repeat([0, 1], 3),
+        is_estimated=np.array([True, True]),
+        information=empty,
+        prior_right=empty,
+        strata=(),
+    )
+    squares = np.array([[3.0, 4.0, 5.0, 30.0, 40.0, 50.0]])
+    some = rows.noise_scales(squares, np.array([[True, True, False, False, False, False]]))
+    every = rows.noise_scales(squares)
+    assert some[0, 1] == every[0, 1]
+    assert some[0, 0] < every[0, 0]

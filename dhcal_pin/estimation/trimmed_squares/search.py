@@ -147,7 +147,7 @@ class LinearizedRows:
 
         Args:
             squares: Sums of squared residuals of the blocks, shape (a, b).
-            inliers: Whether each sample counts, shape (a, m); all if None.
+            inliers: Whether each sample counts, shape (a, m); all if None, and all of a class without any.
 
         Returns:
             Scales, shape (a, c).
@@ -159,7 +159,9 @@ class LinearizedRows:
             # The median of χ²_k/k is about (1 - 2/(9k))³.
             mean_squares = squares[:, members] / (counts * (1 - 2 / (9 * counts)) ** 3)
             if inliers is not None:
-                mean_squares = np.where(inliers[:, self.sample[members]], mean_squares, np.nan)
+                is_counted = inliers[:, self.sample[members]]
+                is_counted |= ~is_counted.any(1)[:, None]
+                mean_squares = np.where(is_counted, mean_squares, np.nan)
             median = np.median(mean_squares, 1) if inliers is None else np.nanmedian(mean_squares, 1)
             scales[:, i] = np.fmax(np.sqrt(median), MIN_SCALE)
         return scales
