@@ -160,7 +160,7 @@ class LinearizedRows:
             mean_squares = squares[:, members] / (counts * (1 - 2 / (9 * counts)) ** 3)
             if inliers is not None:
                 is_counted = inliers[:, self.sample[members]]
-                is_counted |= ~is_counted.any(1)[:, None]
+                is_counted |= ~np.any(is_counted, 1, keepdims=True)
                 mean_squares = np.where(is_counted, mean_squares, np.nan)
             median = np.median(mean_squares, 1) if inliers is None else np.nanmedian(mean_squares, 1)
             scales[:, i] = np.fmax(np.sqrt(median), MIN_SCALE)
