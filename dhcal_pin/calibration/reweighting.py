@@ -88,6 +88,21 @@ class Fit:
         """Number of iterations of all solutions."""
         return self.previous_iterations + self.solution.iterations
 
+    def solved_with(self, data: Sequence[Measurement], max_iterations: int) -> Fit:
+        """Solve loosely again with other standard deviations of the same measurements.
+
+        Args:
+            data: Measurements with these standard deviations, without robust weights.
+            max_iterations: Largest number of iterations of the solution.
+
+        Returns:
+            The fit; its `data` stay as they are.
+        """
+        weighted = [item.with_weights(w) for item, w in zip(data, self.weights, strict=True)]
+        problem = replace(self.problem, data=tuple(weighted))
+        solution = minimize(problem, "lm", self.solution.x, max_iterations, loose=True)
+        return replace(self, problem=problem, solution=solution, previous_iterations=self.iterations)
+
     def without_rejected(self) -> Fit:
         """Return the fit without rejected samples, which are not evidence of the noise."""
         masks = [w > robust.ZERO_WEIGHT for w in self.weights]

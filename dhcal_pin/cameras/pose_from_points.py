@@ -125,7 +125,7 @@ def agreeing_points(points: Array, image: Array) -> Array:
         determine a map are half of them or more.
     """
     everything = np.ones(len(points), bool)
-    if len(points) <= MIN_POINTS:
+    if len(points) <= 2 * MIN_POINTS:
         return everything
     centre = points.mean(0)
     _, extent, axes = np.linalg.svd(points - centre, full_matrices=False)
@@ -144,8 +144,7 @@ def agreeing_points(points: Array, image: Array) -> Array:
     majority = (len(points) + least + 1) // 2
     distances = np.partition(fits, majority - 1, 1)[:, majority - 1]
     best = fits[np.argmin(distances)]
-    is_agreeing = best <= max(_OUTLIER_RATIO * float(distances.min()), limit)
-    return is_agreeing if is_agreeing.sum() > least else everything
+    return best <= max(_OUTLIER_RATIO * float(distances.min()), limit)
 
 
 def _transfer_distances(source: Array, image: Array, chosen: Array) -> Array:

@@ -32,25 +32,28 @@ class AxisOrder:
     Attributes:
         intrinsics: Order of fx, fy, cx, cy.
         pixels: Order of u, v.
+        place: Where the exchanged values are written.
+        min_error: Error of the stated order from which this one is tried [px].
     """
 
     intrinsics: tuple[int, ...] = (0, 1, 2, 3)
     pixels: tuple[int, ...] = (0, 1)
+    place: str = "rig file"
+    min_error: float = 2.0
 
 
-# Orders besides the stated one, by what they exchange.
-U_AND_V = "u and v"
+# Orders besides the stated one, by what they exchange. Exchanged image coordinates make mirror images, whose
+# error is large.
 ORDERS = {
     "fx and fy": AxisOrder((1, 0, 2, 3)),
     "cx and cy": AxisOrder((0, 1, 3, 2)),
     "fx and fy, and cx and cy": AxisOrder((1, 0, 3, 2)),
-    U_AND_V: AxisOrder(pixels=(1, 0)),
+    "u and v": AxisOrder(pixels=(1, 0), place="measurements", min_error=20.0),
 }
 # Smallest change of a value that is tried [px].
 MIN_CHANGE = 5.0
-# Error of stated values below which other intrinsics, and other image coordinates, are not tried [px]: images
-# with exchanged coordinates are mirror images. Largest ratio of the errors for which another order is taken.
-GOOD_ERROR, GOOD_MIRRORED_ERROR, MAX_RATIO = 2.0, 20.0, 0.5
+# Largest ratio of the errors for which another order is taken.
+MAX_RATIO = 0.5
 # Largest number of iterations of one solution, and of corners of a camera that are compared.
 _MAX_ITERATIONS, _MAX_CORNERS = 30, 2000
 
@@ -76,7 +79,7 @@ class Exchange:
     @property
     def sentence(self) -> str:
         """What is exchanged, how it was found, and what to do about it."""
-        place = "measurements" if self.what == U_AND_V else "rig file"
+        place = ORDERS.get(self.what, AxisOrder()).place
         start = f"camera {self.camera!r}: {self.what} are exchanged in the {place}"
         if self.stated is None or self.exchanged is None:
             return f"{start}: corners lie outside its images, and inside if they are exchanged. Correct them."
@@ -105,13 +108,11 @@ def exchange_axes(
         camera.name for item in data if isinstance(item, CameraCorners) for camera in item.rig.cameras
     )
     for name in names:
-        best = _best_order(
-            chain, [part for item in data if (part := _images_of(item, name)) is not None], name
-        )
+        best = _best_order(chain, _images_of(data, name), name)
         if best is not None:
             found.append(best)
             out = reorder(out, [best])
-        if _is_size_exchanged([part for item in out if (part := _images_of(item, name)) is not None], name):
+        if _is_size_exchanged(_images_of(out, name), name):
             found.append(Exchange(name, "width and height", None, None))
     return out, tuple(found)
 
@@ -151,13 +152,15 @@ def axis_stages(exchanges: Sequence[Exchange]) -> tuple[Stage, ...]:
     )
 
 
-def _images_of(item: Measurement, name: str) -> CameraCorners | None:
-    """Return the images of one camera; None if there are none."""
-    if not isinstance(item, CameraCorners):
-        return None
-    numbers = [i for i, camera in enumerate(item.rig.cameras) if camera.name == name]
-    mask = np.isin(item.camera, numbers)
-    return item.take(mask) if mask.any() else None
+def _images_of(data: Sequence[Measurement], name: str) -> list[CameraCorners]:
+    """Return the images of one camera in measurements."""
+    out = []
+    for item in data:
+        if isinstance(item, CameraCorners):
+            numbers = [i for i, camera in enumerate(item.rig.cameras) if camera.name == name]
+            mask = np.isin(item.camera, numbers)
+            out += [item.take(mask)] if mask.any() else []
+    return out
 
 
 def _is_size_exchanged(parts: Sequence[CameraCorners], name: str) -> bool:
@@ -176,13 +179,13 @@ def _best_order(chain: Chain, parts: Sequence[CameraCorners], name: str) -> Exch
     if not cameras or not cameras[0].has_intrinsics:
         return None
     stated = _frames_error(chain, parts)
-    if stated is None or stated[0].pixels < GOOD_ERROR:
+    if stated is None:
         return None
     values, errors = cameras[0].values[:4], {}
     for what, order in ORDERS.items():
         changed = [i for i, other in enumerate(order.intrinsics) if other != i]
-        is_tried = np.all(np.abs(values[list(order.intrinsics)] - values)[changed] > MIN_CHANGE)
-        if is_tried and (what != U_AND_V or stated[0].pixels > GOOD_MIRRORED_ERROR):
+        is_change = np.all(np.abs(values[list(order.intrinsics)] - values)[changed] > MIN_CHANGE)
+        if is_change and stated[0].pixels >= order.min_error:
             found = _frames_error(chain, [_reordered(part, name, order) for part in parts])
             if found is not None:
                 errors[what] = found[0]

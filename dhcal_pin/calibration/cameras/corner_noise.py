@@ -20,15 +20,12 @@ The displacement that the corners of an image share is another model of the same
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from ..._typing import Array
 from ...estimation.priors import effective_parameters
 from ...estimation.problem import Problem
 from ...estimation.robust import ZERO_WEIGHT
-from ...estimation.solver import minimize
 from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners
 from ..reweighting import Fit
@@ -49,16 +46,9 @@ def fit_with_corner_noise(fit: Fit, max_iterations: int) -> Fit:
     Returns:
         Fit with a standard deviation for each image coordinate.
     """
-    problem, solution, iterations = fit.problem, fit.solution, fit.iterations
     for _ in range(_N_ROUNDS):
-        data = _with_corner_noise(replace(fit, problem=problem, solution=solution))
-        weighted = [item.with_weights(w) for item, w in zip(data, fit.weights, strict=True)]
-        problem = replace(problem, data=tuple(weighted))
-        solution = minimize(problem, "lm", solution.x, max_iterations, loose=True)
-        iterations += solution.iterations
-    return replace(
-        fit, problem=problem, solution=solution, previous_iterations=iterations - solution.iterations
-    )
+        fit = fit.solved_with(_with_corner_noise(fit), max_iterations)
+    return fit
 
 
 def _with_corner_noise(fit: Fit) -> tuple[Measurement, ...]:

@@ -119,20 +119,11 @@ def fit_with_jitter(fit: Fit, max_iterations: int) -> tuple[Fit, Jitter]:
     Returns:
         Fit with jitter, and its size.
     """
-    problem, solution = fit.problem, fit.solution
-    iterations = fit.iterations
     jitter = Jitter(1.0, 0.0, 0.0)
     for _ in range(_N_JITTER_ROUNDS):
-        n_determined = effective_parameters(problem, solution)
-        jitter = estimate_jitter(problem, solution.x, fit.data, fit.weights, n_determined)
-        data = with_jitter(problem, solution.x, fit.data, jitter)
-        weighted = [item.with_weights(w) for item, w in zip(data, fit.weights, strict=True)]
-        problem = replace(problem, data=tuple(weighted))
-        solution = minimize(problem, "lm", solution.x, max_iterations, loose=True)
-        iterations += solution.iterations
-    return replace(
-        fit, problem=problem, solution=solution, previous_iterations=iterations - solution.iterations
-    ), jitter
+        jitter = residual_jitter(fit)
+        fit = fit.solved_with(with_jitter(fit.problem, fit.solution.x, fit.data, jitter), max_iterations)
+    return fit, jitter
 
 
 def judge_target_points(fit: Fit, max_iterations: int) -> TargetPoints | None:
