@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import unfolded
+from rig_files import draw_views
 
 import dhcal_pin as dh
 from dhcal_pin import se3
 from dhcal_pin.cameras import Board, Camera, Rig
 from dhcal_pin.detection import ImageQuality, render_images
 from dhcal_pin.io.rig_file import rig_text
-from dhcal_pin.measurements import ViewLimits, is_board_in_view
-from dhcal_pin.robot.sampling import joint_range
 
 cv2 = pytest.importorskip("cv2")
 
@@ -39,11 +38,7 @@ def simulated(robot_folder):
     arm = dh.read_robot("example:ur10", tip="tool0")
     rng = np.random.default_rng(0)
     rig = dh.mount_rig(Rig({"wrist": CAMERA}, {"table": BOARD}), arm)
-    low, high = joint_range(arm)
-    q = rng.uniform(low, high, (400_000, 6))
-    tools = arm.poses(q)
-    is_seen = is_board_in_view(rig, 0, 0, tools, ViewLimits(0.3, 0.8))
-    q = q[is_seen & (tools[:, 2, 3] > 0.1)]
+    q = draw_views(arm, rig, rng, 400_000)
     errors = dh.select_parameters(arm, "placement")
     scale = np.array([1e-3 if p.unit == "m" else 2e-3 for p in errors.parameters])
     truth = errors.at(scale * rng.normal(size=len(scale)))

@@ -8,32 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import unfolded
+from rig_files import BOARD_TABLE, CAMERA_TABLE
 
 from dhcal_pin.io import read_configurations, read_robot
 from dhcal_pin.io.rig_file import read_rig
 from dhcal_pin.measurements import ViewLimits, is_board_in_view, mount_rig
 
-RIG = """[camera.wrist]
-link = "tip"
-width = 1280
-height = 960
-fx = 1000.0
-fy = 1000.0
-cx = 640.0
-cy = 480.0
-xyz_m = [0.0, 0.06, 0.03]
-rotvec_rad = [0.0, 0.0, 0.0]
-[board.table]
-link = "world"
-type = "charuco"
-columns = 7
-rows = 5
-square_mm = 30.0
-marker_mm = 22.0
-dictionary = "DICT_5X5_100"
-xyz_m = [0.6, 0.1, 0.02]
-rotvec_rad = [3.14159, 0.0, 0.0]
-"""
+RIG = (
+    f"{CAMERA_TABLE}xyz_m = [0.0, 0.06, 0.03]\nrotvec_rad = [0.0, 0.0, 0.0]\n"
+    f"{BOARD_TABLE}xyz_m = [0.6, 0.1, 0.02]\nrotvec_rad = [3.14159, 0.0, 0.0]\n"
+)
 PLAN = ("plan", "example:ur10", "--tip", "tool0", "--rig", "rig.toml", "-o", "poses.csv")
 
 
@@ -95,7 +79,7 @@ def test_missing_poses_are_estimated_from_images(run):
     ("change", "options", "message"),
     [
         (("xyz_m = [0.0, 0.06, 0.03]\nrotvec_rad = [0.0, 0.0, 0.0]\n", ""), (), "[camera.wrist] has no pose"),
-        (("fx = 1000.0\nfy = 1000.0\ncx = 640.0\ncy = 480.0\n", ""), (), "[camera.wrist] has no fx, fy"),
+        (("fx = 640.0\nfy = 641.0\ncx = 639.5\ncy = 359.5\n", ""), (), "[camera.wrist] has no fx, fy"),
         (("[0.6, 0.1, 0.02]", "[6.0, 0.1, 0.02]"), (), "no camera can see a board in any pose"),
         (("[3.14159, 0.0, 0.0]", "[0.0, 0.0, 0.0]"), (), "z axis of a board points away"),
         (('link = "world"', 'link = "tip"'), (), "no joint moves a board against a camera"),

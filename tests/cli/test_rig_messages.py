@@ -6,26 +6,11 @@ from pathlib import Path
 
 import pytest
 from command_line import unfolded
+from rig_files import BOARD_TABLE, CAMERA_TABLE
 
 import dhcal_pin as dh
 
-RIG = """[camera.wrist]
-link = "tip"
-width = 800
-height = 600
-fx = 760.0
-fy = 760.0
-cx = 399.5
-cy = 299.5
-[board.table]
-link = "world"
-type = "charuco"
-columns = 7
-rows = 5
-square_mm = 30.0
-marker_mm = 22.0
-dictionary = "DICT_5X5_100"
-"""
+RIG = CAMERA_TABLE + BOARD_TABLE
 # Corners of one image.
 CORNERS = [(0, 300, 200), (1, 330, 201), (6, 301, 231), (7, 332, 230), (8, 361, 229)]
 
@@ -76,7 +61,7 @@ def check(run, command, *parts):
         ("rows = 5", "rows = 90", BOARD, "[board.table]: 7 x 90 squares need 315 markers, and DICT_5X5_100"),
         ("[board.table]", "[board]", CALIBRATE, "[board]: no name; expected a table [board.NAME] with link"),
         ('link = "world"', 'link = "nix"', CALIBRATE, '[board.table]: link = "nix" is not a link of'),
-        ("fx = 760.0\n", "", CALIBRATE, "[camera.wrist]: fy, cx, cy without fx"),
+        ("fx = 640.0\n", "", CALIBRATE, "[camera.wrist]: fy, cx, cy without fx"),
         ('"charuco"', '"chess"', BOARD, "[board.table]: type = 'chess'; choose from"),
         ("22.0", "40.0", BOARD, "[board.table]: marker_mm = 40.0; expected less than square_mm = 30"),
         ("", "", PLAN, "[camera.wrist] has no pose; expected an approximate one in its link"),
@@ -124,8 +109,8 @@ def test_mistakes_of_corners_name_their_file_and_line(run, files, corners, optio
 
 
 def test_far_corners_name_the_rig_to_correct(run, files):
-    Path("rig.toml").write_text(RIG.replace("width = 800", "width = 80"))
-    check(run, CALIBRATE, "corners.csv:2: u = 300", "of 80 x 600 px; check width and height in rig.toml")
+    Path("rig.toml").write_text(RIG.replace("width = 1280", "width = 80"))
+    check(run, CALIBRATE, "corners.csv:2: u = 300", "of 80 x 720 px; check width and height in rig.toml")
 
 
 def test_ends_name_the_rig_to_correct(run, files):

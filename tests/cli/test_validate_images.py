@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import json_of, unfolded
+from rig_files import draw_views
 
 import dhcal_pin as dh
 from dhcal_pin import se3
 from dhcal_pin.cameras import Board, Camera, Rig
 from dhcal_pin.io.rig_file import read_calibrated_rig, rig_text
-from dhcal_pin.measurements import ViewLimits, is_board_in_view, mount_rig, project_board
-from dhcal_pin.robot.sampling import joint_range
+from dhcal_pin.measurements import mount_rig, project_board
 
 NOISE = 0.1
 CAMERA = Camera(
@@ -35,9 +35,7 @@ def calibrated(run, robot_folder):
     corners = BOARD.points + rng.normal(0, 1e-3, BOARD.points.shape)
     bent = replace(BOARD, type="points", listed_points=corners)
     rig = mount_rig(Rig({"wrist": CAMERA}, {"table": bent}), arm)
-    q = rng.uniform(*joint_range(arm), (200_000, 6))
-    tools = arm.poses(q)
-    q = q[is_board_in_view(rig, 0, 0, tools, ViewLimits(0.3, 0.8)) & (tools[:, 2, 3] > 0.1)]
+    q = draw_views(arm, rig, rng, 200_000)
     for name, rows in (("fitted.csv", q[:25]), ("other.csv", q[25:40])):
         pixels, _ = project_board(rig, 0, 0, rig.board_in_camera(0, 0, arm.poses(rows)))
         pixels += NOISE * rng.standard_normal(pixels.shape)

@@ -4,29 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from rig_files import BOARD_TABLE, CAMERA_TABLE
 
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io.rig_file import read_rig, rig_text
 
-CAMERA = """[camera.wrist]
-link = "tip"
-width = 1280
-height = 720
-fx = 640.0
-fy = 641.0
-cx = 639.5
-cy = 359.5
-distortion = [0.1, 0, 0, 0, 0]
-"""
-BOARD = """[board.table]
-link = "world"
-type = "charuco"
-columns = 7
-rows = 5
-square_mm = 30.0
-marker_mm = 22.0
-dictionary = "DICT_5X5_100"
-"""
+CAMERA = CAMERA_TABLE + "distortion = [0.1, 0, 0, 0, 0]\n"
 
 
 def write(path, text):
@@ -35,7 +18,7 @@ def write(path, text):
 
 
 def test_values_of_the_file(tmp_path):
-    rig = read_rig(write(tmp_path / "r.toml", CAMERA + BOARD + "xyz_m = [1.0, 2.0, 3.0]\n"))
+    rig = read_rig(write(tmp_path / "r.toml", CAMERA + BOARD_TABLE + "xyz_m = [1.0, 2.0, 3.0]\n"))
     camera, board = rig.cameras["wrist"], rig.boards["table"]
     np.testing.assert_array_equal(camera.values, [640, 641, 639.5, 359.5, 0.1, 0, 0, 0, 0])
     assert (camera.link, camera.intrinsics, camera.pose) == ("tip", "prior", None)
@@ -50,7 +33,7 @@ def test_text_reads_back(tmp_path):
     grid = '[board.g]\nlink = "tip"\ntype = "aprilgrid"\ncolumns = 2\nrows = 3\n'
     grid += "marker_mm = 40\nspacing_mm = 12\n"
     unknown = '[camera.c]\nlink = "world"\nmodel = "fisheye"\nwidth = 64\nheight = 48\n'
-    first = read_rig(write(tmp_path / "r.toml", CAMERA + unknown + BOARD + points + grid))
+    first = read_rig(write(tmp_path / "r.toml", CAMERA + unknown + BOARD_TABLE + points + grid))
     text = rig_text(list(first.cameras.values()), list(first.boards.values()))
     again = read_rig(write(tmp_path / "s.toml", text))
     assert text == rig_text(list(again.cameras.values()), list(again.boards.values()))
@@ -62,16 +45,19 @@ def test_text_reads_back(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (BOARD, r"no \[camera.NAME\] table"),
+        (BOARD_TABLE, r"no \[camera.NAME\] table"),
         (CAMERA, r"no \[board.NAME\] table"),
-        (CAMERA.replace("fy = 641.0\n", "") + BOARD, "without fy; expected all of fx, fy, cx, cy"),
-        (CAMERA.replace("fx = 640.0", "fx = -1.0") + BOARD, "fx = -1.0; expected a number above 0"),
-        (CAMERA + BOARD.replace("22.0", "33.0"), "marker_mm = 33.0; expected less than square_mm = 30"),
-        (CAMERA + BOARD.replace("22.0", "2e5"), "expected a length in millimetres above 0 and up to 100000"),
-        (CAMERA + BOARD.replace("charuco", "chess"), 'choose from "checkerboard"'),
-        (CAMERA + BOARD + "squares = 3\n", "unknown key 'squares'"),
-        (CAMERA.replace("1280", "12.5") + BOARD, "width = 12.5; expected a whole number"),
-        (CAMERA.replace("[0.1, 0, 0, 0, 0]", "[0.1]") + BOARD, "distortion = .*; expected 5 numbers"),
+        (CAMERA.replace("fy = 641.0\n", "") + BOARD_TABLE, "without fy; expected all of fx, fy, cx, cy"),
+        (CAMERA.replace("fx = 640.0", "fx = -1.0") + BOARD_TABLE, "fx = -1.0; expected a number above 0"),
+        (CAMERA + BOARD_TABLE.replace("22.0", "33.0"), "marker_mm = 33.0; expected less than square_mm = 30"),
+        (
+            CAMERA + BOARD_TABLE.replace("22.0", "2e5"),
+            "expected a length in millimetres above 0 and up",
+        ),
+        (CAMERA + BOARD_TABLE.replace("charuco", "chess"), 'choose from "checkerboard"'),
+        (CAMERA + BOARD_TABLE + "squares = 3\n", "unknown key 'squares'"),
+        (CAMERA.replace("1280", "12.5") + BOARD_TABLE, "width = 12.5; expected a whole number"),
+        (CAMERA.replace("[0.1, 0, 0, 0, 0]", "[0.1]") + BOARD_TABLE, "distortion = .*; expected 5 numbers"),
     ],
 )
 def test_mistakes_are_named(tmp_path, text, message):
