@@ -95,6 +95,19 @@ def test_noise_never_has_a_cause(name, is_on_wrist, seed):
     check_nothing(hand_eye(name, "nothing", seed, is_on_wrist))
 
 
+@pytest.mark.parametrize("n_seeds", [2, pytest.param(12, marks=pytest.mark.slow)])
+def test_noise_of_few_images_is_predicted(n_seeds):
+    """Six images: the noise of the fitted ones adds to the error of a left-out one."""
+    found = [
+        hand_eye(name, "nothing", 160 + seed, is_on_wrist, n_images=6).hand_eye
+        for name in ("ur10", "panda")
+        for is_on_wrist in (True, False)
+        for seed in range(n_seeds)
+    ]
+    assert np.median([each.error.pixels / each.noise.pixels for each in found]) < 1.15
+    assert np.mean([each.is_noise for each in found]) > 0.85
+
+
 def test_figures_of_the_causes_are_true():
     """The size of a board and the focal length are those of the simulation."""
     chain, images, setup = faulty_setup("ur10", "size", 51, is_on_wrist=True, n_images=20)

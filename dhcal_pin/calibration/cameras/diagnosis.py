@@ -1,10 +1,11 @@
 """Likely cause of the error that a hand-eye calibration leaves.
 
-Images of a right arm, a right board and a right lens differ from the model by the noise of the corners. If
-the error of left-out images is more than `MAX_NOISE_RATIO` times that noise, something else is wrong. Each
-cause of `causes` is then estimated in addition, and judged on left-out images. The cause with the smallest
-error is the likely one; if several reach nearly the same error, the one with the fewest unknowns is named
-first, and the others with it. The next causes are tried on top of it, as long as the error exceeds the noise.
+Images of a right arm, a right board and a right lens differ from the model by the noise of the corners. In
+left-out images the noise of the fitted ones is added, through the estimates. If the error of left-out images
+is more than `MAX_NOISE_RATIO` times this prediction, something else is wrong. Each cause of `causes` is then
+estimated in addition, and judged on left-out images. The cause with the smallest error is the likely one; if
+several reach nearly the same error, the one with the fewest unknowns is named first, and the others with it.
+The next causes are tried on top of it, as long as the error exceeds the noise.
 
 The noise is the scatter of the corners within an image, or the smallest error that any cause leaves. Corners
 of one image that are all displaced together, and by no cause that was tried, are an error of the arm of
@@ -48,12 +49,12 @@ from .causes import (
 )
 from .gate import residual_jitter
 from .sets import MAX_POINTS, count_corners
-from .stages import ImageError, fitted_error, held_out_error
+from .stages import ImageError, fitted_error, held_out_error, held_out_prediction_std
 
 # Displacements that all corners of an image share and that no cause explains.
 DISPLACEMENT = "displaced images"
 # An error of left-out images above this multiple of the noise is not noise.
-MAX_NOISE_RATIO = 2.0
+MAX_NOISE_RATIO = 1.5
 # A cause is likely if it reduces the error of left-out images below this share, and as likely as the best one
 # up to this ratio of their errors.
 MAX_ERROR_SHARE, MAX_TIE_RATIO = 0.8, 1.15
@@ -62,7 +63,7 @@ LARGE_ERROR = 10.0
 # Correction of the arm in multiples of manufacturing errors above which the arm is no plausible cause.
 MAX_ARM_CORRECTION = 6.0
 # The error of left-out images is that of one step of the fit. Above this multiple of the error of fitted
-# images the step is too long, and the latter is used.
+# images the step is too long, and the latter is used. Noise is not predicted to grow more than that.
 MAX_LEFT_OUT_RATIO = 3.0
 # Share of rejected corners above which all corners are examined, too.
 MAX_REJECTED_SHARE = 0.03
@@ -279,7 +280,7 @@ def _search(fit: Fit, data: Sequence[Measurement], holdout: Sequence[Measurement
     base = _State.of(hand_eye, Causes(), fit.problem.instruments(fit.solution.x))
     fitted = fitted_error(base.fit)
     if base.error.pixels > MAX_LEFT_OUT_RATIO * fitted.pixels:
-        base = replace(base, error=fitted)
+        base = replace(base, error=fitted, noise=base.scatter)
     return _Search(hand_eye, base, *_find_causes(hand_eye, base))
 
 
@@ -316,11 +317,21 @@ def second_rotation(fit: Fit, data: Sequence[Measurement]) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Fit of a combination of causes, with the error of left-out images and the noise of its corners [px]."""
+    """Fit of a combination of causes.
+
+    Attributes:
+        causes: Causes that are estimated.
+        fit: Fit of all images.
+        error: Error of left-out images.
+        scatter: Noise of the corners, from their scatter within an image [px].
+        noise: Error of left-out images that this noise predicts [px].
+        is_displaced: Whether the corners of an image are significantly displaced together.
+    """
 
     causes: Causes
     fit: Fit
     error: ImageError
+    scatter: float
     noise: float
     is_displaced: bool
 
@@ -328,12 +339,14 @@ class _State:
     def of(cls, hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float] | None) -> _State:
         """Fit a combination of causes."""
         fit = fit_causes(hand_eye, causes, start)
-        error = held_out_error(fit, k_fold(fit.data, N_FOLDS))
+        folds = k_fold(fit.data, N_FOLDS)
+        error = held_out_error(fit, folds)
         assert error is not None
         jitter = residual_jitter(fit)
         sigma = np.concatenate([item.sigma for item in fit.data if isinstance(item, CameraCorners)])
-        noise = jitter.noise * float(np.sqrt(np.mean(np.sum(sigma**2, 1))))
-        return cls(causes, fit, error, noise, jitter.is_significant)
+        scatter = jitter.noise * float(np.sqrt(np.mean(np.sum(sigma**2, 1))))
+        growth = min(float(np.hypot(1.0, held_out_prediction_std(fit, folds))), MAX_LEFT_OUT_RATIO)
+        return cls(causes, fit, error, scatter, growth * scatter, jitter.is_significant)
 
     @property
     def values(self) -> dict[str, float]:
@@ -359,7 +372,7 @@ class _Search:
 
     @property
     def noise(self) -> float:
-        """Scatter within an image, or the smallest error of left-out images [px]."""
+        """Error that the scatter within an image predicts, or the smallest error of left-out images [px]."""
         return min([self.base.noise, *(trial.error.pixels for trial in (*self.trials, *self.causes))])
 
 

@@ -109,6 +109,22 @@ def held_out_error(fit: Fit, folds: Sequence[Fold]) -> ImageError | None:
     )
 
 
+def held_out_prediction_std(fit: Fit, folds: Sequence[Fold]) -> float:
+    """Compute the error of images that the uncertainty of fits of the other images causes.
+
+    Args:
+        fit: Fit of all images.
+        folds: Disjoint folds.
+
+    Returns:
+        The RMS in standard deviations of the corners; infinite if neither other images nor priors limit it.
+    """
+    columns = np.ones(len(fit.solution.x), bool)
+    systems = factor_partition(fit.problem, fit.solution.x, folds)
+    variances = [system.prediction_std(fit.problem.weights, columns) ** 2 for system in systems]
+    return float(np.sqrt(np.average(variances, weights=[system.n_rows for system in systems])))
+
+
 def _image_error(fit: Fit, parts: Sequence[tuple[Array, Sequence[Array]]]) -> ImageError:
     """Compute the error of parts of the images, each at its own solution x (p,)."""
     problem, squares, distances, count = fit.problem, 0.0, 0.0, 0
