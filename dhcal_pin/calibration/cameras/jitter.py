@@ -138,15 +138,13 @@ def _maximize_likelihood(images: Sequence[tuple[Array, Array]], noise: float, n_
     # The fit has absorbed a part of the displacements: that of the parameters among six per image.
     n_displacements = 6 * len(images)
     share = max(1 - n_determined / n_displacements, 0.2)
-    information = [a.T @ a for _, a in images]
-    projected = [a.T @ r for r, a in images]
+    information = np.array([a.T @ a for _, a in images])
+    projected = np.array([a.T @ r for r, a in images])
     for _ in range(_N_ITERATIONS):
         precision = np.diag(1 / np.array([position] * 3 + [rotation] * 3) ** 2)
-        squares = np.zeros(6)
-        for product, right in zip(information, projected, strict=True):
-            covariance = np.linalg.inv(precision + product)
-            squares += (covariance @ right) ** 2 / share + np.diag(covariance)
-        squares /= len(images)
+        covariance = np.linalg.inv(precision + information)
+        mean = (covariance @ projected[:, :, None])[:, :, 0]
+        squares = np.mean(mean**2 / share + np.diagonal(covariance, axis1=1, axis2=2), 0)
         updated = max(np.sqrt(squares[:3].mean()), MIN_STD), max(np.sqrt(squares[3:].mean()), MIN_STD)
         change = max(abs(np.log(updated[0] / position)), abs(np.log(updated[1] / rotation)))
         position, rotation = float(updated[0]), float(updated[1])
