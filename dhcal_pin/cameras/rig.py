@@ -65,3 +65,11 @@ class Rig:
     cameras: Mapping[str, Camera]
     boards: Mapping[str, Board]
     source: str = ""
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the poses of all cameras and boards and the lenses of the cameras are known."""
+        entries = [*self.cameras.values(), *self.boards.values()]
+        return all(entry.pose is not None for entry in entries) and all(
+            camera.has_intrinsics for camera in self.cameras.values()
+        )

@@ -32,7 +32,10 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("data", **DATA)
     add_urdf_options(parser)
     parser.add_argument("--columns", **COLUMNS)
-    parser.add_argument("--rig", **RIG)
+    parser.add_argument(
+        "--rig",
+        **{**RIG, "help": f"{RIG['help']} (default: those of the sidecar, as a calibration estimated them)"},
+    )
     parser.add_argument("--skip-bad-rows", action="store_true", **SKIP_BAD_ROWS)
     parser.add_argument(
         "--sidecar",
@@ -91,7 +94,7 @@ def run(args: Namespace) -> int:
     if args.report:
         check_html_ending(args.report, "the report of a validation")
     chain = read_robot(args.robot, args.tip, sidecar, args.package_dir, args.root)
-    rig, estimated = _mounted_rig(args.rig, sidecar, chain) if args.rig else (None, [])
+    rig, estimated = _mounted_rig(args, sidecar, chain)
     predictor = _predictor(chain, sidecar, args) if args.map else None
     files = [
         read_measurement_file(path, chain, args.columns, skip_bad_rows=args.skip_bad_rows, rig=rig)
@@ -135,9 +138,10 @@ def run(args: Namespace) -> int:
         contents[args.map] = map_content(args.map, predictor, data, known)
     remarks += extrapolation.sentences if extrapolation else ()
     if estimated:
+        others = f", not those of {args.rig}" if args.rig else ""
         remarks.append(
             f"Poses, lenses and corners of {', '.join(estimated)} are the estimates of the calibration "
-            f"({sidecar}), not those of {args.rig}."
+            f"({sidecar}){others}."
         )
     if args.report:
         from ..io.robot import robot_name  # lazy import, as the following: only for reports
@@ -172,23 +176,27 @@ def run(args: Namespace) -> int:
     return 0
 
 
-def _mounted_rig(path: str, sidecar: str | None, chain: Chain) -> tuple[MountedRig, list[str]]:
-    """Read a rig whose entries have the estimates of a calibration.
+def _mounted_rig(args: Namespace, sidecar: str | None, chain: Chain) -> tuple[MountedRig | None, list[str]]:
+    """Return the cameras and boards of the images, with the estimates of a calibration.
+
+    Without a rig file, they are those of the sidecar. Other measurements than images need none.
 
     Returns:
-        The rig, and the names of the entries with estimates, such as `camera.wrist`.
+        The rig, None without one, and the names of the entries with estimates, such as `camera.wrist`.
     """
-    from ..io.rig_file import (
-        read_calibrated_rig,
-        read_rig,
-        with_estimates_of,
-    )  # lazy import, as the following
+    from ..io.measurement_files.reading import has_image_coordinates  # lazy import, as the following
+    from ..io.rig_file import read_calibrated_rig, read_rig, with_estimates_of
     from ..measurements.mounting import mount_rig
 
-    rig = read_rig(path)
     calibrated = read_calibrated_rig(sidecar) if sidecar else None
-    if calibrated is None:
-        return mount_rig(rig, chain), []
+    if args.rig:
+        rig = read_rig(args.rig)
+    else:
+        is_usable = calibrated is not None and calibrated.is_complete
+        has_images = is_usable and any(has_image_coordinates(path, chain, args.columns) for path in args.data)
+        rig = calibrated if has_images else None
+    if rig is None or calibrated is None:
+        return rig and mount_rig(rig, chain), []
     names = [
         *(f"camera.{name}" for name in rig.cameras if name in calibrated.cameras),
         *(f"board.{name}" for name in rig.boards if name in calibrated.boards),

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import tomli_w
 from command_line import json_of, unfolded
 from rig_files import draw_views
 
@@ -79,6 +81,48 @@ def test_estimates_of_the_calibration_replace_an_old_rig(run, calibrated):
         assert f"estimates of the calibration (arm.calibration.toml), not those of {path}" in unfolded(
             run(*args)[2]
         )
+
+
+def test_the_sidecar_of_a_calibration_replaces_the_rig_file(run, calibrated):
+    """Without --rig, the error is the same number as with the rig file of the calibration."""
+    images = ("validate", "arm.urdf", "other.csv", "--tip", "tool0")
+    document, expected = (json_of(run(*images, *rig, "--json", "-")) for rig in ((), ("--rig", "rig.toml")))
+    assert document["after"] == expected["after"]
+    assert document["after"]["residual_rms"] == pytest.approx(np.sqrt(2) * NOISE, rel=0.2)
+    assert document["estimated_entries"] == ["camera.wrist", "board.table"]
+    text = unfolded(run(*images)[2])
+    assert "camera.wrist, board.table are the estimates of the calibration (arm.calibration.toml)." in text
+
+
+def test_a_sidecar_without_lens_or_pose_needs_the_rig_file(run, calibrated):
+    content = tomllib.loads(Path("arm.calibration.toml").read_text())
+    lens = ("fx", "fy", "cx", "cy", "distortion", "intrinsics")
+    pose = ("xyz_m", "rotvec_rad")
+    for kind, name, keys in (("camera", "wrist", lens), ("camera", "wrist", pose), ("board", "table", pose)):
+        entry = {key: value for key, value in content[kind][name].items() if key not in keys}
+        Path("arm.calibration.toml").write_text(tomli_w.dumps({**content, kind: {name: entry}}))
+        status, _, err = run("validate", "arm.urdf", "other.csv", "--tip", "tool0")
+        assert status == 2
+        assert "other.csv: image coordinates need the cameras and boards of a rig; give --rig" in unfolded(
+            err
+        )
+
+
+def test_other_measurements_need_no_camera_of_the_sidecar(run, calibrated):
+    """A sidecar with a link that this robot does not have is refused for images only."""
+    arm = dh.read_robot("arm.urdf", tip="tool0")
+    q = np.random.default_rng(1).uniform(-1, 1, (5, arm.n_joints))
+    header = ",".join([*(f"{name}[rad]" for name in arm.joint_names), "x[m],y[m],z[m]"])
+    np.savetxt("laser.csv", np.hstack([q, arm.poses(q)[:, :3, 3]]), delimiter=",", header=header, comments="")
+    content = tomllib.loads(Path("arm.calibration.toml").read_text())
+    content["camera"]["wrist"]["link"] = "other_hand"
+    Path("arm.calibration.toml").write_text(tomli_w.dumps(content))
+    document = json_of(run("validate", "arm.urdf", "laser.csv", "--tip", "tool0", "--json", "-"))
+    assert document["estimated_entries"] == []
+    assert document["after"]["position_rms_m"] < 1e-9
+    status, _, err = run("validate", "arm.urdf", "other.csv", "--tip", "tool0")
+    assert status == 2
+    assert 'arm.calibration.toml: [camera.wrist]: link = "other_hand" is not a link of' in unfolded(err)
 
 
 def test_other_names_are_not_those_of_the_calibration(run, calibrated):

@@ -149,6 +149,18 @@ def open_measurement_table(source: PathLike | Any, chain: Chain, columns: PathLi
     return read_mapped_table(source, read_map(columns, chain), known_columns(chain))
 
 
+def has_image_coordinates(source: PathLike | Any, chain: Chain, columns: PathLike | None = None) -> bool:
+    """Return whether a measurement file has image coordinates, whose cameras and boards must be known.
+
+    Args:
+        source: Text file, Excel workbook, Parquet file, or a data frame such as one of pandas.
+        chain: Robot that was measured.
+        columns: Column map for a file of another maker.
+    """
+    table = open_measurement_table(source, chain, columns)
+    return not needs_column_map(table, chain) and find_kind(table).kind == "camera"
+
+
 def parse_measurements(
     table: DataTable, chain: Chain, skip_bad_rows: bool = False, rig: MountedRig | None = None
 ) -> MeasurementFile:
