@@ -32,7 +32,7 @@ from .._typing import Array
 from .intrinsics import intrinsics_candidates, undetermined_focal_length
 from .lens import FOCAL_AND_CENTRE, Lens
 from .pose_from_points import estimate_poses
-from .rig import Camera
+from .rig import DISTORTION_PRIORS, PIXEL_PRIORS, Camera
 
 # Largest number of views that the lens is fitted to, and of trial steps.
 _MAX_VIEWS, _N_STEPS = 30, 20
@@ -71,6 +71,38 @@ class LensFit:
     poses: list[list[Pose]]
     cost: float
     std: Array
+
+
+def fit_camera(views: Sequence[View], camera: Camera, *, repeats_errors: bool = False) -> LensFit:
+    """Fit the lens of a camera and the poses of boards to its images, from what the rig states of the lens.
+
+    Args:
+        views: Points of a board, shape (m, 3) [m], and their pixels, shape (m, 2), of each view.
+        camera: Camera of a rig.
+        repeats_errors: Whether points are wrong, and so in every view. All views then count as one.
+
+    Returns:
+        The fit.
+
+    Raises:
+        NotObservableError: The rig states no focal lengths, and the views do not determine them.
+    """
+    std = _lens_widths(camera)
+    if camera.has_intrinsics:
+        return fit_lens(views, camera.lens, camera.values, std, repeats_errors=repeats_errors)
+    return fit_unknown_lens(views, camera, std, repeats_errors=repeats_errors)
+
+
+def _lens_widths(camera: Camera) -> Array:
+    """Return the standard deviations of the first values of a lens, (s,) [px and 1]; 0 if they are fixed.
+
+    Few images determine a lens badly. It stays near stated values, even if the calibration leaves them free.
+    """
+    n_coefficients = len(camera.lens.coefficients)
+    if camera.intrinsics == "fixed":
+        return np.zeros(len(FOCAL_AND_CENTRE) + n_coefficients)
+    pixels = PIXEL_PRIORS["prior" if camera.has_intrinsics else "free"]
+    return np.repeat([pixels, DISTORTION_PRIORS["prior"]], [len(FOCAL_AND_CENTRE), n_coefficients])
 
 
 def fit_lens(

@@ -15,6 +15,9 @@ from .lens import LENSES, Lens
 WORLD, TIP = "world", "tip"
 # How the intrinsics of a camera are treated.
 INTRINSICS_CHOICES = ("fixed", "prior", "free")
+# Prior standard deviations of focal lengths and image centre [px], and of distortion coefficients [1].
+PIXEL_PRIORS = {"prior": 50.0, "free": 1e5}
+DISTORTION_PRIORS = {"prior": 0.3, "free": 1e2}
 
 
 @dataclass(frozen=True, eq=False)

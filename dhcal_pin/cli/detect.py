@@ -47,7 +47,8 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--overlay",
         metavar="DIR",
         help="folder for pictures of the images: circles are the corners that were found, crosses those "
-        "reprojected with the board pose of this image and the camera of the rig",
+        "reprojected with the board pose of this image and the lens of the rig, or the lens estimated from "
+        "the images if the rig states none",
     )
     parser.add_argument(
         "--jobs",
@@ -89,7 +90,9 @@ def run(args: Namespace) -> int:
     comments = [f"corners of boards in images of camera {camera.name}, found by dhcal detect"]
     contents: dict[PathLike, str | bytes] = {args.output: csv_text(columns, comments)}
     if args.overlay:
-        contents |= _overlays(args.overlay, camera, detections, paths)
+        pictures, remarks = _overlays(args.overlay, camera, detections, paths)
+        contents |= pictures
+        notes += remarks
     write_outputs(contents)
     written = [args.output, *([f"{args.overlay} ({len(paths)} pictures)"] if args.overlay else [])]
     console.show(detection_screen(rig, detections, notes, written), args.verbosity)
@@ -112,19 +115,26 @@ def _joints(args: Namespace, paths: Sequence[str]) -> tuple[dict[str, dict[str, 
 
 def _overlays(
     folder: str, camera: Camera, detections: Sequence[BoardDetection], paths: Sequence[str]
-) -> Mapping[PathLike, str | bytes]:
-    """Return the pictures of --overlay, whose folder is created."""
-    from ..detection import overlay_files  # lazy import, as the following: they load OpenCV
+) -> tuple[Mapping[PathLike, str | bytes], list[str]]:
+    """Return the pictures of --overlay, whose folder is created, and notes on them."""
+    from ..detection import camera_with_intrinsics, overlay_files  # lazy import, as the following: slow
     from .outputs import require_writable_outputs
 
     if os.path.exists(folder) and not os.path.isdir(folder):
         raise InvalidArgumentError(f"--overlay {folder}: is a file; expected a folder")
     pictures: dict[PathLike, str | bytes] = {}
-    pictures.update(overlay_files(folder, camera, detections))
+    known = camera_with_intrinsics(camera, detections)
+    pictures.update(overlay_files(folder, known, detections))
     if len(pictures) < len(paths):
         raise InvalidArgumentError(
             f"--overlay {folder}: two images have the same name but for the ending; rename one of them"
         )
     os.makedirs(folder, exist_ok=True)
     require_writable_outputs([os.fspath(path) for path in pictures], paths)
-    return pictures
+    if known is not None:
+        return pictures, []
+    return pictures, [
+        f"--overlay {folder}: the pictures have no reprojected corners, as the images do not determine the "
+        f"lens of camera {camera.name}; state fx, fy, cx, cy in the rig file, or add images of the board "
+        "tilted in different directions"
+    ]

@@ -1,7 +1,8 @@
 """Pictures of images with the corners that were found in them, and with the reprojected corners.
 
-A circle is a detected corner. A cross is a corner as the camera of the rig should see it in the pose
-of the board in this image. Crosses beside their circles come from wrong detections or a wrong lens.
+A circle is a detected corner. A cross is a corner as the camera should see it in the pose of the board in
+this image. Crosses beside their circles come from wrong detections or a wrong lens. There are none if the
+lens is not known.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from ..cameras.rig import Camera
 from .corners import DetectedImage, read_image
 from .images import BoardDetection
 from .opencv import require_opencv
-from .reprojection import Reprojection, camera_with_intrinsics, reproject_corners
+from .reprojection import Reprojection, reproject_corners
 
 # Colours of the corners of the boards in turn (blue, green, red), of corners that are not used, and of
 # reprojected ones.
@@ -31,23 +32,24 @@ _RADIUS, _TEXT, _BITS = 1 / 200, 1 / 1800, 4
 _MIN_TEXT, _LINE = 0.3, 36
 
 
-def overlay_files(folder: str, camera: Camera, detections: Sequence[BoardDetection]) -> Mapping[str, bytes]:
+def overlay_files(
+    folder: str, camera: Camera | None, detections: Sequence[BoardDetection]
+) -> Mapping[str, bytes]:
     """Draw detected and reprojected corners of all boards into the images.
 
     Args:
         folder: Folder of the pictures.
-        camera: Camera that took the images.
+        camera: Camera that took the images, with intrinsics; None if they are not known.
         detections: Corners by board.
 
     Returns:
         PNG by path: the name of the image with the ending `.png`.
     """
     out = {}
-    known = camera_with_intrinsics(camera, detections)
     for images in zip(*(detection.images for detection in detections), strict=True):
         path = str(Path(folder) / f"{Path(images[0].path).stem}.png")
         found = [
-            reproject_corners(known, detection.board, image) if known and not image.problem else None
+            reproject_corners(camera, detection.board, image) if camera and not image.problem else None
             for detection, image in zip(detections, images, strict=True)
         ]
         out[path] = _picture([detection.board.name for detection in detections], images, found)

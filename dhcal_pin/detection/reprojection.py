@@ -1,8 +1,9 @@
 """Corners of boards reprojected into the images in which they were found.
 
-The pose of a board in an image is estimated from its detected corners, with the intrinsics of the rig. The
-corners of the board in this pose are projected back into the image. Their distances from the detected ones
-show wrong detections and a wrong lens. They do not show errors of the robot: joint values have no influence.
+The pose of a board in an image is estimated from its detected corners, with the lens that the rig states or,
+where it states none, the one that explains all images best. The corners of the board in this pose are
+projected back into the image. Their distances from the detected ones show wrong detections and a wrong lens.
+They do not show errors of the robot: joint values have no influence.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 
 from .._typing import Array
 from ..cameras.boards import Board
-from ..cameras.intrinsics import estimate_intrinsics
+from ..cameras.lens_fit import fit_camera
 from ..cameras.pose_from_points import agreeing_points, estimate_pose
 from ..cameras.rig import Camera
 from ..exceptions import NotObservableError
@@ -36,27 +37,33 @@ class Reprojection:
 
 
 def camera_with_intrinsics(camera: Camera, detections: Sequence[BoardDetection]) -> Camera | None:
-    """Return a camera with the intrinsics of the rig, or estimated ones if the rig states none.
+    """Return a camera with the lens of the rig, or an estimated one, with distortion, if the rig states none.
 
     Args:
         camera: Camera that took the images.
         detections: Corners by board.
 
     Returns:
-        The camera; None if the images do not determine its intrinsics.
+        The camera; None if the images do not determine its focal lengths.
     """
     if camera.has_intrinsics:
         return camera
     views = [
-        (detection.board.points[image.corner], image.pixels)
+        _agreeing_view(detection.board.points[image.corner], image.pixels)
         for detection in detections
         for image in detection.used
     ]
+    has_free_points = any(detection.board.has_free_points for detection in detections)
     try:
-        values = estimate_intrinsics(views, camera)
+        return replace(camera, values=fit_camera(views, camera, repeats_errors=has_free_points).values)
     except NotObservableError:
         return None
-    return replace(camera, values=np.pad(values, (0, len(camera.values) - len(values))))
+
+
+def _agreeing_view(points: Array, pixels: Array) -> tuple[Array, Array]:
+    """Return the points (m, 3) [m] and pixels (m, 2) of a view of a board without wrong corners."""
+    agrees = agreeing_points(points, pixels)
+    return points[agrees], pixels[agrees]
 
 
 def reproject_corners(camera: Camera, board: Board, image: DetectedImage) -> Reprojection | None:

@@ -12,7 +12,7 @@ from recordings import Recording, write_bag
 from robots import paper
 
 from dhcal_pin import se3
-from dhcal_pin.cameras import Board, Camera
+from dhcal_pin.cameras import LENSES, Board, Camera
 from dhcal_pin.detection import (
     BoardDetection,
     DetectedImage,
@@ -110,11 +110,60 @@ def test_reprojected_corners_are_those_of_the_true_pose(folder, has_intrinsics):
         assert found is not None
         np.testing.assert_allclose(found.pixels, pixels, atol=1e-3)
         assert found.rms < 1e-3
-    pictures = overlay_files("pictures", known, [detection])
-    picture = cv2.imdecode(np.frombuffer(pictures["pictures/0.png"], np.uint8), cv2.IMREAD_COLOR).astype(int)
-    is_cross = (picture[..., 0] > 150) & (picture[..., 2] < 110)
+    pictures = overlay_files("pictures", camera, [detection])
+    picture = cv2.imdecode(np.frombuffer(pictures["pictures/0.png"], np.uint8), cv2.IMREAD_COLOR)
     for u, v in np.round(exact[0]).astype(int):
-        assert is_cross[v - 2 : v + 3, u - 2 : u + 3].any()
+        assert is_cross(picture)[v - 2 : v + 3, u - 2 : u + 3].any()
+
+
+@pytest.mark.parametrize(
+    ("model", "distortion"),
+    [("pinhole", [-0.3, 0.1, 0.001, -0.002, 0]), ("fisheye", [-0.05, 0.02, 0.01, 0])],
+)
+def test_unknown_lenses_are_estimated_with_distortion(model, distortion):
+    """Crosses are at the true corners, although the first corners of an image are 15 px off."""
+    true = replace(CAMERA, values=np.array([300.0, 302, 158, 122, *distortion]), lens=LENSES[model])
+    board, rng = BOARDS[0], np.random.default_rng(2)
+    middle = se3.translation(-board.points.mean(0))
+    images, exact = [], []
+    for number in range(12):
+        turn = se3.exp3([*rng.uniform(-0.6, 0.6, 2), rng.uniform(-3, 3)])
+        place = [*rng.uniform([-0.08, -0.05], [0.08, 0.05]), rng.uniform(0.25, 0.35)]
+        pose = se3.transform(turn, place) @ middle
+        local = board.points @ pose[:3, :3].T + pose[:3, 3]
+        exact.append(true.lens.project(local.T, true.values)[0].T)
+        pixels = exact[-1] + 0.05 * rng.standard_normal(exact[-1].shape)
+        if number == 0:
+            pixels[:2] += 15.0
+        images.append(DetectedImage(f"{number}.png", np.arange(len(pixels)), pixels))
+    unknown = replace(true, values=np.full(len(true.values), np.nan))
+    camera = camera_with_intrinsics(unknown, [BoardDetection(board, Layout(), images)])
+    assert camera is not None
+    for image, pixels in zip(images, exact, strict=True):
+        found = reproject_corners(camera, board, image)
+        assert found is not None
+        np.testing.assert_allclose(found.pixels, pixels, atol=0.2)
+
+
+def test_pictures_without_a_lens_say_so(run, folder):
+    """Two images do not determine a lens: there are circles, and no crosses."""
+    values = np.full(len(CAMERA.values), np.nan)
+    Path("rig.toml").write_text(rig_text([replace(CAMERA, values=values)], BOARDS[:1]))
+    render(("0.png", [0]), ("1.png", [0]))
+    status, _, err = run(*detect("--overlay", "pictures"))
+    assert status == 0
+    assert "--overlay pictures: the pictures have no reprojected corners" in unfolded(err)
+    assert "the images do not determine the lens of camera fixed; state fx, fy, cx, cy" in unfolded(err)
+    assert not is_cross(cv2.imread("pictures/0.png")).any()
+    Path("rig.toml").write_text(rig_text([CAMERA], BOARDS[:1]))
+    assert "reprojected" not in run(*detect("--overlay", "pictures"))[2]
+    assert is_cross(cv2.imread("pictures/0.png")).any()
+
+
+def is_cross(picture):
+    """Return which pixels (height, width) have the colour of reprojected corners."""
+    picture = picture.astype(int)
+    return (picture[..., 0] > 150) & (picture[..., 2] < 110)
 
 
 def test_a_wrong_corner_stands_out_from_the_reprojected_ones(folder):

@@ -7,15 +7,12 @@ import numpy as np
 from ... import se3
 from ..._typing import Array
 from ...cameras.boards import Board
-from ...cameras.rig import Camera
+from ...cameras.rig import DISTORTION_PRIORS, PIXEL_PRIORS, Camera
 from ..base import POINT_PRIOR, InstrumentParameter
 from ..mounting import MountedRig
 
 # Prior standard deviation of the rotation of a camera or a board [rad]: any.
 ROTATION_PRIOR = 10.0
-# Prior standard deviations of focal lengths and image centre [px], and of distortion coefficients [1].
-PIXEL_PRIORS = {"prior": 50.0, "free": 1e5}
-DISTORTION_PRIORS = {"prior": 0.3, "free": 1e2}
 # Prior standard deviation of the corners of a board [m].
 BOARD_POINT_PRIOR = 1e-3
 # Names of the components of a pose.

@@ -26,14 +26,12 @@ from ... import se3
 from ..._typing import Array
 from ...cameras.boards import Board
 from ...cameras.hand_eye import choose_poses, mean_pose, solve_hand_eye
-from ...cameras.lens import FOCAL_AND_CENTRE
-from ...cameras.lens_fit import LensFit, fit_lens, fit_unknown_lens
+from ...cameras.lens_fit import LensFit, fit_camera
 from ...cameras.pose_from_points import agreeing_points
 from ...cameras.rig import Camera
 from ...exceptions import NotObservableError
 from ...robot.chain import Chain
 from ..mounting import Mount
-from .camera_parameters import DISTORTION_PRIORS, PIXEL_PRIORS
 
 if TYPE_CHECKING:
     from ..camera import CameraCorners
@@ -123,22 +121,7 @@ def _fit_camera(camera: Camera, content: tuple[tuple[bytes, bytes], ...], repeat
         (np.frombuffer(points).reshape(-1, 3), np.frombuffer(pixels).reshape(-1, 2))
         for points, pixels in content
     ]
-    std = _lens_widths(camera)
-    if camera.has_intrinsics:
-        return fit_lens(views, camera.lens, camera.values, std, repeats_errors=repeats_errors)
-    return fit_unknown_lens(views, camera, std, repeats_errors=repeats_errors)
-
-
-def _lens_widths(camera: Camera) -> Array:
-    """Return the standard deviations of the first values of a lens, (s,) [px and 1]; 0 if they are fixed.
-
-    Few images determine a lens badly. It stays near stated values, even if the calibration leaves them free.
-    """
-    n_coefficients = len(camera.lens.coefficients)
-    if camera.intrinsics == "fixed":
-        return np.zeros(len(FOCAL_AND_CENTRE) + n_coefficients)
-    pixels = PIXEL_PRIORS["prior" if camera.has_intrinsics else "free"]
-    return np.repeat([pixels, DISTORTION_PRIORS["prior"]], [len(FOCAL_AND_CENTRE), n_coefficients])
+    return fit_camera(views, camera, repeats_errors=repeats_errors)
 
 
 def first_values(item: CameraCorners, chain: Chain, is_used: Array | None = None) -> dict[str, float]:
