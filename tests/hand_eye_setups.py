@@ -26,6 +26,9 @@ FAULTS = (
     "lag",
 )
 
+# Standard deviation of an image coordinate [px].
+SIGMA = 0.2
+
 
 def shortest_tour(q: np.ndarray) -> list[int]:
     """Return the order of configurations in which each one is followed by the nearest one that is left."""
@@ -43,7 +46,7 @@ def faulty_setup(
     *,
     is_on_wrist: bool,
     n_images: int = 30,
-    sigma: float = 0.2,
+    sigma: float = SIGMA,
     severity: float = 1.0,
     spread: float = 0.5,
 ) -> tuple[Chain, CameraCorners, Setup]:

@@ -8,10 +8,12 @@ import camera_setups
 import numpy as np
 import pytest
 from camera_setups import ARMS, random_setup, simulate, wrong_arm
+from hand_eye_setups import faulty_setup
 from robots import URDF
 
 import dhcal_pin as dh
 from dhcal_pin.calibration.cameras import seen_ranges_warning
+from dhcal_pin.calibration.cameras.axis_order import exchange_axes
 from dhcal_pin.calibration.cameras.gate import cluster_folds
 from dhcal_pin.cameras import Board
 from dhcal_pin.exceptions import DhcalError
@@ -167,6 +169,13 @@ def test_exchanged_image_coordinates_are_named(is_on_wrist):
     assert any("u and v are exchanged in the measurements" in text for text in exchanged.input_warnings)
     rms = [fit.comparisons[0].after["residual_rms"] for fit in (right, exchanged)]
     assert rms[0] == pytest.approx(rms[1], rel=1e-3)
+
+
+@pytest.mark.parametrize("seed", [32, 34])
+def test_images_with_wrong_joint_values_are_not_exchanged(seed):
+    """No order explains them; the least wrong one is chance."""
+    chain, images, _ = faulty_setup("panda", "rows", seed, is_on_wrist=True)
+    assert exchange_axes(chain, [images])[1] == ()
 
 
 def test_exchanged_width_and_height_are_named():

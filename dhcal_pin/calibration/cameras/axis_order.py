@@ -52,8 +52,9 @@ ORDERS = {
 }
 # Smallest change of a value that is tried [px].
 MIN_CHANGE = 5.0
-# Largest ratio of the errors for which another order is taken.
-MAX_RATIO = 0.5
+# Largest ratio of the errors for which another order is taken, and largest error with it as a fraction of the
+# size of the image: no order explains images that are paired with wrong joint values.
+MAX_RATIO, MAX_ERROR_SHARE = 0.5, 0.05
 # Largest number of iterations of one solution, and of corners of a camera that are compared.
 _MAX_ITERATIONS, _MAX_CORNERS = 30, 2000
 
@@ -190,7 +191,8 @@ def _best_order(chain: Chain, parts: Sequence[CameraCorners], name: str) -> Exch
             if found is not None:
                 errors[what] = found[0]
     what = min(errors, key=lambda each: errors[each].pixels, default="")
-    if not what or errors[what].pixels > MAX_RATIO * stated[0].pixels:
+    size = max(cameras[0].width, cameras[0].height)
+    if not what or errors[what].pixels > min(MAX_RATIO * stated[0].pixels, MAX_ERROR_SHARE * size):
         return None
     return Exchange(name, what, stated[0], errors[what], stated[1])
 
