@@ -18,6 +18,7 @@ from ..estimation.initialization import align
 from ..io.measurement_files import MeasurementFile
 from ..io.measurement_files.columns import ROTVEC, SECOND_PREFIX
 from ..measurements.base import Measurement
+from ..measurements.camera import CameraCorners
 from ..measurements.columns import MAX_TOOL_OFFSET
 from ..plausibility.displacement import workspace_radius
 from ..plausibility.mixups import diagnose_mixups
@@ -52,6 +53,9 @@ _ROTVEC_SLACK_RAD = 0.1
 _MAX_RELATIVE_MISFIT, _MAX_CALIBRATED_RAD = 0.02, 0.1
 # Larger residuals, relative to the size of the workspace or [rad], mean another robot or notation.
 _MAX_MISFIT, _MAX_MISFIT_RAD = 0.05, 0.2
+# If at least this share of the corners of a board in an image is there again, the rows are of several
+# photographs in the same configuration.
+_MIN_PHOTOGRAPHED_SHARE = 0.5
 # Fewer positions or rotations than this cannot be compared.
 _MIN_SAMPLES = 3
 # Largest number of rows that the geometric checks use.
@@ -70,7 +74,7 @@ def find_input_warnings(chain: Chain, file: MeasurementFile) -> list[str]:
     Returns:
         One sentence per warning; an empty list for most files.
     """
-    values, repeated = find_value_warnings(chain, file), _check_repeated_rows(file)
+    values, repeated = find_value_warnings(chain, file), _check_repetitions(file)
     if values != repeated:
         # Implausible values explain why measurements do not fit the robot; copied rows do not.
         return values
@@ -111,7 +115,7 @@ def find_value_warnings(chain: Chain, file: MeasurementFile) -> list[str]:
         *_check_lengths(chain, file),
         *_check_rotations(file),
         *_check_limits(chain, file, joint_units),
-        *_check_repeated_rows(file),
+        *_check_repetitions(file),
     ]
 
 
@@ -202,9 +206,9 @@ def _format_as_written(value: float, unit: str) -> str:
     return f"{value * factor:.4g} {unit}".rstrip()
 
 
-def _format_rows(file: MeasurementFile, mask: Array) -> str:
+def _format_rows(data: Measurement, mask: Array) -> str:
     """Return a text such as `line 3` or `lines 3, 5, 8, 9, 12 and 4 more`."""
-    rows = [str(row) for row in file.data.rows[mask]]
+    rows = [str(row) for row in data.rows[mask]]
     listed, more = rows[:_MAX_LISTED_ROWS], len(rows) - _MAX_LISTED_ROWS
     return f"line{'s' if len(rows) > 1 else ''} {', '.join(listed)}" + (
         f" and {more} more" if more > 0 else ""
@@ -336,10 +340,18 @@ def _check_limits(chain: Chain, file: MeasurementFile, reported: Container[str])
                 unit = file.units[prefix + name]
                 out.append(
                     f"joint {prefix + name} is beyond its limits, {_format_as_written(lower, unit)} to "
-                    f"{_format_as_written(upper, unit)}, in {_format_rows(file, is_beyond)}; "
+                    f"{_format_as_written(upper, unit)}, in {_format_rows(file.data, is_beyond)}; "
                     "check its sign, zero and unit"
                 )
     return out
+
+
+def _check_repetitions(file: MeasurementFile) -> list[str]:
+    """Return warnings about measurements that occur more than once."""
+    repeated = _check_repeated_rows(file)
+    return (
+        [*repeated, *_check_repeated_corners(file.data)] if isinstance(file.data, CameraCorners) else repeated
+    )
 
 
 def _check_repeated_rows(file: MeasurementFile) -> list[str]:
@@ -352,8 +364,32 @@ def _check_repeated_rows(file: MeasurementFile) -> list[str]:
         return []
     lines, example = file.data.rows, int(np.flatnonzero(is_repeated)[0])
     return [
-        f"{_format_rows(file, is_repeated)}: identical to other rows in every digit (line {lines[example]} "
-        f"to line {lines[original[example]]}); a copied measurement counts twice, remove it"
+        f"{_format_rows(file.data, is_repeated)}: identical to other rows in every digit (line "
+        f"{lines[example]} to line {lines[original[example]]}); a copied measurement counts twice, remove it"
+    ]
+
+
+def _check_repeated_corners(item: CameraCorners) -> list[str]:
+    """Return a warning about corners that an image has at several places.
+
+    Several photographs in the same configuration are no mistake: they repeat most corners. Rows that are
+    equal in every digit have their own warning.
+    """
+    own = np.arange(len(item.rows))
+    view = first_equal_rows([item.image, item.board])
+    corner = first_equal_rows([view, item.corner])
+    is_other_place = first_equal_rows([corner, *item.values.T]) == own
+    is_again = is_other_place & (corner < own)
+    n_corners = np.bincount(view[corner == own], minlength=len(own))
+    n_again = np.bincount(view[np.unique(corner[is_again])], minlength=len(own))
+    is_wrong = is_again & (n_again < _MIN_PHOTOGRAPHED_SHARE * n_corners)[view]
+    if not is_wrong.any():
+        return []
+    example = int(np.flatnonzero(is_wrong)[0])
+    return [
+        f"{_format_rows(item, is_wrong)}: another place of a corner that the image has already (corner "
+        f"{item.corner[example]} in line {item.rows[corner[example]]} and line {item.rows[example]}); an "
+        "image has each corner once, correct the corner or the joint positions"
     ]
 
 

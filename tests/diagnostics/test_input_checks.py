@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from dhcal_pin import se3
 from dhcal_pin.cli.main import main
 from dhcal_pin.io import measurement_text
-from dhcal_pin.measurements import KINDS, Noise, Position, Wires
+from dhcal_pin.measurements import KINDS, CameraCorners, Noise, Position, Wires
 from dhcal_pin.robot import Chain
 from dhcal_pin.robot.inverse_kinematics import wrap_into_limits
 
@@ -165,6 +165,50 @@ def test_repeated_measurements_of_one_configuration_give_no_warning(warnings_of,
     again = lines[3].split(",")
     again[6] = repr(float(again[6]) + 0.01)
     assert warnings_of(ur10, "\n".join([*lines, ",".join(again)])) == []
+
+
+@pytest.fixture
+def images(ur10):
+    """Simulated images of two cameras, and the lines of their file: a comment, the header and the corners."""
+    rng = np.random.default_rng(1)
+    data = KINDS["camera"].simulate(ur10, rng.uniform(-2.8, 2.8, (8, 6)), Noise(1e-3, 1e-3), rng)
+    assert isinstance(data, CameraCorners)
+    text = measurement_text(data, ur10).splitlines()
+    first = next(i for i, line in enumerate(text) if "u[px]" in line) + 1
+    return data.rig, text[:first], text[first:]
+
+
+def moved(line, header, pixels):
+    """Return a line of corners with another u."""
+    column = header[-1].split(",").index("u[px]")
+    cells = line.split(",")
+    return ",".join([*cells[:column], repr(float(cells[column]) + pixels), *cells[column + 1 :]])
+
+
+def test_repeated_corners_give_a_warning(warnings_of, ur10, images):
+    """Six corners are an image. Copied ones and corners at two places have a warning each."""
+    rig, header, lines = images
+    first = len(header) + 1
+    assert warnings_of(ur10, "\n".join([*header, *lines]), rig) == []
+    end = first + len(lines)
+    (copied,) = warnings_of(ur10, "\n".join([*header, *lines, *lines[:6]]), rig)
+    assert copied.startswith(f"lines {end}, {end + 1}, {end + 2}, {end + 3}, {end + 4} and 1 more: identical")
+    more = [moved(lines[3], header, 20.0), moved(lines[2], header, 0.1), moved(lines[13], header, 0.1)]
+    (places,) = warnings_of(ur10, "\n".join([*header, *lines, *more]), rig)
+    assert places.startswith(
+        f"lines {end}, {end + 1}, {end + 2}: another place of a corner that the image has already "
+        f"(corner 3 in line {first + 3} and line {end})"
+    )
+    both = warnings_of(ur10, "\n".join([*header, *lines, more[0], lines[0]]), rig)
+    assert [text.split(":")[0] for text in both] == [f"line {end + 1}", f"line {end}"]
+
+
+def test_two_photographs_in_one_configuration_give_no_warning(warnings_of, ur10, images):
+    """The second one may lack corners that were not found in it."""
+    rig, header, lines = images
+    for again in (lines[:6], lines[1:6], lines[6:9]):
+        again = [moved(line, header, 0.05) for line in again]
+        assert warnings_of(ur10, "\n".join([*header, *lines, *again]), rig) == []
 
 
 @pytest.mark.parametrize("kind", KINDS)
