@@ -7,7 +7,7 @@ from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
 
 from ..exceptions import InvalidArgumentError
-from .options import COLUMNS, DATA, JSON, ROBOT, add_urdf_options
+from .options import COLUMNS, DATA, JSON, RIG, ROBOT, add_urdf_options
 
 EXAMPLE = "dhcal inspect laser.csv --robot ur10.urdf --tip tool0"
 
@@ -23,6 +23,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--robot", **{**ROBOT, "help": f"compare with the joints and limits of this {ROBOT['help']}"}
     )
     parser.add_argument("--columns", **COLUMNS)
+    parser.add_argument("--rig", **RIG)
     add_urdf_options(parser)
     parser.add_argument("--json", **JSON)
 
@@ -37,10 +38,12 @@ def run(args: Namespace) -> int:
         Exit status 0, also for a file that `dhcal calibrate` would refuse.
 
     Raises:
-        InvalidArgumentError: A column map is given without a robot.
+        InvalidArgumentError: A column map or a rig file is given without a robot.
     """
     from ..diagnostics import inspect_file  # lazy import, as the following: they load Pinocchio
     from ..io import read_robot
+    from ..io.rig_file import read_rig
+    from ..measurements.mounting import mount_rig
     from ..report.document import file_digests
     from . import console
     from .outputs import existing_sidecars, require_writable_outputs, write_outputs
@@ -48,15 +51,19 @@ def run(args: Namespace) -> int:
 
     if args.columns and not args.robot:
         raise InvalidArgumentError("--columns: needs --robot, as the map names its joints")
+    if args.rig and not args.robot:
+        raise InvalidArgumentError("--rig: needs --robot, whose links carry the cameras and boards")
     robots = [args.robot] if args.robot else []
-    inputs = [*robots, *existing_sidecars(robots), *args.data, *([args.columns] if args.columns else [])]
+    settings = [path for path in (args.columns, args.rig) if path]
+    inputs = [*robots, *existing_sidecars(robots), *args.data, *settings]
     require_writable_outputs([args.json], inputs)
     chain = (
         read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root)
         if args.robot
         else None
     )
-    inspections = [inspect_file(path, chain, args.columns) for path in args.data]
+    rig = mount_rig(read_rig(args.rig), chain) if args.rig and chain is not None else None
+    inspections = [inspect_file(path, chain, args.columns, rig) for path in args.data]
     robot = None
     if chain is not None:
         robot = {"path": args.robot, "tip": chain.tip, "joints": list(chain.joint_names)}

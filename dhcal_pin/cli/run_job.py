@@ -189,7 +189,9 @@ def run_job(
     is_kept = job.force or not fit.verdict.is_refused
     robot_contents = _robot_files(fit, job) if is_kept else {}
     contents = dict(robot_contents)
-    files: dict[str, str] = dict(zip(("urdf", "sidecar"), map(str, contents), strict=False))
+    robot_paths = list(map(str, contents))
+    files: dict[str, str] = dict(zip(("urdf", "sidecar"), robot_paths, strict=False))
+    files |= _numbered("camera_file", robot_paths[len(files) :])
     if job.map and is_kept:
         from ..report import workspace_map  # lazy import: only for maps
 
@@ -211,9 +213,7 @@ def run_job(
         files["residuals"] = job.residuals
     if path := json_path(job.json):
         files["json"] = path
-    files |= {
-        "report" if number == 1 else f"report_{number}": path for number, path in enumerate(job.report, 1)
-    }
+    files |= _numbered("report", job.report)
     source = _provenance(job, sets, data, inputs, robot_contents, hint)
     if job.report:
         from ..report import html  # lazy import: only for reports
@@ -462,11 +462,17 @@ def _robot_files(fit: Result, job: Job) -> dict[PathLike, str | bytes]:
     return contents
 
 
+def _numbered(name: str, paths: Sequence[str]) -> dict[str, str]:
+    """Return paths by name, the second and later ones with their numbers."""
+    return {name if number == 1 else f"{name}_{number}": path for number, path in enumerate(paths, 1)}
+
+
 def _camera_frames(fit: Result, job: Job) -> dict[str, tuple[str, Array]]:
     """Return the parent link and the pose (4, 4) of each camera by the name of its new link."""
     if fit.rig is None:
         raise InvalidArgumentError(
-            "--camera-frame: the measurements have no camera; expected image coordinates and --rig"
+            "--camera-frame: the measurements have no camera; expected image coordinates and --rig, or "
+            "--tool-frame NAME for the measured tool pose"
         )
     out = {}
     for camera in fit.rig.cameras:

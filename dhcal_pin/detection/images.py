@@ -16,6 +16,7 @@ from ..cameras.boards import Board
 from ..cameras.rig import Camera, Rig
 from ..exceptions import FileFormatError, InvalidArgumentError
 from .corners import NO_BOARD, DetectedImage, Layout, detect_corners, find_layout, read_image
+from .opencv import silent_opencv_log
 
 # Number of images in which the layouts of a board are compared.
 N_LAYOUT_IMAGES = 8
@@ -53,7 +54,7 @@ def image_files(paths: Sequence[PathLike]) -> list[str]:
         Paths of the files.
 
     Raises:
-        InvalidArgumentError: A folder has no images, or a name comes twice.
+        InvalidArgumentError: A path does not exist, a folder has no images, or a name comes twice.
     """
     files: list[str] = []
     for path in [os.fspath(path) for path in paths]:
@@ -62,8 +63,12 @@ def image_files(paths: Sequence[PathLike]) -> list[str]:
             if not found:
                 raise InvalidArgumentError(f"{path}: no images in this folder; expected {', '.join(ENDINGS)}")
             files += found
-        else:
+        elif os.path.exists(path):
             files.append(path)
+        else:
+            raise InvalidArgumentError(
+                f"{path}: no such file or folder; expected images, or a folder of images"
+            )
     names = [os.path.basename(file) for file in files]
     if repeated := sorted({name for name in names if names.count(name) > 1}):
         raise InvalidArgumentError(f"{repeated[0]}: two images have this name; give each its own")
@@ -101,7 +106,7 @@ def detect_boards(
     size, out, n_done = (camera.width, camera.height), [], 0
     step = max(1, len(paths) // N_LAYOUT_IMAGES)
     some = [read_image(path) for path in paths[::step]]
-    with ThreadPoolExecutor(jobs or os.cpu_count()) as threads:
+    with silent_opencv_log(), ThreadPoolExecutor(jobs or os.cpu_count()) as threads:
         for board in boards:
             layout = find_layout(board, some)
             images = []
@@ -113,8 +118,8 @@ def detect_boards(
             out.append(BoardDetection(board, layout, images))
     if not any(detection.used for detection in out):
         raise FileFormatError(
-            f"{paths[0]}: no board found in any of {len(paths)} images; check type, columns, rows and "
-            f"dictionary of the boards in {rig.source}"
+            f"{paths[0]}: no board found in any of {len(paths)} images; check type, columns, rows, "
+            f"dictionary and the ratio of marker and square of the boards in {rig.source}"
         )
     return out
 

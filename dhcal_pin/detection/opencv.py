@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import ModuleType
 
 from ..exceptions import InvalidArgumentError
@@ -20,3 +22,18 @@ def require_opencv() -> ModuleType:
             "boards in images need OpenCV, which is not installed; run: pip install 'dhcal-pin[camera]'"
         ) from None
     return cv2
+
+
+@contextmanager
+def silent_opencv_log() -> Iterator[None]:
+    """Silence the log of OpenCV in the `with` block, in all threads of this process.
+
+    Its lines name neither the image nor the board; the project reports boards that are not found itself.
+    """
+    logging = require_opencv().utils.logging
+    level = logging.getLogLevel()
+    logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        logging.setLogLevel(level)

@@ -28,6 +28,7 @@ from ..io.measurement_files.reading import (
     parse_measurements,
 )
 from ..io.tables import Column, DataTable, read_table
+from ..measurements.mounting import MountedRig
 from ..robot.chain import Chain
 from ..robot.coverage import BIN_WIDTH_RAD, joint_coverage
 from ..units import ANGLES, LENGTHS
@@ -104,7 +105,10 @@ class FileInspection:
 
 
 def inspect_file(
-    source: PathLike | Any, chain: Chain | None = None, columns: PathLike | None = None
+    source: PathLike | Any,
+    chain: Chain | None = None,
+    columns: PathLike | None = None,
+    rig: MountedRig | None = None,
 ) -> FileInspection:
     """Say what a measurement file contains.
 
@@ -112,6 +116,7 @@ def inspect_file(
         source: Measurement file, or a data frame.
         chain: Nominal robot; without it the joints are not compared with anything.
         columns: Column map for a file of another maker; needs a robot.
+        rig: Cameras and boards of image coordinates, on the chain.
 
     Returns:
         The content. A file that is no table is an error.
@@ -121,7 +126,7 @@ def inspect_file(
         return _inspect_table(table, None)
     table = open_measurement_table(source, chain, columns)
     try:
-        file = parse_measurements(table, chain, skip_bad_rows=True)
+        file = parse_measurements(table, chain, skip_bad_rows=True, rig=rig)
     except DhcalError as error:
         inspection = _inspect_table(table, chain)
         if file_columns.needs_column_map(table, chain):

@@ -13,6 +13,7 @@ from robots import paper
 
 from dhcal_pin import se3
 from dhcal_pin.cameras import LENSES, Board, Camera
+from dhcal_pin.cli import main
 from dhcal_pin.detection import (
     BoardDetection,
     DetectedImage,
@@ -239,3 +240,25 @@ def test_topic_of_joints_needs_a_recording(run, folder):
 )
 def test_times_in_names(name, time):
     assert image_time(name) == (None if time is None else pytest.approx(time, abs=1e-6))
+
+
+def test_the_log_of_opencv_is_silent(folder, capfd):
+    """OpenCV logs a line per search for a board whose markers nearly fill their squares."""
+    render(("one.png", [1]), ("two.png", [1]))
+    wide = replace(BOARDS[1], marker=0.049)
+    Path("rig.toml").write_text(rig_text([CAMERA], [wide]))
+    level = cv2.utils.logging.getLogLevel()
+    assert level > cv2.utils.logging.LOG_LEVEL_SILENT
+    assert main.main([*detect()]) == 0
+    err = capfd.readouterr().err
+    assert "in 2 of 2 images" in err
+    assert "WARN" not in err
+    assert cv2.utils.logging.getLogLevel() == level
+
+
+@pytest.mark.parametrize("joints", [[], ["--joints", "joints.csv"]])
+def test_images_that_do_not_exist_are_named(assert_refused, folder, joints):
+    Path("joints.csv").write_text("image,joint_1[deg]\none,1\n")
+    Path("rig.toml").write_text(rig_text([CAMERA], BOARDS))
+    words = ["nothere: no such file or folder"]
+    assert_refused(words, "detect", "nothere", "--rig", "rig.toml", *joints, "-o", "corners.csv")

@@ -191,3 +191,14 @@ def test_the_proposed_map_of_a_real_file_is_the_one_written_by_hand(run, robot_f
     (expected,) = inspect(run, path, *robot, "--columns", MAPS / "ipa_ur10.toml")["files"]
     assert proposed == expected
     assert expected["warnings"] == []
+
+
+def test_images_need_a_rig_with_a_robot(run, assert_refused):
+    """With the rig, the images are counted and judged; without robot, nothing is missing."""
+    assert run("simulate", "arm.dh.toml", "-m", "20", "--kind", "camera", "-o", "corners.csv")[0] == 0
+    (file,) = inspect(run, "corners.csv", "--robot", "arm.dh.toml", "--rig", "corners.rig.toml")["files"]
+    assert (file["kind"], file["problem"], file["configurations"]) == ("camera", "", 20)
+    (file,) = inspect(run, "corners.csv", "--robot", "arm.dh.toml")["files"]
+    assert "give --rig RIG.toml" in file["problem"]
+    assert inspect(run, "corners.csv")["files"][0]["problem"] == ""
+    assert_refused(["--rig", "needs --robot"], "inspect", "corners.csv", "--rig", "corners.rig.toml")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from pathlib import Path
 
@@ -49,7 +50,12 @@ def test_camera_in_urdf_and_sidecar(tmp_path, monkeypatch):
         assert main(["simulate", nominal, "--truth", actual, "-m", "20", "--kind", "camera",
                      "--noise", "0.1mm", "--seed", str(seed), "-o", f"{name}.csv"]) == 0  # fmt: skip
     assert main(["calibrate", nominal, "fit.csv", "--rig", "fit.rig.toml", "-o", "o.urdf",
-                 "--extend", "none", "--camera-frame", "eye", "--camera-files", "cam"]) == 0  # fmt: skip
+                 "--extend", "none", "--camera-frame", "eye", "--camera-files", "cam",
+                 "--json", "o.json"]) == 0  # fmt: skip
+    files = json.loads(Path("o.json").read_text())["files"]
+    written = [str(path) for path in sorted(Path().glob("cam_*"))]
+    assert len(written) == 6
+    assert sorted(path for name, path in files.items() if name.startswith("camera_file")) == written
     sidecar = tomllib.loads(Path("o.calibration.toml").read_text())
     urdf = read_urdf("o.urdf")
     for name in ("left", "right"):
