@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pytest
 from hand_eye_setups import SIGMA, faulty_setup
@@ -99,12 +101,11 @@ def test_noise_never_has_a_cause(name, is_on_wrist, seed):
 @pytest.mark.parametrize("n_seeds", [2, pytest.param(12, marks=pytest.mark.slow)])
 def test_noise_of_few_images_is_predicted(n_seeds):
     """Six images: the noise of the fitted ones adds to the error of a left-out one."""
-    found = [
-        hand_eye(name, "nothing", 160 + seed, is_on_wrist, n_images=6).hand_eye
-        for name in ("ur10", "panda")
-        for is_on_wrist in (True, False)
-        for seed in range(n_seeds)
-    ]
+    found = []
+    for name, is_on_wrist, seed in product(("ur10", "panda"), (True, False), range(n_seeds)):
+        result = hand_eye(name, "nothing", 160 + seed, is_on_wrist, n_images=6)
+        assert result.hand_eye is not None
+        found.append(result.hand_eye)
     assert np.median([each.error.pixels / each.noise.pixels for each in found]) < 1.15
     assert np.mean([each.is_noise for each in found]) > 0.85
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -15,10 +16,12 @@ from rig_files import draw_views
 import dhcal_pin as dh
 from dhcal_pin import se3
 from dhcal_pin.cameras import Board, Camera, Rig
+from dhcal_pin.cli import main
 from dhcal_pin.io.rig_file import read_calibrated_rig, rig_text
 from dhcal_pin.measurements import mount_rig, project_board
 
 NOISE = 0.1
+N_FITTED, N_OTHER = 20, 12
 CAMERA = Camera(
     "wrist", "tip", 800, 600, np.array([762.0, 765, 402, 298, -0.12, 0.06, 0.001, -0.0005, 0]),
     pose=se3.transform(se3.exp3([0.02, -0.03, 0.8]), [0.03, 0.05, 0.02]),
@@ -29,28 +32,40 @@ BOARD = Board(
 )  # fmt: skip
 
 
-@pytest.fixture
-def calibrated(run, robot_folder):
-    """Calibrate a camera and a board whose corners are 1 mm beside the stated places; other images remain."""
+@pytest.fixture(scope="module")
+def calibration(tmp_path_factory):
+    """Calibrate a camera and a board whose corners are 1 mm beside the stated places; other images remain.
+
+    Returns the folder with all files, and the corners.
+    """
+    folder = tmp_path_factory.mktemp("calibration")
     arm = dh.read_robot("example:ur10", tip="tool0")
     rng = np.random.default_rng(4)
     corners = BOARD.points + rng.normal(0, 1e-3, BOARD.points.shape)
     bent = replace(BOARD, type="points", listed_points=corners)
     rig = mount_rig(Rig({"wrist": CAMERA}, {"table": bent}), arm)
-    q = draw_views(arm, rig, rng, 200_000)
-    for name, rows in (("fitted.csv", q[:25]), ("other.csv", q[25:40])):
+    q = draw_views(arm, rig, rng, 100_000)
+    assert len(q) >= N_FITTED + N_OTHER
+    for name, rows in (("fitted.csv", q[:N_FITTED]), ("other.csv", q[N_FITTED : N_FITTED + N_OTHER])):
         pixels, _ = project_board(rig, 0, 0, rig.board_in_camera(0, 0, arm.poses(rows)))
         pixels += NOISE * rng.standard_normal(pixels.shape)
         lines = [",".join(f"{joint}[rad]" for joint in arm.joint_names) + ",u[px],v[px],corner"]
         for joints, image in zip(rows.tolist(), pixels.tolist(), strict=True):
             lines += [",".join(map(repr, [*joints, *uv, i])) for i, uv in enumerate(image)]
-        Path(name).write_text("\n".join(lines))
-    write_rig("rig.toml", has_free_points=True)
-    status, _, err = run(
-        *("calibrate", "example:ur10", "fitted.csv", "--rig", "rig.toml", "--tip", "tool0"),
-        *("--parameters", "camera,board,intrinsics", "-o", "arm.urdf"),
-    )
-    assert status == 0, err
+        (folder / name).write_text("\n".join(lines))
+    write_rig(folder / "rig.toml", has_free_points=True)
+    inputs = ("example:ur10", str(folder / "fitted.csv"), "--rig", str(folder / "rig.toml"), "--tip", "tool0")
+    sets = ("--parameters", "camera,board,intrinsics")
+    assert main.main(["calibrate", *inputs, *sets, "-o", str(folder / "arm.urdf")]) == 0
+    return folder, corners
+
+
+@pytest.fixture
+def calibrated(calibration, tmp_path, monkeypatch):
+    """Working folder with a copy of the calibration; returns the corners."""
+    folder, corners = calibration
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     return corners
 
 
@@ -74,23 +89,24 @@ def test_estimates_of_the_calibration_replace_an_old_rig(run, calibrated):
         ("fixed.toml", fixed, {"has_exact_points": True, "square": 0.041}),
     ):
         write_rig(path, camera, **changes)
-        args = ("validate", "arm.urdf", "other.csv", "--tip", "tool0", "--rig", path)
-        document = json_of(run(*args, "--json", "-"))
+        result = run("validate", "arm.urdf", "other.csv", "--tip", "tool0", "--rig", path, "--json", "-")
+        document = json_of(result)
         assert document["after"]["residual_rms"] == pytest.approx(np.sqrt(2) * NOISE, rel=0.2)
         assert document["estimated_entries"] == ["camera.wrist", "board.table"]
         assert f"estimates of the calibration (arm.calibration.toml), not those of {path}" in unfolded(
-            run(*args)[2]
+            result[2]
         )
 
 
 def test_the_sidecar_of_a_calibration_replaces_the_rig_file(run, calibrated):
     """Without --rig, the error is the same number as with the rig file of the calibration."""
-    images = ("validate", "arm.urdf", "other.csv", "--tip", "tool0")
-    document, expected = (json_of(run(*images, *rig, "--json", "-")) for rig in ((), ("--rig", "rig.toml")))
+    images = ("validate", "arm.urdf", "other.csv", "--tip", "tool0", "--json", "-")
+    result = run(*images)
+    document, expected = json_of(result), json_of(run(*images, "--rig", "rig.toml"))
     assert document["after"] == expected["after"]
     assert document["after"]["residual_rms"] == pytest.approx(np.sqrt(2) * NOISE, rel=0.2)
     assert document["estimated_entries"] == ["camera.wrist", "board.table"]
-    text = unfolded(run(*images)[2])
+    text = unfolded(result[2])
     assert "camera.wrist, board.table are the estimates of the calibration (arm.calibration.toml)." in text
 
 
