@@ -29,6 +29,8 @@ SMALL_UNITS = {"m": (1e3, " mm"), "rad": (1e3, " mrad"), "px": (1.0, " px"), **R
 DEFAULT_DECIMALS = 3
 # Largest number of decimals.
 MAX_DECIMALS = 6
+# Numbers from here on are shown with an exponent.
+MIN_EXPONENT_VALUE = 1e6
 # Table cells with more characters get the CSS class "long", which allows line breaks.
 MAX_UNBROKEN_CHARS = 48
 # Tables of a page with more columns become lists on medium pages already.
@@ -64,9 +66,14 @@ def format_fixed(value: float, decimals: int) -> str:
         decimals: Number of decimals.
 
     Returns:
-        Text of the number; a dash if it is not finite.
+        Text of the number, with an exponent and three digits from `MIN_EXPONENT_VALUE` on; a dash if it is
+        not finite.
     """
-    return f"{round(value, decimals) + 0.0:.{decimals}f}" if math.isfinite(value) else "–"
+    if not math.isfinite(value):
+        return "–"
+    if abs(value) >= MIN_EXPONENT_VALUE:
+        return f"{value:.2e}"
+    return f"{round(value, decimals) + 0.0:.{decimals}f}"
 
 
 def format_quantity(value: float, unit: str, std: float = math.nan, small: bool = False) -> str:

@@ -21,6 +21,8 @@ from dhcal_pin.formatting import Table, escape_markdown, format_quantity, html_t
         (3.5679, 1.2e-3, "3567.9 mm"),
         (np.inf, 1e-3, "–"),
         (1e-3, np.nan, "1.000 mm"),
+        (999.999, 1e-4, "999999.00 mm"),
+        (-1.03880402979e41, np.nan, "-1.04e+44 mm"),
     ],
 )
 def test_quantities_are_rounded_to_their_standard_deviation(value, std, text):

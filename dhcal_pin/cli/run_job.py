@@ -32,7 +32,7 @@ from ..diagnostics.input_checks import find_value_warnings, poorly_fitted_files
 from ..diagnostics.reachability import UnreachableRow, find_unreachable_rows
 from ..estimation.parameters import select_parameters
 from ..estimation.robust import ZERO_WEIGHT
-from ..exceptions import FileFormatError, InvalidArgumentError, UnknownNameError
+from ..exceptions import FileFormatError, InvalidArgumentError, NotObservableError, UnknownNameError
 from ..io.camera_files import camera_files
 from ..io.measurement_files import MeasurementFile, read_measurement_file
 from ..io.rig_file import read_rig
@@ -158,6 +158,8 @@ def run_job(
         sources = {"bounds": job.bounds, "priors": job.priors, "known": job.instrument}
         path = sources.get(error.argument)
         raise FileFormatError(f"{path}: {error}") if path else error from None
+    except NotObservableError as error:
+        raise NotObservableError(f"{error}{_held_out_images(data)}") from None
     if job.holdout == REGION:
         without_holdout = restrictions | options | {"holdout": (), "extend": extend}
         fit = leave_regions_out(
@@ -378,6 +380,17 @@ def _read_data(chain: Chain, job: Job, has_known_frames: bool) -> _JobData:
     held_out = [(path, item) for path, item in holdout if len(item.rows)]
     n_rows = {path: len(item.rows) for path, item in by_file.items()}
     return _JobData(fitted, held_out, n_rows, unreachable, warnings, notes)
+
+
+def _held_out_images(data: _JobData) -> str:
+    """Say how many images are held out and cannot determine anything; empty without images among them."""
+    fitted, held_out = (
+        len(partition.different_configurations([each for each in items if each.kind == "camera"])[0])
+        for items in (data.fit.values(), [item for _, item in data.holdout])
+    )
+    if not held_out:
+        return ""
+    return f"; the hold-out has {held_out} of {fitted + held_out} images: take more, or hold out fewer"
 
 
 # --- calibration -----------------------------------------------------------------------------------

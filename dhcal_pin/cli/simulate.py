@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING
 
@@ -30,7 +31,8 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--noise",
         default="0mm",
         metavar="LENGTH[,ANGLE]",
-        help="standard deviation per axis, such as 0.1mm,0.01deg (default: %(default)s)",
+        help="standard deviation per axis, such as 0.1mm,0.01deg (default: %(default)s); for the kind camera "
+        "in pixels, such as 0.2px",
     )
     parser.add_argument(
         "-o", "--output", metavar="data.csv", required=True, help="measurement CSV file to write"
@@ -45,7 +47,12 @@ def add_arguments(parser: ArgumentParser) -> None:
         "origin, such as 1mm,0.3deg; drawn with the seed",
     )
     parser.add_argument(
-        "--kind", metavar="KIND", default="pose", help="kind of measurement (default: %(default)s): {kinds}"
+        "--kind",
+        metavar="KIND",
+        default="pose",
+        help="kind of measurement (default: %(default)s): {kinds}; "
+        "camera: six points on the tip in two cameras of 4096 x 4096 px that stand still, in which 1 mm at "
+        "the robot is 1 px; their rig file NAME.rig.toml is written beside NAME.csv",
     )
     add_urdf_options(parser)
     parser.add_argument(
@@ -85,7 +92,7 @@ def run(args: Namespace) -> int:
 
     robots = [args.robot, *([args.truth] if args.truth else [])]
     require_writable_outputs([args.output], [*robots, *existing_sidecars(robots)])
-    noise = Noise(*parse_noise(args.noise))
+    noise = Noise(*parse_noise(_length_of_pixels(args.noise) if args.kind == "camera" else args.noise))
     if args.truth and args.errors:
         raise InvalidArgumentError("--errors: not allowed with --truth, which is the robot with errors")
     if args.kind not in KINDS:
@@ -116,6 +123,11 @@ def run(args: Namespace) -> int:
     write_outputs(contents)
     console.show(Screen([files_block([str(path) for path in contents])]), args.verbosity)
     return 0
+
+
+def _length_of_pixels(noise: str) -> str:
+    """Return noise in pixels as that in millimetres, which are as large in the simulated images."""
+    return re.sub(r"^([0-9.eE+-]+)\s*px$", r"\1mm", noise.strip())
 
 
 def _with_random_errors(nominal: Chain, length: float, angle: float, seed: int) -> Chain:

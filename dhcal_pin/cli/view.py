@@ -32,8 +32,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--rig",
         metavar=RIG["metavar"],
-        help="cameras and boards to draw, with their poses (default: those of the calibrated robot); needed "
-        "to play image coordinates",
+        help="cameras and boards to draw, with their poses (default: those of the calibrated robot, "
+        "which play image coordinates, too); needed for image coordinates of a robot that is not calibrated",
     )
     parser.add_argument(
         "--html", metavar="FILE", help="page to write (default: a temporary file, opened in the browser)"

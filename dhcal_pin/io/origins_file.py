@@ -14,7 +14,7 @@ import numpy as np
 
 from .. import se3
 from .._typing import Array, PathLike
-from ..formatting import Table, format_fixed
+from ..formatting import Table
 from ..robot.chain import Chain
 from ..robot.urdf import UrdfJoint
 from ..robot.urdf_path import path_between
@@ -146,7 +146,7 @@ def _rpy(joint: UrdfJoint, origin: Array) -> Array:
 
 def _numbers(values: Array) -> str:
     """Format numbers with six decimals (1 µm, 1 µrad) at most."""
-    return " ".join(format_fixed(value, 6).rstrip("0").rstrip(".") for value in values.tolist())
+    return " ".join(f"{round(value, 6) + 0.0:.6f}".rstrip("0").rstrip(".") for value in values.tolist())
 
 
 def origins_text(chain: Chain) -> str:

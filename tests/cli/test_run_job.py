@@ -411,3 +411,17 @@ def test_restricted_parameters_are_reported(run, tmp_path, monkeypatch):
     status, _, err = run("calibrate", "arm.dh.toml", "data.csv", *sets, "-o", "out.urdf")
     assert status == 0, err
     assert "arm.dh.toml: warning: --parameters minimal,base,tool reduces" in err
+
+
+def test_images_that_the_hold_out_takes_are_counted(run, assert_refused):
+    """Four images of a camera and a board without known poses; three are needed."""
+    assert run("simulate", "arm.dh.toml", "-m", "8", "--kind", "camera", "-o", "a.csv")[0] == 0
+    rows = Path("a.csv").read_text().splitlines()
+    Path("a.csv").write_text("\n".join(row for row in rows if ",right," not in row))
+    rig = Path("a.rig.toml").read_text()
+    left, board = rig.split("[camera.right]")[0], rig[rig.index("[board.target]") : rig.rindex("xyz_m")]
+    Path("a.rig.toml").write_text(left + board)
+    command = ("calibrate", "arm.dh.toml", "a.csv", "--rig", "a.rig.toml", "-o", "out.urdf")
+    words = ["2 usable images; expected at least 3", "the hold-out has 2 of 4 images"]
+    assert_refused(words, *command, "--holdout", "0.5")
+    assert "usable images" not in run(*command)[2]

@@ -9,6 +9,7 @@ import pytest
 from command_line import stdout_of, tool_positions
 
 from dhcal_pin.io import read_measurement_file, read_robot
+from dhcal_pin.io.tables import read_table
 from dhcal_pin.robot import Chain
 
 
@@ -36,6 +37,24 @@ def test_noise_has_the_given_standard_deviation(run, robot_folder):
         "orientation"
     ]
     np.testing.assert_allclose(errors.std(0), 1e-3, rtol=0.05)
+
+
+def test_noise_of_images_is_in_pixels(run, robot_folder):
+    """The simulated cameras show a millimetre as a pixel. Other kinds have no pixels."""
+    command = ("simulate", "arm.urdf", "-m", "500", "--kind", "camera", "-o")
+    pixels = {}
+    for name, noise in (("exact.csv", "0mm"), ("a.csv", "0.2px"), ("b.csv", "0.2mm")):
+        stdout_of(run(*command, name, "--noise", noise))
+        table = read_table(name)
+        pixels[name] = np.stack([table.values(table.columns[column].index) for column in "uv"])
+    np.testing.assert_array_equal(pixels["a.csv"], pixels["b.csv"])
+    np.testing.assert_allclose((pixels["a.csv"] - pixels["exact.csv"]).std(1), 0.2, rtol=0.05)
+    assert Path("a.rig.toml").exists()
+    for kind, noise in (("pose", "0.2px"), ("camera", "xpx")):
+        status, _, err = run(
+            "simulate", "arm.urdf", "-m", "5", "--kind", kind, "--noise", noise, "-o", "c.csv"
+        )
+        assert (status, f"--noise '{noise}': not a number with a unit" in err) == (2, True)
 
 
 def test_random_errors_have_the_given_standard_deviation(run, robot_folder):
