@@ -20,21 +20,21 @@ from typing import Any
 
 import numpy as np
 
-from .._typing import Array, PathLike, Progress
+from .._typing import PathLike, Progress
 from ..calibration import model_selection, partition, procedure, summary
 from ..calibration.cameras import default_sets
 from ..calibration.cross_validation import leave_regions_out
 from ..calibration.model_selection import FULL_SET, is_restricted
 from ..calibration.result import Result
-from ..cameras.rig import TIP, Camera
 from ..diagnostics.curves import find_lattices
 from ..diagnostics.input_checks import find_value_warnings, poorly_fitted_files
 from ..diagnostics.reachability import UnreachableRow, find_unreachable_rows
 from ..estimation.parameters import select_parameters
 from ..estimation.robust import ZERO_WEIGHT
 from ..exceptions import FileFormatError, InvalidArgumentError, NotObservableError, UnknownNameError
-from ..io.camera_files import camera_files
+from ..io.camera_files import CameraFrame, camera_files, camera_frames
 from ..io.measurement_files import MeasurementFile, read_measurement_file
+from ..io.origins_file import joint_origins
 from ..io.rig_file import read_rig
 from ..io.robot import read_robot, robot_name, urdf_files
 from ..io.settings import parse_payload, read_bounds, read_priors
@@ -49,6 +49,7 @@ from ..report.document import Provenance, content_digests, file_digests, result_
 from ..robot import urdf_edit
 from ..robot.chain import Chain
 from ..robot.correction_table import correction_columns, joint_corrections
+from ..robot.urdf import parse_urdf
 from .job import REGION, Job
 from .options import split_commas
 from .outputs import (
@@ -455,11 +456,10 @@ def _robot_files(fit: Result, job: Job) -> dict[PathLike, str | bytes]:
             data = urdf_edit.with_world(data, chain.base)
         if job.tool_frame:
             data = urdf_edit.with_tool_frame(data, chain.tip, job.tool_frame, chain.tool)
-        for name, (parent, pose) in camera_frames.items():
-            data = urdf_edit.with_fixed_frame(data, parent, name, pose, "--camera-frame")
+        for frame in _camera_frames(fit, job, data) if job.camera_frame else ():
+            data = urdf_edit.with_fixed_frame(data, frame.parent, frame.name, frame.pose, "--camera-frame")
         return data
 
-    camera_frames = _camera_frames(fit, job) if job.camera_frame else {}
     contents = urdf_files(
         written,
         job.output,
@@ -470,8 +470,10 @@ def _robot_files(fit: Result, job: Job) -> dict[PathLike, str | bytes]:
         fit.rig,
     )
     if job.camera_files and fit.rig:
-        for camera in fit.rig.cameras:
-            contents |= camera_files(camera, f"{job.camera_files}_{camera.name}", _parent_link(fit, camera))
+        data = contents[job.output]
+        assert isinstance(data, bytes)
+        for frame in _camera_frames(fit, job, data):
+            contents |= camera_files(frame, f"{job.camera_files}_{frame.camera.name}")
     return contents
 
 
@@ -480,27 +482,17 @@ def _numbered(name: str, paths: Sequence[str]) -> dict[str, str]:
     return {name if number == 1 else f"{name}_{number}": path for number, path in enumerate(paths, 1)}
 
 
-def _camera_frames(fit: Result, job: Job) -> dict[str, tuple[str, Array]]:
-    """Return the parent link and the pose (4, 4) of each camera by the name of its new link."""
+def _camera_frames(fit: Result, job: Job, urdf: bytes) -> list[CameraFrame]:
+    """Return the frames of the cameras in the calibrated URDF, with the measuring frame in it on request."""
     if fit.rig is None:
         raise InvalidArgumentError(
             "--camera-frame: the measurements have no camera; expected image coordinates and --rig, or "
             "--tool-frame NAME for the measured tool pose"
         )
-    out = {}
-    for camera in fit.rig.cameras:
-        name = job.camera_frame if len(fit.rig.cameras) == 1 else f"{job.camera_frame}_{camera.name}"
-        assert name is not None
-        assert camera.pose is not None
-        out[name] = _parent_link(fit, camera), camera.pose
-    return out
-
-
-def _parent_link(fit: Result, camera: Camera) -> str:
-    """Return the link of the URDF that carries a camera."""
-    if camera.link in fit.chain.urdf.links:
-        return camera.link
-    return fit.chain.tip if camera.link == TIP else fit.chain.root
+    root, base = ("world", np.eye(4)) if job.world_joint else (fit.chain.root, fit.chain.base)
+    written = Chain.from_urdf(parse_urdf(urdf, job.output), fit.chain.tip, root)
+    _, tool = joint_origins(fit.chain)
+    return camera_frames(fit.rig, replace(written, base=base, tool=tool), job.camera_frame)
 
 
 def _provenance(

@@ -2,36 +2,112 @@
 
 - `.camera_info.yaml`: intrinsics as ROS keeps them (camera_calibration_parsers);
 - `.opencv.yaml`: camera matrix and distortion for `cv::FileStorage`;
-- `.handeye.yaml`: pose of the camera in its link as easy_handeye keeps it.
+- `.handeye.yaml`: pose of the camera in a link of the robot, for the publisher of easy_handeye 0.4 (ROS 1).
 """
 
 from __future__ import annotations
 
+import json
+from dataclasses import dataclass
+
 import numpy as np
 import pinocchio as pin
 
+from .. import se3
 from .._typing import Array, PathLike
-from ..cameras.rig import Camera
+from ..cameras.rig import TIP, Camera
+from ..measurements.mounting import MountedRig
+from ..robot.chain import Chain
 
 # Names of the distortion models in ROS by lens model.
 _ROS_MODELS = {"pinhole": "plumb_bob", "fisheye": "equidistant"}
 
 
-def camera_files(camera: Camera, prefix: str, parent: str) -> dict[PathLike, str | bytes]:
+@dataclass(frozen=True, eq=False)
+class CameraFrame:
+    """Frame of a calibrated camera on a robot.
+
+    Attributes:
+        camera: Camera with its estimated lens.
+        name: Name of the frame.
+        moves: Whether it moves with the tip; otherwise it stands still with the root.
+        base: Link that stands still: the one that carries the camera, or the root.
+        effector: Link that moves with the tip: the one that carries the camera, or the tip.
+        board: Name of a board at the other end.
+        pose: Pose of the camera in the link that carries it, shape (4, 4) [m].
+    """
+
+    camera: Camera
+    name: str
+    moves: bool
+    base: str
+    effector: str
+    board: str
+    pose: Array
+
+    @property
+    def parent(self) -> str:
+        """Link of the robot that carries the camera."""
+        return self.effector if self.moves else self.base
+
+
+def camera_frames(rig: MountedRig, chain: Chain, name: str | None) -> list[CameraFrame]:
+    """Find the frame of each camera in a URDF.
+
+    A rig states the poses of cameras in the measuring frame or in the tool frame. In the URDF they are poses
+    in links: the base and the tool of the chain are between.
+
+    Args:
+        rig: Cameras and boards with their estimated poses.
+        chain: Robot with the URDF that gets the frames.
+        name: Name of the frame of an only camera; NAME_CAMERA with several. None for the names of the rig.
+
+    Returns:
+        Frame of each camera.
+    """
+    frames = []
+    for i, camera in enumerate(rig.cameras):
+        moves = rig.camera_mounts[i].moves
+        stated = camera.link if camera.link in chain.urdf.links else chain.root
+        parent = chain.tip if camera.link == TIP else stated
+        end, pose = (chain.tip, chain.tool) if moves else (chain.root, se3.inverse(chain.base))
+        end_in_parent = chain.fixed_pose(parent, end)
+        assert end_in_parent is not None
+        boards = zip(rig.boards, rig.board_mounts, strict=True)
+        frames.append(
+            CameraFrame(
+                camera,
+                _frame_name(rig, camera, name),
+                moves,
+                base=chain.root if moves else parent,
+                effector=parent if moves else chain.tip,
+                board=min(boards, key=lambda pair: pair[1].moves == moves)[0].name,
+                pose=end_in_parent @ pose @ rig.camera_in_end(i),
+            )
+        )
+    return frames
+
+
+def _frame_name(rig: MountedRig, camera: Camera, name: str | None) -> str:
+    if name is None:
+        return camera.name
+    return name if len(rig.cameras) == 1 else f"{name}_{camera.name}"
+
+
+def camera_files(frame: CameraFrame, prefix: str) -> dict[PathLike, str | bytes]:
     """Return the contents of the files of a camera.
 
     Args:
-        camera: Camera with its estimated pose and lens.
+        frame: Frame of the camera.
         prefix: Begin of the paths.
-        parent: Link of the robot that carries the camera.
 
     Returns:
         Contents by path.
     """
     return {
-        f"{prefix}.camera_info.yaml": camera_info_text(camera),
-        f"{prefix}.opencv.yaml": opencv_text(camera),
-        f"{prefix}.handeye.yaml": hand_eye_text(camera, parent),
+        f"{prefix}.camera_info.yaml": camera_info_text(frame.camera),
+        f"{prefix}.opencv.yaml": opencv_text(frame.camera),
+        f"{prefix}.handeye.yaml": hand_eye_text(frame),
     }
 
 
@@ -41,9 +117,15 @@ def _matrix(camera: Camera) -> Array:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
+def _number(value: float) -> str:
+    """Write a number that reads back exactly; readers of YAML 1.1 take 1e-05 without a point for a word."""
+    text = repr(float(value))
+    return text if "." in text else text.replace("e", ".0e")
+
+
 def _numbers(values: Array) -> str:
-    """Write numbers as a YAML list that reads back exactly."""
-    return f"[{', '.join(repr(float(value)) for value in values.ravel())}]"
+    """Write numbers as a YAML list."""
+    return f"[{', '.join(map(_number, values.ravel()))}]"
 
 
 def _ros_matrix(name: str, values: Array) -> list[str]:
@@ -94,22 +176,31 @@ def opencv_text(camera: Camera) -> str:
     return "\n".join(lines) + "\n"
 
 
-def hand_eye_text(camera: Camera, parent: str) -> str:
-    """Return the pose of a camera in its link as easy_handeye keeps it.
+def hand_eye_text(frame: CameraFrame) -> str:
+    """Return the pose of a camera in its link as easy_handeye 0.4 keeps it.
+
+    Its publisher sends the pose of `tracking_base_frame` in `robot_effector_frame` if `eye_on_hand` is true,
+    otherwise in `robot_base_frame`. It also stores all frames in the parameter server of ROS, under
+    `namespace`, and stops at one without a name. Keys that it does not know stop it, too.
 
     Args:
-        camera: Camera with its estimated pose.
-        parent: Link of the robot that carries the camera.
+        frame: Frame of the camera.
 
     Returns:
         Text of the file: translation [m] and unit quaternion.
     """
-    assert camera.pose is not None
-    quaternion = pin.Quaternion(camera.pose[:3, :3]).coeffs()
-    lines = ["parameters:", f"  eye_on_hand: {str(camera.link != 'world').lower()}"]
-    lines += [f"  robot_effector_frame: {parent}", f"  tracking_base_frame: {camera.name}"]
+    ending = "eye_on_hand" if frame.moves else "eye_on_base"
+    parameters = {
+        "namespace": f"/{frame.camera.name}_{ending}/",
+        "eye_on_hand": frame.moves,
+        "robot_base_frame": frame.base,
+        "robot_effector_frame": frame.effector,
+        "tracking_base_frame": frame.name,
+        "tracking_marker_frame": frame.board,
+    }
+    values = [*frame.pose[:3, 3], *pin.Quaternion(frame.pose[:3, :3]).coeffs()]
+    lines = ["parameters:", *(f"  {key}: {json.dumps(value)}" for key, value in parameters.items())]
     lines.append("transformation:")
-    lines += [f"  {name}: {float(v)!r}" for name, v in zip("xyz", camera.pose[:3, 3], strict=True)]
-    names = ("qx", "qy", "qz", "qw")
-    lines += [f"  {name}: {float(v)!r}" for name, v in zip(names, quaternion, strict=True)]
+    names = ("x", "y", "z", "qx", "qy", "qz", "qw")
+    lines += [f"  {name}: {_number(value)}" for name, value in zip(names, values, strict=True)]
     return "\n".join(lines) + "\n"

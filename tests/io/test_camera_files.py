@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,27 +12,92 @@ import pytest
 import yaml
 from robots import URDF
 
+import dhcal_pin as dh
 from dhcal_pin import se3
-from dhcal_pin.cameras import Camera
+from dhcal_pin.cameras import Board, Camera, Rig
 from dhcal_pin.cli.main import main
-from dhcal_pin.io.camera_files import camera_files, opencv_text
+from dhcal_pin.io.camera_files import camera_files, camera_frames, opencv_text
+from dhcal_pin.measurements import mount_rig
 from dhcal_pin.robot.urdf import read_urdf
 
-VALUES = np.array([640.5, 641.25, 639.5, 359.5, 0.1, -0.02, 1e-3, 2e-3, 0.003])
+VALUES = np.array([640.5, 641.25, 639.5, 359.5, 1e-5, -0.02, 1e-3, 2e-3, 0.003])
 POSE = se3.transform(se3.exp3([0.3, -0.2, 2.0]), [0.1, 0.2, 0.3])
 CAMERA = Camera("wrist", "tip", 1280, 720, VALUES, pose=POSE)
+BASE = se3.transform(se3.exp3([0.1, 0.0, 0.4]), [0.2, -0.1, 0.05])
+TOOL = se3.transform(se3.exp3([0.2, 0.3, -0.1]), [0.01, 0.02, 0.12])
+
+
+def published(text):
+    """Return what the publisher of easy_handeye sends: frame, frame of the child and transform (4, 4)."""
+    content = yaml.safe_load(text)
+    assert set(content) == {"parameters", "transformation"}
+    parameters, values = content["parameters"], content["transformation"]
+    frames = ["robot_base_frame", "robot_effector_frame", "tracking_base_frame", "tracking_marker_frame"]
+    assert set(parameters) == {"namespace", "eye_on_hand", *frames}
+    assert all(type(parameters[key]) is str for key in frames)
+    assert type(parameters["eye_on_hand"]) is bool
+    assert parameters["namespace"].startswith("/")
+    assert parameters["namespace"].endswith("/")
+    parent = parameters["robot_effector_frame" if parameters["eye_on_hand"] else "robot_base_frame"]
+    rotation = se3.quaternion_to_matrix([values[key] for key in ("qw", "qx", "qy", "qz")])
+    return (
+        parent,
+        parameters["tracking_base_frame"],
+        se3.transform(rotation, [values[key] for key in ("x", "y", "z")]),
+    )
+
+
+def frames_on(link: str, name: str | None = "eye"):
+    """Return a robot with base and tool poses, and the frames of a camera on a link of it."""
+    arm = replace(dh.read_robot("example:ur10", tip="tool0"), base=BASE, tool=TOOL)
+    end = "world" if link in {"tip", "wrist_3_link"} else "tip"
+    far = Board("far", end, "checkerboard", columns=5, rows=4, square=0.04, pose=np.eye(4))
+    near = replace(far, name="near", link="tip" if end == "world" else "world")
+    rig = mount_rig(Rig({"wrist": replace(CAMERA, link=link)}, {"near": near, "far": far}), arm)
+    return arm, rig, camera_frames(rig, arm, name)
 
 
 def test_ros_files():
-    texts = camera_files(CAMERA, "out", "tool0")
-    info = yaml.safe_load(str(texts["out.camera_info.yaml"]))
+    _, _, (frame,) = frames_on("tip")
+    info = yaml.safe_load(str(camera_files(frame, "out")["out.camera_info.yaml"]))
     assert (info["image_width"], info["image_height"], info["distortion_model"]) == (1280, 720, "plumb_bob")
     assert info["camera_matrix"]["data"] == [640.5, 0, 639.5, 0, 641.25, 359.5, 0, 0, 1]
     assert info["distortion_coefficients"]["data"] == VALUES[4:].tolist()
-    pose = yaml.safe_load(str(texts["out.handeye.yaml"]))["transformation"]
-    np.testing.assert_allclose([pose[k] for k in "xyz"], POSE[:3, 3])
-    rotation = se3.quaternion_to_matrix([pose[k] for k in ("qw", "qx", "qy", "qz")])
-    np.testing.assert_allclose(rotation, POSE[:3, :3], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("link", "parent", "moves"),
+    [
+        ("tip", "tool0", True),
+        ("wrist_3_link", "wrist_3_link", True),
+        ("world", "world", False),
+        ("base_link", "base_link", False),
+    ],
+)
+def test_easy_handeye_publishes_the_pose_of_the_camera(link, parent, moves):
+    """The published frame is where the robot has the camera, with base and tool that are not in the URDF."""
+    arm, rig, (frame,) = frames_on(link)
+    text = str(camera_files(frame, "out")["out.handeye.yaml"])
+    assert published(text)[:2] == (parent, "eye")
+    parameters = yaml.safe_load(text)["parameters"]
+    assert parameters["eye_on_hand"] is moves
+    assert parameters["tracking_marker_frame"] == "far"
+    assert parameters["robot_base_frame" if moves else "robot_effector_frame"] == (
+        "world" if moves else "tool0"
+    )
+    q = np.random.default_rng(0).uniform(-2, 2, (4, arm.n_joints))
+    if moves:
+        expected = arm.poses(q) @ rig.camera_in_end(0)
+        links = BASE @ dh.read_robot("example:ur10", tip=parent).poses(q)
+    else:
+        expected = rig.camera_in_end(0)
+        links = BASE @ arm.fixed_pose("world", parent)
+    np.testing.assert_allclose(links @ published(text)[2], expected, atol=1e-12)
+
+
+def test_frames_have_the_names_of_the_rig_without_another_name():
+    _, _, (frame,) = frames_on("tip", None)
+    assert published(str(camera_files(frame, "out")["out.handeye.yaml"]))[1] == "wrist"
 
 
 def test_opencv_reads_its_file(tmp_path):
@@ -63,7 +129,9 @@ def test_camera_in_urdf_and_sidecar(tmp_path, monkeypatch):
         np.testing.assert_allclose(origin[:3, 3], sidecar["camera"][name]["xyz_m"], atol=1e-12)
         rotation = se3.exp3(sidecar["camera"][name]["rotvec_rad"])
         np.testing.assert_allclose(origin[:3, :3], rotation, atol=1e-12)
-        assert Path(f"cam_{name}.camera_info.yaml").exists()
+        parent, child, pose = published(Path(f"cam_{name}.handeye.yaml").read_text())
+        assert (parent, child) == ("base_link", f"eye_{name}")
+        np.testing.assert_allclose(pose, origin, atol=1e-12)
     assert sidecar["board"]["target"]["link"] == "tip"
     assert main(["validate", "o.urdf", "other.csv", "--rig", "other.rig.toml", "--json", "v.json"]) == 0
     assert yaml.safe_load(Path("v.json").read_text())["after"]["residual_rms"] < 0.2
