@@ -96,8 +96,11 @@ def test_easy_handeye_publishes_the_pose_of_the_camera(link, parent, moves):
 
 
 def test_frames_have_the_names_of_the_rig_without_another_name():
+    """A name that is a number stays a name."""
     _, _, (frame,) = frames_on("tip", None)
-    assert published(str(camera_files(frame, "out")["out.handeye.yaml"]))[1] == "wrist"
+    assert frame.name == "wrist"
+    text = str(camera_files(replace(frame, name="2"), "out")["out.handeye.yaml"])
+    assert published(text)[1] == "2"
 
 
 def test_opencv_reads_its_file(tmp_path):
