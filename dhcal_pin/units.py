@@ -25,6 +25,7 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "pixel": PIXELS,
     "number": {},
     "text": {},
+    "remark": {},
 }
 # Largest accepted length or angle [m or rad]; a larger value has the wrong unit.
 MAX_SI_VALUE = 1e6

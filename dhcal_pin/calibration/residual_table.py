@@ -23,6 +23,7 @@ import numpy as np
 from .._typing import Array
 from ..estimation.robust import ZERO_WEIGHT
 from ..measurements.base import Measurement
+from ..measurements.camera import CameraCorners
 from .evaluation import GROUP_UNITS, error_group, fit_instrument_parameters
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ class ResidualTable:
         normalised: Normalised residual of each sample, (N,); NaN if its standard deviation is unknown.
         weight: Robust weight of each fitted sample, (N,): 0 if it was rejected; NaN if it was held out.
         is_outlier: Whether each fitted sample is an outlier, (N,), see `Result.outliers`.
+        image: Name of each sample's photograph, (N,); empty if it has none.
     """
 
     file: Array
@@ -55,6 +57,7 @@ class ResidualTable:
     normalised: Array
     weight: Array
     is_outlier: Array
+    image: Array
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -88,6 +91,7 @@ class ResidualTable:
         return {
             "file": self.file,
             "line": self.line,
+            **({"image": self.image} if any(self.image) else {}),
             "set": np.where(self.is_holdout, "holdout", "fit"),
             "kind": self.kind,
             **{f"{name}[{self.units[name]}]": values for name, values in self.components.items()},
@@ -154,6 +158,12 @@ def residual_table(fit: Result) -> ResidualTable:
             [
                 *(np.isin(item.rows, rows) for item, rows in zip(fit.data, fit.outliers, strict=True)),
                 np.zeros(starts[-1] - starts[n_fitted], bool),
+            ]
+        ),
+        image=np.concatenate(
+            [
+                item.image_names if isinstance(item, CameraCorners) else np.full(len(item.rows), "", object)
+                for item in data
             ]
         ),
     )

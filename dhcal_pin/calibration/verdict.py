@@ -19,6 +19,8 @@ import numpy as np
 from ..estimation.initialization import initialize_frames
 from ..estimation.parameters import select_parameters
 from ..formatting import format_quantity
+from ..measurements.camera import CameraCorners
+from ..measurements.images.names import list_images, whole_images
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
 from ..plausibility.mixups import Diagnosis
 from ..robot.chain import BASE_FRAME
@@ -308,8 +310,22 @@ def _outliers(fit: Result) -> list[Finding]:
     if is_explained or n_outliers <= MAX_OUTLIER_SHARE * fit.n_samples:
         return []
     share = f"{100 * n_outliers / fit.n_samples:.0f} %"
-    text = f"{n_outliers} of {fit.n_samples} samples ({share}) are outliers. Check the measurements"
-    return [Finding("caution", f"{text}; --loss tukey reduces their influence.")]
+    text = f"{n_outliers} of {fit.n_samples} samples ({share}) are outliers{_outlying_images(fit)}"
+    return [Finding("caution", f"{text}. Check the measurements; --loss tukey reduces their influence.")]
+
+
+def _outlying_images(fit: Result) -> str:
+    """Name the images all of whose corners are outliers; empty without such images."""
+    labels = [
+        item.image_labels[number]
+        for item, rows in zip(fit.data, fit.outliers, strict=True)
+        if isinstance(item, CameraCorners)
+        for number in whole_images(item.image, np.isin(item.rows, rows))
+    ]
+    if not labels:
+        return ""
+    images = "one image" if len(labels) == 1 else f"{len(labels)} images"
+    return f", among them all corners of {images}{list_images(labels)}"
 
 
 def _n_robot_parameters(fit: Result) -> int:

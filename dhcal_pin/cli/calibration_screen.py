@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -23,6 +23,8 @@ from ..calibration.verdict import Verdict
 from ..formatting import Table, format_quantity
 from ..identifiability import EXPECTED, label_unobservable
 from ..io import origin_table
+from ..measurements.base import Measurement
+from ..measurements.camera import CameraCorners
 from ..report.document import short_names
 from .job import Job
 from .run_job import CalibrationOutcome
@@ -123,13 +125,34 @@ def _data_lines(outcome: CalibrationOutcome, names: Mapping[str, str]) -> list[s
     for path, n_rows in outcome.n_rows.items():
         fitted = [outcome.fitted[path]] if path in outcome.fitted else []
         held_out = [item for name, item in outcome.held_out if name == path]
-        facts = [f"{n_rows} rows"]
-        for item in [*fitted, *held_out][:1]:
-            facts += [item.kind, *item.description()]
-        counts = {"fitted": fitted, "held out": held_out} if held_out else {}
-        uses = [f"{sum(len(item.rows) for item in items)} {use}" for use, items in counts.items()]
-        lines.append(f"{names[path]}: {', '.join(facts)}{'; ' if uses else ''}{', '.join(uses)}")
+        facts = [f"{n_rows} rows", *_describe_data([*fitted, *held_out])]
+        uses = f"; {_describe_use(fitted, held_out)}" if held_out else ""
+        lines.append(f"{names[path]}: {', '.join(facts)}{uses}")
     return lines
+
+
+def _describe_data(items: Sequence[Measurement]) -> list[str]:
+    """Return the kind, the number of all images, and the standard deviations of measurements."""
+    if not items:
+        return []
+    texts = items[0].description()
+    if n_images := _count_images(items):
+        texts = [f"{n_images} image{'s' if n_images > 1 else ''}", texts[-1]]
+    return [items[0].kind, *texts]
+
+
+def _describe_use(fitted: Sequence[Measurement], held_out: Sequence[Measurement]) -> str:
+    """Return how many samples of a file are fitted and held out, and of how many images they are."""
+    counts = [sum(len(item.rows) for item in items) for items in (fitted, held_out)]
+    images = [_count_images(items) for items in (fitted, held_out)]
+    if any(images):
+        return f"{counts[0]} corners of {images[0]} images fitted, {counts[1]} of {images[1]} held out"
+    return f"{counts[0]} fitted, {counts[1]} held out"
+
+
+def _count_images(items: Sequence[Measurement]) -> int:
+    """Return the number of images in measurements."""
+    return sum(item.n_images for item in items if isinstance(item, CameraCorners))
 
 
 def _row_lines(outcome: CalibrationOutcome, names: Mapping[str, str]) -> Iterator[str]:

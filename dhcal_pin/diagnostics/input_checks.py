@@ -16,7 +16,7 @@ from .._typing import Array
 from ..calibration.evaluation import compute_errors
 from ..estimation.initialization import align
 from ..io.measurement_files import MeasurementFile
-from ..io.measurement_files.columns import ROTVEC, SECOND_PREFIX
+from ..io.measurement_files.columns import ROTVEC, SECOND_PREFIX, VALUE_COLUMNS
 from ..measurements.base import Measurement
 from ..measurements.camera import CameraCorners
 from ..measurements.columns import MAX_TOOL_OFFSET
@@ -357,7 +357,7 @@ def _check_repetitions(file: MeasurementFile) -> list[str]:
 def _check_repeated_rows(file: MeasurementFile) -> list[str]:
     """Return a warning about rows with the same joint positions and the same measured values."""
     columns: list[Array] = [column for q in _joint_positions_by_configuration(file) for column in q.T]
-    columns += [np.asarray(values) for values in file.values.values()]
+    columns += [np.asarray(column) for name, column in file.values.items() if name in VALUE_COLUMNS]
     original = first_equal_rows(columns)
     is_repeated = original < np.arange(len(original))
     if not is_repeated.any():

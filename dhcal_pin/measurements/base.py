@@ -105,7 +105,7 @@ class Measurement(ABC):
     kind: ClassVar[str]
     # Columns of files, except those of the joints.
     COLUMNS: ClassVar[tuple[Column, ...]]
-    # Quantity of each column of files, standard deviations included: "length", "angle", "pixel" or "text".
+    # Quantity of each column of files, standard deviations included; see `Column`.
     columns: ClassVar[Mapping[str, str]]
     # A file is of this kind if it has all columns of one of these sets.
     required_columns: ClassVar[tuple[frozenset[str], ...]]

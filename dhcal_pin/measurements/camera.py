@@ -37,7 +37,7 @@ from ..cameras.rig import WORLD, Camera, Rig
 from ..exceptions import InvalidArgumentError, NotObservableError, SampleError
 from ..robot.chain import Chain
 from .base import Measurement, Noise, format_sigma
-from .columns import pixel_columns, text_column
+from .columns import pixel_columns, remark_column, text_column
 from .images.camera_parameters import (
     POINTS_SET,
     POSE_NAMES,
@@ -46,6 +46,7 @@ from .images.camera_parameters import (
     rig_parameters,
 )
 from .images.camera_start import BoardViews, estimate_views, first_values
+from .images.names import label_images, name_array
 from .mounting import MountedRig, mount_rig
 from .validation import validated_array, validated_joint_positions, validated_sigma
 
@@ -94,6 +95,7 @@ class CameraCorners(Measurement):
         camera: Number of each sample's camera in the rig, (m,).
         board: Number of each sample's board, (m,).
         corner: Number of each sample's corner on its board, (m,).
+        image_names: Name of each sample's photograph, (m,); empty if it is not known.
         jitter: Derivative of the image coordinates by the displacement of the tool, in units of its standard
             deviations, (m, 2, 6) [px]; zero without jitter.
     """
@@ -104,6 +106,7 @@ class CameraCorners(Measurement):
     camera: Array
     board: Array
     corner: Array
+    image_names: Array
     jitter: Array
 
     kind = "camera"
@@ -113,9 +116,13 @@ class CameraCorners(Measurement):
         + text_column("corner", "corner")
         + text_column("camera", "camera")
         + text_column("board", "board")
+        + remark_column("image_names", "image")
     )
     required_columns = (frozenset(("u", "v", "corner")),)
-    sample_fields = (*Measurement.sample_fields, "values", "sigma", "camera", "board", "corner", "jitter")
+    sample_fields = (
+        *Measurement.sample_fields,
+        *("values", "sigma", "camera", "board", "corner", "image_names", "jitter"),
+    )
 
     def __init__(
         self,
@@ -126,6 +133,7 @@ class CameraCorners(Measurement):
         camera: Sequence[str] | None = None,
         board: Sequence[str] | None = None,
         sigma: ArrayLike | None = None,
+        image_names: Sequence[str] | None = None,
     ) -> None:
         """Check and store image coordinates.
 
@@ -137,6 +145,8 @@ class CameraCorners(Measurement):
             camera: Name of each sample's camera, (m,); not needed if there is only one.
             board: Name of each sample's board, (m,); not needed if there is only one.
             sigma: Standard deviations, one number or (m, 2) [px]; estimated with the fit if None.
+            image_names: Name of each sample's photograph, (m,), for messages and reports. Images are the
+                samples of one configuration and one camera, whatever their names.
         """
         q = validated_joint_positions(q, "CameraCorners")
         m = len(q)
@@ -153,6 +163,7 @@ class CameraCorners(Measurement):
             camera=camera_index,
             board=board_index,
             corner=_corner_numbers(corner, rig, board_index),
+            image_names=name_array(image_names, m),
             jitter=np.zeros((m, 2, 6)),
             has_stated_sigma=sigma is not None,
             instrument_parameters=rig_parameters(rig),
@@ -294,6 +305,11 @@ class CameraCorners(Measurement):
         """Number of each sample's image, (m,): samples of one configuration and one camera."""
         keys = np.column_stack([self.q, self.camera])
         return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
+
+    @cached_property
+    def image_labels(self) -> tuple[str, ...]:
+        """Name of each image for people, in the order of the numbers of `image`; empty if it has none."""
+        return label_images(self.image, self.image_names)
 
     @property
     def sample_groups(self) -> Array:
@@ -556,6 +572,8 @@ class CameraCorners(Measurement):
             "camera": [self.rig.cameras[number].name for number in self.camera],
             "board": [self.rig.boards[number].name for number in self.board],
         }
+        if any(self.image_names):
+            values["image"] = self.image_names
         return values, {"sigma_u": self.sigma[:, 0], "sigma_v": self.sigma[:, 1]}
 
     @classmethod

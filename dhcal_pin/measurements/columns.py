@@ -60,7 +60,8 @@ class Column:
 
     Attributes:
         name: Name in the header, without the unit.
-        quantity: "length" [m], "angle" [rad], "pixel" [px] or "text".
+        quantity: "length" [m], "angle" [rad], "pixel" [px], "text", or "remark": a text that only people
+            need, so that it may be empty, and files of other kinds may have it, too.
         argument: Argument of the kind's constructor that the column fills. Several numeric columns with the
             same argument are stacked, (m, k).
         is_implied: Whether the value is zero by definition, so that files have only its standard deviation.
@@ -69,7 +70,7 @@ class Column:
     """
 
     name: str
-    quantity: Literal["length", "angle", "pixel", "text"]
+    quantity: Literal["length", "angle", "pixel", "text", "remark"]
     argument: str = ""
     is_implied: bool = False
     is_common: bool = False
@@ -78,7 +79,7 @@ class Column:
     @property
     def is_numeric(self) -> bool:
         """Whether the column has numbers, and therefore may have standard deviations."""
-        return self.quantity != "text"
+        return self.quantity not in ("text", "remark")
 
     @property
     def sigma_name(self) -> str:
@@ -144,6 +145,19 @@ def text_column(argument: str, name: str, is_common: bool = False) -> tuple[Colu
         The column, as a tuple that can be added to others.
     """
     return (Column(name, "text", argument, is_common=is_common),)
+
+
+def remark_column(argument: str, name: str) -> tuple[Column, ...]:
+    """Declare a column of texts that only people need.
+
+    Args:
+        argument: Name of the constructor's argument.
+        name: Name of the column.
+
+    Returns:
+        The column, as a tuple that can be added to others.
+    """
+    return (Column(name, "remark", argument),)
 
 
 def file_columns(columns: Sequence[Column]) -> dict[str, str]:

@@ -32,6 +32,7 @@ class _Image:
 
     Attributes:
         number: Number in the report, from 1.
+        name: Name of its photograph, or the number if it has none.
         source: Name of the file and lines of its rows.
         camera: Camera that took it.
         role: "fitted" or "hold-out".
@@ -42,6 +43,7 @@ class _Image:
     """
 
     number: int
+    name: str
     source: str
     camera: Camera
     role: str
@@ -107,7 +109,7 @@ def image_table(context: ReportContext) -> Table:
     images = sorted(_images(context), key=lambda image: -image.rms)[:MAX_LISTED_IMAGES]
     rows = [
         [
-            str(image.number),
+            image.name,
             image.source,
             image.camera.name,
             image.role,
@@ -142,6 +144,7 @@ def _images(context: ReportContext) -> list[_Image]:
                 out.append(
                     _Image(
                         number=len(out) + 1,
+                        name=item.image_labels[label] or str(len(out) + 1),
                         source=f"{name}, {lines.min()}-{lines.max()}",
                         camera=item.rig.cameras[item.camera[samples[0]]],
                         role=role,
@@ -189,7 +192,7 @@ def image_figures(context: ReportContext) -> list[FigureGroup]:
     panels = [
         _reprojection_panel(
             f"image-{image.number}",
-            f"Image {image.number}: {image.rms:.3g} px",
+            f"Image {image.name}: {image.rms:.3g} px",
             image.camera,
             image.pixels,
             image.after,

@@ -42,7 +42,7 @@ def plot_reprojection(
 
 
 def plot_image_errors(before: Array, after: Array, ax: Axes | None = None) -> Axes:
-    """Plot the RMS error of each image over its number.
+    """Plot the RMS error of each image over its place, the fitted images before the held-out ones.
 
     Args:
         before: Errors with the nominal arm, shape (n,) [px].
@@ -56,7 +56,7 @@ def plot_image_errors(before: Array, after: Array, ax: Axes | None = None) -> Ax
     numbers = np.arange(1, len(after) + 1)
     for label, values in (("before", before), ("after", after)):
         plots.plot_dots(ax, numbers, values, COLORS[label], DOT_SIZES[1], label=label)
-    ax.set(xlabel="image", ylabel="RMS error, px")
+    ax.set(xlabel="images, fitted ones first", ylabel="RMS error, px")
     ratio = float(np.median(before)) / max(float(np.median(after)), 1e-12)
     if min(float(before.min()), float(after.min())) > 0 and ratio > plots.MAX_MEDIAN_RATIO:
         plots.make_logarithmic(ax, "y")

@@ -152,12 +152,21 @@ def test_images_with_wrong_joint_values_are_counted():
     for first, second in ((3, 17), (8, 20)):
         swapped[np.all(images.q == q[first], 1)] = q[second]
         swapped[np.all(images.q == q[second], 1)] = q[first]
-    data = CameraCorners(swapped, images.values, images.corner, images.rig)
-    fit = dh.calibrate(chain, data, "camera,board")
-    assert fit.hand_eye is not None
-    assert fit.hand_eye.n_wrong_images == 4
-    assert any("4 images do not fit the others" in text for text in fit.verdict.reasons)
-    assert fit.hand_eye.is_noise
+    names = [f"{np.flatnonzero(np.all(q == each, 1))[0]:04}.png" for each in images.q]
+    for image_names in (None, names):
+        data = CameraCorners(swapped, images.values, images.corner, images.rig, image_names=image_names)
+        fit = dh.calibrate(chain, data, "camera,board")
+        assert fit.hand_eye is not None
+        assert fit.hand_eye.n_wrong_images == 4
+        assert fit.hand_eye.is_noise
+        (text,) = [text for text in fit.verdict.reasons if "4 images do not fit the others" in text]
+        listed = fit.hand_eye.to_dict()["wrong_image_names"]
+        if image_names is None:
+            assert "left out: check" in text
+            assert listed == []
+        else:
+            assert sorted(listed) == ["0003.png", "0008.png", "0017.png", "0020.png"]
+            assert f"left out ({', '.join(listed[:3])} and 1 more): check" in text
 
 
 def test_similar_rotations_are_named():

@@ -85,3 +85,4 @@ def test_from_photographs_to_a_calibrated_urdf(run, simulated):
     assert np.sqrt(np.mean((nominal - exact) ** 2)) > 2e-3
     assert np.sqrt(np.mean((found - exact) ** 2)) < 0.05e-3
     assert "px" in unfolded(err)
+    assert "ignored" not in err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -49,6 +50,34 @@ def test_images_with_the_largest_errors_are_listed(result, quick):
         rms += [np.sqrt(squares[item.image == i].sum(1).mean()) for i in range(item.n_images)]
     np.testing.assert_allclose(shown, sorted(rms, reverse=True)[: len(shown)], rtol=0.01)
     assert all(row[1].startswith("corners.csv, ") for row in table.rows if row[3] == "fitted")
+
+
+def test_images_are_called_by_their_names(result, quick):
+    """The names are those of the samples; images without one are numbered."""
+    named = replace(result, data=tuple(with_names(item) for item in result.data))
+    assert "image" not in result.residuals.to_columns()
+    context = ReportContext.from_result(named, Provenance(names=["corners.csv"]))
+    table = image_table(context)
+    lines = {}
+    for item in named.data:
+        for i, label in enumerate(item.image_labels):
+            rows = item.rows[item.image == i]
+            lines[label] = f"{rows.min()}-{rows.max()}"
+    fitted = [row for row in table.rows if row[3] == "fitted"]
+    assert fitted
+    assert all(row[1].endswith(f", {lines[row[0]]}") for row in fitted)
+    assert all(row[0].isdecimal() for row in table.rows if row[3] == "hold-out")
+    titles = [panel.caption for group in image_figures(context) for panel in group.panels]
+    assert any(title.startswith(f"Image {fitted[0][0]}: ") for title in titles)
+    columns = named.residuals.file_columns()
+    by_line = dict(zip(columns["line"], columns["image"], strict=True))
+    for item in named.data:
+        assert [by_line[row] for row in item.rows.tolist()] == item.image_names.tolist()
+
+
+def with_names(item):
+    """Return images with a name for each configuration."""
+    return item.replace(image_names=np.array([f"{q[0]:.6f}.png" for q in item.q], object))
 
 
 def test_page_shows_each_camera_and_the_worst_images(result, quick):

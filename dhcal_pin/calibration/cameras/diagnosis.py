@@ -28,6 +28,7 @@ from ...exceptions import DhcalError
 from ...formatting import Table, format_quantity
 from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners
+from ...measurements.images.names import list_images
 from ...plausibility.displacement import measure_correction
 from ..partition import configuration_groups, k_fold
 from ..reweighting import Fit
@@ -115,7 +116,7 @@ class HandEyeDiagnosis:
         trials: All causes that were tried alone.
         rotation: RMS rotation of the tool about the axis with the second largest rotation [rad].
         position_std: Largest standard deviation of the position of a camera or a board [m].
-        n_wrong_images: Number of images that do not fit the others, and are left out.
+        wrong_images: Label of each image that does not fit the others, and is left out; empty without names.
     """
 
     error: ImageError
@@ -125,7 +126,12 @@ class HandEyeDiagnosis:
     trials: tuple[Trial, ...]
     rotation: float
     position_std: float
-    n_wrong_images: int
+    wrong_images: tuple[str, ...]
+
+    @property
+    def n_wrong_images(self) -> int:
+        """Number of images that do not fit the others, and are left out."""
+        return len(self.wrong_images)
 
     @property
     def is_noise(self) -> bool:
@@ -159,15 +165,16 @@ class HandEyeDiagnosis:
                 f"{1 / self.rotation:.2g} mm, and the images do not show it. Add images that are turned by "
                 "30° or more about two axes that are not parallel."
             )
+        names = list_images(self.wrong_images)
         if self.n_wrong_images == 1:
             out.append(
-                "One image does not fit the others and is left out: check its joint values, and that the "
-                "robot stood still."
+                f"One image does not fit the others and is left out{names}: check its joint values, and that "
+                "the robot stood still."
             )
         elif self.n_wrong_images:
             out.append(
-                f"{self.n_wrong_images} images do not fit the others and are left out: check their joint "
-                "values, and that the robot stood still."
+                f"{self.n_wrong_images} images do not fit the others and are left out{names}: check their "
+                "joint values, and that the robot stood still."
             )
         return out
 
@@ -209,6 +216,7 @@ class HandEyeDiagnosis:
             "second_rotation_rad": self.rotation,
             "position_std_m": self.position_std,
             "wrong_images": self.n_wrong_images,
+            "wrong_image_names": [label for label in self.wrong_images if label],
             "text": self.error_sentence + ("" if self.is_noise else self.likely),
         }
 
@@ -262,9 +270,11 @@ def diagnose_hand_eye(
         found.trials,
         second_rotation(fit, found.hand_eye.data),
         position_std,
-        sum(
-            _count_wrong_images(found.hand_eye, found.last, item, weights)
+        tuple(
+            label
             for item, weights in zip(fit.data, fit.weights, strict=True)
+            if isinstance(item, CameraCorners)
+            for label in _wrong_images(found.hand_eye, found.last, item, weights)
         ),
     )
 
@@ -284,10 +294,8 @@ def _search(fit: Fit, data: Sequence[Measurement], holdout: Sequence[Measurement
     return _Search(hand_eye, base, *_find_causes(hand_eye, base))
 
 
-def _count_wrong_images(hand_eye: HandEyeData, state: _State, item: Measurement, weights: Array) -> int:
-    """Return the number of images whose corners were all rejected, and that the causes do not explain."""
-    if not isinstance(item, CameraCorners):
-        return 0
+def _wrong_images(hand_eye: HandEyeData, state: _State, item: CameraCorners, weights: Array) -> list[str]:
+    """Return the labels of images whose corners were all rejected, and that the causes do not explain."""
     is_rejected = (np.bincount(item.image, weights > 0.5, item.n_images) == 0)[item.image]
     rejected = apply_causes(hand_eye, state.causes, item.take(is_rejected))
     errors = state.fit.problem.errors
@@ -295,7 +303,9 @@ def _count_wrong_images(hand_eye: HandEyeData, state: _State, item: Measurement,
     u = np.array([state.values[p.name] for p in rejected.instrument_parameters])
     pixels = rejected.errors(chain.forward_kinematics(rejected.q), u)["pixels"]
     squares = np.bincount(rejected.image, np.sum(pixels**2, 1)) / np.bincount(rejected.image)
-    return int(np.sum(np.sqrt(squares) > MIN_WRONG_RATIO * state.error.pixels))
+    is_wrong = np.sqrt(squares) > MIN_WRONG_RATIO * state.error.pixels
+    first = np.unique(rejected.image, return_index=True)[1]
+    return [rejected.image_labels[i] for i in np.argsort(first) if is_wrong[i]]
 
 
 def second_rotation(fit: Fit, data: Sequence[Measurement]) -> float:

@@ -34,10 +34,14 @@ AFTER = ("after_x", "after_y", "after_z")
 # Prefix of a joint's name in the columns of the second configuration of a row.
 SECOND_PREFIX = "to:"
 
-# Columns for people only; a reader ignores them without a note.
-_REMARKS = frozenset(("pose_id", "time"))
+# Columns for people only, some of which a kind uses for its messages; others are ignored without a note.
+_REMARKS = frozenset(
+    name for kind in KINDS.values() for name, content in kind.columns.items() if content == "remark"
+) | {"pose_id", "time"}
 AUXILIARY_COLUMNS = frozenset(("set", *_REMARKS, *COMMANDED, *AFTER))
-VALUE_COLUMNS = frozenset(name for kind in KINDS.values() for name in kind.columns) | frozenset(QUATERNION)
+VALUE_COLUMNS = (
+    frozenset((*(name for kind in KINDS.values() for name in kind.columns), *QUATERNION)) - _REMARKS
+)
 _KNOWN = VALUE_COLUMNS | AUXILIARY_COLUMNS
 # Content of each column other than joints: "length", "angle", "number" or "text".
 _CONTENTS: dict[str, str] = {

@@ -243,7 +243,8 @@ def _usable_rows(
     joints = [prefix + name for prefix in prefixes for name in chain.joint_names]
     quantities = {**kind.columns, **dict.fromkeys((*QUATERNION, *COMMANDED, *AFTER), ""), "set": "text"}
     texts = {name for name, quantity in quantities.items() if quantity == "text"}
-    used = [name for name in (*joints, *quantities) if name in table.columns]
+    needed = [name for name, quantity in quantities.items() if quantity != "remark"]
+    used = [name for name in (*joints, *needed) if name in table.columns]
     table = table.without_bad_rows(
         [table.columns[name].index for name in used if name not in texts],
         [table.columns[name].index for name in used if name in texts],
@@ -333,7 +334,8 @@ def parse_values(table: DataTable, kind: type[Measurement]) -> dict[str, Any]:
         if name not in table.columns:
             continue
         column = table.columns[name]
-        values[name] = table.text(column) if content == "text" else table.to_si(column, UNITS[content])
+        is_text = content in ("text", "remark")
+        values[name] = table.text(column) if is_text else table.to_si(column, UNITS[content])
         if "sigma" in name and (too_small := np.flatnonzero(values[name] < _MIN_SIGMA)).size:
             raise FileFormatError(
                 f"{table.cell_location(int(too_small[0]), name)}: must be above zero; "

@@ -49,7 +49,9 @@ def value_columns(data: Measurement) -> dict[str, list[Any]]:
     """
     columns: dict[str, list[Any]] = {}
     for name, values in data.to_columns().items():
-        unit = {"length": "[m]", "angle": "[rad]", "pixel": "[px]", "text": ""}[data.columns[name]]
+        unit = {"length": "[m]", "angle": "[rad]", "pixel": "[px]", "text": "", "remark": ""}[
+            data.columns[name]
+        ]
         columns[name + unit] = list(values) if unit == "" else values.tolist()
     return columns
 
