@@ -12,6 +12,7 @@ from ..calibration.evaluation import Comparison
 from ..calibration.result import Result
 from ..calibration.summary import (
     DEFINITION_TEXT,
+    GROUP_LABELS,
     accuracy_table,
     definition_table,
     estimate_table,
@@ -166,7 +167,12 @@ def _row_lines(outcome: CalibrationOutcome, names: Mapping[str, str]) -> Iterato
             yield f"{names[path]}: {_count_outliers(excluded)} excluded from the fit"
         if included := [row for row in rows if row not in rejected]:
             count = _count_outliers(included)
-            yield f"{names[path]}: {count} kept in the fit; use --loss tukey to down-weight them"
+            yield (
+                f"{names[path]}: {count} kept in the fit, not far from the other samples: a few do no harm; "
+                "--loss tukey down-weights them"
+                if outcome.document["settings"]["loss"] == "auto"
+                else f"{names[path]}: {count} kept in the fit; --loss auto excludes those far from the others"
+            )
 
 
 def _count_outliers(rows: list[int]) -> str:
@@ -196,7 +202,10 @@ def _accuracy_blocks(fit: Result) -> list[Block]:
     ]
     if rows:
         covered, unknown = format_share(known.covered_share), format_share(1 - known.reached_share)
-        sentences.append(f"Measured region: {covered} of joint space. Accuracy unknown: {unknown} of it.")
+        sentences.append(
+            f"Measured region: {covered} of joint space. For {unknown} of joint space the accuracy is "
+            "unknown."
+        )
     return [
         Block(Table(["RMS error", "judged on", "before", "after"], rows, 2), has_space=True),
         Block(sentences),
@@ -215,7 +224,8 @@ def _accuracy_rows(comparison: Comparison | None, place: str) -> Iterator[list[s
             format_quantity(side.rms, side.unit, side.rms_std, small=True)
             for side in (comparison.before.groups[group], after)
         ]
-        yield [f"{group} {place}", judged, *cells]
+        name = GROUP_LABELS[group] if group in ("pixels", "board") else group
+        yield [f"{name} {place}", judged, *cells]
 
 
 def _hand_eye_block(fit: Result) -> Block:

@@ -303,6 +303,8 @@ def test_residuals_are_written_with_files_and_lines(run, robot_folder):
     assert "one.csv: 1 outlier (line 25)" in err
     assert [row["line"] for row in table if row["weight"] == "0.0"] == ["25"]
     assert {row["weight"] for row in table if row["set"] == "holdout"} == {""}
+    linear = " ".join(run(*args[:-1], "linear", "--parameters", "dh,base", "--verbose")[2].split())
+    assert "1 outlier (line 25) kept in the fit; --loss auto excludes those far from the others" in linear
     norms = [
         np.linalg.norm([float(row[f"position_{axis}[m]"]) for axis in "xyz"])
         for row in table

@@ -41,7 +41,7 @@ from ..reweighting import Fit
 from .corner_noise import fit_with_corner_noise
 from .jitter import Jitter, estimate_jitter, with_jitter
 from .sets import MAX_POINTS, count_corners
-from .stages import Stage, fitted_error, held_out_error
+from .stages import Stage, fitted_error, format_ratio, held_out_error
 from .target_points import TargetPoints, boards_of, try_target_points, with_free_points
 
 # Number of clusters of joint space that are left out in turn.
@@ -92,9 +92,9 @@ class Gate:
     @property
     def sentence(self) -> str:
         """Why the arm is estimated or kept."""
-        effect = "estimating it changes the error of left-out parts of joint space by the factor"
+        effect = "estimating it changes the error of left-out parts of joint space to"
         if self.is_open:
-            return f"The arm is demonstrably wrong: {effect} {self.ratio:.2f}."
+            return f"The arm is demonstrably wrong: {effect} {format_ratio(self.ratio)}."
         start = "The nominal arm is kept, as the images do not show that the arm is wrong:"
         if self.is_right:
             return f"{start} the noise of the corners explains them with the nominal arm."
@@ -104,8 +104,8 @@ class Gate:
                 f"space; expected at least {2 * N_CLUSTERS}."
             )
         return (
-            f"{start} {effect} {self.ratio:.2f}, not below {self.max_ratio}. Take images in a larger part "
-            "of joint space."
+            f"{start} {effect} {format_ratio(self.ratio)}, not below {format_ratio(self.max_ratio)}. Take "
+            "images in a larger part of joint space."
         )
 
 
@@ -386,11 +386,11 @@ def judge_stages(
 
 
 def _change(before: Stage, after: Stage) -> str:
-    """Say by which factor a stage changes the error of left-out regions; empty if that is unknown."""
+    """Say to which share a stage changes the error of left-out regions; empty if that is unknown."""
     if before.by_region is None or after.by_region is None or not before.by_region.pixels:
         return ""
-    factor = after.by_region.pixels / before.by_region.pixels
-    return f"Estimating them changes the error of left-out parts of joint space by the factor {factor:.2f}."
+    ratio = format_ratio(after.by_region.pixels / before.by_region.pixels)
+    return f"Estimating them changes the error of left-out parts of joint space to {ratio}."
 
 
 def cluster_folds(data: Sequence[Measurement]) -> tuple[Fold, ...]:

@@ -73,6 +73,21 @@ class Stage:
         return out
 
 
+def format_ratio(ratio: float) -> str:
+    """Format an error relative to another one.
+
+    Args:
+        ratio: Ratio of the errors.
+
+    Returns:
+        Per cent, with two digits below 10 %.
+
+    >>> format_ratio(1.138), format_ratio(0.0213)
+    ('114 %', '2.1 %')
+    """
+    return f"{100 * ratio:.0f} %" if ratio >= 0.1 else f"{100 * ratio:.2g} %"
+
+
 def fitted_error(fit: Fit) -> ImageError:
     """Compute the error of the fitted images that are not outliers.
 

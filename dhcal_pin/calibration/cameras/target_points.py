@@ -20,7 +20,7 @@ from ...measurements.camera import CameraCorners
 from ..partition import Fold
 from ..reweighting import Fit
 from .sets import MAX_POINTS
-from .stages import held_out_error
+from .stages import format_ratio, held_out_error
 
 # Largest ratio of the errors of left-out images and clusters for which the corners are estimated.
 MAX_RATIO = 0.9
@@ -48,11 +48,16 @@ class TargetPoints:
     @property
     def sentence(self) -> str:
         """Why the corners are estimated or held."""
-        start = "The corners are not where the rig states them:" if self.is_kept else "They are held:"
+        start = (
+            "The corners are not where the rig states them:"
+            if self.is_kept
+            else "The corners are kept as stated:"
+        )
         return (
-            f"{start} estimating them with all other unknowns changes the error of left-out images by the "
-            f"factor {self.by_image:.2f}, and that of left-out parts of joint space by {self.by_region:.2f}"
-            + ("." if self.is_kept else f", not both below {MAX_RATIO}.")
+            f"{start} estimating them with all other unknowns changes the error of left-out images to "
+            f"{format_ratio(self.by_image)}, and that of left-out parts of joint space to "
+            f"{format_ratio(self.by_region)}"
+            + ("." if self.is_kept else f", not both below {format_ratio(MAX_RATIO)}.")
         )
 
 
