@@ -372,17 +372,18 @@ def _check_repeated_rows(file: MeasurementFile) -> list[str]:
 def _check_repeated_corners(item: CameraCorners) -> list[str]:
     """Return a warning about corners that an image has at several places.
 
-    Several photographs in the same configuration are no mistake: they repeat most corners. Rows that are
-    equal in every digit have their own warning.
+    Several photographs in the same configuration are no mistake: they have different names or, without names,
+    repeat most corners. Rows that are equal in every digit have their own warning.
     """
     own = np.arange(len(item.rows))
-    view = first_equal_rows([item.image, item.board])
+    view = first_equal_rows([item.image, item.board, item.image_names])
     corner = first_equal_rows([view, item.corner])
     is_other_place = first_equal_rows([corner, *item.values.T]) == own
     is_again = is_other_place & (corner < own)
     n_corners = np.bincount(view[corner == own], minlength=len(own))
     n_again = np.bincount(view[np.unique(corner[is_again])], minlength=len(own))
-    is_wrong = is_again & (n_again < _MIN_PHOTOGRAPHED_SHARE * n_corners)[view]
+    is_one_photograph = (item.image_names != "") | (n_again < _MIN_PHOTOGRAPHED_SHARE * n_corners)[view]
+    is_wrong = is_again & is_one_photograph
     if not is_wrong.any():
         return []
     example = int(np.flatnonzero(is_wrong)[0])

@@ -211,6 +211,24 @@ def test_two_photographs_in_one_configuration_give_no_warning(warnings_of, ur10,
         assert warnings_of(ur10, "\n".join([*header, *lines, *again]), rig) == []
 
 
+def test_names_tell_photographs_from_corners_at_two_places(warnings_of, ur10, images):
+    """A second photograph may show one corner only; all corners of one photograph may be there twice."""
+    rig, header, lines = images
+    header = [*header[:-1], f"{header[-1]},image"]
+    named = [f"{line},{number // 6}.png" for number, line in enumerate(lines)]
+    end = len(header) + 1 + len(lines)
+    for again, count in ((lines[:1], 1), (lines[:6], 6)):
+        for name, n_wrong in (("0.png", count), ("other.png", 0)):
+            more = [f"{moved(line, header, 0.05)},{name}" for line in again]
+            found = warnings_of(ur10, "\n".join([*header, *named, *more]), rig)
+            assert len(found) == (n_wrong > 0)
+            if found:
+                assert found[0].startswith(f"line{'s' if n_wrong > 1 else ''} {end}")
+                assert "another place of a corner" in found[0]
+    (copied,) = warnings_of(ur10, "\n".join([*header, *named, f"{lines[0]},other.png"]), rig)
+    assert copied.startswith(f"line {end}: identical")
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_simulated_files_give_no_warnings(warnings_of, ur10, sim_6dof, kind):
     for chain, noise in ((ur10, Noise(1e-4, 1e-4)), (sim_6dof, Noise(1e-3, 1e-3))):
