@@ -416,6 +416,23 @@ def test_the_screen_says_whether_outliers_in_the_fit_do_harm(run, robot_folder):
     assert text in " ".join(err.split())
 
 
+def test_a_camera_frame_without_images_is_refused(assert_refused):
+    words = ["--camera-frame: the measurements have no camera", "--tool-frame NAME"]
+    assert_refused(words, *CALIBRATE, "--camera-frame", "eye")
+
+
+def test_the_screen_names_the_error_of_images(run, robot_folder):
+    assert (
+        run("simulate", "arm.dh.toml", "-m", "30", "--kind", "camera", "--noise", "0.2px", "-o", "a.csv")[0]
+        == 0
+    )
+    err = run(
+        "calibrate", "arm.dh.toml", "a.csv", "--rig", "a.rig.toml", "-o", "out.urdf", "--extend", "none"
+    )[2]
+    assert "image error in the measured region" in " ".join(err.split())
+    assert "pixels in the" not in err
+
+
 def test_images_that_the_hold_out_takes_are_counted(run, assert_refused):
     """Four images of a camera and a board without known poses; three are needed."""
     assert run("simulate", "arm.dh.toml", "-m", "8", "--kind", "camera", "-o", "a.csv")[0] == 0
