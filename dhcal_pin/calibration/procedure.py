@@ -60,6 +60,7 @@ from .cameras import (
     judge_stages,
     judge_target_points,
     reorder,
+    require_joint_values,
     seen_ranges_warning,
     split_sets,
 )
@@ -104,7 +105,8 @@ def calibrate(
         data: One measurement or several of any kinds.
         parameters: Names of parameter sets, keys of `estimation.PARAMETER_SETS` and, for image coordinates,
             of `calibration.cameras.RIG_SETS`; if not given, the chain's own default set, or for image
-            coordinates six errors per joint, cameras, boards and lenses.
+            coordinates six errors per joint, cameras, boards and lenses, without the errors of the joints if
+            the images have poses of the tip in place of joint values.
         method: "lm" (Levenberg-Marquardt), or "gn" for the Gauss-Newton iteration of the paper, which weights
             metres and radians equally.
         priors: "default", "none", or standard deviations by parameter name or pattern on top of the default
@@ -155,6 +157,7 @@ def calibrate(
         chain.validated_q(item.configurations())
     priors = priors if priors is not None else ("none" if method == "gn" else "default")
     robot_sets, rig_sets = split_sets(parameters if parameters is not None else default_sets(chain, data))
+    require_joint_values((*data, *holdout), [*robot_sets, *free])
     data, exchanges = exchange_axes(chain, data)
     holdout = reorder(holdout, exchanges)
     known = {**held_values(data, rig_sets), **_validated_known(data, known or {})}

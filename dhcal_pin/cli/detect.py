@@ -32,8 +32,9 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--joints",
         metavar="FILE",
         help="joint values of each image: a table with a column `image` with the file names and one column "
-        "per joint, or a recording (.bag, .mcap, or the folder of a ROS 2 bag) if the names of the images "
-        "are times such as 1700000000.25.png; without it the output has no joint values",
+        "per joint, or those of the pose of the flange (x[mm],y[mm],z[mm] and qw,qx,qy,qz or "
+        "rx[rad],ry[rad],rz[rad]), or a recording (.bag, .mcap, or the folder of a ROS 2 bag) if the names "
+        "of the images are times such as 1700000000.25.png; without it the output has no joint values",
     )
     parser.add_argument(
         "--joint-topic",

@@ -31,12 +31,12 @@ from typing import Any
 from .._typing import PathLike
 from ..exceptions import DhcalError, FileFormatError, InvalidArgumentError
 from ..io.robot import robot_name
+from ..io.shipped_files import resolve_robot_file
 from ..io.sidecar import sidecar_path
 from ..io.tabular import csv_text
 from ..io.toml_table import TomlTable
 from ..messages import message_line
 from ..parallel import end_with_parent
-from ..ros_packages import resolve_robot_path
 from . import console
 from .job import Job, option_flags
 from .options import STDOUT, IntegerType
@@ -116,7 +116,7 @@ def read_fleet(path: PathLike) -> list[FleetJob]:
                 raise FileFormatError(
                     f"{job_table.where}: {key} is missing; every [[job]] needs robot, data and output"
                 )
-        options["robot"] = resolve_robot_path(options["robot"])
+        options["robot"] = resolve_robot_file(options["robot"])
         job = Job(**options)
         entries.append(FleetJob(str(name or robot_name(job.robot)), job))
     _require_distinct_files(entries, path)

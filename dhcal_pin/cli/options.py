@@ -117,7 +117,7 @@ NON_NEGATIVE_INTEGER = IntegerType(0)
 
 
 def robot_path(text: str) -> str:
-    """Return the path of a robot file; `example:NAME` is a robot of example-robot-data.
+    """Return the path of a robot file; `example:NAME` is a robot of example-robot-data, and some files ship.
 
     Args:
         text: Word of the command line.
@@ -129,10 +129,10 @@ def robot_path(text: str) -> str:
         ArgumentTypeError: There is no such robot.
     """
     from ..exceptions import UnknownNameError  # lazy import, as the following: only for robots
-    from ..ros_packages import resolve_robot_path
+    from ..io.shipped_files import resolve_robot_file
 
     try:
-        return resolve_robot_path(text)
+        return resolve_robot_file(text)
     except UnknownNameError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
 
@@ -142,7 +142,7 @@ def robot_path(text: str) -> str:
 ROBOT: dict[str, Any] = {
     "metavar": "ROBOT",
     "type": robot_path,
-    "help": "robot: {robot_formats}, or example:NAME",
+    "help": "robot: {robot_formats}, or example:NAME; flange.urdf, which ships, is a flange at any pose",
 }
 DATA: dict[str, Any] = {
     "metavar": "DATA",
@@ -267,11 +267,12 @@ def _described(entries: Mapping[str, Any]) -> str:
 
 
 def _parameter_sets() -> str:
-    from ..calibration.cameras import DEFAULT_SETS, RIG_SETS  # lazy import: loads Pinocchio
+    from ..calibration.cameras import DEFAULT_SETS, HAND_EYE_SETS, RIG_SETS  # lazy import: loads Pinocchio
     from ..estimation.parameters import PARAMETER_SETS
 
     images = "; ".join(f"{name} ({text})" for name, text in RIG_SETS.items())
-    return f"{_described(PARAMETER_SETS)}; with --rig, where the default is {DEFAULT_SETS}: {images}"
+    default = f"{DEFAULT_SETS}, or {HAND_EYE_SETS} if poses of the tip stand in place of joint values"
+    return f"{_described(PARAMETER_SETS)}; with --rig, where the default is {default}: {images}"
 
 
 def _error_families() -> str:

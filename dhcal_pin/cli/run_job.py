@@ -22,7 +22,7 @@ import numpy as np
 
 from .._typing import PathLike, Progress
 from ..calibration import model_selection, partition, procedure, summary
-from ..calibration.cameras import default_sets
+from ..calibration.cameras import default_sets, has_joint_values
 from ..calibration.cross_validation import leave_regions_out
 from ..calibration.model_selection import FULL_SET, is_restricted
 from ..calibration.result import Result
@@ -178,7 +178,7 @@ def run_job(
     )
     fit = fit.accepted
     # More parameters are not suggested if the choice was deliberate, or if the columns may be mixed up.
-    is_deliberate = job.method != "lm" or any(restrictions.values())
+    is_deliberate = job.method != "lm" or any(restrictions.values()) or not has_joint_values(measurements)
     if not is_deliberate and not any(data.warnings.values()) and is_restricted(split_commas(sets)):
         suggestion = improvement_hint(fit, chain, measurements, **options)
         data.warnings[job.robot] = [suggestion] if suggestion else []

@@ -190,8 +190,10 @@ def median_radius(points: Array) -> float:
 
 
 def _joint_positions_by_configuration(file: MeasurementFile) -> list[Array]:
-    """Return the joint positions (m, n) of each configuration of a row."""
+    """Return the joint positions (m, n) of each configuration of a row; none of a file without them."""
     data = file.data
+    if isinstance(data, CameraCorners) and not data.has_joint_values:
+        return []
     return np.split(data.configurations(), data.configurations_per_row) if data.configurations_per_row else []
 
 

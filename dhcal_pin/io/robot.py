@@ -25,11 +25,12 @@ from ..robot.chain import Chain
 from ..robot.dh import Convention, DHTable
 from ..robot.urdf import parse_urdf, read_urdf
 from ..robot.urdf_edit import with_origins
-from ..ros_packages import resolve_robot_path, validated_package_dirs
+from ..ros_packages import validated_package_dirs
 from ..saving import complete_interrupted_save, write_files
 from .dh_file import convert_to_dh, read_dh
 from .origins_file import convert_to_origins, joint_origins, without_negligible_moves
 from .robot_format import ConvertedRobot, RobotFormat, RobotSource
+from .shipped_files import resolve_robot_file
 from .sidecar import existing_sidecar, sidecar_path, sidecar_text, with_sidecar
 from .ur_kinematics import convert_to_ur_kinematics, read_ur_kinematics
 
@@ -136,7 +137,7 @@ def _read(
     root: str | None = None,
 ) -> tuple[Chain, DHTable | None]:
     """Read the chain of a robot file and its sidecar, and its DH table if it has one."""
-    path, folders = resolve_robot_path(path), validated_package_dirs(package_dirs)
+    path, folders = resolve_robot_file(path), validated_package_dirs(package_dirs)
     complete_interrupted_save(path)
     robot_format = find_format(path)
     table = None
@@ -171,7 +172,7 @@ def read_robot(
 
     Args:
         path: File in one of `FORMATS`; a file with another ending is read as a URDF. `example:NAME` is a
-            robot of example-robot-data.
+            robot of example-robot-data, and `flange.urdf` a flange at any pose that ships with the package.
         tip: Tip link of a URDF; the deepest leaf if None.
         sidecar: Sidecar to read in place of the one beside the robot.
         package_dirs: Folders in which packages with meshes are searched first.

@@ -1,4 +1,4 @@
-"""Files that ship with the package: the paper's robots and data, and example studies.
+"""Files that ship with the package: the paper's robots and data, a free flange, and example studies.
 
 They are in the folder `urdf` of the source tree, which is installed as the package `dhcal_pin.data`.
 """
@@ -9,7 +9,9 @@ import os
 from importlib import resources
 from pathlib import Path
 
+from .._typing import PathLike
 from ..exceptions import UnknownNameError
+from ..ros_packages import resolve_robot_path
 
 
 def _folders() -> tuple[Path, Path]:
@@ -34,6 +36,26 @@ def shipped_file(name: str) -> Path:
         if os.path.isfile(folder / name):
             return folder / name
     raise UnknownNameError(f"{name}: no such file, and none that ships with dhcal-pin; check its name")
+
+
+def resolve_robot_file(path: PathLike) -> str:
+    """Return the path of a robot file, also for `example:NAME` and for a robot that ships with the package.
+
+    Args:
+        path: Path of a file, `example:NAME`, or the name of a file such as `flange.urdf`, which is looked
+            for in the current folder first.
+
+    Returns:
+        Path of the file, which need not exist.
+
+    Raises:
+        UnknownNameError: There is no robot `NAME` of example-robot-data.
+    """
+    found = resolve_robot_path(path)
+    if os.path.dirname(found) or os.path.exists(found):
+        return found
+    shipped = (os.fspath(folder / found) for folder in _folders() if os.path.isfile(folder / found))
+    return next(shipped, found)
 
 
 def shipped_names(ending: str) -> list[str]:

@@ -51,7 +51,7 @@ _MAX_STALLED_STEPS, _MIN_PROGRESS_RATIO = 10, 0.99
 # A target counts as reached below this error [m and rad].
 REACHED_TOL = 1e-9
 
-# Number of random restarts before `solve_within_limits` gives up, and steps of each.
+# Number of random restarts before `reach_within_limits` gives up, and steps of each.
 _MAX_RESTARTS, _STEPS_PER_START = 100, 60
 
 
@@ -105,7 +105,12 @@ def without_rotary_limits(chain: Chain) -> Chain:
 
 
 def solve_ik(
-    chain: Chain, task_error: TaskError, start: Array, steps: int = 200, samples: Array | None = None
+    chain: Chain,
+    task_error: TaskError,
+    start: Array,
+    steps: int = 200,
+    samples: Array | None = None,
+    min_damping: float = _MIN_DAMPING,
 ) -> tuple[Array, Array]:
     """Minimize task errors within the joint limits, starting from given joint positions.
 
@@ -116,6 +121,7 @@ def solve_ik(
         steps: Maximum number of steps.
         samples: Numbers by which `task_error` identifies the rows of `start`, shape (m,); 0 to m-1 by
             default.
+        min_damping: Damping λ_min near singularities [m²].
 
     Returns:
         Joint positions, shape (m, n) [rad or m], and norms of the task errors, shape (m,) [m].
@@ -135,7 +141,7 @@ def solve_ik(
         if not active.size:
             break
         trial, jacobian = q[active], jacobians[active]
-        total_damping = _MIN_DAMPING + damping[active] * norms[active] ** 2
+        total_damping = min_damping + damping[active] * norms[active] ** 2
         step = _damped_step(jacobian, errors[active], total_damping)
         at_limit = ((trial <= chain.lower) & (step < 0)) | ((trial >= chain.upper) & (step > 0))
         if at_limit.any():
@@ -226,6 +232,41 @@ def wrap_into_limits(chain: Chain, q: Array, near: Array | float = 0.0) -> tuple
     return q, np.all((q >= chain.lower) & (q <= chain.upper), -1)
 
 
+def reach_within_limits(
+    chain: Chain, task_error: TaskError, start: Array, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Find joint positions that bring every task error as near to zero as the arm can, from several starts.
+
+    Args:
+        chain: Kinematic chain with base and tool.
+        task_error: Task errors of the samples, which are the rows of `start`.
+        start: Initial joint positions, shape (m, n) [rad or m].
+        rng: Random generator for further starts of samples that are not solved within the limits.
+
+    Returns:
+        Joint positions, shape (m, n) [rad or m], within the limits if possible, and norms of the task errors,
+        shape (m,) [m].
+    """
+    unlimited = without_rotary_limits(chain)
+    out, least, within_limits = start.copy(), np.full(len(start), np.inf), np.zeros(len(start), bool)
+    starts, remaining = start, np.arange(len(start))
+    for _ in range(_MAX_RESTARTS):
+        q, norms = solve_ik(unlimited, task_error, starts, _STEPS_PER_START, remaining)
+        q, is_allowed = wrap_into_limits(chain, q)
+        is_reached, was_reached = norms <= REACHED_TOL, least[remaining] <= REACHED_TOL
+        # A solution beyond the limits is replaced by a later one within the limits.
+        improved = np.where(was_reached, is_reached & is_allowed, norms < least[remaining])
+        out[remaining[improved]], least[remaining[improved]] = q[improved], norms[improved]
+        within_limits[remaining] |= is_reached & is_allowed
+        remaining = np.flatnonzero(~within_limits)
+        if not remaining.size:
+            break
+        starts = start[rng.integers(0, len(start), len(remaining))] + rng.uniform(
+            -1, 1, (len(remaining), chain.n_joints)
+        )
+    return out, least
+
+
 def solve_within_limits(chain: Chain, task_error: TaskError, start: Array, rng: np.random.Generator) -> Array:
     """Find joint positions that bring every task error to zero, within the joint limits if possible.
 
@@ -241,26 +282,10 @@ def solve_within_limits(chain: Chain, task_error: TaskError, start: Array, rng: 
     Raises:
         ConvergenceError: The task error of a sample remains.
     """
-    unlimited = without_rotary_limits(chain)
-    out, solved, within_limits = start.copy(), np.zeros(len(start), bool), np.zeros(len(start), bool)
-    starts, remaining = start, np.arange(len(start))
-    for _ in range(_MAX_RESTARTS):
-        q, norms = solve_ik(unlimited, task_error, starts, _STEPS_PER_START, remaining)
-        q, is_allowed = wrap_into_limits(chain, q)
-        # A solution beyond the limits is replaced by a later one within the limits.
-        improved = (norms <= REACHED_TOL) & (is_allowed | ~solved[remaining])
-        out[remaining[improved]] = q[improved]
-        solved[remaining] |= improved
-        within_limits[remaining] |= improved & is_allowed
-        remaining = np.flatnonzero(~within_limits)
-        if not remaining.size:
-            break
-        starts = start[rng.integers(0, len(start), len(remaining))] + rng.uniform(
-            -1, 1, (len(remaining), chain.n_joints)
-        )
-    if not solved.all():
+    q, errors = reach_within_limits(chain, task_error, start, rng)
+    n_missed = np.sum(errors > REACHED_TOL)
+    if n_missed:
         raise ConvergenceError(
-            f"{np.sum(~solved)} of {len(start)} targets are out of reach of this arm; "
-            "choose other joint positions"
+            f"{n_missed} of {len(start)} targets are out of reach of this arm; choose other joint positions"
         )
-    return out
+    return q

@@ -8,12 +8,23 @@ from .axis_order import axis_stages, exchange_axes, reorder
 from .diagnosis import HandEyeDiagnosis, diagnose_hand_eye
 from .gate import apply_gate, has_arm, judge_stages, judge_target_points
 from .seen_ranges import seen_ranges_warning
-from .sets import DEFAULT_SETS, RIG_SETS, default_sets, has_images, held_values, split_sets
+from .sets import (
+    DEFAULT_SETS,
+    HAND_EYE_SETS,
+    RIG_SETS,
+    default_sets,
+    has_images,
+    has_joint_values,
+    held_values,
+    require_joint_values,
+    split_sets,
+)
 from .stages import STAGES, ImageError, Stage
 from .target_points import judged_boards
 
 __all__ = [
     "DEFAULT_SETS",
+    "HAND_EYE_SETS",
     "RIG_SETS",
     "STAGES",
     "HandEyeDiagnosis",
@@ -26,11 +37,13 @@ __all__ = [
     "exchange_axes",
     "has_arm",
     "has_images",
+    "has_joint_values",
     "held_values",
     "judge_stages",
     "judge_target_points",
     "judged_boards",
     "reorder",
+    "require_joint_values",
     "seen_ranges_warning",
     "split_sets",
 ]

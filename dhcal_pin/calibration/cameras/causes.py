@@ -11,6 +11,8 @@ changes one of them:
 - `joint offsets`: the zeros of the joints differ from the nominal ones;
 - `arm geometry`: joint offsets and all link frames differ from the nominal ones.
 
+The last two need joint values; they are not tried if the images have poses of the tip instead.
+
 Causes can be combined. The model of some causes is fitted to the same images as that of none.
 """
 

@@ -49,7 +49,7 @@ from .causes import (
     fit_causes,
 )
 from .gate import residual_jitter
-from .sets import MAX_POINTS, count_corners
+from .sets import MAX_POINTS, count_corners, has_joint_values
 from .stages import ImageError, fitted_error, held_out_error, held_out_prediction_std
 
 # Displacements that all corners of an image share and that no cause explains.
@@ -452,7 +452,7 @@ def _try_causes(hand_eye: HandEyeData, state: _State) -> dict[str, _State]:
         attempt(LENS, replace(causes, has_lens=True))
     if not causes.has_points and count_corners(hand_eye.data) <= MAX_POINTS:
         attempt(CORNERS, replace(causes, has_points=True))
-    for name, sets in ARM_SETS.items():
+    for name, sets in ARM_SETS.items() if has_joint_values(hand_eye.data) else ():
         if len(sets) > len(causes.arm):
             attempt(name, replace(causes, arm=sets))
     least = min((each.error.pixels for each in out.values()), default=np.inf)

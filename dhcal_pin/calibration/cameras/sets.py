@@ -21,6 +21,8 @@ RIG_SETS = {
 }
 # Sets that are estimated by default from image coordinates.
 DEFAULT_SETS = "placement,offset,camera,board,intrinsics"
+# Sets that are estimated by default from images of which only the pose of the tip is known.
+HAND_EYE_SETS = "camera,board,intrinsics"
 # Largest number of corners of all boards that are estimated to judge whether boards are as stated.
 MAX_POINTS = 150
 
@@ -55,9 +57,46 @@ def default_sets(chain: Chain, data: Sequence[Measurement]) -> str:
         data: Measurements.
 
     Returns:
-        Sets of the chain; with image coordinates, those of robot and rig.
+        Sets of the chain; with image coordinates, those of robot and rig, or of the rig alone if there are
+        no joint values.
     """
-    return DEFAULT_SETS if has_images(data) else chain.parameters
+    if not has_images(data):
+        return chain.parameters
+    return DEFAULT_SETS if has_joint_values(data) else HAND_EYE_SETS
+
+
+def has_joint_values(data: Sequence[Measurement]) -> bool:
+    """Return whether the joint positions of all images were measured, rather than poses of the tip.
+
+    Args:
+        data: Measurements.
+    """
+    return all(item.has_joint_values for item in data if isinstance(item, CameraCorners))
+
+
+def require_joint_values(data: Sequence[Measurement], names: Sequence[str]) -> None:
+    """Check that parameters of the robot are estimated from joint values only.
+
+    Args:
+        data: Measurements.
+        names: Sets and parameters of the robot that are estimated.
+
+    Raises:
+        InvalidArgumentError: Images have poses of the tip in place of joint values.
+    """
+    if has_joint_values(data):
+        return
+    if names:
+        raise InvalidArgumentError(
+            f"parameters {names[0]!r}: need joint values, and the images have poses of the tip instead; "
+            f"expected {HAND_EYE_SETS}, or joint values"
+        )
+    others = sorted({item.kind for item in data if not isinstance(item, CameraCorners)})
+    if others:
+        raise InvalidArgumentError(
+            f"measurements of kind {others[0]} beside images with poses of the tip: they need joint values; "
+            "expected images alone, or joint values"
+        )
 
 
 def held_values(data: Sequence[Measurement], sets: Sequence[str]) -> dict[str, float]:

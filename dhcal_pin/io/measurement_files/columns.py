@@ -3,7 +3,7 @@
 A column is a joint of the robot, a value column of a measurement kind, or an auxiliary column. The header
 alone selects the kind: of all kinds whose required columns are present, the one with the most required
 columns, and among those the one with the fewest columns in all. A rotation can be given as a quaternion in
-place of a rotation vector.
+place of a rotation vector. Image coordinates may have the columns of a pose in place of those of the joints.
 
 Other columns are ignored if they cannot be meant as a joint or a measured value: times, counters, texts, and
 quantities other than lengths and angles. Any other unknown column is an error, as it may be misspelt.
@@ -20,6 +20,7 @@ import numpy as np
 from ...exceptions import FileFormatError, UnknownNameError
 from ...measurements import KINDS
 from ...measurements.base import Measurement
+from ...measurements.camera import CameraCorners
 from ...robot.chain import Chain
 from ...units import ANGLES, LENGTHS
 from ..tables import Column, DataTable
@@ -31,6 +32,8 @@ ROTVEC = ("rx", "ry", "rz")
 # the reachability check and the judgement of a compensation, and are never fitted.
 COMMANDED = ("commanded_x", "commanded_y", "commanded_z")
 AFTER = ("after_x", "after_y", "after_z")
+# Pose of the tip, which image coordinates may have in place of the values of all joints.
+TOOL_POSE = ("x", "y", "z", *ROTVEC)
 # Prefix of a joint's name in the columns of the second configuration of a row.
 SECOND_PREFIX = "to:"
 
@@ -140,6 +143,8 @@ def needs_column_map(table: DataTable, chain: Chain) -> bool:
     """
     if table.has_numbers_as_header:
         return True
+    if has_tool_poses(table):
+        return False
     names = set(table.columns)
     joints = {prefix + joint for joint in chain.joint_names for prefix in ("", SECOND_PREFIX)}
     n_unknown = len(names - known_columns(chain))
@@ -226,6 +231,22 @@ def _suggestions(name: str, known: Iterable[str], present: Iterable[str]) -> lis
     return sorted({other for other, ratio in similarity.items() if ratio == best} - set(present))
 
 
+def _present_values(table: DataTable) -> set[str]:
+    """Return the names of the columns of measured values, with a rotation vector in place of a quaternion."""
+    present = set(table.columns) & VALUE_COLUMNS
+    return present - set(QUATERNION) | set(ROTVEC) if present & set(QUATERNION) else present
+
+
+def has_tool_poses(table: DataTable) -> bool:
+    """Return whether a file has image coordinates and poses of the tip.
+
+    Args:
+        table: Table of a measurement file.
+    """
+    present = _present_values(table)
+    return present.issuperset(TOOL_POSE) and any(map(present.issuperset, CameraCorners.required_columns))
+
+
 def find_kind(table: DataTable) -> type[Measurement]:
     """Find the measurement kind of a file from its columns.
 
@@ -238,9 +259,9 @@ def find_kind(table: DataTable) -> type[Measurement]:
     Raises:
         FileFormatError: The columns of no kind are complete, or a column does not belong to the kind.
     """
-    present = set(table.columns) & VALUE_COLUMNS
-    if present & set(QUATERNION):
-        present = present - set(QUATERNION) | set(ROTVEC)
+    present = _present_values(table)
+    if has_tool_poses(table):
+        present -= set(TOOL_POSE)
     candidates = [
         (len(required), -len(kind.columns), kind)
         for kind in KINDS.values()

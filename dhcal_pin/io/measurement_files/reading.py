@@ -1,7 +1,8 @@
 """Reading of measurement files: tables of joint positions and measured values.
 
 The joints are columns under their URDF names, and the measured values are columns whose names select the
-measurement kind (see `columns`). Every length and angle carries its unit in brackets. A table can come from a
+measurement kind (see `columns`). Image coordinates may have the pose of the tip in place of the joints (see
+`tool_poses`). Every length and angle carries its unit in brackets. A table can come from a
 text file, an Excel workbook, a Parquet file or a data frame (see the package `tables`). Files of other makers
 are read through a column map (see `column_map`).
 
@@ -25,6 +26,7 @@ from ..._typing import Array, PathLike
 from ...exceptions import DhcalError, FileFormatError, SampleError
 from ...measurements.base import Measurement
 from ...measurements.mounting import MountedRig
+from ...measurements.pose import Pose
 from ...robot.chain import Chain
 from ...units import LENGTHS, UNITS
 from ..tables import Column, DataTable, format_lines, read_table
@@ -34,14 +36,17 @@ from .columns import (
     QUATERNION,
     ROTVEC,
     SECOND_PREFIX,
+    TOOL_POSE,
     check_columns,
     check_joint_names,
     find_kind,
+    has_tool_poses,
     joint_units,
     joints_off_the_chain,
     known_columns,
     needs_column_map,
 )
+from .tool_poses import solve_tool_poses
 
 # Smallest accepted standard deviation [m or rad]; no instrument is as accurate.
 _MIN_SIGMA = 1e-15
@@ -181,14 +186,20 @@ def parse_measurements(
         raise missing_header_error(table, chain)
     ignored = check_columns(table, chain)
     kind = find_kind(table)
-    prefixes = ("", SECOND_PREFIX)[: kind.configurations_per_row]
+    has_poses = has_tool_poses(table)
+    prefixes = () if has_poses else ("", SECOND_PREFIX)[: kind.configurations_per_row]
     for prefix in prefixes:
         _require_joints(table, chain, prefix)
     table = _usable_rows(table, chain, kind, prefixes, skip_bad_rows)
     values = parse_values(table, kind)
     _require_all_sigmas(table, kind, values)
     q = [parse_joint_positions(table, chain, prefix) for prefix in prefixes]
-    data = build_measurement(table, kind, q or [np.zeros((len(table.lines), chain.n_joints))], values, rig)
+    placeholder = np.zeros((len(table.lines), chain.n_joints))
+    data = build_measurement(table, kind, q or [placeholder], values, rig)
+    if has_poses:
+        tips = parse_values(table, Pose)
+        data = data.replace(q=solve_tool_poses(table, chain, tips), has_joint_values=False)
+        values |= tips
     is_holdout = _parse_holdout_mask(table)
     return MeasurementFile(
         source=table.source,
@@ -241,7 +252,11 @@ def _usable_rows(
 ) -> DataTable:
     """Return the table without the rows that lack a number or a name, or raise an error that names them."""
     joints = [prefix + name for prefix in prefixes for name in chain.joint_names]
-    quantities = {**kind.columns, **dict.fromkeys((*QUATERNION, *COMMANDED, *AFTER), ""), "set": "text"}
+    quantities = {
+        **kind.columns,
+        **dict.fromkeys((*TOOL_POSE, *QUATERNION, *COMMANDED, *AFTER), ""),
+        "set": "text",
+    }
     texts = {name for name, quantity in quantities.items() if quantity == "text"}
     needed = [name for name, quantity in quantities.items() if quantity != "remark"]
     used = [name for name in (*joints, *needed) if name in table.columns]
@@ -345,7 +360,7 @@ def parse_values(table: DataTable, kind: type[Measurement]) -> dict[str, Any]:
             raise FileFormatError(
                 f"{table.cell_location(values[name].index(''), name)} is empty; correct or remove the row"
             )
-    if set(QUATERNION) & set(table.columns):
+    if set(ROTVEC) <= set(kind.columns) and set(QUATERNION) & set(table.columns):
         if set(ROTVEC) & set(table.columns):
             raise FileFormatError(f"{table.header_location}: both qw… and rx… given; keep one rotation")
         rotvec = se3.log3(_parse_quaternion(table))
