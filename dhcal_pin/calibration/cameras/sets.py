@@ -75,7 +75,7 @@ def has_joint_values(data: Sequence[Measurement]) -> bool:
 
 
 def require_joint_values(data: Sequence[Measurement], names: Sequence[str]) -> None:
-    """Check that parameters of the robot are estimated from joint values only.
+    """Check that parameters of the arm, other than base and tool, are estimated from joint values only.
 
     Args:
         data: Measurements.
@@ -86,9 +86,10 @@ def require_joint_values(data: Sequence[Measurement], names: Sequence[str]) -> N
     """
     if has_joint_values(data):
         return
-    if names:
+    arm = [name for name in names if name not in ("base", "tool")]
+    if arm:
         raise InvalidArgumentError(
-            f"parameters {names[0]!r}: need joint values, and the images have poses of the tip instead; "
+            f"parameters {arm[0]!r}: need joint values, and the images have poses of the tip instead; "
             f"expected {HAND_EYE_SETS}, or joint values"
         )
     others = sorted({item.kind for item in data if not isinstance(item, CameraCorners)})
