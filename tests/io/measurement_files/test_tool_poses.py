@@ -219,7 +219,7 @@ def test_cameras_boards_and_lenses_are_estimated_by_default(by_pose):
 
 
 def test_validation_finds_a_moved_base(by_pose):
-    """`dhcal validate` asks whether base and tool are those of another set-up, which needs no joint values."""
+    """A validation asks whether base and tool are those of another set-up, which needs no joint values."""
     setup, file = by_pose
     known = {p.name: p.nominal for p in setup.exact.instrument_parameters}
     known = {p.name: known[p.name] for p in file.data.instrument_parameters}
