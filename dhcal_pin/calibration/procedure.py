@@ -49,11 +49,14 @@ from ..robot.chain import BASE_FRAME, Chain
 from . import model_selection
 from .cameras import (
     DEFAULT_SETS,
+    LARGE_ERROR,
+    HandEyeFit,
     apply_gate,
     axis_stages,
     default_sets,
-    diagnose_hand_eye,
     exchange_axes,
+    find_board_size,
+    fitted_error,
     has_arm,
     has_images,
     held_values,
@@ -63,6 +66,7 @@ from .cameras import (
     require_joint_values,
     seen_ranges_warning,
     split_sets,
+    without_arm,
 )
 from .cross_validation import leave_regions_out
 from .model_selection import Extension
@@ -190,13 +194,14 @@ def calibrate(
             extension = Extension(temperature=gate.temperature, n_configurations=gate.n_configurations)
             result = _make_result(fit, 1.0, holdout, method)
             warnings = [exchange.sentence for exchange in exchanges]
-            is_hand_eye = not has_arm(errors)
-            if not is_hand_eye:
+            if has_arm(errors):
                 warning = seen_ranges_warning(chain, fit.data) if gate.is_open else gate.sentence
                 warnings += [warning] if warning else []
-            if is_hand_eye:
-                diagnosis = diagnose_hand_eye(ungated, result.pose_std, holdout)
-                result = replace(result, hand_eye=diagnosis)
+            if gate.is_open and fitted_error(fit).pixels < LARGE_ERROR:
+                result = replace(result, board_size=find_board_size(ungated))
+            else:
+                frames = without_arm(ungated, max_iterations) if has_arm(errors) else ungated
+                result = replace(result, hand_eye_fit=HandEyeFit(frames, result.pose_std, holdout))
             return replace(
                 result,
                 extension=extension,

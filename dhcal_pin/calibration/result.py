@@ -49,7 +49,8 @@ from ..plausibility.mixups import Diagnosis, diagnose_mixups
 from ..result_plots import ResultPlots
 from ..robot.chain import Chain
 from . import summary
-from .cameras.diagnosis import HandEyeDiagnosis
+from .cameras.board_size import BoardSize
+from .cameras.diagnosis import HandEyeDiagnosis, HandEyeFit
 from .cameras.stages import Stage
 from .cross_validation import (
     FoldComparison,
@@ -120,8 +121,9 @@ class Result(ResultPlots):
             was tried.
         camera_stages: Unknowns of a calibration from images that were freed in turn, and what each group of
             them improved; empty without images.
-        hand_eye: Error of a hand-eye calibration and its likely cause; None if the arm is calibrated along,
-            without images, and with fewer than five configurations.
+        hand_eye_fit: Fit of cameras and boards on the nominal arm; None if the calibrated arm fits the
+            images, and without images.
+        board_size: Other size of the boards that makes the correction of the arm far smaller, if any.
     """
 
     errors: ErrorModel
@@ -139,7 +141,8 @@ class Result(ResultPlots):
     input_warnings: tuple[str, ...] = ()
     decision: Verdict | None = None
     camera_stages: tuple[Stage, ...] = ()
-    hand_eye: HandEyeDiagnosis | None = None
+    hand_eye_fit: HandEyeFit | None = None
+    board_size: BoardSize | None = None
 
     @property
     def model(self) -> pin.Model:
@@ -245,6 +248,14 @@ class Result(ResultPlots):
     def verdict(self) -> Verdict:
         """Whether the calibrated robot may be used, with the reasons."""
         return self._verdict
+
+    @property
+    def hand_eye(self) -> HandEyeDiagnosis | None:
+        """Error of cameras and boards on the nominal arm and its likely cause.
+
+        None if the calibrated arm fits the images, without images, and with fewer than five configurations.
+        """
+        return self.hand_eye_fit.diagnosis if self.hand_eye_fit else None
 
     @cached_property
     def _verdict(self) -> Verdict:

@@ -126,13 +126,13 @@ def judge(fit: Result) -> Verdict:
     """
     findings = _unmoved_joints(fit)
     if not any(finding.status == "refused" for finding in findings):
-        findings += _mixups(fit.diagnosis)
+        findings += [*_mixups(fit.diagnosis), *_board_size(fit)]
     if not any(finding.status == "refused" for finding in findings):
         # A mistake in the measurements explains all of these.
         findings += [
-            *_convergence(fit),
             *_implausible_correction(fit),
             *(_implausible_errors(fit) or _hand_eye_error(fit)),
+            *_convergence(fit),
             *_hand_eye_images(fit),
             *_held_out_errors(fit),
             *_few_measurements(fit),
@@ -169,6 +169,11 @@ def _mixups(diagnosis: Diagnosis) -> list[Finding]:
     return [Finding("refused", f"{diagnosis.sentence} {diagnosis.remedy}")]
 
 
+def _board_size(fit: Result) -> list[Finding]:
+    """Refuse an arm whose lengths follow from a wrong size of the boards."""
+    return [Finding("refused", fit.board_size.sentence)] if fit.board_size else []
+
+
 def _convergence(fit: Result) -> list[Finding]:
     """Refuse a fit that did not converge: its values are those of an arbitrary last step."""
     if fit.converged:
@@ -202,8 +207,10 @@ def _implausible_errors(fit: Result) -> list[Finding]:
         rms = format_quantity(after.rms, after.unit, after.rms_std, small=True)
         text = f"The fit leaves an RMS {GROUP_LABELS[group]} of {rms}"
         # With fewer parameters than the robot has errors, the robot is better than before, but not good.
-        is_restricted = fit.diagnosis.is_explained and not _missing_frames(fit)
+        is_restricted = not fit.camera_stages and fit.diagnosis.is_explained and not _missing_frames(fit)
         status: Status = "refused" if error > MAX_ERROR[after.unit] and not is_restricted else "caution"
+        if fit.hand_eye is not None and fit.hand_eye.causes:
+            return [Finding(status, f"{fit.hand_eye.error_sentence}{fit.hand_eye.likely}")]
         return [Finding(status, f"{text}. {_plausible_cause(fit)}")]
     return []
 
@@ -245,8 +252,11 @@ def _missing_frames(fit: Result) -> list[str]:
 
 def _plausible_cause(fit: Result) -> str:
     """Name the most plausible cause of an implausible result."""
-    if fit.hand_eye is not None and fit.hand_eye.causes:
-        return f"{fit.hand_eye.error_sentence}{fit.hand_eye.likely}"
+    if fit.camera_stages:
+        return (
+            "Check the links of cameras and boards in the rig file, units, signs and order of the joints, "
+            "the joint values of each image, and size, rows and columns of the boards."
+        )
     if fit.diagnosis.is_explained:
         if missing := _missing_frames(fit):
             verb = "are" if len(missing) > 1 else "is"

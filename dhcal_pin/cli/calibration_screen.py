@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from ..calibration.cameras import split_sets
+from ..calibration.cameras import has_arm, split_sets
 from ..calibration.estimates import Estimate
 from ..calibration.evaluation import Comparison
 from ..calibration.result import Result
@@ -207,9 +207,16 @@ def _accuracy_blocks(fit: Result) -> list[Block]:
             "unknown."
         )
     return [
-        Block(Table(["RMS error", "judged on", "before", "after"], rows, 2), has_space=True),
+        Block(
+            Table(["RMS error", "judged on", "before", "after"], rows, 2),
+            noun="figure",
+            rank=7,
+            n_kept=len(rows),
+            has_space=True,
+        ),
         Block(sentences),
-        Block(regressions(fit.comparisons), "yellow"),
+        # Without estimated errors of the arm, the calibrated arm is the nominal one.
+        Block(regressions(fit.comparisons) if has_arm(fit.errors) else [], "yellow"),
     ]
 
 

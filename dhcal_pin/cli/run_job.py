@@ -182,7 +182,8 @@ def run_job(
     if not is_deliberate and not any(data.warnings.values()) and is_restricted(split_commas(sets)):
         suggestion = improvement_hint(fit, chain, measurements, **options)
         data.warnings[job.robot] = [suggestion] if suggestion else []
-    for path, texts in poorly_fitted_files(fit.chain, data.fit, fit.instruments).items():
+    fitted = dict(zip(data.fit, fit.data, strict=True))
+    for path, texts in poorly_fitted_files(fit.chain, fitted, fit.instruments).items():
         # A warning about the columns of a file already explains a poor fit.
         data.warnings[path] += texts if not data.warnings[path] else []
     hint = _family_hint(fit, data, sets, job)

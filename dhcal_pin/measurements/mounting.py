@@ -6,7 +6,7 @@ them, directly or by a link that no joint moves against it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -48,6 +48,23 @@ class MountedRig:
     camera_mounts: tuple[Mount, ...]
     board_mounts: tuple[Mount, ...]
     source: str = ""
+
+    @property
+    def has_links_to_exchange(self) -> bool:
+        """Whether all cameras are on one end of the chain, and all boards on the other."""
+        cameras, boards = (
+            {mount.moves for mount in each} for each in (self.camera_mounts, self.board_mounts)
+        )
+        return len(cameras) == len(boards) == 1 and cameras != boards
+
+    def with_exchanged_links(self) -> MountedRig:
+        """Return the rig with cameras on the link of the first board, boards on that of the first camera."""
+        camera, board = self.camera_mounts[0], self.board_mounts[0]
+        return replace(
+            self,
+            camera_mounts=(board,) * len(self.cameras),
+            board_mounts=(camera,) * len(self.boards),
+        )
 
     def camera_in_end(self, camera: int) -> Array:
         """Return the pose of a camera in the frame of its end, shape (4, 4) [m].

@@ -5,8 +5,9 @@ which of these parameters are unknown, and in which order they are freed.
 """
 
 from .axis_order import axis_stages, exchange_axes, reorder
-from .diagnosis import HandEyeDiagnosis, diagnose_hand_eye
-from .gate import apply_gate, has_arm, judge_stages, judge_target_points
+from .board_size import BoardSize, find_board_size
+from .diagnosis import LARGE_ERROR, HandEyeDiagnosis, HandEyeFit
+from .gate import apply_gate, has_arm, judge_stages, judge_target_points, without_arm
 from .seen_ranges import seen_ranges_warning
 from .sets import (
     DEFAULT_SETS,
@@ -19,22 +20,26 @@ from .sets import (
     require_joint_values,
     split_sets,
 )
-from .stages import STAGES, ImageError, Stage
+from .stages import STAGES, ImageError, Stage, fitted_error
 from .target_points import judged_boards
 
 __all__ = [
     "DEFAULT_SETS",
     "HAND_EYE_SETS",
+    "LARGE_ERROR",
     "RIG_SETS",
     "STAGES",
+    "BoardSize",
     "HandEyeDiagnosis",
+    "HandEyeFit",
     "ImageError",
     "Stage",
     "apply_gate",
     "axis_stages",
     "default_sets",
-    "diagnose_hand_eye",
     "exchange_axes",
+    "find_board_size",
+    "fitted_error",
     "has_arm",
     "has_images",
     "has_joint_values",
@@ -46,4 +51,5 @@ __all__ = [
     "require_joint_values",
     "seen_ranges_warning",
     "split_sets",
+    "without_arm",
 ]

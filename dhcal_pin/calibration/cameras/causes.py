@@ -1,10 +1,12 @@
-"""Models of what can be wrong with a hand-eye calibration: arm, board, lens, or pairing of the images.
+"""Models of what can be wrong with a hand-eye calibration: arm, board, lens, links, or pairing of the images.
 
 A hand-eye calibration holds the arm, the boards and the lenses, and estimates poses only. Each cause frees or
 changes one of them:
 
 - `pairing`: an image belongs to the joint values of another row, earlier or later by a number of rows, or to
   values between two rows;
+- `links`: the rig states the link of the camera for the board, and that of the board for the camera: a camera
+  on the wrist for a fixed one, or the other way round;
 - `board size`: all lengths of a board have one factor;
 - `lens`: focal lengths, image centre and distortion differ from those of the rig;
 - `board corners`: each corner of a board is displaced;
@@ -36,8 +38,9 @@ from ...measurements.camera import CameraCorners
 from ..reweighting import Fit, reweight
 
 # Causes, and parameter sets of those of the arm. Those with fewer unknowns come first.
-PAIRING, SIZE, LENS, CORNERS, OFFSETS, GEOMETRY = (
+PAIRING, LINKS, SIZE, LENS, CORNERS, OFFSETS, GEOMETRY = (
     "pairing",
+    "links",
     "board size",
     "lens",
     "board corners",
@@ -70,6 +73,7 @@ class Causes:
         has_points: Whether the corners of the boards are estimated.
         sizes: Size of each board relative to the stated one, by name.
         shift: Number of rows by which the joint values are shifted; 0.5 is the mean of two rows.
+        has_exchanged_links: Whether cameras and boards are on each other's links.
     """
 
     arm: str = ""
@@ -77,6 +81,7 @@ class Causes:
     has_points: bool = False
     sizes: Mapping[str, float] = field(default_factory=dict)
     shift: float = 0.0
+    has_exchanged_links: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,8 +125,12 @@ def apply_causes(hand_eye: HandEyeData, causes: Causes, item: CameraCorners) -> 
         )
     if causes.has_points:
         boards = tuple(replace(board, has_free_points=True) for board in boards)
-    if cameras is not item.rig.cameras or boards is not item.rig.boards:
-        item = item.with_rig(replace(item.rig, cameras=cameras, boards=boards))
+    rig = item.rig
+    if cameras is not rig.cameras or boards is not rig.boards:
+        rig = replace(rig, cameras=cameras, boards=boards)
+    if causes.has_exchanged_links:
+        rig = rig.with_exchanged_links()
+    item = item if rig is item.rig else item.with_rig(rig)
     return _shifted(item, hand_eye.sequence, causes.shift) if causes.shift else item
 
 
@@ -231,7 +240,7 @@ def find_sizes(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float]
             own = sizes | {name: float(np.exp(log_size))}
             return _cost(hand_eye, replace(causes, sizes=own), start)
 
-        found = _minimum(cost, float(np.log(sizes[name])), SIZE_STEP, MAX_SIZE_STEP)
+        found = find_minimum(cost, float(np.log(sizes[name])), SIZE_STEP, MAX_SIZE_STEP)
         sizes[name] = float(np.exp(found))
     return sizes
 
@@ -252,7 +261,7 @@ def find_shift(hand_eye: HandEyeData, causes: Causes) -> float:
     best = min(costs, key=lambda shift: costs[shift])
     if not best or costs[best] > MAX_SHIFT_COST * costs[0.0]:
         return 0.0
-    found = _minimum(
+    found = find_minimum(
         lambda shift: _cost(hand_eye, replace(causes, shift=shift), None), best, _SHIFT_STEP, 0.5
     )
     return best if best.is_integer() and abs(found - best) < MAX_WHOLE_DIFFERENCE else found
@@ -267,8 +276,18 @@ def _cost(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float] | No
     return fit.solution.system.cost / sum(len(item.rows) for item in fit.data)
 
 
-def _minimum(cost: Callable[[float], float], start: float, step: float, max_step: float) -> float:
-    """Return the minimum of a function by parabolas through three of its values."""
+def find_minimum(cost: Callable[[float], float], start: float, step: float, max_step: float) -> float:
+    """Find a minimum of a function by parabolas through three of its values.
+
+    Args:
+        cost: Function.
+        start: Start of the search.
+        step: Distance of the first values.
+        max_step: Largest step.
+
+    Returns:
+        Place of the minimum.
+    """
     x, middle = start, cost(start)
     for _ in range(_N_ROUNDS):
         left, right = cost(x - step), cost(x + step)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,7 @@ from .causes import (
     CORNERS,
     GEOMETRY,
     LENS,
+    LINKS,
     OFFSETS,
     PAIRING,
     SIZE,
@@ -61,6 +63,9 @@ MAX_NOISE_RATIO = 1.5
 MAX_ERROR_SHARE, MAX_TIE_RATIO = 0.8, 1.15
 # Errors of images above this are those of wrong joint values rather than of arm, board or lens [px].
 LARGE_ERROR = 10.0
+# Largest error of left-out images with exchanged links, as a fraction of the size of the image: links do not
+# explain images that are paired with wrong joint values.
+MAX_LINKS_ERROR = 0.05
 # Correction of the arm in multiples of manufacturing errors above which the arm is no plausible cause.
 MAX_ARM_CORRECTION = 6.0
 # The error of left-out images is that of one step of the fit. Above this multiple of the error of fitted
@@ -237,6 +242,26 @@ def _error_dict(error: ImageError) -> dict[str, Any]:
 
 
 # ---------------------------------------------------------------------------------------------- diagnosis
+@dataclass(frozen=True, eq=False)
+class HandEyeFit:
+    """Poses of cameras and boards on the nominal arm, and what their diagnosis needs.
+
+    Attributes:
+        fit: Fit of the poses with the nominal arm; only base and tool of the robot may be unknown.
+        position_std: Largest standard deviation of the position of a camera or a board [m].
+        holdout: Held-out images, for the order of all images.
+    """
+
+    fit: Fit
+    position_std: float
+    holdout: tuple[Measurement, ...]
+
+    @cached_property
+    def diagnosis(self) -> HandEyeDiagnosis | None:
+        """Likely cause of the error, on first use; None with fewer than five configurations."""
+        return diagnose_hand_eye(self.fit, self.position_std, self.holdout)
+
+
 def diagnose_hand_eye(
     fit: Fit, position_std: float, holdout: Sequence[Measurement] = ()
 ) -> HandEyeDiagnosis | None:
@@ -442,6 +467,12 @@ def _try_causes(hand_eye: HandEyeData, state: _State) -> dict[str, _State]:
         except (DhcalError, np.linalg.LinAlgError):
             return
 
+    if is_large and not causes.has_exchanged_links and _images(hand_eye.data).rig.has_links_to_exchange:
+        attempt(LINKS, replace(causes, has_exchanged_links=True), None)
+        camera = _rig(hand_eye.data).cameras[0]
+        if LINKS in out and out[LINKS].error.pixels < MAX_LINKS_ERROR * max(camera.width, camera.height):
+            return out
+        out.clear()
     if is_large and not causes.shift and (shift := find_shift(hand_eye, causes)):
         attempt(PAIRING, replace(causes, shift=shift), None)
         if PAIRING in out and out[PAIRING].error.pixels < MAX_ERROR_SHARE * state.error.pixels:
@@ -467,6 +498,7 @@ def _trial(hand_eye: HandEyeData, name: str, state: _State) -> Trial:
     """Describe a cause with what was estimated."""
     text, remedy = {
         PAIRING: _pairing_text,
+        LINKS: _links_text,
         SIZE: _size_text,
         LENS: _lens_text,
         CORNERS: _corner_text,
@@ -501,6 +533,17 @@ def _pairing_text(_: HandEyeData, state: _State) -> tuple[str, str]:
         f"the pairing: each image belongs to joint values {abs(shift):.2g} rows {side} its own, a time "
         "offset between camera and robot",
         "Synchronize the clocks, or let the robot stop for each image.",
+    )
+
+
+def _links_text(hand_eye: HandEyeData, _: _State) -> tuple[str, str]:
+    """Describe exchanged links."""
+    rig = _rig(hand_eye.data)
+    camera, board = rig.cameras[0], rig.boards[0]
+    return (
+        f"the links: camera {camera.name!r} on link {board.link!r} and board {board.name!r} on link "
+        f"{camera.link!r} explain the images",
+        "Exchange the links in the rig file.",
     )
 
 
@@ -582,7 +625,10 @@ def _arm_text(_: HandEyeData, state: _State) -> tuple[str, str]:
     """Describe the errors of the arm."""
     errors = state.fit.problem.errors
     x = state.fit.solution.x[: len(errors.parameters)]
-    remedy = "Calibrate the arm, too: leave out --parameters."
+    remedy = (
+        "Estimate the arm, too, without --parameters. If it was kept, take images in a larger part of joint "
+        "space."
+    )
     if state.causes.arm == ARM_SETS[OFFSETS]:
         offsets = {p.name: v for p, v in zip(errors.parameters, x, strict=True) if p.name.endswith("offset")}
         name = max(offsets, key=lambda each: abs(offsets[each]))

@@ -157,7 +157,7 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int) -> tuple[Fit,
     is_good = np.concatenate([weights > ZERO_WEIGHT for weights in fit.weights])
     n_configurations = len(np.unique(configuration_groups(fit.data)[is_good]))
     folds = cluster_folds(fit.problem.data)
-    kept = nominal = _without_arm(fit, max_iterations)
+    kept = nominal = without_arm(fit, max_iterations)
     is_right = not residual_jitter(nominal).is_significant
     if not is_right:
         shared, _ = fit_with_jitter(nominal, max_iterations)
@@ -255,7 +255,7 @@ def _trial(
     """Judge a model of the noise on left-out clusters."""
     closed = _with_evidence(model, groups, temperature, max_iterations)
     error = held_out_error(closed, folds)
-    nominal = held_out_error(_without_arm(model, max_iterations), folds)
+    nominal = held_out_error(without_arm(model, max_iterations), folds)
     if error is None or nominal is None:
         return _Trial(model, closed, float("nan"), float("nan"))
     return _Trial(model, closed, error.pixels, error.pixels / nominal.pixels)
@@ -287,8 +287,17 @@ def _with_evidence(fit: Fit, groups: PriorGroups, temperature: float, max_iterat
     return _solve(fit, fit.problem.with_prior_weights(weights), temperature, max_iterations)
 
 
-def _without_arm(fit: Fit, max_iterations: int, held: Collection[str] = ()) -> Fit:
-    """Fit poses and lenses with the nominal arm; the parameter sets `held` keep their first values."""
+def without_arm(fit: Fit, max_iterations: int, held: Collection[str] = ()) -> Fit:
+    """Fit poses, lenses and target points with the nominal arm.
+
+    Args:
+        fit: Fit with the arm estimated.
+        max_iterations: Largest number of iterations.
+        held: Parameter sets that keep their first values.
+
+    Returns:
+        Fit of the same samples.
+    """
     problem = fit.problem
     errors = nominal_arm(problem.errors)
     values = {
@@ -357,16 +366,16 @@ def judge_stages(
         errors = fitted_error(each), held_out_error(each, images), held_out_error(each, folds)
         return Stage(name, is_kept, n_unknowns, *errors, reason)
 
-    frames = _without_arm(fit, max_iterations, ("intrinsics", POINTS_SET))
+    frames = without_arm(fit, max_iterations, ("intrinsics", POINTS_SET))
     out = [judged("frames", frames, True, "Poses of cameras and boards are always estimated.")]
-    lenses = _without_arm(fit, max_iterations, (POINTS_SET,))
+    lenses = without_arm(fit, max_iterations, (POINTS_SET,))
     if len(lenses.problem.weights) > len(frames.problem.weights):
         stage = judged("intrinsics", lenses, True, "The rig does not fix them.")
         out.append(replace(stage, reason=f"{stage.reason} {_change(out[-1], stage)}".strip()))
-    points = _without_arm(fit, max_iterations)
+    points = without_arm(fit, max_iterations)
     has_points = len(points.problem.weights) > len(lenses.problem.weights)
     if not has_points and count_corners(fit.data) <= MAX_POINTS:
-        points = _without_arm(
+        points = without_arm(
             with_free_points(fit, [board.name for board in boards_of(fit.data)]), max_iterations
         )
     if len(points.problem.weights) > len(lenses.problem.weights):

@@ -1,0 +1,125 @@
+"""Size of the boards, which errors of the arm can imitate.
+
+Images do not show lengths: an arm and a board that are both 1 % longer give the same images. A board that is
+larger or smaller than the rig states therefore changes all lengths of the estimated arm by the same factor.
+Manufacturing errors do not. If another size of the boards makes the correction of the arm far smaller, the
+stated size is probably wrong.
+
+The corrections of the n lengths of the arm, in units of their default prior standard deviations, have the RMS
+w with the stated size and w' with the one that fits best. For a common width of their normal distribution,
+each time of greatest likelihood, the logarithm of the ratio of the likelihoods is n·log(w/w').
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..._typing import Array
+from ...estimation.error_model import ErrorModel
+from ...estimation.problem import Problem
+from ...estimation.solver import minimize
+from ...measurements.base import Measurement
+from ...measurements.camera import CameraCorners
+from ...measurements.images.camera_parameters import POINTS_SET
+from ...robot.chain import BASE_FRAME
+from ..reweighting import Fit
+from .causes import MAX_SIZE_STEP, SIZE_STEP, find_minimum
+
+# RMS correction in prior standard deviations from which another size is tried.
+MIN_CORRECTION = 1.5
+# Logarithm of the ratio of the likelihoods, and change of the size, from which the stated size is wrong.
+MIN_LOG_RATIO, MIN_CHANGE = 8.0, 2e-3
+# Largest number of iterations of one solution.
+_MAX_ITERATIONS = 40
+
+
+@dataclass(frozen=True)
+class BoardSize:
+    """Size of the boards that makes the correction of the arm far smaller.
+
+    Attributes:
+        size: Size relative to the stated one.
+        square: Stated size of the squares of the first board [m]; 0 if it has none.
+        stated: RMS correction of the lengths of the arm in prior standard deviations, with the stated size.
+        found: The same with the other size.
+    """
+
+    size: float
+    square: float
+    stated: float
+    found: float
+
+    @property
+    def sentence(self) -> str:
+        """What was found, and what to do."""
+        lengths = f" (squares of {1e3 * self.size * self.square:.4g} mm, not {1e3 * self.square:.4g} mm)"
+        return (
+            f"The size of the boards is probably wrong: with {100 * self.size:.4g} % of the stated size"
+            f"{lengths if self.square else ''}, the corrections of the lengths of the arm fall from "
+            f"{self.stated:.2g} to {self.found:.2g} times what manufacturing errors would be. Measure the "
+            "boards over their whole length, and correct their size in the rig file."
+        )
+
+
+def find_board_size(fit: Fit) -> BoardSize | None:
+    """Look for a size of the boards that makes the correction of the arm far smaller.
+
+    Args:
+        fit: Fit of the arm, with the priors of the arm.
+
+    Returns:
+        The size; None if the stated one is plausible.
+    """
+    problem, x = fit.problem, fit.solution.x
+    stated = _rms_correction(problem.errors, x)
+    lengths = _lengths(problem.errors)
+    if stated < MIN_CORRECTION or not all(isinstance(item, CameraCorners) for item in problem.data):
+        return None
+    # Wide priors would leave the size of the arm undetermined.
+    weights = problem.weights.copy()
+    weights[: len(lengths)] = 1 / problem.errors.priors
+    problem = problem.with_prior_weights(weights)
+    best = [x]
+
+    def solve(log_size: float) -> tuple[Problem, Array]:
+        scaled = problem.with_data([_scaled(item, float(np.exp(log_size))) for item in problem.data])
+        return scaled, minimize(scaled, "lm", best[0], _MAX_ITERATIONS, loose=True).x
+
+    def cost(log_size: float) -> float:
+        scaled, best[0] = solve(log_size)
+        return scaled.cost(best[0])
+
+    log_size = find_minimum(cost, 0.0, SIZE_STEP, MAX_SIZE_STEP)
+    found = _rms_correction(problem.errors, solve(log_size)[1])
+    ratio = np.count_nonzero(lengths) * np.log(stated / max(found, 1e-9))
+    if ratio < MIN_LOG_RATIO or abs(log_size) < MIN_CHANGE:
+        return None
+    boards = [b for item in problem.data if isinstance(item, CameraCorners) for b in item.rig.boards]
+    return BoardSize(float(np.exp(log_size)), boards[0].square, stated, found)
+
+
+def _lengths(errors: ErrorModel) -> Array:
+    """Return which parameters are lengths of the arm, without base and tool, (p,)."""
+    frames = (BASE_FRAME, errors.chain.tool_frame_index)
+    return np.array([p.unit == "m" and p.error_frame not in frames for p in errors.parameters], bool)
+
+
+def _rms_correction(errors: ErrorModel, x: Array) -> float:
+    """Return the RMS of the lengths of the arm in prior standard deviations; 0 without lengths."""
+    lengths = _lengths(errors)
+    values = x[: len(lengths)][lengths] / errors.priors[lengths]
+    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
+
+
+def _scaled(item: Measurement, size: float) -> Measurement:
+    """Return images of boards of another size."""
+    assert isinstance(item, CameraCorners)
+    boards = tuple(
+        replace(board, type="points", listed_points=size * board.points) for board in item.rig.boards
+    )
+    points = {
+        p.name: size * p.nominal for p in item.instrument_parameters if item.set_of(p.name) == POINTS_SET
+    }
+    return item.with_rig(replace(item.rig, boards=boards)).with_values(points)

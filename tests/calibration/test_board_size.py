@@ -1,0 +1,56 @@
+"""Wrong sizes of boards and exchanged links are found where the arm is estimated, too."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from camera_setups import ARMS, simulate, wrong_arm
+
+import dhcal_pin as dh
+from dhcal_pin.measurements import CameraCorners
+
+
+def photograph(seed, error, is_on_wrist=True):
+    """Simulate 40 images of an arm whose links are wrong by a size [m]."""
+    rng, arm = np.random.default_rng(seed), list(ARMS.values())[seed % 3]()
+    truth = wrong_arm(arm, error, rng)
+    return arm, simulate(arm, truth, rng, is_on_wrist=is_on_wrist, n_images=40, sigma=0.1, spread=0.8).images
+
+
+def with_rig(images, **changes):
+    """Return images with another rig, whose poses are unknown."""
+    rig = replace(images.rig, **changes)
+    return CameraCorners(images.q, images.values, images.corner, rig)
+
+
+@pytest.mark.parametrize(("seed", "size"), [(0, 1.1), (1, 0.97)])
+def test_a_wrong_size_of_the_board_is_not_taken_for_errors_of_the_arm(seed, size):
+    arm, images = photograph(seed, 1e-3)
+    (board,) = images.rig.boards
+    stated = replace(board, type="points", listed_points=size * board.points)
+    fit = dh.calibrate(arm, with_rig(images, boards=(stated,)), loss="linear")
+    assert fit.camera_stages[-1].is_kept
+    assert fit.verdict.status == "refused"
+    assert "size of the boards is probably wrong" in fit.verdict.reasons[0]
+    assert fit.board_size.size == pytest.approx(1 / size, rel=5e-3)
+
+
+@pytest.mark.parametrize("seed", [3, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(4, 24))])
+def test_large_errors_of_the_arm_are_not_taken_for_a_wrong_size(seed):
+    arm, images = photograph(seed, 6e-3, is_on_wrist=seed % 2 == 0)
+    fit = dh.calibrate(arm, images, loss="linear")
+    assert fit.camera_stages[-1].is_kept
+    assert fit.board_size is None
+
+
+@pytest.mark.parametrize("is_on_wrist", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_exchanged_links_are_named(is_on_wrist):
+    """The rig states a camera on the wrist for a fixed one, or the other way round."""
+    arm, images = photograph(0, 1e-3, is_on_wrist)
+    images = images.take(images.image < 20)
+    images = with_rig(images.with_rig(images.rig.with_exchanged_links()))
+    fit = dh.calibrate(arm, images, loss="linear", max_iterations=20)
+    assert fit.verdict.status == "refused"
+    assert "Likely cause: the links" in fit.verdict.reasons[0]
