@@ -239,7 +239,7 @@ def _hand_eye_block(fit: Result) -> Block:
     """Describe the error of a hand-eye calibration, and what each possible cause explains of it."""
     if fit.hand_eye is None:
         return Block([])
-    return Block(fit.hand_eye.table, noun="cause", rank=5, n_kept=4, has_space=True)
+    return Block(fit.hand_eye.table, noun="cause", rank=2, n_kept=4, has_space=True)
 
 
 def _correction_block(fit: Result) -> Block:

@@ -34,6 +34,7 @@ def test_a_wrong_size_of_the_board_is_not_taken_for_errors_of_the_arm(seed, size
     assert fit.camera_stages[-1].is_kept
     assert fit.verdict.status == "refused"
     assert "size of the boards is probably wrong" in fit.verdict.reasons[0]
+    assert fit.board_size is not None
     assert fit.board_size.size == pytest.approx(1 / size, rel=5e-3)
 
 
