@@ -203,8 +203,7 @@ def _accuracy_blocks(fit: Result) -> list[Block]:
     if rows:
         covered, unknown = format_share(known.covered_share), format_share(1 - known.reached_share)
         sentences.append(
-            f"Measured region: {covered} of joint space. For {unknown} of joint space the accuracy is "
-            "unknown."
+            f"Measured region: {covered} of joint space. Accuracy unknown: {unknown} of joint space."
         )
     return [
         Block(

@@ -25,7 +25,7 @@ def with_rig(images, **changes):
     return CameraCorners(images.q, images.values, images.corner, rig)
 
 
-@pytest.mark.parametrize(("seed", "size"), [(0, 1.1), (1, 0.97)])
+@pytest.mark.parametrize(("seed", "size"), [(0, 1.1), (1, 0.97), (2, 0.98)])
 def test_a_wrong_size_of_the_board_is_not_taken_for_errors_of_the_arm(seed, size):
     arm, images = photograph(seed, 1e-3)
     (board,) = images.rig.boards
@@ -38,7 +38,7 @@ def test_a_wrong_size_of_the_board_is_not_taken_for_errors_of_the_arm(seed, size
     assert fit.board_size.size == pytest.approx(1 / size, rel=5e-3)
 
 
-@pytest.mark.parametrize("seed", [3, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(4, 24))])
+@pytest.mark.parametrize("seed", [21, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(20))])
 def test_large_errors_of_the_arm_are_not_taken_for_a_wrong_size(seed):
     arm, images = photograph(seed, 6e-3, is_on_wrist=seed % 2 == 0)
     fit = dh.calibrate(arm, images, loss="linear")

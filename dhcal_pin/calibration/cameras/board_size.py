@@ -5,9 +5,10 @@ larger or smaller than the rig states therefore changes all lengths of the estim
 Manufacturing errors do not. If another size of the boards makes the correction of the arm far smaller, the
 stated size is probably wrong.
 
-The corrections of the n lengths of the arm, in units of their default prior standard deviations, have the RMS
-w with the stated size and w' with the one that fits best. For a common width of their normal distribution,
-each time of greatest likelihood, the logarithm of the ratio of the likelihoods is n·log(w/w').
+The corrections of the lengths of the arm, in units of their default prior standard deviations, have the RMS w
+with the stated size and w' with the one that fits best. For a common width of their normal distribution, each
+time of greatest likelihood, the logarithm of the ratio of the likelihoods is n·log(w/w') with the effective
+number n of lengths that the images determine (MacKay 1992).
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from ..reweighting import Fit
 from .causes import MAX_SIZE_STEP, SIZE_STEP, find_minimum
 
 # RMS correction in prior standard deviations from which another size is tried.
-MIN_CORRECTION = 1.5
+MIN_CORRECTION = 1.2
 # Logarithm of the ratio of the likelihoods, and change of the size, from which the stated size is wrong.
 MIN_LOG_RATIO, MIN_CHANGE = 8.0, 2e-3
 # Largest number of iterations of one solution.
@@ -93,7 +94,9 @@ def find_board_size(fit: Fit) -> BoardSize | None:
 
     log_size = find_minimum(cost, 0.0, SIZE_STEP, MAX_SIZE_STEP)
     found = _rms_correction(problem.errors, solve(log_size)[1])
-    ratio = np.count_nonzero(lengths) * np.log(stated / max(found, 1e-9))
+    root = fit.solution.system.sqrt_covariance(weights)[0][: len(lengths)][lengths]
+    count = np.sum(1 - np.sum((root * weights[: len(lengths)][lengths, None]) ** 2, 1))
+    ratio = count * np.log(stated / max(found, 1e-9))
     if ratio < MIN_LOG_RATIO or abs(log_size) < MIN_CHANGE:
         return None
     boards = [b for item in problem.data if isinstance(item, CameraCorners) for b in item.rig.boards]
