@@ -57,7 +57,6 @@ from .cameras import (
     exchange_axes,
     find_board_size,
     fitted_error,
-    has_arm,
     has_images,
     held_values,
     judge_stages,
@@ -194,13 +193,13 @@ def calibrate(
             extension = Extension(temperature=gate.temperature, n_configurations=gate.n_configurations)
             result = _make_result(fit, 1.0, holdout, method)
             warnings = [exchange.sentence for exchange in exchanges]
-            if has_arm(errors):
+            if errors.has_arm:
                 warning = seen_ranges_warning(chain, fit.data) if gate.is_open else gate.sentence
                 warnings += [warning] if warning else []
             if gate.is_open and fitted_error(fit).pixels < LARGE_ERROR:
                 result = replace(result, board_size=find_board_size(ungated))
             else:
-                frames = without_arm(ungated, max_iterations) if has_arm(errors) else ungated
+                frames = without_arm(ungated, max_iterations) if errors.has_arm else ungated
                 result = replace(result, hand_eye_fit=HandEyeFit(frames, result.pose_std, holdout))
             return replace(
                 result,

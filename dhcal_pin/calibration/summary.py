@@ -16,6 +16,7 @@ from .estimates import Estimate
 from .evaluation import Comparison
 
 if TYPE_CHECKING:
+    from ..estimation.error_model import ErrorModel
     from .cross_validation import Generalization
 
 # With fewer samples the figures come with a note that they are not reliable.
@@ -223,15 +224,19 @@ def format_share(share: float) -> str:
     return f"{100 * share:.0f} %"
 
 
-def regressions(comparisons: Sequence[Comparison]) -> list[str]:
+def regressions(errors: ErrorModel, comparisons: Sequence[Comparison]) -> list[str]:
     """List the comparisons in which the calibrated robot is worse than the nominal one.
 
     Args:
+        errors: Nominal robot and its identified errors.
         comparisons: Comparisons of a calibration.
 
     Returns:
-        One warning each, with what to do about it.
+        One warning each, with what to do about it; none if only base, tool and instruments were estimated, as
+        both robots are the same then.
     """
+    if not errors.has_arm:
+        return []
     return [
         f"The calibrated robot is worse than the nominal one {describe_samples(c)}. Keep the nominal robot, "
         "measure more poses, or identify fewer parameters."

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from ..calibration.cameras import has_arm, split_sets
+from ..calibration.cameras import split_sets
 from ..calibration.estimates import Estimate
 from ..calibration.evaluation import Comparison
 from ..calibration.result import Result
@@ -214,8 +214,7 @@ def _accuracy_blocks(fit: Result) -> list[Block]:
             has_space=True,
         ),
         Block(sentences),
-        # Without estimated errors of the arm, the calibrated arm is the nominal one.
-        Block(regressions(fit.comparisons) if has_arm(fit.errors) else [], "yellow"),
+        Block(regressions(fit.errors, fit.comparisons), "yellow"),
     ]
 
 

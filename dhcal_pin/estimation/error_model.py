@@ -218,6 +218,12 @@ class ErrorModel:
         )
         return replace(self, parameters=tuple(ordered))
 
+    @property
+    def has_arm(self) -> bool:
+        """Whether the arm itself has unknown parameters, besides base and tool."""
+        outside = (BASE_FRAME, self.chain.tool_frame_index)
+        return any(p.error_frame not in outside for p in self.parameters)
+
     def only_frames(self) -> ErrorModel | None:
         """Return the model with the unknowns of base and tool alone.
 

@@ -130,7 +130,7 @@ def accuracy_figures(context: ReportContext) -> list[FigureGroup]:
     fit, panels = context.fit, []
     norms = {
         role: [
-            error_norms(compute_errors(fit.nominal_refitted, data)),
+            error_norms(compute_errors(fit.nominal_refitted, data, fit.nominal_instruments)),
             error_norms(compute_errors(fit.chain, data, fit.instruments)),
         ]
         for role, data in (("hold-out", fit.holdout), ("fitted", fit.inliers))

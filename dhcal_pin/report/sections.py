@@ -168,7 +168,7 @@ def warnings(context: ReportContext) -> list[str]:
         Sentences.
     """
     fit, texts = context.fit, []
-    texts += summary.regressions(context.comparisons)
+    texts += summary.regressions(fit.errors, context.comparisons)
     if not np.isfinite(fit.unit_weight_std):
         texts.append(
             f"{fit.sample_count} determine {fit.rank} directions in parameter space and leave no "

@@ -14,6 +14,7 @@ from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import CameraCorners, Noise
 from dhcal_pin.report import Provenance, ReportContext
 from dhcal_pin.report.document import json_text, result_to_dict
+from dhcal_pin.report.figures import accuracy_figures
 from dhcal_pin.report.html import html_page
 from dhcal_pin.report.images import image_figures, image_table, stage_table
 from dhcal_pin.report.sections import report_sections
@@ -50,6 +51,17 @@ def test_images_with_the_largest_errors_are_listed(result, quick):
         rms += [np.sqrt(squares[item.image == i].sum(1).mean()) for i in range(item.n_images)]
     np.testing.assert_allclose(shown, sorted(rms, reverse=True)[: len(shown)], rtol=0.01)
     assert all(row[1].startswith("corners.csv, ") for row in table.rows if row[3] == "fitted")
+
+
+def test_histograms_show_the_errors_of_the_table(result, quick):
+    """Cameras and boards of the nominal robot are those that fit it best."""
+    (group,) = accuracy_figures(ReportContext.from_result(result, Provenance(names=["corners.csv"])))
+    texts = [panel.description for panel in group.panels]
+    for comparison in result.comparisons:
+        if comparison.title in ("hold-out", "fitted"):
+            before = comparison.before.groups["pixels"].rms
+            (text,) = (t for t in texts if "image error" in t and f"{comparison.title} samples" in t)
+            assert float(text.split("RMS ")[1].split(" px")[0]) == pytest.approx(before, rel=0.02)
 
 
 def test_images_are_called_by_their_names(result, quick):

@@ -136,7 +136,7 @@ def judge_target_points(fit: Fit, max_iterations: int) -> TargetPoints | None:
     Returns:
         The result; None without unknowns of the arm, or if nothing is to be judged.
     """
-    if not has_arm(fit.problem.errors):
+    if not fit.problem.errors.has_arm:
         return None
     clusters = cluster_folds(fit.data)
     images = k_fold(fit.data, N_IMAGE_FOLDS) if clusters else ()
@@ -163,7 +163,7 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int) -> tuple[Fit,
         shared, _ = fit_with_jitter(nominal, max_iterations)
         kept = _best((fit_with_corner_noise(nominal, max_iterations), shared), folds)
     kept = _solve(kept, kept.problem, 1.0, max_iterations)
-    if not has_arm(fit.problem.errors):
+    if not fit.problem.errors.has_arm:
         return kept, kept, Gate(float("nan"), 1.0, n_configurations, is_right, is_right)
     shared, jitter = fit_with_jitter(fit, max_iterations)
     is_complete = not jitter.is_significant
@@ -334,15 +334,6 @@ def nominal_arm(errors: ErrorModel) -> ErrorModel:
     return errors.only_frames() or ErrorModel(errors.chain, ())
 
 
-def has_arm(errors: ErrorModel) -> bool:
-    """Return whether the arm itself has unknown parameters, besides base and tool.
-
-    Args:
-        errors: Nominal chain and its unknown parameters.
-    """
-    return len(errors.parameters) > len(nominal_arm(errors).parameters)
-
-
 def judge_stages(
     fit: Fit, with_arm: Fit, gate: Gate, judged_points: TargetPoints | None, max_iterations: int
 ) -> tuple[Stage, ...]:
@@ -389,7 +380,7 @@ def judge_stages(
         else:
             stage = judged("target points", points, has_points, reason)
             out.append(replace(stage, reason=f"{stage.reason} {_change(out[-1], stage)}".strip()))
-    if has_arm(with_arm.problem.errors):
+    if with_arm.problem.errors.has_arm:
         out.append(judged("arm", with_arm, gate.is_open, gate.sentence))
     return tuple(out)
 
