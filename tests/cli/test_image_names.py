@@ -8,22 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import json_of, unfolded
-from rig_files import draw_views
+from rig_files import BOARD, CAMERA, draw_views
 
 import dhcal_pin as dh
-from dhcal_pin import se3
-from dhcal_pin.cameras import Board, Camera, Rig
+from dhcal_pin.cameras import Rig
 from dhcal_pin.io.rig_file import rig_text
 from dhcal_pin.measurements import mount_rig, project_board
 
-CAMERA = Camera(
-    "wrist", "tip", 800, 600, np.array([762.0, 765, 402, 298, -0.12, 0.06, 0.001, -0.0005, 0]),
-    pose=se3.transform(se3.exp3([0.02, -0.03, 0.8]), [0.03, 0.05, 0.02]),
-)  # fmt: skip
-BOARD = Board(
-    "table", "world", "charuco", columns=5, rows=4, square=0.04, marker=0.03, dictionary="DICT_5X5_100",
-    pose=se3.transform(se3.exp3([np.pi, 0, 0]) @ se3.exp3([0.02, 0.03, 0.5]), [0.75, 0.1, 0.02]),
-)  # fmt: skip
 # Images whose corners are those of another image; the last six are held out.
 WRONG, N_IMAGES, N_HELD_OUT = (4, 11, 15, 19), 26, 6
 

@@ -11,25 +11,16 @@ import numpy as np
 import pytest
 import tomli_w
 from command_line import json_of, unfolded
-from rig_files import draw_views
+from rig_files import BOARD, CAMERA, draw_views
 
 import dhcal_pin as dh
-from dhcal_pin import se3
-from dhcal_pin.cameras import Board, Camera, Rig
+from dhcal_pin.cameras import Rig
 from dhcal_pin.cli import main
 from dhcal_pin.io.rig_file import read_calibrated_rig, rig_text
 from dhcal_pin.measurements import mount_rig, project_board
 
 NOISE = 0.1
 N_FITTED, N_OTHER = 20, 12
-CAMERA = Camera(
-    "wrist", "tip", 800, 600, np.array([762.0, 765, 402, 298, -0.12, 0.06, 0.001, -0.0005, 0]),
-    pose=se3.transform(se3.exp3([0.02, -0.03, 0.8]), [0.03, 0.05, 0.02]),
-)  # fmt: skip
-BOARD = Board(
-    "table", "world", "charuco", columns=5, rows=4, square=0.04, marker=0.03, dictionary="DICT_5X5_100",
-    pose=se3.transform(se3.exp3([np.pi, 0, 0]) @ se3.exp3([0.02, 0.03, 0.5]), [0.75, 0.1, 0.02]),
-)  # fmt: skip
 
 
 @pytest.fixture(scope="module")

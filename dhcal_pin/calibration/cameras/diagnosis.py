@@ -467,12 +467,13 @@ def _try_causes(hand_eye: HandEyeData, state: _State) -> dict[str, _State]:
         except (DhcalError, np.linalg.LinAlgError):
             return
 
-    if is_large and not causes.has_exchanged_links and _images(hand_eye.data).rig.has_links_to_exchange:
+    rig = _rig(hand_eye.data)
+    if is_large and not causes.has_exchanged_links and rig.has_links_to_exchange:
         attempt(LINKS, replace(causes, has_exchanged_links=True), None)
-        camera = _rig(hand_eye.data).cameras[0]
+        camera = rig.cameras[0]
         if LINKS in out and out[LINKS].error.pixels < MAX_LINKS_ERROR * max(camera.width, camera.height):
             return out
-        out.clear()
+        out.pop(LINKS, None)
     if is_large and not causes.shift and (shift := find_shift(hand_eye, causes)):
         attempt(PAIRING, replace(causes, shift=shift), None)
         if PAIRING in out and out[PAIRING].error.pixels < MAX_ERROR_SHARE * state.error.pixels:
