@@ -33,7 +33,7 @@ def franka():
     if not path.exists():
         missing(f"measurements at {path}")
     poses = dh.read_measurements(path, arm)
-    # The board lies below the middle of the positions of the camera, so that it is seen near the image centre.
+    # The board lies below the middle of the camera positions, near the image centre.
     centre = poses.poses[:, :3, 3].mean(0) * [1, 1, 0]
     camera = Camera("wrist", "tip", 1280, 720, LENS, intrinsics="fixed")
     board = Board("board", "world", "points", listed_points=GRID)
@@ -92,7 +92,7 @@ def test_franka_with_a_camera_on_the_wrist(franka, repeats, seed):
 
 
 def one_side(images, sign):
-    """Return which images are on one side of joint space, along the first principal axis of standardised joints."""
+    """Return which images are on one side of joint space, along the first principal axis of scaled joints."""
     q = images.q[:: len(GRID)]
     q = (q - q.mean(0)) / q.std(0)
     return sign * (q @ np.linalg.svd(q, full_matrices=False)[2][0]) <= 0
