@@ -497,15 +497,16 @@ class Generalization:
         covered_share: Share of the joint space in the measured region, 0 to 1.
         reached_share: Share of the joint space that is no farther from the measured configurations than the
             left-out regions are from the others, 0 to 1: there `region_holdout` holds. It is `covered_share`
-            if that cannot be stated. Nothing is known about the rest.
+            if that cannot be stated. Nothing is known about the rest. Both shares are None where joint values
+            have no meaning, as the poses of the tip were measured in their place.
     """
 
     cross_validated: Comparison | None
     cross_validated_reason: str
     region_holdout: Comparison | None
     region_holdout_reason: str
-    covered_share: float
-    reached_share: float
+    covered_share: float | None
+    reached_share: float | None
 
 
 def estimate_generalization(fit: Result) -> Generalization:
@@ -528,7 +529,7 @@ def estimate_generalization(fit: Result) -> Generalization:
     if folds and not has_few:
         beyond = compare_folds(fit, folds, "region hold-out")
         beyond_reason = _unknown_reason(fit, beyond, q, samples_held_out(folds, samples))
-    covered = reached = 0.0
+    covered = reached = 0.0 if fit.has_joint_values else None
     if fit.measured_region is not None:
         distances = fit.measured_region.distances(draw_joint_space(fit.chain))
         covered = float(np.mean(distances <= fit.measured_region.radius))
@@ -564,10 +565,10 @@ def measured_region(fit: Result) -> MeasuredRegion | None:
         fit: Result of a calibration.
 
     Returns:
-        The region; None if no sample has joint values.
+        The region; None if no sample has joint values, or if their place is taken by poses of the tip.
     """
     q, samples = different_configurations(fit.inliers)
-    if not len(q):
+    if not len(q) or not fit.has_joint_values:
         return None
     region = MeasuredRegion.from_configurations(q, fit.chain.is_prismatic)
     folds = region_folds(fit)

@@ -184,6 +184,11 @@ class Result(ResultPlots):
         return [item for item in inliers if len(item.rows)]
 
     @property
+    def has_joint_values(self) -> bool:
+        """Whether the joint positions of all samples were measured, so that joint space has a meaning."""
+        return all(item.has_joint_values for item in self.data)
+
+    @property
     def converged(self) -> bool:
         """Whether the last step was negligible."""
         return self.solution.converged
@@ -620,7 +625,7 @@ class Result(ResultPlots):
 
     @property
     def measured_region(self) -> MeasuredRegion | None:
-        """Region of joint space around the fitted configurations; None if no sample has joint values."""
+        """Region of joint space around the fitted configurations; None without joint values."""
         return self._measured_region
 
     @cached_property

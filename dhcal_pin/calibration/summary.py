@@ -170,6 +170,8 @@ def generalization_lines(
 ) -> tuple[str, str]:
     """State the accuracy within the measured region and beyond it, one line each.
 
+    Where joint values have no meaning, the lines speak of the measured poses, and state no shares.
+
     Args:
         generalization: Both figures of a calibration.
         comparisons: Comparisons of the calibration; hold-out samples are preferred to cross-validated ones.
@@ -180,18 +182,19 @@ def generalization_lines(
     inside, beyond = generalization.cross_validated, generalization.region_holdout
     if comparisons[0].title == "hold-out":
         inside = comparisons[0]
-    covered = format_share(generalization.covered_share)
-    unknown = format_share(1 - generalization.reached_share)
+    covered, reached = generalization.covered_share, generalization.reached_share
+    region, pronoun, rest = "Among the measured poses", "them", ""
+    if covered is not None and reached is not None:
+        region, pronoun = f"Measured region ({format_share(covered)} of joint space)", "it"
+        rest = f"; for {format_share(1 - reached)} of joint space not known"
+    unknown = "cannot be said, "
     return (
-        f"Measured region ({covered} of joint space): "
-        + (
-            f"{_before_and_after(inside)}."
-            if inside
-            else f"cannot be said, {generalization.cross_validated_reason}."
-        ),
-        f"Beyond it: {_before_and_after(beyond)}; for {unknown} of joint space not known."
-        if beyond
-        else f"Beyond it: cannot be said, {generalization.region_holdout_reason}.",
+        f"{region}: "
+        + (_before_and_after(inside) if inside else unknown + generalization.cross_validated_reason)
+        + ".",
+        f"Beyond {pronoun}: "
+        + (_before_and_after(beyond) + rest if beyond else unknown + generalization.region_holdout_reason)
+        + ".",
     )
 
 

@@ -250,12 +250,19 @@ def _missing_frames(fit: Result) -> list[str]:
     return missing if with_frames.rms < MAX_FRAME_RATIO * before.rms else []
 
 
+def _configuration_checks(fit: Result) -> str:
+    """Name what to check of the configurations of images."""
+    if fit.has_joint_values:
+        return "units, signs and order of the joints, the joint values of each image"
+    return "units, notation of rotations and frames of the flange poses, the flange pose of each image"
+
+
 def _plausible_cause(fit: Result) -> str:
     """Name the most plausible cause of an implausible result."""
     if fit.camera_stages:
         return (
-            "Check the links of cameras and boards in the rig file, units, signs and order of the joints, "
-            "the joint values of each image, and size, rows and columns of the boards."
+            f"Check the links of cameras and boards in the rig file, {_configuration_checks(fit)}, and size, "
+            "rows and columns of the boards."
         )
     if fit.diagnosis.is_explained:
         if missing := _missing_frames(fit):

@@ -188,22 +188,23 @@ def _accuracy_blocks(fit: Result) -> list[Block]:
     """Describe the accuracy within the measured region and outside it, before and after."""
     known = fit.generalization
     inside = fit.comparisons[0] if fit.comparisons[0].title == "hold-out" else known.cross_validated
-    rows = [
-        *_accuracy_rows(inside, "in the measured region"),
-        *_accuracy_rows(known.region_holdout, "outside of it"),
-    ]
+    covered, reached = known.covered_share, known.reached_share
+    region = "in the measured region", "outside of it"
+    if covered is None or reached is None:
+        region = "among the measured poses", "outside of them"
+    rows = [*_accuracy_rows(inside, region[0]), *_accuracy_rows(known.region_holdout, region[1])]
     sentences = [
         f"Accuracy {place}: cannot be said, {reason}."
         for comparison, place, reason in (
-            (inside, "in the measured region", known.cross_validated_reason),
-            (known.region_holdout, "outside of it", known.region_holdout_reason),
+            (inside, region[0], known.cross_validated_reason),
+            (known.region_holdout, region[1], known.region_holdout_reason),
         )
         if comparison is None
     ]
-    if rows:
-        covered, unknown = format_share(known.covered_share), format_share(1 - known.reached_share)
+    if rows and covered is not None and reached is not None:
         sentences.append(
-            f"Measured region: {covered} of joint space. Accuracy unknown: {unknown} of joint space."
+            f"Measured region: {format_share(covered)} of joint space. "
+            f"Accuracy unknown: {format_share(1 - reached)} of joint space."
         )
     return [
         Block(
@@ -275,7 +276,7 @@ def _details(fit: Result) -> list[Block]:
     """Describe everything else: all parameters and where they are defined, accuracy, joint origins."""
     state = "converged" if fit.converged else "NOT converged"
     return [
-        Block(fit.extension.sentences if fit.extension else []),
+        Block(fit.extension.sentences if fit.extension and fit.errors.has_arm else []),
         Block(accuracy_table(fit.comparisons), title="accuracy", has_space=True),
         Block(origin_table(fit.chain), title="joint origins in the URDF, in m and rad", has_space=True),
         Block(estimate_table(fit.estimates), title="parameters", has_space=True),

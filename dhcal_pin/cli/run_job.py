@@ -22,7 +22,7 @@ import numpy as np
 
 from .._typing import PathLike, Progress
 from ..calibration import model_selection, partition, procedure, summary
-from ..calibration.cameras import default_sets, has_joint_values
+from ..calibration.cameras import default_sets, has_images, has_joint_values
 from ..calibration.cross_validation import leave_regions_out
 from ..calibration.model_selection import FULL_SET, is_restricted
 from ..calibration.result import Result
@@ -143,6 +143,7 @@ def run_job(
         "executor": executor,
     }
     measurements = list(data.fit.values())
+    _require_cameras(job, measurements)
     extend = None if job.extend == "auto" else job.extend
     try:
         fit = procedure.calibrate(
@@ -384,6 +385,19 @@ def _read_data(chain: Chain, job: Job, has_known_frames: bool) -> _JobData:
     return _JobData(fitted, held_out, n_rows, unreachable, warnings, notes)
 
 
+def _require_cameras(job: Job, data: Sequence[Measurement]) -> None:
+    """Check that there is a camera if files or a frame of it are to be written."""
+    if has_images(data):
+        return
+    expected = "expected image coordinates and --rig"
+    for option, value, other in (
+        ("--camera-frame", job.camera_frame, ", or --tool-frame NAME for the measured tool pose"),
+        ("--camera-files", job.camera_files, ""),
+    ):
+        if value:
+            raise InvalidArgumentError(f"{option}: the measurements have no camera; {expected}{other}")
+
+
 def _held_out_images(data: _JobData) -> str:
     """Say how many images are held out and cannot determine anything; empty without images among them."""
     fitted, held_out = (
@@ -470,7 +484,7 @@ def _robot_files(fit: Result, job: Job) -> dict[PathLike, str | bytes]:
         edit,
         fit.rig,
     )
-    if job.camera_files and fit.rig:
+    if job.camera_files:
         data = contents[job.output]
         assert isinstance(data, bytes)
         for frame in _camera_frames(fit, job, data):
@@ -485,11 +499,7 @@ def _numbered(name: str, paths: Sequence[str]) -> dict[str, str]:
 
 def _camera_frames(fit: Result, job: Job, urdf: bytes) -> list[CameraFrame]:
     """Return the frames of the cameras in the calibrated URDF, with the measuring frame in it on request."""
-    if fit.rig is None:
-        raise InvalidArgumentError(
-            "--camera-frame: the measurements have no camera; expected image coordinates and --rig, or "
-            "--tool-frame NAME for the measured tool pose"
-        )
+    assert fit.rig is not None
     root, base = ("world", np.eye(4)) if job.world_joint else (fit.chain.root, fit.chain.base)
     written = Chain.from_urdf(parse_urdf(urdf, job.output), fit.chain.tip, root)
     _, tool = joint_origins(fit.chain)

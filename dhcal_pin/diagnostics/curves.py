@@ -59,7 +59,7 @@ def fitted_coverage(fit: Result) -> tuple[JointCoverage, ...]:
         Coverage of each revolute joint; empty if no sample has joint values.
     """
     q, _ = different_configurations(fit.inliers)
-    return joint_coverage(fit.chain, q) if len(q) else ()
+    return joint_coverage(fit.chain, q) if len(q) and fit.has_joint_values else ()
 
 
 def joint_curves(fit: Result) -> list[JointCurve]:

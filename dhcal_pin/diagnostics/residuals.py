@@ -128,10 +128,11 @@ def joint_offset_profiles(fit: Result) -> list[JointProfile]:
         fit: Calibration.
 
     Returns:
-        One profile per moving joint; empty if no measurement belongs to one configuration.
+        One profile per moving joint; empty if no measurement belongs to one configuration, or if poses of the
+        tip were measured in place of joint values.
     """
     data = [item for item in fit.holdout or fit.inliers if item.configurations_per_row == 1]
-    if not data:
+    if not data or not fit.has_joint_values:
         return []
     all_errors = compute_errors(fit.chain, data, fit.instruments)
     after = _offset_equations(fit.chain, data, fit)

@@ -93,6 +93,8 @@ class Measurement(ABC):
         has_stated_sigma: Whether the standard deviations are those of the instrument, not placeholders that
             are estimated with the fit.
         instrument_parameters: The s instrument parameters, in the order of u.
+        has_joint_values: Whether the joint positions were measured. Otherwise they only reproduce measured
+            poses of the tip, and say nothing about the joint space of a robot.
     """
 
     q: Array
@@ -100,6 +102,7 @@ class Measurement(ABC):
     has_stated_sigma: bool
     instrument_parameters: tuple[InstrumentParameter, ...]
     source: str
+    has_joint_values: bool
 
     # Name of the kind in files, on the command line and in studies.
     kind: ClassVar[str]
@@ -130,7 +133,7 @@ class Measurement(ABC):
 
     def _initialize(self, **values: Any) -> None:
         """Set attributes of an immutable object; for constructors only."""
-        self.__dict__.update(values)
+        self.__dict__.update({"has_joint_values": True} | values)
 
     def __repr__(self) -> str:
         """Return the kind, the number of samples and the standard deviations."""

@@ -98,8 +98,6 @@ class CameraCorners(Measurement):
         image_names: Name of each sample's photograph, (m,); empty if it is not known.
         jitter: Derivative of the image coordinates by the displacement of the tool, in units of its standard
             deviations, (m, 2, 6) [px]; zero without jitter.
-        has_joint_values: Whether the joint positions were measured; otherwise the poses of the tip were, and
-            the joint positions are only some that reach them. They say nothing about the arm.
     """
 
     rig: MountedRig
@@ -110,7 +108,6 @@ class CameraCorners(Measurement):
     corner: Array
     image_names: Array
     jitter: Array
-    has_joint_values: bool
 
     kind = "camera"
     residual_groups: ClassVar = {"pixels": slice(0, 2)}
@@ -168,7 +165,6 @@ class CameraCorners(Measurement):
             corner=_corner_numbers(corner, rig, board_index),
             image_names=name_array(image_names, m),
             jitter=np.zeros((m, 2, 6)),
-            has_joint_values=True,
             has_stated_sigma=sigma is not None,
             instrument_parameters=rig_parameters(rig),
         )

@@ -17,8 +17,9 @@ import numpy as np
 
 from .. import formatting
 from ..calibration import summary
+from ..calibration.cross_validation import Generalization
 from ..calibration.estimates import Estimate
-from ..calibration.evaluation import GROUP_UNITS
+from ..calibration.evaluation import GROUP_UNITS, error_group
 from ..calibration.model_selection import trial_table
 from ..calibration.summary import GROUP_LABELS
 from ..diagnostics.curves import JointCurve, find_lattices
@@ -192,14 +193,7 @@ def _accuracy_section(context: ReportContext) -> Section:
         "due to the robot parameters alone."
     ]
     if generalization.region_holdout:
-        sentences.append(
-            "“Region hold-out” samples are the ends of the measured region along each principal direction of "
-            "the joint values; each end is judged by a fit of the other samples. Their error holds for "
-            f"{summary.format_share(generalization.reached_share)} of the joint space: where a configuration "
-            "is no farther from the measured ones than these ends are from the others. The measured region "
-            f"itself is {summary.format_share(generalization.covered_share)} of the joint space. Nothing is "
-            "known about the accuracy in the rest."
-        )
+        sentences.append(_region_sentence(generalization))
         if generalization.region_holdout not in comparisons:
             comparisons.insert(1, generalization.region_holdout)
     return Section(
@@ -208,6 +202,24 @@ def _accuracy_section(context: ReportContext) -> Section:
         sentences,
         tables=[summary.accuracy_table(comparisons)],
         figures=partial(figures.accuracy_figures, context),
+    )
+
+
+def _region_sentence(generalization: Generalization) -> str:
+    """Explain what the error of left-out regions means, and where it holds."""
+    covered, reached = generalization.covered_share, generalization.reached_share
+    if covered is None or reached is None:
+        return (
+            "“Region hold-out” samples are the ends of the measured poses along each principal direction of "
+            "their positions and angles; each end is judged by a fit of the other samples."
+        )
+    return (
+        "“Region hold-out” samples are the ends of the measured region along each principal direction of the "
+        "joint values; each end is judged by a fit of the other samples. Their error holds for "
+        f"{summary.format_share(reached)} of the joint space: where a configuration is no farther from the "
+        "measured ones than these ends are from the others. The measured region itself is "
+        f"{summary.format_share(covered)} of the joint space. Nothing is known about the accuracy in the "
+        "rest."
     )
 
 
@@ -273,7 +285,7 @@ def _residual_section(context: ReportContext) -> Section:
 
 def _transmission_section(context: ReportContext) -> Section:
     key, title, extension = "transmission", "Transmission errors", context.fit.extension
-    if extension is None:
+    if extension is None or not context.fit.errors.has_arm:
         hint = context.source.hint
         return Section(key, title, [f"{hint[0].upper()}{hint[1:]}."] if hint else [])
     text = (
@@ -602,7 +614,7 @@ def _data_table(context: ReportContext) -> Table:
     for name, item, sigma in zip(context.data_names, fit.data, median_sigmas(fit), strict=True):
         origin = "stated" if item.has_stated_sigma else ("estimated" if fit.method == "lm" else "assumed")
         values = ", ".join(
-            f"{group} {format_quantity(value, 'rad' if group == 'orientation' else 'm', value, small=True)}"
+            f"{group} {format_quantity(value, GROUP_UNITS[error_group(group)], value, small=True)}"
             for group, value in sigma.items()
         )
         rows.append(

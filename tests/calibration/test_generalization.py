@@ -146,6 +146,7 @@ def test_a_joint_that_did_not_move_leaves_the_rest_unknown():
     assert found.cross_validated is not None
     assert found.region_holdout is None
     assert found.region_holdout_reason == "wrist_2_joint did not move"
+    assert found.reached_share is not None
     assert found.reached_share < 0.01
     lines = generalization_lines(found, fit.comparisons)
     assert lines[1] == "Beyond it: cannot be said, wrist_2_joint did not move."
@@ -195,6 +196,8 @@ def test_shares_of_the_joint_space():
     for spread in (np.pi, 2.0, 1.0):
         data = Position.simulate(truth, rng.uniform(-spread, spread, (300, 6)), NOISE, rng)
         found = calibrate(arm, data, SETS, extend="none").generalization
+        assert found.covered_share is not None
+        assert found.reached_share is not None
         assert found.covered_share <= found.reached_share
         shares.append((found.covered_share, found.reached_share))
     assert shares[0][0] == pytest.approx(0.95, abs=0.04)

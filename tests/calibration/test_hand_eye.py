@@ -218,3 +218,24 @@ def test_document_names_the_cause():
     assert document["error"]["board_rms_m"] > 2 * document["noise"]["board_rms_m"]
     assert document["text"] in fit.verdict.reasons
     assert "Infinity" not in json_text(document)
+
+
+def test_messages_speak_of_flange_poses_where_the_files_state_them():
+    chain, images, _ = faulty_setup("ur10", "nothing", 27, is_on_wrist=True, n_images=12)
+    # One image is paired with the configuration of another one.
+    q = images.q.copy()
+    q[images.image == 3] = images.q[images.image == 9][0] + 0.05
+    fit = dh.calibrate(chain, images.replace(q=q, has_joint_values=False), "camera,board")
+    assert fit.hand_eye is not None
+    assert fit.hand_eye.n_wrong_images == 1
+    assert "check the flange poses in its rows" in fit.hand_eye.image_sentences[0]
+    assert "joint values" not in " ".join([*fit.verdict.reasons, fit.hand_eye.likely])
+
+
+def test_a_shift_of_flange_poses_is_named():
+    chain, images, _ = faulty_setup("ur10", "rows", 27, is_on_wrist=True, n_images=15)
+    fit = dh.calibrate(chain, images.replace(has_joint_values=False), "camera,board", loss="linear")
+    check_cause(fit, "rows")
+    assert fit.hand_eye is not None
+    assert "belongs to the flange poses one row" in fit.hand_eye.likely
+    assert "Correct the table of flange poses." in fit.hand_eye.likely

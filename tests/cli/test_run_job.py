@@ -421,6 +421,11 @@ def test_a_camera_frame_without_images_is_refused(assert_refused):
     assert_refused(words, *CALIBRATE, "--camera-frame", "eye")
 
 
+def test_camera_files_without_images_are_refused(assert_refused):
+    words = ["--camera-files: the measurements have no camera", "expected image coordinates and --rig"]
+    assert_refused(words, *CALIBRATE, "--camera-files", "cam")
+
+
 def test_the_screen_names_the_error_of_images(run, robot_folder):
     assert (
         run("simulate", "arm.dh.toml", "-m", "30", "--kind", "camera", "--noise", "0.2px", "-o", "a.csv")[0]

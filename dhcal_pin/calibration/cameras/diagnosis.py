@@ -51,7 +51,7 @@ from .causes import (
     fit_causes,
 )
 from .gate import residual_jitter
-from .sets import MAX_POINTS, count_corners, has_joint_values
+from .sets import MAX_POINTS, count_corners, describe_configurations, has_joint_values
 from .stages import ImageError, fitted_error, held_out_error, held_out_prediction_std
 
 # Displacements that all corners of an image share and that no cause explains.
@@ -122,6 +122,7 @@ class HandEyeDiagnosis:
         rotation: RMS rotation of the tool about the axis with the second largest rotation [rad].
         position_std: Largest standard deviation of the position of a camera or a board [m].
         wrong_images: Label of each image that does not fit the others, and is left out; empty without names.
+        stated: What the files state of the robot: "joint values" or "flange poses".
     """
 
     error: ImageError
@@ -132,6 +133,7 @@ class HandEyeDiagnosis:
     rotation: float
     position_std: float
     wrong_images: tuple[str, ...]
+    stated: str
 
     @property
     def n_wrong_images(self) -> int:
@@ -173,13 +175,13 @@ class HandEyeDiagnosis:
         names = list_images(self.wrong_images)
         if self.n_wrong_images == 1:
             out.append(
-                f"One image does not fit the others and is left out{names}: check its joint values, and that "
-                "the robot stood still."
+                f"One image does not fit the others and is left out{names}: check the {self.stated} in its "
+                "rows, and that the robot stood still."
             )
         elif self.n_wrong_images:
             out.append(
-                f"{self.n_wrong_images} images do not fit the others and are left out{names}: check their "
-                "joint values, and that the robot stood still."
+                f"{self.n_wrong_images} images do not fit the others and are left out{names}: check the "
+                f"{self.stated} in their rows, and that the robot stood still."
             )
         return out
 
@@ -195,7 +197,7 @@ class HandEyeDiagnosis:
     def likely(self) -> str:
         """Likely cause, causes that cannot be told apart from it, and what to do; with a space before."""
         if not self.causes:
-            return " No cause that was tried explains it: check the images, the board and the joint values."
+            return f" No cause that was tried explains it: check the images, the board and the {self.stated}."
         parts = []
         for number, trial in enumerate(self.causes):
             start = "Likely cause" if not number else "In addition"
@@ -301,6 +303,7 @@ def diagnose_hand_eye(
             if isinstance(item, CameraCorners)
             for label in _wrong_images(found.hand_eye, found.last, item, weights)
         ),
+        describe_configurations(fit.data),
     )
 
 
@@ -430,7 +433,7 @@ def _find_causes(
             break
         if least > MAX_ERROR_SHARE * state.error.pixels:
             if state.is_displaced and state.error.pixels > MAX_NOISE_RATIO * state.noise:
-                found.append(_displacement(state))
+                found.append(_displacement(hand_eye, state))
             break
         equal = [name for name, each in states.items() if each.error.pixels <= MAX_TIE_RATIO * least]
         plausible = [name for name in equal if _is_plausible(name, states[name])] or equal
@@ -509,29 +512,31 @@ def _trial(hand_eye: HandEyeData, name: str, state: _State) -> Trial:
     return Trial(name, state.error, text, remedy)
 
 
-def _displacement(state: _State) -> Trial:
+def _displacement(hand_eye: HandEyeData, state: _State) -> Trial:
     """Describe displaced images that no cause explains."""
+    stated = describe_configurations(hand_eye.data)
+    kind = "of another kind " if has_joint_values(hand_eye.data) else ""
     text = (
-        "all corners of an image are displaced together: errors of the arm of another kind (deflection, "
-        "backlash, periodic errors), a robot that had not stopped, or images with wrong joint values"
+        f"all corners of an image are displaced together: errors of the arm {kind}(deflection, backlash, "
+        f"periodic errors), a robot that had not stopped, or images with wrong {stated}"
     )
-    remedy = "Check the joint values of each image, and wait until the arm stands still; take more images."
+    remedy = f"Check the {stated} of the images, and wait until the arm stands still; take more images."
     return Trial(DISPLACEMENT, state.error, text, remedy)
 
 
-def _pairing_text(_: HandEyeData, state: _State) -> tuple[str, str]:
-    """Describe a shift of the joint values."""
-    shift = state.causes.shift
+def _pairing_text(hand_eye: HandEyeData, state: _State) -> tuple[str, str]:
+    """Describe a shift of the joint values, or of the flange poses."""
+    shift, stated = state.causes.shift, describe_configurations(hand_eye.data)
     side = "before" if shift < 0 else "after"
     if abs(shift - round(shift)) < 0.05 and round(shift):
         count = abs(round(shift))
         rows = f"{count} rows" if count > 1 else "one row"
         return (
-            f"the pairing: each image belongs to the joint values {rows} {side} its own",
-            "Correct the table of joint values.",
+            f"the pairing: each image belongs to the {stated} {rows} {side} its own",
+            f"Correct the table of {stated}.",
         )
     return (
-        f"the pairing: each image belongs to joint values {abs(shift):.2g} rows {side} its own, a time "
+        f"the pairing: each image belongs to {stated} {abs(shift):.2g} rows {side} its own, a time "
         "offset between camera and robot",
         "Synchronize the clocks, or let the robot stop for each image.",
     )

@@ -71,7 +71,19 @@ def has_joint_values(data: Sequence[Measurement]) -> bool:
     Args:
         data: Measurements.
     """
-    return all(item.has_joint_values for item in data if isinstance(item, CameraCorners))
+    return all(item.has_joint_values for item in data)
+
+
+def describe_configurations(data: Sequence[Measurement]) -> str:
+    """Name what the files state of the robot, for messages.
+
+    Args:
+        data: Measurements.
+
+    Returns:
+        "joint values" or "flange poses".
+    """
+    return "joint values" if has_joint_values(data) else "flange poses"
 
 
 def require_joint_values(data: Sequence[Measurement], names: Sequence[str]) -> None:
