@@ -34,6 +34,7 @@ from .. import formatting
 from .._typing import Array
 from ..estimation import qr, robust
 from ..estimation.error_model import ErrorModel, ErrorParameter
+from ..estimation.frame_gauge import separate_frames
 from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.qr import TriangularSystem
 from ..estimation.solver import SolverResult, bounded_step, minimize, next_iterate
@@ -72,7 +73,7 @@ from .evaluation import (
     remove_outliers,
 )
 from .model_selection import Extension
-from .partition import configuration_groups, k_fold
+from .partition import configuration_groups, different_configurations, k_fold
 from .residual_table import ResidualTable, residual_table
 from .verdict import Verdict, judge
 
@@ -411,7 +412,7 @@ class Result(ResultPlots):
         robot = len(self.errors.parameters)
         # Predictions agree with the errors of left-out regions, see `model_selection`.
         scale = self.extension.prediction_scale if self.extension else 1.0
-        return Uncertainty.from_errors(
+        uncertainty = Uncertainty.from_errors(
             self.errors,
             self.x[:robot],
             self.chain,
@@ -420,6 +421,29 @@ class Result(ResultPlots):
             self.problem.temperature,
             self._model_std if self.problem.temperature > 1 else (0.0, 0.0),
         )
+        if self.rank == len(self.x) or not robot:
+            return uncertainty
+        # Even a small last step rotates the null space, so take the Jacobian at x.
+        system = linearize_and_factor(self.problem, self.x, small_angle=False)
+        null_space = qr.null_space(system.r)[:robot]
+        undetermined = Uncertainty.from_errors(
+            self.errors, self.x[:robot], self.chain, null_space, null_space[:, :0]
+        )
+        q, _ = different_configurations(self.inliers)
+        return separate_frames(uncertainty, undetermined.sqrt_covariance, q)
+
+    @property
+    def has_free_frames(self) -> bool:
+        """Whether the measurements leave the pose of base or tool free, at least in part."""
+        return self.uncertainty.has_free_frames
+
+    @property
+    def relative(self) -> Uncertainty:
+        """Uncertainty relative to the base and tool poses that fit the fitted samples best.
+
+        It is that of `predict` if the measurements determine these poses. Images of a board do not.
+        """
+        return self.uncertainty.relative
 
     @property
     def _model_std(self) -> tuple[float, float]:

@@ -6,6 +6,9 @@ workspace:
 
     std = √(mean of std_i² over the configurations i whose tool point lies in the cell)
 
+Where the measurements leave the pose of base or tool free, as images do, positions are relative to the base
+and tool poses that fit the measured configurations best, see `estimation.frame_gauge`.
+
 A position is reached in many configurations, and not equally well in all of them. Errors that the model lacks
 come on top of the prediction; the measured errors of a cell contain them.
 """
@@ -26,6 +29,12 @@ from ..robot.sampling import ConfigurationSampler, WorkspaceConstraints, joint_r
 
 # Configurations of a prediction by configurations, and of a map by cells.
 N_PREDICTED_CONFIGURATIONS, N_MAP_CONFIGURATIONS = 16_000, 20_000
+# Added to texts on predictions where the measurements leave the pose of base or tool free.
+RELATIVE_TEXT = (
+    "The measurements leave the pose of the base or of the tool free, at least in part: unknown poses of "
+    "cameras, boards or instruments take its place. The prediction is therefore that of positions relative "
+    "to the base and tool poses that fit the measured samples best."
+)
 # Predictions that are computed at once; more need more memory and are not faster.
 CHUNK_SIZE = 2000
 
@@ -60,12 +69,12 @@ def predict_workspace(model: Predictor, data: Sequence[Measurement]) -> Workspac
     n = model.chain.n_joints
     drawn = np.random.default_rng(0).uniform(*joint_range(model.chain), (N_PREDICTED_CONFIGURATIONS, n))
     measured = [item.configurations() for item in data if item.configurations_per_row > 0]
-    base_from_measuring = se3.inverse(model.chain.base)
+    base_from_measuring, relative = se3.inverse(model.chain.base), model.relative
 
     def predict(q: Array) -> tuple[Array, Array]:
         if not len(q):
             return np.empty((0, 3)), np.empty(0)
-        predictions = [model.predict(part) for part in np.array_split(q, -(-len(q) // CHUNK_SIZE))]
+        predictions = [relative.predict(part) for part in np.array_split(q, -(-len(q) // CHUNK_SIZE))]
         points = np.concatenate([one.poses[:, :3, 3] for one in predictions])
         points = points @ base_from_measuring[:3, :3].T + base_from_measuring[:3, 3]
         return points, np.concatenate([one.position_std for one in predictions])
@@ -148,7 +157,8 @@ def workspace_map(
 
 def _predict_positions(model: Predictor, q: Array) -> tuple[Array, Array]:
     """Return tool points (m, 3) [m] and the variances (m,) [m²] of their positions."""
-    predictions = [model.predict(part) for part in np.array_split(q, len(q) // CHUNK_SIZE + 1)]
+    relative = model.relative
+    predictions = [relative.predict(part) for part in np.array_split(q, len(q) // CHUNK_SIZE + 1)]
     points = np.concatenate([one.poses[:, :3, 3] for one in predictions])
     return points, np.concatenate([one.position_std for one in predictions]) ** 2
 

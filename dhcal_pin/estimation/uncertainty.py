@@ -24,7 +24,8 @@ Shapes: m samples, k moving joints, e uncertain transmission coefficients, r col
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -76,6 +77,16 @@ class Predictor(Protocol):
         """Calibrated chain."""
         ...
 
+    @property
+    def has_free_frames(self) -> bool:
+        """Whether the measurements leave the pose of base or tool free, at least in part."""
+        ...
+
+    @property
+    def relative(self) -> Uncertainty:
+        """Uncertainty relative to the base and tool poses that fit the measured configurations best."""
+        ...
+
     def predict(self, q: Array) -> Prediction:
         """Predict tool poses and their covariance.
 
@@ -101,6 +112,9 @@ class Uncertainty:
         temperature: Factor on the variance of correlated residuals that the covariance contains.
         model_std: Standard deviation of the errors that the model lacks, per axis, of the position [m] and of
             the orientation [rad] of the tool.
+        frame_part: Part of the square root and of the unbounded directions, shape (6(k+1)+e, r+h), that is
+            only another pose of a base or tool that the measurements leave free, see `frame_gauge`; shape
+            (0, 0) if they leave none free.
     """
 
     chain: Chain
@@ -109,6 +123,28 @@ class Uncertainty:
     unbounded_directions: Array
     temperature: float = 1.0
     model_std: tuple[float, float] = (0.0, 0.0)
+    frame_part: Array = field(default_factory=lambda: np.empty((0, 0)))
+
+    @property
+    def has_free_frames(self) -> bool:
+        """Whether the measurements leave the pose of base or tool free, at least in part."""
+        return bool(self.frame_part.size)
+
+    @cached_property
+    def relative(self) -> Uncertainty:
+        """Uncertainty relative to the base and tool poses that fit the measured configurations best.
+
+        It is the same if the measurements determine these poses.
+        """
+        if not self.has_free_frames:
+            return self
+        parts = np.split(self.frame_part, [self.sqrt_covariance.shape[1]], axis=1)
+        return replace(
+            self,
+            sqrt_covariance=self.sqrt_covariance - parts[0],
+            unbounded_directions=self.unbounded_directions - parts[1],
+            frame_part=np.empty((0, 0)),
+        )
 
     @classmethod
     def from_errors(
@@ -170,13 +206,21 @@ class Uncertainty:
         inverse = np.linalg.pinv(effects.reshape(len(scale), -1).T, rcond=RANK_RTOL)
         frames = self.chain.forward_kinematics(q)
         root, undetermined = (
-            inverse @ self._tool_twists(frames, part).transpose(1, 0, 2).reshape(inverse.shape[1], -1)
+            inverse @ self.tool_twists(frames, part).transpose(1, 0, 2).reshape(inverse.shape[1], -1)
             for part in (self.sqrt_covariance, self.unbounded_directions)
         )
         return root, undetermined
 
-    def _tool_twists(self, frames: FrameBatch, directions: Array) -> Array:
-        """Compute the tool twists (m, 6, c) of directions (6(k+1)+e, c) in body twists and coefficients."""
+    def tool_twists(self, frames: FrameBatch, directions: Array) -> Array:
+        """Compute the tool twists of directions in body twists and coefficients.
+
+        Args:
+            frames: Frames of the chain at m samples.
+            directions: Directions as rows of `sqrt_covariance`, shape (6(k+1)+e, c).
+
+        Returns:
+            Twists [v, ω] of the tool point in axes of the measuring frame, shape (m, 6, c).
+        """
         chain, n_bodies = self.chain, len(self.chain.moving_joints) + 1
         carry = np.tile(np.eye(4), (n_bodies, 1, 1))
         carry[0] = se3.inverse(chain.base)
@@ -209,7 +253,7 @@ class Uncertainty:
         """
         frames = self.chain.forward_kinematics(q)
         root, undetermined = (
-            self._tool_twists(frames, part) for part in (self.sqrt_covariance, self.unbounded_directions)
+            self.tool_twists(frames, part) for part in (self.sqrt_covariance, self.unbounded_directions)
         )
         covariance = root @ np.swapaxes(root, 1, 2) + np.diag(np.repeat(np.square(self.model_std), 3))
         samples, components = np.nonzero(np.sum(undetermined**2, -1) > UNBOUNDED_TOL)

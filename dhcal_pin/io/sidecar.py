@@ -30,6 +30,7 @@ The sidecar of `arm.urdf` is the TOML file `arm.calibration.toml` beside it:
     terms = ["elbow_joint.gain"]
     sqrt_covariance = "..."            # rows of little-endian doubles in base64
     unbounded_directions = "..."
+    frame_part = "..."                 # absent if the measurements determine base and tool
     temperature = 75.8                 # factor on the variance of the residuals that the covariance contains
     model_std_m = 1.1e-4               # errors that the model lacks: of the position, per axis
     model_std_rad = 1e-4               # the same of the orientation
@@ -113,8 +114,9 @@ _JOINT_HEADER = """\
 """
 _UNCERTAINTY_HEADER = """\
 # uncertainty: square root of the covariance of the errors, and directions that neither the measurements nor
-# a prior determine. Rows: six per link (motion in m and rad; the base link's in the measuring frame), then
-# the terms. Little-endian doubles in base64.
+# a prior determine; frame_part: what of both is only another pose of base or tool, which the measurements
+# leave free. Rows: six per link (motion in m and rad; the base link's in the measuring frame), then the
+# terms. Little-endian doubles in base64.
 """
 _MEASURED_HEADER = """\
 # measured: configurations that represent the measured region of joint space. A configuration is in the region
@@ -369,6 +371,9 @@ def read_uncertainty(path: PathLike, chain: Chain) -> Uncertainty | None:
     texts = {
         key: table.get(key, expected="base64 text") for key in ("sqrt_covariance", "unbounded_directions")
     }
+    has_frame_part = "frame_part" in table
+    if has_frame_part:
+        texts["frame_part"] = table.get("frame_part", expected="base64 text")
     temperature = table.number("temperature", 1.0, at_least=1)
     model_std = (table.number("model_std_m", 0.0, at_least=0), table.number("model_std_rad", 0.0, at_least=0))
     table.finish()
@@ -381,13 +386,14 @@ def read_uncertainty(path: PathLike, chain: Chain) -> Uncertainty | None:
         choices = ", ".join(fold_harmonics(indices))
         raise UnknownNameError(f"{table.where}: terms has {quote(unknown[0])}; choose from {choices}")
     n_rows = 6 * (len(chain.moving_joints) + 1) + len(terms)
-    sqrt_covariance, unbounded_directions = (
-        _decode_rows(text, n_rows, f"{table.where}: {key}") for key, text in texts.items()
-    )
+    columns = {key: _decode_rows(text, n_rows, f"{table.where}: {key}") for key, text in texts.items()}
+    n_columns = columns["sqrt_covariance"].shape[1] + columns["unbounded_directions"].shape[1]
+    if has_frame_part and columns["frame_part"].shape[1] != n_columns:
+        raise table.error("frame_part", f"expected {n_columns} columns, as in the other two arrays together")
     entries = np.array([indices[name] for name in terms], int)
     if terms and chain.transmission is None:
         chain = chain.with_transmission(Transmission.zero(chain.loads))
-    return Uncertainty(chain, entries, sqrt_covariance, unbounded_directions, temperature, model_std)
+    return Uncertainty(chain, entries, temperature=temperature, model_std=model_std, **columns)
 
 
 def read_measured_region(path: PathLike, chain: Chain) -> MeasuredRegion | None:
@@ -549,6 +555,7 @@ def _uncertainty_content(uncertainty: Uncertainty | None) -> dict[str, Any]:
         "terms": [names[int(index)] for index in uncertainty.entries],
         "sqrt_covariance": _encode_rows(uncertainty.sqrt_covariance),
         "unbounded_directions": _encode_rows(uncertainty.unbounded_directions),
+        **({"frame_part": _encode_rows(uncertainty.frame_part)} if uncertainty.has_free_frames else {}),
         "temperature": uncertainty.temperature,
         "model_std_m": uncertainty.model_std[0],
         "model_std_rad": uncertainty.model_std[1],

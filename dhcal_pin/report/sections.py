@@ -24,6 +24,7 @@ from ..calibration.model_selection import trial_table
 from ..calibration.summary import GROUP_LABELS
 from ..diagnostics.curves import JointCurve, find_lattices
 from ..diagnostics.residuals import median_sigmas
+from ..diagnostics.workspace import RELATIVE_TEXT
 from ..estimation import robust
 from ..formatting import Table, format_fixed, format_quantity
 from ..identifiability import label_unobservable
@@ -362,7 +363,10 @@ def _format_small(angle: float) -> str:
 
 
 def _workspace_section(context: ReportContext) -> Section:
-    workspace = context.workspace
+    workspace, fit = context.workspace, context.fit
+    if not fit.errors.parameters or (fit.has_free_frames and not fit.errors.has_arm):
+        # Nothing that matters to the tool is uncertain.
+        return Section("workspace", "Predicted accuracy in the workspace")
     is_known = np.isfinite(workspace.std)
     rows = []
     for title, std in (
@@ -392,6 +396,8 @@ def _workspace_section(context: ReportContext) -> Section:
             "At some configurations it cannot be predicted, because the measurements do not determine the "
             "tool position there."
         )
+    if fit.has_free_frames and is_known.any():
+        sentences.append(RELATIVE_TEXT)
     header = [
         "predicted position std, mm",
         "5th percentile",

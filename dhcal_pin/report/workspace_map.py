@@ -12,7 +12,7 @@ import numpy as np
 
 from .. import se3
 from ..calibration.evaluation import position_errors
-from ..diagnostics.workspace import WorkspaceMap, predict_workspace, workspace_map
+from ..diagnostics.workspace import RELATIVE_TEXT, WorkspaceMap, predict_workspace, workspace_map
 from ..estimation.uncertainty import Predictor
 from ..exceptions import InvalidArgumentError
 from ..io.tabular import csv_text
@@ -55,9 +55,11 @@ def map_content(
         "Standard deviation of the tool position that follows from the uncertainty of the parameters, for "
         "configurations drawn within the joint limits. Unmodelled errors come in addition."
     ]
+    if model.has_free_frames:
+        sentences.append(RELATIVE_TEXT)
     q, errors = position_errors(model.chain, data, known)
     if len(errors):
-        std = model.predict(q).position_std
+        std = model.relative.predict(q).position_std
         rms = [
             f"{1e3 * np.sqrt(np.mean(part**2)):.3g} mm" for part in (errors, std) if np.isfinite(part).all()
         ]

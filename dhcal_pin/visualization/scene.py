@@ -437,7 +437,7 @@ def _ellipsoids(model: Predictor, configurations: Array) -> list[dict[str, Any]]
         [m] in the frame of the calibrated base link.
     """
     configurations = configurations[evenly_spaced_indices(len(configurations), MAX_ELLIPSOIDS)]
-    covariance = model.predict(configurations).covariance[:, :3, :3]
+    covariance = model.relative.predict(configurations).covariance[:, :3, :3]
     is_finite = np.isfinite(covariance).all((1, 2))
     variances, axes = np.linalg.eigh(covariance[is_finite])
     # A flat ellipsoid has no surface normals and would be black.

@@ -51,7 +51,7 @@ def uncertainty_cells(predictor: Predictor) -> UncertaintyCells:
     """
     chain = predictor.chain
     q = np.random.default_rng(0).uniform(*joint_range(chain), (N_CONFIGURATIONS, chain.n_joints))
-    prediction = predictor.predict(q)
+    prediction = predictor.relative.predict(q)
     base = se3.inverse(chain.base)
     points = prediction.poses[:, :3, 3] @ base[:3, :3].T + base[:3, 3]
     variances = prediction.position_std**2
