@@ -10,8 +10,9 @@ Correction curves, the harmonics of high order, are explained apart from the oth
 of the joints leave many combinations of them open. The other parameters are explained as if the curves were
 known, and one sentence states how many combinations of the curves are open.
 
-Redundancies of the model, such as base pose and origin of joint 1, exist for every instrument. Their
-sentences start with `EXPECTED`, and users can ignore them.
+Redundancies of the model, such as base pose and origin of joint 1, exist for every instrument. Poses of
+cameras and boards are redundant with those of base and tool in all images. Their sentences start with
+`EXPECTED`, and users can ignore them.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from ..estimation.error_model import ErrorParameter
 from ..estimation.parameters import CURVE_ORDERS, fold_harmonics
 from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.qr import TriangularSystem
+from ..measurements.camera import CameraCorners
 from ..measurements.pose import Pose
 from ..measurements.position import Position
 from ..robot.chain import BASE_FRAME, Chain
@@ -176,6 +178,8 @@ class Explainer:
         names = [self.names[i] for i in group.members]
         if group.cause == "structure" and group.members[-1] < len(self.probe.problem.errors.parameters):
             return EXPECTED + self._explain_redundancy(group, names)
+        if group.cause in ("structure", "instrument") and (entries := self._rig_entries(group)):
+            return EXPECTED + self._explain_free_frame(group, names, entries)
         explain = {
             "structure": self._explain_structure,
             "instrument": self._explain_instrument,
@@ -260,6 +264,43 @@ class Explainer:
             else None
         )
         return [self.plain_errors.parameters[i] for i in members], way
+
+    def _rig_entries(self, group: UnobservableGroup) -> dict[str, bool]:
+        """Return the cameras and boards whose poses take part in a group, and whether the tool moves them.
+
+        Returns:
+            Entries such as "camera_wrist"; none if lenses or other instruments take part, too.
+        """
+        sets, moves = dict[str, str](), dict[str, bool]()
+        for item in self.probe.problem.data:
+            if isinstance(item, CameraCorners):
+                rig = item.rig
+                sets |= {p.name: item.set_of(p.name) for p in item.instrument_parameters}
+                for kind, entries, mounts in (
+                    ("camera", rig.cameras, rig.camera_mounts),
+                    ("board", rig.boards, rig.board_mounts),
+                ):
+                    moves |= {f"{kind}_{e.name}": m.moves for e, m in zip(entries, mounts, strict=True)}
+        n_robot = len(self.probe.problem.errors.parameters)
+        members = [self.names[i] for i in group.members if i >= n_robot]
+        if any(sets.get(name, "intrinsics") == "intrinsics" for name in members):
+            return {}
+        entries = dict.fromkeys(name.rpartition(".")[0] for name in members)
+        return {entry: moves[entry] for entry in entries}
+
+    def _explain_free_frame(
+        self, group: UnobservableGroup, names: list[str], entries: dict[str, bool]
+    ) -> str:
+        """Explain that poses of cameras and boards take the place of those of base and tool."""
+        frames = [frame for frame, moves in (("base", False), ("tool", True)) if moves in entries.values()]
+        frame = f"the pose of {' and '.join(f'the {name}' for name in frames)}"
+        poses = f"the pose{'s' if len(entries) > 1 else ''} of {join_names(list(entries))}"
+        n_directions = group.vectors.shape[1]
+        number = "one combination" if n_directions == 1 else f"{n_directions} combinations"
+        return (
+            f"{poses} can take the place of {frame}, and all images stay the same; {number} of "
+            f"{self._listed(group, names)} {'is' if n_directions == 1 else 'are'} not identifiable by images"
+        )
 
     def _explain_structure(self, group: UnobservableGroup) -> tuple[str, str]:
         """Explain a redundancy in which instrument parameters take part."""
