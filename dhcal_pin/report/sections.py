@@ -193,6 +193,11 @@ def _accuracy_section(context: ReportContext) -> Section:
         f"“Before” is the nominal robot{fitted}. The difference between before and after is therefore "
         "due to the robot parameters alone."
     ]
+    if not context.fit.errors.has_arm:
+        sentences = [
+            "No parameter of the arm was estimated: before and after are errors of the same arm, with frames "
+            "and instruments fitted in both."
+        ]
     if generalization.region_holdout:
         sentences.append(_region_sentence(generalization))
         if generalization.region_holdout not in comparisons:

@@ -55,6 +55,10 @@ def map_content(
         "Standard deviation of the tool position that follows from the uncertainty of the parameters, for "
         "configurations drawn within the joint limits. Unmodelled errors come in addition."
     ]
+    title = f"Predicted accuracy of {model.chain.model.name or 'the robot'}"
+    if not np.concatenate([model.relative.sqrt_covariance, model.relative.unbounded_directions], 1).any():
+        sentences = ["No parameter of the robot was estimated, so that no uncertainty of the tool follows."]
+        return render_page(Page(title, title, [Section("map", "", sentences)]))
     if model.has_free_frames:
         sentences.append(RELATIVE_TEXT)
     q, errors = position_errors(model.chain, data, known)
@@ -70,7 +74,6 @@ def map_content(
         )
     points = (se3.inverse(model.chain.base) @ model.chain.poses(q))[:, :3, 3]
     draw = partial(workspace_maps, predict_workspace(model, data), points, errors)
-    title = f"Predicted accuracy of {model.chain.model.name or 'the robot'}"
     return render_page(Page(title, title, [Section("map", "", sentences, figures=draw)]))
 
 

@@ -32,7 +32,7 @@ def flange_files(tmp_path, monkeypatch):
 def test_nothing_is_stated_about_joint_space(run, flange_files):
     status, _, err = run(
         *("calibrate", "flange.urdf", "images.csv", "--rig", "rig.toml", "--verbose"),
-        *("--report", "report.md", "--json", "fit.json", "-o", "out.urdf"),
+        *("--report", "report.md", "--json", "fit.json", "--map", "map.html", "-o", "out.urdf"),
     )
     assert status == 0, err
     document, report = json.loads(Path("fit.json").read_text()), Path("report.md").read_text()
@@ -46,6 +46,10 @@ def test_nothing_is_stated_about_joint_space(run, flange_files):
         assert "Added to the geometry" not in text
     # The sidecar has no measured region either: `validate` cannot say what is outside of it.
     assert "[measured]" not in Path("out.calibration.toml").read_text()
+    # Nothing of the robot is uncertain, and nothing of it has changed.
+    assert "Predicted accuracy" not in report
+    assert "No parameter of the robot was estimated" in Path("map.html").read_text()
+    assert "before and after are errors of the same arm" in report
     (noise,) = re.findall(r"pixels ([0-9.]+) px, estimated", report)
     assert float(noise) == pytest.approx(0.1, rel=0.15)
 
