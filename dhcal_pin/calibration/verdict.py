@@ -170,8 +170,10 @@ def _mixups(diagnosis: Diagnosis) -> list[Finding]:
 
 
 def _board_size(fit: Result) -> list[Finding]:
-    """Refuse an arm whose lengths follow from a wrong size of the boards."""
-    return [Finding("refused", fit.board_size.sentence)] if fit.board_size else []
+    """Refuse an arm whose lengths follow from a wrong size of the boards; advise caution if they may."""
+    if fit.board_size is None:
+        return []
+    return [Finding("refused" if fit.board_size.is_decisive else "caution", fit.board_size.sentence)]
 
 
 def _convergence(fit: Result) -> list[Finding]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
+from ..exceptions import InvalidArgumentError
 from .options import RIG
 
 EXAMPLE = "dhcal board rig.toml -o board.pdf"
@@ -39,6 +40,8 @@ def run(args: Namespace) -> int:
     from .screen import Screen
 
     require_writable_outputs([args.output], [args.rig])
+    if not args.output.lower().endswith(".pdf"):
+        raise InvalidArgumentError(f"{args.output}: unknown ending; write the board as .pdf")
     rig = read_rig(args.rig)
     board = only_entry(rig.boards, args.board, "board", args.rig)
     write_outputs({args.output: board_pdf(board)})

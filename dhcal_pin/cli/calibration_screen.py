@@ -26,6 +26,7 @@ from ..identifiability import EXPECTED, label_unobservable
 from ..io import origin_table
 from ..measurements.base import Measurement
 from ..measurements.camera import CameraCorners
+from ..measurements.images.names import list_images, whole_images
 from ..report.document import short_names
 from .job import Job
 from .run_job import CalibrationOutcome
@@ -163,10 +164,11 @@ def _row_lines(outcome: CalibrationOutcome, names: Mapping[str, str]) -> Iterato
             yield f"{names[path]}: line {item.row} is excluded: {item.reason}"
     for path, rows in outcome.outliers.items():
         rejected = outcome.rejected[path]
+        item = outcome.fitted[path]
         if excluded := [row for row in rows if row in rejected]:
-            yield f"{names[path]}: {_count_outliers(excluded)} excluded from the fit"
+            yield f"{names[path]}: {_count_outliers(excluded, item)} excluded from the fit"
         if included := [row for row in rows if row not in rejected]:
-            count = _count_outliers(included)
+            count = _count_outliers(included, item)
             yield (
                 f"{names[path]}: {count} kept in the fit, not far from the other samples: a few do no harm; "
                 "--loss tukey down-weights them"
@@ -175,10 +177,18 @@ def _row_lines(outcome: CalibrationOutcome, names: Mapping[str, str]) -> Iterato
             )
 
 
-def _count_outliers(rows: list[int]) -> str:
-    """Count outliers and name their lines."""
+def _count_outliers(rows: list[int], item: Measurement) -> str:
+    """Count outliers, and name their lines and the images whose corners they all are."""
     plural = "s" if len(rows) > 1 else ""
-    return f"{len(rows)} outlier{plural} (line{plural} {list_first(rows)})"
+    text = f"{len(rows)} outlier{plural} (line{plural} {list_first(rows)})"
+    if not isinstance(item, CameraCorners):
+        return text
+    images = whole_images(item.image, np.isin(item.rows, rows))
+    if not images:
+        return text
+    listed = list_images([item.image_labels[number] for number in images])
+    count = f"{len(images)} images" if len(images) > 1 else "an image"
+    return f"{text}, among them all corners of {count}{listed},"
 
 
 # --- accuracy and corrections ----------------------------------------------------------------------

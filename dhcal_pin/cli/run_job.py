@@ -27,7 +27,7 @@ from ..calibration.cross_validation import leave_regions_out
 from ..calibration.model_selection import FULL_SET, is_restricted
 from ..calibration.result import Result
 from ..diagnostics.curves import find_lattices
-from ..diagnostics.input_checks import find_value_warnings, poorly_fitted_files
+from ..diagnostics.input_checks import find_value_warnings, poorly_fitted_files, require_joint_units
 from ..diagnostics.reachability import UnreachableRow, find_unreachable_rows
 from ..estimation.parameters import select_parameters
 from ..estimation.robust import ZERO_WEIGHT
@@ -349,6 +349,8 @@ def _read_data(chain: Chain, job: Job, has_known_frames: bool) -> _JobData:
     rig = mount_rig(read_rig(job.rig), chain) if job.rig else None
     for path in [*job.data, *filter(None, [holdout_file])]:
         read = read_measurement_file(path, chain, job.columns, skip_bad_rows=job.skip_bad_rows, rig=rig)
+        if not job.mend:
+            require_joint_units(chain, read)
         measured = _mended(chain, read, job.mend)
         by_file[path] = measured.data
         notes[path] = list(measured.notes)

@@ -106,7 +106,8 @@ def run(args: Namespace) -> int:
     require_common_reference_target(dict(zip(args.data, data, strict=True)), instrument)
     known = {name: value for name, value in instrument.items() if name in used}
     given = accuracy(chain, data, known)
-    accuracies = {"base and tool as given": given}
+    unstated = _unstated_entries(rig) if rig else []
+    accuracies = {"fitted to these images" if unstated else "base and tool as given": given}
     if args.fit_frames:
         fit = fit_frames(chain, data, known)
         chain, known = fit.chain, known | fit.instruments
@@ -137,6 +138,11 @@ def run(args: Namespace) -> int:
         document["files"]["map"] = args.map
         contents[args.map] = map_content(args.map, predictor, data, known)
     remarks += extrapolation.sentences if extrapolation else ()
+    if unstated:
+        remarks.append(
+            f"Poses or lenses of {', '.join(unstated)} are not stated and were fitted to these images; other "
+            "images have larger errors."
+        )
     if estimated:
         others = f", not those of {args.rig}" if args.rig else ""
         remarks.append(
@@ -203,6 +209,14 @@ def _mounted_rig(args: Namespace, sidecar: str | None, chain: Chain) -> tuple[Mo
     ]
     ends = {"world": chain.root, "tip": chain.tip}
     return mount_rig(with_estimates_of(rig, calibrated, ends), chain), names
+
+
+def _unstated_entries(rig: MountedRig) -> list[str]:
+    """Return the cameras without a pose or a lens and the boards without a pose, such as `camera.wrist`."""
+    return [
+        *(f"camera.{each.name}" for each in rig.cameras if each.pose is None or not each.has_intrinsics),
+        *(f"board.{each.name}" for each in rig.boards if each.pose is None),
+    ]
 
 
 def _nominal_accuracy(

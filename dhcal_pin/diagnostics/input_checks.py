@@ -15,6 +15,7 @@ import numpy as np
 from .._typing import Array
 from ..calibration.evaluation import compute_errors
 from ..estimation.initialization import align
+from ..exceptions import FileFormatError
 from ..io.measurement_files import MeasurementFile
 from ..io.measurement_files.columns import ROTVEC, SECOND_PREFIX, VALUE_COLUMNS
 from ..measurements.base import Measurement
@@ -117,6 +118,25 @@ def find_value_warnings(chain: Chain, file: MeasurementFile) -> list[str]:
         *_check_limits(chain, file, joint_units),
         *_check_repetitions(file),
     ]
+
+
+def require_joint_units(chain: Chain, file: MeasurementFile) -> None:
+    """Raise an error if most joints of images turn farther than joints can.
+
+    A fit to such images takes long, and its result does not show the cause.
+
+    Args:
+        chain: Nominal robot.
+        file: Measurement file.
+
+    Raises:
+        FileFormatError: The values of most joints are implausible in the unit of their columns.
+    """
+    if not isinstance(file.data, CameraCorners):
+        return
+    warnings = list(_check_joint_units(chain, file).values())
+    if 2 * len(warnings) > chain.n_joints:
+        raise FileFormatError(f"{file.source}: {warnings[0]}")
 
 
 def _check_tip(chain: Chain, file: MeasurementFile) -> list[str]:

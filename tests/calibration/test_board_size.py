@@ -55,3 +55,18 @@ def test_exchanged_links_are_named(is_on_wrist):
     fit = dh.calibrate(arm, images, loss="linear", max_iterations=20)
     assert fit.verdict.status == "refused"
     assert "Likely cause: the links" in fit.verdict.reasons[0]
+
+
+@pytest.mark.parametrize(("size", "status"), [(1.0, "ok"), (1.005, "caution")])
+def test_a_size_that_is_slightly_wrong_needs_caution(size, status):
+    """A board 0.5 % too large lengthens a UR10 by 6 mm at full reach, which pixels do not show."""
+    arm, images = photograph(3, 5e-4)
+    (board,) = images.rig.boards
+    stated = replace(board, type="points", listed_points=size * board.points)
+    fit = dh.calibrate(arm, with_rig(images, boards=(stated,)), loss="linear")
+    assert fit.camera_stages[-1].is_kept
+    assert fit.verdict.status == status
+    assert (fit.board_size is not None) == (status == "caution")
+    if fit.board_size:
+        assert "size of the boards may be wrong" in fit.verdict.reasons[0]
+        assert fit.board_size.size == pytest.approx(1 / size, rel=2e-3)

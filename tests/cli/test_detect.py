@@ -81,7 +81,7 @@ def test_exchanged_rows_and_columns_are_named(run, photographs):
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        ("image,joint_1[deg]\nother,1\n", ["joints.csv", "no joint values of"]),
+        ("image,joint_1[deg]\nother,1\n", ["joints.csv", "no joint values of", "such as 'other'"]),
         ("name,joint_1[deg]\nother,1\n", ["joints.csv", "no column `image`"]),
         ("image,joint_1[deg]\nother,1\nother.png,2\n", ["joints.csv:3", "has a row already, line 2"]),
     ],
@@ -114,6 +114,12 @@ def test_images_that_take_too_much_memory_are_refused(assert_refused, photograph
     assert_refused(["long.png", "larger than 64 MiB"], "detect", "long.png", *command)
     Path("broken.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"\0" * 1000)
     assert_refused(["broken.png", "cannot be read as an image"], "detect", "broken.png", *command)
+
+
+def test_boards_are_drawn_as_pdf_only(assert_refused, photographs):
+    assert_refused(
+        ["board.png: unknown ending; write the board as .pdf"], "board", "rig.toml", "-o", "board.png"
+    )
 
 
 def test_board_is_drawn_at_its_true_scale(run, photographs):

@@ -68,6 +68,7 @@ def test_photographs_are_named(run, corners):
     assert f"left out ({listed}): check" in screen
     (outliers,) = [text for text in result["verdict"]["reasons"] if "are outliers" in text]
     assert f"among them all corners of 4 images ({listed}). Check the measurements" in outliers
+    assert f"among them all corners of 4 images ({listed}), excluded from the fit" in screen
     assert "Image 0004.png: " in Path("report.html").read_text()
     with open("residuals.csv", newline="") as file:
         images = [row["image"] for row in csv.DictReader(file)]

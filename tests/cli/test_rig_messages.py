@@ -108,6 +108,21 @@ def test_mistakes_of_corners_name_their_file_and_line(run, files, corners, optio
     check(run, CALIBRATE, f"dhcal: corners.csv{message}")
 
 
+def test_degrees_in_columns_of_radians_are_refused_before_the_fit(run, files):
+    write_corners(CORNERS)
+    text = (
+        Path("corners.csv")
+        .read_text()
+        .replace("[deg]", "[rad]")
+        .replace("1,2,3,4,5,6,", "10,-72,85,-95,20,40,")
+    )
+    Path("corners.csv").write_text(text)
+    message = (
+        "dhcal: corners.csv: joint shoulder_lift_joint reaches 72 rad, 11.5 turns; if the values are degrees"
+    )
+    check(run, CALIBRATE, message, "write [deg] in the header")
+
+
 def test_far_corners_name_the_rig_to_correct(run, files):
     Path("rig.toml").write_text(RIG.replace("width = 1280", "width = 80"))
     check(run, CALIBRATE, "corners.csv:2: u = 300", "of 80 x 720 px; check width and height in rig.toml")

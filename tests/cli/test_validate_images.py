@@ -101,6 +101,18 @@ def test_the_sidecar_of_a_calibration_replaces_the_rig_file(run, calibrated):
     assert "camera.wrist, board.table are the estimates of the calibration (arm.calibration.toml)." in text
 
 
+def test_poses_that_nothing_states_are_fitted_to_the_images(run, calibrated):
+    """The screen says so: errors of fitted images are no errors of a robot with base and tool as given."""
+    fitted = run("validate", "example:ur10", "other.csv", "--tip", "tool0", "--rig", "rig.toml")[2]
+    assert "base and tool as given" not in unfolded(fitted)
+    assert "lenses of camera.wrist, board.table are not stated and were fitted to these images" in unfolded(
+        fitted
+    )
+    given = run("validate", "arm.urdf", "other.csv", "--tip", "tool0")[2]
+    assert "base and tool as given" in unfolded(given)
+    assert "fitted to these images" not in unfolded(given)
+
+
 def test_a_sidecar_without_lens_or_pose_needs_the_rig_file(run, calibrated):
     content = tomllib.loads(Path("arm.calibration.toml").read_text())
     lens = ("fx", "fy", "cx", "cy", "distortion", "intrinsics")

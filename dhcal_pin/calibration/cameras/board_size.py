@@ -3,7 +3,7 @@
 Images do not show lengths: an arm and a board that are both 1 % longer give the same images. A board that is
 larger or smaller than the rig states therefore changes all lengths of the estimated arm by the same factor.
 Manufacturing errors do not. If another size of the boards makes the correction of the arm far smaller, the
-stated size is probably wrong.
+stated size is probably wrong. If it makes it smaller by less, the stated size may be wrong.
 
 The corrections of the lengths of the arm, in units of their default prior standard deviations, have the RMS w
 with the stated size and w' with the one that fits best. For a common width of their normal distribution, each
@@ -28,10 +28,13 @@ from ...robot.chain import BASE_FRAME
 from ..reweighting import Fit
 from .causes import MAX_SIZE_STEP, SIZE_STEP, find_minimum
 
-# RMS correction in prior standard deviations from which another size is tried.
-MIN_CORRECTION = 1.2
-# Logarithm of the ratio of the likelihoods, and change of the size, from which the stated size is wrong.
-MIN_LOG_RATIO, MIN_CHANGE = 8.0, 2e-3
+# RMS correction in prior standard deviations from which the stated size may be wrong, and is wrong.
+MIN_DOUBTFUL_CORRECTION, MIN_CORRECTION = 0.5, 1.2
+# Logarithm of the ratio of the likelihoods from which the stated size may be wrong (very strong evidence, see
+# Kass and Raftery 1995), and is wrong.
+MIN_DOUBTFUL_LOG_RATIO, MIN_LOG_RATIO = 5.0, 8.0
+# Smallest relative change of the size that is reported.
+MIN_CHANGE = 2e-3
 # Largest number of iterations of one solution.
 _MAX_ITERATIONS = 40
 
@@ -45,19 +48,27 @@ class BoardSize:
         square: Stated size of the squares of the first board [m]; 0 if it has none.
         stated: RMS correction of the lengths of the arm in prior standard deviations, with the stated size.
         found: The same with the other size.
+        log_ratio: Logarithm of the ratio of the likelihoods of the two sizes.
     """
 
     size: float
     square: float
     stated: float
     found: float
+    log_ratio: float
+
+    @property
+    def is_decisive(self) -> bool:
+        """Whether the stated size is wrong beyond doubt, rather than possibly wrong."""
+        return self.stated >= MIN_CORRECTION and self.log_ratio >= MIN_LOG_RATIO
 
     @property
     def sentence(self) -> str:
         """What was found, and what to do."""
         lengths = f" (squares of {1e3 * self.size * self.square:.4g} mm, not {1e3 * self.square:.4g} mm)"
+        doubt = "is probably" if self.is_decisive else "may be"
         return (
-            f"The size of the boards is probably wrong: with {100 * self.size:.4g} % of the stated size"
+            f"The size of the boards {doubt} wrong: with {100 * self.size:.4g} % of the stated size"
             f"{lengths if self.square else ''}, the corrections of the lengths of the arm fall from "
             f"{self.stated:.2g} to {self.found:.2g} times what manufacturing errors would be. Measure the "
             "boards over their whole length, and correct their size in the rig file."
@@ -76,7 +87,7 @@ def find_board_size(fit: Fit) -> BoardSize | None:
     problem, x = fit.problem, fit.solution.x
     stated = _rms_correction(problem.errors, x)
     lengths = _lengths(problem.errors)
-    if stated < MIN_CORRECTION or not all(isinstance(item, CameraCorners) for item in problem.data):
+    if stated < MIN_DOUBTFUL_CORRECTION or not all(isinstance(item, CameraCorners) for item in problem.data):
         return None
     # Wide priors would leave the size of the arm undetermined.
     weights = problem.weights.copy()
@@ -97,10 +108,10 @@ def find_board_size(fit: Fit) -> BoardSize | None:
     root = fit.solution.system.sqrt_covariance(weights)[0][: len(lengths)][lengths]
     count = np.sum(1 - np.sum((root * weights[: len(lengths)][lengths, None]) ** 2, 1))
     ratio = count * np.log(stated / max(found, 1e-9))
-    if ratio < MIN_LOG_RATIO or abs(log_size) < MIN_CHANGE:
+    if ratio < MIN_DOUBTFUL_LOG_RATIO or abs(log_size) < MIN_CHANGE:
         return None
     boards = [b for item in problem.data if isinstance(item, CameraCorners) for b in item.rig.boards]
-    return BoardSize(float(np.exp(log_size)), boards[0].square, stated, found)
+    return BoardSize(float(np.exp(log_size)), boards[0].square, stated, found, float(ratio))
 
 
 def _lengths(errors: ErrorModel) -> Array:

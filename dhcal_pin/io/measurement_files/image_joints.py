@@ -45,7 +45,11 @@ def read_image_joints(path: PathLike, images: Sequence[str]) -> dict[str, dict[s
     missing = [image for image in images if _stem(image) not in rows]
     if missing:
         more = f" and of {len(missing) - 1} more images" if len(missing) > 1 else ""
-        raise FileFormatError(f"{table.source}: no joint values of {os.path.basename(missing[0])}{more}")
+        known = f", such as {table.cells[0][index].strip()!r}" if rows else ""
+        raise FileFormatError(
+            f"{table.source}: no joint values of {os.path.basename(missing[0])}{more}; expected a row for "
+            f"each image, with its file name in the column `{IMAGE}`{known}"
+        )
     return {
         os.path.basename(image): {
             header: table.cells[rows[_stem(image)]][i].strip()
