@@ -391,13 +391,15 @@ def _require_cameras(job: Job, data: Sequence[Measurement]) -> None:
     """Check that there is a camera if files or a frame of it are to be written."""
     if has_images(data):
         return
-    expected = "expected image coordinates and --rig"
-    for option, value, other in (
-        ("--camera-frame", job.camera_frame, ", or --tool-frame NAME for the measured tool pose"),
-        ("--camera-files", job.camera_files, ""),
-    ):
-        if value:
-            raise InvalidArgumentError(f"{option}: the measurements have no camera; {expected}{other}")
+    if job.camera_frame:
+        raise InvalidArgumentError(
+            "--camera-frame: the measurements have no camera; expected image coordinates and --rig, or "
+            "--tool-frame NAME for the measured tool pose"
+        )
+    if job.camera_files:
+        raise InvalidArgumentError(
+            "--camera-files: the measurements have no camera; expected image coordinates and --rig"
+        )
 
 
 def _held_out_images(data: _JobData) -> str:
