@@ -61,27 +61,71 @@ _DISTANCE, _SCALE, _BOARD_SIZE = 1.5, 1000.0, 0.3
 
 @dataclass(frozen=True, eq=False)
 class _Projection:
-    """Model of all corners at one state, and what its derivatives are made of.
+    """Model of all corners at one state. Derivatives by the unknowns are computed on first use.
 
     Attributes:
         pixels: Image coordinates, (2, m) [px].
-        by_velocity: Derivative by the velocity of the tool, (2, 6, m).
-        by_camera: Derivative by position and rotation vector of the camera, (2, 6, m).
-        by_board: Derivative by position and rotation vector of the board, (2, 6, m).
-        by_point: Derivative by the corner in its board, (2, 3, m).
-        by_lens: Derivative by the values of the lens of each camera, (2, s, m) for the samples of the camera.
         by_local: Derivative by the corner in the frame of the camera, (2, 3, m) [px/m].
-        depth: Depth of the corners in front of the camera, (m,) [m].
+        by_lens: Derivative by the values of the lens of each camera, (2, s, m) for the samples of the camera.
+        moves: Whether the camera moves with the tool, (m,).
+        to_camera: Rotation from the frame of the camera's end to that of the camera, (3, 3, m).
+        between: Rotation from the frame of the board's end to that of the camera's end, (3, 3, m).
+        board_axes: Axes of the board in the frame of its end, (3, 3, m).
+        arm: Corner relative to the camera in the frame of the camera's end, (3, m) [m].
+        turned: Corner relative to the board in the frame of the board's end, (3, m) [m].
+        lever: Corner relative to the tool in the measuring frame, (3, m) [m].
+        camera_links: Axes of the link of the camera in the frame of its end, (3, 3, m).
+        board_links: Axes of the link of the board in the frame of its end, (3, 3, m).
+        camera_turns: Derivative of the camera's rotation by its rotation vector, (3, 3, m); see `_end_poses`.
+        board_turns: Derivative of the board's rotation by its rotation vector, (3, 3, m).
     """
 
     pixels: Array
-    by_velocity: Array
-    by_camera: Array
-    by_board: Array
-    by_point: Array
-    by_lens: list[Array]
     by_local: Array
-    depth: Array
+    by_lens: list[Array]
+    moves: Array
+    to_camera: Array
+    between: Array
+    board_axes: Array
+    arm: Array
+    turned: Array
+    lever: Array
+    camera_links: Array
+    board_links: Array
+    camera_turns: Array
+    board_turns: Array
+
+    @property
+    def by_velocity(self) -> Array:
+        """Derivative by the velocity of the tool, (2, 6, m)."""
+        # Axes of the measuring frame in the camera, with the sign of the motion of the corner.
+        measuring = np.where(self.moves, -_product(self.to_camera, self.between), self.to_camera)
+        by_linear = _product(self.by_local, measuring)
+        return np.concatenate([by_linear, -_cross(by_linear, self.lever)], 1)
+
+    @property
+    def by_camera(self) -> Array:
+        """Derivative by position and rotation vector of the camera, (2, 6, m)."""
+        by_position = -_product(self.by_local, self.to_camera)
+        # d = R_cᵀ·[arm]×·Jl·δ for a change δ of the rotation vector of the camera in its end.
+        by_rotation = _product(-_cross(by_position, self.arm), self.camera_turns)
+        return np.concatenate([_product(by_position, self.camera_links), by_rotation], 1)
+
+    @property
+    def by_board(self) -> Array:
+        """Derivative by position and rotation vector of the board, (2, 6, m)."""
+        by_rotation = _product(-_cross(self._by_end, self.turned), self.board_turns)
+        return np.concatenate([_product(self._by_end, self.board_links), by_rotation], 1)
+
+    @property
+    def by_point(self) -> Array:
+        """Derivative by the corner in its board, (2, 3, m)."""
+        return _product(self._by_end, self.board_axes)
+
+    @cached_property
+    def _by_end(self) -> Array:
+        """Derivative by the corner in the frame of the board's end, (2, 3, m)."""
+        return _product(self.by_local, _product(self.to_camera, self.between))
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -332,11 +376,16 @@ class CameraCorners(Measurement):
         return 1 / np.ascontiguousarray(self.sigma.T)
 
     # ------------------------------------------------------------------------------------------- model
+    @cached_property
+    def _parameter_ends(self) -> Array:
+        """Number of the parameters of the cameras and boards up to each one, (c + b,)."""
+        sizes = [len(camera_parameters(camera)) for camera in self.rig.cameras]
+        sizes += [len(board_parameters(board)) for board in self.rig.boards]
+        return np.cumsum(sizes)
+
     def _split(self, u: Array) -> tuple[list[Array], list[Array]]:
         """Split u into the parameters of each camera and of each board."""
-        sizes = [len(camera_parameters(c)) for c in self.rig.cameras]
-        sizes += [len(board_parameters(b)) for b in self.rig.boards]
-        parts = np.split(u, np.cumsum(sizes)[:-1])
+        parts = np.split(u, self._parameter_ends[:-1])
         return parts[: len(self.rig.cameras)], parts[len(self.rig.cameras) :]
 
     def lens_values(self, u: Array) -> list[Array]:
@@ -395,34 +444,30 @@ class CameraCorners(Measurement):
         lever = np.where(moves, on_end - tool[3], _rotate(r_tool, on_end))
         in_end = np.where(moves, _rotate(r_between, on_end - tool[3]), lever + tool[3])
         arm = in_end - camera_poses[self.camera, :3, 3].T
-        local = _rotate(r_camera.swapaxes(0, 1), arm)
         to_camera = r_camera.swapaxes(0, 1)
-        # Axes of the measuring frame in the camera, with the sign of the motion of the corner.
-        measuring = np.where(moves, -_product(to_camera, r_between), to_camera)
-        board_axes = _product(to_camera, r_between)
+        local = _rotate(to_camera, arm)
         pixels, by_local, by_lens = np.empty((2, m)), np.empty((2, 3, m)), []
         for number, (camera, values) in enumerate(zip(self.rig.cameras, self.lens_values(u), strict=True)):
             of_camera = self.camera == number
             found = camera.lens.project(local[:, of_camera], values)
             pixels[:, of_camera], by_local[:, :, of_camera] = found[:2]
             by_lens.append(found[2])
-        by_position = -_product(by_local, to_camera)
-        # d = R_cᵀ·[arm]×·Jl·δ for a change δ of the rotation vector of the camera in its end.
-        camera_rotation = _product(-_cross(by_position, arm), camera_turns[self.camera].transpose(1, 2, 0))
-        link_axes = camera_poses_of_links(mounts)[self.camera].transpose(1, 2, 0)
-        by_end = _product(by_local, board_axes)
-        board_rotation = _product(-_cross(by_end, turned), board_turns[self.board].transpose(1, 2, 0))
-        board_links = camera_poses_of_links(self.rig.board_mounts)[self.board].transpose(1, 2, 0)
-        by_linear = _product(by_local, measuring)
+        # The frames are a work array; only copies of their values are kept.
         return _Projection(
-            pixels,
-            np.concatenate([by_linear, -_cross(by_linear, lever)], 1),
-            np.concatenate([_product(by_position, link_axes), camera_rotation], 1),
-            np.concatenate([_product(by_end, board_links), board_rotation], 1),
-            _product(by_end, r_board),
-            by_lens,
-            by_local,
-            local[2],
+            pixels=pixels,
+            by_local=by_local,
+            by_lens=by_lens,
+            moves=moves,
+            to_camera=to_camera,
+            between=r_between,
+            board_axes=r_board,
+            arm=arm,
+            turned=turned,
+            lever=lever,
+            camera_links=camera_poses_of_links(mounts)[self.camera].transpose(1, 2, 0),
+            board_links=camera_poses_of_links(self.rig.board_mounts)[self.board].transpose(1, 2, 0),
+            camera_turns=camera_turns[self.camera].transpose(1, 2, 0),
+            board_turns=board_turns[self.board].transpose(1, 2, 0),
         )
 
     @cached_property
