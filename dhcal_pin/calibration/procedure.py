@@ -65,7 +65,6 @@ from .cameras import (
     require_joint_values,
     seen_ranges_warning,
     split_sets,
-    without_arm,
 )
 from .cross_validation import leave_regions_out
 from .model_selection import Extension
@@ -188,8 +187,9 @@ def calibrate(
             if points is not None and points.is_kept:
                 fit = reweight(points.fit, robust.LOSSES[loss].stages, groups, max_iterations, progress)
             ungated = fit
-            fit, with_arm, gate = apply_gate(ungated, groups, max_iterations)
-            stages = judge_stages(ungated, with_arm, gate, points, max_iterations)
+            gated = apply_gate(ungated, groups, max_iterations)
+            fit, gate = gated.fit, gated.gate
+            stages = judge_stages(ungated, gated, points, max_iterations)
             extension = Extension(temperature=gate.temperature, n_configurations=gate.n_configurations)
             result = _make_result(fit, 1.0, holdout, method)
             warnings = [exchange.sentence for exchange in exchanges]
@@ -199,7 +199,7 @@ def calibrate(
             if gate.is_open and fitted_error(fit).pixels < LARGE_ERROR:
                 result = replace(result, board_size=find_board_size(ungated))
             else:
-                frames = without_arm(ungated, max_iterations) if errors.has_arm else ungated
+                frames = gated.nominal if errors.has_arm else ungated
                 result = replace(result, hand_eye_fit=HandEyeFit(frames, result.pose_std, holdout))
             return replace(
                 result,

@@ -590,7 +590,7 @@ class CameraCorners(Measurement):
     def _with_first_values(self, chain: Chain, is_used: Array | None = None) -> Self:
         """Return a copy with first values; messages begin with the file of the images."""
         try:
-            return self.with_values(first_values(self, chain, is_used))
+            return self.with_values(first_values(self, self.board_views, chain, is_used))
         except NotObservableError as error:
             where = f"{self.source}: " if self.source else ""
             raise NotObservableError(f"{where}{error}") from None

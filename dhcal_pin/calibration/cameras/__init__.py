@@ -7,7 +7,7 @@ which of these parameters are unknown, and in which order they are freed.
 from .axis_order import axis_stages, exchange_axes, reorder
 from .board_size import BoardSize, find_board_size
 from .diagnosis import LARGE_ERROR, HandEyeDiagnosis, HandEyeFit
-from .gate import apply_gate, judge_stages, judge_target_points, without_arm
+from .gate import apply_gate, judge_stages, judge_target_points
 from .seen_ranges import seen_ranges_warning
 from .sets import (
     DEFAULT_SETS,
@@ -50,5 +50,4 @@ __all__ = [
     "require_joint_values",
     "seen_ranges_warning",
     "split_sets",
-    "without_arm",
 ]

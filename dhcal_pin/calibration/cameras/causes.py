@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 
 import numpy as np
 
@@ -35,6 +36,7 @@ from ...estimation.solver import minimize
 from ...exceptions import DhcalError
 from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners
+from ...measurements.images.camera_start import first_values
 from ..reweighting import Fit, reweight
 
 # Causes, and parameter sets of those of the arm. Those with fewer unknowns come first.
@@ -112,6 +114,11 @@ def apply_causes(hand_eye: HandEyeData, causes: Causes, item: CameraCorners) -> 
     Returns:
         The images.
     """
+    return _shifted(_with_rig(causes, item), hand_eye, causes)
+
+
+def _with_rig(causes: Causes, item: CameraCorners) -> CameraCorners:
+    """Return images with the rig of some causes and their own joint values."""
     cameras, boards = item.rig.cameras, item.rig.boards
     if causes.has_lens:
         cameras = tuple(
@@ -130,8 +137,7 @@ def apply_causes(hand_eye: HandEyeData, causes: Causes, item: CameraCorners) -> 
         rig = replace(rig, cameras=cameras, boards=boards)
     if causes.has_exchanged_links:
         rig = rig.with_exchanged_links()
-    item = item if rig is item.rig else item.with_rig(rig)
-    return _shifted(item, hand_eye.sequence, causes.shift) if causes.shift else item
+    return item if rig is item.rig else item.with_rig(rig)
 
 
 def fit_causes(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float] | None = None) -> Fit:
@@ -161,15 +167,18 @@ def _first_fit(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float]
         parameters = sorted((*errors.parameters, *arm.parameters), key=lambda p: p.error_frame)
         errors = replace(arm, parameters=tuple(parameters))
     data = tuple(
-        apply_causes(hand_eye, causes, item) if isinstance(item, CameraCorners) else item
-        for item in hand_eye.data
+        _with_rig(causes, item) if isinstance(item, CameraCorners) else item for item in hand_eye.data
     )
     known = dict(hand_eye.known)
     if causes.has_lens:
         freed = {name for item in data if isinstance(item, CameraCorners) for name in _lens_names(item)}
         known = {name: value for name, value in known.items() if name not in freed}
     if start is None:
-        data = tuple(_without_poses(item, known).initialized(errors.chain) for item in data)
+        data = tuple(_without_poses(item, known) for item in data)
+    data = tuple(
+        _shifted(item, hand_eye, causes) if isinstance(item, CameraCorners) else item for item in data
+    )
+    data = tuple(item.initialized(errors.chain) for item in data)
     weights = np.array([1 / p.prior for p in errors.parameters])
     problem = make_problem(errors, data, weights, known)
     first = start or {}
@@ -192,14 +201,22 @@ def _without_poses(item: Measurement, known: Mapping[str, float]) -> Measurement
     return item.with_values({name: np.nan for name in names if name not in known})
 
 
-def _shifted(item: CameraCorners, sequence: Array, shift: float) -> CameraCorners:
-    """Return images with the joint values of other rows; images without such a row are left out."""
+def _shifted(item: CameraCorners, hand_eye: HandEyeData, causes: Causes) -> CameraCorners:
+    """Return the images for which there are shifted joint values, with these and with first values."""
+    if not causes.shift:
+        return item
+    sequence = hand_eye.sequence
     number = np.array([int(np.argmin(np.abs(sequence - q).max(1))) for q in item.q])
-    place = number + shift
+    place = number + causes.shift
     low = np.clip(np.floor(place).astype(int), 0, len(sequence) - 2)
     part = (place - low)[:, None]
-    q = (1 - part) * sequence[low] + part * sequence[low + 1]
-    return item.replace(q=q).take((place >= 0) & (place <= len(sequence) - 1))
+    is_inside = (place >= 0) & (place <= len(sequence) - 1)
+    shifted = item.replace(q=(1 - part) * sequence[low] + part * sequence[low + 1])
+    if any(np.isnan(p.nominal) for p in item.instrument_parameters):
+        # The boards are where they are in the images, whatever the joint values.
+        values = first_values(shifted, item.board_views, hand_eye.errors.chain, is_inside)
+        shifted = shifted.with_values(values)
+    return shifted.take(is_inside)
 
 
 def file_sequence(data: Sequence[Measurement]) -> Array:
@@ -257,13 +274,15 @@ def find_shift(hand_eye: HandEyeData, causes: Causes) -> float:
     """
     if len(hand_eye.sequence) < 4:
         return 0.0
-    costs = {shift: _cost(hand_eye, replace(causes, shift=shift), None) for shift in (0.0, *SHIFTS)}
-    best = min(costs, key=lambda shift: costs[shift])
-    if not best or costs[best] > MAX_SHIFT_COST * costs[0.0]:
+
+    @cache
+    def cost(shift: float) -> float:
+        return _cost(hand_eye, replace(causes, shift=shift), None)
+
+    best = min((0.0, *SHIFTS), key=cost)
+    if not best or cost(best) > MAX_SHIFT_COST * cost(0.0):
         return 0.0
-    found = find_minimum(
-        lambda shift: _cost(hand_eye, replace(causes, shift=shift), None), best, _SHIFT_STEP, 0.5
-    )
+    found = find_minimum(cost, best, _SHIFT_STEP, 0.5)
     return best if best.is_integer() and abs(found - best) < MAX_WHOLE_DIFFERENCE else found
 
 

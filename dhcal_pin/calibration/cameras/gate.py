@@ -109,6 +109,23 @@ class Gate:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class GatedFit:
+    """Fits with and without errors of the arm, and the gate between them.
+
+    Attributes:
+        fit: Final fit.
+        nominal: Fit of independent corners with the nominal arm.
+        with_arm: Fit with the arm estimated.
+        gate: Whether the arm is estimated in the final fit.
+    """
+
+    fit: Fit
+    nominal: Fit
+    with_arm: Fit
+    gate: Gate
+
+
 def fit_with_jitter(fit: Fit, max_iterations: int) -> tuple[Fit, Jitter]:
     """Estimate the displacement that the corners of an image share, and fit again.
 
@@ -143,7 +160,7 @@ def judge_target_points(fit: Fit, max_iterations: int) -> TargetPoints | None:
     return try_target_points(fit, images, clusters, max_iterations)
 
 
-def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int) -> tuple[Fit, Fit, Gate]:
+def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int) -> GatedFit:
     """Fit arm, cameras and boards as far as the images show that the arm is wrong.
 
     Args:
@@ -152,7 +169,7 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int) -> tuple[Fit,
         max_iterations: Largest number of iterations of one solution.
 
     Returns:
-        The final fit, the fit with the arm estimated, and the gate.
+        The fits and the gate.
     """
     is_good = np.concatenate([weights > ZERO_WEIGHT for weights in fit.weights])
     n_configurations = len(np.unique(configuration_groups(fit.data)[is_good]))
@@ -164,7 +181,8 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int) -> tuple[Fit,
         kept = _best((fit_with_corner_noise(nominal, max_iterations), shared), folds)
     kept = _solve(kept, kept.problem, 1.0, max_iterations)
     if not fit.problem.errors.has_arm:
-        return kept, kept, Gate(float("nan"), 1.0, n_configurations, is_right, is_right)
+        gate = Gate(float("nan"), 1.0, n_configurations, is_right, is_right)
+        return GatedFit(kept, nominal, kept, gate)
     shared, jitter = fit_with_jitter(fit, max_iterations)
     is_complete = not jitter.is_significant
     # If the images share no displacement, their corners are independent, and none of them counts as too many.
@@ -179,13 +197,13 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int) -> tuple[Fit,
     best = min(trials, key=lambda trial: trial.error) if len(folds) > 1 else trials[-1]
     gate = Gate(best.ratio, 1.0, n_configurations, is_right, is_complete)
     if not gate.is_open:
-        return kept, best.closed, gate
+        return GatedFit(kept, nominal, best.closed, gate)
     opened_at = 1.0
     if not is_complete:
         factor = 1.0 if best.model is shared else share
         opened_at = factor * temperature(n_configurations, OPEN_SAMPLES)
     opened = _solve(best.model, best.model.problem, opened_at, max_iterations)
-    return opened, opened, replace(gate, temperature=opened_at)
+    return GatedFit(opened, nominal, opened, replace(gate, temperature=opened_at))
 
 
 def _best(fits: Sequence[Fit], folds: Sequence[Fold]) -> Fit:
@@ -335,14 +353,13 @@ def nominal_arm(errors: ErrorModel) -> ErrorModel:
 
 
 def judge_stages(
-    fit: Fit, with_arm: Fit, gate: Gate, judged_points: TargetPoints | None, max_iterations: int
+    fit: Fit, gated: GatedFit, judged_points: TargetPoints | None, max_iterations: int
 ) -> tuple[Stage, ...]:
     """Judge the stages of a calibration: frames, intrinsics, target points, arm.
 
     Args:
         fit: Fit to which the gate was applied.
-        with_arm: Fit with the arm estimated.
-        gate: Gate.
+        gated: Result of the gate.
         judged_points: Why the corners of the boards are estimated or held; None if the rig says so.
         max_iterations: Largest number of iterations of one solution.
 
@@ -363,7 +380,7 @@ def judge_stages(
     if len(lenses.problem.weights) > len(frames.problem.weights):
         stage = judged("intrinsics", lenses, True, "The rig does not fix them.")
         out.append(replace(stage, reason=f"{stage.reason} {_change(out[-1], stage)}".strip()))
-    points = without_arm(fit, max_iterations)
+    points = gated.nominal
     has_points = len(points.problem.weights) > len(lenses.problem.weights)
     if not has_points and count_corners(fit.data) <= MAX_POINTS:
         points = without_arm(
@@ -380,8 +397,8 @@ def judge_stages(
         else:
             stage = judged("target points", points, has_points, reason)
             out.append(replace(stage, reason=f"{stage.reason} {_change(out[-1], stage)}".strip()))
-    if with_arm.problem.errors.has_arm:
-        out.append(judged("arm", with_arm, gate.is_open, gate.sentence))
+    if gated.with_arm.problem.errors.has_arm:
+        out.append(judged("arm", gated.with_arm, gated.gate.is_open, gated.gate.sentence))
     return tuple(out)
 
 

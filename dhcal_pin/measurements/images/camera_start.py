@@ -124,11 +124,14 @@ def _fit_camera(camera: Camera, content: tuple[tuple[bytes, bytes], ...], repeat
     return fit_camera(views, camera, repeats_errors=repeats_errors)
 
 
-def first_values(item: CameraCorners, chain: Chain, is_used: Array | None = None) -> dict[str, float]:
+def first_values(
+    item: CameraCorners, views: BoardViews, chain: Chain, is_used: Array | None = None
+) -> dict[str, float]:
     """Estimate the first values of all parameters of cameras and boards.
 
     Args:
         item: Image coordinates.
+        views: Boards in these images, whatever their joint values.
         chain: Nominal chain with base and tool.
         is_used: Whether the poses are estimated from each sample, (m,); all or none of an image. All samples
             if None.
@@ -141,7 +144,6 @@ def first_values(item: CameraCorners, chain: Chain, is_used: Array | None = None
     """
     used = np.ones(len(item.rows), bool) if is_used is None else is_used
     values: dict[str, float] = {}
-    views = item.board_views
     for camera, lens in zip(item.rig.cameras, views.lenses, strict=True):
         if not camera.has_intrinsics:
             names = [f"camera_{camera.name}.{name}" for name in camera.lens.names]
