@@ -61,10 +61,13 @@ from .cameras import (
     held_values,
     judge_stages,
     judge_target_points,
+    lens_prior_groups,
     reorder,
     require_joint_values,
     seen_ranges_warning,
     split_sets,
+    with_lens_priors,
+    with_stated_distortion,
 )
 from .cross_validation import leave_regions_out
 from .model_selection import Extension
@@ -172,21 +175,28 @@ def calibrate(
         )
     is_robust = method == "lm" and loss != "linear"
     errors, data, weights = _initialize(errors, data, known, max_iterations, is_robust)
+    data, distortion = with_stated_distortion(data)
     problem = replace(make_problem(errors, data, prior_weights(errors, priors), known), executor=executor)
     if priors == "none":
         problem = problem.with_prior_weights(np.zeros(len(problem.weights)))
     if bounds:
         problem = replace(problem, bounds=_bounds(problem, bounds))
-    fit = _solve(problem, weights, method, max_iterations, progress)
+    start = np.zeros(len(problem.weights))
+    for i, parameter in enumerate(problem.instrument_parameters, len(errors.parameters)):
+        start[i] = distortion.get(parameter.name, parameter.nominal) - parameter.nominal
+    fit = _solve(problem, start, weights, method, max_iterations, progress)
     shrinkage_factor = 1.0
     if method == "lm":
         groups = PriorGroups.from_expected(errors, problem.weights, has_default_prior(errors, priors))
-        fit = reweight(fit, robust.LOSSES[loss].stages, groups, max_iterations, progress)
+        stages_of_loss = robust.LOSSES[loss].stages
+        scaled = groups.joined(lens_prior_groups(problem)) if priors != "none" else groups
+        fit = reweight(fit, stages_of_loss, scaled, max_iterations, progress)
         if has_images(data) and priors != "none":
             points = judge_target_points(fit, max_iterations)
             if points is not None and points.is_kept:
-                fit = reweight(points.fit, robust.LOSSES[loss].stages, groups, max_iterations, progress)
-            ungated = fit
+                scaled = groups.joined(lens_prior_groups(points.fit.problem))
+                fit = reweight(points.fit, stages_of_loss, scaled, max_iterations, progress)
+            ungated = with_lens_priors(fit)
             gated = apply_gate(ungated, groups, max_iterations)
             fit, gate = gated.fit, gated.gate
             stages = judge_stages(ungated, gated, points, max_iterations)
@@ -334,6 +344,7 @@ def _bounds(problem: Problem, bounds: Mapping[str, tuple[float, float]]) -> Arra
 
 def _solve(
     problem: Problem,
+    start: Array,
     weights: Sequence[Array],
     method: Method,
     max_iterations: int,
@@ -346,7 +357,7 @@ def _solve(
     options: dict[str, Any] = {"loose": True} if method == "lm" else {}
     if progress:
         options["progress"] = lambda iteration, cost: progress("fit", iteration, max_iterations)
-    solution = minimize(problem, method, None, max_iterations, **options)
+    solution = minimize(problem, method, start, max_iterations, **options)
     fit = Fit(data, problem, solution, tuple(weights))
     errors = problem.errors
     if not errors.has_transmission:

@@ -107,13 +107,16 @@ class PriorGroups:
         members: Indices of the parameters in any group, shape (n,).
         group_index: Group of each of them, shape (n,).
         expected_weights: Reciprocal expected standard deviation of each group, shape (g,).
-        max_weights: Largest expected weight among the groups of the same unit, shape (g,).
+        max_weights: Largest weight of each group, shape (g,).
+        expectation_counts: Number of determined parameters that the expected standard deviation of each group
+            counts for against smaller errors, shape (g,).
     """
 
     members: Array
     group_index: Array
     expected_weights: Array
     max_weights: Array
+    expectation_counts: Array
 
     @classmethod
     def from_expected(cls, errors: ErrorModel, expected: Array, default: Array) -> PriorGroups:
@@ -139,12 +142,27 @@ class PriorGroups:
             np.array([distinct.index(key) for key in keys], int),
             np.array([weight for _, weight in distinct]),
             np.array(max_weights),
+            np.full(len(distinct), EXPECTATION_COUNT),
         )
 
     @classmethod
     def none(cls) -> PriorGroups:
         """Return no groups: all priors keep their standard deviations."""
-        return cls(np.empty(0, int), np.empty(0, int), np.empty(0), np.empty(0))
+        return cls(np.empty(0, int), np.empty(0, int), np.empty(0), np.empty(0), np.empty(0))
+
+    def joined(self, other: PriorGroups) -> PriorGroups:
+        """Return these groups and others.
+
+        Args:
+            other: Groups of other parameters of the same problem.
+        """
+        return PriorGroups(
+            np.concatenate([self.members, other.members]),
+            np.concatenate([self.group_index, other.group_index + len(self.expected_weights)]),
+            np.concatenate([self.expected_weights, other.expected_weights]),
+            np.concatenate([self.max_weights, other.max_weights]),
+            np.concatenate([self.expectation_counts, other.expectation_counts]),
+        )
 
     def groups(self) -> list[tuple[list[int], float]]:
         """List the groups.
@@ -193,7 +211,9 @@ def update_prior_scales(problem: Problem, solution: SolverResult, groups: PriorG
     determined = np.fmax(0.0, 1 - np.einsum("ij,ij->i", root, root) * problem.weights[members] ** 2)
     squares = np.bincount(group_index, solution.x[members] ** 2) * expected**2
     count = np.bincount(group_index, determined)
-    extra = np.where(squares <= count, EXPECTATION_COUNT, 0.0)
-    updated = np.fmin(expected * np.sqrt((count + extra) / (squares + extra)), groups.max_weights)
+    extra = np.where(squares <= count, groups.expectation_counts, 0.0)
+    smallest = np.finfo(float).tiny
+    updated = expected * np.sqrt(np.fmax(count + extra, smallest) / np.fmax(squares + extra, smallest))
+    updated = np.fmin(updated, groups.max_weights)
     weights[members] = updated[group_index]
     return weights

@@ -197,17 +197,16 @@ def _read_camera(table: TomlTable) -> Camera:
         raise FileFormatError(
             f"{table.where}: {', '.join(given)} without {missing}; expected all of fx, fy, cx, cy or none"
         )
-    values = np.full(4 + len(lens.coefficients), np.nan)
+    values = np.array([np.nan] * 4 + [0.0] * len(lens.coefficients))
     if given:
         values[:2] = [table.number(name, above=0.0) for name in ("fx", "fy")]
         values[2:4] = [table.number(name) for name in ("cx", "cy")]
-        zero = [0.0] * len(lens.coefficients)
-        values[4:] = table.vector("distortion", len(lens.coefficients), zero)
+        values[4:] = table.vector("distortion", len(lens.coefficients), values[4:].tolist())
     elif "distortion" in table:
         raise FileFormatError(
             f"{table.where}: distortion without fx, fy, cx, cy; expected all of them or none"
         )
-    intrinsics = table.choice("intrinsics", INTRINSICS_CHOICES, "prior" if given else "free")
+    intrinsics = table.choice("intrinsics", INTRINSICS_CHOICES, "prior")
     if intrinsics == "fixed" and not given:
         raise FileFormatError(f'{table.where}: intrinsics = "fixed" without values; expected fx, fy, cx, cy')
     camera = Camera(
@@ -217,8 +216,7 @@ def _read_camera(table: TomlTable) -> Camera:
         height=_count(table, "height", _MAX_PIXELS),
         values=values,
         lens=lens,
-        # A value that is not known has no prior.
-        intrinsics=intrinsics if given else "free",
+        intrinsics=intrinsics,
         pose=_first_pose(table),
     )
     table.finish()

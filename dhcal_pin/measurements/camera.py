@@ -279,10 +279,13 @@ class CameraCorners(Measurement):
     @property
     def stated_values(self) -> dict[str, float]:
         """Values of the parameters of poses and lenses that the rig states, by name [m, rad, px or 1]."""
+        unknown = tuple(f"camera_{camera.name}." for camera in self.rig.cameras if not camera.has_intrinsics)
         return {
             p.name: p.nominal
             for p in rig_parameters(self.rig)
-            if np.isfinite(p.nominal) and self.set_of(p.name) != POINTS_SET
+            if np.isfinite(p.nominal)
+            and self.set_of(p.name) != POINTS_SET
+            and not (self.set_of(p.name) == "intrinsics" and p.name.startswith(unknown))
         }
 
     def set_of(self, name: str) -> str:

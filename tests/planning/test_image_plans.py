@@ -383,8 +383,9 @@ SETS = "camera,board,intrinsics"
 
 
 def small_board(rig: MountedRig) -> MountedRig:
-    """Return a rig with a board of twelve corners that are unknown."""
-    return with_points(rig, columns=5, rows=4, has_free_points=True)
+    """Return a rig with a board of twelve corners that are unknown, and a lens without a prior."""
+    cameras = tuple(replace(camera, intrinsics="free") for camera in rig.cameras)
+    return with_points(replace(rig, cameras=cameras), columns=5, rows=4, has_free_points=True)
 
 
 def corners_beside(rig: MountedRig, size: float, rng) -> MountedRig:

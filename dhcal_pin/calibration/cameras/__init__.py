@@ -8,6 +8,7 @@ from .axis_order import axis_stages, exchange_axes, reorder
 from .board_size import BoardSize, find_board_size
 from .diagnosis import LARGE_ERROR, HandEyeDiagnosis, HandEyeFit
 from .gate import apply_gate, judge_stages, judge_target_points
+from .lens_priors import lens_prior_groups, with_lens_priors, with_stated_distortion
 from .seen_ranges import seen_ranges_warning
 from .sets import (
     DEFAULT_SETS,
@@ -46,8 +47,11 @@ __all__ = [
     "judge_stages",
     "judge_target_points",
     "judged_boards",
+    "lens_prior_groups",
     "reorder",
     "require_joint_values",
     "seen_ranges_warning",
     "split_sets",
+    "with_lens_priors",
+    "with_stated_distortion",
 ]

@@ -1,0 +1,111 @@
+"""Prior widths of lenses: how wrong the stated intrinsics are, from the images.
+
+The prior of stated intrinsics is wide, so that a lens that is wrong by 5 % is found. If the stated values are
+right, so wide a prior lets the lens imitate other errors, above all through the distortion near the border of
+the image, where few corners are. The widths are therefore those of greatest evidence, see
+`estimation.priors`: one for focal lengths and image centre of a camera, and one for its distortion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ...estimation.priors import PriorGroups
+from ...estimation.problem import Problem
+from ...measurements.base import Measurement
+from ...measurements.camera import CameraCorners
+from ..reweighting import Fit
+
+# Narrowest prior as a fraction of the default one: half a pixel.
+MIN_LENS_WIDTH = 1e-2
+
+
+def lens_prior_groups(problem: Problem) -> PriorGroups:
+    """Group the values of the lenses that the rig states with a prior.
+
+    Args:
+        problem: Problem in the errors of the robot, then those of the instruments.
+
+    Returns:
+        Groups of each of these cameras: focal lengths and image centre if they are stated, and distortion.
+    """
+    stated = {
+        (f"camera_{camera.name}", unit)
+        for item in problem.data
+        if isinstance(item, CameraCorners)
+        for camera in item.rig.cameras
+        if camera.intrinsics == "prior"
+        for unit in (("px", "1") if camera.has_intrinsics else ("1",))
+    }
+    n_errors = len(problem.errors.parameters)
+    groups: dict[tuple[str, str], list[int]] = {}
+    for i, parameter in enumerate(problem.instrument_parameters, n_errors):
+        camera = parameter.name.rpartition(".")[0]
+        if (camera, parameter.unit) in stated:
+            groups.setdefault((camera, parameter.unit), []).append(i)
+    members = list(groups.values())
+    weights = np.array([1 / problem.instrument_parameters[each[0] - n_errors].prior for each in members])
+    return PriorGroups(
+        np.array([i for each in members for i in each], int),
+        np.repeat(np.arange(len(members)), [len(each) for each in members]),
+        weights,
+        weights / MIN_LENS_WIDTH,
+        np.zeros(len(members)),
+    )
+
+
+def with_stated_distortion(data: Sequence[Measurement]) -> tuple[tuple[Measurement, ...], dict[str, float]]:
+    """Centre the priors of distortion at the values of the rig, not at first values from the images.
+
+    Args:
+        data: Measurements with first values of all parameters.
+
+    Returns:
+        Measurements whose lenses have the distortion of the rig, and first values of the distortion, by name
+        [1].
+    """
+    first: dict[str, float] = {}
+    out = []
+    for item in data:
+        if isinstance(item, CameraCorners):
+            stated = {
+                f"camera_{camera.name}.{name}": float(value)
+                for camera in item.rig.cameras
+                if camera.intrinsics == "prior"
+                for name, value in zip(camera.lens.names, camera.values, strict=True)
+                if name in camera.lens.coefficients
+            }
+            first |= {p.name: p.nominal for p in item.instrument_parameters if p.name in stated}
+            item = item.with_values(stated)
+        out.append(item)
+    return tuple(out), first
+
+
+def with_lens_priors(fit: Fit) -> Fit:
+    """Return a fit whose measurements state the prior widths of its lenses, for fits of the nominal robot.
+
+    Args:
+        fit: Fit whose problem has the widths of greatest evidence.
+    """
+    first = len(fit.problem.errors.parameters)
+    prior = {
+        p.name: 1 / weight
+        for p, weight in zip(
+            fit.problem.instrument_parameters, fit.problem.prior_weights[first:], strict=True
+        )
+        if p.unit in ("px", "1")
+    }
+    data = [
+        item.replace(
+            instrument_parameters=tuple(
+                replace(p, prior=prior.get(p.name, p.prior)) for p in item.instrument_parameters
+            )
+        )
+        if isinstance(item, CameraCorners)
+        else item
+        for item in fit.data
+    ]
+    return replace(fit, data=tuple(data))
