@@ -107,6 +107,7 @@ class PriorGroups:
         members: Indices of the parameters in any group, shape (n,).
         group_index: Group of each of them, shape (n,).
         expected_weights: Reciprocal expected standard deviation of each group, shape (g,).
+        min_weights: Smallest weight of each group, shape (g,).
         max_weights: Largest weight of each group, shape (g,).
         expectation_counts: Number of determined parameters that the expected standard deviation of each group
             counts for against smaller errors, shape (g,).
@@ -115,6 +116,7 @@ class PriorGroups:
     members: Array
     group_index: Array
     expected_weights: Array
+    min_weights: Array
     max_weights: Array
     expectation_counts: Array
 
@@ -141,6 +143,7 @@ class PriorGroups:
             np.array(inside, int),
             np.array([distinct.index(key) for key in keys], int),
             np.array([weight for _, weight in distinct]),
+            np.zeros(len(distinct)),
             np.array(max_weights),
             np.full(len(distinct), EXPECTATION_COUNT),
         )
@@ -148,7 +151,7 @@ class PriorGroups:
     @classmethod
     def none(cls) -> PriorGroups:
         """Return no groups: all priors keep their standard deviations."""
-        return cls(np.empty(0, int), np.empty(0, int), np.empty(0), np.empty(0), np.empty(0))
+        return cls(np.empty(0, int), np.empty(0, int), np.empty(0), np.empty(0), np.empty(0), np.empty(0))
 
     def joined(self, other: PriorGroups) -> PriorGroups:
         """Return these groups and others.
@@ -160,6 +163,7 @@ class PriorGroups:
             np.concatenate([self.members, other.members]),
             np.concatenate([self.group_index, other.group_index + len(self.expected_weights)]),
             np.concatenate([self.expected_weights, other.expected_weights]),
+            np.concatenate([self.min_weights, other.min_weights]),
             np.concatenate([self.max_weights, other.max_weights]),
             np.concatenate([self.expectation_counts, other.expectation_counts]),
         )
@@ -214,6 +218,6 @@ def update_prior_scales(problem: Problem, solution: SolverResult, groups: PriorG
     extra = np.where(squares <= count, groups.expectation_counts, 0.0)
     smallest = np.finfo(float).tiny
     updated = expected * np.sqrt(np.fmax(count + extra, smallest) / np.fmax(squares + extra, smallest))
-    updated = np.fmin(updated, groups.max_weights)
+    updated = np.clip(updated, groups.min_weights, groups.max_weights)
     weights[members] = updated[group_index]
     return weights

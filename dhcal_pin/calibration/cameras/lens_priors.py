@@ -52,6 +52,7 @@ def lens_prior_groups(problem: Problem) -> PriorGroups:
         np.array([i for each in members for i in each], int),
         np.repeat(np.arange(len(members)), [len(each) for each in members]),
         weights,
+        weights,
         weights / MIN_LENS_WIDTH,
         np.zeros(len(members)),
     )
