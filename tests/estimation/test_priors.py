@@ -48,6 +48,27 @@ def test_priors_widen_to_the_errors_that_precise_data_show(sim_6dof, scale):
         np.testing.assert_allclose(1 / weights[members], rms, rtol=0.06)
 
 
+def test_joined_groups_keep_their_own_widths_and_limits(sim_6dof):
+    problem, solution, groups = solved(sim_6dof, 10.0)
+    first, second = (np.flatnonzero(groups.group_index == i) for i in (0, 1))
+    parts = [
+        PriorGroups(
+            groups.members[chosen],
+            np.zeros(len(chosen), int),
+            groups.expected_weights[i : i + 1],
+            limit * groups.expected_weights[i : i + 1],
+            groups.max_weights[i : i + 1],
+            groups.expectation_counts[i : i + 1],
+        )
+        for i, (chosen, limit) in enumerate([(first, 0.0), (second, 1.0)])
+    ]
+    alone = update_prior_scales(problem, solution, groups)
+    together = update_prior_scales(problem, solution, parts[0].joined(parts[1]))
+    np.testing.assert_array_equal(together[groups.members[first]], alone[groups.members[first]])
+    # The errors are ten times the expected ones, but the second group must not become wider.
+    np.testing.assert_array_equal(together[groups.members[second]], groups.expected_weights[1])
+
+
 @pytest.mark.parametrize("value", [0.0, -1.0, 1e-13, 1e7, np.nan, np.inf])
 def test_standard_deviations_beyond_the_limits_are_refused(sim_6dof, value):
     with pytest.raises(InvalidArgumentError, match=r"prior for 'a1': .* must be positive, from 1e-12 to"):
