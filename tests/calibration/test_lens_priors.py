@@ -1,0 +1,36 @@
+"""Prior widths of lenses: stated values that are right are used, and wrong ones do no harm."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from camera_setups import ARMS, simulate
+
+import dhcal_pin as dh
+from dhcal_pin.calibration import procedure
+from dhcal_pin.calibration.evaluation import compute_errors
+from dhcal_pin.estimation.priors import PriorGroups
+
+SETS = "camera,board,intrinsics"
+
+
+def other_images_error(seed, is_right):
+    """Return the RMS error of other images after a calibration from eight images [px]."""
+    rng, arm = np.random.default_rng(seed), ARMS["paper"]()
+    setup = simulate(arm, arm, rng, is_on_wrist=seed % 2 == 0, n_images=40, sigma=0.3)
+    rig = setup.exact.rig if is_right else setup.images.rig
+    is_fitted = setup.images.image < 8
+    fit = dh.calibrate(arm, setup.images.with_rig(rig).take(is_fitted), SETS, loss="linear")
+    others = setup.exact.with_rig(rig).take(~is_fitted)
+    return np.sqrt(np.mean(compute_errors(fit.chain, [others], fit.instruments)[0]["pixels"] ** 2))
+
+
+@pytest.mark.parametrize(("is_right", "most"), [(True, 0.95), (False, 1.05)])
+def test_widths_from_the_images_reduce_the_error_of_other_images(is_right, most, monkeypatch):
+    """The stated lens is right, or 5 % wrong and without distortion."""
+    seeds = range(10)
+    found = [other_images_error(seed, is_right) for seed in seeds]
+    monkeypatch.setattr(procedure, "lens_prior_groups", lambda problem: PriorGroups.none())
+    wide = [other_images_error(seed, is_right) for seed in seeds]
+    ratio = np.exp(np.mean(np.log(found) - np.log(wide)))
+    assert ratio < most
