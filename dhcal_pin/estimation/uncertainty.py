@@ -25,7 +25,6 @@ Shapes: m samples, k moving joints, e uncertain transmission coefficients, r col
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -130,7 +129,7 @@ class Uncertainty:
         """Whether the measurements leave the pose of base or tool free, at least in part."""
         return bool(self.frame_part.size)
 
-    @cached_property
+    @property
     def relative(self) -> Uncertainty:
         """Uncertainty relative to the base and tool poses that fit the measured configurations best.
 
