@@ -66,9 +66,11 @@ class BoardSize:
     def sentence(self) -> str:
         """What was found, and what to do."""
         lengths = f" (squares of {1e3 * self.size * self.square:.4g} mm, not {1e3 * self.square:.4g} mm)"
-        doubt = "is probably" if self.is_decisive else "may be"
+        start = "The size of the boards may be wrong"
+        if self.is_decisive:
+            start = "The size of the boards is probably wrong"
         return (
-            f"The size of the boards {doubt} wrong: with {100 * self.size:.4g} % of the stated size"
+            f"{start}: with {100 * self.size:.4g} % of the stated size"
             f"{lengths if self.square else ''}, the corrections of the lengths of the arm fall from "
             f"{self.stated:.2g} to {self.found:.2g} times what manufacturing errors would be. Measure the "
             "boards over their whole length, and correct their size in the rig file."
