@@ -129,9 +129,11 @@ def judge(fit: Result) -> Verdict:
         findings += [*_mixups(fit.diagnosis), *_board_size(fit)]
     if not any(finding.status == "refused" for finding in findings):
         # A mistake in the measurements explains all of these.
+        correction, errors = _implausible_correction(fit), _implausible_errors(fit) or _hand_eye_error(fit)
+        # A cause that explains the errors of images explains the correction, too.
+        has_cause = fit.hand_eye is not None and bool(fit.hand_eye.causes)
         findings += [
-            *_implausible_correction(fit),
-            *(_implausible_errors(fit) or _hand_eye_error(fit)),
+            *([*errors, *correction] if has_cause else [*correction, *errors]),
             *_convergence(fit),
             *_hand_eye_images(fit),
             *_held_out_errors(fit),
