@@ -52,6 +52,7 @@ from ..robot.chain import Chain
 from . import summary
 from .cameras.board_size import BoardSize
 from .cameras.diagnosis import HandEyeDiagnosis, HandEyeFit
+from .cameras.sets import has_joint_values
 from .cameras.stages import Stage
 from .cross_validation import (
     FoldComparison,
@@ -187,7 +188,7 @@ class Result(ResultPlots):
     @property
     def has_joint_values(self) -> bool:
         """Whether the joint positions of all samples were measured, so that joint space has a meaning."""
-        return all(item.has_joint_values for item in self.data)
+        return has_joint_values(self.data)
 
     @property
     def converged(self) -> bool:

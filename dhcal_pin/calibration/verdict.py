@@ -131,7 +131,7 @@ def judge(fit: Result) -> Verdict:
         # A mistake in the measurements explains all of these.
         correction, errors = _implausible_correction(fit), _implausible_errors(fit) or _hand_eye_error(fit)
         # A cause that explains the errors of images explains the correction, too.
-        has_cause = fit.hand_eye is not None and bool(fit.hand_eye.causes)
+        has_cause = bool(fit.hand_eye and fit.hand_eye.causes)
         findings += [
             *([*errors, *correction] if has_cause else [*correction, *errors]),
             *_convergence(fit),

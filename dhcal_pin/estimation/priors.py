@@ -10,9 +10,9 @@ satisfies, in units of the expected one,
 
     σ² = Σ x_i² / Σ γ_i
 
-and is iterated together with x. If the errors are smaller than expected, both sums
-get EXPECTATION_COUNT additional parameters with σ = 1. No prior becomes narrower than the narrowest expected
-one of its unit.
+and is iterated together with x. If the errors of the robot are smaller than expected, both sums
+get EXPECTATION_COUNT additional parameters with σ = 1, and no prior becomes narrower than the narrowest
+expected one of its unit. Groups of other parameters state their own count and limits.
 
 References:
     D. J. C. MacKay, Bayesian Interpolation, Neural Computation 4, 1992.
