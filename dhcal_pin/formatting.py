@@ -42,12 +42,6 @@ def significant_decimals(std: float) -> int:
 
     The standard deviation keeps two significant digits if these are at most 35, otherwise one (rounding rule
     of the Particle Data Group).
-
-    Args:
-        std: Standard deviation, in the unit that is shown.
-
-    Returns:
-        Number of decimals; `DEFAULT_DECIMALS` if `std` is zero or not finite.
     """
     if not (math.isfinite(std) and std > 0):
         return DEFAULT_DECIMALS
@@ -59,16 +53,7 @@ def significant_decimals(std: float) -> int:
 
 
 def format_fixed(value: float, decimals: int) -> str:
-    """Format a number with a fixed number of decimals, without negative zero.
-
-    Args:
-        value: Number.
-        decimals: Number of decimals.
-
-    Returns:
-        Text of the number, with an exponent and three digits from `MIN_EXPONENT_VALUE` on; a dash if it is
-        not finite.
-    """
+    """Format a number with a fixed number of decimals, without negative zero."""
     if not math.isfinite(value):
         return "–"
     if abs(value) >= MIN_EXPONENT_VALUE:
@@ -77,18 +62,7 @@ def format_fixed(value: float, decimals: int) -> str:
 
 
 def format_quantity(value: float, unit: str, std: float = math.nan, small: bool = False) -> str:
-    """Format a value with its unit, rounded according to its standard deviation.
-
-    Args:
-        value: Value in `unit`.
-        unit: SI unit of the value, "1" for a pure number. A unit that `UNITS` does not contain is shown
-            unchanged and with three significant digits.
-        std: Standard deviation in `unit`; NaN if unknown.
-        small: Whether the value is a change or a standard deviation; angles are then shown in mrad.
-
-    Returns:
-        Text of the value with its unit; a dash if it is not finite.
-    """
+    """Format a value with its unit, rounded according to its standard deviation."""
     if not math.isfinite(value):
         return "–"
     if unit not in UNITS:
@@ -116,11 +90,7 @@ class Table:
 
 @cache
 def html_templates() -> jinja2.Environment:
-    """Return the HTML templates of the package, named by their paths in it.
-
-    Returns:
-        Environment that escapes all inserted texts and refuses undefined names.
-    """
+    """Return the HTML templates of the package, named by their paths in it."""
     # Lazy import: only reports and notebooks need it.
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -145,54 +115,26 @@ def _resource(path: str) -> Markup:
 
 
 def json_for_html(content: Any) -> str:
-    """Format a document as compact JSON that can stand in a script element of a page.
-
-    Args:
-        content: JSON-compatible values.
-
-    Returns:
-        Text without the characters that could end the element.
-    """
+    """Format a document as compact JSON that can stand in a script element of a page."""
     text = json.dumps(content, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
     # A file name need not be UTF-8. Python keeps its other bytes as surrogates, which become JSON escapes.
     return text.replace("<", "\\u003c").encode(errors="backslashreplace").decode()
 
 
 def html_table(table: Table) -> str:
-    """Render a table as HTML.
-
-    Args:
-        table: Table to render; its texts are escaped.
-
-    Returns:
-        HTML element `table`.
-    """
+    """Render a table as HTML."""
     return str(html_templates().get_template("table.html").make_module().render_table(table))  # pyright: ignore
 
 
 def escape_markdown(text: str) -> str:
-    """Escape a text so that Markdown shows it unchanged: no HTML, links or emphasis come from it.
-
-    Args:
-        text: Text on one or several lines.
-
-    Returns:
-        Escaped text on one line.
-    """
+    """Escape a text so that Markdown shows it unchanged: no HTML, links or emphasis come from it."""
     text = " ".join(text.split()).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
     # An underscore within a word is plain text.
     return re.sub(r"([\\`*\[\]|]|(?<![^\W_])_|_(?![^\W_]))", r"\\\1", text)
 
 
 def markdown_table(table: Table) -> str:
-    """Render a table as Markdown with numbers aligned to the right.
-
-    Args:
-        table: Table to render; its texts are escaped.
-
-    Returns:
-        Lines of Markdown, joined by line feeds.
-    """
+    """Render a table as Markdown with numbers aligned to the right."""
     rules = [" --- " if i < table.n_text_columns else " ---: " for i in range(len(table.header))]
     header, *rows = (
         "| " + " | ".join(map(escape_markdown, row)) + " |" for row in (table.header, *table.rows)

@@ -35,16 +35,7 @@ def new_token() -> str:
 def local_application(
     token: str, handlers: Sequence[tuple[Any, ...]], **settings: Any
 ) -> tornado.web.Application:
-    """Create an application that answers requests for the loopback address below a token only.
-
-    Args:
-        token: First part of every path.
-        handlers: Path behind `/TOKEN/` as a regular expression, handler and optionally its arguments.
-        **settings: Settings of the application.
-
-    Returns:
-        Application; every other request has the answer 404.
-    """
+    """Create an application that answers requests for the loopback address below a token only."""
     app = tornado.web.Application(**settings)
     root = f"/{re.escape(token)}/"
     app.add_handlers(_HOSTS, [(root + pattern, *rest) for pattern, *rest in handlers])
@@ -52,13 +43,5 @@ def local_application(
 
 
 def is_same_origin(request: tornado.httputil.HTTPServerRequest) -> bool:
-    """Tell whether a page of this server has sent a request.
-
-    Args:
-        request: Request whose `Host` header was accepted.
-
-    Returns:
-        Whether the header `Origin` is the address of this server. Browsers send it with every request that is
-        not GET or HEAD.
-    """
+    """Tell whether a page of this server has sent a request."""
     return request.headers.get("Origin") == f"{request.protocol}://{request.host}"

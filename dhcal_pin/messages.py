@@ -27,12 +27,6 @@ _SHORT_REPR = _ShortRepr()
 def escape_control_characters(text: str) -> str:
     r"""Replace characters that a terminal acts on by their escapes in Python, such as `\x1b`.
 
-    Args:
-        text: Text of any source, such as a label of a measurement file.
-
-    Returns:
-        The text on one line and without control characters.
-
     >>> escape_control_characters("red: \x1b[31m")
     'red: \\x1b[31m'
     """
@@ -45,14 +39,7 @@ def escape_control_characters(text: str) -> str:
 
 
 def message_line(error: object) -> str:
-    """Write an error as one line for the console.
-
-    Args:
-        error: Exception or text, with any white space.
-
-    Returns:
-        Its text on one line without control characters; the middle of a very long text is left out.
-    """
+    """Write an error as one line for the console."""
     text = escape_control_characters(" ".join(str(error).split()))
     if len(text) <= MAX_MESSAGE_CHARS:
         return text
@@ -61,14 +48,7 @@ def message_line(error: object) -> str:
 
 
 def quote(value: object) -> str:
-    """Quote a value for a message, on one line and shortened.
-
-    Args:
-        value: Text, or another value of a file such as a list.
-
-    Returns:
-        Quoted text, shortened to `MAX_QUOTED_CHARS`.
-    """
+    """Quote a value for a message, on one line and shortened."""
 
     def shorten(text: str) -> str:
         return text if len(text) <= MAX_QUOTED_CHARS else text[: MAX_QUOTED_CHARS - 3] + "..."

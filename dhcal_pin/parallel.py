@@ -42,15 +42,7 @@ class TaskExecutor:
     max_in_flight: int = 8
 
     def map(self, function: Callable[[_Task], _Output], tasks: Iterable[_Task]) -> Iterator[_Output]:
-        """Apply a function to each task, with at most `max_in_flight` tasks in memory.
-
-        Args:
-            function: Function of one task; it must be picklable for processes and clusters.
-            tasks: Tasks, read only as far as they are submitted.
-
-        Yields:
-            Results in the order of the tasks.
-        """
+        """Apply a function to each task, with at most `max_in_flight` tasks in memory."""
         if self.executor is None:
             for task in tasks:
                 yield function(task)
@@ -74,15 +66,7 @@ SERIAL = TaskExecutor()
 
 @contextmanager
 def open_executor(jobs: int = 1, scheduler: str | None = None) -> Iterator[TaskExecutor]:
-    """Open an executor and close it at the end of the `with` block.
-
-    Args:
-        jobs: Number of processes; 1 runs all tasks in the calling thread.
-        scheduler: Address of a Dask scheduler, such as `tcp://host:8786`; it takes precedence over `jobs`.
-
-    Yields:
-        Executor for the `with` block.
-    """
+    """Open an executor and close it at the end of the `with` block."""
     if scheduler:
         with _connect_to_dask(scheduler) as client:
             threads = sum(client.nthreads().values())

@@ -75,29 +75,14 @@ class Program:
 
 
 def program_text(program: Program, path: PathLike) -> str:
-    """Write a program in the format that the ending of a file name selects.
-
-    Args:
-        program: Stops of the arm.
-        path: File that will be written; only its name is used, see `require_program_ending`.
-
-    Returns:
-        Text of the file. Stops that the format cannot express raise an `InvalidArgumentError`.
-    """
+    """Write a program in the format that the ending of a file name selects."""
     require_program_ending(path)
     name = os.fspath(path).lower()
     return next(write for ending, write in FORMATS.items() if name.endswith(ending))(program)
 
 
 def require_program_ending(path: PathLike) -> None:
-    """Require the file extension of a program.
-
-    Args:
-        path: File that will be written.
-
-    Raises:
-        InvalidArgumentError: No format has this ending.
-    """
+    """Require the file extension of a program."""
     if not os.fspath(path).lower().endswith(tuple(FORMATS)):
         raise InvalidArgumentError(f"{os.fspath(path)}: unknown ending; choose from {', '.join(FORMATS)}")
 
@@ -107,15 +92,6 @@ def urscript(program: Program) -> str:
 
     The program shows its warning and waits for the operator before the arm moves for the first time, and
     again before a move that may collide.
-
-    Args:
-        program: Stops of the arm.
-
-    Returns:
-        Text of the script.
-
-    Raises:
-        InvalidArgumentError: The arm does not have six revolute joints.
     """
     chain = program.chain
     if chain.n_joints != _N_UR_JOINTS or chain.is_prismatic.any():
@@ -142,17 +118,7 @@ def urscript(program: Program) -> str:
 
 
 def trajectory_csv(program: Program) -> str:
-    """Write a program as a joint trajectory that starts at rest in the first stop.
-
-    Args:
-        program: Stops of the arm.
-
-    Returns:
-        CSV text with `time` [s] and the joint positions [rad or m] of all independent joints.
-
-    Raises:
-        InvalidArgumentError: The way to a stop is not free.
-    """
+    """Write a program as a joint trajectory that starts at rest in the first stop."""
     if blocked := [stop.name for stop in program.stops if not stop.is_way_free]:
         raise InvalidArgumentError(
             f"the way to {', '.join(blocked)} may collide, and a trajectory does not wait; export a .script "
@@ -172,14 +138,7 @@ def trajectory_csv(program: Program) -> str:
 
 
 def robodk_csv(program: Program) -> str:
-    """Write the stops of a program as a table for RoboDK, without the ways between them.
-
-    Args:
-        program: Stops of the arm.
-
-    Returns:
-        CSV text with joint positions [deg or mm] and tool poses [mm, deg].
-    """
+    """Write the stops of a program as a table for RoboDK, without the ways between them."""
     chain = program.chain
     factors = np.where(chain.is_prismatic, 1e3, np.rad2deg(1.0))
     lines = [",".join([*(f"J{i}" for i in range(1, chain.n_joints + 1)), *"XYZRPW"])]

@@ -44,9 +44,6 @@ def example_robots() -> dict[str, Path]:
 
     A robot has the name of its file without `.urdf` and `_robot`. Files of the same name in two packages have
     names such as `anymal_b_simple_description/anymal`.
-
-    Returns:
-        Paths of the URDF files by name, sorted; empty if example-robot-data is not installed.
     """
     share = _share_folder()
     by_name: dict[str, dict[str, Path]] = {}
@@ -64,17 +61,7 @@ def example_robots() -> dict[str, Path]:
 
 
 def resolve_robot_path(path: PathLike) -> str:
-    """Return the path of a robot file, also for a robot of example-robot-data.
-
-    Args:
-        path: Path of a file, or `example:NAME`.
-
-    Returns:
-        Path of the file; a path that is not `example:NAME` is returned unchanged.
-
-    Raises:
-        UnknownNameError: There is no such robot; the message lists the names.
-    """
+    """Return the path of a robot file, also for a robot of example-robot-data."""
     text = os.fspath(path)
     if not text.startswith(EXAMPLE_PREFIX):
         return text
@@ -90,32 +77,14 @@ def resolve_robot_path(path: PathLike) -> str:
 
 
 def mesh_folders(source: PathLike, package_dirs: Iterable[PathLike]) -> list[str]:
-    """List the folders in which the meshes of a robot are searched.
-
-    Args:
-        source: Path of the URDF.
-        package_dirs: Folders that the user names.
-
-    Returns:
-        Folders in the order of the search, without those of environment variables, which Pinocchio appends.
-    """
+    """List the folders in which the meshes of a robot are searched."""
     named = [folder for path in map(Path, package_dirs) for folder in (path, path.absolute().parent)]
     share = _share_folder()
     return [os.fspath(path) for path in (*named, *Path(source).absolute().parents, share) if path]
 
 
 def validated_package_dirs(folders: Iterable[PathLike]) -> tuple[str, ...]:
-    """Check that folders with meshes exist.
-
-    Args:
-        folders: Folders that the user names.
-
-    Returns:
-        Their paths.
-
-    Raises:
-        InvalidArgumentError: A folder does not exist.
-    """
+    """Check that folders with meshes exist."""
     paths = tuple(os.fspath(folder) for folder in folders)
     for path in paths:
         if not os.path.isdir(path):
@@ -129,13 +98,6 @@ def is_mesh_too_large(mesh: str, folders: Iterable[PathLike]) -> bool:
     """Return whether a mesh is larger than `MAX_MESH_BYTES`.
 
     Pinocchio takes about 25 times the size of a mesh in memory.
-
-    Args:
-        mesh: File name of the mesh in the URDF.
-        folders: Folders of `mesh_folders`; those of environment variables are added.
-
-    Returns:
-        True if a file that the name can mean is too large.
     """
     path = mesh.rpartition("://")[2]
     variables = "ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH"
@@ -146,14 +108,7 @@ def is_mesh_too_large(mesh: str, folders: Iterable[PathLike]) -> bool:
 
 
 def mesh_remedy(mesh: str) -> str:
-    """Say how a missing mesh can be found.
-
-    Args:
-        mesh: File name of the mesh in the URDF, such as `package://ur_description/meshes/base.stl`.
-
-    Returns:
-        Sentence without a full stop.
-    """
+    """Say how a missing mesh can be found."""
     scheme, _, path = mesh.rpartition("://")
     package = path.split("/")[0]
     folder = f"the folder that contains the package {package}" if scheme else "the folder of the meshes"

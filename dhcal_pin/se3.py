@@ -26,14 +26,7 @@ _GIMBAL_LOCK_TOL = 1e-15
 
 
 def skew(w: ArrayLike) -> Array:
-    """Build cross-product matrices.
-
-    Args:
-        w: Vectors, shape (..., 3).
-
-    Returns:
-        Matrices [w]×, shape (..., 3, 3), with [w]×·x = w × x.
-    """
+    """Build cross-product matrices."""
     w = np.asarray(w, float)
     out = np.zeros((*w.shape, 3))
     out[..., 0, 1], out[..., 0, 2] = -w[..., 2], w[..., 1]
@@ -60,26 +53,12 @@ def transform(rotation: ArrayLike, position: ArrayLike) -> Array:
 
 
 def translation(xyz: ArrayLike) -> Array:
-    """Build homogeneous matrices of pure translations.
-
-    Args:
-        xyz: Displacements, shape (..., 3) [m].
-
-    Returns:
-        Homogeneous matrices, shape (..., 4, 4).
-    """
+    """Build homogeneous matrices of pure translations."""
     return transform(np.eye(3), xyz)
 
 
 def inverse(pose: ArrayLike) -> Array:
-    """Invert rigid transformations by transposing the rotation.
-
-    Args:
-        pose: Homogeneous matrices, shape (..., 4, 4).
-
-    Returns:
-        Inverse matrices, shape (..., 4, 4).
-    """
+    """Invert rigid transformations by transposing the rotation."""
     pose = np.asarray(pose, float)
     out = np.zeros(pose.shape)
     rotation = np.swapaxes(pose[..., :3, :3], -1, -2)
@@ -93,12 +72,6 @@ def adjoint(pose: ArrayLike) -> Array:
     """Build the matrices that express twists of frame b in frame a.
 
     With T_ab = (R, p): Ad = [[R, [p]×·R], [0, R]] and ξ_a = Ad·ξ_b.
-
-    Args:
-        pose: T_ab, shape (..., 4, 4).
-
-    Returns:
-        Adjoint matrices, shape (..., 6, 6).
     """
     pose = np.asarray(pose, float)
     rotation = pose[..., :3, :3]
@@ -109,14 +82,7 @@ def adjoint(pose: ArrayLike) -> Array:
 
 
 def exp_coefficients(angle: Array) -> tuple[Array, Array, Array]:
-    """Compute the three coefficients of the exponential maps without cancellation at small angles.
-
-    Args:
-        angle: Rotation angles t, shape (...) [rad].
-
-    Returns:
-        sin(t)/t, (1 - cos t)/t² and (t - sin t)/t³, each of shape (...).
-    """
+    """Compute the three coefficients of the exponential maps without cancellation at small angles."""
     half = np.sinc(angle / (2 * np.pi))
     small = np.abs(angle) < 0.1
     t2 = np.square(angle)
@@ -130,14 +96,7 @@ def exp_coefficients(angle: Array) -> tuple[Array, Array, Array]:
 
 
 def exp3(rotvec: ArrayLike) -> Array:
-    """Compute rotation matrices from rotation vectors.
-
-    Args:
-        rotvec: Rotation vectors, shape (..., 3) [rad].
-
-    Returns:
-        Rotation matrices, shape (..., 3, 3).
-    """
+    """Compute rotation matrices from rotation vectors."""
     rotvec = np.asarray(rotvec, float)
     first, second, _ = exp_coefficients(np.linalg.norm(rotvec, axis=-1))
     k = skew(rotvec)
@@ -149,12 +108,6 @@ def log3(rotation: ArrayLike) -> Array:
 
     The computation is fastest if the last two axes have the largest strides in memory, as in a transposed
     array of shape (3, 3, m). The result has the same layout.
-
-    Args:
-        rotation: Rotation matrices, shape (..., 3, 3).
-
-    Returns:
-        Rotation vectors of norm at most π, shape (..., 3) [rad].
     """
     r = np.asarray(rotation, float)
     out = np.empty((3, *r.shape[:-2]))
@@ -175,9 +128,6 @@ def _log3_near_half_turn(r: Array) -> Array:
 
     Each row of 4·q·qᵀ with q = [w, x, y, z] is proportional to q. The row of the largest vector component
     is used because it has the smallest rounding error.
-
-    Returns:
-        Rotation vectors, shape (m, 3) [rad].
     """
     m, trace = len(r), np.trace(r, axis1=1, axis2=2)
     rows = np.empty((m, 3, 4))
@@ -199,12 +149,6 @@ def right_jacobian_inverse(rotvec: ArrayLike) -> Array:
         Jr⁻¹(φ) = I + ½[φ]× + f·[φ]×²,    f = 1/θ² - 1/(2θ·tan(θ/2)),    θ = |φ|.
 
     For θ² < 1e-3 the series f = 1/12 + θ²/720 + θ⁴/30240 is used.
-
-    Args:
-        rotvec: Rotation vectors φ, shape (..., 3) [rad].
-
-    Returns:
-        Matrices Jr⁻¹, shape (..., 3, 3). The first two axes of the underlying memory are the matrix axes.
     """
     rotvec = np.asarray(rotvec, float)
     v = rotvec.transpose(-1, *range(rotvec.ndim - 1))
@@ -226,14 +170,7 @@ def right_jacobian_inverse(rotvec: ArrayLike) -> Array:
 
 
 def exp6(twist: ArrayLike) -> Array:
-    """Compute rigid transformations from twists.
-
-    Args:
-        twist: Twists [v, ω], shape (..., 6) [m, rad].
-
-    Returns:
-        Homogeneous matrices, shape (..., 4, 4).
-    """
+    """Compute rigid transformations from twists."""
     twist = np.asarray(twist, float)
     v, w = twist[..., :3], twist[..., 3:]
     _, second, third = exp_coefficients(np.linalg.norm(w, axis=-1))
@@ -243,14 +180,7 @@ def exp6(twist: ArrayLike) -> Array:
 
 
 def log6(pose: ArrayLike) -> Array:
-    """Compute twists from rigid transformations.
-
-    Args:
-        pose: Homogeneous matrices, shape (..., 4, 4).
-
-    Returns:
-        Twists [v, ω] with |ω| at most π, shape (..., 6) [m, rad].
-    """
+    """Compute twists from rigid transformations."""
     pose = np.asarray(pose, float)
     w = log3(pose[..., :3, :3])
     v_matrix_inverse = np.swapaxes(right_jacobian_inverse(w), -1, -2)
@@ -262,12 +192,6 @@ def quaternion_to_matrix(quaternion: ArrayLike) -> Array:
     """Convert unit quaternions to rotation matrices.
 
     With w the scalar part and v the vector part, R = I + 2·w·[v] + 2·[v]², where [v] is the skew matrix of v.
-
-    Args:
-        quaternion: Quaternions w, x, y, z of norm 1, shape (..., 4).
-
-    Returns:
-        Rotation matrices, shape (..., 3, 3).
     """
     quaternion = np.asarray(quaternion, float)
     cross = skew(quaternion[..., 1:])
@@ -278,12 +202,6 @@ def nearest_rotation(matrix: Array) -> Array:
     """Find the rotations nearest to given matrices in the Frobenius norm.
 
     With the singular value decomposition U·S·Vᵀ the rotation is U·diag(1, 1, ±1)·Vᵀ (Kabsch 1976).
-
-    Args:
-        matrix: Matrices, for example sums of rotations, shape (..., 3, 3).
-
-    Returns:
-        Rotation matrices, shape (..., 3, 3).
     """
     u, _, vt = np.linalg.svd(matrix)
     u[..., 2] *= np.linalg.det(u @ vt)[..., None]
@@ -291,14 +209,7 @@ def nearest_rotation(matrix: Array) -> Array:
 
 
 def to_xyz_rpy(origin: Array) -> list[float]:
-    """Convert a transformation to the numbers of a URDF origin.
-
-    Args:
-        origin: Homogeneous matrix, shape (4, 4).
-
-    Returns:
-        x, y, z [m], roll, pitch, yaw [rad]; zeros have no minus sign.
-    """
+    """Convert a transformation to the numbers of a URDF origin."""
     return [float(v) + 0.0 for v in (*origin[:3, 3], *pin.rpy.matrixToRpy(origin[:3, :3]))]
 
 

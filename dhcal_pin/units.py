@@ -32,18 +32,7 @@ MAX_SI_VALUE = 1e6
 
 
 def parse_noise(text: str, label: str = "--noise") -> tuple[float, float]:
-    """Parse standard deviations of position and orientation.
-
-    Args:
-        text: One length, one angle, or both, such as `0.1mm` or `0.1mm,0.01deg`.
-        label: Name of the option or key, for error messages.
-
-    Returns:
-        Standard deviations of position [m] and orientation [rad]; 0 for a missing one.
-
-    Raises:
-        InvalidArgumentError: A part is not a number with a unit, is negative, or a quantity occurs twice.
-    """
+    """Parse standard deviations of position and orientation."""
     out: dict[str, float] = {}
     for part in text.split(","):
         where = f"{label} {part.strip()!r}"

@@ -139,14 +139,7 @@ class _Run:
             self.status = await process.wait()
 
     def error(self, *accepted: int) -> dict[str, str]:
-        """Describe the failure of the command.
-
-        Args:
-            *accepted: Exit status that is no failure, in addition to 0.
-
-        Returns:
-            Message for the page; empty if the command succeeded.
-        """
+        """Describe the failure of the command."""
         if self.status in (0, *accepted):
             return {}
         if self.status == _INVALID_INPUT:

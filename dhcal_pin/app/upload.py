@@ -45,19 +45,7 @@ class Upload:
 
     @classmethod
     def from_form(cls, content_type: str, body: bytes) -> Upload:
-        """Read a form with files named `file` and a JSON object `request`.
-
-        Args:
-            content_type: Header of the form.
-            body: Content of the form.
-
-        Returns:
-            Checked upload.
-
-        Raises:
-            InvalidArgumentError: The form is malformed, a file name is not plain or occurs twice, or a file
-                or an option is unknown.
-        """
+        """Read a form with files named `file` and a JSON object `request`."""
         arguments: dict[str, list[bytes]] = {}
         parts: dict[str, list[tornado.httputil.HTTPFile]] = {}
         try:
@@ -84,11 +72,7 @@ class Upload:
         return cls(files, robot, tuple(data), options)
 
     def save(self, folder: Path) -> None:
-        """Write the files.
-
-        Args:
-            folder: Empty folder.
-        """
+        """Write the files."""
         for name, content in self.files.items():
             (folder / name).write_bytes(content)
 

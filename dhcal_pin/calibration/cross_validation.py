@@ -90,14 +90,6 @@ class FoldSystems:
         """Compute the RMS of the held-out whitened rows under the fit of the other rows.
 
         Unknowns that only the held-out rows depend on are fitted to these.
-
-        Args:
-            weights: One over the prior standard deviations of the unknowns, (p,).
-            x: Point of the linearization, (p,).
-            columns: Mask of the unknowns that are fitted, (p,).
-
-        Returns:
-            The RMS in standard deviations.
         """
         step = np.zeros(len(x))
         step[columns] = solve_columns(self.fitted, weights, x, columns)[0]
@@ -109,15 +101,7 @@ class FoldSystems:
         return float(np.sqrt((residual @ residual + self.held_out.min_cost) / self.n_rows))
 
     def prediction_std(self, weights: Array, columns: Array) -> float:
-        """Compute the RMS of the held-out whitened rows that the uncertainty of the fit causes.
-
-        Args:
-            weights: One over the prior standard deviations of the unknowns, (p,).
-            columns: Mask of the unknowns that are fitted, (p,).
-
-        Returns:
-            The RMS in standard deviations; infinite if neither the other rows nor priors determine them.
-        """
+        """Compute the RMS of the held-out whitened rows that the uncertainty of the fit causes."""
         known = columns & ~self.is_unobserved
         if not known.any():
             return 0.0
@@ -145,15 +129,6 @@ def solve_columns(system: TriangularSystem, weights: Array, x: Array, columns: A
 
     Directions that neither rows nor priors determine return to 0, as x may contain information on them from
     held-out rows.
-
-    Args:
-        system: System at x.
-        weights: One over the prior standard deviations of the unknowns, (p,); 0 without a prior.
-        x: Point of the linearization, (p,).
-        columns: Mask of the c unknowns that are fitted, (p,).
-
-    Returns:
-        The step, (c,), and the cost of rows and priors after it.
     """
     prior = weights[columns]
     if prior.all():
@@ -176,16 +151,7 @@ def count_rows(problem: Problem) -> int:
 
 
 def factor_partition(problem: Problem, x: Array, folds: Sequence[Fold]) -> tuple[FoldSystems, ...]:
-    """Compute the triangular systems of disjoint folds; the rows of each sample are factored once.
-
-    Args:
-        problem: Problem with the samples of all folds.
-        x: Point of the linearization, (p,).
-        folds: Folds of its measurements that have no sample in common, with at least one sample each.
-
-    Returns:
-        The systems of each fold.
-    """
+    """Compute the triangular systems of disjoint folds; the rows of each sample are factored once."""
     rest = tuple(~np.any(masks, 0) for masks in zip(*folds, strict=True))
     parts = [
         problem.with_data([item.take(mask) for item, mask in zip(problem.data, masks, strict=True)])
@@ -212,16 +178,7 @@ def factor_partition(problem: Problem, x: Array, folds: Sequence[Fold]) -> tuple
 
 
 def factor_folds(problem: Problem, x: Array, folds: Sequence[Fold]) -> Iterator[FoldSystems]:
-    """Compute the triangular systems of any folds; the rows of consecutive disjoint folds are factored once.
-
-    Args:
-        problem: Problem with the samples of all folds.
-        x: Point of the linearization, (p,).
-        folds: Folds of its measurements.
-
-    Yields:
-        The systems of each fold.
-    """
+    """Compute the triangular systems of folds; consecutive disjoint folds are factored once."""
     group: list[Fold] = []
     for fold in folds:
         if any(np.any(a & b) for other in group for a, b in zip(fold, other, strict=True)):
@@ -270,22 +227,7 @@ def cross_validate_folds(
     refit: Refit,
     shrinkage_factor: float = 1.0,
 ) -> Iterator[FoldErrors]:
-    """Generate the errors of the held-out samples of each fold.
-
-    Args:
-        problem: Problem that was solved.
-        x: Its solution, (p,).
-        data: Fitted measurements without robust weights, whose errors are computed.
-        folds: Folds of these measurements.
-        refit: Fit of a part of the samples, for folds that one step from x does not solve.
-        shrinkage_factor: Factor to the solution of each fold.
-
-    Yields:
-        Errors of the held-out samples of each fold.
-
-    Raises:
-        InvalidArgumentError: If the folds were made for other data.
-    """
+    """Generate the errors of the held-out samples of each fold."""
     sizes = [len(item.rows) for item in data]
     if any([len(mask) for mask in fold] != sizes for fold in folds):
         raise InvalidArgumentError(
@@ -327,15 +269,7 @@ class CrossValidation:
 
 
 def standard_error(values: Array) -> float:
-    """Compute the standard error of a mean, widened for few values by Student's t distribution.
-
-    Args:
-        values: Values, (k,).
-
-    Returns:
-        Half width of the interval that contains the mean as often as one standard deviation of a normal
-        distribution; infinite for one value.
-    """
+    """Compute the standard error of a mean, widened for few values by Student's t distribution."""
     if len(values) < 2:
         return np.inf
     from scipy.special import ndtr, stdtrit  # lazy import: slow, and few calibrations need it
@@ -395,14 +329,6 @@ def compare_folds(fit: Result, folds: Sequence[Fold], title: Title) -> FoldCompa
 
     The nominal robot is judged in the same way: base, tool and instrument parameters are fitted to the other
     samples of each fold.
-
-    Args:
-        fit: Result of a calibration.
-        folds: Folds of `fit.inliers`.
-        title: Title of the comparison.
-
-    Returns:
-        The comparison of the held-out samples of all folds together.
     """
     data = fit.inliers
     nominal = replace(fit.errors, chain=fit.nominal_refitted)
@@ -442,15 +368,6 @@ def leave_regions_out(
 
     Unlike in `compare_folds`, everything is estimated again without the region: noise, prior widths, outliers
     and additional parameters.
-
-    Args:
-        fit: Result of a calibration with all samples.
-        recalibrate: The same calibration of some of the samples.
-        progress: Called with "left-out regions", the number of the region and the number of regions.
-
-    Returns:
-        The same result with the comparison as `region_comparison`; None if all samples have the same joint
-        values.
     """
     try:
         folds = blocked_folds(fit.data, groups=contact_groups(fit.problem, fit.x))
@@ -510,14 +427,7 @@ class Generalization:
 
 
 def estimate_generalization(fit: Result) -> Generalization:
-    """Estimate the accuracy of a calibration within the measured region and beyond it.
-
-    Args:
-        fit: Result of a calibration.
-
-    Returns:
-        Both figures and the shares of the joint space where they hold.
-    """
+    """Estimate the accuracy of a calibration within the measured region and beyond it."""
     q, samples = different_configurations(fit.inliers)
     has_few = 1 < len(q) < MIN_SAMPLES
     inside, beyond = fit.random_folds, None
@@ -545,28 +455,14 @@ def estimate_generalization(fit: Result) -> Generalization:
 
 
 def region_folds(fit: Result) -> tuple[Fold, ...]:
-    """Return the folds of the inliers that leave out regions of joint space.
-
-    Args:
-        fit: Result of a calibration.
-
-    Returns:
-        The folds; none if all samples have the same joint values.
-    """
+    """Return the folds of the inliers that leave out regions of joint space."""
     with suppress(NotObservableError):
         return blocked_folds(fit.inliers, groups=contact_groups(fit.inlier_problem, fit.x))
     return ()
 
 
 def measured_region(fit: Result) -> MeasuredRegion | None:
-    """Describe the region of joint space of the inliers.
-
-    Args:
-        fit: Result of a calibration.
-
-    Returns:
-        The region; None if no sample has joint values, or if their place is taken by poses of the tip.
-    """
+    """Describe the region of joint space of the inliers."""
     q, samples = different_configurations(fit.inliers)
     if not len(q) or not fit.has_joint_values:
         return None
@@ -576,30 +472,12 @@ def measured_region(fit: Result) -> MeasuredRegion | None:
 
 
 def samples_held_out(folds: Sequence[Fold], samples: Array) -> Array:
-    """Return whether each fold holds out each of some samples.
-
-    Args:
-        folds: The k folds.
-        samples: Numbers of u samples among those of all measurements.
-
-    Returns:
-        Masks, (k, u).
-    """
+    """Return whether each fold holds out each of some samples."""
     return np.stack([np.concatenate(fold)[samples] for fold in folds])
 
 
 def _unknown_reason(fit: Result, regions: FoldComparison, q: Array, is_held_out: Array) -> str:
-    """Say why the error beyond the measured region cannot be stated.
-
-    Args:
-        fit: Result of a calibration.
-        regions: Accuracy of the left-out regions.
-        q: Different configurations, (u, n) [rad or m].
-        is_held_out: Whether each fold holds out each configuration, (k, u).
-
-    Returns:
-        The reason; empty if the error can be stated.
-    """
+    """Say why the error beyond the measured region cannot be stated."""
 
     def names(mask: Array) -> str:
         return ", ".join(np.array(fit.chain.joint_names)[mask].tolist())

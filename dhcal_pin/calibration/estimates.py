@@ -75,18 +75,7 @@ def make_estimates(
     figures: Array,
     fixed: Sequence[ErrorParameter],
 ) -> tuple[Estimate, ...]:
-    """Make the estimates of all identified parameters, then those of the fixed ones.
-
-    Args:
-        chain: Calibrated chain.
-        parameters: The p identified parameters of the robot and the instruments.
-        figures: Identified error, standard deviation, standard deviation of the prior, observability and
-            ratio of posterior to prior standard deviation of each parameter, shape (p, 5).
-        fixed: Parameters that were held at their nominal values.
-
-    Returns:
-        The estimates.
-    """
+    """Make the estimates of all identified parameters, then those of the fixed ones."""
     frames = {BASE_FRAME: chain.base, chain.tool_frame_index: chain.tool}
     # Position and rotation vector of base and tool, shape (6,).
     components = {frame: np.append(pose[:3, 3], se3.log3(pose[:3, :3])) for frame, pose in frames.items()}

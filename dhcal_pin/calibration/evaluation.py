@@ -69,16 +69,7 @@ class ErrorStatistics:
 
     @classmethod
     def from_norms(cls, norms: Array, unit: str, axes: Sequence[Array] = ()) -> ErrorStatistics:
-        """Compute the statistics of error norms.
-
-        Args:
-            norms: Error norms, shape (m,).
-            unit: Their unit.
-            axes: Error components, arrays of shape (·, 3).
-
-        Returns:
-            The statistics.
-        """
+        """Compute the statistics of error norms."""
         square = norms**2
         rms = float(np.sqrt(np.mean(square)))
         return cls(
@@ -116,14 +107,7 @@ class Accuracy(Mapping[str, Any]):
 
     @classmethod
     def from_errors(cls, errors: Sequence[Mapping[str, Array]]) -> Accuracy:
-        """Compute the statistics of errors as returned by `compute_errors`.
-
-        Args:
-            errors: Errors by name of each measurement, arrays of shape (m, ·) [m or rad].
-
-        Returns:
-            The statistics of all measurements together.
-        """
+        """Compute the statistics of errors as returned by `compute_errors`."""
         return cls(
             **{
                 group: ErrorStatistics.from_norms(
@@ -173,16 +157,7 @@ class Accuracy(Mapping[str, Any]):
 def fit_instrument_parameters(
     chain: Chain, data: Sequence[Measurement], known: Mapping[str, float]
 ) -> dict[str, float]:
-    """Fit the instrument parameters that are not known to measurements of a given chain.
-
-    Args:
-        chain: Chain with base and tool.
-        data: Measurements whose instrument parameters are initialized.
-        known: Values of instrument parameters by name [m or rad].
-
-    Returns:
-        Values of all instrument parameters of the measurements by name [m or rad].
-    """
+    """Fit the instrument parameters that are not known to measurements of a given chain."""
     parameters = merge_instrument_parameters(data)
     given = {p.name: known[p.name] for p in parameters if p.name in known and not p.is_local}
     weights = np.array([1 / p.prior for p in parameters if p.name not in given])
@@ -195,17 +170,7 @@ def fit_instrument_parameters(
 def fit_nominal(
     nominal: ErrorModel, data: Sequence[Measurement], known: Mapping[str, float]
 ) -> tuple[Chain, dict[str, float]]:
-    """Fit base, tool and instrument parameters of the nominal robot to measurements.
-
-    Args:
-        nominal: Nominal chain and its unknown parameters, of which base and tool are fitted.
-        data: Measurements of any kinds.
-        known: Values of instrument parameters by name [m or rad].
-
-    Returns:
-        The nominal chain with these frames, and the values of the instrument parameters that the measurements
-        depend on: not of a contact point that none of the samples touches.
-    """
+    """Fit base, tool and instrument parameters of the nominal robot to measurements."""
     chain = fit_frames(nominal, tuple(data), known)
     data = [item.initialized(chain) for item in data]
     values = fit_instrument_parameters(chain, data, known)
@@ -229,17 +194,7 @@ def fit_nominal(
 def compute_errors(
     chain: Chain, data: Sequence[Measurement], known: Mapping[str, float] | None = None
 ) -> list[dict[str, Array]]:
-    """Compute the errors of all samples, measured minus modelled, without weights.
-
-    Args:
-        chain: Chain with base and tool.
-        data: Measurements of any kinds.
-        known: Values of instrument parameters by name [m or rad]; the others, such as a point that only
-            these samples touch, are fitted to the data first.
-
-    Returns:
-        Errors of each measurement by the name that its kind gives them, arrays of shape (m, ·) [m or rad].
-    """
+    """Compute the errors of all samples, measured minus modelled, without weights."""
     known = known or {}
     data = [item.matched_to(known) for item in data]
     data = [
@@ -259,16 +214,7 @@ def compute_errors(
 def position_errors(
     chain: Chain, data: Sequence[Measurement], known: Mapping[str, float] | None = None
 ) -> tuple[Array, Array]:
-    """Compute the position errors of all measurements that contain positions.
-
-    Args:
-        chain: Chain with base and tool.
-        data: Measurements of any kinds, with m positions in all.
-        known: Values of instrument parameters by name [m or rad]; the others are fitted to the data first.
-
-    Returns:
-        Joint values, shape (m, n) [rad or m], and norms of the position errors, shape (m,) [m].
-    """
+    """Compute the position errors of all measurements that contain positions."""
     q, norms = [np.empty((0, chain.n_joints))], [np.empty(0)]
     with_positions = [item for item in data if len(item.positions())]
     for item, errors in zip(with_positions, compute_errors(chain, with_positions, known), strict=True):
@@ -278,14 +224,7 @@ def position_errors(
 
 
 def error_norms(errors: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
-    """Return the error norms (m,) of all measurements by group.
-
-    Args:
-        errors: Errors by name of each measurement, arrays of shape (m, ·) [m or rad].
-
-    Returns:
-        Norms by group of `GROUP_UNITS`, in its order.
-    """
+    """Return the error norms (m,) of all measurements by group."""
     out: dict[str, list[Array]] = {}
     for item in errors:
         for name, error in item.items():
@@ -316,12 +255,6 @@ def remove_outliers(errors: Sequence[Mapping[str, Array]]) -> tuple[list[dict[st
     """Remove the samples whose errors are outliers among those of their measurement.
 
     Only the first group of errors of a measurement is tested: of a pose, the position.
-
-    Args:
-        errors: Errors by name of each measurement, arrays of shape (m, ·) [m or rad].
-
-    Returns:
-        Errors of the other samples, and the number of outliers.
     """
     inliers, n_outliers = [], 0
     for item in errors:
@@ -351,16 +284,7 @@ class PairedErrors:
     def from_errors(
         cls, before: Sequence[Mapping[str, Array]], after: Sequence[Mapping[str, Array]], labels: Array
     ) -> PairedErrors:
-        """Average the squared errors of the most important group over the samples of each configuration.
-
-        Args:
-            before: Errors of each measurement, as from `compute_errors`, with m samples in all.
-            after: The same after the calibration.
-            labels: Label of the configuration of each sample, shape (m,).
-
-        Returns:
-            The mean squared errors.
-        """
+        """Average the squared errors of the most important group over the samples of each configuration."""
         group = next(iter(error_norms(before)))
         squares, kept, start, n_components = [], [], 0, 1
         for items in zip(before, after, strict=True):

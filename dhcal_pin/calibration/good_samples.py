@@ -96,17 +96,7 @@ class GoodSamples:
 def find_good_samples(
     problem: Problem, solution: SolverResult, data: Sequence[Measurement], groups: Array
 ) -> GoodSamples:
-    """Find the samples that agree with the fit of a majority of the samples.
-
-    Args:
-        problem: Problem as it was solved.
-        solution: Its solution.
-        data: Fitted measurements with estimated standard deviations, without robust weights.
-        groups: Label of each sample's configuration, the measurements one after the other.
-
-    Returns:
-        The good samples; all samples if there are too few to judge each other.
-    """
+    """Find the samples that agree with the fit of a majority of the samples."""
     counts = [len(item.rows) for item in data]
     if _looks_like_noise(problem.with_data(data), solution.x, groups):
         return GoodSamples([np.ones(count) for count in counts], FAR_REJECTED)
@@ -137,16 +127,7 @@ def find_good_samples(
 
 
 def _looks_like_noise(problem: Problem, x: Array, groups: Array) -> bool:
-    """Return whether many residuals of a fit to all samples follow the distribution of noise.
-
-    Args:
-        problem: Problem with all samples.
-        x: Solution, shape (p+s,).
-        groups: Label of each sample's configuration, shape (m,).
-
-    Returns:
-        Whether the search for outliers is unnecessary; False also if the data are too few to tell.
-    """
+    """Return whether many residuals of a fit to all samples follow the distribution of noise."""
     starts = np.cumsum([0, *(len(item.rows) for item in problem.data)])
     n_rows = sum(
         item.residual_dim * len(np.unique(groups[a:b]))
@@ -186,15 +167,7 @@ def _judge(problem: Problem, x: Array, rows: LinearizedRows, scales: Array, thre
 
 
 def _independent_rows(rows: LinearizedRows, groups: Array) -> int:
-    """Count the rows that differ; repeated rows of a configuration add nothing to what a majority can tell.
-
-    Args:
-        rows: Linearized rows.
-        groups: Label of each sample's configuration, shape (m,).
-
-    Returns:
-        Sum of the ranks of the rows of each configuration.
-    """
+    """Count the rows that differ; repeated rows of a configuration do not strengthen a majority."""
     total, first = 0, 0
     for item in rows.items:
         labels = groups[first : first + item.shape[2]]
@@ -232,16 +205,7 @@ class _Core:
 
 
 def _best_core(rows: LinearizedRows, fits: Sequence[tuple[Array, Array]], redundancy: float) -> _Core | None:
-    """Extend the samples of several fits and choose the most likely ones.
-
-    Args:
-        rows: Linearized rows.
-        fits: Result of `search_majorities`.
-        redundancy: Number of rows per independent row.
-
-    Returns:
-        The most likely extension; None if it is likelier that all samples are good.
-    """
+    """Extend the samples of several fits and choose the most likely ones."""
     everything = np.ones(rows.n_samples, bool)
     scales = rows.noise_scales(rows.residual_squares(rows.solve(everything[None] * 1.0, fits[0][1][None])))[0]
     cores: list[_Core] = []
@@ -260,15 +224,6 @@ def _extend(rows: LinearizedRows, is_good: Array, scales: Array, redundancy: flo
 
     The threshold is strict: a small outlier that is included too early would pull the fit towards itself and
     stay.
-
-    Args:
-        rows: Linearized rows.
-        is_good: The majority that agrees best, shape (m,).
-        scales: Noise scales of the classes, shape (c,).
-        redundancy: Number of rows per independent row.
-
-    Returns:
-        Fit of the extended samples.
     """
     y, t = np.zeros(0), np.zeros(0)
     for _ in range(MAX_EXTENSIONS):
@@ -284,17 +239,7 @@ def _extend(rows: LinearizedRows, is_good: Array, scales: Array, redundancy: flo
 
 
 def _log_likelihood(rows: LinearizedRows, is_good: Array, scales: Array, redundancy: float) -> float:
-    """Compute the negative logarithm of the likelihood of a choice of good samples, see the module docstring.
-
-    Args:
-        rows: Linearized rows.
-        is_good: Whether each sample is good, shape (m,).
-        scales: Noise scales of the classes, shape (c,).
-        redundancy: Number of rows per independent row.
-
-    Returns:
-        The negative logarithm; infinite if the good samples have no more rows than unknowns.
-    """
+    """Compute the negative log-likelihood of a choice of good samples; see the module docstring."""
     squares = rows.residual_squares(rows.solve(is_good[None].astype(float), scales[None]))[0]
     fitted, total = is_good[rows.sample], 0.0
     freedom = 1 - rows.n_determined * redundancy / rows.counts[fitted].sum()

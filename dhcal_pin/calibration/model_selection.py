@@ -167,14 +167,7 @@ class FamilyTrial:
 
 
 def trial_table(trials: Sequence[FamilyTrial]) -> Table:
-    """Make a table of the effect of each family on the cross-validated error.
-
-    Args:
-        trials: Trials of a selection.
-
-    Returns:
-        Table with one row per family.
-    """
+    """Make a table of the effect of each family on the cross-validated error."""
     header = ["family", "verdict", "before", "after", "log evidence", "prior width"]
     rows = [
         [
@@ -309,14 +302,7 @@ class _Candidates:
         return (self.family == "") | np.isin(self.family, list(widths))
 
     def maximize_evidence(self, widths: Mapping[str, float]) -> _Model:
-        """Find the prior widths of some families, and the noise, of greatest evidence.
-
-        Args:
-            widths: First guess of the widths by family.
-
-        Returns:
-            The model.
-        """
+        """Find the prior widths of some families, and the noise, of greatest evidence."""
         columns = self.columns(widths)
         reduced, n_rows = self.system.select(columns), count_rows(self.problem)
         family, x, expected = self.family[columns], self.x[columns], self.problem.weights[columns]
@@ -367,31 +353,12 @@ def _unknown_names(problem: Problem) -> list[str]:
 
 
 def _prior_weights(problem: Problem, family: Array, widths: Mapping[str, float]) -> Array:
-    """Return the weights of the priors (p,) of a problem with the expected widths for other widths.
-
-    Args:
-        problem: Problem with the expected priors.
-        family: Name of the family of each unknown, (p,).
-        widths: Standard deviations of the priors of each family, as fractions of the expected ones.
-
-    Returns:
-        Weights (p,).
-    """
+    """Return the weights of the priors (p,) of a problem with the expected widths for other widths."""
     return problem.weights / np.array([widths.get(name, 1.0) for name in family])
 
 
 def _best_width(x: Array, determined: Array, expected: Array, members: Array) -> float:
-    """Return the prior width of greatest evidence of some parameters, as a fraction of the expected one.
-
-    Args:
-        x: Parameters, (p,).
-        determined: Fraction of each parameter that the data determine, (p,).
-        expected: Reciprocal expected standard deviations, (p,).
-        members: Mask of the parameters of the family, (p,).
-
-    Returns:
-        √(Σ x² / Σ γ), between `MIN_PRIOR_WIDTH` and 1.
-    """
+    """Return the prior width of greatest evidence of some parameters, as a fraction of the expected one."""
     count = max(float(np.sum(determined[members])), EVIDENCE_TOL)
     size = np.sqrt(float(np.sum((x * expected)[members] ** 2)) / count)
     return float(np.clip(size, MIN_PRIOR_WIDTH, 1.0))
@@ -432,16 +399,7 @@ def _with_families(
 
 
 def _select(candidates: _Candidates, names: Sequence[str], model: _Model) -> tuple[list[FamilyTrial], _Model]:
-    """Select families one after the other.
-
-    Args:
-        candidates: Linear model with the columns of all families.
-        names: Families to try.
-        model: Families that are selected already.
-
-    Returns:
-        Trials of the selected families in order, then of the others on top of those; the selected model.
-    """
+    """Select families one after the other."""
     remaining, chosen = list(names), list[FamilyTrial]()
     while True:
         trials = [candidates.trial(name, model) for name in remaining]
@@ -463,15 +421,6 @@ def _may_have_curves(problem: Problem, x: Array, orders: range) -> bool:
         z² = (Σ a·r·sin kq)² / Σ |a|²·sin² kq,    and the same with the cosine,
 
     are distributed as χ²_1, or smaller where the fit has taken up a part.
-
-    Args:
-        problem: Problem without these curves.
-        x: Its solution, (p,).
-        orders: Orders of the harmonics of the curves.
-
-    Returns:
-        Whether the highest line or the sum of all exceeds what white residuals have; always true for few
-        rows, and for measurements with two configurations per row.
     """
     robot = len(problem.errors.parameters)
     chain = problem.errors.at(x[:robot])
@@ -548,13 +497,7 @@ class _Regions:
     """Left-out regions of joint space, and fits of the other samples at any temperature."""
 
     def __init__(self, problem: Problem, x: Array, noise: float):
-        """Factor the rows of the regions.
-
-        Args:
-            problem: Problem at temperature 1.
-            x: Point of the linearization, (p,).
-            noise: Standard deviation of the whitened residuals.
-        """
+        """Factor the rows of the regions."""
         self._x, self._noise, self._weights = x, noise, problem.weights * noise
         self._folds = [
             fold
@@ -584,21 +527,7 @@ class _Regions:
 def extend(
     fit: Fit, families: Sequence[str], max_iterations: int, progress: Progress | None
 ) -> tuple[Fit, Extension]:
-    """Add the families of joint errors that the measurements support, and find how much the samples count.
-
-    Args:
-        fit: Fit of the geometry by method "lm", with priors.
-        families: Names of `estimation.EXTENSIONS` to try; those without a parameter on this robot, or whose
-            parameters are fixed or estimated already, are skipped.
-        max_iterations: Largest number of iterations of one solution.
-        progress: Called with the name of the phase, the number of its step and the largest number of steps.
-
-    Returns:
-        The fit, and what was added; the given fit if nothing was.
-
-    Raises:
-        UnknownNameError: If a family is unknown.
-    """
+    """Add the families of joint errors that the measurements support, and find how much the samples count."""
     if unknown := [name for name in families if name not in EXTENSIONS]:
         raise UnknownNameError(
             f"unknown extension {unknown[0]!r}; choose from {', '.join(EXTENSIONS)}, or auto or none"
@@ -657,17 +586,7 @@ def _fit_selected(
     model: _Model,
     max_iterations: int,
 ) -> tuple[Fit, float]:
-    """Fit the geometry and selected families at temperature 1.
-
-    Args:
-        fit: Fit of the geometry.
-        selected: Parameters of the families.
-        model: Prior widths and values of the families from the linear model around the fit.
-        max_iterations: Largest number of iterations.
-
-    Returns:
-        The fit, with the prior widths of greatest evidence, and the standard deviation of its residuals.
-    """
+    """Fit the geometry and selected families at temperature 1."""
     problem, _, family = _with_families(fit.problem, fit.solution.x, selected)
     x = np.array([model.values[name] for name in _unknown_names(problem)])
     if problem.bounds is not None:
@@ -731,16 +650,7 @@ def _noise(fit: Fit) -> float:
 def _select_families(
     fit: Fit, missing: dict[str, list[ErrorParameter]]
 ) -> tuple[tuple[FamilyTrial, ...], _Model, float]:
-    """Select families of joint errors.
-
-    Args:
-        fit: Fit of the geometry.
-        missing: Parameters of the families to try.
-
-    Returns:
-        Trials of the selected families, then of the others; the selected model; error of random left-out
-        samples as a fraction of that of the geometry, NaN if nothing was selected.
-    """
+    """Select families of joint errors."""
     trials: list[FamilyTrial] = []
     model, random_ratio = _Model({}, _noise(fit), float("nan"), {}), float("nan")
     problem, x = fit.problem, fit.solution.x
@@ -779,15 +689,7 @@ def _select_families(
 
 
 def _are_residuals_correlated(fit: Fit, noise: float) -> bool:
-    """Check whether neighbouring configurations share an error of the model.
-
-    Args:
-        fit: Fit at temperature 1.
-        noise: Standard deviation of its whitened residuals.
-
-    Returns:
-        Whether the residuals contradict independence.
-    """
+    """Check whether neighbouring configurations share an error of the model."""
     if noise < MIN_CORRELATED_NOISE:
         return False
     root = fit.solution.system.scaled(1 / noise).sqrt_covariance(fit.problem.weights)[0]
@@ -800,12 +702,6 @@ def family_hint(fit: Result) -> str:
     The hint is computed from a linearization around the fit and at most `MAX_HINT_SAMPLES` samples of each
     measurement. It requires a change of the cost that chance causes less than once in a million fits, by
     the bound P(χ²_q > q + 2·sqrt(q·t) + 2·t) <= exp(-t) of Laurent and Massart (2000).
-
-    Args:
-        fit: Calibration of the geometry by method "lm" and with priors.
-
-    Returns:
-        One sentence; empty without a significant family.
     """
     data = [item.take(w > robust.ZERO_WEIGHT) for item, w in zip(fit.problem.data, fit.weights, strict=True)]
     data = [item.take(np.s_[:: max(1, -(-len(item.rows) // MAX_HINT_SAMPLES))]) for item in data]
@@ -831,14 +727,7 @@ def family_hint(fit: Result) -> str:
 
 
 def is_restricted(sets: Sequence[str]) -> bool:
-    """Check whether parameter sets describe the robot, but fewer of its errors than `FULL_SET`.
-
-    Args:
-        sets: Names of parameter sets.
-
-    Returns:
-        Whether the full set has parameters that these sets lack.
-    """
+    """Check whether parameter sets describe the robot, but fewer of its errors than `FULL_SET`."""
     frames = {"base", "tool"}
     is_full = frames <= set(sets) and {"minimal", "placement"} & set(sets)
     return not is_full and not set(sets) <= frames

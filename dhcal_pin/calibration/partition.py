@@ -116,12 +116,6 @@ def configuration_groups(data: Sequence[Measurement]) -> Array:
 
     A sample with several configurations, such as a relative pose, is compared by all of its joint values. A
     sample without a configuration, such as a known distance between points, has a label of its own.
-
-    Args:
-        data: Measurements of any kinds, m samples in all.
-
-    Returns:
-        Labels of shape (m,), counted from 0 in the order of first appearance.
     """
     counts = [len(item.rows) for item in data]
     starts = np.cumsum([0, *counts])
@@ -141,15 +135,7 @@ def configuration_groups(data: Sequence[Measurement]) -> Array:
 
 
 def different_configurations(data: Sequence[Measurement]) -> tuple[Array, Array]:
-    """Return the different configurations of measurements.
-
-    Args:
-        data: Measurements of any kinds, m samples in all.
-
-    Returns:
-        Joint values in the order of first appearance, shape (u, n) [rad or m], and the first sample of each,
-        shape (u,), counted from 0 to m - 1. Shapes (0, 0) and (0,) if no sample has a configuration.
-    """
+    """Return the different configurations of measurements."""
     q, samples, start = [np.empty((0, 0))], [np.empty(0, int)], 0
     for item in data:
         if item.configurations_per_row and len(item.rows):
@@ -304,14 +290,6 @@ def region_partitions(
 
     The medians along two principal directions of the joint values divide the samples. Samples that belong
     together are in one region, see `blocked_folds`.
-
-    Args:
-        data: One measurement or several of any kinds, m samples in all.
-        groups: Labels of samples that belong together, shape (m,), as in `blocked_folds`.
-
-    Returns:
-        Partitions of the samples into two to four folds each; empty if all samples have the same joint
-        values.
     """
     data = as_measurements(data)
     along, label, is_counted = _principal_coordinates(data, groups)
@@ -329,17 +307,7 @@ def region_partitions(
 
 
 def _principal_coordinates(data: tuple[Measurement, ...], groups: Array | None) -> tuple[Array, Array, Array]:
-    """Return coordinates of groups of samples along the principal directions of the joint values.
-
-    Args:
-        data: Measurements, m samples in all.
-        groups: Labels of samples that belong together, shape (m,); configurations if not given. If there is
-            only one group, each configuration is its own group.
-
-    Returns:
-        Coordinates (c, d) of the c groups with a configuration along d directions, group of each sample (m,),
-        and flags of the groups with a configuration (g,).
-    """
+    """Return coordinates of groups of samples along the principal directions of the joint values."""
     has_configuration = np.concatenate(
         [np.full(len(item.rows), item.configurations_per_row > 0) for item in data]
     )
@@ -366,13 +334,6 @@ def contact_groups(problem: Problem, x: Array) -> Array:
 
     Points that are joined by a known distance count as the same thing. A sample that touches nothing has a
     label of its own.
-
-    Args:
-        problem: Problem with the measurements, m samples in all.
-        x: Errors of its parameters, shape (p,) [m or rad].
-
-    Returns:
-        Labels of shape (m,).
     """
     chain = problem.errors.at(x[: len(problem.errors.parameters)])
     node = {parameter.name: i for i, parameter in enumerate(merge_instrument_parameters(problem.data))}

@@ -235,19 +235,7 @@ def _initialize(
     max_iterations: int,
     is_robust: bool,
 ) -> tuple[ErrorModel, tuple[Measurement, ...], list[Array]]:
-    """Initialize base, tool and instruments.
-
-    Args:
-        errors: Nominal chain and its unknown parameters.
-        data: Measurements.
-        known: Values of instrument parameters by name [m or rad].
-        max_iterations: Largest number of iterations of each fit.
-        is_robust: Whether to find gross outliers and initialize without them.
-
-    Returns:
-        Parameters on the chain with these frames, initialized measurements, and first weights of each
-        measurement's samples, shape (m,) each.
-    """
+    """Initialize base, tool and instruments."""
     started = initialize_frames(errors, data, known, max_iterations)
     items = tuple(item.initialized(started.chain) for item in data)
     weights = [np.ones(len(item.rows)) for item in data]

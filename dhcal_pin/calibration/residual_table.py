@@ -117,14 +117,7 @@ class ResidualTable:
 
 
 def residual_table(fit: Result) -> ResidualTable:
-    """Collect the residuals of a calibration.
-
-    Args:
-        fit: Calibration.
-
-    Returns:
-        Residuals of the fitted and of the held-out samples under the calibrated robot.
-    """
+    """Collect the residuals of a calibration."""
     data = [*fit.data, *fit.holdout]
     residuals = [*_fitted_residuals(fit), *_holdout_residuals(fit)]
     n_fitted = len(fit.data)

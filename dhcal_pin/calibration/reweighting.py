@@ -89,15 +89,7 @@ class Fit:
         return self.previous_iterations + self.solution.iterations
 
     def solved_with(self, data: Sequence[Measurement], max_iterations: int) -> Fit:
-        """Solve loosely again with other standard deviations of the same measurements.
-
-        Args:
-            data: Measurements with these standard deviations, without robust weights.
-            max_iterations: Largest number of iterations of the solution.
-
-        Returns:
-            The fit; its `data` stay as they are.
-        """
+        """Solve loosely again with other standard deviations of the same measurements."""
         weighted = [item.with_weights(w) for item, w in zip(data, self.weights, strict=True)]
         problem = replace(self.problem, data=tuple(weighted))
         solution = minimize(problem, "lm", self.solution.x, max_iterations, loose=True)
@@ -142,15 +134,7 @@ class ReweightState:
 
 
 def observable_directions(problem: Problem, solution: SolverResult) -> float:
-    """Return the number of directions of parameter space that the data determine.
-
-    Args:
-        problem: Problem that was solved.
-        solution: Its solution.
-
-    Returns:
-        Rank of the whitened Jacobian.
-    """
+    """Return the number of directions of parameter space that the data determine."""
     return qr.rank(solution.system.r)
 
 
@@ -163,20 +147,7 @@ def reweight(
     count_determined: CountDetermined = observable_directions,
     loose: bool = True,
 ) -> Fit:
-    """Solve a problem again until noise scales, prior widths and robust weights have settled.
-
-    Args:
-        fit: Fit with unit scales and the expected prior widths; its weights are the first ones.
-        stages: Robust stages, see `robust.LOSSES`.
-        groups: Parameters whose default priors share one scale.
-        max_iterations: Largest number of iterations of one solution.
-        progress: Called with the name of the phase, the number of its step and the largest number of steps.
-        count_determined: Function that returns the number of parameters that the data determine.
-        loose: Whether early rounds solve loosely. This takes more rounds, each of fewer iterations.
-
-    Returns:
-        The fit of the last round.
-    """
+    """Solve a problem again until noise scales, prior widths and robust weights have settled."""
     expected = fit.problem.weights
     state = ReweightState(fit, np.ones(sum(len(item.residual_groups) for item in fit.data)), stages)
     for rounds_left in reversed(range(MAX_ROUNDS)):
@@ -254,16 +225,6 @@ def estimate_variance_components(
     determined parameters. A group with no more rows than that could be fitted exactly, so its residuals
     do not show its noise. It takes the pooled scale of all groups of its unit that do not state their
     standard deviations, or 1 if it is the only one.
-
-    Args:
-        problem: Problem that was solved.
-        solution: Solution of `problem`.
-        data: Measurements with their own standard deviations, without robust weights.
-        weights: Robust weight of each sample, one array of shape (m,) per measurement.
-        count_determined: Function that returns the number of parameters that the data determine.
-
-    Returns:
-        Scales of shape (g,), in the order of the residual groups of the measurements.
     """
     if all(item.has_stated_sigma for item in data):
         return np.ones(sum(len(item.residual_groups) for item in data))
@@ -311,15 +272,7 @@ class _ResidualGroup(NamedTuple):
 
 
 def with_sigma_scales(data: tuple[Measurement, ...], scales: Array) -> tuple[Measurement, ...]:
-    """Scale the standard deviations of each residual group.
-
-    Args:
-        data: Measurements.
-        scales: Scales of shape (g,), in the order of the residual groups of the measurements.
-
-    Returns:
-        The measurements with scaled standard deviations; the same objects if all scales are 1.
-    """
+    """Scale the standard deviations of each residual group."""
     if np.all(scales == 1):
         return data
     remaining = iter(scales.tolist())

@@ -67,18 +67,7 @@ N_FACTORS = 101
 def compute_shrinkage_factor(
     problem: Problem, solution: SolverResult, groups: Sequence[tuple[Sequence[int], float]]
 ) -> float:
-    """Compute the largest factor of a solution that is hardly worse than the nominal robot.
-
-    Args:
-        problem: Problem that was solved; its chain has base and tool frames that fit the nominal robot.
-        solution: Solution of `problem`.
-        groups: Parameters that share one unknown prior width, and one over the default standard deviation of
-            their priors.
-
-    Returns:
-        Factor c from 0 to 1; 1 if there are more equations than parameters or than observable directions, as
-        their residuals show how reliable the solution is.
-    """
+    """Compute the largest factor of a solution that is hardly worse than the nominal robot."""
     errors, x = problem.errors, solution.x
     n_rows = sum(len(item.rows) * item.residual_dim for item in problem.data)
     if n_rows > len(x) or n_rows > rank(solution.system.r) or not groups:
@@ -114,12 +103,7 @@ def compute_shrinkage_factor(
 
 
 def _eliminate(system: TriangularSystem, x: Array, robot: Array, others: Array) -> tuple[Array, Array, Array]:
-    """Eliminate the other unknowns from the rows of the system.
-
-    Returns:
-        Least-squares change of the others per robot error (o, i), remaining rows (r, i) and right-hand side
-        (r,).
-    """
+    """Eliminate the other unknowns from the rows of the system."""
     measured = system.z + system.r @ x
     u, s, vt = np.linalg.svd(system.r[:, others], full_matrices=False)
     is_observable = s > RANK_RTOL * s.max(initial=0.0)
@@ -177,17 +161,7 @@ class _Evidence:
 
 
 def _largest_safe_factor(mean: Array, std: Array, posterior: Array, squared_change: float) -> float:
-    """Find the largest factor whose probability of harm is accepted; 0 if there is none.
-
-    Args:
-        mean: Mean of a = dᵀ·e for each combination of widths, (w,).
-        std: Standard deviation of a, (w,).
-        posterior: Probability of the widths, (w,).
-        squared_change: |d|².
-
-    Returns:
-        The factor.
-    """
+    """Find the largest factor whose probability of harm is accepted; 0 if there is none."""
     from scipy.special import ndtr  # lazy import: slow, and few calibrations need it
 
     factors = np.linspace(1, 0, N_FACTORS)

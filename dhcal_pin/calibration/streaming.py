@@ -50,14 +50,7 @@ class StreamProblem(Problem):
     scales: Mapping[str, float] | None = None
 
     def map_chunks(self, function: Callable[[Chunk], _Value]) -> Iterator[_Value]:
-        """Apply a function to each part.
-
-        Args:
-            function: Function of a chunk; it must be picklable for executors of other processes.
-
-        Returns:
-            Its values in the order of the parts.
-        """
+        """Apply a function to each part."""
         return self.executor.map(
             partial(_apply_to_part, function, self.errors.chain, self.scales), self.parts()
         )

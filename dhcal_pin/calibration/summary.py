@@ -47,14 +47,7 @@ DEFINITION_TEXT = (
 
 
 def estimate_table(estimates: Sequence[Estimate]) -> Table:
-    """Make a table of nominal and calibrated values, changes and standard deviations.
-
-    Args:
-        estimates: Estimates of a calibration.
-
-    Returns:
-        Table with one row per parameter.
-    """
+    """Make a table of nominal and calibrated values, changes and standard deviations."""
     rows = [
         [
             e.name,
@@ -69,14 +62,7 @@ def estimate_table(estimates: Sequence[Estimate]) -> Table:
 
 
 def definition_table(estimates: Sequence[Estimate]) -> Table:
-    """Make a table of the frames and directions in which the parameters are defined.
-
-    Args:
-        estimates: Estimates of a calibration.
-
-    Returns:
-        Table with one row per frame; instrument parameters are not in it.
-    """
+    """Make a table of the frames and directions in which the parameters are defined."""
     by_frame: dict[str, list[str]] = {}
     for e in estimates:
         if e.frame:
@@ -86,14 +72,7 @@ def definition_table(estimates: Sequence[Estimate]) -> Table:
 
 
 def accuracy_table(comparisons: Sequence[Comparison]) -> Table:
-    """Make a table of the error statistics before and after a calibration, in mm and mrad.
-
-    Args:
-        comparisons: Comparisons of a calibration.
-
-    Returns:
-        Table with one row per comparison, group of errors and state.
-    """
+    """Make a table of the error statistics before and after a calibration, in mm and mrad."""
     rows = []
     for c in comparisons:
         for group, after in c.after.groups.items():
@@ -135,15 +114,7 @@ class Headline:
 
 
 def headline(comparisons: Sequence[Comparison]) -> Headline:
-    """Summarize the accuracy in one sentence.
-
-    Args:
-        comparisons: Comparisons of a calibration; the first is used: hold-out samples, else cross-validated,
-            else fitted ones.
-
-    Returns:
-        The sentence and its figures.
-    """
+    """Summarize the accuracy in one sentence."""
     best = comparisons[0]
     group, after = next(iter(best.after.groups.items()))
     before = best.before.groups[group]
@@ -171,13 +142,6 @@ def generalization_lines(
     """State the accuracy within the measured region and beyond it, one line each.
 
     Where joint values have no meaning, the lines speak of the measured poses, and state no shares.
-
-    Args:
-        generalization: Both figures of a calibration.
-        comparisons: Comparisons of the calibration; hold-out samples are preferred to cross-validated ones.
-
-    Returns:
-        The lines.
     """
     inside, beyond = generalization.cross_validated, generalization.region_holdout
     if comparisons[0].title == "hold-out":
@@ -211,12 +175,6 @@ def _before_and_after(comparison: Comparison) -> str:
 def format_share(share: float) -> str:
     """Format a share of random configurations in percent; it is never exactly 0 or 100 %.
 
-    Args:
-        share: Share, 0 to 1.
-
-    Returns:
-        Text such as "12 %" or "under 1 %".
-
     >>> format_share(0.004)
     'under 1 %'
     """
@@ -228,16 +186,7 @@ def format_share(share: float) -> str:
 
 
 def regressions(errors: ErrorModel, comparisons: Sequence[Comparison]) -> list[str]:
-    """List the comparisons in which the calibrated robot is worse than the nominal one.
-
-    Args:
-        errors: Nominal robot and its identified errors.
-        comparisons: Comparisons of a calibration.
-
-    Returns:
-        One warning each, with what to do about it; none if only base, tool and instruments were estimated, as
-        both robots are the same then.
-    """
+    """List the comparisons in which the calibrated robot is worse than the nominal one."""
     if not errors.has_arm:
         return []
     return [
@@ -254,14 +203,7 @@ def _count_outliers(count: int) -> str:
 
 
 def describe_samples(comparison: Comparison) -> str:
-    """Describe the samples of a comparison, such as "on 12 hold-out samples".
-
-    Args:
-        comparison: Comparison of a calibration.
-
-    Returns:
-        The description.
-    """
+    """Describe the samples of a comparison, such as "on 12 hold-out samples"."""
     count = comparison.n_samples
     if comparison.title == "region hold-out":
         return "on regions that were left out"

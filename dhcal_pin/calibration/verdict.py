@@ -98,14 +98,7 @@ class Verdict:
 
     @classmethod
     def from_findings(cls, findings: Iterable[Finding]) -> Verdict:
-        """Combine findings.
-
-        Args:
-            findings: Any number of findings.
-
-        Returns:
-            The most severe status, with the reasons of all findings.
-        """
+        """Combine findings."""
         ordered = sorted(findings, key=lambda finding: -STATUSES.index(finding.status))
         status = ordered[0].status if ordered else "ok"
         return cls(
@@ -116,14 +109,7 @@ class Verdict:
 
 
 def judge(fit: Result) -> Verdict:
-    """Judge a calibration by all rules.
-
-    Args:
-        fit: Result of a calibration.
-
-    Returns:
-        The verdict.
-    """
+    """Judge a calibration by all rules."""
     findings = _unmoved_joints(fit)
     if not any(finding.status == "refused" for finding in findings):
         findings += [*_mixups(fit.diagnosis), *_board_size(fit)]

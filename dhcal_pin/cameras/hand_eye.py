@@ -131,14 +131,7 @@ def _require_two_axes(rotations: Array, where: str) -> None:
 
 
 def mean_pose(candidates: Array) -> Array:
-    """Compute the mean of the poses of several images that agree best.
-
-    Args:
-        candidates: Poses from each image, one of which agrees with the others, shape (i, k, 4, 4) [m].
-
-    Returns:
-        Pose with the nearest rotation to the mean and the median position, shape (4, 4) [m].
-    """
+    """Compute the mean of the poses of several images that agree best."""
     rotations = candidates[..., :3, :3]
     cosine = 0.5 * (np.einsum("jlab,ikab->jlik", rotations, rotations) - 1)
     angles = np.arccos(np.clip(cosine, -1, 1)).reshape(-1, *candidates.shape[:2])

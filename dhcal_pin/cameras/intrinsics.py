@@ -53,19 +53,7 @@ _MIN_INCREASE = 25.0
 def estimate_intrinsics(
     views: Sequence[tuple[Array, Array]], camera: Camera
 ) -> tuple[float, float, float, float]:
-    """Estimate the focal lengths and the image centre of a camera without distortion.
-
-    Args:
-        views: Points of a board, shape (m, 3) [m], and their pixels, shape (m, 2), of each view.
-        camera: Camera: its lens model, the size of its images and its name.
-
-    Returns:
-        fx, fy, cx, cy [px]; of both methods those whose poses of the board leave the smaller error in the
-        images.
-
-    Raises:
-        NotObservableError: There are too few views, or they do not determine the focal length.
-    """
+    """Estimate the focal lengths and the image centre of a camera without distortion."""
     candidates = intrinsics_candidates(views, camera)
     if not candidates:
         raise undetermined_focal_length(camera)
@@ -76,18 +64,7 @@ def estimate_intrinsics(
 def intrinsics_candidates(
     views: Sequence[tuple[Array, Array]], camera: Camera
 ) -> list[tuple[float, float, float, float]]:
-    """Estimate the focal lengths and the image centre of a camera by each method that determines them.
-
-    Args:
-        views: Points of a board, shape (m, 3) [m], and their pixels, shape (m, 2), of each view.
-        camera: Camera: its lens model, the size of its images and its name.
-
-    Returns:
-        fx, fy, cx, cy [px] of each estimate; none if the views do not determine them without distortion.
-
-    Raises:
-        NotObservableError: There are too few views.
-    """
+    """Estimate the focal lengths and the image centre of a camera by each method that determines them."""
     views = [view for view in views if len(view[0]) >= MIN_POINTS]
     if len(views) < MIN_VIEWS:
         raise NotObservableError(
@@ -99,14 +76,7 @@ def intrinsics_candidates(
 
 
 def undetermined_focal_length(camera: Camera) -> NotObservableError:
-    """Return the error of images that do not determine the focal length of a camera.
-
-    Args:
-        camera: Camera.
-
-    Returns:
-        The error.
-    """
+    """Return the error of images that do not determine the focal length of a camera."""
     return NotObservableError(
         f"camera {camera.name!r}: the images do not determine its focal length; expected images of the "
         "board tilted in different directions, or fx, fy, cx, cy in the rig file"

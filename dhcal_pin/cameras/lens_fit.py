@@ -74,19 +74,7 @@ class LensFit:
 
 
 def fit_camera(views: Sequence[View], camera: Camera, *, repeats_errors: bool = False) -> LensFit:
-    """Fit the lens of a camera and the poses of boards to its images, from what the rig states of the lens.
-
-    Args:
-        views: Points of a board, shape (m, 3) [m], and their pixels, shape (m, 2), of each view.
-        camera: Camera of a rig.
-        repeats_errors: Whether points are wrong, and so in every view. All views then count as one.
-
-    Returns:
-        The fit.
-
-    Raises:
-        NotObservableError: The rig states no focal lengths, and the views do not determine them.
-    """
+    """Fit the lens of a camera and the poses of boards to its images, starting from the lens of the rig."""
     std = _lens_widths(camera)
     if camera.has_intrinsics:
         return fit_lens(views, camera.lens, camera.values, std, repeats_errors=repeats_errors)
@@ -138,20 +126,7 @@ def fit_lens(
 def fit_unknown_lens(
     views: Sequence[View], camera: Camera, std: Array, *, repeats_errors: bool = False
 ) -> LensFit:
-    """Fit the lens of a camera whose focal lengths are not known.
-
-    Args:
-        views: Points of a board, shape (m, 3) [m], and their pixels, shape (m, 2), of each view.
-        camera: Camera: its lens model, the size of its images and its name.
-        std: Standard deviations of first values, shape (s,).
-        repeats_errors: As for `fit_lens`.
-
-    Returns:
-        The best fit from several first values.
-
-    Raises:
-        NotObservableError: There are too few views, or they do not determine the focal length.
-    """
+    """Fit the lens of a camera whose focal lengths are not known."""
     candidates = intrinsics_candidates(views, camera)
     size = max(camera.width, camera.height)
     starts = candidates or [(size * each, size * each, *camera.image_centre) for each in _FOCAL_LENGTHS]

@@ -43,14 +43,7 @@ _MIN_DEPTH = 1e-6
 
 
 def normalizing_transform(points: Array) -> Array:
-    """Compute the similarity that moves points to the origin and scales them to unit size.
-
-    Args:
-        points: Points, shape (..., m, d).
-
-    Returns:
-        Homogeneous matrices, shape (..., d+1, d+1).
-    """
+    """Compute the similarity that moves points to the origin and scales them to unit size."""
     d = points.shape[-1]
     centre = points.mean(-2)
     size = np.sqrt(np.mean(np.sum((points - centre[..., None, :]) ** 2, -1), -1) / d)
@@ -88,14 +81,7 @@ def direct_linear_transform(source: Array, target: Array) -> Array:
 
 
 def determines_homography(points: Array) -> bool:
-    """Check that points of a plane determine its homography: no line contains all of them but one.
-
-    Args:
-        points: Points in the plane, shape (m, 2), not all of them in one line.
-
-    Returns:
-        Whether four of them have no three in one line.
-    """
+    """Check that points of a plane determine its homography: no line contains all of them but one."""
     if len(points) < MIN_POINTS:
         return False
     centred = points - points.mean(0)
@@ -304,11 +290,7 @@ def _residuals(poses: Array, points: Array, image: Array) -> tuple[Array, Array]
 
 
 def _refine(poses: Array, views: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
-    """Minimize the distances in the image of each pose (c, 4, 4) in its view.
-
-    Returns:
-        Poses (c, 4, 4) and RMS distances (c,), infinite if points are behind the camera.
-    """
+    """Minimize the distances in the image of each pose (c, 4, 4) in its view."""
     counts = np.array([len(points) for points, _ in views])
     # Views are filled up with copies of their first points, which do not count.
     index = [np.pad(np.arange(count), (0, counts.max() - count)) for count in counts]

@@ -11,11 +11,7 @@ _MEGABYTE = 10**6
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal app`.
-
-    Args:
-        parser: Parser of the command.
-    """
+    """Declare the arguments of `dhcal app`."""
     parser.add_argument(
         "--port",
         metavar="N",
@@ -36,14 +32,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """Serve the page.
-
-    Args:
-        args: Parsed arguments.
-
-    Returns:
-        Exit status 0, after an interrupt.
-    """
+    """Serve the page."""
     import asyncio  # lazy import, as the following: slow to load
 
     from ..app import serve

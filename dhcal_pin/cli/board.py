@@ -11,11 +11,7 @@ EXAMPLE = "dhcal board rig.toml -o board.pdf"
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal board`.
-
-    Args:
-        parser: Parser of the command.
-    """
+    """Declare the arguments of `dhcal board`."""
     parser.add_argument("rig", metavar=RIG["metavar"], help="rig file with the board")
     parser.add_argument(
         "--board", metavar="NAME", help="board of the rig file; only needed if it has several"
@@ -24,14 +20,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """Draw a board.
-
-    Args:
-        args: Parsed arguments.
-
-    Returns:
-        Exit status 0.
-    """
+    """Draw a board."""
     from ..detection import board_pdf  # lazy import, as the following
     from ..io.rig_file import only_entry, read_rig
     from . import console

@@ -16,11 +16,7 @@ EXAMPLE = "dhcal calibrate ur10.urdf laser.csv --tip tool0 --holdout 0.3 -o ur10
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal calibrate`.
-
-    Args:
-        parser: Parser of the command.
-    """
+    """Declare the arguments of `dhcal calibrate`."""
     add_job_arguments(parser)
     add_execution_options(parser, "processes (default: 1; with a manifest, one per processor)", jobs=None)
     parser.add_argument(
@@ -33,18 +29,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """Calibrate one robot or all robots of a manifest, and show the results.
-
-    Args:
-        args: Parsed arguments.
-
-    Returns:
-        Exit status: 0; 1 if a robot of a manifest failed or was refused; 3 if the robot was refused and
-        nothing but JSON and report was written.
-
-    Raises:
-        InvalidArgumentError: Arguments are missing or contradict each other.
-    """
+    """Calibrate one robot or all robots of a manifest, and show the results."""
     if is_manifest(args.robot):
         if args.scheduler:
             raise InvalidArgumentError("--scheduler: not available with a manifest; use --jobs")

@@ -39,15 +39,7 @@ _VERDICT_STYLES = {"ok": "green", "caution": "yellow", "refused": "red"}
 
 
 def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
-    """Describe the result of a calibration.
-
-    Args:
-        outcome: Result, and what was found in the input.
-        job: Options of the calibration.
-
-    Returns:
-        The screen; its details are the tables of parameters, frames, accuracy and joint origins.
-    """
+    """Describe the result of a calibration."""
     fit = outcome.fit
     names = short_names([job.robot, *outcome.n_rows])
     is_refused = fit.verdict.is_refused
@@ -83,15 +75,7 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
 
 
 def verdict_blocks(verdict: Verdict, is_forced: bool) -> list[Block]:
-    """Describe a verdict and its reasons.
-
-    Args:
-        verdict: Verdict on a calibration.
-        is_forced: Whether a refused robot is written.
-
-    Returns:
-        Blocks that are the last ones of a screen.
-    """
+    """Describe a verdict and its reasons."""
     style = _VERDICT_STYLES[verdict.status]
     text = f"verdict: {verdict.status}"
     if verdict.is_refused:
@@ -263,16 +247,7 @@ def _correction_block(fit: Result) -> Block:
 
 
 def largest_corrections(fit: Result, count: int = N_CORRECTIONS) -> list[Estimate]:
-    """Choose the largest corrections of a robot.
-
-    Args:
-        fit: Result of a calibration.
-        count: Largest number of corrections.
-
-    Returns:
-        Estimates of parameters of the robot, without base, tool and instruments, in the order of their
-        changes relative to the prior standard deviations.
-    """
+    """Choose the largest corrections of a robot."""
     sizes = np.abs(fit.x) / fit.prior_std
     estimates = fit.estimates[: len(sizes)]
     order = [i for i in np.argsort(-sizes, kind="stable") if estimates[i].category == "robot" and sizes[i]]

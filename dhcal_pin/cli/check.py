@@ -11,25 +11,14 @@ EXAMPLE = "dhcal check arm.dh.toml"
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal check`.
-
-    Args:
-        parser: Parser of the command.
-    """
+    """Declare the arguments of `dhcal check`."""
     parser.add_argument("robot", **ROBOT)
     add_urdf_options(parser)
     parser.add_argument("--json", **JSON)
 
 
 def run(args: Namespace) -> int:
-    """Compute the Jacobian in several ways and show the differences.
-
-    Args:
-        args: Parsed arguments.
-
-    Returns:
-        Exit status: 0 if all agree, else 1.
-    """
+    """Compute the Jacobian in several ways and show the differences."""
     from ..io import read_robot  # lazy import, as the following: they load Pinocchio
     from ..paper.jacobian_check import crosscheck
     from . import console

@@ -29,11 +29,7 @@ _DESIGN_ANGLE, _DESIGN_TOL = math.pi / 12, 1e-6
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal compensate`.
-
-    Args:
-        parser: Parser of the command.
-    """
+    """Declare the arguments of `dhcal compensate`."""
     parser.add_argument(
         "nominal", metavar="NOMINAL.urdf", type=ROBOT["type"], help="robot model of the controller"
     )
@@ -66,14 +62,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """Correct targets, write them, and show which could not be reached.
-
-    Args:
-        args: Parsed arguments.
-
-    Returns:
-        Exit status 0.
-    """
+    """Correct targets, write them, and show which could not be reached."""
     from ..compensation import compensate  # lazy import, as the following: they load Pinocchio
     from ..io import read_targets
     from ..programs import program_text, require_program_ending
@@ -112,17 +101,7 @@ def run(args: Namespace) -> int:
 
 
 def read_robots(args: Namespace) -> tuple[Chain, Chain]:
-    """Read both robots, with the base and the tool that the targets refer to.
-
-    Args:
-        args: Parsed arguments.
-
-    Returns:
-        Nominal and calibrated robot.
-
-    Raises:
-        InvalidArgumentError: The two robots have different tips, or --tcp is neither a link nor a file.
-    """
+    """Read both robots, with the base and the tool that the targets refer to."""
     from dataclasses import replace  # lazy import, as the following: they are slow to load
 
     import numpy as np
@@ -185,15 +164,6 @@ def exchange_warning(nominal_path: str, calibrated_path: str, nominal: Chain, ca
     have one, and of the numbers that differ between the URDFs most are computed in the nominal file and most
     are not in the calibrated one. A number is computed if it has at least 15 significant digits and is not a
     multiple of 15 degrees: a calibration writes all digits, and people do not.
-
-    Args:
-        nominal_path: Path of the nominal robot.
-        calibrated_path: Path of the calibrated robot.
-        nominal: Nominal robot.
-        calibrated: Calibrated robot.
-
-    Returns:
-        One sentence; empty if there is no reason for doubt.
     """
     from ..io.sidecar import existing_sidecar  # lazy import: loads Pinocchio
 
@@ -245,18 +215,7 @@ def _program(result: Compensation, nominal: Chain) -> Program:
 
 
 def corrected_text(result: Compensation, chain: Chain, targets: TargetPoses, joint_units: str = "rad") -> str:
-    """Format corrected targets.
-
-    Args:
-        result: Corrected targets.
-        chain: Calibrated robot.
-        targets: Targets as read, with their units.
-        joint_units: "rad" (with metres) or "deg" (with millimetres) of the joint values.
-
-    Returns:
-        CSV text with one row per target: joint values, corrected target in the units of the input, remaining
-        error of the calibrated tool, and status. Cells of targets that are not reached are empty.
-    """
+    """Format corrected targets."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
     from .. import se3

@@ -45,26 +45,13 @@ def show(screen: Screen, verbosity: Verbosity) -> None:
 
 
 def print_lines(*texts: str, style: str = "") -> None:
-    """Print sentences.
-
-    Args:
-        *texts: Sentences; each starts a line.
-        style: Style of rich, such as "yellow" or "bold".
-    """
+    """Print sentences."""
     _print(_console(), [Line(escape_control_characters(text), style) for text in texts])
 
 
 @contextmanager
 def show_progress(title: str) -> Iterator[Progress | None]:
-    """Show the phase of the work in a status line.
-
-    Args:
-        title: Description of the work, shown until the first phase is known.
-
-    Yields:
-        Callback with the name of the phase, the number of its step and the largest number of steps; None if
-        stderr is not a terminal.
-    """
+    """Show the phase of the work in a status line."""
     console = _console()
     if not console.is_terminal:
         yield None
@@ -78,28 +65,13 @@ def show_progress(title: str) -> Iterator[Progress | None]:
 
 
 def print_progress(phase: str, step: int, total: int) -> None:
-    """Print the phase of the work as a line for a program, such as `progress: robust weights 3/30`.
-
-    Args:
-        phase: Name of the phase.
-        step: Number of its step.
-        total: Largest number of steps.
-    """
+    """Print the phase of the work as a line for a program, such as `progress: robust weights 3/30`."""
     print_lines(f"progress: {phase} {step}/{total}")
 
 
 @contextmanager
 def progress_bar(title: str, total: int, n_done: int = 0) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar; nothing is shown if stderr is not a terminal.
-
-    Args:
-        title: Description of the work.
-        total: Number of tasks.
-        n_done: Number of tasks that are already done.
-
-    Yields:
-        Callback with the number of tasks done.
-    """
+    """Show a progress bar; nothing is shown if stderr is not a terminal."""
     console = _console()
     if not console.is_terminal:
         # A disabled bar of older versions of rich prints an empty line.
@@ -112,19 +84,11 @@ def progress_bar(title: str, total: int, n_done: int = 0) -> Iterator[Callable[[
 
 
 def open_page(path: str) -> None:
-    """Open a page in the browser; without a browser print its address.
-
-    Args:
-        path: Path of the page.
-    """
+    """Open a page in the browser; without a browser print its address."""
     open_url(Path(path).resolve().as_uri())
 
 
 def open_url(url: str) -> None:
-    """Open an address in the browser; without a browser print it.
-
-    Args:
-        url: Address.
-    """
+    """Open an address in the browser; without a browser print it."""
     if not webbrowser.open(url):
         print_lines(f"no browser found; open {url}")

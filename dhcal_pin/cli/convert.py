@@ -12,11 +12,7 @@ EXAMPLE = "dhcal convert arm.dh.toml arm.urdf"
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal convert`.
-
-    Args:
-        parser: Parser of the command.
-    """
+    """Declare the arguments of `dhcal convert`."""
     parser.add_argument(
         "input",
         metavar="IN",
@@ -55,14 +51,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """Convert a robot file to the format that the ending of the output selects, or a recording.
-
-    Args:
-        args: Parsed arguments.
-
-    Returns:
-        Exit status 0.
-    """
+    """Convert a robot file to the format that the ending of the output selects, or a recording."""
     from ..io.measurement_files.bag import is_bag  # lazy import, as the following: they load Pinocchio
     from . import console
     from .outputs import require_writable_outputs, write_outputs

@@ -24,11 +24,7 @@ EXAMPLE = "dhcal demo --out demo"
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal demo`.
-
-    Args:
-        parser: Parser of the command.
-    """
+    """Declare the arguments of `dhcal demo`."""
     parser.add_argument(
         "--out", default="demo", metavar="DIR", help="folder for the results (default: %(default)s)"
     )
@@ -37,14 +33,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """Run experiment and simulations.
-
-    Args:
-        args: Parsed arguments.
-
-    Returns:
-        Exit status 0.
-    """
+    """Run experiment and simulations."""
     from . import console  # lazy import, as the following: they load Pinocchio
     from .outputs import require_writable_outputs
 
@@ -58,19 +47,7 @@ def run(args: Namespace) -> int:
 def run_demo(
     folder: PathLike, json_target: str | None = None, verbosity: Verbosity = "normal"
 ) -> dict[str, Any]:
-    """Run experiment and simulations, show the results and write all files.
-
-    Args:
-        folder: Folder for the files; created if it does not exist.
-        json_target: Path of a further JSON file, or `-` for standard output.
-        verbosity: What is shown.
-
-    Returns:
-        JSON document of the experiment.
-
-    Raises:
-        InvalidArgumentError: The folder cannot be created.
-    """
+    """Run experiment and simulations, show the results and write all files."""
     from ..calibration.summary import estimate_table  # lazy import, as the following: they load Pinocchio
     from ..formatting import Table
     from ..paper import simulations
@@ -126,14 +103,7 @@ class _Section(NamedTuple):
 
 
 def experiment_remarks(experiment: PaperExperiment) -> list[str]:
-    """Say in sentences what the experiment shows.
-
-    Args:
-        experiment: Experiment of the paper.
-
-    Returns:
-        Sentences.
-    """
+    """Say in sentences what the experiment shows."""
     mm = {key: f"{1e3 * value:.1f} mm" for key, value in experiment.figures.items()}
     n_points, n_parameters = len(experiment.data.q), len(experiment.fit.parameters)
     return [

@@ -19,11 +19,7 @@ EXAMPLE = "dhcal detect images --rig rig.toml --joints joints.csv -o corners.csv
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal detect`.
-
-    Args:
-        parser: Parser of the command.
-    """
+    """Declare the arguments of `dhcal detect`."""
     parser.add_argument("images", metavar="IMAGES", nargs="+", help="image files, or folders of images")
     parser.add_argument(
         "--rig", **{**RIG, "required": True, "help": "rig file with the camera and the boards"}
@@ -63,14 +59,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """Find the corners and write them.
-
-    Args:
-        args: Parsed arguments.
-
-    Returns:
-        Exit status 0.
-    """
+    """Find the corners and write them."""
     from ..detection import corner_columns, detect_boards, image_files  # lazy import, as the following
     from ..io.rig_file import only_entry, read_rig
     from ..io.tabular import csv_text

@@ -14,23 +14,12 @@ _STYLES = {"ok": "", "note": "yellow", "failed": "bold red"}
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal doctor`.
-
-    Args:
-        parser: Parser of the command.
-    """
+    """Declare the arguments of `dhcal doctor`."""
     parser.add_argument("--json", **JSON)
 
 
 def run(args: Namespace) -> int:
-    """Check the installation and calibrate a small robot.
-
-    Args:
-        args: Parsed arguments.
-
-    Returns:
-        Exit status: 0 if the installation works, else 1.
-    """
+    """Check the installation and calibrate a small robot."""
     try:
         from ..diagnostics.installation import check_installation  # lazy import: loads Pinocchio
         from . import console

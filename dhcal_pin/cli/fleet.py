@@ -83,17 +83,7 @@ JobRunner = Callable[[Job], Mapping[str, Any]]
 
 
 def read_fleet(path: PathLike) -> list[FleetJob]:
-    """Read and check a manifest.
-
-    Args:
-        path: Path of the manifest.
-
-    Returns:
-        Its jobs.
-
-    Raises:
-        FileFormatError: The file is not a manifest, a key or a value is invalid, or two jobs use one file.
-    """
+    """Read and check a manifest."""
     document = TomlTable.read(path)
     tables = document.tables("job", expected="one for each robot, with robot, data and output")
     shared = {key: document.get(key) for key in document.keys() if key != "job"}
@@ -186,15 +176,7 @@ def _output_paths(job: Job) -> list[str]:
 
 
 def file_paths(entries: Sequence[FleetJob], path: PathLike) -> list[str]:
-    """List the files that the jobs of a manifest read or write.
-
-    Args:
-        entries: Jobs of the manifest.
-        path: Path of the manifest.
-
-    Returns:
-        Paths relative to the current folder.
-    """
+    """List the files that the jobs of a manifest read or write."""
     folder = os.path.dirname(os.fspath(path))
     files = [file for e in entries for file in (e.job.robot, *e.job.data, *_output_paths(e.job))]
     return [os.path.join(folder, file) for file in files]
@@ -210,18 +192,7 @@ def run_fleet(
     n_processes: int,
     on_done: Callable[[int, FleetJobOutcome], None],
 ) -> list[FleetJobOutcome]:
-    """Run every job in processes that work in the folder of the manifest.
-
-    Args:
-        entries: Jobs.
-        path: Path of the manifest.
-        runner: Function that runs one job; other processes must be able to import it.
-        n_processes: Number of processes at a time.
-        on_done: Called with the index of a job and its outcome as soon as the job has ended.
-
-    Returns:
-        Outcome of each job, in the order of `entries`.
-    """
+    """Run every job in processes that work in the folder of the manifest."""
     folder = os.path.dirname(os.path.abspath(path))
     outcomes: dict[int, FleetJobOutcome] = {}
 
@@ -310,14 +281,7 @@ _FIGURES = ("iterations", "samples", "samples_holdout", "rank", "parameters_tota
 
 
 def run_manifest(args: Namespace) -> int:
-    """Calibrate the robots of a manifest and write their summary.
-
-    Args:
-        args: Parsed arguments of `dhcal calibrate`.
-
-    Returns:
-        Exit status: 0 all jobs done, 1 a job failed or was refused without `force`, 130 interrupted.
-    """
+    """Calibrate the robots of a manifest and write their summary."""
     _require_manifest_arguments(args)
     entries = read_fleet(args.robot)
     require_writable_outputs([args.output, args.json], [args.robot, *file_paths(entries, args.robot)])
@@ -415,15 +379,7 @@ def _outcome_text(outcome: FleetJobOutcome) -> str:
 
 
 def summary_text(entries: Sequence[FleetJob], outcomes: Sequence[FleetJobOutcome]) -> str:
-    """Format the summary of a manifest.
-
-    Args:
-        entries: Jobs.
-        outcomes: Their outcomes.
-
-    Returns:
-        CSV text with one row per job; cells are empty if a job failed or has no such value.
-    """
+    """Format the summary of a manifest."""
     rows = []
     for entry, outcome in zip(entries, outcomes, strict=True):
         row: dict[str, Any] = {"name": entry.name, "robot": entry.job.robot, "output": entry.job.output}

@@ -13,11 +13,7 @@ EXAMPLE = "dhcal inspect laser.csv --robot ur10.urdf --tip tool0"
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal inspect`.
-
-    Args:
-        parser: Parser of the command.
-    """
+    """Declare the arguments of `dhcal inspect`."""
     parser.add_argument("data", **DATA)
     parser.add_argument(
         "--robot", **{**ROBOT, "help": f"compare with the joints and limits of this {ROBOT['help']}"}
@@ -29,17 +25,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """Show the content of files.
-
-    Args:
-        args: Parsed arguments.
-
-    Returns:
-        Exit status 0, also for a file that `dhcal calibrate` would refuse.
-
-    Raises:
-        InvalidArgumentError: A column map or a rig file is given without a robot.
-    """
+    """Show the content of files."""
     from ..diagnostics import inspect_file  # lazy import, as the following: they load Pinocchio
     from ..io import read_robot
     from ..io.rig_file import read_rig

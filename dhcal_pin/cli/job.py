@@ -253,14 +253,7 @@ class Job:
 
     @classmethod
     def from_args(cls, args: Namespace) -> Job:
-        """Create the job that a command line describes.
-
-        Args:
-            args: Parsed arguments, among them those of `add_job_arguments`.
-
-        Returns:
-            Job with these options.
-        """
+        """Create the job that a command line describes."""
         values: dict[str, Any] = {}
         for option in fields(cls):
             value = getattr(args, option.name)
@@ -284,12 +277,6 @@ class Job:
     def command(self, names: Mapping[str, str]) -> str:
         """Format the command line of this job without the options that only name outputs.
 
-        Args:
-            names: Other names for files, by path.
-
-        Returns:
-            Command line for a shell.
-
         >>> Job("in/arm.urdf", ("in/a.csv",), "out.urdf", seed=3).command({"in/arm.urdf": "arm.urdf"})
         'dhcal calibrate arm.urdf in/a.csv --seed 3'
         """
@@ -304,23 +291,12 @@ class Job:
 
 
 def option_flags(option: Field[Any]) -> tuple[str, ...]:
-    """Return the names of an option on the command line.
-
-    Args:
-        option: Field of `Job`.
-
-    Returns:
-        Flags such as `("-o", "--output")`, or the name of a positional argument.
-    """
+    """Return the names of an option on the command line."""
     return option.metadata.get("flags", (f"--{option.name.replace('_', '-')}",))
 
 
 def add_job_arguments(parser: ArgumentParser) -> None:
-    """Declare the options of a job.
-
-    Args:
-        parser: Parser of a command.
-    """
+    """Declare the options of a job."""
     for option in fields(Job):
         keywords = {key: v for key, v in option.metadata.items() if key not in ("flags", "is_output")}
         flags = option_flags(option)
@@ -334,12 +310,5 @@ def add_job_arguments(parser: ArgumentParser) -> None:
 
 
 def is_manifest(path: str) -> bool:
-    """Tell a manifest of several jobs from a robot file by its name.
-
-    Args:
-        path: Path of a robot or a manifest.
-
-    Returns:
-        Whether the path names a manifest.
-    """
+    """Tell a manifest of several jobs from a robot file by its name."""
     return path.lower().endswith(MANIFEST_ENDING)

@@ -56,15 +56,7 @@ class _LazyCommandParser(CommandParser):
         self._has_arguments = False
 
     def parse_known_args(self, *args: Any, **options: Any) -> Any:
-        """Declare the arguments of the command, then parse.
-
-        Args:
-            *args: Positional arguments of the method of `argparse.ArgumentParser`.
-            **options: Its keyword arguments.
-
-        Returns:
-            Namespace, and words that no argument takes.
-        """
+        """Declare the arguments of the command, then parse."""
         self.declare_arguments()
         return super().parse_known_args(*args, **options)
 
@@ -91,11 +83,7 @@ class _VersionAction(argparse.Action):
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """Build the parser of all commands.
-
-    Returns:
-        Parser whose namespace has `command` and `run`, the function that executes the command.
-    """
+    """Build the parser of all commands."""
     parser = CommandParser(
         prog="dhcal",
         description="Robot kinematic calibration: estimate the errors of a robot and correct its URDF.",
@@ -114,11 +102,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def command_parsers() -> dict[str, argparse.ArgumentParser]:
-    """Build the complete parsers of all commands, for their documentation.
-
-    Returns:
-        Parsers by the name of the command.
-    """
+    """Build the complete parsers of all commands, for their documentation."""
     out: dict[str, argparse.ArgumentParser] = {}
     for command in COMMANDS:
         parser = _LazyCommandParser(
@@ -135,15 +119,7 @@ def _parser_options(command: Command) -> dict[str, Any]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command.
-
-    Args:
-        argv: Words of the command line; those of this process by default.
-
-    Returns:
-        Exit status: 0 done, 1 a check or a robot of a manifest failed, 2 invalid input, 3 a calibration was
-        refused, 130 interrupted.
-    """
+    """Run one command."""
     try:
         if (outputs := _outputs_module()) is not None:
             outputs.forget_written_files()

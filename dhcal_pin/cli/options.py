@@ -28,14 +28,7 @@ STDOUT = "-"
 
 
 def split_commas(text: str) -> list[str]:
-    """Split the entries of a comma-separated option.
-
-    Args:
-        text: Value of the option.
-
-    Returns:
-        Entries without surrounding spaces; empty ones are dropped.
-    """
+    """Split the entries of a comma-separated option."""
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
@@ -51,11 +44,7 @@ class CommandParser(argparse.ArgumentParser):
         self._negative_number_matcher = re.compile(r"-\.?\d")
 
     def error(self, message: str) -> NoReturn:
-        """Print one line to stderr and exit with status 2.
-
-        Args:
-            message: Description of the error.
-        """
+        """Print one line to stderr and exit with status 2."""
         print(f"{self.prog}: {message_line(message)}; see {self.prog} --help", file=sys.stderr)
         sys.exit(2)
 
@@ -67,11 +56,7 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
         super().__init__(prog, max_help_position=30, **options)
 
     def add_argument(self, action: argparse.Action) -> None:
-        """Add an option to the help.
-
-        Args:
-            action: Option; the placeholders of its help text are replaced.
-        """
+        """Add an option to the help."""
         if action.help and "{" in action.help:
             action.help = expand_placeholders(action.help)
         super().add_argument(action)
@@ -92,17 +77,7 @@ class IntegerType(NamedTuple):
         return f"an integer of at least {self.minimum}"
 
     def __call__(self, text: str) -> int:
-        """Parse a value.
-
-        Args:
-            text: Word of the command line.
-
-        Returns:
-            Value from `minimum` to the largest of 64 bits.
-
-        Raises:
-            ArgumentTypeError: The text is not such a number.
-        """
+        """Parse a value."""
         try:
             value = int(text)
         except ValueError:
@@ -117,17 +92,7 @@ NON_NEGATIVE_INTEGER = IntegerType(0)
 
 
 def robot_path(text: str) -> str:
-    """Return the path of a robot file; `example:NAME` is a robot of example-robot-data, and some files ship.
-
-    Args:
-        text: Word of the command line.
-
-    Returns:
-        Path of the file, which need not exist.
-
-    Raises:
-        ArgumentTypeError: There is no such robot.
-    """
+    """Return the path of a robot file, also for `example:NAME` and for a robot that ships."""
     from ..exceptions import UnknownNameError  # lazy import, as the following: only for robots
     from ..io.shipped_files import resolve_robot_file
 
@@ -195,22 +160,14 @@ SCHEDULER: dict[str, Any] = {
 
 
 def add_urdf_options(parser: argparse.ArgumentParser) -> None:
-    """Add --tip, --root and --package-dir, the options of every command that reads a URDF.
-
-    Args:
-        parser: Parser of a command.
-    """
+    """Add --tip, --root and --package-dir, the options of every command that reads a URDF."""
     parser.add_argument("--tip", **TIP)
     parser.add_argument("--root", **ROOT)
     parser.add_argument("--package-dir", action="append", default=[], **PACKAGE_DIR)
 
 
 def add_verbosity_options(parser: argparse.ArgumentParser) -> None:
-    """Add --quiet and --verbose, which exclude each other.
-
-    Args:
-        parser: Parser of a command.
-    """
+    """Add --quiet and --verbose, which exclude each other."""
     group = parser.add_mutually_exclusive_group()
     for name, text in (
         ("quiet", "show the verdict or the final result only"),
@@ -222,12 +179,7 @@ def add_verbosity_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_motion_options(parser: argparse.ArgumentParser, joint_units: str) -> None:
-    """Add --joint-units and --export, the options of commands that write joint positions.
-
-    Args:
-        parser: Parser of a command.
-        joint_units: Default units, "deg" or "rad".
-    """
+    """Add --joint-units and --export, the options of commands that write joint positions."""
     parser.add_argument(
         "--joint-units",
         choices=("deg", "rad"),
@@ -246,13 +198,7 @@ def add_motion_options(parser: argparse.ArgumentParser, joint_units: str) -> Non
 
 
 def add_execution_options(parser: argparse.ArgumentParser, jobs_help: str, jobs: int | None) -> None:
-    """Add --jobs and --scheduler, which exclude each other.
-
-    Args:
-        parser: Parser of a command.
-        jobs_help: Help text of --jobs.
-        jobs: Default number of processes; None if it depends on the command line.
-    """
+    """Add --jobs and --scheduler, which exclude each other."""
     group = parser.add_mutually_exclusive_group()
     group.add_argument("--jobs", metavar="N", type=POSITIVE_INTEGER, default=jobs, help=jobs_help)
     group.add_argument("--scheduler", **SCHEDULER)
@@ -344,12 +290,5 @@ PLACEHOLDERS: dict[str, Callable[[], str]] = {
 
 
 def expand_placeholders(text: str) -> str:
-    """Replace the placeholders of a help text.
-
-    Args:
-        text: Help text in the syntax of argparse, with placeholders such as `{losses}`.
-
-    Returns:
-        The text with names and descriptions from the modules that define them.
-    """
+    """Replace the placeholders of a help text."""
     return re.sub(r"\{(\w+)\}", lambda match: PLACEHOLDERS[match[1]]().replace("%", "%%"), text)

@@ -17,30 +17,14 @@ from .options import STDOUT
 
 
 def is_same_file(a: str, b: str) -> bool:
-    """Compare two paths, whether the files exist or not.
-
-    Args:
-        a: Path.
-        b: Path.
-
-    Returns:
-        Whether both paths lead to one file.
-    """
+    """Compare two paths, whether the files exist or not."""
     if os.path.exists(a) and os.path.exists(b):
         return os.path.samefile(a, b)
     return os.path.realpath(a) == os.path.realpath(b)
 
 
 def require_writable_outputs(outputs: Sequence[str | None], inputs: Sequence[str]) -> None:
-    """Require that outputs can be written and overwrite neither an input nor each other.
-
-    Args:
-        outputs: Paths to write; None and standard output are ignored.
-        inputs: Paths that are read.
-
-    Raises:
-        InvalidArgumentError: An output is also an input or another output.
-    """
+    """Require that outputs can be written and overwrite neither an input nor each other."""
     paths = [path for path in outputs if path and path != STDOUT]
     for number, path in enumerate(paths):
         if any(is_same_file(path, other) for other in inputs):
@@ -52,39 +36,18 @@ def require_writable_outputs(outputs: Sequence[str | None], inputs: Sequence[str
 
 
 def require_urdf_ending(path: str) -> None:
-    """Require the file extension of a URDF.
-
-    Args:
-        path: Path of a URDF to write.
-
-    Raises:
-        InvalidArgumentError: The path has another extension.
-    """
+    """Require the file extension of a URDF."""
     if not path.lower().endswith(".urdf"):
         raise InvalidArgumentError(f"{path}: unknown file extension; expected .urdf")
 
 
 def existing_sidecars(robots: Sequence[str]) -> list[str]:
-    """List the sidecars that exist beside robot files.
-
-    Args:
-        robots: Paths of robot files.
-
-    Returns:
-        Paths of their sidecars.
-    """
+    """List the sidecars that exist beside robot files."""
     return [path for path in map(existing_sidecar, robots) if path]
 
 
 def json_path(target: str | None) -> str | None:
-    """Return the file that an option --json names, if it names one.
-
-    Args:
-        target: Value of the option.
-
-    Returns:
-        Path of the file; None without the option and for standard output.
-    """
+    """Return the file that an option --json names, if it names one."""
     return target if target != STDOUT else None
 
 
@@ -107,13 +70,7 @@ def write_outputs(
     json_target: str | None = None,
     document: object = None,
 ) -> None:
-    """Write all outputs of a command, all or none.
-
-    Args:
-        contents: Content of each file, by path; None removes a file.
-        json_target: Path of the JSON file, or `-` to print it alone on stdout; none by default.
-        document: Content of the JSON.
-    """
+    """Write all outputs of a command, all or none."""
     if path := json_path(json_target):
         contents = {**contents, path: json_text(document)}
 
@@ -127,14 +84,7 @@ def write_outputs(
 
 
 def print_to_stdout(text: str) -> None:
-    """Print a JSON text and nothing else on standard output.
-
-    Args:
-        text: JSON text.
-
-    Raises:
-        FileFormatError: Nobody reads standard output any more, or its disk is full.
-    """
+    """Print a JSON text and nothing else on standard output."""
     try:
         try:
             sys.stdout.write(text)

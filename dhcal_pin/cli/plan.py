@@ -47,11 +47,7 @@ _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal plan`.
-
-    Args:
-        parser: Parser of the command.
-    """
+    """Declare the arguments of `dhcal plan`."""
     parser.add_argument("robot", **ROBOT)
     parser.add_argument(
         "-n", "--count", type=POSITIVE_INTEGER, required=True, metavar="N", help="number of poses"
@@ -187,14 +183,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """Choose poses, write them and show the predicted accuracy.
-
-    Args:
-        args: Parsed arguments.
-
-    Returns:
-        Exit status 0.
-    """
+    """Choose poses, write them and show the predicted accuracy."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
     from ..io import configurations_text, read_configurations, read_measurement_file, read_priors, read_robot
@@ -400,14 +389,7 @@ def _parse_angle(text: str, option: str, largest: float, what: str = "angle") ->
 
 
 def move_texts(result: Plan) -> list[str]:
-    """Describe the moves between the poses of a plan.
-
-    Args:
-        result: Plan.
-
-    Returns:
-        Sentences; none if there is nothing to collide with.
-    """
+    """Describe the moves between the poses of a plan."""
     if not result.is_way_free:
         return []
     blocked = [str(i) for i, is_free in enumerate(result.is_way_free, 1) if not is_free]
@@ -551,18 +533,7 @@ def _require_few(source: str, count: int) -> None:
 
 
 def read_task(path: PathLike, chain: Chain) -> Array:
-    """Read the configurations where the accuracy matters.
-
-    Args:
-        path: CSV file with joint values, or with positions or poses of the tool in the measuring frame.
-        chain: Nominal robot.
-
-    Returns:
-        Joint values, shape (m, n) [rad or m]; for tool positions and poses those of the inverse kinematics.
-
-    Raises:
-        InvalidArgumentError: A target is out of reach.
-    """
+    """Read the configurations where the accuracy matters."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
     from ..compensation import LIMITS, compensate

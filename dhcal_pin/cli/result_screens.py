@@ -40,39 +40,18 @@ MAIN_STUDY_COLUMNS = (
 
 
 def notes_block(texts: Sequence[str]) -> Block:
-    """Describe notes on a result.
-
-    Args:
-        texts: Notes.
-
-    Returns:
-        Block of the notes.
-    """
+    """Describe notes on a result."""
     return Block([f"note: {text}" for text in texts], noun="note", rank=1)
 
 
 def warnings_block(warnings: Mapping[str, Sequence[str]]) -> Block:
-    """Describe warnings about files.
-
-    Args:
-        warnings: Warnings by file.
-
-    Returns:
-        Block of the warnings.
-    """
+    """Describe warnings about files."""
     texts = [f"{path}: warning: {text}" for path, items in warnings.items() for text in items]
     return Block(texts, "yellow", noun="warning", rank=2)
 
 
 def files_block(paths: Iterable[object]) -> Block:
-    """Describe the files that were written.
-
-    Args:
-        paths: Paths.
-
-    Returns:
-        Block of the files.
-    """
+    """Describe the files that were written."""
     return Block([f"wrote {path}" for path in paths], noun="file written", rank=3)
 
 
@@ -84,19 +63,7 @@ def validation_screen(
     warnings: Mapping[str, Sequence[str]],
     files: Mapping[str, str],
 ) -> Screen:
-    """Describe the accuracy of a model on measurements.
-
-    Args:
-        title: What was judged.
-        accuracies: Accuracy by the column that shows it.
-        remarks: Sentences on the figures.
-        notes: What of the input is not used.
-        warnings: Warnings by file.
-        files: Paths of the files that were written, by what they are.
-
-    Returns:
-        The screen.
-    """
+    """Describe the accuracy of a model on measurements."""
     rows = []
     for group in GROUP_UNITS:
         columns = [each.groups[group] for each in accuracies.values() if group in each.groups]
@@ -119,17 +86,7 @@ def validation_screen(
 def detection_screen(
     rig: Rig, detections: Sequence[BoardDetection], notes: Sequence[str], files: Sequence[str]
 ) -> Screen:
-    """Describe which corners were found in images.
-
-    Args:
-        rig: Cameras and boards.
-        detections: Corners by board.
-        notes: Warnings about the joint values.
-        files: Files that were written.
-
-    Returns:
-        The screen.
-    """
+    """Describe which corners were found in images."""
     from ..detection import unused_images  # lazy import: only this command needs it
 
     found, warnings = [], list(notes)
@@ -157,15 +114,7 @@ def detection_screen(
 
 
 def inspection_screen(robot: str, inspections: Sequence[FileInspection]) -> Screen:
-    """Describe what measurement files contain.
-
-    Args:
-        robot: Description of the robot; empty without one.
-        inspections: Content of each file.
-
-    Returns:
-        The screen; its verdict is what is wrong with each file.
-    """
+    """Describe what measurement files contain."""
     first = Block([robot] if robot else [])
     blocks = [block for inspection in inspections for block in _inspection_blocks(inspection)]
     if len(inspections) == 1:
@@ -253,15 +202,7 @@ def _inspection_title(inspection: FileInspection) -> str:
 
 
 def crosscheck_screen(robot: str, agreements: Sequence[Agreement]) -> Screen:
-    """Describe how well other computations agree with the error factors of the paper.
-
-    Args:
-        robot: Path of the robot.
-        agreements: One comparison per computation.
-
-    Returns:
-        The screen.
-    """
+    """Describe how well other computations agree with the error factors of the paper."""
     rows = [
         [
             agreement.route,
@@ -281,16 +222,7 @@ def crosscheck_screen(robot: str, agreements: Sequence[Agreement]) -> Screen:
 
 
 def plan_screen(plan: Plan, moves: Sequence[str], files: Iterable[object]) -> Screen:
-    """Describe the predicted error over the number of poses, and compare a plan with random poses.
-
-    Args:
-        plan: Plan.
-        moves: Sentences on the moves between the poses.
-        files: Files that were written.
-
-    Returns:
-        The screen.
-    """
+    """Describe the predicted error over the number of poses, and compare a plan with random poses."""
     sizes, count = plan.sizes.tolist(), len(plan.q)
     random_errors = dict(zip(plan.random_sizes.tolist(), plan.random_errors.tolist(), strict=True))
     selected = {*random_errors, count, sizes[-1]}
@@ -364,20 +296,7 @@ def compensation_screen(
     hint: str,
     files: Iterable[object],
 ) -> Screen:
-    """Describe how many targets have which status, and the lines of those that are not corrected exactly.
-
-    Args:
-        frame: Sentence on the frame of the targets.
-        result: Corrected targets.
-        chain: Calibrated robot.
-        targets: Targets as read.
-        warnings: Warnings by file.
-        hint: Suggestion; empty if there is none.
-        files: Files that were written.
-
-    Returns:
-        The screen.
-    """
+    """Describe how many targets have which status, and the lines of those that are not corrected exactly."""
     from ..compensation import SINGULAR  # lazy import: only this command needs it
 
     counts, lines = [], []
@@ -433,17 +352,7 @@ def _distance(error: Array) -> str:
 def study_screen(
     study: StudyGrid, header: Sequence[str], rows: Sequence[Sequence[Any]], files: Iterable[object]
 ) -> Screen:
-    """Describe the results of a study in mm and degrees, with the settings that differ.
-
-    Args:
-        study: Study.
-        header: Names of the columns, the settings first.
-        rows: Values of the columns, one row per setting.
-        files: Files that were written.
-
-    Returns:
-        The screen; the table of all figures is in its details.
-    """
+    """Describe the results of a study in mm and degrees, with the settings that differ."""
     from ..studies import Setting  # lazy import: only this command needs it
 
     n_settings = len(fields(Setting))

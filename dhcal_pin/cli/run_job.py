@@ -110,17 +110,7 @@ class CalibrationOutcome:
 def run_job(
     job: Job, progress: Progress | None = None, executor: TaskExecutor = SERIAL
 ) -> CalibrationOutcome:
-    """Calibrate one robot and write its outputs, in this process or another; no messages are shown.
-
-    Args:
-        job: Options of the calibration.
-        progress: Called with the name of the phase, the number of its step and the largest number of steps.
-        executor: Where the samples are processed.
-
-    Returns:
-        The result and what was written. If the input is invalid or a file cannot be written, an error is
-        raised and no file is written.
-    """
+    """Calibrate one robot and write its outputs, in this process or another; no messages are shown."""
     inputs = _checked_inputs(job)
     chain = read_robot(job.robot, job.tip, package_dirs=job.package_dir, root=job.root)
     if job.payload:
@@ -425,17 +415,7 @@ def _family_hint(fit: Result, data: _JobData, sets: str, job: Job) -> str:
 
 
 def improvement_hint(fit: Result, chain: Chain, data: Sequence[Measurement], **options: Any) -> str:
-    """Suggest the full parameter set if it considerably reduces the error on samples that are not fitted.
-
-    Args:
-        fit: Calibration with fewer parameters.
-        chain: Nominal robot.
-        data: Fitted measurements.
-        **options: Options of `calibrate`, as for the fit.
-
-    Returns:
-        A sentence, or an empty text if the reduction is small or unknown.
-    """
+    """Suggest the full parameter set if it considerably reduces the error on samples that are not fitted."""
     # The other calibration does not leave out regions.
     current = next(each for each in fit.comparisons if each.title != "region hold-out")
     group, after = next(iter(current.after.groups.items()))

@@ -83,16 +83,7 @@ class Screen:
     details: Sequence[Block] = field(default=())
 
     def lines(self, verbosity: Verbosity, width: int | None = WIDTH) -> list[Line]:
-        """Lay out the screen.
-
-        Args:
-            verbosity: What is shown.
-            width: Largest number of columns; None for texts of any length. The view "normal" is never wider
-                than `WIDTH`.
-
-        Returns:
-            Lines; at most `HEIGHT` for the view "normal" if the blocks that are never shortened allow it.
-        """
+        """Lay out the screen."""
         if verbosity == "quiet":
             return _full_lines([block for block in self.blocks if block.is_verdict], width)
         if verbosity == "verbose":
@@ -166,14 +157,7 @@ def _joined(parts: Sequence[_Part], counts: Sequence[int], has_spaces: bool) -> 
 
 
 def list_first(items: Sequence[object]) -> str:
-    """Join the first items of a list and count the others.
-
-    Args:
-        items: Items.
-
-    Returns:
-        Text such as "3, 8, 15 and 4 more".
-    """
+    """Join the first items of a list and count the others."""
     text = ", ".join(map(str, items[:MAX_LISTED]))
     return text + (f" and {len(items) - MAX_LISTED} more" if len(items) > MAX_LISTED else "")
 
@@ -182,14 +166,7 @@ def list_first(items: Sequence[object]) -> str:
 
 
 def cell_width(text: str) -> int:
-    """Count the columns of a terminal that a text takes.
-
-    Args:
-        text: Text on one line.
-
-    Returns:
-        Number of columns: 2 for a wide East Asian character, 0 for a combining one, else 1.
-    """
+    """Count the columns of a terminal that a text takes."""
     return sum(map(_char_width, text))
 
 
@@ -201,14 +178,6 @@ def _char_width(char: str) -> int:
 
 def fold(text: str, width: int | None, indent: str = _INDENT) -> list[str]:
     """Fold a text into lines; characters that control a terminal are escaped.
-
-    Args:
-        text: Text; its leading spaces are kept on all lines.
-        width: Largest number of columns; None for one line of any length.
-        indent: Further indentation of continuation lines.
-
-    Returns:
-        Lines with all characters of the text but the spaces between them.
 
     >>> fold("wrote measurements/a.csv", 16)
     ['wrote', '  measurements/', '  a.csv']
@@ -253,13 +222,6 @@ def fold_table(table: Table, width: int | None) -> tuple[list[str], list[list[st
 
     The texts of the header are folded. If the table is still too wide, its text columns are folded; if that
     is not enough, the last columns follow in a further table below.
-
-    Args:
-        table: Table.
-        width: Largest number of columns of the terminal; None for a table of any width.
-
-    Returns:
-        Lines of the header, and the lines of each row.
     """
     n_text = table.n_text_columns
     header = [escape_control_characters(name) for name in table.header]

@@ -18,11 +18,7 @@ EXAMPLE = "dhcal simulate arm.dh.toml --truth actual.dh.toml -m 50 --noise 0.1mm
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal simulate`.
-
-    Args:
-        parser: Parser of the command.
-    """
+    """Declare the arguments of `dhcal simulate`."""
     parser.add_argument("robot", metavar="ROBOT", type=ROBOT["type"], help=f"nominal {ROBOT['help']}")
     parser.add_argument(
         "-m", "--samples", type=POSITIVE_INTEGER, required=True, metavar="M", help="number of samples"
@@ -65,18 +61,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """Simulate measurements and write them.
-
-    Args:
-        args: Parsed arguments.
-
-    Returns:
-        Exit status 0.
-
-    Raises:
-        UnknownNameError: There is no such kind of measurement.
-        InvalidArgumentError: The two robots have different joints, or --truth and --errors are both given.
-    """
+    """Simulate measurements and write them."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
     from ..io import measurement_text, read_robot

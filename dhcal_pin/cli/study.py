@@ -19,11 +19,7 @@ EXAMPLE = "dhcal study ur10_poses --jobs 2 -o results.csv"
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal study`.
-
-    Args:
-        parser: Parser of the command.
-    """
+    """Declare the arguments of `dhcal study`."""
     parser.add_argument(
         "study",
         metavar="STUDY.toml",
@@ -36,14 +32,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """Run a study, or the blocks that an interrupted run has left.
-
-    Args:
-        args: Parsed arguments.
-
-    Returns:
-        Exit status: 0 done, 130 interrupted.
-    """
+    """Run a study, or the blocks that an interrupted run has left."""
     from .. import studies  # lazy import, as the following: they load Pinocchio
     from ..io import shipped_file
     from ..parallel import open_executor

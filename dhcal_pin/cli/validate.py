@@ -23,11 +23,7 @@ FRAMES_TOL = 1e-9
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal validate`.
-
-    Args:
-        parser: Parser of the command.
-    """
+    """Declare the arguments of `dhcal validate`."""
     parser.add_argument("robot", **ROBOT)
     parser.add_argument("data", **DATA)
     add_urdf_options(parser)
@@ -61,14 +57,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """Compute the accuracy of a model, write it and show it.
-
-    Args:
-        args: Parsed arguments.
-
-    Returns:
-        Exit status 0.
-    """
+    """Compute the accuracy of a model, write it and show it."""
     from ..calibration import accuracy  # lazy import, as the following: they load Pinocchio
     from ..diagnostics import FRAMES_WARNING, find_extrapolation, fit_frames, frames_differ
     from ..io import (
@@ -186,9 +175,6 @@ def _mounted_rig(args: Namespace, sidecar: str | None, chain: Chain) -> tuple[Mo
     """Return the cameras and boards of the images, with the estimates of a calibration.
 
     Without a rig file, they are those of the sidecar. Other measurements than images need none.
-
-    Returns:
-        The rig, None without one, and the names of the entries with estimates, such as `camera.wrist`.
     """
     from ..io.measurement_files.reading import has_image_coordinates  # lazy import, as the following
     from ..io.rig_file import read_calibrated_rig, read_rig, with_estimates_of
@@ -222,12 +208,7 @@ def _unstated_entries(rig: MountedRig) -> list[str]:
 def _nominal_accuracy(
     chain: Chain, data: Sequence[Measurement], known: Mapping[str, float], args: Namespace
 ) -> tuple[Accuracy, tuple[Chain, Mapping[str, float]], list[str]]:
-    """Compute the accuracy of the nominal robot; fit its base and tool if the calibrated robot has others.
-
-    Returns:
-        The accuracy, the nominal robot with its instrument parameters, and a note if base or tool were
-        fitted.
-    """
+    """Compute the accuracy of the nominal robot; fit its base and tool if the calibrated robot has others."""
     import numpy as np  # lazy import, as the following
 
     from ..calibration import accuracy

@@ -19,11 +19,7 @@ EXAMPLE = "dhcal view ur10.urdf ur10_calibrated.urdf --tip tool0 --data laser.cs
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal view`.
-
-    Args:
-        parser: Parser of the command.
-    """
+    """Declare the arguments of `dhcal view`."""
     parser.add_argument("nominal", metavar="NOMINAL.urdf", type=ROBOT["type"], help=ROBOT["help"])
     parser.add_argument("calibrated", metavar="CALIBRATED.urdf", nargs="?", help="the same robot, calibrated")
     parser.add_argument(
@@ -64,17 +60,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """Write the page of a robot, or serve a live scene.
-
-    Args:
-        args: Parsed arguments.
-
-    Returns:
-        Exit status 0.
-
-    Raises:
-        InvalidArgumentError: --live with options of the page, or --fit-frames without measurements.
-    """
+    """Write the page of a robot, or serve a live scene."""
     from ..diagnostics import FRAMES_WARNING, fit_frames, frames_differ  # lazy import, as the following
     from ..io import read_measurements, read_robot
     from ..io.robot import has_dh_table, robot_name

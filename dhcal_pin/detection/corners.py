@@ -52,14 +52,7 @@ class Layout:
     is_legacy: bool = False
 
     def describe(self, board: Board) -> str:
-        """Return what differs from the board of the rig; empty if nothing does.
-
-        Args:
-            board: Board of the rig.
-
-        Returns:
-            Text such as "columns = 7, rows = 5".
-        """
+        """Return what differs from the board of the rig; empty if nothing does."""
         parts = []
         if self.is_exchanged:
             parts.append(f"columns = {board.rows}, rows = {board.columns}")
@@ -86,17 +79,7 @@ class DetectedImage:
 
 
 def read_image(path: PathLike) -> Array:
-    """Read an image as grey values.
-
-    Args:
-        path: Image file of a format that OpenCV and Pillow read.
-
-    Returns:
-        Grey values, shape (height, width), 8 bit.
-
-    Raises:
-        FileFormatError: The file cannot be read, or the image is too large.
-    """
+    """Read an image as grey values."""
     cv2 = require_opencv()
     _require_few_pixels(path)
     with discard_native_messages():
@@ -138,26 +121,14 @@ def _require_few_pixels(path: PathLike) -> None:
 
 
 def layouts_of(board: Board) -> list[Layout]:
-    """Return all layouts in which a board may have been printed, that of the rig first.
-
-    Args:
-        board: Board of the rig.
-    """
+    """Return all layouts in which a board may have been printed, that of the rig first."""
     exchanged = [False] if board.columns == board.rows else [False, True]
     legacy = [board.is_legacy, not board.is_legacy] if board.type == "charuco" else [False]
     return [Layout(turn, old) for turn in exchanged for old in legacy]
 
 
 def find_layout(board: Board, images: Sequence[Array]) -> Layout:
-    """Find the layout of a board that shows the most corners in some images.
-
-    Args:
-        board: Board of the rig.
-        images: Grey values, shape (height, width) each.
-
-    Returns:
-        The layout; that of the rig if no layout shows more.
-    """
+    """Find the layout of a board that shows the most corners in some images."""
     layouts = layouts_of(board)
     if len(layouts) == 1:
         return layouts[0]
@@ -166,20 +137,7 @@ def find_layout(board: Board, images: Sequence[Array]) -> Layout:
 
 
 def detect_corners(board: Board, layout: Layout, path: str, size: tuple[int, int]) -> DetectedImage:
-    """Find the corners of a board in an image file.
-
-    Args:
-        board: Board of the rig.
-        layout: Layout in which it was printed.
-        path: Image file.
-        size: Width and height that the rig states [px].
-
-    Returns:
-        Corners, or why the image is not used.
-
-    Raises:
-        FileFormatError: The image has another size.
-    """
+    """Find the corners of a board in an image file."""
     image = read_image(path)
     if image.shape[::-1] != size:
         raise FileFormatError(
@@ -258,11 +216,7 @@ def marker_dictionary(board: Board) -> Any:
 
 
 def charuco_board(board: Board) -> Any:
-    """Return a ChArUco board as OpenCV describes it.
-
-    Args:
-        board: Board of the type "charuco".
-    """
+    """Return a ChArUco board as OpenCV describes it."""
     aruco = require_opencv().aruco
     out = aruco.CharucoBoard(
         (board.columns, board.rows), board.square, board.marker, marker_dictionary(board)

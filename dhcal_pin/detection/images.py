@@ -45,17 +45,7 @@ class BoardDetection:
 
 
 def image_files(paths: Sequence[PathLike]) -> list[str]:
-    """List image files, those of folders by name.
-
-    Args:
-        paths: Image files and folders.
-
-    Returns:
-        Paths of the files.
-
-    Raises:
-        InvalidArgumentError: A path does not exist, a folder has no images, or a name comes twice.
-    """
+    """List image files, those of folders by name."""
     files: list[str] = []
     for path in [os.fspath(path) for path in paths]:
         if os.path.isdir(path):
@@ -82,21 +72,7 @@ def detect_boards(
     on_progress: Callable[[int], None],
     jobs: int | None = None,
 ) -> list[BoardDetection]:
-    """Find the corners of all boards of a rig in the images of one camera.
-
-    Args:
-        rig: Cameras and boards.
-        camera: Camera that took the images.
-        paths: Image files.
-        on_progress: Called with the number of searches done, at most one per board and image.
-        jobs: Number of images that are searched at the same time; one per processor if None.
-
-    Returns:
-        Corners by board.
-
-    Raises:
-        FileFormatError: An image cannot be read or has another size, or no image shows a board.
-    """
+    """Find the corners of all boards of a rig in the images of one camera."""
     boards = [board for board in rig.boards.values() if board.type != "points"]
     if not boards:
         raise FileFormatError(
@@ -125,15 +101,7 @@ def detect_boards(
 
 
 def unused_images(detections: Sequence[BoardDetection]) -> list[tuple[str, str]]:
-    """Find images that are not used, for one board or for all.
-
-    Args:
-        detections: Corners by board.
-
-    Returns:
-        Path of each image and why it is not used. That a board is not in an image is no problem if another
-        one is.
-    """
+    """Find images that are not used, for one board or for all."""
     out = []
     for images in zip(*(detection.images for detection in detections), strict=True):
         problems = {
@@ -155,17 +123,7 @@ def corner_columns(
     detections: Sequence[BoardDetection],
     joints: Mapping[str, Mapping[str, str]] | None = None,
 ) -> dict[str, list[Any]]:
-    """Arrange corners as the columns of a measurement file, one row per corner.
-
-    Args:
-        rig: Cameras and boards.
-        camera: Camera that took the images.
-        detections: Corners by board.
-        joints: Cells of the joint columns by header, by the name of the image; None without joint values.
-
-    Returns:
-        Columns by header. Columns for the camera and the board exist only where the rig has several.
-    """
+    """Arrange corners as the columns of a measurement file, one row per corner."""
     rows = [
         (image, detection.board.name, number, pixels)
         for detection in detections

@@ -10,11 +10,7 @@ from ..exceptions import InvalidArgumentError
 
 
 def require_opencv() -> ModuleType:
-    """Return the module of OpenCV.
-
-    Raises:
-        InvalidArgumentError: It is not installed.
-    """
+    """Return the module of OpenCV."""
     try:
         import cv2  # lazy import: an optional extra
     except ImportError:

@@ -35,16 +35,7 @@ _MIN_TEXT, _LINE = 0.3, 36
 def overlay_files(
     folder: str, camera: Camera | None, detections: Sequence[BoardDetection]
 ) -> Mapping[str, bytes]:
-    """Draw detected and reprojected corners of all boards into the images.
-
-    Args:
-        folder: Folder of the pictures.
-        camera: Camera that took the images, with intrinsics; None if they are not known.
-        detections: Corners by board.
-
-    Returns:
-        PNG by path: the name of the image with the ending `.png`.
-    """
+    """Draw detected and reprojected corners of all boards into the images."""
     out = {}
     for images in zip(*(detection.images for detection in detections), strict=True):
         path = str(Path(folder) / f"{Path(images[0].path).stem}.png")

@@ -19,18 +19,7 @@ _BORDER_BITS = 1
 
 
 def black_rectangles(board: Board) -> tuple[Array, tuple[float, float]]:
-    """Return the black rectangles of a flat board.
-
-    Args:
-        board: Board of the type "checkerboard", "charuco" or "aprilgrid".
-
-    Returns:
-        Left, top, width and height of each rectangle, shape (r, 4) [m], from the outer corner of the first
-        square or tag with y down, and width and height of the board [m].
-
-    Raises:
-        InvalidArgumentError: The board is a set of points.
-    """
+    """Return the black rectangles of a flat board."""
     if board.type == "points":
         raise InvalidArgumentError(f"{board.where}: a set of points cannot be printed; expected another type")
     if board.type == "aprilgrid":
@@ -78,14 +67,7 @@ def _marker(board: Board, number: int, left: float, top: float, size: float) -> 
 
 
 def board_pdf(board: Board) -> bytes:
-    """Draw a board at its true scale.
-
-    Args:
-        board: Board of the type "checkerboard", "charuco" or "aprilgrid".
-
-    Returns:
-        PDF of one page that is as large as the board and a margin of 10 mm.
-    """
+    """Draw a board at its true scale."""
     rectangles, (width, height) = black_rectangles(board)
     scale = _POINTS_PER_METRE
     page = [(side + 2 * MARGIN) * scale for side in (width, height)]

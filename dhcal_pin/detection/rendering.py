@@ -84,17 +84,7 @@ def render_images(
     rng: np.random.Generator,
     quality: ImageQuality | None = None,
 ) -> Iterator[Array]:
-    """Render images of boards by one camera.
-
-    Args:
-        camera: Camera with known intrinsics.
-        views: Flat boards of each image, each with its pose in the frame of the camera, shape (4, 4) [m].
-        rng: Random numbers of the noise.
-        quality: Blur and noise; the default ones if None.
-
-    Yields:
-        Grey values of each image, shape (height, width), 8 bit.
-    """
+    """Render images of boards by one camera."""
     quality = quality or ImageQuality()
     sight = _sight_of_pixel_corners(camera)
     for boards in views:

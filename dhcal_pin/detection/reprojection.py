@@ -37,15 +37,7 @@ class Reprojection:
 
 
 def camera_with_intrinsics(camera: Camera, detections: Sequence[BoardDetection]) -> Camera | None:
-    """Return a camera with the lens of the rig, or an estimated one, with distortion, if the rig states none.
-
-    Args:
-        camera: Camera that took the images.
-        detections: Corners by board.
-
-    Returns:
-        The camera; None if the images do not determine its focal lengths.
-    """
+    """Return a camera with the lens of the rig; estimate the lens if the rig states none."""
     if camera.has_intrinsics:
         return camera
     views = [
@@ -67,16 +59,7 @@ def _agreeing_view(points: Array, pixels: Array) -> tuple[Array, Array]:
 
 
 def reproject_corners(camera: Camera, board: Board, image: DetectedImage) -> Reprojection | None:
-    """Reproject the corners of a board with its pose in one image.
-
-    Args:
-        camera: Camera with intrinsics.
-        board: Board of the rig.
-        image: Its detected corners.
-
-    Returns:
-        The corners; None if the detected ones do not determine a pose.
-    """
+    """Reproject the corners of a board with its pose in one image."""
     points = board.points[image.corner]
     plane = camera.lens.normalize(image.pixels.T, camera.values).T
     if len(points) < 4:

@@ -50,27 +50,13 @@ class JointCurve:
 
 
 def fitted_coverage(fit: Result) -> tuple[JointCoverage, ...]:
-    """Compute which joint values the fitted samples visited.
-
-    Args:
-        fit: Result of a calibration.
-
-    Returns:
-        Coverage of each revolute joint; empty if no sample has joint values.
-    """
+    """Compute which joint values the fitted samples visited."""
     q, _ = different_configurations(fit.inliers)
     return joint_coverage(fit.chain, q) if len(q) and fit.has_joint_values else ()
 
 
 def joint_curves(fit: Result) -> list[JointCurve]:
-    """Compute the correction curves of the joints that have harmonics.
-
-    Args:
-        fit: Result of a calibration.
-
-    Returns:
-        One curve per joint; empty if no joint has harmonics.
-    """
+    """Compute the correction curves of the joints that have harmonics."""
     if fit.chain.transmission is None:
         return []
     harmonics = fit.chain.transmission.harmonics
@@ -89,14 +75,7 @@ def joint_curves(fit: Result) -> list[JointCurve]:
 
 
 def find_lattices(fit: Result) -> list[str]:
-    """Find joints whose estimated correction curve is not determined because their values form a lattice.
-
-    Args:
-        fit: Result of a calibration.
-
-    Returns:
-        One sentence for each of these joints; empty if no curves were estimated.
-    """
+    """Find joints whose estimated correction curve is not determined because their values form a lattice."""
     n = fit.chain.n_joints
     _, indices, _ = split_coefficients(np.arange(n_coefficients(n)), n)
     orders, joints = np.nonzero(np.isin(indices, fit.uncertainty.entries).any(1))

@@ -101,17 +101,7 @@ class Extrapolation:
 def find_extrapolation(
     region: MeasuredRegion, chain: Chain, data: Sequence[Measurement], known: Mapping[str, float]
 ) -> Extrapolation:
-    """Find the samples outside the measured region of a calibration, and the errors inside and outside.
-
-    Args:
-        region: Measured region of the calibration.
-        chain: Calibrated chain.
-        data: Measurements of any kinds. Samples without joint values are ignored.
-        known: Values of instrument parameters by name [m or rad]; the others are fitted to the data.
-
-    Returns:
-        The samples and their errors. A sample with several configurations is outside if one of them is.
-    """
+    """Find the samples outside the measured region of a calibration, and the errors inside and outside."""
     data = [item for item in data if item.configurations_per_row and len(item.rows)]
     errors = compute_errors(chain, data, known)
     # The distance of a sample is that of its farthest configuration.

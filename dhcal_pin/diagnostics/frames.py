@@ -30,15 +30,6 @@ def fit_frames(
     """Fit base and tool to measurements; the rest of the robot is kept.
 
     All samples take part with their full weight, outliers too, as in a validation.
-
-    Args:
-        chain: Robot.
-        data: Measurements.
-        known: Values of instrument parameters by name.
-        frames: Which of base and tool are fitted, separated by a comma.
-
-    Returns:
-        Result of the fit.
     """
     return calibrate(chain, data, frames, known=known, loss="linear")
 
@@ -46,16 +37,7 @@ def fit_frames(
 def frames_differ(
     chain: Chain, data: Sequence[Measurement], known: Mapping[str, float] | None = None
 ) -> bool:
-    """Check whether fitting base and tool to the measurements would reduce the error many times.
-
-    Args:
-        chain: Robot with base and tool of the set-up that it is believed to be in.
-        data: Measurements.
-        known: Values of instrument parameters by name.
-
-    Returns:
-        Whether base or tool are those of another set-up; False where the measurements are too few to tell.
-    """
+    """Check whether fitting base and tool to the measurements would reduce the error many times."""
     n_samples = sum(len(item.rows) for item in data)
     if n_samples < MIN_SAMPLES:
         return False

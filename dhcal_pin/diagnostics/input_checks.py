@@ -66,15 +66,7 @@ _MAX_LISTED_ROWS = 5
 
 
 def find_input_warnings(chain: Chain, file: MeasurementFile) -> list[str]:
-    """Find implausible values and mixed-up columns in a measurement file.
-
-    Args:
-        chain: Nominal robot.
-        file: Measurement file.
-
-    Returns:
-        One sentence per warning; an empty list for most files.
-    """
+    """Find implausible values and mixed-up columns in a measurement file."""
     values, repeated = find_value_warnings(chain, file), _check_repetitions(file)
     if values != repeated:
         # Implausible values explain why measurements do not fit the robot; copied rows do not.
@@ -99,15 +91,7 @@ def _check_fit(chain: Chain, file: MeasurementFile) -> list[str]:
 
 
 def find_value_warnings(chain: Chain, file: MeasurementFile) -> list[str]:
-    """Find implausible values in a measurement file.
-
-    Args:
-        chain: Nominal robot.
-        file: Measurement file.
-
-    Returns:
-        One sentence per warning; an empty list for most files.
-    """
+    """Find implausible values in a measurement file."""
     joint_units = _check_joint_units(chain, file)
     joints = [*joint_units.values(), *_check_small_joints(chain, file)]
     return [
@@ -124,13 +108,6 @@ def require_joint_units(chain: Chain, file: MeasurementFile) -> None:
     """Raise an error if most joints of images turn farther than joints can.
 
     A fit to such images takes long, and its result does not show the cause.
-
-    Args:
-        chain: Nominal robot.
-        file: Measurement file.
-
-    Raises:
-        FileFormatError: The values of most joints are implausible in the unit of their columns.
     """
     if not isinstance(file.data, CameraCorners):
         return
@@ -157,16 +134,7 @@ def _check_tip(chain: Chain, file: MeasurementFile) -> list[str]:
 def poorly_fitted_files(
     chain: Chain, data: Mapping[str, Measurement], known: Mapping[str, float]
 ) -> dict[str, list[str]]:
-    """Find files whose errors remain large after a fit to them and others.
-
-    Args:
-        chain: Calibrated robot.
-        data: Fitted measurements by file.
-        known: Estimated values of the instrument parameters by name.
-
-    Returns:
-        Warnings by file, one sentence each; empty lists for well fitted files.
-    """
+    """Find files whose errors remain large after a fit to them and others."""
     _, reach = reach_sphere(chain)
     limits = {"orientation": _MAX_CALIBRATED_RAD, "pixels": _MAX_CALIBRATED_PX}
     out: dict[str, list[str]] = {path: [] for path in data}
@@ -198,14 +166,7 @@ def poorly_fitted_files(
 
 
 def median_radius(points: Array) -> float:
-    """Compute the median distance of points from their median, which outliers hardly change.
-
-    Args:
-        points: Shape (m, 3) [m].
-
-    Returns:
-        Distance [m].
-    """
+    """Compute the median distance of points from their median, which outliers hardly change."""
     return float(np.median(np.linalg.norm(points - np.median(points, 0), axis=1)))
 
 
@@ -417,15 +378,7 @@ def _check_repeated_corners(item: CameraCorners) -> list[str]:
 
 
 def first_equal_rows(columns: Sequence[Array]) -> Array:
-    """Find rows that are equal in all columns.
-
-    Args:
-        columns: Numbers or texts, (m,) each.
-
-    Returns:
-        Index of the first row that is equal to each row, (m,); its own index for a row without an earlier
-        one.
-    """
+    """Find rows that are equal in all columns."""
     if not columns or not len(columns[0]):
         return np.empty(0, int)
     # Ranks, as columns of texts and of numbers cannot be stacked.

@@ -110,17 +110,7 @@ def inspect_file(
     columns: PathLike | None = None,
     rig: MountedRig | None = None,
 ) -> FileInspection:
-    """Say what a measurement file contains.
-
-    Args:
-        source: Measurement file, or a data frame.
-        chain: Nominal robot; without it the joints are not compared with anything.
-        columns: Column map for a file of another maker; needs a robot.
-        rig: Cameras and boards of image coordinates, on the chain.
-
-    Returns:
-        The content. A file that is no table is an error.
-    """
+    """Say what a measurement file contains."""
     if chain is None:
         table = read_table(source)
         return _inspect_table(table, None)
@@ -270,15 +260,7 @@ def _count_configurations(file: MeasurementFile) -> int | None:
 
 
 def column_table(columns: Sequence[ColumnSummary]) -> Table:
-    """Make a table of the columns of numbers; those of one rotation, and of sigmas, share a row.
-
-    Args:
-        columns: Content of the columns.
-
-    Returns:
-        Table of ranges, limits and coverage, in the units of the file. Columns that are ignored are only in
-        it if all are, as in a file without a known header.
-    """
+    """Make a table of the columns of numbers; those of one rotation, and of sigmas, share a row."""
     is_foreign = all(column.role == "ignored" for column in columns)
     numeric = [
         column

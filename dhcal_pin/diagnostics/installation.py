@@ -55,11 +55,7 @@ class InstallationCheck:
 
 
 def check_installation() -> Iterator[InstallationCheck]:
-    """Check the installation, the quick checks first.
-
-    Yields:
-        Results, each as soon as it is known.
-    """
+    """Check the installation, the quick checks first."""
     yield _check_versions()
     yield _check_kernels()
     yield _check_blas()
@@ -124,11 +120,7 @@ def _check_extras() -> Iterator[InstallationCheck]:
 
 
 def check_calibration() -> InstallationCheck:
-    """Calibrate a small robot from simulated poses, write it, and compare it with the true one.
-
-    Returns:
-        Result with the largest error of the tool and the time.
-    """
+    """Calibrate a small robot from simulated poses, write it, and compare it with the true one."""
     start = time.perf_counter()
     try:
         error = _calibration_error()

@@ -59,12 +59,6 @@ def reach_sphere(chain: Chain) -> tuple[Array, float]:
 
     The centre moves up the chain as long as the next origin lies on the axis just passed. For most robots it
     is the shoulder. Prismatic joints add their longest stroke; one without limits makes the radius infinite.
-
-    Args:
-        chain: Robot, base and tool included.
-
-    Returns:
-        Centre in the measuring frame, (3,) [m], and radius [m].
     """
     origins = np.concatenate([chain.origins[:-1], (chain.origins[-1] @ chain.tool)[None]])
     frame = chain.base @ origins[0]
@@ -109,15 +103,7 @@ def solve_position(chain: Chain, target: Array, near: Array) -> Array | None:
 
 
 def find_unreachable_rows(chain: Chain, file: MeasurementFile) -> list[UnreachableRow]:
-    """Find the impossible rows of a file.
-
-    Args:
-        chain: Robot whose base and tool are known.
-        file: Measurement file, with positions or with commanded positions.
-
-    Returns:
-        The impossible rows in the order of the file.
-    """
+    """Find the impossible rows of a file."""
     impossible: dict[int, UnreachableRow] = {}
     rows = file.data.rows.tolist()
     centre, radius = reach_sphere(chain)

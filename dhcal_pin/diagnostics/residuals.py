@@ -50,11 +50,7 @@ class Outlier:
 
 
 def find_outliers(fit: Result) -> list[Outlier]:
-    """Return the outliers of a calibration, by measurement object and row.
-
-    Args:
-        fit: Calibration.
-    """
+    """Return the outliers of a calibration, by measurement object and row."""
     all_errors = compute_errors(fit.chain, fit.data, fit.instruments)
     out = []
     for i, (item, errors) in enumerate(zip(fit.data, all_errors, strict=True)):
@@ -66,14 +62,7 @@ def find_outliers(fit: Result) -> list[Outlier]:
 
 
 def median_sigmas(fit: Result) -> list[dict[str, float]]:
-    """Compute the median standard deviations that the fitted measurements were weighted with.
-
-    Args:
-        fit: Calibration.
-
-    Returns:
-        For each measurement object the standard deviation per axis [m or rad] of each residual group.
-    """
+    """Compute the median standard deviations that the fitted measurements were weighted with."""
     out = []
     for item, weights in zip(fit.problem.data, fit.weights, strict=True):
         frames = fit.chain.forward_kinematics(item.configurations())
@@ -123,13 +112,6 @@ def joint_offset_profiles(fit: Result) -> list[JointProfile]:
     """Compute the residual joint error of each moving joint over its position.
 
     The samples are those held out, or the fitted ones without outliers if none are held out.
-
-    Args:
-        fit: Calibration.
-
-    Returns:
-        One profile per moving joint; empty if no measurement belongs to one configuration, or if poses of the
-        tip were measured in place of joint values.
     """
     data = [item for item in fit.holdout or fit.inliers if item.configurations_per_row == 1]
     if not data or not fit.has_joint_values:

@@ -57,15 +57,7 @@ class WorkspacePrediction:
 
 
 def predict_workspace(model: Predictor, data: Sequence[Measurement]) -> WorkspacePrediction:
-    """Predict the accuracy in configurations all over the joint ranges, and in the measured ones.
-
-    Args:
-        model: Calibration, or what its sidecar file contains of it.
-        data: Measurements.
-
-    Returns:
-        Tool points and their standard deviations.
-    """
+    """Predict the accuracy in configurations all over the joint ranges, and in the measured ones."""
     n = model.chain.n_joints
     drawn = np.random.default_rng(0).uniform(*joint_range(model.chain), (N_PREDICTED_CONFIGURATIONS, n))
     measured = [item.configurations() for item in data if item.configurations_per_row > 0]

@@ -65,15 +65,7 @@ class ErrorParameter:
     coefficient_index: int | None = None
 
     def definition(self, chain: Chain) -> tuple[str, str]:
-        """Describe the frame and the direction in which the error is defined.
-
-        Args:
-            chain: Nominal chain.
-
-        Returns:
-            Frame as in `frame_name`, and direction in its axes as in `direction_name`. A transmission
-            coefficient is defined by its joint: "joint NAME" and "position".
-        """
+        """Describe the frame and the direction in which the error is defined."""
         if self.coefficient_index is not None:
             return f"joint {chain.moving_joints[self.error_frame // 2 - 1]}", "position"
         return frame_name(chain, self.error_frame), direction_name(self.twist)
@@ -148,12 +140,6 @@ class ErrorModel:
         """Build the chain with given errors.
 
         The gravity torques remain those of the nominal chain; see `with_current_loads`.
-
-        Args:
-            x: Errors of shape (p,), each in the unit of its parameter.
-
-        Returns:
-            Chain with the errors.
         """
         x = np.ascontiguousarray(x, float)
         return self._with_transmission(self.chain.perturbed(self._perturb_frames(x)[0]), x)
@@ -173,14 +159,7 @@ class ErrorModel:
         return self.chain.transmission or Transmission.zero(self.chain.loads)
 
     def with_current_loads(self, x: Array) -> ErrorModel:
-        """Return the model with the gravity torques of the chain at x.
-
-        Args:
-            x: Errors of shape (p,), each in the unit of its parameter.
-
-        Returns:
-            Model with the same unknowns.
-        """
+        """Return the model with the gravity torques of the chain at x."""
         transmission = replace(self._transmission, loads=self.at(x).loads)
         return replace(self, chain=self.chain.with_transmission(transmission))
 
@@ -204,14 +183,7 @@ class ErrorModel:
         return chain, np.concatenate([bodies, entries]), np.pad(twists, ((0, len(entries)), (0, 0)))
 
     def with_parameters(self, parameters: Iterable[ErrorParameter]) -> ErrorModel:
-        """Return the model with further unknowns, sorted by error frame.
-
-        Args:
-            parameters: Unknowns to add.
-
-        Returns:
-            Model with all unknowns; transmission coefficients last.
-        """
+        """Return the model with further unknowns, sorted by error frame."""
         ordered = sorted(
             (*self.parameters, *parameters),
             key=lambda p: (-1 if p.coefficient_index is None else p.coefficient_index, p.error_frame),
@@ -225,27 +197,14 @@ class ErrorModel:
         return any(p.error_frame not in outside for p in self.parameters)
 
     def only_frames(self) -> ErrorModel | None:
-        """Return the model with the unknowns of base and tool alone.
-
-        Returns:
-            Model of base and tool; None if neither is unknown.
-        """
+        """Return the model with the unknowns of base and tool alone."""
         outside = (BASE_FRAME, self.chain.tool_frame_index)
         frame_parameters = tuple(p for p in self.parameters if p.error_frame in outside)
         return replace(self, parameters=frame_parameters) if frame_parameters else None
 
 
 def frame_name(chain: Chain, error_frame: int) -> str:
-    """Name an error frame for people.
-
-    Args:
-        chain: Kinematic chain.
-        error_frame: Index of the error frame: 0 base, 2j joint j, 2j+1 link j, 2k+2 tip, 2k+3 tool.
-
-    Returns:
-        "origin of JOINT" for the frame into which the `<origin>` of a joint places it, before the joint
-        moves; "link LINK" for the frame of a link, which moves with its joint; "tool" for the measured point.
-    """
+    """Name an error frame for people."""
     if error_frame == chain.tool_frame_index:
         return "tool"
     if error_frame == chain.tip_frame:
@@ -260,16 +219,7 @@ def frame_name(chain: Chain, error_frame: int) -> str:
 
 
 def direction_name(twist: Sequence[float]) -> str:
-    """Describe the direction of a translation or rotation.
-
-    Args:
-        twist: Twist [v, ω] in axes of its frame, shape (6,); v alone for a translation, and for a rotation
-            about an axis through a point p, ω and v = p × ω.
-
-    Returns:
-        Text such as "along x", "about -z", "along (0.000, 0.600, 0.800)" or, if the axis does not pass
-        through the origin of the frame, "about x through (0.000, 0.100, 0.000) m".
-    """
+    """Describe the direction of a translation or rotation."""
     v, w = np.array(twist[:3]), np.array(twist[3:])
     if not w.any():
         return f"along {_axis_name(v)}"

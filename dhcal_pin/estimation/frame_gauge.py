@@ -47,17 +47,7 @@ MIN_LEVER = 0.1
 
 
 def separate_frames(uncertainty: Uncertainty, undetermined: Array, q: Array) -> Uncertainty:
-    """Separate what base and tool poses, which the measurements leave free, contribute to the uncertainty.
-
-    Args:
-        uncertainty: Uncertainty of a calibrated chain.
-        undetermined: Directions that the measurements do not determine, as rows of `sqrt_covariance`, shape
-            (6(k+1)+e, d).
-        q: Measured configurations, shape (m, n) [rad or m].
-
-    Returns:
-        Uncertainty with `frame_part`.
-    """
+    """Separate what base and tool poses, which the measurements leave free, contribute to the uncertainty."""
     columns = np.concatenate([uncertainty.sqrt_covariance, uncertainty.unbounded_directions], 1)
     if not (undetermined.size and len(q) and np.isfinite(columns).all()):
         return uncertainty

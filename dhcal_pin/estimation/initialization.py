@@ -92,14 +92,7 @@ def align(source: Array, target: Array) -> tuple[Array, Array]:
 
 
 def subsample(item: Measurement) -> Measurement:
-    """Take at most 100 samples of a measurement, drawn at random as their order may be systematic.
-
-    Args:
-        item: Measurement.
-
-    Returns:
-        The same kind of measurement with the drawn samples in their order.
-    """
+    """Take at most 100 samples of a measurement, drawn at random as their order may be systematic."""
     return item.take(np.sort(np.random.default_rng(0).permutation(len(item.rows))[:_MAX_SAMPLES]))
 
 
@@ -109,15 +102,6 @@ def candidate_frames(
     """Generate chains with base and tool computed from the measured positions, the best aligned first.
 
     Nothing is generated with fewer than three measured positions.
-
-    Args:
-        chain: Nominal chain.
-        data: Measurements of any kinds.
-        is_base_unknown: Whether to compute the base; otherwise that of the chain is used.
-        is_tool_unknown: Whether to compute the tool; otherwise that of the chain is used.
-
-    Yields:
-        Chains that differ by base and tool.
     """
     with_positions = [item for item in data if len(item.positions())]
     bare = chain.with_base_and_tool(np.eye(4), np.eye(4))
@@ -152,15 +136,7 @@ def candidate_frames(
 
 
 def relative_misfit(chain: Chain, data: Sequence[Measurement]) -> float:
-    """Compute the RMS position error relative to the RMS distance of the positions from their mean.
-
-    Args:
-        chain: Chain with base and tool.
-        data: Measurements, some of which contain positions.
-
-    Returns:
-        The ratio; infinite if all measured positions are equal.
-    """
+    """Compute the RMS position error relative to the RMS distance of the positions from their mean."""
     with_positions = [item for item in data if len(item.positions())]
     measured = np.concatenate([item.positions() for item in with_positions])
     modelled = np.concatenate([chain.poses(item.q)[:, :3, 3] for item in with_positions])
@@ -171,18 +147,7 @@ def relative_misfit(chain: Chain, data: Sequence[Measurement]) -> float:
 def agreeing_samples(
     chain: Chain, data: Sequence[Measurement], is_base_unknown: bool, is_tool_unknown: bool
 ) -> list[Array]:
-    """Find the samples whose measured positions agree with those of a majority, by the linear equations.
-
-    Args:
-        chain: Nominal chain.
-        data: Measurements of any kinds.
-        is_base_unknown: Whether the base is unknown; otherwise that of the chain is used.
-        is_tool_unknown: Whether the tool is unknown; otherwise that of the chain is used.
-
-    Returns:
-        Whether each sample agrees, shape (m,) for each measurement; True for samples without a position, and
-        for all samples if they are too few to judge each other.
-    """
+    """Find the samples whose measured positions agree with those of a majority, by the linear equations."""
     out = [np.ones(len(item.rows), bool) for item in data]
     with_positions = [(k, item) for k, item in enumerate(data) if len(item.positions())]
     if not with_positions or not (is_base_unknown or is_tool_unknown):
@@ -247,16 +212,7 @@ def _trimmed_distances(columns: Array, right: Array) -> Array | None:
 
 
 def gross_outliers(chain: Chain, data: Sequence[Measurement]) -> list[Array]:
-    """Find samples whose position is so far from that of the initialized chain that a fit must begin without.
-
-    Args:
-        chain: Nominal chain with initialized base and tool.
-        data: Measurements of any kinds.
-
-    Returns:
-        Whether each sample is a gross outlier, shape (m,) for each measurement; False for samples without a
-        position.
-    """
+    """Find samples that a fit must begin without: too far from the initialized chain."""
     out = [np.zeros(len(item.rows), bool) for item in data]
     with_positions = [k for k, item in enumerate(data) if len(item.positions())]
     if with_positions:
@@ -283,15 +239,6 @@ def make_problem(
     """Make the least-squares problem of a robot and its instruments.
 
     Instrument parameters have priors of their own.
-
-    Args:
-        errors: Nominal chain and its p unknown parameters.
-        data: Measurements with initialized instrument parameters.
-        weights: One over the prior standard deviations of the robot's parameters, shape (p,); 0 without.
-        known: Values of instrument parameters by name [m or rad].
-
-    Returns:
-        The problem.
     """
     wide = np.array(
         [
@@ -317,17 +264,7 @@ def _fit_frames(
 def initialize_frames(
     errors: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float], max_iterations: int
 ) -> ErrorModel:
-    """Initialize unknown base and tool frames from a subsample of the measurements.
-
-    Args:
-        errors: Nominal chain and its unknown parameters.
-        data: Measurements of any kinds.
-        known: Values of instrument parameters by name [m or rad].
-        max_iterations: Largest number of iterations of each fit.
-
-    Returns:
-        The same parameters on the nominal chain with these frames.
-    """
+    """Initialize unknown base and tool frames from a subsample of the measurements."""
     frames = errors.only_frames()
     if frames is None:
         return errors
@@ -362,16 +299,7 @@ def _best_frames(
 
 
 def fit_frames(errors: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float]) -> Chain:
-    """Fit the unknown base and tool frames of the nominal chain to all measurements.
-
-    Args:
-        errors: Nominal chain and its unknown parameters.
-        data: Measurements of any kinds.
-        known: Values of instrument parameters by name [m or rad].
-
-    Returns:
-        The nominal chain with these frames.
-    """
+    """Fit the unknown base and tool frames of the nominal chain to all measurements."""
     frames = errors.only_frames()
     if frames is None:
         return errors.chain.with_current_loads()

@@ -35,11 +35,7 @@ class NormalEquations(TriangularSystem):
     products: Array
 
     def __init__(self, products: Array):
-        """Store the inner products.
-
-        Args:
-            products: [J | r]ᵀ·[J | r], shape (p+1, p+1).
-        """
+        """Store the inner products."""
         vars(self)["products"] = products
 
     @cached_property
@@ -62,22 +58,11 @@ class NormalEquations(TriangularSystem):
         return np.diag(self.products)[:-1] == 0
 
     def scaled(self, factor: float) -> NormalEquations:
-        """Return the system of the rows times a factor.
-
-        Args:
-            factor: Factor of all rows.
-        """
+        """Return the system of the rows times a factor."""
         return NormalEquations(factor**2 * self.products)
 
     def merged(self, other: TriangularSystem) -> TriangularSystem:
-        """Compute the system of the rows of two systems of the same unknowns.
-
-        Args:
-            other: System of other rows.
-
-        Returns:
-            The normal equations if both are normal equations.
-        """
+        """Compute the system of the rows of two systems of the same unknowns."""
         if isinstance(other, NormalEquations):
             return NormalEquations(self.products + other.products)
         return super().merged(other)
@@ -87,14 +72,7 @@ class NormalEquations(TriangularSystem):
         return NormalEquations(self.products[np.ix_(kept, kept)])
 
     def recentered(self, step: Array) -> NormalEquations:
-        """Build the system at x + step, assuming that the model is linear over the step.
-
-        Args:
-            step: Step δ of shape (p,) [m and rad].
-
-        Returns:
-            System of the rows [J | r - J·δ].
-        """
+        """Build the system at x + step, assuming that the model is linear over the step."""
         products = self.products.copy()
         products[:-1, -1] -= self.products[:-1, :-1] @ step
         products[-1, :-1] = products[:-1, -1]
@@ -102,27 +80,12 @@ class NormalEquations(TriangularSystem):
         return NormalEquations(products)
 
     def squared_error(self, step: Array) -> float:
-        """Compute the cost after a step.
-
-        Args:
-            step: Step δ of shape (p,) [m and rad].
-
-        Returns:
-            ‖J·δ - r‖².
-        """
+        """Compute the cost after a step."""
         both = np.append(step, -1.0)
         return max(float(both @ self.products @ both), 0.0)
 
     def with_priors(self, weights: Array, x: Array | float) -> TriangularSystem:
-        """Build the triangular system of data and priors.
-
-        Args:
-            weights: Reciprocal prior standard deviations of shape (p,), all positive.
-            x: Current values of shape (p,), or 0 [m and rad].
-
-        Returns:
-            The system.
-        """
+        """Build the triangular system of data and priors."""
         root, scale = self._decompose(weights)
         z, min_cost = self._right_side(weights, x)
         rows = np.zeros_like(self.products)
@@ -166,11 +129,7 @@ class NormalEquations(TriangularSystem):
         return vars(self)["_inverse_root"], np.empty((len(weights), 0))
 
     def _decompose(self, weights: Array) -> tuple[Array, Array]:
-        """Decompose JᵀJ + W² = D·RᵀR·D; the last result is kept for the covariance of the same solution.
-
-        Returns:
-            R, shape (p, p), and the diagonal of D, shape (p,).
-        """
+        """Decompose JᵀJ + W² = D·RᵀR·D; the last result is kept for the covariance of the same solution."""
         last = vars(self).get("_decomposition")
         if last is not None and np.array_equal(last[0], weights):
             return last[1:]
@@ -191,14 +150,7 @@ class NormalEquations(TriangularSystem):
         return root, scale
 
     def predicted_variance(self, root: Array) -> float:
-        """Compute the variance of all rows that uncertain unknowns cause.
-
-        Args:
-            root: Square root S of the covariance of the unknowns, upper triangular, shape (p, p).
-
-        Returns:
-            ‖J·S‖², the trace of J·S·Sᵀ·Jᵀ.
-        """
+        """Compute the variance of all rows that uncertain unknowns cause."""
         upper = np.triu(lapack.dlauum(root)[0])
         products = self.products[:-1, :-1]
         return 2 * float(np.vdot(products, upper)) - float(np.diag(products) @ np.diag(upper))

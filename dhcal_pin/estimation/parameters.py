@@ -123,38 +123,17 @@ def _is_nearly_parallel(chain: Chain, i: int, convention: Convention) -> bool:
 
 
 def dh(chain: Chain) -> list[ErrorParameter]:
-    """Build the entries θ, d, a, α of all rows of the standard DH table: the columns of the paper's R.
-
-    Args:
-        chain: Nominal chain.
-
-    Returns:
-        4 parameters per joint.
-    """
+    """Build the entries θ, d, a, α of all rows of the standard DH table: the columns of the paper's R."""
     return list(_dh_parameters(chain, "standard", hayati=False))
 
 
 def modified_dh(chain: Chain) -> list[ErrorParameter]:
-    """Build the entries a, α, d, θ of all rows of the modified DH table.
-
-    Args:
-        chain: Nominal chain.
-
-    Returns:
-        4 parameters per joint; a and α belong to the link before the joint.
-    """
+    """Build the entries a, α, d, θ of all rows of the modified DH table."""
     return list(_dh_parameters(chain, "modified", hayati=False))
 
 
 def hayati(chain: Chain) -> list[ErrorParameter]:
-    """Build the entries of the standard DH table, with β in place of d between nearly parallel axes.
-
-    Args:
-        chain: Nominal chain.
-
-    Returns:
-        4 parameters per joint.
-    """
+    """Build the entries of the standard DH table, with β in place of d between nearly parallel axes."""
     rows = _dh_parameters(chain, "standard", hayati=True)
     replaced = {f"d{row.name[4:]}" for row in rows if row.name.startswith("beta")}
     return [row for row in rows if row.name not in replaced]
@@ -171,14 +150,7 @@ def _frame_parameters(prefix: str, error_frame: int, length: float, angle: float
 
 
 def placement(chain: Chain) -> list[ErrorParameter]:
-    """Build three translations and three rotations of each joint origin, in its own frame.
-
-    Args:
-        chain: Nominal chain.
-
-    Returns:
-        6 parameters per joint.
-    """
+    """Build three translations and three rotations of each joint origin, in its own frame."""
     return [
         parameter
         for j, name in enumerate(chain.moving_joints)
@@ -192,12 +164,6 @@ def minimal(chain: Chain) -> list[ErrorParameter]:
     A joint origin moves in all directions but along and about its axis. Those two commute with the joint's
     motion; they pass on to the next joint, and from the last joint to the tool. A translation of a prismatic
     joint's axis passes on in the same way.
-
-    Args:
-        chain: Nominal chain.
-
-    Returns:
-        4 parameters per revolute joint, 2 per prismatic joint.
     """
     out = []
     for j, (name, axis, is_prismatic) in enumerate(
@@ -227,14 +193,7 @@ def minimal(chain: Chain) -> list[ErrorParameter]:
 
 
 def offset(chain: Chain) -> list[ErrorParameter]:
-    """Build the offset of each moving joint's zero position.
-
-    Args:
-        chain: Nominal chain.
-
-    Returns:
-        1 parameter per joint [rad, or m if prismatic].
-    """
+    """Build the offset of each moving joint's zero position."""
     out = []
     for j, (name, axis, is_prismatic) in enumerate(
         zip(chain.moving_joints, chain.axes, chain.prismatic, strict=True)
@@ -251,43 +210,19 @@ def _joint_twist(axis: Sequence[float], is_prismatic: bool) -> tuple[float, ...]
 
 
 def base(chain: Chain) -> list[ErrorParameter]:
-    """Build the pose of the robot's base in the measuring frame.
-
-    Args:
-        chain: Nominal chain.
-
-    Returns:
-        6 parameters.
-    """
+    """Build the pose of the robot's base in the measuring frame."""
     return _frame_parameters("base", BASE_FRAME, FRAME_LENGTH_PRIOR, FRAME_ANGLE_PRIOR)
 
 
 def tool(chain: Chain) -> list[ErrorParameter]:
-    """Build the pose of the measured point in the tip frame.
-
-    Args:
-        chain: Nominal chain.
-
-    Returns:
-        6 parameters.
-    """
+    """Build the pose of the measured point in the tip frame."""
     return _frame_parameters("tool", chain.tool_frame_index, FRAME_LENGTH_PRIOR, FRAME_ANGLE_PRIOR)
 
 
 def _transmission_parameters(
     chain: Chain, joint: int, coefficients: Sequence[tuple[int, str, str]], prior: float
 ) -> list[ErrorParameter]:
-    """Build the parameters of transmission coefficients that move an independent joint.
-
-    Args:
-        chain: Nominal chain.
-        joint: Number of the joint.
-        coefficients: Index, name and unit of each coefficient.
-        prior: Standard deviation of each coefficient before any measurement.
-
-    Returns:
-        1 parameter per coefficient.
-    """
+    """Build the parameters of transmission coefficients that move an independent joint."""
     # The error acts at the first moving joint that the independent joint drives.
     moving_joint = int(np.flatnonzero(chain.mimic_matrix[:, joint])[0])
     twist = _joint_twist(chain.axes[moving_joint].tolist(), chain.prismatic[moving_joint])
@@ -318,14 +253,7 @@ def _revolute_joints(chain: Chain) -> list[int]:
 
 
 def gain(chain: Chain) -> list[ErrorParameter]:
-    """Build the relative error of each joint's gear ratio.
-
-    Args:
-        chain: Nominal chain.
-
-    Returns:
-        1 parameter per joint [1].
-    """
+    """Build the relative error of each joint's gear ratio."""
     linear, _, _ = _coefficient_indices(chain)
     return [
         parameter
@@ -337,16 +265,7 @@ def gain(chain: Chain) -> list[ErrorParameter]:
 def harmonics(
     chain: Chain, orders: Sequence[int] = HARMONIC_ORDERS, prior: float = HARMONIC_PRIOR
 ) -> list[ErrorParameter]:
-    """Build the periodic errors of each revolute joint: sine and cosine of multiples of its position.
-
-    Args:
-        chain: Nominal chain.
-        orders: Multiples, periods per turn of the joint.
-        prior: Standard deviation of a coefficient before any measurement [rad].
-
-    Returns:
-        2 parameters for each revolute joint and order [rad].
-    """
+    """Build the periodic errors of each revolute joint: sine and cosine of multiples of its position."""
     _, indices, _ = _coefficient_indices(chain)
     out = []
     for i in _revolute_joints(chain):
@@ -360,14 +279,7 @@ def harmonics(
 
 
 def compliance(chain: Chain) -> list[ErrorParameter]:
-    """Build the rotation of each revolute joint per unit of its gravity torque.
-
-    Args:
-        chain: Nominal chain.
-
-    Returns:
-        1 parameter for each revolute joint that gravity loads in some configuration [rad/Nm].
-    """
+    """Build the rotation of each revolute joint per unit of its gravity torque."""
     _, _, indices = _coefficient_indices(chain)
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (chain.n_joints, 64))
     is_loaded = np.abs(chain.loads.torques(q)).max(-1) > MIN_TORQUE
@@ -380,14 +292,7 @@ def compliance(chain: Chain) -> list[ErrorParameter]:
 
 
 def coupling(chain: Chain) -> list[ErrorParameter]:
-    """Build the rotation of each revolute joint per unit of every other joint's position.
-
-    Args:
-        chain: Nominal chain.
-
-    Returns:
-        1 parameter for each pair of a revolute joint and another joint [rad/rad or rad/m].
-    """
+    """Build the rotation of each revolute joint per unit of every other joint's position."""
     linear, _, _ = _coefficient_indices(chain)
     units = ["rad/m" if is_prismatic else "rad/rad" for is_prismatic in chain.is_prismatic]
     out = []
@@ -412,14 +317,7 @@ class ParameterSet:
     help: str
 
     def __call__(self, chain: Chain) -> list[ErrorParameter]:
-        """Build the parameters of the set.
-
-        Args:
-            chain: Nominal chain.
-
-        Returns:
-            Parameters of the set; empty if no joint has such errors.
-        """
+        """Build the parameters of the set."""
         return self.build(chain)
 
 
@@ -494,12 +392,6 @@ def select_parameters(
 
 def fold_harmonics(names: Iterable[str]) -> list[str]:
     """Replace the harmonics of each joint by one entry, for messages that list parameters.
-
-    Args:
-        names: Names of parameters.
-
-    Returns:
-        Names in the same order; more than `MAX_LISTED_HARMONICS` harmonics of a joint are one entry.
 
     >>> fold_harmonics(["j1.gain", "j1.sin3", "j1.cos3", "j1.sin4", "j1.cos4", "j1.sin5", "j2.sin3"])
     ['j1.gain', 'j1.sin3 ... sin5 (5 harmonics)', 'j2.sin3']

@@ -46,20 +46,7 @@ EXPECTATION_COUNT = 0.5
 
 
 def prior_weights(errors: ErrorModel, priors: Priors) -> Array:
-    """Compute the reciprocal prior standard deviation of each parameter.
-
-    Args:
-        errors: Error model of p parameters.
-        priors: "default", "none", or standard deviations by parameter name or pattern that replace the
-            default ones, each in the unit of its parameter.
-
-    Returns:
-        Weights 1/σ of shape (p,); zero without a prior.
-
-    Raises:
-        InvalidArgumentError: If a standard deviation is not from `MIN_PRIOR_STD` to `MAX_PRIOR_STD`.
-        UnknownNameError: If the choice is unknown, or no parameter matches a name.
-    """
+    """Compute the reciprocal prior standard deviation of each parameter."""
     if isinstance(priors, str):
         if priors not in ("default", "none"):
             raise UnknownNameError(
@@ -85,15 +72,7 @@ def prior_weights(errors: ErrorModel, priors: Priors) -> Array:
 
 
 def has_default_prior(errors: ErrorModel, priors: Priors) -> Array:
-    """Find the parameters that have default priors.
-
-    Args:
-        errors: Error model of p parameters.
-        priors: Choice of priors as for `prior_weights`.
-
-    Returns:
-        Flags of shape (p,).
-    """
+    """Find the parameters that have default priors."""
     if isinstance(priors, str):
         return np.full(len(errors.parameters), priors == "default")
     return np.array([not any(fnmatch.fnmatchcase(p.name, key) for key in priors) for p in errors.parameters])
@@ -122,16 +101,7 @@ class PriorGroups:
 
     @classmethod
     def from_expected(cls, errors: ErrorModel, expected: Array, default: Array) -> PriorGroups:
-        """Group the parameters of the robot that have default priors; base and tool are left out.
-
-        Args:
-            errors: Error model of p parameters.
-            expected: Expected weights 1/σ of shape (p,) or longer.
-            default: Flags of the parameters with default priors, shape (p,).
-
-        Returns:
-            Groups in order of their first parameters.
-        """
+        """Group the parameters of the robot that have default priors; base and tool are left out."""
         outside = (BASE_FRAME, errors.chain.tool_frame_index)
         inside = [i for i, p in enumerate(errors.parameters) if default[i] and p.error_frame not in outside]
         # Angles of the geometry and of the transmission count as different units.
@@ -154,11 +124,7 @@ class PriorGroups:
         return cls(np.empty(0, int), np.empty(0, int), np.empty(0), np.empty(0), np.empty(0), np.empty(0))
 
     def joined(self, other: PriorGroups) -> PriorGroups:
-        """Return these groups and others.
-
-        Args:
-            other: Groups of other parameters of the same problem.
-        """
+        """Return these groups and others."""
         return PriorGroups(
             np.concatenate([self.members, other.members]),
             np.concatenate([self.group_index, other.group_index + len(self.expected_weights)]),
@@ -169,11 +135,7 @@ class PriorGroups:
         )
 
     def groups(self) -> list[tuple[list[int], float]]:
-        """List the groups.
-
-        Returns:
-            Parameter indices and expected weight of each group.
-        """
+        """List the groups."""
         return [
             (self.members[self.group_index == i].tolist(), weight)
             for i, weight in enumerate(self.expected_weights.tolist())
@@ -181,31 +143,13 @@ class PriorGroups:
 
 
 def effective_parameters(problem: Problem, solution: SolverResult) -> float:
-    """Compute the effective number of parameters that the data determine (MacKay 1992).
-
-    Args:
-        problem: Problem that was solved, in p unknowns.
-        solution: Its solution, with the triangular factor R of the whitened Jacobian.
-
-    Returns:
-        γ = ‖R·S‖² = r - ‖W·S‖², with a square root S of the covariance, r columns, and prior weights W: 1 per
-        parameter that the data determine, 0 per parameter that its prior determines.
-    """
+    """Compute the effective number of parameters that the data determine (MacKay 1992)."""
     root = solution.system.sqrt_covariance(problem.weights)[0]
     return root.shape[1] - float(np.einsum("ij,ij,i->", root, root, problem.weights**2))
 
 
 def update_prior_scales(problem: Problem, solution: SolverResult, groups: PriorGroups) -> Array:
-    """Estimate the scale of each group's priors from the errors in a solution (evidence procedure).
-
-    Args:
-        problem: Problem that was solved, in p robot errors and s instrument parameters.
-        solution: Its solution.
-        groups: Parameters whose priors are updated.
-
-    Returns:
-        New prior weights of shape (p+s,); priors outside the groups keep their weights.
-    """
+    """Estimate the scale of each group's priors from the errors in a solution (evidence procedure)."""
     weights, members, group_index = problem.weights.copy(), groups.members, groups.group_index
     if not len(members):
         return weights

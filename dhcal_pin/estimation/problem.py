@@ -88,41 +88,19 @@ class Problem:
         return tuple(u for u in merge_instrument_parameters(self.data) if u.name not in self.known)
 
     def instruments(self, x: Array) -> dict[str, float]:
-        """Compute the values of all instrument parameters, known and unknown.
-
-        Args:
-            x: Unknowns of shape (p+s,).
-
-        Returns:
-            Values by name [m or rad].
-        """
+        """Compute the values of all instrument parameters, known and unknown."""
         differences = x[len(self.errors.parameters) :]
         return {
             u.name: u.nominal + float(v) for u, v in zip(self.instrument_parameters, differences, strict=True)
         } | dict(self.known)
 
     def instrument_values_of(self, item: Measurement, x: Array) -> Array:
-        """Compute the instrument parameters of one measurement.
-
-        Args:
-            item: Measurement of this problem.
-            x: Unknowns of shape (p+s,).
-
-        Returns:
-            Values in the order of `item.instrument_parameters` [m or rad].
-        """
+        """Compute the instrument parameters of one measurement."""
         values = self.instruments(x)
         return np.array([values[parameter.name] for parameter in item.instrument_parameters])
 
     def linearize(self, x: Array) -> Linearization:
-        """Linearize the model.
-
-        Args:
-            x: Unknowns of shape (p+s,).
-
-        Returns:
-            Linearization at x for any chunk of data.
-        """
+        """Linearize the model."""
         n_robot = len(self.errors.parameters)
         columns = {parameter.name: n_robot + i for i, parameter in enumerate(self.instrument_parameters)}
         model = self.errors.derivative(x[:n_robot])
@@ -144,14 +122,7 @@ class Problem:
         )
 
     def with_data(self, data: Sequence[Measurement]) -> Problem:
-        """Return the problem with other samples or standard deviations of the same measurements.
-
-        Args:
-            data: Measurements in the order of `self.data`.
-
-        Returns:
-            Problem with the scale gauge of this one; chunks and joint states are reused where possible.
-        """
+        """Return the problem with other samples or standard deviations of the same measurements."""
         out = replace(self, data=tuple(data))
         vars(out)["scale_gauge"] = self.scale_gauge
         if "chunks" not in vars(self) or len(data) != len(self.data):
@@ -174,14 +145,7 @@ class Problem:
         )
 
     def with_prior_weights(self, weights: Array) -> Problem:
-        """Return the problem with other priors.
-
-        Args:
-            weights: Reciprocal prior standard deviations of shape (p+s,).
-
-        Returns:
-            Problem with the same data and chunks.
-        """
+        """Return the problem with other priors."""
         return self._with_same_rows(weights=weights)
 
     def _with_same_rows(self, **changes: Any) -> Problem:
@@ -191,53 +155,25 @@ class Problem:
         return out
 
     def at_temperature(self, temperature: float) -> Problem:
-        """Return the problem with the same priors at another temperature of the residuals.
-
-        Args:
-            temperature: Factor T on the variance of the residuals.
-
-        Returns:
-            Problem with the same data and chunks.
-        """
+        """Return the problem with the same priors at another temperature of the residuals."""
         weights = self.prior_weights * np.sqrt(temperature)
         return self._with_same_rows(weights=weights, temperature=temperature)
 
     def is_interior(self, x: Array) -> Array:
-        """Find the unknowns whose bounds are not active.
-
-        Args:
-            x: Unknowns of shape (p+s,).
-
-        Returns:
-            Flags of shape (p+s,).
-        """
+        """Find the unknowns whose bounds are not active."""
         if self.bounds is None:
             return np.ones(len(x), bool)
         return ~np.any(np.abs(self.bounds - x) <= ACTIVE_BOUND_TOL, 0)
 
     def cost(self, x: Array) -> float:
-        """Compute the sum of squared whitened residuals and priors.
-
-        Args:
-            x: Unknowns of shape (p+s,).
-
-        Returns:
-            Cost F(x).
-        """
+        """Compute the sum of squared whitened residuals and priors."""
         chain = self.errors.at(x[: len(self.errors.parameters)])
         size = self.scale_gauge.size(chain) if self.scale_gauge else 1.0
         costs = self.map_chunks(partial(_chunk_cost, chain, self.instruments(x), size))
         return sum(costs, float(np.sum((self.weights * x) ** 2)))
 
     def map_chunks(self, function: Callable[[Chunk], _Output]) -> Iterator[_Output]:
-        """Apply a function to each chunk.
-
-        Args:
-            function: Function that the executor can send to another process.
-
-        Returns:
-            Iterator over the results in the order of the chunks.
-        """
+        """Apply a function to each chunk."""
         return self.executor.map(function, self.chunks)
 
 
@@ -259,35 +195,17 @@ class Chunk:
         return self.nominal.joint_state(self.data.configurations())
 
     def reuse_joint_state(self, other: Chunk) -> None:
-        """Take over the joint state of a chunk, if it has been computed.
-
-        Args:
-            other: Chunk at the same configurations.
-        """
+        """Take over the joint state of a chunk, if it has been computed."""
         if "joint_state" in vars(other):
             vars(self)["joint_state"] = other.joint_state
 
     def frames(self, chain: Chain) -> FrameBatch:
-        """Compute the frames of a chain at the samples.
-
-        Args:
-            chain: Chain with the joints of the nominal one.
-
-        Returns:
-            Frames in a work array, valid until the next call.
-        """
+        """Compute the frames of a chain at the samples."""
         k, m = self.joint_state.positions.shape
         return chain.forward_kinematics(self.joint_state, work_array("frames", k + 2, 7, 3, m))
 
     def instrument_values(self, instruments: Mapping[str, float]) -> Array:
-        """Select the instrument parameters of the measurement.
-
-        Args:
-            instruments: Values of all instrument parameters by name [m or rad].
-
-        Returns:
-            Values in the order of `data.instrument_parameters`.
-        """
+        """Select the instrument parameters of the measurement."""
         return np.array([instruments[parameter.name] for parameter in self.data.instrument_parameters])
 
 
@@ -314,17 +232,7 @@ class Linearization:
     gauge_rates: Array
 
     def r_factor(self, chunk: Chunk, small_angle: bool) -> Array:
-        """Compute the R factor of a chunk's whitened rows [J | r].
-
-        Args:
-            chunk: Samples.
-            small_angle: Whether to use the paper's residuals and Jacobian, equation (36), instead of the
-                exact ones.
-
-        Returns:
-            R factor of shape (p+s+1, p+s+1); the rows themselves, shape (u, p+s+1), if there are many columns
-            and fewer rows.
-        """
+        """Compute the R factor of a chunk's whitened rows [J | r]."""
         n_rows = chunk.data.residual_dim * len(chunk.data.rows)
         if MANY_COLUMNS < self._n_columns > n_rows and not small_angle:
             return self.rows(chunk).reshape(self._n_columns, -1).T
@@ -340,14 +248,7 @@ class Linearization:
         return factor_jacobian(frames.columns, frames.tool[3], bodies, twists, observation, filled)[0]
 
     def structured_rows(self, chunk: Chunk) -> StructuredRows:
-        """Compute the whitened rows [J | r] of a chunk, the transmission columns as products.
-
-        Args:
-            chunk: Samples of one configuration per row, of a measurement with a length scale.
-
-        Returns:
-            The rows.
-        """
+        """Compute the whitened rows [J | r] of a chunk, the transmission columns as products."""
         frames = chunk.frames(self.chain)
         first = int(np.searchsorted(self.bodies, len(frames.columns)))
         entries = self.bodies[first:] - len(frames.columns)
@@ -378,14 +279,7 @@ class Linearization:
         return StructuredRows(dense, joint_rows, np.array([terms[i] for i in by_joint]), blocks, columns)
 
     def rows(self, chunk: Chunk) -> Array:
-        """Compute the whitened rows [J | r] of a chunk.
-
-        Args:
-            chunk: Samples.
-
-        Returns:
-            Rows of shape (p+s+1, k, m).
-        """
+        """Compute the whitened rows [J | r] of a chunk."""
         out = np.empty((self._n_columns, chunk.data.residual_dim, len(chunk.data.rows)))
         self._fill(out, chunk, chunk.frames(self.chain), False)
         return out
@@ -463,14 +357,7 @@ class StructuredRows:
         return out[np.ix_(order, order)]
 
     def covariances(self, covariance: Array) -> Array:
-        """Compute the covariance of the rows of each sample that uncertain unknowns cause.
-
-        Args:
-            covariance: Covariance C of the unknowns, shape (c+e-1, c+e-1).
-
-        Returns:
-            J·C·Jᵀ of each sample, shape (m, k, k).
-        """
+        """Compute the covariance of the rows of each sample that uncertain unknowns cause."""
         c, dense = len(self.dense), self.dense[:-1]
         dense_columns, coefficients = self.columns[: c - 1], self.columns[c:]
         of_dense = covariance[np.ix_(dense_columns, dense_columns)]
@@ -490,16 +377,7 @@ class StructuredRows:
 
 
 def chunk_residual(chain: Chain, instruments: Mapping[str, float], chunk: Chunk) -> Array:
-    """Compute the whitened residuals of a chunk.
-
-    Args:
-        chain: Chain with errors.
-        instruments: Values of all instrument parameters by name [m or rad].
-        chunk: Samples.
-
-    Returns:
-        Residuals of shape (k, m).
-    """
+    """Compute the whitened residuals of a chunk."""
     return chunk.data.residual(chunk.frames(chain), chunk.instrument_values(instruments))
 
 
@@ -515,14 +393,7 @@ def _chunk_r_factor(linearization: Linearization, small_angle: bool, chunk: Chun
 
 
 def merge_instrument_parameters(data: Sequence[Measurement]) -> tuple[InstrumentParameter, ...]:
-    """Collect the instrument parameters of several measurements.
-
-    Args:
-        data: Measurements; parameters of the same name are the same.
-
-    Returns:
-        Parameters, each once. The initial value is the first one that is not NaN, or zero.
-    """
+    """Collect the instrument parameters of several measurements."""
     merged: dict[str, InstrumentParameter] = {}
     for item in data:
         for parameter in item.instrument_parameters:
@@ -535,17 +406,7 @@ def merge_instrument_parameters(data: Sequence[Measurement]) -> tuple[Instrument
 
 
 def linearize_and_factor(problem: Problem, x: Array, small_angle: bool) -> TriangularSystem:
-    """Compute the triangular system of all data, without priors.
-
-    Args:
-        problem: Problem in p robot errors and s instrument parameters.
-        x: Unknowns of shape (p+s,).
-        small_angle: Whether to use the paper's residuals and Jacobian, equation (36), instead of the exact
-        ones.
-
-    Returns:
-        System at x.
-    """
+    """Compute the triangular system of all data, without priors."""
     return combine_r_factors(
         problem.map_chunks(partial(_chunk_r_factor, problem.linearize(x), small_angle)), len(x)
     )
@@ -563,12 +424,7 @@ class UnfactoredSystem(TriangularSystem):
     x: Array
 
     def __init__(self, problem: Problem, x: Array):
-        """Store the problem.
-
-        Args:
-            problem: Problem in p robot errors and s instrument parameters.
-            x: Unknowns of shape (p+s,).
-        """
+        """Store the problem."""
         vars(self).update(problem=problem, x=x)
 
     @cached_property
@@ -582,12 +438,6 @@ def uses_normal_equations(problem: Problem) -> bool:
 
     They are accurate if all unknowns have priors. There are many transmission coefficients, more rows than
     unknowns, and one configuration per row.
-
-    Args:
-        problem: Problem.
-
-    Returns:
-        Whether `linear_system` computes the normal equations.
     """
     n_coefficients = sum(parameter.coefficient_index is not None for parameter in problem.errors.parameters)
     n_rows = sum(item.residual_dim * len(item.rows) for item in problem.data)
@@ -606,30 +456,14 @@ def _is_structured(item: Measurement) -> bool:
 
 
 def linear_system(problem: Problem, x: Array) -> TriangularSystem:
-    """Compute the system of all data, without priors, in the form that takes less time.
-
-    Args:
-        problem: Problem in p robot errors and s instrument parameters.
-        x: Unknowns of shape (p+s,).
-
-    Returns:
-        System at x.
-    """
+    """Compute the system of all data, without priors, in the form that takes less time."""
     if uses_normal_equations(problem):
         return normal_equations(problem, x)
     return linearize_and_factor(problem, x, small_angle=False)
 
 
 def normal_equations(problem: Problem, x: Array) -> NormalEquations:
-    """Compute the normal equations of all data, without priors.
-
-    Args:
-        problem: Problem with structure, see `uses_normal_equations`, or some of its samples.
-        x: Unknowns of shape (p+s,).
-
-    Returns:
-        Normal equations at x.
-    """
+    """Compute the normal equations of all data, without priors."""
     parts = problem.map_chunks(partial(_chunk_products, problem.linearize(x)))
     return NormalEquations(reduce(np.add, parts))
 
@@ -640,15 +474,7 @@ def _chunk_products(linearization: Linearization, chunk: Chunk) -> Array:
 
 
 def whitened_residuals(problem: Problem, x: Array) -> Iterator[Array]:
-    """Yield the whitened residuals of each measurement.
-
-    Args:
-        problem: Problem.
-        x: Unknowns, (p,).
-
-    Yields:
-        Residuals, (k, m) for each measurement.
-    """
+    """Yield the whitened residuals of each measurement."""
     chain = problem.errors.at(x[: len(problem.errors.parameters)])
     chunks = problem.map_chunks(partial(chunk_residual, chain, problem.instruments(x)))
     for item in problem.data:

@@ -44,14 +44,7 @@ WELL_CONDITIONED = 1e3 * RANK_RTOL
 
 
 def singular_value_decomposition(a: Array) -> tuple[Array, Array, Array]:
-    """Compute the singular value decomposition of a matrix.
-
-    Args:
-        a: Matrix of shape (n, p).
-
-    Returns:
-        U, shape (n, n), the singular values, largest first, and Vᵀ, shape (p, p).
-    """
+    """Compute the singular value decomposition of a matrix."""
     try:
         u, s, vt = np.linalg.svd(a)
         return u, s, vt
@@ -61,90 +54,41 @@ def singular_value_decomposition(a: Array) -> tuple[Array, Array, Array]:
 
 
 def singular_values(r: Array) -> Array:
-    """Compute the singular values of R.
-
-    Args:
-        r: Triangular factor of shape (p, p).
-
-    Returns:
-        Singular values of shape (p,), largest first.
-    """
+    """Compute the singular values of R."""
     return np.linalg.svd(r, compute_uv=False)
 
 
 def row_space(r: Array) -> Array:
-    """Compute an orthonormal basis of the observable directions in parameter space.
-
-    Args:
-        r: Triangular factor of shape (p, p).
-
-    Returns:
-        Basis of shape (rank, p).
-    """
+    """Compute an orthonormal basis of the observable directions in parameter space."""
     _, s, vt = singular_value_decomposition(r)
     return vt[: int(np.sum(s > RANK_RTOL * s[0]))] if s.size and s[0] > 0 else vt[:0]
 
 
 def rank(r: Array) -> int:
-    """Count the observable directions in parameter space.
-
-    Args:
-        r: Triangular factor of shape (p, p).
-
-    Returns:
-        Number of singular values above RANK_RTOL times the largest.
-    """
+    """Count the observable directions in parameter space."""
     s = singular_values(r)
     return int(np.sum(s > RANK_RTOL * s[0])) if s.size else 0
 
 
 def condition(r: Array) -> float:
-    """Compute the condition number within the observable directions.
-
-    Args:
-        r: Triangular factor of shape (p, p).
-
-    Returns:
-        Largest over smallest singular value above the rank cut; 0 if the rank is 0.
-    """
+    """Compute the condition number within the observable directions."""
     s = singular_values(r)
     nonzero = s[s > RANK_RTOL * s[0]] if s.size else s
     return float(nonzero[0] / nonzero[-1]) if nonzero.size else 0.0
 
 
 def null_space(r: Array) -> Array:
-    """Compute an orthonormal basis of the directions that the data do not determine.
-
-    Args:
-        r: Triangular factor of shape (p, p).
-
-    Returns:
-        Basis of shape (p, d), d = p - rank.
-    """
+    """Compute an orthonormal basis of the directions that the data do not determine."""
     return singular_value_decomposition(r)[2][rank(r) :].T
 
 
 def sum_of_squares(a: Array) -> float:
-    """Compute the sum of the squared elements of an array.
-
-    Args:
-        a: Array of any shape.
-
-    Returns:
-        Sum of squares as a Python float.
-    """
+    """Compute the sum of the squared elements of an array."""
     return float(np.vdot(a, a))
 
 
 def euclidean_norm(a: Array) -> float:
-    """Compute the root of the sum of the squared elements of an array.
-
-    Args:
-        a: Vector, or matrix for its Frobenius norm.
-
-    Returns:
-        Norm as a Python float.
-    """
+    """Compute the root of the sum of the squared elements of an array."""
     return math.sqrt(sum_of_squares(a))
 
 
@@ -194,36 +138,15 @@ class TriangularSystem:
         return np.logical_not(self.r.any(0))
 
     def scaled(self, factor: float) -> TriangularSystem:
-        """Return the system of the rows times a factor.
-
-        Args:
-            factor: Factor of all rows.
-
-        Returns:
-            The system.
-        """
+        """Return the system of the rows times a factor."""
         return TriangularSystem(factor * self.rows)
 
     def merged(self, other: TriangularSystem) -> TriangularSystem:
-        """Compute the system of the rows of two systems of the same unknowns.
-
-        Args:
-            other: System of other rows.
-
-        Returns:
-            The system.
-        """
+        """Compute the system of the rows of two systems of the same unknowns."""
         return TriangularSystem(merge_r_factors([self.rows, other.rows]))
 
     def select(self, columns: Array) -> TriangularSystem:
-        """Compute the system of some of the unknowns, the others held.
-
-        Args:
-            columns: Mask of the unknowns that stay, (p,).
-
-        Returns:
-            The system; the given one if all stay.
-        """
+        """Compute the system of some of the unknowns, the others held."""
         return self if columns.all() else self._with_columns(np.flatnonzero(np.append(columns, True)))
 
     def _with_columns(self, kept: Array) -> TriangularSystem:
@@ -231,15 +154,7 @@ class TriangularSystem:
         return TriangularSystem(merge_r_factors([self.rows[:, kept]]))
 
     def with_priors(self, weights: Array, x: Array | float) -> TriangularSystem:
-        """Append the prior rows δ/σ = -x/σ.
-
-        Args:
-            weights: Reciprocal prior standard deviations 1/σ of shape (p,); zero without a prior.
-            x: Current values of shape (p,), or 0 [m and rad].
-
-        Returns:
-            System of data and priors.
-        """
+        """Append the prior rows δ/σ = -x/σ."""
         return append_rows(self, weights, -(weights * x))
 
     def solve(self, weights: Array, x: Array | float) -> tuple[Array, float]:
@@ -295,73 +210,31 @@ class TriangularSystem:
         return root, unobservable @ np.delete(yt, np.flatnonzero(has_prior), 0).T
 
     def squared_error(self, step: Array) -> float:
-        """Compute the cost after a step.
-
-        Args:
-            step: Step δ of shape (p,) [m and rad].
-
-        Returns:
-            ‖R·δ - z‖² + min_cost.
-        """
+        """Compute the cost after a step."""
         return sum_of_squares(self.z - self.r @ step) + self.min_cost
 
     def predicted_variance(self, root: Array) -> float:
-        """Compute the variance of all rows that uncertain unknowns cause.
-
-        Args:
-            root: Square root S of the covariance of the unknowns, shape (p, r).
-
-        Returns:
-            ‖R·S‖², the trace of R·S·Sᵀ·Rᵀ.
-        """
+        """Compute the variance of all rows that uncertain unknowns cause."""
         return sum_of_squares(self.r @ root)
 
     def residual_change(self, step: Array) -> Array:
-        """Compute the change of the rows by a step, up to a rotation.
-
-        Args:
-            step: Step δ of shape (p,) [m and rad].
-
-        Returns:
-            R·δ of shape (p,).
-        """
+        """Compute the change of the rows by a step, up to a rotation."""
         return self.r @ step
 
     def predicted_reduction(self, change: Array) -> float:
-        """Compute by how much the linear model reduces the cost.
-
-        Args:
-            change: Result of `residual_change`, shape (p,).
-
-        Returns:
-            ‖z‖² - ‖R·δ - z‖².
-        """
+        """Compute by how much the linear model reduces the cost."""
         z = self.z
         return sum_of_squares(z) - sum_of_squares(change - z)
 
     def recentered(self, step: Array) -> TriangularSystem:
-        """Build the system at x + step, assuming that the model is linear over the step.
-
-        Args:
-            step: Step δ of shape (p,) [m and rad].
-
-        Returns:
-            System with right-hand side z - R·δ.
-        """
+        """Build the system at x + step, assuming that the model is linear over the step."""
         rows = self.rows.copy()
         rows[:-1, -1] -= self.r @ step
         return TriangularSystem(rows)
 
 
 def merge_r_factors(factors: Sequence[Array]) -> Array:
-    """Merge R factors of different rows of the same columns.
-
-    Args:
-        factors: Factors or plain rows of shape (u, c), with any number u of rows each.
-
-    Returns:
-        R factor of all rows, shape (c, c).
-    """
+    """Merge R factors of different rows of the same columns."""
     return r_factor(np.concatenate(factors).T[:, None].copy())
 
 
@@ -369,13 +242,6 @@ def combine_r_factors(factors: Iterable[Array], p: int) -> TriangularSystem:
     """Merge the R factors of all chunks of data, one after the other.
 
     Two factors are in memory at a time. The plain rows of small chunks are collected first.
-
-    Args:
-        factors: R factors of [J | r], shape (p+1, p+1) each, or plain rows, shape (u, p+1) with u <= p.
-        p: Number of unknowns.
-
-    Returns:
-        System of all rows; zero if there are no factors.
     """
     merged: Array | None = None
     pending: list[Array] = []
@@ -397,16 +263,7 @@ def _merge_with(merged: Array | None, pending: Sequence[Array]) -> Array:
 
 
 def append_rows(system: TriangularSystem, diagonal: Array, right: Array) -> TriangularSystem:
-    """Append the rows diag(diagonal)·δ = right to a system.
-
-    Args:
-        system: System of p unknowns.
-        diagonal: Coefficients of shape (p,).
-        right: Right-hand sides of shape (p,).
-
-    Returns:
-        System with the further rows; `system` itself if all coefficients are zero.
-    """
+    """Append the rows diag(diagonal)·δ = right to a system."""
     return TriangularSystem(append_diagonal(system.rows, diagonal, right)) if diagonal.any() else system
 
 

@@ -202,15 +202,7 @@ def standardize_ratios(ratios: Array, k: int | Array) -> Array:
 
 
 def is_chi_square(mean_squares: Array, k: int) -> bool:
-    """Return whether mean squares of residuals follow the distribution χ²_k/k (Pearson's test).
-
-    Args:
-        mean_squares: Mean square of the k whitened residuals of each sample, shape (m,).
-        k: Number of residuals per sample.
-
-    Returns:
-        Whether the counts in equally likely parts of the distribution are as expected.
-    """
+    """Return whether mean squares of residuals follow the distribution χ²_k/k (Pearson's test)."""
     from scipy.special import gammaincinv  # lazy import: slow
 
     bounds = gammaincinv(k / 2, np.arange(1, N_PARTS) / N_PARTS) * 2 / k
@@ -220,29 +212,14 @@ def is_chi_square(mean_squares: Array, k: int) -> bool:
 
 
 def rejection_stage(t: Array) -> str:
-    """Choose the stage that rejects outliers, by whether they are set apart from all other samples.
-
-    Args:
-        t: Standardized residuals of shape (m,).
-
-    Returns:
-        `REJECTED` if they are, `FAR_REJECTED` if residuals of all sizes occur.
-    """
+    """Choose the stage that rejects outliers, by whether they are set apart from all other samples."""
     n_far = np.sum(t > OUTLIER_THRESHOLD)
     n_between = np.sum((t > REJECTION_THRESHOLD) & (t <= OUTLIER_THRESHOLD))
     return REJECTED if n_between <= MAX_BETWEEN * n_far + 1 else FAR_REJECTED
 
 
 def sample_weights(t: Array, stage: str) -> Array:
-    """Compute the weights of samples.
-
-    Args:
-        t: Standardized residuals of shape (m,).
-        stage: Key of `WEIGHT_FUNCTIONS`.
-
-    Returns:
-        Weights of shape (m,), at least ZERO_WEIGHT.
-    """
+    """Compute the weights of samples."""
     weight_function, cutoff = WEIGHT_FUNCTIONS[stage]
     return np.maximum(np.where(t > cutoff, 0.0, weight_function(t)), ZERO_WEIGHT)
 
@@ -303,15 +280,6 @@ def update_weights(
     Weights whose change hardly falls alternate between two sets; their mean is used then. Weights of samples
     with much leverage alternate again after that. From the second time on, every round makes a part of the
     change only, and half of that part after each further time.
-
-    Args:
-        previous: Weights of each measurement's samples, shape (m,) each.
-        residuals: Standardized residuals of each measurement, shape (m,) each.
-        stage: Key of `WEIGHT_FUNCTIONS`.
-        last: Change of the weights in the last round of this stage.
-
-    Returns:
-        New weights, and their change.
     """
     weights = [sample_weights(t, stage) for t in residuals]
     steps = tuple(a - b for a, b in zip(weights, previous, strict=True))
@@ -326,15 +294,7 @@ def update_weights(
 
 
 def weight_change(weights: Sequence[Array], previous: Sequence[Array]) -> WeightChange:
-    """Compute the change of weights.
-
-    Args:
-        weights: New weights of each measurement's samples, shape (m,) each.
-        previous: Their weights before.
-
-    Returns:
-        The change, with `n_reversals` 0.
-    """
+    """Compute the change of weights."""
     steps = tuple(a - b for a, b in zip(weights, previous, strict=True))
     return WeightChange(max(float(np.abs(step).max(initial=0.0)) for step in steps), steps)
 
@@ -342,18 +302,7 @@ def weight_change(weights: Sequence[Array], previous: Sequence[Array]) -> Weight
 def studentized_residuals(
     problem: Problem, solution: SolverResult, data: Sequence[Measurement], weights: Sequence[Array]
 ) -> list[Array]:
-    """Compute standardized residuals that are corrected for leverage.
-
-    Args:
-        problem: Problem as it was solved, with robust weights.
-        solution: Its solution.
-        data: Fitted measurements with the standard deviations of good samples, without robust weights.
-        weights: Robust weights of each measurement's samples in the solution, shape (m,) each.
-
-    Returns:
-        Standardized residuals of each measurement, shape (m,) each. They are zero if there are not more rows
-        than observable directions: residuals do not contain information on the noise then.
-    """
+    """Compute standardized residuals that are corrected for leverage."""
     n_rows = sum(np.count_nonzero(w > 0.5) * item.residual_dim for item, w in zip(data, weights, strict=True))
     n_unknowns = len(solution.x)
     if problem.temperature > 1:
@@ -398,14 +347,6 @@ def residual_covariances(problem: Problem, solution: SolverResult, weights: Sequ
     H_i = J_i·C·J_iᵀ, the covariance is I + (1 - 2·w_i)·H_i. A sample of weight 1 has less than unit
     covariance, I - H_i, as it pulls the fit towards itself. A rejected sample has more, I + H_i, as the fit
     is uncertain there.
-
-    Args:
-        problem: Problem as it was solved, with robust weights.
-        solution: Its solution.
-        weights: Robust weights of each measurement's samples in the solution, shape (m,) each.
-
-    Returns:
-        Covariances of each measurement, shape (m, k, k) each.
     """
     system = solution.system
     if solution.converged:

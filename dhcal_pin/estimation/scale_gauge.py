@@ -56,28 +56,13 @@ class ScaleGauge:
 
     @classmethod
     def from_configurations(cls, chain: Chain, q: Array) -> ScaleGauge:
-        """Choose configurations by drawing each joint from the measured ones.
-
-        Args:
-            chain: Nominal chain.
-            q: Measured joint positions of shape (m, n) [rad or m].
-
-        Returns:
-            Gauge in which the nominal chain has size 1.
-        """
+        """Choose configurations by drawing each joint from the measured ones."""
         rng = np.random.default_rng(0)
         drawn = np.stack([rng.choice(column, _N_SAMPLES) for column in q.T], 1)
         return cls(drawn, _rms_radius(_centered(chain.forward_kinematics(drawn).tool[3])))
 
     def size(self, chain: Chain) -> float:
-        """Compute the size of a chain.
-
-        Args:
-            chain: Chain with the joints of the nominal one.
-
-        Returns:
-            Size s; 1 for the nominal chain, and for a tool that does not move.
-        """
+        """Compute the size of a chain."""
         if not self.nominal:
             return 1.0
         return _rms_radius(_centered(chain.forward_kinematics(self.q).tool[3])) / self.nominal
@@ -119,16 +104,7 @@ def _rms_radius(offsets: Array) -> float:
 
 
 def normalize_by_scale(block: Array, size: float, rates: Array, vectors: slice | None) -> None:
-    """Make whitened rows invariant to the size and the orientation of the robot.
-
-    Args:
-        block: Rows [J | e] of shape (p+1, k, m), the derivatives by the robot errors first; changed in
-            place.
-        size: Size s of the chain.
-        rates: Result of `ScaleGauge.rates`, shape (e, 4).
-        vectors: Which of the k rows are components of a vector along the axes of the measuring frame; None if
-            there are none.
-    """
+    """Make whitened rows invariant to the size and the orientation of the robot."""
     block /= size
     residual = block[-1]
     block[: len(rates)] += (rates[:, 0] / size)[:, None, None] * residual

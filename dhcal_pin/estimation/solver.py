@@ -109,22 +109,7 @@ def minimize(
     progress: IterationCallback | None = None,
     **options: Any,
 ) -> SolverResult:
-    """Minimize the cost of a problem.
-
-    Args:
-        problem: Least-squares problem in p unknowns.
-        method: Key of METHODS: "lm" for `levenberg_marquardt`, "gn" for `gauss_newton`.
-        x: Starting point of shape (p,) [m and rad]; zero, the nominal robot, by default.
-        max_iterations: Largest number of iterations.
-        progress: Called after each iteration with its number and the cost.
-        **options: Further arguments of the method.
-
-    Returns:
-        Solution with the triangular system there.
-
-    Raises:
-        UnknownNameError: If the method is unknown.
-    """
+    """Minimize the cost of a problem."""
     if method not in METHODS:
         raise UnknownNameError(f"unknown method {method!r}; choose from {', '.join(METHODS)}")
     start = np.zeros(len(problem.weights)) if x is None else x
@@ -132,16 +117,7 @@ def minimize(
 
 
 def bounded_step(problem: Problem, system: TriangularSystem, x: Array) -> Array:
-    """Compute the least-squares step that stays within the bounds of a problem.
-
-    Args:
-        problem: Problem with or without bounds.
-        system: Triangular system at x, with priors and damping.
-        x: Current point of shape (p,) [m and rad].
-
-    Returns:
-        Step δ of shape (p,) [m and rad].
-    """
+    """Compute the least-squares step that stays within the bounds of a problem."""
     if problem.bounds is None:
         return pseudo_inverse(system.r, system.z)
     # lazy import: scipy.optimize takes longer to import than most calibrations take.
@@ -156,15 +132,7 @@ def bounded_step(problem: Problem, system: TriangularSystem, x: Array) -> Array:
 
 
 def next_iterate(problem: Problem, solution: SolverResult) -> Array:
-    """Compute the point that one undamped step reaches from a loose solution.
-
-    Args:
-        problem: Problem that was solved.
-        solution: Its solution.
-
-    Returns:
-        Point of shape (p,) [m and rad].
-    """
+    """Compute the point that one undamped step reaches from a loose solution."""
     system = solution.system.with_priors(problem.weights, solution.x)
     return solution.x + bounded_step(problem, system, solution.x)
 
@@ -199,18 +167,6 @@ def gauss_newton(
     """Minimize by undamped steps with a pseudo-inverse: the paper's iteration, equations (37) to (39).
 
     Rotation errors are those of equation (36), and the Jacobian is the paper's matrix as printed.
-
-    Args:
-        problem: Least-squares problem in p unknowns; its bounds are ignored.
-        x: Starting point of shape (p,) [m and rad].
-        max_iterations: Largest number of iterations.
-        progress: Called after each iteration with its number and the cost before it.
-
-    Returns:
-        Solution; its triangular system is that of the exact residuals.
-
-    Raises:
-        ConvergenceError: If the iteration diverges.
     """
     iterates, converged, iteration = [x], False, 0
     while iteration < max_iterations and not converged:
@@ -253,20 +209,7 @@ def levenberg_marquardt(
     warm_start: SolverResult | None = None,
     loose: bool = False,
 ) -> SolverResult:
-    """Minimize by damped steps (see the module docstring).
-
-    Args:
-        problem: Least-squares problem in p unknowns.
-        x: Starting point of shape (p,) [m and rad].
-        max_iterations: Largest number of iterations, those of `warm_start` included.
-        progress: Called after each iteration with its number and the cost.
-        warm_start: Solution at x of a problem with the same data, possibly with other priors. Its triangular
-            system and damping are used, and its iterations are continued.
-        loose: Stop as soon as LOOSE_RTOL is met; the result is then reported as not converged.
-
-    Returns:
-        Solution with the triangular system there.
-    """
+    """Minimize by damped steps (see the module docstring)."""
     state = warm_start.damping_state if warm_start else DampingState()
     damping, scale, last_change = state.damping, state.scale, state.last_change
     iterates, iteration = (list(warm_start.iterates), warm_start.iterations) if warm_start else ([x], 0)

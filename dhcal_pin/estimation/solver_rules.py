@@ -85,16 +85,6 @@ def step_is_negligible(
 
     Three cases are negligible: the change is below a fraction of the rows' norm, or below the rounding error
     of the model, or steps shrink quadratically and the next change will be below that fraction.
-
-    Args:
-        change: Change of the rows by the step, ‖R·δ‖.
-        residual_norm: Norm √F of the rows before the step.
-        last_change: Change of the rows by the previous step; zero if unknown.
-        roundoff: Rounding error ε of the rows.
-        rtol: Fraction of `residual_norm` that is negligible.
-
-    Returns:
-        A flag, or an array of flags for arrays.
     """
     tolerance = rtol * residual_norm
     is_quadratic = (change < MAX_QUADRATIC_RATIO * last_change) & (
@@ -107,13 +97,6 @@ def cost_roundoff(residual_norm: _Number, roundoff: _Number) -> _Number:
     """Compute the rounding error of a cost.
 
     A predicted reduction below this value cannot be verified by comparing costs.
-
-    Args:
-        residual_norm: Norm √F of the rows.
-        roundoff: Rounding error ε of the rows.
-
-    Returns:
-        Rounding error of F.
     """
     return (ROUNDOFF_FACTOR * roundoff) ** 2 + 2 * roundoff * residual_norm
 
@@ -121,62 +104,24 @@ def cost_roundoff(residual_norm: _Number, roundoff: _Number) -> _Number:
 def is_within_roundoff(
     predicted_reduction: _Number, trial_cost: _Number, residual_norm: _Number, roundoff: _Number
 ) -> Any:
-    """Decide whether the costs before and after a step agree within rounding.
-
-    Args:
-        predicted_reduction: Reduction of the cost that the linear model predicts.
-        trial_cost: Cost F₊ after the step.
-        residual_norm: Norm √F of the rows before the step.
-        roundoff: Rounding error ε of the rows.
-
-    Returns:
-        A flag, or an array of flags for arrays.
-    """
+    """Decide whether the costs before and after a step agree within rounding."""
     max_cost = (residual_norm + ROUNDOFF_FACTOR * roundoff) ** 2
     return (predicted_reduction <= cost_roundoff(residual_norm, roundoff)) & (trial_cost <= max_cost)
 
 
 def gain_ratio(cost: _Number, trial_cost: _Number, predicted_reduction: _Number) -> _Number:
-    """Compute the actual over the predicted reduction of the cost.
-
-    Args:
-        cost: Cost F before the step.
-        trial_cost: Cost F₊ after the step.
-        predicted_reduction: Reduction that the linear model predicts.
-
-    Returns:
-        Gain ratio ρ; zero if no reduction is predicted.
-    """
+    """Compute the actual over the predicted reduction of the cost."""
     is_descent = predicted_reduction > 0
     return _select(is_descent, (cost - trial_cost) / _select(is_descent, predicted_reduction, 1.0), 0.0)
 
 
 def is_acceptable(cost: _Number, trial_cost: _Number, gain: _Number, within_roundoff: Any) -> Any:
-    """Decide whether a step is accepted.
-
-    Args:
-        cost: Cost F before the step.
-        trial_cost: Cost F₊ after the step.
-        gain: Gain ratio ρ of the step.
-        within_roundoff: Result of `is_within_roundoff`.
-
-    Returns:
-        A flag, or an array of flags for arrays.
-    """
+    """Decide whether a step is accepted."""
     return within_roundoff | ((trial_cost <= cost) & (gain > MIN_GAIN_RATIO))
 
 
 def damping_after_acceptance(damping: _Number, gain: _Number, within_roundoff: Any) -> _Number:
-    """Compute the damping that follows an accepted step.
-
-    Args:
-        damping: Damping λ of the accepted step.
-        gain: Gain ratio ρ of the step.
-        within_roundoff: Result of `is_within_roundoff`; the gain ratio is then meaningless.
-
-    Returns:
-        Damping of the next step.
-    """
+    """Compute the damping that follows an accepted step."""
     # Clipping changes no result, and keeps the cube of a meaningless gain ratio from overflowing.
     clipped = _select(gain > 1.0, 1.0, _select(gain > 0.0, gain, 0.0))
     cubic = 1 - (2 * clipped - 1) ** 3
@@ -190,15 +135,7 @@ def damping_after_acceptance(damping: _Number, gain: _Number, within_roundoff: A
 
 
 def damping_after_rejection(damping: _Number, growth: _Number) -> tuple[_Number, _Number]:
-    """Compute the damping and its growth factor that follow a rejected step.
-
-    Args:
-        damping: Damping λ of the rejected step.
-        growth: Growth factor ν.
-
-    Returns:
-        New damping and new growth factor.
-    """
+    """Compute the damping and its growth factor that follow a rejected step."""
     return damping * growth, growth * 2
 
 
@@ -207,24 +144,10 @@ def undamped_steps_are_due(iteration: Any, last_undamped: Any) -> Any:
 
     The first series follows iteration UNDAMPED_INTERVAL; the iteration number of each further one is twice
     that of the last.
-
-    Args:
-        iteration: Number of iterations so far.
-        last_undamped: Iteration of the last series; zero if there was none.
-
-    Returns:
-        A flag, or an array of flags for arrays.
     """
     return (iteration >= UNDAMPED_INTERVAL) & (iteration >= 2 * last_undamped)
 
 
 def has_diverged(x: Array) -> Any:
-    """Decide whether parameter errors are too large to be meaningful, or not finite.
-
-    Args:
-        x: Parameter errors of shape (p,) or (b, p) [m and rad].
-
-    Returns:
-        A flag, or an array of flags of shape (b,).
-    """
+    """Decide whether parameter errors are too large to be meaningful, or not finite."""
     return ~(np.abs(x).max(-1) < DIVERGENCE_LIMIT)

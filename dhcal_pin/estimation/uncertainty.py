@@ -87,11 +87,7 @@ class Predictor(Protocol):
         ...
 
     def predict(self, q: Array) -> Prediction:
-        """Predict tool poses and their covariance.
-
-        Args:
-            q: Joint positions of shape (m, n) [rad or m].
-        """
+        """Predict tool poses and their covariance."""
         ...
 
 
@@ -191,13 +187,6 @@ class Uncertainty:
         Parameters are matched by their effect on the tool (least squares). Effects shared by several
         parameters are distributed in proportion to `scale`; effects outside the parameters' span are
         projected onto it.
-
-        Args:
-            errors: Error model of p parameters on the calibrated chain.
-            scale: Units of the parameters, such as prior standard deviations, shape (p,).
-
-        Returns:
-            Square root of the covariance of x/scale, shape (p, r), and undetermined directions, shape (p, h).
         """
         q = np.random.default_rng(0).uniform(-np.pi, np.pi, (N_MATCHING_SAMPLES, self.chain.n_joints))
         chain, bodies, twists = errors.derivative(np.zeros(len(scale)))
@@ -211,15 +200,7 @@ class Uncertainty:
         return root, undetermined
 
     def tool_twists(self, frames: FrameBatch, directions: Array) -> Array:
-        """Compute the tool twists of directions in body twists and coefficients.
-
-        Args:
-            frames: Frames of the chain at m samples.
-            directions: Directions as rows of `sqrt_covariance`, shape (6(k+1)+e, c).
-
-        Returns:
-            Twists [v, ω] of the tool point in axes of the measuring frame, shape (m, 6, c).
-        """
+        """Compute the tool twists of directions in body twists and coefficients."""
         chain, n_bodies = self.chain, len(self.chain.moving_joints) + 1
         carry = np.tile(np.eye(4), (n_bodies, 1, 1))
         carry[0] = se3.inverse(chain.base)
@@ -242,14 +223,7 @@ class Uncertainty:
         return out
 
     def predict(self, q: Array) -> Prediction:
-        """Predict tool poses and their covariance.
-
-        Args:
-            q: Joint positions of shape (m, n) [rad or m].
-
-        Returns:
-            Calibrated tool poses with the covariance of the identified errors and of those the model lacks.
-        """
+        """Predict tool poses and their covariance."""
         frames = self.chain.forward_kinematics(q)
         root, undetermined = (
             self.tool_twists(frames, part) for part in (self.sqrt_covariance, self.unbounded_directions)

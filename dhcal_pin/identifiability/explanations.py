@@ -70,14 +70,7 @@ _N_SCALING_SAMPLES = 30
 
 
 def join_names(names: Sequence[str]) -> str:
-    """Join names with commas and "and"; summarize the last ones if there are too many.
-
-    Args:
-        names: At least one name.
-
-    Returns:
-        Text such as "a, b and c".
-    """
+    """Join names with commas and "and"; summarize the last ones if there are too many."""
     if len(names) > _MAX_NAMES:
         names = [*names[: _MAX_NAMES - 1], f"{len(names) - _MAX_NAMES + 1} more"]
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
@@ -167,14 +160,7 @@ class Explainer:
     plain_errors: PlainErrors
 
     def sentence(self, group: UnobservableGroup) -> str:
-        """Explain one group of unobservable directions.
-
-        Args:
-            group: Group of directions.
-
-        Returns:
-            Sentence with names, reason, identifiable combinations and advice.
-        """
+        """Explain one group of unobservable directions."""
         names = [self.names[i] for i in group.members]
         if group.cause == "structure" and group.members[-1] < len(self.probe.problem.errors.parameters):
             return EXPECTED + self._explain_redundancy(group, names)
@@ -224,9 +210,6 @@ class Explainer:
 
         The count refers to the null space of the group's cause, because other groups may share its members.
         With `listed`, the text names the members, otherwise it refers to names that precede it.
-
-        Returns:
-            Clause without a full stop.
         """
         members, r = group.members, group.vectors.shape[1]
         _, s, vt = np.linalg.svd(self.layers[group.cause][members].T)
@@ -266,11 +249,7 @@ class Explainer:
         return [self.plain_errors.parameters[i] for i in members], way
 
     def _rig_entries(self, group: UnobservableGroup) -> dict[str, bool]:
-        """Return the cameras and boards whose poses take part in a group, and whether the tool moves them.
-
-        Returns:
-            Entries such as "camera_wrist"; none if lenses or other instruments take part, too.
-        """
+        """Return the cameras and boards whose poses take part in a group, and whether the tool moves them."""
         sets, moves = dict[str, str](), dict[str, bool]()
         for item in self.probe.problem.data:
             if isinstance(item, CameraCorners):
@@ -404,17 +383,7 @@ class Explainer:
 
 
 def explain_unobservable(problem: Problem, x: Array, system: TriangularSystem) -> list[str]:
-    """Explain which parameters are not identifiable, why, and what to measure.
-
-    Args:
-        problem: Unknowns and measurements.
-        x: Values of the unknowns, shape (p,) [m or rad].
-        system: Triangular system of the measurements without priors, at x or at the start of the last step.
-
-    Returns:
-        Sentences that together cover every unobservable direction; empty if all are observable. Sentences on
-        redundancies of the model start with `EXPECTED`.
-    """
+    """Explain which parameters are not identifiable, why, and what to measure."""
     if qr.rank(system.r) == len(x):
         return []
     curve_joints = _curve_joints(problem)
@@ -448,16 +417,7 @@ def _with_known_curves(problem: Problem, x: Array, kept: Array) -> tuple[Problem
 
 
 def _explain_curves(probe: ObservabilityProbe, r: Array, curve_joints: Array) -> list[str]:
-    """Explain how many combinations of the correction curves are not identifiable, and of which joints.
-
-    Args:
-        probe: Problem, and values at which its Jacobian is taken.
-        r: R factor of the measurements, shape (p, p).
-        curve_joints: Joint of each unknown that belongs to a curve, -1 for others, shape (p,).
-
-    Returns:
-        One sentence; none if all combinations are identifiable once the other unknowns are known.
-    """
+    """Explain how many combinations of the correction curves are not identifiable, and of which joints."""
     others = curve_joints < 0
 
     def n_open(factor: Array) -> int:
@@ -503,14 +463,7 @@ def _explain_null_space(problem: Problem, x: Array) -> list[str]:
 
 
 def label_unobservable(sentence: str) -> str:
-    """Label a sentence of `explain_unobservable` for lists with other topics.
-
-    Args:
-        sentence: Sentence.
-
-    Returns:
-        Sentence with "not observable" in front; expected redundancies have their own label.
-    """
+    """Label a sentence of `explain_unobservable` for lists with other topics."""
     return sentence if sentence.startswith(EXPECTED) else f"not observable: {sentence}"
 
 
@@ -518,9 +471,6 @@ def _merge_groups(groups: list[UnobservableGroup]) -> list[UnobservableGroup]:
     """Merge groups of one cause if their union has one identifiable combination.
 
     Groups of the causes "poses" and "unmoved" are always merged.
-
-    Returns:
-        Merged groups.
     """
     out: list[UnobservableGroup] = []
     for group in groups:
@@ -538,18 +488,7 @@ def _merge_groups(groups: list[UnobservableGroup]) -> list[UnobservableGroup]:
 def explain_weakly_observable(
     problem: Problem, x: Array, system: TriangularSystem, prior_std: Array, noise: float
 ) -> list[str]:
-    """Explain which parameters are observable but hardly better known than before the measurement.
-
-    Args:
-        problem: Unknowns and measurements.
-        x: Values at which `system` was computed, shape (p,) [m or rad].
-        system: Triangular system of the measurements without priors.
-        prior_std: Prior standard deviations, shape (p,) [m or rad].
-        noise: Standard deviation of the whitened residuals; NaN if it cannot be estimated.
-
-    Returns:
-        One sentence per set of parameters that share weakly observable directions.
-    """
+    """Explain which parameters are observable but hardly better known than before the measurement."""
     if np.isnan(noise):
         return [
             "the accuracy of all parameters is unknown, because there are no redundant measurements to "

@@ -111,11 +111,7 @@ class ObservabilityProbe:
         return sum(item.residual_dim * len(item.rows) for item in self.problem.data)
 
     def with_offset_point(self) -> ObservabilityProbe:
-        """Return a copy whose measured point is displaced in the tool frame.
-
-        Returns:
-            Probe with another tool.
-        """
+        """Return a copy whose measured point is displaced in the tool frame."""
         errors = self.problem.errors
         offset = {errors.chain.tool_frame_index: se3.translation(_POINT_OFFSET)}
         return ObservabilityProbe(
@@ -123,15 +119,7 @@ class ObservabilityProbe:
         )
 
     def draw_configurations(self, rng: np.random.Generator, m: int) -> Array:
-        """Draw joint positions within the limits and within ±π rad or ±π m.
-
-        Args:
-            rng: Random generator.
-            m: Number of configurations.
-
-        Returns:
-            Joint positions, shape (m, n) [rad or m].
-        """
+        """Draw joint positions within the limits and within ±π rad or ±π m."""
         chain = self.chain
         low, high = np.maximum(chain.lower, -np.pi), np.minimum(chain.upper, np.pi)
         return rng.uniform(low, high, (m, chain.n_joints))
@@ -145,15 +133,7 @@ class ObservabilityProbe:
         return item.resample(q)
 
     def hypothetical_r_factor(self, joints: Sequence[int], *extra: type[Pose] | type[Position]) -> Array:
-        """Compute the R factor of hypothetical measurements with the same instruments.
-
-        Args:
-            joints: Joints to draw anew, from 0; the others keep their measured positions.
-            *extra: Kinds of additional measurements in the measuring frame.
-
-        Returns:
-            R factor of the whitened Jacobian, shape (p, p).
-        """
+        """Compute the R factor of hypothetical measurements with the same instruments."""
         rng = np.random.default_rng(0)
         measured = self.problem.data
         p = len(self.x)
@@ -171,25 +151,14 @@ class ObservabilityProbe:
         return linearize_and_factor(replace(self.problem, data=tuple(data)), self.x, small_angle=False).r
 
     def unmoved_joints(self) -> list[int]:
-        """Find the independent joints that have the same position in all measurements.
-
-        Returns:
-            Indices of the joints, from 0.
-        """
+        """Find the independent joints that have the same position in all measurements."""
         q = [item.configurations() for item in self.problem.data if item.configurations_per_row]
         if not q:
             return []
         return np.flatnonzero(np.ptp(np.concatenate(q), axis=0) < _MIN_JOINT_RANGE).tolist()
 
     def is_scale_unobservable(self, r: Array) -> bool:
-        """Decide whether a direction of the null space changes the size of the robot.
-
-        Args:
-            r: R factor of the whitened Jacobian, shape (p, p).
-
-        Returns:
-            False for problems without scale gauge.
-        """
+        """Decide whether a direction of the null space changes the size of the robot."""
         if self.problem.scale_gauge is None:
             return False
         n_robot = len(self.problem.errors.parameters)
@@ -197,14 +166,7 @@ class ObservabilityProbe:
         return bool(np.abs(growth @ qr.null_space(r)[:n_robot]).max(initial=0.0) > NEGLIGIBLE)
 
     def null_space_layers(self, r: Array) -> list[tuple[Cause, Array]]:
-        """Split the null space by cause.
-
-        Args:
-            r: R factor of the measurements at x, shape (p, p).
-
-        Returns:
-            Causes with orthonormal bases, each of shape (p, ·); each space contains the preceding one.
-        """
+        """Split the null space by cause."""
         all_joints = list(range(self.chain.n_joints))
         data = qr.null_space(r)
         unmoved = self.unmoved_joints()
@@ -249,14 +211,6 @@ def group_directions(layers: Sequence[tuple[Cause, Array]], error_frames: Array)
 
     Every direction belongs to one group. A group has sparse combinations on the shortest possible part of the
     chain.
-
-    Args:
-        layers: Result of `ObservabilityProbe.null_space_layers`.
-        error_frames: Error frame of each geometric error, shape (r,). The geometric errors are the first
-            unknowns.
-
-    Returns:
-        Groups that together span the null space.
     """
     p = layers[-1][1].shape[0]
     frames = np.unique(error_frames)

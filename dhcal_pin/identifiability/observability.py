@@ -40,12 +40,6 @@ def observable_fraction(r: Array) -> Array:
     The fraction is the diagonal of the projector P: 1 for an identifiable parameter, 0 for one without effect
     on the measurements, and between them for a parameter that is identifiable only in combination with
     others.
-
-    Args:
-        r: R factor of the whitened Jacobian, shape (p, p).
-
-    Returns:
-        Fractions in [0, 1], shape (p,).
     """
     return np.clip(np.sum(row_space(r) ** 2, 0), 0.0, 1.0)
 
@@ -60,13 +54,6 @@ def observability_indices(r: Array, samples: int) -> dict[str, float]:
     * O3 = σ_L: Nahvi, Hollerbach and Hayward (1994);
     * O4 = σ_L²/σ₁, the noise amplification index: Nahvi and Hollerbach (1996);
     * O5 = 1/(1/σ₁ + … + 1/σ_L): Sun and Hollerbach (2008).
-
-    Args:
-        r: R factor of the whitened Jacobian, shape (p, p).
-        samples: Number m of samples.
-
-    Returns:
-        Indices by name; all are 0 if no direction is observable.
     """
     s = singular_values(r)[: rank(r)]
     if not s.size:
@@ -82,14 +69,7 @@ def observability_indices(r: Array, samples: int) -> dict[str, float]:
 
 
 def correlation(covariance: Array) -> Array:
-    """Compute correlation coefficients from a covariance matrix.
-
-    Args:
-        covariance: Covariance matrix, shape (p, p).
-
-    Returns:
-        Correlations in [-1, 1], shape (p, p); NaN off the diagonal where a variance is not finite.
-    """
+    """Compute correlation coefficients from a covariance matrix."""
     std = np.sqrt(np.diag(covariance))
     with np.errstate(invalid="ignore", divide="ignore"):
         out = np.clip(covariance / np.outer(std, std), -1.0, 1.0)
@@ -122,14 +102,7 @@ def weakly_observable(r: Array, prior_std: Array, noise: float) -> tuple[Array, 
 
 
 def connected_components(adjacency: Array) -> list[tuple[int, ...]]:
-    """Find the connected components of an undirected graph.
-
-    Args:
-        adjacency: Symmetric table of edges, shape (p, p). Nodes with a zero on the diagonal are ignored.
-
-    Returns:
-        Nodes of each component, ascending.
-    """
+    """Find the connected components of an undirected graph."""
     out: list[tuple[int, ...]] = []
     remaining = set(np.flatnonzero(np.diag(adjacency)).tolist())
     while remaining:
@@ -143,14 +116,7 @@ def connected_components(adjacency: Array) -> list[tuple[int, ...]]:
 
 
 def unobservable_groups(r: Array) -> list[tuple[tuple[int, ...], int]]:
-    """Group the parameters that are identifiable only in combination.
-
-    Args:
-        r: R factor of the whitened Jacobian, shape (p, p).
-
-    Returns:
-        Parameters of each group and the number of its unobservable directions.
-    """
+    """Group the parameters that are identifiable only in combination."""
     basis = row_space(r)
     projector = np.eye(r.shape[1]) - basis.T @ basis
     return [

@@ -55,15 +55,7 @@ class PlainErrors:
 
     @classmethod
     def from_model(cls, errors: ErrorModel, x: Array) -> PlainErrors:
-        """Select the geometric errors of a model; they are its first parameters.
-
-        Args:
-            errors: Error model.
-            x: Values of its parameters, shape (p,) [m or rad].
-
-        Returns:
-            Geometric errors at x.
-        """
+        """Select the geometric errors of a model; they are its first parameters."""
         chain, bodies, twists = errors.derivative(x)
         count = int(np.sum(bodies <= len(chain.moving_joints)))
         return cls(chain, errors.parameters[:count], bodies[:count], twists[:count])
@@ -87,15 +79,7 @@ class Propagation:
 
 
 def propagate_along_chain(errors: PlainErrors, vectors: Array) -> Propagation | None:
-    """Propagate combinations of errors along the chain.
-
-    Args:
-        errors: Geometric errors of the chain.
-        vectors: Combinations, shape (r, c).
-
-    Returns:
-        Joints that the combinations pass; None if a joint motion changes their effect.
-    """
+    """Propagate combinations of errors along the chain."""
     chain = errors.chain
     translations, rotations, crossings = set[int](), set[int](), set[int]()
     propagated = np.zeros((6, vectors.shape[1]))
@@ -120,14 +104,6 @@ def axis_angle_and_distance(chain: Chain, first: int, second: int) -> tuple[floa
 
     The distance is that of the second joint's origin from the first axis. The joints between them are at
     zero; for parallel and coincident axes the result does not depend on that.
-
-    Args:
-        chain: Chain.
-        first: Number of the first joint, from 1.
-        second: Number of the second joint, greater than `first`.
-
-    Returns:
-        Angle in [0, π/2] [rad] and distance [m].
     """
     transform = np.eye(4)
     for j in range(first, second):
@@ -137,15 +113,7 @@ def axis_angle_and_distance(chain: Chain, first: int, second: int) -> tuple[floa
 
 
 def axes_acted_on(chain: Chain, parameters: Sequence[ErrorParameter]) -> set[int]:
-    """Find the joints whose own axes parameters translate along or rotate about.
-
-    Args:
-        chain: Chain.
-        parameters: Geometric error parameters.
-
-    Returns:
-        Numbers of the joints, from 1.
-    """
+    """Find the joints whose own axes parameters translate along or rotate about."""
     out = set()
     for p in parameters:
         twist = np.array(p.twist).reshape(2, 3)

@@ -81,19 +81,7 @@ class ResidualCorrelation:
 def find_residual_correlation(
     problem: Problem, x: Array, root: Array, noise: float, weights: Sequence[Array]
 ) -> ResidualCorrelation:
-    """Test whether the residuals of neighbouring configurations are correlated.
-
-    Args:
-        problem: Problem at temperature 1 with any measurements; kinds with two configurations per row are
-            left out.
-        x: Its solution, (p,).
-        root: Square root of the covariance of x for rows divided by `noise`, (p, r).
-        noise: Standard deviation of the whitened residuals.
-        weights: Robust weight of each sample, (m,) for each measurement; rejected samples are left out.
-
-    Returns:
-        The correlation; 0 without samples to compare.
-    """
+    """Test whether the residuals of neighbouring configurations are correlated."""
     linearization, chain = problem.linearize(x), problem.errors.at(x[: len(problem.errors.parameters)])
     excess, variance, is_exact = np.zeros(len(LENGTHS)), np.zeros(len(LENGTHS)), True
     quadratic = np.zeros((len(LENGTHS), root.shape[1], root.shape[1]))
@@ -176,15 +164,7 @@ def _score_terms(points: Array, residual: Array, effect: Array) -> _ScoreTerms:
 
 
 def design_effect(q: Array, is_prismatic: Array) -> float:
-    """Compute by how much the correlation of residuals enlarges the variance of a mean (Kish 1965).
-
-    Args:
-        q: Different configurations, (m, n) [rad or m].
-        is_prismatic: Whether each joint is prismatic, (n,).
-
-    Returns:
-        Number of configurations over the number of independent ones with the same information, at least 1.
-    """
+    """Compute by how much the correlation of residuals enlarges the variance of a mean (Kish 1965)."""
     n_configurations = len(q)
     q = q[:: -(-n_configurations // MAX_CONFIGURATIONS)] if n_configurations else q
     if len(q) < 2:

@@ -56,14 +56,6 @@ def camera_frames(rig: MountedRig, chain: Chain, name: str | None) -> list[Camer
 
     A rig states the poses of cameras in the measuring frame or in the tool frame. In the URDF they are poses
     in links: the base and the tool of the chain are between.
-
-    Args:
-        rig: Cameras and boards with their estimated poses.
-        chain: Robot with the URDF that gets the frames.
-        name: Name of the frame of an only camera; NAME_CAMERA with several. None for the names of the rig.
-
-    Returns:
-        Frame of each camera.
     """
     frames = []
     for i, camera in enumerate(rig.cameras):
@@ -95,15 +87,7 @@ def _frame_name(rig: MountedRig, camera: Camera, name: str | None) -> str:
 
 
 def camera_files(frame: CameraFrame, prefix: str) -> dict[PathLike, str | bytes]:
-    """Return the contents of the files of a camera.
-
-    Args:
-        frame: Frame of the camera.
-        prefix: Begin of the paths.
-
-    Returns:
-        Contents by path.
-    """
+    """Return the contents of the files of a camera."""
     return {
         f"{prefix}.camera_info.yaml": camera_info_text(frame.camera),
         f"{prefix}.opencv.yaml": opencv_text(frame.camera),
@@ -134,14 +118,7 @@ def _ros_matrix(name: str, values: Array) -> list[str]:
 
 
 def camera_info_text(camera: Camera) -> str:
-    """Return the intrinsics of a camera as a ROS camera_info YAML.
-
-    Args:
-        camera: Camera.
-
-    Returns:
-        Text of the file.
-    """
+    """Return the intrinsics of a camera as a ROS camera_info YAML."""
     matrix = _matrix(camera)
     lines = [
         f"image_width: {camera.width}",
@@ -157,14 +134,7 @@ def camera_info_text(camera: Camera) -> str:
 
 
 def opencv_text(camera: Camera) -> str:
-    """Return the intrinsics of a camera as a YAML of OpenCV.
-
-    Args:
-        camera: Camera.
-
-    Returns:
-        Text of the file.
-    """
+    """Return the intrinsics of a camera as a YAML of OpenCV."""
     lines = ["%YAML:1.0", "---", f"image_width: {camera.width}", f"image_height: {camera.height}"]
     for name, values in (
         ("camera_matrix", _matrix(camera)),
@@ -182,12 +152,6 @@ def hand_eye_text(frame: CameraFrame) -> str:
     Its publisher sends the pose of `tracking_base_frame` in `robot_effector_frame` if `eye_on_hand` is true,
     otherwise in `robot_base_frame`. It also stores all frames in the parameter server of ROS, under
     `namespace`, and stops at one without a name. Keys that it does not know stop it, too.
-
-    Args:
-        frame: Frame of the camera.
-
-    Returns:
-        Text of the file: translation [m] and unit quaternion.
     """
     ending = "eye_on_hand" if frame.moves else "eye_on_base"
     parameters = {

@@ -227,15 +227,7 @@ def _build_table(
 
 
 def dh_text(table: DHTable, path: PathLike) -> str:
-    """Return the text of a DH file in metres and radians.
-
-    Args:
-        table: DH table to write.
-        path: Path of the file; its ending selects CSV or TOML.
-
-    Returns:
-        Text with all digits.
-    """
+    """Return the text of a DH file in metres and radians."""
     require_usable_names(table.names, os.fspath(path))
     poses = {
         key: pose
@@ -280,13 +272,6 @@ def convert_to_dh(robot: RobotSource, path: PathLike) -> ConvertedRobot:
 
     A table that already has the requested convention is written as it is. Another table is extracted from the
     chain.
-
-    Args:
-        robot: Robot to convert.
-        path: Path of the file; its ending selects CSV or TOML.
-
-    Returns:
-        Text of the file, and notes on what a table cannot hold.
     """
     if robot.table is not None and robot.convention in (None, robot.table.convention):
         return ConvertedRobot(dh_text(robot.table, path))

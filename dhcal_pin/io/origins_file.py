@@ -33,12 +33,6 @@ def without_negligible_moves(chain: Chain) -> Chain:
     """Return a chain whose joint origins are exactly nominal where they moved less than rounding errors.
 
     Translation and rotation of each origin are compared separately with the URDF.
-
-    Args:
-        chain: Chain whose origins may differ from those of its URDF.
-
-    Returns:
-        Chain with the nominal translation or rotation of each origin that moved by at most `MIN_MOVE`.
     """
     nominal = chain.nominal().origins
     origins = chain.origins.copy()
@@ -56,13 +50,6 @@ def joint_origins(chain: Chain) -> tuple[dict[str, Array], Array]:
     The origins of fixed joints before a moving joint stay; the origin of the moving joint takes up the whole
     change. A change of the tip goes to the last fixed joint after the last moving joint. Without such a joint
     it goes to the tool.
-
-    Args:
-        chain: Chain whose origins may differ from those of its URDF.
-
-    Returns:
-        Origin in the parent link by joint name, shape (4, 4) each [m], for changed joints only; and the tool
-        pose in the tip frame, shape (4, 4) [m].
     """
     nominal = chain.nominal()
     changed: dict[str, Array] = {}
@@ -115,15 +102,7 @@ def _changed_origin(joint: UrdfJoint, parent: Array, new: Array, old: Array) -> 
 
 
 def origin_table(chain: Chain) -> Table:
-    """Make a table of the origins of all joints that moved, before and after, as in the URDF.
-
-    Args:
-        chain: Calibrated chain; its URDF is the nominal one.
-
-    Returns:
-        Table with two rows per joint: `xyz` [m] with the distance and `rpy` [rad] with the angle by which the
-        origin moved. Without a moved joint it has no rows.
-    """
+    """Make a table of the origins of all joints that moved, before and after, as in the URDF."""
     changed, _ = joint_origins(without_negligible_moves(chain))
     rows = []
     for joint, _ in path_between(chain.urdf, chain.root, chain.tip):
@@ -150,14 +129,7 @@ def _numbers(values: Array) -> str:
 
 
 def origins_text(chain: Chain) -> str:
-    """Return the CSV text of the origins of all joints on the path to the tip.
-
-    Args:
-        chain: Chain whose origins are written.
-
-    Returns:
-        One row per joint: its name, then x, y, z [m] and roll, pitch, yaw [rad] in its parent link.
-    """
+    """Return the CSV text of the origins of all joints on the path to the tip."""
     changed, _ = joint_origins(without_negligible_moves(chain))
     lines = ["joint," + ",".join(f"{key}[{'m' if key in 'xyz' else 'rad'}]" for key in ORIGIN_KEYS)]
     for joint, _ in path_between(chain.urdf, chain.root, chain.tip):
@@ -168,13 +140,5 @@ def origins_text(chain: Chain) -> str:
 
 
 def convert_to_origins(robot: RobotSource, path: PathLike) -> ConvertedRobot:
-    """Convert a robot to a table of joint origins.
-
-    Args:
-        robot: Robot to convert.
-        path: Path of the file.
-
-    Returns:
-        Text of the file.
-    """
+    """Convert a robot to a table of joint origins."""
     return ConvertedRobot(origins_text(robot.chain))

@@ -49,14 +49,7 @@ def read_rig(path: PathLike) -> Rig:
 
 
 def read_calibrated_rig(path: PathLike) -> Rig | None:
-    """Read the cameras and boards of the sidecar of a calibrated robot.
-
-    Args:
-        path: Sidecar.
-
-    Returns:
-        The rig with the estimated poses; None if the robot was not calibrated with a camera.
-    """
+    """Read the cameras and boards of the sidecar of a calibrated robot."""
     rig = _read_tables(TomlTable.read(path, MAX_SIDECAR_BYTES))
     return rig if rig.cameras and rig.boards else None
 
@@ -79,12 +72,7 @@ def _read_tables(table: TomlTable) -> Rig:
 
 
 def with_poses_of(rig: Rig, other: Rig) -> Rig:
-    """Return a rig whose entries without a pose have those of the same names in another rig.
-
-    Args:
-        rig: Cameras and boards.
-        other: Rig with poses and intrinsics, such as that of a sidecar.
-    """
+    """Return a rig whose entries without a pose have those of the same names in another rig."""
     return replace(
         rig,
         cameras={
@@ -101,19 +89,7 @@ def with_poses_of(rig: Rig, other: Rig) -> Rig:
 
 
 def with_estimates_of(rig: Rig, calibrated: Rig, ends: Mapping[str, str]) -> Rig:
-    """Return a rig whose entries have the estimated poses, lenses and corners of the same names.
-
-    Args:
-        rig: Cameras and boards as a user states them.
-        calibrated: Rig of the sidecar of a calibrated robot.
-        ends: Names of the links "world" and "tip" of the robot.
-
-    Returns:
-        The rig; entries that the sidecar does not have are as they were.
-
-    Raises:
-        InvalidArgumentError: An entry is another camera or board than that of the same name in the sidecar.
-    """
+    """Return a rig whose entries have the estimated poses, lenses and corners of the same names."""
     pairs = [
         ("camera", rig.cameras, calibrated.cameras, _camera_properties),
         ("board", rig.boards, calibrated.boards, _board_properties),
@@ -146,21 +122,7 @@ def _board_properties(board: Board, ends: Mapping[str, str]) -> dict[str, Any]:
 
 
 def only_entry(entries: Mapping[str, Entry], name: str | None, kind: str, source: PathLike) -> Entry:
-    """Return a camera or a board of a rig by name, or the only one.
-
-    Args:
-        entries: Cameras or boards by name.
-        name: Name; None for the only one.
-        kind: "camera" or "board", for messages.
-        source: Path of the rig file, for messages.
-
-    Returns:
-        The camera or the board.
-
-    Raises:
-        InvalidArgumentError: There are several, and none is named.
-        UnknownNameError: The name is unknown.
-    """
+    """Return a camera or a board of a rig by name, or the only one."""
     if name is None and len(entries) == 1:
         return next(iter(entries.values()))
     if name is None:
@@ -299,30 +261,14 @@ def _listed_points(table: TomlTable) -> Array:
 
 
 def rig_text(cameras: Sequence[Camera], boards: Sequence[Board]) -> str:
-    """Return the text of a rig file.
-
-    Args:
-        cameras: Cameras.
-        boards: Boards.
-
-    Returns:
-        TOML that `read_rig` reads back exactly.
-    """
+    """Return the text of a rig file."""
     import tomli_w  # lazy import: only for writing
 
     return tomli_w.dumps(rig_content(cameras, boards))
 
 
 def rig_content(cameras: Sequence[Camera], boards: Sequence[Board]) -> dict[str, Any]:
-    """Return the tables of a rig file.
-
-    Args:
-        cameras: Cameras.
-        boards: Boards.
-
-    Returns:
-        Tables `camera` and `board`, each with one table per name.
-    """
+    """Return the tables of a rig file."""
     content: dict[str, Any] = {"camera": {}, "board": {}}
     for camera in cameras:
         entry: dict[str, Any] = {

@@ -42,14 +42,7 @@ N_READ_BACK_SAMPLES = 50
 
 
 def robot_name(path: PathLike) -> str:
-    """Return the name of a robot from the path of its file.
-
-    Args:
-        path: Path such as `dir/arm.dh.toml`.
-
-    Returns:
-        File name up to the first dot, such as `arm`, with escapes for characters that XML cannot hold.
-    """
+    """Return the name of a robot from the path of its file."""
     return escape_control_characters(Path(path).name.split(".")[0]) or "arm"
 
 
@@ -98,14 +91,7 @@ def _endings(formats: Iterable[RobotFormat]) -> list[str]:
 
 
 def find_format(path: PathLike) -> RobotFormat | None:
-    """Find the format of a robot file by the ending of its name.
-
-    Args:
-        path: Path of the file, which need not exist.
-
-    Returns:
-        Row of `FORMATS`; None if no format has the ending.
-    """
+    """Find the format of a robot file by the ending of its name."""
     name = os.fspath(path).lower()
     by_ending = {
         ending: robot_format
@@ -117,14 +103,7 @@ def find_format(path: PathLike) -> RobotFormat | None:
 
 
 def has_dh_table(path: PathLike) -> bool:
-    """Return whether a path names a robot file that holds a DH table.
-
-    Args:
-        path: Path of the file, which need not exist.
-
-    Returns:
-        True if the robot has one tip only, so that it cannot be chosen by name.
-    """
+    """Return whether a path names a robot file that holds a DH table."""
     robot_format = find_format(path)
     return robot_format is not None and robot_format.read_table is not None
 
@@ -188,20 +167,7 @@ def read_robot(
 def convert_robot(
     source: PathLike, target: PathLike, tip: str | None = None, convention: Convention | None = None
 ) -> ConvertedRobot:
-    """Convert a robot file to another format, chosen by the ending of the target; a URDF can be copied.
-
-    Args:
-        source: File to read.
-        target: File to write; only its name is used.
-        tip: Tip link of a URDF; the deepest leaf if None.
-        convention: Convention of a DH table that is written.
-
-    Returns:
-        Text of the target file, and notes on what it could not hold.
-
-    Raises:
-        InvalidArgumentError: No format has the ending of the target, or a URDF has a DH convention.
-    """
+    """Convert a robot file to another format, chosen by the ending of the target; a URDF can be copied."""
     robot_format = find_format(target)
     if robot_format is None:
         raise InvalidArgumentError(
@@ -234,21 +200,6 @@ def urdf_files(
     compared with the chain. A sidecar is needed only for a base, a tool, a payload, joint errors, instrument
     parameters, an uncertainty or a measured region. One that exists already is always replaced, because it
     would be read with the new URDF.
-
-    Args:
-        chain: Calibrated robot.
-        path: Path of the URDF.
-        instrument: Instrument parameters by name [m or rad].
-        uncertainty: Uncertainty of the calibrated robot.
-        measured_region: Region of joint space that was measured for the calibration.
-        edit: Last change of the URDF, such as more links; the sidecar contains the hash of the result.
-        rig: Cameras and boards with their estimated poses and lenses.
-
-    Returns:
-        Contents by path.
-
-    Raises:
-        DhcalError: The written text would not be the same robot.
     """
     chain = without_negligible_moves(chain)
     origins, tool = joint_origins(chain)

@@ -19,14 +19,7 @@ _METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 
 
 def read_bounds(path: PathLike | None) -> dict[str, tuple[float, float]]:
-    """Read the bounds of parameters.
-
-    Args:
-        path: TOML file of the least and the largest value by parameter name or pattern; None for no bounds.
-
-    Returns:
-        Least and largest value by name or pattern [m or rad]; either may be infinite.
-    """
+    """Read the bounds of parameters."""
     if not path:
         return {}
     table = TomlTable.read(path)
@@ -45,18 +38,7 @@ def read_bounds(path: PathLike | None) -> dict[str, tuple[float, float]]:
 
 
 def read_priors(choice: str | None) -> Priors | None:
-    """Read the prior standard deviations of parameters.
-
-    Args:
-        choice: "default", "none", or a TOML file of standard deviations [m or rad] by parameter name or
-            pattern.
-
-    Returns:
-        The choice itself, or the standard deviations by name or pattern.
-
-    Raises:
-        InvalidArgumentError: The choice is neither a name nor a file.
-    """
+    """Read the prior standard deviations of parameters."""
     if choice is None or choice == "default" or choice == "none":
         return choice
     if not os.path.exists(choice):
@@ -75,18 +57,7 @@ def read_priors(choice: str | None) -> Priors | None:
 
 
 def parse_payload(text: str, label: str = "--payload") -> Payload:
-    """Parse a mass and its centre in the tip frame.
-
-    Args:
-        text: Text such as `5kg` or `5kg@0,0,80mm`.
-        label: Name of the option, for messages.
-
-    Returns:
-        The payload.
-
-    Raises:
-        InvalidArgumentError: The text has another form, or a value is out of range.
-    """
+    """Parse a mass and its centre in the tip frame."""
     match = _PAYLOAD.fullmatch(text.replace(" ", ""))
     if not match:
         raise InvalidArgumentError(

@@ -21,17 +21,7 @@ def _folders() -> tuple[Path, Path]:
 
 
 def shipped_file(name: str) -> Path:
-    """Find a file that ships with the package.
-
-    Args:
-        name: Name of the file, such as `sim_6dof.dh.toml`.
-
-    Returns:
-        Path of the file, in the installed package or in the source tree.
-
-    Raises:
-        UnknownNameError: No such file ships with the package.
-    """
+    """Find a file that ships with the package."""
     for folder in _folders():
         if os.path.isfile(folder / name):
             return folder / name
@@ -39,18 +29,7 @@ def shipped_file(name: str) -> Path:
 
 
 def resolve_robot_file(path: PathLike) -> str:
-    """Return the path of a robot file, also for `example:NAME` and for a robot that ships with the package.
-
-    Args:
-        path: Path of a file, `example:NAME`, or the name of a file such as `flange.urdf`, which is looked
-            for in the current folder first.
-
-    Returns:
-        Path of the file, which need not exist.
-
-    Raises:
-        UnknownNameError: There is no robot `NAME` of example-robot-data.
-    """
+    """Return the path of a robot file, also for `example:NAME` and for a robot that ships."""
     found = resolve_robot_path(path)
     if os.path.dirname(found) or os.path.exists(found):
         return found
@@ -59,13 +38,6 @@ def resolve_robot_file(path: PathLike) -> str:
 
 
 def shipped_names(ending: str) -> list[str]:
-    """List the files of one type that ship with the package.
-
-    Args:
-        ending: End of the file names, such as `.study.toml`.
-
-    Returns:
-        Sorted names without the ending.
-    """
+    """List the files of one type that ship with the package."""
     paths = (path for folder in _folders() for path in folder.glob(f"*{ending}"))
     return sorted({path.name.removesuffix(ending) for path in paths})

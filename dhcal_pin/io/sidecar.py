@@ -126,26 +126,12 @@ _MEASURED_HEADER = """\
 
 
 def sidecar_path(path: PathLike) -> str:
-    """Return the path of the sidecar of a robot.
-
-    Args:
-        path: Path of the robot, such as `arm.urdf`.
-
-    Returns:
-        Path with another ending, such as `arm.calibration.toml`.
-    """
+    """Return the path of the sidecar of a robot."""
     return f"{os.path.splitext(os.fspath(path))[0]}.calibration.toml"
 
 
 def existing_sidecar(path: PathLike) -> str | None:
-    """Return the path of the sidecar of a robot if the file exists.
-
-    Args:
-        path: Path of the robot.
-
-    Returns:
-        Path of the sidecar; None if there is none.
-    """
+    """Return the path of the sidecar of a robot if the file exists."""
     complete_interrupted_save(path)
     return sidecar_path(path) if os.path.exists(sidecar_path(path)) else None
 
@@ -154,19 +140,7 @@ def existing_sidecar(path: PathLike) -> str | None:
 
 
 def with_sidecar(chain: Chain, path: PathLike) -> Chain:
-    """Return a chain with the frames, the payload and the joint errors of a sidecar.
-
-    Args:
-        chain: Robot as read from its URDF or DH table.
-        path: Path of the sidecar.
-
-    Returns:
-        The chain. If its tip is not the tip of the sidecar, its tool stays. Unknown links and joints raise
-        an `UnknownNameError`.
-
-    Raises:
-        FileFormatError: The sidecar is invalid, or its payload is carried by another tip.
-    """
+    """Return a chain with the frames, the payload and the joint errors of a sidecar."""
     table = TomlTable.read(path, MAX_SIDECAR_BYTES)
     tip = table.text("tip", chain.tip)
     if tip not in chain.urdf.links:
@@ -198,17 +172,7 @@ def with_sidecar(chain: Chain, path: PathLike) -> Chain:
 
 
 def read_tool(path: PathLike) -> Array:
-    """Read the pose of a tool.
-
-    Args:
-        path: TOML file with `xyz_m` and `rotvec_rad`, or a sidecar with them in the table `[tool]`.
-
-    Returns:
-        Pose of the tool in the tip link, shape (4, 4) [m].
-
-    Raises:
-        FileFormatError: The file has neither.
-    """
+    """Read the pose of a tool."""
     table = TomlTable.read(path, MAX_SIDECAR_BYTES)
     if "tool" in table:
         return read_pose(table.table("tool"))
@@ -338,31 +302,13 @@ def _coefficient(table: TomlTable, key: str) -> float:
 
 
 def read_instrument(path: PathLike) -> dict[str, float]:
-    """Read the table [instrument] of a sidecar or of a file of surveyed values.
-
-    Args:
-        path: TOML file.
-
-    Returns:
-        Values of instrument parameters by name [m or rad]; empty without the table.
-    """
+    """Read the table [instrument] of a sidecar or of a file of surveyed values."""
     table = TomlTable.read(path, MAX_SIDECAR_BYTES).table("instrument")
     return {name: table.number(name) for name in table.keys()}
 
 
 def read_uncertainty(path: PathLike, chain: Chain) -> Uncertainty | None:
-    """Read the table [uncertainty] of a sidecar.
-
-    Args:
-        path: The sidecar.
-        chain: Calibrated robot, as read with the sidecar.
-
-    Returns:
-        Uncertainty of the robot; None without the table.
-
-    Raises:
-        UnknownNameError: A term is unknown.
-    """
+    """Read the table [uncertainty] of a sidecar."""
     document = TomlTable.read(path, MAX_SIDECAR_BYTES)
     if "uncertainty" not in document:
         return None
@@ -397,18 +343,7 @@ def read_uncertainty(path: PathLike, chain: Chain) -> Uncertainty | None:
 
 
 def read_measured_region(path: PathLike, chain: Chain) -> MeasuredRegion | None:
-    """Read the table [measured] of a sidecar.
-
-    Args:
-        path: The sidecar.
-        chain: Calibrated robot, as read with the sidecar.
-
-    Returns:
-        Region of joint space that was measured for the calibration; None without the table.
-
-    Raises:
-        FileFormatError: The table is invalid or belongs to a robot with other joints.
-    """
+    """Read the table [measured] of a sidecar."""
     document = TomlTable.read(path, MAX_SIDECAR_BYTES)
     if "measured" not in document:
         return None
@@ -464,21 +399,7 @@ def sidecar_text(
     *,
     required: bool = False,
 ) -> str | None:
-    """Return the text of the sidecar of a calibrated robot.
-
-    Args:
-        chain: Calibrated robot, whose base, payload and joint errors are written.
-        tool: Pose of the measured point in the tip frame, shape (4, 4) [m].
-        urdf: Content of the URDF that is written with the sidecar; its hash connects both.
-        instrument: Instrument parameters by name [m or rad].
-        uncertainty: Uncertainty of the robot.
-        measured_region: Region of joint space that was measured.
-        rig: Cameras and boards with their estimated poses and lenses.
-        required: Return the text even if the URDF alone holds everything.
-
-    Returns:
-        TOML text with explanations at the top; None if the URDF alone holds everything.
-    """
+    """Return the text of the sidecar of a calibrated robot."""
     tables = {
         "payload": _payload_content(chain.payload),
         "joint": _transmission_content(chain),

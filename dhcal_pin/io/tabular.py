@@ -37,19 +37,7 @@ _REFUSED_TOML = {
 
 
 def read_text(path: PathLike, encoding: str = "utf-8", max_bytes: int = MAX_TEXT_BYTES) -> str:
-    """Read a text file.
-
-    Args:
-        path: Path of the file.
-        encoding: Name of the encoding.
-        max_bytes: Largest size of the file [byte].
-
-    Returns:
-        Content of the file, without a byte order mark.
-
-    Raises:
-        FileFormatError: The file cannot be read, is too large, or has bytes that the encoding does not allow.
-    """
+    """Read a text file."""
     try:
         with open(path, "rb") as file:
             data = file.read(max_bytes + 1)
@@ -69,27 +57,12 @@ def read_text(path: PathLike, encoding: str = "utf-8", max_bytes: int = MAX_TEXT
 
 
 def size_text(size: int) -> str:
-    """Return a size in MiB, or in KiB below one MiB.
-
-    Args:
-        size: Size [byte].
-    """
+    """Return a size in MiB, or in KiB below one MiB."""
     return f"{size >> 20} MiB" if size >> 20 else f"{size >> 10} KiB"
 
 
 def read_toml(path: PathLike, max_bytes: int = MAX_TOML_BYTES) -> dict[str, Any]:
-    """Read a TOML file.
-
-    Args:
-        path: Path of the file.
-        max_bytes: Largest size of the file [byte].
-
-    Returns:
-        Its top-level table. Do not change it: a second reading of the same text returns the same table.
-
-    Raises:
-        FileFormatError: The file cannot be read, is too large or is not TOML.
-    """
+    """Read a TOML file."""
     text = read_text(path, max_bytes=max_bytes)
     rest = re.sub(_ENCODED_ARRAY, lambda match: "\n" * match[0].count("\n"), text)
     if len(rest) > MAX_TOML_BYTES:
@@ -117,15 +90,7 @@ def _parse_toml(text: str) -> dict[str, Any]:
 
 
 def require_usable_names(names: Sequence[str], source: str) -> None:
-    """Require names that can be the header of a CSV column.
-
-    Args:
-        names: Names of joints.
-        source: File of the robot, for messages.
-
-    Raises:
-        FileFormatError: A name is empty, is not printable, or has a character with a meaning in a header.
-    """
+    """Require names that can be the header of a CSV column."""
     for name in names:
         is_plain = (
             name and name == name.strip() and name.isprintable() and not _RESERVED_CHARACTERS & set(name)
@@ -139,34 +104,14 @@ def require_usable_names(names: Sequence[str], source: str) -> None:
 
 
 def parse_number(text: str) -> float:
-    """Parse the number in a cell.
-
-    Args:
-        text: Text of the cell.
-
-    Returns:
-        The number, possibly infinite or not a number.
-
-    Raises:
-        ValueError: The text is not a number. Underscores such as in 1_000 are refused, although Python reads
-            them.
-    """
+    """Parse the number in a cell."""
     if "_" in text:
         raise ValueError(text)
     return float(text)
 
 
 def csv_text(columns: Mapping[str, Iterable[Any]], comments: Iterable[str] = ()) -> str:
-    """Return the text of a CSV file.
-
-    Args:
-        columns: Values by header, all of one length m. Numbers are written with all digits, None as an empty
-            cell. A text that spreadsheets would execute as a formula gets an apostrophe before it.
-        comments: Lines that precede the header, each after a number sign and a space.
-
-    Returns:
-        Comment lines, header and m rows.
-    """
+    """Return the text of a CSV file."""
     out = io.StringIO()
     out.writelines(f"# {escape_control_characters(comment)}\n" for comment in comments)
     writer = csv.writer(out, lineterminator="\n")

@@ -44,16 +44,7 @@ class TomlTable:
     """
 
     def __init__(self, path: PathLike, raw: object, name: str = ""):
-        """Wrap a table.
-
-        Args:
-            path: Path of the file, for messages.
-            raw: Content of the table.
-            name: Name of the table in messages; empty for the top level.
-
-        Raises:
-            FileFormatError: The content is not a table.
-        """
+        """Wrap a table."""
         self.path, self.name = os.fspath(path), name
         if not isinstance(raw, dict):
             raise FileFormatError(
@@ -65,15 +56,7 @@ class TomlTable:
 
     @classmethod
     def read(cls, path: PathLike, max_bytes: int = MAX_TOML_BYTES) -> TomlTable:
-        """Read the top level of a TOML file.
-
-        Args:
-            path: Path of the file.
-            max_bytes: Largest size of the file [byte].
-
-        Returns:
-            The table of all top-level keys.
-        """
+        """Read the top level of a TOML file."""
         return cls(path, read_toml(path, max_bytes))
 
     @property
@@ -91,31 +74,11 @@ class TomlTable:
         return list(self._raw)
 
     def error(self, key: str, expected: str) -> FileFormatError:
-        """Build the error of a wrong value.
-
-        Args:
-            key: Key of the value.
-            expected: What is expected, such as "expected a number" or "choose from a, b".
-
-        Returns:
-            Exception that names file, table, key and value.
-        """
+        """Build the error of a wrong value."""
         return FileFormatError(f"{self.where}: {key} = {quote(self._raw[key])}; {expected}")
 
     def get(self, key: str, default: Any = None, *, expected: str = "a value") -> Any:
-        """Return a value of any type.
-
-        Args:
-            key: Key of the value.
-            default: Value of an absent key; None if the key is required.
-            expected: What the message about an absent key says is expected.
-
-        Returns:
-            The value.
-
-        Raises:
-            FileFormatError: The key is required and absent.
-        """
+        """Return a value of any type."""
         if key in self:
             return self._raw[key]
         if default is not None:
@@ -136,19 +99,7 @@ class TomlTable:
         at_most: float = _MAX_NUMBER,
         expected: str = "",
     ) -> float:
-        """Return a finite number.
-
-        Args:
-            key: Key of the value.
-            default: Number of an absent key; None if the key is required.
-            at_least: Smallest allowed number.
-            above: Number that must be exceeded.
-            at_most: Largest allowed number.
-            expected: What a message says is expected; the range if empty.
-
-        Returns:
-            The number; an absent key or a number out of the range is an error.
-        """
+        """Return a finite number."""
         expected = expected or _range_text(at_least, above, at_most)
         value = self.get(key, default, expected=expected)
         if not is_number(value) or not at_least <= value <= at_most or (above is not None and value <= above):
@@ -156,17 +107,7 @@ class TomlTable:
         return float(value)
 
     def value(self, key: str, kind: type[T], default: T | None = None, *, expected: str = "") -> T:
-        """Return a text, a whole number or a truth value.
-
-        Args:
-            key: Key of the value.
-            kind: Type of the value: `str`, `int` or `bool`.
-            default: Value of an absent key; None if the key is required.
-            expected: What a message says is expected; the type if empty.
-
-        Returns:
-            The value; an absent key or another type is an error.
-        """
+        """Return a text, a whole number or a truth value."""
         expected = expected or _TYPE_NAMES[kind]
         value = self.get(key, default, expected=expected)
         if type(value) is not kind:
@@ -174,29 +115,11 @@ class TomlTable:
         return value
 
     def text(self, key: str, default: str | None = None, *, expected: str = "") -> str:
-        """Return a text.
-
-        Args:
-            key: Key of the value.
-            default: Text of an absent key; None if the key is required.
-            expected: What a message says is expected; "a text in quotes" if empty.
-
-        Returns:
-            The text; an absent key or another type is an error.
-        """
+        """Return a text."""
         return self.value(key, str, default, expected=expected)
 
     def choice(self, key: str, choices: Iterable[str], default: str | None = None) -> str:
-        """Return one of several texts.
-
-        Args:
-            key: Key of the value.
-            choices: Allowed texts.
-            default: Text of an absent key; None if the key is required.
-
-        Returns:
-            The text; an absent key or another text is an error.
-        """
+        """Return one of several texts."""
         choices = list(choices)
         # Micro has two code points in Unicode: units are listed in their ASCII spelling only.
         names = ", ".join(f'"{choice}"' for choice in choices if choice.isascii())
@@ -206,19 +129,7 @@ class TomlTable:
         return value
 
     def array(self, key: str, default: Sequence[Any] | None = None, *, size: int | None = None) -> list[Any]:
-        """Return a list of any values.
-
-        Args:
-            key: Key of the list.
-            default: List of an absent key; None if the key is required.
-            size: Required number of entries; None for one or more.
-
-        Returns:
-            The entries.
-
-        Raises:
-            FileFormatError: The key is absent, or its value is not a list of this size.
-        """
+        """Return a list of any values."""
         expected = "a list in brackets" + ("" if size is None else f" with {size} entries")
         value = self.get(key, default, expected=expected)
         if isinstance(value, str) or not isinstance(value, Sequence) or not value:
@@ -230,17 +141,7 @@ class TomlTable:
     def vector(
         self, key: str, size: int, default: Sequence[float] | None = None, *, at_most: float = _MAX_NUMBER
     ) -> list[float]:
-        """Return a list of finite numbers.
-
-        Args:
-            key: Key of the list.
-            size: Number of entries.
-            default: List of an absent key; None if the key is required.
-            at_most: Largest allowed absolute value.
-
-        Returns:
-            The numbers; an absent key or another list is an error.
-        """
+        """Return a list of finite numbers."""
         limit = f" up to ±{at_most:g}" if at_most < _MAX_NUMBER else ""
         expected = f"{size} numbers{limit}, such as {[0.0] * size}"
         value = self.get(key, default, expected=expected)
@@ -254,44 +155,21 @@ class TomlTable:
         return [float(entry) for entry in value]
 
     def table(self, key: str, *, required: bool = False) -> TomlTable:
-        """Return a table of this table.
-
-        Args:
-            key: Key of the table.
-            required: Whether an absent table is an error; otherwise it is empty.
-
-        Returns:
-            The table; a value of another type is an error.
-        """
+        """Return a table of this table."""
         outer = self.name.removeprefix("[").removesuffix("]")
         name = f"[{outer}.{key}]" if outer else f"[{key}]"
         raw = self.get(key, None if required else {}, expected=f"a table {name}")
         return TomlTable(self.path, raw, name)
 
     def tables(self, key: str, *, expected: str) -> list[TomlTable]:
-        """Return an array of tables, one or more.
-
-        Args:
-            key: Key of the array, written `[[key]]` before each table.
-            expected: What a message says is expected.
-
-        Returns:
-            The tables; their names in messages are the key and their number, counted from 1.
-
-        Raises:
-            FileFormatError: The value is not a list of tables, or is empty.
-        """
+        """Return an array of tables, one or more."""
         value = self.get(key, [], expected=expected)
         if not isinstance(value, list) or not value or not all(isinstance(entry, dict) for entry in value):
             raise FileFormatError(f"{self.where}: no [[{key}]] table; write {expected}")
         return [TomlTable(self.path, entry, f"{key} {number}") for number, entry in enumerate(value, 1)]
 
     def finish(self) -> None:
-        """Raise an error if the table has a key that was not asked for.
-
-        Raises:
-            FileFormatError: The message names the key and the allowed keys.
-        """
+        """Raise an error if the table has a key that was not asked for."""
         for key in self._raw:
             if key not in self._known_keys:
                 allowed = ", ".join(self._known_keys)
@@ -299,14 +177,7 @@ class TomlTable:
 
 
 def is_number(value: object) -> bool:
-    """Return whether a TOML value is a finite number.
-
-    Args:
-        value: Value of a key or entry of a list.
-
-    Returns:
-        False for a truth value, which Python counts as a number.
-    """
+    """Return whether a TOML value is a finite number."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _MAX_NUMBER
 
 
@@ -322,14 +193,7 @@ def _range_text(at_least: float, above: float | None, at_most: float) -> str:
 
 
 def read_pose(table: TomlTable) -> Array:
-    """Read a pose from the keys xyz_m and rotvec_rad.
-
-    Args:
-        table: Table with no other keys; an absent key means zero.
-
-    Returns:
-        Pose, shape (4, 4) [m].
-    """
+    """Read a pose from the keys xyz_m and rotvec_rad."""
     zero = (0.0, 0.0, 0.0)
     xyz, rotvec = (table.vector(key, 3, zero, at_most=_MAX_POSE_VALUE) for key in ("xyz_m", "rotvec_rad"))
     table.finish()
@@ -337,12 +201,5 @@ def read_pose(table: TomlTable) -> Array:
 
 
 def pose_content(pose: Array) -> dict[str, list[float]]:
-    """Return the keys and values of a pose, the inverse of `read_pose`.
-
-    Args:
-        pose: Pose, shape (4, 4) [m].
-
-    Returns:
-        Position [m] and rotation vector [rad].
-    """
+    """Return the keys and values of a pose, the inverse of `read_pose`."""
     return {"xyz_m": pose[:3, 3].tolist(), "rotvec_rad": se3.log3(pose[:3, :3]).tolist()}

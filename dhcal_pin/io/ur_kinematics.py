@@ -46,19 +46,7 @@ _HASH_DIGITS = 15
 
 
 def ur_kinematics(chain: Chain) -> dict[str, dict[str, float]]:
-    """Compute the origins of a UR arm's joints, each with its joint axis along z.
-
-    Args:
-        chain: UR arm, possibly with a prefix before its joint names; its tip is on the axis of the last
-            joint.
-
-    Returns:
-        x, y, z [m] and roll, pitch, yaw [rad] by the name of the origin: the `kinematics` mapping of the
-        file.
-
-    Raises:
-        InvalidArgumentError: The joints are not those of a UR arm, or the tip is not on the last axis.
-    """
+    """Compute the origins of a UR arm's joints, each with its joint axis along z."""
     names = [
         name[len(name) - len(ur_name) :] for name, ur_name in zip(chain.joint_names, UR_JOINTS, strict=False)
     ]
@@ -86,15 +74,7 @@ def ur_kinematics(chain: Chain) -> dict[str, dict[str, float]]:
 
 
 def ur_kinematics_text(chain: Chain) -> str:
-    """Return the text of a UR kinematics file.
-
-    Args:
-        chain: UR arm, as for `ur_kinematics`.
-
-    Returns:
-        YAML text with all digits. Its hash is computed from the numbers; it is not the hash of the
-        controller.
-    """
+    """Return the text of a UR kinematics file."""
     lines = ["kinematics:"]
     for name, origin in ur_kinematics(chain).items():
         lines += [f"  {name}:", *(f"    {key}: {_yaml_number(value)}" for key, value in origin.items())]
@@ -109,17 +89,7 @@ def _yaml_number(value: float) -> str:
 
 
 def read_ur_kinematics(path: PathLike) -> DHTable:
-    """Read a UR kinematics file.
-
-    Args:
-        path: YAML file.
-
-    Returns:
-        Modified DH table with the joints of `UR_JOINTS`.
-
-    Raises:
-        FileFormatError: The file is not YAML, or lacks an origin.
-    """
+    """Read a UR kinematics file."""
     import yaml  # lazy import: slow to import, and few commands read YAML
 
     source = os.fspath(path)
@@ -159,13 +129,5 @@ def _origin_number(value: Any, where: str) -> float:
 
 
 def convert_to_ur_kinematics(robot: RobotSource, path: PathLike) -> ConvertedRobot:
-    """Convert a robot to a UR kinematics file.
-
-    Args:
-        robot: Robot to convert.
-        path: Path of the file.
-
-    Returns:
-        Text of the file.
-    """
+    """Convert a robot to a UR kinematics file."""
     return ConvertedRobot(ur_kinematics_text(robot.chain))

@@ -12,15 +12,7 @@ from .base import Measurement
 
 
 def require_chain(value: Any, name: str = "chain") -> None:
-    """Raise an error if a value is not a chain.
-
-    Args:
-        value: Value that was passed.
-        name: Name of the argument.
-
-    Raises:
-        InvalidArgumentError: If it is not a chain.
-    """
+    """Raise an error if a value is not a chain."""
     if isinstance(value, Chain):
         return
     hint = ""
@@ -34,18 +26,7 @@ def require_chain(value: Any, name: str = "chain") -> None:
 def as_measurements(
     value: Measurement | Iterable[Measurement], name: str = "data"
 ) -> tuple[Measurement, ...]:
-    """Return one measurement or several as a tuple.
-
-    Args:
-        value: Value that was passed.
-        name: Name of the argument.
-
-    Returns:
-        The measurements.
-
-    Raises:
-        InvalidArgumentError: If it is anything else.
-    """
+    """Return one measurement or several as a tuple."""
     if isinstance(value, Measurement):
         return (value,)
     is_collection = isinstance(value, Iterable) and not isinstance(value, str | bytes)

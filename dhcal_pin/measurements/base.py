@@ -408,17 +408,7 @@ _Kind = TypeVar("_Kind", bound=Measurement)
 
 
 def concatenate(items: Sequence[_Kind]) -> _Kind:
-    """Join the samples of several measurement objects.
-
-    Args:
-        items: Objects of one kind, which differ in their samples only.
-
-    Returns:
-        One object with all samples in the order of `items`.
-
-    Raises:
-        InvalidArgumentError: The objects are of different kinds, or differ in more than their samples.
-    """
+    """Join the samples of several measurement objects."""
     first = items[0]
     common = [field.name for field in fields(first) if field.name not in first.sample_fields]
     for item in items[1:]:
@@ -440,12 +430,7 @@ def _is_equal(a: Any, b: Any) -> bool:
 
 
 def point_parameters(prefix: str, point: Array) -> tuple[InstrumentParameter, ...]:
-    """Return the three coordinates of an unknown point as instrument parameters.
-
-    Args:
-        prefix: First part of the names; the second is x, y or z.
-        point: Initial position, (3,) [m].
-    """
+    """Return the three coordinates of an unknown point as instrument parameters."""
     return tuple(
         InstrumentParameter(f"{prefix}.{axis}", "m", float(value), POINT_PRIOR)
         for axis, value in zip("xyz", point, strict=True)
@@ -453,11 +438,7 @@ def point_parameters(prefix: str, point: Array) -> tuple[InstrumentParameter, ..
 
 
 def format_sigma(*sigmas: tuple[Array, float, str]) -> str:
-    """Return a text with standard deviations for `repr`.
-
-    Args:
-        *sigmas: Standard deviations, factor to the shown unit, and name of that unit.
-    """
+    """Return a text with standard deviations for `repr`."""
     texts = []
     for values, factor, unit in sigmas:
         extremes = (values.min(), values.max()) if values.size else ()

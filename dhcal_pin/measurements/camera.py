@@ -645,15 +645,7 @@ class CameraCorners(Measurement):
 
 
 def simulated_rig(chain: Chain, q: Array) -> Rig:
-    """Return two fixed cameras that look at the tool from two sides, and six points on the tool.
-
-    Args:
-        chain: Robot.
-        q: Joint positions that are simulated, (m, n) [rad or m].
-
-    Returns:
-        Rig with the poses of the cameras and the board.
-    """
+    """Return two fixed cameras that look at the tool from two sides, and six points on the tool."""
     tools = chain.poses(q)[:, :3, 3] if len(q) else np.zeros((1, 3))
     centre = tools.mean(0)
     distance = _DISTANCE * max(1.0, float(np.abs(tools - centre).max()))
@@ -675,14 +667,7 @@ def simulated_rig(chain: Chain, q: Array) -> Rig:
 
 
 def camera_poses_of_links(mounts: Sequence[Any]) -> Array:
-    """Return the rotations of the links of mounts in the frames of their ends.
-
-    Args:
-        mounts: Mounts of cameras or boards.
-
-    Returns:
-        Rotations, shape (c, 3, 3).
-    """
+    """Return the rotations of the links of mounts in the frames of their ends."""
     return np.array([mount.link_pose[:3, :3] for mount in mounts])
 
 
@@ -699,14 +684,7 @@ def _end_poses(parts: Sequence[Array], mounts: Sequence[Any]) -> tuple[Array, Ar
 
 
 def left_jacobian(rotvec: Array) -> Array:
-    """Compute the left Jacobian of SO(3): exp(φ + δ) = exp(Jl·δ)·exp(φ) to first order.
-
-    Args:
-        rotvec: Rotation vector φ, shape (3,) [rad].
-
-    Returns:
-        Matrix Jl, shape (3, 3).
-    """
+    """Compute the left Jacobian of SO(3): exp(φ + δ) = exp(Jl·δ)·exp(φ) to first order."""
     _, second, third = se3.exp_coefficients(np.asarray(np.linalg.norm(rotvec)))
     k = se3.skew(rotvec)
     return np.eye(3) + second * k + third * (k @ k)

@@ -28,29 +28,17 @@ PlausibleRange = Callable[[float], tuple[float, float]]
 
 
 def displacement_range(reach: float) -> tuple[float, float]:
-    """Return the plausible distances [m] between two positions of the tool point.
-
-    Args:
-        reach: Radius of the sphere that the tip can reach [m].
-    """
+    """Return the plausible distances [m] between two positions of the tool point."""
     return 0.0, 2 * (reach + MAX_TOOL_OFFSET)
 
 
 def point_distance_range(reach: float) -> tuple[float, float]:
-    """Return the plausible distances [m] between two points that the tool can touch.
-
-    Args:
-        reach: Radius of the sphere that the tip can reach [m].
-    """
+    """Return the plausible distances [m] between two points that the tool can touch."""
     return MIN_LENGTH, 2 * (reach + MAX_TOOL_OFFSET)
 
 
 def instrument_range(reach: float) -> tuple[float, float]:
-    """Return the plausible distances [m] between the tool point and a part of an instrument.
-
-    Args:
-        reach: Radius of the sphere that the tip can reach [m].
-    """
+    """Return the plausible distances [m] between the tool point and a part of an instrument."""
     return MIN_LENGTH, reach + MAX_INSTRUMENT_DISTANCE
 
 
@@ -90,17 +78,7 @@ class Column:
 def length_columns(
     argument: str, *names: str, is_implied: bool = False, plausible_range: PlausibleRange | None = None
 ) -> tuple[Column, ...]:
-    """Declare columns of lengths that fill one argument of the constructor.
-
-    Args:
-        argument: Name of the constructor's argument.
-        *names: Names of the columns.
-        is_implied: Whether the lengths are zero by definition, so that files have only their sigmas.
-        plausible_range: Plausible values; None if they are not checked by themselves.
-
-    Returns:
-        One column per name.
-    """
+    """Declare columns of lengths that fill one argument of the constructor."""
     return tuple(
         Column(name, "length", argument, is_implied=is_implied, plausible_range=plausible_range)
         for name in names
@@ -108,55 +86,22 @@ def length_columns(
 
 
 def angle_columns(argument: str, *names: str) -> tuple[Column, ...]:
-    """Declare columns of angles that fill one argument of the constructor.
-
-    Args:
-        argument: Name of the constructor's argument.
-        *names: Names of the columns.
-
-    Returns:
-        One column per name.
-    """
+    """Declare columns of angles that fill one argument of the constructor."""
     return tuple(Column(name, "angle", argument) for name in names)
 
 
 def pixel_columns(argument: str, *names: str) -> tuple[Column, ...]:
-    """Declare columns of image coordinates that fill one argument of the constructor.
-
-    Args:
-        argument: Name of the constructor's argument.
-        *names: Names of the columns.
-
-    Returns:
-        One column per name.
-    """
+    """Declare columns of image coordinates that fill one argument of the constructor."""
     return tuple(Column(name, "pixel", argument) for name in names)
 
 
 def text_column(argument: str, name: str, is_common: bool = False) -> tuple[Column, ...]:
-    """Declare a column of text.
-
-    Args:
-        argument: Name of the constructor's argument.
-        name: Name of the column.
-        is_common: Whether all rows of a file must have the same text.
-
-    Returns:
-        The column, as a tuple that can be added to others.
-    """
+    """Declare a column of text."""
     return (Column(name, "text", argument, is_common=is_common),)
 
 
 def remark_column(argument: str, name: str) -> tuple[Column, ...]:
-    """Declare a column of texts that only people need.
-
-    Args:
-        argument: Name of the constructor's argument.
-        name: Name of the column.
-
-    Returns:
-        The column, as a tuple that can be added to others.
-    """
+    """Declare a column of texts that only people need."""
     return (Column(name, "remark", argument),)
 
 
@@ -164,9 +109,6 @@ def file_columns(columns: Sequence[Column]) -> dict[str, str]:
     """Return the quantity of each column of a file, in the order in which files are written.
 
     The columns of standard deviations follow the last numeric column.
-
-    Args:
-        columns: Columns that a measurement kind declares.
     """
     sigmas = {column.sigma_name: column.quantity for column in columns if column.is_numeric}
     last = max((i for i, column in enumerate(columns) if column.is_numeric), default=-1)
@@ -180,43 +122,19 @@ def file_columns(columns: Sequence[Column]) -> dict[str, str]:
 
 
 def stack_columns(values: Mapping[str, Any], names: Iterable[str]) -> Array:
-    """Stack numeric columns of a file.
-
-    Args:
-        values: Columns of a file by name, (m,) each.
-        names: Names of the columns to stack.
-
-    Returns:
-        Shape (m,) for one name, (m, k) for several.
-    """
+    """Stack numeric columns of a file."""
     columns = [values[name] for name in names]
     return columns[0] if len(columns) == 1 else np.stack(columns, -1)
 
 
 def stack_sigmas(values: Mapping[str, Any], columns: Iterable[Column]) -> Array | None:
-    """Stack the standard deviations of some columns of a file.
-
-    Args:
-        values: Columns of a file by name, (m,) each.
-        columns: Numeric columns whose standard deviations are wanted.
-
-    Returns:
-        Shape (m,) for one column, (m, k) for several; None if the file has no standard deviations.
-    """
+    """Stack the standard deviations of some columns of a file."""
     names = [column.sigma_name for column in columns]
     return stack_columns(values, names) if names and all(name in values for name in names) else None
 
 
 def common_text(texts: Sequence[str], where: str) -> str:
-    """Return the text that all rows of a column have.
-
-    Args:
-        texts: Texts of the rows, (m,).
-        where: Name of the column, for the error message.
-
-    Raises:
-        InvalidArgumentError: The texts differ.
-    """
+    """Return the text that all rows of a column have."""
     distinct = sorted(set(texts))
     if len(distinct) != 1:
         raise InvalidArgumentError(

@@ -57,14 +57,7 @@ class PointContact(PointMeasurement):
     sample_fields = (*PointMeasurement.sample_fields, "label")
 
     def __init__(self, q: ArrayLike, points: Sequence[str], sigma: ArrayLike | None = None) -> None:
-        """Check and store contacts with named points.
-
-        Args:
-            q: Joint positions, (m, n) [rad or m].
-            points: Name of the point that each sample touches, (m,).
-            sigma: Standard deviations of the contact, one number or (m, 3) [m]; estimated with the fit if
-                None.
-        """
+        """Check and store contacts with named points."""
         q = validated_joint_positions(q, "PointContact")
         names, label = encode_labels(points, len(q), "PointContact: points")
         parameters = tuple(u for name in names for u in point_parameters(f"point_{name}", _ORIGIN))
@@ -230,14 +223,7 @@ class PlaneContact(PointMeasurement):
     COLUMNS = text_column("name", "plane", is_common=True) + length_columns("", "plane", is_implied=True)
 
     def __init__(self, q: ArrayLike, sigma: ArrayLike | None = None, name: str = "1") -> None:
-        """Check and store contacts with a plane.
-
-        Args:
-            q: Joint positions, (m, n) [rad or m].
-            sigma: Standard deviations along the normal, one number or (m,) [m]; estimated with the fit if
-                None.
-            name: Name of the plane.
-        """
+        """Check and store contacts with a plane."""
         q = validated_joint_positions(q, "PlaneContact")
         parameters = tuple(
             InstrumentParameter(f"plane_{name}.{parameter}", unit, 0.0, POINT_PRIOR, is_local=True)

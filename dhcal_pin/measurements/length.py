@@ -31,15 +31,7 @@ MIN_DIVISOR = 1e-12
 
 
 def norm_and_direction(vectors: Array, axis: int) -> tuple[Array, Array]:
-    """Return the norms of vectors and the unit vectors along them.
-
-    Args:
-        vectors: Vectors along one axis [m].
-        axis: Axis of the three components.
-
-    Returns:
-        Norms without that axis, and unit vectors; zero vectors stay zero.
-    """
+    """Return the norms of vectors and the unit vectors along them."""
     norm = np.linalg.norm(vectors, axis=axis)
     return norm, vectors / np.expand_dims(np.maximum(norm, MIN_DIVISOR), axis)
 

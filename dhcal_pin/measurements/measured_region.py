@@ -58,15 +58,7 @@ class MeasuredRegion:
 
     @classmethod
     def from_configurations(cls, q: Array, is_prismatic: Array) -> MeasuredRegion:
-        """Describe the region of measured configurations.
-
-        Args:
-            q: Different configurations, (m, n) [rad or m], m > 0.
-            is_prismatic: Whether each joint is prismatic, (n,).
-
-        Returns:
-            The region; its reach is its radius.
-        """
+        """Describe the region of measured configurations."""
         region = cls(is_prismatic, q.min(0), q.max(0), q.std(0), q, 0.0, 0.0)
         drawn = _is_drawn(len(q))
         if drawn.all():
@@ -77,16 +69,7 @@ class MeasuredRegion:
         return replace(region, radius=radius, reach=radius)
 
     def with_reach(self, q: Array, is_left_out: Array) -> MeasuredRegion:
-        """Determine the reach from parts of the region that were left out in turn.
-
-        Args:
-            q: The different configurations, (m, n) [rad or m].
-            is_left_out: Whether each part contains each configuration, (k, m).
-
-        Returns:
-            Region whose reach is the 95th percentile of the distances of the left-out configurations from the
-            others.
-        """
+        """Determine the reach from parts of the region that were left out in turn."""
         distances = [
             replace(self, configurations=q[~mask][_is_drawn(int(np.sum(~mask)))]).distances(_thinned(q[mask]))
             for mask in is_left_out
@@ -96,14 +79,7 @@ class MeasuredRegion:
         return replace(self, reach=max(self.radius, reach))
 
     def distances(self, q: Array) -> Array:
-        """Compute the distances of configurations from the nearest one that represents the region.
-
-        Args:
-            q: Configurations, (m, n) [rad or m].
-
-        Returns:
-            Distances, (m,), in spreads of the joints.
-        """
+        """Compute the distances of configurations from the nearest one that represents the region."""
         centres, out = self.configurations, np.empty(len(q))
         for start in range(0, len(q), _CHUNK_SIZE):
             part = q[start : start + _CHUNK_SIZE]
@@ -117,25 +93,11 @@ class MeasuredRegion:
         return out
 
     def contains(self, q: Array) -> Array:
-        """Check which configurations are in the region.
-
-        Args:
-            q: Configurations, (m, n) [rad or m].
-
-        Returns:
-            Whether each is in the region, (m,).
-        """
+        """Check which configurations are in the region."""
         return self.distances(q) <= self.radius
 
     def excess(self, q: Array) -> Array:
-        """Compute how far joint values are outside the measured range of their joint.
-
-        Args:
-            q: Configurations, (m, n) [rad or m].
-
-        Returns:
-            Distances from the range, (m, n) [rad or m], 0 inside; of revolute joints modulo one turn.
-        """
+        """Compute how far joint values are outside the measured range of their joint."""
         width = self.upper - self.lower
         above = q - self.upper
         outside = np.maximum(np.maximum(above, self.lower - q), 0.0)
@@ -157,14 +119,7 @@ def _thinned(q: Array) -> Array:
 
 
 def draw_joint_space(chain: Chain) -> Array:
-    """Draw configurations evenly from the joint space within the limits.
-
-    Args:
-        chain: Kinematic chain.
-
-    Returns:
-        Configurations, (2000, n) [rad or m], always the same ones.
-    """
+    """Draw configurations evenly from the joint space within the limits."""
     from ..robot.sampling import joint_range  # lazy import: slow, and few calibrations need it
 
     return np.random.default_rng(0).uniform(*joint_range(chain), (N_CONFIGURATIONS, chain.n_joints))

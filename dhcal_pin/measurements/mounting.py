@@ -67,35 +67,15 @@ class MountedRig:
         )
 
     def camera_in_end(self, camera: int) -> Array:
-        """Return the pose of a camera in the frame of its end, shape (4, 4) [m].
-
-        Args:
-            camera: Number of a camera whose pose is known.
-        """
+        """Return the pose of a camera in the frame of its end, shape (4, 4) [m]."""
         return self.camera_mounts[camera].link_pose @ _stated_pose(self.cameras[camera])
 
     def board_in_end(self, board: int) -> Array:
-        """Return the pose of a board in the frame of its end, shape (4, 4) [m].
-
-        Args:
-            board: Number of a board whose pose is known.
-        """
+        """Return the pose of a board in the frame of its end, shape (4, 4) [m]."""
         return self.board_mounts[board].link_pose @ _stated_pose(self.boards[board])
 
     def board_in_camera(self, camera: int, board: int, tools: Array) -> Array:
-        """Compute poses of a board in a camera.
-
-        Args:
-            camera: Number of the camera.
-            board: Number of the board.
-            tools: Poses of the tool in the measuring frame, shape (m, 4, 4) [m].
-
-        Returns:
-            Poses, shape (m, 4, 4) [m].
-
-        Raises:
-            InvalidArgumentError: The rig does not state one of the poses, or both move together.
-        """
+        """Compute poses of a board in a camera."""
         moves = self.camera_mounts[camera].moves
         if moves == self.board_mounts[board].moves:
             raise InvalidArgumentError(

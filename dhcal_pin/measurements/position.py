@@ -389,16 +389,7 @@ class MultiTargetPosition(PointMeasurement):
 
 
 def require_common_reference_target(data: Mapping[str, Measurement], known: Container[str] = ()) -> None:
-    """Raise an error if files measure their targets relative to different ones.
-
-    Args:
-        data: Measurements by file.
-        known: Names of instrument parameters that were estimated before.
-
-    Raises:
-        InvalidArgumentError: The first targets of two files differ, or the first target of a file was another
-            target when the known parameters were estimated.
-    """
+    """Raise an error if files measure their targets relative to different ones."""
     first_targets = {
         path: item.names[0] for path, item in data.items() if isinstance(item, MultiTargetPosition)
     }

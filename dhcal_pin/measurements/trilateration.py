@@ -121,11 +121,7 @@ def trilaterate(lengths: ArrayLike, anchors: ArrayLike, side: int = 1) -> Array:
 
 
 def _require_meeting(squares: Array, where: str, name: str) -> None:
-    """Check that squared coordinates are not negative.
-
-    Raises:
-        InvalidArgumentError: A squared coordinate (m,) [m²] is negative.
-    """
+    """Check that squared coordinates are not negative."""
     bad = np.flatnonzero(squares < 0)
     if bad.size:
         raise InvalidArgumentError(

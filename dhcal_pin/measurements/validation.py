@@ -34,16 +34,7 @@ def _require_finite(value: Array, where: str) -> None:
 
 
 def validated_joint_positions(value: Any, kind: str, what: str = "q") -> Array:
-    """Return joint positions as an array of shape (m, n).
-
-    Args:
-        value: Joint positions, shape (m, n) [rad or m].
-        kind: Class that is constructed, for error messages.
-        what: Name of the argument, for error messages.
-
-    Raises:
-        InvalidArgumentError: The value has another shape, or is not finite.
-    """
+    """Return joint positions as an array of shape (m, n)."""
     where, expected = f"{kind}: {what}", "shape (m, n), one row of n joint positions per sample"
     q = _as_numbers(value, where, expected)
     if q.ndim != 2:
@@ -60,18 +51,7 @@ def validated_joint_positions(value: Any, kind: str, what: str = "q") -> Array:
 def validated_array(
     value: Any, shape: tuple[int | None, ...], where: str, each: str = "row", per: str = "sample"
 ) -> Array:
-    """Return an array of finite numbers of a given shape.
-
-    Args:
-        value: Array or nested lists.
-        shape: Expected shape; None stands for any size.
-        where: Start of error messages, such as "Pose: poses".
-        each: What one entry along the first axis is, such as "position".
-        per: What there is one entry for.
-
-    Raises:
-        InvalidArgumentError: The value is no array of numbers, has another shape, or is not finite.
-    """
+    """Return an array of finite numbers of a given shape."""
     sizes = ", ".join("k" if size is None else str(size) for size in shape)
     expected = f"shape ({sizes}{',' if len(shape) == 1 else ''}), one {each} per {per}"
     out = _as_numbers(value, where, expected)
@@ -115,17 +95,7 @@ def validated_sigma(value: Any, shape: tuple[int, int], where: str) -> Array:
 
 
 def validated_poses(value: Any, m: int, kind: str) -> Array:
-    """Return homogeneous matrices as an array of shape (m, 4, 4).
-
-    Args:
-        value: Poses, shape (m, 4, 4).
-        m: Number of samples.
-        kind: Class that is constructed, for error messages.
-
-    Raises:
-        InvalidArgumentError: The value has another shape, is not finite, or a rotation part is not a
-            rotation.
-    """
+    """Return homogeneous matrices as an array of shape (m, 4, 4)."""
     where = f"{kind}: poses"
     poses = validated_array(value, (m, 4, 4), where, "homogeneous 4 x 4 matrix")
     rotation = poses[:, :3, :3]
@@ -141,19 +111,7 @@ def validated_poses(value: Any, m: int, kind: str) -> Array:
 
 
 def encode_labels(labels: Sequence[str], m: int, where: str) -> tuple[tuple[str, ...], Array]:
-    """Number the distinct labels of the samples in order of first appearance.
-
-    Args:
-        labels: Name of each sample.
-        m: Number of samples.
-        where: Start of error messages, such as "PointContact: points".
-
-    Returns:
-        The distinct names, and the index of each sample's name, shape (m,).
-
-    Raises:
-        InvalidArgumentError: The value is not a sequence, or has a wrong number of names.
-    """
+    """Number the distinct labels of the samples in order of first appearance."""
     if isinstance(labels, str) or not hasattr(labels, "__len__"):
         raise InvalidArgumentError(f"{where} is {labels!r:.40}; expected a sequence of {m} names")
     if len(labels) != m:

@@ -27,29 +27,12 @@ from ..robot.chain import Chain
 
 
 def paper_arm(name: str) -> Chain:
-    """Read one of the paper's arms.
-
-    Args:
-        name: Name of its DH file without ending: `sim_6dof` (Table 2), `sim_6dof_actual` (Table 1),
-            `sim_3dof` and `sim_3dof_actual` (their first three links), `experiment` (Table 3),
-            `experiment_published` (Table 4).
-
-    Returns:
-        The arm.
-    """
+    """Read one of the paper's arms."""
     return Chain.from_dh(read_dh(shipped_file(f"{name}.dh.toml")), name)
 
 
 def parameters_to_fix(chain: Chain, data: Sequence[Measurement]) -> list[str]:
-    """Find DH parameters that have to be held so that the others are observable.
-
-    Args:
-        chain: Nominal arm.
-        data: Measurements of it.
-
-    Returns:
-        Names, sorted: of each group of parameters with k unobservable combinations, the last k.
-    """
+    """Find DH parameters that have to be held so that the others are observable."""
     errors = select_parameters(chain, "dh")
     zero = np.zeros(len(errors.parameters))
     system = linearize_and_factor(Problem(errors, tuple(data), zero), zero, small_angle=False)
@@ -62,15 +45,7 @@ def parameters_to_fix(chain: Chain, data: Sequence[Measurement]) -> list[str]:
 
 
 def leave_one_out(fit: Callable[[Measurement], Result], data: Measurement) -> Accuracy:
-    """Compute the accuracy of each sample under the fit to all other samples.
-
-    Args:
-        fit: Function that calibrates on some of the samples.
-        data: All m samples.
-
-    Returns:
-        Error statistics over the m fits.
-    """
+    """Compute the accuracy of each sample under the fit to all other samples."""
     rows = np.arange(len(data.q))
     errors = [compute_errors(fit(data.take(rows != row)).chain, [data.take(rows == row)])[0] for row in rows]
     return Accuracy.from_errors(errors)
@@ -109,11 +84,7 @@ class PaperExperiment:
 
 
 def run_experiment() -> PaperExperiment:
-    """Screen Table 5, calibrate the robot of Table 3 on its good rows, and compare with the paper's figures.
-
-    Returns:
-        The robot, the data, the calibration and its accuracy.
-    """
+    """Screen Table 5, calibrate the robot of Table 3 on its good rows, compare with the paper."""
     chain = paper_arm("experiment")
     measurements = read_measurement_file(shipped_file("experiment_table5.csv"), chain)
     # Rows are numbered as in the paper's table.

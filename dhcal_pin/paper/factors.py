@@ -38,12 +38,6 @@ def q_matrices(table: DHTable) -> Array:
     """Return the derivative matrices Q, equations (9) and (10).
 
     They satisfy ∂A_i/∂x = A_i·Q_x. Erratum, probably of the transcription: Q_α has -1 at row 2, column 3.
-
-    Args:
-        table: Standard DH table.
-
-    Returns:
-        Q_θ, Q_d, Q_a and Q_α of each link, shape (4, n, 4, 4).
     """
     s, c = np.sin(table.alpha), np.cos(table.alpha)
     out = np.zeros((4, table.n_joints, 4, 4))
@@ -67,12 +61,6 @@ def link_vectors(table: DHTable) -> tuple[Array, Array, Array]:
 
     Erratum: (15) prints k1 = [0, a·sα, -a·cα], which contradicts (13). A row with Hayati's angle β ends with
     Ry(β), so its vectors are expressed in a frame rotated by β.
-
-    Args:
-        table: Standard DH table.
-
-    Returns:
-        k1 [m], k2 and k3 (directions), shape (n, 3) each.
     """
     s, c, zero = np.sin(table.alpha), np.cos(table.alpha), np.zeros(table.n_joints)
     k1 = np.stack([zero, table.a * c, -table.a * s], -1)
@@ -90,13 +78,6 @@ def tail_matrices(table: DHTable, q: Array) -> Array:
     """Return the tail matrices U_i = A_i·…·A_N·tool, equation (19).
 
     Entry i of the second axis is U_{i+2}, the tail after link i+1. In the paper the tool is the identity.
-
-    Args:
-        table: Standard DH table.
-        q: Joint positions, shape (m, n) [rad or m].
-
-    Returns:
-        U_2 … U_{N+1}, shape (m, n, 4, 4).
     """
     rows = table.rows(q)
     out = np.empty_like(rows)
@@ -284,14 +265,6 @@ def pseudo_inverse_step(factors: Array, error: Array, rtol: float = 1e-9) -> Arr
 
 
 def apply_correction(table: DHTable, change: Array) -> DHTable:
-    """Return the table with PAR' = PAR + ΔPAR, equation (39).
-
-    Args:
-        table: DH table.
-        change: ΔPAR in the order of the columns of R, shape (4n,) [rad, m].
-
-    Returns:
-        Corrected table.
-    """
+    """Return the table with PAR' = PAR + ΔPAR, equation (39)."""
     theta, d, a, alpha = np.asarray(change, float).reshape(4, table.n_joints)
     return replace(table, theta=table.theta + theta, d=table.d + d, a=table.a + a, alpha=table.alpha + alpha)

@@ -64,16 +64,7 @@ def _paper_order(errors: ErrorModel, n_joints: int) -> Array:
 
 
 def kernel_jacobian(chain: Chain, errors: ErrorModel, q: Array) -> Array:
-    """Compute the Jacobian with the kernels that calibrate.
-
-    Args:
-        chain: Robot without base and tool.
-        errors: Error model of the robot.
-        q: Joint positions, shape (m, n) [rad or m].
-
-    Returns:
-        Jacobian in the tool frame, shape (m, 6, p).
-    """
+    """Compute the Jacobian with the kernels that calibrate."""
     _, bodies, twists = errors.derivative(np.zeros(len(errors.parameters)))
     frames = chain.forward_kinematics(q)
     jacobian = chain.tool_jacobian(frames, bodies, twists)
@@ -84,15 +75,7 @@ def kernel_jacobian(chain: Chain, errors: ErrorModel, q: Array) -> Array:
 
 
 def frame_jacobian(chain: Chain, q: Array) -> Array:
-    """Compute Pinocchio's LOCAL frame Jacobian at the tip.
-
-    Args:
-        chain: Robot without mimic joints.
-        q: Joint positions, shape (m, n) [rad or m].
-
-    Returns:
-        Jacobian with respect to the joint positions in path order, shape (m, 6, n).
-    """
+    """Compute Pinocchio's LOCAL frame Jacobian at the tip."""
     model, frame = chain.model, chain.frame_id
     data = model.createData()
     columns = [model.joints[model.getJointId(name)].idx_v for name in chain.moving_joints]
@@ -105,15 +88,7 @@ def frame_jacobian(chain: Chain, q: Array) -> Array:
 
 
 def augmented_jacobian(table: DHTable, q: Array) -> Array:
-    """Compute Pinocchio's Jacobian of a chain with one virtual joint for each DH parameter.
-
-    Args:
-        table: Standard DH table.
-        q: Joint positions, shape (m, n) [rad or m].
-
-    Returns:
-        Jacobian with respect to Δθ…, Δd…, Δa…, Δα…, shape (m, 6, 4n).
-    """
+    """Compute Pinocchio's Jacobian of a chain with one virtual joint for each DH parameter."""
     model = pin.Model()
     parent, placement = 0, pin.SE3(table.base)
     for i in range(table.n_joints):
@@ -142,14 +117,6 @@ def regressor_jacobian(chain: Chain, errors: ErrorModel, q: Array) -> Array:
 
     The regressor is the derivative of the tip frame with respect to a right perturbation of each joint
     placement. It is multiplied by the matrix K from errors to perturbations.
-
-    Args:
-        chain: Robot without base and tool.
-        errors: Error model of the robot.
-        q: Joint positions, shape (m, n) [rad or m].
-
-    Returns:
-        Jacobian in the tool frame, shape (m, 6, p).
     """
     model, frame = chain.model, chain.frame_id
     data = model.createData()
@@ -175,15 +142,7 @@ def regressor_jacobian(chain: Chain, errors: ErrorModel, q: Array) -> Array:
 
 
 def numerical_jacobian(table: DHTable, q: Array) -> Array:
-    """Compute central differences of the DH product.
-
-    Args:
-        table: DH table.
-        q: Joint positions, shape (m, n) [rad or m].
-
-    Returns:
-        Jacobian with respect to Δθ…, Δd…, Δa…, Δα…, shape (m, 6, 4n).
-    """
+    """Compute central differences of the DH product."""
     columns = []
     for kind in _KINDS:
         for i in range(table.n_joints):

@@ -93,19 +93,7 @@ class Simulation:
 def simulate(
     arm: str, kind: str, poses: int, resample_each_iteration: bool, steps: int = 10, seeds: int = SEEDS
 ) -> Simulation:
-    """Run the paper's loop from an arm's nominal table to its actual one, without noise.
-
-    Args:
-        arm: `sim_6dof` or `sim_3dof`.
-        kind: Measurement kind, `pose` or `position`.
-        poses: Number of joint sets per iteration.
-        resample_each_iteration: Whether the joint sets are drawn again in each iteration.
-        steps: Number of iterations.
-        seeds: Number of runs, seeded 0, 1, …. A run that diverges keeps its last parameters.
-
-    Returns:
-        Errors of all runs by iteration.
-    """
+    """Run the paper's loop from an arm's nominal table to its actual one, without noise."""
     nominal, actual = paper_arm(arm), paper_arm(f"{arm}_actual")
     errors, actual_errors = select_parameters(nominal, "dh"), select_parameters(actual, "dh")
     truth = _parameter_differences(errors, actual_errors)
@@ -179,15 +167,7 @@ def _parameter_differences(nominal: ErrorModel, actual: ErrorModel) -> Array:
 
 
 def simulation_rows(seeds: int = SEEDS) -> list[list[str]]:
-    """Run all settings and format their results.
-
-    Args:
-        seeds: Number of runs of each setting.
-
-    Returns:
-        One row per setting under `SIMULATION_HEADER`: ranks, the median over the runs of the largest test
-        error [mm] by iteration, and the numbers of runs with an exact fit and with the true parameters.
-    """
+    """Run all settings and format their results."""
     rows = []
     for title, arm, kind, poses, resample_each_iteration in SETTINGS:
         run = simulate(arm, kind, poses, resample_each_iteration, seeds=seeds)

@@ -41,14 +41,7 @@ def filling_gains(values: Array, filled: Array) -> Array:
 
 
 def filling_cost(filled: Array) -> float:
-    """Compute the negative weighted evenness of a design.
-
-    Args:
-        filled: Joint values of the design, shape (n, j) [rad].
-
-    Returns:
-        Cost; smaller is more even.
-    """
+    """Compute the negative weighted evenness of a design."""
     harmonic_numbers = np.cumsum(1 / np.arange(1, len(filled) + 1))
     return -_WEIGHT * sum(
         float(harmonic_numbers[counts[counts > 0] - 1].sum()) for counts in _bin_counts(filled)

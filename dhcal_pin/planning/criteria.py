@@ -41,14 +41,7 @@ class Criterion(Protocol):
     """Optimality criterion of a design; smaller values are better."""
 
     def value(self, sqrt_covariance: Array) -> float:
-        """Compute the logarithm of the criterion.
-
-        Args:
-            sqrt_covariance: Square root H of the covariance C = H·Hᵀ, shape (p, p).
-
-        Returns:
-            Logarithm; a difference of 0.01 is one per cent.
-        """
+        """Compute the logarithm of the criterion."""
         ...
 
     def gains(self, rows: Array, sqrt_covariance: Array) -> Array:
@@ -100,14 +93,7 @@ class DOptimality:
     """D-optimality: volume of the confidence ellipsoid of all unknowns."""
 
     def value(self, sqrt_covariance: Array) -> float:
-        """Compute log det(C)^(1/p); see `Criterion.value`.
-
-        Args:
-            sqrt_covariance: Upper triangular square root of the covariance, shape (p, p).
-
-        Returns:
-            Logarithm of the criterion.
-        """
+        """Compute log det(C)^(1/p); see `Criterion.value`."""
         return 2 * float(np.mean(np.log(np.abs(np.diag(sqrt_covariance)))))
 
     def gains(self, rows: Array, sqrt_covariance: Array) -> Array:
@@ -136,14 +122,7 @@ class AOptimality:
     combinations: Array
 
     def value(self, sqrt_covariance: Array) -> float:
-        """Compute log tr(Wᵀ·C·W); see `Criterion.value`.
-
-        Args:
-            sqrt_covariance: Square root of the covariance, shape (p, p).
-
-        Returns:
-            Logarithm of the criterion.
-        """
+        """Compute log tr(Wᵀ·C·W); see `Criterion.value`."""
         return float(np.log(np.sum((self.combinations.T @ sqrt_covariance) ** 2)))
 
     def gains(self, rows: Array, sqrt_covariance: Array) -> Array:
@@ -173,14 +152,7 @@ class EOptimality:
     observable: Array
 
     def value(self, sqrt_covariance: Array) -> float:
-        """Compute the logarithm of the largest eigenvalue of V·C·Vᵀ; see `Criterion.value`.
-
-        Args:
-            sqrt_covariance: Square root of the covariance, shape (p, p).
-
-        Returns:
-            Logarithm of the criterion.
-        """
+        """Compute the logarithm of the largest eigenvalue of V·C·Vᵀ; see `Criterion.value`."""
         return 2 * float(np.log(np.linalg.norm(self.observable @ sqrt_covariance, 2)))
 
     def gains(self, rows: Array, sqrt_covariance: Array) -> Array:
@@ -232,9 +204,6 @@ class BiasVarianceCriterion:
         Both follow from the joint covariance C of all unknowns: C_f is the conditional covariance of the
             fitted ones for
         known omitted ones, and -B is the regression matrix of the fitted on the omitted ones.
-
-        Returns:
-            Square root of C_f, and B.
         """
         fitted, omitted = sqrt_covariance[self.fitted], sqrt_covariance[~self.fitted]
         q, r = np.linalg.qr(omitted.T)
@@ -243,14 +212,7 @@ class BiasVarianceCriterion:
         return conditional, -np.linalg.solve(r, shared.T).T
 
     def value(self, sqrt_covariance: Array) -> float:
-        """Compute the logarithm of the geometric mean of variance and squared bias; see `Criterion.value`.
-
-        Args:
-            sqrt_covariance: Square root of the covariance of all unknowns, shape (p+f, p+f).
-
-        Returns:
-            Logarithm of the criterion.
-        """
+        """Compute the logarithm of the geometric mean of variance and squared bias; see `Criterion.value`."""
         conditional, bias = self._fit_covariance_and_bias(sqrt_covariance)
         variance = np.sum((self.combinations.T @ conditional) ** 2)
         return float(np.log(variance * np.sum((self.combinations.T @ bias - self.target_bias) ** 2)) / 2)

@@ -94,30 +94,12 @@ class CandidateSet:
         is_feasible: Callable[[int], bool] = _always_feasible,
         bin_columns: Sequence[int] | Array = (),
     ) -> CandidateSet:
-        """Create a set of candidates of which none is known to be infeasible.
-
-        Args:
-            rows: Whitened rows, shape (p, k, m).
-            coordinates: Coordinates, shape (m, d).
-            min_distance: Smallest distance of two selected candidates.
-            is_feasible: Test of a candidate by its index.
-            bin_columns: Columns of the coordinates that are joint values whose bins are filled evenly.
-
-        Returns:
-            Candidates.
-        """
+        """Create a set of candidates of which none is known to be infeasible."""
         columns, infeasible = np.array(bin_columns, int), np.zeros(rows.shape[2], bool)
         return cls(rows, coordinates, min_distance, is_feasible, columns, infeasible)
 
     def rows_of(self, selected: Array) -> Array:
-        """Return the rows of selected candidates.
-
-        Args:
-            selected: Indices, shape (n,).
-
-        Returns:
-            Rows, shape (n, k, p).
-        """
+        """Return the rows of selected candidates."""
         return np.ascontiguousarray(self.rows[:, :, selected].transpose(2, 1, 0))
 
     def filling_gains(self, indices: Array, occupied: Array) -> Array:
@@ -133,14 +115,7 @@ class CandidateSet:
         return filling_gains(self.coordinates[indices][:, self.bin_columns], occupied[:, self.bin_columns])
 
     def filling_cost(self, occupied: Array) -> float:
-        """Compute how unevenly configurations fill the bins of the joints.
-
-        Args:
-            occupied: Coordinates of all configurations, shape (n, d).
-
-        Returns:
-            Term to add to the value of a criterion; zero if no bins are filled.
-        """
+        """Compute how unevenly configurations fill the bins of the joints."""
         return filling_cost(occupied[:, self.bin_columns])
 
     def best_candidate(self, gains: Array, indices: Array, occupied: Array) -> int | None:

@@ -78,11 +78,7 @@ class PlannedCalibration:
     images: PlannedImages | None = None
 
     def with_free_points(self, boards: Collection[str]) -> PlannedCalibration:
-        """Return a copy that estimates the corners of some boards, and takes those of all others as exact.
-
-        Args:
-            boards: Names of boards.
-        """
+        """Return a copy that estimates the corners of some boards, and takes those of all others as exact."""
         if self.images is None or set(self.images.free_boards) == set(boards):
             return self
         return replace(self, images=self.images.with_free_points(boards))
@@ -134,14 +130,7 @@ class Information:
         return self.instrument.noise
 
     def rows(self, q: Array) -> Array:
-        """Compute the whitened Jacobian rows of measurements.
-
-        Args:
-            q: Joint positions, shape (m, n) [rad or m].
-
-        Returns:
-            Rows of k residuals, shape (p+s', k, m).
-        """
+        """Compute the whitened Jacobian rows of measurements."""
         return self._of_unknowns(*self.instrument.jacobians(self._model, q))
 
     def _of_unknowns(self, by_errors: Array, by_instrument: Array) -> Array:
@@ -153,24 +142,13 @@ class Information:
         return out * self.prior_sigma[:, None, None]
 
     def task_combinations(self, q: Array) -> Array:
-        """Compute combinations of the unknowns whose variances sum to the mean squared position error.
-
-        Args:
-            q: Joint positions of the task, shape (m, n) [rad or m].
-
-        Returns:
-            Combinations W, shape (p+s', w) [m].
-        """
+        """Compute combinations of the unknowns whose variances sum to the mean squared position error."""
         found = self._of_unknowns(*self.instrument.displacements(self._model, q))
         rows = found.reshape(len(found), -1).T / np.sqrt(len(q))
         return np.asarray(np.linalg.qr(rows, mode="r")).T
 
     def without_omitted(self) -> Information:
-        """Return the knowledge about the fitted unknowns alone, as if the omitted ones were zero.
-
-        Returns:
-            Information whose unknowns are all fitted.
-        """
+        """Return the knowledge about the fitted unknowns alone, as if the omitted ones were zero."""
         fitted, n_robot = self.fitted, len(self.x)
         parameters = [
             p for p, is_fitted in zip(self.errors.parameters, fitted[:n_robot], strict=True) if is_fitted
@@ -188,14 +166,7 @@ class Information:
         )
 
     def observable_directions(self, rows: Array) -> Array:
-        """Compute the directions that existing and further measurements observe.
-
-        Args:
-            rows: Whitened rows of further measurements, shape (n, k, p+s').
-
-        Returns:
-            Orthonormal directions, shape (r, p+s').
-        """
+        """Compute the directions that existing and further measurements observe."""
         stacked = np.concatenate([self.data_factor, rows.reshape(-1, len(self.prior_sigma))])
         return qr.row_space(np.asarray(np.linalg.qr(stacked, mode="r")))
 
@@ -216,20 +187,7 @@ class Information:
     def from_prior(
         cls, planned: PlannedCalibration, q: Array, omitted_sets: Sequence[str] = ()
     ) -> Information:
-        """Collect the knowledge before measuring from priors, existing measurements or a calibration.
-
-        Args:
-            planned: Calibration that is planned.
-            q: Joint positions similar to those that will be measured, shape (m, n) [rad or m].
-            omitted_sets: Sets whose parameters the robot has, and which the fit takes as zero unless they are
-                among those of the calibration.
-
-        Returns:
-            Knowledge about all unknowns.
-
-        Raises:
-            InvalidArgumentError: Priors or standard deviations are missing.
-        """
+        """Collect the knowledge before measuring from priors, existing measurements or a calibration."""
         if planned.priors == "none":
             raise InvalidArgumentError(
                 "priors 'none': a plan needs priors; choose default, or standard deviations by name"
@@ -391,17 +349,7 @@ def _information_rows(sqrt_covariance: Array, unbounded_directions: Array) -> Ar
 def _add_parameter_sets(
     errors: ErrorModel, x: Array, sigma: Array, sets: Sequence[str]
 ) -> tuple[ErrorModel, Array, Array, Array]:
-    """Add the parameters of further sets to an error model.
-
-    Args:
-        errors: Error model with p parameters.
-        x: Their values, shape (p,) [m or rad].
-        sigma: Prior standard deviations of these and of instrument parameters, shape (p+s,).
-        sets: Names of the sets.
-
-    Returns:
-        Error model, values, prior standard deviations, and which unknowns were there before.
-    """
+    """Add the parameters of further sets to an error model."""
     indices = {parameter.name: i for i, parameter in enumerate(errors.parameters)}
     new = [p for name in sets for p in PARAMETER_SETS[name](errors.chain) if p.name not in indices]
     extended = errors.with_parameters(new)
@@ -434,11 +382,7 @@ def add_joint_scatter(chain: Chain, q: Array, noise: Noise) -> Noise:
 
 
 def plannable_kinds() -> dict[str, type[Measurement]]:
-    """Select the kinds whose measurements are independent.
-
-    Returns:
-        Kinds by name with one configuration per row and no names that link rows.
-    """
+    """Select the kinds whose measurements are independent."""
     return {
         name: kind
         for name, kind in KINDS.items()
@@ -447,11 +391,7 @@ def plannable_kinds() -> dict[str, type[Measurement]]:
 
 
 def _plannable_kind(kind: str) -> type[Measurement]:
-    """Return a kind that can be planned.
-
-    Raises:
-        UnknownNameError: The kind is unknown or cannot be planned.
-    """
+    """Return a kind that can be planned."""
     kinds = plannable_kinds()
     if kind not in kinds:
         raise UnknownNameError(f"kind {kind!r} cannot be planned; choose from {', '.join(kinds)}")

@@ -68,27 +68,11 @@ class Instrument(Protocol):
         ...
 
     def template(self, chain: Chain, q: Array) -> Measurement:
-        """Return measurements whose instrument parameters have initial values.
-
-        Args:
-            chain: Robot.
-            q: Joint positions, shape (m, n) [rad or m].
-
-        Returns:
-            Measurements.
-        """
+        """Return measurements whose instrument parameters have initial values."""
         ...
 
     def jacobians(self, model: PresentModel, q: Array) -> tuple[Array, Array]:
-        """Compute the whitened Jacobian of measurements.
-
-        Args:
-            model: Robot and instrument.
-            q: Joint positions, shape (m, n) [rad or m].
-
-        Returns:
-            Derivatives by the errors, shape (p, k, m), and by the instrument parameters, shape (s, k, m).
-        """
+        """Compute the whitened Jacobian of measurements."""
         ...
 
     def displacements(self, model: PresentModel, q: Array) -> tuple[Array, Array]:
@@ -123,27 +107,11 @@ class SimulatedInstrument:
         return self.noise.position
 
     def template(self, chain: Chain, q: Array) -> Measurement:
-        """Return measurements whose instrument parameters have initial values.
-
-        Args:
-            chain: Robot.
-            q: Joint positions, shape (m, n) [rad or m].
-
-        Returns:
-            Measurements.
-        """
+        """Return measurements whose instrument parameters have initial values."""
         return self.kind.simulate(chain, q, self.noise, np.random.default_rng(0)).initialized(chain)
 
     def jacobians(self, model: PresentModel, q: Array) -> tuple[Array, Array]:
-        """Compute the whitened Jacobian of measurements.
-
-        Args:
-            model: Robot and instrument.
-            q: Joint positions, shape (m, n) [rad or m].
-
-        Returns:
-            Derivatives by the errors, shape (p, k, m), and by the instrument parameters, shape (s, k, m).
-        """
+        """Compute the whitened Jacobian of measurements."""
         chain, u = model.chain, model.values
         data = self.kind.simulate(chain, q, self.noise, np.random.default_rng(0))
         frames = chain.forward_kinematics(q)
@@ -152,15 +120,7 @@ class SimulatedInstrument:
         return by_errors, data.instrument_jacobian(frames, u)
 
     def displacements(self, model: PresentModel, q: Array) -> tuple[Array, Array]:
-        """Compute displacements of the tool point in the measuring frame.
-
-        Args:
-            model: Robot and instrument.
-            q: Joint positions, shape (m, n) [rad or m].
-
-        Returns:
-            Derivatives by the errors, shape (p, 3, m), and by the instrument parameters, shape (s, 3, m) [m].
-        """
+        """Compute displacements of the tool point in the measuring frame."""
         frames = model.chain.forward_kinematics(q)
         jacobian = model.chain.tool_jacobian(frames, model.bodies, model.twists)[:, :3]
         return jacobian, np.zeros((len(model.values), 3, len(q)))
@@ -188,15 +148,7 @@ class CameraInstrument:
         return float(np.hypot(self.noise.position, self.images.sigma * np.mean(sizes)))
 
     def template(self, chain: Chain, q: Array) -> CameraCorners:
-        """Return all corners at the first configuration, in view or not.
-
-        Args:
-            chain: Robot.
-            q: Joint positions, shape (m, n) [rad or m].
-
-        Returns:
-            Image coordinates whose values mean nothing.
-        """
+        """Return all corners at the first configuration, in view or not."""
         return self._corners.replace(q=np.repeat(q[:1], len(self._corners.rows), 0))
 
     @cached_property
@@ -217,15 +169,7 @@ class CameraInstrument:
         return corners.replace(instrument_parameters=rig_parameters(corners.rig))
 
     def images_of(self, chain: Chain, q: Array) -> CameraCorners:
-        """Return the corners of all images of configurations, with infinite standard deviation out of view.
-
-        Args:
-            chain: Robot.
-            q: Joint positions, shape (m, n) [rad or m].
-
-        Returns:
-            The c corners of all pairs of a camera and a board, configuration by configuration.
-        """
+        """Return the corners of all images; those out of view have an infinite standard deviation."""
         one, m = self._corners, len(q)
         visible = np.concatenate(self.images.visible_corners(chain.poses(q)), 1).reshape(-1)
         tiled = {name: np.tile(getattr(one, name), m) for name in ("camera", "board", "corner")}
@@ -239,18 +183,7 @@ class CameraInstrument:
         )
 
     def existing(self, item: Measurement, chain: Chain) -> CameraCorners:
-        """Return existing images as this instrument would measure them.
-
-        Args:
-            item: Image coordinates by the cameras of this instrument.
-            chain: Robot.
-
-        Returns:
-            Image coordinates with the noise and the initial values of this instrument.
-
-        Raises:
-            InvalidArgumentError: The measurements are no image coordinates.
-        """
+        """Return existing images as this instrument would measure them."""
         if not isinstance(item, CameraCorners):
             raise InvalidArgumentError(
                 f"{item.source or item.kind}: a plan of images complements images; expected the columns u, v "
@@ -265,29 +198,12 @@ class CameraInstrument:
         return self.with_shared_noise(item, chain, np.array([p.nominal for p in item.instrument_parameters]))
 
     def with_shared_noise(self, item: CameraCorners, chain: Chain, u: Array) -> CameraCorners:
-        """Return image coordinates whose corners share a displacement of the tool.
-
-        Args:
-            item: Image coordinates.
-            chain: Robot.
-            u: Values of the instrument parameters, shape (s,).
-
-        Returns:
-            Image coordinates with jitter.
-        """
+        """Return image coordinates whose corners share a displacement of the tool."""
         std = np.array([self.noise.position] * 3 + [self.noise.rotation] * 3)
         return item.with_jitter(item.displacement_derivative(chain.forward_kinematics(item.q), u) * std)
 
     def jacobians(self, model: PresentModel, q: Array) -> tuple[Array, Array]:
-        """Compute the whitened and reduced Jacobian of images.
-
-        Args:
-            model: Robot and instrument.
-            q: Joint positions, shape (m, n) [rad or m].
-
-        Returns:
-            Derivatives by the errors, shape (p, k, m), and by the instrument parameters, shape (s, k, m).
-        """
+        """Compute the whitened and reduced Jacobian of images."""
         size = _FREE_CHUNK if self.images.free_boards else _CHUNK
         starts = range(0, max(len(q), 1), size)
         parts = [self._reduced_jacobian(model, q[start : start + size]) for start in starts]
@@ -333,14 +249,6 @@ class CameraInstrument:
         The measured point is the middle of a board on the tool, in the frame of a camera that stands still;
         or a point in front of a camera on the tool, in the frame of a board that stands still. The frame of a
         board is where its corners are: a motion that all of them share moves it.
-
-        Args:
-            model: Robot and instrument.
-            q: Joint positions, shape (m, n) [rad or m].
-
-        Returns:
-            Derivatives by the errors, shape (p, d, m), and by the instrument parameters, shape (s, d, m) [m],
-            with d three times the number of pairs of a camera and a board.
         """
         frames = model.chain.forward_kinematics(q)
         jacobian = model.chain.tool_jacobian(frames, model.bodies, model.twists)

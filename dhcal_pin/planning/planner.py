@@ -505,14 +505,7 @@ CRITERIA: dict[str, CriterionOption] = {
 
 
 def _split_criterion(text: str) -> tuple[str, bool]:
-    """Split the name of a criterion, or two names joined by a comma of which one is `curves`.
-
-    Returns:
-        Name of the criterion, and whether the bins of the joints are filled evenly before it decides.
-
-    Raises:
-        UnknownNameError: A name is unknown, or two criteria are combined otherwise.
-    """
+    """Split the name of a criterion, or two names joined by a comma of which one is `curves`."""
     names = text.split(",")
     main = [name for name in names if name != FILLS_BINS] or [FILLS_BINS]
     if len(names) > 2 or len(main) > 1 or main[0] not in CRITERIA:
@@ -641,18 +634,7 @@ def _error_curve(
 def _random_errors(
     goal: DesignGoal, candidates: CandidateSet, q: Array, sizes: Array, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Predict the error of random poses for some numbers of poses.
-
-    Args:
-        goal: What to optimize.
-        candidates: All candidates.
-        q: Their joint positions, shape (m, dof) [rad or m].
-        sizes: Numbers of poses to choose from.
-        rng: Random generator.
-
-    Returns:
-        Numbers of poses and predicted errors, medians of random plans [m].
-    """
+    """Predict the error of random poses for some numbers of poses."""
     if not sizes.size:
         return sizes, np.empty(0)
     order = rng.permutation(candidates.rows.shape[2])
@@ -675,12 +657,7 @@ def _random_errors(
 
 
 def _recommended_size(sizes: Array, errors: Array, sigma: float) -> int | None:
-    """Find the number of poses with diminishing returns for an instrument of this standard deviation.
-
-    Returns:
-        First size at which `EXTRA_POSES` more lower the error that a check shows, with the noise of the
-        instrument included, by less than `MIN_EXTRA_GAIN`; None if there is none.
-    """
+    """Find the number of poses with diminishing returns for an instrument of this standard deviation."""
     shown = np.sqrt(errors**2 + 3 * sigma**2)
     is_diminishing = np.flatnonzero(shown[EXTRA_POSES:] > (1 - MIN_EXTRA_GAIN) * shown[:-EXTRA_POSES])
     return int(sizes[is_diminishing[0]]) if is_diminishing.size else None

@@ -54,18 +54,7 @@ class DesignGoal:
 def refine(
     goal: DesignGoal, q: Array, sampler: ConfigurationSampler, min_distance: float, rng: np.random.Generator
 ) -> Array:
-    """Move configurations to better ones nearby, with decreasing steps.
-
-    Args:
-        goal: What to optimize.
-        q: Joint positions, shape (n, dof) [rad or m].
-        sampler: Feasible configurations.
-        min_distance: Smallest distance of two configurations, in the units of `scale_joint_units`.
-        rng: Random generator.
-
-    Returns:
-        Improved joint positions, shape (n, dof) [rad or m].
-    """
+    """Move configurations to better ones nearby, with decreasing steps."""
     information, criterion = goal.full_information, goal.criterion
     prior_factor, columns = information.prior_factor, goal.bin_columns
     q = q.copy()

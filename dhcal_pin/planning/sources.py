@@ -32,30 +32,15 @@ class MeasurementSource(Protocol):
         ...
 
     def restrict(self, sampler: ConfigurationSampler) -> ConfigurationSampler:
-        """Restrict a sampler to configurations that can be measured.
-
-        Args:
-            sampler: Sampler of configurations that the robot can take.
-
-        Returns:
-            Sampler.
-        """
+        """Restrict a sampler to configurations that can be measured."""
         ...
 
     def can_measure(self, tools: Array) -> Array:
-        """Return whether poses of the tool can be measured, shape (m,).
-
-        Args:
-            tools: Poses of the tool in the measuring frame, shape (m, 4, 4) [m].
-        """
+        """Return whether poses of the tool can be measured, shape (m,)."""
         ...
 
     def summarize(self, tools: Array) -> tuple[CameraViews, ...]:
-        """Describe the images of a plan; empty for other kinds of measurement.
-
-        Args:
-            tools: Poses of the tool in the measuring frame, shape (m, 4, 4) [m].
-        """
+        """Describe the images of a plan; empty for other kinds of measurement."""
         ...
 
 

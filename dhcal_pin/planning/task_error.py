@@ -29,49 +29,19 @@ class TaskError:
 
     @classmethod
     def over(cls, information: Information, task: Array) -> TaskError:
-        """Prepare the prediction over a task, with the parts of the error that only priors limit.
-
-        Args:
-            information: Knowledge before the measurements.
-            task: Joint positions of the task, shape (t, n) [rad or m].
-
-        Returns:
-            Position error over the task.
-        """
+        """Prepare the prediction over a task, with the parts of the error that only priors limit."""
         return cls(information, information.task_combinations(task))
 
     def observable_part(self, observable: Array) -> TaskError:
-        """Return the part of the error that measurements determine.
-
-        Args:
-            observable: Orthonormal directions that measurements observe, shape (r, p).
-
-        Returns:
-            Position error over the task without any other part.
-        """
+        """Return the part of the error that measurements determine."""
         return replace(self, combinations=observable.T @ (observable @ self.combinations))
 
     def after(self, q: Array) -> float:
-        """Predict the error after measurements.
-
-        Args:
-            q: Joint positions of the measurements, shape (m, n) [rad or m].
-
-        Returns:
-            RMS position error [m].
-        """
+        """Predict the error after measurements."""
         return self.after_first(q, [len(q)])[0]
 
     def after_first(self, q: Array, sizes: Iterable[int]) -> list[float]:
-        """Predict the error after the first measurements of a sequence, for several numbers of them.
-
-        Args:
-            q: Joint positions of the measurements, shape (m, n) [rad or m].
-            sizes: Numbers of measurements, in ascending order.
-
-        Returns:
-            RMS position error for each number [m].
-        """
+        """Predict the error after the first measurements of a sequence, for several numbers of them."""
         rows = self.information.rows(q).transpose(2, 1, 0)
         r, done, out = self.information.prior_factor, 0, []
         for size in sizes:

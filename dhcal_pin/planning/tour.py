@@ -97,16 +97,7 @@ def find_tour(
 
 
 def is_move_free(checker: CollisionChecker, start: Array, end: Array) -> bool:
-    """Check the configurations of a straight line in joint space.
-
-    Args:
-        checker: Collision checks.
-        start: Joint positions at the start, shape (dof,) [rad or m].
-        end: Joint positions at the end, shape (dof,) [rad or m].
-
-    Returns:
-        Whether none of them collides.
-    """
+    """Check the configurations of a straight line in joint space."""
     length = np.abs(scale_joint_units(checker.chain, (end - start)[None])).max()
     n_steps = max(1, int(np.ceil(length / MAX_STEP_RAD)))
     return all(

@@ -46,44 +46,18 @@ class ViewSampler(ConfigurationSampler):
 
     @classmethod
     def from_sampler(cls, sampler: ConfigurationSampler, images: PlannedImages) -> ViewSampler:
-        """Restrict a sampler to configurations in which a camera sees a board.
-
-        Args:
-            sampler: Sampler.
-            images: Cameras and boards.
-
-        Returns:
-            Sampler.
-        """
+        """Restrict a sampler to configurations in which a camera sees a board."""
         return cls(sampler.chain, sampler.workspace, sampler.low, sampler.high, sampler.collision, images)
 
     def in_workspace(self, q: Array) -> Array:
-        """Return in which configurations the tool is in the workspace and a board is in view.
-
-        Args:
-            q: Joint positions, shape (m, n) [rad or m].
-
-        Returns:
-            Whether the constraints are satisfied, shape (m,).
-        """
+        """Return in which configurations the tool is in the workspace and a board is in view."""
         inside = super().in_workspace(q)
         near = np.flatnonzero(inside)
         inside[near] = self.images.in_view(self.chain.poses(q[near]))
         return inside
 
     def draw(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw joint positions in which a board is in view; collisions and hidden views are not checked.
-
-        Args:
-            count: Number of configurations.
-            rng: Random generator.
-
-        Returns:
-            Joint positions, shape (count, n) [rad or m].
-
-        Raises:
-            InvalidArgumentError: Too few configurations have a board in view.
-        """
+        """Draw joint positions in which a board is in view; collisions and hidden views are not checked."""
 
         def drawn() -> Array:
             start = rng.uniform(self.low, self.high, (_BATCH, self.chain.n_joints))
@@ -105,17 +79,7 @@ class ViewSampler(ConfigurationSampler):
         )
 
     def perturb(self, q: Array, step: float, count: int, rng: np.random.Generator) -> Array:
-        """Draw configurations around given ones; those without a board in view are brought to a view.
-
-        Args:
-            q: Joint positions, shape (m, n) [rad or m].
-            step: Standard deviation as a fraction of the joint range.
-            count: Number of configurations around each of q.
-            rng: Random generator.
-
-        Returns:
-            Joint positions, shape (m·count, n) [rad or m].
-        """
+        """Draw configurations around given ones; those without a board in view are brought to a view."""
         out = super().perturb(q, step, count, rng)
         lost = np.flatnonzero(~self.in_workspace(out))
         if lost.size:
@@ -123,14 +87,7 @@ class ViewSampler(ConfigurationSampler):
         return out
 
     def is_feasible(self, q: Array) -> bool:
-        """Return whether a configuration has no collision, and no board in view is hidden.
-
-        Args:
-            q: Joint positions, shape (n,) [rad or m].
-
-        Returns:
-            Whether the robot can take images in this configuration.
-        """
+        """Return whether a configuration has no collision, and no board in view is hidden."""
         return super().is_feasible(q) and not self._is_hidden(q)
 
     def _bring_into_view(self, start: Array, rng: np.random.Generator) -> Array:

@@ -172,16 +172,7 @@ def _default_distances(camera: Camera, board: Board) -> tuple[float, float]:
 
 
 def with_measured_poses(rig: MountedRig, chain: Chain, data: Sequence[Measurement]) -> MountedRig:
-    """Return a rig whose missing poses and intrinsics are estimated from images.
-
-    Args:
-        rig: Cameras and boards.
-        chain: Nominal robot.
-        data: Measurements; those that are no image coordinates are ignored.
-
-    Returns:
-        The rig; without images, or with all poses and intrinsics known, as it is.
-    """
+    """Return a rig whose missing poses and intrinsics are estimated from images."""
     images = [item for item in data if isinstance(item, CameraCorners)]
     is_known = all(entry.pose is not None for entry in (*rig.cameras, *rig.boards))
     if not images or (is_known and all(camera.has_intrinsics for camera in rig.cameras)):
@@ -193,22 +184,7 @@ def with_measured_poses(rig: MountedRig, chain: Chain, data: Sequence[Measuremen
 def draw_views(
     rig: MountedRig, camera: int, board: int, limits: ViewLimits, count: int, rng: np.random.Generator
 ) -> Array:
-    """Draw poses of a board in a camera in which the board is in view.
-
-    Args:
-        rig: Cameras with known intrinsics, and boards.
-        camera: Number of the camera.
-        board: Number of the board.
-        limits: Limits of the view.
-        count: Number of poses.
-        rng: Random generator.
-
-    Returns:
-        Poses, shape (count, 4, 4) [m].
-
-    Raises:
-        InvalidArgumentError: The board does not fit into the image within the limits.
-    """
+    """Draw poses of a board in a camera in which the board is in view."""
     entry, target = rig.cameras[camera], rig.boards[board]
     middle = target.points.mean(0)
     largest = np.pi if target.type == "points" else limits.max_angle
@@ -271,14 +247,7 @@ class CameraViews:
 
 
 def views_table(views: Sequence[CameraViews]) -> Table:
-    """Build the table of the planned images of each camera.
-
-    Args:
-        views: Planned images.
-
-    Returns:
-        Table; without rows if there are none.
-    """
+    """Build the table of the planned images of each camera."""
     rows = [
         [
             one.camera,
@@ -293,15 +262,7 @@ def views_table(views: Sequence[CameraViews]) -> Table:
 
 
 def summarize_views(images: PlannedImages, tools: Array) -> tuple[CameraViews, ...]:
-    """Describe how the images of a plan fill the image planes.
-
-    Args:
-        images: Cameras and boards.
-        tools: Poses of the tool in the measuring frame, shape (m, 4, 4) [m].
-
-    Returns:
-        One description per camera that can see a board.
-    """
+    """Describe how the images of a plan fill the image planes."""
     rig, visible = images.rig, images.visible_corners(tools)
     out = []
     for number in dict.fromkeys(camera for camera, _ in images.pairs):

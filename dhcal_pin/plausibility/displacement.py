@@ -50,15 +50,7 @@ class CorrectionSize:
 
 
 def measure_correction(errors: ErrorModel, calibrated: Chain) -> CorrectionSize:
-    """Measure the displacement of joint axes and tool by a correction.
-
-    Args:
-        errors: Nominal robot and its identified errors.
-        calibrated: Calibrated robot.
-
-    Returns:
-        The displacement that is largest relative to the expected one.
-    """
+    """Measure the displacement of joint axes and tool by a correction."""
     rng = np.random.default_rng(0)
     nominal = errors.chain.with_base_and_tool(np.eye(4), calibrated.tool)
     q = rng.uniform(*joint_range(nominal), (_N_CONFIGURATIONS, nominal.n_joints))
@@ -100,14 +92,7 @@ def _displacements(a: Chain, b: Chain, q: Array) -> Array:
 
 
 def workspace_radius(chain: Chain) -> float:
-    """Compute the RMS distance of the tool from its mean position over the joint range.
-
-    Args:
-        chain: Robot.
-
-    Returns:
-        Distance [m].
-    """
+    """Compute the RMS distance of the tool from its mean position over the joint range."""
     q = np.random.default_rng(0).uniform(*joint_range(chain), (_N_CONFIGURATIONS, chain.n_joints))
     points = chain.poses(q)[:, :3, 3]
     return float(np.sqrt(np.mean(np.sum((points - points.mean(0)) ** 2, 1))))

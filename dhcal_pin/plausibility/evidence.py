@@ -80,15 +80,7 @@ class Evidence:
 
 
 def fit_evidence(chain: Chain, data: Sequence[Measurement]) -> Evidence:
-    """Fit a robot with small errors to measurements and compute the evidence.
-
-    Args:
-        chain: Nominal robot; its base and tool are ignored.
-        data: Measurements of any kinds; their standard deviations are ignored.
-
-    Returns:
-        The evidence.
-    """
+    """Fit a robot with small errors to measurements and compute the evidence."""
     equal = tuple(_with_equal_sigmas(item) for item in data)
     errors = initialize_frames(select_parameters(chain, _PARAMETERS), equal, {}, _N_FRAME_ITERATIONS)
     equal = tuple(item.initialized(errors.chain) for item in equal)
@@ -192,18 +184,7 @@ def _estimate_noise(problem: Problem, x: Array) -> _Noise:
 def _maximize(
     system: TriangularSystem, x: Array, prior_std: Array, n_rows: int, min_factor: float
 ) -> tuple[float, float, float]:
-    """Maximize the evidence over the width of the priors and the scale of the noise.
-
-    Args:
-        system: Triangular system of the whitened rows at x, (p,).
-        x: Point of the linearization.
-        prior_std: Default prior standard deviations of the robot's errors; 0 for all other unknowns, (p,).
-        n_rows: Number of whitened rows.
-        min_factor: Smallest scale σ.
-
-    Returns:
-        Logarithm of the evidence, width w and noise scale σ.
-    """
+    """Maximize the evidence over the width of the priors and the scale of the noise."""
     robot = prior_std > 0
     measured, rows = system.z + system.r @ x, system.r[:, robot] * prior_std[robot]
     u, s, _ = np.linalg.svd(system.r[:, ~robot], full_matrices=False)

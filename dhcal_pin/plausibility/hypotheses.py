@@ -38,11 +38,7 @@ class Change(Protocol):
     """Change of measurements that undoes a mistake."""
 
     def apply(self, item: Measurement) -> Measurement | None:
-        """Return the changed measurements; None if the change does not apply to this kind.
-
-        Args:
-            item: Measurements as they were read.
-        """
+        """Return the changed measurements; None if the change does not apply to this kind."""
         ...
 
 
@@ -72,18 +68,7 @@ class JointChange:
         offsets: Sequence[float] | None = None,
         factors: Sequence[float] | None = None,
     ) -> JointChange:
-        """Make a change of n joints in which everything that is not given stays as it is.
-
-        Args:
-            n: Number of joints.
-            sources: See the attributes.
-            signs: See the attributes.
-            offsets: See the attributes.
-            factors: See the attributes.
-
-        Returns:
-            The change.
-        """
+        """Make a change of n joints in which everything that is not given stays as it is."""
         return cls(
             tuple(sources if sources is not None else range(n)),
             tuple(signs if signs is not None else [1] * n),
@@ -92,14 +77,7 @@ class JointChange:
         )
 
     def apply(self, item: Measurement) -> Measurement | None:
-        """Return the measurements at the changed joint positions.
-
-        Args:
-            item: Measurements as they were read.
-
-        Returns:
-            None for kinds without joint positions.
-        """
+        """Return the measurements at the changed joint positions."""
         if not item.configurations_per_row:
             return None
         q = item.configurations()[:, self.sources]
@@ -117,14 +95,7 @@ class RowShift:
     step: int
 
     def apply(self, item: Measurement) -> Measurement | None:
-        """Return the measured values with the joint positions of neighbouring rows.
-
-        Args:
-            item: Measurements as they were read; rows without a neighbour are left out.
-
-        Returns:
-            None for kinds without joint positions, or if no two rows are neighbours.
-        """
+        """Return the measured values with the joint positions of neighbouring rows."""
         if not item.configurations_per_row or len(item.rows) < 2:
             return None
         order = np.argsort(item.rows, kind="stable")
@@ -149,14 +120,7 @@ class LengthChange:
     factor: float
 
     def apply(self, item: Measurement) -> Measurement | None:
-        """Return the measurements with scaled lengths.
-
-        Args:
-            item: Measurements as they were read.
-
-        Returns:
-            None for kinds that measure no lengths.
-        """
+        """Return the measurements with scaled lengths."""
         if isinstance(item, PoseMeasurement):
             return _with_positions(item, self.factor * item.poses[:, :3, 3])
         if isinstance(item, PointMeasurement) and item.has_length_scale:
@@ -177,14 +141,7 @@ class AxisChange:
     signs: tuple[int, int, int] = (1, 1, 1)
 
     def apply(self, item: Measurement) -> Measurement | None:
-        """Return the measurements with changed positions.
-
-        Args:
-            item: Measurements as they were read.
-
-        Returns:
-            None for kinds without positions.
-        """
+        """Return the measurements with changed positions."""
         if not isinstance(item, Pose | Position | MultiTargetPosition):
             return None
         return _with_positions(item, item.positions()[:, self.sources] * np.array(self.signs))
@@ -195,14 +152,7 @@ class MirroredPoses:
     """Positions and rotations in a left-handed measuring frame."""
 
     def apply(self, item: Measurement) -> Measurement | None:
-        """Return the poses with the sign of z changed.
-
-        Args:
-            item: Measurements as they were read.
-
-        Returns:
-            None for kinds other than poses.
-        """
+        """Return the poses with the sign of z changed."""
         mirror = np.diag([1.0, 1.0, -1.0, 1.0])
         return item.replace(poses=mirror @ item.poses @ mirror) if isinstance(item, Pose) else None
 
@@ -218,14 +168,7 @@ class QuaternionOrder:
     order: QuaternionNotation
 
     def apply(self, item: Measurement) -> Measurement | None:
-        """Return the poses with the rotations of the reordered quaternions.
-
-        Args:
-            item: Measurements as they were read.
-
-        Returns:
-            None for kinds other than poses.
-        """
+        """Return the poses with the rotations of the reordered quaternions."""
         # Read as w, x, y, z, the columns x, y, z, w have to move by one; the other way round, back.
         step = 1 if self.order == "xyzw" else -1
         return _with_rotations(
@@ -238,14 +181,7 @@ class InversePose:
     """Poses of the measuring frame in the tool frame, in place of the tool in the measuring frame."""
 
     def apply(self, item: Measurement) -> Measurement | None:
-        """Return the inverse poses.
-
-        Args:
-            item: Measurements as they were read.
-
-        Returns:
-            None for kinds other than poses.
-        """
+        """Return the inverse poses."""
         return item.replace(poses=se3.inverse(item.poses)) if isinstance(item, PoseMeasurement) else None
 
 
@@ -254,14 +190,7 @@ class InverseRotation:
     """Inverse rotations beside correct positions."""
 
     def apply(self, item: Measurement) -> Measurement | None:
-        """Return the poses with inverse rotations.
-
-        Args:
-            item: Measurements as they were read.
-
-        Returns:
-            None for kinds other than poses.
-        """
+        """Return the poses with inverse rotations."""
         return _with_rotations(item, lambda rotations: np.swapaxes(rotations, 1, 2))
 
 
@@ -270,14 +199,7 @@ class RotationUnit:
     """Rotation vectors in radians that were read as degrees."""
 
     def apply(self, item: Measurement) -> Measurement | None:
-        """Return the poses with rotation vectors in radians.
-
-        Args:
-            item: Measurements as they were read.
-
-        Returns:
-            None for kinds other than poses, and if a vector is too long for that.
-        """
+        """Return the poses with rotation vectors in radians."""
         if not isinstance(item, PoseMeasurement):
             return None
         vectors = se3.log3(item.poses[:, :3, :3])
@@ -334,26 +256,14 @@ class Hypothesis:
     change: Change
 
     def apply(self, data: Sequence[Measurement]) -> list[Measurement] | None:
-        """Undo the mistake in measurements.
-
-        Args:
-            data: Measurements as they were read.
-
-        Returns:
-            Changed measurements; those that the change does not apply to are unchanged. None if it applies
-            to none of them.
-        """
+        """Undo the mistake in measurements."""
         changed = [self.change.apply(item) for item in data]
         if all(item is None for item in changed):
             return None
         return [old if new is None else new for new, old in zip(changed, data, strict=True)]
 
     def log_jacobian(self, data: Sequence[Measurement]) -> float:
-        """Return the logarithm of the determinant of the change of the measured values.
-
-        Args:
-            data: Measurements as they were read.
-        """
+        """Return the logarithm of the determinant of the change of the measured values."""
         if not isinstance(self.change, LengthChange):
             return 0.0
         n_lengths = sum(_count_lengths(item) for item in data if self.change.apply(item) is not None)
@@ -369,15 +279,7 @@ def _count_lengths(item: Measurement) -> int:
 
 
 def list_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypothesis]:
-    """List the hypotheses about measurements of a robot, the simpler ones first.
-
-    Args:
-        chain: Nominal robot.
-        data: Measurements; only hypotheses about their kinds are listed.
-
-    Yields:
-        Hypotheses.
-    """
+    """List the hypotheses about measurements of a robot, the simpler ones first."""
     yield from _joint_hypotheses(chain)
     yield from _order_hypotheses(chain)
     yield from _unit_hypotheses(chain)
@@ -397,19 +299,7 @@ def list_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypot
 
 
 def mend(chain: Chain, data: Measurement, key: str) -> Measurement:
-    """Undo a mistake in measurements, such as the wrong sign of a joint.
-
-    Args:
-        chain: Nominal robot.
-        data: Measurements as they were read.
-        key: Key of a hypothesis, as a refused calibration names it.
-
-    Returns:
-        The changed measurements.
-
-    Raises:
-        UnknownNameError: There is no such change of these measurements.
-    """
+    """Undo a mistake in measurements, such as the wrong sign of a joint."""
     by_key = {hypothesis.key: hypothesis for hypothesis in list_hypotheses(chain, [data])}
     if key not in by_key:
         near = difflib.get_close_matches(key, by_key, 3, 0.0)

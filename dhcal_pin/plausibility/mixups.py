@@ -107,13 +107,6 @@ def diagnose_mixups(chain: Chain, data: Sequence[Measurement]) -> Diagnosis:
     A mistake may be in all measurements or in one of several. Contacts with planes and spheres are left out:
     a robot with other errors can touch an unknown surface exactly, whatever the mistake is. So are image
     coordinates, which the mistakes listed here do not concern.
-
-    Args:
-        chain: Nominal robot; its base and tool are ignored.
-        data: Measurements of any kinds.
-
-    Returns:
-        The diagnosis; without hypotheses if the measurements fit the robot, or if none is decisive.
     """
     items = [item for item in data if item.configurations_per_row and not _is_surface_contact(item)]
     items = [item for item in items if not isinstance(item, CameraCorners)]
@@ -161,20 +154,12 @@ def _diagnose(chain: Chain, data: Sequence[Measurement]) -> Diagnosis:
 
 
 def is_suspicious(evidence: Evidence) -> bool:
-    """Return whether measurements may be mixed up: they need large errors or leave large residuals.
-
-    Args:
-        evidence: Evidence of the measurements as they were read.
-    """
+    """Return whether measurements may be mixed up: they need large errors or leave large residuals."""
     return evidence.width >= _SUSPICIOUS_WIDTH or leaves_residuals(evidence)
 
 
 def leaves_residuals(evidence: Evidence) -> bool:
-    """Return whether no robot fits the measurements, however large its errors are.
-
-    Args:
-        evidence: Evidence of the measurements as they were read.
-    """
+    """Return whether no robot fits the measurements, however large its errors are."""
     return evidence.length_scale > _SUSPICIOUS_LENGTH or evidence.angle_scale > _SUSPICIOUS_ANGLE
 
 
@@ -187,13 +172,6 @@ def nominal_distance(chain: Chain, data: Sequence[Measurement]) -> float:
 
     with A = Q/f for the orientation Q of the instrument and a unit of length f. All elements of A, b and t
     are free here, which makes the equation linear and the distance too small rather than too large.
-
-    Args:
-        chain: Nominal robot; its base and tool are ignored.
-        data: Measurements of any kinds.
-
-    Returns:
-        RMS distance in the lengths of the robot [m]; 0 if there are no or few measured positions.
     """
     arm = chain.with_base_and_tool(np.eye(4), np.eye(4))
     squares, counts = [0.0], [0]

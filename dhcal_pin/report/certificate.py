@@ -53,17 +53,7 @@ def write_certificate(
 
 
 def parse_meta(texts: Sequence[str]) -> dict[str, str]:
-    """Parse the values of --meta.
-
-    Args:
-        texts: Texts KEY=VALUE.
-
-    Returns:
-        Values by key.
-
-    Raises:
-        InvalidArgumentError: A text has no key or no value, or a key is given twice.
-    """
+    """Parse the values of --meta."""
     meta: dict[str, str] = {}
     for text in texts:
         key, sign, value = (part.strip() for part in text.partition("="))
@@ -79,16 +69,7 @@ def parse_meta(texts: Sequence[str]) -> dict[str, str]:
 
 
 def certificate_page(fit: Result, meta: Mapping[str, str], source: Provenance) -> str:
-    """Render the certificate of a calibration.
-
-    Args:
-        fit: Result of the calibration.
-        meta: Facts about the measurement, by key.
-        source: Files, hashes and settings.
-
-    Returns:
-        Text of the page; the same for the same input.
-    """
+    """Render the certificate of a calibration."""
     cross_validated = source.comparison
     comparisons = (
         fit.comparisons if cross_validated is None or fit.holdout else (cross_validated, *fit.comparisons)

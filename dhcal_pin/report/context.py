@@ -43,15 +43,7 @@ class ReportContext:
 
     @classmethod
     def from_result(cls, fit: Result, source: Provenance) -> ReportContext:
-        """Compute what the report of a result needs.
-
-        Args:
-            fit: Result of the calibration.
-            source: Files, settings and other facts that the result does not contain.
-
-        Returns:
-            The context.
-        """
+        """Compute what the report of a result needs."""
         workspace = predict_workspace(fit, fit.data)
         return cls(
             fit=fit,
@@ -98,15 +90,7 @@ class ReportContext:
 
 
 def measurement_names(paths: Sequence[str], data: Sequence[Measurement]) -> list[str]:
-    """Return short names of measurements.
-
-    Args:
-        paths: File of each measurement; none for data that do not come from files.
-        data: Measurements.
-
-    Returns:
-        Short names of the files, or numbered kinds.
-    """
+    """Return short names of measurements."""
     if len(paths) == len(data):
         short = short_names(paths)
         return [short[path] for path in paths]

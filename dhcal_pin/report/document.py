@@ -60,26 +60,12 @@ class Provenance:
 
 
 def file_digests(paths: Sequence[PathLike]) -> dict[str, str]:
-    """Compute the SHA-256 of files.
-
-    Args:
-        paths: Paths of the files.
-
-    Returns:
-        Hexadecimal digests by path.
-    """
+    """Compute the SHA-256 of files."""
     return {str(path): hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in paths}
 
 
 def content_digests(contents: Mapping[PathLike, str | bytes]) -> dict[str, str]:
-    """Compute the SHA-256 of files that are not written yet.
-
-    Args:
-        contents: Content by path; texts are written in UTF-8.
-
-    Returns:
-        Hexadecimal digests by path.
-    """
+    """Compute the SHA-256 of files that are not written yet."""
     return {
         str(path): hashlib.sha256(content if isinstance(content, bytes) else content.encode()).hexdigest()
         for path, content in contents.items()
@@ -93,12 +79,6 @@ def versions() -> dict[str, str]:
 
 def short_names(paths: Sequence[PathLike]) -> dict[str, str]:
     """Shorten paths to as many of their last parts as make them unique.
-
-    Args:
-        paths: Paths of files.
-
-    Returns:
-        Short name of each path.
 
     >>> short_names(["a/front/hole.csv", "a/back/hole.csv", "arm.urdf"])
     {'a/front/hole.csv': 'front/hole.csv', 'a/back/hole.csv': 'back/hole.csv', 'arm.urdf': 'arm.urdf'}
@@ -127,26 +107,12 @@ def _select_keys(content: Mapping[str, Any], keys: Sequence[str]) -> dict[str, A
 
 
 def main_statistics(accuracy: Mapping[str, Any]) -> dict[str, Any]:
-    """Select RMS and largest errors.
-
-    Args:
-        accuracy: Flat keys and values of an accuracy, see `calibration.Accuracy`.
-
-    Returns:
-        The selected keys and values.
-    """
+    """Select RMS and largest errors."""
     return _select_keys(accuracy, _ACCURACY)
 
 
 def parameter_rows(fit: Result) -> list[dict[str, Any]]:
-    """Return the parameters as the JSON document lists them.
-
-    Args:
-        fit: Result of the calibration.
-
-    Returns:
-        Keys and values of each parameter, in SI units.
-    """
+    """Return the parameters as the JSON document lists them."""
     return [_select_keys(asdict(estimate), _PARAMETER) for estimate in fit.estimates]
 
 
@@ -157,18 +123,7 @@ def result_to_dict(
     outliers: Sequence[int] = (),
     is_calibration: bool = True,
 ) -> dict[str, Any]:
-    """Collect the JSON document of a calibration, or of a validation that fits base and tool.
-
-    Args:
-        fit: Result of the calibration.
-        files: Paths of the written files by their meaning.
-        inputs: SHA-256 of each input file by path.
-        outliers: Outliers, as they are numbered in the files.
-        is_calibration: Whether the accuracy on configurations that are not fitted is stated, too.
-
-    Returns:
-        Content of the document.
-    """
+    """Collect the JSON document of a calibration, or of a validation that fits base and tool."""
     comparisons = {comparison.title: comparison for comparison in fit.comparisons}
     fitted, holdout = comparisons["fitted"], comparisons.get("hold-out")
     return {
@@ -206,14 +161,7 @@ def result_to_dict(
 
 
 def generalization_to_dict(generalization: Generalization | None) -> dict[str, Any]:
-    """Return the accuracy on configurations that are not fitted.
-
-    Args:
-        generalization: The accuracy and where it holds; None if it is unknown.
-
-    Returns:
-        Keys and values of the document; None where something is unknown.
-    """
+    """Return the accuracy on configurations that are not fitted."""
     names = ("cross_validated", "holdout_region")
     comparisons: tuple[Comparison | None, ...] = (None, None)
     reasons: tuple[str, ...] = ("", "")
@@ -233,17 +181,7 @@ def generalization_to_dict(generalization: Generalization | None) -> dict[str, A
 def validation_to_dict(
     chain: Chain, data: Sequence[Measurement], inputs: Mapping[str, str], known: Mapping[str, float]
 ) -> dict[str, Any]:
-    """Collect the JSON document of a validation; it has the keys of a calibration.
-
-    Args:
-        chain: Validated robot.
-        data: Measurements.
-        inputs: SHA-256 of each input file by path.
-        known: Values of instrument parameters by name; the others are fitted to the data.
-
-    Returns:
-        Content of the document.
-    """
+    """Collect the JSON document of a validation; it has the keys of a calibration."""
     statistics = main_statistics(accuracy(chain, data, known))
     return {
         "verdict": Verdict("ok").to_dict(),
@@ -276,14 +214,7 @@ def validation_to_dict(
 
 
 def json_text(content: Any) -> str:
-    """Format a document as JSON; NaN and infinity become null.
-
-    Args:
-        content: Content of the document.
-
-    Returns:
-        Text with a line feed at its end.
-    """
+    """Format a document as JSON; NaN and infinity become null."""
 
     def clean(value: Any) -> Any:
         if isinstance(value, dict):

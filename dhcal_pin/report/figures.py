@@ -119,14 +119,7 @@ class FigureGroup:
 
 
 def accuracy_figures(context: ReportContext) -> list[FigureGroup]:
-    """Draw histograms of the errors before and after, for hold-out and fitted samples and each error group.
-
-    Args:
-        context: Result and diagnostics.
-
-    Returns:
-        One group of figures.
-    """
+    """Draw histograms of the errors before and after, for hold-out and fitted samples by error group."""
     fit, panels = context.fit, []
     norms = {
         role: [
@@ -146,15 +139,7 @@ def accuracy_figures(context: ReportContext) -> list[FigureGroup]:
 
 
 def histogram_panels(group: str, errors: Mapping[str, tuple[Array, Array]]) -> list[Panel]:
-    """Draw histograms of the errors of samples of different roles, on the same horizontal axis.
-
-    Args:
-        group: Group of errors.
-        errors: Error norms before and after, (m,) each [m or rad], by role.
-
-    Returns:
-        One figure per role.
-    """
+    """Draw histograms of the errors of samples of different roles, on the same horizontal axis."""
     if not errors:
         return []
     quantity, unit = GROUP_LABELS[group], GROUP_UNITS[group]
@@ -171,14 +156,7 @@ def histogram_panels(group: str, errors: Mapping[str, tuple[Array, Array]]) -> l
 
 
 def residual_figures(context: ReportContext) -> list[FigureGroup]:
-    """Draw the residual error of each joint, and the errors over the joint positions and over the samples.
-
-    Args:
-        context: Result and diagnostics.
-
-    Returns:
-        Groups of figures.
-    """
+    """Draw the residual error of each joint, and the errors over the joint positions and over the samples."""
     groups = [
         _joint_offset_group(context),
         joint_error_group(context.samples),
@@ -248,14 +226,7 @@ def _offset_unit(profile: JointProfile) -> str:
 
 
 def joint_curve_figures(context: ReportContext) -> list[FigureGroup]:
-    """Draw the correction curve of each joint with its band and the joint values that were not measured.
-
-    Args:
-        context: Result and diagnostics.
-
-    Returns:
-        One group of figures; none if no joint has harmonics.
-    """
+    """Draw the correction curve of each joint with its band and the joint values that were not measured."""
     curves = context.joint_curves
     if not curves:
         return []
@@ -288,14 +259,7 @@ def joint_curve_figures(context: ReportContext) -> list[FigureGroup]:
 
 
 def joint_error_group(samples: Samples) -> FigureGroup:
-    """Draw the errors of samples over the positions of the joints.
-
-    Args:
-        samples: Samples with errors.
-
-    Returns:
-        Group of figures, one per joint; none if no sample belongs to a configuration.
-    """
+    """Draw the errors of samples over the positions of the joints."""
     group = next(iter(samples.errors))
     quantity, errors, panels = GROUP_LABELS[group], samples.errors[group]["after"], []
     is_shown = np.isfinite(errors) & np.isfinite(samples.q).all(1)
@@ -318,14 +282,7 @@ def joint_error_group(samples: Samples) -> FigureGroup:
 
 
 def sample_group(samples: Samples) -> FigureGroup:
-    """Draw the errors of samples in the order of their files.
-
-    Args:
-        samples: Samples with errors.
-
-    Returns:
-        Group of figures, one per group of errors.
-    """
+    """Draw the errors of samples in the order of their files."""
     panels, roles = [], {}
     for group in samples.errors:
         by_role = _errors_by_role(samples, group)
@@ -362,14 +319,7 @@ def _errors_by_role(samples: Samples, group: str) -> dict[str, tuple[Array, Arra
 
 
 def workspace_figures(context: ReportContext) -> list[FigureGroup]:
-    """Draw maps of the predicted standard deviation of the tool position, beside the measured errors.
-
-    Args:
-        context: Result and diagnostics.
-
-    Returns:
-        One group of figures; none if nothing can be predicted.
-    """
+    """Draw maps of the predicted standard deviation of the tool position, beside the measured errors."""
     samples = context.samples
     errors = samples.errors.get("position", {}).get("after", np.full(len(samples), np.nan))
     is_measured = np.isfinite(errors) & np.isfinite(samples.q).all(1)
@@ -381,14 +331,6 @@ def workspace_maps(workspace: WorkspacePrediction, points: Array, errors: Array)
     """Draw maps of the predicted standard deviation of the tool position beside maps of measured errors.
 
     All maps have the same colours, evenly spaced from zero.
-
-    Args:
-        workspace: Predictions over the workspace, and measured samples.
-        points: Tool positions of measured errors in the base frame, (m, 3) [m].
-        errors: Measured position errors, (m,) [m].
-
-    Returns:
-        One group of figures; none if nothing can be predicted.
     """
     finite = workspace.std[np.isfinite(workspace.std)]
     if not finite.size:
@@ -431,14 +373,7 @@ def _without_largest(errors: Array) -> Array:
 
 
 def scene_figures(context: ReportContext) -> list[FigureGroup]:
-    """Draw the robot before and after calibration: a 3-D scene on screens, two drawings in print.
-
-    Args:
-        context: Result and diagnostics.
-
-    Returns:
-        One group of figures.
-    """
+    """Draw the robot before and after calibration: a 3-D scene on screens, two drawings in print."""
     fit, magnification = context.fit, scene_magnification(context)
     base = se3.inverse(fit.chain.base)
     nominal, calibrated = (
@@ -469,28 +404,14 @@ def scene_figures(context: ReportContext) -> list[FigureGroup]:
 
 
 def packed_scene(page: str) -> str:
-    """Compress the page of a scene, with the script that moves its arm to the samples that a report selects.
-
-    Args:
-        page: Page of a scene.
-
-    Returns:
-        The page in zlib format as Base64, which the scripts of the report unpack when it is needed.
-    """
+    """Compress the page of a scene, with the script that moves its arm to selected samples."""
     script = SCENE_LINK.read_text("utf-8")
     linked = f"<script>\n{script}</script>\n</body>".join(page.rsplit("</body>", 1))
     return base64.b64encode(zlib.compress(linked.encode(errors="backslashreplace"), 9)).decode()
 
 
 def scene_magnification(context: ReportContext) -> float:
-    """Choose how many times larger than true the errors of the robot are drawn.
-
-    Args:
-        context: Result and diagnostics.
-
-    Returns:
-        Magnification: 1, 2 or 5 times a power of ten, from 1 to `scene.MAX_MAGNIFICATION`.
-    """
+    """Choose how many times larger than true the errors of the robot are drawn."""
     nominal, calibrated = (
         _arm_points(chain, context)[:-1] for chain in (context.fit.nominal_refitted, context.fit.chain)
     )
@@ -518,14 +439,7 @@ def _round_up_125(value: float) -> float:
 
 
 def observability_figures(context: ReportContext) -> list[FigureGroup]:
-    """Draw the singular values of the whitened Jacobian.
-
-    Args:
-        context: Result and diagnostics.
-
-    Returns:
-        One group of figures; none if all singular values are zero.
-    """
+    """Draw the singular values of the whitened Jacobian."""
     values, rank = qr.singular_values(context.fit.solution.system.r), context.fit.rank
     if not (values.size and values[0] > 0):
         return []

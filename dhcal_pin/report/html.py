@@ -42,16 +42,7 @@ def write_report(fit: Result, path: PathLike, source: Provenance | None = None) 
 
 
 def report_files(fit: Result, paths: Sequence[PathLike], source: Provenance) -> dict[PathLike, str | bytes]:
-    """Render the report for each path, as HTML or Markdown according to its ending.
-
-    Args:
-        fit: Result of the calibration.
-        paths: Files that will be written; see `check_ending`.
-        source: Files, hashes and settings, which a result does not contain.
-
-    Returns:
-        Text of each file by path.
-    """
+    """Render the report for each path, as HTML or Markdown according to its ending."""
     if not paths:
         return {}
     for path in paths:
@@ -61,28 +52,13 @@ def report_files(fit: Result, paths: Sequence[PathLike], source: Provenance) -> 
 
 
 def check_ending(path: PathLike) -> None:
-    """Raise an error if a path is neither that of an HTML nor that of a Markdown file.
-
-    Args:
-        path: Path of a report.
-
-    Raises:
-        InvalidArgumentError: The ending is unknown.
-    """
+    """Raise an error if a path is neither that of an HTML nor that of a Markdown file."""
     if not (_is_html(path) or os.fspath(path).lower().endswith(".md")):
         raise InvalidArgumentError(f"{os.fspath(path)}: unknown ending; write a report as .html or .md")
 
 
 def check_html_ending(path: PathLike, content: str) -> None:
-    """Raise an error if a path is not that of an HTML file.
-
-    Args:
-        path: Path of a page.
-        content: What the page contains, such as "a certificate".
-
-    Raises:
-        InvalidArgumentError: The ending is unknown.
-    """
+    """Raise an error if a path is not that of an HTML file."""
     if not _is_html(path):
         raise InvalidArgumentError(f"{os.fspath(path)}: unknown ending; write {content} as .html")
 
@@ -121,14 +97,7 @@ class Page:
 
 
 def html_page(context: ReportContext) -> str:
-    """Render the report as an HTML page.
-
-    Args:
-        context: Result and diagnostics.
-
-    Returns:
-        Text of the page; the same for the same input.
-    """
+    """Render the report as an HTML page."""
     head = summary.headline(context.comparisons)
     best = head.comparison
     if best.title != "fitted":
@@ -163,14 +132,7 @@ def html_page(context: ReportContext) -> str:
 
 
 def render_page(page: Page) -> str:
-    """Render a page that contains everything it shows: style, scripts, figures and data.
-
-    Args:
-        page: Content of the page.
-
-    Returns:
-        Text of the page; the same for the same content.
-    """
+    """Render a page that contains everything it shows: style, scripts, figures and data."""
     shown = []
     for section in page.sections:
         groups = section.figures() if section.figures else ()

@@ -64,23 +64,12 @@ def _rms(errors: Array) -> float:
 
 
 def has_images(context: ReportContext) -> bool:
-    """Return whether a result comes from images.
-
-    Args:
-        context: Result and diagnostics.
-    """
+    """Return whether a result comes from images."""
     return any(isinstance(item, CameraCorners) for item in context.fit.data)
 
 
 def stage_table(stages: Sequence[Stage]) -> Table:
-    """Return the accuracy after each stage of a calibration from images.
-
-    Args:
-        stages: Stages in their order.
-
-    Returns:
-        Table with the errors in the image and at the board.
-    """
+    """Return the accuracy after each stage of a calibration from images."""
 
     def cells(error: ImageError | None) -> list[str]:
         if error is None:
@@ -101,11 +90,7 @@ def stage_table(stages: Sequence[Stage]) -> Table:
 
 
 def image_table(context: ReportContext) -> Table:
-    """Return the images with the largest errors.
-
-    Args:
-        context: Result and diagnostics.
-    """
+    """Return the images with the largest errors."""
     images = sorted(_images(context), key=lambda image: -image.rms)[:MAX_LISTED_IMAGES]
     rows = [
         [
@@ -158,14 +143,7 @@ def _images(context: ReportContext) -> list[_Image]:
 
 
 def image_figures(context: ReportContext) -> list[FigureGroup]:
-    """Draw the errors of corners over the images of each camera, of each image, and of the worst images.
-
-    Args:
-        context: Result and diagnostics.
-
-    Returns:
-        Groups of figures.
-    """
+    """Draw the errors of corners over the images of each camera, of each image, and of the worst images."""
     images = _images(context)
     before, after = (np.array([_rms(e) for e in side]) for side in
                      ([i.before for i in images], [i.after for i in images]))  # fmt: skip

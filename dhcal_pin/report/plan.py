@@ -53,14 +53,7 @@ class PlanReport:
 
 
 def plan_page(report: PlanReport) -> str:
-    """Render the page of a plan.
-
-    Args:
-        report: Plan and what its page shows beside it.
-
-    Returns:
-        Text of the page; the same for the same input.
-    """
+    """Render the page of a plan."""
     plan, count = report.plan, len(report.plan.q)
     samples = Samples(
         chain=report.chain,

@@ -121,12 +121,7 @@ class Samples:
 
 
 def is_prismatic_joint(chain: Chain, joint: int) -> bool:
-    """Return whether an independent joint of a chain is prismatic.
-
-    Args:
-        chain: The robot.
-        joint: Index of the joint.
-    """
+    """Return whether an independent joint of a chain is prismatic."""
     return bool(chain.prismatic[np.flatnonzero(chain.mimic_matrix[:, joint])[0]])
 
 
@@ -159,15 +154,7 @@ def _values(values: Array, decimals: int) -> list[float | None]:
 
 
 def first_configurations(data: Sequence[Any], n_joints: int) -> Array:
-    """Return the first configuration of each sample of measurements.
-
-    Args:
-        data: Measurements.
-        n_joints: Number of joints n.
-
-    Returns:
-        Joint positions (N, n) [rad or m]; NaN for samples without a configuration.
-    """
+    """Return the first configuration of each sample of measurements."""
     parts = [
         item.q if item.configurations_per_row else np.full((len(item.rows), n_joints), np.nan)
         for item in data
@@ -176,15 +163,7 @@ def first_configurations(data: Sequence[Any], n_joints: int) -> Array:
 
 
 def sample_numbers(names: Sequence[str], data: Sequence[Any]) -> Array:
-    """Number the samples of files in a row: a file begins after the last line of the file before it.
-
-    Args:
-        names: File of each measurement.
-        data: Measurements.
-
-    Returns:
-        Numbers, (N,).
-    """
+    """Number the samples of files in a row: a file begins after the last line of the file before it."""
     last_rows: dict[str, int] = {}
     for name, item in zip(names, data, strict=True):
         last_rows[name] = max(last_rows.get(name, 0), int(item.rows.max()))
@@ -193,16 +172,7 @@ def sample_numbers(names: Sequence[str], data: Sequence[Any]) -> Array:
 
 
 def result_samples(fit: Result, data_names: Sequence[str], holdout_names: Sequence[str]) -> Samples:
-    """Collect the samples of a calibration.
-
-    Args:
-        fit: Result of the calibration.
-        data_names: Name of each fitted measurement.
-        holdout_names: Name of each held-out measurement.
-
-    Returns:
-        Fitted and held-out samples.
-    """
+    """Collect the samples of a calibration."""
     data, names = [*fit.data, *fit.holdout], [*data_names, *holdout_names]
     table = fit.residuals
     order = table.file_order
@@ -225,28 +195,12 @@ def result_samples(fit: Result, data_names: Sequence[str], holdout_names: Sequen
 
 
 def residuals_text(fit: Result, names: Array) -> str:
-    """Render the residuals of a calibration as CSV, as --residuals writes them.
-
-    Args:
-        fit: Result of the calibration.
-        names: Name of the file of each sample in the order of the CSV file, (N,); a page does not contain
-            the folders of the files.
-
-    Returns:
-        Text of the file.
-    """
+    """Render the residuals of a calibration as CSV, as --residuals writes them."""
     return csv_text(fit.residuals.file_columns() | {"file": names.tolist()})
 
 
 def parameters_text(fit: Result) -> str:
-    """Render the parameters of a calibration as CSV, with the keys of the JSON document.
-
-    Args:
-        fit: Result of the calibration.
-
-    Returns:
-        Text of the file: one row per parameter, in SI units; a value that is not finite is empty.
-    """
+    """Render the parameters of a calibration as CSV, with the keys of the JSON document."""
     rows = parameter_rows(fit)
     return csv_text({key: [_cell(row[key]) for row in rows] for key in rows[0]} if rows else {})
 

@@ -136,14 +136,7 @@ class Section:
 
 
 def report_sections(context: ReportContext) -> list[Section]:
-    """Return all sections of the report below its headline.
-
-    Args:
-        context: Result and diagnostics.
-
-    Returns:
-        Sections in their order; a section without content is left out of the report.
-    """
+    """Return all sections of the report below its headline."""
     return [
         _accuracy_section(context),
         _image_section(context),
@@ -161,14 +154,7 @@ def report_sections(context: ReportContext) -> list[Section]:
 
 
 def warnings(context: ReportContext) -> list[str]:
-    """Return what a reader must know before relying on the report.
-
-    Args:
-        context: Result and diagnostics.
-
-    Returns:
-        Sentences.
-    """
+    """Return what a reader must know before relying on the report."""
     fit, texts = context.fit, []
     texts += summary.regressions(fit.errors, context.comparisons)
     if not np.isfinite(fit.unit_weight_std):
@@ -560,15 +546,7 @@ def _outlier_section(context: ReportContext) -> Section:
 
 
 def samples_section(samples: Samples, title: str = "Samples") -> Section:
-    """List the samples with the largest errors; scripts of the page make it a list of all samples.
-
-    Args:
-        samples: Samples of the page.
-        title: Heading of the section.
-
-    Returns:
-        The section.
-    """
+    """List the samples with the largest errors; scripts of the page make it a list of all samples."""
     groups = {
         group: states["after"]
         for group, states in samples.errors.items()
@@ -671,14 +649,7 @@ def _hash_table(context: ReportContext) -> Table:
 
 
 def markdown(context: ReportContext) -> str:
-    """Render the report as Markdown, without figures.
-
-    Args:
-        context: Result and diagnostics.
-
-    Returns:
-        Text of the Markdown file.
-    """
+    """Render the report as Markdown, without figures."""
     head = summary.headline(context.comparisons)
     verdict = context.fit.verdict
     escape = formatting.escape_markdown

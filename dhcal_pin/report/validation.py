@@ -56,14 +56,7 @@ class Validation:
 
 
 def validation_page(validation: Validation) -> str:
-    """Render the page of a validation.
-
-    Args:
-        validation: Accuracy of a robot on measurements.
-
-    Returns:
-        Text of the page; the same for the same input.
-    """
+    """Render the page of a validation."""
     samples = _samples(validation)
     group, statistics = next(iter(list(validation.accuracies.values())[-1].groups.items()))
     values = [

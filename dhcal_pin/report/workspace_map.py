@@ -23,14 +23,7 @@ from .sections import Section
 
 
 def check_map_ending(path: str) -> None:
-    """Raise an error if a path is neither that of a CSV file nor that of an HTML file.
-
-    Args:
-        path: Path of a map.
-
-    Raises:
-        InvalidArgumentError: The ending is unknown.
-    """
+    """Raise an error if a path is neither that of a CSV file nor that of an HTML file."""
     if not path.lower().endswith((".csv", ".html")):
         raise InvalidArgumentError(f"{path}: unknown ending; write a map as .csv or .html")
 
@@ -38,17 +31,7 @@ def check_map_ending(path: str) -> None:
 def map_content(
     path: str, model: Predictor, data: Sequence[Measurement], known: Mapping[str, float] | None = None
 ) -> str:
-    """Compute a map and render it as a table or a page, according to the ending of the path.
-
-    Args:
-        path: File that will be written, `.csv` or `.html`.
-        model: Calibration, or what its sidecar file contains of it.
-        data: Measurements to compare with.
-        known: Values of their instrument parameters by name; others are fitted to the data.
-
-    Returns:
-        Text of the file.
-    """
+    """Compute a map and render it as a table or a page, according to the ending of the path."""
     if path.lower().endswith(".csv"):
         return map_text(workspace_map(model, data, known))
     sentences = [
@@ -78,14 +61,7 @@ def map_content(
 
 
 def map_text(workspace: WorkspaceMap) -> str:
-    """Render a map as CSV in millimetres; columns of measurements exist only if there are any.
-
-    Args:
-        workspace: Map of the workspace.
-
-    Returns:
-        Text of the file.
-    """
+    """Render a map as CSV in millimetres; columns of measurements exist only if there are any."""
     names = ("x[mm]", "y[mm]", "z[mm]")
     columns = {name: (1e3 * workspace.centre[:, i]).round(6).tolist() for i, name in enumerate(names)}
     columns |= {

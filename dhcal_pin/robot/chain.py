@@ -67,26 +67,12 @@ _IDENTITY = np.eye(4)
 
 
 def joint_frame(j: int) -> int:
-    """Return the index of the error frame at the origin of a joint, before its motion.
-
-    Args:
-        j: Number of the moving joint, 1 to k.
-
-    Returns:
-        Index of the error frame.
-    """
+    """Return the index of the error frame at the origin of a joint, before its motion."""
     return 2 * j
 
 
 def link_frame(j: int) -> int:
-    """Return the index of the error frame after the motion of a joint.
-
-    Args:
-        j: Number of the moving joint, 1 to k, or 0 for the base link.
-
-    Returns:
-        Index of the error frame.
-    """
+    """Return the index of the error frame after the motion of a joint."""
     return 2 * j + 1
 
 
@@ -647,15 +633,7 @@ class Chain:
 
 
 def bodies_of_frames(chain: Chain, error_frames: ArrayLike) -> Array:
-    """Return the bodies that perturbations of error frames move.
-
-    Args:
-        chain: Kinematic chain.
-        error_frames: Indices of error frames, shape (p,).
-
-    Returns:
-        Body numbers, shape (p,).
-    """
+    """Return the bodies that perturbations of error frames move."""
     return np.clip((np.asarray(error_frames, int) - 1) // 2, 0, len(chain.moving_joints))
 
 
@@ -683,14 +661,7 @@ def twists_in_bodies(
 
 
 def without_mimics(chain: Chain) -> Chain:
-    """Return a copy in which every moving joint is independent.
-
-    Args:
-        chain: Kinematic chain, possibly with mimic joints.
-
-    Returns:
-        Chain with n = k joints without limits.
-    """
+    """Return a copy in which every moving joint is independent."""
     k = len(chain.moving_joints)
     unlimited = np.full(k, np.inf)
     return replace(

@@ -112,16 +112,7 @@ class CollisionChecker:
 
     @classmethod
     def from_chain(cls, chain: Chain, obstacles: Sequence[Obstacle] = ()) -> CollisionChecker:
-        """Load the collision geometry of a chain's URDF.
-
-        Args:
-            chain: Kinematic chain of the robot.
-            obstacles: Floor and obstacles.
-
-        Returns:
-            Checker. If a mesh is missing or the URDF has no collision shapes, it checks floor and obstacles
-            only.
-        """
+        """Load the collision geometry of a chain's URDF."""
         geometry, problem = _load_geometry(chain.urdf, chain.model)
         note = f"self-collision is not checked: {problem}" if problem else ""
         if geometry is not None:
@@ -146,14 +137,7 @@ class CollisionChecker:
         return self.chain.model.createData(), shapes
 
     def is_collision_free(self, q: Array) -> bool:
-        """Return whether no two shapes collide; True if there is nothing to check.
-
-        Args:
-            q: Joint positions, shape (n,) [rad or m].
-
-        Returns:
-            Whether the configuration is free of collisions.
-        """
+        """Return whether no two shapes collide; True if there is nothing to check."""
         if self.geometry is None:
             return True
         data, shapes = self._data
@@ -177,14 +161,7 @@ class CollisionChecker:
         return self.shapes_on_line(q, eye, point) <= self.shapes_on_end(True)
 
     def shapes_on_end(self, is_tip: bool) -> frozenset[int]:
-        """Return the shapes of the robot that no joint of the chain moves against its tip, or its begin.
-
-        Args:
-            is_tip: Whether the end is the tip.
-
-        Returns:
-            Numbers of the shapes.
-        """
+        """Return the shapes of the robot that no joint of the chain moves against its tip, or its begin."""
         if self.geometry is None:
             return frozenset()
         chain, model = self.chain, self.chain.model
@@ -272,15 +249,6 @@ def obstacles_from_urdf(urdf: Urdf) -> list[Obstacle]:
     """Read the collision shapes of a scene that stands still.
 
     The root link of the scene is that of the robot. The joints of the scene are at their neutral positions.
-
-    Args:
-        urdf: Scene.
-
-    Returns:
-        One obstacle per shape, named by its link.
-
-    Raises:
-        FileFormatError: The scene has no collision shapes, or a mesh is missing.
     """
     model = build_model(urdf)
     geometry, problem = _load_geometry(urdf, model)

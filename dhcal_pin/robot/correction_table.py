@@ -50,15 +50,6 @@ def joint_corrections(chain: Chain) -> list[JointCorrection]:
 
     The values are the multiples of 1° within the joint limits, and the limits themselves. A joint without
     limits has the values from -180° to 180°.
-
-    Args:
-        chain: Calibrated robot.
-
-    Returns:
-        One table per joint; empty if no joint has harmonics.
-
-    Raises:
-        ConvergenceError: The errors of a joint are so large that it does not reach some values.
     """
     if chain.transmission is None:
         return []
@@ -76,14 +67,7 @@ def joint_corrections(chain: Chain) -> list[JointCorrection]:
 
 
 def correction_columns(corrections: Sequence[JointCorrection]) -> dict[str, list[Any]]:
-    """Return the columns of a CSV file with corrections.
-
-    Args:
-        corrections: Tables of the joints.
-
-    Returns:
-        Joint, value [deg] and correction [deg] of each row, by header.
-    """
+    """Return the columns of a CSV file with corrections."""
     names, values, angles = [list[Any]() for _ in range(3)]
     for table in corrections:
         names += [table.joint] * len(table.values)

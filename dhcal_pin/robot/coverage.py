@@ -83,14 +83,7 @@ class JointCoverage:
         return [(float(low), float(high)) for low, high in edges.reshape(-1, 2)]
 
     def n_different_values(self, order: int) -> int:
-        """Count the joint values that a curve can distinguish.
-
-        Args:
-            order: Highest harmonic of the curve.
-
-        Returns:
-            Number of different values.
-        """
+        """Count the joint values that a curve can distinguish."""
         tolerance, count, last = _SAME_PHASE_RAD / order, 0, -np.inf
         for value in self._from_widest_gap():
             if value - last > tolerance:
@@ -98,15 +91,7 @@ class JointCoverage:
         return count
 
     def is_lattice(self, order: int) -> bool:
-        """Return whether the joint took so few different values that harmonics cannot be told apart.
-
-        Args:
-            order: Highest harmonic of the curve.
-
-        Returns:
-            Whether the values repeat, and are fewer than the degrees of freedom of a curve over their range;
-            false for a joint that did not move.
-        """
+        """Return whether the joint took so few different values that harmonics cannot be told apart."""
         count = self.n_different_values(order)
         if count < 2 or _MIN_REPETITIONS * count > len(self.values):
             return False
@@ -123,29 +108,14 @@ class JointCoverage:
 
 
 def bin_indices(values: Array) -> Array:
-    """Compute the bins of joint values.
-
-    Args:
-        values: Joint values [rad].
-
-    Returns:
-        Indices into `BIN_CENTRES`, in the shape of the values.
-    """
+    """Compute the bins of joint values."""
     # Whole turns are removed first: a value of 1e308 overflows if it is divided by the width.
     within_turn = np.fmod(values, 2 * np.pi)
     return np.mod(np.rint(within_turn / BIN_WIDTH_RAD) + N_BINS // 2, N_BINS).astype(int)
 
 
 def joint_coverage(chain: Chain, q: Array) -> tuple[JointCoverage, ...]:
-    """Compute which parts of a turn the revolute joints visited.
-
-    Args:
-        chain: Robot.
-        q: Joint positions, shape (m, n) [rad or m]; repeated configurations count once.
-
-    Returns:
-        Coverage of each revolute joint, in the order of the chain.
-    """
+    """Compute which parts of a turn the revolute joints visited."""
     # Quotients that overflow count as one value.
     with np.errstate(over="ignore"):
         rounded = np.rint(q / _SAME_CONFIGURATION)
@@ -172,15 +142,7 @@ def _bins_in_range(lower: float, upper: float) -> Array:
 
 
 def lattice_warnings(coverage: Sequence[JointCoverage], order: int) -> list[str]:
-    """Describe joints whose values do not determine a correction curve because they form a lattice.
-
-    Args:
-        coverage: Coverage of the joints.
-        order: Highest harmonic of the curves.
-
-    Returns:
-        One sentence for each joint.
-    """
+    """Describe joints whose values do not determine a correction curve because they form a lattice."""
     return [
         f"the values of {one.joint} form a lattice, {one.n_different_values(order)} different ones in "
         f"{len(one.values)} configurations: the correction curve is not determined between them; measure at "

@@ -32,13 +32,6 @@ def axis_rotation(axis: int, angle: Array) -> Array:
     """Compute rotations about a coordinate axis.
 
     Quarter turns are exact: the cosine of 90° is 0, not 6e-17.
-
-    Args:
-        axis: 0, 1 or 2 for x, y or z.
-        angle: Angles, shape (...,) [rad].
-
-    Returns:
-        Homogeneous matrices, shape (..., 4, 4).
     """
     c, s = np.cos(angle), np.sin(angle)
     c, s = np.where(np.abs(c) < 1e-16, 0.0, c), np.where(np.abs(s) < 1e-16, 0.0, s)
@@ -50,15 +43,7 @@ def axis_rotation(axis: int, angle: Array) -> Array:
 
 
 def axis_translation(axis: int, length: Array) -> Array:
-    """Compute translations along a coordinate axis.
-
-    Args:
-        axis: 0, 1 or 2 for x, y or z.
-        length: Distances, shape (...,) [m].
-
-    Returns:
-        Homogeneous matrices, shape (..., 4, 4).
-    """
+    """Compute translations along a coordinate axis."""
     return se3.translation(np.asarray(length)[..., None] * np.eye(3)[axis])
 
 

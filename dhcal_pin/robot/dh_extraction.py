@@ -212,12 +212,6 @@ def normalize_offsets(table: DHTable) -> DHTable:
     Each joint frame is moved along its own axis, back to where the axis passes the frame before; this changes
     no pose. The result is used if it shortens the whole chain by a third or more; its rows then have β.
     Exactly parallel axes stay as they are.
-
-    Args:
-        table: DH table.
-
-    Returns:
-        Table of the same arm.
     """
     origins = table.origins()
     moved = origins.copy()
@@ -242,9 +236,6 @@ def _base_transform(
 
     The base can contain any motion, so it takes everything except the offset along an upright axis 1. Only an
     origin that already is a modified row goes to the table.
-
-    Returns:
-        Base, shape (4, 4), and the parameters that remain for row 1.
     """
     row = _split_origin(origin, 0.0, arm_length, max_tilt, offset_first=False)
     if not standard and row.t1 == 0 and row.d1 == 0:
@@ -260,9 +251,6 @@ def _split_origin(
 
     `previous_t2` is the rotation that the joint before the origin already has. For a row with β, the free
     offset goes to d1 if `offset_first`, else to d2.
-
-    Returns:
-        Parameters of the preferred form of the row.
     """
     tilt = _tilt(origin)
     t1, d2 = _common_normal(origin) if tilt > QUARTER_TURN_TOL else (0.0, 0.0)

@@ -179,9 +179,6 @@ def _skeletons(table: DHTable) -> list[_Skeleton]:
 
     In the standard convention, row i belongs to link i, d before a. In the modified convention, row i belongs
     to link i-1, a before d.
-
-    Returns:
-        Skeletons of base_link, link_1 … link_n.
     """
     row = table.rows(np.zeros((1, table.n_joints)))[0]
     start, zero = table.base[:3, 3], np.zeros(3)

@@ -56,16 +56,7 @@ _MAX_RESTARTS, _STEPS_PER_START = 100, 60
 
 
 def tool_pose_and_jacobian(chain: Chain, q: Array) -> tuple[Array, Array]:
-    """Compute tool poses and geometric Jacobians.
-
-    Args:
-        chain: Kinematic chain.
-        q: Joint positions, shape (m, n) [rad or m].
-
-    Returns:
-        Poses, shape (m, 4, 4), and Jacobians, shape (m, 6, n): twists [v, ω] of the tool point in axes of the
-        measuring frame per unit of each joint.
-    """
+    """Compute tool poses and geometric Jacobians."""
     frames = chain.forward_kinematics(q)
     return frames.poses(), chain.joint_jacobian(frames).transpose(2, 1, 0)
 
@@ -75,12 +66,6 @@ def characteristic_length(chain: Chain) -> float:
 
     It is a third of the total length of links and prismatic strokes (at most 1 m each): a rotation of a joint
     by one radian moves the tool by about that distance.
-
-    Args:
-        chain: Kinematic chain.
-
-    Returns:
-        Characteristic length [m].
     """
     links = np.concatenate([chain.origins[1:-1], (chain.origins[-1] @ chain.tool)[None]])
     strokes = np.minimum(chain.upper - chain.lower, 1.0)[chain.is_prismatic]
@@ -88,14 +73,7 @@ def characteristic_length(chain: Chain) -> float:
 
 
 def without_rotary_limits(chain: Chain) -> Chain:
-    """Return a copy of a chain without limits of revolute joints; prismatic joints keep theirs.
-
-    Args:
-        chain: Kinematic chain.
-
-    Returns:
-        Copy of the chain.
-    """
+    """Return a copy of a chain without limits of revolute joints; prismatic joints keep theirs."""
     is_revolute = ~chain.is_prismatic
     return replace(
         chain,
@@ -175,14 +153,7 @@ def _damped_step(jacobians: Array, errors: Array, damping: Array) -> Array:
 
 
 def position_task(targets: Array) -> TaskError:
-    """Create the task error of target positions.
-
-    Args:
-        targets: Positions of the tool, shape (m, 3) [m].
-
-    Returns:
-        Task error with 3 components.
-    """
+    """Create the task error of target positions."""
     return lambda poses, samples: (
         poses[:, :3, 3] - targets[samples],
         np.broadcast_to(np.eye(3), (len(poses), 3, 3)),
@@ -268,20 +239,7 @@ def reach_within_limits(
 
 
 def solve_within_limits(chain: Chain, task_error: TaskError, start: Array, rng: np.random.Generator) -> Array:
-    """Find joint positions that bring every task error to zero, within the joint limits if possible.
-
-    Args:
-        chain: Kinematic chain with base and tool.
-        task_error: Task errors of the samples, which are the rows of `start`.
-        start: Initial joint positions, shape (m, n) [rad or m].
-        rng: Random generator for further starts of samples that are not solved within the limits.
-
-    Returns:
-        Joint positions, shape (m, n) [rad or m].
-
-    Raises:
-        ConvergenceError: The task error of a sample remains.
-    """
+    """Find joint positions that bring every task error to zero, within the joint limits if possible."""
     q, errors = reach_within_limits(chain, task_error, start, rng)
     n_missed = np.sum(errors > REACHED_TOL)
     if n_missed:

@@ -152,29 +152,12 @@ class ConfigurationSampler:
     def from_chain(
         cls, chain: Chain, workspace: WorkspaceConstraints, angle: float, length: float
     ) -> ConfigurationSampler:
-        """Create a sampler with margins to the joint limits.
-
-        Args:
-            chain: Kinematic chain with base and tool.
-            workspace: Constraints of the tool pose.
-            angle: Margin to the limits of revolute joints [rad].
-            length: Margin to the limits of prismatic joints [m].
-
-        Returns:
-            Sampler with the collision geometry of the URDF.
-        """
+        """Create a sampler with margins to the joint limits."""
         checker = CollisionChecker.from_chain(chain, workspace.environment)
         return cls(chain, workspace, *joint_range(chain, angle, length), checker)
 
     def in_workspace(self, q: Array) -> Array:
-        """Return in which configurations the tool is in the workspace and above the floor.
-
-        Args:
-            q: Joint positions, shape (m, n) [rad or m].
-
-        Returns:
-            Whether the constraints of the tool are satisfied, shape (m,).
-        """
+        """Return in which configurations the tool is in the workspace and above the floor."""
         poses = self.chain.poses(q)
         inside = self.workspace.contains(poses)
         if self.workspace.floor is not None:
@@ -183,18 +166,7 @@ class ConfigurationSampler:
         return inside
 
     def draw(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw uniform joint positions whose tool poses are in the workspace; collisions are not checked.
-
-        Args:
-            count: Number of configurations.
-            rng: Random generator.
-
-        Returns:
-            Joint positions, shape (count, n) [rad or m].
-
-        Raises:
-            InvalidArgumentError: Too few configurations are in the workspace.
-        """
+        """Draw uniform joint positions whose tool poses are in the workspace; collisions are not checked."""
 
         def drawn() -> Array:
             q = rng.uniform(self.low, self.high, (count, self.chain.n_joints))
@@ -210,29 +182,12 @@ class ConfigurationSampler:
         return out
 
     def perturb(self, q: Array, step: float, count: int, rng: np.random.Generator) -> Array:
-        """Draw configurations around given ones, clipped to the joint range.
-
-        Args:
-            q: Joint positions, shape (m, n) [rad or m].
-            step: Standard deviation as a fraction of the joint range.
-            count: Number of configurations around each of q.
-            rng: Random generator.
-
-        Returns:
-            Joint positions, shape (m·count, n) [rad or m].
-        """
+        """Draw configurations around given ones, clipped to the joint range."""
         moves = rng.standard_normal((len(q), count, self.chain.n_joints)) * step * (self.high - self.low)
         return np.clip(q[:, None] + moves, self.low, self.high).reshape(-1, self.chain.n_joints)
 
     def is_feasible(self, q: Array) -> bool:
-        """Return whether a configuration has no collision and a free line of sight if one is required.
-
-        Args:
-            q: Joint positions, shape (n,) [rad or m].
-
-        Returns:
-            Whether the robot can be measured in this configuration.
-        """
+        """Return whether a configuration has no collision and a free line of sight if one is required."""
         if not self.collision.is_collision_free(q):
             return False
         if self.workspace.instrument_position is None:
@@ -247,17 +202,7 @@ class ConfigurationSampler:
 
 
 def collect_draws(draw: Callable[[], Array], count: int, max_rounds: int, max_empty_rounds: int) -> Array:
-    """Repeat random draws until enough of them were accepted.
-
-    Args:
-        draw: Draws once and returns what was accepted, shape (m, ...); m may differ from round to round.
-        count: Number of accepted draws.
-        max_rounds: Largest number of rounds.
-        max_empty_rounds: Number of rounds after which to give up if none of them accepted anything.
-
-    Returns:
-        Accepted draws, shape (count, ...), or fewer after the last round.
-    """
+    """Repeat random draws until enough of them were accepted."""
     parts: list[Array] = []
     for number in range(1, max_rounds + 1):
         parts.append(draw())
@@ -268,15 +213,7 @@ def collect_draws(draw: Callable[[], Array], count: int, max_rounds: int, max_em
 
 
 def scale_joint_units(chain: Chain, q: Array) -> Array:
-    """Convert positions of prismatic joints to radians by `RAD_PER_METRE`, so that distances can be compared.
-
-    Args:
-        chain: Kinematic chain.
-        q: Joint positions, shape (m, n) [rad or m].
-
-    Returns:
-        Joint positions, shape (m, n) [rad].
-    """
+    """Convert positions of prismatic joints to radians by `RAD_PER_METRE`."""
     return q * np.where(_is_prismatic(chain), RAD_PER_METRE, 1.0)
 
 

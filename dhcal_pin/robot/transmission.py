@@ -67,14 +67,7 @@ class GravityLoads:
     _cache: dict[bytes, Array] = field(default_factory=dict, repr=False)
 
     def configurations(self, q: Array) -> Array:
-        """Return Pinocchio configurations; joints that are not on the chain stay at neutral.
-
-        Args:
-            q: Actual joint positions, shape (n, m) [rad or m].
-
-        Returns:
-            Configurations of the whole model, shape (m, nq).
-        """
+        """Return Pinocchio configurations; joints that are not on the chain stay at neutral."""
         out = np.tile(pin.neutral(self.model), (q.shape[1], 1))
         for name, value in zip(
             self.moving_joints, self.mimic_matrix @ q + self.mimic_offset[:, None], strict=True
@@ -87,14 +80,7 @@ class GravityLoads:
         return out
 
     def torques(self, q: Array) -> Array:
-        """Compute the generalised gravity torques; the z axis of the root link points up.
-
-        Args:
-            q: Joint positions, shape (n, m) [rad or m].
-
-        Returns:
-            Torques or forces of the independent joints, shape (n, m) [N·m or N].
-        """
+        """Compute the generalised gravity torques; the z axis of the root link points up."""
         key = np.ascontiguousarray(q).tobytes()
         if key not in self._cache:
             data = self.model.createData()
@@ -125,14 +111,7 @@ class Transmission:
 
     @classmethod
     def zero(cls, loads: GravityLoads) -> Transmission:
-        """Create a transmission without errors: all coefficients are zero.
-
-        Args:
-            loads: Gravity torques on the joints.
-
-        Returns:
-            Transmission for which actual and commanded positions agree.
-        """
+        """Create a transmission without errors: all coefficients are zero."""
         return cls(np.zeros(n_coefficients(loads.mimic_matrix.shape[1])), loads)
 
     @property
@@ -167,28 +146,14 @@ class Transmission:
         return max(self.min_order, int(used[-1]) + 1 if used.size else 0)
 
     def terms(self, q: Array) -> Array:
-        """Evaluate the terms q, sin q, cos q, sin 2q, cos 2q, … and τ.
-
-        Args:
-            q: Commanded joint positions, shape (n, m) [rad or m].
-
-        Returns:
-            Values of the t = 2·order + 2 terms, shape (t, n, m).
-        """
+        """Evaluate the terms q, sin q, cos q, sin 2q, cos 2q, … and τ."""
         out = np.empty((2 * self.order + 2, *q.shape))
         out[0], out[-1] = q, self.loads.torques(q)
         fill_harmonics(q, out[1:-1].reshape(self.order, 2, *q.shape))
         return out
 
     def errors(self, terms: Array) -> Array:
-        """Compute the differences between actual and commanded joint positions.
-
-        Args:
-            terms: Values of the terms, shape (t, n, m).
-
-        Returns:
-            Joint errors, shape (n, m) [rad or m].
-        """
+        """Compute the differences between actual and commanded joint positions."""
         n = len(self.linear)
         joints, weights = np.arange(n), np.zeros((len(terms), n, n))
         weights[0], weights[-1, joints, joints] = self.linear, self.compliance
@@ -196,15 +161,7 @@ class Transmission:
         return np.tensordot(weights, terms, ((0, 2), (0, 1)))
 
     def locate(self, entries: Array) -> tuple[Array, Array, Array]:
-        """Find the joint that each of some coefficients moves, and its term.
-
-        Args:
-            entries: Indices of coefficients, shape (e,).
-
-        Returns:
-            Joint that moves, index of the term in the result of `terms`, and joint at which the term is
-            evaluated, each of shape (e,).
-        """
+        """Find the joint that each of some coefficients moves, and its term."""
         n = len(self.linear)
         rows, sources = np.divmod(entries, n)
         is_linear, is_compliance = rows < n, rows == len(self.coefficients) // n - 1
@@ -212,42 +169,19 @@ class Transmission:
         return np.where(is_linear, rows, sources), terms, sources
 
     def evaluating(self, entries: Array) -> Transmission:
-        """Return a transmission that evaluates the terms of some coefficients.
-
-        Args:
-            entries: Indices of coefficients, shape (e,).
-
-        Returns:
-            This transmission if it has these terms, otherwise a copy.
-        """
+        """Return a transmission that evaluates the terms of some coefficients."""
         order = int(harmonic_orders(entries, len(self.linear)).max(initial=0))
         return self if order <= self.order else replace(self, min_order=order)
 
     def with_coefficients_added(self, entries: Array, changes: Array) -> Transmission:
-        """Return a copy with increments added to some coefficients.
-
-        Args:
-            entries: Indices of coefficients, shape (e,).
-            changes: Increments, shape (e,).
-
-        Returns:
-            Transmission with the sums as coefficients. The harmonics among them are evaluated even where the
-            sum is zero.
-        """
+        """Return a copy with increments added to some coefficients."""
         coefficients = self.coefficients.copy()
         coefficients[entries] += changes
         return replace(self.evaluating(entries), coefficients=coefficients)
 
 
 def n_coefficients(n: int) -> int:
-    """Return the number of transmission coefficients.
-
-    Args:
-        n: Number of independent joints.
-
-    Returns:
-        Length c of the vector of coefficients.
-    """
+    """Return the number of transmission coefficients."""
     return n * (n + 2 * MAX_CURVE_ORDER + 1)
 
 
@@ -267,15 +201,7 @@ def split_coefficients(coefficients: Array, n: int) -> tuple[Array, Array, Array
 
 
 def harmonic_orders(entries: Array, n: int) -> Array:
-    """Return the orders of some coefficients.
-
-    Args:
-        entries: Indices of coefficients, shape (e,).
-        n: Number of independent joints.
-
-    Returns:
-        Order of each coefficient, shape (e,); 0 if it is no harmonic.
-    """
+    """Return the orders of some coefficients."""
     orders = (entries // n - n) // 2 + 1
     return np.where((entries >= n * n) & (orders <= MAX_CURVE_ORDER), orders, 0)
 
@@ -288,10 +214,6 @@ def fill_harmonics(q: Array, out: Array) -> None:
         sin (k+2)q = sin kq·cos 2q + cos kq·sin 2q,    cos (k+2)q = cos kq·cos 2q - sin kq·sin 2q.
 
     The rounding errors grow in proportion to k.
-
-    Args:
-        q: Joint positions, shape (n, m) [rad].
-        out: Array to fill with sin kq and cos kq for k = 1 … K, shape (K, 2, n, m).
     """
     for k, harmonic in enumerate(out[:2], 1):
         np.sin(k * q, out=harmonic[0])

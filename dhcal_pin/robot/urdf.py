@@ -96,14 +96,7 @@ class UrdfTag:
     children: dict[str, UrdfTag] = field(default_factory=dict)
 
     def error(self, text: str) -> FileFormatError:
-        """Create an error that names the file, the line and the element.
-
-        Args:
-            text: What is wrong and what is expected.
-
-        Returns:
-            Error to raise.
-        """
+        """Create an error that names the file, the line and the element."""
         return FileFormatError(f"{self.source}:{self.line}: {self.label}: {text}")
 
 
@@ -175,17 +168,7 @@ class Urdf:
         return {joint.child: joint for joint in self.joints}
 
     def joint(self, name: str) -> UrdfJoint:
-        """Return a joint by name.
-
-        Args:
-            name: Name of the joint.
-
-        Returns:
-            Joint of that name.
-
-        Raises:
-            UnknownNameError: There is no such joint; the message suggests similar names.
-        """
+        """Return a joint by name."""
         if name not in self._joints_by_name:
             suggestion = suggest_names(name, self._joints_by_name)
             raise UnknownNameError(f"{self.source}: unknown joint {quote(name)}; {suggestion}")
@@ -201,17 +184,7 @@ class Urdf:
         return tuple(link for link in self.links if link not in parents)
 
     def path(self, tip: str) -> tuple[UrdfJoint, ...]:
-        """Return the joints between the root and a link.
-
-        Args:
-            tip: Name of the link.
-
-        Returns:
-            Joints in the order from root to tip; empty for the root.
-
-        Raises:
-            UnknownNameError: There is no such link; the message suggests similar names.
-        """
+        """Return the joints between the root and a link."""
         if tip != self.root and tip not in self._joints_by_child:
             raise UnknownNameError(
                 f"{self.source}: unknown link {quote(tip)}; {suggest_names(tip, self.links)}"
@@ -224,17 +197,7 @@ class Urdf:
 
 
 def read_urdf(path: PathLike) -> Urdf:
-    """Read and check a URDF file.
-
-    Args:
-        path: Path of the file, or `example:NAME` for a robot of example-robot-data.
-
-    Returns:
-        Checked file.
-
-    Raises:
-        FileFormatError: The file cannot be read or is not a valid URDF; the message names the line.
-    """
+    """Read and check a URDF file."""
     source = resolve_robot_path(path)
     try:
         with open(source, "rb") as file:
@@ -246,18 +209,7 @@ def read_urdf(path: PathLike) -> Urdf:
 
 
 def parse_urdf(data: bytes, source: str) -> Urdf:
-    """Parse and check the bytes of a URDF.
-
-    Args:
-        data: Bytes of the file, UTF-8.
-        source: Name of the file for messages.
-
-    Returns:
-        Checked file.
-
-    Raises:
-        FileFormatError: The bytes are not a valid URDF; the message names the line.
-    """
+    """Parse and check the bytes of a URDF."""
     if len(data) > _MAX_BYTES:
         raise FileFormatError(
             f"{source}: the file is larger than {_MAX_BYTES >> 20} MiB, which no URDF is; check the path"
@@ -284,16 +236,6 @@ def scan_tags(data: bytes, source: str) -> tuple[UrdfTag, dict[str, UrdfTag], di
     """Find the tags of the robot, its links and its joints.
 
     Errors of the XML and of names are raised as `FileFormatError` with the line.
-
-    Args:
-        data: Bytes of the file, UTF-8.
-        source: Name of the file for messages.
-
-    Returns:
-        Tag of the robot, tags of the links by name, and tags of the joints by name.
-
-    Raises:
-        FileFormatError: The XML is not well-formed.
     """
     parser = expat.ParserCreate("utf-8")
     depth, robot = 0, None
@@ -386,14 +328,6 @@ def parse_numbers(tag: UrdfTag, key: str, count: int) -> list[float]:
     """Parse the finite numbers of an attribute.
 
     A wrong number raises a `FileFormatError` with the line.
-
-    Args:
-        tag: Tag that has the attribute.
-        key: Name of the attribute.
-        count: Expected number of numbers.
-
-    Returns:
-        The numbers.
     """
     # Expat replaces white space by spaces, except for character references such as &#9;, which do not
     # separate.
@@ -409,15 +343,7 @@ def parse_numbers(tag: UrdfTag, key: str, count: int) -> list[float]:
 
 
 def suggest_names(name: str, known: Iterable[str]) -> str:
-    """Suggest names that are similar to an unknown one, or list the known names.
-
-    Args:
-        name: Unknown name.
-        known: Known names.
-
-    Returns:
-        Part of a sentence for an error message.
-    """
+    """Suggest names that are similar to an unknown one, or list the known names."""
     # Matching takes quadratic time in the length of a name, and the names come from a file.
     short = [other for other in known if len(other) <= 100]
     similar = difflib.get_close_matches(name[:100], short, 3)
@@ -430,12 +356,6 @@ def xml_attribute(text: str) -> str:
     """Write the value of an XML attribute, with quotes.
 
     `xml.sax.saxutils.quoteattr` does the same but imports an HTTP client.
-
-    Args:
-        text: Value of the attribute.
-
-    Returns:
-        Escaped and quoted value.
     """
     return f'"{html.escape(text)}"'
 

@@ -37,16 +37,6 @@ def with_origins(urdf: Urdf, origins: Mapping[str, Array]) -> bytes:
 
     Translation and rotation are each rewritten only if they differ from those of the file. An unknown joint
     raises an `UnknownNameError`.
-
-    Args:
-        urdf: File to edit.
-        origins: Pose of the joint frame in its parent link, shape (4, 4) [m], by joint name.
-
-    Returns:
-        Bytes of the edited file.
-
-    Raises:
-        InvalidArgumentError: An origin is not a finite rigid motion.
     """
     edits: list[tuple[int, int, bytes]] = []
     for name, value in origins.items():
@@ -80,16 +70,6 @@ def with_world(data: bytes, base: Array) -> bytes:
     """Return the bytes of a URDF whose root is the link `world`, the measuring frame.
 
     If the root is already called `world`, the origins of its joints take up the base.
-
-    Args:
-        data: Bytes of a valid URDF.
-        base: Pose of the root link in the measuring frame, shape (4, 4) [m].
-
-    Returns:
-        Bytes of the edited file.
-
-    Raises:
-        InvalidArgumentError: The name `world` or `world_joint` is already used.
     """
     urdf = parse_urdf(data, "the calibrated URDF")
     if urdf.root == "world":
@@ -104,39 +84,12 @@ def with_world(data: bytes, base: Array) -> bytes:
 
 
 def with_tool_frame(data: bytes, tip: str, name: str, tool: Array) -> bytes:
-    """Return the bytes of a URDF with one more link at the measured point.
-
-    Args:
-        data: Bytes of a valid URDF.
-        tip: Name of the tip link.
-        name: Name of the new link; the joint is called NAME_joint.
-        tool: Pose of the new link in the tip link, shape (4, 4) [m].
-
-    Returns:
-        Bytes of the edited file.
-
-    Raises:
-        InvalidArgumentError: A link or a joint already has that name.
-    """
+    """Return the bytes of a URDF with one more link at the measured point."""
     return with_fixed_frame(data, tip, name, tool, "--tool-frame")
 
 
 def with_fixed_frame(data: bytes, parent: str, name: str, pose: Array, option: str) -> bytes:
-    """Return the bytes of a URDF with one more link that is fixed to another one.
-
-    Args:
-        data: Bytes of a valid URDF.
-        parent: Name of the link that carries the new one.
-        name: Name of the new link; the joint is called NAME_joint.
-        pose: Pose of the new link in its parent, shape (4, 4) [m].
-        option: Option that asks for it, for messages.
-
-    Returns:
-        Bytes of the edited file.
-
-    Raises:
-        InvalidArgumentError: A link or a joint already has that name.
-    """
+    """Return the bytes of a URDF with one more link that is fixed to another one."""
     urdf = parse_urdf(data, "the calibrated URDF")
     joint = f"{name}_joint"
     if name in urdf.links or joint in {other.name for other in urdf.joints}:
@@ -151,9 +104,6 @@ def _attribute_spans(data: bytes, start: int) -> tuple[dict[bytes, tuple[int, in
 
     Expat reports the offset of a tag, but values only after normalization. The tag is known to be
     well-formed.
-
-    Returns:
-        Span of each value between its quotes by name, end of the last attribute, and its quote character.
     """
     element = _ELEMENT.match(data, start)
     assert element is not None, "expat found a tag at this offset"

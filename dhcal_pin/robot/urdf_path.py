@@ -38,17 +38,7 @@ _MAX_MOVING_JOINTS = 64
 
 
 def build_model(urdf: Urdf) -> pin.Model:
-    """Build Pinocchio's model of the whole robot.
-
-    Args:
-        urdf: File of the robot.
-
-    Returns:
-        Model without geometry.
-
-    Raises:
-        FileFormatError: Pinocchio does not accept the file.
-    """
+    """Build Pinocchio's model of the whole robot."""
     try:
         # Pinocchio separates numbers at spaces only; XML allows any white space.
         text = urdf.data.decode("utf-8-sig").translate(dict.fromkeys(b"\t\r\n", " "))
@@ -62,15 +52,6 @@ def default_tip(urdf: Urdf) -> str:
     """Choose the leaf behind the most moving joints, and of these the one behind the most links.
 
     `tool0` is preferred among the leaves behind the most moving joints.
-
-    Args:
-        urdf: File of the robot.
-
-    Returns:
-        Name of the tip link.
-
-    Raises:
-        DhcalError: Several leaves are equally deep; the message lists them.
     """
     paths = {leaf: urdf.path(leaf) for leaf in urdf.leaves()}
     depths = {leaf: (sum(j.type != "fixed" for j in path), len(path)) for leaf, path in paths.items()}
@@ -91,16 +72,7 @@ def default_tip(urdf: Urdf) -> str:
 
 
 def path_between(urdf: Urdf, root: str, tip: str) -> list[tuple[UrdfJoint, bool]]:
-    """Find the joints on the path from one link to another.
-
-    Args:
-        urdf: File of the robot.
-        root: Name of the first link.
-        tip: Name of the last link.
-
-    Returns:
-        Joints in the order of the path, each with whether it is passed from child to parent.
-    """
+    """Find the joints on the path from one link to another."""
     up, down = urdf.path(root), urdf.path(tip)
     n_common = 0
     while n_common < min(len(up), len(down)) and up[n_common].name == down[n_common].name:
@@ -110,20 +82,7 @@ def path_between(urdf: Urdf, root: str, tip: str) -> list[tuple[UrdfJoint, bool]
 
 
 def find_moving_joints(urdf: Urdf, tip: str, root: str) -> list[tuple[UrdfJoint, bool]]:
-    """Find the joints that move between a link and a tip.
-
-    Args:
-        urdf: File of the robot.
-        tip: Name of the tip link.
-        root: Name of the first link.
-
-    Returns:
-        Revolute, continuous and prismatic joints in the order of the path, each with whether it is passed
-        from child to parent.
-
-    Raises:
-        DhcalError: No joint moves, too many do, or one has more than one degree of freedom.
-    """
+    """Find the joints that move between a link and a tip."""
     joints = [(joint, up) for joint, up in path_between(urdf, root, tip) if joint.type != "fixed"]
     for joint, _ in joints:
         if joint.type in ("floating", "planar"):
@@ -146,18 +105,7 @@ def find_moving_joints(urdf: Urdf, tip: str, root: str) -> list[tuple[UrdfJoint,
 
 
 def independent_joints(urdf: Urdf, moving: list[str]) -> tuple[list[str], Array, Array]:
-    """Find the independent joints behind the moving joints, and the mimic rules between them.
-
-    Args:
-        urdf: File of the robot.
-        moving: Names of the k moving joints.
-
-    Returns:
-        Names of the n independent joints, mimic matrix (k, n), and mimic offset (k,) [rad or m].
-
-    Raises:
-        FileFormatError: A joint mimics an unknown or fixed joint, or no independent joint remains.
-    """
+    """Find the independent joints behind the moving joints, and the mimic rules between them."""
     movable = [joint.name for joint in urdf.joints if joint.type in ("revolute", "continuous", "prismatic")]
     rules = []
     for name in moving:
@@ -185,19 +133,7 @@ def independent_joints(urdf: Urdf, moving: list[str]) -> tuple[list[str], Array,
 def placements(
     model: pin.Model, root: str, tip: str, moving: Sequence[str], is_reversed: Sequence[bool]
 ) -> tuple[Array, Array]:
-    """Return the constant transforms and axes of a path in Pinocchio's model.
-
-    Args:
-        model: Model of the whole robot.
-        root: Name of the first link.
-        tip: Name of the tip link.
-        moving: Names of the k moving joints.
-        is_reversed: Whether each joint is passed from child to parent, (k,).
-
-    Returns:
-        Pose of each moving joint in the moving joint before it, then the tip, shape (k+1, 4, 4) [m], and unit
-        axes, shape (k, 3); those of reversed joints are negative.
-    """
+    """Return the constant transforms and axes of a path in Pinocchio's model."""
     origins, axes = [], []
     before = se3.inverse(_frame_placement(model, root))
     for name, is_up in zip(moving, is_reversed, strict=True):
@@ -221,16 +157,6 @@ def joint_placements(
     """Compute the poses of joints in the moving joints before them from the transforms of a path.
 
     At the turn of the path, the first joint that is not reversed takes up the whole change.
-
-    Args:
-        model: Nominal model of the whole robot.
-        tip: Name of the tip link.
-        moving: Names of the k moving joints.
-        is_reversed: Whether each joint is passed from child to parent, (k,).
-        origins: Constant transforms of the path, shape (k+1, 4, 4) [m].
-
-    Returns:
-        Pose of each joint, shape (4, 4) [m] each, in the order of the path.
     """
     nominal = [model.jointPlacements[model.getJointId(name)].homogeneous for name in moving]
     out = []
@@ -252,14 +178,7 @@ def _frame_placement(model: pin.Model, link: str) -> Array:
 
 @lru_cache(maxsize=256)
 def axis_frame(unit: tuple[float, ...]) -> Array:
-    """Return a rotation that turns z onto a unit axis; it is a permutation for a coordinate axis.
-
-    Args:
-        unit: Unit axis, 3 components.
-
-    Returns:
-        Rotation as a homogeneous matrix, shape (4, 4).
-    """
+    """Return a rotation that turns z onto a unit axis; it is a permutation for a coordinate axis."""
     axis = np.array(unit)
     i = int(np.argmax(np.abs(axis)))
     sign = 1.0 if axis[i] > 0 else -1.0

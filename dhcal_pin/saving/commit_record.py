@@ -42,17 +42,7 @@ class CommitRecord:
 
     @classmethod
     def read(cls, folder: str) -> CommitRecord | None:
-        """Read the record in a folder.
-
-        Args:
-            folder: Path of the folder.
-
-        Returns:
-            The record; None if there is none.
-
-        Raises:
-            FileFormatError: The file with the name of a record is not a record.
-        """
+        """Read the record in a folder."""
         path = os.path.join(folder, RECORD_NAME)
         if not os.path.isfile(path):
             return None
@@ -88,25 +78,12 @@ def _is_name(name: Any) -> bool:
 
 
 def temporary_name(token: str, number: int, kind: str) -> str:
-    """Return the name of a temporary file.
-
-    Args:
-        token: Random text of the commit.
-        number: Number of the file.
-        kind: "new" for a content, "old" for a backup.
-
-    Returns:
-        Name that `remove_stale` recognises.
-    """
+    """Return the name of a temporary file."""
     return f".dhcal-{token}-{number}.{kind}"
 
 
 def remove_stale(folder: str) -> None:
-    """Remove the temporary files of runs that were killed before their commit.
-
-    Args:
-        folder: Locked folder, in which no run is saving.
-    """
+    """Remove the temporary files of runs that were killed before their commit."""
     with os.scandir(folder) as entries:
         stale = [entry.path for entry in entries if _TEMPORARY.fullmatch(entry.name)]
     for path in stale:
@@ -117,9 +94,6 @@ def complete(folder: str) -> None:
     """Complete the commit whose record lies in a folder, or discard a record that was not committed.
 
     Completing it again after an interruption has the same result.
-
-    Args:
-        folder: Folder of the commit. Errors are `OSError`.
     """
     record = CommitRecord.read(folder)
     if record is None:
@@ -155,11 +129,7 @@ def _remove(path: str) -> None:
 
 
 def flush_folder(folder: str) -> None:
-    """Flush the names of a folder to the disk, where the file system can do so.
-
-    Args:
-        folder: Path of the folder.
-    """
+    """Flush the names of a folder to the disk, where the file system can do so."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -169,14 +139,7 @@ def flush_folder(folder: str) -> None:
 
 
 def complete_interrupted_save(path: PathLike) -> None:
-    """Complete the commit of a run that was killed while it saved files beside a file.
-
-    Args:
-        path: File that is about to be read.
-
-    Raises:
-        FileFormatError: The commit cannot be completed; the message names the files.
-    """
+    """Complete the commit of a run that was killed while it saved files beside a file."""
     folder = os.path.dirname(os.path.realpath(path))
     if not os.path.exists(os.path.join(folder, RECORD_NAME)):
         return
@@ -185,14 +148,7 @@ def complete_interrupted_save(path: PathLike) -> None:
 
 
 def complete_or_explain(folder: str) -> None:
-    """Complete the commit whose record lies in a folder.
-
-    Args:
-        folder: Locked folder.
-
-    Raises:
-        FileFormatError: The commit cannot be completed; the message names the files.
-    """
+    """Complete the commit whose record lies in a folder."""
     try:
         complete(folder)
     except OSError as error:

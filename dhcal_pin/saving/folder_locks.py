@@ -21,16 +21,6 @@ def lock_folders(folders: Iterable[str], signals: DeferredSignals) -> Iterator[b
     """Lock folders against other runs that save in them; wait for those that do.
 
     The system releases the locks of a process that ends, even if it is killed. No lock files are left behind.
-
-    Args:
-        folders: Absolute paths without symbolic links.
-        signals: Signals that may end the waiting.
-
-    Yields:
-        Whether all folders are locked: some network file systems and unreadable folders have no locks.
-
-    Raises:
-        FileFormatError: Another run saves in a folder and does not end.
     """
     descriptors: list[int] = []
     is_locked = True

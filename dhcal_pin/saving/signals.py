@@ -65,14 +65,7 @@ class DeferredSignals:
 
     @contextmanager
     def interruptible(self) -> Iterator[None]:
-        """Let signals end a block that may take long, such as waiting for the reader of a pipe.
-
-        Yields:
-            Nothing. A signal raises `KeyboardInterrupt`, and is delivered later as well.
-
-        Raises:
-            KeyboardInterrupt: A signal has been received already.
-        """
+        """Let signals end a block that may take long, such as waiting for the reader of a pipe."""
         if self._received:
             raise KeyboardInterrupt
         self._is_interruptible = True
@@ -83,11 +76,7 @@ class DeferredSignals:
 
 
 def defer_signals() -> AbstractContextManager[DeferredSignals]:
-    """Let SIGINT, SIGTERM and SIGHUP wait until the end of the `with` block.
-
-    Returns:
-        Context; within another block of this function the context of that block, which goes on.
-    """
+    """Let SIGINT, SIGTERM and SIGHUP wait until the end of the `with` block."""
     active = DeferredSignals._active
     is_nested = active is not None and threading.current_thread() is threading.main_thread()
     return nullcontext(active) if active is not None and is_nested else DeferredSignals()

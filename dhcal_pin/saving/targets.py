@@ -16,14 +16,7 @@ _STANDARD_STREAMS = {"stdout": 1, "stderr": 2}
 
 
 def require_writable(path: PathLike) -> None:
-    """Require that a file can be created at a path.
-
-    Args:
-        path: Path of the file to write.
-
-    Raises:
-        InvalidArgumentError: The folder of the path does not exist, or the path is a folder itself.
-    """
+    """Require that a file can be created at a path."""
     folder = os.path.dirname(path) or os.curdir
     if os.path.isdir(path):
         raise InvalidArgumentError(f"{path}: is a folder; name a file in it")
@@ -32,14 +25,7 @@ def require_writable(path: PathLike) -> None:
 
 
 def is_stream(path: PathLike) -> bool:
-    """Return whether a path is a device, a pipe, a socket or an open descriptor such as /dev/stdout.
-
-    Args:
-        path: Path, which need not exist.
-
-    Returns:
-        False for a regular file, a folder and a path at which there is nothing.
-    """
+    """Return whether a path is a device, a pipe, a socket or an open descriptor such as /dev/stdout."""
     if _descriptor(path) is not None:
         return True
     try:
@@ -50,12 +36,7 @@ def is_stream(path: PathLike) -> bool:
 
 
 def write_stream(path: PathLike, data: bytes) -> None:
-    """Write to a stream. Opening a named pipe waits for its reader; errors are `OSError`.
-
-    Args:
-        path: Path for which `is_stream` is true.
-        data: Bytes to write.
-    """
+    """Write to a stream. Opening a named pipe waits for its reader; errors are `OSError`."""
     descriptor = _descriptor(path)
     if descriptor is not None:
         # Opening the path again would write over the beginning of a redirected file.

@@ -34,16 +34,6 @@ def write_files(
     A symbolic link stays a link, and its target is written. An existing file keeps its permissions and its
     owner. A device or a pipe is written to before the commit. SIGINT, SIGTERM and SIGHUP take effect when all
     files are saved, or when nothing is changed.
-
-    Args:
-        contents: Text, written as UTF-8, or bytes by path; None removes a file.
-        before_commit: Called when all contents are on the disk and no file is changed yet. If it raises an
-            error, no file is changed.
-
-    Raises:
-        FileFormatError: A file cannot be written, for example because the disk is full, or another run is
-            saving in the same folder.
-        InvalidArgumentError: Two paths are one file.
     """
     with defer_signals() as signals:
         _save(contents, before_commit, signals)

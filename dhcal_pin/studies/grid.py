@@ -94,17 +94,7 @@ class Setting:
 
 
 def draw_configurations(chain: Chain, count: int, rng: np.random.Generator, fraction: float = 1.0) -> Array:
-    """Draw uniform joint positions from the lower part of the joint ranges.
-
-    Args:
-        chain: Kinematic chain.
-        count: Number of configurations.
-        rng: Random generator.
-        fraction: Part of each joint range that is used, from its lower end.
-
-    Returns:
-        Joint positions, shape (count, n) [rad or m].
-    """
+    """Draw uniform joint positions from the lower part of the joint ranges."""
     low, high = joint_range(chain)
     return rng.uniform(low, low + fraction * (high - low), (count, chain.n_joints))
 
@@ -135,15 +125,7 @@ class Case:
     poses: Array | None = None
 
     def plan_poses(self, count: int, candidates: int = _N_CANDIDATES) -> Array:
-        """Plan poses for the nominal robot with the kind, noise and parameters of the setting.
-
-        Args:
-            count: Number of poses.
-            candidates: Number of random configurations to choose from.
-
-        Returns:
-            Joint positions, shape (count, n) [rad or m].
-        """
+        """Plan poses for the nominal robot with the kind, noise and parameters of the setting."""
         setting = self.setting
         return plan(
             self.nominal,
@@ -155,14 +137,7 @@ class Case:
         ).q
 
     def draw_poses(self, rng: np.random.Generator) -> Array:
-        """Return the measured joint positions of one robot.
-
-        Args:
-            rng: Random generator of the robot.
-
-        Returns:
-            Joint positions, shape (poses, n) [rad or m].
-        """
+        """Return the measured joint positions of one robot."""
         if self.poses is not None:
             return self.poses
         return SAMPLERS[self.setting.pose_selection](self.nominal, self.setting.poses, rng)
@@ -197,17 +172,6 @@ class StudyGrid:
 
         Example:
             `study.plot(list(run(study))).figure.savefig("study.png")`
-
-        Args:
-            blocks: Results of all tasks in order, as `run` yields them.
-            ax: Axes to draw into; a new figure if None.
-            column: Column of `result_table` that is plotted.
-
-        Returns:
-            The axes.
-
-        Raises:
-            ValueError: No numeric setting varies.
         """
         from ..visualization import plots  # lazy import, as the following: they are slow to load
         from .runner import result_table
@@ -228,14 +192,7 @@ class StudyGrid:
 
 
 def read_study(path: PathLike) -> StudyGrid:
-    """Read a study and the robots that it names.
-
-    Args:
-        path: TOML file with `title`, `seeds`, and `[settings]` with entries of `Setting` or lists of them.
-
-    Returns:
-        Grid of all combinations of settings.
-    """
+    """Read a study and the robots that it names."""
     document = TomlTable.read(path)
     where = document.path
     title = str(document.get("title", ""))

@@ -38,14 +38,7 @@ class StudyJournal:
         self.path, self.blocks, self._descriptor = path, blocks, descriptor
 
     def append(self, block: Block) -> None:
-        """Add the results of a block; if the process is killed then, only unfinished blocks are lost.
-
-        Args:
-            block: Results of the next block.
-
-        Raises:
-            FileFormatError: The journal cannot be written, for example because the disk is full.
-        """
+        """Add the results of a block; if the process is killed then, only unfinished blocks are lost."""
         self._write(json.dumps(block))
         self.blocks.append(block)
 
@@ -63,19 +56,7 @@ class StudyJournal:
 
 @contextmanager
 def open_journal(path: str, study: StudyGrid) -> Iterator[StudyJournal]:
-    """Open the journal of a study, or begin one.
-
-    Args:
-        path: Path of the journal.
-        study: Study whose results it holds.
-
-    Yields:
-        Journal with the blocks that are finished.
-
-    Raises:
-        FileFormatError: The journal cannot be opened, belongs to another study, or another run uses it.
-        InvalidArgumentError: The path is a device or a pipe.
-    """
+    """Open the journal of a study, or begin one."""
     if is_stream(path):
         raise InvalidArgumentError(f"{path}: is not a regular file; choose another output path")
     try:

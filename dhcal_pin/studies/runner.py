@@ -56,28 +56,12 @@ MEASURE_UNITS = {
 
 
 def run(study: StudyGrid, done: int = 0, executor: TaskExecutor = SERIAL) -> Iterator[list[list[float]]]:
-    """Run the tasks of a study in order.
-
-    Args:
-        study: Study to run.
-        done: Number of tasks that are already done, from the first one on.
-        executor: Executor of the tasks.
-
-    Returns:
-        Iterator over the results of the remaining tasks, each as of `run_block`.
-    """
+    """Run the tasks of a study in order."""
     return executor.map(run_block, _with_planned_poses(study.tasks()[done:]))
 
 
 def run_block(task: Task) -> list[list[float]]:
-    """Simulate and calibrate the robots of a block.
-
-    Args:
-        task: Case, first seed and number of seeds.
-
-    Returns:
-        One row per seed with the columns of `MEASURE_UNITS`.
-    """
+    """Simulate and calibrate the robots of a block."""
     case, first, count = task
     setting, nominal, seeds = case.setting, case.nominal, range(first, first + count)
     errors = select_parameters(nominal, setting.parameters)
@@ -135,13 +119,6 @@ def result_table(study: StudyGrid, blocks: Sequence[list[list[float]]]) -> tuple
     The columns are the entries of the setting, the number of calibrations, the fraction that converged, the
     medians of the other results, and the 90 % quantile of the position error. Values that are not defined for
     a setting are None.
-
-    Args:
-        study: Study that was run.
-        blocks: Results of all tasks in order.
-
-    Returns:
-        Names of the columns, and the rows.
     """
     names = [field.name for field in fields(Setting)]
     measures = [f"{name}[{unit}]" if unit else name for name, unit in MEASURE_UNITS.items()]
@@ -158,11 +135,7 @@ def result_table(study: StudyGrid, blocks: Sequence[list[list[float]]]) -> tuple
 
 
 def _draw_true_chains(case: Case, seeds: range) -> tuple[ChainBatch, Array]:
-    """Draw the true robots of a block.
-
-    Returns:
-        Robots, and their errors in the estimated parameters, shape (b, p); NaN if these cannot express them.
-    """
+    """Draw the true robots of a block."""
     setting, b = case.setting, len(seeds)
     estimated = select_parameters(case.nominal, setting.parameters)
     undefined = np.full((b, len(estimated.parameters)), np.nan)

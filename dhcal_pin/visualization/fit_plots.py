@@ -63,18 +63,7 @@ class SampleErrors:
 
     @classmethod
     def from_fit(cls, fit: Result, group: str | None) -> SampleErrors:
-        """Compute the errors of the fitted and the held-out samples.
-
-        Args:
-            fit: Result of a calibration.
-            group: "position", "orientation" or "residual"; the first of these that was measured if None.
-
-        Returns:
-            Errors of the samples that have this group.
-
-        Raises:
-            UnknownNameError: No sample has this group.
-        """
+        """Compute the errors of the fitted and the held-out samples."""
         norms, table = fit.error_norms, fit.residuals
         choices = [name for name in GROUP_UNITS if name in norms]
         if group is not None and group not in choices:
@@ -123,19 +112,7 @@ class SampleErrors:
 
 
 def plot_accuracy(fit: Result, ax: Axes | None = None, *, group: str | None = None) -> Axes:
-    """Plot the error before and after: RMS as a dot, and a line up to the 95th percentile.
-
-    Args:
-        fit: Result of a calibration.
-        ax: Axes to draw into; a new figure if None.
-        group: "position", "orientation" or "residual"; the first that was measured if None.
-
-    Returns:
-        The axes; one row for hold-out or cross-validated samples, for left-out regions, and for fitted ones.
-
-    Raises:
-        UnknownNameError: The group was not measured.
-    """
+    """Plot the error before and after: RMS as a dot, and a line up to the 95th percentile."""
     ax = ax or new_axes()[0]
     regions = fit.generalization.region_holdout
     comparisons = list(fit.comparisons)
@@ -176,21 +153,7 @@ def _comparison_label(comparison: Comparison, group: str) -> str:
 def plot_residuals(
     fit: Result, ax: Axes | None = None, *, over: str | Array = "sample", group: str | None = None
 ) -> Axes:
-    """Plot the errors of all samples before and after, fitted and held-out ones on the same axes.
-
-    Args:
-        fit: Result of a calibration.
-        ax: Axes to draw into; a new figure if None.
-        over: "sample" (in the order of the files), "histogram", the name of a joint, or a number per sample,
-            shape (N,), such as the time [s]; fitted samples come first.
-        group: "position", "orientation" or "residual"; the first that was measured if None.
-
-    Returns:
-        The axes.
-
-    Raises:
-        UnknownNameError: There is no such joint or group.
-    """
+    """Plot the errors of all samples before and after, fitted and held-out ones on the same axes."""
     ax = ax or new_axes()[0]
     errors = SampleErrors.from_fit(fit, group)
     if isinstance(over, str) and over == "histogram":
@@ -291,14 +254,6 @@ def plot_parameters(fit: Result, ax: Axes | None = None, *, count: int = MAX_PAR
 
     A prior is drawn as a band of one and of two of its standard deviations. A line as long as the band
     belongs to a parameter that the measurements do not determine.
-
-    Args:
-        fit: Result of a calibration.
-        ax: Axes to draw into; a new figure if None.
-        count: Largest number of parameters; those with the largest corrections are drawn.
-
-    Returns:
-        The axes; one row per parameter of the robot, without base, tool and instruments.
     """
     prior = fit.prior_std
     names = [estimate.name for estimate in fit.estimates[: len(fit.x)]]
@@ -331,15 +286,7 @@ def plot_parameters(fit: Result, ax: Axes | None = None, *, count: int = MAX_PAR
 
 
 def plot_singular_values(fit: Result, ax: Axes | None = None) -> Axes:
-    """Plot the singular values of the whitened Jacobian relative to the largest one.
-
-    Args:
-        fit: Result of a calibration.
-        ax: Axes to draw into; a new figure if None.
-
-    Returns:
-        The axes.
-    """
+    """Plot the singular values of the whitened Jacobian relative to the largest one."""
     ax = ax or new_axes()[0]
     plots.plot_singular_values(qr.singular_values(fit.solution.system.r), fit.rank, ax)
     _legend(ax)
@@ -347,15 +294,7 @@ def plot_singular_values(fit: Result, ax: Axes | None = None) -> Axes:
 
 
 def plot_correlation(fit: Result, ax: Axes | None = None) -> Axes:
-    """Plot the correlation matrix of all estimated parameters.
-
-    Args:
-        fit: Result of a calibration.
-        ax: Axes to draw into; a new figure if None.
-
-    Returns:
-        The axes: blue for -1, white for 0, orange for 1, and grey for parameters of infinite variance.
-    """
+    """Plot the correlation matrix of all estimated parameters."""
     from matplotlib.colors import LinearSegmentedColormap
 
     correlation = fit.correlation

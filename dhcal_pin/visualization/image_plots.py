@@ -42,16 +42,7 @@ def plot_reprojection(
 
 
 def plot_image_errors(before: Array, after: Array, ax: Axes | None = None) -> Axes:
-    """Plot the RMS error of each image over its place, the fitted images before the held-out ones.
-
-    Args:
-        before: Errors with the nominal arm, shape (n,) [px].
-        after: Errors after the calibration, shape (n,) [px].
-        ax: Axes to draw into; a new figure if None.
-
-    Returns:
-        The axes.
-    """
+    """Plot the RMS error of each image over its place, the fitted images before the held-out ones."""
     ax = ax if ax is not None else plots.new_axes()[0]
     numbers = np.arange(1, len(after) + 1)
     for label, values in (("before", before), ("after", after)):

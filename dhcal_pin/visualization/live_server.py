@@ -55,11 +55,7 @@ class _LocalBridge(ZMQWebSocketBridge):
 
 
 def main(address: str) -> None:
-    """Serve until standard input closes, which happens when the parent process ends in any way.
-
-    Args:
-        address: Address of the socket for commands.
-    """
+    """Serve until standard input closes, which happens when the parent process ends in any way."""
     bridge = _LocalBridge(zmq_url=address, host=LOOPBACK)
     bridge.ioloop.add_handler(sys.stdin, lambda *_: bridge.ioloop.stop(), bridge.ioloop.READ)
     print(f"http://{LOOPBACK}:{bridge.fileserver_port}/{bridge.token}/", flush=True)

@@ -50,26 +50,12 @@ class MeasuredSamples:
         return len(self.lines)
 
     def take(self, index: Array) -> MeasuredSamples:
-        """Return some of the samples.
-
-        Args:
-            index: Numbers of the samples.
-
-        Returns:
-            These samples.
-        """
+        """Return some of the samples."""
         return MeasuredSamples(**{name: values[index] for name, values in vars(self).items()})
 
 
 def sets_of(fit: Result) -> list[Array]:
-    """Return the set of each sample of the fitted and the held-out measurements of a result.
-
-    Args:
-        fit: Result of a calibration.
-
-    Returns:
-        Index into `SETS` for each sample, one array for each of `fit.data` and `fit.holdout`.
-    """
+    """Return the set of each sample of the fitted and the held-out measurements of a result."""
     fitted = [
         np.where(np.isin(item.rows, rows), OUTLIER, FITTED)
         for item, rows in zip(fit.data, fit.outliers, strict=True)
@@ -83,18 +69,7 @@ def measured_samples(
     known: tuple[Mapping[str, float], Mapping[str, float]],
     sets: Sequence[Array],
 ) -> MeasuredSamples:
-    """Collect the measured positions and their residuals.
-
-    Args:
-        arms: Nominal and calibrated robot.
-        measurements: Measurements.
-        known: Values of instrument parameters by name that belong to each robot; others have their initial
-            values.
-        sets: Index into `SETS` for each sample of each measurement.
-
-    Returns:
-        Samples with measured positions.
-    """
+    """Collect the measured positions and their residuals."""
     n = arms[0].n_joints
     parts: dict[str, list[Array]] = {
         "q": [np.empty((0, n))],
@@ -133,16 +108,7 @@ def _position_residuals(chain: Chain, item: Measurement, known: Mapping[str, flo
 
 
 def drawn_samples(samples: MeasuredSamples, limit: int, n_largest: int) -> Array:
-    """Choose samples to draw: those with the largest residuals, and others spread evenly over the files.
-
-    Args:
-        samples: All samples.
-        limit: Largest number of samples.
-        n_largest: Number of samples with the largest residuals that are always drawn.
-
-    Returns:
-        Increasing numbers of the samples; all of them if there are at most `limit`.
-    """
+    """Choose samples to draw: those with the largest residuals, and others spread evenly over the files."""
     if len(samples) <= limit:
         return np.arange(len(samples))
     order = np.argsort(-np.linalg.norm(samples.residuals, axis=1), kind="stable")

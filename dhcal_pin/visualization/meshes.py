@@ -61,17 +61,7 @@ class Visuals:
 def visuals_of(
     chain: Chain, bodies: Sequence[dict[str, Any]], package_dirs: Sequence[PathLike] | None, triangles: int
 ) -> Visuals:
-    """Read the visual geometry of a robot.
-
-    Args:
-        chain: The robot.
-        bodies: Its bodies as in `scene.kinematic_tree`, from which rods are built.
-        package_dirs: Folders that contain the meshes; by default those of `ros_packages`.
-        triangles: Largest number of triangles of all meshes.
-
-    Returns:
-        Shapes and meshes.
-    """
+    """Read the visual geometry of a robot."""
     folders = (
         chain.urdf.mesh_folders() if package_dirs is None else [os.fspath(path) for path in package_dirs]
     )
@@ -110,14 +100,7 @@ def visuals_of(
 
 
 def rows(pose: Array) -> list[float]:
-    """Return the upper three rows of a pose as a list.
-
-    Args:
-        pose: Pose, shape (4, 4).
-
-    Returns:
-        Twelve numbers, row by row.
-    """
+    """Return the upper three rows of a pose as a list."""
     return (np.asarray(pose, float)[:3] + 0.0).ravel().tolist()
 
 
@@ -191,17 +174,7 @@ def _missing_meshes_note(missing: dict[str, list[str]]) -> str:
 
 
 def _parent_body(model: pin.Model, chain: Chain, frame: int, placement: pin.SE3) -> tuple[int, Array]:
-    """Return the body to which an object on a link frame is fixed, and its pose (4, 4) in this body.
-
-    Args:
-        model: Pinocchio model of the robot.
-        chain: The robot; objects fixed to its tip belong to the body of the tip.
-        frame: Link frame of the object.
-        placement: Pose of the object in the joint that moves it.
-
-    Returns:
-        Number of the body and pose.
-    """
+    """Return the body to which an object on a link frame is fixed, and its pose (4, 4) in this body."""
     tip, joint = chain.frame_id, int(model.frames[frame].parentJoint)
     while frame != tip and model.frames[frame].type != pin.FrameType.JOINT and frame > 0:
         frame = model.frames[frame].parentFrame
@@ -211,15 +184,7 @@ def _parent_body(model: pin.Model, chain: Chain, frame: int, placement: pin.SE3)
 
 
 def obstacle_shapes(obstacles: Sequence[Obstacle], n_meshes: int) -> tuple[list[dict[str, Any]], list[Mesh]]:
-    """Return the shapes of obstacles for the page, on body 0.
-
-    Args:
-        obstacles: Obstacles; the floor is not drawn, because the page has a grid.
-        n_meshes: Number of meshes that the page has already.
-
-    Returns:
-        Shapes with placements in the frame of the root link, and their meshes.
-    """
+    """Return the shapes of obstacles for the page, on body 0."""
     shapes, meshes = [], []
     for obstacle in obstacles:
         if obstacle.name == FLOOR:
@@ -263,29 +228,13 @@ class Mesh:
 
     @classmethod
     def from_geometry(cls, geometry: Any) -> Mesh:
-        """Convert a mesh that Coal has read.
-
-        Args:
-            geometry: Mesh of Coal.
-
-        Returns:
-            Mesh on the finest grid.
-        """
+        """Convert a mesh that Coal has read."""
         faces = [(t[0], t[1], t[2]) for t in map(geometry.tri_indices, range(geometry.num_tris))]
         return cls.on_grid(np.asarray(geometry.vertices(), float), np.array(faces, int).reshape(-1, 3))
 
     @classmethod
     def on_grid(cls, corners: Array, triangles: Array, grid: int = GRID) -> Mesh:
-        """Round the vertices to a grid; merge equal vertices and drop degenerate and duplicate triangles.
-
-        Args:
-            corners: Vertices, shape (v, 3) [m].
-            triangles: Numbers of the vertices of each triangle, shape (t, 3).
-            grid: Number of steps along the longest side.
-
-        Returns:
-            Mesh on the grid.
-        """
+        """Round the vertices to a grid; merge equal vertices and drop degenerate and duplicate triangles."""
         origin, size = corners.min(0), np.ptp(corners, axis=0).max()
         step = size / grid or 1.0
         x, y, z = np.round((corners - origin) / step).astype(np.int64).T
@@ -311,14 +260,7 @@ class Mesh:
         return self.origin.tobytes(), self.corners.tobytes(), self.triangles.tobytes()
 
     def simplify(self, limit: int) -> Mesh:
-        """Reduce the number of triangles by collapsing the edges that change the form least.
-
-        Args:
-            limit: Largest number of triangles, which a mesh that would vanish exceeds.
-
-        Returns:
-            Simplified mesh, or the mesh itself if it is small enough.
-        """
+        """Reduce the number of triangles by collapsing the edges that change the form least."""
         mesh, limit = self, max(limit, 1)
         for grid in COARSER_GRIDS:
             if len(mesh.triangles) <= limit:
@@ -335,12 +277,7 @@ class Mesh:
         return mesh
 
     def encoded(self) -> dict[str, Any]:
-        """Return the mesh for the page.
-
-        Returns:
-            `origin`, `step`, and in base64 the little-endian integers of `corners` (2 bytes each) and
-            `triangles` (`bytes` bytes each).
-        """
+        """Return the mesh for the page."""
         width = 2 if len(self.corners) <= 1 << 16 else 4
         return {
             "origin": self.origin.tolist(),
@@ -356,13 +293,6 @@ def allocate_triangles(counts: Sequence[int], total: int) -> list[int]:
 
     A mesh with four times as many triangles as another one thus keeps twice as many. Meshes with fewer
     triangles than their share are not simplified.
-
-    Args:
-        counts: Number of triangles of each mesh.
-        total: Largest number of triangles of all meshes.
-
-    Returns:
-        Largest number of triangles of each mesh.
     """
     remaining, roots = float(total), np.sqrt(counts)
     rate = np.inf

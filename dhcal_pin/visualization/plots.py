@@ -158,18 +158,6 @@ def plot_error_histogram(
     """Plot histograms of the errors before and after a calibration.
 
     The horizontal axis is logarithmic if the medians differ by more than a factor of four.
-
-    Args:
-        before: Error norms of the nominal robot, shape (m,) [`unit`].
-        after: Error norms of the calibrated robot, shape (m,) [`unit`].
-        ax: Axes to draw into; a new figure if None.
-        quantity: What the errors are, for the axis label.
-        unit: SI unit of the errors.
-        bins: Edges of the bins [`unit`] and whether they are spaced logarithmically, so that several
-            histograms share an axis; from the data if None, see `histogram_edges`.
-
-    Returns:
-        The axes.
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -199,15 +187,7 @@ def plot_error_histogram(
 
 
 def histogram_edges(before: Array, after: Array) -> tuple[Array, bool]:
-    """Choose the bins of histograms of the errors before and after a calibration.
-
-    Args:
-        before: Error norms of the nominal robot, shape (m,).
-        after: Error norms of the calibrated robot, shape (m,).
-
-    Returns:
-        Edges of the bins, and whether they are spaced logarithmically.
-    """
+    """Choose the bins of histograms of the errors before and after a calibration."""
     errors = np.concatenate([before, after])
     high = float(errors.max()) or 1.0
     n_bins = min(_MAX_BINS, max(8, len(after) // 3))
@@ -225,18 +205,7 @@ def plot_errors_by_sample(
     quantity: str = "position error",
     unit: str = "m",
 ) -> Axes:
-    """Plot the error of each sample over its number.
-
-    Args:
-        samples: Sample numbers (m,) and error norms (m,) [`unit`] of the "fitted" samples and, if there are
-            any, of the "hold-out" samples and of the "outlier" samples.
-        ax: Axes to draw into; a new figure if None.
-        quantity: What the errors are, for the axis label.
-        unit: SI unit of the errors.
-
-    Returns:
-        The axes.
-    """
+    """Plot the error of each sample over its number."""
     ax = _axes(ax)
     factor, unit_name = shown_unit(unit)
     n_samples = sum(len(numbers) for numbers, _ in samples.values())
@@ -254,15 +223,7 @@ def plot_errors_by_sample(
 
 
 def sample_color(role: str, has_holdout: bool) -> str:
-    """Return the name in `COLORS` of the dots of "fitted", "hold-out" or "outlier" samples.
-
-    Args:
-        role: Role of the samples.
-        has_holdout: Whether fitted and hold-out samples are drawn together.
-
-    Returns:
-        Name of the colour.
-    """
+    """Return the name in `COLORS` of the dots of "fitted", "hold-out" or "outlier" samples."""
     if role == "outlier":
         return "outlier"
     return "sample" if role == "fitted" and has_holdout else "after"
@@ -278,20 +239,7 @@ def plot_errors_over_joint(
     quantity: str = "position error",
     unit: str = "m",
 ) -> Axes:
-    """Plot the errors of the samples over the position of one joint, with their medians along its range.
-
-    Args:
-        values: Joint position of each sample, shape (m,) [rad or m].
-        errors: Error norm of each sample, shape (m,) [`unit`].
-        ax: Axes to draw into; a new figure if None.
-        joint: Name of the joint.
-        is_prismatic: Whether the joint positions are lengths.
-        quantity: What the errors are, for the axis label.
-        unit: SI unit of the errors.
-
-    Returns:
-        The axes.
-    """
+    """Plot the errors of the samples over the position of one joint, with their medians along its range."""
     ax = _axes(ax)
     scale, angle = shown_joint_unit(is_prismatic)
     factor, unit_name = shown_unit(unit)
@@ -408,16 +356,7 @@ def plot_joint_corrections(
 
 
 def plot_singular_values(singular_values: Array, rank: int, ax: Axes | None = None) -> Axes:
-    """Plot the singular values of the whitened Jacobian relative to the largest one.
-
-    Args:
-        singular_values: Singular values in decreasing order, shape (p,).
-        rank: Number of observable directions; the values beyond are marked, with the limit of the rank.
-        ax: Axes to draw into; a new figure if None.
-
-    Returns:
-        The axes.
-    """
+    """Plot the singular values of the whitened Jacobian relative to the largest one."""
     ax = _axes(ax)
     # Exact zeros are drawn at this ratio, below every rounding error.
     ratios = np.maximum(singular_values / singular_values[0], 1e-18)
@@ -521,15 +460,7 @@ def plot_position_std_map(
 
 
 def std_levels(std: Array) -> Array:
-    """Return the edges between the levels of a map, evenly spaced from zero.
-
-    Args:
-        std: Standard deviations, shape (s,) [m]; infinite values are ignored.
-
-    Returns:
-        Edges, shape (N_LEVELS + 1,) [m]. At least 98 % of the values lie below the last edge. It is at least
-        twice the median, so that a map of nearly equal values has medium colours.
-    """
+    """Return the edges between the levels of a map, evenly spaced from zero."""
     finite = std[np.isfinite(std)]
     high = max(float(np.quantile(finite, 0.98)), 2 * float(np.median(finite))) if finite.size else 0.0
     step = max(high, 1e-12) / N_LEVELS
@@ -574,17 +505,7 @@ def _fill_cells(ax: Axes, corners: Array, size: float, color: str) -> None:
 def plot_arms(
     arms: Mapping[str, Array], ax: Axes | None = None, *, plane: str = "xz", samples: Array | None = None
 ) -> Axes:
-    """Plot the joints of an arm before and after calibration as connected points.
-
-    Args:
-        arms: Points along the arm in the base frame, shape (k, 3) [m], of the states "before" and "after".
-        ax: Axes to draw into; a new figure if None.
-        plane: Horizontal and vertical coordinate: "xy", "xz" or "yz".
-        samples: Measured tool positions in the base frame, shape (m, 3) [m].
-
-    Returns:
-        The axes.
-    """
+    """Plot the joints of an arm before and after calibration as connected points."""
     ax = _axes(ax)
     columns = ["xyz".index(name) for name in plane]
     shown = [points[:, columns] for points in arms.values()]
@@ -631,19 +552,6 @@ def plot_study(
     """Plot one column of a study over the numeric setting with the most values.
 
     Each combination of the other settings is one line.
-
-    Args:
-        header: Names of the columns.
-        rows: One row per setting; None where a value is missing.
-        n_settings: Number of leading columns that are settings.
-        column: Column to plot, one of `STUDY_COLUMNS`.
-        ax: Axes to draw into; a new figure if None.
-
-    Returns:
-        The axes.
-
-    Raises:
-        ValueError: No numeric setting varies.
     """
     ax = _axes(ax)
     abscissa = _study_abscissa(rows, n_settings)
@@ -704,17 +612,7 @@ def _study_series(
 
 
 def study_svg(title: str, header: Sequence[str], rows: Sequence[Sequence[Any]], n_settings: int) -> str:
-    """Draw the table of a study as one SVG file with a panel per column.
-
-    Args:
-        title: Title of the study.
-        header: Names of the columns.
-        rows: One row per setting; None where a value is missing.
-        n_settings: Number of leading columns that are settings.
-
-    Returns:
-        Text of the SVG file; empty if no numeric setting varies.
-    """
+    """Draw the table of a study as one SVG file with a panel per column."""
     if _study_abscissa(rows, n_settings) is None:
         return ""
     columns = [name for name in STUDY_COLUMNS if any(row[header.index(name)] is not None for row in rows)]
@@ -763,11 +661,8 @@ def study_svg(title: str, header: Sequence[str], rows: Sequence[Sequence[Any]], 
 def svg_panels() -> Iterator[SvgPanels]:
     """Draw plots as SVG elements of a web page.
 
-        with svg_panels() as svg:
-            element = svg.draw(partial(plot_singular_values, values, rank), "sv", "Singular values", "...")
-
-    Yields:
-        Object that draws one plot after the other.
+    with svg_panels() as svg:
+        element = svg.draw(partial(plot_singular_values, values, rank), "sv", "Singular values", "...")
     """
     with _svg_style():
         yield SvgPanels()
@@ -790,18 +685,7 @@ class SvgPanels:
         description: str,
         size: tuple[float, float] = PANEL,
     ) -> str:
-        """Draw a plot as an SVG element.
-
-        Args:
-            plot: Plot function of this module with all its arguments except `ax`.
-            key: Prefix of the identifiers in the SVG; unique on the page.
-            title: Short name for screen readers.
-            description: What the plot shows, in words, for screen readers.
-            size: Width and height [px].
-
-        Returns:
-            SVG element with the role of an image; its colours are CSS variables.
-        """
+        """Draw a plot as an SVG element."""
         figure = self._empty_figure(size)
         ax = figure.axes[0]
         plot(ax=ax)
@@ -926,15 +810,7 @@ def _svg_tree(figure: Figure, key: str) -> ElementTree.Element:
 
 # --- shared by the plots ----------------------------------------------------------------------------
 def new_axes(n_panels: int = 1, size: tuple[float, float] = (6.4, 3.6)) -> list[Axes]:
-    """Create axes in the style of this package, in a new figure that does not depend on a display.
-
-    Args:
-        n_panels: Number of axes, at most three in a row.
-        size: Width and height of each [inch].
-
-    Returns:
-        Axes.
-    """
+    """Create axes in the style of this package, in a new figure that does not depend on a display."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
@@ -953,27 +829,13 @@ def _axes(ax: Axes | None) -> Axes:
 
 
 def shown_unit(unit: str) -> tuple[float, str]:
-    """Return the unit in which errors are shown.
-
-    Args:
-        unit: SI unit.
-
-    Returns:
-        Factor from the SI unit, and name.
-    """
+    """Return the unit in which errors are shown."""
     factor, name = SMALL_UNITS[unit]
     return factor, name.strip()
 
 
 def shown_joint_unit(is_prismatic: bool) -> tuple[float, str]:
-    """Return the unit in which joint positions are shown.
-
-    Args:
-        is_prismatic: Whether the joint positions are lengths.
-
-    Returns:
-        Factor from the SI unit, and name.
-    """
+    """Return the unit in which joint positions are shown."""
     factor, name = UNITS["m" if is_prismatic else "rad"]
     return factor, name.strip()
 
@@ -1004,12 +866,7 @@ def plot_dots(ax: Axes, x: Array, y: Array, color: str, size: float, label: str)
 
 
 def make_logarithmic(ax: Axes, name: Literal["x", "y"]) -> None:
-    """Make an axis logarithmic, with plain numbers at 1, 2 and 5 in each decade if there are few decades.
-
-    Args:
-        ax: Axes.
-        name: Axis.
-    """
+    """Make an axis logarithmic, with plain numbers at 1, 2 and 5 in each decade if there are few decades."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     axis = ax.xaxis if name == "x" else ax.yaxis

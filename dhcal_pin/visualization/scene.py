@@ -253,15 +253,7 @@ def _meshcat() -> str:
 
 
 def with_shared_frames(nominal: Chain, calibrated: Chain) -> Chain:
-    """Give a nominal robot without base or tool those of the calibrated robot.
-
-    Args:
-        nominal: Nominal robot.
-        calibrated: Calibrated robot.
-
-    Returns:
-        Nominal robot for drawing and comparison.
-    """
+    """Give a nominal robot without base or tool those of the calibrated robot."""
     identity = np.eye(4)
     return replace(
         nominal,
@@ -282,17 +274,6 @@ def kinematic_tree(nominal: Chain, calibrated: Chain) -> dict[str, Any]:
     - `twist`: twist from the nominal to the calibrated placement.
     - `axes`, if a joint moves it: joint axis of the nominal and of the calibrated robot; further the keys of
       `_joint_input`.
-
-    Args:
-        nominal: Nominal robot.
-        calibrated: Calibrated robot with the same joints; the nominal one if there is no other.
-
-    Returns:
-        `bodies`; `base_in_measuring_frame`, the pose of the calibrated base link; and `transmissions` of the
-        nominal and the calibrated robot, see `_transmission`.
-
-    Raises:
-        InvalidArgumentError: The robots have different joints.
     """
     if (calibrated.joint_names, calibrated.moving_joints) != (nominal.joint_names, nominal.moving_joints):
         first, second = (", ".join(chain.moving_joints) for chain in (nominal, calibrated))
@@ -350,16 +331,7 @@ def _joint_input(chain: Chain, j: int) -> dict[str, Any]:
 
 
 def _transmission(chain: Chain) -> dict[str, Any]:
-    """Return the transmission errors of a robot; see the formula in `robot.transmission`.
-
-    Args:
-        chain: The robot.
-
-    Returns:
-        `linear`: gains and couplings, row by row; `harmonics`: joint, order and coefficients of sine and
-        cosine of each harmonic; and, if a joint is elastic, `compliance` of each joint and `gravity_bodies`,
-        see `_gravity_bodies`. Empty for ideal joints.
-    """
+    """Return the transmission errors of a robot; see the formula in `robot.transmission`."""
     transmission = chain.transmission
     if transmission is None:
         return {}
@@ -427,14 +399,6 @@ def _ellipsoids(model: Predictor, configurations: Array) -> list[dict[str, Any]]
     """Return the ellipsoids of one standard deviation of the calibrated tool position.
 
     Configurations with an undetermined direction of the tool position have none.
-
-    Args:
-        model: Source of the covariance.
-        configurations: Joint positions, shape (m, n) [rad or m].
-
-    Returns:
-        Joint positions `q` and `axes` of each: the 3 x 3 matrix, row by row, whose columns are the half axes
-        [m] in the frame of the calibrated base link.
     """
     configurations = configurations[evenly_spaced_indices(len(configurations), MAX_ELLIPSOIDS)]
     covariance = model.relative.predict(configurations).covariance[:, :3, :3]

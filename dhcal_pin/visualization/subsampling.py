@@ -8,13 +8,5 @@ from .._typing import Array
 
 
 def evenly_spaced_indices(count: int, limit: int) -> Array:
-    """Choose at most `limit` indices that are spread evenly over a series.
-
-    Args:
-        count: Length of the series.
-        limit: Largest number of indices.
-
-    Returns:
-        Increasing indices; all of them if `count` is at most `limit`.
-    """
+    """Choose at most `limit` indices that are spread evenly over a series."""
     return np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(int))

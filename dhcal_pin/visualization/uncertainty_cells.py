@@ -41,14 +41,7 @@ class UncertaintyCells:
 
 
 def uncertainty_cells(predictor: Predictor) -> UncertaintyCells:
-    """Predict the uncertainty of the tool position by cells.
-
-    Args:
-        predictor: Calibrated robot with uncertainty.
-
-    Returns:
-        Cells whose uncertainty the measurements determine.
-    """
+    """Predict the uncertainty of the tool position by cells."""
     chain = predictor.chain
     q = np.random.default_rng(0).uniform(*joint_range(chain), (N_CONFIGURATIONS, chain.n_joints))
     prediction = predictor.relative.predict(q)

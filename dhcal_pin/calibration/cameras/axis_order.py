@@ -94,15 +94,7 @@ class Exchange:
 def exchange_axes(
     chain: Chain, data: Sequence[Measurement]
 ) -> tuple[tuple[Measurement, ...], tuple[Exchange, ...]]:
-    """Find exchanged values of cameras, and put intrinsics into the order that explains the images.
-
-    Args:
-        chain: Nominal robot.
-        data: Measurements of any kinds.
-
-    Returns:
-        The measurements in the right order, and what was exchanged.
-    """
+    """Find exchanged values of cameras, and put intrinsics into the order that explains the images."""
     out = tuple(data)
     found: list[Exchange] = []
     names = dict.fromkeys(
@@ -119,15 +111,7 @@ def exchange_axes(
 
 
 def reorder(data: Sequence[Measurement], exchanges: Sequence[Exchange]) -> tuple[Measurement, ...]:
-    """Exchange the same values of the cameras of measurements.
-
-    Args:
-        data: Measurements of any kinds.
-        exchanges: What is exchanged.
-
-    Returns:
-        The measurements.
-    """
+    """Exchange the same values of the cameras of measurements."""
     out = tuple(data)
     for exchange in exchanges:
         if exchange.what in ORDERS:
@@ -141,11 +125,7 @@ def reorder(data: Sequence[Measurement], exchanges: Sequence[Exchange]) -> tuple
 
 
 def axis_stages(exchanges: Sequence[Exchange]) -> tuple[Stage, ...]:
-    """Return the stages of exchanged intrinsics: their errors are those of the values as they are stated.
-
-    Args:
-        exchanges: What is exchanged.
-    """
+    """Return the stages of exchanged intrinsics: their errors are those of the values as they are stated."""
     return tuple(
         Stage("axis order", True, each.unknowns, each.stated, None, None, each.sentence)
         for each in exchanges

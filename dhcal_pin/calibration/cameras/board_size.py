@@ -78,14 +78,7 @@ class BoardSize:
 
 
 def find_board_size(fit: Fit) -> BoardSize | None:
-    """Look for a size of the boards that makes the correction of the arm far smaller.
-
-    Args:
-        fit: Fit of the arm, with the priors of the arm.
-
-    Returns:
-        The size; None if the stated one is plausible.
-    """
+    """Look for a size of the boards that makes the correction of the arm far smaller."""
     problem, x = fit.problem, fit.solution.x
     stated = _rms_correction(problem.errors, x)
     lengths = _lengths(problem.errors)

@@ -104,16 +104,7 @@ class HandEyeData:
 
 
 def apply_causes(hand_eye: HandEyeData, causes: Causes, item: CameraCorners) -> CameraCorners:
-    """Return images with the rig and the joint values of some causes.
-
-    Args:
-        hand_eye: Images and what is held.
-        causes: Causes.
-        item: Images; those without joint values after a shift are left out.
-
-    Returns:
-        The images.
-    """
+    """Return images with the rig and the joint values of some causes."""
     return _shifted(_with_rig(causes, item), hand_eye, causes)
 
 
@@ -141,16 +132,7 @@ def _with_rig(causes: Causes, item: CameraCorners) -> CameraCorners:
 
 
 def fit_causes(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float] | None = None) -> Fit:
-    """Fit the model of some causes; noise and the sizes of the arm's errors are estimated.
-
-    Args:
-        hand_eye: Images and what is held.
-        causes: Causes of the model.
-        start: First values of cameras and boards by name; from the images themselves if None.
-
-    Returns:
-        The fit.
-    """
+    """Fit the model of some causes; noise and the sizes of the arm's errors are estimated."""
     fit = _first_fit(hand_eye, causes, start)
     errors = fit.problem.errors
     has_default = np.ones(len(errors.parameters), bool)
@@ -220,14 +202,7 @@ def _shifted(item: CameraCorners, hand_eye: HandEyeData, causes: Causes) -> Came
 
 
 def file_sequence(data: Sequence[Measurement]) -> Array:
-    """Return the joint values of all images in the order of the rows of their file.
-
-    Args:
-        data: Measurements, fitted and held out.
-
-    Returns:
-        Joint values, (k, n) [rad or m].
-    """
+    """Return the joint values of all images in the order of the rows of their file."""
     images = [item for item in data if isinstance(item, CameraCorners)]
     q = np.concatenate([item.q for item in images])
     rows = np.concatenate([item.rows for item in images])
@@ -239,16 +214,7 @@ def file_sequence(data: Sequence[Measurement]) -> Array:
 
 # ------------------------------------------------------------------------------------ sizes and shifts
 def find_sizes(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float]) -> dict[str, float]:
-    """Find the size of each board that fits the images best.
-
-    Args:
-        hand_eye: Images and what is held.
-        causes: Other causes of the model.
-        start: First values of cameras and boards by name.
-
-    Returns:
-        Size relative to the stated one by name of the board.
-    """
+    """Find the size of each board that fits the images best."""
     names = [b.name for item in hand_eye.data if isinstance(item, CameraCorners) for b in item.rig.boards]
     sizes = dict.fromkeys(dict.fromkeys(names), 1.0) | dict(causes.sizes)
     for name in sizes:
@@ -263,15 +229,7 @@ def find_sizes(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float]
 
 
 def find_shift(hand_eye: HandEyeData, causes: Causes) -> float:
-    """Find the shift of the joint values that fits the images best.
-
-    Args:
-        hand_eye: Images and what is held.
-        causes: Other causes of the model.
-
-    Returns:
-        Number of rows; 0 if no shift fits far better.
-    """
+    """Find the shift of the joint values that fits the images best."""
     if len(hand_eye.sequence) < 4:
         return 0.0
 
@@ -296,17 +254,7 @@ def _cost(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float] | No
 
 
 def find_minimum(cost: Callable[[float], float], start: float, step: float, max_step: float) -> float:
-    """Find a minimum of a function by parabolas through three of its values.
-
-    Args:
-        cost: Function.
-        start: Start of the search.
-        step: Distance of the first values.
-        max_step: Largest step.
-
-    Returns:
-        Place of the minimum.
-    """
+    """Find a minimum of a function by parabolas through three of its values."""
     x, middle = start, cost(start)
     for _ in range(_N_ROUNDS):
         left, right = cost(x - step), cost(x + step)

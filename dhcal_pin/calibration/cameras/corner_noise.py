@@ -37,15 +37,7 @@ _MAX_STATED_SHARE = 0.9999
 
 
 def fit_with_corner_noise(fit: Fit, max_iterations: int) -> Fit:
-    """Estimate how far corners are displaced in the image and at the board, and fit again.
-
-    Args:
-        fit: Fit of corners whose noise is the same in all images.
-        max_iterations: Largest number of iterations of one solution.
-
-    Returns:
-        Fit with a standard deviation for each image coordinate.
-    """
+    """Estimate how far corners are displaced in the image and at the board, and fit again."""
     for _ in range(_N_ROUNDS):
         fit = fit.solved_with(_with_corner_noise(fit), max_iterations)
     return fit

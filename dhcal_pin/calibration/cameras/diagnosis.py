@@ -267,16 +267,7 @@ class HandEyeFit:
 def diagnose_hand_eye(
     fit: Fit, position_std: float, holdout: Sequence[Measurement] = ()
 ) -> HandEyeDiagnosis | None:
-    """Find the likely cause of the error that a hand-eye calibration leaves.
-
-    Args:
-        fit: Fit of poses with the nominal arm; base and tool are the only parameters of the robot, if any.
-        position_std: Largest standard deviation of the position of a camera or a board [m].
-        holdout: Held-out images, for the order of all images.
-
-    Returns:
-        The diagnosis; None with fewer than five configurations, which cannot be left out.
-    """
+    """Find the likely cause of the error that a hand-eye calibration leaves."""
     inliers = _search(fit, fit.without_rejected().data, holdout)
     if inliers is None:
         return None
@@ -337,15 +328,7 @@ def _wrong_images(hand_eye: HandEyeData, state: _State, item: CameraCorners, wei
 
 
 def second_rotation(fit: Fit, data: Sequence[Measurement]) -> float:
-    """Return the RMS rotation of the tool about the axis with the second largest rotation [rad].
-
-    Args:
-        fit: Fit of the nominal arm.
-        data: Images.
-
-    Returns:
-        The rotation.
-    """
+    """Return the RMS rotation of the tool about the axis with the second largest rotation [rad]."""
     q = np.unique(np.concatenate([item.q for item in data if isinstance(item, CameraCorners)]), axis=0)
     rotations = fit.problem.errors.chain.poses(q)[:, :3, :3]
     mean = se3.nearest_rotation(rotations.mean(0))

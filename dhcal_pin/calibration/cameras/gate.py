@@ -127,15 +127,7 @@ class GatedFit:
 
 
 def fit_with_jitter(fit: Fit, max_iterations: int) -> tuple[Fit, Jitter]:
-    """Estimate the displacement that the corners of an image share, and fit again.
-
-    Args:
-        fit: Fit of independent corners.
-        max_iterations: Largest number of iterations of one solution.
-
-    Returns:
-        Fit with jitter, and its size.
-    """
+    """Estimate the displacement that the corners of an image share, and fit again."""
     jitter = Jitter(1.0, 0.0, 0.0)
     for _ in range(_N_JITTER_ROUNDS):
         jitter = residual_jitter(fit)
@@ -144,15 +136,7 @@ def fit_with_jitter(fit: Fit, max_iterations: int) -> tuple[Fit, Jitter]:
 
 
 def judge_target_points(fit: Fit, max_iterations: int) -> TargetPoints | None:
-    """Judge whether the corners of boards are where the rig states them; see `target_points`.
-
-    Args:
-        fit: Fit of independent corners at temperature 1 with the default priors, without outliers.
-        max_iterations: Largest number of iterations of one solution.
-
-    Returns:
-        The result; None without unknowns of the arm, or if nothing is to be judged.
-    """
+    """Judge whether the corners of boards are where the rig states them; see `target_points`."""
     if not fit.problem.errors.has_arm:
         return None
     clusters = cluster_folds(fit.data)
@@ -161,16 +145,7 @@ def judge_target_points(fit: Fit, max_iterations: int) -> TargetPoints | None:
 
 
 def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int) -> GatedFit:
-    """Fit arm, cameras and boards as far as the images show that the arm is wrong.
-
-    Args:
-        fit: Fit of independent corners at temperature 1 with the default priors, without outliers.
-        groups: Parameters of the arm whose default priors share one scale.
-        max_iterations: Largest number of iterations of one solution.
-
-    Returns:
-        The fits and the gate.
-    """
+    """Fit arm, cameras and boards as far as the images show that the arm is wrong."""
     is_good = np.concatenate([weights > ZERO_WEIGHT for weights in fit.weights])
     n_configurations = len(np.unique(configuration_groups(fit.data)[is_good]))
     folds = cluster_folds(fit.problem.data)
@@ -214,12 +189,7 @@ def _best(fits: Sequence[Fit], folds: Sequence[Fold]) -> Fit:
 
 
 def temperature(n_configurations: int, samples: int) -> float:
-    """Return the temperature of configurations with errors of the arm that the model lacks.
-
-    Args:
-        n_configurations: Number of different configurations.
-        samples: Configurations per unit of the temperature.
-    """
+    """Return the temperature of configurations with errors of the arm that the model lacks."""
     return 1 + n_configurations / samples
 
 
@@ -228,9 +198,6 @@ def rows_per_displacement(data: Sequence[Measurement]) -> float:
 
     Corners that share a displacement contain six independent values per image, however many they are. If
     they are taken for independent, they count as too many by this factor.
-
-    Args:
-        data: Measurements.
     """
     images = [item for item in data if isinstance(item, CameraCorners)]
     n_configurations = len(np.unique(configuration_groups(images)))
@@ -238,14 +205,7 @@ def rows_per_displacement(data: Sequence[Measurement]) -> float:
 
 
 def residual_jitter(fit: Fit) -> Jitter:
-    """Estimate the displacement of images from the residuals of a fit of independent corners.
-
-    Args:
-        fit: Fit.
-
-    Returns:
-        Its size.
-    """
+    """Estimate the displacement of images from the residuals of a fit of independent corners."""
     n_determined = effective_parameters(fit.problem, fit.solution)
     return estimate_jitter(fit.problem, fit.solution.x, fit.data, fit.weights, n_determined)
 
@@ -306,16 +266,7 @@ def _with_evidence(fit: Fit, groups: PriorGroups, temperature: float, max_iterat
 
 
 def without_arm(fit: Fit, max_iterations: int, held: Collection[str] = ()) -> Fit:
-    """Fit poses, lenses and target points with the nominal arm.
-
-    Args:
-        fit: Fit with the arm estimated.
-        max_iterations: Largest number of iterations.
-        held: Parameter sets that keep their first values.
-
-    Returns:
-        Fit of the same samples.
-    """
+    """Fit poses, lenses and target points with the nominal arm."""
     problem = fit.problem
     errors = nominal_arm(problem.errors)
     values = {
@@ -344,28 +295,14 @@ def without_arm(fit: Fit, max_iterations: int, held: Collection[str] = ()) -> Fi
 
 
 def nominal_arm(errors: ErrorModel) -> ErrorModel:
-    """Return the model of the nominal arm, with the unknowns of base and tool alone.
-
-    Args:
-        errors: Nominal chain and its unknown parameters.
-    """
+    """Return the model of the nominal arm, with the unknowns of base and tool alone."""
     return errors.only_frames() or ErrorModel(errors.chain, ())
 
 
 def judge_stages(
     fit: Fit, gated: GatedFit, judged_points: TargetPoints | None, max_iterations: int
 ) -> tuple[Stage, ...]:
-    """Judge the stages of a calibration: frames, intrinsics, target points, arm.
-
-    Args:
-        fit: Fit to which the gate was applied.
-        gated: Result of the gate.
-        judged_points: Why the corners of the boards are estimated or held; None if the rig says so.
-        max_iterations: Largest number of iterations of one solution.
-
-    Returns:
-        Accuracy of each stage.
-    """
+    """Judge the stages of a calibration: frames, intrinsics, target points, arm."""
     folds = cluster_folds(fit.data)
     images = k_fold(fit.data, N_IMAGE_FOLDS) if folds else ()
 
@@ -411,14 +348,7 @@ def _change(before: Stage, after: Stage) -> str:
 
 
 def cluster_folds(data: Sequence[Measurement]) -> tuple[Fold, ...]:
-    """Divide the configurations of measurements into clusters of joint space.
-
-    Args:
-        data: Measurements.
-
-    Returns:
-        Folds that hold out one cluster each; empty for too few configurations.
-    """
+    """Divide the configurations of measurements into clusters of joint space."""
     label = configuration_groups(data)
     q, _ = different_configurations(data)
     if len(q) < 2 * N_CLUSTERS or len(q) != label.max() + 1:

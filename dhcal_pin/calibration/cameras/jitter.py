@@ -68,18 +68,7 @@ def estimate_jitter(
     weights: Sequence[Array],
     n_determined: float,
 ) -> Jitter:
-    """Estimate the noise of corners and the displacement of images from the residuals of a fit.
-
-    Args:
-        problem: Problem that was solved.
-        x: Its solution, (p,).
-        data: Measurements with the standard deviations of the corners, without jitter.
-        weights: Robust weight of each sample, one array of shape (m,) per measurement.
-        n_determined: Number of parameters that the data determine.
-
-    Returns:
-        Standard deviations; stated ones of corners are kept.
-    """
+    """Estimate the noise of corners and the displacement of images from the residuals of a fit."""
     chain = problem.errors.at(x[: len(problem.errors.parameters)])
     images: list[tuple[Array, Array]] = []
     is_stated = True
@@ -156,17 +145,7 @@ def _maximize_likelihood(images: Sequence[tuple[Array, Array]], noise: float, n_
 def with_jitter(
     problem: Problem, x: Array, data: Sequence[Measurement], jitter: Jitter
 ) -> tuple[Measurement, ...]:
-    """Give image coordinates the noise and the jitter that were estimated.
-
-    Args:
-        problem: Problem whose model gives the derivatives by the displacement.
-        x: Its solution, (p,).
-        data: Measurements with the standard deviations of the corners.
-        jitter: Standard deviations.
-
-    Returns:
-        Measurements; those that are no image coordinates are unchanged.
-    """
+    """Give image coordinates the noise and the jitter that were estimated."""
     chain = problem.errors.at(x[: len(problem.errors.parameters)])
     std = np.array([jitter.position] * 3 + [jitter.rotation] * 3)
     out: list[Measurement] = []

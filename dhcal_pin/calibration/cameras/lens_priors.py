@@ -24,14 +24,7 @@ MIN_LENS_WIDTH = 1e-2
 
 
 def lens_prior_groups(problem: Problem) -> PriorGroups:
-    """Group the values of the lenses that the rig states with a prior.
-
-    Args:
-        problem: Problem in the errors of the robot, then those of the instruments.
-
-    Returns:
-        Groups of each of these cameras: focal lengths and image centre if they are stated, and distortion.
-    """
+    """Group the values of the lenses that the rig states with a prior."""
     stated = {
         (f"camera_{camera.name}", unit)
         for item in problem.data
@@ -59,15 +52,7 @@ def lens_prior_groups(problem: Problem) -> PriorGroups:
 
 
 def with_stated_distortion(data: Sequence[Measurement]) -> tuple[tuple[Measurement, ...], dict[str, float]]:
-    """Centre the priors of distortion at the values of the rig, not at first values from the images.
-
-    Args:
-        data: Measurements with first values of all parameters.
-
-    Returns:
-        Measurements whose lenses have the distortion of the rig, and first values of the distortion, by name
-        [1].
-    """
+    """Centre the priors of distortion at the values of the rig, not at first values from the images."""
     first: dict[str, float] = {}
     out = []
     for item in data:
@@ -86,11 +71,7 @@ def with_stated_distortion(data: Sequence[Measurement]) -> tuple[tuple[Measureme
 
 
 def with_lens_priors(fit: Fit) -> Fit:
-    """Return a fit whose measurements state the prior widths of its lenses, for fits of the nominal robot.
-
-    Args:
-        fit: Fit whose problem has the widths of greatest evidence.
-    """
+    """Return a fit whose measurements state the prior widths of its lenses, for fits of the nominal robot."""
     first = len(fit.problem.errors.parameters)
     prior = {
         p.name: 1 / weight

@@ -15,15 +15,7 @@ MIN_SHARE, MAX_JOINTS = 0.5, 3
 
 
 def seen_ranges_warning(chain: Chain, data: Sequence[Measurement]) -> str:
-    """Warn of joints that moved in a small part of their range only.
-
-    Args:
-        chain: Robot. Ranges of revolute joints are counted within half a turn each way.
-        data: Measurements that the arm was estimated from.
-
-    Returns:
-        Sentence that names the joints with the smallest shares of their ranges; empty if all moved far.
-    """
+    """Warn of joints that moved in a small part of their range only."""
     q = different_configurations(data)[0]
     limit = np.where(chain.is_prismatic, np.inf, np.pi)
     ranges = np.minimum(chain.upper, limit) - np.maximum(chain.lower, -limit)

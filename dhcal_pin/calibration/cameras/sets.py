@@ -28,74 +28,35 @@ MAX_POINTS = 150
 
 
 def split_sets(parameters: str | Iterable[str]) -> tuple[list[str], list[str]]:
-    """Separate the sets of the rig from those of the robot.
-
-    Args:
-        parameters: Names of sets, comma-separated or one by one.
-
-    Returns:
-        Sets of the robot, and sets of the rig.
-    """
+    """Separate the sets of the rig from those of the robot."""
     names = [s.strip() for s in parameters.split(",")] if isinstance(parameters, str) else list(parameters)
     return [name for name in names if name not in RIG_SETS], [name for name in names if name in RIG_SETS]
 
 
 def has_images(data: Sequence[Measurement]) -> bool:
-    """Return whether there are image coordinates among measurements.
-
-    Args:
-        data: Measurements.
-    """
+    """Return whether there are image coordinates among measurements."""
     return any(isinstance(item, CameraCorners) for item in data)
 
 
 def default_sets(chain: Chain, data: Sequence[Measurement]) -> str:
-    """Return the parameter sets that are estimated by default.
-
-    Args:
-        chain: Robot.
-        data: Measurements.
-
-    Returns:
-        Sets of the chain; with image coordinates, those of robot and rig, or of the rig alone if there are
-        no joint values.
-    """
+    """Return the parameter sets that are estimated by default."""
     if not has_images(data):
         return chain.parameters
     return DEFAULT_SETS if has_joint_values(data) else HAND_EYE_SETS
 
 
 def has_joint_values(data: Sequence[Measurement]) -> bool:
-    """Return whether the joint positions of all images were measured, rather than poses of the tip.
-
-    Args:
-        data: Measurements.
-    """
+    """Return whether the joint positions of all images were measured, rather than poses of the tip."""
     return all(item.has_joint_values for item in data)
 
 
 def describe_configurations(data: Sequence[Measurement]) -> str:
-    """Name what the files state of the robot, for messages.
-
-    Args:
-        data: Measurements.
-
-    Returns:
-        "joint values" or "flange poses".
-    """
+    """Name what the files state of the robot, for messages."""
     return "joint values" if has_joint_values(data) else "flange poses"
 
 
 def require_joint_values(data: Sequence[Measurement], names: Sequence[str]) -> None:
-    """Check that parameters of the arm, other than base and tool, are estimated from joint values only.
-
-    Args:
-        data: Measurements.
-        names: Sets and parameters of the robot that are estimated.
-
-    Raises:
-        InvalidArgumentError: Images have poses of the tip in place of joint values.
-    """
+    """Check that parameters of the arm, other than base and tool, are estimated from joint values only."""
     if has_joint_values(data):
         return
     arm = [name for name in names if name not in ("base", "tool")]
@@ -113,18 +74,7 @@ def require_joint_values(data: Sequence[Measurement], names: Sequence[str]) -> N
 
 
 def held_values(data: Sequence[Measurement], sets: Sequence[str]) -> dict[str, float]:
-    """Find the parameters of cameras and boards that are held at the values of the rig.
-
-    Args:
-        data: Measurements.
-        sets: Names of the sets of the rig that are estimated.
-
-    Returns:
-        Values by parameter name [m, rad, px or 1].
-
-    Raises:
-        InvalidArgumentError: Sets of a rig are named without image coordinates.
-    """
+    """Find the parameters of cameras and boards that are held at the values of the rig."""
     images = [item for item in data if isinstance(item, CameraCorners)]
     if sets and not images:
         raise InvalidArgumentError(
@@ -140,11 +90,7 @@ def held_values(data: Sequence[Measurement], sets: Sequence[str]) -> dict[str, f
 
 
 def count_corners(data: Sequence[Measurement]) -> int:
-    """Return the number of corners of all boards.
-
-    Args:
-        data: Measurements.
-    """
+    """Return the number of corners of all boards."""
     boards = {
         board.name: len(board.points)
         for item in data

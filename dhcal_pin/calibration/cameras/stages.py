@@ -76,12 +76,6 @@ class Stage:
 def format_ratio(ratio: float) -> str:
     """Format an error relative to another one.
 
-    Args:
-        ratio: Ratio of the errors.
-
-    Returns:
-        Per cent, with two digits below 10 %.
-
     >>> format_ratio(1.138), format_ratio(0.0213)
     ('114 %', '2.1 %')
     """
@@ -89,27 +83,12 @@ def format_ratio(ratio: float) -> str:
 
 
 def fitted_error(fit: Fit) -> ImageError:
-    """Compute the error of the fitted images that are not outliers.
-
-    Args:
-        fit: Fit.
-
-    Returns:
-        The error.
-    """
+    """Compute the error of the fitted images that are not outliers."""
     return _image_error(fit, [(fit.solution.x, [np.ones(len(item.rows), bool) for item in fit.data])])
 
 
 def held_out_error(fit: Fit, folds: Sequence[Fold]) -> ImageError | None:
-    """Compute the error of images under fits of the other images, by one step from the fit of all.
-
-    Args:
-        fit: Fit of all images.
-        folds: Disjoint folds.
-
-    Returns:
-        Error of all held-out corners that are not outliers; None with fewer than two folds.
-    """
+    """Compute the error of images under fits of the other images, by one step from the fit of all."""
     if len(folds) < 2:
         return None
     problem, x = fit.problem, fit.solution.x
@@ -125,15 +104,7 @@ def held_out_error(fit: Fit, folds: Sequence[Fold]) -> ImageError | None:
 
 
 def held_out_prediction_std(fit: Fit, folds: Sequence[Fold]) -> float:
-    """Compute the error of images that the uncertainty of fits of the other images causes.
-
-    Args:
-        fit: Fit of all images.
-        folds: Disjoint folds.
-
-    Returns:
-        The RMS in standard deviations of the corners; infinite if neither other images nor priors limit it.
-    """
+    """Compute the error of images that the uncertainty of fits of the other images causes."""
     columns = np.ones(len(fit.solution.x), bool)
     systems = factor_partition(fit.problem, fit.solution.x, folds)
     variances = [system.prediction_std(fit.problem.weights, columns) ** 2 for system in systems]

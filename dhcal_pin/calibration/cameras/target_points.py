@@ -64,18 +64,7 @@ class TargetPoints:
 def try_target_points(
     fit: Fit, images: Sequence[Fold], clusters: Sequence[Fold], max_iterations: int
 ) -> TargetPoints | None:
-    """Judge the corners of boards as unknowns on left-out images.
-
-    Args:
-        fit: Fit of all other unknowns.
-        images: Folds of random images.
-        clusters: Folds of clusters of joint space.
-        max_iterations: Largest number of iterations of one solution.
-
-    Returns:
-        The result; None if the rig says how the corners are treated, they are too many, or the images cannot
-        be divided.
-    """
+    """Judge the corners of boards as unknowns on left-out images."""
     names = judged_boards(boards_of(fit.data))
     if not names or len(clusters) < 2:
         return None
@@ -92,15 +81,7 @@ def try_target_points(
 
 
 def judged_boards(boards: Iterable[Board]) -> list[str]:
-    """Find the boards whose corners are tried as further unknowns.
-
-    Args:
-        boards: Boards of a rig, or of several measurements with the same boards.
-
-    Returns:
-        Names of the boards whose corners the rig neither fixes nor leaves free; empty if all boards together
-        have too many corners.
-    """
+    """Find the boards whose corners are tried as further unknowns."""
     by_name = {board.name: board for board in boards}
     if sum(len(board.points) for board in by_name.values()) > MAX_POINTS:
         return []
@@ -110,24 +91,12 @@ def judged_boards(boards: Iterable[Board]) -> list[str]:
 
 
 def boards_of(data: Sequence[Measurement]) -> list[Board]:
-    """Return the boards of images.
-
-    Args:
-        data: Measurements of any kinds.
-    """
+    """Return the boards of images."""
     return [board for item in data if isinstance(item, CameraCorners) for board in item.rig.boards]
 
 
 def with_free_points(fit: Fit, boards: Collection[str]) -> Fit:
-    """Return a fit whose corners of boards are further unknowns, at their first values and not yet solved.
-
-    Args:
-        fit: Fit.
-        boards: Names of the boards.
-
-    Returns:
-        The fit; its solution is that of the other unknowns.
-    """
+    """Return a fit whose corners of boards are further unknowns, at their first values and not yet solved."""
     problem, robot = fit.problem, len(fit.problem.errors.parameters)
     names = [p.name for p in problem.instrument_parameters]
     weights = dict(zip(names, problem.weights[robot:].tolist(), strict=True))

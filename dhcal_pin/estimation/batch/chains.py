@@ -59,17 +59,7 @@ class ChainBatch:
 
     @classmethod
     def from_models(cls, models: Sequence[ErrorModel]) -> ChainBatch:
-        """Stack the chains of several error models.
-
-        Args:
-            models: Error models with the same joints and parameters.
-
-        Returns:
-            Batch of their nominal chains.
-
-        Raises:
-            InvalidArgumentError: If the models differ in joints or parameters, or have transmission errors.
-        """
+        """Stack the chains of several error models."""
         first = models[0]
         for number, model in enumerate(models, 1):
             if model.has_transmission:
@@ -96,14 +86,7 @@ class ChainBatch:
         return self.n_chains
 
     def take(self, index: Array) -> ChainBatch:
-        """Select chains.
-
-        Args:
-            index: Indices of shape (j,).
-
-        Returns:
-            Batch of j chains.
-        """
+        """Select chains."""
         arrays = {name: getattr(self, name) for name in ("base", "link_transforms", "tool", "twists")}
         return replace(
             self,
@@ -112,14 +95,7 @@ class ChainBatch:
         )
 
     def chain(self, number: int) -> Chain:
-        """Build one of the chains.
-
-        Args:
-            number: Index of the chain, from 0.
-
-        Returns:
-            Single chain.
-        """
+        """Build one of the chains."""
         chain = self.model.chain
         base, links, tool = (
             array[number % len(array)] for array in (self.base, self.link_transforms, self.tool)
@@ -173,14 +149,7 @@ class ChainBatch:
         return replace(self, base=self.base @ base_error, link_transforms=links, tool=tool), frames
 
     def at(self, x: Array) -> ChainBatch:
-        """Build the chains with given errors.
-
-        Args:
-            x: Errors of shape (b, p) [m and rad].
-
-        Returns:
-            Batch of b chains.
-        """
+        """Build the chains with given errors."""
         return self._propagate(x)[0]
 
     def derivative(self, x: Array) -> tuple[ChainBatch, Array, Array]:
@@ -204,14 +173,7 @@ class ChainBatch:
         return chains, bodies, np.concatenate([linear, angular], -1)
 
     def forward_kinematics(self, q: Array) -> FrameBatch:
-        """Compute all frames.
-
-        Args:
-            q: Joint positions of shape (c, b, m, n) [rad or m].
-
-        Returns:
-            Frames at c·b·m samples.
-        """
+        """Compute all frames."""
         chain = self.model.chain
         positions = np.moveaxis(q @ chain.mimic_matrix.T + chain.mimic_offset, -1, 0).copy()
         shape = positions.shape[1:]

@@ -43,26 +43,12 @@ class TriangularSystemBatch:
 
     @classmethod
     def from_r_factors(cls, rows: Array) -> TriangularSystemBatch:
-        """Split the R factors of [J | r].
-
-        Args:
-            rows: [R z; 0 ρ] of each problem, shape (b, p+1, p+1).
-
-        Returns:
-            Systems of b problems.
-        """
+        """Split the R factors of [J | r]."""
         return cls(rows[:, :-1, :-1], rows[:, :-1, -1], rows[:, -1, -1] ** 2)
 
     @classmethod
     def from_columns(cls, columns: Array) -> TriangularSystemBatch:
-        """Factor whitened rows.
-
-        Args:
-            columns: Columns of [J | r] of each problem, k rows each, shape (b, p+1, k).
-
-        Returns:
-            Systems of b problems.
-        """
+        """Factor whitened rows."""
         return cls.from_r_factors(r_factors(np.ascontiguousarray(columns)[:, :, None]))
 
     @property
@@ -76,34 +62,15 @@ class TriangularSystemBatch:
         return EPS_MODEL * _frobenius_norms(self.r)
 
     def take(self, members: Array) -> TriangularSystemBatch:
-        """Select problems.
-
-        Args:
-            members: Indices of shape (j,).
-
-        Returns:
-            Copy of the systems of j problems.
-        """
+        """Select problems."""
         return TriangularSystemBatch(self.r[members], self.z[members], self.min_cost[members])
 
     def assign(self, members: Array, other: TriangularSystemBatch) -> None:
-        """Replace the systems of some problems in place.
-
-        Args:
-            members: Indices of shape (j,).
-            other: Systems of j problems.
-        """
+        """Replace the systems of some problems in place."""
         self.r[members], self.z[members], self.min_cost[members] = other.r, other.z, other.min_cost
 
     def with_damping(self, diagonal: Array) -> TriangularSystemBatch:
-        """Append the rows diag(diagonal)·δ = 0.
-
-        Args:
-            diagonal: Coefficients of shape (b, p).
-
-        Returns:
-            Systems for `solve`; their `min_cost` does not include that of `self`.
-        """
+        """Append the rows diag(diagonal)·δ = 0."""
         b, p = self.z.shape
         columns = np.zeros((b, p + 1, 2 * p))
         columns[:, :p, :p], columns[:, p, :p] = self.r.swapaxes(1, 2), self.z
@@ -116,12 +83,6 @@ class TriangularSystemBatch:
         Singular values below RANK_RTOL times the largest count as zero. Only matrices that may have such
         singular values are decomposed; for the others a solution of a few random right-hand sides bounds the
         condition number.
-
-        Args:
-            min_singular_value: Known lower bounds of the singular values, shape (b,); zero if unknown.
-
-        Returns:
-            Solutions of shape (b, p).
         """
         p = self.z.shape[1]
         size, out = _frobenius_norms(self.r), np.empty_like(self.z)
@@ -145,25 +106,11 @@ class TriangularSystemBatch:
         return out
 
     def residual_change(self, step: Array) -> Array:
-        """Compute the changes of the rows by steps, up to a rotation.
-
-        Args:
-            step: Steps δ of shape (b, p) [m and rad].
-
-        Returns:
-            R·δ of shape (b, p).
-        """
+        """Compute the changes of the rows by steps, up to a rotation."""
         return (self.r @ step[..., None])[..., 0]
 
     def predicted_reduction(self, change: Array) -> Array:
-        """Compute by how much the linear models reduce the costs.
-
-        Args:
-            change: Result of `residual_change`, shape (b, p).
-
-        Returns:
-            ‖z‖² - ‖R·δ - z‖² of shape (b,).
-        """
+        """Compute by how much the linear models reduce the costs."""
         return np.sum(self.z**2, -1) - np.sum((change - self.z) ** 2, -1)
 
     def is_stationary(self, cost: Array, last_change: Array) -> Array:

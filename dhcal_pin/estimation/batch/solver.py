@@ -310,9 +310,6 @@ def _levenberg_marquardt(batch: BatchProblem, x: Array, max_iterations: int) -> 
     In each pass every active problem tries one step. Problems whose step was accepted are linearized again;
     the others retry with more damping. State that outlives a pass has one element per problem of the batch;
     quantities of one pass have one element per active problem.
-
-    Returns:
-        Solutions (b, p), numbers of iterations (b,) and convergence flags (b,).
     """
     b, p, active_batch, active = len(batch), len(batch.weights), batch, np.arange(len(batch))
     x, iterations, converged = x.copy(), np.zeros(b, int), np.zeros(b, bool)

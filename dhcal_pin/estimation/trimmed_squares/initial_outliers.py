@@ -49,17 +49,7 @@ MIN_MEDIAN = 1e-6
 def find_initial_outliers(
     errors: ErrorModel, data: Sequence[Measurement], known: Mapping[str, float]
 ) -> list[Array]:
-    """Find samples that are so far from the nominal robot that a fit must begin without them.
-
-    Args:
-        errors: Nominal chain and its unknown parameters.
-        data: Measurements of any kinds.
-        known: Values of instrument parameters by name [m or rad].
-
-    Returns:
-        Whether each sample is an outlier, shape (m,) for each measurement; False for all samples if they are
-        too few to judge each other.
-    """
+    """Find samples that are so far from the nominal robot that a fit must begin without them."""
     all_good = [np.zeros(len(item.rows), bool) for item in data]
     frames = errors.only_frames() or ErrorModel(errors.chain, ())
     parts = [item.take(_draw_groups(item)) for item in data]

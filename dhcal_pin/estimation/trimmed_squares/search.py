@@ -127,14 +127,7 @@ class LinearizedRows:
         return information + MIN_INFORMATION * np.eye(u)
 
     def residual_squares(self, y: Array) -> Array:
-        """Compute the sum of squared residuals of each block.
-
-        Args:
-            y: Solutions, shape (a, u).
-
-        Returns:
-            Sums, shape (a, b).
-        """
+        """Compute the sum of squared residuals of each block."""
         out = []
         for item, groups in zip(self.items, self.groups, strict=True):
             residual = item[-1].ravel() - y @ item[:-1].reshape(y.shape[1], -1)
@@ -205,16 +198,7 @@ class LinearizedRows:
 
 
 def linearize_rows(problem: Problem, x: Array, root: Array) -> LinearizedRows:
-    """Compute the rows of a problem in the coordinates of a square root of the covariance.
-
-    Args:
-        problem: Problem with all samples.
-        x: Point of the linearization, shape (p+s,).
-        root: Square root S of the covariance of the unknowns, shape (p+s, u).
-
-    Returns:
-        The rows.
-    """
+    """Compute the rows of a problem in the coordinates of a square root of the covariance."""
     linearization = problem.linearize(x)
     chunks = iter(problem.chunks)
     u, first = root.shape[1], 0
@@ -263,16 +247,7 @@ def linearize_rows(problem: Problem, x: Array, root: Array) -> LinearizedRows:
 
 
 def _strata(depends: Array, k: int, first: int) -> list[tuple[Array, int]]:
-    """Divide the samples of a measurement by the instrument parameters that they depend on.
-
-    Args:
-        depends: Whether each sample depends on each instrument parameter, shape (s, m).
-        k: Number of residuals per sample.
-        first: Number of the first sample among those of all measurements.
-
-    Returns:
-        Samples of each stratum that has unknowns of its own, and the smallest number of them in a fit.
-    """
+    """Divide the samples of a measurement by the instrument parameters that they depend on."""
     out: list[tuple[Array, int]] = []
     patterns, labels = np.unique(depends, axis=1, return_inverse=True)
     for i, pattern in enumerate(patterns.T if len(patterns) else ()):
@@ -320,11 +295,7 @@ def search_majorities(rows: LinearizedRows, groups: Array, n_determined: int) ->
 
 
 def _concentrate(rows: LinearizedRows, weights: Array, scales: Array) -> tuple[Array, Array, Array]:
-    """Fit the weighted samples, then choose the majority with the smallest residuals.
-
-    Returns:
-        Noise scales (a, c), weights of the chosen samples (a, m) and objective (a,).
-    """
+    """Fit the weighted samples, then choose the majority with the smallest residuals."""
     y = rows.solve(weights, scales)
     squares = rows.residual_squares(y)
     scales = rows.noise_scales(squares)
@@ -345,9 +316,6 @@ def _random_subsets(rows: LinearizedRows, groups: Array, n_determined: int) -> A
     Every second subset consists of whole configurations, every other pair is half as large as needed to
     determine all unknowns: fewer samples are more often all good, and the priors supply what is missing. Each
     stratum has its smallest number of samples. The first subset contains all samples.
-
-    Returns:
-        Weights of the samples, shape (a, m).
     """
     u, m = len(rows.prior_right), rows.n_samples
     work = len(rows.counts) * u * u

@@ -101,33 +101,14 @@ class ConvertedBag(NamedTuple):
 
 
 def is_bag(path: PathLike) -> bool:
-    """Return whether a path is that of a recording: by its ending, or a folder of ROS 2.
-
-    Args:
-        path: Path of a file or a folder.
-    """
+    """Return whether a path is that of a recording: by its ending, or a folder of ROS 2."""
     return os.fspath(path).lower().endswith(ENDINGS) or os.path.exists(os.path.join(path, "metadata.yaml"))
 
 
 def convert_bag(
     path: PathLike, pose_topic: str | None, joint_topic: str | None = None, chain: Chain | None = None
 ) -> ConvertedBag:
-    """Make a measurement file from the stops of a recording.
-
-    Args:
-        path: Recording.
-        pose_topic: Topic of the measured positions or poses; `TOPIC:FRAME` for a child frame of a topic of
-            transforms.
-        joint_topic: Topic of the joint positions; if None the only one of its type, or `/joint_states`.
-        chain: Robot, whose joints are written; without it all joints are written, as revolute ones.
-
-    Returns:
-        Text of the file, and notes.
-
-    Raises:
-        InvalidArgumentError: A topic is missing; the message names the candidates.
-        FileFormatError: The recording cannot be read, or has no stops.
-    """
+    """Make a measurement file from the stops of a recording."""
     source = os.fspath(path)
     with _open_bag(source) as reader:
         joint_topic = _choose_joint_topic(reader, source, joint_topic)
@@ -161,19 +142,7 @@ def convert_bag(
 
 
 def read_bag_joints(path: PathLike, joint_topic: str | None = None) -> RecordedJoints:
-    """Read all joint positions of a recording.
-
-    Args:
-        path: Recording.
-        joint_topic: Topic of the joint positions; if None the only one of its type, or `/joint_states`.
-
-    Returns:
-        Joint positions with their times.
-
-    Raises:
-        InvalidArgumentError: The topic is missing; the message names the candidates.
-        FileFormatError: The recording cannot be read.
-    """
+    """Read all joint positions of a recording."""
     source = os.fspath(path)
     with _open_bag(source) as reader:
         return _read_joints(reader, source, _choose_joint_topic(reader, source, joint_topic), None)

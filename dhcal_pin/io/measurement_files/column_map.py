@@ -136,19 +136,7 @@ class ColumnMap:
 
 
 def read_map(path: PathLike, chain: Chain) -> ColumnMap:
-    """Read a column map and check it for a robot.
-
-    Args:
-        path: TOML file.
-        chain: The robot.
-
-    Returns:
-        The map.
-
-    Raises:
-        FileFormatError: The map is invalid or contradicts itself.
-        UnknownNameError: The map names a column that the robot's files cannot have.
-    """
+    """Read a column map and check it for a robot."""
     table = TomlTable.read(path)
     contents = column_contents(chain)
     layout = _layout(table)

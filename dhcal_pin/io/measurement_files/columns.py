@@ -65,28 +65,13 @@ _MAX_COMPARED = 100
 
 
 def joint_units(chain: Chain, name: str) -> Mapping[str, float]:
-    """Return the units allowed in the column of a joint.
-
-    Args:
-        chain: Robot with the joint.
-        name: Name of the joint.
-
-    Returns:
-        Divisor to SI units of each unit: lengths for a prismatic joint, otherwise angles.
-    """
+    """Return the units allowed in the column of a joint."""
     joint = chain.urdf.joint(name)
     return LENGTHS if joint.type == "prismatic" else ANGLES
 
 
 def column_contents(chain: Chain) -> dict[str, str]:
-    """Return the content of each column that a measurement file of a robot can have.
-
-    Args:
-        chain: The robot.
-
-    Returns:
-        "length", "angle", "number" or "text" by column name.
-    """
+    """Return the content of each column that a measurement file of a robot can have."""
     joints = {
         prefix + joint.name: "length" if joint.type == "prismatic" else "angle"
         for joint in chain.urdf.joints
@@ -96,14 +81,7 @@ def column_contents(chain: Chain) -> dict[str, str]:
 
 
 def check_joint_names(chain: Chain) -> None:
-    """Check that the joints of a robot can be columns beside the measured values.
-
-    Args:
-        chain: The robot.
-
-    Raises:
-        FileFormatError: A joint's name cannot be a header, or is the name of another column.
-    """
+    """Check that the joints of a robot can be columns beside the measured values."""
     require_usable_names(chain.joint_names, chain.urdf.source)
     if clashes := sorted(_KNOWN & set(chain.joint_names)):
         raise FileFormatError(
@@ -113,21 +91,13 @@ def check_joint_names(chain: Chain) -> None:
 
 
 def known_columns(chain: Chain) -> frozenset[str]:
-    """Return the names of all columns that a measurement file of a robot can have.
-
-    Args:
-        chain: The robot.
-    """
+    """Return the names of all columns that a measurement file of a robot can have."""
     names = [joint.name for joint in chain.urdf.joints]
     return _KNOWN | {prefix + name for name in names for prefix in ("", SECOND_PREFIX)}
 
 
 def joints_off_the_chain(chain: Chain) -> list[str]:
-    """Return the names of the joints of the URDF whose values do not change the pose of the tip.
-
-    Args:
-        chain: The robot.
-    """
+    """Return the names of the joints of the URDF whose values do not change the pose of the tip."""
     used = {*chain.joint_names, *chain.moving_joints}
     return [joint.name for joint in chain.urdf.joints if joint.name not in used]
 
@@ -136,10 +106,6 @@ def needs_column_map(table: DataTable, chain: Chain) -> bool:
     """Return whether a file has no header, or one that names no joint or no measured value.
 
     A file with too few unknown columns to be described by a map does not need one.
-
-    Args:
-        table: Table of a measurement file.
-        chain: The robot.
     """
     if table.has_numbers_as_header:
         return True
@@ -154,18 +120,7 @@ def needs_column_map(table: DataTable, chain: Chain) -> bool:
 
 
 def check_columns(table: DataTable, chain: Chain) -> list[str]:
-    """Check that every column is a joint of the robot, a measured value, or can be ignored.
-
-    Args:
-        table: Table of a measurement file.
-        chain: The robot.
-
-    Returns:
-        Labels of the columns that are ignored, such as `column 'comment'`.
-
-    Raises:
-        UnknownNameError: A column is unknown; the message suggests a similar name.
-    """
+    """Check that every column is a joint of the robot, a measured value, or can be ignored."""
     known = known_columns(chain)
     columns = table.columns
     for name, column in columns.items():
@@ -195,18 +150,7 @@ def _can_be_ignored(table: DataTable, column: Column, known: Iterable[str]) -> b
 def unknown_column_error(
     where: str, name: str, known: Iterable[str], present: Iterable[str], joint_names: Iterable[str]
 ) -> UnknownNameError:
-    """Build the error of a column that is neither a joint nor a measured value.
-
-    Args:
-        where: File and line of the header, for the message.
-        name: Name of the column.
-        known: Names of all columns that a file can have.
-        present: Names of the columns of the file.
-        joint_names: Names of the robot's joints.
-
-    Returns:
-        Exception whose message suggests a similar name.
-    """
+    """Build the error of a column that is neither a joint nor a measured value."""
     suggestions = _suggestions(name, known, present)
     remedy = (
         f"did you mean {suggestions[0]!r}?"
@@ -238,27 +182,13 @@ def _present_values(table: DataTable) -> set[str]:
 
 
 def has_tool_poses(table: DataTable) -> bool:
-    """Return whether a file has image coordinates and poses of the tip.
-
-    Args:
-        table: Table of a measurement file.
-    """
+    """Return whether a file has image coordinates and poses of the tip."""
     present = _present_values(table)
     return present.issuperset(TOOL_POSE) and any(map(present.issuperset, CameraCorners.required_columns))
 
 
 def find_kind(table: DataTable) -> type[Measurement]:
-    """Find the measurement kind of a file from its columns.
-
-    Args:
-        table: Table of a measurement file.
-
-    Returns:
-        Class of the kind.
-
-    Raises:
-        FileFormatError: The columns of no kind are complete, or a column does not belong to the kind.
-    """
+    """Find the measurement kind of a file from its columns."""
     present = _present_values(table)
     if has_tool_poses(table):
         present -= set(TOOL_POSE)

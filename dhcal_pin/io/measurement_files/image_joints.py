@@ -13,19 +13,7 @@ IMAGE = "image"
 
 
 def read_image_joints(path: PathLike, images: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Read the joint values that belong to images.
-
-    Args:
-        path: Table with the column `image`, file names with or without folder and ending, and one column per
-            joint with its unit, such as `elbow_joint[deg]`.
-        images: Paths of the images.
-
-    Returns:
-        Cells of the joint columns by header, for the name of each image.
-
-    Raises:
-        FileFormatError: The column is missing, or an image has no row or several.
-    """
+    """Read the joint values that belong to images."""
     table = read_table(path)
     headers = [header.strip() for header in table.headers]
     if IMAGE not in headers:

@@ -37,12 +37,6 @@ class RecordedImages(NamedTuple):
 def image_time(name: str) -> float | None:
     """Return the time in the name of an image [s].
 
-    Args:
-        name: Name such as `1700000000.25.png`, `left_1700000000_250000000.png` or `1700000000250000000.png`.
-
-    Returns:
-        Time; None without one.
-
     >>> image_time("left_1700000000_250000000.png")
     1700000000.25
     """
@@ -60,19 +54,7 @@ def image_time(name: str) -> float | None:
 def read_recorded_joints(
     path: PathLike, images: Sequence[str], joint_topic: str | None = None
 ) -> RecordedImages:
-    """Read the joint values at the times of images from a recording.
-
-    Args:
-        path: Recording of ROS 1, ROS 2 or MCAP.
-        images: Paths of the images, with their times in the names.
-        joint_topic: Topic of the joint positions; if None the only one, or `/joint_states`.
-
-    Returns:
-        Joint values in radians, and notes. Prismatic joints are not recognized.
-
-    Raises:
-        FileFormatError: A name has no time, or the recording has no joint values at that time.
-    """
+    """Read the joint values at the times of images from a recording."""
     source, times = os.fspath(path), np.empty(len(images))
     for i, image in enumerate(images):
         time = image_time(image)

@@ -40,15 +40,7 @@ _ROTATION = r"(?<![a-z])(?:q[wxyz0-3]|r[xyz]|[abcwpr]|roll|pitch|yaw|rot.*)(?![a
 
 
 def propose_map(table: DataTable, chain: Chain) -> list[str]:
-    """Propose the lines of a column map.
-
-    Args:
-        table: Table without header, or with the headers of another program.
-        chain: Robot that was measured.
-
-    Returns:
-        Lines of a TOML file; empty if there are fewer columns of numbers than joints.
-    """
+    """Propose the lines of a column map."""
     columns = _numeric_columns(table)
     joints = _choose_joints(table, chain, columns)
     if not joints:
@@ -134,15 +126,7 @@ def _rotation_line(table: DataTable, turns: Sequence[int], columns: Mapping[int,
 
 
 def header_problem(table: DataTable, chain: Chain) -> str:
-    """Say what is wrong with the header of a file that needs a column map, see `columns.needs_column_map`.
-
-    Args:
-        table: Table of the file.
-        chain: Robot that was measured.
-
-    Returns:
-        Sentence without a full stop.
-    """
+    """Say what is wrong with the header of a file that needs a column map, see `columns.needs_column_map`."""
     where = table.header_location
     if table.has_numbers_as_header:
         example = f"{chain.joint_names[0]}[deg],…,x[mm],y[mm],z[mm]"
@@ -157,15 +141,7 @@ def header_problem(table: DataTable, chain: Chain) -> str:
 
 
 def missing_header_error(table: DataTable, chain: Chain) -> FileFormatError:
-    """Build the error of a file that needs a column map, see `columns.needs_column_map`.
-
-    Args:
-        table: Table of the file.
-        chain: Robot that was measured.
-
-    Returns:
-        Exception whose message proposes the lines of a column map.
-    """
+    """Build the error of a file that needs a column map, see `columns.needs_column_map`."""
     problem, lines = header_problem(table, chain), propose_map(table, chain)
     if not lines:
         return FileFormatError(f"{problem}, or describe them in a column map (--columns)")

@@ -81,17 +81,6 @@ def read_mapped_table(source: PathLike | Any, column_map: ColumnMap, known: Set[
     """Read a file of another maker as a table with the project's own columns.
 
     A file whose header has the project's columns only, and lacks columns of the map, is read as it is.
-
-    Args:
-        source: File, or data frame.
-        column_map: Map of its columns.
-        known: Columns that a file of the project can have.
-
-    Returns:
-        Table with the columns of the map.
-
-    Raises:
-        FileFormatError: A column of the map is missing.
     """
     if _is_native(source, known) and not _matches(source, column_map):
         return read_table(source)
@@ -177,16 +166,7 @@ def _rotation_columns(vendor: _VendorTable, notation: Rotation) -> dict[str, Arr
 
 
 def euler_to_matrix(angles: Array, axes: str, frame: str) -> Array:
-    """Convert Euler angles to rotation matrices.
-
-    Args:
-        angles: Angles about the three axes in their order, shape (m, 3) [rad].
-        axes: Three letters such as "xyz".
-        frame: "intrinsic" for rotations about the axes as rotated so far, "extrinsic" for fixed axes.
-
-    Returns:
-        Rotation matrices, shape (m, 3, 3).
-    """
+    """Convert Euler angles to rotation matrices."""
     first, second, third = (
         se3.exp3(angles[:, i, None] * np.eye(3)["xyz".index(axis)]) for i, axis in enumerate(axes)
     )

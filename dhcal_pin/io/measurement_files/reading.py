@@ -118,34 +118,13 @@ def read_measurement_file(
     skip_bad_rows: bool = False,
     rig: MountedRig | None = None,
 ) -> MeasurementFile:
-    """Read a measurement file with its division into fitted and held-out samples.
-
-    Args:
-        source: Text file, Excel workbook, Parquet file, or a data frame such as one of pandas.
-        chain: Robot that was measured.
-        columns: Column map for a file of another maker.
-        skip_bad_rows: Whether rows without a number or a name in a column are skipped; otherwise they are an
-            error.
-        rig: Cameras and boards of image coordinates, on the chain.
-
-    Returns:
-        Content of the file.
-    """
+    """Read a measurement file with its division into fitted and held-out samples."""
     check_joint_names(chain)
     return parse_measurements(open_measurement_table(source, chain, columns), chain, skip_bad_rows, rig)
 
 
 def open_measurement_table(source: PathLike | Any, chain: Chain, columns: PathLike | None) -> DataTable:
-    """Read the table of a measurement file, through a column map if one is given.
-
-    Args:
-        source: Text file, Excel workbook, Parquet file, or a data frame such as one of pandas.
-        chain: Robot that was measured.
-        columns: Column map for a file of another maker; None for a file with the project's own columns.
-
-    Returns:
-        Table with the project's own columns.
-    """
+    """Read the table of a measurement file, through a column map if one is given."""
     if columns is None:
         return read_table(source)
     from .column_map import read_map  # lazy import, as the following: only for files of other makers
@@ -155,13 +134,7 @@ def open_measurement_table(source: PathLike | Any, chain: Chain, columns: PathLi
 
 
 def has_image_coordinates(source: PathLike | Any, chain: Chain, columns: PathLike | None = None) -> bool:
-    """Return whether a measurement file has image coordinates, whose cameras and boards must be known.
-
-    Args:
-        source: Text file, Excel workbook, Parquet file, or a data frame such as one of pandas.
-        chain: Robot that was measured.
-        columns: Column map for a file of another maker.
-    """
+    """Return whether a measurement file has image coordinates, whose cameras and boards must be known."""
     table = open_measurement_table(source, chain, columns)
     return not needs_column_map(table, chain) and find_kind(table).kind == "camera"
 
@@ -169,17 +142,7 @@ def has_image_coordinates(source: PathLike | Any, chain: Chain, columns: PathLik
 def parse_measurements(
     table: DataTable, chain: Chain, skip_bad_rows: bool = False, rig: MountedRig | None = None
 ) -> MeasurementFile:
-    """Parse the samples of a table.
-
-    Args:
-        table: Table of a measurement file, or of a part of one.
-        chain: Robot that was measured.
-        skip_bad_rows: Whether rows without a number or a name in a column are skipped.
-        rig: Cameras and boards of image coordinates, on the chain.
-
-    Returns:
-        Content of the table.
-    """
+    """Parse the samples of a table."""
     if needs_column_map(table, chain):
         from .map_proposal import missing_header_error  # lazy import: only for the message
 
@@ -223,21 +186,13 @@ def _find_other_moving_joints(table: DataTable, chain: Chain) -> tuple[str, ...]
 
 
 def ignored_columns_note(labels: Sequence[str]) -> list[str]:
-    """Return one sentence that names ignored columns, none if there are no such columns.
-
-    Args:
-        labels: Labels such as `column 'comment'`.
-    """
+    """Return one sentence that names ignored columns, none if there are no such columns."""
     names = ", ".join(label.removeprefix("column ") for label in labels)
     return [f"column{'s' if len(labels) > 1 else ''} {names} ignored"] if labels else []
 
 
 def skipped_rows_note(table: DataTable) -> list[str]:
-    """Return one sentence that names the skipped rows of a table, none if there are no such rows.
-
-    Args:
-        table: Table of a measurement file.
-    """
+    """Return one sentence that names the skipped rows of a table, none if there are no such rows."""
     if not table.bad_rows:
         return []
     count, lines = len(table.bad_rows), format_lines(table.bad_rows)
@@ -278,21 +233,7 @@ def build_measurement(
     values: Mapping[str, Any],
     rig: MountedRig | None = None,
 ) -> Measurement:
-    """Build the samples with their file and lines, and put the name of the file in front of an error.
-
-    Args:
-        table: Table that the values are from.
-        kind: Measurement kind.
-        q: Joint positions of each configuration, (m, n) [rad or m].
-        values: Columns by name, (m,) each.
-        rig: Cameras and boards of image coordinates, on the chain.
-
-    Returns:
-        The samples.
-
-    Raises:
-        FileFormatError: The values contradict each other.
-    """
+    """Build the samples with their file and lines, and put the name of the file in front of an error."""
     try:
         data = kind.from_columns(q, values, rig)
     except SampleError as error:
@@ -304,16 +245,7 @@ def build_measurement(
 
 
 def parse_joint_positions(table: DataTable, chain: Chain, prefix: str = "") -> Array:
-    """Parse the columns of the joints.
-
-    Args:
-        table: Table with a column for each joint.
-        chain: Robot with the joints.
-        prefix: Text before each joint's name, such as "to:" for the second configuration of a row.
-
-    Returns:
-        Joint positions, shape (m, n) [rad or m]; a missing column is an error.
-    """
+    """Parse the columns of the joints."""
     _require_joints(table, chain, prefix)
     columns = [(table.columns[prefix + name], joint_units(chain, name)) for name in chain.joint_names]
     return np.stack([table.to_si(column, units) for column, units in columns], -1)
@@ -332,18 +264,7 @@ def _require_joints(table: DataTable, chain: Chain, prefix: str) -> None:
 
 
 def parse_values(table: DataTable, kind: type[Measurement]) -> dict[str, Any]:
-    """Parse the columns of a kind in SI units or as text; a quaternion becomes a rotation vector.
-
-    Args:
-        table: Table of a measurement file.
-        kind: Measurement kind.
-
-    Returns:
-        Columns by name, (m,) each.
-
-    Raises:
-        FileFormatError: A standard deviation is not above zero, a name is empty, or there are two rotations.
-    """
+    """Parse the columns of a kind in SI units or as text; a quaternion becomes a rotation vector."""
     values: dict[str, Any] = {}
     for name, content in kind.columns.items():
         if name not in table.columns:
@@ -432,9 +353,5 @@ def _parse_holdout_mask(table: DataTable) -> Array:
 
 
 def column_units(table: DataTable) -> dict[str, str]:
-    """Return the unit of each column, by name.
-
-    Args:
-        table: Table of a measurement file.
-    """
+    """Return the unit of each column, by name."""
     return {name: column.unit for name, column in table.columns.items()}

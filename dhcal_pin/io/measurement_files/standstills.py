@@ -95,19 +95,7 @@ class Stops:
 
 
 def find_stops(joints: JointSeries, poses: PoseSeries) -> Stops:
-    """Find the stops of a recording and average the samples of each.
-
-    Args:
-        joints: Joint positions over time.
-        poses: Positions or poses over time.
-
-    Returns:
-        The stops in the order of time.
-
-    Raises:
-        FileFormatError: The arm never stands still, no pose was recorded at a stop, or the measured point
-            does not move when the joints do.
-    """
+    """Find the stops of a recording and average the samples of each."""
     is_still = _stands_still(joints.times, joints.q, _JOINT_TOLERANCE)
     is_measured_still = _stands_still(poses.times, poses.positions, _POSITION_TOLERANCE)
     if not is_still.any():

@@ -79,16 +79,7 @@ def read_targets(path: PathLike, chain: Chain) -> TargetPoses:
 
 
 def read_configurations(path: PathLike, chain: Chain, columns: PathLike | None = None) -> Array:
-    """Read the joint positions of a file; measured values beside them are ignored.
-
-    Args:
-        path: File with a column for each joint, or one that `columns` describes.
-        chain: Robot with the joints.
-        columns: Column map for a file of another maker.
-
-    Returns:
-        Joint positions, shape (m, n) [rad or m].
-    """
+    """Read the joint positions of a file; measured values beside them are ignored."""
     check_joint_names(chain)
     table = open_measurement_table(path, chain, columns)
     table.require_good_rows()

@@ -37,20 +37,7 @@ _MAX_START = 0.5
 
 
 def solve_tool_poses(table: DataTable, chain: Chain, values: Mapping[str, Array]) -> Array:
-    """Find joint positions that reach the poses in the rows of a table.
-
-    Args:
-        table: Table that the poses are from.
-        chain: Robot; its base and its tool are not part of the poses.
-        values: Position and rotation vector of the tip link in the frame of the base link, by column
-            name, (m,) each [m and rad].
-
-    Returns:
-        Joint positions, shape (m, n) [rad or m].
-
-    Raises:
-        FileFormatError: There are joint values, too, or the robot does not reach a pose.
-    """
+    """Find joint positions that reach the poses in the rows of a table."""
     _require_no_joints(table, chain)
     arm = replace(chain, base=np.eye(4), tool=np.eye(4))
     columns = np.stack([values[name] for name in TOOL_POSE], -1)

@@ -19,16 +19,7 @@ _LENGTH_UNITS = {"rad": "m", "deg": "mm"}
 
 
 def measurement_text(data: Measurement, chain: Chain, comments: Sequence[str] = ()) -> str:
-    """Return the CSV text of samples of any kind.
-
-    Args:
-        data: Samples to write.
-        chain: Robot that was measured.
-        comments: Comment lines before the header.
-
-    Returns:
-        Table in metres and radians with all digits, so that it reads back bit-identical.
-    """
+    """Return the CSV text of samples of any kind."""
     check_joint_names(chain)
     count = data.configurations_per_row
     configurations = np.split(data.configurations(), max(count, 1))
@@ -39,14 +30,7 @@ def measurement_text(data: Measurement, chain: Chain, comments: Sequence[str] = 
 
 
 def value_columns(data: Measurement) -> dict[str, list[Any]]:
-    """Return the columns of measured values and standard deviations, in metres, radians and pixels.
-
-    Args:
-        data: Samples to write.
-
-    Returns:
-        Values, m each, by header.
-    """
+    """Return the columns of measured values and standard deviations, in metres, radians and pixels."""
     columns: dict[str, list[Any]] = {}
     for name, values in data.to_columns().items():
         unit = {"length": "[m]", "angle": "[rad]", "pixel": "[px]", "text": "", "remark": ""}[
@@ -59,18 +43,7 @@ def value_columns(data: Measurement) -> dict[str, list[Any]]:
 def configurations_text(
     q: Array, chain: Chain, comments: Sequence[str], angle_unit: str = "rad", decimals: int | None = None
 ) -> str:
-    """Return the CSV text of joint positions.
-
-    Args:
-        q: Joint positions, shape (m, n) [rad or m].
-        chain: Robot with the joints.
-        comments: Comment lines before the header.
-        angle_unit: "rad" (with metres) or "deg" (with millimetres).
-        decimals: Number of decimals; None for all digits.
-
-    Returns:
-        Table of the joint positions. In radians with all digits it reads back bit-identical.
-    """
+    """Return the CSV text of joint positions."""
     check_joint_names(chain)
     return csv_text(joint_columns(q, chain, angle_unit=angle_unit, decimals=decimals), comments)
 
@@ -78,18 +51,7 @@ def configurations_text(
 def joint_columns(
     q: Array, chain: Chain, prefix: str = "", angle_unit: str = "rad", decimals: int | None = None
 ) -> dict[str, list[float]]:
-    """Return the columns of joint positions for a CSV file.
-
-    Args:
-        q: Joint positions, shape (m, n) [rad or m].
-        chain: Robot with the joints.
-        prefix: Text before each joint's name.
-        angle_unit: "rad" (with metres) or "deg" (with millimetres).
-        decimals: Number of decimals; None for all digits.
-
-    Returns:
-        Values, m each, by header.
-    """
+    """Return the columns of joint positions for a CSV file."""
     columns = {}
     for name, values in zip(chain.joint_names, q.T, strict=True):
         is_length = joint_units(chain, name) is LENGTHS

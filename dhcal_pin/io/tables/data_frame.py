@@ -24,27 +24,12 @@ _MISSING = frozenset(("None", "nan", "NaN", "NaT", "<NA>"))
 
 
 def is_data_frame(source: Any) -> bool:
-    """Return whether an object is a data frame.
-
-    Args:
-        source: Path or other object.
-    """
+    """Return whether an object is a data frame."""
     return not isinstance(source, str | os.PathLike) and hasattr(source, "columns")
 
 
 def data_frame_table(frame: Any, source: str = "DataFrame") -> DataTable:
-    """Make a table from a data frame.
-
-    Args:
-        frame: Data frame of m rows, such as one of pandas.
-        source: Name for messages.
-
-    Returns:
-        The table, with rows 1 to m.
-
-    Raises:
-        FileFormatError: A column has several dimensions.
-    """
+    """Make a table from a data frame."""
     columns = {}
     for name in frame.columns:
         values = np.asarray(frame[name])
@@ -55,18 +40,7 @@ def data_frame_table(frame: Any, source: str = "DataFrame") -> DataTable:
 
 
 def read_parquet(path: PathLike, layout: TextLayout) -> DataTable:
-    """Read a table from a Parquet file.
-
-    Args:
-        path: Path of the file.
-        layout: Has no meaning for a file of this format.
-
-    Returns:
-        The table, with rows 1 to m.
-
-    Raises:
-        FileFormatError: pyarrow is not installed, or the file is not a Parquet file.
-    """
+    """Read a table from a Parquet file."""
     del layout
     source = os.fspath(path)
     try:

@@ -47,18 +47,7 @@ _UNREADABLE = {
 
 
 def read_table(source: PathLike | Any, layout: TextLayout = DETECTED) -> DataTable:
-    """Read a table from a file or a data frame.
-
-    Args:
-        source: Path of a text file, an Excel workbook or a Parquet file, or a data frame.
-        layout: What is known about the layout of a text file; the rest is detected.
-
-    Returns:
-        The table.
-
-    Raises:
-        FileFormatError: The file cannot be read, or has no table.
-    """
+    """Read a table from a file or a data frame."""
     if is_data_frame(source):
         return data_frame_table(source)
     name = os.fspath(source).lower()

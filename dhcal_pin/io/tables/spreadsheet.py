@@ -23,18 +23,7 @@ MAX_XML_BYTES = 32 << 20
 
 
 def read_spreadsheet(path: PathLike, layout: TextLayout) -> DataTable:
-    """Read a table from an Excel workbook.
-
-    Args:
-        path: Path of the file.
-        layout: What is known about the file; separator and encoding have no meaning here.
-
-    Returns:
-        The table.
-
-    Raises:
-        FileFormatError: openpyxl is not installed, or the file is not a workbook with a table.
-    """
+    """Read a table from an Excel workbook."""
     source = os.fspath(path)
     try:
         from openpyxl import load_workbook  # lazy import: an optional package

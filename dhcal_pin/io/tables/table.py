@@ -49,19 +49,7 @@ class Column:
     index: int
 
     def divisor(self, units: Mapping[str, float], where: str) -> float:
-        """Return the divisor that converts the column to SI units.
-
-        Args:
-            units: Divisor of each allowed unit.
-            where: File and line of the header, for messages.
-
-        Returns:
-            Divisor of the column's unit.
-
-        Raises:
-            FileFormatError: The column has no unit.
-            UnknownNameError: The unit is unknown or belongs to another quantity.
-        """
+        """Return the divisor that converts the column to SI units."""
         if self.unit in units:
             return units[self.unit]
         choices = ", ".join(f"{self.name}[{unit}]" for unit in units if unit.isascii())
@@ -106,17 +94,7 @@ class DataTable:
     def from_columns(
         cls, source: str, columns: Mapping[str, Array | Sequence[str]], lines: Sequence[int], **others: Any
     ) -> DataTable:
-        """Build a table from its columns.
-
-        Args:
-            source: Name of the file.
-            columns: Numbers as an array, or texts, m each, by header cell.
-            lines: Line of each row.
-            **others: Further attributes.
-
-        Returns:
-            The table.
-        """
+        """Build a table from its columns."""
         values = list(columns.values())
         numbers = {i: column for i, column in enumerate(values) if isinstance(column, np.ndarray)}
         rows = _ColumnRows(values, len(lines))
@@ -160,41 +138,17 @@ class DataTable:
         return columns
 
     def column_label(self, index: int) -> str:
-        """Return how messages call a column: its name without the unit, or its number.
-
-        Args:
-            index: Index of the column, counted from 0.
-        """
+        """Return how messages call a column: its name without the unit, or its number."""
         name = self.headers[index].split("[")[0].strip() or self.headers[index]
         return f"column {quote(name)}" if name else f"column {index + 1}"
 
     def cell_location(self, row: int, column: str) -> str:
-        """Return file, line and column of a cell, for messages.
-
-        Args:
-            row: Index of the row, counted from 0.
-            column: Name of the column.
-
-        Returns:
-            Text such as `data.csv:7: column 'x'`.
-        """
+        """Return file, line and column of a cell, for messages."""
         return f"{self.source}:{self.lines[row]}: column {column!r}"
 
     # ----------------------------------------------------------------------------------------- values
     def to_si(self, column: Column, units: Mapping[str, float]) -> Array:
-        """Return the numbers of a column in SI units.
-
-        Args:
-            column: Column of this table.
-            units: Divisor of each allowed unit.
-
-        Returns:
-            Values, shape (m,) [m or rad].
-
-        Raises:
-            FileFormatError: A number is too large. A cell that is not a number and a unit that is missing or
-                unknown raise the errors of `finite_numbers` and `Column.divisor`.
-        """
+        """Return the numbers of a column in SI units."""
         values = self.finite_numbers(column) / column.divisor(units, self.header_location)
         too_large = np.flatnonzero(np.abs(values) > MAX_SI_VALUE)
         if too_large.size:
@@ -207,17 +161,7 @@ class DataTable:
         return values
 
     def finite_numbers(self, column: Column) -> Array:
-        """Return the numbers of a column, in the column's own unit.
-
-        Args:
-            column: Column of this table.
-
-        Returns:
-            Finite numbers, shape (m,).
-
-        Raises:
-            FileFormatError: A cell is not a finite number.
-        """
+        """Return the numbers of a column, in the column's own unit."""
         values = self.values(column.index)
         wrong = np.flatnonzero(~np.isfinite(values))
         if wrong.size:
@@ -229,26 +173,12 @@ class DataTable:
         return values
 
     def values(self, index: int) -> Array:
-        """Return the numbers of a column.
-
-        Args:
-            index: Index of the column, counted from 0.
-
-        Returns:
-            Numbers, shape (m,); NaN where a cell is not a number.
-        """
+        """Return the numbers of a column."""
         known = self.numbers.get(index)
         return known if known is not None else np.array([self._parse(row[index]) for row in self.cells])
 
     def text(self, column: Column) -> list[str]:
-        """Return the cells of a column as text.
-
-        Args:
-            column: Column of this table.
-
-        Returns:
-            One text per row, without surrounding white space.
-        """
+        """Return the cells of a column as text."""
         return [row[column.index].strip() for row in self.cells]
 
     def _parse(self, cell: str) -> float:
@@ -269,15 +199,7 @@ class DataTable:
 
     # --------------------------------------------------------------------------------------- bad rows
     def without_bad_rows(self, numbers: Iterable[int], texts: Iterable[int] = ()) -> DataTable:
-        """Move the rows with a missing value to `bad_rows`.
-
-        Args:
-            numbers: Indices of the columns that must have finite numbers.
-            texts: Indices of the columns that must not be empty.
-
-        Returns:
-            The table without these rows, with the numbers of these columns parsed.
-        """
+        """Move the rows with a missing value to `bad_rows`."""
         values = {index: self.values(index) for index in numbers}
         reasons: dict[int, str] = {}
         for index, column in values.items():
@@ -301,14 +223,7 @@ class DataTable:
         )
 
     def require_good_rows(self, alternative: str = "") -> None:
-        """Require that no row was left out.
-
-        Args:
-            alternative: What else the message advises than to correct or remove the rows.
-
-        Raises:
-            FileFormatError: The message names the lines of all bad rows, and the reason of the first.
-        """
+        """Require that no row was left out."""
         if not self.bad_rows:
             return
         line, reason = next(iter(self.bad_rows.items()))
@@ -322,15 +237,7 @@ class DataTable:
 
 
 def require_few_rows(source: str, count: int) -> None:
-    """Require that a table is small enough for the memory.
-
-    Args:
-        source: Name of the file, for messages.
-        count: Number of rows, which may include lines without content.
-
-    Raises:
-        FileFormatError: There are too many rows.
-    """
+    """Require that a table is small enough for the memory."""
     if count > MAX_ROWS:
         raise FileFormatError(
             f"{source}: {count} rows, more than {MAX_ROWS}; keep one in "
@@ -360,9 +267,6 @@ def format_lines(lines: Iterable[int]) -> str:
     """Return a list of line numbers as text, with consecutive ones joined.
 
     After MAX_LISTED_RUNS numbers or runs of numbers, the text says how many lines follow.
-
-    Args:
-        lines: Line numbers in ascending order.
 
     >>> format_lines([2, 5, 6, 7, 11])
     '2, 5-7, 11'

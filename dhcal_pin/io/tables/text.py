@@ -69,18 +69,7 @@ DETECTED = TextLayout()
 
 
 def read_text_table(path: PathLike, layout: TextLayout) -> DataTable:
-    """Read a table from a text file.
-
-    Args:
-        path: Path of the file.
-        layout: What is known about the file.
-
-    Returns:
-        The table.
-
-    Raises:
-        FileFormatError: The file is too large, or has no table; see `parse_lines`.
-    """
+    """Read a table from a text file."""
     source, text = os.fspath(path), read_text(path, layout.encoding)
     # One of the lines is the header.
     require_few_rows(source, text.count("\n") - 1)
@@ -95,19 +84,7 @@ def read_text_table(path: PathLike, layout: TextLayout) -> DataTable:
 
 
 def parse_lines(source: str, numbered: Iterable[tuple[int, str]], layout: TextLayout = DETECTED) -> DataTable:
-    """Parse numbered lines of a text file, possibly of a part of it.
-
-    Args:
-        source: Name of the file, for messages.
-        numbered: Line number and text of each line; the first one with content is the header.
-        layout: What is known about the file.
-
-    Returns:
-        The table.
-
-    Raises:
-        FileFormatError: There is no header or no row.
-    """
+    """Parse numbered lines of a text file, possibly of a part of it."""
     comments: list[str] = []
     content: list[tuple[int, str]] = []
     for line_number, line in numbered:
@@ -256,31 +233,14 @@ def _decimal_of_lines(rows: Sequence[str], separator: str) -> str:
 
 
 def detect_decimal(cells: Iterable[str]) -> str:
-    """Return the decimal sign of some cells.
-
-    Args:
-        cells: Numbers and other texts.
-
-    Returns:
-        A comma if there are numbers with a decimal comma and none with a decimal point, otherwise a point.
-    """
+    """Return the decimal sign of some cells."""
     cells = [cell.strip() for cell in cells]
     has = {sign: any(map(pattern.fullmatch, cells)) for sign, pattern in _DECIMALS.items()}
     return "," if has[","] and not has["."] else "."
 
 
 def _parse_numbers(rows: Sequence[str], separator: str, decimal: str) -> dict[int, Array]:
-    """Parse all columns that are numeric in the first row.
-
-    Args:
-        rows: Lines with a cell for each column.
-        separator: Key of `SEPARATORS`.
-        decimal: Decimal sign.
-
-    Returns:
-        Numbers, shape (m,) each, by column index; empty if a cell is quoted, or if a cell of such a column is
-        not a number.
-    """
+    """Parse all columns that are numeric in the first row."""
     has_points = decimal == "," and any("." in line for line in rows)
     if not rows or has_points or any('"' in line for line in rows):
         return {}

@@ -30,17 +30,7 @@ class ViewLimits:
 
 
 def project_board(rig: MountedRig, camera: int, board: int, poses: Array) -> tuple[Array, Array]:
-    """Project all corners of a board.
-
-    Args:
-        rig: Cameras with known intrinsics, and boards.
-        camera: Number of the camera.
-        board: Number of the board.
-        poses: Poses of the board in the camera, shape (m, 4, 4) [m].
-
-    Returns:
-        Image coordinates, shape (m, c, 2) [px], and depths in front of the camera, shape (m, c) [m].
-    """
+    """Project all corners of a board."""
     points = rig.boards[board].points
     local = np.einsum("mij,cj->mci", poses[:, :3, :3], points) + poses[:, None, :3, 3]
     lens, values = rig.cameras[camera].lens, rig.cameras[camera].values
@@ -49,18 +39,7 @@ def project_board(rig: MountedRig, camera: int, board: int, poses: Array) -> tup
 
 
 def visible_corners(rig: MountedRig, camera: int, board: int, poses: Array, limits: ViewLimits) -> Array:
-    """Return which corners of a board a camera sees.
-
-    Args:
-        rig: Cameras with known intrinsics, and boards.
-        camera: Number of the camera.
-        board: Number of the board.
-        poses: Poses of the board in the camera, shape (m, 4, 4) [m].
-        limits: Limits of the view.
-
-    Returns:
-        Whether each corner is in the image, shape (m, c); no corner of a board that is not in view.
-    """
+    """Return which corners of a board a camera sees."""
     middle = poses[:, :3, :3] @ rig.boards[board].points.mean(0) + poses[:, :3, 3]
     distance = np.linalg.norm(middle, axis=1)
     # The z axis of a flat board points away from its printed side.
@@ -80,17 +59,6 @@ def visible_corners(rig: MountedRig, camera: int, board: int, poses: Array, limi
 def is_board_in_view(
     rig: MountedRig, camera: int, board: int, tools: Array, limits: ViewLimits | None = None
 ) -> Array:
-    """Return in which poses of the tool a camera sees a board.
-
-    Args:
-        rig: Cameras and boards whose poses and intrinsics are known.
-        camera: Number of the camera.
-        board: Number of the board.
-        tools: Poses of the tool in the measuring frame, shape (m, 4, 4) [m].
-        limits: Limits of the view; the default ones if None.
-
-    Returns:
-        Whether the board is in view, shape (m,).
-    """
+    """Return in which poses of the tool a camera sees a board."""
     poses = rig.board_in_camera(camera, board, tools)
     return np.any(visible_corners(rig, camera, board, poses, limits or ViewLimits()), 1)

@@ -22,15 +22,7 @@ POINTS_SET = "points"
 
 
 def pose_parameters(prefix: str, pose: Array | None) -> list[InstrumentParameter]:
-    """Build the six parameters of the pose of a camera or a board.
-
-    Args:
-        prefix: First part of the names, such as `camera_wrist`.
-        pose: First guess, shape (4, 4) [m]; None if there is none.
-
-    Returns:
-        Position [m] and rotation vector [rad]; NaN without a guess.
-    """
+    """Build the six parameters of the pose of a camera or a board."""
     values = np.full(6, np.nan)
     if pose is not None:
         values = np.concatenate([pose[:3, 3], se3.log3(pose[:3, :3])])
@@ -46,14 +38,7 @@ def pose_parameters(prefix: str, pose: Array | None) -> list[InstrumentParameter
 
 
 def camera_parameters(camera: Camera) -> list[InstrumentParameter]:
-    """Build the parameters of a camera: its pose, and its lens unless that is fixed.
-
-    Args:
-        camera: Camera of a rig.
-
-    Returns:
-        Parameters in the order of u.
-    """
+    """Build the parameters of a camera: its pose, and its lens unless that is fixed."""
     out = pose_parameters(f"camera_{camera.name}", camera.pose)
     if camera.intrinsics != "fixed":
         for i, (name, value) in enumerate(zip(camera.lens.names, camera.values, strict=True)):
@@ -65,14 +50,7 @@ def camera_parameters(camera: Camera) -> list[InstrumentParameter]:
 
 
 def board_parameters(board: Board) -> list[InstrumentParameter]:
-    """Build the parameters of a board: its pose, and its corners if they are not fixed.
-
-    Args:
-        board: Board of a rig.
-
-    Returns:
-        Parameters in the order of u.
-    """
+    """Build the parameters of a board: its pose, and its corners if they are not fixed."""
     out = pose_parameters(f"board_{board.name}", board.pose)
     if board.has_free_points:
         out += [
@@ -84,13 +62,6 @@ def board_parameters(board: Board) -> list[InstrumentParameter]:
 
 
 def rig_parameters(rig: MountedRig) -> tuple[InstrumentParameter, ...]:
-    """Build the parameters of all cameras, then of all boards.
-
-    Args:
-        rig: Cameras and boards on a chain.
-
-    Returns:
-        Parameters in the order of u.
-    """
+    """Build the parameters of all cameras, then of all boards."""
     cameras = [parameter for camera in rig.cameras for parameter in camera_parameters(camera)]
     return (*cameras, *(parameter for board in rig.boards for parameter in board_parameters(board)))

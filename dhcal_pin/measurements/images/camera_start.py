@@ -78,17 +78,7 @@ class BoardViews:
 
 
 def estimate_views(item: CameraCorners) -> BoardViews:
-    """Estimate the lens of each camera, and the pose of each board in each image.
-
-    Args:
-        item: Image coordinates.
-
-    Returns:
-        Views of boards whose corners determine a pose.
-
-    Raises:
-        NotObservableError: The images do not determine the focal length of a camera.
-    """
+    """Estimate the lens of each camera, and the pose of each board in each image."""
     images = _images(item)
     lenses: list[Array] = []
     found: list[tuple[int, Array, float]] = []
@@ -127,21 +117,7 @@ def _fit_camera(camera: Camera, content: tuple[tuple[bytes, bytes], ...], repeat
 def first_values(
     item: CameraCorners, views: BoardViews, chain: Chain, is_used: Array | None = None
 ) -> dict[str, float]:
-    """Estimate the first values of all parameters of cameras and boards.
-
-    Args:
-        item: Image coordinates.
-        views: Boards in these images, whatever their joint values.
-        chain: Nominal chain with base and tool.
-        is_used: Whether the poses are estimated from each sample, (m,); all or none of an image. All samples
-            if None.
-
-    Returns:
-        Values by parameter name [m, rad, px or 1].
-
-    Raises:
-        NotObservableError: The images do not determine a pose.
-    """
+    """Estimate the first values of all parameters of cameras and boards."""
     used = np.ones(len(item.rows), bool) if is_used is None else is_used
     values: dict[str, float] = {}
     for camera, lens in zip(item.rig.cameras, views.lenses, strict=True):

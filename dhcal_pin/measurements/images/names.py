@@ -19,15 +19,7 @@ MAX_NAMED = 3
 
 
 def name_array(names: Sequence[str] | None, m: int) -> Array:
-    """Return the name of the photograph of each sample, (m,); empty texts for no names.
-
-    Args:
-        names: Names, (m,); None if they are not known.
-        m: Number of samples.
-
-    Raises:
-        InvalidArgumentError: The number of names differs from that of the samples.
-    """
+    """Return the name of the photograph of each sample, (m,); empty texts for no names."""
     out = np.full(m, "", object)
     if names is not None:
         if len(names) != m:
@@ -37,15 +29,7 @@ def name_array(names: Sequence[str] | None, m: int) -> Array:
 
 
 def label_images(image: Array, names: Array) -> tuple[str, ...]:
-    """Return one label per image, safe to be shown: its name, or its first names joined with a plus sign.
-
-    Args:
-        image: Number of each sample's image, (m,).
-        names: Name of each sample's photograph, (m,); may be empty.
-
-    Returns:
-        Labels, one for each number of an image; empty for images without a name.
-    """
+    """Return one label per image, safe to be shown: its name, or its first names joined with a plus sign."""
     found: list[list[str]] = [[] for _ in range(int(image.max(initial=-1)) + 1)]
     for number, name in dict.fromkeys(zip(image.tolist(), names.tolist(), strict=True)):
         if name:
@@ -54,29 +38,14 @@ def label_images(image: Array, names: Array) -> tuple[str, ...]:
 
 
 def whole_images(image: Array, is_chosen: Array) -> list[int]:
-    """Return the images all of whose samples are chosen, in the order of their first samples.
-
-    Args:
-        image: Number of each sample's image, (m,), from 0 and without gaps.
-        is_chosen: Whether each sample is chosen, (m,).
-
-    Returns:
-        Numbers of the images.
-    """
+    """Return the images all of whose samples are chosen, in the order of their first samples."""
     first = np.unique(image, return_index=True)[1]
     n_others = np.bincount(image, ~is_chosen, len(first))
     return [int(number) for number in np.argsort(first) if not n_others[number]]
 
 
 def list_images(labels: Sequence[str]) -> str:
-    """Name the first of some images in parentheses, to be read after their number; empty without names.
-
-    Args:
-        labels: Label of each image, which may be empty.
-
-    Returns:
-        Text such as " (0003.png, 0007.png, 0012.png and 4 more)".
-    """
+    """Name the first of some images in parentheses, to be read after their number; empty without names."""
     named = [label for label in labels if label][:MAX_NAMED]
     n_others = len(labels) - len(named)
     more = f" and {n_others} more" if n_others else ""
