@@ -25,7 +25,7 @@ from pathlib import Path
 # More threads would change the order of summation; NumPy reads this when it is loaded.
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", COLUMNS="120")
 
-import numpy as np  # noqa: E402
+import numpy as np
 
 TOLERANCE = 1e-12
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
