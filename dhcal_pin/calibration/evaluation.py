@@ -29,18 +29,11 @@ from ..estimation.problem import Problem, merge_instrument_parameters
 from ..estimation.solver import minimize
 from ..measurements.arguments import as_measurements, require_chain
 from ..measurements.base import Measurement
+from ..measurements.groups import ERROR_GROUPS, error_group, in_order
 from ..robot.chain import Chain
-
-# Unit of each group of errors, in the order of importance.
-GROUP_UNITS = {"position": "m", "orientation": "rad", "residual": "m", "pixels": "px", "board": "m"}
 
 # Samples that a comparison judges.
 Title = Literal["hold-out", "region hold-out", "cross-validated", "fitted"]
-
-
-def error_group(name: str) -> str:
-    """Return the group of `GROUP_UNITS` of the errors that a measurement kind calls by this name."""
-    return name if name in GROUP_UNITS else "residual"
 
 
 @dataclass(frozen=True)
@@ -86,52 +79,37 @@ class ErrorStatistics:
 
 @dataclass(frozen=True, eq=False)
 class Accuracy(Mapping[str, Any]):
-    """Error statistics of each group of errors, None for a group that was not measured.
+    """Error statistics of each group of errors that was measured.
 
     It is also a read-only mapping of the flat keys of the JSON document: `accuracy["position_rms_m"]`.
 
     Attributes:
-        position: Of positions [m].
-        orientation: Of orientations [rad].
-        residual: Of other residuals, such as lengths and distances.
-        pixels: Of image coordinates [px]. Without other residuals their keys begin with "residual", too.
-        board: Of the corners of boards, seen from the camera: smallest displacements that explain the errors
-            in the image [m].
+        groups: Statistics by name of the error group, the most important group first.
     """
 
-    position: ErrorStatistics | None = None
-    orientation: ErrorStatistics | None = None
-    residual: ErrorStatistics | None = None
-    pixels: ErrorStatistics | None = None
-    board: ErrorStatistics | None = None
+    groups: Mapping[str, ErrorStatistics] = field(default_factory=dict)
 
     @classmethod
     def from_errors(cls, errors: Sequence[Mapping[str, Array]]) -> Accuracy:
         """Compute the statistics of errors as returned by `compute_errors`."""
         return cls(
-            **{
+            {
                 group: ErrorStatistics.from_norms(
                     norms,
-                    GROUP_UNITS[group],
+                    ERROR_GROUPS[group].unit,
                     [error for item in errors for name, error in item.items() if name == group],
                 )
                 for group, norms in error_norms(errors).items()
             }
         )
 
-    @property
-    def groups(self) -> dict[str, ErrorStatistics]:
-        """Statistics of the measured groups by name, the most important group first."""
-        found = {group: getattr(self, group) for group in GROUP_UNITS}
-        return {group: statistics for group, statistics in found.items() if statistics is not None}
-
     def to_dict(self) -> dict[str, Any]:
         """Return the flat keys and values of the JSON document, such as `position_rms_m`."""
-        endings = {"position": "_m", "orientation": "_rad", "residual": "", "pixels": "_px", "board": "_m"}
         out: dict[str, Any] = {}
         for group, statistics in self.groups.items():
-            prefix, ending = group, endings[group]
-            if group == "pixels" and self.residual is None:
+            prefix, ending = group, f"_{statistics.unit}"
+            # The first error that is no vector along axes is called the residual, with its unit.
+            if "unit" not in out and not ERROR_GROUPS[group].is_vector:
                 prefix, ending = "residual", ""
             out[f"{prefix}_samples"] = statistics.samples
             for key in ("rms", "rms_std", "mean", "p95", "max", "axes_rms"):
@@ -229,7 +207,7 @@ def error_norms(errors: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
     for item in errors:
         for name, error in item.items():
             out.setdefault(error_group(name), []).append(np.linalg.norm(error, axis=1))
-    return {group: np.concatenate(out[group]) for group in GROUP_UNITS if group in out}
+    return {group: np.concatenate(out[group]) for group in in_order(out)}
 
 
 def accuracy(

@@ -136,7 +136,7 @@ def _looks_like_noise(problem: Problem, x: Array, groups: Array) -> bool:
     if n_rows < MIN_ROWS_PER_UNKNOWN * len(x) or min(np.diff(starts)) < MIN_TESTED_SAMPLES:
         return False
     for item, residual in zip(problem.data, whitened_residuals(problem, x), strict=True):
-        for rows in item.residual_groups.values():
+        for rows in (group.rows for group in item.residual_groups.values()):
             k = np.arange(len(residual))[rows].size
             mean_squares = np.mean(residual[rows] ** 2, 0)
             t = standardize_ratios(mean_squares, k)

@@ -24,7 +24,7 @@ from .._typing import Array
 from ..estimation.robust import ZERO_WEIGHT
 from ..measurements.base import Measurement
 from ..measurements.camera import CameraCorners
-from .evaluation import GROUP_UNITS, error_group, fit_instrument_parameters
+from .evaluation import fit_instrument_parameters
 
 if TYPE_CHECKING:
     from .result import Result
@@ -127,10 +127,10 @@ def residual_table(fit: Result) -> ResidualTable:
     units: dict[str, str] = {}
     for start, item, (errors, _) in zip(starts, data, residuals, strict=False):
         names = iter(item.residual_names)
-        for group in item.residual_groups:
-            for column in errors[group].T:
+        for group_name, group in item.residual_groups.items():
+            for column in errors[group_name].T:
                 name = next(names)
-                units[name] = GROUP_UNITS[error_group(group)]
+                units[name] = group.unit
                 into = components.setdefault(name, np.full(starts[-1], np.nan))
                 into[start : start + len(column)] = column
     return ResidualTable(
@@ -204,7 +204,7 @@ def _sigma_scales(fit: Result, index: int) -> dict[str, float]:
     weights = np.sqrt(fit.weights[index])
     plain, scaled = (item.data[index].residual(frames, u) for item in (fit, fit.problem))
     norms = {
-        name: (np.linalg.norm(plain[rows]), np.linalg.norm(scaled[rows] / weights))
-        for name, rows in fit.data[index].residual_groups.items()
+        name: (np.linalg.norm(plain[group.rows]), np.linalg.norm(scaled[group.rows] / weights))
+        for name, group in fit.data[index].residual_groups.items()
     }
     return {name: float(a / b) if b else 1.0 for name, (a, b) in norms.items()}

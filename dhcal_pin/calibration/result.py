@@ -44,6 +44,7 @@ from ..identifiability import explanations, observability
 from ..measurements.arguments import as_measurements
 from ..measurements.base import InstrumentParameter, Measurement
 from ..measurements.camera import CameraCorners
+from ..measurements.groups import ERROR_GROUPS, error_group
 from ..measurements.measured_region import MeasuredRegion
 from ..measurements.mounting import MountedRig
 from ..plausibility.mixups import Diagnosis, diagnose_mixups
@@ -63,13 +64,11 @@ from .cross_validation import (
 )
 from .estimates import Estimate, make_estimates
 from .evaluation import (
-    GROUP_UNITS,
     Accuracy,
     Comparison,
     PairedErrors,
     accuracy,
     compute_errors,
-    error_group,
     fit_nominal,
     remove_outliers,
 )
@@ -312,14 +311,14 @@ class Result(ResultPlots):
 
     @cached_property
     def _row_counts(self) -> list[tuple[str, bool, float]]:
-        """Name, whether sigmas are stated, and weighted number of rows of each residual group."""
+        """Unit, whether sigmas are stated, and weighted number of rows of each residual group."""
         counts = []
         for item, weights in zip(self.data, self.weights, strict=True):
             frames = self.chain.forward_kinematics(item.configurations())
             residual = item.residual(frames, self.problem.instrument_values_of(item, self.x))
             counts += [
-                (name, item.has_stated_sigma, len(residual[rows]) * weights.sum())
-                for name, rows in item.residual_groups.items()
+                (group.unit, item.has_stated_sigma, len(residual[group.rows]) * weights.sum())
+                for group in item.residual_groups.values()
             ]
         return counts
 
@@ -330,14 +329,14 @@ class Result(ResultPlots):
         The residual groups share the loss of degrees of freedom in proportion to their rows. A group with few
         rows takes the common scale of its unit, as in `reweighting.estimate_variance_components`.
         """
-        estimated = [
-            (name == "orientation", count) for name, is_stated, count in self._row_counts if not is_stated
-        ]
+        estimated = [(unit, count) for unit, is_stated, count in self._row_counts if not is_stated]
         if not estimated:
             return np.inf
         least = min(
-            count if count > self.rank else sum(other for unit, other in estimated if unit == is_angle)
-            for is_angle, count in estimated
+            count
+            if count > self.rank
+            else sum(other for other_unit, other in estimated if other_unit == unit)
+            for unit, count in estimated
         )
         return self.degrees_of_freedom * least / sum(count for _, _, count in self._row_counts)
 
@@ -462,12 +461,12 @@ class Result(ResultPlots):
                 self.chain.forward_kinematics(item.configurations()),
                 np.array([self.instruments[parameter.name] for parameter in item.instrument_parameters]),
             )
-            for name, rows in item.residual_groups.items():
+            for name, group in item.residual_groups.items():
                 share = 1.0
                 if item.has_stated_sigma:
-                    noise = 1 / (per_freedom * max(float(np.mean(whitened[rows] ** 2)), 1.0))
+                    noise = 1 / (per_freedom * max(float(np.mean(whitened[group.rows] ** 2)), 1.0))
                     share = max(1 - noise, MIN_MODEL_SHARE)
-                squares.get(GROUP_UNITS[error_group(name)], []).append(share * np.ravel(errors[name]) ** 2)
+                squares.get(group.unit, []).append(share * np.ravel(errors[name]) ** 2)
         length, angle = (
             float(np.sqrt(per_freedom * np.mean(np.concatenate(parts)))) if parts else 0.0
             for parts in squares.values()
@@ -705,7 +704,7 @@ class Result(ResultPlots):
     def __repr__(self) -> str:
         """Return the size of the fit and its most important figure in one line."""
         head = summary.headline(self.comparisons)
-        label = summary.GROUP_LABELS[head.group]
+        label = ERROR_GROUPS[head.group].label
         return (
             f"Result({len(self.parameters)} parameters, {self.sample_count}, "
             f"RMS {label} {head.before} before, {head.after} after, {head.comparison.title})"

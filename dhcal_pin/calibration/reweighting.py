@@ -240,17 +240,17 @@ def estimate_variance_components(
     freedom = 1 - n_determined / sum(len(r) * count for r, count in zip(residuals, counts, strict=True))
     groups = [
         _ResidualGroup(
-            name == "orientation",
+            group.unit,
             item.has_stated_sigma,
-            len(r[rows]) * count,
-            np.sum(r[rows] ** 2 * w),
+            len(r[group.rows]) * count,
+            np.sum(r[group.rows] ** 2 * w),
         )
         for item, r, w, count in zip(data, residuals, weights, counts, strict=True)
-        for name, rows in item.residual_groups.items()
+        for group in item.residual_groups.values()
     ]
     scales = np.ones(len(groups))
     for i, group in enumerate(groups if freedom > 0 else ()):
-        same_unit = [other for other in groups if other.is_angle == group.is_angle]
+        same_unit = [other for other in groups if other.unit == group.unit]
         pooled = [other for other in same_unit if not other.is_stated]
         n_rows, squares, is_stated = group.n_rows, group.squares, group.is_stated
         if n_rows <= n_determined and len(same_unit) > 1:
@@ -265,7 +265,7 @@ def estimate_variance_components(
 class _ResidualGroup(NamedTuple):
     """Residual group of one measurement: unit, weighted number of rows and sum of their squares."""
 
-    is_angle: bool
+    unit: str
     is_stated: bool
     n_rows: float
     squares: float

@@ -212,8 +212,8 @@ def _sigma_scales(fit: Result, head: Measurement) -> dict[str, float] | None:
     u = fit.problem.instrument_values_of(head, fit.x)
     plain, scaled = (item.residual(frames, u) for item in (head, used))
     return {
-        name: float(np.linalg.norm(plain[rows]) / np.linalg.norm(scaled[rows])) or 1.0
-        for name, rows in head.residual_groups.items()
+        name: float(np.linalg.norm(plain[group.rows]) / np.linalg.norm(scaled[group.rows])) or 1.0
+        for name, group in head.residual_groups.items()
     }
 
 

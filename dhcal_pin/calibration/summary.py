@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from ..formatting import SMALL_UNITS, Table, format_fixed, format_quantity, significant_decimals
+from ..measurements.groups import ERROR_GROUPS
 from .estimates import Estimate
 from .evaluation import Comparison
 
@@ -26,14 +27,6 @@ OUTLIER_RMS_RATIO = 0.9
 # Smaller shares of the joint space are shown as "under 1 %", and larger ones than the rest as "over 99 %".
 MIN_SHOWN_SHARE = 0.01
 
-# Groups of errors in words.
-GROUP_LABELS = {
-    "position": "position error",
-    "orientation": "orientation error",
-    "residual": "residual",
-    "pixels": "image error",
-    "board": "error at the board",
-}
 # Statistics in words, by the attribute of `ErrorStatistics`.
 STATISTIC_LABELS = {"mean": "mean", "rms": "RMS", "p95": "95th percentile", "max": "maximum"}
 
@@ -85,7 +78,9 @@ def accuracy_table(comparisons: Sequence[Comparison]) -> Table:
                 # Image coordinates have two axes.
                 values += [*axes_rms, *[math.nan] * (3 - len(axes_rms))]
                 cells = [format_fixed(factor * value, decimals) for value in values]
-                rows.append([f"{after.samples} {c.title}", f"{GROUP_LABELS[group]},{unit}", state, *cells])
+                rows.append(
+                    [f"{after.samples} {c.title}", f"{ERROR_GROUPS[group].label},{unit}", state, *cells]
+                )
     axes = [f"{axis}, RMS" for axis in "xyz"]
     return Table(
         ["samples", "error", "calibration", *STATISTIC_LABELS.values(), *axes], rows, n_text_columns=3
@@ -101,7 +96,7 @@ class Headline:
         before: RMS error before, with its unit.
         after: RMS error after, with its unit.
         percent_reduction: Reduction of the RMS error in percent; negative if the error grew.
-        group: Name of the group of errors, see `evaluation.GROUP_UNITS`.
+        group: Name of the group of errors, see `measurements.groups.ERROR_GROUPS`.
         comparison: Comparison that the figure is taken from; `n_samples` counts the samples of the group.
     """
 
@@ -122,7 +117,9 @@ def headline(comparisons: Sequence[Comparison]) -> Headline:
     before_text, after_text = (
         format_quantity(side.rms, side.unit, side.rms_std, small=True) for side in (before, after)
     )
-    text = f"RMS {GROUP_LABELS[group]} {describe_samples(best)}: {before_text} before, {after_text} after"
+    text = (
+        f"RMS {ERROR_GROUPS[group].label} {describe_samples(best)}: {before_text} before, {after_text} after"
+    )
     clean = best.after_without_outliers.groups.get(group)
     if clean and clean.rms < OUTLIER_RMS_RATIO * after.rms:
         clean_text = format_quantity(clean.rms, clean.unit, clean.rms_std, small=True)

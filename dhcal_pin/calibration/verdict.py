@@ -20,12 +20,12 @@ from ..estimation.initialization import initialize_frames
 from ..estimation.parameters import select_parameters
 from ..formatting import format_quantity
 from ..measurements.camera import CameraCorners
+from ..measurements.groups import ERROR_GROUPS
 from ..measurements.images.names import list_images, whole_images
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
 from ..plausibility.mixups import Diagnosis
 from ..robot.chain import BASE_FRAME
 from .evaluation import accuracy, fit_nominal
-from .summary import GROUP_LABELS
 
 if TYPE_CHECKING:
     from .result import Result
@@ -195,7 +195,7 @@ def _implausible_errors(fit: Result) -> list[Finding]:
         if error <= MAX_USUAL_ERROR[after.unit]:
             continue
         rms = format_quantity(after.rms, after.unit, after.rms_std, small=True)
-        text = f"The fit leaves an RMS {GROUP_LABELS[group]} of {rms}"
+        text = f"The fit leaves an RMS {ERROR_GROUPS[group].label} of {rms}"
         # With fewer parameters than the robot has errors, the robot is better than before, but not good.
         is_restricted = not fit.camera_stages and fit.diagnosis.is_explained and not _missing_frames(fit)
         status: Status = "refused" if error > MAX_ERROR[after.unit] and not is_restricted else "caution"

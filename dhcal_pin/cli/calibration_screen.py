@@ -12,7 +12,6 @@ from ..calibration.evaluation import Comparison
 from ..calibration.result import Result
 from ..calibration.summary import (
     DEFINITION_TEXT,
-    GROUP_LABELS,
     accuracy_table,
     definition_table,
     estimate_table,
@@ -26,6 +25,7 @@ from ..identifiability import EXPECTED, label_unobservable
 from ..io import origin_table
 from ..measurements.base import Measurement
 from ..measurements.camera import CameraCorners
+from ..measurements.groups import ERROR_GROUPS
 from ..measurements.images.names import list_images, whole_images
 from ..report.document import short_names
 from .job import Job
@@ -224,7 +224,8 @@ def _accuracy_rows(comparison: Comparison | None, place: str) -> Iterator[list[s
             format_quantity(side.rms, side.unit, side.rms_std, small=True)
             for side in (comparison.before.groups[group], after)
         ]
-        name = GROUP_LABELS[group] if group in ("pixels", "board") else group
+        errors = ERROR_GROUPS[group]
+        name = errors.name if errors.is_vector else errors.label
         yield [f"{name} {place}", judged, *cells]
 
 

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..calibration.evaluation import GROUP_UNITS, Accuracy
-from ..calibration.summary import GROUP_LABELS, STATISTIC_LABELS
+from ..calibration.evaluation import Accuracy
+from ..calibration.summary import STATISTIC_LABELS
 from ..diagnostics.inspection import FileInspection, column_table
 from ..formatting import Table, format_quantity
 from ..io.tables import format_lines
+from ..measurements.groups import ERROR_GROUPS, in_order
 from ..planning.views import views_table
 from ..report.document import short_names
 from .screen import Block, Screen, list_first
@@ -65,14 +66,14 @@ def validation_screen(
 ) -> Screen:
     """Describe the accuracy of a model on measurements."""
     rows = []
-    for group in GROUP_UNITS:
+    for group in in_order({group for each in accuracies.values() for group in each.groups}):
         columns = [each.groups[group] for each in accuracies.values() if group in each.groups]
         for key, label in STATISTIC_LABELS.items():
             cells = [
                 format_quantity(getattr(column, key), column.unit, column.rms_std, small=True)
                 for column in columns
             ]
-            rows += [[f"{GROUP_LABELS[group]}, {label}", *cells]] if cells else []
+            rows += [[f"{ERROR_GROUPS[group].label}, {label}", *cells]] if cells else []
     blocks = [
         Block(Table(["error", *accuracies], rows), title=title, is_verdict=True),
         Block(remarks, noun="remark", rank=1, has_space=True),

@@ -41,6 +41,7 @@ from ..io.settings import parse_payload, read_bounds, read_priors
 from ..io.sidecar import read_instrument, sidecar_path
 from ..io.tabular import csv_text
 from ..measurements.base import Measurement
+from ..measurements.groups import ERROR_GROUPS
 from ..measurements.mounting import mount_rig
 from ..measurements.position import require_common_reference_target
 from ..parallel import SERIAL, TaskExecutor
@@ -431,7 +432,7 @@ def improvement_hint(fit: Result, chain: Chain, data: Sequence[Measurement], **o
         return ""
     with_full_set, with_this_set = summary.headline([full]).after, summary.headline([current]).after
     return (
-        f"--parameters {FULL_SET} reduces the RMS {summary.GROUP_LABELS[group]} on samples that are not "
+        f"--parameters {FULL_SET} reduces the RMS {ERROR_GROUPS[group].label} on samples that are not "
         f"fitted from {with_this_set} to {with_full_set}: the chosen parameters cannot represent the errors"
     )
 

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from ..calibration.evaluation import Accuracy, compute_errors
-from ..calibration.summary import GROUP_LABELS
 from ..formatting import format_quantity
 from ..measurements.base import Measurement
+from ..measurements.groups import ERROR_GROUPS
 from ..measurements.measured_region import MeasuredRegion
 from ..robot.chain import Chain
 
@@ -73,7 +73,7 @@ class Extrapolation:
             texts = [
                 format_quantity(side.rms, side.unit, side.rms_std, small=True) for side in (inside, outside)
             ]
-            out.append(f"RMS {GROUP_LABELS[group]}: {texts[0]} inside, {texts[1]} outside.")
+            out.append(f"RMS {ERROR_GROUPS[group].label}: {texts[0]} inside, {texts[1]} outside.")
         exceeding = [
             f"{name} by {1e3 * value:.0f} mm"
             if self.is_prismatic[name]

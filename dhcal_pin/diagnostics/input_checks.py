@@ -21,6 +21,7 @@ from ..io.measurement_files.columns import ROTVEC, SECOND_PREFIX, VALUE_COLUMNS
 from ..measurements.base import Measurement
 from ..measurements.camera import CameraCorners
 from ..measurements.columns import MAX_TOOL_OFFSET
+from ..measurements.groups import ERROR_GROUPS, error_group
 from ..plausibility.displacement import workspace_radius
 from ..plausibility.mixups import diagnose_mixups
 from ..robot.chain import Chain
@@ -136,7 +137,7 @@ def poorly_fitted_files(
 ) -> dict[str, list[str]]:
     """Find files whose errors remain large after a fit to them and others."""
     _, reach = reach_sphere(chain)
-    limits = {"orientation": _MAX_CALIBRATED_RAD, "pixels": _MAX_CALIBRATED_PX}
+    limits = {"m": _MAX_RELATIVE_MISFIT * reach, "rad": _MAX_CALIBRATED_RAD, "px": _MAX_CALIBRATED_PX}
     out: dict[str, list[str]] = {path: [] for path in data}
     for (path, item), all_errors in zip(
         data.items(), compute_errors(chain, list(data.values()), known), strict=True
@@ -149,11 +150,10 @@ def poorly_fitted_files(
         ]
         for group, errors in all_errors.items():
             median = float(np.median(np.linalg.norm(errors, axis=1)))
-            if median <= limits.get(group, _MAX_RELATIVE_MISFIT * reach):
+            si_unit = ERROR_GROUPS[error_group(group)].unit
+            if median <= limits[si_unit]:
                 continue
-            unit, factor = {"orientation": ("deg", 180 / np.pi), "pixels": ("px", 1.0)}.get(
-                group, ("mm", 1e3)
-            )
+            factor, unit = {"m": (1e3, "mm"), "rad": (180 / np.pi, "deg"), "px": (1.0, "px")}[si_unit]
             size = f"{factor * median:.3g} {unit}"
             text = (
                 f"after the fit, the median {group} error is {size}; check the robot, the tip and the columns"

@@ -18,11 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from .._typing import Array
-from ..calibration.evaluation import compute_errors, error_group, fit_instrument_parameters
+from ..calibration.evaluation import compute_errors, fit_instrument_parameters
 from ..calibration.result import Result
 from ..estimation.error_model import ErrorModel
 from ..estimation.parameters import offset
 from ..measurements.base import Measurement, whitened_jacobian
+from ..measurements.groups import error_group
 from ..robot.chain import Chain
 
 # Parts that the range of a joint is divided into, and the fewest samples of a part that is used.
@@ -69,10 +70,10 @@ def median_sigmas(fit: Result) -> list[dict[str, float]]:
         u = fit.problem.instrument_values_of(item, fit.x)
         whitened, errors = item.residual(frames, u), item.errors(frames, u)
         medians = {}
-        for name, rows in item.residual_groups.items():
+        for name, group in item.residual_groups.items():
             with np.errstate(divide="ignore", invalid="ignore"):
                 # A robust loss enlarges the sigmas of single samples, which is not noise of the instrument.
-                ratio = np.abs(errors[name].T / whitened[rows]) * np.sqrt(weights)
+                ratio = np.abs(errors[name].T / whitened[group.rows]) * np.sqrt(weights)
             finite = ratio[np.isfinite(ratio)]
             medians[name] = float(np.median(finite)) if finite.size else float("nan")
         out.append(medians)

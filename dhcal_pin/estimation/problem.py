@@ -34,6 +34,7 @@ from .._kernels.types import FrameBatch, JointState, ObservationMatrix
 from .._kernels.work_arrays import UnbufferedRows, work_array
 from .._typing import Array
 from ..measurements.base import InstrumentParameter, Measurement
+from ..measurements.groups import POSITION
 from ..parallel import SERIAL, TaskExecutor
 from ..robot.chain import Chain
 from .error_model import ErrorModel
@@ -310,7 +311,8 @@ class Linearization:
             if parameter.name in self.instrument_columns:
                 block[self.instrument_columns[parameter.name] - first] = rows
         if not data.has_length_scale:
-            normalize_by_scale(block, self.arm_scale, self.gauge_rates, data.residual_groups.get("position"))
+            rows = next((group.rows for group in data.residual_groups.values() if group is POSITION), None)
+            normalize_by_scale(block, self.arm_scale, self.gauge_rates, rows)
         return observation
 
 

@@ -35,6 +35,7 @@ from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from ..robot.chain import Chain
 from .columns import Column, common_text, file_columns, stack_columns, stack_sigmas
+from .groups import ErrorGroup, Group, declare
 from .mounting import MountedRig
 
 # Standard deviations [m], [rad] of measurements that state none: a millimetre weighs as much as a
@@ -112,8 +113,10 @@ class Measurement(ABC):
     columns: ClassVar[Mapping[str, str]]
     # A file is of this kind if it has all columns of one of these sets.
     required_columns: ClassVar[tuple[frozenset[str], ...]]
-    # Rows of the residual by name.
-    residual_groups: ClassVar[Mapping[str, slice]]
+    # Rows of the residual by name, with their unit.
+    residual_groups: ClassVar[Mapping[str, Group]]
+    # Errors that `errors` returns besides those of the residual.
+    further_errors: ClassVar[Mapping[str, ErrorGroup]] = {}
     # Configurations per row of a file: 0, 1, or 2, the second one in columns `to:JOINT`.
     configurations_per_row: ClassVar[int] = 1
     # Attributes with one entry per sample.
@@ -124,8 +127,10 @@ class Measurement(ABC):
     has_length_scale: ClassVar[bool] = True
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Derive the columns of files from `COLUMNS`."""
+        """Derive the columns of files from `COLUMNS`, and enter the residual groups."""
         super().__init_subclass__(**options)
+        declare(cls.__dict__.get("residual_groups", {}))
+        declare(cls.__dict__.get("further_errors", {}))
         if "COLUMNS" in cls.__dict__:
             cls.columns = file_columns(cls.COLUMNS)
             if "required_columns" not in cls.__dict__:
@@ -200,10 +205,10 @@ class Measurement(ABC):
     def residual_names(self) -> tuple[str, ...]:
         """Names of the k residuals of a sample, such as "position_x" or "length_2"."""
         names: list[str] = []
-        for group, rows in self.residual_groups.items():
-            count = len(range(self.residual_dim)[rows])
-            endings = "xyz" if group in ("position", "orientation") else range(1, count + 1)
-            names += [f"{group}_{ending}" for ending in endings] if count > 1 else [group]
+        for name, group in self.residual_groups.items():
+            count = len(range(self.residual_dim)[group.rows])
+            endings = group.axes or range(1, count + 1)
+            names += [f"{name}_{ending}" for ending in endings] if count > 1 else [name]
         return tuple(names)
 
     def configurations(self) -> Array:
@@ -297,8 +302,7 @@ class Measurement(ABC):
             u: Values of the instrument parameters, (s,).
 
         Returns:
-            "position" (m, 3) [m], "orientation" (m, 3) [rad], "pixels" (m, 2) [px], or other names (m, ·)
-            [m]. Reports show errors of other names as "residual" in metres.
+            Errors (m, ·) by the names in `residual_groups` and `further_errors`, in the units stated there.
         """
 
     def positions(self) -> Array:

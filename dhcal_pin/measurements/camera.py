@@ -38,6 +38,7 @@ from ..exceptions import InvalidArgumentError, NotObservableError, SampleError
 from ..robot.chain import Chain
 from .base import Measurement, Noise, format_sigma
 from .columns import pixel_columns, remark_column, text_column
+from .groups import ErrorGroup, Group
 from .images.camera_parameters import (
     POINTS_SET,
     POSE_NAMES,
@@ -154,7 +155,10 @@ class CameraCorners(Measurement):
     jitter: Array
 
     kind = "camera"
-    residual_groups: ClassVar = {"pixels": slice(0, 2)}
+    residual_groups: ClassVar = {
+        "pixels": Group.of(ErrorGroup("pixels", "px", "image error", 3), slice(0, 2))
+    }
+    further_errors: ClassVar = {"board": ErrorGroup("board", "m", "error at the board", 4)}
     COLUMNS = (
         pixel_columns("pixels", "u", "v")
         + text_column("corner", "corner")

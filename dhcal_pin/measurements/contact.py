@@ -23,6 +23,7 @@ from ..robot.chain import Chain
 from ..robot.inverse_kinematics import position_task, solve_within_limits
 from .base import POINT_PRIOR, InstrumentParameter, Noise, point_parameters
 from .columns import instrument_range, length_columns, point_distance_range, text_column
+from .groups import LENGTHS, POSITION, Group
 from .length import MIN_DIVISOR, norm_and_direction
 from .mounting import MountedRig
 from .position import PointMeasurement
@@ -52,7 +53,7 @@ class PointContact(PointMeasurement):
     kind = "point"
     is_contact = True
     has_length_scale = False
-    residual_groups: ClassVar = {"position": slice(0, 3)}
+    residual_groups: ClassVar = {"position": POSITION}
     COLUMNS = text_column("points", "point") + length_columns("", "x", "y", "z", is_implied=True)
     sample_fields = (*PointMeasurement.sample_fields, "label")
 
@@ -119,7 +120,7 @@ class PointDistance(PointMeasurement):
     names: tuple[str, ...]
 
     kind = "point_distance"
-    residual_groups: ClassVar = {"length": slice(0, 1)}
+    residual_groups: ClassVar = {"length": Group.of(LENGTHS, slice(0, 1))}
     COLUMNS = (
         *text_column("point_a", "point_a"),
         *text_column("point_b", "point_b"),
@@ -219,7 +220,7 @@ class PlaneContact(PointMeasurement):
     kind = "plane"
     is_contact = True
     has_length_scale = False
-    residual_groups: ClassVar = {"height": slice(0, 1)}
+    residual_groups: ClassVar = {"height": Group.of(LENGTHS, slice(0, 1))}
     COLUMNS = text_column("name", "plane", is_common=True) + length_columns("", "plane", is_implied=True)
 
     def __init__(self, q: ArrayLike, sigma: ArrayLike | None = None, name: str = "1") -> None:
@@ -283,7 +284,7 @@ class SphereContact(PointMeasurement):
 
     kind = "sphere"
     is_contact = True
-    residual_groups: ClassVar = {"radius": slice(0, 1)}
+    residual_groups: ClassVar = {"radius": Group.of(LENGTHS, slice(0, 1))}
     COLUMNS = text_column("name", "sphere", is_common=True) + length_columns(
         "radius", "radius", plausible_range=instrument_range
     )

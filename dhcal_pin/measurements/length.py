@@ -20,6 +20,7 @@ from ..exceptions import InvalidArgumentError
 from ..robot.chain import Chain
 from .base import OFFSET_PRIOR, InstrumentParameter, Noise, point_parameters
 from .columns import Column, displacement_range, instrument_range, length_columns
+from .groups import LENGTHS, Group
 from .position import PointMeasurement
 from .trilateration import locate_point
 from .validation import validated_array, validated_joint_positions
@@ -53,7 +54,7 @@ class Wires(PointMeasurement):
     offsets: Array
 
     kind = "wires"
-    residual_groups: ClassVar = {"length": slice(None)}
+    residual_groups: ClassVar = {"length": Group.of(LENGTHS, slice(None))}
     COLUMNS = length_columns(
         "lengths", "length", *(f"L{i}" for i in range(1, MAX_WIRES + 1)), plausible_range=instrument_range
     )
@@ -197,7 +198,7 @@ class Distance(PointMeasurement):
     q_to: Array
 
     kind = "distance"
-    residual_groups: ClassVar = {"length": slice(0, 1)}
+    residual_groups: ClassVar = {"length": Group.of(LENGTHS, slice(0, 1))}
     COLUMNS = length_columns("distances", "distance", plausible_range=displacement_range)
     configurations_per_row = 2
     sample_fields = (*PointMeasurement.sample_fields, "q_to")

@@ -26,6 +26,7 @@ from ..exceptions import InvalidArgumentError
 from ..robot.chain import Chain
 from .base import ANGLE_SIGMA, LENGTH_SIGMA, Measurement, Noise, format_sigma
 from .columns import angle_columns, displacement_range, length_columns, stack_columns, stack_sigmas
+from .groups import ORIENTATION, POSITION
 from .validation import validated_array, validated_joint_positions, validated_poses, validated_sigma
 
 # Rows and velocity components of the terms of a pose: each coordinate of the position by its own velocity,
@@ -55,7 +56,7 @@ class PoseMeasurement(Measurement):
     sigma: Array
     rotation_sigma: Array
 
-    residual_groups: ClassVar = {"position": slice(0, 3), "orientation": slice(3, 6)}
+    residual_groups: ClassVar = {"position": POSITION, "orientation": ORIENTATION}
     sample_fields = (*Measurement.sample_fields, "poses", "sigma", "rotation_sigma")
 
     def __init__(

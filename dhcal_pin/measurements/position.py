@@ -27,6 +27,7 @@ from ..exceptions import InvalidArgumentError
 from ..robot.chain import Chain
 from .base import LENGTH_SIGMA, OFFSET_PRIOR, InstrumentParameter, Measurement, Noise, format_sigma
 from .columns import Column, length_columns, text_column
+from .groups import LENGTHS, POSITION, Group
 from .validation import encode_labels, validated_array, validated_joint_positions, validated_sigma
 
 _AXES = ("x", "y", "z")
@@ -145,8 +146,8 @@ class PointMeasurement(Measurement):
     def errors(self, frames: FrameBatch, u: Array) -> dict[str, Array]:
         """Return measured minus modelled values (m, ·) by residual group [m]."""
         return {
-            name: (self.residual(frames, u) * self.sigma.T)[rows].T
-            for name, rows in self.residual_groups.items()
+            name: (self.residual(frames, u) * self.sigma.T)[group.rows].T
+            for name, group in self.residual_groups.items()
         }
 
     def with_scaled_sigma(self, scales: Mapping[str, float]) -> Self:
@@ -167,7 +168,7 @@ class Position(PointMeasurement):
     """
 
     kind = "position"
-    residual_groups: ClassVar = {"position": slice(0, 3)}
+    residual_groups: ClassVar = {"position": POSITION}
     COLUMNS = length_columns("positions", *_AXES)
 
     def __init__(self, q: ArrayLike, positions: ArrayLike, sigma: ArrayLike | None = None) -> None:
@@ -213,7 +214,7 @@ class PositionComponents(PointMeasurement):
     axes: tuple[int, ...]
 
     kind = "axes"
-    residual_groups: ClassVar = {"axes": slice(None)}
+    residual_groups: ClassVar = {"axes": Group.of(LENGTHS, slice(None))}
     COLUMNS = length_columns("values", *_AXES)
     required_columns = tuple(frozenset([axis]) for axis in _AXES)
 
@@ -290,7 +291,7 @@ class MultiTargetPosition(PointMeasurement):
     names: tuple[str, ...]
 
     kind = "targets"
-    residual_groups: ClassVar = {"position": slice(0, 3)}
+    residual_groups: ClassVar = {"position": POSITION}
     COLUMNS = length_columns("positions", *_AXES) + text_column("targets", "target")
     sample_fields = (*PointMeasurement.sample_fields, "label")
 

@@ -291,7 +291,8 @@ def _before_measuring(planned: PlannedCalibration, q: Array) -> _Before:
     instrument = SimulatedInstrument(maker, noise)
     template = instrument.template(errors.at(x), q[:_N_PLACEMENT_SAMPLES])
     if not template.has_stated_sigma:
-        example = "0.1mm,0.01deg" if "orientation" in maker.residual_groups else "0.1mm"
+        has_angles = any(group.unit == "rad" for group in maker.residual_groups.values())
+        example = "0.1mm,0.01deg" if has_angles else "0.1mm"
         raise InvalidArgumentError(
             f"kind {kind!r}: standard deviations must be above zero; give them, for example {example}"
         )

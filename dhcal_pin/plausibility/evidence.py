@@ -151,22 +151,23 @@ def _estimate_noise(problem: Problem, x: Array) -> _Noise:
     for item in problem.data:
         u = problem.instrument_values_of(item, x)
         r = item.residual(chain.forward_kinematics(item.configurations()), u)
-        squares.append({name: np.mean(r[rows] ** 2, 0) for name, rows in item.residual_groups.items()})
+        squares.append({name: np.mean(r[g.rows] ** 2, 0) for name, g in item.residual_groups.items()})
     n_rows = sum(item.residual_dim * len(item.rows) for item in problem.data)
     share = min(1.0, 0.5 * (1 + len(x) / n_rows))
     scales = {}
-    for is_angle in (False, True):
-        values = [v for item in squares for name, v in item.items() if (name == "orientation") == is_angle]
-        typical = np.quantile(np.concatenate(values), share) if values else np.nan
-        scales[is_angle] = float(np.clip(np.sqrt(typical), _MIN_SCALE, _MAX_SCALE))
+    units = {name: g.unit for item in problem.data for name, g in item.residual_groups.items()}
+    for unit in set(units.values()):
+        values = [v for item in squares for name, v in item.items() if units[name] == unit]
+        typical = np.quantile(np.concatenate(values), share)
+        scales[unit] = float(np.clip(np.sqrt(typical), _MIN_SCALE, _MAX_SCALE))
     data, log_determinant = [], 0.0
     for item, by_name in zip(problem.data, squares, strict=True):
-        factors = {name: scales[name == "orientation"] for name in by_name}
+        factors = {name: scales[units[name]] for name in by_name}
         ratio = np.max([np.sqrt(v) / factors[name] for name, v in by_name.items()], 0)
         excess = np.fmax(ratio / _OUTLIER_RATIO, 1.0)
         data.append(item.with_scaled_sigma(factors).with_weights(excess**-2))
         rows_per_sample = {
-            name: len(range(item.residual_dim)[rows]) for name, rows in item.residual_groups.items()
+            name: len(range(item.residual_dim)[g.rows]) for name, g in item.residual_groups.items()
         }
         log_determinant += len(item.rows) * sum(
             count * np.log(factors[name]) for name, count in rows_per_sample.items()
@@ -175,8 +176,8 @@ def _estimate_noise(problem: Problem, x: Array) -> _Noise:
     return _Noise(
         tuple(data),
         log_determinant,
-        LENGTH_SIGMA * scales[False],
-        ANGLE_SIGMA * scales[True],
+        LENGTH_SIGMA * scales.get("m", np.nan),
+        ANGLE_SIGMA * scales.get("rad", np.nan),
         _MIN_SCALE / np.nanmin([*scales.values()]),
     )
 

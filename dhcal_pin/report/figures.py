@@ -19,12 +19,12 @@ import numpy as np
 
 from .. import se3
 from .._typing import Array
-from ..calibration.evaluation import GROUP_UNITS, compute_errors, error_norms
-from ..calibration.summary import GROUP_LABELS
+from ..calibration.evaluation import compute_errors, error_norms
 from ..diagnostics.residuals import JointProfile
 from ..diagnostics.workspace import WorkspacePrediction
 from ..estimation import qr
 from ..formatting import format_quantity
+from ..measurements.groups import ERROR_GROUPS, in_order
 from ..robot.chain import Chain
 from ..visualization import plots, scene
 from ..visualization.plots import SQUARE_PANEL, WIDE_PANEL
@@ -129,7 +129,7 @@ def accuracy_figures(context: ReportContext) -> list[FigureGroup]:
         for role, data in (("hold-out", fit.holdout), ("fitted", fit.inliers))
         if data
     }
-    for group in GROUP_UNITS:
+    for group in in_order(set().union(*(after for _, after in norms.values()))):
         roles = {
             role: (before[group], after[group]) for role, (before, after) in norms.items() if group in after
         }
@@ -142,7 +142,7 @@ def histogram_panels(group: str, errors: Mapping[str, tuple[Array, Array]]) -> l
     """Draw histograms of the errors of samples of different roles, on the same horizontal axis."""
     if not errors:
         return []
-    quantity, unit = GROUP_LABELS[group], GROUP_UNITS[group]
+    quantity, unit = ERROR_GROUPS[group].label, ERROR_GROUPS[group].unit
     bins = plots.histogram_edges(*(np.concatenate(side) for side in zip(*errors.values(), strict=True)))
     panels = []
     for role, (before, after) in errors.items():
@@ -261,7 +261,7 @@ def joint_curve_figures(context: ReportContext) -> list[FigureGroup]:
 def joint_error_group(samples: Samples) -> FigureGroup:
     """Draw the errors of samples over the positions of the joints."""
     group = next(iter(samples.errors))
-    quantity, errors, panels = GROUP_LABELS[group], samples.errors[group]["after"], []
+    quantity, errors, panels = ERROR_GROUPS[group].label, samples.errors[group]["after"], []
     is_shown = np.isfinite(errors) & np.isfinite(samples.q).all(1)
     state = _shown_state(samples, group)
     for i, joint in enumerate(samples.chain.joint_names if is_shown.any() else ()):
@@ -272,7 +272,7 @@ def joint_error_group(samples: Samples) -> FigureGroup:
             joint=joint,
             is_prismatic=is_prismatic_joint(samples.chain, i),
             quantity=quantity,
-            unit=GROUP_UNITS[group],
+            unit=ERROR_GROUPS[group].unit,
         )
         text = f"{_capitalized(quantity)} of the samples{state} over the position of {joint}."
         points = SamplePoints(f"joint:{i}", f"error:{group}")
@@ -289,7 +289,7 @@ def sample_group(samples: Samples) -> FigureGroup:
         if not by_role:
             continue
         roles |= dict.fromkeys(by_role)
-        quantity, unit = GROUP_LABELS[group], GROUP_UNITS[group]
+        quantity, unit = ERROR_GROUPS[group].label, ERROR_GROUPS[group].unit
         errors = np.concatenate([errors for _, errors in by_role.values()])
         caption = f"{_capitalized(quantity)} by sample"
         largest = _shown(float(errors.max()), unit)

@@ -15,10 +15,11 @@ from .._typing import PathLike
 from ..calibration import summary
 from ..calibration.evaluation import Comparison
 from ..calibration.result import Result
-from ..calibration.summary import GROUP_LABELS, STATISTIC_LABELS
+from ..calibration.summary import STATISTIC_LABELS
 from ..calibration.verdict import Verdict
 from ..exceptions import InvalidArgumentError
 from ..formatting import format_quantity
+from ..measurements.groups import ERROR_GROUPS
 from ..saving import write_files
 from ..visualization.plots import svg_panels
 from . import sections
@@ -101,7 +102,7 @@ def html_page(context: ReportContext) -> str:
     head = summary.headline(context.comparisons)
     best = head.comparison
     if best.title != "fitted":
-        heading = f"{_capitalized(GROUP_LABELS[head.group])} {summary.describe_samples(best)}"
+        heading = f"{_capitalized(ERROR_GROUPS[head.group].label)} {summary.describe_samples(best)}"
         note = summary.small_sample_note(best)
     else:
         heading = "No hold-out measurements"
@@ -169,7 +170,9 @@ def _details(best: Comparison, group: str) -> list[tuple[str, str, str]]:
                 format_quantity(side.rms, after.unit, after.rms_std, small=True)
                 for side in (best.before.groups[name], after)
             )
-            details.append(("", f"{GROUP_LABELS[name]}, {STATISTIC_LABELS['rms']}", f"{before} → {value}"))
+            details.append(
+                ("", f"{ERROR_GROUPS[name].label}, {STATISTIC_LABELS['rms']}", f"{before} → {value}")
+            )
     return details
 
 

@@ -16,11 +16,10 @@ import numpy as np
 
 from .. import se3
 from .._typing import Array
-from ..calibration.evaluation import GROUP_UNITS
 from ..calibration.result import Result
-from ..calibration.summary import GROUP_LABELS
 from ..formatting import SMALL_UNITS, UNITS
 from ..io.tabular import csv_text
+from ..measurements.groups import ERROR_GROUPS, in_order
 from ..robot.chain import Chain
 from ..visualization.subsampling import evenly_spaced_indices
 from .document import parameter_rows
@@ -138,8 +137,10 @@ def _groups(errors: Mapping[str, object]) -> list[dict[str, Any]]:
     """Return key, label and shown unit of each group of errors."""
     groups = []
     for group in errors:
-        factor, unit = SMALL_UNITS[GROUP_UNITS[group]]
-        groups.append({"key": group, "label": GROUP_LABELS[group], "factor": factor, "unit": unit.strip()})
+        factor, unit = SMALL_UNITS[ERROR_GROUPS[group].unit]
+        groups.append(
+            {"key": group, "label": ERROR_GROUPS[group].label, "factor": factor, "unit": unit.strip()}
+        )
     return groups
 
 
@@ -189,7 +190,7 @@ def result_samples(fit: Result, data_names: Sequence[str], holdout_names: Sequen
         role=np.where(table.is_holdout, "hold-out", "fitted")[order],
         is_outlier=table.is_outlier[order],
         q=first_configurations(data, fit.chain.n_joints)[order],
-        errors={group: errors[group] for group in GROUP_UNITS if group in errors},
+        errors={group: errors[group] for group in in_order(errors)},
         downloads={"residuals.csv": residuals_text(fit, file), "parameters.csv": parameters_text(fit)},
     )
 

@@ -19,9 +19,7 @@ from .. import formatting
 from ..calibration import summary
 from ..calibration.cross_validation import Generalization
 from ..calibration.estimates import Estimate
-from ..calibration.evaluation import GROUP_UNITS, error_group
 from ..calibration.model_selection import trial_table
-from ..calibration.summary import GROUP_LABELS
 from ..diagnostics.curves import JointCurve, find_lattices
 from ..diagnostics.residuals import median_sigmas
 from ..diagnostics.workspace import RELATIVE_TEXT
@@ -29,6 +27,7 @@ from ..estimation import robust
 from ..formatting import Table, format_fixed, format_quantity
 from ..identifiability import label_unobservable
 from ..io.origins_file import origin_table
+from ..measurements.groups import ERROR_GROUPS, error_group
 from ..robot.chain import BASE_FRAME
 from . import figures, images
 from .context import ReportContext
@@ -520,7 +519,7 @@ def _outlier_section(context: ReportContext) -> Section:
     names, rows = context.data_names, []
     for outlier in context.outliers[:MAX_OUTLIERS]:
         errors = ", ".join(
-            format_quantity(value, "rad" if group == "orientation" else "m", value / 10, small=True)
+            format_quantity(value, ERROR_GROUPS[group].unit, value / 10, small=True)
             for group, value in outlier.error_norms.items()
         )
         rows.append([names[outlier.item], str(outlier.row), errors, f"{outlier.score:.0f}"])
@@ -557,7 +556,7 @@ def samples_section(samples: Samples, title: str = "Samples") -> Section:
     if groups:
         first = next(iter(groups.values()))
         largest = np.argsort(-np.nan_to_num(first, nan=-1.0), kind="stable")
-        label = GROUP_LABELS[next(iter(groups))]
+        label = ERROR_GROUPS[next(iter(groups))].label
         text = f"The {min(len(samples), MAX_LISTED_SAMPLES)} samples with the largest {label}."
     shown = largest[:MAX_LISTED_SAMPLES]
     joints = samples.chain.joint_names
@@ -573,13 +572,13 @@ def samples_section(samples: Samples, title: str = "Samples") -> Section:
                 for j in range(len(joints))
             ),
             *(
-                format_quantity(float(errors[i]), GROUP_UNITS[group], float(errors[i]) / 10, small=True)
+                format_quantity(float(errors[i]), ERROR_GROUPS[group].unit, float(errors[i]) / 10, small=True)
                 for group, errors in groups.items()
             ),
         ]
         for i in shown
     ]
-    header = ["file", "line", "set", *joints, *(GROUP_LABELS[group] for group in groups)]
+    header = ["file", "line", "set", *joints, *(ERROR_GROUPS[group].label for group in groups)]
     sentences = [text, *filter(None, [samples.note])]
     return Section("samples", title, sentences, tables=[Table(header, rows)] if rows else [])
 
@@ -603,7 +602,7 @@ def _data_table(context: ReportContext) -> Table:
     for name, item, sigma in zip(context.data_names, fit.data, median_sigmas(fit), strict=True):
         origin = "stated" if item.has_stated_sigma else ("estimated" if fit.method == "lm" else "assumed")
         values = ", ".join(
-            f"{group} {format_quantity(value, GROUP_UNITS[error_group(group)], value, small=True)}"
+            f"{group} {format_quantity(value, ERROR_GROUPS[error_group(group)].unit, value, small=True)}"
             for group, value in sigma.items()
         )
         rows.append(

@@ -9,10 +9,11 @@ from functools import partial
 import numpy as np
 
 from .._typing import Array
-from ..calibration.evaluation import GROUP_UNITS, Accuracy, compute_errors, error_norms
-from ..calibration.summary import GROUP_LABELS, STATISTIC_LABELS
+from ..calibration.evaluation import Accuracy, compute_errors, error_norms
+from ..calibration.summary import STATISTIC_LABELS
 from ..formatting import Table, format_quantity
 from ..measurements.base import Measurement
+from ..measurements.groups import ERROR_GROUPS, in_order
 from ..robot.chain import Chain
 from ..visualization import scene
 from . import figures
@@ -67,11 +68,11 @@ def validation_page(validation: Validation) -> str:
         ("", STATISTIC_LABELS[key], _quantity(getattr(statistics, key), statistics.unit, statistics.rms_std))
         for key in ("mean", "p95", "max")
     ]
-    count = len(samples)
+    label, count = ERROR_GROUPS[group].label, len(samples)
     return render_page(
         Page(
             title=f"Validation of {validation.name}",
-            heading=f"{GROUP_LABELS[group].capitalize()} on {count} {'sample' if count == 1 else 'samples'}",
+            heading=f"{label.capitalize()} on {count} {'sample' if count == 1 else 'samples'}",
             sections=_sections(validation, samples.limited()),
             eyebrow=f"Validation of {validation.name}",
             values=values,
@@ -101,8 +102,7 @@ def _samples(validation: Validation) -> Samples:
         q=first_configurations(data, chain.n_joints),
         errors={
             group: {state: norms[group] for state, norms in errors.items()}
-            for group in GROUP_UNITS
-            if group in errors["after"]
+            for group in in_order(errors["after"])
         },
     )
 
@@ -142,7 +142,7 @@ def _accuracy_table(accuracies: Mapping[str, Accuracy]) -> Table:
     rows = [
         [
             name,
-            GROUP_LABELS[group],
+            ERROR_GROUPS[group].label,
             *(_quantity(getattr(each, key), each.unit, each.rms_std) for key in STATISTIC_LABELS),
         ]
         for name, accuracy in accuracies.items()

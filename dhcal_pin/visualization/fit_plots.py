@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .._typing import Array
-from ..calibration.evaluation import GROUP_UNITS, Comparison
-from ..calibration.summary import GROUP_LABELS
+from ..calibration.evaluation import Comparison
 from ..estimation import qr
 from ..exceptions import UnknownNameError
+from ..measurements.groups import ERROR_GROUPS, in_order
 from . import plots
 from .plots import COLORS, DOT_SIZES, MAX_DOTS, new_axes
 from .subsampling import evenly_spaced_indices
@@ -65,7 +65,7 @@ class SampleErrors:
     def from_fit(cls, fit: Result, group: str | None) -> SampleErrors:
         """Compute the errors of the fitted and the held-out samples."""
         norms, table = fit.error_norms, fit.residuals
-        choices = [name for name in GROUP_UNITS if name in norms]
+        choices = in_order(norms)
         if group is not None and group not in choices:
             raise UnknownNameError(f"group {group!r}: not measured; choose from {', '.join(choices)}")
         name = group or choices[0]
@@ -73,7 +73,7 @@ class SampleErrors:
         index = np.flatnonzero(np.isfinite(after))
         return cls(
             name,
-            GROUP_UNITS[name],
+            ERROR_GROUPS[name].unit,
             before[index],
             after[index],
             table.is_holdout[index],
@@ -84,7 +84,7 @@ class SampleErrors:
     @property
     def label(self) -> str:
         """Text of an axis with these errors."""
-        return f"{GROUP_LABELS[self.group]}, {plots.shown_unit(self.unit)[1]}"
+        return f"{ERROR_GROUPS[self.group].label}, {plots.shown_unit(self.unit)[1]}"
 
     @property
     def is_wide(self) -> bool:
@@ -118,12 +118,12 @@ def plot_accuracy(fit: Result, ax: Axes | None = None, *, group: str | None = No
     comparisons = list(fit.comparisons)
     if regions is not None and all(each.title != "region hold-out" for each in comparisons):
         comparisons.insert(-1, regions)
-    choices = [name for name in GROUP_UNITS if name in comparisons[0].after.groups]
+    choices = list(comparisons[0].after.groups)
     if group is not None and group not in choices:
         raise UnknownNameError(f"group {group!r}: not measured; choose from {', '.join(choices)}")
     name = group or choices[0]
     rows = [each for each in comparisons if name in each.after.groups]
-    factor, unit = plots.shown_unit(GROUP_UNITS[name])
+    factor, unit = plots.shown_unit(ERROR_GROUPS[name].unit)
     values = []
     for state, offset in (("before", -0.14), ("after", 0.14)):
         sides: list[ErrorStatistics] = [getattr(each, state).groups[name] for each in rows]
@@ -134,7 +134,7 @@ def plot_accuracy(fit: Result, ax: Axes | None = None, *, group: str | None = No
         ax.plot(p95, height, "|", color=COLORS[state], markersize=9, label=f"{state}, 95th percentile")
         values += [*rms, *p95]
     ax.set_yticks(range(len(rows)), [_comparison_label(each, name) for each in rows])
-    ax.set(xlabel=f"{GROUP_LABELS[name]}, {unit}", ylim=(len(rows) - 0.5, -0.5))
+    ax.set(xlabel=f"{ERROR_GROUPS[name].label}, {unit}", ylim=(len(rows) - 0.5, -0.5))
     if 0 < min(values) and max(values) > plots.MAX_MEDIAN_RATIO * min(values):
         plots.make_logarithmic(ax, "x")
     else:

@@ -69,7 +69,7 @@ def find_initial_outliers(
     out = []
     for item, residual in zip(full.data, whitened_residuals(full, x), strict=True):
         is_outlier = np.zeros(len(item.rows), bool)
-        for rows in item.residual_groups.values():
+        for rows in (group.rows for group in item.residual_groups.values()):
             distances = np.linalg.norm(residual[rows], axis=0)
             if len(distances):
                 is_outlier |= distances > MIN_RATIO * max(float(np.median(distances)), MIN_MEDIAN)

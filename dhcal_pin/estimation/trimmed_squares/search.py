@@ -213,9 +213,9 @@ def linearize_rows(problem: Problem, x: Array, root: Array) -> LinearizedRows:
         strata += _strata(np.any(raw[n_robot:-1] != 0, 1), item.residual_dim, first)
         row_class = np.zeros(item.residual_dim, int)
         for name, group in item.residual_groups.items() if m else ():
-            b, r = rows[:-1, group], rows[-1, group]
+            b, r = rows[:-1, group.rows], rows[-1, group.rows]
             label = _noise_class_name(index, item, name, r.size, u)
-            row_class[group] = classes.setdefault(label, len(classes))
+            row_class[group.rows] = classes.setdefault(label, len(classes))
             blocks.append(
                 (
                     np.einsum("ukm,vkm->muv", b, b, optimize=True).reshape(m, u * u),
@@ -235,7 +235,10 @@ def linearize_rows(problem: Problem, x: Array, root: Array) -> LinearizedRows:
         tuple(row_classes),
         gram,
         right,
-        tuple(tuple(item.residual_groups.values()) if len(item.rows) else () for item in problem.data),
+        tuple(
+            tuple(group.rows for group in item.residual_groups.values()) if len(item.rows) else ()
+            for item in problem.data
+        ),
         counts,
         sample,
         noise_class,
@@ -264,7 +267,7 @@ def _noise_class_name(index: int, item: Measurement, group: str, n_rows: int, u:
         return "stated"
     if n_rows > 2 * u:
         return f"{index} {group}"
-    return "angle" if group == "orientation" else "length"
+    return item.residual_groups[group].unit
 
 
 def search_majorities(rows: LinearizedRows, groups: Array, n_determined: int) -> list[tuple[Array, Array]]:
