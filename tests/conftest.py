@@ -13,8 +13,19 @@ from robots import missing, paper
 from dhcal_pin.robot.chain import Chain
 from dhcal_pin.robot.urdf import parse_urdf
 
+# The workers of pytest share the processors, and NumPy reads this when it is loaded.
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")
+
 # Benchmarks need rivals in environments of their own.
 collect_ignore_glob = ["bench_*.py"]
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark notebooks in Jupyter as slow, but one; `test_tutorials.py` runs the cells of all of them."""
+    for item in items:
+        if item.path.suffix == ".ipynb" and item.path.stem != "01_paper":
+            item.add_marker(pytest.mark.slow)
 
 
 @pytest.fixture(scope="session")

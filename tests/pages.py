@@ -6,12 +6,15 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 CHROMIUM = "/usr/bin/chromium"
+# The checker of accessibility, as the package ships it.
+AXE = resources.files("axe_playwright_python").joinpath("axe.min.js").read_text(encoding="utf-8")
 # Software rendering, which works without a graphics card and in a container.
 ARGUMENTS = (
     "--no-sandbox --disable-dev-shm-usage --use-gl=angle --use-angle=swiftshader "

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from robots import DATA, missing
+from slow_cases import some_slow
 
 import dhcal_pin as dh
 from dhcal_pin import se3
@@ -97,7 +98,9 @@ def test_franka_with_a_camera_on_the_wrist(franka, repeats, seed):
 
 
 @pytest.mark.parametrize(
-    "focal_and_centre", [(640, 640, 640, 360), (655, 630, 655, 350), (np.nan,) * 4], ids=str
+    "focal_and_centre",
+    some_slow([((640, 640, 640, 360),), ((655, 630, 655, 350),), ((np.nan,) * 4,)], {2}),
+    ids=["stated", "wrong", "unknown"],
 )
 def test_franka_with_a_lens_that_is_estimated(franka, focal_and_centre):
     """An estimated lens, stated rightly, stated wrongly or unknown, costs little accuracy in other images."""

@@ -10,6 +10,7 @@ import json
 import numpy as np
 import pytest
 from robots import DATA, MAPS, missing, robot_file
+from slow_cases import some_slow
 
 from dhcal_pin.calibration import blocked_folds, calibrate, cross_validate, k_fold
 from dhcal_pin.calibration.evaluation import position_errors
@@ -83,7 +84,8 @@ def test_links_of_one_series_are_accurate_on_another(dhcal, tmp_path, series, ot
 
 
 @pytest.mark.parametrize(
-    ("series", "other", "held", "moved"), [("B", "D", 0.16e-3, 0.24e-3), ("D", "B", 0.17e-3, 0.26e-3)]
+    ("series", "other", "held", "moved"),
+    some_slow([("B", "D", 0.16e-3, 0.24e-3), ("D", "B", 0.17e-3, 0.26e-3)], {0}),
 )
 def test_extensions_are_accurate_on_hold_out_and_on_another_series(
     dhcal, tmp_path, series, other, held, moved
@@ -209,9 +211,10 @@ def hold_out_errors(dhcal, folder, arm, places, left, *more):
     return [[1e3 * one[key] for key in ("position_rms_m", "residual_rms")] for one in found]
 
 
-def test_contacts_of_a_panda_with_sockets_at_eight_places(dhcal, tmp_path):
+@pytest.mark.parametrize("step", some_slow([1, 4], {1}))
+def test_contacts_of_a_panda_with_sockets_at_eight_places(dhcal, tmp_path, step):
     fitted, nominal = np.array(
-        [hold_out_errors(dhcal, tmp_path, "panda_2_clean", PANDA_2, left) for left in PANDA_2]
+        [hold_out_errors(dhcal, tmp_path, "panda_2_clean", PANDA_2, left) for left in PANDA_2[::step]]
     ).swapaxes(0, 1)
     assert 7 < np.sqrt(np.mean(nominal[:, 0] ** 2)) < 11
     consistency, distance = fitted.mean(0)
@@ -220,12 +223,12 @@ def test_contacts_of_a_panda_with_sockets_at_eight_places(dhcal, tmp_path):
     auto = [
         hold_out_errors(dhcal, tmp_path, "panda_2_clean", PANDA_2, left, *EXTEND)[0] for left in PANDA_2[::4]
     ]
-    extended, plain = (np.sqrt(np.mean(np.square(found), 0)) for found in (auto, fitted[::4]))
+    extended, plain = (np.sqrt(np.mean(np.square(found), 0)) for found in (auto, fitted[:: 4 // step]))
     assert extended[0] < plain[0]
     assert extended[1] < 1.05 * plain[1]
 
 
-@pytest.mark.parametrize("left", ["front_center", "mid_left"])
+@pytest.mark.parametrize("left", some_slow(["front_center", "mid_left"], {0}))
 def test_known_distances_determine_the_scale_of_the_robot(dhcal, tmp_path, left):
     """A smaller robot would reduce hundreds of contact errors; seven known distances prevent it."""
     (consistency, distance), _ = hold_out_errors(
@@ -235,7 +238,9 @@ def test_known_distances_determine_the_scale_of_the_robot(dhcal, tmp_path, left)
     assert distance <= 0.34
 
 
-@pytest.mark.parametrize(("left", "most"), [("back-high", 1.05), ("front", 0.74), ("right", 0.86)])
+@pytest.mark.parametrize(
+    ("left", "most"), some_slow([("back-high", 1.05), ("front", 0.74), ("right", 0.86)], {1})
+)
 def test_contacts_of_a_panda_with_sockets_at_three_places(dhcal, tmp_path, left, most):
     (fitted, _), (nominal, _) = hold_out_errors(dhcal, tmp_path, "panda_1", PANDA_1, left)
     assert nominal > 7

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
-from pages import READY, VIEWPORT
+from pages import AXE, READY, VIEWPORT
 
-AXE = Path(sys.prefix) / "node_modules" / "axe-core" / "axe.min.js"
 WIDTHS = (390, 768, 1200)
 DROP = """([files]) => {
   const data = new DataTransfer();
@@ -196,7 +194,7 @@ def violations(page: Any) -> list[tuple[str, list[str]]]:
 
 
 def test_every_state_is_accessible_at_every_width(page, example):
-    page.add_script_tag(path=str(AXE))
+    page.evaluate(AXE)
 
     def check() -> None:
         for width in WIDTHS:

@@ -120,7 +120,7 @@ def test_two_outliers_among_few_measurements_are_reported_and_have_no_influence(
 @pytest.mark.parametrize("loss", ["auto", "huber", "tukey"])
 def test_good_samples_among_few_measurements_are_not_reported(loss, sim_6dof, sim_6dof_actual):
     """45 equations for 23 directions: the mean leverage is one half, and that of some samples nearly one."""
-    for seed in range(10):
+    for seed in range(3):
         data, _, _ = with_outliers(Position, sim_6dof_actual, seed, m=15)
         fit = calibrate(sim_6dof, data, "dh", loss=loss)
         assert fit.outliers[0].size == 0

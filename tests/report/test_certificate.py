@@ -5,18 +5,17 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import sys
 from html import escape, unescape
 from pathlib import Path
 
 import pytest
-from robots import URDF, missing
+from pages import AXE
+from robots import URDF
 
 from dhcal_pin.cli.main import main
 from dhcal_pin.report import write_certificate
 from dhcal_pin.report.certificate import parse_meta
 
-AXE = Path(sys.prefix) / "node_modules" / "axe-core" / "axe.min.js"
 META = {"serial": "<b>20</b>", "operator": 'A. "B" & C', "cell": "7"}
 
 
@@ -102,14 +101,12 @@ def test_the_command_writes_it(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("width", [390, 1200])
 def test_it_is_accessible_and_prints_on_two_pages_at_most(browser, path, width):
-    if not AXE.exists():
-        missing("axe-core")
     page = browser.new_page(viewport={"width": width, "height": 800}, bypass_csp=True)
     complaints = []
     page.on("console", lambda message: complaints.append(message.text))
     page.goto(path.as_uri())
     assert page.evaluate("document.documentElement.scrollWidth") == width
-    page.evaluate(AXE.read_text(encoding="utf-8"))
+    page.evaluate(AXE)
     found = page.evaluate("axe.run(document)")
     document = page.pdf(prefer_css_page_size=True)
     page.close()

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import re
-import sys
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from pages import READY, wait_for
-from robots import URDF, missing
+from pages import AXE, READY, wait_for
+from robots import URDF
 
 from dhcal_pin.calibration import accuracy, calibrate
 from dhcal_pin.cli.main import main
@@ -23,7 +22,6 @@ from dhcal_pin.report.document import file_digests
 from dhcal_pin.report.html import html_page
 from dhcal_pin.report.sections import markdown
 
-AXE = Path(sys.prefix) / "node_modules" / "axe-core" / "axe.min.js"
 # Width of an A4 page between margins of 14 mm [CSS px].
 PRINTED = round((210 - 2 * 14) / 25.4 * 96)
 
@@ -179,12 +177,10 @@ def page_without_scene(page_file) -> Path:
 
 @pytest.mark.parametrize(("scheme", "width"), [("light", 1200), ("dark", 390)])
 def test_the_page_is_accessible_and_fits(browser, page_without_scene, scheme, width):
-    if not AXE.exists():
-        missing("axe-core")
     page = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme, bypass_csp=True)
     page.goto(page_without_scene.as_uri())
     assert page.evaluate("document.documentElement.scrollWidth") == width
-    page.evaluate(AXE.read_text(encoding="utf-8"))
+    page.evaluate(AXE)
     found = page.evaluate("axe.run(document, {iframes: false})")
     page.close()
     assert len(found["passes"]) > 15

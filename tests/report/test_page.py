@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import re
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,8 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from pages import wait_for
-from robots import missing, robot_file
+from pages import AXE, wait_for
+from robots import robot_file
 
 from dhcal_pin import se3
 from dhcal_pin.calibration import Result, calibrate, split
@@ -23,7 +22,6 @@ from dhcal_pin.measurements import Noise, Pose
 from dhcal_pin.report import Provenance, result_to_dict, write_report
 from dhcal_pin.robot import Chain
 
-AXE = Path(sys.prefix) / "node_modules" / "axe-core" / "axe.min.js"
 NAME = "a & <b>.csv"
 # Names of the tables that are wider than the page.
 CUT_OFF = """[...document.querySelectorAll('.scroll')]
@@ -301,8 +299,6 @@ def test_everything_is_there_without_scripts(open_page, path):
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [390, 768, 1200])
 def test_the_page_is_accessible_and_fits(browser, path, scheme, width):
-    if not AXE.exists():
-        missing("axe-core")
     without_scene = path.with_name("without_scene.html")
     without_scene.write_text(re.sub('data-scene="[^"]*"', 'data-scene=""', path.read_text("utf-8")), "utf-8")
     page = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme, bypass_csp=True)
@@ -312,7 +308,7 @@ def test_the_page_is_accessible_and_fits(browser, path, scheme, width):
     assert page.evaluate("document.documentElement.scrollWidth") == width
     # No table is cut off: where it would not fit, its rows are lists.
     assert page.evaluate(CUT_OFF) == []
-    page.evaluate(AXE.read_text(encoding="utf-8"))
+    page.evaluate(AXE)
     found = page.evaluate("axe.run(document, {iframes: false})")
     page.close()
     assert len(found["passes"]) > 15

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from pages import Window, window_of
+from pages import AXE, Window, window_of
 from robots import paper
 
 from dhcal_pin import se3
@@ -25,7 +24,6 @@ from dhcal_pin.visualization.measured_samples import drawn_samples, measured_sam
 from dhcal_pin.visualization.scene import scene_html
 from dhcal_pin.visualization.uncertainty_cells import uncertainty_cells
 
-AXE = Path(sys.prefix) / "node_modules" / "axe-core" / "axe.min.js"
 N_FITTED, N_HELD_OUT, WRONG = 150, 40, (3, 70)
 # Instances of a mesh with a size, as (number, place).
 DRAWN = """name => {
@@ -285,7 +283,7 @@ def test_the_picture_is_saved(scene):
 
 def test_the_page_is_accessible_at_every_width(scene):
     page = scene.page
-    page.evaluate(AXE.read_text(encoding="utf-8"))
+    page.evaluate(AXE)
     page.evaluate("dhcal.pick(0)")
     page.click("#inspector summary")
     page.select_option("#cells", "uncertainty")

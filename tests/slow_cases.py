@@ -1,0 +1,17 @@
+"""Cases of a test of which the fast suite runs some."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import Any
+
+import pytest
+
+
+def some_slow(cases: Sequence[Any], fast: Collection[int]) -> list[Any]:
+    """Mark all cases as slow but those at the given places; a case with several values is a tuple."""
+    out = []
+    for i, case in enumerate(cases):
+        values = case if isinstance(case, tuple) else (case,)
+        out.append(case if i in fast else pytest.param(*values, marks=pytest.mark.slow))
+    return out
