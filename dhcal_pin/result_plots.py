@@ -16,7 +16,7 @@ from .exceptions import InvalidArgumentError
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from .calibration.result import Result
+    from .calibration.evidence import Evidence
 
 
 class ResultPlots:
@@ -31,8 +31,8 @@ class ResultPlots:
     """
 
     @property
-    def _result(self) -> Result:
-        return cast("Result", self)
+    def _result(self) -> Evidence:
+        return cast("Evidence", self)
 
     def plot_accuracy(self, ax: Axes | None = None, *, group: str | None = None) -> Axes:
         """Plot the error before and after: RMS as a dot, and a line up to the 95th percentile.

@@ -7,6 +7,7 @@ import inspect
 import re
 import tomllib
 from collections.abc import Callable, Iterator
+from graphlib import CycleError, TopologicalSorter
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -86,12 +87,68 @@ def test_sentences_are_plain(path):
     assert [part for part in UNCLEAR if part in text] == []
 
 
+def module_files() -> dict[str, Path]:
+    """Return the modules of the package by their full names."""
+    names = {
+        path: ".".join(["dhcal_pin", *path.relative_to(PACKAGE).with_suffix("").parts]) for path in FILES
+    }
+    return {name.removesuffix(".__init__"): path for path, name in names.items()}
+
+
+def imports_of(path: Path, name: str) -> Iterator[tuple[str, str]]:
+    """Yield module and name of every import of a file, wherever it stands; the name is empty for a module."""
+    package = name if path.stem == "__init__" else name.rpartition(".")[0]
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, "") for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            parents = package.split(".")[: len(package.split(".")) + 1 - node.level] if node.level else []
+            module = ".".join([*parents, *([node.module] if node.module else [])])
+            yield from ((module, alias.name) for alias in node.names)
+
+
+def import_graph() -> dict[str, set[str]]:
+    """Return the modules that each module imports: at its top, in functions and under TYPE_CHECKING.
+
+    A public name of a package belongs to the module that its stub names.
+    """
+    modules = module_files()
+    exported: dict[tuple[str, str], str] = {}
+    for name, path in modules.items():
+        if path.stem == "__init__":
+            for source in filter(Path.exists, (path, path.with_suffix(".pyi"))):
+                exported |= {(name, public): module for module, public in imports_of(source, name)}
+    compiled = {(name, path.stem) for name in modules for path in modules[name].parent.glob("*.pyi")}
+    graph: dict[str, set[str]] = {name: set() for name in modules}
+    for name, path in modules.items():
+        for module, imported in imports_of(path, name):
+            if f"{module}.{imported}" in modules:
+                module = f"{module}.{imported}"
+            elif (module, imported) in compiled:
+                continue
+            while (module, imported) in exported and exported[module, imported] != module:
+                module = exported[module, imported]
+            if module in modules and module != name:
+                graph[name].add(module)
+    return graph
+
+
+def test_imports_have_no_circle():
+    """Imports in functions and for type checking count: a reader has to follow them, too."""
+    sorter = TopologicalSorter(import_graph())
+    try:
+        order = list(sorter.static_order())
+    except CycleError as error:
+        pytest.fail(f"circle: {' -> '.join(error.args[1])}")
+    assert len(order) > 200
+
+
 @pytest.mark.parametrize("folder", [PACKAGE, *PACKAGES], ids=lambda folder: folder.name)
 def test_packages_are_small_and_say_what_belongs_there(folder):
     modules = {path.stem for path in folder.glob("*.py")} - {"__init__", "__main__"}
     if folder.name == "cli":
         modules -= COMMANDS
-    assert len(modules) <= 14
+    assert len(modules) <= 16
     assert len(ast.get_docstring(ast.parse((folder / "__init__.py").read_text(encoding="utf-8"))) or "") > 60
 
 

@@ -1,14 +1,6 @@
 """Cross-validation: errors of held-out samples under a fit of the other samples.
 
-The model is nearly linear around a solution x. A fold is therefore solved from two triangular systems at x
-instead of a new iteration: one of its fitted rows, [R_f | z_f], and one of its held-out rows, [R_h | z_h].
-With prior weights W, the step of the fit without the fold, and the error of the fold, are
-
-    δ = argmin ‖R_f·δ - z_f‖² + ‖W·(x + δ)‖²,        error² = (‖R_h·δ - z_h‖² + ρ_h²) / m_h,
-
-with ρ_h² the part of the held-out cost that no δ changes and m_h the number of held-out rows. If the true
-cost at x + δ exceeds the cost that the linear model predicts, the model is not linear enough over δ, and
-the fold is fitted by iteration.
+Folds are solved by one step from the solution, see `estimation.folds`.
 
 Unknowns that only held-out samples depend on, such as a contact point, are fitted to the held-out samples.
 
@@ -26,182 +18,30 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.linalg import lstsq
 
 from .._typing import Array, Progress
-from ..estimation import qr, robust
-from ..estimation.normal_equations import NormalEquations
-from ..estimation.problem import Problem, linearize_and_factor, normal_equations, uses_normal_equations
-from ..estimation.qr import TriangularSystem, merge_r_factors
+from ..estimation import robust
+from ..estimation.folds import Fold, Refit, factor_folds, solve_fold
+from ..estimation.problem import Problem
 from ..exceptions import InvalidArgumentError, NotObservableError
 from ..measurements.base import Measurement
 from ..measurements.measured_region import MIN_SPREAD, MeasuredRegion, draw_joint_space
-from .evaluation import Accuracy, Comparison, PairedErrors, Title, compute_errors, fit_nominal
+from .evaluation import MIN_SAMPLES, Accuracy, Comparison, PairedErrors, Title, compute_errors, fit_nominal
+from .fitted import FittedModel
 from .partition import (
-    Fold,
     blocked_folds,
     configuration_groups,
     contact_groups,
     different_configurations,
 )
-from .summary import MIN_SAMPLES
 
-if TYPE_CHECKING:
-    from .result import Result
-
-# A fold is fitted by iteration if its cost exceeds that of the linear model by more than this fraction of the
-# mean cost of a fitted sample.
-_NONLINEARITY_TOL = 1e-3
-# Undetermined directions that change the held-out rows by less than this fraction have no effect on them.
-_UNBOUNDED_TOL = 1e-6
 # A fold does not determine the held-out errors if uncertain parameters contribute more to them than this, in
 # standard deviations of the measurements.
 MAX_PREDICTION_STD = 3.0
 # A joint hardly moved if its spread in some of the samples is below this fraction of its spread in all.
 _MIN_SPREAD_RATIO = 0.1
-
-# Function that returns the solution x (p,) of a problem with some of the samples, from an approximate one.
-Refit = Callable[[Problem, Array], Array]
-
-
-@dataclass(frozen=True, eq=False)
-class FoldSystems:
-    """Triangular systems of the fitted and of the held-out samples of a fold, at one x.
-
-    Attributes:
-        fitted: System of the fitted rows.
-        held_out: System of the held-out rows.
-        n_rows: Number of held-out rows.
-    """
-
-    fitted: TriangularSystem
-    held_out: TriangularSystem
-    n_rows: int
-
-    @property
-    def is_unobserved(self) -> Array:
-        """Unknowns that no fitted row depends on, such as a point that only held-out samples touch, (p,)."""
-        return self.fitted.is_unobserved
-
-    def error(self, weights: Array, x: Array, columns: Array) -> float:
-        """Compute the RMS of the held-out whitened rows under the fit of the other rows.
-
-        Unknowns that only the held-out rows depend on are fitted to these.
-        """
-        step = np.zeros(len(x))
-        step[columns] = solve_columns(self.fitted, weights, x, columns)[0]
-        own = self._own_unknowns(columns)
-        if not own.size:
-            return float(np.sqrt(self.held_out.squared_error(step) / self.n_rows))
-        residual = self.held_out.z - self.held_out.r @ step
-        residual -= own @ (own.T @ residual)
-        return float(np.sqrt((residual @ residual + self.held_out.min_cost) / self.n_rows))
-
-    def prediction_std(self, weights: Array, columns: Array) -> float:
-        """Compute the RMS of the held-out whitened rows that the uncertainty of the fit causes."""
-        known = columns & ~self.is_unobserved
-        if not known.any():
-            return 0.0
-        root, unbounded = self.fitted.select(known).sqrt_covariance(weights[known])
-        own = self._own_unknowns(columns)
-        if known.all() and not unbounded.size:
-            return float(np.sqrt(self.held_out.predicted_variance(root) / self.n_rows))
-        rows = self.held_out.r[:, known]
-        rows = rows - own @ (own.T @ rows) if own.size else rows
-        if np.linalg.norm(rows @ unbounded) > _UNBOUNDED_TOL * np.linalg.norm(rows):
-            return np.inf
-        return float(np.linalg.norm(rows @ root) / np.sqrt(self.n_rows))
-
-    def _own_unknowns(self, columns: Array) -> Array:
-        """Return an orthonormal basis of the held-out rows that only unknowns of their own explain."""
-        own = columns & self.is_unobserved
-        if not own.any():
-            return np.empty((0, 0))
-        rows = self.held_out.r[:, own]
-        return np.linalg.qr(rows[:, rows.any(0)])[0]
-
-
-def solve_columns(system: TriangularSystem, weights: Array, x: Array, columns: Array) -> tuple[Array, float]:
-    """Solve a triangular system with priors for some of the unknowns.
-
-    Directions that neither rows nor priors determine return to 0, as x may contain information on them from
-    held-out rows.
-    """
-    prior = weights[columns]
-    if prior.all():
-        return system.select(columns).solve(prior, x[columns])
-    a = np.concatenate([system.r[:, columns], np.diag(prior)])
-    b = np.concatenate([system.z, -prior * x[columns]])
-    solution = lstsq(a, b, lapack_driver="gelsy", check_finite=False)
-    assert solution is not None
-    step = solution[0]
-    if not prior.all():
-        _, s, vt = np.linalg.svd(a)
-        null_space = vt[s <= qr.RANK_RTOL * s[0]]
-        step = step - null_space.T @ (null_space @ (x[columns] + step))
-    return step, system.min_cost + float(np.sum((a @ step - b) ** 2))
-
-
-def count_rows(problem: Problem) -> int:
-    """Return the number of whitened rows of a problem."""
-    return sum(item.residual_dim * len(item.rows) for item in problem.data)
-
-
-def factor_partition(problem: Problem, x: Array, folds: Sequence[Fold]) -> tuple[FoldSystems, ...]:
-    """Compute the triangular systems of disjoint folds; the rows of each sample are factored once."""
-    rest = tuple(~np.any(masks, 0) for masks in zip(*folds, strict=True))
-    parts = [
-        problem.with_data([item.take(mask) for item, mask in zip(problem.data, masks, strict=True)])
-        for masks in (*folds, rest)
-        if np.any(np.concatenate(masks))
-    ]
-    if uses_normal_equations(problem):
-        equations = [normal_equations(part, x).products for part in parts]
-        total = np.sum(equations, 0)
-        systems = [(NormalEquations(total - one), NormalEquations(one)) for one in equations]
-    else:
-        factors = [linearize_and_factor(part, x, small_angle=False).rows for part in parts]
-        systems = [
-            (
-                TriangularSystem(merge_r_factors([other for other in factors if other is not one])),
-                TriangularSystem(one),
-            )
-            for one in factors[: len(folds)]
-        ]
-    return tuple(
-        FoldSystems(*system, count_rows(part))
-        for system, part in zip(systems[: len(folds)], parts[: len(folds)], strict=True)
-    )
-
-
-def factor_folds(problem: Problem, x: Array, folds: Sequence[Fold]) -> Iterator[FoldSystems]:
-    """Compute the triangular systems of folds; consecutive disjoint folds are factored once."""
-    group: list[Fold] = []
-    for fold in folds:
-        if any(np.any(a & b) for other in group for a, b in zip(fold, other, strict=True)):
-            yield from factor_partition(problem, x, group)
-            group = []
-        group.append(fold)
-    if group:
-        yield from factor_partition(problem, x, group)
-
-
-def _solve_fold(
-    problem: Problem, fold: Fold, systems: FoldSystems, x: Array, columns: Array, refit: Refit
-) -> Array:
-    """Solve a fold by one step from x (p,) in the free columns, or by iteration if that is not enough."""
-    fitted = problem.with_data([item.take(~mask) for item, mask in zip(problem.data, fold, strict=True)])
-    candidate = x.copy()
-    step, cost = solve_columns(systems.fitted, fitted.weights, x, columns)
-    candidate[columns] += step
-    cost += float(np.sum((fitted.weights * x)[~columns] ** 2))
-    n_samples = sum(len(item.rows) for item in fitted.data)
-    if fitted.cost(candidate) <= cost + _NONLINEARITY_TOL * cost / max(1, n_samples):
-        return candidate
-    return refit(fitted, candidate)
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +75,7 @@ def cross_validate_folds(
         )
     columns, robot = problem.is_interior(x), len(problem.errors.parameters)
     for fold, systems in zip(folds, factor_folds(problem, x, folds), strict=True):
-        solution = shrinkage_factor * _solve_fold(problem, fold, systems, x, columns, refit)
+        solution = shrinkage_factor * solve_fold(problem, fold, systems, x, columns, refit)
         unobserved = {
             parameter.name
             for parameter, is_unobserved in zip(
@@ -277,13 +117,13 @@ def standard_error(values: Array) -> float:
     return float(stdtrit(len(values) - 1, ndtr(1.0)) * values.std(ddof=1) / np.sqrt(len(values)))
 
 
-def cross_validate(fit: Result, folds: Sequence[Fold] | None = None) -> CrossValidation:
+def cross_validate(fit: FittedModel, folds: Sequence[Fold] | None = None) -> CrossValidation:
     """Measure how well the model of a calibration predicts samples that it is not fitted to.
 
     Standard deviations, weights and priors are those of the calibration.
 
     Args:
-        fit: Result of a calibration.
+        fit: FittedModel of a calibration.
         folds: Folds of `fit.data` from `k_fold`, `leave_one_group_out` or `blocked_folds`; the last one
             with the contacts of the measurements if not given.
 
@@ -324,7 +164,7 @@ class FoldComparison:
         return self.prediction_std <= MAX_PREDICTION_STD
 
 
-def compare_folds(fit: Result, folds: Sequence[Fold], title: Title) -> FoldComparison:
+def compare_folds(fit: FittedModel, folds: Sequence[Fold], title: Title) -> FoldComparison:
     """Compare the accuracy of held-out samples before and after a calibration.
 
     The nominal robot is judged in the same way: base, tool and instrument parameters are fitted to the other
@@ -360,19 +200,19 @@ def compare_folds(fit: Result, folds: Sequence[Fold], title: Title) -> FoldCompa
 
 
 def leave_regions_out(
-    fit: Result,
-    recalibrate: Callable[[list[Measurement]], Result],
+    fit: FittedModel,
+    recalibrate: Callable[[list[Measurement]], FittedModel],
     progress: Progress | None = None,
-) -> Result:
+) -> Comparison | None:
     """Judge a calibration by further ones, each without the samples of a region of joint space.
 
     Unlike in `compare_folds`, everything is estimated again without the region: noise, prior widths, outliers
-    and additional parameters.
+    and additional parameters. None if no region can be left out.
     """
     try:
         folds = blocked_folds(fit.data, groups=contact_groups(fit.problem, fit.x))
     except NotObservableError:
-        return fit
+        return None
     before: list[dict[str, Array]] = []
     after: list[dict[str, Array]] = []
     for number, fold in enumerate(folds, 1):
@@ -385,11 +225,14 @@ def leave_regions_out(
         held_out = [item.take(mask) for item, mask in zip(fit.data, is_judged, strict=True) if mask.any()]
         before += compute_errors(part.nominal_refitted, held_out, part.nominal_instruments)
         after += compute_errors(part.chain, held_out, part.instruments)
-    return replace(fit, region_comparison=_comparison(fit, "region hold-out", before, after))
+    return _comparison(fit, "region hold-out", before, after)
 
 
 def _comparison(
-    fit: Result, title: Title, before: Sequence[Mapping[str, Array]], after: Sequence[Mapping[str, Array]]
+    fit: FittedModel,
+    title: Title,
+    before: Sequence[Mapping[str, Array]],
+    after: Sequence[Mapping[str, Array]],
 ) -> Comparison:
     """Compare the errors of held-out samples before and after a calibration."""
     accuracy_before, accuracy_after = map(Accuracy.from_errors, (before, after))
@@ -426,11 +269,16 @@ class Generalization:
     reached_share: float | None
 
 
-def estimate_generalization(fit: Result) -> Generalization:
-    """Estimate the accuracy of a calibration within the measured region and beyond it."""
+def estimate_generalization(
+    fit: FittedModel,
+    inside: FoldComparison | None,
+    region: MeasuredRegion | None,
+    region_comparison: Comparison | None,
+) -> Generalization:
+    """Estimate the accuracy within the measured region, from random folds, and beyond it."""
     q, samples = different_configurations(fit.inliers)
     has_few = 1 < len(q) < MIN_SAMPLES
-    inside, beyond = fit.random_folds, None
+    beyond = None
     inside_reason = "too few samples" if has_few else "all samples have the same joint values"
     beyond_reason = inside_reason if len(q) else "the samples have no joint values"
     if inside is not None and not has_few:
@@ -440,28 +288,28 @@ def estimate_generalization(fit: Result) -> Generalization:
         beyond = compare_folds(fit, folds, "region hold-out")
         beyond_reason = _unknown_reason(fit, beyond, q, samples_held_out(folds, samples))
     covered = reached = 0.0 if fit.has_joint_values else None
-    if fit.measured_region is not None:
-        distances = fit.measured_region.distances(draw_joint_space(fit.chain))
-        covered = float(np.mean(distances <= fit.measured_region.radius))
-        reached = covered if beyond_reason else float(np.mean(distances <= fit.measured_region.reach))
+    if region is not None:
+        distances = region.distances(draw_joint_space(fit.chain))
+        covered = float(np.mean(distances <= region.radius))
+        reached = covered if beyond_reason else float(np.mean(distances <= region.reach))
     return Generalization(
         None if inside is None or inside_reason else inside.comparison,
         inside_reason,
-        None if beyond is None or beyond_reason else fit.region_comparison or beyond.comparison,
+        None if beyond is None or beyond_reason else region_comparison or beyond.comparison,
         beyond_reason,
         covered,
         reached,
     )
 
 
-def region_folds(fit: Result) -> tuple[Fold, ...]:
+def region_folds(fit: FittedModel) -> tuple[Fold, ...]:
     """Return the folds of the inliers that leave out regions of joint space."""
     with suppress(NotObservableError):
         return blocked_folds(fit.inliers, groups=contact_groups(fit.inlier_problem, fit.x))
     return ()
 
 
-def measured_region(fit: Result) -> MeasuredRegion | None:
+def measured_region(fit: FittedModel) -> MeasuredRegion | None:
     """Describe the region of joint space of the inliers."""
     q, samples = different_configurations(fit.inliers)
     if not len(q) or not fit.has_joint_values:
@@ -476,7 +324,7 @@ def samples_held_out(folds: Sequence[Fold], samples: Array) -> Array:
     return np.stack([np.concatenate(fold)[samples] for fold in folds])
 
 
-def _unknown_reason(fit: Result, regions: FoldComparison, q: Array, is_held_out: Array) -> str:
+def _unknown_reason(fit: FittedModel, regions: FoldComparison, q: Array, is_held_out: Array) -> str:
     """Say why the error beyond the measured region cannot be stated."""
 
     def names(mask: Array) -> str:

@@ -32,6 +32,8 @@ from ..measurements.base import Measurement
 from ..measurements.groups import ERROR_GROUPS, error_group, in_order
 from ..robot.chain import Chain
 
+# With fewer samples the figures come with a note that they are not reliable.
+MIN_SAMPLES = 10
 # Samples that a comparison judges.
 Title = Literal["hold-out", "region hold-out", "cross-validated", "fitted"]
 

@@ -59,13 +59,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from .._typing import Array, Progress
 from ..estimation import robust
 from ..estimation.error_model import ErrorModel, ErrorParameter
+from ..estimation.folds import FoldSystems, count_rows, factor_partition, solve_columns
 from ..estimation.parameters import CURVE_ORDERS, EXTENSIONS, FINE_CURVE_ORDERS, PARAMETER_SETS
 from ..estimation.priors import PriorGroups, effective_parameters
 from ..estimation.problem import Problem, linearize_and_factor
@@ -75,7 +76,6 @@ from ..exceptions import UnknownNameError
 from ..formatting import Table, format_fixed
 from ..identifiability.residual_correlation import design_effect, find_residual_correlation
 from ..robot.error_families import COMPLIANCE, COUPLING, CURVES, FAMILIES, FINE_CURVES, GAIN, HARMONICS
-from .cross_validation import FoldSystems, count_rows, factor_partition, solve_columns
 from .partition import (
     configuration_groups,
     contact_groups,
@@ -84,9 +84,6 @@ from .partition import (
     region_partitions,
 )
 from .reweighting import Fit, reweight, with_sigma_scales
-
-if TYPE_CHECKING:
-    from .result import Result
 
 # Whitened residuals of exact data are smaller, as their standard deviations have a lower limit. They are
 # rounding errors, whose correlation says nothing about the model.
@@ -696,17 +693,17 @@ def _are_residuals_correlated(fit: Fit, noise: float) -> bool:
     return find_residual_correlation(fit.problem, fit.solution.x, root, noise, fit.weights).is_significant
 
 
-def family_hint(fit: Result) -> str:
+def family_hint(solved: Problem, x: Array, weights: Sequence[Array]) -> str:
     """Suggest an extension if one family explains a significant part of the residuals.
 
     The hint is computed from a linearization around the fit and at most `MAX_HINT_SAMPLES` samples of each
     measurement. It requires a change of the cost that chance causes less than once in a million fits, by
     the bound P(χ²_q > q + 2·sqrt(q·t) + 2·t) <= exp(-t) of Laurent and Massart (2000).
     """
-    data = [item.take(w > robust.ZERO_WEIGHT) for item, w in zip(fit.problem.data, fit.weights, strict=True)]
+    data = [item.take(w > robust.ZERO_WEIGHT) for item, w in zip(solved.data, weights, strict=True)]
     data = [item.take(np.s_[:: max(1, -(-len(item.rows) // MAX_HINT_SAMPLES))]) for item in data]
-    missing = _missing_parameters(fit.errors, [name for name in EXTENSIONS if name not in CURVE_FAMILIES])
-    problem, x, family = _with_families(replace(fit.problem, data=tuple(data)), fit.x, missing)
+    missing = _missing_parameters(solved.errors, [name for name in EXTENSIONS if name not in CURVE_FAMILIES])
+    problem, x, family = _with_families(replace(solved, data=tuple(data)), x, missing)
     system, n_rows = linearize_and_factor(problem, x, small_angle=False), count_rows(problem)
     cost_before, best = solve_columns(system, problem.weights, x, family == "")[1], (MAX_HINT_RATIO, "")
     for name in missing:

@@ -21,6 +21,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from .._typing import Array
+from ..estimation.folds import Fold
 from ..estimation.problem import Problem, merge_instrument_parameters
 from ..exceptions import InvalidArgumentError, NotObservableError
 from ..measurements.arguments import as_measurements
@@ -32,9 +33,6 @@ CONFIGURATION_TOL = 1e-6
 BLOCK_FRACTION = 0.25
 # Principal directions whose spread is below this fraction of the largest one's are ignored.
 _MIN_RELATIVE_SPREAD = 1e-6
-
-# Mask of the held-out samples (m,) of each measurement.
-Fold = tuple[Array, ...]
 
 
 def group_by_configuration(q: Array, tolerance: float = CONFIGURATION_TOL) -> Array:

@@ -155,7 +155,8 @@ def calibrate(
             max_iterations=max_iterations,
             executor=executor,
         )
-        return leave_regions_out(recalibrate(data, progress=progress), recalibrate, progress)
+        result = recalibrate(data, progress=progress)
+        return replace(result, region_comparison=leave_regions_out(result, recalibrate, progress))
     data, holdout = as_measurements(data), as_measurements(holdout, "holdout")
     _check_options(data, method, loss, bounds)
     for item in (*data, *holdout):

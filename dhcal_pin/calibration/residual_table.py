@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -25,9 +25,7 @@ from ..estimation.robust import ZERO_WEIGHT
 from ..measurements.base import Measurement
 from ..measurements.camera import CameraCorners
 from .evaluation import fit_instrument_parameters
-
-if TYPE_CHECKING:
-    from .result import Result
+from .fitted import FittedModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +114,7 @@ class ResidualTable:
         }
 
 
-def residual_table(fit: Result) -> ResidualTable:
+def residual_table(fit: FittedModel) -> ResidualTable:
     """Collect the residuals of a calibration."""
     data = [*fit.data, *fit.holdout]
     residuals = [*_fitted_residuals(fit), *_holdout_residuals(fit)]
@@ -162,7 +160,7 @@ def residual_table(fit: Result) -> ResidualTable:
     )
 
 
-def _fitted_residuals(fit: Result) -> Iterator[tuple[dict[str, Array], Array]]:
+def _fitted_residuals(fit: FittedModel) -> Iterator[tuple[dict[str, Array], Array]]:
     """Yield the errors by group and the normalised residuals (m,) of each fitted measurement."""
     for item, weighted, weights in zip(fit.data, fit.problem.data, fit.weights, strict=True):
         frames = fit.chain.forward_kinematics(item.configurations())
@@ -171,7 +169,7 @@ def _fitted_residuals(fit: Result) -> Iterator[tuple[dict[str, Array], Array]]:
         yield item.errors(frames, u), _root_mean_square(weighted.residual(frames, u)) / np.sqrt(weights)
 
 
-def _holdout_residuals(fit: Result) -> Iterator[tuple[dict[str, Array], Array]]:
+def _holdout_residuals(fit: FittedModel) -> Iterator[tuple[dict[str, Array], Array]]:
     """Yield the errors by group and the normalised residuals (m,) of each held-out measurement."""
     data = [item.initialized(fit.chain) for item in fit.holdout]
     values = fit_instrument_parameters(fit.chain, data, fit.instruments)
@@ -186,7 +184,7 @@ def _root_mean_square(residual: Array) -> Array:
     return np.sqrt(np.mean(residual**2, axis=0))
 
 
-def _with_fitted_sigma(fit: Result, item: Measurement) -> Measurement:
+def _with_fitted_sigma(fit: FittedModel, item: Measurement) -> Measurement:
     """Scale a held-out measurement as the fit scaled its file, or else its kind; by NaN without either."""
     if item.has_stated_sigma:
         return item
@@ -197,7 +195,7 @@ def _with_fitted_sigma(fit: Result, item: Measurement) -> Measurement:
     return item.with_scaled_sigma(dict.fromkeys(item.residual_groups, np.nan))
 
 
-def _sigma_scales(fit: Result, index: int) -> dict[str, float]:
+def _sigma_scales(fit: FittedModel, index: int) -> dict[str, float]:
     """Return the factor by which the fit scaled the standard deviations of each residual group."""
     u = fit.problem.instrument_values_of(fit.data[index], fit.x)
     frames = fit.chain.forward_kinematics(fit.data[index].configurations())

@@ -9,19 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
+from ..estimation.error_model import ErrorModel
 from ..formatting import SMALL_UNITS, Table, format_fixed, format_quantity, significant_decimals
 from ..measurements.groups import ERROR_GROUPS
+from .cross_validation import Generalization
 from .estimates import Estimate
-from .evaluation import Comparison
+from .evaluation import MIN_SAMPLES, Comparison
 
-if TYPE_CHECKING:
-    from ..estimation.error_model import ErrorModel
-    from .cross_validation import Generalization
-
-# With fewer samples the figures come with a note that they are not reliable.
-MIN_SAMPLES = 10
 # The headline gives the RMS without outliers if it is below this fraction of the RMS with them.
 OUTLIER_RMS_RATIO = 0.9
 # Smaller shares of the joint space are shown as "under 1 %", and larger ones than the rest as "over 99 %".

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -26,9 +26,7 @@ from ..plausibility.displacement import CorrectionSize, measure_correction, work
 from ..plausibility.mixups import Diagnosis
 from ..robot.chain import BASE_FRAME
 from .evaluation import accuracy, fit_nominal
-
-if TYPE_CHECKING:
-    from .result import Result
+from .evidence import Evidence
 
 Status = Literal["ok", "caution", "refused"]
 # Statuses, the most severe one last.
@@ -108,7 +106,7 @@ class Verdict:
         )
 
 
-def judge(fit: Result) -> Verdict:
+def judge(fit: Evidence) -> Verdict:
     """Judge a calibration by all rules."""
     findings = _unmoved_joints(fit)
     if not any(finding.status == "refused" for finding in findings):
@@ -129,7 +127,7 @@ def judge(fit: Result) -> Verdict:
     return Verdict.from_findings(findings)
 
 
-def _unmoved_joints(fit: Result) -> list[Finding]:
+def _unmoved_joints(fit: Evidence) -> list[Finding]:
     """Refuse measurements in which most joints never moved; advise caution if a few did not."""
     q = [item.configurations() for item in fit.data if item.configurations_per_row]
     if not q:
@@ -157,14 +155,14 @@ def _mixups(diagnosis: Diagnosis) -> list[Finding]:
     return [Finding("refused", f"{diagnosis.sentence} {diagnosis.remedy}")]
 
 
-def _board_size(fit: Result) -> list[Finding]:
+def _board_size(fit: Evidence) -> list[Finding]:
     """Refuse an arm whose lengths follow from a wrong size of the boards; advise caution if they may."""
     if fit.board_size is None:
         return []
     return [Finding("refused" if fit.board_size.is_decisive else "caution", fit.board_size.sentence)]
 
 
-def _convergence(fit: Result) -> list[Finding]:
+def _convergence(fit: Evidence) -> list[Finding]:
     """Refuse a fit that did not converge: its values are those of an arbitrary last step."""
     if fit.converged:
         return []
@@ -177,7 +175,7 @@ def _convergence(fit: Result) -> list[Finding]:
     ]
 
 
-def _implausible_correction(fit: Result) -> list[Finding]:
+def _implausible_correction(fit: Evidence) -> list[Finding]:
     """Refuse corrections that are far larger than manufacturing errors."""
     if not _n_robot_parameters(fit):
         return []
@@ -188,7 +186,7 @@ def _implausible_correction(fit: Result) -> list[Finding]:
     return [Finding(status, f"The correction {_describe(size)}. {_plausible_cause(fit)}")]
 
 
-def _implausible_errors(fit: Result) -> list[Finding]:
+def _implausible_errors(fit: Evidence) -> list[Finding]:
     """Refuse a robot that does not fit the measurements after the calibration either."""
     for group, after in fit.comparisons[-1].after.groups.items():
         error = after.rms / (workspace_radius(fit.chain) if after.unit == "m" else 1.0)
@@ -205,14 +203,14 @@ def _implausible_errors(fit: Result) -> list[Finding]:
     return []
 
 
-def _hand_eye_error(fit: Result) -> list[Finding]:
+def _hand_eye_error(fit: Evidence) -> list[Finding]:
     """Advise caution if noise does not explain the error of a hand-eye calibration, and name the cause."""
     if fit.hand_eye is None or fit.hand_eye.is_noise:
         return []
     return [Finding("caution", f"{fit.hand_eye.error_sentence}{fit.hand_eye.likely}")]
 
 
-def _hand_eye_images(fit: Result) -> list[Finding]:
+def _hand_eye_images(fit: Evidence) -> list[Finding]:
     """Advise caution if the images of a hand-eye calibration are too similar, or some do not fit."""
     return [Finding("caution", text) for text in (fit.hand_eye.image_sentences if fit.hand_eye else [])]
 
@@ -225,7 +223,7 @@ def _describe(size: CorrectionSize) -> str:
     return f"moves {frame} by {moved}, {size.ratio:.0f} times what manufacturing errors would"
 
 
-def _missing_frames(fit: Result) -> list[str]:
+def _missing_frames(fit: Evidence) -> list[str]:
     """Return which of base and tool are not estimated, if the nominal robot fits much better with them."""
     frames = {"base": BASE_FRAME, "tool": fit.errors.chain.tool_frame_index}
     estimated = {parameter.error_frame for parameter in fit.errors.parameters}
@@ -240,14 +238,14 @@ def _missing_frames(fit: Result) -> list[str]:
     return missing if with_frames.rms < MAX_FRAME_RATIO * before.rms else []
 
 
-def _configuration_checks(fit: Result) -> str:
+def _configuration_checks(fit: Evidence) -> str:
     """Name what to check of the configurations of images."""
     if fit.has_joint_values:
         return "units, signs and order of the joints, the joint values of each image"
     return "units, notation of rotations and frames of the flange poses, the flange pose of each image"
 
 
-def _plausible_cause(fit: Result) -> str:
+def _plausible_cause(fit: Evidence) -> str:
     """Name the most plausible cause of an implausible result."""
     if fit.camera_stages:
         return (
@@ -273,7 +271,7 @@ def _plausible_cause(fit: Result) -> str:
     )
 
 
-def _held_out_errors(fit: Result) -> list[Finding]:
+def _held_out_errors(fit: Evidence) -> list[Finding]:
     """Refuse a robot that is worse than the nominal one; keep the nominal one if there is no difference."""
     paired = fit.held_out_errors
     if paired is None or not (fit.shrinkage_factor and _n_robot_parameters(fit)):
@@ -296,7 +294,7 @@ def _held_out_errors(fit: Result) -> list[Finding]:
     return [Finding("caution", f"{text}. No correction is applied; measure more poses.", True)]
 
 
-def _overfitting(fit: Result) -> float:
+def _overfitting(fit: Evidence) -> float:
     """Return the increase of the squared error that the uncertainty of the parameters causes, relative to it.
 
     A robot that needs no correction becomes worse by this much, which is no reason to doubt the measurements.
@@ -304,12 +302,12 @@ def _overfitting(fit: Result) -> float:
     return fit.random_folds.prediction_std**2 if fit.random_folds else np.inf
 
 
-def _few_measurements(fit: Result) -> list[Finding]:
+def _few_measurements(fit: Evidence) -> list[Finding]:
     """Advise caution if there are too few measurements to apply the correction in full."""
     return [Finding("caution", note, not fit.shrinkage_factor) for note in fit.shrinkage_notes]
 
 
-def _outliers(fit: Result) -> list[Finding]:
+def _outliers(fit: Evidence) -> list[Finding]:
     """Advise caution if many samples are outliers."""
     n_outliers = sum(map(len, fit.outliers))
     # Images that differ because of a wrong lens or a wrong arm are no outliers.
@@ -321,7 +319,7 @@ def _outliers(fit: Result) -> list[Finding]:
     return [Finding("caution", f"{text}. Check the measurements; --loss tukey reduces their influence.")]
 
 
-def _outlying_images(fit: Result) -> str:
+def _outlying_images(fit: Evidence) -> str:
     """Name the images all of whose corners are outliers; empty without such images."""
     labels = [
         item.image_labels[number]
@@ -335,7 +333,7 @@ def _outlying_images(fit: Result) -> str:
     return f", among them all corners of {images}{list_images(labels)}"
 
 
-def _n_robot_parameters(fit: Result) -> int:
+def _n_robot_parameters(fit: Evidence) -> int:
     """Return the number of parameters of the robot itself that are estimated, without base and tool."""
     frames = (BASE_FRAME, fit.errors.chain.tool_frame_index)
     return sum(parameter.error_frame not in frames for parameter in fit.errors.parameters)

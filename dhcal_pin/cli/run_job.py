@@ -155,11 +155,12 @@ def run_job(
         raise NotObservableError(f"{error}{_held_out_images(data)}") from None
     if job.holdout == REGION:
         without_holdout = restrictions | options | {"holdout": (), "extend": extend}
-        fit = leave_regions_out(
+        regions = leave_regions_out(
             fit,
             lambda part: procedure.calibrate(chain, part, sets, method=job.method, **without_holdout),
             progress,
         )
+        fit = replace(fit, region_comparison=regions)
     if progress:
         progress("accuracy and verdict", 1, 1)
     on_images = fit.input_warnings
@@ -412,7 +413,7 @@ def _family_hint(fit: Result, data: _JobData, sets: str, job: Job) -> str:
     is_default = job.method == "lm" and job.priors != "none" and job.extend == "none"
     if not is_default or any(data.warnings.values()) or set(split_commas(sets)) <= {"base", "tool"}:
         return ""
-    return model_selection.family_hint(fit)
+    return model_selection.family_hint(fit.problem, fit.x, fit.weights)
 
 
 def improvement_hint(fit: Result, chain: Chain, data: Sequence[Measurement], **options: Any) -> str:

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from .._typing import Array
+from ..calibration.evidence import Evidence
 from ..calibration.partition import different_configurations
-from ..calibration.result import Result
 from ..estimation.parameters import CURVE_ORDERS
 from ..estimation.uncertainty import UNBOUNDED_TOL, Uncertainty
 from ..robot.coverage import JointCoverage, bin_indices, joint_coverage, lattice_warnings
@@ -49,13 +49,13 @@ class JointCurve:
         return self.coverage.counts[bin_indices(self.values)] > 0
 
 
-def fitted_coverage(fit: Result) -> tuple[JointCoverage, ...]:
+def fitted_coverage(fit: Evidence) -> tuple[JointCoverage, ...]:
     """Compute which joint values the fitted samples visited."""
     q, _ = different_configurations(fit.inliers)
     return joint_coverage(fit.chain, q) if len(q) and fit.has_joint_values else ()
 
 
-def joint_curves(fit: Result) -> list[JointCurve]:
+def joint_curves(fit: Evidence) -> list[JointCurve]:
     """Compute the correction curves of the joints that have harmonics."""
     if fit.chain.transmission is None:
         return []
@@ -74,7 +74,7 @@ def joint_curves(fit: Result) -> list[JointCurve]:
     return out
 
 
-def find_lattices(fit: Result) -> list[str]:
+def find_lattices(fit: Evidence) -> list[str]:
     """Find joints whose estimated correction curve is not determined because their values form a lattice."""
     n = fit.chain.n_joints
     _, indices, _ = split_coefficients(np.arange(n_coefficients(n)), n)

@@ -46,7 +46,7 @@ from .images.camera_parameters import (
     camera_parameters,
     rig_parameters,
 )
-from .images.camera_start import BoardViews, estimate_views, first_values
+from .images.camera_start import BoardViews, Corners, estimate_views, first_values
 from .images.names import label_images, name_array
 from .mounting import MountedRig, mount_rig
 from .validation import validated_array, validated_joint_positions, validated_sigma
@@ -351,6 +351,11 @@ class CameraCorners(Measurement):
         """Number of images."""
         return int(self.image.max(initial=-1)) + 1
 
+    @property
+    def corners(self) -> Corners:
+        """Data of the corners for the first values of cameras and boards."""
+        return Corners(self.q, self.values, self.rig, self.camera, self.board, self.corner, self.image)
+
     @cached_property
     def image(self) -> Array:
         """Number of each sample's image, (m,): samples of one configuration and one camera."""
@@ -597,7 +602,7 @@ class CameraCorners(Measurement):
     def _with_first_values(self, chain: Chain, is_used: Array | None = None) -> Self:
         """Return a copy with first values; messages begin with the file of the images."""
         try:
-            return self.with_values(first_values(self, self.board_views, chain, is_used))
+            return self.with_values(first_values(self.corners, self.board_views, chain, is_used))
         except NotObservableError as error:
             where = f"{self.source}: " if self.source else ""
             raise NotObservableError(f"{where}{error}") from None
@@ -605,7 +610,7 @@ class CameraCorners(Measurement):
     @cached_property
     def board_views(self) -> BoardViews:
         """Poses of the boards in the cameras, from each image alone."""
-        return estimate_views(self)
+        return estimate_views(self.corners)
 
     def with_scaled_sigma(self, scales: Mapping[str, float]) -> Self:
         """Return a copy with multiplied standard deviations."""

@@ -7,5 +7,6 @@ from .grid import read_study as read_study
 from .journal import StudyJournal as StudyJournal
 from .journal import open_journal as open_journal
 from .runner import MEASURE_UNITS as MEASURE_UNITS
+from .runner import plot_study as plot_study
 from .runner import result_table as result_table
 from .runner import run as run

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -34,9 +34,6 @@ from ..robot.chain import Chain
 from ..robot.sampling import joint_range
 from ..ros_packages import EXAMPLE_PREFIX, resolve_robot_path
 from ..units import parse_noise
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 # Number of calibrations of a task, which takes some tenths of a second.
 BLOCK_SIZE = 100
@@ -164,23 +161,6 @@ class StudyGrid:
     cases: tuple[Case, ...]
     digest: str
     robots: tuple[str, ...]
-
-    def plot(
-        self, blocks: Sequence[list[list[float]]], ax: Axes | None = None, *, column: str = "position_rms[m]"
-    ) -> Axes:
-        """Plot one result of the study over the numeric setting with the most values.
-
-        Example:
-            `study.plot(list(run(study))).figure.savefig("study.png")`
-        """
-        from ..visualization import plots  # lazy import, as the following: they are slow to load
-        from .runner import result_table
-
-        header, rows = result_table(self, blocks)
-        ax = plots.plot_study(header, rows, len(fields(Setting)), column, ax)
-        if len(ax.get_lines()) > 1:
-            ax.legend(frameon=False, fontsize="small")
-        return ax
 
     def tasks(self) -> list[Task]:
         """Return the blocks of calibrations, in the order of the cases."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import astuple, fields, replace
 from itertools import groupby
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -39,6 +39,9 @@ _TABLE_SETS = frozenset(("dh", "modified-dh"))
 
 # Quantile of the position error in the last column of the table.
 _UPPER_QUANTILE = 0.9
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 # Results of each calibration, and their units.
 MEASURE_UNITS = {
@@ -132,6 +135,27 @@ def result_table(study: StudyGrid, blocks: Sequence[list[list[float]]]) -> tuple
         finite = [float(value) if np.isfinite(value) else None for value in (*statistics, quantile)]
         rows.append([*astuple(case.setting), study.seeds, *finite])
     return header, rows
+
+
+def plot_study(
+    study: StudyGrid,
+    blocks: Sequence[list[list[float]]],
+    ax: Axes | None = None,
+    *,
+    column: str = "position_rms[m]",
+) -> Axes:
+    """Plot one result of a study over the numeric setting with the most values.
+
+    Example:
+        `plot_study(study, list(run(study))).figure.savefig("study.png")`
+    """
+    from ..visualization import plots  # lazy import: slow to load
+
+    header, rows = result_table(study, blocks)
+    ax = plots.plot_study(header, rows, len(fields(Setting)), column, ax)
+    if len(ax.get_lines()) > 1:
+        ax.legend(frameon=False, fontsize="small")
+    return ax
 
 
 def _draw_true_chains(case: Case, seeds: range) -> tuple[ChainBatch, Array]:

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
 
-    from ..calibration import Result
     from ..calibration.evaluation import ErrorStatistics
+    from ..calibration.evidence import Evidence
 
 # Largest number of rows of a plot of parameters, and of names beside a matrix.
 MAX_PARAMETERS, _MAX_NAMES = 40, 60
@@ -62,7 +62,7 @@ class SampleErrors:
     index: Array
 
     @classmethod
-    def from_fit(cls, fit: Result, group: str | None) -> SampleErrors:
+    def from_fit(cls, fit: Evidence, group: str | None) -> SampleErrors:
         """Compute the errors of the fitted and the held-out samples."""
         norms, table = fit.error_norms, fit.residuals
         choices = in_order(norms)
@@ -111,7 +111,7 @@ class SampleErrors:
 # --- errors ----------------------------------------------------------------------------------------
 
 
-def plot_accuracy(fit: Result, ax: Axes | None = None, *, group: str | None = None) -> Axes:
+def plot_accuracy(fit: Evidence, ax: Axes | None = None, *, group: str | None = None) -> Axes:
     """Plot the error before and after: RMS as a dot, and a line up to the 95th percentile."""
     ax = ax or new_axes()[0]
     regions = fit.generalization.region_holdout
@@ -151,7 +151,7 @@ def _comparison_label(comparison: Comparison, group: str) -> str:
 
 
 def plot_residuals(
-    fit: Result, ax: Axes | None = None, *, over: str | Array = "sample", group: str | None = None
+    fit: Evidence, ax: Axes | None = None, *, over: str | Array = "sample", group: str | None = None
 ) -> Axes:
     """Plot the errors of all samples before and after, fitted and held-out ones on the same axes."""
     ax = ax or new_axes()[0]
@@ -179,7 +179,7 @@ def plot_residuals(
     return ax
 
 
-def _abscissa(fit: Result, over: str | Array) -> tuple[Array, str]:
+def _abscissa(fit: Evidence, over: str | Array) -> tuple[Array, str]:
     """Return the horizontal coordinate of each sample (N,) and its label."""
     n_samples = len(fit.residuals)
     if not isinstance(over, str):
@@ -249,7 +249,7 @@ def _plot_histogram(errors: SampleErrors, ax: Axes) -> None:
 # --- parameters ------------------------------------------------------------------------------------
 
 
-def plot_parameters(fit: Result, ax: Axes | None = None, *, count: int = MAX_PARAMETERS) -> Axes:
+def plot_parameters(fit: Evidence, ax: Axes | None = None, *, count: int = MAX_PARAMETERS) -> Axes:
     """Plot the corrections of the robot with two standard deviations, relative to their priors.
 
     A prior is drawn as a band of one and of two of its standard deviations. A line as long as the band
@@ -285,7 +285,7 @@ def plot_parameters(fit: Result, ax: Axes | None = None, *, count: int = MAX_PAR
     return ax
 
 
-def plot_singular_values(fit: Result, ax: Axes | None = None) -> Axes:
+def plot_singular_values(fit: Evidence, ax: Axes | None = None) -> Axes:
     """Plot the singular values of the whitened Jacobian relative to the largest one."""
     ax = ax or new_axes()[0]
     plots.plot_singular_values(qr.singular_values(fit.solution.system.r), fit.rank, ax)
@@ -293,7 +293,7 @@ def plot_singular_values(fit: Result, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def plot_correlation(fit: Result, ax: Axes | None = None) -> Axes:
+def plot_correlation(fit: Evidence, ax: Axes | None = None) -> Axes:
     """Plot the correlation matrix of all estimated parameters."""
     from matplotlib.colors import LinearSegmentedColormap
 

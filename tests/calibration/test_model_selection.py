@@ -22,6 +22,10 @@ from dhcal_pin.robot import Chain
 from dhcal_pin.robot.error_families import FAMILIES
 
 
+def hint(fit) -> str:
+    return family_hint(fit.problem, fit.x, fit.weights)
+
+
 def simulated(
     sets: str, seed: int, m: int = 60, noise: float = 1e-4, kind: type[Measurement] = Pose
 ) -> tuple[Chain, Measurement]:
@@ -40,14 +44,14 @@ def test_hint_names_the_missing_family_and_its_effect(family):
     arm, data = simulated(f"{family},minimal,base,tool", seed=1)
     plain = calibrate(arm, data, "minimal,base,tool", extend="none")
     found = re.fullmatch(
-        r"residuals vary .* \((.*)\?\); --extend auto may reduce them by about (\d+) %", family_hint(plain)
+        r"residuals vary .* \((.*)\?\); --extend auto may reduce them by about (\d+) %", hint(plain)
     )
     assert found
     assert found[1] == FAMILIES[family].description
     whole = calibrate(arm, data, f"{family},minimal,base,tool", extend="none")
     rms = [np.sqrt(fit.solution.system.cost / (360 - fit.rank)) for fit in (plain, whole)]
     assert 100 - float(found[2]) == pytest.approx(100 * rms[1] / rms[0], abs=2, rel=0.3)
-    assert not family_hint(whole)
+    assert not hint(whole)
 
 
 @pytest.mark.parametrize("seeds", [20, pytest.param(300, marks=pytest.mark.slow)])
@@ -57,14 +61,12 @@ def test_geometric_errors_alone_give_no_hint(kind, seeds):
     for seed in range(seeds):
         arm, data = simulated("minimal,base,tool", seed, (20, 40, 80)[seed % 3], kind=kind)
         data = data.replace(has_stated_sigma=bool(seed % 2))
-        assert not family_hint(calibrate(arm, data, "minimal,base,tool", extend="none"))
+        assert not hint(calibrate(arm, data, "minimal,base,tool", extend="none"))
 
 
 def test_hint_uses_a_part_of_many_samples():
     arm, data = simulated("harmonics,minimal,base,tool", seed=0, m=3 * MAX_HINT_SAMPLES + 1)
-    assert FAMILIES["harmonics"].description in family_hint(
-        calibrate(arm, data, "minimal,base,tool", extend="none")
-    )
+    assert FAMILIES["harmonics"].description in hint(calibrate(arm, data, "minimal,base,tool", extend="none"))
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -296,8 +296,7 @@ def test_everything_is_there_without_scripts(open_page, path):
     page.close()
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [390, 768, 1200])
+@pytest.mark.parametrize(("width", "scheme"), [(390, "light"), (768, "dark"), (1200, "light")])
 def test_the_page_is_accessible_and_fits(browser, path, scheme, width):
     without_scene = path.with_name("without_scene.html")
     without_scene.write_text(re.sub('data-scene="[^"]*"', 'data-scene=""', path.read_text("utf-8")), "utf-8")

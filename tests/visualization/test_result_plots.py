@@ -13,7 +13,7 @@ import dhcal_pin as dh
 from dhcal_pin.estimation import qr
 from dhcal_pin.exceptions import InvalidArgumentError, UnknownNameError
 from dhcal_pin.planning import plan
-from dhcal_pin.studies import read_study, run
+from dhcal_pin.studies import plot_study, read_study, run
 from dhcal_pin.visualization.plots import COLORS
 
 PLOTS = ("accuracy", "residuals", "parameters", "singular_values", "correlation", "workspace")
@@ -175,7 +175,7 @@ def test_study(tmp_path):
     robot = URDF / "sim_3dof.dh.toml"
     path.write_text(f'seeds = 5\n[settings]\nrobot = "{robot}"\nnoise = "0.1mm"\nposes = [10, 20, 40]\n')
     study = read_study(path)
-    ax = drawn(study.plot(list(run(study))))
+    ax = drawn(plot_study(study, list(run(study))))
     (line,) = ax.get_lines()
     assert line.get_xdata().tolist() == [10, 20, 40]
     assert np.all(np.diff(line.get_ydata()) < 0)

@@ -196,7 +196,7 @@ def _shifted(item: CameraCorners, hand_eye: HandEyeData, causes: Causes) -> Came
     shifted = item.replace(q=(1 - part) * sequence[low] + part * sequence[low + 1])
     if any(np.isnan(p.nominal) for p in item.instrument_parameters):
         # The boards are where they are in the images, whatever the joint values.
-        values = first_values(shifted, item.board_views, hand_eye.errors.chain, is_inside)
+        values = first_values(shifted.corners, item.board_views, hand_eye.errors.chain, is_inside)
         shifted = shifted.with_values(values)
     return shifted.take(is_inside)
 

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 
 from ..._typing import Array
+from ...estimation.folds import Fold, factor_partition, solve_columns
 from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners
-from ..cross_validation import factor_partition, solve_columns
-from ..partition import Fold
 from ..reweighting import Fit
 
 # Stages in their order: exchanged axes of the intrinsics, poses of cameras and boards, lenses, corners of the

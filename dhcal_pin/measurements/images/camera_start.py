@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -31,10 +31,7 @@ from ...cameras.pose_from_points import agreeing_points
 from ...cameras.rig import Camera
 from ...exceptions import NotObservableError
 from ...robot.chain import Chain
-from ..mounting import Mount
-
-if TYPE_CHECKING:
-    from ..camera import CameraCorners
+from ..mounting import Mount, MountedRig
 
 # Largest RMS distance in the image, X/Z and Y/Z, of a pose that is used, as a multiple of the median one.
 _MAX_RATIO = 5.0
@@ -77,7 +74,30 @@ class BoardViews:
     rms: Array
 
 
-def estimate_views(item: CameraCorners) -> BoardViews:
+@dataclass(frozen=True, eq=False)
+class Corners:
+    """Image coordinates of m corners.
+
+    Attributes:
+        q: Joint positions, (m, n) [rad or m].
+        values: Image coordinates, (m, 2) [px].
+        rig: Cameras and boards on the chain.
+        camera: Number of the camera of each corner, (m,).
+        board: Number of the board of each corner, (m,).
+        corner: Number of each corner on its board, (m,).
+        image: Number of the image of each corner, (m,).
+    """
+
+    q: Array
+    values: Array
+    rig: MountedRig
+    camera: Array
+    board: Array
+    corner: Array
+    image: Array
+
+
+def estimate_views(item: Corners) -> BoardViews:
     """Estimate the lens of each camera, and the pose of each board in each image."""
     images = _images(item)
     lenses: list[Array] = []
@@ -115,10 +135,10 @@ def _fit_camera(camera: Camera, content: tuple[tuple[bytes, bytes], ...], repeat
 
 
 def first_values(
-    item: CameraCorners, views: BoardViews, chain: Chain, is_used: Array | None = None
+    item: Corners, views: BoardViews, chain: Chain, is_used: Array | None = None
 ) -> dict[str, float]:
     """Estimate the first values of all parameters of cameras and boards."""
-    used = np.ones(len(item.rows), bool) if is_used is None else is_used
+    used = np.ones(len(item.q), bool) if is_used is None else is_used
     values: dict[str, float] = {}
     for camera, lens in zip(item.rig.cameras, views.lenses, strict=True):
         if not camera.has_intrinsics:
@@ -146,7 +166,7 @@ def _stated_poses(entries: Sequence[Camera] | Sequence[Board], mounts: Sequence[
     return {i: mount.link_pose @ entry.pose for i, (entry, mount) in pairs if entry.pose is not None}
 
 
-def _images(item: CameraCorners) -> list[Array]:
+def _images(item: Corners) -> list[Array]:
     """Return the samples of each image of one board, without those that disagree with most others."""
     keys = np.column_stack([item.image, item.board])
     label = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
@@ -155,7 +175,7 @@ def _images(item: CameraCorners) -> list[Array]:
     return [samples[_agreeing(item, samples)] for samples in images if len(samples)]
 
 
-def _agreeing(item: CameraCorners, samples: Array) -> Array:
+def _agreeing(item: Corners, samples: Array) -> Array:
     """Return which samples of an image of one board belong to the same view of the board."""
     board = item.rig.boards[item.board[samples[0]]]
     return _agreeing_points(board.points[item.corner[samples]], item.values[samples])
@@ -166,7 +186,7 @@ def _agreeing(item: CameraCorners, samples: Array) -> Array:
 _Pairs = dict[tuple[int, int], tuple[Array, Array]]
 
 
-def _board_poses(item: CameraCorners, views: BoardViews, chain: Chain, used: Array) -> _Pairs:
+def _board_poses(item: Corners, views: BoardViews, chain: Chain, used: Array) -> _Pairs:
     """Collect the views of each pair of camera and board in the used samples, without badly fitting ones."""
     is_chosen = used[views.sample]
     samples, poses, rms = views.sample[is_chosen], views.poses[is_chosen], views.rms[is_chosen]
@@ -182,7 +202,7 @@ def _board_poses(item: CameraCorners, views: BoardViews, chain: Chain, used: Arr
 
 
 def _locate(
-    item: CameraCorners,
+    item: Corners,
     used: Array,
     pairs: _Pairs,
     cameras: dict[int, Array],

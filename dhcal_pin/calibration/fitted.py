@@ -1,0 +1,532 @@
+"""Fitted model: identified errors of a robot, their uncertainty and the statistics of the fit.
+
+All statistics follow from the triangular factor R of the whitened Jacobian at the solution and from the prior
+weights W (one over the prior standard deviations, 0 without a prior). With m whitened rows, p unknowns and
+cost C, the sum of the squared whitened residuals:
+
+    covariance               Σ  = (RᵀR + W²)⁻¹, as a square root S with S·Sᵀ = Σ
+    effective parameters     γ  = ‖R·S‖²  (Frobenius norm; MacKay 1992)
+    degrees of freedom       ν  = m - γ
+    unit weight std          σ0 = sqrt(C / ν)
+
+γ counts a parameter that the data determine as 1 and one that its prior determines as 0. σ0 is 1 if the
+standard deviations of the measurements are right. If they are not stated, or if σ0² exceeds 1 by more than
+three standard deviations of χ²/ν, R is divided by σ0 before the covariance is computed; the priors stay.
+
+Shapes: p unknowns (parameters of the robot, then of the instruments), m samples of a measurement, n joints.
+
+Reference: D. J. C. MacKay, Bayesian interpolation, Neural Computation 4 (1992) 415-447.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pinocchio as pin
+
+from .._typing import Array
+from ..estimation import qr, robust
+from ..estimation.error_model import ErrorModel, ErrorParameter
+from ..estimation.frame_gauge import separate_frames
+from ..estimation.problem import Problem, linearize_and_factor
+from ..estimation.qr import TriangularSystem
+from ..estimation.solver import SolverResult, bounded_step, minimize, next_iterate
+from ..estimation.uncertainty import UNBOUNDED_TOL, Prediction, Uncertainty
+from ..exceptions import DhcalError
+from ..identifiability import observability
+from ..measurements.arguments import as_measurements
+from ..measurements.base import InstrumentParameter, Measurement
+from ..measurements.camera import CameraCorners
+from ..measurements.mounting import MountedRig
+from ..robot.chain import Chain
+from .cameras.sets import has_joint_values
+from .evaluation import (
+    Accuracy,
+    accuracy,
+    compute_errors,
+    fit_nominal,
+)
+from .model_selection import Extension
+from .partition import different_configurations
+
+# Stated standard deviations are rejected if the reduced cost exceeds 1 by this many standard deviations.
+CONTRADICTION_SIGMAS = 3.0
+# Upper limit of the interval that holds 95 %, as a quantile of Student's t and of the normal distribution.
+CONFIDENCE = 0.975
+# Smallest scale of standard deviations, for residuals that are exactly zero.
+MIN_SCALE = 1e-9
+# Number of random folds of the cross-validation.
+N_FOLDS = 5
+# So few configurations are held out one by one instead.
+MAX_LEAVE_ONE_OUT = 10
+# Largest number of iterations of a fold's own fit.
+MAX_REFIT_ITERATIONS = 100
+# Rows left over by no more than this fraction of all count as none: rounding.
+MIN_FREEDOM_RATIO = 1e-6
+# Smallest share of the variance of correlated residuals that counts as an error of the model. Stated standard
+# deviations of an instrument may be too large.
+MIN_MODEL_SHARE = 0.5
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FittedModel:
+    """Model that was fitted to measurements, with the uncertainty of its parameters.
+
+    Attributes:
+        errors: Nominal chain and its p_robot unknown error parameters; unknown base and tool frames are
+            initialized from the data.
+        x: Identified errors of the robot, then of the instruments relative to their initial values, shape
+            (p,) [m or rad, or the unit of the parameter].
+        chain: Calibrated chain.
+        data: Fitted measurements.
+        holdout: Measurements that were held out.
+        problem: Least-squares problem with the final standard deviations, sample weights and priors.
+        solution: Solution of `problem`.
+        method: "lm" or "gn".
+        weights: Robust weight of each fitted sample, one array of shape (m,) per measurement; 0 if rejected.
+        shrinkage_factor: Factor c in `x = c · solution.x`; below 1 if there are too few measurements, see
+            `shrinkage`.
+        extension: Families of joint errors that were added, and how much the samples count; None if nothing
+            was tried.
+    """
+
+    errors: ErrorModel
+    x: Array
+    chain: Chain
+    data: tuple[Measurement, ...]
+    holdout: tuple[Measurement, ...]
+    problem: Problem
+    solution: SolverResult
+    method: str
+    weights: tuple[Array, ...]
+    shrinkage_factor: float = 1.0
+    extension: Extension | None = None
+
+    @property
+    def model(self) -> pin.Model:
+        """Pinocchio model with the calibrated joint placements."""
+        return self.chain.model
+
+    @cached_property
+    def nominal_refitted(self) -> Chain:
+        """Nominal chain with unknown base and tool fitted to the same inliers.
+
+        The accuracy before and after a calibration thus differs by the errors of the robot alone.
+        """
+        return self._nominal[0]
+
+    @cached_property
+    def _nominal(self) -> tuple[Chain, dict[str, float]]:
+        """`nominal_refitted` and the instrument parameters that fit it best."""
+        nominal = self.errors if self.shrinkage_factor else ErrorModel(self.chain, ())
+        return fit_nominal(nominal, self.inliers, self.problem.known)
+
+    @property
+    def nominal_instruments(self) -> dict[str, float]:
+        """Values of the instrument parameters that fit `nominal_refitted` best, by name [m or rad]."""
+        return self._nominal[1]
+
+    @property
+    def inlier_problem(self) -> Problem:
+        """`problem` without rejected samples; its measurements correspond to `inliers`."""
+        return self.problem.with_data(self._without_rejected(self.problem.data))
+
+    @property
+    def inliers(self) -> list[Measurement]:
+        """Fitted measurements without rejected samples."""
+        return self._without_rejected(self.data)
+
+    def _without_rejected(self, data: Sequence[Measurement]) -> list[Measurement]:
+        """Remove the samples of zero weight from measurements that correspond to `data`."""
+        inliers = [item.take(w > robust.ZERO_WEIGHT) for item, w in zip(data, self.weights, strict=True)]
+        return [item for item in inliers if len(item.rows)]
+
+    @property
+    def has_joint_values(self) -> bool:
+        """Whether the joint positions of all samples were measured, so that joint space has a meaning."""
+        return has_joint_values(self.data)
+
+    @property
+    def converged(self) -> bool:
+        """Whether the last step was negligible."""
+        return self.solution.converged
+
+    @property
+    def iterations(self) -> int:
+        """Number of iterations."""
+        return self.solution.iterations
+
+    @property
+    def n_samples(self) -> int:
+        """Number of fitted samples, rejected ones included."""
+        return sum(len(d.rows) for d in self.data)
+
+    @property
+    def n_inliers(self) -> int:
+        """Number of fitted samples without rejected ones."""
+        return sum(len(item.rows) for item in self.inliers)
+
+    @property
+    def sample_count(self) -> str:
+        """Number of samples that the fit used, such as "60 samples" or "57 of 60 samples"."""
+        used = "" if self.n_inliers == self.n_samples else f"{self.n_inliers} of "
+        return f"{used}{self.n_samples} samples"
+
+    @cached_property
+    def rank(self) -> int:
+        """Number of observable directions in parameter space, without priors."""
+        return qr.rank(self.solution.system.r)
+
+    @property
+    def condition(self) -> float:
+        """Ratio of the largest to the smallest singular value of the observable directions."""
+        return qr.condition(self.solution.system.r)
+
+    @property
+    def observability_indices(self) -> dict[str, float]:
+        """Observability indices O1 to O5; see `identifiability.observability_indices`."""
+        return observability.observability_indices(self.solution.system.r, self.n_inliers)
+
+    @property
+    def prior_std(self) -> Array:
+        """Standard deviations before the measurement, (p,): of the priors used, else of the default ones."""
+        default = np.array([parameter.prior for parameter in self.parameters])
+        weights = self.problem.prior_weights
+        return np.where(weights > 0, 1 / np.where(weights > 0, weights, 1.0), default)
+
+    @property
+    def posterior_to_prior_std(self) -> Array:
+        """Ratio of `std` to `prior_std`, (p,): 0 for a well-known parameter, 1 or more for an unknown one."""
+        return self.std / self.prior_std
+
+    @property
+    def correlation(self) -> Array:
+        """Correlation matrix of x, (p, p); NaN for parameters of infinite variance."""
+        return observability.correlation(self.covariance)
+
+    @cached_property
+    def degrees_of_freedom(self) -> float:
+        """Number of weighted rows minus the effective number of parameters that the data determine."""
+        count = sum(n_rows for _, _, n_rows in self._row_counts)
+        freedom = count - float(np.sum((self.solution.system.r @ self._sqrt_covariance[0]) ** 2))
+        return freedom if freedom > MIN_FREEDOM_RATIO * count else 0.0
+
+    @cached_property
+    def _row_counts(self) -> list[tuple[str, bool, float]]:
+        """Unit, whether sigmas are stated, and weighted number of rows of each residual group."""
+        counts = []
+        for item, weights in zip(self.data, self.weights, strict=True):
+            frames = self.chain.forward_kinematics(item.configurations())
+            residual = item.residual(frames, self.problem.instrument_values_of(item, self.x))
+            counts += [
+                (group.unit, item.has_stated_sigma, len(residual[group.rows]) * weights.sum())
+                for group in item.residual_groups.values()
+            ]
+        return counts
+
+    @property
+    def noise_degrees_of_freedom(self) -> float:
+        """Degrees of freedom of the least known noise scale; infinite if all sigmas are stated.
+
+        The residual groups share the loss of degrees of freedom in proportion to their rows. A group with few
+        rows takes the common scale of its unit, as in `reweighting.estimate_variance_components`.
+        """
+        estimated = [(unit, count) for unit, is_stated, count in self._row_counts if not is_stated]
+        if not estimated:
+            return np.inf
+        least = min(
+            count
+            if count > self.rank
+            else sum(other for other_unit, other in estimated if other_unit == unit)
+            for unit, count in estimated
+        )
+        return self.degrees_of_freedom * least / sum(count for _, _, count in self._row_counts)
+
+    @property
+    def unit_weight_std(self) -> float:
+        """Standard deviation σ0 of the whitened residuals, about 1; NaN without degrees of freedom."""
+        system = self.solution.system
+        cost = system.min_cost + float(np.sum(system.z**2))
+        return float(np.sqrt(cost / self.degrees_of_freedom)) if self.degrees_of_freedom else float("nan")
+
+    @cached_property
+    def _sigma_scale(self) -> float:
+        """Factor to the standard deviations of the whitened rows; NaN if it cannot be determined.
+
+        A noise scale that is estimated from few rows is uncertain itself, and the errors then have Student's
+        t distribution. The factor widens the standard deviations so that ±1.96 of them contain 95 % of it.
+        """
+        if all(item.has_stated_sigma for item in self.data):
+            surprise = (
+                1 + CONTRADICTION_SIGMAS * np.sqrt(2 / self.degrees_of_freedom)
+                if self.degrees_of_freedom
+                else np.inf
+            )
+            # Also without degrees of freedom, where the scale is not a number.
+            if not self.unit_weight_std**2 > surprise:
+                return 1.0
+            return self.unit_weight_std * _student_ratio(self.degrees_of_freedom)
+        return self.unit_weight_std * _student_ratio(self.noise_degrees_of_freedom)
+
+    @cached_property
+    def _sqrt_covariance(self) -> tuple[Array, Array]:
+        """Square root of the covariance (p, r) and unbounded directions (p, h), with sigmas as fitted."""
+        return self.solution.system.sqrt_covariance(self.problem.weights)
+
+    @cached_property
+    def _scaled_sqrt_covariance(self) -> tuple[Array, Array]:
+        """As `_sqrt_covariance`, with the sigmas scaled and the error of shrinkage as a further column."""
+        root, unbounded = self._sqrt_covariance
+        scale, system = self._sigma_scale, self.solution.system
+        if np.isnan(scale) or scale == 1:
+            root = root * scale
+        else:
+            # Scale the measured rows only; priors are not measurements.
+            scaled = TriangularSystem(system.rows / max(scale, MIN_SCALE))
+            root, unbounded = scaled.sqrt_covariance(self.problem.weights)
+        # The variance of correlated residuals counts T times against the priors.
+        root = root * np.sqrt(self.problem.temperature)
+        # The part of the correction that was not applied is an error of its own.
+        not_applied = (self.solution.x - self.x)[:, None]
+        return (np.concatenate([root, not_applied], 1) if self.shrinkage_factor < 1 else root), unbounded
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance matrix of x, (p, p); infinite on the diagonal if nothing determines a parameter.
+
+        Stated standard deviations are used unless the residuals contradict them. NaN if standard deviations
+        are not stated and there are no degrees of freedom to estimate the noise.
+        """
+        root, unbounded = self._scaled_sqrt_covariance
+        out = root @ root.T
+        unknown = np.sum(unbounded**2, 1) > UNBOUNDED_TOL
+        out[unknown, unknown] = np.inf
+        return out
+
+    @property
+    def uncertainty(self) -> Uncertainty:
+        """Uncertainty of the robot without that of the instruments, for predictions and for the sidecar."""
+        return self._uncertainty
+
+    @cached_property
+    def _uncertainty(self) -> Uncertainty:
+        root, unbounded = self._scaled_sqrt_covariance
+        robot = len(self.errors.parameters)
+        # Predictions agree with the errors of left-out regions, see `model_selection`.
+        scale = self.extension.prediction_scale if self.extension else 1.0
+        uncertainty = Uncertainty.from_errors(
+            self.errors,
+            self.x[:robot],
+            self.chain,
+            scale * root[:robot],
+            unbounded[:robot],
+            self.problem.temperature,
+            self._model_std if self.problem.temperature > 1 else (0.0, 0.0),
+        )
+        if self.rank == len(self.x) or not robot:
+            return uncertainty
+        # Even a small last step rotates the null space, so take the Jacobian at x.
+        system = linearize_and_factor(self.problem, self.x, small_angle=False)
+        null_space = qr.null_space(system.r)[:robot]
+        undetermined = Uncertainty.from_errors(
+            self.errors, self.x[:robot], self.chain, null_space, null_space[:, :0]
+        )
+        q, _ = different_configurations(self.inliers)
+        return separate_frames(uncertainty, undetermined.sqrt_covariance, q)
+
+    @property
+    def has_free_frames(self) -> bool:
+        """Whether the measurements leave the pose of base or tool free, at least in part."""
+        return self.uncertainty.has_free_frames
+
+    @property
+    def relative(self) -> Uncertainty:
+        """Uncertainty relative to the base and tool poses that fit the fitted samples best.
+
+        It is that of `predict` if the measurements determine these poses. Images of a board do not.
+        """
+        return self.uncertainty.relative
+
+    @property
+    def _model_std(self) -> tuple[float, float]:
+        """Standard deviation of what the model lacks, per axis, of lengths [m] and of angles [rad].
+
+        It is that of the residuals of the inliers, without the noise of the instrument where it is stated.
+        """
+        squares: dict[str, list[Array]] = {"m": [], "rad": []}
+        n_rows = sum(count for _, _, count in self._row_counts)
+        per_freedom = n_rows / self.degrees_of_freedom if self.degrees_of_freedom else 1.0
+        for item, errors in zip(
+            self.inliers, compute_errors(self.chain, self.inliers, self.instruments), strict=True
+        ):
+            whitened = item.residual(
+                self.chain.forward_kinematics(item.configurations()),
+                np.array([self.instruments[parameter.name] for parameter in item.instrument_parameters]),
+            )
+            for name, group in item.residual_groups.items():
+                share = 1.0
+                if item.has_stated_sigma:
+                    noise = 1 / (per_freedom * max(float(np.mean(whitened[group.rows] ** 2)), 1.0))
+                    share = max(1 - noise, MIN_MODEL_SHARE)
+                squares.get(group.unit, []).append(share * np.ravel(errors[name]) ** 2)
+        length, angle = (
+            float(np.sqrt(per_freedom * np.mean(np.concatenate(parts)))) if parts else 0.0
+            for parts in squares.values()
+        )
+        return length, angle
+
+    def predict(self, q: Array) -> Prediction:
+        """Predict tool poses and their covariance.
+
+        The covariance of the identified errors is propagated to the tool to first order. Where residuals are
+        correlated, errors that the model lacks are added. Noise of a future measurement is not included.
+
+        Args:
+            q: Joint positions, (m, n) [rad or m].
+
+        Returns:
+            Poses in the measuring frame with their covariances.
+        """
+        return self.uncertainty.predict(q)
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations of x, (p,) [m or rad, or the unit of the parameter]."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def observable_fraction(self) -> Array:
+        """Fraction of each parameter that lies in the observable directions, (p,), 0 to 1."""
+        return observability.observable_fraction(self.solution.system.r)
+
+    @property
+    def parameters(self) -> tuple[ErrorParameter | InstrumentParameter, ...]:
+        """Parameters of the robot, then of the instruments, in the order of x."""
+        return (*self.errors.parameters, *self.problem.instrument_parameters)
+
+    @property
+    def instruments(self) -> dict[str, float]:
+        """Values of the instrument parameters by name [m or rad].
+
+        A parameter that no fitted sample depends on, such as a point that only hold-out samples touch, is not
+        among them.
+        """
+        is_used = np.any(self.solution.system.r != 0, 0)[len(self.errors.parameters) :]
+        unused = {
+            p.name for p, used in zip(self.problem.instrument_parameters, is_used, strict=True) if not used
+        }
+        return {name: v for name, v in self.problem.instruments(self.x).items() if name not in unused}
+
+    @cached_property
+    def studentized_residuals(self) -> tuple[Array, ...]:
+        """Studentized residual of each fitted sample, one array of shape (m,) per measurement."""
+        data = [item.with_weights(1 / w) for item, w in zip(self.problem.data, self.weights, strict=True)]
+        return tuple(robust.studentized_residuals(self.problem, self.solution, data, self.weights))
+
+    @cached_property
+    def outliers(self) -> tuple[Array, ...]:
+        """Lines of the outliers of each fitted measurement; numbers from 1 for samples from Python.
+
+        Outliers are the samples that were rejected and those whose studentized residual is large.
+        """
+        return tuple(
+            item.rows[(residuals > robust.OUTLIER_THRESHOLD) | (weights <= robust.ZERO_WEIGHT)]
+            for item, residuals, weights in zip(
+                self.data, self.studentized_residuals, self.weights, strict=True
+            )
+        )
+
+    @property
+    def transferable_instruments(self) -> dict[str, float]:
+        """Values of the instrument parameters that hold for other measurements, too, by name [m or rad]."""
+        local = {parameter.name for parameter in self.problem.instrument_parameters if parameter.is_local}
+        return {name: value for name, value in self.instruments.items() if name not in local}
+
+    @property
+    def rig(self) -> MountedRig | None:
+        """Cameras and boards with their estimated poses and lenses; None without image coordinates."""
+        for item in self.data:
+            if isinstance(item, CameraCorners):
+                return item.solved_rig(self.instruments)
+        return None
+
+    @property
+    def pose_std(self) -> float:
+        """Largest standard deviation of the position of a camera or a board in its link [m].
+
+        It is that along the worst direction; 0 if all of these positions are known, or if they cannot be told
+        apart from an unknown base or tool.
+        """
+        if self.errors.only_frames():
+            return 0.0
+        index = {p.name: i for i, p in enumerate(self.parameters)}
+        largest = 0.0
+        for name in index:
+            entry, _, component = name.rpartition(".")
+            if component == "x" and entry.startswith(("camera_", "board_")):
+                position = [index[f"{entry}.{axis}"] for axis in "xyz"]
+                block = self.covariance[np.ix_(position, position)]
+                is_known = np.isfinite(block).all()
+                largest = max(largest, float(np.linalg.eigvalsh(block)[-1]) if is_known else np.inf)
+        return float(np.sqrt(largest))
+
+    def refit(self, problem: Problem, start: Array) -> Array:
+        """Fit some of the samples by the same method.
+
+        If there are parameters without a prior, the fit starts from the nominal robot, as the values of
+        undetermined parameters in x contain information of all samples. If this calibration did not converge,
+        the fit stops after as many iterations.
+
+        Args:
+            problem: `self.problem` with a part of its samples.
+            start: Approximate solution, shape (p,) [m or rad].
+
+        Returns:
+            Solution x, shape (p,) [m or rad].
+        """
+        nominal = np.zeros_like(self.x)
+        if self.converged and problem.weights.all():
+            return next_iterate(problem, minimize(problem, "lm", start, MAX_REFIT_ITERATIONS, loose=True))
+        if not self.converged:
+            with suppress(DhcalError):  # method "gn" may diverge on few samples
+                return minimize(problem, self.method, nominal, self.iterations).x
+        return minimize(problem, "lm", nominal, MAX_REFIT_ITERATIONS).x
+
+    def validate(self, data: Measurement | Sequence[Measurement]) -> Accuracy:
+        """Compute the accuracy of the calibrated chain on other measurements.
+
+        Args:
+            data: One measurement or several, in the frames of the fitted ones.
+
+        Returns:
+            Error statistics, which can also be indexed by the keys of the JSON document, such as
+            "position_rms_m" [m] and "orientation_rms_rad" [rad].
+        """
+        return accuracy(self.chain, as_measurements(data), self.instruments)
+
+    def is_converged(self, eps: float = 1e-6) -> bool:
+        """Check convergence with a fresh Gauss-Newton step from the solution.
+
+        Args:
+            eps: Largest RMS change of the whitened rows by that step, in standard deviations.
+
+        Returns:
+            Whether the step changes them by less.
+        """
+        system = linearize_and_factor(self.problem, self.solution.x, small_angle=False)
+        with_priors = system.with_priors(self.problem.weights, self.solution.x)
+        step = bounded_step(self.problem, with_priors, self.solution.x)
+        return float(np.linalg.norm(with_priors.r @ step)) <= eps * np.sqrt(max(1, self.n_samples))
+
+
+def _student_ratio(degrees_of_freedom: float) -> float:
+    """Return the 97.5 % quantile of Student's t distribution relative to that of the normal distribution."""
+    from scipy.special import ndtri, stdtrit  # lazy import: a third of the import time of this package
+
+    if not degrees_of_freedom:
+        return np.nan
+    return float(stdtrit(degrees_of_freedom, CONFIDENCE) / ndtri(CONFIDENCE))
