@@ -30,14 +30,12 @@ import numpy as np
 from .._typing import Array, Progress
 from ..estimation import robust
 from ..estimation.error_model import ErrorModel
-from ..estimation.initialization import fit_frames, gross_outliers, initialize_frames, make_problem
+from ..estimation.initialization import gross_outliers, initialize_frames, make_problem
 from ..estimation.parameters import EXTENSIONS, fold_harmonics, select_parameters
 from ..estimation.priors import PriorGroups, Priors, has_default_prior, prior_weights
 from ..estimation.problem import (
     Problem,
-    UnfactoredSystem,
     merge_instrument_parameters,
-    uses_normal_equations,
 )
 from ..estimation.solver import METHODS, minimize
 from ..estimation.trimmed_squares import find_initial_outliers
@@ -48,30 +46,18 @@ from ..parallel import SERIAL, TaskExecutor
 from ..robot.chain import BASE_FRAME, Chain
 from . import model_selection
 from .cameras import (
-    DEFAULT_SETS,
-    LARGE_ERROR,
-    HandEyeFit,
-    apply_gate,
-    axis_stages,
     default_sets,
     exchange_axes,
-    find_board_size,
-    fitted_error,
     has_images,
     held_values,
-    judge_stages,
-    judge_target_points,
-    lens_prior_groups,
     reorder,
     require_joint_values,
-    seen_ranges_warning,
     split_sets,
-    with_lens_priors,
     with_stated_distortion,
 )
+from .cameras.procedure import ImageFitting, calibrate_images, require_no_selection
 from .cross_validation import leave_regions_out
-from .model_selection import Extension
-from .result import Result
+from .result import Result, make_result
 from .reweighting import Fit, reweight
 from .shrinkage import compute_shrinkage_factor
 
@@ -169,11 +155,8 @@ def calibrate(
     known = {**held_values(data, rig_sets), **_validated_known(data, known or {})}
     errors = select_parameters(chain, robot_sets, fix, free) if robot_sets or free else ErrorModel(chain, ())
     families = _extension_families(extend, errors, method, priors)
-    if has_images(data) and families and extend not in (None, "auto"):
-        raise InvalidArgumentError(
-            f"extend {','.join(families)!r}: families of joint errors are not selected from images; name "
-            f"them among the parameters, as in {DEFAULT_SETS.replace('offset', f'offset,{families[0]}', 1)}"
-        )
+    if has_images(data):
+        require_no_selection(extend, families)
     is_robust = method == "lm" and loss != "linear"
     errors, data, weights = _initialize(errors, data, known, max_iterations, is_robust)
     data, distortion = with_stated_distortion(data)
@@ -182,51 +165,43 @@ def calibrate(
         problem = problem.with_prior_weights(np.zeros(len(problem.weights)))
     if bounds:
         problem = replace(problem, bounds=_bounds(problem, bounds))
+    fit = _solve(problem, _start(problem, distortion), weights, method, max_iterations, progress)
+    if method != "lm":
+        return make_result(fit, 1.0, holdout, method)
+    groups = PriorGroups.from_expected(errors, problem.weights, has_default_prior(errors, priors))
+    stages = robust.LOSSES[loss].stages
+    if has_images(data) and priors != "none":
+        fitting = ImageFitting(groups, stages, max_iterations, progress)
+        return calibrate_images(fitting, fit, chain, holdout, exchanges)
+    fit = reweight(fit, stages, groups, max_iterations, progress)
+    return _calibrate_samples(fit, groups, families, holdout, max_iterations, progress)
+
+
+def _start(problem: Problem, distortion: Mapping[str, float]) -> Array:
+    """Return the start x (p,) of the solver: the nominal robot, and lenses with the distortion of the rig."""
     start = np.zeros(len(problem.weights))
-    for i, parameter in enumerate(problem.instrument_parameters, len(errors.parameters)):
+    for i, parameter in enumerate(problem.instrument_parameters, len(problem.errors.parameters)):
         start[i] = distortion.get(parameter.name, parameter.nominal) - parameter.nominal
-    fit = _solve(problem, start, weights, method, max_iterations, progress)
-    shrinkage_factor = 1.0
-    if method == "lm":
-        groups = PriorGroups.from_expected(errors, problem.weights, has_default_prior(errors, priors))
-        stages_of_loss = robust.LOSSES[loss].stages
-        scaled = groups.joined(lens_prior_groups(problem)) if priors != "none" else groups
-        fit = reweight(fit, stages_of_loss, scaled, max_iterations, progress)
-        if has_images(data) and priors != "none":
-            points = judge_target_points(fit, max_iterations)
-            if points is not None and points.is_kept:
-                scaled = groups.joined(lens_prior_groups(points.fit.problem))
-                fit = reweight(points.fit, stages_of_loss, scaled, max_iterations, progress)
-            ungated = with_lens_priors(fit)
-            gated = apply_gate(ungated, groups, max_iterations)
-            fit, gate = gated.fit, gated.gate
-            stages = judge_stages(ungated, gated, points, max_iterations)
-            extension = Extension(temperature=gate.temperature, n_configurations=gate.n_configurations)
-            result = _make_result(fit, 1.0, holdout, method)
-            warnings = [exchange.sentence for exchange in exchanges]
-            if errors.has_arm:
-                warning = seen_ranges_warning(chain, fit.data) if gate.is_open else gate.sentence
-                warnings += [warning] if warning else []
-            if gate.is_open and fitted_error(fit).pixels < LARGE_ERROR:
-                result = replace(result, board_size=find_board_size(ungated))
-            else:
-                frames = gated.nominal if errors.has_arm else ungated
-                result = replace(result, hand_eye_fit=HandEyeFit(frames, result.pose_std, holdout))
-            return replace(
-                result,
-                extension=extension,
-                input_warnings=tuple(warnings),
-                camera_stages=(*axis_stages(exchanges), *stages),
-            )
-        shrinkage_factor = compute_shrinkage_factor(
-            fit.without_rejected().problem, fit.solution, groups.groups()
-        )
-    result = _make_result(fit, shrinkage_factor, holdout, method)
+    return start
+
+
+def _calibrate_samples(
+    fit: Fit,
+    groups: PriorGroups,
+    families: Sequence[str],
+    holdout: tuple[Measurement, ...],
+    max_iterations: int,
+    progress: Progress | None,
+) -> Result:
+    """Shrink the correction of a fit where the data are too few, and add families of joint errors."""
+    inliers = fit.without_rejected().problem
+    shrinkage_factor = compute_shrinkage_factor(inliers, fit.solution, groups.groups())
+    result = make_result(fit, shrinkage_factor, holdout, "lm")
     # Residuals of mixed-up measurements say nothing about other errors.
     if not families or shrinkage_factor < 1 or result.diagnosis.hypotheses:
         return result
     fit, extension = model_selection.extend(fit, families, max_iterations, progress)
-    return replace(_make_result(fit, shrinkage_factor, holdout, method), extension=extension)
+    return replace(make_result(fit, shrinkage_factor, holdout, "lm"), extension=extension)
 
 
 def _initialize(
@@ -355,34 +330,3 @@ def _solve(
     problem = replace(problem, errors=errors.with_current_loads(solution.x[: len(errors.parameters)]))
     second = minimize(problem, method, solution.x, max_iterations, **options)
     return replace(fit, problem=problem, solution=second, previous_iterations=solution.iterations)
-
-
-def _make_result(
-    fit: Fit,
-    shrinkage_factor: float,
-    holdout: tuple[Measurement, ...],
-    method: str,
-) -> Result:
-    """Apply the shrinkage factor to the solution of a fit and build the result."""
-    problem, errors = fit.problem, fit.problem.errors
-    solution = replace(fit.solution, iterations=fit.iterations)
-    if uses_normal_equations(problem):
-        # Rank and null space need the R factor of the rows.
-        solution = replace(solution, system=UnfactoredSystem(problem, solution.x))
-    x = shrinkage_factor * fit.solution.x
-    if shrinkage_factor:
-        calibrated = errors.at(x[: len(errors.parameters)]).with_current_loads()
-    else:
-        calibrated = fit_frames(errors, fit.data, problem.known)
-    return Result(
-        errors=errors,
-        x=x,
-        chain=calibrated,
-        data=fit.data,
-        holdout=holdout,
-        problem=problem,
-        solution=solution,
-        method=method,
-        weights=fit.weights,
-        shrinkage_factor=shrinkage_factor,
-    )

@@ -9,16 +9,18 @@ import numpy as np
 
 from .. import formatting
 from .._typing import Array
+from ..estimation.initialization import fit_frames
+from ..estimation.problem import UnfactoredSystem, uses_normal_equations
 from ..identifiability import explanations
+from ..measurements.base import Measurement
 from ..measurements.groups import ERROR_GROUPS, error_group
 from ..result_plots import ResultPlots
 from . import summary
 from .estimates import Estimate, make_estimates
-from .evaluation import (
-    compute_errors,
-)
+from .evaluation import compute_errors
 from .evidence import Evidence
 from .residual_table import ResidualTable, residual_table
+from .reweighting import Fit
 from .verdict import Verdict, judge
 
 
@@ -120,3 +122,34 @@ class Result(Evidence, ResultPlots):
         tables = (summary.accuracy_table(self.comparisons), summary.estimate_table(self.estimates))
         html = "".join(f"<p>{text}</p>" for text in paragraphs)
         return "\n".join([html, *map(formatting.html_table, tables)])
+
+
+def make_result(
+    fit: Fit,
+    shrinkage_factor: float,
+    holdout: tuple[Measurement, ...],
+    method: str,
+) -> Result:
+    """Apply the shrinkage factor to the solution of a fit and build the result."""
+    problem, errors = fit.problem, fit.problem.errors
+    solution = replace(fit.solution, iterations=fit.iterations)
+    if uses_normal_equations(problem):
+        # Rank and null space need the R factor of the rows.
+        solution = replace(solution, system=UnfactoredSystem(problem, solution.x))
+    x = shrinkage_factor * fit.solution.x
+    if shrinkage_factor:
+        calibrated = errors.at(x[: len(errors.parameters)]).with_current_loads()
+    else:
+        calibrated = fit_frames(errors, fit.data, problem.known)
+    return Result(
+        errors=errors,
+        x=x,
+        chain=calibrated,
+        data=fit.data,
+        holdout=holdout,
+        problem=problem,
+        solution=solution,
+        method=method,
+        weights=fit.weights,
+        shrinkage_factor=shrinkage_factor,
+    )

@@ -1,0 +1,96 @@
+"""Calibration from images: cameras, boards and lenses first, then the arm where left-out images demand it.
+
+After the first fit these stages follow:
+
+1. Widths of the priors of lenses and noise of the corners (`lens_priors`, `reweighting`).
+2. Corners of boards as unknowns, where they improve left-out images (`target_points`).
+3. The gate decides how far the arm is corrected (`gate`).
+4. A wrong size of the boards, or the cause of a large error of a hand-eye calibration, is looked for
+   (`board_size`, `diagnosis`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from ..._typing import Progress
+from ...estimation.priors import PriorGroups
+from ...exceptions import InvalidArgumentError
+from ...measurements.base import Measurement
+from ...robot.chain import Chain
+from ..model_selection import Extension
+from ..result import Result, make_result
+from ..reweighting import Fit, reweight
+from .axis_order import Exchange, axis_stages
+from .board_size import find_board_size
+from .diagnosis import LARGE_ERROR, HandEyeFit
+from .gate import apply_gate, judge_stages, judge_target_points
+from .lens_priors import lens_prior_groups, with_lens_priors
+from .seen_ranges import seen_ranges_warning
+from .sets import DEFAULT_SETS
+from .stages import fitted_error
+
+
+def require_no_selection(extend: str | Sequence[str] | None, families: Sequence[str]) -> None:
+    """Raise an error if families of joint errors shall be selected from images."""
+    if families and extend not in (None, "auto"):
+        raise InvalidArgumentError(
+            f"extend {','.join(families)!r}: families of joint errors are not selected from images; name "
+            f"them among the parameters, as in {DEFAULT_SETS.replace('offset', f'offset,{families[0]}', 1)}"
+        )
+
+
+@dataclass(frozen=True)
+class ImageFitting:
+    """Settings of the fits of images.
+
+    Attributes:
+        groups: Groups of priors of the robot, whose widths are estimated.
+        stages: Stages of the robust loss.
+        max_iterations: Largest number of iterations of one solution.
+        progress: Function that is called with the progress, if any.
+    """
+
+    groups: PriorGroups
+    stages: tuple[str, ...]
+    max_iterations: int
+    progress: Progress | None
+
+    def reweight(self, fit: Fit) -> Fit:
+        """Estimate noise, weights and widths of priors, those of lenses included."""
+        groups = self.groups.joined(lens_prior_groups(fit.problem))
+        return reweight(fit, self.stages, groups, self.max_iterations, self.progress)
+
+
+def calibrate_images(
+    fitting: ImageFitting,
+    fit: Fit,
+    chain: Chain,
+    holdout: tuple[Measurement, ...],
+    exchanges: Sequence[Exchange],
+) -> Result:
+    """Calibrate from images, starting from a first fit."""
+    has_arm = fit.problem.errors.has_arm
+    fit = fitting.reweight(fit)
+    points = judge_target_points(fit, fitting.max_iterations)
+    if points is not None and points.is_kept:
+        fit = fitting.reweight(points.fit)
+    ungated = with_lens_priors(fit)
+    gated = apply_gate(ungated, fitting.groups, fitting.max_iterations)
+    stages = judge_stages(ungated, gated, points, fitting.max_iterations)
+    gate = gated.gate
+    warnings = [exchange.sentence for exchange in exchanges]
+    if has_arm:
+        warning = seen_ranges_warning(chain, gated.fit.data) if gate.is_open else gate.sentence
+        warnings += [warning] if warning else []
+    result = replace(
+        make_result(gated.fit, 1.0, holdout, "lm"),
+        extension=Extension(temperature=gate.temperature, n_configurations=gate.n_configurations),
+        input_warnings=tuple(warnings),
+        camera_stages=(*axis_stages(exchanges), *stages),
+    )
+    if gate.is_open and fitted_error(gated.fit).pixels < LARGE_ERROR:
+        return replace(result, board_size=find_board_size(ungated))
+    frames = gated.nominal if has_arm else ungated
+    return replace(result, hand_eye_fit=HandEyeFit(frames, result.pose_std, holdout))
