@@ -199,7 +199,7 @@ def _robot_with_meshes() -> dict[str, bytes]:
 def _journal() -> bytes:
     """Return the journal of a study that was interrupted."""
     with _folder({}), contextlib.redirect_stderr(io.StringIO()):
-        with mock.patch("dhcal_pin.cli.study._write_results", side_effect=KeyboardInterrupt):
+        with mock.patch("dhcal_pin.cli.commands.study._write_results", side_effect=KeyboardInterrupt):
             main(["study", "s.study.toml", "-o", "s.csv", "--quiet"])
         return Path("s.csv.part").read_bytes()
 

@@ -19,9 +19,6 @@ import dhcal_pin
 PACKAGE = Path(dhcal_pin.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
 PACKAGES = sorted({path.parent for path in FILES} - {PACKAGE, PACKAGE / "data"})
-COMMANDS = set(
-    "app calibrate doctor inspect validate convert simulate check demo plan compensate study view".split()
-)
 # Parts of sentences that new users could not understand.
 UNCLEAR = [
     "stay unseen",
@@ -146,8 +143,6 @@ def test_imports_have_no_circle():
 @pytest.mark.parametrize("folder", [PACKAGE, *PACKAGES], ids=lambda folder: folder.name)
 def test_packages_are_small_and_say_what_belongs_there(folder):
     modules = {path.stem for path in folder.glob("*.py")} - {"__init__", "__main__"}
-    if folder.name == "cli":
-        modules -= COMMANDS
     assert len(modules) <= 16
     assert len(ast.get_docstring(ast.parse((folder / "__init__.py").read_text(encoding="utf-8"))) or "") > 60
 
@@ -156,7 +151,7 @@ def test_packages_are_small_and_say_what_belongs_there(folder):
 def test_exported_names_exist_and_hide_no_module(folder):
     package = import_module(".".join(["dhcal_pin", *folder.relative_to(PACKAGE).parts]))
     exported = getattr(package, "__all__", [])
-    assert exported or folder.name == "cli"
+    assert exported or "cli" in folder.parts[-2:]
     assert [name for name in exported if not hasattr(package, name)] == []
     assert set(exported) & {path.stem for path in folder.glob("*.py")} == set()
 

@@ -37,12 +37,12 @@ from ..io.tabular import csv_text
 from ..io.toml_table import TomlTable
 from ..messages import message_line
 from ..parallel import end_with_parent
-from . import console
 from .job import Job, option_flags
 from .options import STDOUT, IntegerType
 from .outputs import forget_written_files, require_writable_outputs, write_outputs, written_files
 from .run_job import run_job
-from .screen import Block, Screen
+from .screens import console
+from .screens.screen import Block, Screen
 
 OK, CAUTION, REFUSED, FAILED = "ok", "caution", "refused", "failed"
 

@@ -19,7 +19,7 @@ class Command(NamedTuple):
 
     Attributes:
         name: Word on the command line.
-        module: Module of this package with `EXAMPLE`, `add_arguments(parser)` and `run(args) -> int`.
+        module: Module of `commands` with `EXAMPLE`, `add_arguments(parser)` and `run(args) -> int`.
         help: One line for `dhcal --help`.
     """
 
@@ -65,7 +65,7 @@ class _LazyCommandParser(CommandParser):
         if self._has_arguments:
             return
         self._has_arguments = True
-        module = import_module(f".{self._module}", __package__)
+        module = import_module(f".commands.{self._module}", __package__)
         self.epilog = f"example:\n  {module.EXAMPLE}"
         module.add_arguments(self)
         add_verbosity_options(self)

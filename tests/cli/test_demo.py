@@ -10,7 +10,7 @@ import pytest
 from command_line import KEYS, assert_same_poses, json_of, parse_json, tool_positions
 from robots import URDF
 
-from dhcal_pin.cli import console
+from dhcal_pin.cli.screens import console
 from dhcal_pin.paper import simulations
 
 

@@ -17,7 +17,8 @@ from command_line import CALIBRATE, positions_csv
 from robots import URDF
 from study_runs import SMALL_STUDY
 
-from dhcal_pin.cli import console, outputs, run_job
+from dhcal_pin.cli import outputs, run_job
+from dhcal_pin.cli.screens import console
 from dhcal_pin.saving import transaction
 from dhcal_pin.studies import open_journal, read_study
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from robots import URDF
 
-from dhcal_pin.cli.screen import HEIGHT, WIDTH, Block, Screen, cell_width, fold
+from dhcal_pin.cli.screens.screen import HEIGHT, WIDTH, Block, Screen, cell_width, fold
 from dhcal_pin.formatting import Table
 from dhcal_pin.measurements import KINDS
 

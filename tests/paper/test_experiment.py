@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dhcal_pin.calibration import accuracy, calibrate
-from dhcal_pin.cli import demo
+from dhcal_pin.cli.commands import demo
 from dhcal_pin.diagnostics import find_unreachable_rows
 from dhcal_pin.io import measurement_text, read_measurement_file
 from dhcal_pin.paper import run_experiment

@@ -198,8 +198,8 @@ def test_matplotlib_is_imported_for_plots_only():
     """Commands without a plot must not wait for the import."""
     modules = (
         "dhcal_pin.cli.main",
-        "dhcal_pin.cli.calibrate",
-        "dhcal_pin.cli.study",
+        "dhcal_pin.cli.commands.calibrate",
+        "dhcal_pin.cli.commands.study",
         "dhcal_pin.report.html",
     )
     script = (

@@ -11,14 +11,14 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ..exceptions import InvalidArgumentError
-from .options import JSON
-from .screen import Block, Screen, Verbosity
+from ...exceptions import InvalidArgumentError
+from ..options import JSON
+from ..screens.screen import Block, Screen, Verbosity
 
 if TYPE_CHECKING:
-    from .._typing import PathLike
-    from ..formatting import Table
-    from ..paper import PaperExperiment
+    from ..._typing import PathLike
+    from ...formatting import Table
+    from ...paper import PaperExperiment
 
 EXAMPLE = "dhcal demo --out demo"
 
@@ -34,8 +34,8 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Run experiment and simulations."""
-    from . import console  # lazy import, as the following: they load Pinocchio
-    from .outputs import require_writable_outputs
+    from ..outputs import require_writable_outputs
+    from ..screens import console  # lazy import, as the following: they load Pinocchio
 
     require_writable_outputs([args.json], [])
     document = run_demo(args.out, args.json, args.verbosity)
@@ -48,11 +48,11 @@ def run_demo(
     folder: PathLike, json_target: str | None = None, verbosity: Verbosity = "normal"
 ) -> dict[str, Any]:
     """Run experiment and simulations, show the results and write all files."""
-    from ..calibration.summary import estimate_table  # lazy import, as the following: they load Pinocchio
-    from ..formatting import Table
-    from ..paper import simulations
-    from ..paper.experiment import run_experiment
-    from . import console
+    from ...calibration.summary import estimate_table  # lazy import, as the following: they load Pinocchio
+    from ...formatting import Table
+    from ...paper import simulations
+    from ...paper.experiment import run_experiment
+    from ..screens import console
 
     folder = os.fspath(folder)
     try:
@@ -121,12 +121,12 @@ def _write_results(
     experiment: PaperExperiment, folder: str, sections: Sequence[_Section], json_target: str | None
 ) -> dict[str, Any]:
     """Write URDFs, JSON, summary, scene and report; return the JSON document."""
-    from ..formatting import markdown_table  # lazy import, as the following: they load Pinocchio
-    from ..io import shipped_file, urdf_files
-    from ..report import html
-    from ..report.document import Provenance, file_digests, json_text, result_to_dict
-    from ..visualization import scene_html
-    from .outputs import write_outputs
+    from ...formatting import markdown_table  # lazy import, as the following: they load Pinocchio
+    from ...io import shipped_file, urdf_files
+    from ...report import html
+    from ...report.document import Provenance, file_digests, json_text, result_to_dict
+    from ...visualization import scene_html
+    from ..outputs import write_outputs
 
     names = {
         "urdf": "experiment_calibrated.urdf",

@@ -6,11 +6,11 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from ..calibration.cameras import split_sets
-from ..calibration.estimates import Estimate
-from ..calibration.evaluation import Comparison
-from ..calibration.result import Result
-from ..calibration.summary import (
+from ...calibration.cameras import split_sets
+from ...calibration.estimates import Estimate
+from ...calibration.evaluation import Comparison
+from ...calibration.result import Result
+from ...calibration.summary import (
     DEFINITION_TEXT,
     accuracy_table,
     definition_table,
@@ -19,17 +19,17 @@ from ..calibration.summary import (
     headline,
     regressions,
 )
-from ..calibration.verdict import Verdict
-from ..formatting import Table, format_quantity
-from ..identifiability import EXPECTED, label_unobservable
-from ..io import origin_table
-from ..measurements.base import Measurement
-from ..measurements.camera import CameraCorners
-from ..measurements.groups import ERROR_GROUPS
-from ..measurements.images.names import list_images, whole_images
-from ..report.document import short_names
-from .job import Job
-from .run_job import CalibrationOutcome
+from ...calibration.verdict import Verdict
+from ...formatting import Table, format_quantity
+from ...identifiability import EXPECTED, label_unobservable
+from ...io import origin_table
+from ...measurements.base import Measurement
+from ...measurements.camera import CameraCorners
+from ...measurements.groups import ERROR_GROUPS
+from ...measurements.images.names import list_images, whole_images
+from ...report.document import short_names
+from ..job import Job
+from ..run_job import CalibrationOutcome
 from .screen import Block, Screen, list_first
 
 # Number of corrections that are shown.

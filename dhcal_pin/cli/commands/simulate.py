@@ -7,12 +7,12 @@ import re
 from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING
 
-from ..exceptions import InvalidArgumentError, UnknownNameError
-from .options import NON_NEGATIVE_INTEGER, POSITIVE_INTEGER, ROBOT, add_urdf_options
+from ...exceptions import InvalidArgumentError, UnknownNameError
+from ..options import NON_NEGATIVE_INTEGER, POSITIVE_INTEGER, ROBOT, add_urdf_options
 
 if TYPE_CHECKING:
-    from .._typing import PathLike
-    from ..robot import Chain
+    from ..._typing import PathLike
+    from ...robot import Chain
 
 EXAMPLE = "dhcal simulate arm.dh.toml --truth actual.dh.toml -m 50 --noise 0.1mm,0.01deg -o data.csv"
 
@@ -64,16 +64,16 @@ def run(args: Namespace) -> int:
     """Simulate measurements and write them."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
-    from ..io import measurement_text, read_robot
-    from ..io.rig_file import rig_text
-    from ..io.robot import has_dh_table
-    from ..measurements import KINDS, CameraCorners, Noise
-    from ..robot.sampling import joint_range
-    from ..units import parse_noise
-    from . import console
-    from .outputs import existing_sidecars, require_writable_outputs, write_outputs
-    from .result_screens import files_block
-    from .screen import Screen
+    from ...io import measurement_text, read_robot
+    from ...io.rig_file import rig_text
+    from ...io.robot import has_dh_table
+    from ...measurements import KINDS, CameraCorners, Noise
+    from ...robot.sampling import joint_range
+    from ...units import parse_noise
+    from ..outputs import existing_sidecars, require_writable_outputs, write_outputs
+    from ..screens import console
+    from ..screens.result_screens import files_block
+    from ..screens.screen import Screen
 
     robots = [args.robot, *([args.truth] if args.truth else [])]
     require_writable_outputs([args.output], [*robots, *existing_sidecars(robots)])
@@ -119,7 +119,7 @@ def _with_random_errors(nominal: Chain, length: float, angle: float, seed: int) 
     """Move every joint origin by normally distributed errors, with standard deviations in m and rad."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
-    from ..estimation import select_parameters
+    from ...estimation import select_parameters
 
     errors = select_parameters(nominal, "placement")
     std = np.array([length if parameter.unit == "m" else angle for parameter in errors.parameters])

@@ -8,12 +8,12 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from ..exceptions import InvalidArgumentError
-from .options import FIT_FRAMES, POSITIVE_INTEGER, RIG, ROBOT, add_urdf_options
+from ...exceptions import InvalidArgumentError
+from ..options import FIT_FRAMES, POSITIVE_INTEGER, RIG, ROBOT, add_urdf_options
 
 if TYPE_CHECKING:
-    from ..measurements import Measurement, MountedRig
-    from ..robot import Chain
+    from ...measurements import Measurement, MountedRig
+    from ...robot import Chain
 
 EXAMPLE = "dhcal view ur10.urdf ur10_calibrated.urdf --tip tool0 --data laser.csv --html scene.html"
 
@@ -61,15 +61,15 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Write the page of a robot, or serve a live scene."""
-    from ..diagnostics import FRAMES_WARNING, fit_frames, frames_differ  # lazy import, as the following
-    from ..io import read_measurements, read_robot
-    from ..io.robot import has_dh_table, robot_name
-    from ..io.sidecar import existing_sidecar, read_instrument, read_uncertainty
-    from ..visualization import scene
-    from . import console
-    from .outputs import existing_sidecars, require_writable_outputs, write_outputs
-    from .result_screens import files_block, warnings_block
-    from .screen import Screen
+    from ...diagnostics import FRAMES_WARNING, fit_frames, frames_differ  # lazy import, as the following
+    from ...io import read_measurements, read_robot
+    from ...io.robot import has_dh_table, robot_name
+    from ...io.sidecar import existing_sidecar, read_instrument, read_uncertainty
+    from ...visualization import scene
+    from ..outputs import existing_sidecars, require_writable_outputs, write_outputs
+    from ..screens import console
+    from ..screens.result_screens import files_block, warnings_block
+    from ..screens.screen import Screen
 
     if args.live and (args.html or args.open):
         raise InvalidArgumentError("--live writes no page; omit --html and --open")
@@ -123,8 +123,8 @@ def run(args: Namespace) -> int:
 
 def _rig(path: str | None, sidecar: str | None, chain: Chain) -> MountedRig | None:
     """Return the rig of a file, with poses of the sidecar where it has none, or that of the sidecar."""
-    from ..io.rig_file import read_calibrated_rig, read_rig, with_poses_of  # lazy import, as the following
-    from ..measurements import mount_rig
+    from ...io.rig_file import read_calibrated_rig, read_rig, with_poses_of  # lazy import, as the following
+    from ...measurements import mount_rig
 
     calibrated = read_calibrated_rig(sidecar) if sidecar else None
     rig = read_rig(path) if path else calibrated
@@ -137,8 +137,8 @@ def _serve_live(chains: Sequence[Chain], data: Sequence[Measurement], args: Name
     """Play the measured poses repeatedly in a live scene."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
-    from ..visualization import live
-    from . import console
+    from ...visualization import live
+    from ..screens import console
 
     q = np.concatenate([item.configurations() for item in data] or [np.zeros((1, chains[0].n_joints))])
     with live.serve(*chains, magnification=args.magnification, triangles=args.simplify) as server:

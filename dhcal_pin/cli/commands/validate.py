@@ -6,15 +6,15 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from ..exceptions import InvalidArgumentError
-from .options import COLUMNS, DATA, FIT_FRAMES, JSON, RIG, ROBOT, SKIP_BAD_ROWS, add_urdf_options
+from ...exceptions import InvalidArgumentError
+from ..options import COLUMNS, DATA, FIT_FRAMES, JSON, RIG, ROBOT, SKIP_BAD_ROWS, add_urdf_options
 
 if TYPE_CHECKING:
-    from ..calibration import Accuracy
-    from ..estimation.uncertainty import Predictor
-    from ..io import MeasurementFile
-    from ..measurements import Measurement, MountedRig
-    from ..robot import Chain
+    from ...calibration import Accuracy
+    from ...estimation.uncertainty import Predictor
+    from ...io import MeasurementFile
+    from ...measurements import Measurement, MountedRig
+    from ...robot import Chain
 
 EXAMPLE = "dhcal validate ur10_calibrated.urdf other.csv --tip tool0 --nominal ur10.urdf --fit-frames"
 
@@ -58,22 +58,22 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Compute the accuracy of a model, write it and show it."""
-    from ..calibration import accuracy  # lazy import, as the following: they load Pinocchio
-    from ..diagnostics import FRAMES_WARNING, find_extrapolation, fit_frames, frames_differ
-    from ..io import (
+    from ...calibration import accuracy  # lazy import, as the following: they load Pinocchio
+    from ...diagnostics import FRAMES_WARNING, find_extrapolation, fit_frames, frames_differ
+    from ...io import (
         existing_sidecar,
         read_instrument,
         read_measured_region,
         read_measurement_file,
         read_robot,
     )
-    from ..measurements.position import require_common_reference_target
-    from ..report.document import file_digests, main_statistics, result_to_dict, validation_to_dict
-    from ..report.html import check_html_ending
-    from ..report.workspace_map import map_content
-    from . import console
-    from .outputs import existing_sidecars, json_path, require_writable_outputs, write_outputs
-    from .result_screens import validation_screen
+    from ...measurements.position import require_common_reference_target
+    from ...report.document import file_digests, main_statistics, result_to_dict, validation_to_dict
+    from ...report.html import check_html_ending
+    from ...report.workspace_map import map_content
+    from ..outputs import existing_sidecars, json_path, require_writable_outputs, write_outputs
+    from ..screens import console
+    from ..screens.result_screens import validation_screen
 
     sidecar = args.sidecar or existing_sidecar(args.robot)
     robots = [args.robot, args.nominal] if args.nominal else [args.robot]
@@ -139,8 +139,8 @@ def run(args: Namespace) -> int:
             f"({sidecar}){others}."
         )
     if args.report:
-        from ..io.robot import robot_name  # lazy import, as the following: only for reports
-        from ..report.validation import Validation, validation_page
+        from ...io.robot import robot_name  # lazy import, as the following: only for reports
+        from ...report.validation import Validation, validation_page
 
         document["files"]["report"] = args.report
         contents[args.report] = validation_page(
@@ -176,9 +176,9 @@ def _mounted_rig(args: Namespace, sidecar: str | None, chain: Chain) -> tuple[Mo
 
     Without a rig file, they are those of the sidecar. Other measurements than images need none.
     """
-    from ..io.measurement_files.reading import has_image_coordinates  # lazy import, as the following
-    from ..io.rig_file import read_calibrated_rig, read_rig, with_estimates_of
-    from ..measurements.mounting import mount_rig
+    from ...io.measurement_files.reading import has_image_coordinates  # lazy import, as the following
+    from ...io.rig_file import read_calibrated_rig, read_rig, with_estimates_of
+    from ...measurements.mounting import mount_rig
 
     calibrated = read_calibrated_rig(sidecar) if sidecar else None
     if args.rig:
@@ -211,9 +211,9 @@ def _nominal_accuracy(
     """Compute the accuracy of the nominal robot; fit its base and tool if the calibrated robot has others."""
     import numpy as np  # lazy import, as the following
 
-    from ..calibration import accuracy
-    from ..diagnostics import fit_frames
-    from ..io import read_robot
+    from ...calibration import accuracy
+    from ...diagnostics import fit_frames
+    from ...io import read_robot
 
     nominal = read_robot(args.nominal, args.tip, None, args.package_dir, args.root)
     if nominal.joint_names != chain.joint_names:
@@ -232,8 +232,8 @@ def _nominal_accuracy(
 
 def _input_warnings(chain: Chain, file: MeasurementFile, has_unknown_frames: bool) -> list[str]:
     """List the warnings about a file, rows that the robot cannot reach included; no row is excluded."""
-    from ..diagnostics.input_checks import find_input_warnings  # lazy import: loads Pinocchio
-    from ..diagnostics.reachability import find_unreachable_rows
+    from ...diagnostics.input_checks import find_input_warnings  # lazy import: loads Pinocchio
+    from ...diagnostics.reachability import find_unreachable_rows
 
     unreachable = [] if has_unknown_frames else find_unreachable_rows(chain, file)
     return [
@@ -244,8 +244,8 @@ def _input_warnings(chain: Chain, file: MeasurementFile, has_unknown_frames: boo
 
 def _predictor(chain: Chain, sidecar: str | None, args: Namespace) -> Predictor:
     """Read the uncertainty that the calibration has written beside the robot."""
-    from ..io.sidecar import read_uncertainty  # lazy import: loads Pinocchio
-    from ..report.workspace_map import check_map_ending
+    from ...io.sidecar import read_uncertainty  # lazy import: loads Pinocchio
+    from ...report.workspace_map import check_map_ending
 
     check_map_ending(args.map)
     if args.fit_frames:

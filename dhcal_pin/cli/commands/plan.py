@@ -7,8 +7,8 @@ import re
 from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING, Any
 
-from ..exceptions import InvalidArgumentError
-from .options import (
+from ...exceptions import InvalidArgumentError
+from ..options import (
     COLUMNS,
     FIX,
     FREE,
@@ -25,11 +25,11 @@ from .options import (
 )
 
 if TYPE_CHECKING:
-    from .._typing import Array, PathLike
-    from ..measurements import MountedRig, Noise
-    from ..planning import Plan, PlannedImages
-    from ..programs import Program
-    from ..robot import Chain, Obstacle, WorkspaceConstraints
+    from ..._typing import Array, PathLike
+    from ...measurements import MountedRig, Noise
+    from ...planning import Plan, PlannedImages
+    from ...programs import Program
+    from ...robot import Chain, Obstacle, WorkspaceConstraints
 
 EXAMPLE = "dhcal plan ur10.urdf -n 40 --tip tool0 --sigma 0.1mm,0.01deg -o poses.csv"
 
@@ -186,17 +186,17 @@ def run(args: Namespace) -> int:
     """Choose poses, write them and show the predicted accuracy."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
-    from ..io import configurations_text, read_configurations, read_measurement_file, read_priors, read_robot
-    from ..io.sidecar import existing_sidecar, read_instrument, read_uncertainty
-    from ..measurements import Noise
-    from ..planning import plan, with_measured_poses
-    from ..programs import program_text, require_program_ending
-    from ..report.document import file_digests, versions
-    from ..report.html import check_html_ending
-    from ..units import parse_noise
-    from . import console
-    from .outputs import existing_sidecars, require_writable_outputs, write_outputs
-    from .result_screens import plan_screen
+    from ...io import configurations_text, read_configurations, read_measurement_file, read_priors, read_robot
+    from ...io.sidecar import existing_sidecar, read_instrument, read_uncertainty
+    from ...measurements import Noise
+    from ...planning import plan, with_measured_poses
+    from ...programs import program_text, require_program_ending
+    from ...report.document import file_digests, versions
+    from ...report.html import check_html_ending
+    from ...units import parse_noise
+    from ..outputs import existing_sidecars, require_writable_outputs, write_outputs
+    from ..screens import console
+    from ..screens.result_screens import plan_screen
 
     kind = _kind(args)
     files = [
@@ -278,8 +278,8 @@ def run(args: Namespace) -> int:
     if args.html:
         contents[args.html] = _preview(result, chain, space, args, images)
     if args.report:
-        from ..io.robot import robot_name  # lazy import, as the following: only for reports
-        from ..report.plan import PlanReport, plan_page
+        from ...io.robot import robot_name  # lazy import, as the following: only for reports
+        from ...report.plan import PlanReport, plan_page
 
         contents[args.report] = plan_page(
             PlanReport(
@@ -316,9 +316,9 @@ def _kind(args: Namespace) -> str:
 
 def _mounted_rig(path: str, robot: str, chain: Chain) -> MountedRig:
     """Return the rig of a file, with the poses of a calibrated robot where it has none."""
-    from ..io.rig_file import read_calibrated_rig, read_rig, with_poses_of  # lazy import, as the following
-    from ..io.sidecar import existing_sidecar
-    from ..measurements import mount_rig
+    from ...io.rig_file import read_calibrated_rig, read_rig, with_poses_of  # lazy import, as the following
+    from ...io.sidecar import existing_sidecar
+    from ...measurements import mount_rig
 
     rig, sidecar = read_rig(path), existing_sidecar(robot)
     calibrated = read_calibrated_rig(sidecar) if sidecar else None
@@ -327,9 +327,9 @@ def _mounted_rig(path: str, robot: str, chain: Chain) -> MountedRig:
 
 def _planned_images(args: Namespace, rig: MountedRig) -> tuple[PlannedImages, Noise]:
     """Return the images to plan and the noise of the robot, from the options that need --rig."""
-    from ..measurements import Noise  # lazy import, as the following: they are slow to load
-    from ..planning import PlannedImages
-    from ..units import parse_noise
+    from ...measurements import Noise  # lazy import, as the following: they are slow to load
+    from ...planning import PlannedImages
+    from ...units import parse_noise
 
     pixels, *others = (args.sigma or _DEFAULT_IMAGE_SIGMA).split(",")
     sigma = _parse_pixels(pixels, "--sigma", f"pixels above zero first, such as {_DEFAULT_IMAGE_SIGMA}")
@@ -357,7 +357,7 @@ def _parse_pixels(text: str, option: str, expected: str = "pixels above zero, su
 
 def _parse_distances(text: str) -> tuple[float, float]:
     """Parse the smallest and the largest distance of a board [m]."""
-    from ..units import LENGTHS  # lazy import: slow to load
+    from ...units import LENGTHS  # lazy import: slow to load
 
     match = re.fullmatch(rf"\s*({_NUMBER})\s*:\s*({_NUMBER})\s*([a-zµμ]+)\s*", text)
     if not match or match[3] not in LENGTHS:
@@ -377,7 +377,7 @@ def _parse_angle(text: str, option: str, largest: float, what: str = "angle") ->
     """Parse an angle above zero and at most some degrees [rad]."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
-    from ..units import ANGLES
+    from ...units import ANGLES
 
     match = re.fullmatch(rf"\s*({_NUMBER})\s*(rad|deg)\s*", text)
     angle = float(match[1]) / ANGLES[match[2]] if match else 0.0
@@ -409,7 +409,7 @@ def _program(result: Plan, chain: Chain) -> Program:
 
     import numpy as np
 
-    from ..programs import Program, Stop
+    from ...programs import Program, Stop
 
     poses = replace(chain, base=np.eye(4)).poses(result.q)
     is_checked = bool(result.is_way_free)
@@ -431,8 +431,8 @@ def _preview(
     """Return the page that shows the poses, the path, cameras and boards, floor and obstacles."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
-    from ..io.robot import robot_name
-    from ..visualization import Preview, scene_html
+    from ...io.robot import robot_name
+    from ...visualization import Preview, scene_html
 
     path = [part for way, q in zip(result.ways, result.q, strict=True) for part in (way, q[None])]
     stops = np.cumsum([len(way) + 1 for way in result.ways]) - 1
@@ -453,7 +453,7 @@ def _obstacles(args: Namespace) -> list[Obstacle]:
     """Create the obstacles of --obstacle."""
     from dataclasses import replace  # lazy import, as the following: they load Pinocchio
 
-    from ..robot import Obstacle, obstacles_from_urdf, read_urdf
+    from ...robot import Obstacle, obstacles_from_urdf, read_urdf
 
     obstacles = []
     for text in args.obstacle:
@@ -466,7 +466,7 @@ def _obstacles(args: Namespace) -> list[Obstacle]:
 
 def _floor(text: str | None, root: str | None) -> float | None:
     """Parse the height of the floor [m]; None without a floor."""
-    from ..units import LENGTHS  # lazy import: slow to load
+    from ...units import LENGTHS  # lazy import: slow to load
 
     # The height counts from the first link, which may be the head of the robot.
     text = text or ("none" if root else "0mm")
@@ -494,7 +494,7 @@ def _workspace_constraints(args: Namespace) -> WorkspaceConstraints:
     """Create the constraints of the robot from --box, --visible-from, --cone, --floor and --obstacle."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
-    from ..robot import WorkspaceConstraints
+    from ...robot import WorkspaceConstraints
 
     box = _parse_box(args.box, "--box") if args.box else None
     instrument = None
@@ -510,7 +510,7 @@ def _parse_points(text: str, option: str, example: str, count: int, expected: st
     """Parse points, shape (count, 3) [m], from coordinates with one unit at the end."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
-    from ..units import LENGTHS
+    from ...units import LENGTHS
 
     point = rf"\s*{_NUMBER}\s*,\s*{_NUMBER}\s*,\s*{_NUMBER}\s*"
     match = re.fullmatch(rf"({point}(?::{point}){{{count - 1}}})([a-zµμ]+)\s*", text)
@@ -524,7 +524,7 @@ def _parse_points(text: str, option: str, example: str, count: int, expected: st
 
 def _require_few(source: str, count: int) -> None:
     """Require configurations that fit into the memory."""
-    from ..planning.planner import MAX_CANDIDATES  # lazy import: slow to load
+    from ...planning.planner import MAX_CANDIDATES  # lazy import: slow to load
 
     if count > MAX_CANDIDATES:
         raise InvalidArgumentError(
@@ -536,9 +536,9 @@ def read_task(path: PathLike, chain: Chain) -> Array:
     """Read the configurations where the accuracy matters."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
-    from ..compensation import LIMITS, compensate
-    from ..io import read_configurations, read_targets
-    from ..io.tables import read_table
+    from ...compensation import LIMITS, compensate
+    from ...io import read_configurations, read_targets
+    from ...io.tables import read_table
 
     table = read_table(path)
     _require_few(os.fspath(path), len(table.lines))
@@ -557,7 +557,7 @@ def read_task(path: PathLike, chain: Chain) -> Array:
 
 def _plan_document(result: Plan, args: Namespace, kind: str, chosen_rows: list[int] | None) -> dict[str, Any]:
     """Create the JSON document of a plan, in SI units."""
-    from .outputs import json_path  # lazy import: loads Pinocchio
+    from ..outputs import json_path  # lazy import: loads Pinocchio
 
     noise = result.information.noise
     path = json_path(args.json)

@@ -6,8 +6,8 @@ import os
 from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
 
-from ..exceptions import InvalidArgumentError
-from .options import COLUMNS, DATA, JSON, RIG, ROBOT, add_urdf_options
+from ...exceptions import InvalidArgumentError
+from ..options import COLUMNS, DATA, JSON, RIG, ROBOT, add_urdf_options
 
 EXAMPLE = "dhcal inspect laser.csv --robot ur10.urdf --tip tool0"
 
@@ -26,14 +26,14 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Show the content of files."""
-    from ..diagnostics import inspect_file  # lazy import, as the following: they load Pinocchio
-    from ..io import read_robot
-    from ..io.rig_file import read_rig
-    from ..measurements.mounting import mount_rig
-    from ..report.document import file_digests
-    from . import console
-    from .outputs import existing_sidecars, require_writable_outputs, write_outputs
-    from .result_screens import inspection_screen
+    from ...diagnostics import inspect_file  # lazy import, as the following: they load Pinocchio
+    from ...io import read_robot
+    from ...io.rig_file import read_rig
+    from ...measurements.mounting import mount_rig
+    from ...report.document import file_digests
+    from ..outputs import existing_sidecars, require_writable_outputs, write_outputs
+    from ..screens import console
+    from ..screens.result_screens import inspection_screen
 
     if args.columns and not args.robot:
         raise InvalidArgumentError("--columns: needs --robot, as the map names its joints")

@@ -6,8 +6,8 @@ import sys
 from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
 
-from ..messages import message_line
-from .options import JSON
+from ...messages import message_line
+from ..options import JSON
 
 EXAMPLE = "dhcal doctor"
 _STYLES = {"ok": "", "note": "yellow", "failed": "bold red"}
@@ -21,9 +21,9 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(args: Namespace) -> int:
     """Check the installation and calibrate a small robot."""
     try:
-        from ..diagnostics.installation import check_installation  # lazy import: loads Pinocchio
-        from . import console
-        from .outputs import require_writable_outputs, write_outputs
+        from ...diagnostics.installation import check_installation  # lazy import: loads Pinocchio
+        from ..outputs import require_writable_outputs, write_outputs
+        from ..screens import console
     except ImportError as error:
         print(f"failed  imports: {message_line(error)}; install dhcal-pin again", file=sys.stderr)
         return 1

@@ -10,10 +10,10 @@ import os
 from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING
 
-from .options import add_execution_options
+from ..options import add_execution_options
 
 if TYPE_CHECKING:
-    from ..studies import StudyGrid, StudyJournal
+    from ...studies import StudyGrid, StudyJournal
 
 EXAMPLE = "dhcal study ur10_poses --jobs 2 -o results.csv"
 
@@ -33,12 +33,12 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Run a study, or the blocks that an interrupted run has left."""
-    from .. import studies  # lazy import, as the following: they load Pinocchio
-    from ..io import shipped_file
-    from ..parallel import open_executor
-    from ..saving import complete_interrupted_save
-    from . import console
-    from .outputs import existing_sidecars, require_writable_outputs, written_files
+    from ... import studies  # lazy import, as the following: they load Pinocchio
+    from ...io import shipped_file
+    from ...parallel import open_executor
+    from ...saving import complete_interrupted_save
+    from ..outputs import existing_sidecars, require_writable_outputs, written_files
+    from ..screens import console
 
     is_file = os.path.exists(args.study) or args.study.endswith(".toml")
     path = args.study if is_file else shipped_file(f"{args.study}.study.toml")
@@ -81,12 +81,12 @@ def _write_results(study: StudyGrid, journal: StudyJournal, args: Namespace) -> 
     """Write table and plot of a finished study, remove its journal, and show the table."""
     from dataclasses import fields  # lazy import, as the following: they load Pinocchio
 
-    from .. import studies
-    from ..io.tabular import csv_text
-    from ..visualization.plots import study_svg
-    from . import console
-    from .outputs import write_outputs
-    from .result_screens import study_screen
+    from ... import studies
+    from ...io.tabular import csv_text
+    from ...visualization.plots import study_svg
+    from ..outputs import write_outputs
+    from ..screens import console
+    from ..screens.result_screens import study_screen
 
     header, rows = studies.result_table(study, journal.blocks)
     drawing = study_svg(study.title or "study", header, rows, len(fields(studies.Setting)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
-from .options import NON_NEGATIVE_INTEGER, POSITIVE_INTEGER
+from ..options import NON_NEGATIVE_INTEGER, POSITIVE_INTEGER
 
 EXAMPLE = "dhcal app"
 _MEGABYTE = 10**6
@@ -35,8 +35,8 @@ def run(args: Namespace) -> int:
     """Serve the page."""
     import asyncio  # lazy import, as the following: slow to load
 
-    from ..app import serve
-    from . import console
+    from ...app import serve
+    from ..screens import console
 
     def show_address(url: str) -> None:
         console.print_lines(f"page at {url}; end with Ctrl-C")

@@ -8,26 +8,26 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..calibration.evaluation import Accuracy
-from ..calibration.summary import STATISTIC_LABELS
-from ..diagnostics.inspection import FileInspection, column_table
-from ..formatting import Table, format_quantity
-from ..io.tables import format_lines
-from ..measurements.groups import ERROR_GROUPS, in_order
-from ..planning.views import views_table
-from ..report.document import short_names
+from ...calibration.evaluation import Accuracy
+from ...calibration.summary import STATISTIC_LABELS
+from ...diagnostics.inspection import FileInspection, column_table
+from ...formatting import Table, format_quantity
+from ...io.tables import format_lines
+from ...measurements.groups import ERROR_GROUPS, in_order
+from ...planning.views import views_table
+from ...report.document import short_names
 from .screen import Block, Screen, list_first
 
 if TYPE_CHECKING:
-    from .._typing import Array
-    from ..cameras.rig import Rig
-    from ..compensation import Compensation
-    from ..detection import BoardDetection
-    from ..io import TargetPoses
-    from ..paper.jacobian_check import Agreement
-    from ..planning import Plan
-    from ..robot import Chain
-    from ..studies import StudyGrid
+    from ..._typing import Array
+    from ...cameras.rig import Rig
+    from ...compensation import Compensation
+    from ...detection import BoardDetection
+    from ...io import TargetPoses
+    from ...paper.jacobian_check import Agreement
+    from ...planning import Plan
+    from ...robot import Chain
+    from ...studies import StudyGrid
 
 
 # Columns of a study that fit on a screen; --verbose shows the others.
@@ -88,7 +88,7 @@ def detection_screen(
     rig: Rig, detections: Sequence[BoardDetection], notes: Sequence[str], files: Sequence[str]
 ) -> Screen:
     """Describe which corners were found in images."""
-    from ..detection import unused_images  # lazy import: only this command needs it
+    from ...detection import unused_images  # lazy import: only this command needs it
 
     found, warnings = [], list(notes)
     for detection in detections:
@@ -298,7 +298,7 @@ def compensation_screen(
     files: Iterable[object],
 ) -> Screen:
     """Describe how many targets have which status, and the lines of those that are not corrected exactly."""
-    from ..compensation import SINGULAR  # lazy import: only this command needs it
+    from ...compensation import SINGULAR  # lazy import: only this command needs it
 
     counts, lines = [], []
     for status in dict.fromkeys(result.status):
@@ -354,7 +354,7 @@ def study_screen(
     study: StudyGrid, header: Sequence[str], rows: Sequence[Sequence[Any]], files: Iterable[object]
 ) -> Screen:
     """Describe the results of a study in mm and degrees, with the settings that differ."""
-    from ..studies import Setting  # lazy import: only this command needs it
+    from ...studies import Setting  # lazy import: only this command needs it
 
     n_settings = len(fields(Setting))
     varied = [i for i in range(n_settings) if len({row[i] for row in rows}) > 1]

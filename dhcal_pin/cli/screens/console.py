@@ -16,8 +16,8 @@ from rich.markup import escape
 from rich.progress import Progress as ProgressBar
 from rich.text import Text
 
-from .._typing import Progress
-from ..messages import escape_control_characters
+from ..._typing import Progress
+from ...messages import escape_control_characters
 from .screen import Line, Screen, Verbosity
 
 

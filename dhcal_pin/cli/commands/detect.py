@@ -7,13 +7,13 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from ..exceptions import InvalidArgumentError
-from .options import POSITIVE_INTEGER, RIG
+from ...exceptions import InvalidArgumentError
+from ..options import POSITIVE_INTEGER, RIG
 
 if TYPE_CHECKING:
-    from .._typing import PathLike
-    from ..cameras import Camera
-    from ..detection import BoardDetection
+    from ..._typing import PathLike
+    from ...cameras import Camera
+    from ...detection import BoardDetection
 
 EXAMPLE = "dhcal detect images --rig rig.toml --joints joints.csv -o corners.csv"
 
@@ -60,12 +60,12 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Find the corners and write them."""
-    from ..detection import corner_columns, detect_boards, image_files  # lazy import, as the following
-    from ..io.rig_file import only_entry, read_rig
-    from ..io.tabular import csv_text
-    from . import console
-    from .outputs import require_writable_outputs, write_outputs
-    from .result_screens import detection_screen
+    from ...detection import corner_columns, detect_boards, image_files  # lazy import, as the following
+    from ...io.rig_file import only_entry, read_rig
+    from ...io.tabular import csv_text
+    from ..outputs import require_writable_outputs, write_outputs
+    from ..screens import console
+    from ..screens.result_screens import detection_screen
 
     # A recording of ROS 2 is a folder.
     files = [args.joints] if args.joints and os.path.isfile(args.joints) else []
@@ -91,8 +91,8 @@ def run(args: Namespace) -> int:
 
 def _joints(args: Namespace, paths: Sequence[str]) -> tuple[dict[str, dict[str, str]] | None, list[str]]:
     """Return the joint values of the images, and notes on them."""
-    from ..io.measurement_files import read_image_joints, read_recorded_joints  # lazy import: slow to load
-    from ..io.measurement_files.bag import is_bag
+    from ...io.measurement_files import read_image_joints, read_recorded_joints  # lazy import: slow to load
+    from ...io.measurement_files.bag import is_bag
 
     is_recording = bool(args.joints) and is_bag(args.joints)
     if args.joint_topic and not is_recording:
@@ -107,8 +107,8 @@ def _overlays(
     folder: str, camera: Camera, detections: Sequence[BoardDetection], paths: Sequence[str]
 ) -> tuple[Mapping[PathLike, str | bytes], list[str]]:
     """Return the pictures of --overlay, whose folder is created, and notes on them."""
-    from ..detection import camera_with_intrinsics, overlay_files  # lazy import, as the following: slow
-    from .outputs import require_writable_outputs
+    from ...detection import camera_with_intrinsics, overlay_files  # lazy import, as the following: slow
+    from ..outputs import require_writable_outputs
 
     if os.path.exists(folder) and not os.path.isdir(folder):
         raise InvalidArgumentError(f"--overlay {folder}: is a file; expected a folder")

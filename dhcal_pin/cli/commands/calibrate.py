@@ -5,9 +5,9 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
 
-from ..exceptions import InvalidArgumentError
-from .job import Job, add_job_arguments, is_manifest
-from .options import add_execution_options
+from ...exceptions import InvalidArgumentError
+from ..job import Job, add_job_arguments, is_manifest
+from ..options import add_execution_options
 
 # Exit status of a refused calibration.
 REFUSED = 3
@@ -33,7 +33,7 @@ def run(args: Namespace) -> int:
     if is_manifest(args.robot):
         if args.scheduler:
             raise InvalidArgumentError("--scheduler: not available with a manifest; use --jobs")
-        from .fleet import run_manifest  # lazy import: loads Pinocchio
+        from ..fleet import run_manifest  # lazy import: loads Pinocchio
 
         return run_manifest(args)
     if not args.data:
@@ -43,10 +43,10 @@ def run(args: Namespace) -> int:
 
 def _calibrate_robot(args: Namespace) -> int:
     """Calibrate one robot and show its result."""
-    from ..parallel import open_executor  # lazy import, as the following: they load Pinocchio
-    from . import console
-    from .calibration_screen import calibration_screen
-    from .run_job import run_job
+    from ...parallel import open_executor  # lazy import, as the following: they load Pinocchio
+    from ..run_job import run_job
+    from ..screens import console
+    from ..screens.calibration_screen import calibration_screen
 
     job = Job.from_args(args)
     shown = {

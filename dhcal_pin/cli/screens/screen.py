@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from itertools import zip_longest
 from typing import Literal, NamedTuple
 
-from ..formatting import Table
-from ..messages import escape_control_characters
+from ...formatting import Table
+from ...messages import escape_control_characters
 
 # Views of a screen: the verdict only, one screen, everything.
 Verbosity = Literal["quiet", "normal", "verbose"]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
-from ..exceptions import InvalidArgumentError
-from .options import RIG
+from ...exceptions import InvalidArgumentError
+from ..options import RIG
 
 EXAMPLE = "dhcal board rig.toml -o board.pdf"
 
@@ -21,12 +21,12 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Draw a board."""
-    from ..detection import board_pdf  # lazy import, as the following
-    from ..io.rig_file import only_entry, read_rig
-    from . import console
-    from .outputs import require_writable_outputs, write_outputs
-    from .result_screens import files_block
-    from .screen import Screen
+    from ...detection import board_pdf  # lazy import, as the following
+    from ...io.rig_file import only_entry, read_rig
+    from ..outputs import require_writable_outputs, write_outputs
+    from ..screens import console
+    from ..screens.result_screens import files_block
+    from ..screens.screen import Screen
 
     require_writable_outputs([args.output], [args.rig])
     if not args.output.lower().endswith(".pdf"):

@@ -1,0 +1,7 @@
+"""Commands of `dhcal`: one module per command.
+
+Each module has `EXAMPLE`, `add_arguments(parser)` and `run(args)`, and a row of `COMMANDS` in `cli/main.py`.
+
+Modules import only light modules at their top; everything that loads NumPy or Pinocchio is imported inside
+functions ("lazy import"), so that help pages and argument errors appear at once.
+"""
