@@ -30,23 +30,10 @@ from .evaluation import (
 from .fitted import FittedModel
 from .partition import configuration_groups, k_fold
 
-# Stated standard deviations are rejected if the reduced cost exceeds 1 by this many standard deviations.
-CONTRADICTION_SIGMAS = 3.0
-# Upper limit of the interval that holds 95 %, as a quantile of Student's t and of the normal distribution.
-CONFIDENCE = 0.975
-# Smallest scale of standard deviations, for residuals that are exactly zero.
-MIN_SCALE = 1e-9
 # Number of random folds of the cross-validation.
 N_FOLDS = 5
 # So few configurations are held out one by one instead.
 MAX_LEAVE_ONE_OUT = 10
-# Largest number of iterations of a fold's own fit.
-MAX_REFIT_ITERATIONS = 100
-# Rows left over by no more than this fraction of all count as none: rounding.
-MIN_FREEDOM_RATIO = 1e-6
-# Smallest share of the variance of correlated residuals that counts as an error of the model. Stated standard
-# deviations of an instrument may be too large.
-MIN_MODEL_SHARE = 0.5
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -40,7 +40,6 @@ from ..exceptions import DhcalError
 from ..identifiability import observability
 from ..measurements.arguments import as_measurements
 from ..measurements.base import InstrumentParameter, Measurement
-from ..measurements.camera import CameraCorners
 from ..measurements.mounting import MountedRig
 from ..robot.chain import Chain
 from .cameras.sets import has_joint_values
@@ -59,10 +58,6 @@ CONTRADICTION_SIGMAS = 3.0
 CONFIDENCE = 0.975
 # Smallest scale of standard deviations, for residuals that are exactly zero.
 MIN_SCALE = 1e-9
-# Number of random folds of the cross-validation.
-N_FOLDS = 5
-# So few configurations are held out one by one instead.
-MAX_LEAVE_ONE_OUT = 10
 # Largest number of iterations of a fold's own fit.
 MAX_REFIT_ITERATIONS = 100
 # Rows left over by no more than this fraction of all count as none: rounding.
@@ -449,10 +444,8 @@ class FittedModel:
     @property
     def rig(self) -> MountedRig | None:
         """Cameras and boards with their estimated poses and lenses; None without image coordinates."""
-        for item in self.data:
-            if isinstance(item, CameraCorners):
-                return item.solved_rig(self.instruments)
-        return None
+        rigs = (item.solved_rig(self.instruments) for item in self.data)
+        return next((rig for rig in rigs if rig is not None), None)
 
     @property
     def pose_std(self) -> float:

@@ -23,7 +23,6 @@ import numpy as np
 from .._typing import Array
 from ..estimation.robust import ZERO_WEIGHT
 from ..measurements.base import Measurement
-from ..measurements.camera import CameraCorners
 from .evaluation import fit_instrument_parameters
 from .fitted import FittedModel
 
@@ -151,12 +150,7 @@ def residual_table(fit: FittedModel) -> ResidualTable:
                 np.zeros(starts[-1] - starts[n_fitted], bool),
             ]
         ),
-        image=np.concatenate(
-            [
-                item.image_names if isinstance(item, CameraCorners) else np.full(len(item.rows), "", object)
-                for item in data
-            ]
-        ),
+        image=np.concatenate([item.photographs() for item in data]),
     )
 
 

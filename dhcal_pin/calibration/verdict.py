@@ -19,9 +19,8 @@ import numpy as np
 from ..estimation.initialization import initialize_frames
 from ..estimation.parameters import select_parameters
 from ..formatting import format_quantity
-from ..measurements.camera import CameraCorners
 from ..measurements.groups import ERROR_GROUPS
-from ..measurements.images.names import list_images, whole_images
+from ..measurements.images.names import list_images
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
 from ..plausibility.mixups import Diagnosis
 from ..robot.chain import BASE_FRAME
@@ -322,10 +321,9 @@ def _outliers(fit: Evidence) -> list[Finding]:
 def _outlying_images(fit: Evidence) -> str:
     """Name the images all of whose corners are outliers; empty without such images."""
     labels = [
-        item.image_labels[number]
+        label
         for item, rows in zip(fit.data, fit.outliers, strict=True)
-        if isinstance(item, CameraCorners)
-        for number in whole_images(item.image, np.isin(item.rows, rows))
+        for label in item.images_within(np.isin(item.rows, rows))
     ]
     if not labels:
         return ""

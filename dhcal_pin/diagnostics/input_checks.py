@@ -110,7 +110,7 @@ def require_joint_units(chain: Chain, file: MeasurementFile) -> None:
 
     A fit to such images takes long, and its result does not show the cause.
     """
-    if not isinstance(file.data, CameraCorners):
+    if file.data.rig is None:
         return
     warnings = list(_check_joint_units(chain, file).values())
     if 2 * len(warnings) > chain.n_joints:
@@ -173,7 +173,7 @@ def median_radius(points: Array) -> float:
 def _joint_positions_by_configuration(file: MeasurementFile) -> list[Array]:
     """Return the joint positions (m, n) of each configuration of a row; none of a file without them."""
     data = file.data
-    if isinstance(data, CameraCorners) and not data.has_joint_values:
+    if not data.has_joint_values:
         return []
     return np.split(data.configurations(), data.configurations_per_row) if data.configurations_per_row else []
 

@@ -29,7 +29,6 @@ from ..estimation.error_model import ErrorParameter
 from ..estimation.parameters import CURVE_ORDERS, fold_harmonics
 from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.qr import TriangularSystem
-from ..measurements.camera import CameraCorners
 from ..measurements.pose import Pose
 from ..measurements.position import Position
 from ..robot.chain import BASE_FRAME, Chain
@@ -252,8 +251,7 @@ class Explainer:
         """Return the cameras and boards whose poses take part in a group, and whether the tool moves them."""
         sets, moves = dict[str, str](), dict[str, bool]()
         for item in self.probe.problem.data:
-            if isinstance(item, CameraCorners):
-                rig = item.rig
+            if (rig := item.rig) is not None:
                 sets |= {p.name: item.set_of(p.name) for p in item.instrument_parameters}
                 for kind, entries, mounts in (
                     ("camera", rig.cameras, rig.camera_mounts),

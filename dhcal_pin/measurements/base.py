@@ -96,6 +96,7 @@ class Measurement(ABC):
         instrument_parameters: The s instrument parameters, in the order of u.
         has_joint_values: Whether the joint positions were measured. Otherwise they only reproduce measured
             poses of the tip, and say nothing about the joint space of a robot.
+        rig: Cameras and boards of image coordinates; None for all other kinds.
     """
 
     q: Array
@@ -104,6 +105,7 @@ class Measurement(ABC):
     instrument_parameters: tuple[InstrumentParameter, ...]
     source: str
     has_joint_values: bool
+    rig: MountedRig | None
 
     # Name of the kind in files, on the command line and in studies.
     kind: ClassVar[str]
@@ -125,6 +127,8 @@ class Measurement(ABC):
     is_contact: ClassVar[bool] = False
     # Whether the measured values contain a length; otherwise a scaled robot fits equally well.
     has_length_scale: ClassVar[bool] = True
+    # Whether a file may have poses of the tip in place of joint values.
+    accepts_tool_poses: ClassVar[bool] = False
 
     def __init_subclass__(cls, **options: Any) -> None:
         """Derive the columns of files from `COLUMNS`, and enter the residual groups."""
@@ -138,7 +142,7 @@ class Measurement(ABC):
 
     def _initialize(self, **values: Any) -> None:
         """Set attributes of an immutable object; for constructors only."""
-        self.__dict__.update({"has_joint_values": True} | values)
+        self.__dict__.update({"has_joint_values": True, "rig": None} | values)
 
     def __repr__(self) -> str:
         """Return the kind, the number of samples and the standard deviations."""
@@ -225,6 +229,42 @@ class Measurement(ABC):
             return np.zeros(0, int)
         parts = np.split(self.configurations(), max(self.configurations_per_row, 1))
         return np.unique(np.concatenate(parts, 1), axis=0, return_inverse=True)[1].reshape(-1)
+
+    @property
+    def n_images(self) -> int:
+        """Number of images."""
+        return 0
+
+    def images_within(self, is_chosen: Array) -> list[str]:
+        """Return the names of the images all of whose corners are among some of the samples.
+
+        Args:
+            is_chosen: Whether each sample is among them, (m,).
+
+        Returns:
+            Names of the images, empty texts for images without a name.
+        """
+        return []
+
+    def photographs(self) -> Array:
+        """Return the name of the photograph of each sample, (m,); empty texts without photographs."""
+        return np.full(len(self.rows), "", object)
+
+    def solved_rig(self, values: Mapping[str, float]) -> MountedRig | None:
+        """Return the rig with estimated poses, lenses and corners; None for kinds without a rig.
+
+        Args:
+            values: Values of all instrument parameters by name [m, rad, px or 1].
+        """
+        return None
+
+    def set_of(self, name: str) -> str:
+        """Return the parameter set of an instrument parameter; empty if it belongs to none.
+
+        Args:
+            name: Name of the parameter.
+        """
+        return ""
 
     def initialized(self, chain: Chain) -> Self:
         """Return a copy with initial values of the instrument parameters.

@@ -47,7 +47,7 @@ from .images.camera_parameters import (
     rig_parameters,
 )
 from .images.camera_start import BoardViews, Corners, estimate_views, first_values
-from .images.names import label_images, name_array
+from .images.names import label_images, name_array, whole_images
 from .mounting import MountedRig, mount_rig
 from .validation import validated_array, validated_joint_positions, validated_sigma
 
@@ -167,6 +167,7 @@ class CameraCorners(Measurement):
         + remark_column("image_names", "image")
     )
     required_columns = (frozenset(("u", "v", "corner")),)
+    accepts_tool_poses = True
     sample_fields = (
         *Measurement.sample_fields,
         *("values", "sigma", "camera", "board", "corner", "image_names", "jitter"),
@@ -355,6 +356,21 @@ class CameraCorners(Measurement):
     def corners(self) -> Corners:
         """Data of the corners for the first values of cameras and boards."""
         return Corners(self.q, self.values, self.rig, self.camera, self.board, self.corner, self.image)
+
+    def photographs(self) -> Array:
+        """Return the name of the photograph of each sample, (m,); empty texts without photographs."""
+        return self.image_names
+
+    def images_within(self, is_chosen: Array) -> list[str]:
+        """Return the names of the images all of whose corners are among some of the samples.
+
+        Args:
+            is_chosen: Whether each sample is among them, (m,).
+
+        Returns:
+            Names of the images, empty texts for images without a name.
+        """
+        return [self.image_labels[number] for number in whole_images(self.image, is_chosen)]
 
     @cached_property
     def image(self) -> Array:

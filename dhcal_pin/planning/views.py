@@ -23,7 +23,6 @@ from ..cameras.rig import Camera
 from ..exceptions import InvalidArgumentError
 from ..formatting import Table
 from ..measurements.base import Measurement
-from ..measurements.camera import CameraCorners
 from ..measurements.images import ViewLimits, project_board, visible_corners
 from ..measurements.mounting import MountedRig
 from ..robot.chain import Chain
@@ -173,7 +172,7 @@ def _default_distances(camera: Camera, board: Board) -> tuple[float, float]:
 
 def with_measured_poses(rig: MountedRig, chain: Chain, data: Sequence[Measurement]) -> MountedRig:
     """Return a rig whose missing poses and intrinsics are estimated from images."""
-    images = [item for item in data if isinstance(item, CameraCorners)]
+    images = [item for item in data if item.rig is not None]
     is_known = all(entry.pose is not None for entry in (*rig.cameras, *rig.boards))
     if not images or (is_known and all(camera.has_intrinsics for camera in rig.cameras)):
         return rig

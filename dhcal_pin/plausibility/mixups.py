@@ -17,7 +17,6 @@ import numpy as np
 
 from ..formatting import format_quantity
 from ..measurements.base import Measurement
-from ..measurements.camera import CameraCorners
 from ..robot.chain import Chain
 from .evidence import Evidence, fit_evidence
 from .hypotheses import Hypothesis, RowShift, list_hypotheses
@@ -109,7 +108,7 @@ def diagnose_mixups(chain: Chain, data: Sequence[Measurement]) -> Diagnosis:
     coordinates, which the mistakes listed here do not concern.
     """
     items = [item for item in data if item.configurations_per_row and not _is_surface_contact(item)]
-    items = [item for item in items if not isinstance(item, CameraCorners)]
+    items = [item for item in items if item.rig is None]
     items = sorted(items, key=lambda item: -len(item.rows))[:_MAX_ITEMS]
     if not items:
         return Diagnosis(NO_EVIDENCE)

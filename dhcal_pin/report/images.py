@@ -65,7 +65,7 @@ def _rms(errors: Array) -> float:
 
 def has_images(context: ReportContext) -> bool:
     """Return whether a result comes from images."""
-    return any(isinstance(item, CameraCorners) for item in context.fit.data)
+    return any(item.rig is not None for item in context.fit.data)
 
 
 def stage_table(stages: Sequence[Stage]) -> Table:

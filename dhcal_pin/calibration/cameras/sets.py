@@ -35,7 +35,7 @@ def split_sets(parameters: str | Iterable[str]) -> tuple[list[str], list[str]]:
 
 def has_images(data: Sequence[Measurement]) -> bool:
     """Return whether there are image coordinates among measurements."""
-    return any(isinstance(item, CameraCorners) for item in data)
+    return any(item.rig is not None for item in data)
 
 
 def default_sets(chain: Chain, data: Sequence[Measurement]) -> str:
@@ -65,7 +65,7 @@ def require_joint_values(data: Sequence[Measurement], names: Sequence[str]) -> N
             f"parameters {arm[0]!r}: need joint values, and the images have poses of the tip instead; "
             f"expected {HAND_EYE_SETS}, or joint values"
         )
-    others = sorted({item.kind for item in data if not isinstance(item, CameraCorners)})
+    others = sorted({item.kind for item in data if item.rig is None})
     if others:
         raise InvalidArgumentError(
             f"measurements of kind {others[0]} beside images with poses of the tip: they need joint values; "

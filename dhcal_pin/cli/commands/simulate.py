@@ -67,7 +67,7 @@ def run(args: Namespace) -> int:
     from ...io import measurement_text, read_robot
     from ...io.rig_file import rig_text
     from ...io.robot import has_dh_table
-    from ...measurements import KINDS, CameraCorners, Noise
+    from ...measurements import KINDS, Noise
     from ...robot.sampling import joint_range
     from ...units import parse_noise
     from ..outputs import existing_sidecars, require_writable_outputs, write_outputs
@@ -101,7 +101,7 @@ def run(args: Namespace) -> int:
         f"simulated {args.kind} of {args.truth or args.robot}{errors}, noise {args.noise}, seed {args.seed}"
     )
     contents: dict[PathLike, str | bytes] = {args.output: measurement_text(data, nominal, [comment])}
-    if isinstance(data, CameraCorners):
+    if data.rig is not None:
         rig_path = os.path.splitext(args.output)[0] + ".rig.toml"
         require_writable_outputs([rig_path], [*robots, args.output])
         contents[rig_path] = rig_text(data.rig.cameras, data.rig.boards)

@@ -24,9 +24,8 @@ from ...formatting import Table, format_quantity
 from ...identifiability import EXPECTED, label_unobservable
 from ...io import origin_table
 from ...measurements.base import Measurement
-from ...measurements.camera import CameraCorners
 from ...measurements.groups import ERROR_GROUPS
-from ...measurements.images.names import list_images, whole_images
+from ...measurements.images.names import list_images
 from ...report.document import short_names
 from ..job import Job
 from ..run_job import CalibrationOutcome
@@ -138,7 +137,7 @@ def _describe_use(fitted: Sequence[Measurement], held_out: Sequence[Measurement]
 
 def _count_images(items: Sequence[Measurement]) -> int:
     """Return the number of images in measurements."""
-    return sum(item.n_images for item in items if isinstance(item, CameraCorners))
+    return sum(item.n_images for item in items)
 
 
 def _row_lines(outcome: CalibrationOutcome, names: Mapping[str, str]) -> Iterator[str]:
@@ -165,14 +164,11 @@ def _count_outliers(rows: list[int], item: Measurement) -> str:
     """Count outliers, and name their lines and the images whose corners they all are."""
     plural = "s" if len(rows) > 1 else ""
     text = f"{len(rows)} outlier{plural} (line{plural} {list_first(rows)})"
-    if not isinstance(item, CameraCorners):
-        return text
-    images = whole_images(item.image, np.isin(item.rows, rows))
+    images = item.images_within(np.isin(item.rows, rows))
     if not images:
         return text
-    listed = list_images([item.image_labels[number] for number in images])
     count = f"{len(images)} images" if len(images) > 1 else "an image"
-    return f"{text}, among them all corners of {count}{listed},"
+    return f"{text}, among them all corners of {count}{list_images(images)},"
 
 
 # --- accuracy and corrections ----------------------------------------------------------------------

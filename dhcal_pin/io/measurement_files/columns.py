@@ -20,7 +20,6 @@ import numpy as np
 from ...exceptions import FileFormatError, UnknownNameError
 from ...measurements import KINDS
 from ...measurements.base import Measurement
-from ...measurements.camera import CameraCorners
 from ...robot.chain import Chain
 from ...units import ANGLES, LENGTHS
 from ..tables import Column, DataTable
@@ -184,7 +183,12 @@ def _present_values(table: DataTable) -> set[str]:
 def has_tool_poses(table: DataTable) -> bool:
     """Return whether a file has image coordinates and poses of the tip."""
     present = _present_values(table)
-    return present.issuperset(TOOL_POSE) and any(map(present.issuperset, CameraCorners.required_columns))
+    return present.issuperset(TOOL_POSE) and any(
+        present.issuperset(columns)
+        for kind in KINDS.values()
+        if kind.accepts_tool_poses
+        for columns in kind.required_columns
+    )
 
 
 def find_kind(table: DataTable) -> type[Measurement]:
