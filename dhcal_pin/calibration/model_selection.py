@@ -14,7 +14,7 @@ questions are asked.
 
      The standard deviation w of the priors of each family, and s, are those of greatest evidence,
      w² = Σ x_i² / Σ γ_i and s² = ‖r‖² / (m - Σ γ_i) (MacKay 1992), but w is never above the expected one;
-   - the squared error of random folds falls by more than `MIN_IMPROVEMENT` of the family. Folds are random,
+   - the squared error of random folds falls by more than the rule of the family says. Folds are random,
      not regions of joint space, as fast periodic errors are visible between neighbouring configurations only.
 
    Correction curves of high order are tried only on top of those of low order. The screening of the lines
@@ -57,7 +57,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -67,7 +67,7 @@ from .._typing import Array, Progress
 from ..estimation import robust
 from ..estimation.error_model import ErrorModel, ErrorParameter
 from ..estimation.folds import FoldSystems, count_rows, factor_partition, solve_columns
-from ..estimation.parameters import CURVE_ORDERS, EXTENSIONS, FINE_CURVE_ORDERS, PARAMETER_SETS
+from ..estimation.parameters import EXTENSIONS, PARAMETER_SETS
 from ..estimation.priors import PriorGroups, effective_parameters
 from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.qr import TriangularSystem
@@ -75,7 +75,7 @@ from ..estimation.solver import minimize
 from ..exceptions import UnknownNameError
 from ..formatting import Table, format_fixed
 from ..identifiability.residual_correlation import design_effect, find_residual_correlation
-from ..robot.error_families import COMPLIANCE, COUPLING, CURVES, FAMILIES, FINE_CURVES, GAIN, HARMONICS
+from ..robot.error_families import FAMILIES, HARMONICS
 from .partition import (
     configuration_groups,
     contact_groups,
@@ -88,13 +88,6 @@ from .reweighting import Fit, reweight, with_sigma_scales
 # Whitened residuals of exact data are smaller, as their standard deviations have a lower limit. They are
 # rounding errors, whose correlation says nothing about the model.
 MIN_CORRELATED_NOISE = 0.02
-# Families of low order in the order in which they are tried, and the smallest relative improvement of the
-# cross-validated squared error for which each is added. Eccentricity and elasticity have a physical cause in
-# every arm and hold outside the measured region; the others have to improve the error noticeably.
-TIERS = ((HARMONICS, COMPLIANCE), (GAIN, COUPLING))
-MIN_IMPROVEMENT = {HARMONICS: 0.0, COMPLIANCE: 0.0, GAIN: 0.1, COUPLING: 0.1, CURVES: 0.02, FINE_CURVES: 0.02}
-# Families of correction curves and the orders of their harmonics, each tried on top of the one before.
-CURVE_FAMILIES = {CURVES: CURVE_ORDERS, FINE_CURVES: FINE_CURVE_ORDERS}
 # Smallest rise of the log evidence for which a family is added: odds of 250 to 1.
 MIN_LOG_BAYES_FACTOR = 5.5
 # Number of random folds.
@@ -159,7 +152,8 @@ class FamilyTrial:
     def is_supported(self) -> bool:
         """Whether the measurements support the family."""
         return (
-            self.log_bayes_factor > MIN_LOG_BAYES_FACTOR and self.improvement > MIN_IMPROVEMENT[self.family]
+            self.log_bayes_factor > MIN_LOG_BAYES_FACTOR
+            and self.improvement > FAMILIES[self.family].rule.min_improvement
         )
 
 
@@ -644,6 +638,14 @@ def _noise(fit: Fit) -> float:
     return float(np.sqrt(fit.solution.system.cost / max(freedom, 1.0)))
 
 
+def families_by_stage(names: Iterable[str]) -> list[tuple[str, ...]]:
+    """Return the names of families of each stage of selection, in the order of the table of families."""
+    chosen = set(names)
+    known = [family for family in FAMILIES.values() if family.name in chosen]
+    stages = sorted({family.rule.stage for family in known})
+    return [tuple(family.name for family in known if family.rule.stage == stage) for stage in stages]
+
+
 def _select_families(
     fit: Fit, missing: dict[str, list[ErrorParameter]]
 ) -> tuple[tuple[FamilyTrial, ...], _Model, float]:
@@ -651,24 +653,28 @@ def _select_families(
     trials: list[FamilyTrial] = []
     model, random_ratio = _Model({}, _noise(fit), float("nan"), {}), float("nan")
     problem, x = fit.problem, fit.solution.x
-    low_order = tuple(name for name in missing if name not in CURVE_FAMILIES)
-    stages = [(low_order, TIERS)] if low_order else []
-    stages += [((name,), ((name,),)) for name in CURVE_FAMILIES if name in missing]
+    low_order = tuple(name for name in missing if not FAMILIES[name].orders)
+    stages = [(low_order, families_by_stage(low_order))] if low_order else []
+    curves = families_by_stage(name for name in missing if FAMILIES[name].orders)
+    stages += [(names, (names,)) for names in curves]
+    physical_families = families_by_stage(FAMILIES)[0]
     for added, tiers in stages:
-        orders = CURVE_FAMILIES.get(added[0])
+        orders = FAMILIES[added[0]].orders
         if orders and not _may_have_curves(problem, x, orders):
             break
-        families = {name: ps for name, ps in missing.items() if name in (*model.widths, *added, *TIERS[0])}
+        families = {
+            name: ps for name, ps in missing.items() if name in (*model.widths, *added, *physical_families)
+        }
         candidates = _Candidates.with_folds(*_with_families(fit.problem, fit.solution.x, families))
         # From the expected widths: the iteration does not leave a width near zero, which may have been the
         # best one without the families that were added since.
         model = candidates.maximize_evidence(dict.fromkeys(model.widths, 1.0))
         for tier in tiers:
-            more, model = _select(candidates, [name for name in tier if name in added], model)
+            more, model = _select(candidates, tier, model)
             trials += more
         if model.widths:
             # The arm has errors of its joints: those with a physical cause are shrunk, not selected.
-            physical = [name for name in TIERS[0] if name in families and name not in model.widths]
+            physical = [name for name in physical_families if name in families and name not in model.widths]
             model = candidates.maximize_evidence({**model.widths, **dict.fromkeys(physical, 1.0)})
             trials = [
                 replace(trial, is_selected=True, prior_width=model.widths[trial.family])
@@ -702,7 +708,7 @@ def family_hint(solved: Problem, x: Array, weights: Sequence[Array]) -> str:
     """
     data = [item.take(w > robust.ZERO_WEIGHT) for item, w in zip(solved.data, weights, strict=True)]
     data = [item.take(np.s_[:: max(1, -(-len(item.rows) // MAX_HINT_SAMPLES))]) for item in data]
-    missing = _missing_parameters(solved.errors, [name for name in EXTENSIONS if name not in CURVE_FAMILIES])
+    missing = _missing_parameters(solved.errors, [name for name in EXTENSIONS if not FAMILIES[name].orders])
     problem, x, family = _with_families(replace(solved, data=tuple(data)), x, missing)
     system, n_rows = linearize_and_factor(problem, x, small_angle=False), count_rows(problem)
     cost_before, best = solve_columns(system, problem.weights, x, family == "")[1], (MAX_HINT_RATIO, "")

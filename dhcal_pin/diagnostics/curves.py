@@ -18,9 +18,9 @@ import numpy as np
 from .._typing import Array
 from ..calibration.evidence import Evidence
 from ..calibration.partition import different_configurations
-from ..estimation.parameters import CURVE_ORDERS
 from ..estimation.uncertainty import UNBOUNDED_TOL, Uncertainty
 from ..robot.coverage import JointCoverage, bin_indices, joint_coverage, lattice_warnings
+from ..robot.error_families import CURVE_ORDERS
 from ..robot.transmission import MAX_CURVE_ORDER, fill_harmonics, n_coefficients, split_coefficients
 
 # Joint values of a curve: every degree of a turn [rad].

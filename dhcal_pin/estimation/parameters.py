@@ -37,8 +37,8 @@ from .._typing import Array
 from ..exceptions import DhcalError, InvalidArgumentError, UnknownNameError
 from ..robot.chain import BASE_FRAME, Chain, extract_dh_table, joint_frame, link_frame, without_mimics
 from ..robot.dh import Convention
-from ..robot.error_families import COMPLIANCE, COUPLING, CURVES, FAMILIES, FINE_CURVES, GAIN, HARMONICS
-from ..robot.transmission import MAX_CURVE_ORDER, n_coefficients, split_coefficients
+from ..robot.error_families import COMPLIANCE, COUPLING, FAMILIES, GAIN, HARMONICS
+from ..robot.transmission import n_coefficients, split_coefficients
 from .error_model import ErrorModel, ErrorParameter
 
 # Prior standard deviations of manufacturing and assembly errors: lengths [m], angles and joint offsets [rad].
@@ -57,8 +57,8 @@ HARMONIC_PRIOR, CURVE_PRIOR = 1e-3, 1e-4
 COMPLIANCE_PRIOR = 1e-4
 COUPLING_PRIOR = 2e-3
 
-# Orders of the harmonics of the sets `harmonics`, `curves` and `fine-curves`.
-HARMONIC_ORDERS, CURVE_ORDERS, FINE_CURVE_ORDERS = range(1, 3), range(3, 33), range(33, MAX_CURVE_ORDER + 1)
+# Orders of the harmonics of the set `harmonics`: eccentricity and its second harmonic.
+HARMONIC_ORDERS = range(1, 3)
 
 # Smallest maximum [N·m] of the gravity torque on a compliant joint. A joint that is loaded less has no
 # compliance: some URDFs have links with token masses.
@@ -335,8 +335,11 @@ PARAMETER_SETS: dict[str, ParameterSet] = {
         for name, build in (
             (GAIN, gain),
             (HARMONICS, harmonics),
-            (CURVES, functools.partial(harmonics, orders=CURVE_ORDERS, prior=CURVE_PRIOR)),
-            (FINE_CURVES, functools.partial(harmonics, orders=FINE_CURVE_ORDERS, prior=CURVE_PRIOR)),
+            *(
+                (family.name, functools.partial(harmonics, orders=family.orders, prior=CURVE_PRIOR))
+                for family in FAMILIES.values()
+                if family.orders
+            ),
             (COMPLIANCE, compliance),
             (COUPLING, coupling),
         )

@@ -26,12 +26,13 @@ import numpy as np
 from .._typing import Array
 from ..estimation import qr
 from ..estimation.error_model import ErrorParameter
-from ..estimation.parameters import CURVE_ORDERS, fold_harmonics
+from ..estimation.parameters import fold_harmonics
 from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.qr import TriangularSystem
 from ..measurements.pose import Pose
 from ..measurements.position import Position
 from ..robot.chain import BASE_FRAME, Chain
+from ..robot.error_families import CURVE_ORDERS
 from ..robot.transmission import harmonic_orders
 from . import observability
 from .null_space import Cause, ObservabilityProbe, UnobservableGroup, group_directions

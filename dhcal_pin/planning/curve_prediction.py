@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from .._typing import Array
-from ..estimation.parameters import CURVE_ORDERS
 from ..robot.coverage import BIN_CENTRES, joint_coverage
+from ..robot.error_families import CURVE_ORDERS
 from .exchange import compute_sqrt_covariance
 from .information import Information
 

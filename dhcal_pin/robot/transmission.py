@@ -28,9 +28,7 @@ import numpy as np
 import pinocchio as pin
 
 from .._typing import Array
-
-# Highest order of the harmonics: 64 periods per turn of a joint.
-MAX_CURVE_ORDER = 64
+from .error_families import MAX_CURVE_ORDER
 
 # Maximum number of cached torque arrays, one per array of joint positions. A full cache is emptied.
 MAX_CACHED_TORQUES = 256

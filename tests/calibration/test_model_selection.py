@@ -10,7 +10,7 @@ import pytest
 from robots import robot_file
 
 from dhcal_pin.calibration import Extension, calibrate
-from dhcal_pin.calibration.model_selection import MAX_HINT_SAMPLES, family_hint
+from dhcal_pin.calibration.model_selection import MAX_HINT_SAMPLES, families_by_stage, family_hint
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.parameters import EXTENSIONS
@@ -19,7 +19,7 @@ from dhcal_pin.identifiability.residual_correlation import design_effect
 from dhcal_pin.io import measurement_text
 from dhcal_pin.measurements import Measurement, Noise, Pose, Position
 from dhcal_pin.robot import Chain
-from dhcal_pin.robot.error_families import FAMILIES
+from dhcal_pin.robot.error_families import FAMILIES, ErrorFamily
 
 
 def hint(fit) -> str:
@@ -240,3 +240,11 @@ def test_command_reports_the_extension(tmp_path, monkeypatch, capsys):
     capsys.readouterr()
     assert main([*common, "--extend", "gains"]) == 2
     assert "unknown extension 'gains'; choose from gain, harmonics" in capsys.readouterr().err
+
+
+def test_a_family_needs_a_rule_of_selection():
+    """Without a rule it would never be selected, and nothing would say so."""
+    with pytest.raises(TypeError, match="rule"):
+        ErrorFamily("backdrive", "errors of a test", "a moving joint")  # pyright: ignore[reportCallIssue]
+    assert families_by_stage(FAMILIES)[:2] == [("harmonics", "compliance"), ("gain", "coupling")]
+    assert sorted(name for stage in families_by_stage(FAMILIES) for name in stage) == sorted(FAMILIES)

@@ -10,7 +10,6 @@ from robots import SCARA, paper, robot_file, write
 
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.estimation import select_parameters
-from dhcal_pin.estimation.parameters import CURVE_ORDERS
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import read_dh
 from dhcal_pin.measurements import Noise, Pose
@@ -25,6 +24,7 @@ from dhcal_pin.planning.exchange import (
 )
 from dhcal_pin.robot import Chain, joint_coverage
 from dhcal_pin.robot.coverage import BIN_CENTRES
+from dhcal_pin.robot.error_families import CURVE_ORDERS
 
 NOISE = Noise(1e-4, np.deg2rad(0.01))
 SETS = "minimal,base,tool"
