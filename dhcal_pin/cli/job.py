@@ -5,7 +5,8 @@ several robots and the command line that a report shows are built from them. The
 keyword arguments of `argparse.ArgumentParser.add_argument`, and in addition
 
 - `flags`: names on the command line; `--name` by default;
-- `is_output`: whether the option only says where results are written.
+- `output`: the `Output` that the option names; None if it changes outputs only. The other options say how to
+  calibrate. Output files are listed in the order of the fields.
 
 A job contains text and numbers only, so it can be sent to another process.
 """
@@ -18,6 +19,15 @@ from collections.abc import Mapping
 from dataclasses import Field, dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
+from .job_outputs import (
+    Output,
+    certificate_content,
+    curves_content,
+    map_content,
+    report_content,
+    residuals_content,
+    scene_content,
+)
 from .options import (
     COLUMNS,
     DATA,
@@ -72,7 +82,7 @@ class Job:
             "metavar": "OUT.urdf",
             "required": True,
             "help": "corrected URDF; with a manifest, a summary of all robots (.csv)",
-            "is_output": True,
+            "output": None,
         }
     )
     tip: str | None = field(default=None, metadata=TIP)
@@ -157,7 +167,7 @@ class Job:
         },
     )
     in_place: bool = field(
-        default=False, metadata={"help": "allow OUT.urdf to replace ROBOT", "is_output": True}
+        default=False, metadata={"help": "allow OUT.urdf to replace ROBOT", "output": None}
     )
     world_joint: bool = field(
         default=False, metadata={"help": "write the base pose into the URDF, as a joint from link `world`"}
@@ -183,19 +193,58 @@ class Job:
             "metavar": "PREFIX",
             "help": "write each camera for other programs: PREFIX_CAMERA.camera_info.yaml (ROS), "
             ".opencv.yaml and .handeye.yaml (transform from its link)",
-            "is_output": True,
+            "output": None,
         },
     )
     force: bool = field(
         default=False,
         metadata={"help": "write the corrected robot even if the calibration is refused"},
     )
+    map: str | None = field(
+        default=None,
+        metadata={
+            "metavar": "MAP",
+            "help": "write the predicted position uncertainty and the hold-out errors over the workspace "
+            "(.csv or .html)",
+            "output": Output(map_content, "a map", (".csv", ".html")),
+        },
+    )
+    scene: str | None = field(
+        default=None,
+        metadata={
+            "metavar": "SCENE.html",
+            "help": "write the 3-D scene of the nominal and the calibrated robot (.html)",
+            "output": Output(scene_content),
+        },
+    )
+    curves: str | None = field(
+        default=None,
+        metadata={
+            "metavar": "CURVES.csv",
+            "help": "write joint corrections for controllers that accept a table: joint, value and the angle "
+            "to add to it before it is commanded, in steps of 1 degree (.csv)",
+            "output": Output(curves_content),
+        },
+    )
+    residuals: str | None = field(
+        default=None,
+        metadata={
+            "metavar": "R.csv",
+            "help": "write the residuals of all measurements with their files and lines (.csv)",
+            "output": Output(residuals_content, is_written_if_refused=True),
+        },
+    )
+    json: str | None = field(
+        default=None, metadata={**JSON, "output": Output(None, is_written_if_refused=True)}
+    )
     report: tuple[str, ...] = field(
         default=(),
         metadata={
             "metavar": "R.html",
             "help": "write a report (.html or .md); may be repeated",
-            "is_output": True,
+            "output": Output(
+                report_content, "a report", (".html", ".md"), (".htm",), is_written_if_refused=True
+            ),
         },
     )
     certificate: str | None = field(
@@ -203,7 +252,7 @@ class Job:
         metadata={
             "metavar": "C.html",
             "help": "write a certificate for quality records, to print or save as PDF (.html)",
-            "is_output": True,
+            "output": Output(certificate_content, "a certificate", (".html",), (".htm",)),
         },
     )
     meta: tuple[str, ...] = field(
@@ -212,42 +261,7 @@ class Job:
             "metavar": "KEY=VALUE",
             "help": "fact for the certificate: robot, serial, controller, instrument, temperature, location, "
             "date, operator or any other; may be repeated",
-            "is_output": True,
-        },
-    )
-    json: str | None = field(default=None, metadata={**JSON, "is_output": True})
-    curves: str | None = field(
-        default=None,
-        metadata={
-            "metavar": "CURVES.csv",
-            "help": "write joint corrections for controllers that accept a table: joint, value and the angle "
-            "to add to it before it is commanded, in steps of 1 degree (.csv)",
-            "is_output": True,
-        },
-    )
-    residuals: str | None = field(
-        default=None,
-        metadata={
-            "metavar": "R.csv",
-            "help": "write the residuals of all measurements with their files and lines (.csv)",
-            "is_output": True,
-        },
-    )
-    scene: str | None = field(
-        default=None,
-        metadata={
-            "metavar": "SCENE.html",
-            "help": "write the 3-D scene of the nominal and the calibrated robot (.html)",
-            "is_output": True,
-        },
-    )
-    map: str | None = field(
-        default=None,
-        metadata={
-            "metavar": "MAP",
-            "help": "write the predicted position uncertainty and the hold-out errors over the workspace "
-            "(.csv or .html)",
-            "is_output": True,
+            "output": None,
         },
     )
 
@@ -261,18 +275,20 @@ class Job:
         return cls(**values)
 
     @property
-    def output_paths(self) -> tuple[str | None, ...]:
-        """Paths that the options name for outputs; the sidecar is beside the first one."""
-        return (
-            self.output,
-            self.scene,
-            self.map,
-            self.curves,
-            self.json,
-            self.residuals,
-            self.certificate,
-            *self.report,
-        )
+    def outputs(self) -> list[tuple[str, Output, str]]:
+        """Output files except the robot: option, output and path."""
+        found: list[tuple[str, Output, str]] = []
+        for option in fields(self):
+            value, output = getattr(self, option.name), option.metadata.get("output")
+            if output and value:
+                paths = value if isinstance(value, tuple) else (value,)
+                found += [(option.name, output, path) for path in paths]
+        return found
+
+    @property
+    def output_paths(self) -> list[str]:
+        """Paths of all outputs; the sidecar is beside the first one."""
+        return [self.output, *(path for _, _, path in self.outputs)]
 
     def command(self, names: Mapping[str, str]) -> str:
         """Format the command line of this job without the options that only name outputs.
@@ -284,7 +300,7 @@ class Job:
         for option in fields(self):
             value = getattr(self, option.name)
             flag = option_flags(option)[-1]
-            if flag.startswith("-") and not option.metadata.get("is_output") and value != option.default:
+            if flag.startswith("-") and "output" not in option.metadata and value != option.default:
                 for item in value if isinstance(value, tuple) else (value,):
                     words += [flag] if item is True else [flag, names.get(str(item), str(item))]
         return shlex.join(words)
@@ -298,7 +314,7 @@ def option_flags(option: Field[Any]) -> tuple[str, ...]:
 def add_job_arguments(parser: ArgumentParser) -> None:
     """Declare the options of a job."""
     for option in fields(Job):
-        keywords = {key: v for key, v in option.metadata.items() if key not in ("flags", "is_output")}
+        keywords = {key: v for key, v in option.metadata.items() if key not in ("flags", "output")}
         flags = option_flags(option)
         if option.default is False:
             keywords["action"] = "store_true"

@@ -35,12 +35,6 @@ def require_writable_outputs(outputs: Sequence[str | None], inputs: Sequence[str
         require_writable(path)
 
 
-def require_urdf_ending(path: str) -> None:
-    """Require the file extension of a URDF."""
-    if not path.lower().endswith(".urdf"):
-        raise InvalidArgumentError(f"{path}: unknown file extension; expected .urdf")
-
-
 def existing_sidecars(robots: Sequence[str]) -> list[str]:
     """List the sidecars that exist beside robot files."""
     return [path for path in map(existing_sidecar, robots) if path]

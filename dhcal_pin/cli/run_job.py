@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import fnmatch
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -36,10 +36,9 @@ from ..io.camera_files import CameraFrame, camera_files, camera_frames
 from ..io.measurement_files import MeasurementFile, read_measurement_file
 from ..io.origins_file import joint_origins
 from ..io.rig_file import read_rig
-from ..io.robot import read_robot, robot_name, urdf_files
+from ..io.robot import read_robot, urdf_files
 from ..io.settings import parse_payload, read_bounds, read_priors
 from ..io.sidecar import read_instrument, sidecar_path
-from ..io.tabular import csv_text
 from ..measurements.base import Measurement
 from ..measurements.groups import ERROR_GROUPS
 from ..measurements.mounting import mount_rig
@@ -49,15 +48,14 @@ from ..plausibility.hypotheses import mend
 from ..report.document import Provenance, content_digests, file_digests, result_to_dict, short_names
 from ..robot import urdf_edit
 from ..robot.chain import Chain
-from ..robot.correction_table import correction_columns, joint_corrections
+from ..robot.correction_table import joint_corrections
 from ..robot.urdf import parse_urdf
 from .job import REGION, Job
-from .options import split_commas
+from .job_outputs import Calibrated
+from .options import STDOUT, split_commas
 from .outputs import (
     existing_sidecars,
     is_same_file,
-    json_path,
-    require_urdf_ending,
     require_writable_outputs,
     write_outputs,
 )
@@ -135,34 +133,7 @@ def run_job(
     }
     measurements = list(data.fit.values())
     _require_cameras(job, measurements)
-    extend = None if job.extend == "auto" else job.extend
-    try:
-        fit = procedure.calibrate(
-            chain,
-            measurements,
-            sets,
-            method=job.method,
-            extend=extend,
-            progress=progress,
-            **restrictions,
-            **options,
-        )
-    except UnknownNameError as error:
-        sources = {"bounds": job.bounds, "priors": job.priors, "known": job.instrument}
-        path = sources.get(error.argument)
-        raise FileFormatError(f"{path}: {error}") if path else error from None
-    except NotObservableError as error:
-        raise NotObservableError(f"{error}{_held_out_images(data)}") from None
-    if job.holdout == REGION:
-        without_holdout = restrictions | options | {"holdout": (), "extend": extend}
-        regions = leave_regions_out(
-            fit,
-            lambda part: procedure.calibrate(chain, part, sets, method=job.method, **without_holdout),
-            progress,
-        )
-        fit = replace(fit, region_comparison=regions)
-    if progress:
-        progress("accuracy and verdict", 1, 1)
+    fit = _calibrate(job, chain, data, sets, restrictions, options, progress)
     on_images = fit.input_warnings
     fit = replace(
         fit,
@@ -175,74 +146,8 @@ def run_job(
     if not is_deliberate and not any(data.warnings.values()) and is_restricted(split_commas(sets)):
         suggestion = improvement_hint(fit, chain, measurements, **options)
         data.warnings[job.robot] = [suggestion] if suggestion else []
-    fitted = dict(zip(data.fit, fit.data, strict=True))
-    for path, texts in poorly_fitted_files(fit.chain, fitted, fit.instruments).items():
-        # A warning about the columns of a file already explains a poor fit.
-        data.warnings[path] += texts if not data.warnings[path] else []
-    hint = _family_hint(fit, data, sets, job)
-    data.warnings.setdefault(job.robot, []).extend([*on_images, *find_lattices(fit)])
-
-    # A refused robot must not reach a controller; JSON and report explain why it was refused.
-    is_kept = job.force or not fit.verdict.is_refused
-    robot_contents = _robot_files(fit, job) if is_kept else {}
-    contents = dict(robot_contents)
-    robot_paths = list(map(str, contents))
-    files: dict[str, str] = dict(zip(("urdf", "sidecar"), robot_paths, strict=False))
-    files |= _numbered("camera_file", robot_paths[len(files) :])
-    if job.map and is_kept:
-        from ..report import workspace_map  # lazy import: only for maps
-
-        contents[job.map] = workspace_map.map_content(job.map, fit, fit.holdout, fit.instruments)
-        files["map"] = job.map
-    if job.scene and is_kept:
-        from ..visualization import scene  # lazy import: only for scenes
-
-        contents[job.scene] = scene.scene_html(fit.nominal_refitted, fit, title=robot_name(job.robot))
-        files["scene"] = job.scene
-    if job.curves and is_kept:
-        corrections = joint_corrections(fit.chain)
-        contents[job.curves] = csv_text(correction_columns(corrections))
-        files["curves"] = job.curves
-        if not corrections:
-            data.warnings.setdefault(job.robot, []).append(NO_CORRECTIONS)
-    if job.residuals:
-        contents[job.residuals] = csv_text(fit.residuals.file_columns())
-        files["residuals"] = job.residuals
-    if path := json_path(job.json):
-        files["json"] = path
-    files |= _numbered("report", job.report)
-    source = _provenance(job, sets, data, inputs, robot_contents, hint)
-    if job.report:
-        from ..report import html  # lazy import: only for reports
-
-        contents |= html.report_files(fit, job.report, source)
-    if job.certificate and is_kept:
-        from ..report import certificate  # lazy import: only for certificates
-
-        meta = certificate.parse_meta(job.meta)
-        contents[job.certificate] = certificate.certificate_page(fit, meta, source)
-        files["certificate"] = job.certificate
-    outliers = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))
-    zero_weight = (
-        item.rows[weight <= ZERO_WEIGHT] for item, weight in zip(fit.data, fit.weights, strict=True)
-    )
-    rejected = dict(zip(data.fit, (rows.tolist() for rows in zero_weight), strict=True))
-    document = _job_document(fit, data, outliers, files, source)
-    write_outputs(contents, job.json, document)
-    return CalibrationOutcome(
-        fit=fit,
-        document=document,
-        files=files,
-        n_rows=data.n_rows,
-        fitted=data.fit,
-        held_out=data.holdout,
-        unreachable=data.unreachable,
-        outliers=outliers,
-        rejected=rejected,
-        warnings=data.warnings,
-        notes=data.notes,
-        hint=hint,
-    )
+    hint = _add_warnings(job, fit, data, sets, on_images)
+    return _write_job(job, fit, sets, data, inputs, hint)
 
 
 # --- input -----------------------------------------------------------------------------------------
@@ -287,26 +192,18 @@ def _checked_inputs(job: Job) -> list[str]:
     settings = [job.priors] if job.priors not in (None, "default", "none") else []
     settings += [path for path in (job.bounds, job.instrument, job.columns, job.rig) if path]
     inputs = [job.robot, *existing_sidecars([job.robot]), *measured, *settings]
-    require_urdf_ending(job.output)
-    require_writable_outputs([job.json, job.residuals, *job.report, job.certificate], inputs)
+    _robot_ending(job.output)
+    require_writable_outputs([path for _, _, path in job.outputs], inputs)
     protected = [*measured, *settings] if job.in_place else inputs
     require_writable_outputs([*job.output_paths, sidecar_path(job.output)], protected)
-    if job.report:
-        from ..report import html  # lazy import: only for reports
+    for _, output, path in job.outputs:
+        output.require_ending(path)
+    if job.meta:
+        from ..report import certificate  # lazy import: only for certificates
 
-        for path in job.report:
-            html.check_ending(path)
-    if job.certificate:
-        from ..report import certificate, html  # lazy import: only for certificates
-
-        html.check_html_ending(job.certificate, "a certificate")
+        if not job.certificate:
+            raise InvalidArgumentError("--meta: needs --certificate, the file that shows it")
         certificate.parse_meta(job.meta)
-    elif job.meta:
-        raise InvalidArgumentError("--meta: needs --certificate, the file that shows it")
-    if job.map:
-        from ..report import workspace_map  # lazy import: only for maps
-
-        workspace_map.check_map_ending(job.map)
     return inputs
 
 
@@ -408,6 +305,57 @@ def _held_out_images(data: _JobData) -> str:
 # --- calibration -----------------------------------------------------------------------------------
 
 
+def _calibrate(
+    job: Job,
+    chain: Chain,
+    data: _JobData,
+    sets: str,
+    restrictions: Mapping[str, Any],
+    options: Mapping[str, Any],
+    progress: Progress | None,
+) -> Result:
+    """Calibrate the robot, and repeat it without each region of joint space on request."""
+    settings: dict[str, Any] = {
+        "method": job.method,
+        "extend": None if job.extend == "auto" else job.extend,
+        **restrictions,
+        **options,
+    }
+    try:
+        fit = procedure.calibrate(chain, list(data.fit.values()), sets, progress=progress, **settings)
+    except UnknownNameError as error:
+        sources = {"bounds": job.bounds, "priors": job.priors, "known": job.instrument}
+        path = sources.get(error.argument)
+        raise FileFormatError(f"{path}: {error}") if path else error from None
+    except NotObservableError as error:
+        raise NotObservableError(f"{error}{_held_out_images(data)}") from None
+    if job.holdout == REGION:
+        without_holdout: dict[str, Any] = {**settings, "holdout": ()}
+        regions = leave_regions_out(
+            fit,
+            lambda part: procedure.calibrate(chain, part, sets, **without_holdout),
+            progress,
+        )
+        fit = replace(fit, region_comparison=regions)
+    if progress:
+        progress("accuracy and verdict", 1, 1)
+    return fit
+
+
+def _add_warnings(job: Job, fit: Result, data: _JobData, sets: str, on_images: Sequence[str]) -> str:
+    """Add warnings about the fit to those about the data; return the hint on joint error families."""
+    fitted = dict(zip(data.fit, fit.data, strict=True))
+    for path, texts in poorly_fitted_files(fit.chain, fitted, fit.instruments).items():
+        # A warning about the columns of a file already explains a poor fit.
+        data.warnings[path] += texts if not data.warnings[path] else []
+    hint = _family_hint(fit, data, sets, job)
+    data.warnings.setdefault(job.robot, []).extend([*on_images, *find_lattices(fit)])
+
+    if job.curves and not joint_corrections(fit.chain) and _is_kept(job, fit):
+        data.warnings.setdefault(job.robot, []).append(NO_CORRECTIONS)
+    return hint
+
+
 def _family_hint(fit: Result, data: _JobData, sets: str, job: Job) -> str:
     """Suggest --extend only if there are no warnings and parameters of the robot itself are estimated."""
     is_default = job.method == "lm" and job.priors != "none" and job.extend == "none"
@@ -439,6 +387,50 @@ def improvement_hint(fit: Result, chain: Chain, data: Sequence[Measurement], **o
 
 
 # --- output ----------------------------------------------------------------------------------------
+
+
+def _is_kept(job: Job, fit: Result) -> bool:
+    """Return whether the robot is written; a refused one must not reach a controller."""
+    return job.force or not fit.verdict.is_refused
+
+
+def _write_job(
+    job: Job, fit: Result, sets: str, data: _JobData, inputs: Sequence[str], hint: str
+) -> CalibrationOutcome:
+    """Write the outputs of a job, all or none; JSON and report explain why a robot was refused."""
+    is_kept = _is_kept(job, fit)
+    contents = ROBOT_FORMATS[_robot_ending(job.output)](fit, job) if is_kept else {}
+    source = _provenance(job, sets, data, inputs, contents, hint)
+    robot_paths = list(map(str, contents))
+    files = dict(zip((_robot_ending(job.output)[1:], "sidecar"), robot_paths, strict=False))
+    files |= _numbered("camera_file", robot_paths[len(files) :])
+    done = Calibrated(fit, source, job.robot, job.report, job.meta)
+    outputs = [row for row in job.outputs if is_kept or row[1].is_written_if_refused]
+    for name in dict.fromkeys(name for name, _, _ in outputs):
+        paths = [path for other, _, path in outputs if other == name and path != STDOUT]
+        files |= _numbered(name, paths)
+    contents |= {path: output.content(done, path) for _, output, path in outputs if output.content}
+    outliers = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))
+    zero_weight = (
+        item.rows[weight <= ZERO_WEIGHT] for item, weight in zip(fit.data, fit.weights, strict=True)
+    )
+    rejected = dict(zip(data.fit, (rows.tolist() for rows in zero_weight), strict=True))
+    document = _job_document(fit, data, outliers, files, source)
+    write_outputs(contents, job.json, document)
+    return CalibrationOutcome(
+        fit=fit,
+        document=document,
+        files=files,
+        n_rows=data.n_rows,
+        fitted=data.fit,
+        held_out=data.holdout,
+        unreachable=data.unreachable,
+        outliers=outliers,
+        rejected=rejected,
+        warnings=data.warnings,
+        notes=data.notes,
+        hint=hint,
+    )
 
 
 def _robot_files(fit: Result, job: Job) -> dict[PathLike, str | bytes]:
@@ -476,6 +468,18 @@ def _robot_files(fit: Result, job: Job) -> dict[PathLike, str | bytes]:
         for frame in _camera_frames(fit, job, data):
             contents |= camera_files(frame, f"{job.camera_files}_{frame.camera.name}")
     return contents
+
+
+# Functions that make the files of a calibrated robot, by the ending of --output.
+ROBOT_FORMATS: dict[str, Callable[[Result, Job], dict[PathLike, str | bytes]]] = {".urdf": _robot_files}
+
+
+def _robot_ending(path: str) -> str:
+    """Return the ending of --output that selects its format."""
+    for ending in ROBOT_FORMATS:
+        if path.lower().endswith(ending):
+            return ending
+    raise InvalidArgumentError(f"{path}: unknown file extension; expected {' or '.join(ROBOT_FORMATS)}")
 
 
 def _numbered(name: str, paths: Sequence[str]) -> dict[str, str]:

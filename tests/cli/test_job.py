@@ -43,14 +43,14 @@ VALUES = {
     "camera_frame": '"eye"',
     "camera_files": '"cam"',
     "force": "true",
+    "map": '"map.csv"',
+    "scene": '"scene.html"',
+    "curves": '"curves.csv"',
+    "residuals": '"residuals.csv"',
+    "json": '"r.json"',
     "report": '["r.html", "r.md"]',
     "certificate": '"c.html"',
     "meta": '["meta.toml"]',
-    "json": '"r.json"',
-    "curves": '"curves.csv"',
-    "residuals": '"residuals.csv"',
-    "scene": '"scene.html"',
-    "map": '"map.csv"',
 }
 ARGUMENTS = (
     "calibrate arm.urdf a.csv b.csv -o out.urdf --tip tool0 --root link0 --package-dir meshes "
