@@ -311,8 +311,10 @@ class Linearization:
             if parameter.name in self.instrument_columns:
                 block[self.instrument_columns[parameter.name] - first] = rows
         if not data.has_length_scale:
-            rows = next((group.rows for group in data.residual_groups.values() if group is POSITION), None)
-            normalize_by_scale(block, self.arm_scale, self.gauge_rates, rows)
+            for group in data.residual_groups.values():
+                if group.unit == "m":  # the size of a robot does not change angles
+                    rows = block[:, group.rows]
+                    normalize_by_scale(rows, self.arm_scale, self.gauge_rates, group is POSITION)
         return observation
 
 
@@ -385,8 +387,13 @@ def chunk_residual(chain: Chain, instruments: Mapping[str, float], chunk: Chunk)
 
 def _chunk_cost(chain: Chain, instruments: Mapping[str, float], size: float, chunk: Chunk) -> float:
     """Compute the sum of squared whitened residuals of a chunk, for a chain of a given size."""
-    cost = sum_of_squares(chunk_residual(chain, instruments, chunk))
-    return cost if chunk.data.has_length_scale else cost / size**2
+    residual = chunk_residual(chain, instruments, chunk)
+    if chunk.data.has_length_scale:
+        return sum_of_squares(residual)
+    return sum(
+        sum_of_squares(residual[group.rows]) / (size**2 if group.unit == "m" else 1.0)
+        for group in chunk.data.residual_groups.values()
+    )
 
 
 def _chunk_r_factor(linearization: Linearization, small_angle: bool, chunk: Chunk) -> Array:

@@ -103,10 +103,10 @@ def _rms_radius(offsets: Array) -> float:
     return float(np.sqrt(np.vdot(offsets, offsets) / _N_SAMPLES))
 
 
-def normalize_by_scale(block: Array, size: float, rates: Array, vectors: slice | None) -> None:
-    """Make whitened rows invariant to the size and the orientation of the robot."""
+def normalize_by_scale(block: Array, size: float, rates: Array, are_vectors: bool) -> None:
+    """Make whitened rows of lengths invariant to the size and the orientation of the robot."""
     block /= size
     residual = block[-1]
     block[: len(rates)] += (rates[:, 0] / size)[:, None, None] * residual
-    if vectors is not None:
-        block[: len(rates), vectors] += np.cross(rates[:, 1:, None], residual[None, vectors], axis=1)
+    if are_vectors:
+        block[: len(rates)] += np.cross(rates[:, 1:, None], residual[None], axis=1)

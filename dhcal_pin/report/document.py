@@ -10,6 +10,7 @@ import hashlib
 import json
 import math
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import metadata
@@ -96,9 +97,7 @@ def short_names(paths: Sequence[PathLike]) -> dict[str, str]:
 
 
 # Keys of an accuracy and of a parameter; further values are under `comparisons` and `priors`.
-_ACCURACY = (
-    "position_rms_m position_max_m orientation_rms_rad residual_rms residual_max unit board_rms_m board_max_m"
-).split()
+_ACCURACY = re.compile("(?!.*_axes_).+_(rms_m|max_m|rms_rad)|residual_(rms|max)|unit")
 _PARAMETER = "name unit nominal value std observability posterior_to_prior_std fixed frame direction".split()
 
 
@@ -108,7 +107,7 @@ def _select_keys(content: Mapping[str, Any], keys: Sequence[str]) -> dict[str, A
 
 def main_statistics(accuracy: Mapping[str, Any]) -> dict[str, Any]:
     """Select RMS and largest errors."""
-    return _select_keys(accuracy, _ACCURACY)
+    return {key: value for key, value in accuracy.items() if _ACCURACY.fullmatch(key)}
 
 
 def parameter_rows(fit: Result) -> list[dict[str, Any]]:
