@@ -373,8 +373,9 @@ def test_hand_eye_alone_keeps_the_arm(arm):
     assert fit.errors.parameters == ()
     np.testing.assert_array_equal(fit.chain.origins, arm.origins)
     assert fit.comparisons[-1].after["residual_rms"] < 0.35
-    truth = fit.data[0].rig.boards[0].pose
     assert fit.rig is not None
+    assert fit.data[0].rig is not None
+    truth = fit.data[0].rig.boards[0].pose
     assert fit.rig.boards[0].pose is not None
     assert np.abs(fit.rig.boards[0].pose - truth).max() < 1e-3
 
