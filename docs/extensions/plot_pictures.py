@@ -20,7 +20,7 @@ from sphinx.application import Sphinx
 import dhcal_pin as dh
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.ros_packages import resolve_robot_path
-from dhcal_pin.studies import read_study, run
+from dhcal_pin.studies import plot_study, read_study, run
 
 _FOLDER = Path("reference/api/pictures")
 _EXAMPLE = re.compile(r"`(.+\.savefig\(\"(\w+\.png)\"\))`")
@@ -52,6 +52,7 @@ def _namespace(folder: Path) -> dict[str, Any]:
         "plan": dh.plan(nominal, 20, noise=dh.Noise(1e-4, 1e-4), candidates=500),
         "study": read_study(study),
         "run": run,
+        "plot_study": plot_study,
     }
 
 

@@ -7,7 +7,7 @@ import pytest
 from camera_setups import ARMS, simulate
 
 import dhcal_pin as dh
-from dhcal_pin.calibration import procedure
+from dhcal_pin.calibration.cameras import procedure
 from dhcal_pin.calibration.evaluation import compute_errors
 from dhcal_pin.estimation.priors import PriorGroups
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from robots import measured_arm, random_joints, random_table
 
-import dhcal_pin.calibration.cross_validation as cross_validation
+import dhcal_pin.estimation.folds as folds
 import dhcal_pin.estimation.problem as problem_module
 from dhcal_pin import Chain, calibrate
 from dhcal_pin.estimation import Problem, TriangularSystem, linearize_and_factor, select_parameters
@@ -124,7 +124,7 @@ def test_calibration_is_the_same_with_the_r_factor_of_the_rows(monkeypatch):
     problem, _ = curved_problem(m=220, sets="minimal,base,tool,compliance,harmonics,curves")
     arm, data = problem.errors.chain, problem.data
     fit = calibrate(arm, data)
-    for module in (problem_module, cross_validation):
+    for module in (problem_module, folds):
         monkeypatch.setattr(module, "uses_normal_equations", lambda problem: False)
     reference = calibrate(arm, data)
     assert fit.extension is not None
