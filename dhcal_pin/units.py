@@ -18,11 +18,19 @@ LENGTHS = {"m": 1.0, "cm": 1e2, "mm": 1e3, "um": 1e6, "\u00b5m": 1e6, "\u03bcm":
 ANGLES = {"rad": 1.0, "mrad": 1e3, "deg": 180.0 / np.pi}
 # Units of image coordinates.
 PIXELS = {"px": 1.0}
+# Units per second, per kilogram, and of temperatures.
+TIMES = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9, "min": 1 / 60, "h": 1 / 3600}
+MASSES = {"kg": 1.0, "g": 1e3}
+TEMPERATURES = {"degC": 1.0}
 # Units allowed for each content type of a column.
 UNITS: Mapping[str, Mapping[str, float]] = {
     "length": LENGTHS,
     "angle": ANGLES,
     "pixel": PIXELS,
+    "time": TIMES,
+    "mass": MASSES,
+    "temperature": TEMPERATURES,
+    "direction": {},
     "number": {},
     "text": {},
     "remark": {},

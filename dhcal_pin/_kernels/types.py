@@ -7,6 +7,7 @@ per sample, r residuals per sample. The samples are on the last axis.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -21,13 +22,11 @@ class JointState:
     estimates transmission errors.
 
     Attributes:
-        independent: Positions of the independent joints, shape (n, m) [rad or m].
         positions: Positions of the moving joints, shape (k, m) [rad or m].
         cos: Cosines of `positions`, shape (k, m).
         sin: Sines of `positions`, shape (k, m).
     """
 
-    independent: Array
     positions: Array
     cos: Array
     sin: Array
@@ -44,11 +43,13 @@ class FrameBatch:
         tool: Columns x, y, z, p of the tool frame, shape (4, 3, m) [1, m].
         terms: Transmission terms of the independent joints, shape (t, n, m); None if the chain has no
             transmission.
+        conditions: Conditions of the samples that the terms were evaluated at; None without terms.
     """
 
     columns: Array
     tool: Array
     terms: Array | None = None
+    conditions: Any = None
 
     @property
     def bodies(self) -> Array:

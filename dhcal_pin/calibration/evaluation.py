@@ -161,7 +161,7 @@ def fit_nominal(
         for parameter, jacobian in zip(
             item.instrument_parameters,
             item.instrument_jacobian(
-                chain.forward_kinematics(item.configurations()),
+                chain.forward_kinematics(item.conditions()),
                 np.array([values[parameter.name] for parameter in item.instrument_parameters]),
             ),
             strict=True,
@@ -184,7 +184,7 @@ def compute_errors(
     values = fit_instrument_parameters(chain, data, known)
     return [
         item.errors(
-            chain.forward_kinematics(item.configurations()),
+            chain.forward_kinematics(item.conditions()),
             np.array([values[parameter.name] for parameter in item.instrument_parameters]),
         )
         for item in data

@@ -215,7 +215,7 @@ class FittedModel:
         """Unit, whether sigmas are stated, and weighted number of rows of each residual group."""
         counts = []
         for item, weights in zip(self.data, self.weights, strict=True):
-            frames = self.chain.forward_kinematics(item.configurations())
+            frames = self.chain.forward_kinematics(item.conditions())
             residual = item.residual(frames, self.problem.instrument_values_of(item, self.x))
             counts += [
                 (group.unit, item.has_stated_sigma, len(residual[group.rows]) * weights.sum())
@@ -359,7 +359,7 @@ class FittedModel:
             self.inliers, compute_errors(self.chain, self.inliers, self.instruments), strict=True
         ):
             whitened = item.residual(
-                self.chain.forward_kinematics(item.configurations()),
+                self.chain.forward_kinematics(item.conditions()),
                 np.array([self.instruments[parameter.name] for parameter in item.instrument_parameters]),
             )
             for name, group in item.residual_groups.items():

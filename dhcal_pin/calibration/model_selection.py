@@ -20,6 +20,8 @@ questions are asked.
    Correction curves of high order are tried only on top of those of low order. The screening of the lines
    of the residuals spares most trials of curves that are not there.
 
+   Backlash and thermal growth are tried only where the direction of approach or the temperature is known.
+
    If a family is supported, eccentricity and elasticity are added in any case. Their priors shrink them where
    the measurements do not determine them. The model is then fitted by iteration.
 
@@ -75,6 +77,7 @@ from ..estimation.solver import minimize
 from ..exceptions import UnknownNameError
 from ..formatting import Table, format_fixed
 from ..identifiability.residual_correlation import design_effect, find_residual_correlation
+from ..measurements.base import known_conditions
 from ..robot.error_families import FAMILIES, HARMONICS
 from .partition import (
     configuration_groups,
@@ -355,11 +358,17 @@ def _best_width(x: Array, determined: Array, expected: Array, members: Array) ->
     return float(np.clip(size, MIN_PRIOR_WIDTH, 1.0))
 
 
-def _missing_parameters(errors: ErrorModel, families: Sequence[str]) -> dict[str, list[ErrorParameter]]:
-    """Return the parameters of each family that are neither estimated nor fixed, if there are any."""
+def _missing_parameters(problem: Problem, families: Sequence[str]) -> dict[str, list[ErrorParameter]]:
+    """Return the parameters of each family that are neither estimated nor fixed, if there are any.
+
+    Families whose condition is not known of any sample have none.
+    """
+    errors, conditions = problem.errors, known_conditions(problem.data)
     known = {p.name for p in (*errors.parameters, *errors.fixed)}
     by_family = {
-        name: [p for p in PARAMETER_SETS[name](errors.chain) if p.name not in known] for name in families
+        name: [p for p in PARAMETER_SETS[name](errors.chain) if p.name not in known]
+        for name in families
+        if FAMILIES[name].condition in conditions
     }
     return {name: parameters for name, parameters in by_family.items() if parameters}
 
@@ -525,7 +534,7 @@ def extend(
         )
     judged = fit.without_rejected()
     n_configurations = len(np.unique(configuration_groups(judged.data)))
-    missing = _missing_parameters(fit.problem.errors, families)
+    missing = _missing_parameters(fit.problem, families)
     if n_configurations < MIN_CONFIGURATIONS or not _noise(judged) > 0:
         return fit, Extension(n_configurations=n_configurations)
     report = progress or _ignore
@@ -609,7 +618,7 @@ def _outlier_weights(problem: Problem, x: Array, previous: Sequence[Array]) -> t
     weights = []
     for item, w in zip(problem.data, previous, strict=True):
         values = problem.instrument_values_of(item, x)
-        residual = item.residual(chain.forward_kinematics(item.configurations()), values)
+        residual = item.residual(chain.forward_kinematics(item.conditions()), values)
         is_outlier = robust.standardized_residuals(residual, None, w > 0.5) > robust.OUTLIER_THRESHOLD
         weights.append(np.where(is_outlier, robust.ZERO_WEIGHT, 1.0))
     return tuple(weights)
@@ -627,7 +636,7 @@ def _rejection_stage(fit: Fit) -> str:
     for item, w in zip(problem.data, fit.weights, strict=True):
         item = item.with_weights(1 / w)
         values = problem.instrument_values_of(item, fit.solution.x)
-        residual = item.residual(chain.forward_kinematics(item.configurations()), values)
+        residual = item.residual(chain.forward_kinematics(item.conditions()), values)
         t.append(robust.standardized_residuals(residual, None, w > 0.5))
     return robust.rejection_stage(np.concatenate(t))
 
@@ -653,14 +662,14 @@ def _select_families(
     trials: list[FamilyTrial] = []
     model, random_ratio = _Model({}, _noise(fit), float("nan"), {}), float("nan")
     problem, x = fit.problem, fit.solution.x
-    low_order = tuple(name for name in missing if not FAMILIES[name].orders)
+    low_order = tuple(name for name in missing if not FAMILIES[name].is_curve)
     stages = [(low_order, families_by_stage(low_order))] if low_order else []
-    curves = families_by_stage(name for name in missing if FAMILIES[name].orders)
+    curves = families_by_stage(name for name in missing if FAMILIES[name].is_curve)
     stages += [(names, (names,)) for names in curves]
-    physical_families = families_by_stage(FAMILIES)[0]
+    physical_families = [family.name for family in FAMILIES.values() if family.rule.is_universal]
     for added, tiers in stages:
-        orders = FAMILIES[added[0]].orders
-        if orders and not _may_have_curves(problem, x, orders):
+        is_curve, orders = FAMILIES[added[0]].is_curve, FAMILIES[added[0]].orders
+        if is_curve and not _may_have_curves(problem, x, orders):
             break
         families = {
             name: ps for name, ps in missing.items() if name in (*model.widths, *added, *physical_families)
@@ -684,7 +693,7 @@ def _select_families(
             ]
             geometry = candidates.cv_error(candidates.maximize_evidence({}))
             random_ratio = candidates.cv_error(model) / geometry if geometry else 1.0
-        if orders and added[0] not in model.widths:
+        if is_curve and added[0] not in model.widths:
             break
         problem = candidates.problem
         x = np.array([model.values.get(name, 0.0) for name in _unknown_names(problem)])
@@ -708,7 +717,7 @@ def family_hint(solved: Problem, x: Array, weights: Sequence[Array]) -> str:
     """
     data = [item.take(w > robust.ZERO_WEIGHT) for item, w in zip(solved.data, weights, strict=True)]
     data = [item.take(np.s_[:: max(1, -(-len(item.rows) // MAX_HINT_SAMPLES))]) for item in data]
-    missing = _missing_parameters(solved.errors, [name for name in EXTENSIONS if not FAMILIES[name].orders])
+    missing = _missing_parameters(solved, [name for name in EXTENSIONS if not FAMILIES[name].is_curve])
     problem, x, family = _with_families(replace(solved, data=tuple(data)), x, missing)
     system, n_rows = linearize_and_factor(problem, x, small_angle=False), count_rows(problem)
     cost_before, best = solve_columns(system, problem.weights, x, family == "")[1], (MAX_HINT_RATIO, "")

@@ -339,7 +339,7 @@ def contact_groups(problem: Problem, x: Array) -> Array:
     start, samples, parameters = len(node), [], []
     for item in problem.data:
         if (item.is_contact or not item.configurations_per_row) and len(item.rows):
-            frames = chain.forward_kinematics(item.configurations())
+            frames = chain.forward_kinematics(item.conditions())
             depends, sample = np.nonzero(
                 item.instrument_jacobian(frames, problem.instrument_values_of(item, x)).any(1)
             )

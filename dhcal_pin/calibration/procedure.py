@@ -41,9 +41,11 @@ from ..estimation.solver import METHODS, minimize
 from ..estimation.trimmed_squares import find_initial_outliers
 from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..measurements.arguments import as_measurements, require_chain
-from ..measurements.base import Measurement
+from ..measurements.base import Measurement, known_conditions
 from ..parallel import SERIAL, TaskExecutor
 from ..robot.chain import BASE_FRAME, Chain
+from ..robot.conditions import CONDITIONS
+from ..robot.error_families import FAMILIES
 from . import model_selection
 from .cameras import (
     default_sets,
@@ -60,6 +62,9 @@ from .cross_validation import leave_regions_out
 from .result import Result, make_result
 from .reweighting import Fit, reweight
 from .shrinkage import compute_shrinkage_factor
+
+# Decimals of the reference temperature of a model [°C].
+REFERENCE_DECIMALS = 1
 
 Method = Literal["lm", "gn"]
 
@@ -148,6 +153,7 @@ def calibrate(
     for item in (*data, *holdout):
         chain.validated_q(item.configurations())
     priors = priors if priors is not None else ("none" if method == "gn" else "default")
+    chain = _at_measured_temperature(chain, data)
     robot_sets, rig_sets = split_sets(parameters if parameters is not None else default_sets(chain, data))
     require_joint_values((*data, *holdout), [*robot_sets, *free])
     data, exchanges = exchange_axes(chain, data)
@@ -155,6 +161,7 @@ def calibrate(
     known = {**held_values(data, rig_sets), **_validated_known(data, known or {})}
     errors = select_parameters(chain, robot_sets, fix, free) if robot_sets or free else ErrorModel(chain, ())
     families = _extension_families(extend, errors, method, priors)
+    _require_conditions([*robot_sets, *(families if extend not in (None, "auto") else ())], data)
     if has_images(data):
         require_no_selection(extend, families)
     is_robust = method == "lm" and loss != "linear"
@@ -175,6 +182,30 @@ def calibrate(
         return calibrate_images(fitting, fit, chain, holdout, exchanges)
     fit = reweight(fit, stages, groups, max_iterations, progress)
     return _calibrate_samples(fit, groups, families, holdout, max_iterations, progress)
+
+
+def _at_measured_temperature(chain: Chain, data: Sequence[Measurement]) -> Chain:
+    """Return the chain whose links have the lengths of its model at the mean measured temperature."""
+    parts = [item.recorded.temperature for item in data if item.recorded is not None]
+    measured = [part for part in parts if part is not None]
+    is_known = chain.transmission is not None and chain.transmission.link_terms.any()
+    if is_known or not sum(map(len, measured)):
+        return chain
+    reference = round(float(np.mean(np.concatenate(measured))), REFERENCE_DECIMALS)
+    return replace(chain, reference_temperature=reference)
+
+
+def _require_conditions(sets: Sequence[str], data: Sequence[Measurement]) -> None:
+    """Raise an error if a named family of joint errors needs a condition that no sample states."""
+    known = known_conditions(data)
+    for name in sets:
+        if name in FAMILIES and FAMILIES[name].condition not in known:
+            condition = CONDITIONS[FAMILIES[name].condition]
+            column = f"{condition.name}_JOINT" if condition.is_per_joint else condition.name
+            raise InvalidArgumentError(
+                f"{name!r} needs the {condition.description}, which no measurement states; expected columns "
+                f"{column!r} in the measurement file"
+            )
 
 
 def _start(problem: Problem, distortion: Mapping[str, float]) -> Array:

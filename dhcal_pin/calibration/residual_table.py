@@ -157,7 +157,7 @@ def residual_table(fit: FittedModel) -> ResidualTable:
 def _fitted_residuals(fit: FittedModel) -> Iterator[tuple[dict[str, Array], Array]]:
     """Yield the errors by group and the normalised residuals (m,) of each fitted measurement."""
     for item, weighted, weights in zip(fit.data, fit.problem.data, fit.weights, strict=True):
-        frames = fit.chain.forward_kinematics(item.configurations())
+        frames = fit.chain.forward_kinematics(item.conditions())
         u = fit.problem.instrument_values_of(item, fit.x)
         # The rows of the problem are scaled by the square roots of the robust weights.
         yield item.errors(frames, u), _root_mean_square(weighted.residual(frames, u)) / np.sqrt(weights)
@@ -168,7 +168,7 @@ def _holdout_residuals(fit: FittedModel) -> Iterator[tuple[dict[str, Array], Arr
     data = [item.initialized(fit.chain) for item in fit.holdout]
     values = fit_instrument_parameters(fit.chain, data, fit.instruments)
     for item in data:
-        frames = fit.chain.forward_kinematics(item.configurations())
+        frames = fit.chain.forward_kinematics(item.conditions())
         u = np.array([values[parameter.name] for parameter in item.instrument_parameters])
         yield item.errors(frames, u), _root_mean_square(_with_fitted_sigma(fit, item).residual(frames, u))
 
@@ -192,7 +192,7 @@ def _with_fitted_sigma(fit: FittedModel, item: Measurement) -> Measurement:
 def _sigma_scales(fit: FittedModel, index: int) -> dict[str, float]:
     """Return the factor by which the fit scaled the standard deviations of each residual group."""
     u = fit.problem.instrument_values_of(fit.data[index], fit.x)
-    frames = fit.chain.forward_kinematics(fit.data[index].configurations())
+    frames = fit.chain.forward_kinematics(fit.data[index].conditions())
     weights = np.sqrt(fit.weights[index])
     plain, scaled = (item.data[index].residual(frames, u) for item in (fit, fit.problem))
     norms = {

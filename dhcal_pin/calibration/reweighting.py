@@ -231,7 +231,7 @@ def estimate_variance_components(
     chain = problem.errors.at(solution.x[: len(problem.errors.parameters)])
     residuals = [
         item.residual(
-            chain.forward_kinematics(item.configurations()), problem.instrument_values_of(item, solution.x)
+            chain.forward_kinematics(item.conditions()), problem.instrument_values_of(item, solution.x)
         )
         for item in data
     ]

@@ -208,7 +208,7 @@ def _sigma_scales(fit: Result, head: Measurement) -> dict[str, float] | None:
     if head.has_stated_sigma:
         return None
     (used,) = fit.problem.data
-    frames = fit.chain.forward_kinematics(head.configurations())
+    frames = fit.chain.forward_kinematics(head.conditions())
     u = fit.problem.instrument_values_of(head, fit.x)
     plain, scaled = (item.residual(frames, u) for item in (head, used))
     return {

@@ -21,7 +21,7 @@ from ..calibration.partition import different_configurations
 from ..estimation.uncertainty import UNBOUNDED_TOL, Uncertainty
 from ..robot.coverage import JointCoverage, bin_indices, joint_coverage, lattice_warnings
 from ..robot.error_families import CURVE_ORDERS
-from ..robot.transmission import MAX_CURVE_ORDER, fill_harmonics, n_coefficients, split_coefficients
+from ..robot.transmission import MAX_CURVE_ORDER, coefficient_indices, fill_harmonics
 
 # Joint values of a curve: every degree of a turn [rad].
 CURVE_VALUES = np.deg2rad(np.arange(-180.0, 181.0))
@@ -76,8 +76,7 @@ def joint_curves(fit: Evidence) -> list[JointCurve]:
 
 def find_lattices(fit: Evidence) -> list[str]:
     """Find joints whose estimated correction curve is not determined because their values form a lattice."""
-    n = fit.chain.n_joints
-    _, indices, _ = split_coefficients(np.arange(n_coefficients(n)), n)
+    _, indices, *_ = coefficient_indices(*fit.chain.mimic_matrix.shape)
     orders, joints = np.nonzero(np.isin(indices, fit.uncertainty.entries).any(1))
     estimated = {fit.chain.joint_names[i] for i in joints[orders + 1 >= CURVE_ORDERS.start]}
     if not estimated:
@@ -88,8 +87,7 @@ def find_lattices(fit: Evidence) -> list[str]:
 
 def _curve_std(uncertainty: Uncertainty, joint: int, waves: Array) -> Array:
     """Return the standard deviation of a joint's curve (v,) from the harmonics (K, 2, v) at its values."""
-    n = uncertainty.chain.n_joints
-    _, indices, _ = split_coefficients(np.arange(n_coefficients(n)), n)
+    _, indices, *_ = coefficient_indices(*uncertainty.chain.mimic_matrix.shape)
     is_of_joint = np.isin(uncertainty.entries, indices[:, :, joint])
     by_index = dict(
         zip(indices[:, :, joint].ravel().tolist(), waves.reshape(-1, waves.shape[-1]), strict=True)

@@ -66,7 +66,7 @@ def median_sigmas(fit: Result) -> list[dict[str, float]]:
     """Compute the median standard deviations that the fitted measurements were weighted with."""
     out = []
     for item, weights in zip(fit.problem.data, fit.weights, strict=True):
-        frames = fit.chain.forward_kinematics(item.configurations())
+        frames = fit.chain.forward_kinematics(item.conditions())
         u = fit.problem.instrument_values_of(item, fit.x)
         whitened, errors = item.residual(frames, u), item.errors(frames, u)
         medians = {}
@@ -148,7 +148,7 @@ def _offset_equations(chain: Chain, data: Sequence[Measurement], fit: Result) ->
     ar, aa = [], []
     for item in data:
         u = np.array([known[parameter.name] for parameter in item.instrument_parameters])
-        frames = chain.forward_kinematics(item.configurations())
+        frames = chain.forward_kinematics(item.conditions())
         residual = item.residual(frames, u)
         a = whitened_jacobian(item, frames, chain.tool_jacobian(frames, bodies, twists), u, residual)
         ar.append(np.sum(a * residual, 1))

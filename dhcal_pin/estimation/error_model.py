@@ -46,14 +46,15 @@ class ErrorParameter:
 
     Attributes:
         name: Name for users, such as `d2` or `elbow_joint.rx`.
-        unit: Unit of the value: "m" or "rad" for a geometric error; "1", "rad", "rad/Nm", "rad/rad" or
-            "rad/m" for a transmission coefficient.
+        unit: Unit of the value: "m" or "rad" for a geometric error; "1", "rad", "rad/Nm", "rad/rad",
+            "rad/m" or "1/K" for a transmission coefficient.
         nominal: Nominal value in that unit: the DH table entry or the transmission coefficient; zero for
             errors that are differences.
         error_frame: Index of the error frame: 0 base, 2j joint j, 2j+1 link j, 2k+2 tip, 2k+3 tool.
         twist: Twist [v, ω] per unit of the error, in axes of the error frame.
         prior: Standard deviation expected before any measurement, in the unit of the value.
         coefficient_index: Index of the transmission coefficient; None for a geometric error.
+        quantity: What a transmission coefficient changes: "position" of a joint or "length" of a link.
     """
 
     name: str
@@ -63,12 +64,13 @@ class ErrorParameter:
     twist: tuple[float, ...]
     prior: float
     coefficient_index: int | None = None
+    quantity: str = ""
 
     def definition(self, chain: Chain) -> tuple[str, str]:
         """Describe the frame and the direction in which the error is defined."""
-        if self.coefficient_index is not None:
-            return f"joint {chain.moving_joints[self.error_frame // 2 - 1]}", "position"
-        return frame_name(chain, self.error_frame), direction_name(self.twist)
+        if self.quantity == "position":
+            return f"joint {chain.moving_joints[self.error_frame // 2 - 1]}", self.quantity
+        return frame_name(chain, self.error_frame), self.quantity or direction_name(self.twist)
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,12 +33,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import se3
-from .._typing import Array
 from ..exceptions import DhcalError, InvalidArgumentError, UnknownNameError
 from ..robot.chain import BASE_FRAME, Chain, extract_dh_table, joint_frame, link_frame, without_mimics
 from ..robot.dh import Convention
-from ..robot.error_families import COMPLIANCE, COUPLING, FAMILIES, GAIN, HARMONICS
-from ..robot.transmission import n_coefficients, split_coefficients
+from ..robot.error_families import COUPLING, FAMILIES, GAIN, JOINT_TERMS, LINK_TERMS, ErrorFamily
+from ..robot.transmission import coefficient_indices
 from .error_model import ErrorModel, ErrorParameter
 
 # Prior standard deviations of manufacturing and assembly errors: lengths [m], angles and joint offsets [rad].
@@ -49,20 +48,6 @@ OFFSET_PRIOR = np.deg2rad(2.0)
 FRAME_LENGTH_PRIOR = 10.0
 FRAME_ANGLE_PRIOR = 10.0
 
-# Prior standard deviations of transmission coefficients, typical of industrial arms: gear ratios are off by
-# 0.2 % [1]; eccentricity is about 1 mrad, and a higher harmonic about 0.1 mrad [rad]; a joint yields by about
-# 0.1 mrad/Nm [rad/Nm]; coupling [rad/rad or rad/m].
-GAIN_PRIOR = 2e-3
-HARMONIC_PRIOR, CURVE_PRIOR = 1e-3, 1e-4
-COMPLIANCE_PRIOR = 1e-4
-COUPLING_PRIOR = 2e-3
-
-# Orders of the harmonics of the set `harmonics`: eccentricity and its second harmonic.
-HARMONIC_ORDERS = range(1, 3)
-
-# Smallest maximum [N·m] of the gravity torque on a compliant joint. A joint that is loaded less has no
-# compliance: some URDFs have links with token masses.
-MIN_TORQUE = 0.1
 # Largest number of harmonics of a joint that messages list one by one.
 MAX_LISTED_HARMONICS = 4
 _HARMONIC_NAME = re.compile(r"(.+)\.((?:sin|cos)\d+)")
@@ -219,88 +204,84 @@ def tool(chain: Chain) -> list[ErrorParameter]:
     return _frame_parameters("tool", chain.tool_frame_index, FRAME_LENGTH_PRIOR, FRAME_ANGLE_PRIOR)
 
 
-def _transmission_parameters(
-    chain: Chain, joint: int, coefficients: Sequence[tuple[int, str, str]], prior: float
-) -> list[ErrorParameter]:
-    """Build the parameters of transmission coefficients that move an independent joint."""
-    # The error acts at the first moving joint that the independent joint drives.
-    moving_joint = int(np.flatnonzero(chain.mimic_matrix[:, joint])[0])
-    twist = _joint_twist(chain.axes[moving_joint].tolist(), chain.prismatic[moving_joint])
-    nominal = None if chain.transmission is None else chain.transmission.coefficients
-    frame, joint_name = link_frame(moving_joint + 1), chain.joint_names[joint]
+@dataclass(frozen=True)
+class _Coefficient:
+    """Transmission coefficient of an independent joint or of a link.
+
+    Attributes:
+        index: Index of the coefficient.
+        owner: Number of the joint or link.
+        name: Name, after that of the joint or link.
+        unit: Unit.
+    """
+
+    index: int
+    owner: int
+    name: str
+    unit: str
+
+
+def _joint_coefficients(chain: Chain, family: ErrorFamily) -> list[_Coefficient]:
+    """Return the coefficients of a family that move joints."""
+    linear, harmonics, joint_terms, _ = coefficient_indices(*chain.mimic_matrix.shape)
+    n, joints = chain.n_joints, np.flatnonzero(~chain.is_prismatic).tolist()
+    if family.name == GAIN:
+        return [_Coefficient(int(linear[i, i]), i, "gain", "1") for i in range(n)]
+    if family.name == COUPLING:
+        units = ["rad/m" if is_prismatic else "rad/rad" for is_prismatic in chain.is_prismatic]
+        names = chain.joint_names
+        return [
+            _Coefficient(int(linear[i, j]), i, names[j], units[j]) for i in joints for j in range(n) if i != j
+        ]
+    if family.joint_term:
+        term, row = family.joint_term, list(JOINT_TERMS).index(family.name)
+        has_effect = term.has_effect(chain.loads)
+        return [
+            _Coefficient(int(joint_terms[row, i]), i, term.coefficient, term.unit)
+            for i in joints
+            if has_effect[i]
+        ]
     return [
-        ErrorParameter(
-            f"{joint_name}.{name}",
-            unit,
-            0.0 if nominal is None else float(nominal[index]),
-            frame,
-            twist,
-            prior,
-            index,
-        )
-        for index, name, unit in coefficients
+        _Coefficient(int(harmonics[k - 1, part, i]), i, f"{function}{k}", "rad")
+        for i in joints
+        for k in family.orders
+        for part, function in enumerate(("sin", "cos"))
     ]
 
 
-def _coefficient_indices(chain: Chain) -> tuple[Array, Array, Array]:
-    """Return the indices of linear coefficients (n, n), harmonics (K, 2, n) and compliance (n,)."""
-    return split_coefficients(np.arange(n_coefficients(chain.n_joints)), chain.n_joints)
+def _link_coefficients(chain: Chain, family: ErrorFamily) -> list[_Coefficient]:
+    """Return the coefficients of a family that change lengths of links."""
+    term = family.link_term
+    if term is None:
+        return []
+    *_, link_terms = coefficient_indices(*chain.mimic_matrix.shape)
+    indices = link_terms[list(LINK_TERMS).index(family.name)]
+    links = np.flatnonzero(term.has_effect(chain.loads)).tolist()
+    return [_Coefficient(int(indices[j]), j, term.coefficient, term.unit) for j in links]
 
 
-def _revolute_joints(chain: Chain) -> list[int]:
-    """Return the numbers of the independent joints that are revolute."""
-    return np.flatnonzero(~chain.is_prismatic).tolist()
+def joint_errors(chain: Chain, family: ErrorFamily) -> list[ErrorParameter]:
+    """Build the parameters of a family of joint errors: transmission coefficients."""
+    known = chain.transmission
 
+    def parameter(
+        coefficient: _Coefficient, owner: str, frame: int, twist: tuple[float, ...], quantity: str
+    ) -> ErrorParameter:
+        name, index = f"{owner}.{coefficient.name}", coefficient.index
+        nominal = 0.0 if known is None else float(known.coefficients[index])
+        return ErrorParameter(name, coefficient.unit, nominal, frame, twist, family.prior, index, quantity)
 
-def gain(chain: Chain) -> list[ErrorParameter]:
-    """Build the relative error of each joint's gear ratio."""
-    linear, _, _ = _coefficient_indices(chain)
-    return [
-        parameter
-        for i in range(chain.n_joints)
-        for parameter in _transmission_parameters(chain, i, [(int(linear[i, i]), "gain", "1")], GAIN_PRIOR)
-    ]
-
-
-def harmonics(
-    chain: Chain, orders: Sequence[int] = HARMONIC_ORDERS, prior: float = HARMONIC_PRIOR
-) -> list[ErrorParameter]:
-    """Build the periodic errors of each revolute joint: sine and cosine of multiples of its position."""
-    _, indices, _ = _coefficient_indices(chain)
     out = []
-    for i in _revolute_joints(chain):
-        coefficients = [
-            (int(indices[k - 1, part, i]), f"{function}{k}", "rad")
-            for k in orders
-            for part, function in enumerate(("sin", "cos"))
-        ]
-        out += _transmission_parameters(chain, i, coefficients, prior)
-    return out
-
-
-def compliance(chain: Chain) -> list[ErrorParameter]:
-    """Build the rotation of each revolute joint per unit of its gravity torque."""
-    _, _, indices = _coefficient_indices(chain)
-    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (chain.n_joints, 64))
-    is_loaded = np.abs(chain.loads.torques(q)).max(-1) > MIN_TORQUE
-    out = []
-    for i in _revolute_joints(chain):
-        if is_loaded[i]:
-            coefficients = [(int(indices[i]), "compliance", "rad/Nm")]
-            out += _transmission_parameters(chain, i, coefficients, COMPLIANCE_PRIOR)
-    return out
-
-
-def coupling(chain: Chain) -> list[ErrorParameter]:
-    """Build the rotation of each revolute joint per unit of every other joint's position."""
-    linear, _, _ = _coefficient_indices(chain)
-    units = ["rad/m" if is_prismatic else "rad/rad" for is_prismatic in chain.is_prismatic]
-    out = []
-    for i in _revolute_joints(chain):
-        coefficients = [
-            (int(linear[i, j]), source, units[j]) for j, source in enumerate(chain.joint_names) if i != j
-        ]
-        out += _transmission_parameters(chain, i, coefficients, COUPLING_PRIOR)
+    for coefficient in _joint_coefficients(chain, family):
+        # The error acts at the first moving joint that the independent joint drives.
+        joint = int(np.flatnonzero(chain.mimic_matrix[:, coefficient.owner])[0])
+        twist = _joint_twist(chain.axes[joint].tolist(), chain.prismatic[joint])
+        name = chain.joint_names[coefficient.owner]
+        out.append(parameter(coefficient, name, link_frame(joint + 1), twist, "position"))
+    for coefficient in _link_coefficients(chain, family):
+        twist = (*chain.loads.link_vectors[coefficient.owner].tolist(), *_ZERO)
+        name = chain.link_names[coefficient.owner]
+        out.append(parameter(coefficient, name, link_frame(coefficient.owner), twist, "length"))
     return out
 
 
@@ -331,18 +312,8 @@ PARAMETER_SETS: dict[str, ParameterSet] = {
     "tool": ParameterSet(tool, "pose of the measured point in the tip frame"),
     "offset": ParameterSet(offset, "zero position of each joint"),
     **{
-        name: ParameterSet(build, FAMILIES[name].description)
-        for name, build in (
-            (GAIN, gain),
-            (HARMONICS, harmonics),
-            *(
-                (family.name, functools.partial(harmonics, orders=family.orders, prior=CURVE_PRIOR))
-                for family in FAMILIES.values()
-                if family.orders
-            ),
-            (COMPLIANCE, compliance),
-            (COUPLING, coupling),
-        )
+        name: ParameterSet(functools.partial(joint_errors, family=family), family.description)
+        for name, family in FAMILIES.items()
     },
 }
 

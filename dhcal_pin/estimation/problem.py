@@ -30,13 +30,14 @@ from typing import Any, TypeVar
 import numpy as np
 
 from .._kernels import apply_observation_matrix, factor_jacobian
-from .._kernels.types import FrameBatch, JointState, ObservationMatrix
+from .._kernels.types import FrameBatch, ObservationMatrix
 from .._kernels.work_arrays import UnbufferedRows, work_array
 from .._typing import Array
 from ..measurements.base import InstrumentParameter, Measurement
 from ..measurements.groups import POSITION
 from ..parallel import SERIAL, TaskExecutor
 from ..robot.chain import Chain
+from ..robot.conditions import SampleState
 from .error_model import ErrorModel
 from .normal_equations import NormalEquations
 from .qr import TriangularSystem, combine_r_factors, sum_of_squares
@@ -131,7 +132,10 @@ class Problem:
         pairs = list(zip(self.data, data, strict=True))
         if all(old is new for old, new in pairs):
             vars(out)["chunks"] = self.chunks
-        elif all(old.configurations() is new.configurations() for old, new in pairs):
+        elif all(
+            old.configurations() is new.configurations() and old.recorded is new.recorded
+            for old, new in pairs
+        ):
             for old, new in zip(self.chunks, out.chunks, strict=True):
                 new.reuse_joint_state(old)
         return out
@@ -191,9 +195,9 @@ class Chunk:
     nominal: Chain
 
     @cached_property
-    def joint_state(self) -> JointState:
+    def joint_state(self) -> SampleState:
         """Joint state at the configurations of the samples."""
-        return self.nominal.joint_state(self.data.configurations())
+        return self.nominal.joint_state(self.data.conditions())
 
     def reuse_joint_state(self, other: Chunk) -> None:
         """Take over the joint state of a chunk, if it has been computed."""
@@ -264,10 +268,10 @@ class Linearization:
         residual_dim, m = chunk.data.residual_dim, len(chunk.data.rows)
         dense = np.empty((other._n_columns, residual_dim, m))
         observation = other._fill(dense, chunk, frames, False)
-        motions = self.chain.joint_jacobian(frames)
+        joints, terms = self.chain.transmission_terms(frames, entries)
+        motions = self.chain.motions(frames, joints)
         joint_rows = np.empty((len(motions), residual_dim, m))
         apply_observation_matrix(motions, observation, joint_rows)
-        joints, terms = self.chain.transmission_terms(frames, entries)
         by_joint = np.argsort(joints, kind="stable")
         starts = np.unique(np.sort(joints), return_index=True)
         ends = [*starts[1][1:].tolist(), len(entries)]

@@ -212,9 +212,9 @@ class Uncertainty:
         out = out.swapaxes(0, 1)
         if not len(self.entries):
             return out
-        # All coefficients of a joint share the twist of its motion.
-        by_joint = chain.joint_jacobian(frames)
+        # All coefficients of a motion share its twist.
         joints, terms = chain.transmission_terms(frames, self.entries)
+        by_joint = chain.motions(frames, joints)
         angles = np.zeros((len(out), len(by_joint), directions.shape[1]))
         for joint in set(joints):
             moving = np.flatnonzero(np.array(joints) == joint)

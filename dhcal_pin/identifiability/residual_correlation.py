@@ -97,7 +97,7 @@ def find_residual_correlation(
             effect, residual = np.tensordot(root, rows[:-1], (0, 0)), rows[-1]
         else:
             values = problem.instrument_values_of(part, x)
-            residual = part.residual(chain.forward_kinematics(part.configurations()), values) / noise
+            residual = part.residual(chain.forward_kinematics(part.conditions()), values) / noise
             effect, is_exact = np.empty((0, *residual.shape)), False
         scores = _score_terms(_points(part.q, problem.errors.chain.is_prismatic), residual, effect)
         excess += scores.excess

@@ -205,7 +205,13 @@ def urdf_files(
     origins, tool = joint_origins(chain)
     data = with_origins(chain.urdf, origins)
     parsed = Chain.from_urdf(parse_urdf(data, os.fspath(path)), chain.tip, chain.root)
-    written = replace(parsed, base=chain.base, tool=tool, payload=chain.payload)
+    written = replace(
+        parsed,
+        base=chain.base,
+        tool=tool,
+        payload=chain.payload,
+        reference_temperature=chain.reference_temperature,
+    )
     if chain.transmission is not None:
         # The torque of gravity on the joints follows from the masses of the written URDF.
         transmission = replace(chain.transmission, loads=written.loads)

@@ -18,9 +18,16 @@ The sidecar of `arm.urdf` is the TOML file `arm.calibration.toml` beside it:
     gain = 0.001
     harmonics = [[1, 2e-4, -1e-4]]     # order, sine and cosine of each harmonic [rad]
     compliance_rad_per_nm = -2e-5
+    backlash_rad = 4e-4                # width; the joint lags behind its direction of motion by half of it
 
     [joint.elbow_joint.coupling]       # coefficients of other joints' positions
     wrist_1_joint = 0.0001
+
+    [thermal]                          # growth of the links
+    reference_degc = 24.0              # temperature at which the links have the lengths of the URDF
+
+    [thermal.per_kelvin]               # relative growth of each link, by the name of the link
+    forearm_link = 2.3e-5
 
     [instrument]                       # parameters of instruments [m or rad]
     "wire1.x" = 1.25
@@ -75,7 +82,8 @@ from ..measurements.measured_region import MeasuredRegion
 from ..measurements.mounting import MountedRig
 from ..messages import quote
 from ..robot.chain import Chain
-from ..robot.error_families import FAMILIES
+from ..robot.conditions import TEMPERATURE_RANGE
+from ..robot.error_families import FAMILIES, JOINT_TERMS, LINK_TERMS
 from ..robot.transmission import (
     MAX_CURVE_ORDER,
     Payload,
@@ -111,6 +119,9 @@ _HEADER = """\
 _JOINT_HEADER = """\
 # joint: what is added to the commanded position q of a joint, by q and the torque of gravity. harmonics:
 # k and the factors of sin(k q) and cos(k q) in radians.
+"""
+_THERMAL_HEADER = """\
+# thermal: relative growth of the length of each link per kelvin above the reference temperature.
 """
 _UNCERTAINTY_HEADER = """\
 # uncertainty: square root of the covariance of the errors, and directions that neither the measurements nor
@@ -150,6 +161,7 @@ def with_sidecar(chain: Chain, path: PathLike) -> Chain:
     frames = {key: read_pose(table.table(key)) for key in ("base", "tool") if key in table}
     payload = _read_payload(table.table("payload")) if "payload" in table else None
     joints = table.table("joint") if "joint" in table else None
+    thermal = table.table("thermal") if "thermal" in table else None
     if "manifest" in table:
         _check_manifest(table.table("manifest"), chain.urdf, tip)
     # `read_instrument`, `read_uncertainty` and `read_measured_region` read these tables; those of cameras and
@@ -166,8 +178,10 @@ def with_sidecar(chain: Chain, path: PathLike) -> Chain:
                 f"{table.where}: [payload] is carried by {tip!r}; select that link with --tip"
             )
         chain = chain.with_payload(payload)
-    if joints is not None:
-        chain = chain.with_transmission(_read_transmission(chain, joints))
+    if thermal is not None:
+        chain = replace(chain, reference_temperature=_read_reference(thermal))
+    if joints is not None or thermal is not None:
+        chain = chain.with_transmission(_read_transmission(chain, joints, thermal))
     return chain
 
 
@@ -220,18 +234,42 @@ def _read_payload(table: TomlTable) -> Payload:
     return Payload(mass, (x, y, z))
 
 
-def _read_transmission(chain: Chain, table: TomlTable) -> Transmission:
-    """Read the tables [joint.NAME]; joints of the robot that are not on the chain are ignored."""
-    coefficients = np.zeros(n_coefficients(chain.n_joints))
-    for name in table.keys():
-        joint = table.table(name)
+def _read_transmission(chain: Chain, joints: TomlTable | None, thermal: TomlTable | None) -> Transmission:
+    """Read the tables [joint.NAME] and [thermal]; joints and links that are not on the chain are ignored."""
+    coefficients = np.zeros(n_coefficients(*chain.mimic_matrix.shape))
+    for name in joints.keys() if joints is not None else ():
+        joint = joints.table(name)
         if name in chain.joint_names:
             _read_joint(chain, chain.joint_names.index(name), joint, coefficients)
         elif name not in _joints_off_path(chain):
             raise UnknownNameError(
-                f"{table.where}: unknown joint {name!r}; choose from {', '.join(chain.joint_names)}"
+                f"{joints.where}: unknown joint {name!r}; choose from {', '.join(chain.joint_names)}"
             )
+    if thermal is not None:
+        _read_links(chain, thermal, coefficients)
     return Transmission(coefficients, chain.loads)
+
+
+def _read_reference(table: TomlTable) -> float:
+    """Return the temperature at which the links have the lengths of the URDF [°C]."""
+    low, high = TEMPERATURE_RANGE
+    return table.number("reference_degc", at_least=low, at_most=high)
+
+
+def _read_links(chain: Chain, table: TomlTable, coefficients: Array) -> None:
+    """Read the coefficients of links, by family and name of the link, into those of a transmission (c,)."""
+    *_, link_terms = split_coefficients(coefficients, chain.n_joints)
+    for row, term in zip(link_terms, LINK_TERMS.values(), strict=True):
+        links = table.table(term.sidecar_key)
+        for name in links.keys():
+            value = _coefficient(links, name)
+            if name in chain.link_names:
+                row[chain.link_names.index(name)] = value
+            elif name not in chain.urdf.links:
+                raise UnknownNameError(
+                    f"{links.where}: unknown link {name!r}; choose from {', '.join(chain.link_names)}"
+                )
+    table.finish()
 
 
 def _joints_off_path(chain: Chain) -> set[str]:
@@ -241,13 +279,13 @@ def _joints_off_path(chain: Chain) -> set[str]:
 
 def _read_joint(chain: Chain, i: int, table: TomlTable, coefficients: Array) -> None:
     """Read the table of joint i into the coefficients of a transmission, shape (c,)."""
-    linear, harmonics, compliance = split_coefficients(coefficients, chain.n_joints)
+    linear, harmonics, joint_terms, _ = split_coefficients(coefficients, chain.n_joints)
     if chain.is_prismatic[i]:
         table.name += " (prismatic)"
     linear[i, i] = _coefficient(table, "gain")
     if not chain.is_prismatic[i]:
         harmonics[:, :, i] = _read_harmonics(table)
-        compliance[i] = _coefficient(table, "compliance_rad_per_nm")
+        joint_terms[:, i] = [_coefficient(table, term.sidecar_key) for term in JOINT_TERMS.values()]
         coupling = table.table("coupling")
         others = {name: j for j, name in enumerate(chain.joint_names) if j != i}
         for name in coupling.keys():
@@ -403,6 +441,7 @@ def sidecar_text(
     tables = {
         "payload": _payload_content(chain.payload),
         "joint": _transmission_content(chain),
+        "thermal": _thermal_content(chain),
         "instrument": {name: float(value) for name, value in (instrument or {}).items()},
         "uncertainty": _uncertainty_content(uncertainty),
         "measured": _measured_content(chain, measured_region),
@@ -414,6 +453,7 @@ def sidecar_text(
         return None
     header = _HEADER
     header += _JOINT_HEADER if "joint" in tables else ""
+    header += _THERMAL_HEADER if "thermal" in tables else ""
     header += _UNCERTAINTY_HEADER if "uncertainty" in tables else ""
     header += _MEASURED_HEADER if "measured" in tables else ""
     frames = {"base": pose_content(chain.base), "tool": pose_content(tool)}
@@ -454,7 +494,10 @@ def _transmission_content(chain: Chain) -> dict[str, Any]:
         joint: dict[str, Any] = {
             "gain": transmission.linear[i, i].item(),
             "harmonics": [[k + 1, *harmonics[k].tolist()] for k in np.flatnonzero(harmonics.any(1)).tolist()],
-            "compliance_rad_per_nm": transmission.compliance[i].item(),
+            **{
+                term.sidecar_key: row[i].item()
+                for term, row in zip(JOINT_TERMS.values(), transmission.joint_terms, strict=True)
+            },
             "coupling": {
                 names[j]: transmission.linear[i, j].item()
                 for j in np.flatnonzero(transmission.linear[i])
@@ -464,6 +507,20 @@ def _transmission_content(chain: Chain) -> dict[str, Any]:
         if joint := {key: value for key, value in joint.items() if value}:
             content[name] = joint
     return content
+
+
+def _thermal_content(chain: Chain) -> dict[str, Any]:
+    """Return the table [thermal]; empty if no link grows."""
+    if chain.transmission is None or not chain.transmission.link_terms.any():
+        return {}
+    rows = zip(LINK_TERMS.values(), chain.transmission.link_terms, strict=True)
+    return {
+        "reference_degc": chain.reference_temperature,
+        **{
+            term.sidecar_key: {chain.link_names[j]: row[j].item() for j in np.flatnonzero(row).tolist()}
+            for term, row in rows
+        },
+    }
 
 
 def _uncertainty_content(uncertainty: Uncertainty | None) -> dict[str, Any]:

@@ -23,17 +23,19 @@ entered in `measurements.KINDS`. Files, simulation, calibration and planning tak
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .._kernels import apply_observation_matrix
 from .._kernels.types import FrameBatch, ObservationMatrix
 from .._typing import Array
-from ..exceptions import InvalidArgumentError
+from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..robot.chain import Chain
+from ..robot.conditions import CONDITIONS, Conditions, concatenate_conditions, directions_in_order
 from .columns import Column, common_text, file_columns, stack_columns, stack_sigmas
 from .groups import ErrorGroup, Group, declare
 from .mounting import MountedRig
@@ -97,6 +99,7 @@ class Measurement(ABC):
         has_joint_values: Whether the joint positions were measured. Otherwise they only reproduce measured
             poses of the tip, and say nothing about the joint space of a robot.
         rig: Cameras and boards of image coordinates; None for all other kinds.
+        recorded: Conditions that were recorded with the samples; None without.
     """
 
     q: Array
@@ -106,6 +109,7 @@ class Measurement(ABC):
     source: str
     has_joint_values: bool
     rig: MountedRig | None
+    recorded: Conditions | None
 
     # Name of the kind in files, on the command line and in studies.
     kind: ClassVar[str]
@@ -142,7 +146,7 @@ class Measurement(ABC):
 
     def _initialize(self, **values: Any) -> None:
         """Set attributes of an immutable object; for constructors only."""
-        self.__dict__.update({"has_joint_values": True, "rig": None} | values)
+        self.__dict__.update({"has_joint_values": True, "rig": None, "recorded": None} | values)
 
     def __repr__(self) -> str:
         """Return the kind, the number of samples and the standard deviations."""
@@ -155,6 +159,49 @@ class Measurement(ABC):
         return []
 
     # ------------------------------------------------------------------------------------------- copies
+    def with_conditions(self, **conditions: ArrayLike) -> Self:
+        """Return a copy with conditions of the samples besides the joint positions.
+
+        Args:
+            **conditions: Values by name: `time` (m,) [s], `temperature` (m,) [°C], `payload` (m,) [kg], and
+                `approach` (m, n), the direction of the last motion of each joint, which is -1, 0 or 1.
+
+        Returns:
+            Copy with these conditions; others that were known before are kept.
+
+        Raises:
+            InvalidArgumentError: A shape is wrong, or a value is not plausible.
+            UnknownNameError: There is no such condition.
+        """
+        values = {name: self._validated_condition(name, value) for name, value in conditions.items()}
+        return self.replace(recorded=replace(self.recorded or Conditions(self.q), **values))
+
+    def in_order(self) -> Self:
+        """Return a copy whose samples are declared to be in the order of measurement.
+
+        Returns:
+            Copy with the number of each sample, and with the direction of the last motion of each joint, from
+            the sample before, unless the directions are known.
+        """
+        known = self.recorded or Conditions(self.q)
+        approach = known.approach if known.approach is not None else directions_in_order(self.q)
+        return self.replace(recorded=replace(known, order=np.arange(len(self.rows)), approach=approach))
+
+    def _validated_condition(self, name: str, value: ArrayLike) -> Array:
+        """Return the values of a condition after checking them."""
+        if name not in CONDITIONS:
+            raise UnknownNameError(
+                f"{self.kind}: unknown condition {name!r}; choose from {', '.join(CONDITIONS)}"
+            )
+        condition, values = CONDITIONS[name], np.asarray(value, float)
+        shape = self.q.shape if condition.is_per_joint else self.q.shape[:1]
+        if values.shape != shape:
+            raise InvalidArgumentError(f"{self.kind}: {name} has shape {values.shape}; expected {shape}")
+        for column in values.reshape(len(values), -1).T:
+            if problem := condition.find_problem(column):
+                raise InvalidArgumentError(f"{self.kind}: {name} in row {problem[0] + 1}: {problem[1]}")
+        return values
+
     def replace(self, **values: Any) -> Self:
         """Return a copy with other values of some attributes, which are not checked.
 
@@ -173,7 +220,8 @@ class Measurement(ABC):
         Args:
             index: Indices or mask along the samples.
         """
-        return self.replace(**{name: getattr(self, name)[index] for name in self.sample_fields})
+        parts = {name: getattr(self, name)[index] for name in self.sample_fields}
+        return self.replace(**parts, recorded=self.recorded[index] if self.recorded else None)
 
     def resample(self, q: Array) -> Self:
         """Return the same measurement at other joint positions, with unchanged measured values.
@@ -218,6 +266,11 @@ class Measurement(ABC):
     def configurations(self) -> Array:
         """Return the joint positions (c·m, n) of all samples, one configuration after the other."""
         return self.q
+
+    def conditions(self) -> Conditions:
+        """Return the conditions of the samples at `configurations()`."""
+        q = self.configurations()
+        return Conditions(q) if self.recorded is None else self.recorded.at(q)
 
     @property
     def sample_groups(self) -> Array:
@@ -282,7 +335,8 @@ class Measurement(ABC):
             is_used: Whether each sample is used, (m,).
         """
         part = self.take(is_used).initialized(chain)
-        common = [field.name for field in fields(self) if field.name not in self.sample_fields]
+        per_sample = (*self.sample_fields, "recorded")
+        common = [field.name for field in fields(self) if field.name not in per_sample]
         return self.replace(**{name: getattr(part, name) for name in common})
 
     def matched_to(self, known: Mapping[str, float]) -> Self:
@@ -354,16 +408,37 @@ class Measurement(ABC):
         return np.empty((0, 3, 3))
 
     @classmethod
-    @abstractmethod
-    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Self:
+    def simulate(
+        cls, chain: Chain, q: ArrayLike | Conditions, noise: Noise, rng: np.random.Generator
+    ) -> Self:
         """Return measurements of a chain with normal noise, by an instrument in a sensible place.
 
         Args:
             chain: Robot that is measured.
-            q: Joint positions, (m, n) [rad or m]. Kinds with contact move them onto the touched object.
+            q: Joint positions, (m, n) [rad or m], or conditions with joint positions. Kinds with contact move
+                the joints onto the touched object.
             noise: Standard deviations of the noise.
             rng: Random generator of the noise.
+
+        Returns:
+            Measurements with the conditions, if these are more than joint positions.
+
+        Raises:
+            InvalidArgumentError: There are conditions, but the kind moves the joints, or it has two
+                configurations per sample.
         """
+        conditions = chain.conditions(q)
+        if conditions.names and (cls.is_contact or cls.configurations_per_row != 1):
+            raise InvalidArgumentError(
+                f"{cls.kind}: cannot be simulated with conditions; expected joint positions alone"
+            )
+        data = cls._simulate(chain, conditions, noise, rng)
+        return data.replace(recorded=data.recorded or conditions) if conditions.names else data
+
+    @classmethod
+    @abstractmethod
+    def _simulate(cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator) -> Self:
+        """Return measurements at given conditions."""
 
     # ------------------------------------------------------------------------------------------- files
     @classmethod
@@ -448,13 +523,19 @@ def whitened_jacobian(
     return apply_observation_matrix(tool_jacobian, item.observation_matrix(frames, u, residual), out)
 
 
+def known_conditions(data: Iterable[Measurement]) -> frozenset[str]:
+    """Return the names of the conditions that are known of any samples, and "" for the joint positions."""
+    return frozenset(("",)).union(*(item.recorded.names for item in data if item.recorded))
+
+
 _Kind = TypeVar("_Kind", bound=Measurement)
 
 
 def concatenate(items: Sequence[_Kind]) -> _Kind:
     """Join the samples of several measurement objects."""
     first = items[0]
-    common = [field.name for field in fields(first) if field.name not in first.sample_fields]
+    per_sample = (*first.sample_fields, "recorded")
+    common = [field.name for field in fields(first) if field.name not in per_sample]
     for item in items[1:]:
         if type(item) is not type(first) or not all(
             _is_equal(getattr(item, name), getattr(first, name)) for name in common
@@ -464,7 +545,8 @@ def concatenate(items: Sequence[_Kind]) -> _Kind:
                 "expected the same kind, names and instrument"
             )
     return first.replace(
-        **{name: np.concatenate([getattr(item, name) for item in items]) for name in first.sample_fields}
+        **{name: np.concatenate([getattr(item, name) for item in items]) for name in first.sample_fields},
+        recorded=concatenate_conditions([item.recorded or Conditions(item.q) for item in items]),
     )
 
 

@@ -36,6 +36,7 @@ from ..cameras.boards import Board
 from ..cameras.rig import WORLD, Camera, Rig
 from ..exceptions import InvalidArgumentError, NotObservableError, SampleError
 from ..robot.chain import Chain
+from ..robot.conditions import Conditions
 from .base import Measurement, Noise, format_sigma
 from .columns import pixel_columns, remark_column, text_column
 from .groups import ErrorGroup, Group
@@ -650,23 +651,27 @@ class CameraCorners(Measurement):
         return values, {"sigma_u": self.sigma[:, 0], "sigma_v": self.sigma[:, 1]}
 
     @classmethod
-    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> CameraCorners:
+    def _simulate(
+        cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
+    ) -> CameraCorners:
         """Return images of six points on the tool, by two cameras in turn that look at the robot.
 
         The cameras have a scale of one pixel per millimetre at the robot: noise of a millimetre is noise of a
         pixel. The place of the points on the tool is known, that of the cameras is not.
         """
-        q = chain.validated_q(q)
+        q = conditions.q
         rig = mount_rig(simulated_rig(chain, q), chain)
         corner = np.tile(np.arange(6), len(q))
         camera = [rig.cameras[i % 2].name for i in range(len(q)) for _ in range(6)]
         sigma = _SCALE * noise.position
-        exact = cls(np.repeat(q, 6, 0), np.full((len(corner), 2), 2048.0), corner, rig, camera)
+        shown = conditions[np.repeat(np.arange(len(q)), 6)]
+        exact = cls(shown.q, np.full((len(corner), 2), 2048.0), corner, rig, camera)
         u = np.array([parameter.nominal for parameter in exact.instrument_parameters])
-        pixels = exact._project(chain.forward_kinematics(exact.q), u).pixels.T
+        pixels = exact._project(chain.forward_kinematics(shown), u).pixels.T
         pixels = pixels + sigma * rng.standard_normal(pixels.shape)
         without_guess = tuple(replace(camera, pose=None) for camera in rig.cameras)
-        return cls(exact.q, pixels, corner, replace(rig, cameras=without_guess), camera, None, sigma or None)
+        seen = cls(exact.q, pixels, corner, replace(rig, cameras=without_guess), camera, None, sigma or None)
+        return seen.replace(recorded=shown if shown.names else None)
 
 
 def simulated_rig(chain: Chain, q: Array) -> Rig:

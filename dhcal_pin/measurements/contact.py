@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from .._typing import Array
 from ..robot.chain import Chain
+from ..robot.conditions import Conditions
 from ..robot.inverse_kinematics import position_task, solve_within_limits
 from .base import POINT_PRIOR, InstrumentParameter, Noise, point_parameters
 from .columns import instrument_range, length_columns, point_distance_range, text_column
@@ -95,9 +96,11 @@ class PointContact(PointMeasurement):
         return self.replace(instrument_parameters=tuple(parameters))
 
     @classmethod
-    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> PointContact:
+    def _simulate(
+        cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
+    ) -> PointContact:
         """Return contacts with the first four tool points, in configurations moved onto them in turn."""
-        q = chain.validated_q(q)
+        q = conditions.q
         points = chain.poses(q)[:4, :3, 3]
         label = np.arange(len(q)) % len(points)
         targets = points[label] + noise.position * rng.standard_normal((len(q), 3))
@@ -185,7 +188,9 @@ class PointDistance(PointMeasurement):
         return length[None], np.zeros((1, 1, 3, m)), jacobian
 
     @classmethod
-    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> PointDistance:
+    def _simulate(
+        cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
+    ) -> PointDistance:
         """Return the six distances between four points of a rig of half a metre."""
         points = np.array([[0, 0, 0], [0.5, 0, 0], [0, 0.4, 0], [0, 0, 0.3]])
         pairs = [(i, j) for i in range(4) for j in range(i + 1, 4)]
@@ -256,9 +261,11 @@ class PlaneContact(PointMeasurement):
         return self.replace(origin=origin, axes=np.linalg.svd(points - origin)[2][::-1])
 
     @classmethod
-    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> PlaneContact:
+    def _simulate(
+        cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
+    ) -> PlaneContact:
         """Return contacts with a tilted plane amid the tool points, in configurations moved onto it."""
-        q = chain.validated_q(q)
+        q = conditions.q
         centre = chain.poses(q)[:, :3, 3].mean(0)
         normal = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
         height = noise.position * rng.standard_normal(len(q))
@@ -322,9 +329,11 @@ class SphereContact(PointMeasurement):
         return self.replace(instrument_parameters=point_parameters(f"sphere_{self.name}", centre))
 
     @classmethod
-    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> SphereContact:
+    def _simulate(
+        cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
+    ) -> SphereContact:
         """Return contacts with a sphere of radius 150 mm, in configurations moved onto it."""
-        q = chain.validated_q(q)
+        q = conditions.q
         centre = chain.poses(q)[0, :3, 3]
         radius = 0.15
         noisy_radius = radius + noise.position * rng.standard_normal(len(q))

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from ..robot.chain import Chain
+from ..robot.conditions import Conditions
 from .base import OFFSET_PRIOR, InstrumentParameter, Noise, point_parameters
 from .columns import Column, displacement_range, instrument_range, length_columns
 from .groups import LENGTHS, Group
@@ -162,10 +163,10 @@ class Wires(PointMeasurement):
         return self.replace(instrument_parameters=_wire_parameters(self.anchors, self.offsets, anchors))
 
     @classmethod
-    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Wires:
+    def _simulate(cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator) -> Wires:
         """Return lengths of a three-wire device: a triangle of radius 0.3 m, 1.5 m from the tool points."""
-        q = chain.validated_q(q)
-        points = chain.forward_kinematics(q).tool[3].T
+        q = conditions.q
+        points = chain.forward_kinematics(conditions).tool[3].T
         anchors = (
             points.mean(0) + [-1.5, 0, 0] + 0.3 * np.array([[0, 0, 1], [0, 0.866, -0.5], [0, -0.866, -0.5]])
         )
@@ -236,9 +237,11 @@ class Distance(PointMeasurement):
         return length[None], np.stack([-direction, direction]), np.empty((0, 1, points.shape[-1]))
 
     @classmethod
-    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Distance:
+    def _simulate(
+        cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
+    ) -> Distance:
         """Return distances between each configuration and the next one, and the last and the first."""
-        q = chain.validated_q(q)
+        q = conditions.q
         points = chain.forward_kinematics(q).tool[3].T
         following = np.roll(np.arange(len(q)), -1)
         distances = np.linalg.norm(points[following] - points, axis=1)

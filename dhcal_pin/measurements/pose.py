@@ -24,6 +24,7 @@ from .._kernels.types import FrameBatch, ObservationMatrix
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from ..robot.chain import Chain
+from ..robot.conditions import Conditions
 from .base import ANGLE_SIGMA, LENGTH_SIGMA, Measurement, Noise, format_sigma
 from .columns import angle_columns, displacement_range, length_columns, stack_columns, stack_sigmas
 from .groups import ORIENTATION, POSITION
@@ -221,10 +222,10 @@ class Pose(PoseMeasurement):
         }
 
     @classmethod
-    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Pose:
+    def _simulate(cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator) -> Pose:
         """Return poses of the chain's tool with normal noise on each axis."""
-        q = chain.validated_q(q)
-        poses = chain.poses(q)
+        q = conditions.q
+        poses = chain.poses(conditions)
         poses[:, :3, 3] += noise.position * rng.standard_normal((len(q), 3))
         poses[:, :3, :3] = se3.exp3(noise.rotation * rng.standard_normal((len(q), 3))) @ poses[:, :3, :3]
         is_noisy = noise.position > 0 and noise.rotation > 0
@@ -335,9 +336,11 @@ class RelativePose(PoseMeasurement):
         return {"position": translation.T, "orientation": log_rotations(rotation).T}
 
     @classmethod
-    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> RelativePose:
+    def _simulate(
+        cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
+    ) -> RelativePose:
         """Return relative poses from each configuration to the next one, and from the last to the first."""
-        q = chain.validated_q(q)
+        q = conditions.q
         following = np.roll(np.arange(len(q)), -1)
         poses = chain.poses(q)
         relative = se3.inverse(poses) @ poses[following]

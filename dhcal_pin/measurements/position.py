@@ -25,6 +25,7 @@ from .._kernels.types import FrameBatch, ObservationMatrix
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from ..robot.chain import Chain
+from ..robot.conditions import Conditions
 from .base import LENGTH_SIGMA, OFFSET_PRIOR, InstrumentParameter, Measurement, Noise, format_sigma
 from .columns import Column, length_columns, text_column
 from .groups import LENGTHS, POSITION, Group
@@ -196,10 +197,14 @@ class Position(PointMeasurement):
         return self.values
 
     @classmethod
-    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> Position:
+    def _simulate(
+        cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
+    ) -> Position:
         """Return positions of the chain's tool point with normal noise on each axis."""
-        q = chain.validated_q(q)
-        positions = chain.forward_kinematics(q).tool[3].T + noise.position * rng.standard_normal((len(q), 3))
+        q = conditions.q
+        positions = chain.forward_kinematics(conditions).tool[3].T + noise.position * rng.standard_normal(
+            (len(q), 3)
+        )
         return cls(q, positions, noise.position or None)
 
 
@@ -267,10 +272,14 @@ class PositionComponents(PointMeasurement):
         )
 
     @classmethod
-    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> PositionComponents:
+    def _simulate(
+        cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
+    ) -> PositionComponents:
         """Return the coordinates x and z of the chain's tool point with normal noise."""
-        q = chain.validated_q(q)
-        positions = chain.forward_kinematics(q).tool[3].T + noise.position * rng.standard_normal((len(q), 3))
+        q = conditions.q
+        positions = chain.forward_kinematics(conditions).tool[3].T + noise.position * rng.standard_normal(
+            (len(q), 3)
+        )
         return cls(q, positions[:, [0, 2]], (0, 2), noise.position or None)
 
 
@@ -378,12 +387,14 @@ class MultiTargetPosition(PointMeasurement):
         return self.values
 
     @classmethod
-    def simulate(cls, chain: Chain, q: Array, noise: Noise, rng: np.random.Generator) -> MultiTargetPosition:
+    def _simulate(
+        cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
+    ) -> MultiTargetPosition:
         """Return positions of three targets within 5 cm of each other, measured in turn."""
-        q = chain.validated_q(q)
+        q = conditions.q
         label = np.arange(len(q)) % 3
         offsets = np.array([[0, 0, 0], [0.05, 0, 0.01], [0, 0.04, -0.02]])[label]
-        pose = chain.poses(q)
+        pose = chain.poses(conditions)
         positions = pose[:, :3, 3] + np.einsum("mij,mj->mi", pose[:, :3, :3], offsets)
         positions += noise.position * rng.standard_normal(positions.shape)
         return cls(q, positions, [f"t{i + 1}" for i in label], noise.position or None)

@@ -150,7 +150,7 @@ def _estimate_noise(problem: Problem, x: Array) -> _Noise:
     squares: list[dict[str, Array]] = []
     for item in problem.data:
         u = problem.instrument_values_of(item, x)
-        r = item.residual(chain.forward_kinematics(item.configurations()), u)
+        r = item.residual(chain.forward_kinematics(item.conditions()), u)
         squares.append({name: np.mean(r[g.rows] ** 2, 0) for name, g in item.residual_groups.items()})
     n_rows = sum(item.residual_dim * len(item.rows) for item in problem.data)
     share = min(1.0, 0.5 * (1 + len(x) / n_rows))

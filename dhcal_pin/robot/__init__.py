@@ -3,8 +3,7 @@
 This package holds what is known about a robot without measurements. Error parameters and their estimation
 belong to `estimation`; reading and writing of files other than URDF belongs to `io`.
 
-The public names are listed in `__init__.pyi`. Each is loaded on first use, so that the command line can list
-the families of joint errors without loading Pinocchio.
+The public names are listed in `__init__.pyi`. Each is loaded on first use.
 """
 
 import lazy_loader

@@ -8,6 +8,9 @@ from .chain import link_frame as link_frame
 from .collision import CollisionChecker as CollisionChecker
 from .collision import Obstacle as Obstacle
 from .collision import obstacles_from_urdf as obstacles_from_urdf
+from .conditions import CONDITIONS as CONDITIONS
+from .conditions import Condition as Condition
+from .conditions import Conditions as Conditions
 from .correction_table import JointCorrection as JointCorrection
 from .correction_table import joint_corrections as joint_corrections
 from .coverage import JointCoverage as JointCoverage

@@ -30,7 +30,7 @@ Shapes: m samples, n independent joints, k moving joints, p error parameters, t 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -41,10 +41,11 @@ from numpy.typing import ArrayLike
 
 from .. import _kernels, se3
 from .._kernels.kinematics import error_frame_poses
-from .._kernels.types import FrameBatch, JointState
+from .._kernels.types import FrameBatch
 from .._typing import Array
 from ..exceptions import DhcalError, InvalidArgumentError, UnknownNameError
 from ..messages import quote
+from .conditions import Conditions, SampleState
 from .dh import Convention, DHTable
 from .dh_extraction import Extraction, extract_dh
 from .dh_urdf import dh_to_urdf
@@ -62,6 +63,9 @@ from .urdf_path import (
 
 # Index of the error frame of the base.
 BASE_FRAME = 0
+
+# Reference temperature of lengths [°C], ISO 1.
+REFERENCE_TEMPERATURE = 20.0
 
 _IDENTITY = np.eye(4)
 
@@ -98,6 +102,7 @@ class Chain:
         parameters: Parameter sets that a calibration estimates by default.
         transmission: Transmission errors of the independent joints; None for ideal joints.
         payload: Point mass at the tip that loads compliant joints.
+        reference_temperature: Temperature at which the links have their lengths [°C].
         first_link: Name of the link where the chain begins; empty for the root of the URDF.
         n_reversed: Number of joints at the begin of the chain that are passed from child to parent.
     """
@@ -118,6 +123,7 @@ class Chain:
     parameters: str = "minimal,base,tool"
     transmission: Transmission | None = None
     payload: Payload | None = None
+    reference_temperature: float = REFERENCE_TEMPERATURE
     first_link: str = ""
     n_reversed: int = 0
 
@@ -226,6 +232,15 @@ class Chain:
         return len(self.joint_names)
 
     @property
+    def link_names(self) -> list[str]:
+        """Names of the k+1 links between the moving joints, from the first link to that of the tip."""
+        behind = [
+            self.urdf.joint(name).parent if is_reversed else self.urdf.joint(name).child
+            for name, is_reversed in zip(self.moving_joints, self.is_reversed, strict=True)
+        ]
+        return [self.root, *behind]
+
+    @property
     def is_prismatic(self) -> Array:
         """Whether each independent joint moves a prismatic joint, shape (n,)."""
         return np.any(self.mimic_matrix[self.prismatic] != 0, 0)
@@ -269,7 +284,18 @@ class Chain:
     @cached_property
     def loads(self) -> GravityLoads:
         """Gravity torques of the whole robot with the joint origins of this chain."""
-        return GravityLoads(self.model, self.moving_joints, self.mimic_matrix, self.mimic_offset)
+        links = self.link_transforms
+        axes = np.concatenate([links[:-1, :3, :3], _IDENTITY[None, :3, :3]])
+        return GravityLoads(
+            self.model,
+            self.moving_joints,
+            self.mimic_matrix,
+            self.mimic_offset,
+            (links[:, None, :3, 3] @ axes)[:, 0],
+            self.reference_temperature,
+            self.tip,
+            self.payload,
+        )
 
     def configurations(self, q: ArrayLike) -> Array:
         """Return Pinocchio configurations; joints that are not on the chain stay at neutral.
@@ -280,7 +306,7 @@ class Chain:
         Returns:
             Configurations of `model` at the actual joint positions, shape (m, nq).
         """
-        return self.loads.configurations(self.actual_positions(self.validated_q(q).T)[0])
+        return self.loads.configurations(self.actual_positions(Conditions(self.validated_q(q)))[0])
 
     def validated_q(self, q: ArrayLike) -> Array:
         """Return joint positions as an array after checking shape and values.
@@ -305,18 +331,31 @@ class Chain:
             raise InvalidArgumentError("q has a value that is not finite; expected finite joint positions")
         return q
 
-    def actual_positions(self, q: Array) -> tuple[Array, Array | None]:
+    def conditions(self, q: ArrayLike | Conditions) -> Conditions:
+        """Return conditions after checking the joint positions.
+
+        Args:
+            q: Joint positions, shape (m, n) [rad or m], or conditions with joint positions.
+
+        Returns:
+            Conditions of m samples.
+        """
+        known = q if isinstance(q, Conditions) else Conditions(np.asarray(q, float))
+        return replace(known, q=self.validated_q(known.q))
+
+    def actual_positions(self, conditions: Conditions) -> tuple[Array, Array | None]:
         """Compute the actual joint positions, which differ from the commanded ones by transmission errors.
 
         Args:
-            q: Commanded positions of the independent joints, shape (n, m) [rad or m].
+            conditions: Conditions of m samples, with the commanded joint positions.
 
         Returns:
             Actual positions, shape (n, m), and transmission terms, shape (t, n, m), or None for ideal joints.
         """
+        q = np.ascontiguousarray(conditions.q.T)
         if self.transmission is None:
             return q, None
-        terms = self.transmission.terms(q)
+        terms = self.transmission.terms(conditions)
         return q + self.transmission.errors(terms), terms
 
     def with_transmission(self, transmission: Transmission) -> Chain:
@@ -331,7 +370,7 @@ class Chain:
         Raises:
             InvalidArgumentError: The type or the shape of the coefficients does not fit the chain.
         """
-        shape = (n_coefficients(self.n_joints),)
+        shape = (n_coefficients(len(self.moving_joints), self.n_joints),)
         if not isinstance(transmission, Transmission):
             raise InvalidArgumentError(
                 f"transmission has type {type(transmission).__name__}; expected a Transmission"
@@ -396,42 +435,69 @@ class Chain:
         """Link transforms with the tool appended to the last one, shape (k+1, 4, 4)."""
         return np.concatenate([self.link_transforms[:-1], self.link_transforms[-1:] @ self.tool])
 
-    def joint_state(self, q: ArrayLike) -> JointState:
+    def joint_state(self, q: ArrayLike | Conditions) -> SampleState:
         """Compute positions, cosines and sines of the moving joints.
 
         Args:
-            q: Joint positions, shape (m, n) [rad or m].
+            q: Joint positions, shape (m, n) [rad or m], or conditions with joint positions.
 
         Returns:
             Joint state that `forward_kinematics` accepts in the place of q. Errors of the geometry do not
             change it, so one state serves a whole optimization.
         """
-        return self._joint_state(np.ascontiguousarray(self.validated_q(q).T))
+        conditions = self.conditions(q)
+        return self._joint_state(np.ascontiguousarray(conditions.q.T), conditions)
 
-    def _joint_state(self, independent: Array) -> JointState:
-        """Compute the joint state of independent joint positions, shape (n, m)."""
+    def _joint_state(self, independent: Array, conditions: Conditions) -> SampleState:
+        """Compute the joint state of actual positions of the independent joints, shape (n, m)."""
         positions = self.mimic_matrix @ independent + self.mimic_offset[:, None]
-        return JointState(independent, positions, *_kernels.cos_sin(positions))
+        return SampleState(positions, *_kernels.cos_sin(positions), conditions)
 
-    def forward_kinematics(self, q: ArrayLike | JointState, out: Array | None = None) -> FrameBatch:
+    def forward_kinematics(
+        self, q: ArrayLike | Conditions | SampleState, out: Array | None = None
+    ) -> FrameBatch:
         """Compute all frames of the chain, vectorized over the samples.
 
         Args:
-            q: Joint positions, shape (m, n) [rad or m], or a joint state of this chain.
+            q: Joint positions, shape (m, n) [rad or m], conditions, or a joint state of this chain.
             out: Work array of shape (k+2, 7, 3, m) that holds the result.
 
         Returns:
             Frames in the measuring frame.
         """
-        state, terms = q if isinstance(q, JointState) else self.joint_state(q), None
+        state, terms = q if isinstance(q, SampleState) else self.joint_state(q), None
         if self.transmission is not None:
-            actual, terms = self.actual_positions(state.independent)
-            state = self._joint_state(actual)
+            actual, terms = self.actual_positions(state.conditions)
+            state = self._joint_state(actual, state.conditions)
         k, m = state.positions.shape
         frames = np.empty((k + 2, 7, 3, m)) if out is None else out
         frames[0, :4] = self.base[:3].T[:, :, None]
         _kernels.propagate_frames(self._link_and_tool_transforms, self.prismatic, state, frames)
-        return FrameBatch(frames[:-1], frames[-1, :4], terms)
+        batch = FrameBatch(frames[:-1], frames[-1, :4], terms, state.conditions)
+        if terms is not None and self.transmission is not None and self.transmission.link_terms.any():
+            growth = self.transmission.growth(terms)[:, None]
+            shifts = np.cumsum(self.growth_motions(batch)[:, :3] * growth, 0)
+            frames[1:-2, 3] += shifts[:-2]
+            frames[-2:, 3] += shifts[-1]
+        return batch
+
+    def growth_motions(self, frames: FrameBatch) -> Array:
+        """Compute the tool twist per relative growth of each link.
+
+        Growth moves all that is behind a link along the link; it turns nothing. A link grows in front of the
+        next joint, the last one behind the motion of the last joint, in front of all errors of its own.
+
+        Args:
+            frames: Frames of this chain at m samples.
+
+        Returns:
+            Twists [v, ω] of the tool point in axes of the measuring frame, shape (k+1, 6, m).
+        """
+        assert self.transmission is not None
+        axes = np.concatenate([self.link_transforms[:-1, :3, :3], _IDENTITY[None, :3, :3]])
+        vectors = (axes @ self.transmission.loads.link_vectors[..., None])[..., 0]
+        linear = np.einsum("ja,jacm->jcm", vectors, frames.columns[:, :3])
+        return np.concatenate([linear, np.zeros_like(linear)], 1)
 
     def pose_in_tip(self, link: str) -> Array:
         """Return the constant pose of another link in the tip link.
@@ -476,11 +542,11 @@ class Chain:
             return None
         return (own.placement.inverse() * wanted.placement).homogeneous
 
-    def poses(self, q: ArrayLike) -> Array:
+    def poses(self, q: ArrayLike | Conditions) -> Array:
         """Compute tool poses.
 
         Args:
-            q: Joint positions, shape (m, n) [rad or m].
+            q: Joint positions, shape (m, n) [rad or m], or conditions with joint positions.
 
         Returns:
             Poses of the tool in the measuring frame, shape (m, 4, 4) [m].
@@ -517,9 +583,25 @@ class Chain:
 
         All coefficients of a joint share the twist of its motion, which each one scales by its own term.
         """
+        numbers, terms = self.transmission_terms(frames, entries)
+        motions = self.motions(frames, numbers)
+        for number, term, column in zip(numbers, terms, out, strict=True):
+            np.multiply(motions[number], term, out=column)
+
+    def motions(self, frames: FrameBatch, numbers: Sequence[int]) -> Array:
+        """Compute the tool twists of the motions that transmission coefficients scale.
+
+        Args:
+            frames: Frames of this chain at m samples.
+            numbers: Numbers of the motions that are used, as `transmission_terms` returns them.
+
+        Returns:
+            Twists [v, ω] by number of the motion, shape (n, 6, m), or (n+k+1, 6, m) if a link grows.
+        """
         by_joint = self.joint_jacobian(frames)
-        for joint, term, column in zip(*self.transmission_terms(frames, entries), out, strict=True):
-            np.multiply(by_joint[joint], term, out=column)
+        if max(numbers, default=0) < self.n_joints:
+            return by_joint
+        return np.concatenate([by_joint, self.growth_motions(frames)])
 
     def transmission_terms(self, frames: FrameBatch, entries: Array) -> tuple[list[int], list[Array]]:
         """Return what transmission coefficients scale.
@@ -529,13 +611,13 @@ class Chain:
             entries: Entries of the transmission coefficients, shape (e,).
 
         Returns:
-            The independent joint that each coefficient moves, and by how much per unit of it, (m,) each.
+            The number of the motion that each coefficient scales, see `motions`, and its factor, (m,) each.
         """
         assert self.transmission is not None
         assert frames.terms is not None
         terms, transmission = frames.terms, self.transmission.evaluating(entries)
         if transmission is not self.transmission:
-            terms = transmission.terms(terms[0])
+            terms = transmission.terms(frames.conditions)
         joints, numbers, sources = (indices.tolist() for indices in transmission.locate(entries))
         return joints, [terms[term, source] for term, source in zip(numbers, sources, strict=True)]
 

@@ -1,15 +1,77 @@
-"""Families of joint errors: the parameter sets that describe how a joint misses its commanded position.
+"""Families of joint errors: everything that is known about each one, in one row of `FAMILIES`.
 
-A family is one parameter set, such as `harmonics`. The formula of all of them is in `transmission`. This
-module imports nothing heavy, because the help of the command line lists the families.
+A family is one parameter set, such as `harmonics`. Its coefficients scale *terms*, functions of the
+conditions of a sample. There are four types of coefficients, see `transmission`:
+
+- linear: the positions of the joint itself (gain) and of the other joints (coupling);
+- harmonics: sine and cosine of multiples of the position of the joint;
+- joint terms: one function per joint, with one coefficient per joint;
+- link terms: one function of the sample, with one coefficient per link, which changes the length of the link.
+
+To add a family with a joint term or a link term: write a row with its function.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from .._typing import Array
+from .conditions import Conditions
 
 # Highest order of the harmonics: 64 periods per turn of a joint.
 MAX_CURVE_ORDER = 64
+# Smallest maximum [N·m] of the gravity torque on a compliant joint. A joint that is loaded less has no
+# compliance: some URDFs have links with token masses.
+MIN_TORQUE = 0.1
+# Shortest link [m] that has a thermal growth.
+MIN_LINK_LENGTH = 1e-3
+
+
+class ArmProperties(Protocol):
+    """Properties of a chain that the terms depend on; see `transmission.GravityLoads`."""
+
+    @property
+    def n_joints(self) -> int:
+        """Number n of independent joints."""
+        ...
+
+    @property
+    def link_vectors(self) -> Array:
+        """Vectors of the links, shape (k+1, 3) [m]."""
+        ...
+
+    @property
+    def reference_temperature(self) -> float:
+        """Temperature at which the links have the lengths of the model [°C]."""
+        ...
+
+    def torques(self, q: Array, payload: Array | None = None) -> Array:
+        """Compute the gravity torques on the joints, shape (n, m) [N·m]."""
+        ...
+
+
+@dataclass(frozen=True)
+class Term:
+    """Function of the conditions of a sample, and the coefficient that scales it.
+
+    Attributes:
+        coefficient: Name of the coefficient, after the name of its joint or link.
+        unit: Unit of the coefficient.
+        sidecar_key: Key of the coefficient in sidecar files.
+        evaluate: Function of the conditions of m samples, shape (n, m) of a joint term and (m,) of a link
+            term, whose value is the same for all links.
+        has_effect: Joints, shape (n,), or links, shape (k+1,), on which the term has an effect.
+    """
+
+    coefficient: str
+    unit: str
+    sidecar_key: str
+    evaluate: Callable[[Conditions, ArmProperties], Array]
+    has_effect: Callable[[ArmProperties], Array]
 
 
 @dataclass(frozen=True)
@@ -17,13 +79,15 @@ class SelectionRule:
     """When a calibration adds a family of joint errors by itself.
 
     Attributes:
-        stage: Families of the same stage are tried together, one stage after the other. The families of stage
-            0 have a physical cause in every arm and are shrunk rather than left out where others are added.
+        stage: Families of the same stage are tried together, one stage after the other.
         min_improvement: Smallest relative improvement of the cross-validated squared error.
+        is_universal: Whether every arm has such errors: where others are added, the family is added as well
+            and shrunk by its priors.
     """
 
     stage: int
     min_improvement: float
+    is_universal: bool = False
 
 
 @dataclass(frozen=True)
@@ -35,47 +99,126 @@ class ErrorFamily:
         description: Physical cause, such as "gear ratio errors", for help and reports.
         requirement: What a robot must have for the family to have parameters, for error messages.
         rule: When the family is added; there is no family without a rule.
-        orders: Orders of the harmonics of correction curves; empty for other families.
+        prior: Standard deviation of its coefficients expected before any measurement, in their unit.
+        orders: Orders of its harmonics; empty for other families.
+        joint_term: Term of each joint; None for other families.
+        link_term: Term of the links; None for other families.
+        condition: Condition that must be known of the samples, one of `CONDITIONS`; empty for q alone.
     """
 
     name: str
     description: str
     requirement: str
     rule: SelectionRule
+    prior: float
     orders: range = range(0)
+    joint_term: Term | None = None
+    link_term: Term | None = None
+    condition: str = ""
+
+    @property
+    def is_curve(self) -> bool:
+        """Whether the family consists of correction curves."""
+        return self.orders.start >= CURVE_ORDERS.start
+
+
+def _torques(conditions: Conditions, arm: ArmProperties) -> Array:
+    """Return the gravity torques on the joints."""
+    return arm.torques(np.ascontiguousarray(conditions.q.T), conditions.payload)
+
+
+def _is_loaded(arm: ArmProperties) -> Array:
+    """Return whether gravity loads each joint, in random configurations."""
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (arm.n_joints, 64))
+    return np.abs(arm.torques(q)).max(-1) > MIN_TORQUE
+
+
+def _half_direction(conditions: Conditions, arm: ArmProperties) -> Array:
+    """Return half the direction of the last motion of each joint, negative because the joint lags behind."""
+    if conditions.approach is None:
+        return np.zeros(conditions.q.T.shape)
+    return conditions.approach.T / -2
+
+
+def _all_joints(arm: ArmProperties) -> Array:
+    """Return that the term has an effect on all joints."""
+    return np.ones(arm.n_joints, bool)
+
+
+def _temperature_rise(conditions: Conditions, arm: ArmProperties) -> Array:
+    """Return the difference from the reference temperature."""
+    if conditions.temperature is None:
+        return np.zeros(len(conditions.q))
+    return conditions.temperature - arm.reference_temperature
+
+
+def _has_length(arm: ArmProperties) -> Array:
+    """Return whether each link has a length that can grow."""
+    return np.linalg.norm(arm.link_vectors, axis=1) > MIN_LINK_LENGTH
 
 
 GAIN, COMPLIANCE, COUPLING = "gain", "compliance", "coupling"
 HARMONICS, CURVES, FINE_CURVES = "harmonics", "curves", "fine-curves"
+BACKLASH, THERMAL = "backlash", "thermal"
 
-# Orders of correction curves, and those of high order.
+# Orders of eccentricity and its second harmonic, of correction curves, and of those of high order.
+HARMONIC_ORDERS = range(1, 3)
 CURVE_ORDERS, FINE_CURVE_ORDERS = range(3, 33), range(33, MAX_CURVE_ORDER + 1)
 
 # Eccentricity and elasticity hold outside the measured region; other families have to improve the error
 # noticeably. Curves are tried one after the other, on top of those of lower order.
-_PHYSICAL, _OTHER = SelectionRule(0, 0.0), SelectionRule(1, 0.1)
+_UNIVERSAL, _OTHER = SelectionRule(0, 0.0, is_universal=True), SelectionRule(1, 0.1)
+# Backlash and thermal growth follow from a measured condition, which chance hardly imitates.
+_OF_A_CONDITION = SelectionRule(0, 0.02)
 
+# The priors are typical of industrial arms: gear ratios are off by 0.2 %; eccentricity is about 1 mrad, and a
+# higher harmonic about 0.1 mrad; a joint yields by about 0.1 mrad/Nm; backlash reaches a few mrad; aluminium
+# grows by 23e-6 per kelvin, steel by 12e-6.
 FAMILIES = {
     family.name: family
     for family in (
-        ErrorFamily(GAIN, "gear ratio errors", "a moving joint", _OTHER),
-        ErrorFamily(HARMONICS, "gear eccentricity", "a revolute joint", _PHYSICAL),
+        ErrorFamily(GAIN, "gear ratio errors", "a moving joint", _OTHER, 2e-3),
+        ErrorFamily(HARMONICS, "gear eccentricity", "a revolute joint", _UNIVERSAL, 1e-3, HARMONIC_ORDERS),
         ErrorFamily(
-            CURVES, "joint correction curves", "a revolute joint", SelectionRule(2, 0.02), CURVE_ORDERS
+            CURVES, "joint correction curves", "a revolute joint", SelectionRule(2, 0.02), 1e-4, CURVE_ORDERS
         ),
         ErrorFamily(
             FINE_CURVES,
             "joint correction curves of high order",
             "a revolute joint",
             SelectionRule(3, 0.02),
+            1e-4,
             FINE_CURVE_ORDERS,
         ),
         ErrorFamily(
             COMPLIANCE,
             "joint elasticity under gravity",
             "a revolute joint that gravity loads, and links with masses in the URDF",
-            _PHYSICAL,
+            _UNIVERSAL,
+            1e-4,
+            joint_term=Term("compliance", "rad/Nm", "compliance_rad_per_nm", _torques, _is_loaded),
         ),
-        ErrorFamily(COUPLING, "coupling between joints", "a revolute joint and another joint", _OTHER),
+        ErrorFamily(COUPLING, "coupling between joints", "a revolute joint and another joint", _OTHER, 2e-3),
+        ErrorFamily(
+            BACKLASH,
+            "backlash of the joints",
+            "a revolute joint",
+            _OF_A_CONDITION,
+            3e-3,
+            joint_term=Term("backlash", "rad", "backlash_rad", _half_direction, _all_joints),
+            condition="approach",
+        ),
+        ErrorFamily(
+            THERMAL,
+            "thermal growth of the links",
+            "a link with a length",
+            _OF_A_CONDITION,
+            2e-5,
+            link_term=Term("thermal", "1/K", "per_kelvin", _temperature_rise, _has_length),
+            condition="temperature",
+        ),
     )
 }
+# Families with a term of each joint, and of the links, in the order of their coefficients.
+JOINT_TERMS = {name: family.joint_term for name, family in FAMILIES.items() if family.joint_term}
+LINK_TERMS = {name: family.link_term for name, family in FAMILIES.items() if family.link_term}

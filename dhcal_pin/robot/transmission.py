@@ -1,19 +1,23 @@
-"""Joint transmission errors: from commanded to actual joint positions.
+"""Joint transmission errors: from commanded to actual joint positions, and the growth of links.
 
 The actual position of independent joint i at commanded positions q is
 
-    q_i + Σ_j A_ij·q_j + Σ_k (S_ki·sin(k·q_i) + C_ki·cos(k·q_i)) + c_i·τ_i(q)
+    q_i + Σ_j A_ij·q_j + Σ_k (S_ki·sin(k·q_i) + C_ki·cos(k·q_i)) + Σ_f c_fi·t_fi
 
 with the gain A_ii, the coupling A_ij of joint i to joint j, the harmonics S_ki and C_ki of order k = 1 … K,
-the compliance c_i, and the generalised gravity torque τ. All coefficients are entries of one vector:
+and the coefficients c_fi of the joint terms t_f of `error_families`: the generalised gravity torque τ_i for
+compliance, and -s_i/2 for backlash, where s_i is the direction of the last motion. A link term g, such as the
+temperature rise, makes link j longer by the factor 1 + α_j·g; its growth moves everything behind it along the
+link. All coefficients are entries of one vector:
 
-    A row by row (n·n), then S_k (n) and C_k (n) of each order k, then c (n)
+    A row by row (n·n), then S_k (n) and C_k (n) of each order k, then c_f (n) of each joint term,
+    then α (k+1) of each link term
 
 The vector has room for all orders up to `MAX_CURVE_ORDER`. Only the orders that are in use are evaluated.
 
-The functions q, sin q, cos q, sin 2q, cos 2q, …, τ are the *terms*. The derivative of the tool pose by a
-coefficient is the twist of the joint's own motion, scaled by one term. The harmonics of a joint therefore
-share one Jacobian column.
+The functions q, sin q, cos q, sin 2q, cos 2q, …, t_f, g are the *terms*. The derivative of the tool pose by a
+coefficient is the twist of one *motion*, of a joint or of the growth of a link, scaled by one term. The
+harmonics of a joint therefore share one Jacobian column.
 
 Shapes: t terms, n independent joints, k moving joints (k > n only with mimic joints), m samples, c
 coefficients, e selected coefficients. Arrays of joint positions are (n, m) in this module.
@@ -28,7 +32,8 @@ import numpy as np
 import pinocchio as pin
 
 from .._typing import Array
-from .error_families import MAX_CURVE_ORDER
+from .conditions import Conditions
+from .error_families import COMPLIANCE, JOINT_TERMS, LINK_TERMS, MAX_CURVE_ORDER
 
 # Maximum number of cached torque arrays, one per array of joint positions. A full cache is emptied.
 MAX_CACHED_TORQUES = 256
@@ -49,20 +54,45 @@ class Payload:
 
 @dataclass(frozen=True, eq=False)
 class GravityLoads:
-    """Gravity torques on the independent joints of a chain.
+    """What joint errors need of a chain: gravity torques on its joints, and its link vectors.
 
     Attributes:
         model: Pinocchio model of the whole robot.
         moving_joints: Names of the k moving joints of the chain.
         mimic_matrix: Matrix (k, n) from independent to moving joint positions.
         mimic_offset: Constant part of the moving joint positions, shape (k,) [rad or m].
+        link_vectors: Vector from each joint to the next one, in the axes of the next one before its motion,
+            shape (k+1, 3) [m]. The first one begins at the base link. The last one ends at the tip and is in
+            the axes of the last joint.
+        reference_temperature: Temperature at which the links have the lengths of the model [°C].
+        tip: Name of the link that carries the payload.
+        payload: Payload that the model contains; None without.
     """
 
     model: pin.Model
     moving_joints: tuple[str, ...]
     mimic_matrix: Array
     mimic_offset: Array
+    link_vectors: Array
+    reference_temperature: float
+    tip: str
+    payload: Payload | None = None
     _cache: dict[bytes, Array] = field(default_factory=dict, repr=False)
+
+    @property
+    def n_joints(self) -> int:
+        """Number n of independent joints."""
+        return self.mimic_matrix.shape[1]
+
+    @cached_property
+    def _with_one_kilogram(self) -> pin.Model:
+        """Model whose payload is heavier by 1 kg."""
+        model = self.model.copy()
+        tip = model.frames[model.getFrameId(self.tip, pin.FrameType.BODY)]
+        centre = np.array(self.payload.centre if self.payload else (0.0, 0.0, 0.0))
+        inertia = pin.Inertia(1.0, centre, np.zeros((3, 3)))
+        model.appendBodyToJoint(tip.parentJoint, inertia, tip.placement)
+        return model
 
     def configurations(self, q: Array) -> Array:
         """Return Pinocchio configurations; joints that are not on the chain stay at neutral."""
@@ -77,15 +107,26 @@ class GravityLoads:
                 out[:, joint.idx_q] = value
         return out
 
-    def torques(self, q: Array) -> Array:
-        """Compute the generalised gravity torques; the z axis of the root link points up."""
-        key = np.ascontiguousarray(q).tobytes()
+    def torques(self, q: Array, payload: Array | None = None) -> Array:
+        """Compute the generalised gravity torques; the z axis of the root link points up.
+
+        A payload (m,) [kg] replaces the mass of the payload in the model.
+        """
+        torques = self._torques(self.model, b"", q)
+        if payload is None:
+            return torques
+        per_kilogram = self._torques(self._with_one_kilogram, b"+1 kg", q) - torques
+        return torques + (payload - (self.payload.mass if self.payload else 0.0)) * per_kilogram
+
+    def _torques(self, model: pin.Model, prefix: bytes, q: Array) -> Array:
+        """Compute the generalised gravity torques of a model, (n, m)."""
+        key = prefix + np.ascontiguousarray(q).tobytes()
         if key not in self._cache:
-            data = self.model.createData()
-            columns = [self.model.joints[self.model.getJointId(name)].idx_v for name in self.moving_joints]
+            data = model.createData()
+            columns = [model.joints[model.getJointId(name)].idx_v for name in self.moving_joints]
             torques = np.empty((q.shape[1], len(columns)))
             for row, configuration in zip(torques, self.configurations(q), strict=True):
-                row[:] = pin.computeGeneralizedGravity(self.model, data, configuration)[columns]
+                row[:] = pin.computeGeneralizedGravity(model, data, configuration)[columns]
             if len(self._cache) >= MAX_CACHED_TORQUES:
                 self._cache.clear()
             self._cache[key] = self.mimic_matrix.T @ torques.T
@@ -110,7 +151,7 @@ class Transmission:
     @classmethod
     def zero(cls, loads: GravityLoads) -> Transmission:
         """Create a transmission without errors: all coefficients are zero."""
-        return cls(np.zeros(n_coefficients(loads.mimic_matrix.shape[1])), loads)
+        return cls(np.zeros(n_coefficients(*loads.mimic_matrix.shape)), loads)
 
     @property
     def linear(self) -> Array:
@@ -123,9 +164,19 @@ class Transmission:
         return self._parts[1]
 
     @property
+    def joint_terms(self) -> Array:
+        """Coefficients of the joint terms, one row per family of `JOINT_TERMS`, shape (f, n), as a view."""
+        return self._parts[2]
+
+    @property
+    def link_terms(self) -> Array:
+        """Coefficients of the link terms, one row per family of `LINK_TERMS`, shape (g, k+1), as a view."""
+        return self._parts[3]
+
+    @property
     def compliance(self) -> Array:
         """Change of each joint per unit of its gravity torque, shape (n,) [rad/Nm], as a view."""
-        return self._parts[2]
+        return self.joint_terms[list(JOINT_TERMS).index(COMPLIANCE)]
 
     @property
     def has_compliance(self) -> bool:
@@ -133,9 +184,9 @@ class Transmission:
         return bool(self.compliance.any())
 
     @cached_property
-    def _parts(self) -> tuple[Array, Array, Array]:
-        """Views of the coefficients: linear, harmonics and compliance."""
-        return split_coefficients(self.coefficients, self.loads.mimic_matrix.shape[1])
+    def _parts(self) -> tuple[Array, Array, Array, Array]:
+        """Views of the coefficients: linear, harmonics, joint terms and link terms."""
+        return split_coefficients(self.coefficients, self.loads.n_joints)
 
     @cached_property
     def order(self) -> int:
@@ -143,28 +194,50 @@ class Transmission:
         used = np.flatnonzero(self.harmonics.any((1, 2)))
         return max(self.min_order, int(used[-1]) + 1 if used.size else 0)
 
-    def terms(self, q: Array) -> Array:
-        """Evaluate the terms q, sin q, cos q, sin 2q, cos 2q, … and τ."""
-        out = np.empty((2 * self.order + 2, *q.shape))
-        out[0], out[-1] = q, self.loads.torques(q)
-        fill_harmonics(q, out[1:-1].reshape(self.order, 2, *q.shape))
+    def terms(self, conditions: Conditions) -> Array:
+        """Evaluate the terms q, sin q, cos q, sin 2q, cos 2q, …, the joint terms and the link terms."""
+        q = np.ascontiguousarray(conditions.q.T)
+        first = 2 * self.order + 1
+        out = np.empty((first + len(JOINT_TERMS) + len(LINK_TERMS), *q.shape))
+        out[0] = q
+        fill_harmonics(q, out[1:first].reshape(self.order, 2, *q.shape))
+        for row, term in zip(out[first:], (*JOINT_TERMS.values(), *LINK_TERMS.values()), strict=True):
+            row[:] = term.evaluate(conditions, self.loads)
         return out
 
     def errors(self, terms: Array) -> Array:
         """Compute the differences between actual and commanded joint positions."""
         n = len(self.linear)
+        terms = terms[: 2 * self.order + 1 + len(JOINT_TERMS)]
         joints, weights = np.arange(n), np.zeros((len(terms), n, n))
-        weights[0], weights[-1, joints, joints] = self.linear, self.compliance
-        weights[1:-1, joints, joints] = self.harmonics[: self.order].reshape(-1, n)
+        weights[0] = self.linear
+        of_joints = np.concatenate([self.harmonics[: self.order].reshape(-1, n), self.joint_terms])
+        weights[1:, joints, joints] = of_joints
         return np.tensordot(weights, terms, ((0, 2), (0, 1)))
 
+    def growth(self, terms: Array) -> Array:
+        """Compute the relative growth of each link, shape (k+1, m)."""
+        return np.tensordot(self.link_terms, terms[-len(LINK_TERMS) :, 0], (0, 0))
+
     def locate(self, entries: Array) -> tuple[Array, Array, Array]:
-        """Find the joint that each of some coefficients moves, and its term."""
-        n = len(self.linear)
+        """Find what each of some coefficients scales.
+
+        Returns:
+            Number of the motion, shape (e,): those of the joints are 0 to n-1, those of the growth of links
+            follow. Number of the term, shape (e,), and of its joint, shape (e,).
+        """
+        n, n_links = len(self.linear), self.link_terms.shape[1]
+        first_link_term = len(self.coefficients) - self.link_terms.size
         rows, sources = np.divmod(entries, n)
-        is_linear, is_compliance = rows < n, rows == len(self.coefficients) // n - 1
-        terms = np.where(is_linear, 0, np.where(is_compliance, 2 * self.order + 1, rows - n + 1))
-        return np.where(is_linear, rows, sources), terms, sources
+        families, links = np.divmod(entries - first_link_term, n_links)
+        n_waves, is_link = 2 * self.order, entries >= first_link_term
+        terms = np.select(
+            [rows < n, rows < n + 2 * MAX_CURVE_ORDER, ~is_link],
+            [0, rows - n + 1, rows - n - 2 * MAX_CURVE_ORDER + 1 + n_waves],
+            1 + n_waves + len(JOINT_TERMS) + families,
+        )
+        motions = np.where(is_link, n + links, np.where(rows < n, rows, sources))
+        return motions, terms, np.where(is_link, 0, sources)
 
     def evaluating(self, entries: Array) -> Transmission:
         """Return a transmission that evaluates the terms of some coefficients."""
@@ -178,12 +251,17 @@ class Transmission:
         return replace(self.evaluating(entries), coefficients=coefficients)
 
 
-def n_coefficients(n: int) -> int:
-    """Return the number of transmission coefficients."""
-    return n * (n + 2 * MAX_CURVE_ORDER + 1)
+def n_coefficients(k: int, n: int) -> int:
+    """Return the number of coefficients of a chain of k moving and n independent joints."""
+    return n * (n + 2 * MAX_CURVE_ORDER + len(JOINT_TERMS)) + (k + 1) * len(LINK_TERMS)
 
 
-def split_coefficients(coefficients: Array, n: int) -> tuple[Array, Array, Array]:
+def coefficient_indices(k: int, n: int) -> tuple[Array, Array, Array, Array]:
+    """Return the indices of the coefficients, in the parts of `split_coefficients`."""
+    return split_coefficients(np.arange(n_coefficients(k, n)), n)
+
+
+def split_coefficients(coefficients: Array, n: int) -> tuple[Array, Array, Array, Array]:
     """Split a vector of coefficients, or of their indices, into its parts.
 
     Args:
@@ -192,10 +270,18 @@ def split_coefficients(coefficients: Array, n: int) -> tuple[Array, Array, Array
 
     Returns:
         Views of the linear part, shape (n, n), with gains on the diagonal and couplings beside it; of the
-        harmonics, shape (K, 2, n), sine before cosine; and of the compliance, shape (n,).
+        harmonics, shape (K, 2, n), sine before cosine; of the joint terms, shape (f, n); and of the link
+        terms, shape (g, k+1).
     """
-    rows = coefficients.reshape(-1, n)
-    return rows[:n], rows[n:-1].reshape(MAX_CURVE_ORDER, 2, n), rows[-1]
+    n_harmonics, n_rows = 2 * MAX_CURVE_ORDER, n + 2 * MAX_CURVE_ORDER + len(JOINT_TERMS)
+    rows, link_terms = coefficients[: n * n_rows].reshape(n_rows, n), coefficients[n * n_rows :]
+    harmonics, joint_terms = rows[n : n + n_harmonics], rows[n + n_harmonics :]
+    return (
+        rows[:n],
+        harmonics.reshape(MAX_CURVE_ORDER, 2, n),
+        joint_terms,
+        link_terms.reshape(len(LINK_TERMS), -1),
+    )
 
 
 def harmonic_orders(entries: Array, n: int) -> Array:

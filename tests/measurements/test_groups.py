@@ -39,8 +39,9 @@ class Bearing(PointMeasurement):
         return np.arctan2(y, x)[None], derivative, np.empty((0, 1, len(x)))
 
     @classmethod
-    def simulate(cls, chain, q, noise, rng):
+    def _simulate(cls, chain, conditions, noise, rng):
         """Return angles with normal noise."""
+        q = conditions.q
         x, y, _ = chain.poses(q)[:, :3, 3].T
         angle = np.arctan2(y, x) + noise.rotation * rng.standard_normal(len(q))
         return cls(q, angle[:, None], noise.rotation or None)

@@ -15,7 +15,7 @@ from dhcal_pin.estimation import select_parameters
 from dhcal_pin.exceptions import ConvergenceError
 from dhcal_pin.io import measurement_text, read_robot
 from dhcal_pin.measurements import Noise, Pose
-from dhcal_pin.robot import Chain, joint_corrections
+from dhcal_pin.robot import Chain, Conditions, joint_corrections
 from dhcal_pin.robot.correction_table import correction_columns
 
 SETS = "gain,harmonics,curves"
@@ -45,8 +45,9 @@ def test_corrected_command_reaches_the_value(arm):
     for i, table in enumerate(tables):
         q = np.zeros((6, len(table.values)))
         q[i] = table.values + table.corrections
-        np.testing.assert_allclose(found.actual_positions(q)[0][i], table.values, rtol=0, atol=1e-14)
-        largest = max(largest, np.abs(found.actual_positions(q)[0][i] - q[i]).max())
+        actual = found.actual_positions(Conditions(q.T))[0][i]
+        np.testing.assert_allclose(actual, table.values, rtol=0, atol=1e-14)
+        largest = max(largest, np.abs(actual - q[i]).max())
     assert largest > 5e-3
 
 
@@ -124,7 +125,8 @@ def test_calibrate_writes_the_table(capsys, tmp_path, monkeypatch, arm):
         value, correction = (np.array([float(row[key]) for row in rows]) for key in list(table[0])[1:])
         q = np.zeros((6, len(rows)))
         q[i] = np.deg2rad(value + correction)
-        np.testing.assert_allclose(np.rad2deg(found.actual_positions(q)[0][i]), value, rtol=0, atol=1e-11)
+        actual = found.actual_positions(Conditions(q.T))[0][i]
+        np.testing.assert_allclose(np.rad2deg(actual), value, rtol=0, atol=1e-11)
     status, err = run(*command)
     assert status == 0, err
     assert Path("curves.csv").read_text() == "joint,value[deg],correction[deg]\n"

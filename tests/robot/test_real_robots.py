@@ -19,7 +19,7 @@ from dhcal_pin.io import read_robot, write_urdf
 from dhcal_pin.measurements import Noise, Pose
 from dhcal_pin.paper import crosscheck
 from dhcal_pin.paper.jacobian_check import kernel_jacobian, regressor_jacobian
-from dhcal_pin.robot import Chain, extract_dh_table, read_urdf
+from dhcal_pin.robot import Chain, Conditions, extract_dh_table, read_urdf
 
 ARMS = {
     "ur3": ("ur_description/urdf/ur3_robot.urdf", "tool0"),
@@ -202,10 +202,15 @@ def recovered(chain: Chain, sets: str, seed: int) -> float:
     errors = select_parameters(chain, sets)
     size = np.array([np.deg2rad(2) if p.unit == "rad" else 0.01 for p in errors.parameters])
     truth = errors.at(size * rng.uniform(-1, 1, len(size)))
-    q = rng.uniform(-np.pi, np.pi, (80, chain.n_joints))
-    data = Pose.simulate(truth, q[:40], Noise(), rng)
+    shape = (80, chain.n_joints)
+    conditions = Conditions(
+        rng.uniform(-np.pi, np.pi, shape),
+        approach=rng.choice([-1.0, 1.0], shape),
+        temperature=chain.reference_temperature + np.tile(np.linspace(-10, 10, 40), 2),
+    )
+    data = Pose.simulate(truth, conditions[:40], Noise(), rng)
     fit = calibrate(chain, data, sets, priors="none")
-    return fit.validate(Pose.simulate(truth, q[40:], Noise(), rng))["position_max_m"]
+    return fit.validate(Pose.simulate(truth, conditions[40:], Noise(), rng))["position_max_m"]
 
 
 WITH_FRAMES = [f"{s},base,tool" for s in ("dh", "modified-dh", "hayati", "minimal", "placement", "offset")]

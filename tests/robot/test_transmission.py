@@ -18,7 +18,7 @@ from dhcal_pin.estimation.batch import ChainBatch
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import measurement_text, read_robot, write_urdf
 from dhcal_pin.measurements import Noise, Pose
-from dhcal_pin.robot import FAMILIES, Chain, Payload, parse_urdf
+from dhcal_pin.robot import FAMILIES, Chain, Conditions, Payload, parse_urdf
 from dhcal_pin.robot.transmission import MAX_CURVE_ORDER, Transmission, fill_harmonics, n_coefficients
 
 
@@ -31,6 +31,15 @@ def drawn(chain: Chain, sets: str, rng: np.random.Generator):
     errors = select_parameters(chain, sets)
     x = rng.normal(size=len(errors.parameters)) * np.minimum(errors.priors, 0.01)
     return errors.at(x).with_current_loads(), dict(zip([p.name for p in errors.parameters], x, strict=True))
+
+
+def random_conditions(arm: Chain, m: int, rng: np.random.Generator) -> Conditions:
+    """Random joint positions, directions of approach and temperatures around the reference."""
+    return Conditions(
+        rng.uniform(-2.5, 2.5, (m, arm.n_joints)),
+        approach=rng.choice([-1.0, 1.0], (m, arm.n_joints)),
+        temperature=arm.reference_temperature + rng.uniform(-10, 10, m),
+    )
 
 
 def test_actual_positions_follow_the_formula():
@@ -73,13 +82,21 @@ def test_harmonics_agree_with_direct_evaluation():
 
 def test_every_coefficient_is_a_parameter_of_one_set():
     """Only the compliance of joints that gravity does not load is no parameter."""
-    sets = [PARAMETER_SETS[name](ur10()) for name in FAMILIES]
-    indices = [p.coefficient_index for parameters in sets for p in parameters]
+    sets = {name: PARAMETER_SETS[name](ur10()) for name in FAMILIES}
+    indices = [p.coefficient_index for parameters in sets.values() for p in parameters]
     assert len(set(indices)) == len(indices)
-    assert [len(parameters) for parameters in sets[:4]] == [6, 6 * 2 * 2, 6 * 2 * 30, 6 * 2 * 32]
-    assert len(sets[-1]) == 6 * 5
-    assert set(indices) < set(range(n_coefficients(6)))
-    assert n_coefficients(6) == len(indices) + 6 - len(sets[4])
+    counts = {name: len(parameters) for name, parameters in sets.items() if name != "compliance"}
+    assert counts == {
+        "gain": 6,
+        "harmonics": 6 * 2 * 2,
+        "curves": 6 * 2 * 30,
+        "fine-curves": 6 * 2 * 32,
+        "coupling": 6 * 5,
+        "backlash": 6,
+        "thermal": 7,
+    }
+    assert set(indices) < set(range(n_coefficients(6, 6)))
+    assert n_coefficients(6, 6) == len(indices) + 6 - len(sets["compliance"])
 
 
 MIMIC = """<robot name="r"><link name="base"/><link name="a"/><link name="b"/>
@@ -285,7 +302,7 @@ def test_simulated_family_is_recovered(family):
     for seed in range(2):
         rng = np.random.default_rng(seed)
         truth, x = drawn(arm, f"minimal,base,tool,{family}", rng)
-        data = Pose.simulate(truth, rng.uniform(-2.5, 2.5, (80, 6)), Noise(1e-4, 1e-4), rng)
+        data = Pose.simulate(truth, random_conditions(arm, 80, rng), Noise(1e-4, 1e-4), rng)
         fit = calibrate(arm, data, f"minimal,base,tool,{family}")
         assert fit.converged
         for p, value, std in zip(fit.parameters, fit.x, fit.std, strict=True):

@@ -77,7 +77,7 @@ def estimate_jitter(
             continue
         inliers = item.take(weight > 0.5)
         plain = inliers.with_jitter(np.zeros_like(inliers.jitter))
-        frames = chain.forward_kinematics(plain.configurations())
+        frames = chain.forward_kinematics(plain.conditions())
         u = problem.instrument_values_of(plain, x)
         residual = plain.residual(frames, u)
         derivative = plain.displacement_derivative(frames, u) / plain.sigma[:, :, None]
@@ -151,7 +151,7 @@ def with_jitter(
     out: list[Measurement] = []
     for item in data:
         if isinstance(item, CameraCorners):
-            frames = chain.forward_kinematics(item.configurations())
+            frames = chain.forward_kinematics(item.conditions())
             derivative = item.displacement_derivative(frames, problem.instrument_values_of(item, x))
             item = item.with_scaled_sigma({"pixels": jitter.noise}).with_jitter(derivative * std)
         out.append(item)

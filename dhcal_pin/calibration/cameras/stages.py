@@ -128,4 +128,4 @@ def _image_error(fit: Fit, parts: Sequence[tuple[Array, Sequence[Array]]]) -> Im
 def _errors(item: Measurement, mask: Array, u: Array, chain: Any) -> dict[str, Array]:
     """Return the errors of some samples of a measurement."""
     part = item.take(mask)
-    return part.errors(chain.forward_kinematics(part.configurations()), u)
+    return part.errors(chain.forward_kinematics(part.conditions()), u)

@@ -102,7 +102,7 @@ def _initialize_instruments(chain: Chain, item: Measurement) -> Measurement:
     best = item.initialized(chain)
     if not item.instrument_parameters or not len(item.rows):
         return best
-    frames = chain.forward_kinematics(item.configurations())
+    frames = chain.forward_kinematics(item.conditions())
     labels = item.sample_groups
     n_labels = int(labels.max()) + 1
     rows_per_label = item.residual_dim * len(labels) / n_labels

@@ -5,6 +5,9 @@ alone selects the kind: of all kinds whose required columns are present, the one
 columns, and among those the one with the fewest columns in all. A rotation can be given as a quaternion in
 place of a rotation vector. Image coordinates may have the columns of a pose in place of those of the joints.
 
+The conditions of the samples may stand beside them: `time[s]`, `temperature[degC]`, `payload[kg]` and the
+direction of the last motion of a joint, `approach_JOINT`. A joint of such a name comes first.
+
 Other columns are ignored if they cannot be meant as a joint or a measured value: times, counters, texts, and
 quantities other than lengths and angles. Any other unknown column is an error, as it may be misspelt.
 """
@@ -21,7 +24,8 @@ from ...exceptions import FileFormatError, UnknownNameError
 from ...measurements import KINDS
 from ...measurements.base import Measurement
 from ...robot.chain import Chain
-from ...units import ANGLES, LENGTHS
+from ...robot.conditions import CONDITIONS
+from ...units import ANGLES, LENGTHS, UNITS
 from ..tables import Column, DataTable
 from ..tabular import require_usable_names
 
@@ -76,7 +80,12 @@ def column_contents(chain: Chain) -> dict[str, str]:
         for joint in chain.urdf.joints
         for prefix in ("", SECOND_PREFIX)
     }
-    return {**_CONTENTS, **joints}
+    conditions = {
+        column: CONDITIONS[name].quantity
+        for name, columns in condition_columns(chain).items()
+        for column in columns
+    }
+    return {**conditions, **_CONTENTS, **joints}
 
 
 def check_joint_names(chain: Chain) -> None:
@@ -89,10 +98,33 @@ def check_joint_names(chain: Chain) -> None:
         )
 
 
+def condition_columns(chain: Chain) -> dict[str, list[str]]:
+    """Return the names of the columns of each condition: one, or one per joint."""
+    joints = {joint.name for joint in chain.urdf.joints}
+    columns = {
+        condition.name: [f"{condition.name}_{joint}" for joint in chain.joint_names]
+        if condition.is_per_joint
+        else [condition.name]
+        for condition in CONDITIONS.values()
+    }
+    return {name: names for name, names in columns.items() if not joints.intersection(names)}
+
+
+def describe_conditions() -> str:
+    """Return the columns of all conditions, for messages."""
+    texts = []
+    for condition in CONDITIONS.values():
+        unit = next(iter(UNITS.get(condition.quantity, ())), "")
+        ending = "_JOINT" if condition.is_per_joint else f"[{unit}]"
+        texts.append(condition.name + ending)
+    return ", ".join(texts)
+
+
 def known_columns(chain: Chain) -> frozenset[str]:
     """Return the names of all columns that a measurement file of a robot can have."""
     names = [joint.name for joint in chain.urdf.joints]
-    return _KNOWN | {prefix + name for name in names for prefix in ("", SECOND_PREFIX)}
+    conditions = [name for columns in condition_columns(chain).values() for name in columns]
+    return _KNOWN | {prefix + name for name in names for prefix in ("", SECOND_PREFIX)} | {*conditions}
 
 
 def joints_off_the_chain(chain: Chain) -> list[str]:
@@ -122,6 +154,7 @@ def check_columns(table: DataTable, chain: Chain) -> list[str]:
     """Check that every column is a joint of the robot, a measured value, or can be ignored."""
     known = known_columns(chain)
     columns = table.columns
+    _check_condition_names(table, chain)
     for name, column in columns.items():
         if name not in known and not _can_be_ignored(table, column, known):
             raise unknown_column_error(table.header_location, name, known, columns, chain.joint_names)
@@ -132,6 +165,18 @@ def check_columns(table: DataTable, chain: Chain) -> list[str]:
         for index, cell in enumerate(table.headers)
         if index not in used and (cell or any(row[index].strip() for row in table.cells))
     ]
+
+
+def _check_condition_names(table: DataTable, chain: Chain) -> None:
+    """Check that the columns of conditions of single joints end with the names of joints."""
+    known = known_columns(chain)
+    for condition in CONDITIONS.values():
+        for name in table.columns:
+            if condition.is_per_joint and name.startswith(f"{condition.name}_") and name not in known:
+                raise UnknownNameError(
+                    f"{table.header_location}: column {name!r} is not a condition; the conditions are "
+                    f"{describe_conditions()}, and the joints {', '.join(chain.joint_names)}"
+                )
 
 
 def _can_be_ignored(table: DataTable, column: Column, known: Iterable[str]) -> bool:

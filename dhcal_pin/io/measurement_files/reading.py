@@ -28,7 +28,8 @@ from ...measurements.base import Measurement
 from ...measurements.mounting import MountedRig
 from ...measurements.pose import Pose
 from ...robot.chain import Chain
-from ...units import LENGTHS, UNITS
+from ...robot.conditions import CONDITIONS, Condition
+from ...units import LENGTHS, MASSES, TEMPERATURES, UNITS
 from ..tables import Column, DataTable, format_lines, read_table
 from .columns import (
     AFTER,
@@ -39,6 +40,8 @@ from .columns import (
     TOOL_POSE,
     check_columns,
     check_joint_names,
+    condition_columns,
+    describe_conditions,
     find_kind,
     has_tool_poses,
     joint_units,
@@ -48,6 +51,8 @@ from .columns import (
 )
 from .tool_poses import solve_tool_poses
 
+# Comment that declares that the rows of a file are in the order of measurement.
+IN_ORDER = "rows: in order"
 # Smallest accepted standard deviation [m or rad]; no instrument is as accurate.
 _MIN_SIGMA = 1e-15
 # Largest deviation of a quaternion's norm from 1. Rounding to three decimals stays below it.
@@ -163,6 +168,7 @@ def parse_measurements(
         tips = parse_values(table, Pose)
         data = data.replace(q=solve_tool_poses(table, chain, tips), has_joint_values=False)
         values |= tips
+    data = _with_conditions(data, table, chain)
     is_holdout = _parse_holdout_mask(table)
     return MeasurementFile(
         source=table.source,
@@ -173,7 +179,12 @@ def parse_measurements(
         measured_after=_parse_group(table, AFTER, LENGTHS),
         values=values,
         units=column_units(table),
-        notes=(*table.notes, *ignored_columns_note(ignored), *skipped_rows_note(table)),
+        notes=(
+            *table.notes,
+            *ignored_columns_note(ignored),
+            *_unknown_conditions_note(table, chain),
+            *skipped_rows_note(table),
+        ),
         bad_rows=table.bad_rows,
         other_moving_joints=_find_other_moving_joints(table, chain),
     )
@@ -189,6 +200,15 @@ def ignored_columns_note(labels: Sequence[str]) -> list[str]:
     """Return one sentence that names ignored columns, none if there are no such columns."""
     names = ", ".join(label.removeprefix("column ") for label in labels)
     return [f"column{'s' if len(labels) > 1 else ''} {names} ignored"] if labels else []
+
+
+def _unknown_conditions_note(table: DataTable, chain: Chain) -> list[str]:
+    """Return a sentence on ignored columns that have the unit of a condition, none without such columns."""
+    units, known = {*TEMPERATURES, *MASSES}, known_columns(chain)
+    names = [name for name, column in table.columns.items() if column.unit in units and name not in known]
+    if not names:
+        return []
+    return [f"{', '.join(names)}: not a known condition; the conditions are {describe_conditions()}"]
 
 
 def skipped_rows_note(table: DataTable) -> list[str]:
@@ -214,7 +234,8 @@ def _usable_rows(
     }
     texts = {name for name, quantity in quantities.items() if quantity == "text"}
     needed = [name for name, quantity in quantities.items() if quantity != "remark"]
-    used = [name for name in (*joints, *needed) if name in table.columns]
+    conditions = [column.name for columns in _present_conditions(table, chain).values() for column in columns]
+    used = [name for name in (*joints, *needed, *conditions) if name in table.columns]
     table = table.without_bad_rows(
         [table.columns[name].index for name in used if name not in texts],
         [table.columns[name].index for name in used if name in texts],
@@ -224,6 +245,50 @@ def _usable_rows(
     if not len(table.lines):
         raise FileFormatError(f"{table.source}: no row has all numbers; correct the file or its columns")
     return table
+
+
+def _present_conditions(table: DataTable, chain: Chain) -> dict[str, list[Column]]:
+    """Return the columns of each condition that a table has; a time without a unit is a text for people."""
+    present = {
+        name: [table.columns[column] for column in columns if column in table.columns]
+        for name, columns in condition_columns(chain).items()
+    }
+    return {
+        name: columns
+        for name, columns in present.items()
+        if columns and not (name == "time" and not columns[0].unit)
+    }
+
+
+def _with_conditions(data: Measurement, table: DataTable, chain: Chain) -> Measurement:
+    """Return the samples with their conditions; rows with a time are in the order of measurement."""
+    present = _present_conditions(table, chain)
+    values: dict[str, Array] = {}
+    for name, columns in present.items():
+        parsed = [_parse_condition(table, column, CONDITIONS[name]) for column in columns]
+        if CONDITIONS[name].is_per_joint:
+            by_column = dict(zip([column.name for column in columns], parsed, strict=True))
+            unknown = np.zeros(len(table.lines))
+            values[name] = np.stack([by_column.get(c, unknown) for c in condition_columns(chain)[name]], -1)
+        else:
+            values[name] = parsed[0]
+    if values:
+        data = data.with_conditions(**values)
+    is_ordered = "time" in values or any(text.strip().lower() == IN_ORDER for text in table.comments)
+    return data.in_order() if is_ordered and data.configurations_per_row == 1 else data
+
+
+def _parse_condition(table: DataTable, column: Column, condition: Condition) -> Array:
+    """Parse and check a column of a condition, shape (m,)."""
+    units = UNITS[condition.quantity]
+    if units:
+        values = table.finite_numbers(column) / column.divisor(units, table.header_location)
+    else:
+        values = _pure_numbers(table, column)
+    if problem := condition.find_problem(values):
+        row, text = problem
+        raise FileFormatError(f"{table.cell_location(row, column.name)}: {text}")
+    return values
 
 
 def build_measurement(
@@ -318,13 +383,17 @@ def _parse_group(table: DataTable, names: Sequence[str], units: Mapping[str, flo
     columns = [table.columns[name] for name in names]
     if units is not None:
         return np.stack([table.to_si(column, units) for column in columns], -1)
-    for column in columns:
-        if column.unit:
-            raise FileFormatError(
-                f"{table.header_location}: column {column.name!r} is a pure number; "
-                f"write {column.name} without a unit"
-            )
-    return np.stack([table.finite_numbers(column) for column in columns], -1)
+    return np.stack([_pure_numbers(table, column) for column in columns], -1)
+
+
+def _pure_numbers(table: DataTable, column: Column) -> Array:
+    """Return the numbers of a column without a unit, shape (m,)."""
+    if column.unit:
+        raise FileFormatError(
+            f"{table.header_location}: column {column.name!r} is a pure number; "
+            f"write {column.name} without a unit"
+        )
+    return table.finite_numbers(column)
 
 
 def _require_all_sigmas(table: DataTable, kind: type[Measurement], values: Mapping[str, Any]) -> None:

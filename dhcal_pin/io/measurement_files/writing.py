@@ -10,9 +10,10 @@ import numpy as np
 from ..._typing import Array
 from ...measurements.base import Measurement
 from ...robot.chain import Chain
-from ...units import ANGLES, LENGTHS
+from ...robot.conditions import CONDITIONS
+from ...units import ANGLES, LENGTHS, UNITS
 from ..tabular import csv_text
-from .columns import SECOND_PREFIX, check_joint_names, joint_units
+from .columns import SECOND_PREFIX, check_joint_names, condition_columns, joint_units
 
 # Unit of prismatic joints beside the unit of revolute joints.
 _LENGTH_UNITS = {"rad": "m", "deg": "mm"}
@@ -26,7 +27,7 @@ def measurement_text(data: Measurement, chain: Chain, comments: Sequence[str] = 
     columns: dict[str, Any] = {}
     for prefix, q in zip(("", SECOND_PREFIX)[:count], configurations, strict=False):
         columns |= joint_columns(q, chain, prefix)
-    return csv_text(columns | value_columns(data), comments)
+    return csv_text(columns | value_columns(data) | _condition_columns(data, chain), comments)
 
 
 def value_columns(data: Measurement) -> dict[str, list[Any]]:
@@ -37,6 +38,19 @@ def value_columns(data: Measurement) -> dict[str, list[Any]]:
             data.columns[name]
         ]
         columns[name + unit] = list(values) if unit == "" else values.tolist()
+    return columns
+
+
+def _condition_columns(data: Measurement, chain: Chain) -> dict[str, list[Any]]:
+    """Return the columns of the conditions that are known of the samples."""
+    columns: dict[str, list[Any]] = {}
+    for name, names in condition_columns(chain).items():
+        values = getattr(data.recorded, name, None)
+        if values is not None:
+            unit = next(iter(UNITS[CONDITIONS[name].quantity]), "")
+            ending = f"[{unit}]" if unit else ""
+            by_column = zip(names, values.reshape(len(values), -1).T.tolist(), strict=True)
+            columns |= {column + ending: numbers for column, numbers in by_column}
     return columns
 
 

@@ -1,0 +1,141 @@
+"""Conditions of samples: what the model of a robot depends on.
+
+The tool pose depends on the joint positions q and, for some joint errors, on the direction in which each
+joint moved last, on the temperature and on the payload. A condition that is not known has no effect: a joint
+has no direction, the links have the lengths of the model, and the payload is that of the model.
+
+Shapes: m samples, n independent joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from .._kernels.types import JointState
+from .._typing import Array
+
+# Plausible temperatures of a robot [°C], and heaviest payload [kg].
+TEMPERATURE_RANGE = -50.0, 150.0
+MAX_PAYLOAD = 1e5
+# Smallest motion of a joint between two samples [rad or m]; smaller ones are noise of its encoder.
+MIN_MOTION = 1e-4
+
+
+@dataclass(frozen=True)
+class Condition:
+    """Condition of a sample that a measurement file can state.
+
+    Attributes:
+        name: Name of the column and of the attribute of `Conditions`.
+        quantity: "time" [s], "temperature" [°C], "mass" [kg] or "direction" (-1, 0 or 1).
+        description: What it is, for messages.
+        low: Lowest value, in the unit of the quantity.
+        high: Highest value.
+        is_per_joint: Whether each joint has a column `NAME_JOINT`.
+    """
+
+    name: str
+    quantity: str
+    description: str
+    low: float
+    high: float
+    is_per_joint: bool = False
+
+    def find_problem(self, values: Array) -> tuple[int, str] | None:
+        """Return the first sample with a value (m,) that is not possible, and what is wrong with it."""
+        if self.quantity == "direction" and (wrong := np.flatnonzero(~np.isin(values, (-1, 0, 1)))).size:
+            return int(wrong[0]), f"{values[wrong[0]]:g} is not a direction; expected -1, 0 or 1"
+        if (wrong := np.flatnonzero(~((values >= self.low) & (values <= self.high)))).size:
+            limits = f"a number from {self.low:g} to {self.high:g}"
+            return int(wrong[0]), f"{values[wrong[0]]:g} is not plausible; expected {limits}"
+        if self.quantity == "time" and (wrong := np.flatnonzero(np.diff(values) < 0)).size:
+            return int(wrong[0]) + 1, "is earlier than the row before; expected rows in the order of time"
+        return None
+
+
+CONDITIONS = {
+    condition.name: condition
+    for condition in (
+        Condition("time", "time", "time of the measurement", -np.inf, np.inf),
+        Condition(
+            "approach", "direction", "direction of the last motion of a joint", -1, 1, is_per_joint=True
+        ),
+        Condition("temperature", "temperature", "temperature of the robot", *TEMPERATURE_RANGE),
+        Condition("payload", "mass", "mass at the tip", 0, MAX_PAYLOAD),
+    )
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Conditions:
+    """Conditions of m samples; None for a condition that is not known.
+
+    Attributes:
+        q: Commanded positions of the independent joints, shape (m, n) [rad or m].
+        order: Number of each sample in the order of measurement, shape (m,).
+        time: Time of each sample, shape (m,) [s].
+        approach: Direction of the last motion of each joint, -1, 0 or 1, shape (m, n); 0 if it is not known.
+        temperature: Temperature of the robot, shape (m,) [°C].
+        payload: Mass at the tip, shape (m,) [kg].
+    """
+
+    q: Array
+    order: Array | None = None
+    time: Array | None = None
+    approach: Array | None = None
+    temperature: Array | None = None
+    payload: Array | None = None
+
+    def __getitem__(self, index: Array | slice) -> Conditions:
+        """Return the samples of an index, mask or slice."""
+        return Conditions(**{name: values[index] for name, values in self._known.items()})
+
+    @property
+    def _known(self) -> dict[str, Array]:
+        """Known conditions by name."""
+        pairs = ((field.name, getattr(self, field.name)) for field in fields(self))
+        return {name: values for name, values in pairs if values is not None}
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Names of the known conditions besides q."""
+        return frozenset(self._known) - {"q"}
+
+    def at(self, q: Array) -> Conditions:
+        """Return the same conditions at other joint positions (c·m, n), all samples of each configuration."""
+        count = len(q) // max(len(self.q), 1)
+        if count <= 1:
+            return replace(self, q=q)
+        repeated = {name: np.concatenate([values] * count) for name, values in self._known.items()}
+        if self.approach is not None:
+            # The direction of the second configuration is not known.
+            repeated["approach"][len(self.q) :] = 0.0
+        return Conditions(**repeated | {"q": q})
+
+
+@dataclass(frozen=True, eq=False)
+class SampleState(JointState):
+    """Positions of a chain's joints at samples, with the conditions of the samples."""
+
+    conditions: Conditions
+
+
+def concatenate_conditions(parts: Sequence[Conditions]) -> Conditions:
+    """Join the conditions of several sets of samples; a condition has to be known of all of them."""
+    known = frozenset.intersection(*(part.names for part in parts)) | {"q"}
+    return Conditions(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in known})
+
+
+def directions_in_order(q: Array) -> Array:
+    """Return the direction of the last motion of each joint for samples in the order of measurement, (m, n).
+
+    A joint that does not move keeps its direction. The direction before the first motion is not known: 0.
+    """
+    steps = np.diff(q, axis=0, prepend=q[:1])
+    directions = np.where(np.abs(steps) < MIN_MOTION, 0.0, np.sign(steps))
+    rows = np.arange(len(q))[:, None]
+    last_motion = np.maximum.accumulate(np.where(directions == 0, 0, rows), 0)
+    return np.take_along_axis(directions, last_motion, 0)

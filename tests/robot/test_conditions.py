@@ -1,0 +1,295 @@
+"""Conditions of samples: from the file to backlash and thermal growth, and back to the sidecar."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+
+import numpy as np
+import pytest
+from robots import robot_file
+
+import dhcal_pin as dh
+from dhcal_pin.cli.main import main
+from dhcal_pin.estimation import select_parameters
+from dhcal_pin.exceptions import DhcalError, FileFormatError, InvalidArgumentError, UnknownNameError
+from dhcal_pin.io import measurement_text, read_measurements, read_robot, write_urdf
+from dhcal_pin.measurements import Noise, Position
+from dhcal_pin.robot import Chain, Conditions
+from dhcal_pin.robot.conditions import directions_in_order
+
+
+@pytest.fixture(scope="module")
+def arm() -> Chain:
+    return Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+
+
+def drawn(arm: Chain, m: int, rng: np.random.Generator) -> Conditions:
+    """Random joint positions, directions of approach and temperatures."""
+    q = rng.uniform(-2.5, 2.5, (m, arm.n_joints))
+    return Conditions(q, approach=rng.choice([-1.0, 1.0], q.shape), temperature=rng.uniform(20, 40, m))
+
+
+def with_errors(arm: Chain, family: str, size: float, rng: np.random.Generator) -> Chain:
+    """The arm with random geometric errors and coefficients of one family."""
+    geometry = select_parameters(arm, "minimal,base,tool")
+    std = np.array([1e-3 if parameter.unit == "m" else 3e-3 for parameter in geometry.parameters])
+    moved = geometry.at(std * rng.normal(size=len(std)))
+    errors = select_parameters(moved, family)
+    x = size * np.ones(len(errors.parameters))
+    return errors.with_current_loads(x).at(x)
+
+
+# --- the model -------------------------------------------------------------------------------------
+
+
+def test_backlash_moves_a_joint_by_half_its_width(arm):
+    errors = select_parameters(arm, "backlash")
+    width = 1e-3 * np.arange(1, 7)
+    rng = np.random.default_rng(0)
+    conditions = drawn(arm, 20, rng)
+    assert conditions.approach is not None
+    wanted = arm.poses(conditions.q - width * conditions.approach / 2)
+    np.testing.assert_allclose(errors.at(width).poses(conditions), wanted, atol=1e-14)
+    np.testing.assert_array_equal(errors.at(width).poses(conditions.q), arm.poses(conditions.q))
+
+
+def test_thermal_growth_is_that_of_longer_links(arm):
+    """By a chain whose joint origins are farther apart."""
+    errors = select_parameters(arm, "thermal")
+    rate, rise = 1e-5 * np.arange(1, 1 + len(errors.parameters)), 15.0
+    q = np.random.default_rng(1).uniform(-2.5, 2.5, (20, arm.n_joints))
+    temperature = np.full(len(q), arm.reference_temperature + rise)
+    growth = dict(zip([p.name.rsplit(".", 1)[0] for p in errors.parameters], rate * rise, strict=True))
+    origins = arm.origins.copy()
+    for name, origin in zip(arm.link_names, origins, strict=True):
+        origin[:3, 3] *= 1 + growth.get(name, 0.0)
+    longer = Chain(**{**arm.__getstate__(), "origins": origins})
+    found = errors.at(rate).poses(Conditions(q, temperature=temperature))
+    np.testing.assert_allclose(found, longer.poses(q), atol=1e-14)
+
+
+@pytest.mark.parametrize("family", ["backlash", "thermal"])
+def test_derivatives_agree_with_finite_differences(arm, family):
+    """By geometric errors and coefficients, at an arm with errors of all kinds."""
+    rng = np.random.default_rng(2)
+    errors = select_parameters(arm, f"minimal,base,tool,harmonics,{family}")
+    x = 1e-3 * rng.normal(size=len(errors.parameters))
+    conditions, step = drawn(arm, 10, rng), 1e-6
+    chain, bodies, twists = errors.derivative(x)
+    found = chain.tool_jacobian(chain.forward_kinematics(conditions), bodies, twists)
+    for i, change in enumerate(step * np.eye(len(x))):
+        moved = [errors.at(x + sign * change).poses(conditions)[:, :3, 3] for sign in (1, -1)]
+        np.testing.assert_allclose(found[i, :3].T, (moved[0] - moved[1]) / (2 * step), atol=1e-7)
+
+
+def test_payload_of_a_sample_loads_compliant_joints(arm):
+    """As the payload of the robot does."""
+    errors = select_parameters(arm, "compliance")
+    soft = errors.at(np.full(len(errors.parameters), 1e-4))
+    q = np.random.default_rng(3).uniform(-2, 2, (5, arm.n_joints))
+    carrying = soft.with_payload(dh.robot.Payload(4.0))
+    wanted = carrying.with_transmission(
+        dh.robot.Transmission(carrying.transmission.coefficients, carrying.loads)  # pyright: ignore
+    ).poses(q)
+    np.testing.assert_allclose(soft.poses(Conditions(q, payload=np.full(5, 4.0))), wanted, atol=1e-12)
+
+
+def test_a_joint_that_does_not_move_keeps_its_direction():
+    q = np.array([[0.0, 0.0], [0.1, 0.0], [0.1, -0.2], [0.1 + 1e-6, 0.3]])
+    np.testing.assert_array_equal(directions_in_order(q), [[0, 0], [1, 0], [1, -1], [1, 1]])
+
+
+# --- selection -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("family", "size"), [("backlash", 3.5e-4), ("thermal", 2e-5)])
+def test_family_is_selected_and_improves_the_arm(arm, family, size):
+    rng = np.random.default_rng(4)
+    truth = with_errors(arm, family, size, rng)
+    data = Position.simulate(truth, drawn(arm, 100, rng), Noise(5e-5), rng)
+    more = Position.simulate(truth, drawn(arm, 400, rng), Noise(1e-9), rng)
+    fit, plain = dh.calibrate(arm, data), dh.calibrate(arm, data, extend="none")
+    assert fit.extension is not None
+    assert family in fit.extension.families
+    errors = [one.validate(more)["position_rms_m"] for one in (fit, plain)]
+    assert errors[0] < 0.4 * errors[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ["ur10", "panda", "ur5"])
+@pytest.mark.parametrize(("family", "size"), [("backlash", 3.5e-4), ("backlash", 3.5e-3), ("thermal", 2e-5)])
+def test_families_are_selected_in_95_percent_and_remove_80_percent_of_their_error(robot, family, size):
+    """The error that the family causes is what is above that of the same arm without it, in squares."""
+    arm = slow_arm(robot)
+    selected, removed = 0, []
+    for seed in range(20):
+        errors = []
+        for scale in (size, 0.0):
+            rng = np.random.default_rng(seed)
+            truth = with_errors(arm, family, scale, rng)
+            data = Position.simulate(truth, drawn(arm, 100, rng), Noise(5e-5), rng)
+            more = Position.simulate(truth, drawn(arm, 400, rng), Noise(1e-9), rng)
+            fits = [dh.calibrate(arm, data, extend=extend) for extend in ("auto", "none")]
+            errors.append([fit.validate(more)["position_rms_m"] ** 2 for fit in fits])
+            if scale:
+                extension = fits[0].extension
+                selected += extension is not None and family in extension.families
+        caused = errors[0][1] - errors[1][1]
+        left = max(errors[0][0] - errors[1][1], 0.0)
+        removed.append(1 - np.sqrt(left / caused))
+    assert selected >= 19
+    assert np.median(removed) >= 0.8
+
+
+@pytest.mark.slow
+def test_neither_family_is_selected_on_200_arms_without_them():
+    for seed in range(200):
+        arm, rng = slow_arm(("ur10", "panda", "ur5")[seed % 3]), np.random.default_rng(seed)
+        truth = with_errors(arm, "backlash", 0.0, rng)
+        data = Position.simulate(truth, drawn(arm, 100, rng), Noise(5e-5), rng)
+        extension = dh.calibrate(arm, data).extension
+        assert extension is None or not {"backlash", "thermal"} & set(extension.families), seed
+
+
+def slow_arm(name: str) -> Chain:
+    files = {
+        "ur10": ("ur_description/urdf/ur10_robot.urdf", "tool0"),
+        "ur5": ("ur_description/urdf/ur5_robot.urdf", "tool0"),
+        "panda": ("panda_description/urdf/panda.urdf", "panda_hand"),
+    }
+    path, tip = files[name]
+    return Chain.from_urdf(robot_file(path), tip)
+
+
+@pytest.mark.parametrize("family", ["backlash", "thermal"])
+def test_a_named_family_without_its_condition_is_refused(arm, family):
+    q = np.random.default_rng(5).uniform(-2, 2, (30, 6))
+    data = Position(q, arm.poses(q)[:, :3, 3])
+    with pytest.raises(InvalidArgumentError, match=f"'{family}' needs the .* which no measurement states"):
+        dh.calibrate(arm, data, extend=family)
+    with pytest.raises(InvalidArgumentError, match=f"'{family}' needs the"):
+        dh.calibrate(arm, data, f"minimal,base,tool,{family}")
+
+
+# --- files -----------------------------------------------------------------------------------------
+
+
+def test_files_and_sidecar_preserve_conditions_and_coefficients(arm, tmp_path):
+    rng = np.random.default_rng(6)
+    conditions = drawn(arm, 60, rng)
+    truth = with_errors(with_errors(arm, "backlash", 1e-3, rng), "thermal", 2e-5, rng)
+    data = Position.simulate(truth, conditions, Noise(5e-5), rng)
+    (tmp_path / "data.csv").write_text(measurement_text(data, arm))
+    read = read_measurements(tmp_path / "data.csv", arm)
+    assert read.recorded is not None
+    np.testing.assert_array_equal(read.recorded.approach, conditions.approach)
+    np.testing.assert_array_equal(read.recorded.temperature, conditions.temperature)
+    write_urdf(truth, tmp_path / "truth.urdf")
+    again = read_robot(tmp_path / "truth.urdf", "tool0")
+    np.testing.assert_allclose(again.poses(conditions), truth.poses(conditions), atol=1e-9)
+    sidecar = tomllib.loads((tmp_path / "truth.calibration.toml").read_text())
+    assert sidecar["joint"]["elbow_joint"]["backlash_rad"] == 1e-3
+    assert sidecar["thermal"]["per_kelvin"]["forearm_link"] == 2e-5
+    assert sidecar["thermal"]["reference_degc"] == arm.reference_temperature
+
+
+def text(arm: Chain, **columns: list[object]) -> str:
+    """A file of positions with further columns."""
+    q = np.random.default_rng(7).uniform(-2, 2, (3, 6))
+    positions = arm.poses(q)[:, :3, 3]
+    names = [f"{name}[rad]" for name in arm.joint_names]
+    lines = [",".join([*names, "x[m]", "y[m]", "z[m]", *columns])]
+    for i in range(3):
+        lines.append(",".join(map(str, [*q[i], *positions[i], *(values[i] for values in columns.values())])))
+    return "\n".join(lines) + "\n"
+
+
+def test_rows_with_a_time_are_in_order(arm, tmp_path):
+    (tmp_path / "data.csv").write_text(text(arm, **{"time[ms]": [0, 500, 1500]}))
+    recorded = read_measurements(tmp_path / "data.csv", arm).recorded
+    assert recorded is not None
+    np.testing.assert_allclose(recorded.time, [0, 0.5, 1.5])
+    np.testing.assert_array_equal(recorded.approach[1:], np.sign(np.diff(recorded.q, axis=0)))
+    (tmp_path / "data.csv").write_text("# rows: in order\n" + text(arm))
+    recorded = read_measurements(tmp_path / "data.csv", arm).recorded
+    assert recorded is not None
+    assert recorded.order.tolist() == [0, 1, 2]
+    (tmp_path / "data.csv").write_text(text(arm))
+    assert read_measurements(tmp_path / "data.csv", arm).recorded is None
+
+
+@pytest.mark.parametrize(
+    ("columns", "words"),
+    [
+        (
+            {"approach_elbow_joint": [1, 0, 2]},
+            "data.csv:4: column 'approach_elbow_joint': 2 is not a direction",
+        ),
+        (
+            {"approach_elbow_joint": [0.5, 0, 1]},
+            "data.csv:2: column 'approach_elbow_joint': 0.5 is not a dir",
+        ),
+        ({"time[s]": [0, 2, 1]}, "data.csv:4: column 'time': is earlier than the row before"),
+        ({"temperature[degC]": [20, 151, 20]}, "data.csv:3: column 'temperature': 151 is not plausible"),
+        ({"temperature[degC]": [20, "", 20]}, "data.csv:3: column 'temperature' is empty"),
+        (
+            {"temperature[K]": [290, 290, 290]},
+            "column 'temperature' has unit 'K'; write one of temperature[degC]",
+        ),
+        (
+            {"payload[kg]": [1, -1, 1]},
+            "data.csv:3: column 'payload': -1 is not plausible; expected a number from 0",
+        ),
+        (
+            {"approach_elbow": [1, 1, 1]},
+            "column 'approach_elbow' is not a condition; the conditions are time[s],",
+        ),
+        ({"temprature[degC]": [20, 20, 20]}, "did you mean 'temperature'?"),
+    ],
+)
+def test_wrong_conditions_are_named_in_one_line(arm, columns, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "data.csv").write_text(text(arm, **columns))
+    with pytest.raises((FileFormatError, UnknownNameError)) as caught:
+        read_measurements("data.csv", arm)
+    assert words in str(caught.value)
+    robot = str(robot_file("ur_description/urdf/ur10_robot.urdf"))
+    assert main(["calibrate", robot, "data.csv", "--tip", "tool0", "-o", "out.urdf"]) == 2
+    err = capsys.readouterr().err
+    assert words in " ".join(err.split())
+    assert not (tmp_path / "out.urdf").exists()
+
+
+def test_unknown_conditions_of_python_are_refused(arm):
+    q = np.zeros((2, 6))
+    data = Position(q, arm.poses(q)[:, :3, 3])
+    with pytest.raises(UnknownNameError, match="unknown condition 'humidity'; choose from time, approach"):
+        data.with_conditions(humidity=[1, 2])
+    with pytest.raises(InvalidArgumentError, match=r"temperature has shape \(3,\); expected \(2,\)"):
+        data.with_conditions(temperature=[1, 2, 3])
+    with pytest.raises(InvalidArgumentError, match="approach in row 2: 3 is not a direction"):
+        data.with_conditions(approach=[[0] * 6, [3] * 6])
+
+
+def test_conditions_go_through_the_command_line(arm, tmp_path, monkeypatch, capsys):
+    """Calibrated and validated with temperatures, the arm is as good as its noise."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(8)
+    truth = with_errors(arm, "thermal", 3e-5, rng)
+    for name, m in (("fit.csv", 100), ("other.csv", 50)):
+        data = Position.simulate(truth, drawn(arm, m, rng), Noise(2e-5), rng)
+        (tmp_path / name).write_text(measurement_text(data, arm))
+    robot = str(robot_file("ur_description/urdf/ur10_robot.urdf"))
+    assert main(["calibrate", robot, "fit.csv", "--tip", "tool0", "-o", "out.urdf", "--quiet"]) == 0
+    assert main(["validate", "out.urdf", "other.csv", "--json", "v.json", "--quiet"]) == 0
+    assert json.loads((tmp_path / "v.json").read_text())["after"]["position_rms_m"] < 6e-5
+    sidecar = tomllib.loads((tmp_path / "out.calibration.toml").read_text())
+    assert abs(sidecar["thermal"]["per_kelvin"]["forearm_link"] - 3e-5) < 1e-5
+    capsys.readouterr()
+
+
+def test_kinds_that_move_the_joints_cannot_be_simulated_with_conditions(arm):
+    rng = np.random.default_rng(9)
+    with pytest.raises(DhcalError, match="point: cannot be simulated with conditions"):
+        dh.measurements.KINDS["point"].simulate(arm, drawn(arm, 8, rng), Noise(), rng)
