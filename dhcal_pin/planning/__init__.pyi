@@ -4,7 +4,7 @@ from .curve_prediction import CurvePrediction as CurvePrediction
 from .information import Information as Information
 from .information import PlannedCalibration as PlannedCalibration
 from .information import plannable_kinds as plannable_kinds
-from .planner import CRITERIA as CRITERIA
+from .named_criteria import CRITERIA as CRITERIA
 from .planner import Plan as Plan
 from .planner import plan as plan
 from .views import CameraViews as CameraViews

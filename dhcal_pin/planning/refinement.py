@@ -51,6 +51,25 @@ class DesignGoal:
     bin_columns: Array
 
 
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """Poses that the search has found for a goal.
+
+    Attributes:
+        candidates: Candidates to choose from.
+        q: Their joint positions, shape (m, n) [rad or m].
+        greedy: Indices of the greedy selection in its order, shape (c,).
+        selected: Indices of the selection after exchange, shape (c,).
+        refined: Joint positions after refinement, shape (c, n) [rad or m].
+    """
+
+    candidates: CandidateSet
+    q: Array
+    greedy: Array
+    selected: Array
+    refined: Array
+
+
 def refine(
     goal: DesignGoal, q: Array, sampler: ConfigurationSampler, min_distance: float, rng: np.random.Generator
 ) -> Array:
