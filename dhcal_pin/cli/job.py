@@ -20,7 +20,7 @@ from dataclasses import Field, dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 from .job_outputs import (
-    Output,
+    Calibrated,
     certificate_content,
     curves_content,
     map_content,
@@ -46,6 +46,7 @@ from .options import (
     SKIP_BAD_ROWS,
     TIP,
 )
+from .output_table import Output, OutputFile, chosen_files
 
 if TYPE_CHECKING:
     from ..calibration import Method
@@ -275,20 +276,15 @@ class Job:
         return cls(**values)
 
     @property
-    def outputs(self) -> list[tuple[str, Output, str]]:
-        """Output files except the robot: option, output and path."""
-        found: list[tuple[str, Output, str]] = []
-        for option in fields(self):
-            value, output = getattr(self, option.name), option.metadata.get("output")
-            if output and value:
-                paths = value if isinstance(value, tuple) else (value,)
-                found += [(option.name, output, path) for path in paths]
-        return found
+    def outputs(self) -> list[OutputFile[Calibrated]]:
+        """Output files except the robot."""
+        rows = {option.name: option.metadata.get("output") for option in fields(self)}
+        return chosen_files(vars(self), {name: output for name, output in rows.items() if output})
 
     @property
     def output_paths(self) -> list[str]:
         """Paths of all outputs; the sidecar is beside the first one."""
-        return [self.output, *(path for _, _, path in self.outputs)]
+        return [self.output, *(file.path for file in self.outputs)]
 
     def command(self, names: Mapping[str, str]) -> str:
         """Format the command line of this job without the options that only name outputs.

@@ -1,17 +1,14 @@
-"""Output files of a calibration job: their endings and the functions that make their contents.
+"""Contents of the output files of a calibration job.
 
-A field of `Job` that names an output file holds an `Output`; `ROBOT_FORMATS` in `run_job` lists those
-of the robot itself. Functions import what they need when they are called, because help pages load no NumPy.
+A field of `Job` that names an output file holds its `Output`; `ROBOT_FORMATS` in `run_job` lists the files of
+the robot itself. Functions import what they need when they are called, because help pages load no NumPy.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
-
-from ..exceptions import InvalidArgumentError
 
 if TYPE_CHECKING:
     from .._typing import PathLike
@@ -43,31 +40,6 @@ class Calibrated:
         from ..report.html import report_files  # lazy import: only for reports
 
         return report_files(self.fit, self.reports, self.source)
-
-
-@dataclass(frozen=True)
-class Output:
-    """Output file of a job.
-
-    Attributes:
-        content: Function that makes the content for a path; None for the JSON document, which is made last.
-        noun: What the file is, in the message on an unknown ending.
-        endings: Endings of its name; any if there are none.
-        other_endings: Endings that are accepted, too.
-        is_written_if_refused: Whether the file is written for a refused calibration, too.
-    """
-
-    content: Callable[[Calibrated, str], str | bytes] | None
-    noun: str = ""
-    endings: tuple[str, ...] = ()
-    other_endings: tuple[str, ...] = ()
-    is_written_if_refused: bool = False
-
-    def require_ending(self, path: str) -> None:
-        """Require one of the endings of this output."""
-        if self.endings and not path.lower().endswith((*self.endings, *self.other_endings)):
-            endings = " or ".join(self.endings)
-            raise InvalidArgumentError(f"{path}: unknown ending; write {self.noun} as {endings}")
 
 
 def map_content(done: Calibrated, path: str) -> str:

@@ -52,7 +52,8 @@ from ..robot.correction_table import joint_corrections
 from ..robot.urdf import parse_urdf
 from .job import REGION, Job
 from .job_outputs import Calibrated
-from .options import STDOUT, split_commas
+from .options import split_commas
+from .output_table import file_contents, numbered, paths_by_name, require_endings
 from .outputs import (
     existing_sidecars,
     is_same_file,
@@ -193,11 +194,10 @@ def _checked_inputs(job: Job) -> list[str]:
     settings += [path for path in (job.bounds, job.instrument, job.columns, job.rig) if path]
     inputs = [job.robot, *existing_sidecars([job.robot]), *measured, *settings]
     _robot_ending(job.output)
-    require_writable_outputs([path for _, _, path in job.outputs], inputs)
+    require_writable_outputs([file.path for file in job.outputs], inputs)
     protected = [*measured, *settings] if job.in_place else inputs
     require_writable_outputs([*job.output_paths, sidecar_path(job.output)], protected)
-    for _, output, path in job.outputs:
-        output.require_ending(path)
+    require_endings(job.outputs)
     if job.meta:
         from ..report import certificate  # lazy import: only for certificates
 
@@ -403,13 +403,11 @@ def _write_job(
     source = _provenance(job, sets, data, inputs, contents, hint)
     robot_paths = list(map(str, contents))
     files = dict(zip((_robot_ending(job.output)[1:], "sidecar"), robot_paths, strict=False))
-    files |= _numbered("camera_file", robot_paths[len(files) :])
+    files |= numbered("camera_file", robot_paths[len(files) :])
     done = Calibrated(fit, source, job.robot, job.report, job.meta)
-    outputs = [row for row in job.outputs if is_kept or row[1].is_written_if_refused]
-    for name in dict.fromkeys(name for name, _, _ in outputs):
-        paths = [path for other, _, path in outputs if other == name and path != STDOUT]
-        files |= _numbered(name, paths)
-    contents |= {path: output.content(done, path) for _, output, path in outputs if output.content}
+    outputs = [file for file in job.outputs if is_kept or file.output.is_written_if_refused]
+    files |= paths_by_name(outputs)
+    contents |= file_contents(outputs, done)
     outliers = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))
     zero_weight = (
         item.rows[weight <= ZERO_WEIGHT] for item, weight in zip(fit.data, fit.weights, strict=True)
@@ -480,11 +478,6 @@ def _robot_ending(path: str) -> str:
         if path.lower().endswith(ending):
             return ending
     raise InvalidArgumentError(f"{path}: unknown file extension; expected {' or '.join(ROBOT_FORMATS)}")
-
-
-def _numbered(name: str, paths: Sequence[str]) -> dict[str, str]:
-    """Return paths by name, the second and later ones with their numbers."""
-    return {name if number == 1 else f"{name}_{number}": path for number, path in enumerate(paths, 1)}
 
 
 def _camera_frames(fit: Result, job: Job, urdf: bytes) -> list[CameraFrame]:

@@ -25,15 +25,7 @@ _WEIGHT = 1e6
 
 
 def filling_gains(values: Array, filled: Array) -> Array:
-    """Compute the weighted increase of the evenness by each of several configurations.
-
-    Args:
-        values: Joint values of the configurations, shape (w, j) [rad].
-        filled: Joint values of the design so far, shape (n, j) [rad].
-
-    Returns:
-        Increases, shape (w,).
-    """
+    """Compute how much each of some joint values (w, j) raises the weighted evenness of a design (n, j)."""
     out = np.zeros(len(values))
     for bins, counts in zip(bin_indices(values).T, _bin_counts(filled), strict=True):
         out += _WEIGHT / (1 + counts[bins])

@@ -97,15 +97,7 @@ class DOptimality:
         return 2 * float(np.mean(np.log(np.abs(np.diag(sqrt_covariance)))))
 
     def gains(self, rows: Array, sqrt_covariance: Array) -> Array:
-        """Compute log det(I + A·C·Aᵀ); see `Criterion.gains`.
-
-        Args:
-            rows: Whitened rows of m candidates, shape (p, k, m).
-            sqrt_covariance: Square root of the covariance before, shape (p, p).
-
-        Returns:
-            Gains, shape (m,).
-        """
+        """Compute log det(I + A·C·Aᵀ); see `Criterion.gains`."""
         factor = _factor(_transform_rows(rows, sqrt_covariance))
         return 2 * np.log(np.einsum("iim->im", factor)).sum(0)
 
@@ -126,15 +118,7 @@ class AOptimality:
         return float(np.log(np.sum((self.combinations.T @ sqrt_covariance) ** 2)))
 
     def gains(self, rows: Array, sqrt_covariance: Array) -> Array:
-        """Compute the decrease of the sum, tr((I + A·C·Aᵀ)⁻¹·A·C·W·Wᵀ·C·Aᵀ); see `Criterion.gains`.
-
-        Args:
-            rows: Whitened rows of m candidates, shape (p, k, m).
-            sqrt_covariance: Square root of the covariance before, shape (p, p).
-
-        Returns:
-            Gains, shape (m,).
-        """
+        """Compute the decrease of the sum, tr((I + A·C·Aᵀ)⁻¹·A·C·W·Wᵀ·C·Aᵀ); see `Criterion.gains`."""
         scaled = _transform_rows(rows, sqrt_covariance)
         factor = _factor(scaled)
         change = _solve_factor(_transform_rows(scaled, sqrt_covariance.T @ self.combinations), factor)
@@ -160,13 +144,6 @@ class EOptimality:
 
         The substitute is the sum of the variances of the principal axes of V·C·Vᵀ, weighted by a high power
         of their standard deviations, so that the largest ones dominate.
-
-        Args:
-            rows: Whitened rows of m candidates, shape (p, k, m).
-            sqrt_covariance: Square root of the covariance before, shape (p, p).
-
-        Returns:
-            Gains, shape (m,).
         """
         directions, std, _ = np.linalg.svd(self.observable @ sqrt_covariance, full_matrices=False)
         weighted = self.observable.T @ directions * (std / std[0]) ** _E_WEIGHT_POWER
@@ -218,15 +195,7 @@ class BiasVarianceCriterion:
         return float(np.log(variance * np.sum((self.combinations.T @ bias - self.target_bias) ** 2)) / 2)
 
     def gains(self, rows: Array, sqrt_covariance: Array) -> Array:
-        """Compute the negative logarithm of the criterion after each candidate; see `Criterion.gains`.
-
-        Args:
-            rows: Whitened rows of m candidates, shape (p+f, k, m).
-            sqrt_covariance: Square root of the covariance before, shape (p+f, p+f).
-
-        Returns:
-            Gains up to a constant, shape (m,).
-        """
+        """Compute the negative logarithm of the criterion after each candidate; see `Criterion.gains`."""
         conditional, bias = self._fit_covariance_and_bias(sqrt_covariance)
         fitted, omitted = rows[self.fitted], rows[~self.fitted]
         scaled = _transform_rows(fitted, conditional)

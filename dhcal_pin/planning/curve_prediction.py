@@ -38,17 +38,7 @@ class CurvePrediction:
 def predict_curves(
     information: Information, plans: Sequence[Array], existing: Array, candidates: Array
 ) -> tuple[CurvePrediction, ...]:
-    """Predict what plans of several sizes say about the joint correction curves.
-
-    Args:
-        information: Knowledge before the plans, with the parameters of the curves among its unknowns.
-        plans: Joint positions of each plan, shape (n, dof) [rad or m].
-        existing: Joint positions of existing measurements, shape (e, dof) [rad or m].
-        candidates: Joint positions from which the plans were selected, shape (m, dof) [rad or m].
-
-    Returns:
-        One prediction per plan.
-    """
+    """Predict what plans of several sizes (n, dof) contain about the joint correction curves, one by one."""
     chain = information.chain
     everywhere = joint_coverage(chain, np.concatenate([existing, candidates]))
     reached = {one.joint: one.counts > 0 for one in everywhere}

@@ -42,15 +42,7 @@ MAX_EXCHANGE_CANDIDATES = 600
 
 
 def compute_sqrt_covariance(prior_factor: Array, rows: Array) -> Array:
-    """Compute a square root of the covariance after measurements.
-
-    Args:
-        prior_factor: R factor of the knowledge before, shape (p, p).
-        rows: Whitened rows of n measurements, shape (n, k, p).
-
-    Returns:
-        R⁻¹ for the R factor of both, upper triangular, shape (p, p).
-    """
+    """Compute a square root of the covariance, R⁻¹ (p, p), after measurements with rows (n, k, p)."""
     p = prior_factor.shape[1]
     r = np.linalg.qr(np.concatenate([prior_factor, rows.reshape(-1, p)]), mode="r")
     return lapack.dtrtri(r)[0]
@@ -103,15 +95,7 @@ class CandidateSet:
         return np.ascontiguousarray(self.rows[:, :, selected].transpose(2, 1, 0))
 
     def filling_gains(self, indices: Array, occupied: Array) -> Array:
-        """Rate candidates by how evenly the bins of the joints are filled with each of them.
-
-        Args:
-            indices: Indices of candidates, shape (w,).
-            occupied: Coordinates of the other configurations, shape (n, d).
-
-        Returns:
-            Terms to add to the gains of a criterion, shape (w,); zero if no bins are filled.
-        """
+        """Rate candidates (w,) by how evenly each fills the bins beside occupied coordinates (n, d)."""
         return filling_gains(self.coordinates[indices][:, self.bin_columns], occupied[:, self.bin_columns])
 
     def filling_cost(self, occupied: Array) -> float:
@@ -119,16 +103,7 @@ class CandidateSet:
         return filling_cost(occupied[:, self.bin_columns])
 
     def best_candidate(self, gains: Array, indices: Array, occupied: Array) -> int | None:
-        """Find the feasible candidate of the largest gain.
-
-        Args:
-            gains: Gains, -inf for candidates that must not be selected, shape (w,).
-            indices: Indices of these candidates, shape (w,).
-            occupied: Coordinates to which `min_distance` must be kept, shape (n, d).
-
-        Returns:
-            Index of the candidate; None if none is feasible.
-        """
+        """Find the feasible candidate of the largest gain away from occupied coordinates (n, d), if any."""
         is_excluded = self.infeasible[indices] | self._is_too_close(indices, occupied)
         gains = np.where(is_excluded, -np.inf, gains)
         while gains.size:
@@ -158,18 +133,9 @@ def select_greedily(
     selected: Array,
     existing: Array,
 ) -> Array:
-    """Add candidates to a selection, each the best one to add next.
+    """Add candidates to a selection, each the best one to add next; fewer if no more are feasible.
 
-    Args:
-        candidates: Candidates.
-        prior_factor: R factor of the knowledge before, shape (p, p).
-        count: Number of candidates to add.
-        criterion: Optimality criterion.
-        selected: Indices of candidates already selected, shape (c,).
-        existing: Coordinates of existing measurements, to which the distance is kept, shape (n, d).
-
-    Returns:
-        Indices of the selection; fewer than c + count if no more are feasible.
+    They keep their distance to the coordinates (n, d) of existing measurements.
     """
     every = np.arange(candidates.rows.shape[2])
     out = list(map(int, selected))
@@ -196,16 +162,7 @@ def improve_by_exchange(
 ) -> Array:
     """Exchange selected candidates one at a time for better ones, until a pass gains too little.
 
-    Args:
-        candidates: Candidates.
-        prior_factor: R factor of the knowledge before, shape (p, p).
-        selected: Indices of the selection to start with, shape (n,).
-        criterion: Optimality criterion.
-        existing: Coordinates of existing measurements, to which the distance is kept, shape (c, d).
-        max_passes: Largest number of passes over the selection.
-
-    Returns:
-        Indices of the improved selection, shape (n,).
+    They keep their distance to the coordinates (n, d) of existing measurements.
     """
     selected = selected.copy()
 

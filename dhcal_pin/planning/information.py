@@ -326,16 +326,9 @@ def _before_images(planned: PlannedCalibration, images: PlannedImages, q: Array)
 
 
 def _information_rows(sqrt_covariance: Array, unbounded_directions: Array) -> Array:
-    """Compute rows (p, p) with the information of a covariance, in units of the priors.
+    """Compute rows (p, p) with the information of a covariance (p, r), given as its square root.
 
-    Unknowns and directions that the calibration did not estimate have no covariance and keep their prior.
-
-    Args:
-        sqrt_covariance: Square root of the covariance, shape (p, r).
-        unbounded_directions: Directions without any information, shape (p, h).
-
-    Returns:
-        Rows whose R factor is the knowledge, shape (p, p).
+    Unknowns, and unbounded directions (p, h), that the calibration did not estimate keep their prior.
     """
     n_missing = max(0, len(sqrt_covariance) - sqrt_covariance.shape[1])
     axes, std, _ = np.linalg.svd(np.pad(sqrt_covariance, ((0, 0), (0, n_missing))))
@@ -363,16 +356,7 @@ def _add_parameter_sets(
 
 
 def add_joint_scatter(chain: Chain, q: Array, noise: Noise) -> Noise:
-    """Add the effect of scattering joint positions on the tool to the noise of an instrument.
-
-    Args:
-        chain: Robot.
-        q: Joint positions over which the effect is averaged, shape (m, n) [rad or m].
-        noise: Standard deviations of the instrument [m, rad].
-
-    Returns:
-        Standard deviations of instrument and `JOINT_SCATTER` together [m, rad].
-    """
+    """Add the effect of `JOINT_SCATTER`, averaged over joint positions (m, n), to a noise."""
     errors = select_parameters(chain, "offset")
     model, bodies, twists = errors.derivative(np.zeros(len(errors.parameters)))
     is_angle = np.array([parameter.unit == "rad" for parameter in errors.parameters])

@@ -149,19 +149,8 @@ def _connected(
 ) -> tuple[Array, Array, bool]:
     """Find a free way to a part of a tour; the moves within the part are free.
 
-    All poses of the part may turn together, so that the moves between them stay the same.
-
-    Args:
-        checker: Collision checks.
-        start: Pose before the part, shape (dof,) [rad or m].
-        part: Poses of the part, shape (m, dof) [rad or m].
-        low: Lowest joint positions, shape (dof,) [rad or m].
-        high: Highest joint positions, shape (dof,) [rad or m].
-        can_turn: Joints that may turn by a whole turn, shape (dof,).
-        rng: Random generator.
-
-    Returns:
-        Poses of the part, possibly turned; way points, shape (w, dof); and whether a free way was found.
+    All poses of the part may turn together, so that the moves between them stay the same. The result is the
+    part, possibly turned, way points (w, dof), and whether a free way was found.
     """
     variants = [part]
     for joint in np.flatnonzero(can_turn):
@@ -217,18 +206,9 @@ class _Tree:
 def find_way(
     checker: CollisionChecker, start: Array, end: Array, low: Array, high: Array, rng: np.random.Generator
 ) -> Array:
-    """Find way points between two poses by two trees that grow towards each other (RRT-Connect).
+    """Find way points (w, dof) between two poses by two trees that grow towards each other (RRT-Connect).
 
-    Args:
-        checker: Collision checks.
-        start: Joint positions at the start, shape (dof,) [rad or m].
-        end: Joint positions at the end, shape (dof,) [rad or m].
-        low: Lowest joint positions, shape (dof,) [rad or m].
-        high: Highest joint positions, shape (dof,) [rad or m].
-        rng: Random generator.
-
-    Returns:
-        Way points with free moves from the start to the end, shape (w, dof); (0, dof) if none were found.
+    There are none if no free way was found.
     """
     first, second = _Tree(checker, [start], [-1]), _Tree(checker, [end], [-1])
     # Joints without limits have a range of two turns.

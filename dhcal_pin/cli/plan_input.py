@@ -1,0 +1,250 @@
+"""Input of `dhcal plan`: files and values with units that its options name, as arguments of `plan`."""
+
+from __future__ import annotations
+
+import os
+import re
+from argparse import Namespace
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from .._typing import Array, PathLike
+from ..compensation import LIMITS, compensate
+from ..exceptions import InvalidArgumentError
+from ..io.measurement_files import read_configurations, read_measurement_file, read_targets
+from ..io.rig_file import read_calibrated_rig, read_rig, with_poses_of
+from ..io.settings import read_priors
+from ..io.sidecar import existing_sidecar, read_instrument, read_uncertainty
+from ..io.tables import read_table
+from ..measurements.base import Noise
+from ..measurements.mounting import MountedRig, mount_rig
+from ..planning.planner import MAX_CANDIDATES
+from ..planning.views import PlannedImages, with_measured_poses
+from ..robot.chain import Chain
+from ..robot.collision import Obstacle, obstacles_from_urdf
+from ..robot.sampling import WorkspaceConstraints
+from ..robot.urdf import read_urdf
+from ..units import ANGLES, LENGTHS, parse_noise
+from .options import split_commas
+from .outputs import existing_sidecars
+from .plan_options import DEFAULT_IMAGE_SIGMA, DEFAULT_SIGMA, N_CANDIDATES, N_IMAGE_CANDIDATES
+
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+
+
+def input_paths(args: Namespace) -> list[str]:
+    """List the files that a plan reads."""
+    paths = [args.robot, *existing_sidecars([args.robot]), *(args.data or [])]
+    paths += filter(None, (args.candidates_from, args.task, args.columns, args.instrument))
+    paths += [*filter(_is_scene, args.obstacle), *([args.rig] if args.rig else [])]
+    return paths if args.priors in (None, "default") else [*paths, args.priors]
+
+
+def read_input(args: Namespace, chain: Chain, kind: str) -> tuple[dict[str, Any], Array]:
+    """Return the keyword arguments of `plan`, and the rows (m,) of given candidates in their file, from 0."""
+    space = _workspace_constraints(args)
+    candidates, rows = _read_candidates(args, chain)
+    rig = _mounted_rig(args.rig, args.robot, chain) if args.rig else None
+    data = [read_measurement_file(path, chain, args.columns, rig=rig).data for path in args.data or []]
+    # The uncertainty of an earlier calibration would count twice beside its data, and replaces the priors.
+    sidecar = None if args.data or args.priors else existing_sidecar(args.robot)
+    images, noise = None, None
+    if rig is not None:
+        images, noise = _planned_images(args, with_measured_poses(rig, chain, data))
+    elif args.sigma or not any(item.kind == kind for item in data):
+        noise = Noise(*parse_noise(args.sigma or DEFAULT_SIGMA, "--sigma"))
+    keywords = {
+        "kind": kind,
+        "noise": noise,
+        "parameters": args.parameters,
+        "priors": read_priors(args.priors) or "default",
+        "fix": split_commas(args.fix),
+        "free": split_commas(args.free),
+        "criterion": args.criterion,
+        "data": data,
+        "known": read_instrument(args.instrument) if args.instrument else None,
+        "prior_uncertainty": read_uncertainty(sidecar, chain) if sidecar else None,
+        "images": images,
+        "task": read_task(args.task, chain) if args.task else None,
+        "candidates": candidates,
+        "space": space,
+        "margin": Noise(*parse_noise(args.margin, "--margin")),
+        "seed": args.seed,
+    }
+    return keywords, rows
+
+
+def _read_candidates(args: Namespace, chain: Chain) -> tuple[int | Array, Array]:
+    """Return the number of candidates to draw, or those of --from, and their rows in the file."""
+    if not args.candidates_from:
+        return args.candidates or (N_IMAGE_CANDIDATES if args.rig else N_CANDIDATES), np.zeros(0, int)
+    candidates = read_configurations(args.candidates_from, chain, args.columns)
+    rows = np.arange(len(candidates))
+    if args.rig:
+        # A table of image coordinates has one row per corner.
+        rows = np.sort(np.unique(candidates, axis=0, return_index=True)[1])
+    _require_few(args.candidates_from, len(rows))
+    return candidates[rows], rows
+
+
+def planned_kind(args: Namespace) -> str:
+    """Return the kind of measurement, after a check of the options that need --rig or exclude it."""
+    if args.rig:
+        if args.kind not in (None, "camera"):
+            raise InvalidArgumentError(f"--kind {args.kind}: not allowed with --rig, which plans images")
+        return "camera"
+    if args.kind == "camera":
+        raise InvalidArgumentError("--kind camera: needs --rig, the file with cameras and boards")
+    for option in ("distance", "angle", "corners", "border"):
+        if getattr(args, option) is not None:
+            raise InvalidArgumentError(f"--{option}: needs --rig, the file with cameras and boards")
+    return args.kind or "pose"
+
+
+def _mounted_rig(path: str, robot: str, chain: Chain) -> MountedRig:
+    """Return the rig of a file, with the poses of a calibrated robot where it has none."""
+    rig, sidecar = read_rig(path), existing_sidecar(robot)
+    calibrated = read_calibrated_rig(sidecar) if sidecar else None
+    return mount_rig(with_poses_of(rig, calibrated) if calibrated else rig, chain)
+
+
+def _planned_images(args: Namespace, rig: MountedRig) -> tuple[PlannedImages, Noise]:
+    """Return the images to plan and the noise of the robot, from the options that need --rig."""
+    pixels, *others = (args.sigma or DEFAULT_IMAGE_SIGMA).split(",")
+    sigma = _parse_pixels(pixels, "--sigma", f"pixels above zero first, such as {DEFAULT_IMAGE_SIGMA}")
+    noise = Noise(*parse_noise(",".join(others), "--sigma")) if others else Noise()
+    distance = _parse_distances(args.distance) if args.distance else None
+    options: dict[str, Any] = {"sigma": sigma, "distance": distance}
+    if args.angle:
+        options["max_angle"] = _parse_angle(args.angle, "--angle", 90.0)
+    if args.corners is not None:
+        if not 0 < args.corners <= 1:
+            raise InvalidArgumentError(f"--corners {args.corners:g}: expected a share above 0 and at most 1")
+        options["min_share"] = args.corners
+    if args.border:
+        options["margin"] = _parse_pixels(args.border, "--border")
+    return PlannedImages(rig, **options), noise
+
+
+def _is_scene(obstacle: str) -> bool:
+    """Return whether the value of --obstacle names a file and not a box."""
+    return obstacle.lower().endswith(".urdf") or os.path.exists(obstacle)
+
+
+def _obstacles(args: Namespace) -> list[Obstacle]:
+    """Create the obstacles of --obstacle."""
+    obstacles = []
+    for text in args.obstacle:
+        if _is_scene(text):
+            obstacles += obstacles_from_urdf(replace(read_urdf(text), package_dirs=tuple(args.package_dir)))
+        else:
+            obstacles.append(Obstacle.box(*_parse_box(text, "--obstacle", "a URDF, or corners")))
+    return obstacles
+
+
+def _workspace_constraints(args: Namespace) -> WorkspaceConstraints:
+    """Create the constraints of the robot from --box, --visible-from, --cone, --floor and --obstacle."""
+    box = _parse_box(args.box, "--box") if args.box else None
+    instrument = None
+    if args.visible_from:
+        instrument = _parse_points(args.visible_from, "--visible-from", "3000,0,1200mm", 1)[0]
+    if args.cone and instrument is None:
+        raise InvalidArgumentError("--cone: needs --visible-from, the position of the instrument")
+    cone = _parse_angle(args.cone, "--cone", 180.0, "half angle") if args.cone else np.pi
+    return WorkspaceConstraints(box, instrument, cone, _floor(args.floor, args.root), _obstacles(args))
+
+
+def _require_few(source: str, count: int) -> None:
+    """Require configurations that fit into the memory."""
+    if count > MAX_CANDIDATES:
+        raise InvalidArgumentError(
+            f"{source}: {count} configurations, more than {MAX_CANDIDATES}; give fewer"
+        )
+
+
+def read_task(path: PathLike, chain: Chain) -> Array:
+    """Read the configurations where the accuracy matters."""
+    table = read_table(path)
+    _require_few(os.fspath(path), len(table.lines))
+    if any(name in table.columns for name in chain.joint_names):
+        return read_configurations(path, chain)
+    targets = read_targets(path, chain)
+    result = compensate(chain, chain, targets.values)
+    if (failed := np.flatnonzero(~result.reached)).size:
+        is_limited = result.status[failed[0]] == LIMITS
+        problem = "within reach only beyond the joint limits" if is_limited else "out of reach"
+        raise InvalidArgumentError(
+            f"{targets.source}: target {failed[0] + 1} is {problem}; correct or remove it"
+        )
+    return result.q
+
+
+def _parse_pixels(text: str, option: str, expected: str = "pixels above zero, such as 60px") -> float:
+    """Parse a positive number of pixels."""
+    match = re.fullmatch(rf"\s*({_NUMBER})\s*px\s*", text)
+    if not match or float(match[1]) <= 0:
+        raise InvalidArgumentError(f"{option} {text}: expected {expected}")
+    return float(match[1])
+
+
+def _parse_distances(text: str) -> tuple[float, float]:
+    """Parse the smallest and the largest distance of a board [m]."""
+    match = re.fullmatch(rf"\s*({_NUMBER})\s*:\s*({_NUMBER})\s*([a-zµμ]+)\s*", text)
+    if not match or match[3] not in LENGTHS:
+        raise InvalidArgumentError(
+            f"--distance {text}: expected the smallest and the largest distance with a unit, such as "
+            "300:900mm"
+        )
+    low, high = (float(match[i]) / LENGTHS[match[3]] for i in (1, 2))
+    if not 0 <= low < high:
+        raise InvalidArgumentError(
+            f"--distance {text}: the first distance must be at least 0 and less than the second"
+        )
+    return low, high
+
+
+def _parse_angle(text: str, option: str, largest: float, what: str = "angle") -> float:
+    """Parse an angle above zero and at most some degrees [rad]."""
+    match = re.fullmatch(rf"\s*({_NUMBER})\s*(rad|deg)\s*", text)
+    angle = float(match[1]) / ANGLES[match[2]] if match else 0.0
+    if not 0 < angle <= np.deg2rad(largest):
+        raise InvalidArgumentError(
+            f"{option} {text}: invalid {what}; expected at most {largest:g}deg, such as 30deg"
+        )
+    return angle
+
+
+def _floor(text: str | None, root: str | None) -> float | None:
+    """Parse the height of the floor [m]; None without a floor."""
+    # The height counts from the first link, which may be the head of the robot.
+    text = text or ("none" if root else "0mm")
+    if text == "none":
+        return None
+    match = re.fullmatch(rf"\s*({_NUMBER})\s*([a-zµμ]+)\s*", text)
+    if not match or match[2] not in LENGTHS:
+        raise InvalidArgumentError(f"--floor {text}: expected a height with a unit, such as -800mm, or none")
+    return float(match[1]) / LENGTHS[match[2]]
+
+
+def _parse_box(text: str, option: str, expected: str = "corners") -> Array:
+    """Parse the lowest and the highest corner of a box, shape (2, 3) [m]."""
+    box = _parse_points(text, option, "200,-400,100:900,400,800mm", 2, expected)
+    if not np.all(box[0] < box[1]):
+        raise InvalidArgumentError(
+            f"{option} {text}: the first corner must be below the second in x, y and z"
+        )
+    return box
+
+
+def _parse_points(text: str, option: str, example: str, count: int, expected: str = "x,y,z") -> Array:
+    """Parse points, shape (count, 3) [m], from coordinates with one unit at the end."""
+    point = rf"\s*{_NUMBER}\s*,\s*{_NUMBER}\s*,\s*{_NUMBER}\s*"
+    match = re.fullmatch(rf"({point}(?::{point}){{{count - 1}}})([a-zµμ]+)\s*", text)
+    if not match or match[2] not in LENGTHS:
+        raise InvalidArgumentError(
+            f"{option} {text}: invalid coordinates; expected {expected} with a unit at the end, such as "
+            f"{example}"
+        )
+    return np.array(re.findall(_NUMBER, match[1]), float).reshape(count, 3) / LENGTHS[match[2]]

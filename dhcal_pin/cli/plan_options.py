@@ -1,0 +1,178 @@
+"""Options of `dhcal plan`."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser
+
+from .options import (
+    COLUMNS,
+    FIX,
+    FREE,
+    INSTRUMENT,
+    JSON,
+    NON_NEGATIVE_INTEGER,
+    PARAMETERS,
+    POSITIVE_INTEGER,
+    RIG,
+    ROBOT,
+    add_motion_options,
+    add_urdf_options,
+)
+
+# Standard deviation of a laser tracker and a precise robot, used without --sigma and --data.
+DEFAULT_SIGMA = "0.1mm,0.01deg"
+# Standard deviation of detected corners and the same robot, used with --rig.
+DEFAULT_IMAGE_SIGMA = "0.3px,0.1mm,0.01deg"
+# Random candidates; images have more rows each, and more of their candidates are good.
+N_CANDIDATES, N_IMAGE_CANDIDATES = 5000, 2000
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the arguments of `dhcal plan`."""
+    parser.add_argument("robot", **ROBOT)
+    parser.add_argument(
+        "-n", "--count", type=POSITIVE_INTEGER, required=True, metavar="N", help="number of poses"
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="poses.csv",
+        required=True,
+        help="joint values to write, ordered as a short tour",
+    )
+    add_urdf_options(parser)
+    _add_measurement_options(parser)
+    _add_calibration_options(parser)
+    _add_search_options(parser)
+    add_motion_options(parser, "deg")
+    parser.add_argument("--html", metavar="FILE", help="page with a preview of the poses and the moves")
+    parser.add_argument("--report", metavar="R.html", help="write a report with the poses (.html)")
+    parser.add_argument("--json", **JSON)
+
+
+def _add_measurement_options(parser: ArgumentParser) -> None:
+    """Declare what is measured, and with which instrument."""
+    parser.add_argument(
+        "--kind",
+        metavar="KIND",
+        help="kind of measurement (default: pose; camera with --rig): {plannable_kinds}",
+    )
+    parser.add_argument(
+        "--sigma",
+        metavar="[PIXELS,]LENGTH[,ANGLE]",
+        help="standard deviation per axis of instrument and robot repeatability (default: as in --data, else "
+        f"{DEFAULT_SIGMA}); with --rig, of corners in the image and of the robot (default: "
+        f"{DEFAULT_IMAGE_SIGMA})",
+    )
+    parser.add_argument(
+        "--rig",
+        metavar=RIG["metavar"],
+        help="plan images by these cameras of these boards, with approximate poses and intrinsics; poses "
+        "that are missing are those of a calibrated robot, or are estimated from --data",
+    )
+    parser.add_argument(
+        "--distance",
+        metavar="MIN:MAXUNIT",
+        help="with --rig: distance of the middle of a board from the camera at which images are sharp, such "
+        "as 300:900mm (default: from the size of the board in the image)",
+    )
+    parser.add_argument(
+        "--angle",
+        metavar="ANGLE",
+        help="with --rig: largest angle between the normal of a board and the line of sight (default: 60deg)",
+    )
+    parser.add_argument(
+        "--corners",
+        metavar="SHARE",
+        type=float,
+        help="with --rig: smallest share of the corners of a board that is in the image (default: 1)",
+    )
+    parser.add_argument(
+        "--border",
+        metavar="PIXELS",
+        help="with --rig: distance of the corners from the edge of the image, such as 60px; more if the "
+        "poses of camera and board are uncertain (default: 2 %% of the width)",
+    )
+
+
+def _add_calibration_options(parser: ArgumentParser) -> None:
+    """Declare the goal, and the calibration for which the poses are planned."""
+    parser.add_argument(
+        "--criterion",
+        metavar="C",
+        default="D",
+        help="optimality criterion (default: %(default)s): {criteria}",
+    )
+    parser.add_argument(
+        "--task",
+        metavar="FILE",
+        help="configurations where the accuracy matters: joint values, or tool positions x[mm],y[mm],z[mm]",
+    )
+    parser.add_argument("--parameters", **PARAMETERS)
+    parser.add_argument("--fix", default="", **FIX)
+    parser.add_argument("--free", default="", **FREE)
+    parser.add_argument(
+        "--priors",
+        metavar="default|FILE",
+        help="prior standard deviations, as in calibrate (default: the uncertainty in the sidecar of a "
+        "calibrated robot, else default)",
+    )
+    parser.add_argument("--instrument", **INSTRUMENT)
+    parser.add_argument(
+        "--data", metavar="DATA", nargs="+", help="existing measurements to complement, as CSV files"
+    )
+    parser.add_argument("--columns", **COLUMNS)
+
+
+def _add_search_options(parser: ArgumentParser) -> None:
+    """Declare where the poses may be."""
+    parser.add_argument(
+        "--candidates",
+        type=POSITIVE_INTEGER,
+        metavar="N",
+        help=f"number of random candidates (default: {N_CANDIDATES}; {N_IMAGE_CANDIDATES} with --rig)",
+    )
+    parser.add_argument(
+        "--from", dest="candidates_from", metavar="FILE", help="choose from the joint values in a file"
+    )
+    parser.add_argument(
+        "--box", metavar="X,Y,Z:X,Y,ZUNIT", help="allowed box of the tool in the measuring frame"
+    )
+    parser.add_argument(
+        "--floor",
+        metavar="HEIGHT|none",
+        help="height of the floor above the root link, which the robot stays above (default: 0mm; none with "
+        "--root); none for a robot without a floor, such as one on a ceiling",
+    )
+    parser.add_argument(
+        "--obstacle",
+        metavar="SCENE.urdf|X,Y,Z:X,Y,ZUNIT",
+        action="append",
+        default=[],
+        help="obstacle in the frame of the root link: the collision shapes of a URDF, or a box; may be "
+        "repeated",
+    )
+    parser.add_argument(
+        "--visible-from",
+        metavar="X,Y,ZUNIT",
+        help="position of the instrument in the measuring frame; its line of sight to the tool must be free",
+    )
+    parser.add_argument(
+        "--cone",
+        metavar="ANGLE",
+        help="largest angle between the z axis of the tool and the direction to the instrument, such "
+        "as 30deg",
+    )
+    parser.add_argument(
+        "--margin",
+        default="5mm,2deg",
+        metavar="LENGTH,ANGLE",
+        help="distance to the joint limits (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--seed",
+        metavar="N",
+        type=NON_NEGATIVE_INTEGER,
+        default=0,
+        help="random seed of the candidates (default: %(default)s)",
+    )
