@@ -30,8 +30,8 @@ MIN_SPREAD = 1e-3
 MAX_DISTANCES = 1000
 # Number of random configurations from which the covered share of the joint space is computed.
 N_CONFIGURATIONS = 2000
-# Distances are computed for this many configurations at once.
-_CHUNK_SIZE = 2000
+# Distances are computed for this many configurations at once; those to 200 others then stay in the cache.
+_CHUNK_SIZE = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +87,10 @@ class MeasuredRegion:
             for joint, spread in enumerate(np.maximum(self.spread, MIN_SPREAD)):
                 difference = part[:, None, joint] - centres[None, :, joint]
                 if not self.is_prismatic[joint]:
-                    difference = difference - 2 * np.pi * np.round(difference / (2 * np.pi))
-                squares += (difference / spread) ** 2
+                    turns = difference / (2 * np.pi)
+                    difference -= np.multiply(np.rint(turns, out=turns), 2 * np.pi, out=turns)
+                difference /= spread
+                squares += np.square(difference, out=difference)
             out[start : start + _CHUNK_SIZE] = np.sqrt(squares.min(1))
         return out
 

@@ -454,9 +454,10 @@ def _predict_curves(
 ) -> tuple[CurvePrediction, ...]:
     """Predict the knowledge of the joint correction curves after plans of several sizes."""
     information = Information.from_prior(planned, found.q, (CURVES,))
+    # The search for larger plans finds more candidates that are infeasible.
+    plans = plans_for_curves(goal, found)
     measured = np.concatenate([found.q[:0], *(item.configurations() for item in planned.data)])
-    feasible = found.q[~found.candidates.infeasible]
-    return predict_curves(information, plans_for_curves(goal, found), measured, feasible)
+    return predict_curves(information, plans, measured, found.q[~found.candidates.infeasible])
 
 
 def _predict(
