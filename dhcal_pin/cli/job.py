@@ -215,7 +215,7 @@ class Job:
         metadata={
             "metavar": "SCENE.html",
             "help": "write the 3-D scene of the nominal and the calibrated robot (.html)",
-            "output": Output(scene_content),
+            "output": Output(scene_content, "a scene", (".html",), (".htm",)),
         },
     )
     curves: str | None = field(
@@ -224,7 +224,7 @@ class Job:
             "metavar": "CURVES.csv",
             "help": "write joint corrections for controllers that accept a table: joint, value and the angle "
             "to add to it before it is commanded, in steps of 1 degree (.csv)",
-            "output": Output(curves_content),
+            "output": Output(curves_content, "a table of corrections", (".csv",)),
         },
     )
     residuals: str | None = field(
@@ -232,7 +232,7 @@ class Job:
         metadata={
             "metavar": "R.csv",
             "help": "write the residuals of all measurements with their files and lines (.csv)",
-            "output": Output(residuals_content, is_written_if_refused=True),
+            "output": Output(residuals_content, "a table of residuals", (".csv",), is_written_if_refused=True),
         },
     )
     json: str | None = field(

@@ -50,9 +50,6 @@ from .propagation import (
 EXPECTED = "Expected, no action needed: "
 # Reason for an undetermined size of the robot.
 SCALE_UNKNOWN = "the measurements do not determine the size of the robot"
-SCALE = (
-    f"all lengths together: {SCALE_UNKNOWN}, only the priors do; add a known distance between contact points"
-)
 # Largest angle of axes that a sentence calls parallel to within an angle [rad].
 _NEARLY_PARALLEL_RAD = np.deg2rad(5.0)
 # Largest number of names in a sentence.
@@ -455,10 +452,14 @@ def _explain_null_space(problem: Problem, x: Array) -> list[str]:
     explainer = Explainer(probe, dict(layers), names, plain_errors)
     groups = _merge_groups(group_directions(layers, plain_errors.error_frames))
     sentences = [explainer.sentence(group) for group in groups]
-    is_scale_unexplained = probe.is_scale_unobservable(r) and not any(
-        SCALE_UNKNOWN in text for text in sentences
-    )
-    return [SCALE, *sentences] if is_scale_unexplained else sentences
+    if probe.is_scale_unobservable(r) and not any(SCALE_UNKNOWN in text for text in sentences):
+        advice = (
+            "add a known distance between contact points"
+            if any(item.is_contact for item in problem.data)
+            else "measure the position of the tool in a fixed frame"
+        )
+        sentences.insert(0, f"all lengths together: {SCALE_UNKNOWN}, only the priors do; {advice}")
+    return sentences
 
 
 def label_unobservable(sentence: str) -> str:

@@ -313,6 +313,21 @@ def test_residuals_of_a_refused_calibration_are_written(run, robot_folder):
     assert len(Path("r.csv").read_text().splitlines()) == 41
 
 
+@pytest.mark.parametrize(
+    ("option", "path", "expected"),
+    [
+        ("--curves", "c.txt", "c.txt: unknown ending; write a table of corrections as .csv"),
+        ("--residuals", "r.xlsx", "r.xlsx: unknown ending; write a table of residuals as .csv"),
+        ("--scene", "scene.png", "scene.png: unknown ending; write a scene as .html"),
+    ],
+)
+def test_endings_of_outputs_are_checked_before_any_work(run, robot_folder, option, path, expected):
+    before = folder_contents(robot_folder)
+    status, out, err = run(*CALIBRATE, option, path)
+    assert (status, out, err) == (2, "", f"dhcal: {expected}\n")
+    assert folder_contents(robot_folder) == before
+
+
 def mirrored(row):
     """A row of a measurement file with y in the opposite direction."""
     *joints, x, y, z = row.split(",")

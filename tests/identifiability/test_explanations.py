@@ -282,6 +282,28 @@ def test_reasons_for_each_instrument(kind, reasons):
     assert all(reason in text for reason, text in zip(reasons, instrument, strict=True))
 
 
+class Orientation(Pose):
+    """Poses of which only the rotation counts."""
+
+    kind = "orientation"
+    has_length_scale = False
+
+
+def test_advice_for_an_unknown_size_fits_the_measurements(sim_6dof_actual):
+    """A distance between contact points helps where there are contacts."""
+    q = np.random.default_rng(0).uniform(-1, 1, (60, 6))
+    turned = Orientation(q, sim_6dof_actual.poses(q), 1e14, 1e-4)
+    touched = KINDS["point"].simulate(sim_6dof_actual, q[:4], Noise(1e-4), np.random.default_rng(1))
+    advice = {
+        "measure the position of the tool in a fixed frame": [turned],
+        "add a known distance between contact points": [turned, touched],
+    }
+    for expected, data in advice.items():
+        first = calibrate(sim_6dof_actual, data, "dh", extend="none").unobservable[0]
+        assert first.startswith("all lengths together: the measurements do not determine the size")
+        assert first.endswith(f"; {expected}")
+
+
 def test_orientation_determines_what_position_does_not():
     chain = load("ur10")
     texts = explain(problem(chain, "minimal,base,tool", Position))
