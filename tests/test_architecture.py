@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 import dhcal_pin
+from dhcal_pin.measurements import KINDS
 
 PACKAGE = Path(dhcal_pin.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
@@ -138,6 +139,30 @@ def test_imports_have_no_circle():
     except CycleError as error:
         pytest.fail(f"circle: {' -> '.join(error.args[1])}")
     assert len(order) > 200
+
+
+def test_kinds_of_measurements_state_what_they_can():
+    """Only the modules of images compare types with the kind of images; others ask for its rig."""
+    images = [cls.__name__ for cls in KINDS.values() if cls.residual_groups.keys() & {"pixels"}]
+    assert images == ["CameraCorners"]
+    found = []
+    for path in FILES:
+        name = relative(path)
+        if name == "measurements/camera.py" or name.startswith(
+            ("measurements/images/", "calibration/cameras/")
+        ):
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            tested: list[ast.AST] = []
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("isinstance", "issubclass"):
+                tested = node.args[1:]
+            elif isinstance(node, ast.MatchClass):
+                tested = [node.cls]
+            elif isinstance(node, ast.Compare):
+                tested = [node.left, *node.comparators]
+            words = re.findall(r"\w+", " ".join(map(ast.unparse, tested)))
+            found += [f"{name}:{node.lineno}" for image in images if image in words]
+    assert found == []
 
 
 @pytest.mark.parametrize("folder", [PACKAGE, *PACKAGES], ids=lambda folder: folder.name)

@@ -108,15 +108,6 @@ class CrossValidation:
     accuracy: Accuracy
 
 
-def standard_error(values: Array) -> float:
-    """Compute the standard error of a mean, widened for few values by Student's t distribution."""
-    if len(values) < 2:
-        return np.inf
-    from scipy.special import ndtr, stdtrit  # lazy import: slow, and few calibrations need it
-
-    return float(stdtrit(len(values) - 1, ndtr(1.0)) * values.std(ddof=1) / np.sqrt(len(values)))
-
-
 def cross_validate(fit: FittedModel, folds: Sequence[Fold] | None = None) -> CrossValidation:
     """Measure how well the model of a calibration predicts samples that it is not fitted to.
 

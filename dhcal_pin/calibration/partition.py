@@ -35,18 +35,11 @@ BLOCK_FRACTION = 0.25
 _MIN_RELATIVE_SPREAD = 1e-6
 
 
-def group_by_configuration(q: Array, tolerance: float = CONFIGURATION_TOL) -> Array:
-    """Label rows of joint values, equal rows by the same label.
+def group_by_configuration(q: Array) -> Array:
+    """Label rows of joint values (m, n), equal rows by the same label, in the order of first appearance.
 
-    Rows are equal if no joint value differs by more than the tolerance. Equality is transitive: rows that are
-    connected by a chain of equal rows get the same label.
-
-    Args:
-        q: Joint values, shape (m, n) [rad or m].
-        tolerance: Largest difference of equal joint values [rad or m].
-
-    Returns:
-        Labels of shape (m,), counted from 0 in the order of first appearance.
+    Rows are equal if no joint value differs by more than `CONFIGURATION_TOL`. Equality is transitive: rows
+    that are connected by a chain of equal rows get the same label.
 
     >>> group_by_configuration(np.array([[0.5, 1.0], [0.0, 1.0], [0.5, 1.0 + 1e-9]]))
     array([0, 1, 0])
@@ -62,10 +55,10 @@ def group_by_configuration(q: Array, tolerance: float = CONFIGURATION_TOL) -> Ar
     rows, projection = q[order[is_new]], projection[order[is_new]]
     first, second = [], []
     for offset in range(1, len(rows)):
-        (near,) = np.nonzero(projection[offset:] - projection[:-offset] <= tolerance * (1 + 1e-6))
+        (near,) = np.nonzero(projection[offset:] - projection[:-offset] <= CONFIGURATION_TOL * (1 + 1e-6))
         if not near.size:
             break
-        near = near[np.abs(rows[near + offset] - rows[near]).max(1) <= tolerance]
+        near = near[np.abs(rows[near + offset] - rows[near]).max(1) <= CONFIGURATION_TOL]
         first.append(near)
         second.append(near + offset)
     if len(rows) == m and not any(map(len, first)):

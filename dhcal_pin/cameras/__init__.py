@@ -7,7 +7,6 @@ a start for the calibration. Files and the detection of boards in images are the
 
 from .boards import Board
 from .hand_eye import solve_hand_eye
-from .intrinsics import estimate_intrinsics
 from .lens import LENSES, Lens
 from .pose_from_points import estimate_pose
 from .rig import Camera, Rig
@@ -18,7 +17,6 @@ __all__ = [
     "Camera",
     "Lens",
     "Rig",
-    "estimate_intrinsics",
     "estimate_pose",
     "solve_hand_eye",
 ]

@@ -50,17 +50,6 @@ _MAX_VIEWS = 12
 _MIN_INCREASE = 25.0
 
 
-def estimate_intrinsics(
-    views: Sequence[tuple[Array, Array]], camera: Camera
-) -> tuple[float, float, float, float]:
-    """Estimate the focal lengths and the image centre of a camera without distortion."""
-    candidates = intrinsics_candidates(views, camera)
-    if not candidates:
-        raise undetermined_focal_length(camera)
-    some = _drawn([view for view in views if len(view[0]) >= MIN_POINTS])
-    return min(candidates, key=lambda values: _square_sum(some, camera, values))
-
-
 def intrinsics_candidates(
     views: Sequence[tuple[Array, Array]], camera: Camera
 ) -> list[tuple[float, float, float, float]]:

@@ -232,7 +232,9 @@ class Job:
         metadata={
             "metavar": "R.csv",
             "help": "write the residuals of all measurements with their files and lines (.csv)",
-            "output": Output(residuals_content, "a table of residuals", (".csv",), is_written_if_refused=True),
+            "output": Output(
+                residuals_content, "a table of residuals", (".csv",), is_written_if_refused=True
+            ),
         },
     )
     json: str | None = field(

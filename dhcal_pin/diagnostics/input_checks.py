@@ -19,7 +19,6 @@ from ..exceptions import FileFormatError
 from ..io.measurement_files import MeasurementFile
 from ..io.measurement_files.columns import ROTVEC, SECOND_PREFIX, VALUE_COLUMNS
 from ..measurements.base import Measurement
-from ..measurements.camera import CameraCorners
 from ..measurements.columns import MAX_TOOL_OFFSET
 from ..measurements.groups import ERROR_GROUPS, error_group
 from ..plausibility.displacement import workspace_radius
@@ -332,9 +331,7 @@ def _check_limits(chain: Chain, file: MeasurementFile, reported: Container[str])
 def _check_repetitions(file: MeasurementFile) -> list[str]:
     """Return warnings about measurements that occur more than once."""
     repeated = _check_repeated_rows(file)
-    return (
-        [*repeated, *_check_repeated_corners(file.data)] if isinstance(file.data, CameraCorners) else repeated
-    )
+    return repeated if file.data.rig is None else [*repeated, *_check_repeated_corners(file.data)]
 
 
 def _check_repeated_rows(file: MeasurementFile) -> list[str]:
@@ -352,7 +349,7 @@ def _check_repeated_rows(file: MeasurementFile) -> list[str]:
     ]
 
 
-def _check_repeated_corners(item: CameraCorners) -> list[str]:
+def _check_repeated_corners(item: Measurement) -> list[str]:
     """Return a warning about corners that an image has at several places.
 
     Several photographs in the same configuration are no mistake: they have different names or, without names,

@@ -56,22 +56,22 @@ def read_priors(choice: str | None) -> Priors | None:
     }
 
 
-def parse_payload(text: str, label: str = "--payload") -> Payload:
+def parse_payload(text: str) -> Payload:
     """Parse a mass and its centre in the tip frame."""
     match = _PAYLOAD.fullmatch(text.replace(" ", ""))
     if not match:
         raise InvalidArgumentError(
-            f"{label} {text}: write the mass and, in the tip frame, its centre, as 5kg or 5kg@0,0,80mm"
+            f"--payload {text}: write the mass and, in the tip frame, its centre, as 5kg or 5kg@0,0,80mm"
         )
     mass, *position, unit = match.groups()
     x, y, z = (_METRES[unit or "m"] * float(value or 0) for value in position)
     if not 0 < float(mass) <= MAX_PAYLOAD_KG:
         raise InvalidArgumentError(
-            f"{label} {text}: the mass must be positive and at most {MAX_PAYLOAD_KG:g} kg"
+            f"--payload {text}: the mass must be positive and at most {MAX_PAYLOAD_KG:g} kg"
         )
     if not max(abs(x), abs(y), abs(z)) <= MAX_PAYLOAD_DISTANCE_M:
         raise InvalidArgumentError(
-            f"{label} {text}: the centre must be within {MAX_PAYLOAD_DISTANCE_M:g} m of the tip; "
+            f"--payload {text}: the centre must be within {MAX_PAYLOAD_DISTANCE_M:g} m of the tip; "
             "write its position in the tip frame"
         )
     return Payload(float(mass), (x, y, z))

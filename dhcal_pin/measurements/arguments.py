@@ -11,7 +11,7 @@ from ..robot.chain import Chain
 from .base import Measurement
 
 
-def require_chain(value: Any, name: str = "chain") -> None:
+def require_chain(value: Any) -> None:
     """Raise an error if a value is not a chain."""
     if isinstance(value, Chain):
         return
@@ -20,7 +20,7 @@ def require_chain(value: Any, name: str = "chain") -> None:
         hint = "; the chain comes first, then the measurements"
     elif isinstance(value, str | os.PathLike):
         hint = "; read a robot with Chain.from_urdf(path, tip) or read_robot(path, tip)"
-    raise InvalidArgumentError(f"{name}: expected a Chain, got {_describe(value)}{hint}")
+    raise InvalidArgumentError(f"chain: expected a Chain, got {_describe(value)}{hint}")
 
 
 def as_measurements(

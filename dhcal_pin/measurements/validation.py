@@ -33,16 +33,16 @@ def _require_finite(value: Array, where: str) -> None:
         raise InvalidArgumentError(f"{where} is not finite in row {row}; expected finite numbers")
 
 
-def validated_joint_positions(value: Any, kind: str, what: str = "q") -> Array:
+def validated_joint_positions(value: Any, kind: str) -> Array:
     """Return joint positions as an array of shape (m, n)."""
-    where, expected = f"{kind}: {what}", "shape (m, n), one row of n joint positions per sample"
+    where, expected = f"{kind}: q", "shape (m, n), one row of n joint positions per sample"
     q = _as_numbers(value, where, expected)
     if q.ndim != 2:
         hint = ""
         if q.ndim == 1:
-            hint = f"; write {what}[None] for a single sample"
+            hint = "; write q[None] for a single sample"
         elif q.shape[1:] == (4, 4):
-            hint = f"; these are poses, which come after {what}"
+            hint = "; these are poses, which come after q"
         raise InvalidArgumentError(f"{where} has shape {q.shape}; expected {expected}{hint}")
     _require_finite(q, where)
     return q

@@ -33,6 +33,9 @@ from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from ..robot.dh import DHTable
 
+# Singular values below this fraction of the largest one count as zero.
+RTOL = 1e-9
+
 
 def q_matrices(table: DHTable) -> Array:
     """Return the derivative matrices Q, equations (9) and (10).
@@ -245,23 +248,22 @@ def tool_error(measured: Array, model: Array) -> Array:
     return np.concatenate([_dot_axes(model, dp), angular], -1)
 
 
-def pseudo_inverse_step(factors: Array, error: Array, rtol: float = 1e-9) -> Array:
+def pseudo_inverse_step(factors: Array, error: Array) -> Array:
     """Compute the parameter correction ΔPAR, equations (37) and (38).
 
     (37) stacks DX_i = R_i·ΔPAR over all configurations to D = ReL·ΔPAR. Erratum: (38) inverts ReLᵀ·ReL, which
     is singular for nominally parallel axes, however many configurations there are. The pseudo-inverse by
-    singular values takes its place.
+    singular values takes its place; those below `RTOL` of the largest one count as zero.
 
     Args:
         factors: R of each configuration, shape (m, k, p).
         error: DX of each configuration, shape (m, k) [m, rad].
-        rtol: Singular values below this fraction of the largest one count as zero.
 
     Returns:
         ΔPAR, shape (p,) [rad, m].
     """
     stacked = factors.reshape(-1, factors.shape[-1])
-    return np.linalg.lstsq(stacked, error.reshape(-1), rcond=rtol)[0]
+    return np.linalg.lstsq(stacked, error.reshape(-1), rcond=RTOL)[0]
 
 
 def apply_correction(table: DHTable, change: Array) -> DHTable:

@@ -182,9 +182,9 @@ class CameraInstrument:
             **tiled,
         )
 
-    def existing(self, item: Measurement, chain: Chain) -> CameraCorners:
+    def existing(self, item: Measurement, chain: Chain) -> Measurement:
         """Return existing images as this instrument would measure them."""
-        if not isinstance(item, CameraCorners):
+        if item.rig is None:
             raise InvalidArgumentError(
                 f"{item.source or item.kind}: a plan of images complements images; expected the columns u, v "
                 "and corner"
@@ -197,7 +197,7 @@ class CameraInstrument:
         )
         return self.with_shared_noise(item, chain, np.array([p.nominal for p in item.instrument_parameters]))
 
-    def with_shared_noise(self, item: CameraCorners, chain: Chain, u: Array) -> CameraCorners:
+    def with_shared_noise(self, item: Measurement, chain: Chain, u: Array) -> Measurement:
         """Return image coordinates whose corners share a displacement of the tool."""
         std = np.array([self.noise.position] * 3 + [self.noise.rotation] * 3)
         return item.with_jitter(item.displacement_derivative(chain.forward_kinematics(item.q), u) * std)

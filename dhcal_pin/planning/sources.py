@@ -7,7 +7,6 @@ robot can take.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -16,32 +15,6 @@ from ..measurements.camera import CameraCorners
 from ..robot.sampling import ConfigurationSampler
 from .view_sampler import ViewSampler
 from .views import CameraViews, PlannedImages, summarize_views
-
-
-class MeasurementSource(Protocol):
-    """What is measured in the configurations of a plan."""
-
-    @property
-    def kind(self) -> str:
-        """Name in `KINDS`."""
-        ...
-
-    @property
-    def condition(self) -> str:
-        """What a configuration needs beside the constraints of the robot, for messages."""
-        ...
-
-    def restrict(self, sampler: ConfigurationSampler) -> ConfigurationSampler:
-        """Restrict a sampler to configurations that can be measured."""
-        ...
-
-    def can_measure(self, tools: Array) -> Array:
-        """Return whether poses of the tool can be measured, shape (m,)."""
-        ...
-
-    def summarize(self, tools: Array) -> tuple[CameraViews, ...]:
-        """Describe the images of a plan; empty for other kinds of measurement."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -53,18 +26,19 @@ class ToolSource:
     """
 
     kind: str
+    # What a configuration needs beside the constraints of the robot, for messages.
     condition = ""
 
     def restrict(self, sampler: ConfigurationSampler) -> ConfigurationSampler:
-        """Return the sampler itself; see `MeasurementSource.restrict`."""
+        """Restrict a sampler to configurations that can be measured: here all."""
         return sampler
 
     def can_measure(self, tools: Array) -> Array:
-        """Return true for all poses; see `MeasurementSource.can_measure`."""
+        """Return whether poses of the tool (m, 4, 4) can be measured, shape (m,): here all."""
         return np.ones(len(tools), bool)
 
     def summarize(self, tools: Array) -> tuple[CameraViews, ...]:
-        """Return nothing; see `MeasurementSource.summarize`."""
+        """Return the images of a plan: here none."""
         return ()
 
 
@@ -81,13 +55,13 @@ class ImageSource:
     condition = "; a board must be in view, and nothing may hide it"
 
     def restrict(self, sampler: ConfigurationSampler) -> ConfigurationSampler:
-        """Restrict a sampler to views of a board; see `MeasurementSource.restrict`."""
+        """Restrict a sampler to views of a board."""
         return ViewSampler.from_sampler(sampler, self.images)
 
     def can_measure(self, tools: Array) -> Array:
-        """Return where a board is in view; see `MeasurementSource.can_measure`."""
+        """Return in which poses of the tool (m, 4, 4) a board is in view, shape (m,)."""
         return self.images.in_view(tools)
 
     def summarize(self, tools: Array) -> tuple[CameraViews, ...]:
-        """Describe the images of each camera; see `MeasurementSource.summarize`."""
+        """Describe the images of each camera."""
         return summarize_views(self.images, tools)

@@ -13,7 +13,6 @@ from ..calibration.cameras import ImageError, Stage
 from ..calibration.evaluation import compute_errors
 from ..cameras.rig import Camera
 from ..formatting import Table, format_fixed
-from ..measurements.camera import CameraCorners
 from ..visualization import image_plots
 from .context import ReportContext
 from .figures import FigureGroup, LegendEntry, Panel
@@ -118,7 +117,7 @@ def _images(context: ReportContext) -> list[_Image]:
     )
     for role, names, data in parts:
         for name, item in zip(names, data, strict=True):
-            if not isinstance(item, CameraCorners):
+            if item.rig is None:
                 continue
             before = compute_errors(fit.nominal_refitted, [item], fit.nominal_instruments)[0]
             after = compute_errors(fit.chain, [item], fit.instruments)[0]

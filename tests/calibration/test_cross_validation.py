@@ -9,7 +9,6 @@ import pytest
 from robots import paper
 
 from dhcal_pin.calibration import Result, accuracy, calibrate, cross_validate, k_fold
-from dhcal_pin.calibration.cross_validation import standard_error
 from dhcal_pin.estimation import levenberg_marquardt
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.measurements import Measurement, Noise, PointContact, Pose, Position
@@ -51,13 +50,6 @@ def test_folds_equal_fits_of_the_other_samples():
 def test_folds_of_other_data_are_refused():
     with pytest.raises(DhcalError, match="made for other data"):
         cross_validate(fitted(m=30), k_fold(fitted().data, 5))
-
-
-def test_standard_error_is_wider_for_few_folds():
-    """The quantile of Student's t that corresponds to one sigma is 1.84 for two folds and 1.32 for three."""
-    assert standard_error(np.array([0.0, 1.0])) == pytest.approx(0.5 * 1.837, rel=1e-3)
-    assert standard_error(np.array([0.0, 1.0, 2.0])) == pytest.approx(1.321 / np.sqrt(3), rel=1e-3)
-    assert standard_error(np.array([1.0])) == np.inf
 
 
 def test_point_of_held_out_samples_is_fitted_to_them():

@@ -243,12 +243,12 @@ def _correction_block(fit: Result) -> Block:
     return Block(table, noun="correction", rank=5, n_kept=min(3, len(rows)), has_space=True)
 
 
-def largest_corrections(fit: Result, count: int = N_CORRECTIONS) -> list[Estimate]:
+def largest_corrections(fit: Result) -> list[Estimate]:
     """Choose the largest corrections of a robot."""
     sizes = np.abs(fit.x) / fit.prior_std
     estimates = fit.estimates[: len(sizes)]
     order = [i for i in np.argsort(-sizes, kind="stable") if estimates[i].category == "robot" and sizes[i]]
-    return [estimates[i] for i in order[:count]]
+    return [estimates[i] for i in order[:N_CORRECTIONS]]
 
 
 # --- details ---------------------------------------------------------------------------------------

@@ -28,15 +28,15 @@ def is_data_frame(source: Any) -> bool:
     return not isinstance(source, str | os.PathLike) and hasattr(source, "columns")
 
 
-def data_frame_table(frame: Any, source: str = "DataFrame") -> DataTable:
+def data_frame_table(frame: Any) -> DataTable:
     """Make a table from a data frame."""
     columns = {}
     for name in frame.columns:
         values = np.asarray(frame[name])
         if values.ndim != 1:
-            raise FileFormatError(f"{source}: column {name!r} appears twice; remove one")
+            raise FileFormatError(f"DataFrame: column {name!r} appears twice; remove one")
         columns[str(name)] = values
-    return _table_of_arrays(columns, source, "data frame")
+    return _table_of_arrays(columns, "DataFrame", "data frame")
 
 
 def read_parquet(path: PathLike, layout: TextLayout) -> DataTable:

@@ -56,9 +56,7 @@ def visible_corners(rig: MountedRig, camera: int, board: int, poses: Array, limi
     return out
 
 
-def is_board_in_view(
-    rig: MountedRig, camera: int, board: int, tools: Array, limits: ViewLimits | None = None
-) -> Array:
+def is_board_in_view(rig: MountedRig, camera: int, board: int, tools: Array, limits: ViewLimits) -> Array:
     """Return in which poses of the tool a camera sees a board."""
     poses = rig.board_in_camera(camera, board, tools)
-    return np.any(visible_corners(rig, camera, board, poses, limits or ViewLimits()), 1)
+    return np.any(visible_corners(rig, camera, board, poses, limits), 1)
