@@ -31,6 +31,7 @@ from .measurements.contact import PlaneContact as PlaneContact
 from .measurements.contact import PointContact as PointContact
 from .measurements.contact import PointDistance as PointDistance
 from .measurements.contact import SphereContact as SphereContact
+from .measurements.inclination import Inclination as Inclination
 from .measurements.length import Distance as Distance
 from .measurements.length import Wires as Wires
 from .measurements.mounting import mount_rig as mount_rig

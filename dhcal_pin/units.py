@@ -16,6 +16,8 @@ from .exceptions import InvalidArgumentError
 # 606.8·0.001 is not. Micro has two code points in Unicode: U+00B5 and U+03BC.
 LENGTHS = {"m": 1.0, "cm": 1e2, "mm": 1e3, "um": 1e6, "\u00b5m": 1e6, "\u03bcm": 1e6, "in": 1 / 0.0254}
 ANGLES = {"rad": 1.0, "mrad": 1e3, "deg": 180.0 / np.pi}
+# Units of accelerations, per m/s².
+ACCELERATIONS = {"m/s2": 1.0, "g": 1 / 9.80665, "mg": 1e3 / 9.80665}
 # Units of image coordinates.
 PIXELS = {"px": 1.0}
 # Units per second, per kilogram, and of temperatures.
@@ -26,6 +28,7 @@ TEMPERATURES = {"degC": 1.0}
 UNITS: Mapping[str, Mapping[str, float]] = {
     "length": LENGTHS,
     "angle": ANGLES,
+    "acceleration": ACCELERATIONS,
     "pixel": PIXELS,
     "time": TIMES,
     "mass": MASSES,

@@ -58,12 +58,9 @@ def analytic(problem: Problem) -> tuple[Callable[..., np.ndarray], Callable[...,
         return np.concatenate([rows.ravel(), problem.weights * x])
 
     def jacobian(x: np.ndarray) -> np.ndarray:
-        chain, bodies, twists = errors.derivative(x)
-        frames = chain.forward_kinematics(motion)
-        velocities = chain.tool_jacobian(frames, bodies, twists)
-        rows = whitened_jacobian(data, frames, velocities, NONE, data.residual(frames, NONE)).reshape(
-            len(x), -1
-        )
+        model = errors.derivative(x)
+        frames = model[0].forward_kinematics(motion)
+        rows = whitened_jacobian(data, model, frames, NONE, data.residual(frames, NONE)).reshape(len(x), -1)
         return np.concatenate([-rows.T, np.diag(problem.weights)])
 
     return residual, jacobian

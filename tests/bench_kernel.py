@@ -27,10 +27,10 @@ def iteration(chain: Chain, sets: str, m: int, repeats: int) -> tuple[float, flo
         return pseudo_inverse(free.r, free.z)
 
     (data,) = case.data
-    nominal, bodies, twists = case.errors.derivative(x)
-    frames = nominal.forward_kinematics(data.q)
+    model = case.errors.derivative(x)
+    frames = model[0].forward_kinematics(data.q)
     residual = data.residual(frames, none)
-    rows = whitened_jacobian(data, frames, nominal.tool_jacobian(frames, bodies, twists), none, residual)
+    rows = whitened_jacobian(data, model, frames, none, residual)
     whole = np.concatenate([rows.reshape(len(x), -1), residual.reshape(1, -1)])
     room = np.empty_like(whole)
 

@@ -72,6 +72,9 @@ class FrameBatch:
 class ObservationMatrix:
     """Sparse matrix H of a measurement: maps tool velocities to the r residual rows of each of m samples.
 
+    The velocities are those of the tool point. If a measurement observes another body than the last one, they
+    are those that the tool point would have if it were fixed to that body.
+
     With the tool velocity y = [vx, vy, vz, ωx, ωy, ωz] of the first configuration, followed by that of the
     second one for relative measurements, row i of sample t is the sum of coefficients[j, t]·y[components[j]]
     over the terms j with rows[j] = i. This is the Jacobian of the whitened residual by the tool pose.
@@ -81,8 +84,18 @@ class ObservationMatrix:
         components: Velocity component of each term, 0 to 5 in the first and 6 to 11 in the second
             configuration, shape (j,).
         coefficients: Coefficients of the terms, shape (j, m).
+        body: Number of the observed body, 1 to k; None for the tool.
     """
 
     rows: Array
     components: Array
     coefficients: Array
+    body: int | None = None
+
+
+def twists_before(body: int | None, bodies: Array, twists: Array) -> Array:
+    """Return twists (..., p, 6) of bodies (p,), those that do not move the frame of an observed body zeroed.
+
+    A twist of a body moves the frames of the bodies behind it; see `ObservationMatrix.body`.
+    """
+    return twists if body is None else np.where((bodies < body)[:, None], twists, 0.0)

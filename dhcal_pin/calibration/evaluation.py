@@ -178,7 +178,9 @@ def compute_errors(
     known = known or {}
     data = [item.matched_to(known) for item in data]
     data = [
-        item if all(p.name in known for p in item.instrument_parameters) else item.initialized(chain)
+        item.mounted(chain)
+        if all(parameter.name in known for parameter in item.instrument_parameters)
+        else item.initialized(chain)
         for item in data
     ]
     values = fit_instrument_parameters(chain, data, known)

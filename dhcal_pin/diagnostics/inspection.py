@@ -10,7 +10,8 @@ positions that differ by less than a milliradian and a millimetre are one config
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import groupby
 from typing import Any
@@ -145,10 +146,22 @@ def _is_numeric(table: DataTable, index: int) -> bool:
     return np.isfinite(values).sum() >= max(1, _MIN_NUMERIC_SHARE * len(values))
 
 
-def _role(column: Column, chain: Chain | None) -> str:
+def _value_table(table: DataTable, chain: Chain | None) -> DataTable:
+    """Return a table without the columns of joints whose names are those of measured values."""
+    if chain is not None:
+        return file_columns.value_table(table, chain)
+    unambiguous = table.without_columns(file_columns.AMBIGUOUS_COLUMNS)
+    try:
+        file_columns.find_kind(unambiguous)
+    except DhcalError:
+        return table
+    return unambiguous
+
+
+def _role(column: Column, chain: Chain | None, measured: Set[str]) -> str:
     """Return the role of a column; without a robot, an unknown column with a unit is a joint."""
     name = column.name
-    if name in file_columns.VALUE_COLUMNS:
+    if name in measured:
         return "sigma" if name.startswith("sigma_") else "measured"
     if name in file_columns.AUXILIARY_COLUMNS:
         return "other"
@@ -161,23 +174,29 @@ def _inspect_table(table: DataTable, chain: Chain | None) -> FileInspection:
     """Summarize the columns and rows of a table."""
     lines = sorted([*table.lines, *table.bad_rows])
     named = {column.index: column for column in _names(table).values()}
-    try:
-        kind = file_columns.find_kind(table).kind if named else ""
-    except DhcalError:
-        kind = ""
+    kind, measured = "", set[str]()
+    if named:
+        values = _value_table(table, chain)
+        measured = values.columns.keys() & file_columns.VALUE_COLUMNS
+        with suppress(DhcalError):
+            kind = file_columns.find_kind(values).kind
     numeric = [
-        i for i in named if _role(named[i], chain) not in ("other", "ignored") and _is_numeric(table, i)
+        i
+        for i in named
+        if _role(named[i], chain, measured) not in ("other", "ignored") and _is_numeric(table, i)
     ]
     usable = table.without_bad_rows(numeric)
     summaries = tuple(
-        _summarize_column(usable, named.get(i) or Column(str(i + 1), "", i), chain if i in named else None)
+        _summarize_column(
+            usable, named.get(i) or Column(str(i + 1), "", i), chain if i in named else None, measured
+        )
         for i in range(len(table.headers))
         if i in named or table.has_numbers_as_header or any(row[i].strip() for row in table.cells)
     )
     compared = [
         _comparable(usable, column)
         for column in named.values()
-        if _role(column, chain) in ("joint", "measured")
+        if _role(column, chain, measured) in ("joint", "measured")
     ]
     original = first_equal_rows(compared)
     repeated = np.flatnonzero(original < np.arange(len(original)))
@@ -202,10 +221,12 @@ def _comparable(table: DataTable, column: Column) -> Array:
     return table.values(column.index) if is_numeric else np.array(table.text(column), str)
 
 
-def _summarize_column(table: DataTable, column: Column, chain: Chain | None) -> ColumnSummary:
+def _summarize_column(
+    table: DataTable, column: Column, chain: Chain | None, measured: Set[str]
+) -> ColumnSummary:
     """Summarize one column."""
     is_unnamed = not table.headers[column.index] or table.has_numbers_as_header
-    role = "ignored" if is_unnamed else _role(column, chain)
+    role = "ignored" if is_unnamed else _role(column, chain, measured)
     if not _is_numeric(table, column.index):
         texts, counts = np.unique(table.text(column), return_counts=True)
         by_text = dict(zip(texts.tolist(), counts.tolist(), strict=True))

@@ -144,13 +144,13 @@ def _offset_equations(chain: Chain, data: Sequence[Measurement], fit: Result) ->
     data = [item.initialized(chain) for item in data]
     known = fit_instrument_parameters(chain, data, fit.instruments if chain is fit.chain else {})
     errors = ErrorModel(chain, tuple(offset(chain)))
-    _, bodies, twists = errors.derivative(np.zeros(len(errors.parameters)))
+    model = errors.derivative(np.zeros(len(errors.parameters)))
     ar, aa = [], []
     for item in data:
         u = np.array([known[parameter.name] for parameter in item.instrument_parameters])
         frames = chain.forward_kinematics(item.conditions())
         residual = item.residual(frames, u)
-        a = whitened_jacobian(item, frames, chain.tool_jacobian(frames, bodies, twists), u, residual)
+        a = whitened_jacobian(item, model, frames, u, residual)
         ar.append(np.sum(a * residual, 1))
         aa.append(np.sum(a**2, 1))
     return np.concatenate(ar, 1), np.concatenate(aa, 1)

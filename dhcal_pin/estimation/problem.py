@@ -30,7 +30,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from .._kernels import apply_observation_matrix, factor_jacobian
-from .._kernels.types import FrameBatch, ObservationMatrix
+from .._kernels.types import FrameBatch, ObservationMatrix, twists_before
 from .._kernels.work_arrays import UnbufferedRows, work_array
 from .._typing import Array
 from ..measurements.base import InstrumentParameter, Measurement
@@ -249,7 +249,8 @@ class Linearization:
             "filled columns", data.residual_dim, self._n_columns - n_geometric, len(data.rows)
         ).swapaxes(0, 1)
         observation = self._fill(filled, chunk, frames, small_angle)
-        bodies, twists = self.bodies[:n_geometric], self.twists[None, :n_geometric]
+        bodies = self.bodies[:n_geometric]
+        twists = twists_before(observation.body, bodies, self.twists[None, :n_geometric])
         return factor_jacobian(frames.columns, frames.tool[3], bodies, twists, observation, filled)[0]
 
     def structured_rows(self, chunk: Chunk) -> StructuredRows:
@@ -269,7 +270,7 @@ class Linearization:
         dense = np.empty((other._n_columns, residual_dim, m))
         observation = other._fill(dense, chunk, frames, False)
         joints, terms = self.chain.transmission_terms(frames, entries)
-        motions = self.chain.motions(frames, joints)
+        motions = self.chain.motions(frames, joints, observation.body)
         joint_rows = np.empty((len(motions), residual_dim, m))
         apply_observation_matrix(motions, observation, joint_rows)
         by_joint = np.argsort(joints, kind="stable")
@@ -307,7 +308,8 @@ class Linearization:
         n_errors = len(self.bodies) - first
         if n_errors:
             jacobian = work_array("filled jacobian", n_errors, 6, frames.tool.shape[-1])
-            self.chain.tool_jacobian(frames, self.bodies[first:], self.twists[first:], jacobian)
+            bodies, twists = self.bodies[first:], self.twists[first:]
+            self.chain.tool_jacobian(frames, bodies, twists, jacobian, observation.body)
             apply_observation_matrix(jacobian, observation, block[:n_errors])
         block[n_errors:-1] = 0.0
         instrument_rows = data.instrument_jacobian(frames, u) if data.instrument_parameters else ()

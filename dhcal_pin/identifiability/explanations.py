@@ -62,8 +62,8 @@ _OBSERVABLE_RTOL = 1e-8
 # Weights of a sum that are this close to 1 are not written; a sum with weights below the second value is not
 # written.
 _UNIT_WEIGHT_TOL, _ZERO_WEIGHT = 1e-4, 1e-6
-# Configurations for the test whether a combination scales the robot.
-_N_SCALING_SAMPLES = 30
+# Configurations for tests of how a combination moves the robot.
+_N_RANDOM_SAMPLES = 30
 
 
 def join_names(names: Sequence[str]) -> str:
@@ -286,11 +286,17 @@ class Explainer:
         members, way = self._robot_part(group)
         chain = self.plain_errors.chain
         has_other_members = len(group.members) > len(members)
+        observed = [item.observed_body for item in self.probe.problem.data]
+        nearest = min((self.plain_errors.bodies[i] for i in group.members[: len(members)]), default=-1)
+        if not has_other_members and all(body is not None and body <= nearest for body in observed):
+            return "the observed links are before this part of the robot", self._suggest_measurement(group)
         if members and all(p.error_frame == BASE_FRAME for p in members):
             if has_other_members:
                 reason = "the robot and the instrument can move together without changing a measurement"
             else:
                 reason = "the measurements do not change when the whole robot moves in this way"
+            return reason, self._suggest_measurement(group)
+        if not has_other_members and (reason := self._explain_angles(group)):
             return reason, self._suggest_measurement(group)
         if way is not None and np.abs(way.tool_twists[:, :3]).max() < NEGLIGIBLE:
             reason = "only the orientation of the tool depends on this, and the orientation is not measured"
@@ -314,20 +320,39 @@ class Explainer:
             return SCALE_UNKNOWN, self._suggest_measurement(group)
         return "the measurements do not change", self._suggest_measurement(group)
 
+    def _explain_angles(self, group: UnobservableGroup) -> str:
+        """Explain why measured angles do not depend on a group; empty if lengths are measured, too."""
+        data = self.probe.problem.data
+        if any(each.unit != "rad" for item in data for each in item.residual_groups.values()):
+            return ""
+        _, motions = self._tool_motions(group)
+        turns = np.concatenate(motions[:, 3:], 1)
+        sizes = np.linalg.svd(turns, compute_uv=False)
+        if sizes[0] < NEGLIGIBLE:
+            return "this does not turn the tool, and only angles are measured"
+        axes = {item.symmetry_axis for item in data}
+        if sizes[1] < NEGLIGIBLE and len(axes) == 1 and (axis := axes.pop()):
+            return f"this turns the tool about {axis}, and the measurements stay the same"
+        return ""
+
+    def _tool_motions(self, group: UnobservableGroup) -> tuple[Array, Array]:
+        """Return the tool (3, m) at random configurations, and its velocities (r, 6, m) by a group."""
+        errors, count = self.plain_errors, len(self.plain_errors.parameters)
+        q = self.probe.draw_configurations(np.random.default_rng(0), _N_RANDOM_SAMPLES)
+        frames = errors.chain.forward_kinematics(q)
+        velocities = errors.chain.tool_jacobian(frames, errors.bodies, errors.twists)
+        return frames.tool[3], np.tensordot(group.vectors[:count].T, velocities, 1)
+
     def _is_scaling(self, group: UnobservableGroup) -> bool:
         """Decide whether a group scales the robot about some point and has no other effect."""
         if group.vectors.shape[1] != 1 or len(group.members) < 2:
             return False
-        errors, count = self.plain_errors, len(self.plain_errors.parameters)
         robot = [i for i in group.members if i < len(self.probe.problem.errors.parameters)]
-        if not robot or robot[-1] >= count:
+        if not robot or robot[-1] >= len(self.plain_errors.parameters):
             return False
-        q = self.probe.draw_configurations(np.random.default_rng(0), _N_SCALING_SAMPLES)
-        frames = errors.chain.forward_kinematics(q)
-        velocities = errors.chain.tool_jacobian(frames, errors.bodies, errors.twists)[:, :3]
-        displacement = np.tensordot(group.vectors[:count, 0], velocities, 1)
         # Displacement = scale·point + translation + rotation × point, fitted to all samples.
-        point = frames.tool[3]
+        point, velocities = self._tool_motions(group)
+        displacement = velocities[0, :3]
         motions = [*(np.eye(3)[i][:, None] * np.ones_like(point) for i in range(3))]
         motions += [np.cross(np.eye(3)[i], point.T).T for i in range(3)]
         rows = np.array([point, *motions]).reshape(7, -1).T

@@ -10,6 +10,7 @@ from .base import InstrumentParameter, Measurement, Noise
 from .camera import CameraCorners
 from .contact import PlaneContact, PointContact, PointDistance, SphereContact
 from .images import ViewLimits, is_board_in_view, project_board
+from .inclination import Inclination
 from .length import Distance, Wires
 from .measured_region import MeasuredRegion
 from .mounting import MountedRig, mount_rig
@@ -32,6 +33,7 @@ KINDS: dict[str, type[Measurement]] = {
         SphereContact,
         RelativePose,
         CameraCorners,
+        Inclination,
     )
 }
 
@@ -39,6 +41,7 @@ __all__ = [
     "KINDS",
     "CameraCorners",
     "Distance",
+    "Inclination",
     "InstrumentParameter",
     "MeasuredRegion",
     "Measurement",

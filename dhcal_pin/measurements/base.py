@@ -129,8 +129,10 @@ class Measurement(ABC):
     sample_fields: ClassVar[tuple[str, ...]] = ("q", "rows")
     # Whether the tool must be in contact with an object; otherwise any configuration can be measured.
     is_contact: ClassVar[bool] = False
-    # Whether the measured values contain a length; otherwise a scaled robot fits equally well.
+    # False if residuals are lengths that shrink with the robot, and no measured length opposes.
     has_length_scale: ClassVar[bool] = True
+    # Name of the direction about which the measuring frame can turn without changing a measurement.
+    symmetry_axis: ClassVar[str] = ""
     # Whether a file may have poses of the tip in place of joint values.
     accepts_tool_poses: ClassVar[bool] = False
 
@@ -319,6 +321,19 @@ class Measurement(ABC):
         """
         return ""
 
+    @property
+    def observed_body(self) -> int | None:
+        """Number of the body that is observed, see `ObservationMatrix`; None for the tool."""
+        return None
+
+    def mounted(self, chain: Chain) -> Self:
+        """Return a copy that knows the body that it observes; kinds that observe the tool are returned as is.
+
+        Args:
+            chain: Robot that was measured.
+        """
+        return self
+
     def initialized(self, chain: Chain) -> Self:
         """Return a copy with initial values of the instrument parameters.
 
@@ -505,22 +520,24 @@ class Measurement(ABC):
 
 
 def whitened_jacobian(
-    item: Measurement, frames: FrameBatch, tool_jacobian: Array, u: Array, residual: Array
+    item: Measurement, model: tuple[Chain, Array, Array], frames: FrameBatch, u: Array, residual: Array
 ) -> Array:
     """Compute the Jacobian of the whitened model with respect to the error parameters.
 
     Args:
         item: Measurements.
+        model: Chain, bodies (p,) and twists (p, 6) of the p error parameters; see `Chain.tool_jacobian`.
         frames: Frames of the chain at `item.configurations()`.
-        tool_jacobian: Velocities of the tool per unit of each error parameter, (p, 6, c·m).
         u: Values of the instrument parameters, (s,).
         residual: Whitened residuals at these frames and values, (k, m).
 
     Returns:
         Shape (p, k, m).
     """
-    out = np.empty((len(tool_jacobian), *residual.shape))
-    return apply_observation_matrix(tool_jacobian, item.observation_matrix(frames, u, residual), out)
+    chain, bodies, twists = model
+    observation = item.observation_matrix(frames, u, residual)
+    jacobian = chain.tool_jacobian(frames, bodies, twists, body=observation.body)
+    return apply_observation_matrix(jacobian, observation, np.empty((len(bodies), *residual.shape)))
 
 
 def known_conditions(data: Iterable[Measurement]) -> frozenset[str]:

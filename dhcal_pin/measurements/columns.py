@@ -48,8 +48,8 @@ class Column:
 
     Attributes:
         name: Name in the header, without the unit.
-        quantity: "length" [m], "angle" [rad], "pixel" [px], "text", or "remark": a text that only people
-            need, so that it may be empty, and files of other kinds may have it, too.
+        quantity: "length" [m], "angle" [rad], "acceleration" [m/s2], "pixel" [px], "text", or "remark": a
+            text that only people need, so that it may be empty, and files of other kinds may have it, too.
         argument: Argument of the kind's constructor that the column fills. Several numeric columns with the
             same argument are stacked, (m, k).
         is_implied: Whether the value is zero by definition, so that files have only its standard deviation.
@@ -58,7 +58,7 @@ class Column:
     """
 
     name: str
-    quantity: Literal["length", "angle", "pixel", "text", "remark"]
+    quantity: Literal["length", "angle", "acceleration", "pixel", "text", "remark"]
     argument: str = ""
     is_implied: bool = False
     is_common: bool = False

@@ -371,7 +371,8 @@ def plannable_kinds() -> dict[str, type[Measurement]]:
     return {
         name: kind
         for name, kind in KINDS.items()
-        if kind.configurations_per_row == 1 and "text" not in kind.columns.values()
+        if kind.configurations_per_row == 1
+        and not any(kind.columns[column] == "text" for columns in kind.required_columns for column in columns)
     }
 
 

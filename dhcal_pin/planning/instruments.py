@@ -115,8 +115,8 @@ class SimulatedInstrument:
         chain, u = model.chain, model.values
         data = self.kind.simulate(chain, q, self.noise, np.random.default_rng(0))
         frames = chain.forward_kinematics(q)
-        jacobian = chain.tool_jacobian(frames, model.bodies, model.twists)
-        by_errors = whitened_jacobian(data, frames, jacobian, u, data.residual(frames, u))
+        linear = chain, model.bodies, model.twists
+        by_errors = whitened_jacobian(data, linear, frames, u, data.residual(frames, u))
         return by_errors, data.instrument_jacobian(frames, u)
 
     def displacements(self, model: PresentModel, q: Array) -> tuple[Array, Array]:
@@ -217,8 +217,8 @@ class CameraInstrument:
         plain = self.images_of(chain, q)
         frames = chain.forward_kinematics(plain.q)
         data = self.with_shared_noise(plain, chain, u)
-        jacobian = chain.tool_jacobian(frames, model.bodies, model.twists)
-        by_errors = whitened_jacobian(data, frames, jacobian, u, data.residual(frames, u))
+        linear = chain, model.bodies, model.twists
+        by_errors = whitened_jacobian(data, linear, frames, u, data.residual(frames, u))
         rows = np.concatenate([by_errors, data.instrument_jacobian(frames, u)])
         rows = rows.reshape(len(rows), 2, m, n_corners).transpose(2, 1, 3, 0)
         rows = rows.reshape(m, 2 * n_corners, rows.shape[-1])

@@ -41,7 +41,7 @@ from numpy.typing import ArrayLike
 
 from .. import _kernels, se3
 from .._kernels.kinematics import error_frame_poses
-from .._kernels.types import FrameBatch
+from .._kernels.types import FrameBatch, twists_before
 from .._typing import Array
 from ..exceptions import DhcalError, InvalidArgumentError, UnknownNameError
 from ..messages import quote
@@ -58,6 +58,7 @@ from .urdf_path import (
     find_moving_joints,
     independent_joints,
     joint_placements,
+    link_on_path,
     placements,
 )
 
@@ -499,6 +500,13 @@ class Chain:
         linear = np.einsum("ja,jacm->jcm", vectors, frames.columns[:, :3])
         return np.concatenate([linear, np.zeros_like(linear)], 1)
 
+    def _require_link(self, link: str) -> None:
+        """Raise an error if the robot has no such link."""
+        if link not in self.urdf.links:
+            raise UnknownNameError(
+                f"{self.urdf.source}: unknown link {quote(link)}; {suggest_names(link, self.urdf.links)}"
+            )
+
     def pose_in_tip(self, link: str) -> Array:
         """Return the constant pose of another link in the tip link.
 
@@ -512,10 +520,7 @@ class Chain:
             UnknownNameError: There is no such link.
             InvalidArgumentError: A joint moves the link against the tip.
         """
-        if link not in self.urdf.links:
-            raise UnknownNameError(
-                f"{self.urdf.source}: unknown link {quote(link)}; {suggest_names(link, self.urdf.links)}"
-            )
+        self._require_link(link)
         pose = self.fixed_pose(self.tip, link)
         if pose is None:
             raise InvalidArgumentError(
@@ -542,6 +547,28 @@ class Chain:
             return None
         return (own.placement.inverse() * wanted.placement).homogeneous
 
+    def link_in_body(self, link: str) -> tuple[int, Array]:
+        """Find the body of the chain that carries a link, for sensors on the link.
+
+        Args:
+            link: Name of a link of the robot.
+
+        Returns:
+            Number of the body, 1 to k, and pose of the link in the frame of the body, shape (4, 4) [m].
+
+        Raises:
+            UnknownNameError: There is no such link.
+            InvalidArgumentError: No joint of the chain moves the link, or a joint off the chain moves it.
+        """
+        self._require_link(link)
+        found = link_on_path(self.urdf, self.root, self.moving_joints, self.n_reversed, link)
+        if not found or not found[0]:
+            raise InvalidArgumentError(
+                f"{self.urdf.source}: link {quote(link)} is not on the chain to {quote(self.tip)}; "
+                "expected a link behind its first joint"
+            )
+        return found[0], self.body_from_urdf[found[0]] @ found[1]
+
     def poses(self, q: ArrayLike | Conditions) -> Array:
         """Compute tool poses.
 
@@ -554,7 +581,12 @@ class Chain:
         return self.forward_kinematics(q).poses()
 
     def tool_jacobian(
-        self, frames: FrameBatch, bodies: Array, twists: Array, out: Array | None = None
+        self,
+        frames: FrameBatch,
+        bodies: Array,
+        twists: Array,
+        out: Array | None = None,
+        body: int | None = None,
     ) -> Array:
         """Compute the tool twist per unit of each body twist or transmission coefficient.
 
@@ -564,6 +596,7 @@ class Chain:
                 transmission coefficients.
             twists: Twists [v, ω] in the frames of the bodies, shape (p, 6); not used for coefficients.
             out: Array of shape (p, 6, m) that holds the result.
+            body: Observed body, see `ObservationMatrix`; the tool if None.
 
         Returns:
             Twists [v, ω] of the tool point in axes of the measuring frame, shape (p, 6, m).
@@ -573,35 +606,42 @@ class Chain:
         n_bodies, n_geometric = len(frames.columns), len(bodies)
         if n_geometric and bodies[-1] >= n_bodies:
             n_geometric = int(np.searchsorted(bodies, n_bodies))
-            self._fill_transmission_jacobian(frames, bodies[n_geometric:] - n_bodies, out[n_geometric:])
+            self._fill_transmission_jacobian(frames, bodies[n_geometric:] - n_bodies, out[n_geometric:], body)
             bodies, twists = bodies[:n_geometric], twists[:n_geometric]
+        twists = twists_before(body, bodies, twists)
         _kernels.point_jacobian(frames.columns, frames.tool[3], bodies, twists, out[:n_geometric])
         return out
 
-    def _fill_transmission_jacobian(self, frames: FrameBatch, entries: Array, out: Array) -> None:
+    def _fill_transmission_jacobian(
+        self, frames: FrameBatch, entries: Array, out: Array, body: int | None
+    ) -> None:
         """Compute the tool twist per unit of transmission coefficients (e,) into an array (e, 6, m).
 
         All coefficients of a joint share the twist of its motion, which each one scales by its own term.
         """
         numbers, terms = self.transmission_terms(frames, entries)
-        motions = self.motions(frames, numbers)
+        motions = self.motions(frames, numbers, body)
         for number, term, column in zip(numbers, terms, out, strict=True):
             np.multiply(motions[number], term, out=column)
 
-    def motions(self, frames: FrameBatch, numbers: Sequence[int]) -> Array:
+    def motions(self, frames: FrameBatch, numbers: Sequence[int], body: int | None = None) -> Array:
         """Compute the tool twists of the motions that transmission coefficients scale.
 
         Args:
             frames: Frames of this chain at m samples.
             numbers: Numbers of the motions that are used, as `transmission_terms` returns them.
+            body: Observed body, see `ObservationMatrix`; the tool if None.
 
         Returns:
             Twists [v, ω] by number of the motion, shape (n, 6, m), or (n+k+1, 6, m) if a link grows.
         """
-        by_joint = self.joint_jacobian(frames)
+        by_joint = self.joint_jacobian(frames, body)
         if max(numbers, default=0) < self.n_joints:
             return by_joint
-        return np.concatenate([by_joint, self.growth_motions(frames)])
+        growth = self.growth_motions(frames)
+        if body is not None and body < len(self.moving_joints):
+            growth[body:] = 0.0
+        return np.concatenate([by_joint, growth])
 
     def transmission_terms(self, frames: FrameBatch, entries: Array) -> tuple[list[int], list[Array]]:
         """Return what transmission coefficients scale.
@@ -621,11 +661,12 @@ class Chain:
         joints, numbers, sources = (indices.tolist() for indices in transmission.locate(entries))
         return joints, [terms[term, source] for term, source in zip(numbers, sources, strict=True)]
 
-    def joint_jacobian(self, frames: FrameBatch) -> Array:
+    def joint_jacobian(self, frames: FrameBatch, body: int | None = None) -> Array:
         """Compute the geometric Jacobian with respect to the actual positions of the independent joints.
 
         Args:
             frames: Frames of this chain at m samples.
+            body: Observed body, see `ObservationMatrix`; the tool if None.
 
         Returns:
             Twists [v, ω] of the tool point in axes of the measuring frame, shape (n, 6, m).
@@ -633,6 +674,8 @@ class Chain:
         k = len(self.moving_joints)
         twists = np.zeros((k, 6))
         twists[np.arange(k), np.where(self.prismatic, 2, 5)] = 1.0
+        # The motion of joint j is a twist of body j, and moves its frame.
+        twists = twists_before(body, np.arange(k), twists)
         jacobian = self.tool_jacobian(frames, np.arange(1, k + 1), twists)
         return np.tensordot(self.mimic_matrix, jacobian, (0, 0))
 

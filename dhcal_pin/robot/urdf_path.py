@@ -151,6 +151,29 @@ def placements(
     return np.array(origins), np.array(axes)
 
 
+@lru_cache(maxsize=64)
+def link_on_path(
+    urdf: Urdf, root: str, moving: tuple[str, ...], n_reversed: int, link: str
+) -> tuple[int, Array] | None:
+    """Return the body of a path that carries a link, and the pose (4, 4) of the link in its joint frame.
+
+    Body 0 carries the root, body j lies behind moving joint j. None if a joint off the path moves the link.
+    """
+    model = build_model(urdf)
+    frames = [model.frames[model.getFrameId(name, pin.FrameType.BODY)] for name in (root, link)]
+    bodies = [(frames[0].parentJoint, se3.inverse(frames[0].placement.homogeneous))]
+    for j, name in enumerate(moving):
+        index = model.getJointId(name)
+        placement = model.jointPlacements[index].homogeneous
+        bodies.append(
+            (model.parents[index], se3.inverse(placement)) if j < n_reversed else (index, np.eye(4))
+        )
+    for number, (joint, from_joint) in enumerate(bodies):
+        if joint == frames[1].parentJoint:
+            return number, from_joint @ frames[1].placement.homogeneous
+    return None
+
+
 def joint_placements(
     model: pin.Model, tip: str, moving: Sequence[str], is_reversed: Sequence[bool], origins: Array
 ) -> list[Array]:

@@ -27,11 +27,10 @@ NO_INSTRUMENT = np.empty(0)
 
 def whitened_rows(errors, data, x):
     """Return the whitened Jacobian (p, k·m) and residuals (k·m,) of all samples at once."""
-    chain, bodies, twists = errors.derivative(x)
-    frames = chain.forward_kinematics(data.q)
+    model = errors.derivative(x)
+    frames = model[0].forward_kinematics(data.q)
     residual = data.residual(frames, NO_INSTRUMENT)
-    jacobian = chain.tool_jacobian(frames, bodies, twists)
-    rows = whitened_jacobian(data, frames, jacobian, NO_INSTRUMENT, residual)
+    rows = whitened_jacobian(data, model, frames, NO_INSTRUMENT, residual)
     return rows.reshape(len(x), -1), residual.ravel()
 
 

@@ -39,10 +39,10 @@ def check_derivatives(kind, sim_6dof_actual, seeds):
     for seed in seeds:
         data, errors, x, u, rng = setting(sim_6dof_actual, kind, seed)
         x = x + 0.2 * rng.normal(size=len(x))
-        chain, bodies, twists = errors.derivative(x)
-        frames = chain.forward_kinematics(data.configurations())
+        model = errors.derivative(x)
+        frames = model[0].forward_kinematics(data.configurations())
         residual = data.residual(frames, u)
-        rows = whitened_jacobian(data, frames, chain.tool_jacobian(frames, bodies, twists), u, residual)
+        rows = whitened_jacobian(data, model, frames, u, residual)
         assert rows.shape == (len(x), *residual.shape)
         bound = 1e-6 * max(1.0, np.abs(rows).max())
         for k in range(len(x)):
@@ -163,6 +163,11 @@ def check_calibration(kind, sim_6dof, seeds):
         other = rng.uniform(-2.5, 2.5, (50, 6))
         found, wanted = (chain.poses(other)[:, :3, 3] for chain in (fit.chain, truth))
         lengths = [np.linalg.norm(points[1:] - points[0], axis=1) for points in (found, wanted)]
+        if {group.unit for group in kind.residual_groups.values()} == {"rad"}:
+            # Angles do not determine lengths, but angles elsewhere.
+            elsewhere = kind.simulate(truth, rng.uniform(-2.5, 2.5, (50, 6)), Noise(), rng)
+            assert fit.validate(elsewhere)["residual_rms"] < 1e-9
+            continue
         # Contacts with a plane or with points do not determine the scale.
         scale = np.sum(lengths[0]) / np.sum(lengths[1]) if kind in (PlaneContact, PointContact) else 1.0
         assert scale == pytest.approx(1, abs=0.2)
@@ -205,8 +210,8 @@ def test_repr_is_short_and_names_kind_and_samples(kind, sim_6dof):
         data = kind.simulate(sim_6dof, np.zeros((5, 6)) + 0.3, noise, np.random.default_rng(0))
         text = repr(data)
         assert text.startswith(f"{kind.__name__}({len(data.rows)} samples, ")
-        unit = "px" if kind.kind == "camera" else "mm"
-        assert (f"sigma 0.1 {unit}" in text) == data.has_stated_sigma
+        sigma = {"camera": "0.1 px", "inclination": "0.0115 deg"}.get(kind.kind, "0.1 mm")
+        assert (f"sigma {sigma}" in text) == data.has_stated_sigma
         assert len(text) < 80
 
 

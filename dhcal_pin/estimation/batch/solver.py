@@ -20,6 +20,7 @@ from functools import cached_property
 import numpy as np
 
 from ..._kernels import factor_jacobian
+from ..._kernels.types import twists_before
 from ..._typing import Array
 from ...exceptions import InvalidArgumentError, UnknownNameError
 from ...measurements.base import Measurement, concatenate
@@ -193,8 +194,9 @@ class BatchProblem:
             else:
                 residual = item.residual(frames, u)
                 observation = item.observation_matrix(frames, u, residual)
+            moving = twists_before(observation.body, bodies, twists)
             factors.append(
-                factor_jacobian(frames.columns, frames.tool[3], bodies, twists, observation, residual[None])
+                factor_jacobian(frames.columns, frames.tool[3], bodies, moving, observation, residual[None])
             )
         if (with_prior := np.flatnonzero(weights)).size:
             rows = np.zeros((b, len(with_prior), p + 1))

@@ -5,6 +5,9 @@ alone selects the kind: of all kinds whose required columns are present, the one
 columns, and among those the one with the fewest columns in all. A rotation can be given as a quaternion in
 place of a rotation vector. Image coordinates may have the columns of a pose in place of those of the joints.
 
+A column that names a joint belongs to the joint. Joints cannot have the names of columns that a measurement
+kind needs in any case.
+
 The conditions of the samples may stand beside them: `time[s]`, `temperature[degC]`, `payload[kg]` and the
 direction of the last motion of a joint, `approach_JOINT`. A joint of such a name comes first.
 
@@ -49,6 +52,10 @@ VALUE_COLUMNS = (
     frozenset((*(name for kind in KINDS.values() for name in kind.columns), *QUATERNION)) - _REMARKS
 )
 _KNOWN = VALUE_COLUMNS | AUXILIARY_COLUMNS
+# Columns that may be those of joints: only kinds that can be written in several ways have them.
+AMBIGUOUS_COLUMNS = VALUE_COLUMNS.difference(
+    QUATERNION, *(kind.columns for kind in KINDS.values() if len(kind.required_columns) == 1)
+)
 # Content of each column other than joints: "length", "angle", "number" or "text".
 _CONTENTS: dict[str, str] = {
     **{name: content for kind in KINDS.values() for name, content in kind.columns.items()},
@@ -91,7 +98,7 @@ def column_contents(chain: Chain) -> dict[str, str]:
 def check_joint_names(chain: Chain) -> None:
     """Check that the joints of a robot can be columns beside the measured values."""
     require_usable_names(chain.joint_names, chain.urdf.source)
-    if clashes := sorted(_KNOWN & set(chain.joint_names)):
+    if clashes := sorted((_KNOWN - AMBIGUOUS_COLUMNS) & set(chain.joint_names)):
         raise FileFormatError(
             f"{chain.urdf.source}: joint {clashes[0]!r} has the name of a measurement column; "
             "rename the joint"
@@ -127,6 +134,22 @@ def known_columns(chain: Chain) -> frozenset[str]:
     return _KNOWN | {prefix + name for name in names for prefix in ("", SECOND_PREFIX)} | {*conditions}
 
 
+def value_table(table: DataTable, chain: Chain) -> DataTable:
+    """Return a table without the columns that belong to joints, see the module."""
+    joints = {joint.name for joint in chain.urdf.joints} & AMBIGUOUS_COLUMNS
+    names = [header.partition("[")[0].strip() for header in table.headers]
+    for name in sorted(name for name in joints if names.count(name) > 1):
+        ways = [
+            kind.required_columns for kind in KINDS.values() if name in set().union(*kind.required_columns)
+        ]
+        other = [",".join(sorted(way)) for each in ways for way in each if name not in way]
+        raise FileFormatError(
+            f"{table.header_location}: column {name!r} appears twice, and is the joint {name!r}; "
+            f"{f'write the measured values as {other[0]}, or ' if other else ''}rename the joint"
+        )
+    return table.without_columns(joints)
+
+
 def joints_off_the_chain(chain: Chain) -> list[str]:
     """Return the names of the joints of the URDF whose values do not change the pose of the tip."""
     used = {*chain.joint_names, *chain.moving_joints}
@@ -140,12 +163,13 @@ def needs_column_map(table: DataTable, chain: Chain) -> bool:
     """
     if table.has_numbers_as_header:
         return True
-    if has_tool_poses(table):
+    values = value_table(table, chain)
+    if has_tool_poses(values):
         return False
     names = set(table.columns)
     joints = {prefix + joint for joint in chain.joint_names for prefix in ("", SECOND_PREFIX)}
     n_unknown = len(names - known_columns(chain))
-    if names & VALUE_COLUMNS:
+    if set(values.columns) & VALUE_COLUMNS:
         return not names & joints and n_unknown >= chain.n_joints
     return n_unknown >= (1 if names & joints else chain.n_joints)
 

@@ -48,6 +48,7 @@ from .columns import (
     joints_off_the_chain,
     known_columns,
     needs_column_map,
+    value_table,
 )
 from .tool_poses import solve_tool_poses
 
@@ -141,7 +142,7 @@ def open_measurement_table(source: PathLike | Any, chain: Chain, columns: PathLi
 def has_image_coordinates(source: PathLike | Any, chain: Chain, columns: PathLike | None = None) -> bool:
     """Return whether a measurement file has image coordinates, whose cameras and boards must be known."""
     table = open_measurement_table(source, chain, columns)
-    return not needs_column_map(table, chain) and find_kind(table).kind == "camera"
+    return not needs_column_map(table, chain) and find_kind(value_table(table, chain)).kind == "camera"
 
 
 def parse_measurements(
@@ -153,19 +154,20 @@ def parse_measurements(
 
         raise missing_header_error(table, chain)
     ignored = check_columns(table, chain)
-    kind = find_kind(table)
-    has_poses = has_tool_poses(table)
+    kind = find_kind(value_table(table, chain))
+    has_poses = has_tool_poses(value_table(table, chain))
     prefixes = () if has_poses else ("", SECOND_PREFIX)[: kind.configurations_per_row]
     for prefix in prefixes:
         _require_joints(table, chain, prefix)
     table = _usable_rows(table, chain, kind, prefixes, skip_bad_rows)
-    values = parse_values(table, kind)
-    _require_all_sigmas(table, kind, values)
+    measured = value_table(table, chain)
+    values = parse_values(measured, kind)
+    _require_all_sigmas(measured, kind, values)
     q = [parse_joint_positions(table, chain, prefix) for prefix in prefixes]
     placeholder = np.zeros((len(table.lines), chain.n_joints))
-    data = build_measurement(table, kind, q or [placeholder], values, rig)
+    data = build_measurement(table, kind, q or [placeholder], values, chain, rig)
     if has_poses:
-        tips = parse_values(table, Pose)
+        tips = parse_values(measured, Pose)
         data = data.replace(q=solve_tool_poses(table, chain, tips), has_joint_values=False)
         values |= tips
     data = _with_conditions(data, table, chain)
@@ -296,11 +298,12 @@ def build_measurement(
     kind: type[Measurement],
     q: Sequence[Array],
     values: Mapping[str, Any],
+    chain: Chain,
     rig: MountedRig | None = None,
 ) -> Measurement:
     """Build the samples with their file and lines, and put the name of the file in front of an error."""
     try:
-        data = kind.from_columns(q, values, rig)
+        data = kind.from_columns(q, values, rig).mounted(chain)
     except SampleError as error:
         line = int(table.lines[error.sample])
         raise FileFormatError(f"{table.source}:{line}: {error.problem}") from None

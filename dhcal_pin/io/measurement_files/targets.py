@@ -13,7 +13,7 @@ from ...measurements.pose import Pose
 from ...measurements.position import Position
 from ...robot.chain import Chain
 from ..tables import read_table
-from .columns import check_columns, check_joint_names, find_kind
+from .columns import check_columns, check_joint_names, find_kind, value_table
 from .reading import (
     build_measurement,
     column_units,
@@ -63,7 +63,8 @@ def read_targets(path: PathLike, chain: Chain) -> TargetPoses:
     table = read_table(path)
     table.require_good_rows()
     ignored = check_columns(table, chain)
-    kind = find_kind(table)
+    measured = value_table(table, chain)
+    kind = find_kind(measured)
     if kind not in (Pose, Position):
         raise FileFormatError(
             f"{table.header_location}: the columns are those of kind {kind.kind}; targets have "
@@ -72,7 +73,7 @@ def read_targets(path: PathLike, chain: Chain) -> TargetPoses:
     has_joints = bool(set(chain.joint_names) & set(table.columns))
     near = parse_joint_positions(table, chain) if has_joints else None
     placeholder = np.zeros((len(table.lines), chain.n_joints))
-    data = build_measurement(table, kind, [placeholder], parse_values(table, kind))
+    data = build_measurement(table, kind, [placeholder], parse_values(measured, kind), chain)
     values = data.poses if isinstance(data, Pose) else data.positions()
     notes = (*table.notes, *ignored_columns_note(ignored))
     return TargetPoses(table.source, values, near, column_units(table), data.rows, notes)

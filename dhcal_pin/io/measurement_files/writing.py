@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..._typing import Array
+from ...exceptions import FileFormatError
 from ...measurements.base import Measurement
 from ...robot.chain import Chain
 from ...robot.conditions import CONDITIONS
@@ -22,6 +23,12 @@ _LENGTH_UNITS = {"rad": "m", "deg": "mm"}
 def measurement_text(data: Measurement, chain: Chain, comments: Sequence[str] = ()) -> str:
     """Return the CSV text of samples of any kind."""
     check_joint_names(chain)
+    values = data.to_columns()
+    if clashes := sorted(set(values) & set(chain.joint_names)):
+        raise FileFormatError(
+            f"{chain.urdf.source}: joint {clashes[0]!r} has the name of a column of kind {data.kind}; "
+            "rename the joint"
+        )
     count = data.configurations_per_row
     configurations = np.split(data.configurations(), max(count, 1))
     columns: dict[str, Any] = {}
@@ -34,10 +41,8 @@ def value_columns(data: Measurement) -> dict[str, list[Any]]:
     """Return the columns of measured values and standard deviations, in metres, radians and pixels."""
     columns: dict[str, list[Any]] = {}
     for name, values in data.to_columns().items():
-        unit = {"length": "[m]", "angle": "[rad]", "pixel": "[px]", "text": "", "remark": ""}[
-            data.columns[name]
-        ]
-        columns[name + unit] = list(values) if unit == "" else values.tolist()
+        unit = next(iter(UNITS[data.columns[name]]), "")
+        columns[f"{name}[{unit}]" if unit else name] = values.tolist() if unit else list(values)
     return columns
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -136,6 +136,12 @@ class DataTable:
                 )
             columns[name] = Column(name, unit, index)
         return columns
+
+    def without_columns(self, names: Container[str]) -> DataTable:
+        """Return a table whose `columns` lack some names."""
+        out = replace(self)
+        vars(out)["columns"] = {name: column for name, column in self.columns.items() if name not in names}
+        return out
 
     def column_label(self, index: int) -> str:
         """Return how messages call a column: its name without the unit, or its number."""
