@@ -65,3 +65,7 @@ class ImageSource:
     def summarize(self, tools: Array) -> tuple[CameraViews, ...]:
         """Describe the images of each camera."""
         return summarize_views(self.images, tools)
+
+
+# What is measured in the configurations of a plan.
+MeasurementSource = ToolSource | ImageSource
