@@ -30,6 +30,7 @@ extensions = [
     "cli_pages",
     "mathml",
     "plot_pictures",
+    "schema_files",
     "tutorial_pages",
 ]
 exclude_patterns = ["_build", "extensions"]

@@ -19,13 +19,17 @@ import shlex
 import shutil
 import textwrap
 import tomllib
-from dataclasses import fields, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import numpy as np
 import pytest
+import schema_files
+import tomli_w
 from camera_setups import visible_corners, wrong_arm
 from robots import ROOT
 
@@ -33,18 +37,21 @@ import dhcal_pin
 from dhcal_pin import se3
 from dhcal_pin.cameras import Rig
 from dhcal_pin.cli import main
-from dhcal_pin.cli.job import Job
 from dhcal_pin.estimation import parameters
-from dhcal_pin.io import measurement_text
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io import measurement_text, read_dh
 from dhcal_pin.io.rig_file import read_rig
 from dhcal_pin.io.tables import sources
 from dhcal_pin.measurements import CameraCorners
 from dhcal_pin.measurements.mounting import mount_rig
-from dhcal_pin.studies.grid import Setting
+from dhcal_pin.studies import read_study
 
 DOCS = ROOT / "docs"
 PAGES = sorted(path for path in DOCS.rglob("*.md") if "_build" not in path.parts)
-SCHEMAS = DOCS / "reference" / "schemas"
+SCHEMAS = {
+    **schema_files.schemas(),
+    "result": json.loads((DOCS / "reference" / "schemas" / "result.schema.json").read_text()),
+}
 _FENCE = re.compile(r"^( *)```(\w+)\n(.*?)^\1```$", re.DOTALL | re.MULTILINE)
 _OUTPUT = re.compile(r"<!-- output: last (\d+) -->\s*$")
 _NUMBER = re.compile(r"\d+(\.\d+)?(e[-+]?\d+)?")
@@ -201,20 +208,46 @@ def test_examples_follow_the_schemas(page):
     for language, text, _ in blocks(page):
         if name := re.search(r"^# schema: (\w+)$", text, re.MULTILINE):
             assert language == "toml"
-            schema = json.loads((SCHEMAS / f"{name[1]}.schema.json").read_text())
-            jsonschema.validate(tomllib.loads(text), schema)
+            jsonschema.validate(tomllib.loads(text), SCHEMAS[name[1]])
 
 
-def test_schemas_of_settings_have_all_keys():
-    fleet = json.loads((SCHEMAS / "fleet.schema.json").read_text())
-    names = {"name", *(option.name for option in fields(Job))}
-    keys = names | {name.replace("_", "-") for name in names}
-    assert set(fleet["$defs"]["job"]["properties"]) == keys
-    assert set(fleet["properties"]) == keys - {"name"} | {"job"}
-    study = json.loads((SCHEMAS / "study.schema.json").read_text())
-    assert set(study["properties"]["settings"]["properties"]) == {option.name for option in fields(Setting)}
+def test_shipped_studies_follow_the_schema():
     for path in (ROOT / "urdf").glob("*.study.toml"):
-        jsonschema.validate(tomllib.loads(path.read_text()), study)
+        jsonschema.validate(tomllib.loads(path.read_text()), SCHEMAS["study"])
+
+
+def changed_tables(content: Any) -> Iterator[Any]:
+    """Yield copies of a TOML document with one key absent, unknown, or of another type."""
+    if isinstance(content, list):
+        for i, entry in enumerate(content):
+            yield from ([*content[:i], other, *content[i + 1 :]] for other in changed_tables(entry))
+    elif isinstance(content, dict):
+        for key, value in content.items():
+            rest = {other: content[other] for other in content if other != key}
+            yield from (rest, {**rest, f"{key}_": value})
+            yield from ({**content, key: wrong} for wrong in (True, -7.5, "no such text", [], {"a": 1}))
+            yield from ({**content, key: other} for other in changed_tables(value))
+
+
+@pytest.mark.parametrize(
+    ("name", "source", "read"),
+    [
+        ("dh", "arm.dh.toml", read_dh),
+        ("rig", "charuco_rig.toml", read_rig),
+        ("study", ROOT / "urdf" / "figure3.study.toml", read_study),
+    ],
+)
+def test_readers_refuse_what_the_schemas_refuse(name, source, read, examples, tmp_path):
+    validator = jsonschema.Draft202012Validator(SCHEMAS[name])
+    content = tomllib.loads((examples / source).read_text())
+    validator.validate(content)
+    wrong = [each for each in changed_tables(content) if not validator.is_valid(each)]
+    assert len(wrong) > 20
+    path = tmp_path / f"wrong.{name}.toml"
+    for each in wrong:
+        path.write_text(tomli_w.dumps(each), encoding="utf-8")
+        with pytest.raises(DhcalError, match=r"wrong\."):
+            read(path)
 
 
 def test_files_of_a_run_follow_the_schemas(examples, tmp_path, monkeypatch):
@@ -230,9 +263,8 @@ def test_files_of_a_run_follow_the_schemas(examples, tmp_path, monkeypatch):
         "column_map": [tomllib.loads(path.read_text()) for path in (ROOT / "tests" / "maps").glob("*.toml")],
     }
     for name, contents in documents.items():
-        schema = json.loads((SCHEMAS / f"{name}.schema.json").read_text())
         for content in contents:
-            jsonschema.validate(content, schema)
+            jsonschema.validate(content, SCHEMAS[name])
     broken = documents["result"][0] | {"verdict": {"status": "perfect", "reasons": []}}
     with pytest.raises(jsonschema.ValidationError):
-        jsonschema.validate(broken, json.loads((SCHEMAS / "result.schema.json").read_text()))
+        jsonschema.validate(broken, SCHEMAS["result"])

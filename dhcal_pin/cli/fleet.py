@@ -30,11 +30,12 @@ from typing import Any
 
 from .._typing import PathLike
 from ..exceptions import DhcalError, FileFormatError, InvalidArgumentError
+from ..io import toml_table as toml
 from ..io.robot import robot_name
 from ..io.shipped_files import resolve_robot_file
 from ..io.sidecar import sidecar_path
 from ..io.tabular import csv_text
-from ..io.toml_table import TomlTable
+from ..io.toml_table import Key, TomlTable
 from ..messages import message_line
 from ..parallel import end_with_parent
 from .job import Job, option_flags
@@ -96,7 +97,7 @@ def read_fleet(path: PathLike) -> list[FleetJob]:
         )
         name = job_table.get("name", "")
         options = {
-            option.name: _option_value(job_table, option)
+            option.name: option_key(option).read(job_table, option.name)
             for option in fields(Job)
             if option.name in job_table
         }
@@ -113,34 +114,38 @@ def read_fleet(path: PathLike) -> list[FleetJob]:
     return entries
 
 
-def _option_value(table: TomlTable, option: Field[Any]) -> Any:
-    """Check the value of an option and return it in the type of its field."""
-    value, expected = _converted(option, table.get(option.name))
-    if value is None or (option.name == "json" and value == STDOUT):
-        raise table.error(option.name, f"expected {expected}")
-    return value
-
-
-def _converted(option: Field[Any], value: Any) -> tuple[Any, str]:
-    """Return a value in the type of its field, or None, and a description of the values that are expected."""
+def option_key(option: Field[Any]) -> Key:
+    """Declare the key of a manifest for an option."""
     default = () if option.name == "data" else option.default
     if isinstance(default, bool):
-        return (value if isinstance(value, bool) else None), "true or false"
+        return toml.flag(default)
     if isinstance(default, int):
         integer: IntegerType = option.metadata["type"]
-        is_valid = isinstance(value, int) and not isinstance(value, bool) and value >= integer.minimum
-        return (value if is_valid else None), integer.description
+        return toml.whole(integer.minimum, description=integer.description)
     if isinstance(default, tuple):
-        paths = [value] if isinstance(value, str) else value if isinstance(value, list) else [None]
-        return (
-            tuple(paths) if all(isinstance(item, str) for item in paths) else None
-        ), "a path or a list of paths"
+        return Key(
+            "a path or a list of paths",
+            {"type": ["string", "array"], "items": {"type": "string"}},
+            lambda value: all(
+                isinstance(path, str) for path in (value if isinstance(value, list) else [value])
+            ),
+            lambda value: (value,) if isinstance(value, str) else tuple(value),
+        )
     if choices := option.metadata.get("choices"):
-        return (value if value in choices else None), " or ".join(choices)
+        return Key(" or ".join(choices), {"enum": list(choices)}, choices.__contains__)
+    if option.name == "json":
+        return Key(
+            "the path of a file",
+            {"type": "string"},
+            lambda value: isinstance(value, str) and value not in ("", STDOUT),
+        )
     # A number such as the fraction 0.3 may be written without quotes.
-    text = str(value) if isinstance(value, int | float) and not isinstance(value, bool) else value
-    expected = "the path of a file" if option.name == "json" else "a text in quotes"
-    return (text if isinstance(text, str) and text else None), expected
+    return Key(
+        "a text in quotes",
+        {"type": ["string", "number"]},
+        lambda value: isinstance(value, str | int | float) and not isinstance(value, bool) and value != "",
+        str,
+    )
 
 
 def _require_distinct_files(entries: Sequence[FleetJob], path: PathLike) -> None:

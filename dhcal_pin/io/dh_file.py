@@ -37,11 +37,12 @@ from ..exceptions import DhcalError, FileFormatError, UnknownNameError
 from ..robot.chain import extract_dh_table
 from ..robot.dh import CONVENTIONS, Convention, DHTable
 from ..units import ANGLES, LENGTHS
+from . import toml_table as toml
 from .robot_format import ConvertedRobot, RobotSource
 from .sidecar import existing_sidecar
 from .tables import Column, DataTable, read_table
 from .tabular import parse_number, require_usable_names
-from .toml_table import TomlTable, pose_content, read_pose
+from .toml_table import Key, TomlTable
 
 # Columns of numbers with their units, those among them that are required, and the limits with their defaults.
 _UNITS = {"theta": ANGLES, "d": LENGTHS, "a": LENGTHS, "alpha": ANGLES, "beta": ANGLES}
@@ -52,6 +53,38 @@ _JOINT_TYPES = ("revolute", "prismatic")
 _MAX_ENTRY = 1e4
 # Largest number of joints.
 _MAX_JOINTS = 250
+
+# Keys of the file before its joints.
+HEAD_KEYS = {
+    "convention": toml.choice(CONVENTIONS),
+    "units": toml.table_of({"length": toml.choice(LENGTHS), "angle": toml.choice(ANGLES)}, is_optional=False),
+}
+POSE_TABLES = {"base": toml.table_of(toml.POSE_KEYS), "tool": toml.table_of(toml.POSE_KEYS)}
+
+
+def _limit_key(no_limit: float) -> Key:
+    """Declare a limit, which may be infinite."""
+    return Key(
+        "a finite number",
+        {"type": "number"},
+        lambda value: toml.is_number(value) or value in (-math.inf, math.inf),
+        lambda value: float(value) if toml.is_number(value) else no_limit,
+        default=no_limit,
+    )
+
+
+# Keys of a joint; an absent name is made from its number.
+JOINT_KEYS = {
+    "type": toml.choice(_JOINT_TYPES, default="revolute"),
+    "name": toml.text(is_optional=True),
+    **{
+        key: toml.number(
+            description=f"a finite number such as {key} = 0.0", default=None if key in _REQUIRED else 0.0
+        )
+        for key in _UNITS
+    },
+    **{key: _limit_key(no_limit) for key, no_limit in _LIMITS.items()},
+}
 
 # Name, type and numbers of a joint.
 _Row = tuple[str, str, dict[str, float]]
@@ -78,33 +111,21 @@ def read_dh(path: PathLike) -> DHTable:
 
 def _read_dh_toml(path: PathLike) -> DHTable:
     document = TomlTable.read(path)
-    convention = document.choice("convention", CONVENTIONS)
-    units = document.table("units", required=True)
-    lengths, angles = (
-        divisors[units.choice(quantity, divisors)]
-        for quantity, divisors in (("length", LENGTHS), ("angle", ANGLES))
-    )
-    units.finish()
+    head = document.some_values(HEAD_KEYS)
+    lengths, angles = LENGTHS[head["units"]["length"]], ANGLES[head["units"]["angle"]]
     joints = document.tables("joint", expected="one per joint, with theta, d, a and alpha")
-    poses = {key: read_pose(document.table(key)) for key in ("base", "tool") if key in document}
-    document.finish()
+    poses = {key: toml.pose_of(values) for key, values in document.values(POSE_TABLES).items() if values}
     columns: dict[str, list[Any]] = {key: [] for key in ("name", "type", *_UNITS, *_LIMITS)}
-    for number, joint in enumerate(joints, 1):
-        name = joint.get("name", f"joint_{number}")
+    for count, joint in enumerate(joints, 1):
+        name = joint.get("name", f"joint_{count}")
         joint.name = f"joint {name!r}"
-        joint_type = joint.choice("type", _JOINT_TYPES, "revolute")
-        columns["name"].append(joint.text("name", name))
-        columns["type"].append(joint_type)
-        for key, known in _UNITS.items():
-            default = None if key in _REQUIRED else 0.0
-            value = joint.number(key, default, expected=f"a finite number such as {key} = 0.0")
-            columns[key].append(value / (lengths if known is LENGTHS else angles))
-        for key, no_limit in _LIMITS.items():
-            is_infinite = joint.get(key, no_limit) in (-math.inf, math.inf)
-            value = no_limit if is_infinite else joint.number(key)
-            columns[key].append(value / (lengths if joint_type == "prismatic" else angles))
-        joint.finish()
-    return _build_table(document.path, convention, columns, poses)
+        values = joint.values(JOINT_KEYS) | {"name": name}
+        of_limits = lengths if values["type"] == "prismatic" else angles
+        divisors = {key: lengths if known is LENGTHS else angles for key, known in _UNITS.items()}
+        divisors |= dict.fromkeys(_LIMITS, of_limits)
+        for key, column in columns.items():
+            column.append(values[key] / divisors[key] if key in divisors else values[key])
+    return _build_table(document.path, head["convention"], columns, poses)
 
 
 def _read_dh_csv(path: PathLike) -> DHTable:
@@ -167,7 +188,7 @@ def _parse_pose_note(table: DataTable, key: str, note: str) -> Array:
     if len(numbers) != 6:
         raise FileFormatError(f"{table.source}: '# {key}:' needs six numbers: x y z in m, rx ry rz in rad")
     content = {"xyz_m": numbers[:3], "rotvec_rad": numbers[3:]}
-    return read_pose(TomlTable(table.source, content, f"[{key}]"))
+    return toml.read_pose(TomlTable(table.source, content, f"[{key}]"))
 
 
 def _parse_limit(table: DataTable, column: Column, row: int, joint_type: str, no_limit: float) -> float:
@@ -259,7 +280,7 @@ def _csv_text(convention: str, poses: Mapping[str, Array], keys: list[str], rows
 
 def _toml_text(convention: str, poses: Mapping[str, Array], keys: list[str], rows: list[_Row]) -> str:
     head = {"convention": convention, "units": {"length": "m", "angle": "rad"}}
-    blocks = [tomli_w.dumps(head | {key: pose_content(pose) for key, pose in poses.items()})]
+    blocks = [tomli_w.dumps(head | {key: toml.pose_content(pose) for key, pose in poses.items()})]
     for name, joint_type, values in rows:
         finite = {key: value for key, value in values.items() if math.isfinite(value)}
         # One by one, because tomli_w writes short tables of an array on one line each.

@@ -11,18 +11,74 @@ import numpy as np
 
 from .._typing import Array, PathLike
 from ..cameras.boards import BOARD_TYPES, Board
-from ..cameras.lens import FOCAL_AND_CENTRE, LENSES
+from ..cameras.lens import FOCAL_AND_CENTRE, LENSES, Lens
 from ..cameras.rig import INTRINSICS_CHOICES, Camera, Rig
 from ..exceptions import FileFormatError, InvalidArgumentError, UnknownNameError
+from . import toml_table as toml
 from .tabular import MAX_SIDECAR_BYTES
-from .toml_table import TomlTable, is_number, pose_content, read_pose
+from .toml_table import Key, TomlTable
 
 # Largest number of squares or tags along a side, and of pixels along a side of an image.
 _MAX_COUNT, _MAX_PIXELS = 1000, 100_000
 # Largest side of a square and largest coordinate of a point [mm].
 _MAX_MM = 100_000
-# Keys of a pose.
-_POSE_KEYS = ("xyz_m", "rotvec_rad")
+
+_LINK = toml.text('a link of the robot, "world" or "tip"')
+_LENGTH = toml.number(
+    above=0.0, at_most=_MAX_MM, description=f"a length in millimetres above 0 and up to {_MAX_MM:g}"
+)
+# A first guess of a pose needs one of its keys only.
+_FIRST_POSE = {
+    key: replace(declared, default=None, is_optional=True) for key, declared in toml.POSE_KEYS.items()
+}
+_SIZE = {"columns": toml.whole(1, _MAX_COUNT), "rows": toml.whole(1, _MAX_COUNT)}
+# Keys of each type of board, in addition to those of all boards.
+_TYPE_KEYS: dict[str, dict[str, Key]] = {
+    "points": {"points_mm": toml.list_of(toml.vector(3, _MAX_MM, "[x, y, z] in millimetres"))},
+    "checkerboard": {**_SIZE, "square_mm": _LENGTH},
+    "charuco": {
+        **_SIZE,
+        "square_mm": _LENGTH,
+        "marker_mm": _LENGTH,
+        "dictionary": toml.text('a dictionary such as "DICT_5X5_100"'),
+        "legacy": toml.flag(False),
+    },
+    "aprilgrid": {
+        **_SIZE,
+        "marker_mm": _LENGTH,
+        "spacing_mm": _LENGTH,
+        "dictionary": toml.text(default="DICT_APRILTAG_36h11"),
+    },
+}
+
+
+def camera_keys(lens: Lens) -> dict[str, Key]:
+    """Declare the keys of a camera with a lens."""
+    return {
+        "model": toml.choice(LENSES, default="pinhole"),
+        "fx": toml.number(above=0.0, is_optional=True),
+        "fy": toml.number(above=0.0, is_optional=True),
+        "cx": toml.number(is_optional=True),
+        "cy": toml.number(is_optional=True),
+        "distortion": toml.vector(len(lens.coefficients), is_optional=True),
+        "intrinsics": toml.choice(INTRINSICS_CHOICES, default="prior"),
+        "link": _LINK,
+        "width": toml.whole(1, _MAX_PIXELS),
+        "height": toml.whole(1, _MAX_PIXELS),
+        **_FIRST_POSE,
+    }
+
+
+def board_keys(board_type: str) -> dict[str, Key]:
+    """Declare the keys of a board of a type."""
+    return {
+        "type": toml.choice(BOARD_TYPES),
+        "points": toml.choice(("auto", "fixed", "prior"), default="auto"),
+        "link": _LINK,
+        **_FIRST_POSE,
+        **_TYPE_KEYS[board_type],
+    }
+
 
 Entry = TypeVar("Entry", Camera, Board)
 
@@ -142,122 +198,72 @@ def _name(table: TomlTable) -> str:
     return table.name.removeprefix("[").removesuffix("]").split(".", 1)[1]
 
 
-def _first_pose(table: TomlTable) -> Array | None:
+def _first_pose(values: Mapping[str, Any]) -> Array | None:
     """Return the first guess of a pose (4, 4), None without one."""
-    present = [key for key in _POSE_KEYS if key in table]
-    if not present:
-        return None
-    return read_pose(TomlTable(table.path, {key: table.get(key) for key in present}, table.name))
+    given = {key: values[key] for key in toml.POSE_KEYS if values[key] is not None}
+    return (
+        toml.pose_of({key: declared.default for key, declared in toml.POSE_KEYS.items()} | given)
+        if given
+        else None
+    )
 
 
 def _read_camera(table: TomlTable) -> Camera:
     """Read a camera."""
-    lens = LENSES[table.choice("model", LENSES, "pinhole")]
+    lens = LENSES[toml.choice(LENSES, default="pinhole").read(table, "model")]
     given = [name for name in FOCAL_AND_CENTRE if name in table]
     if given and len(given) < 4:
         missing = next(name for name in FOCAL_AND_CENTRE if name not in given)
         raise FileFormatError(
             f"{table.where}: {', '.join(given)} without {missing}; expected all of fx, fy, cx, cy or none"
         )
-    values = np.array([np.nan] * 4 + [0.0] * len(lens.coefficients))
-    if given:
-        values[:2] = [table.number(name, above=0.0) for name in ("fx", "fy")]
-        values[2:4] = [table.number(name) for name in ("cx", "cy")]
-        values[4:] = table.vector("distortion", len(lens.coefficients), values[4:].tolist())
-    elif "distortion" in table:
+    if "distortion" in table and not given:
         raise FileFormatError(
             f"{table.where}: distortion without fx, fy, cx, cy; expected all of them or none"
         )
-    intrinsics = table.choice("intrinsics", INTRINSICS_CHOICES, "prior")
-    if intrinsics == "fixed" and not given:
+    values = table.values(camera_keys(lens))
+    if values["intrinsics"] == "fixed" and not given:
         raise FileFormatError(f'{table.where}: intrinsics = "fixed" without values; expected fx, fy, cx, cy')
-    camera = Camera(
+    stated = [values[name] if given else np.nan for name in FOCAL_AND_CENTRE]
+    return Camera(
         name=_name(table),
-        link=table.text("link", expected='a link of the robot, "world" or "tip"'),
-        width=_count(table, "width", _MAX_PIXELS),
-        height=_count(table, "height", _MAX_PIXELS),
-        values=values,
+        link=values["link"],
+        width=values["width"],
+        height=values["height"],
+        values=np.array(stated + (values["distortion"] or [0.0] * len(lens.coefficients))),
         lens=lens,
-        intrinsics=intrinsics,
-        pose=_first_pose(table),
+        intrinsics=values["intrinsics"],
+        pose=_first_pose(values),
     )
-    table.finish()
-    return camera
-
-
-def _count(table: TomlTable, key: str, at_most: int) -> int:
-    """Return a positive whole number."""
-    value = table.value(key, int, expected=f"a whole number from 1 to {at_most}")
-    if not 1 <= value <= at_most:
-        raise table.error(key, f"expected a whole number from 1 to {at_most}")
-    return value
 
 
 def _read_board(table: TomlTable) -> Board:
     """Read a board."""
-    kind = table.choice("type", BOARD_TYPES)
-    points = table.choice("points", ("auto", "fixed", "prior"), "auto")
-    common: dict[str, Any] = {
-        "name": _name(table),
-        "link": table.text("link", expected='a link of the robot, "world" or "tip"'),
-        "type": kind,
-        "has_free_points": points == "prior",
-        "has_exact_points": points == "fixed",
-        "pose": _first_pose(table),
-        "source": table.where,
-    }
+    kind = toml.choice(BOARD_TYPES).read(table, "type")
+    values = table.values(board_keys(kind))
+    smallest = 1 if kind == "aprilgrid" else 2
+    if kind != "points" and min(values["columns"], values["rows"]) < smallest:
+        raise FileFormatError(f"{table.where}: columns and rows count squares; expected at least 2 each")
+    if kind == "charuco" and values["marker_mm"] >= values["square_mm"]:
+        raise table.error("marker_mm", f"expected less than square_mm = {values['square_mm']:g}")
+    # A square of an AprilGrid is a tag.
+    lengths = {"square": "marker_mm" if kind == "aprilgrid" else "square_mm", "marker": "marker_mm"}
+    lengths |= {"spacing": "spacing_mm"}
+    names = {"columns": "columns", "rows": "rows", "dictionary": "dictionary", "is_legacy": "legacy"}
+    own: dict[str, Any] = {field: values[key] for field, key in names.items() if key in values}
+    own |= {field: values[key] / 1e3 for field, key in lengths.items() if key in values}
     if kind == "points":
-        board = Board(**common, listed_points=_listed_points(table))
-    else:
-        smallest = 1 if kind == "aprilgrid" else 2
-        size: dict[str, Any] = {key: _count(table, key, _MAX_COUNT) for key in ("columns", "rows")}
-        if min(size.values()) < smallest:
-            raise FileFormatError(f"{table.where}: columns and rows count squares; expected at least 2 each")
-        if kind == "aprilgrid":
-            marker = _millimetres(table, "marker_mm")
-            board = Board(
-                **common,
-                **size,
-                square=marker,
-                marker=marker,
-                spacing=_millimetres(table, "spacing_mm"),
-                dictionary=table.text("dictionary", "DICT_APRILTAG_36h11"),
-            )
-        else:
-            square = _millimetres(table, "square_mm")
-            markers: dict[str, Any] = {}
-            if kind == "charuco":
-                markers = {
-                    "marker": _millimetres(table, "marker_mm"),
-                    "dictionary": table.text("dictionary", expected='a dictionary such as "DICT_5X5_100"'),
-                    "is_legacy": table.value("legacy", bool, False),
-                }
-                if markers["marker"] >= square:
-                    raise table.error("marker_mm", f"expected less than square_mm = {1e3 * square:g}")
-            board = Board(**common, **size, square=square, **markers)
-    table.finish()
-    return board
-
-
-def _millimetres(table: TomlTable, key: str) -> float:
-    """Return a positive length in millimetres, in metres."""
-    expected = f"a length in millimetres above 0 and up to {_MAX_MM:g}"
-    return table.number(key, above=0.0, at_most=_MAX_MM, expected=expected) / 1e3
-
-
-def _listed_points(table: TomlTable) -> Array:
-    """Return the points of a board of that type, (c, 3) [m]."""
-    points = table.array("points_mm")
-    for point in points:
-        if not (
-            isinstance(point, list)
-            and len(point) == 3
-            and all(is_number(v) and abs(v) < _MAX_MM for v in point)
-        ):
-            raise FileFormatError(
-                f"{table.where}: points_mm has the entry {point!r}; expected [x, y, z] in millimetres"
-            )
-    return np.array(points, float) / 1e3
+        own["listed_points"] = np.array(values["points_mm"]) / 1e3
+    return Board(
+        name=_name(table),
+        link=values["link"],
+        type=kind,
+        has_free_points=values["points"] == "prior",
+        has_exact_points=values["points"] == "fixed",
+        pose=_first_pose(values),
+        source=table.where,
+        **own,
+    )
 
 
 def rig_text(cameras: Sequence[Camera], boards: Sequence[Board]) -> str:
@@ -306,4 +312,4 @@ def rig_content(cameras: Sequence[Camera], boards: Sequence[Board]) -> dict[str,
 
 def _pose_entry(pose: Array | None) -> dict[str, list[float]]:
     """Return the keys of a first guess of a pose."""
-    return {} if pose is None else pose_content(pose)
+    return {} if pose is None else toml.pose_content(pose)

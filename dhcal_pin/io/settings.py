@@ -9,32 +9,38 @@ from .._typing import PathLike
 from ..estimation.priors import MAX_PRIOR_STD, MIN_PRIOR_STD, Priors
 from ..exceptions import InvalidArgumentError
 from ..robot.transmission import Payload
+from . import toml_table as toml
 from .sidecar import MAX_PAYLOAD_DISTANCE_M, MAX_PAYLOAD_KG
-from .toml_table import TomlTable, is_number
+from .toml_table import Key, TomlTable
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _PAYLOAD = re.compile(rf"({_NUMBER})kg(?:@({_NUMBER}),({_NUMBER}),({_NUMBER})(mm|cm|m))?")
+# Bounds of a parameter. Unlike other numbers, a bound may be infinite.
+BOUNDS = Key(
+    'the least and the largest value in m or rad, such as "d2" = [0.12, 0.13]',
+    {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2},
+    lambda value: (
+        isinstance(value, list)
+        and len(value) == 2
+        and all(isinstance(bound, float) or toml.is_number(bound) for bound in value)
+        and value[0] < value[1]
+    ),
+    lambda value: (float(value[0]), float(value[1])),
+)
+# Prior standard deviation of a parameter.
+PRIOR = toml.number(
+    MIN_PRIOR_STD,
+    MAX_PRIOR_STD,
+    description=f"a positive standard deviation in m or rad from {MIN_PRIOR_STD:g} to {MAX_PRIOR_STD:g}, "
+    'such as "theta*" = 0.01; use --fix for a parameter that is known exactly',
+)
 # Metres per unit of the centre of a payload.
 _METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 
 
 def read_bounds(path: PathLike | None) -> dict[str, tuple[float, float]]:
     """Read the bounds of parameters."""
-    if not path:
-        return {}
-    table = TomlTable.read(path)
-    bounds: dict[str, tuple[float, float]] = {}
-    for name in table.keys():
-        value = table.get(name)
-        pair = value if isinstance(value, list) and len(value) == 2 else []
-        # Unlike other numbers, a bound may be infinite.
-        numbers = [float(v) for v in pair if isinstance(v, float) or is_number(v)]
-        if len(numbers) != 2 or not numbers[0] < numbers[1]:
-            raise table.error(
-                name, 'expected the least and the largest value in m or rad, such as "d2" = [0.12, 0.13]'
-            )
-        bounds[name] = numbers[0], numbers[1]
-    return bounds
+    return TomlTable.read(path).values_by_name(BOUNDS) if path else {}
 
 
 def read_priors(choice: str | None) -> Priors | None:
@@ -45,15 +51,7 @@ def read_priors(choice: str | None) -> Priors | None:
         raise InvalidArgumentError(
             f"--priors {choice}: unknown choice; expected default, none, or a file of standard deviations"
         )
-    table = TomlTable.read(choice)
-    expected = (
-        f"a positive standard deviation in m or rad from {MIN_PRIOR_STD:g} to {MAX_PRIOR_STD:g}, such as "
-        '"theta*" = 0.01; use --fix for a parameter that is known exactly'
-    )
-    return {
-        name: table.number(name, at_least=MIN_PRIOR_STD, at_most=MAX_PRIOR_STD, expected=expected)
-        for name in table.keys()
-    }
+    return TomlTable.read(choice).values_by_name(PRIOR)
 
 
 def parse_payload(text: str) -> Payload:

@@ -93,14 +93,83 @@ from ..robot.transmission import (
 )
 from ..robot.urdf import Urdf, parse_urdf, suggest_names
 from ..saving import complete_interrupted_save
+from . import toml_table as toml
 from .rig_file import rig_content
 from .tabular import MAX_SIDECAR_BYTES
-from .toml_table import TomlTable, is_number, pose_content, read_pose
+from .toml_table import Key, TomlTable
 
 # Heaviest payload [kg] and farthest centre [m]; beyond them the unit is wrong.
 MAX_PAYLOAD_KG, MAX_PAYLOAD_DISTANCE_M = 1e5, 1e2
 # Largest coefficient of a joint error, in its unit.
 _MAX_COEFFICIENT = 1e6
+_COEFFICIENT = toml.number(-_MAX_COEFFICIENT, _MAX_COEFFICIENT, description="a finite number", default=0.0)
+_HARMONIC = Key(
+    f"[order, sin_rad, cos_rad] with an order from 1 to {MAX_CURVE_ORDER}, such as [1, 2e-4, -1e-4]",
+    {"type": "array", "minItems": 3, "maxItems": 3, "items": {"type": "number"}},
+    lambda value: (
+        isinstance(value, list)
+        and len(value) == 3
+        and all(toml.is_number(entry) and abs(entry) <= _MAX_COEFFICIENT for entry in value)
+        and isinstance(value[0], int)
+        and 1 <= value[0] <= MAX_CURVE_ORDER
+    ),
+)
+_NAMES = Key("a list of names", {"type": "array", "items": {"type": "string"}})
+_BASE64 = Key("base64 text", {"type": "string"})
+_PAYLOAD_KEYS = {
+    "mass_kg": toml.number(above=0, at_most=MAX_PAYLOAD_KG),
+    "centre_m": toml.vector(3, MAX_PAYLOAD_DISTANCE_M, default=(0.0, 0.0, 0.0)),
+}
+_MANIFEST_KEYS = {"urdf_sha256": toml.text(), "joints_sha256": toml.text(default="")}
+# Temperature at which the links have the lengths of the URDF [°C].
+_REFERENCE = toml.number(*TEMPERATURE_RANGE)
+_THERMAL_KEYS = {
+    "reference_degc": _REFERENCE,
+    **{term.sidecar_key: toml.table_by_name(_COEFFICIENT) for term in LINK_TERMS.values()},
+}
+# A prismatic joint has the first of these keys only.
+_JOINT_KEYS = {
+    "gain": _COEFFICIENT,
+    "harmonics": toml.list_of(_HARMONIC, default=()),
+    **{term.sidecar_key: _COEFFICIENT for term in JOINT_TERMS.values()},
+    "coupling": toml.table_by_name(_COEFFICIENT),
+}
+_UNCERTAINTY_KEYS = {
+    "joints": _NAMES,
+    "terms": _NAMES,
+    "sqrt_covariance": _BASE64,
+    "unbounded_directions": _BASE64,
+    "frame_part": replace(_BASE64, is_optional=True),
+    "temperature": toml.number(1, default=1.0),
+    "model_std_m": toml.number(0, default=0.0),
+    "model_std_rad": toml.number(0, default=0.0),
+}
+_MEASURED_KEYS = {
+    "joints": _NAMES,
+    # One number per joint.
+    **{key: toml.list_of(toml.number()) for key in ("lower", "upper", "spread")},
+    "radius": toml.number(0),
+    "reach": toml.number(0),
+    "configurations": _BASE64,
+}
+_FRAME_KEYS = {
+    "tip": toml.text(is_optional=True),
+    "base": toml.table_of(toml.POSE_KEYS),
+    "tool": toml.table_of(toml.POSE_KEYS),
+    "payload": toml.table_of(_PAYLOAD_KEYS),
+    "manifest": toml.table_of(_MANIFEST_KEYS),
+}
+# Tables of a sidecar; those of cameras and boards are those of rig files.
+SIDECAR_KEYS = {
+    **_FRAME_KEYS,
+    "joint": toml.table_by_name(toml.table_of(_JOINT_KEYS)),
+    "thermal": toml.table_of(_THERMAL_KEYS),
+    "instrument": toml.table_by_name(toml.number()),
+    "uncertainty": toml.table_of(_UNCERTAINTY_KEYS),
+    "measured": toml.table_of(_MEASURED_KEYS),
+    "camera": toml.table_by_name(Key()),
+    "board": toml.table_by_name(Key()),
+}
 # Keys of single harmonics, which the key `harmonics` replaces.
 _FORMER_HARMONIC_KEYS = ("sin_rad", "cos_rad", "sin2_rad", "cos2_rad")
 # Entry of `harmonics` as tomli_w writes it.
@@ -153,33 +222,34 @@ def existing_sidecar(path: PathLike) -> str | None:
 def with_sidecar(chain: Chain, path: PathLike) -> Chain:
     """Return a chain with the frames, the payload and the joint errors of a sidecar."""
     table = TomlTable.read(path, MAX_SIDECAR_BYTES)
-    tip = table.text("tip", chain.tip)
+    read = table.some_values(_FRAME_KEYS)
+    tip = chain.tip if read["tip"] is None else read["tip"]
     if tip not in chain.urdf.links:
         raise UnknownNameError(
             f"{table.where}: tip = {quote(tip)}: no such link; {suggest_names(tip, chain.urdf.links)}"
         )
-    frames = {key: read_pose(table.table(key)) for key in ("base", "tool") if key in table}
-    payload = _read_payload(table.table("payload")) if "payload" in table else None
+    frames = {key: toml.pose_of(read[key]) for key in ("base", "tool") if read[key] is not None}
     joints = table.table("joint") if "joint" in table else None
     thermal = table.table("thermal") if "thermal" in table else None
-    if "manifest" in table:
-        _check_manifest(table.table("manifest"), chain.urdf, tip)
-    # `read_instrument`, `read_uncertainty` and `read_measured_region` read these tables; those of cameras and
-    # boards are for people, and for rig files.
-    for key in ("instrument", "uncertainty", "measured", "camera", "board"):
+    if read["manifest"] is not None:
+        _check_manifest(read["manifest"], table.path, chain.urdf, tip)
+    # `read_instrument`, `read_uncertainty` and `read_measured_region` read the other tables; those of cameras
+    # and boards are for people, and for rig files.
+    for key in SIDECAR_KEYS:
         table.get(key, {})
     table.finish()
     if tip != chain.tip:
         frames.pop("tool", None)
     chain = replace(chain, **frames)
-    if payload is not None:
+    if read["payload"] is not None:
         if tip != chain.tip:
             raise FileFormatError(
                 f"{table.where}: [payload] is carried by {tip!r}; select that link with --tip"
             )
-        chain = chain.with_payload(payload)
+        payload = read["payload"]
+        chain = chain.with_payload(Payload(payload["mass_kg"], tuple(payload["centre_m"])))
     if thermal is not None:
-        chain = replace(chain, reference_temperature=_read_reference(thermal))
+        chain = replace(chain, reference_temperature=_REFERENCE.read(thermal, "reference_degc"))
     if joints is not None or thermal is not None:
         chain = chain.with_transmission(_read_transmission(chain, joints, thermal))
     return chain
@@ -189,23 +259,21 @@ def read_tool(path: PathLike) -> Array:
     """Read the pose of a tool."""
     table = TomlTable.read(path, MAX_SIDECAR_BYTES)
     if "tool" in table:
-        return read_pose(table.table("tool"))
+        return toml.read_pose(table.table("tool"))
     if "xyz_m" not in table and "rotvec_rad" not in table:
         raise FileFormatError(f"{table.where}: no tool; expected xyz_m and rotvec_rad, or a table [tool]")
-    return read_pose(table)
+    return toml.read_pose(table)
 
 
-def _check_manifest(table: TomlTable, urdf: Urdf, tip: str) -> None:
+def _check_manifest(manifest: Mapping[str, str], path: str, urdf: Urdf, tip: str) -> None:
     """Require that the sidecar was written with this URDF, or with one that has the same joints.
 
     Only the joints from the root to the tip count: a changed mesh or another gripper does not matter.
     """
-    digest, joints_digest = table.text("urdf_sha256"), table.text("joints_sha256", "")
-    table.finish()
     actual = hashlib.sha256(urdf.data).hexdigest()
-    if digest != actual and joints_digest != _joints_digest(urdf, tip):
+    if manifest["urdf_sha256"] != actual and manifest["joints_sha256"] != _joints_digest(urdf, tip):
         raise FileFormatError(
-            f"{table.path}: does not belong to {urdf.source}: it was written with another content of that "
+            f"{path}: does not belong to {urdf.source}: it was written with another content of that "
             "file; calibrate again, restore the other file, or, if you edited the robot yourself, write "
             f'urdf_sha256 = "{actual}" in [manifest]'
         )
@@ -227,13 +295,6 @@ def _joints_digest(urdf: Urdf, tip: str) -> str:
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
-def _read_payload(table: TomlTable) -> Payload:
-    mass = table.number("mass_kg", above=0, at_most=MAX_PAYLOAD_KG)
-    x, y, z = table.vector("centre_m", 3, (0.0, 0.0, 0.0), at_most=MAX_PAYLOAD_DISTANCE_M)
-    table.finish()
-    return Payload(mass, (x, y, z))
-
-
 def _read_transmission(chain: Chain, joints: TomlTable | None, thermal: TomlTable | None) -> Transmission:
     """Read the tables [joint.NAME] and [thermal]; joints and links that are not on the chain are ignored."""
     coefficients = np.zeros(n_coefficients(*chain.mimic_matrix.shape))
@@ -250,26 +311,19 @@ def _read_transmission(chain: Chain, joints: TomlTable | None, thermal: TomlTabl
     return Transmission(coefficients, chain.loads)
 
 
-def _read_reference(table: TomlTable) -> float:
-    """Return the temperature at which the links have the lengths of the URDF [°C]."""
-    low, high = TEMPERATURE_RANGE
-    return table.number("reference_degc", at_least=low, at_most=high)
-
-
 def _read_links(chain: Chain, table: TomlTable, coefficients: Array) -> None:
     """Read the coefficients of links, by family and name of the link, into those of a transmission (c,)."""
     *_, link_terms = split_coefficients(coefficients, chain.n_joints)
+    values = table.values(_THERMAL_KEYS)
     for row, term in zip(link_terms, LINK_TERMS.values(), strict=True):
-        links = table.table(term.sidecar_key)
-        for name in links.keys():
-            value = _coefficient(links, name)
+        for name, value in values[term.sidecar_key].items():
             if name in chain.link_names:
                 row[chain.link_names.index(name)] = value
             elif name not in chain.urdf.links:
+                where = table.table(term.sidecar_key).where
                 raise UnknownNameError(
-                    f"{links.where}: unknown link {name!r}; choose from {', '.join(chain.link_names)}"
+                    f"{where}: unknown link {name!r}; choose from {', '.join(chain.link_names)}"
                 )
-    table.finish()
 
 
 def _joints_off_path(chain: Chain) -> set[str]:
@@ -282,67 +336,35 @@ def _read_joint(chain: Chain, i: int, table: TomlTable, coefficients: Array) -> 
     linear, harmonics, joint_terms, _ = split_coefficients(coefficients, chain.n_joints)
     if chain.is_prismatic[i]:
         table.name += " (prismatic)"
-    linear[i, i] = _coefficient(table, "gain")
-    if not chain.is_prismatic[i]:
-        harmonics[:, :, i] = _read_harmonics(table)
-        joint_terms[:, i] = [_coefficient(table, term.sidecar_key) for term in JOINT_TERMS.values()]
-        coupling = table.table("coupling")
-        others = {name: j for j, name in enumerate(chain.joint_names) if j != i}
-        for name in coupling.keys():
-            value = _coefficient(coupling, name)
-            if name in others:
-                linear[i, others[name]] = value
-            elif name not in _joints_off_path(chain):
-                raise UnknownNameError(
-                    f"{coupling.where}: {name!r} is not another joint; choose from {', '.join(others)}"
-                )
-    table.finish()
-
-
-def _read_harmonics(table: TomlTable) -> Array:
-    """Return the harmonics of a joint, shape (K, 2) [rad]."""
+        linear[i, i] = table.values({"gain": _COEFFICIENT})["gain"]
+        return
     for key in _FORMER_HARMONIC_KEYS:
         if key in table.keys():
             raise FileFormatError(
                 f"{table.where}: unknown key {key!r}; write harmonics = [[order, sin_rad, cos_rad], ...]"
             )
-    out = np.zeros((MAX_CURVE_ORDER, 2))
-    entries = table.array("harmonics") if "harmonics" in table else []
-    orders = [_checked_harmonic(table, entry)[0] for entry in entries]
-    for order, entry in zip(orders, entries, strict=True):
+    values = table.values(_JOINT_KEYS)
+    linear[i, i] = values["gain"]
+    joint_terms[:, i] = [values[term.sidecar_key] for term in JOINT_TERMS.values()]
+    others = {name: j for j, name in enumerate(chain.joint_names) if j != i}
+    for name, value in values["coupling"].items():
+        if name in others:
+            linear[i, others[name]] = value
+        elif name not in _joints_off_path(chain):
+            raise UnknownNameError(
+                f"{table.table('coupling').where}: {name!r} is not another joint; choose from "
+                f"{', '.join(others)}"
+            )
+    orders = [order for order, *_ in values["harmonics"]]
+    for order, *factors in values["harmonics"]:
         if orders.count(order) > 1:
             raise FileFormatError(f"{table.where}: harmonics has the order {order} twice; write it once")
-        out[order - 1] = entry[1:]
-    return out
-
-
-def _checked_harmonic(table: TomlTable, entry: Any) -> list[Any]:
-    """Return an entry of `harmonics` after checking it: order, sine and cosine."""
-    is_valid = (
-        isinstance(entry, list)
-        and len(entry) == 3
-        and all(is_number(value) and abs(value) <= _MAX_COEFFICIENT for value in entry)
-        and isinstance(entry[0], int)
-        and 1 <= entry[0] <= MAX_CURVE_ORDER
-    )
-    if not is_valid:
-        raise FileFormatError(
-            f"{table.where}: harmonics has the entry {entry!r}; expected [order, sin_rad, cos_rad] with an "
-            f"order from 1 to {MAX_CURVE_ORDER}, such as [1, 2e-4, -1e-4]"
-        )
-    return entry
-
-
-def _coefficient(table: TomlTable, key: str) -> float:
-    return table.number(
-        key, 0.0, at_least=-_MAX_COEFFICIENT, at_most=_MAX_COEFFICIENT, expected="a finite number"
-    )
+        harmonics[order - 1, :, i] = factors
 
 
 def read_instrument(path: PathLike) -> dict[str, float]:
     """Read the table [instrument] of a sidecar or of a file of surveyed values."""
-    table = TomlTable.read(path, MAX_SIDECAR_BYTES).table("instrument")
-    return {name: table.number(name) for name in table.keys()}
+    return SIDECAR_KEYS["instrument"].read(TomlTable.read(path, MAX_SIDECAR_BYTES), "instrument")
 
 
 def read_uncertainty(path: PathLike, chain: Chain) -> Uncertainty | None:
@@ -351,17 +373,9 @@ def read_uncertainty(path: PathLike, chain: Chain) -> Uncertainty | None:
     if "uncertainty" not in document:
         return None
     table = document.table("uncertainty")
-    joints, terms = (table.get(key, expected="a list of names") for key in ("joints", "terms"))
-    texts = {
-        key: table.get(key, expected="base64 text") for key in ("sqrt_covariance", "unbounded_directions")
-    }
-    has_frame_part = "frame_part" in table
-    if has_frame_part:
-        texts["frame_part"] = table.get("frame_part", expected="base64 text")
-    temperature = table.number("temperature", 1.0, at_least=1)
-    model_std = (table.number("model_std_m", 0.0, at_least=0), table.number("model_std_rad", 0.0, at_least=0))
-    table.finish()
-    if joints != list(chain.moving_joints):
+    values = table.values(_UNCERTAINTY_KEYS)
+    terms = values["terms"]
+    if values["joints"] != list(chain.moving_joints):
         raise table.error("joints", f"expected the joints of this robot: {', '.join(chain.moving_joints)}")
     indices = _coefficient_indices(chain)
     if not isinstance(terms, list):
@@ -370,14 +384,19 @@ def read_uncertainty(path: PathLike, chain: Chain) -> Uncertainty | None:
         choices = ", ".join(fold_harmonics(indices))
         raise UnknownNameError(f"{table.where}: terms has {quote(unknown[0])}; choose from {choices}")
     n_rows = 6 * (len(chain.moving_joints) + 1) + len(terms)
-    columns = {key: _decode_rows(text, n_rows, f"{table.where}: {key}") for key, text in texts.items()}
+    columns = {
+        key: _decode_rows(values[key], n_rows, f"{table.where}: {key}")
+        for key in ("sqrt_covariance", "unbounded_directions", "frame_part")
+        if values[key] is not None
+    }
     n_columns = columns["sqrt_covariance"].shape[1] + columns["unbounded_directions"].shape[1]
-    if has_frame_part and columns["frame_part"].shape[1] != n_columns:
+    if "frame_part" in columns and columns["frame_part"].shape[1] != n_columns:
         raise table.error("frame_part", f"expected {n_columns} columns, as in the other two arrays together")
     entries = np.array([indices[name] for name in terms], int)
     if terms and chain.transmission is None:
         chain = chain.with_transmission(Transmission.zero(chain.loads))
-    return Uncertainty(chain, entries, temperature=temperature, model_std=model_std, **columns)
+    model_std = (values["model_std_m"], values["model_std_rad"])
+    return Uncertainty(chain, entries, temperature=values["temperature"], model_std=model_std, **columns)
 
 
 def read_measured_region(path: PathLike, chain: Chain) -> MeasuredRegion | None:
@@ -386,18 +405,16 @@ def read_measured_region(path: PathLike, chain: Chain) -> MeasuredRegion | None:
     if "measured" not in document:
         return None
     table = document.table("measured")
-    joints = table.get("joints", expected="a list of names")
-    lower, upper, spread = (table.vector(key, chain.n_joints) for key in ("lower", "upper", "spread"))
-    radius, reach = (table.number(key, at_least=0) for key in ("radius", "reach"))
-    text = table.get("configurations", expected="base64 text")
-    table.finish()
-    if joints != list(chain.joint_names):
+    sides = ("lower", "upper", "spread")
+    values = table.values(_MEASURED_KEYS | dict.fromkeys(sides, toml.vector(chain.n_joints)))
+    if values["joints"] != list(chain.joint_names):
         raise table.error("joints", f"expected the joints of this robot: {', '.join(chain.joint_names)}")
-    rows = _decode_rows(text, chain.n_joints, f"{table.where}: configurations")
+    rows = _decode_rows(values["configurations"], chain.n_joints, f"{table.where}: configurations")
     if not rows.size:
         raise table.error("configurations", "expected at least one configuration")
+    lower, upper, spread = (np.array(values[key]) for key in sides)
     return MeasuredRegion(
-        chain.is_prismatic, np.array(lower), np.array(upper), np.array(spread), rows.T.copy(), radius, reach
+        chain.is_prismatic, lower, upper, spread, rows.T.copy(), values["radius"], values["reach"]
     )
 
 
@@ -456,7 +473,7 @@ def sidecar_text(
     header += _THERMAL_HEADER if "thermal" in tables else ""
     header += _UNCERTAINTY_HEADER if "uncertainty" in tables else ""
     header += _MEASURED_HEADER if "measured" in tables else ""
-    frames = {"base": pose_content(chain.base), "tool": pose_content(tool)}
+    frames = {"base": toml.pose_content(chain.base), "tool": toml.pose_content(tool)}
     content = {"tip": chain.tip, **frames, "manifest": _manifest_content(urdf, chain.tip), **tables}
     # tomli_w writes each number on a line of its own; one line per harmonic is easier to read.
     return header + _HARMONIC_LINES.sub(r"    [\1, \2, \3]", _toml_text(content))

@@ -1,24 +1,26 @@
-"""Tables of TOML files, read key by key with checks.
+"""Tables of TOML files, and declarations of their keys.
 
-A reader asks for each key that it knows, with the type and the range that it expects, and calls `finish` at
-the end:
+A reader declares the keys that it knows, with the type, the limits and the default of each:
+
+    PAYLOAD_KEYS = {"mass_kg": number(above=0), "centre_m": vector(3, default=(0.0, 0.0, 0.0))}
 
     table = TomlTable.read("arm.calibration.toml")
-    payload = table.table("payload")
-    mass = payload.number("mass_kg", above=0)
-    centre = payload.vector("centre_m", 3, default=(0.0, 0.0, 0.0))
-    payload.finish()
+    payload = table.table("payload").values(PAYLOAD_KEYS)
 
 Every error is a `FileFormatError` that names the file, the table, the key, the value and what is expected. A
-key that no one asked for is an error of `finish`, which names the keys that are allowed.
+key that is not declared is an error, which names the keys that are allowed. The documentation writes its JSON
+schemas from the same declarations (`docs/extensions/schema_files.py`).
 """
 
 from __future__ import annotations
 
 import difflib
+import math
 import os
-from collections.abc import Iterable, Sequence
-from typing import Any, TypeVar
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 from .. import se3
 from .._typing import Array, PathLike
@@ -26,13 +28,10 @@ from ..exceptions import FileFormatError
 from ..messages import quote
 from .tabular import MAX_TOML_BYTES, read_toml
 
-T = TypeVar("T", str, int, bool)
-
 # Largest number that remains a finite double after a conversion of units.
-_MAX_NUMBER = 1e300
+MAX_NUMBER = 1e300
 # Largest component of a pose [m or rad]; a larger one has the wrong unit.
 _MAX_POSE_VALUE = 1e4
-_TYPE_NAMES = {str: "a text in quotes", int: "a whole number", bool: "true or false"}
 
 
 class TomlTable:
@@ -89,70 +88,19 @@ class TomlTable:
         given = f"; the keys given are {', '.join(self._raw)}" if self._raw else ""
         raise FileFormatError(f"{self.where}: {key} is missing; expected {expected}{given}")
 
-    def number(
-        self,
-        key: str,
-        default: float | None = None,
-        *,
-        at_least: float = -_MAX_NUMBER,
-        above: float | None = None,
-        at_most: float = _MAX_NUMBER,
-        expected: str = "",
-    ) -> float:
-        """Return a finite number."""
-        expected = expected or _range_text(at_least, above, at_most)
-        value = self.get(key, default, expected=expected)
-        if not is_number(value) or not at_least <= value <= at_most or (above is not None and value <= above):
-            raise self.error(key, f"expected {expected}")
-        return float(value)
+    def some_values(self, keys: Mapping[str, Key]) -> dict[str, Any]:
+        """Return the values of declared keys."""
+        return {key: declared.read(self, key) for key, declared in keys.items()}
 
-    def value(self, key: str, kind: type[T], default: T | None = None, *, expected: str = "") -> T:
-        """Return a text, a whole number or a truth value."""
-        expected = expected or _TYPE_NAMES[kind]
-        value = self.get(key, default, expected=expected)
-        if type(value) is not kind:
-            raise self.error(key, f"expected {expected}")
-        return value
+    def values(self, keys: Mapping[str, Key]) -> dict[str, Any]:
+        """Return the values of declared keys; any other key is an error."""
+        values = self.some_values(keys)
+        self.finish()
+        return values
 
-    def text(self, key: str, default: str | None = None, *, expected: str = "") -> str:
-        """Return a text."""
-        return self.value(key, str, default, expected=expected)
-
-    def choice(self, key: str, choices: Iterable[str], default: str | None = None) -> str:
-        """Return one of several texts."""
-        choices = list(choices)
-        # Micro has two code points in Unicode: units are listed in their ASCII spelling only.
-        names = ", ".join(f'"{choice}"' for choice in choices if choice.isascii())
-        value = self.get(key, default, expected=f"one of {names}")
-        if value not in choices:
-            raise self.error(key, f"choose from {names}")
-        return value
-
-    def array(self, key: str, default: Sequence[Any] | None = None, *, size: int | None = None) -> list[Any]:
-        """Return a list of any values."""
-        expected = "a list in brackets" + ("" if size is None else f" with {size} entries")
-        value = self.get(key, default, expected=expected)
-        if isinstance(value, str) or not isinstance(value, Sequence) or not value:
-            raise self.error(key, f"expected {expected}")
-        if size is not None and len(value) != size:
-            raise FileFormatError(f"{self.where}: {key} has {len(value)} entries; expected {size}")
-        return list(value)
-
-    def vector(
-        self, key: str, size: int, default: Sequence[float] | None = None, *, at_most: float = _MAX_NUMBER
-    ) -> list[float]:
-        """Return a list of finite numbers."""
-        limit = f" up to ±{at_most:g}" if at_most < _MAX_NUMBER else ""
-        expected = f"{size} numbers{limit}, such as {[0.0] * size}"
-        value = self.get(key, default, expected=expected)
-        if (
-            isinstance(value, str)
-            or not isinstance(value, Sequence)
-            or len(value) != size
-            or not all(is_number(entry) and abs(entry) <= at_most for entry in value)
-        ):
-            raise self.error(key, f"expected {expected}")
-        return [float(entry) for entry in value]
+    def values_by_name(self, each: Key) -> dict[str, Any]:
+        """Return the values of a table whose keys are names."""
+        return self.some_values(dict.fromkeys(self._raw, each))
 
     def table(self, key: str, *, required: bool = False) -> TomlTable:
         """Return a table of this table."""
@@ -176,28 +124,213 @@ class TomlTable:
                 raise FileFormatError(f"{self.where}: unknown key {key!r}; choose from {allowed}")
 
 
+# --- declarations ----------------------------------------------------------------------------------
+
+
 def is_number(value: object) -> bool:
     """Return whether a TOML value is a finite number."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _MAX_NUMBER
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MAX_NUMBER
 
 
-def _range_text(at_least: float, above: float | None, at_most: float) -> str:
-    limits = []
-    if above is not None:
-        limits.append(f"above {above:g}")
-    if at_least > -_MAX_NUMBER:
-        limits.append(f"of at least {at_least:g}")
-    if at_most < _MAX_NUMBER:
-        limits.append(f"of at most {at_most:g}")
-    return f"a number {' and '.join(limits)}" if limits else "a finite number"
+@dataclass(frozen=True)
+class Key:
+    """Declaration of the value of a key; the functions below make those of each type.
+
+    Attributes:
+        description: Allowed values, for messages.
+        schema: The same as a JSON schema.
+        accepts: Whether a value is allowed.
+        converted: Allowed value in the type that readers use.
+        default: Value of an absent key; None if it has none.
+        is_optional: Whether a key without a default may be absent; its value is then None.
+        remedy: End of the message on another value; what is expected if it is empty.
+    """
+
+    description: str = "a value"
+    schema: Mapping[str, Any] = field(default_factory=dict)
+    accepts: Callable[[Any], bool] = lambda value: True
+    converted: Callable[[Any], Any] = lambda value: value
+    default: Any = None
+    is_optional: bool = False
+    remedy: str = ""
+
+    @property
+    def is_required(self) -> bool:
+        """Whether an absent key is an error."""
+        return self.default is None and not self.is_optional
+
+    def read(self, table: TomlTable, key: str) -> Any:
+        """Return the value of a key of a table."""
+        if self.is_optional and key not in table:
+            return None
+        value = table.get(key, self.default, expected=self.description)
+        if key in table and not self.accepts(value):
+            raise table.error(key, self.remedy or f"expected {self.description}")
+        return self.converted(value)
+
+
+@dataclass(frozen=True)
+class ListKey(Key):
+    """Declaration of a list of `size` entries, each as `entry` declares it."""
+
+    entry: Key = field(default_factory=Key)
+    size: int | None = None
+
+    def read(self, table: TomlTable, key: str) -> list[Any] | None:
+        """Return the entries of a list."""
+        values = super().read(table, key)
+        if values is None:
+            return None
+        if self.size not in (None, len(values)):
+            raise FileFormatError(f"{table.where}: {key} has {len(values)} entries; expected {self.size}")
+        for value in values:
+            if not self.entry.accepts(value):
+                raise FileFormatError(
+                    f"{table.where}: {key} has the entry {value!r}; expected {self.entry.description}"
+                )
+        return [self.entry.converted(value) for value in values]
+
+
+@dataclass(frozen=True)
+class TableKey(Key):
+    """Declaration of a table: its keys, or `each` if its keys are names that the user chooses."""
+
+    keys: Mapping[str, Key] = field(default_factory=dict)
+    each: Key | None = None
+
+    def read(self, table: TomlTable, key: str) -> dict[str, Any] | None:
+        """Return the values of a table by their keys."""
+        if self.is_optional and key not in table:
+            return None
+        inner = table.table(key, required=self.is_required)
+        return inner.values(self.keys) if self.each is None else inner.values_by_name(self.each)
+
+
+def table_schema(keys: Mapping[str, Key]) -> dict[str, Any]:
+    """Return the JSON schema of a table with these keys."""
+    return {
+        "type": "object",
+        "required": [key for key, declared in keys.items() if declared.is_required],
+        "properties": {key: declared.schema for key, declared in keys.items()},
+        "additionalProperties": False,
+    }
+
+
+def table_of(keys: Mapping[str, Key], *, is_optional: bool = True) -> Key:
+    """Declare a table with these keys."""
+    return TableKey(schema=table_schema(keys), is_optional=is_optional, keys=keys)
+
+
+def table_by_name(each: Key) -> Key:
+    """Declare a table whose keys are names; it is empty if it is absent."""
+    return TableKey(schema={"type": "object", "additionalProperties": each.schema}, default={}, each=each)
+
+
+def list_of(entry: Key, size: int | None = None, default: Sequence[Any] | None = None, **options: Any) -> Key:
+    """Declare a list that is not empty."""
+    return ListKey(
+        "a list in brackets" + ("" if size is None else f" with {size} entries"),
+        {"type": "array", "minItems": size or 1, "items": entry.schema}
+        | ({"maxItems": size} if size else {}),
+        lambda value: isinstance(value, Sequence) and not isinstance(value, str) and len(value) > 0,
+        default=default,
+        entry=entry,
+        size=size,
+        **options,
+    )
+
+
+def number(
+    at_least: float = -MAX_NUMBER,
+    at_most: float = MAX_NUMBER,
+    *,
+    above: float = -math.inf,
+    description: str = "",
+    **options: Any,
+) -> Key:
+    """Declare a finite number."""
+    limits = [
+        (f"above {above:g}", {"exclusiveMinimum": above}, above > -math.inf),
+        (f"of at least {at_least:g}", {"minimum": at_least}, at_least > -MAX_NUMBER),
+        (f"of at most {at_most:g}", {"maximum": at_most}, at_most < MAX_NUMBER),
+    ]
+    schema: dict[str, Any] = {"type": "number"}
+    for _, limit, is_given in limits:
+        schema |= limit if is_given else {}
+    texts = [text for text, _, is_given in limits if is_given]
+    return Key(
+        description or (f"a number {' and '.join(texts)}" if texts else "a finite number"),
+        schema,
+        lambda value: is_number(value) and at_least <= value <= at_most and value > above,
+        float,
+        **options,
+    )
+
+
+def whole(at_least: int, at_most: int | None = None, description: str = "", **options: Any) -> Key:
+    """Declare a whole number."""
+    upper = math.inf if at_most is None else at_most
+    return Key(
+        description or f"a whole number from {at_least} to {at_most}",
+        {"type": "integer", "minimum": at_least} | ({} if at_most is None else {"maximum": at_most}),
+        lambda value: type(value) is int and at_least <= value <= upper,
+        **options,
+    )
+
+
+def flag(default: bool) -> Key:
+    """Declare a truth value."""
+    return Key("true or false", {"type": "boolean"}, lambda value: isinstance(value, bool), default=default)
+
+
+def text(description: str = "a text in quotes", pattern: str = "(?s:.*)", **options: Any) -> Key:
+    """Declare a text, which may have to match a regular expression."""
+    return Key(
+        description,
+        {"type": "string"},
+        lambda value: isinstance(value, str) and re.fullmatch(pattern, value) is not None,
+        **options,
+    )
+
+
+def choice(choices: Iterable[str], **options: Any) -> Key:
+    """Declare one of several texts."""
+    choices = list(choices)
+    # Micro has two code points in Unicode: units are listed in their ASCII spelling only.
+    names = ", ".join(f'"{each}"' for each in choices if each.isascii())
+    return Key(
+        f"one of {names}", {"enum": choices}, choices.__contains__, remedy=f"choose from {names}", **options
+    )
+
+
+def vector(size: int, at_most: float = MAX_NUMBER, description: str = "", **options: Any) -> Key:
+    """Declare a list of finite numbers."""
+    limit = f" up to ±{at_most:g}" if at_most < MAX_NUMBER else ""
+    return Key(
+        description or f"{size} numbers{limit}, such as {[0.0] * size}",
+        {"type": "array", "minItems": size, "maxItems": size, "items": {"type": "number"}},
+        lambda value: (
+            isinstance(value, Sequence)
+            and len(value) == size
+            and all(is_number(entry) and abs(entry) <= at_most for entry in value)
+        ),
+        lambda value: [float(entry) for entry in value],
+        **options,
+    )
+
+
+# Keys of a pose.
+POSE_KEYS = dict.fromkeys(("xyz_m", "rotvec_rad"), vector(3, _MAX_POSE_VALUE, default=(0.0, 0.0, 0.0)))
+
+
+def pose_of(values: Mapping[str, Any]) -> Array:
+    """Return the pose of the values of `POSE_KEYS`."""
+    return se3.transform(se3.exp3(values["rotvec_rad"]), values["xyz_m"])
 
 
 def read_pose(table: TomlTable) -> Array:
     """Read a pose from the keys xyz_m and rotvec_rad."""
-    zero = (0.0, 0.0, 0.0)
-    xyz, rotvec = (table.vector(key, 3, zero, at_most=_MAX_POSE_VALUE) for key in ("xyz_m", "rotvec_rad"))
-    table.finish()
-    return se3.transform(se3.exp3(rotvec), xyz)
+    return pose_of(table.values(POSE_KEYS))
 
 
 def pose_content(pose: Array) -> dict[str, list[float]]:

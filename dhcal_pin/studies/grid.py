@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import Field, dataclass, fields
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -23,9 +23,10 @@ from ..estimation.batch import BatchProblem, ChainBatch
 from ..estimation.parameters import select_parameters
 from ..estimation.solver import METHODS
 from ..exceptions import DhcalError, FileFormatError
+from ..io import toml_table as toml
 from ..io.robot import read_robot
 from ..io.shipped_files import shipped_file
-from ..io.toml_table import TomlTable
+from ..io.toml_table import Key, TomlTable
 from ..measurements import KINDS
 from ..measurements.base import Noise
 from ..messages import quote
@@ -88,6 +89,30 @@ class Setting:
     method: str = "lm"
     priors: str = "default"
     iterations: int = 100
+
+
+def _setting_key(field: Field[Any]) -> Key:
+    """Declare the key of a setting: a value of its type, or a list of such values."""
+    kind, name, schema = {
+        "str": (str, "a text", "string"),
+        "int": (int, "a whole number", "integer"),
+        "bool": (bool, "true or false", "boolean"),
+    }[str(field.type)]
+    return Key(
+        f"{name}, or a list of such values",
+        {"anyOf": [{"type": schema}, {"type": "array", "minItems": 1, "items": {"type": schema}}]},
+        lambda value: all(type(entry) is kind for entry in (value if isinstance(value, list) else [value])),
+        lambda value: value if isinstance(value, list) else [value],
+        is_optional=True,
+    )
+
+
+# Keys of the table [settings] of a study, and those before it.
+SETTING_KEYS = {field.name: _setting_key(field) for field in fields(Setting)}
+HEAD_KEYS = {
+    "title": Key(default=""),
+    "seeds": toml.whole(1, MAX_SEEDS, default=100),
+}
 
 
 def draw_configurations(chain: Chain, count: int, rng: np.random.Generator, fraction: float = 1.0) -> Array:
@@ -175,12 +200,10 @@ def read_study(path: PathLike) -> StudyGrid:
     """Read a study and the robots that it names."""
     document = TomlTable.read(path)
     where = document.path
-    title = str(document.get("title", ""))
-    seeds = document.value("seeds", int, 100, expected="a whole number from 1 to 1000000")
-    if not 1 <= seeds <= MAX_SEEDS:
-        raise document.error("seeds", "expected a whole number from 1 to 1000000")
+    head = document.some_values(HEAD_KEYS)
     table = document.table("settings", required=True)
     document.finish()
+    seeds = head["seeds"]
     settings = [_validated(setting, where) for setting in _grid(table)]
     robots = {(name, s.tip) for s in settings for name in (s.robot, s.truth) if name}
     files = {name: os.fspath(_find_robot_file(name, path)) for name in sorted({name for name, _ in robots})}
@@ -197,27 +220,19 @@ def read_study(path: PathLike) -> StudyGrid:
     digest = hashlib.sha256(repr((seeds, settings)).encode())
     for chain in chains.values():
         digest.update(chain.urdf.data + chain.origins.tobytes())
-    return StudyGrid(title, seeds, tuple(cases), digest.hexdigest(), tuple(files.values()))
+    return StudyGrid(str(head["title"]), seeds, tuple(cases), digest.hexdigest(), tuple(files.values()))
 
 
 def _grid(table: TomlTable) -> Iterator[Setting]:
     """Build all combinations of the entries of [settings]; the last list varies fastest."""
-    types = {"str": "a text", "int": "a whole number", "bool": "true or false"}
-    known = {field.name: types[str(field.type)] for field in fields(Setting)}
-    values: dict[str, list[Any]] = {}
     table.get("robot", expected='a robot, as in robot = "arm.urdf"')
-    present = [name for name in known if name in table]
-    table.finish()
-    for key in sorted(present, key=table.keys().index):
-        value = table.get(key)
-        values[key] = value if isinstance(value, list) else [value]
+    values = table.values(SETTING_KEYS)
+    present = [key for key in table.keys() if key in values]
+    for key in present:
         if not values[key]:
             raise table.error(key, "expected at least one value")
-        for entry in values[key]:
-            if types.get(type(entry).__name__) != known[key]:
-                raise table.error(key, f"expected {known[key]}, or a list of such values")
-    for combination in product(*values.values()):
-        yield Setting(**dict(zip(values, combination, strict=True)))
+    for combination in product(*(values[key] for key in present)):
+        yield Setting(**dict(zip(present, combination, strict=True)))
 
 
 def _validated(setting: Setting, where: str) -> Setting:

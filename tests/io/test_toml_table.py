@@ -7,6 +7,7 @@ from robots import write
 
 from dhcal_pin.exceptions import FileFormatError
 from dhcal_pin.io import TomlTable
+from dhcal_pin.io import toml_table as toml
 
 TEXT = """
 number = 2
@@ -29,64 +30,93 @@ def table(tmp_path) -> TomlTable:
 
 
 def test_values_have_the_type_that_was_asked_for(table):
-    number = table.number("number", at_least=0, at_most=2)
-    assert (number, type(number)) == (2.0, float)
-    assert table.text("name") == "arm"
-    assert table.choice("name", ["arm", "leg"]) == "arm"
-    assert table.value("count", int) == 3
-    assert table.value("flag", bool) is True
-    assert table.vector("vector", 3) == [1.0, 2.5, -3.0]
-    assert table.array("vector", size=3) == [1, 2.5, -3]
-    assert table.table("outer").table("inner").number("key") == 1.0
-    assert [job.text("robot") for job in table.tables("job", expected="")] == ["a", "b"]
-    table.finish()
+    inner = toml.table_of({"key": toml.number()})
+    keys = {
+        "number": toml.number(0, 2),
+        "name": toml.choice(["arm", "leg"]),
+        "count": toml.whole(1, 3),
+        "flag": toml.flag(False),
+        "vector": toml.vector(3),
+        "outer": toml.table_by_name(inner),
+        "job": toml.Key(),
+    }
+    jobs = table.tables("job", expected="")
+    assert [job.values({"robot": toml.text()}) for job in jobs] == [{"robot": "a"}, {"robot": "b"}]
+    assert toml.list_of(toml.number(), 3).read(table, "vector") == [1.0, 2.5, -3.0]
+    values = table.values(keys)
+    assert [type(values[key]) for key in ("number", "count")] == [float, int]
+    assert list(values.values())[:-1] == [2.0, "arm", 3, True, [1.0, 2.5, -3.0], {"inner": {"key": 1.0}}]
 
 
 def test_absent_keys_have_their_default(table):
-    assert table.number("x", 1.5) == 1.5
-    assert table.text("y", "") == ""
-    assert table.value("z", bool, False) is False
-    assert table.vector("v", 2, (0.0, 1.0)) == [0.0, 1.0]
+    keys = {
+        "x": toml.number(default=1.5),
+        "y": toml.text(default=""),
+        "z": toml.flag(False),
+        "v": toml.vector(2, default=(0.0, 1.0)),
+        "l": toml.list_of(toml.number(), default=()),
+        "o": toml.table_of({"key": toml.number()}),
+        "n": toml.table_by_name(toml.number()),
+    }
+    assert list(table.some_values(keys).values()) == [1.5, "", False, [0.0, 1.0], [], None, {}]
     assert table.table("t").keys() == []
     assert "x" not in table
 
 
 @pytest.mark.parametrize(
-    ("ask", "message"),
+    ("declared", "key", "message"),
     [
-        (lambda t: t.number("name"), "name = 'arm'; expected a finite number"),
-        (lambda t: t.number("flag"), "flag = True; expected a finite number"),
-        (lambda t: t.number("number", above=2), "number = 2; expected a number above 2"),
-        (lambda t: t.number("number", at_least=3), "number = 2; expected a number of at least 3"),
-        (lambda t: t.number("number", at_most=1), "number = 2; expected a number of at most 1"),
-        (lambda t: t.number("x"), "x is missing; expected a finite number; the keys given are number, name"),
-        (lambda t: t.number("numbr"), "unknown key 'number'; did you mean 'numbr'?"),
-        (lambda t: t.text("count"), "count = 3; expected a text in quotes"),
-        (lambda t: t.value("flag", int), "flag = True; expected a whole number"),
-        (lambda t: t.value("count", bool), "count = 3; expected true or false"),
-        (lambda t: t.choice("name", ["left", "right"]), 'name = \'arm\'; choose from "left", "right"'),
-        (lambda t: t.vector("vector", 2), "vector = [1, 2.5, -3]; expected 2 numbers, such as [0.0, 0.0]"),
-        (lambda t: t.vector("vector", 3, at_most=2), "expected 3 numbers up to ±2"),
-        (lambda t: t.array("vector", size=2), "vector has 3 entries; expected 2"),
-        (lambda t: t.array("name"), "name = 'arm'; expected a list in brackets"),
-        (lambda t: t.table("name"), "[name]: 'arm' is not a table"),
-        (lambda t: t.table("outer").table("inner").text("key"), "[outer.inner]: key = 1; expected a text"),
-        (lambda t: t.tables("outer", expected="one per arm"), "no [[outer]] table; write one per arm"),
-        (lambda t: t.tables("job", expected="")[1].number("robot"), "job 2: robot = 'b'; expected a finite"),
+        (toml.number(), "name", "name = 'arm'; expected a finite number"),
+        (toml.number(), "flag", "flag = True; expected a finite number"),
+        (toml.number(above=2), "number", "number = 2; expected a number above 2"),
+        (toml.number(3), "number", "number = 2; expected a number of at least 3"),
+        (toml.number(at_most=1), "number", "number = 2; expected a number of at most 1"),
+        (toml.number(), "x", "x is missing; expected a finite number; the keys given are number, name"),
+        (toml.number(), "numbr", "unknown key 'number'; did you mean 'numbr'?"),
+        (toml.text(), "count", "count = 3; expected a text in quotes"),
+        (toml.text("a letter", "[a-z]"), "name", "name = 'arm'; expected a letter"),
+        (toml.whole(1, 9), "flag", "flag = True; expected a whole number from 1 to 9"),
+        (toml.whole(5, 9), "count", "count = 3; expected a whole number from 5 to 9"),
+        (toml.flag(False), "count", "count = 3; expected true or false"),
+        (toml.choice(["left", "right"]), "name", 'name = \'arm\'; choose from "left", "right"'),
+        (toml.choice(["left", "right"]), "x", 'x is missing; expected one of "left", "right"'),
+        (toml.vector(2), "vector", "vector = [1, 2.5, -3]; expected 2 numbers, such as [0.0, 0.0]"),
+        (toml.vector(3, 2), "vector", "expected 3 numbers up to ±2"),
+        (toml.list_of(toml.Key(), 2), "vector", "vector has 3 entries; expected 2"),
+        (toml.list_of(toml.number(0)), "vector", "vector has the entry -3; expected a number of at least 0"),
+        (toml.list_of(toml.Key()), "name", "name = 'arm'; expected a list in brackets"),
+        (toml.table_of({}), "name", "[name]: 'arm' is not a table"),
+        (toml.table_of({}, is_optional=False), "x", "x is missing; expected a table [x]"),
+        (
+            toml.table_of({"inner": toml.table_of({"key": toml.text()})}),
+            "outer",
+            "[outer.inner]: key = 1; expected a text",
+        ),
+        (
+            toml.table_by_name(toml.table_of({"gain": toml.number()})),
+            "outer",
+            "[outer.inner]: gain is missing",
+        ),
     ],
 )
-def test_errors_name_file_table_key_and_expected_value(table, ask, message):
+def test_errors_name_file_table_key_and_expected_value(table, declared, key, message):
     with pytest.raises(FileFormatError) as caught:
-        ask(table)
+        declared.read(table, key)
     assert str(caught.value).startswith(f"{table.path}: ")
     assert message in str(caught.value)
 
 
+def test_errors_of_arrays_of_tables(table):
+    with pytest.raises(FileFormatError, match=r"no \[\[outer\]\] table; write one per arm"):
+        table.tables("outer", expected="one per arm")
+    second = table.tables("job", expected="")[1]
+    with pytest.raises(FileFormatError, match="job 2: robot = 'b'; expected a finite number"):
+        second.values({"robot": toml.number()})
+
+
 def test_unknown_keys_are_an_error_at_the_end(table):
     inner = table.table("outer").table("inner")
-    inner.number("gain", 0.0)
-    inner.number("offset", 0.0)
     with pytest.raises(
         FileFormatError, match=r"\[outer\.inner\]: unknown key 'key'; choose from gain, offset$"
     ):
-        inner.finish()
+        inner.values({"gain": toml.number(default=0.0), "offset": toml.number(default=0.0)})

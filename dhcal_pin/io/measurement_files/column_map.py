@@ -49,14 +49,15 @@ from ...exceptions import FileFormatError, UnknownNameError
 from ...messages import quote
 from ...robot.chain import Chain
 from ...units import ANGLES, UNITS
+from .. import toml_table as toml
 from ..tables import SEPARATORS, TextLayout
-from ..toml_table import TomlTable, is_number
+from ..toml_table import Key, TomlTable
 from .columns import ROTVEC, SECOND_PREFIX, column_contents, known_columns, unknown_column_error
 
 # Placeholders in a constant, each written in braces.
 PATH_PARTS = ("file", "stem", "parent")
 # Number of columns of each convention of rotations, and the other keys that it needs.
-_CONVENTIONS: Mapping[str, tuple[int, tuple[str, ...]]] = {
+CONVENTIONS: Mapping[str, tuple[int, tuple[str, ...]]] = {
     "rotvec": (3, ("unit",)),
     "euler": (3, ("unit", "axes", "frame")),
     "quaternion": (4, ("order",)),
@@ -69,6 +70,51 @@ _CONVENTION_KEYS = {
     "frame": ("intrinsic|extrinsic", "intrinsic (rotated axes) or extrinsic (fixed axes)"),
     "order": ("wxyz|xyzw", "wxyz or xyzw"),
 }
+_COLUMN = Key('the header of a column, as in from = "X pos"', {"type": ["string", "integer"]})
+# Keys at the top of a map.
+LAYOUT_KEYS = {
+    "separator": toml.choice(SEPARATORS, default=""),
+    "decimal": toml.choice((".", ","), default=""),
+    "skip": Key(
+        "a number of lines, as in skip = 2",
+        {"type": "integer", "minimum": 0},
+        lambda value: type(value) is int,
+        default=0,
+    ),
+    "header": toml.flag(True),
+    "comment": toml.text(default="#"),
+    "encoding": toml.text(default="utf-8"),
+}
+# Keys of a column in the table [columns].
+COLUMN_KEYS = {
+    "from": _COLUMN,
+    "unit": Key(schema={"type": "string"}, default=""),
+    "scale": toml.number(default=1.0),
+    "offset": toml.number(default=0.0),
+}
+
+
+def joint_keys(size: int | None = None, names: Sequence[str] = ()) -> dict[str, Key]:
+    """Declare the keys of [joints] for a number of columns and the joints of a robot."""
+    repeated = size or 0
+    return {
+        "order": toml.list_of(_COLUMN, size),
+        "names": toml.list_of(Key(), size, default=names),
+        "unit": Key(schema={"type": ["string", "array"]}, default=""),
+        "sign": toml.list_of(Key(), size, default=[1] * repeated),
+        "offset": toml.list_of(Key(), size, default=[0] * repeated),
+    }
+
+
+def rotation_keys(convention: str) -> dict[str, Key]:
+    """Declare the keys of [rotation] for a convention."""
+    count, needed_keys = CONVENTIONS[convention]
+    needed = {key: row for key, row in _CONVENTION_KEYS.items() if key in needed_keys}
+    return {
+        "convention": toml.choice(CONVENTIONS),
+        **{key: toml.text(f"{words} for {convention}", pattern) for key, (pattern, words) in needed.items()},
+        "columns": toml.list_of(_COLUMN, count),
+    }
 
 
 @dataclass(frozen=True)
@@ -160,14 +206,8 @@ def read_map(path: PathLike, chain: Chain) -> ColumnMap:
 
 def _layout(table: TomlTable) -> TextLayout:
     """Read how the file is divided into cells."""
-    layout = TextLayout(
-        separator=table.choice("separator", SEPARATORS) if "separator" in table else "",
-        decimal=table.choice("decimal", (".", ",")) if "decimal" in table else "",
-        skip=table.value("skip", int, 0, expected="a number of lines, as in skip = 2"),
-        has_header=table.value("header", bool, True),
-        comment=table.text("comment", "#"),
-        encoding=table.text("encoding", "utf-8"),
-    )
+    values = table.some_values(LAYOUT_KEYS)
+    layout = TextLayout(has_header=values.pop("header"), **values)
     if layout.separator == layout.decimal == ",":
         raise FileFormatError(f"{table.where}: separator and decimal are both ','; change one of them")
     if layout.skip < 0:
@@ -183,22 +223,20 @@ def _layout(table: TomlTable) -> TextLayout:
 
 
 def _joint_rules(table: TomlTable, joints: Sequence[str], contents: Mapping[str, str]) -> list[ColumnRule]:
-    order = table.array("order")
-    size = len(order)
-    names = table.array("names", joints, size=size)
-    unit = table.get("unit", "")
-    units = table.array("unit", size=size) if isinstance(unit, list) else [unit] * size
-    signs = table.array("sign", [1] * size, size=size)
-    offsets = table.array("offset", [0] * size, size=size)
-    table.finish()
+    size = len(toml.list_of(_COLUMN).read(table, "order"))
+    values = table.values(joint_keys(size, joints))
+    unit, signs, offsets = (values[key] for key in ("unit", "sign", "offset"))
+    units = toml.list_of(Key(), size).read(table, "unit") if isinstance(unit, list) else [unit] * size
     if any(type(sign) is bool or sign not in (1, -1) for sign in signs):
         raise table.error("sign", "expected 1 or -1 for each joint")
     for offset in offsets:
-        if not is_number(offset):
+        if not toml.is_number(offset):
             raise table.error("offset", f"{quote(offset)} is not a number")
     return [
         _rule(table, str(name), contents, source, unit, float(sign), float(offset))
-        for name, source, unit, sign, offset in zip(names, order, units, signs, offsets, strict=True)
+        for name, source, unit, sign, offset in zip(
+            values["names"], values["order"], units, signs, offsets, strict=True
+        )
     ]
 
 
@@ -206,10 +244,7 @@ def _column_rules(table: TomlTable, contents: Mapping[str, str]) -> list[ColumnR
     rules = []
     for name in table.keys():
         entry = table.table(name)
-        source = entry.get("from", expected='the header of a column, as in from = "X pos"')
-        unit = entry.get("unit", "")
-        scale, offset = entry.number("scale", 1.0), entry.number("offset", 0.0)
-        entry.finish()
+        source, unit, scale, offset = entry.values(COLUMN_KEYS).values()
         rules.append(_rule(entry, name, contents, source, unit, scale, offset))
     return rules
 
@@ -248,35 +283,31 @@ def _source_column(table: TomlTable, value: Any) -> str | int:
 
 
 def _rotation(table: TomlTable) -> Rotation:
-    convention = table.choice("convention", _CONVENTIONS)
-    count, needed_keys = _CONVENTIONS[convention]
-    values: dict[str, str] = {}
-    for key, (pattern, description) in _CONVENTION_KEYS.items():
-        if key not in needed_keys:
-            if key in table:
-                raise table.error(key, f"does not go with {convention}; leave it out")
-            continue
-        expected = f"{description} for {convention}"
-        value = table.text(key, expected=expected)
-        if not re.fullmatch(pattern, value):
-            raise table.error(key, f"expected {expected}")
-        values[key] = value if key == "unit" else value.lower()
-    columns = table.array("columns", size=count)
-    table.finish()
-    return Rotation(convention, tuple(_source_column(table, name) for name in columns), **values)
+    convention = toml.choice(CONVENTIONS).read(table, "convention")
+    keys = rotation_keys(convention)
+    for key in (other for other in _CONVENTION_KEYS if other not in keys):
+        if key in table:
+            raise table.error(key, f"does not go with {convention}; leave it out")
+    values = table.values(keys)
+    columns = tuple(_source_column(table, name) for name in values.pop("columns"))
+    return Rotation(
+        values.pop("convention"),
+        columns,
+        **{key: value if key == "unit" else value.lower() for key, value in values.items()},
+    )
 
 
 def _constants(table: TomlTable, contents: Mapping[str, str]) -> dict[str, str]:
-    constants: dict[str, str] = {}
-    for name in (name for name, content in contents.items() if content == "text" and name in table):
-        example = f'a text in quotes, as in {name} = "{{stem}}"'
-        constants[name] = table.text(name, expected=example)
-        if not constants[name]:
-            raise table.error(name, f"expected {example}")
+    keys = {
+        name: toml.text(f'a text in quotes, as in {name} = "{{stem}}"', "(?s:.+)", is_optional=True)
+        for name, content in contents.items()
+        if content == "text"
+    }
+    constants = {name: value for name, value in table.values(keys).items() if value is not None}
+    for name in constants:
         if unknown := set(re.findall(r"\{([^}]*)\}", constants[name])) - set(PATH_PARTS):
             choices = ", ".join(f"{{{part}}}" for part in PATH_PARTS)
             raise UnknownNameError(
                 f"{table.where}: {name}: unknown placeholder {{{min(unknown)}}}; choose from {choices}"
             )
-    table.finish()
     return constants
