@@ -30,16 +30,10 @@ _ROTATION_MIX = np.vstack([np.eye(4), [[0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.
 
 
 def cos_sin(angles: Array) -> tuple[Array, Array]:
-    """Compute cosines and sines by the half-angle formulas.
+    """Compute cosines and sines of angles (k, m) [rad], (k, m) each, by the half-angle formulas.
 
     With t = tan(angle/2): cos = (1 - t²)/(1 + t²) and sin = 2t/(1 + t²). One tangent takes a fifth of the
     time of a cosine and a sine.
-
-    Args:
-        angles: Angles, shape (k, m) [rad].
-
-    Returns:
-        Cosines and sines, each of shape (k, m).
     """
     half = np.tan(0.5 * angles)
     square = half * half
@@ -218,9 +212,6 @@ def _exponentials(twists: Array, x: Array) -> Array:
     With the matrix A of ξ/|ω| and θ = x·|ω|: exp = I + θ·A + (1 - cos θ)·A² + (θ - sin θ)·A³, because A⁴ =
     -A². The term 1 - cos θ is computed as 2·sin²(θ/2), which does not cancel. For ω = 0 the exponential is I
     + x·ξ.
-
-    Returns:
-        Transforms, shape (p, 4, 4).
     """
     matrices = np.zeros((len(x), 4, 4))
     matrices[:, :3, :3], matrices[:, :3, 3] = se3.skew(twists[:, 3:]), twists[:, :3]
@@ -232,26 +223,12 @@ def _exponentials(twists: Array, x: Array) -> Array:
 
 
 def log_rotations(rotations: Array) -> Array:
-    """Compute rotation vectors; see `se3.log3`.
-
-    Args:
-        rotations: Rotation matrices, shape (3, 3, m).
-
-    Returns:
-        Rotation vectors, shape (3, m) [rad].
-    """
+    """Compute rotation vectors (3, m) [rad] of matrices (3, 3, m); see `se3.log3`."""
     return se3.log3(rotations.transpose(2, 0, 1)).T
 
 
 def right_jacobian_inverse_batch(rotvecs: Array) -> Array:
-    """Compute inverse right Jacobians of SO(3); see `se3.right_jacobian_inverse`.
-
-    Args:
-        rotvecs: Rotation vectors, shape (3, m) [rad].
-
-    Returns:
-        Matrices Jr⁻¹, shape (3, 3, m).
-    """
+    """Compute Jr⁻¹ (3, 3, m) of rotation vectors (3, m) [rad]; see `se3.right_jacobian_inverse`."""
     return se3.right_jacobian_inverse(rotvecs.T).transpose(1, 2, 0)
 
 

@@ -15,14 +15,7 @@ from .work_arrays import work_array
 
 
 def cos_sin(angles: Array) -> tuple[Array, Array]:
-    """Compute cosines and sines; see `kinematics.cos_sin`.
-
-    Args:
-        angles: Angles, shape (k, m) [rad].
-
-    Returns:
-        Cosines and sines, each of shape (k, m).
-    """
+    """Compute cosines and sines; see `kinematics.cos_sin`."""
     cosines, sines = np.empty_like(angles), np.empty_like(angles)
     _native.cos_sin(angles, cosines, sines)
     return cosines, sines
@@ -31,14 +24,7 @@ def cos_sin(angles: Array) -> tuple[Array, Array]:
 def propagate_frames(
     link_transforms: Array, prismatic: Array, joint_state: JointState, frames: Array
 ) -> None:
-    """Compute the frames along a chain; see `kinematics.propagate_frames`.
-
-    Args:
-        link_transforms: Constant transforms, shape (k+1, 4, 4).
-        prismatic: Whether each joint is prismatic, shape (k,).
-        joint_state: Positions of the joints.
-        frames: Frames to fill, shape (k+2, 7, 3, m); frame 0 is given.
-    """
+    """Compute the frames along a chain; see `kinematics.propagate_frames`."""
     _native.propagate_frames(
         link_transforms, prismatic, joint_state.positions, joint_state.cos, joint_state.sin, frames
     )
@@ -58,16 +44,7 @@ def point_jacobian(frames: Array, point: Array, bodies: Array, twists: Array, ou
 
 
 def apply_observation_matrix(jacobian: Array, observation: ObservationMatrix, out: Array) -> Array:
-    """Multiply an observation matrix by a Jacobian; see `kinematics.apply_observation_matrix`.
-
-    Args:
-        jacobian: Tool velocities by p errors, shape (p, 6, c·m).
-        observation: Observation matrix of m samples.
-        out: Product to fill, shape (p, r, m).
-
-    Returns:
-        `out`.
-    """
+    """Multiply an observation matrix by a Jacobian; see `kinematics.apply_observation_matrix`."""
     _native.apply_observation_matrix(jacobian, *_contiguous_terms(observation), out)
     return out
 
@@ -95,14 +72,7 @@ def perturb_frames(
 
 
 def log_rotations(rotations: Array) -> Array:
-    """Compute rotation vectors; see `kinematics.log_rotations`.
-
-    Args:
-        rotations: Rotation matrices, shape (3, 3, m).
-
-    Returns:
-        Rotation vectors, shape (3, m) [rad].
-    """
+    """Compute rotation vectors; see `kinematics.log_rotations`."""
     out = np.empty(rotations.shape[1:])
     n_near_half_turn = _native.log_rotations(rotations, out)
     # Near an angle of π the compiled formula loses digits.
@@ -110,14 +80,7 @@ def log_rotations(rotations: Array) -> Array:
 
 
 def right_jacobian_inverse_batch(rotvecs: Array) -> Array:
-    """Compute inverse right Jacobians of SO(3); see `se3.right_jacobian_inverse`.
-
-    Args:
-        rotvecs: Rotation vectors, shape (3, m) [rad].
-
-    Returns:
-        Matrices Jr⁻¹, shape (3, 3, m).
-    """
+    """Compute inverse right Jacobians of SO(3); see `kinematics.right_jacobian_inverse_batch`."""
     out = np.empty((3, *rotvecs.shape))
     _native.right_jacobian_inverse_batch(rotvecs, out)
     return out
@@ -153,19 +116,7 @@ def r_factors(rows: Array) -> Array:
 def factor_jacobian(
     frames: Array, point: Array, bodies: Array, twists: Array, observation: ObservationMatrix, given: Array
 ) -> Array:
-    """Compute R factors of whitened Jacobians without storing the rows; see `qr.factor_jacobian`.
-
-    Args:
-        frames: Body frames, shape (j, 7, 3, c·b·m).
-        point: Tool point, shape (3, c·b·m) [m].
-        bodies: Body of each error, ascending, shape (p,).
-        twists: Twists of each member's errors in body frames, shape (b, p, 6).
-        observation: Observation matrix of r rows at b·m samples.
-        given: Further columns, shape (s, r, b·m).
-
-    Returns:
-        Upper triangular factors, shape (b, p+s, p+s).
-    """
+    """Compute R factors of whitened Jacobians without storing the rows; see `qr.factor_jacobian`."""
     (s, k, n), (b, p, _) = given.shape, twists.shape
     out = np.empty((b, p + s, p + s))
     work = _work_array(p + s, k, point.shape[1] // n if n else 1)
@@ -174,16 +125,7 @@ def factor_jacobian(
 
 
 def append_diagonal(r: Array, diagonal: Array, target: Array) -> Array:
-    """Append a diagonal block of rows to an R factor; see `qr.append_diagonal`.
-
-    Args:
-        r: R factor with the right-hand side in its last column, shape (p+1, p+1).
-        diagonal: Diagonal of the appended block, shape (p,).
-        target: Right-hand side of the appended rows, shape (p,).
-
-    Returns:
-        Upper triangular factor, shape (p+1, p+1).
-    """
+    """Append a diagonal block of rows to an R factor; see `qr.append_diagonal`."""
     out = np.empty(r.shape)
     _native.append_diagonal(r, diagonal, target, _work_array(len(r), 1, 0), out)
     return out

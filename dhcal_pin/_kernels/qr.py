@@ -121,9 +121,6 @@ def _factor_nonzero_columns(rows: Array) -> Array:
 
     Half the errors of a robot are translations, which do not affect orientation residuals. Skipping these
     columns saves three quarters of the work for such rows.
-
-    Returns:
-        R factor, shape (u, c).
     """
     columns = len(rows)
     nonzero, zero = np.flatnonzero(rows[:, 0]), np.flatnonzero(rows[:, 0] == 0)

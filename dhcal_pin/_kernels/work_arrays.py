@@ -21,15 +21,7 @@ _BUFFER_SIZE = 64
 
 
 def work_array(name: str, *shape: int) -> Array:
-    """Return an uninitialized array that is reused by the next call with this name in this thread.
-
-    Args:
-        name: Name of the memory.
-        *shape: Shape of the array.
-
-    Returns:
-        Array of doubles; it must not be kept beyond the next call with the same name.
-    """
+    """Return an uninitialized array; the next call with this name in this thread reuses its memory."""
     size = math.prod(shape)
     memory: Array | None = _store.__dict__.get(name)
     if memory is None or memory.size < size:

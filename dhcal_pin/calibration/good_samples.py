@@ -146,18 +146,7 @@ def _looks_like_noise(problem: Problem, x: Array, groups: Array) -> bool:
 
 
 def _judge(problem: Problem, x: Array, rows: LinearizedRows, scales: Array, threshold: float) -> list[Array]:
-    """Judge all samples by a solution that a part of them was searched for.
-
-    Args:
-        problem: Problem with all samples.
-        x: Solution, shape (p+s,).
-        rows: Rows of the part.
-        scales: Noise scales of the classes, shape (c,).
-        threshold: Largest standardized residual of good samples.
-
-    Returns:
-        Weights of each measurement's samples, shape (m,) each: 1 for good samples, ZERO_WEIGHT for others.
-    """
+    """Weigh the samples of each measurement by a solution of the chosen rows: 1 if good, else ZERO_WEIGHT."""
     weights = []
     for residual, classes in zip(whitened_residuals(problem, x), rows.row_classes, strict=True):
         residual = residual / scales[classes][:, None]
@@ -266,18 +255,7 @@ def _log_choices(m: int, n_good: int) -> float:
 def _standardized(
     rows: LinearizedRows, y: Array, scales: Array, is_fitted: Array, covariance: Array
 ) -> Array:
-    """Compute standardized residuals that are corrected for leverage, see `robust.residual_covariances`.
-
-    Args:
-        rows: Linearized rows.
-        y: Solution, shape (u,).
-        scales: Noise scales of the classes, shape (c,).
-        is_fitted: Whether each sample was fitted and counts for the noise scale, shape (m,).
-        covariance: Covariance of y, shape (u, u).
-
-    Returns:
-        Standardized residuals, shape (m,).
-    """
+    """Compute residuals (m,) at y (u,), standardized and corrected by `robust.residual_covariances`."""
     out, first = [], 0
     for item, classes in zip(rows.items, rows.row_classes, strict=True):
         k, m = item.shape[1:]

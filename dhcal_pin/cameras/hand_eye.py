@@ -80,16 +80,7 @@ def _solve_rotations(a: Array, p: Array) -> tuple[Array, Array]:
 
 
 def choose_poses(link_poses: Array, candidates: Array) -> Array:
-    """Choose the pose of the board in each image that agrees with those of the other images.
-
-    Args:
-        link_poses: Pose of the board's link in the camera's link, shape (i, 4, 4) [m].
-        candidates: Poses of the board in the camera that explain each image, the best first, shape
-            (i, k, 4, 4) [m].
-
-    Returns:
-        Chosen poses, shape (i, 4, 4) [m].
-    """
+    """Choose of the candidates (i, k, 4, 4) of each image the pose that agrees with the other images."""
     a, p = link_poses[:, :3, :3], candidates[..., :3, :3]
     images = np.arange(len(a))
     if len(a) < MIN_IMAGES:

@@ -54,15 +54,7 @@ def normalizing_transform(points: Array) -> Array:
 
 
 def direct_linear_transform(source: Array, target: Array) -> Array:
-    """Compute the projective map of points onto image points by the direct linear transformation.
-
-    Args:
-        source: Points, shape (..., m, d).
-        target: Image points, shape (..., m, 2).
-
-    Returns:
-        Matrices, shape (..., 3, d+1), up to a factor.
-    """
+    """Compute maps (..., 3, d+1) of points (..., m, d) onto image points (..., m, 2), up to a factor."""
     normalize_source, normalize_target = normalizing_transform(source), normalizing_transform(target)
     one = np.ones((*source.shape[:-1], 1))
     points = np.concatenate([source, one], -1) @ normalize_source.swapaxes(-1, -2)

@@ -132,15 +132,10 @@ def _ideal_image(sight: Array, boards: Sequence[tuple[Board, Array]], n: int) ->
 
 
 def _hits(sight: Array, inverse: Array) -> tuple[Array, Array]:
-    """Return where lines of sight (2, m) meet the plane of a board.
+    """Return where lines of sight X/Z, Y/Z (2, m) meet the plane of a board, by the pose of the camera in it.
 
-    Args:
-        sight: Lines X/Z, Y/Z in the camera, (2, m).
-        inverse: Pose of the camera in the board, (4, 4) [m].
-
-    Returns:
-        Depths in the camera, (m,) [m], infinite without a hit of the printed side, and points x, y on the
-        board, (2, m) [m].
+    The depths (m,) [m] are infinite without a hit of the printed side. The points on the board are
+    (2, m) [m].
     """
     direction = inverse[:3, :2] @ sight + inverse[:3, 2:3]
     is_hit = (direction[2] > _MIN_COSINE) & (inverse[2, 3] < 0)

@@ -29,16 +29,7 @@ _MAX_BEND = 0.5
 
 
 def refine_by_edges(image: Array, corners: Array, n_modules: int) -> Array | None:
-    """Improve the corners of a tag.
-
-    Args:
-        image: Grey values, shape (height, width).
-        corners: Corners in the order around the tag, shape (4, 2) [px].
-        n_modules: Number of modules along a side, with the black border.
-
-    Returns:
-        Corners, shape (4, 2) [px]; None if an edge is too short or too weak, or partly hidden.
-    """
+    """Improve the corners (4, 2) [px] of a tag; None if an edge is too short, too weak or hidden."""
     for _ in range(_N_ROUNDS):
         sides = np.roll(corners, -1, 0) - corners
         shortest = float(np.linalg.norm(sides, axis=1).min())

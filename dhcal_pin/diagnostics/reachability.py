@@ -82,16 +82,7 @@ def reach_sphere(chain: Chain) -> tuple[Array, float]:
 
 
 def solve_position(chain: Chain, target: Array, near: Array) -> Array | None:
-    """Find joint positions that move the tool point to a position.
-
-    Args:
-        chain: Robot, base and tool included.
-        target: Position in the measuring frame, (3,) [m].
-        near: Joint positions, (n,) [rad or m]; the nearest of the solutions found is returned.
-
-    Returns:
-        Joint positions, (n,) [rad or m], or None if no solution is found.
-    """
+    """Find joint positions (n,) near given ones that move the tool point to (3,) [m], or None."""
     rng = np.random.default_rng(0)
     starts = rng.uniform(-START_RANGE, START_RANGE, (N_RANDOM_STARTS, chain.n_joints))
     targets = np.broadcast_to(target, (N_RANDOM_STARTS + 1, 3))

@@ -72,15 +72,7 @@ _MAX_ITERATIONS = 100
 
 
 def align(source: Array, target: Array) -> tuple[Array, Array]:
-    """Compute the rigid motions that align points with others in the least-squares sense.
-
-    Args:
-        source: Points to move, shape (..., m, 3) [m].
-        target: Points to reach, shape (m, 3) [m].
-
-    Returns:
-        Motions, shape (..., 4, 4), and RMS distances after them, shape (...) [m].
-    """
+    """Return the motions (..., 4, 4) that align points with others (m, 3) best, and RMS distances [m]."""
     source_mean, target_mean = source.mean(-2), target.mean(0)
     a, b = source - source_mean[..., None, :], target - target_mean
     product = b.T @ a
@@ -180,15 +172,7 @@ def agreeing_samples(
 
 
 def _trimmed_distances(columns: Array, right: Array) -> Array | None:
-    """Return the distances of linear equations from their least trimmed squares fit.
-
-    Args:
-        columns: Matrices of the equations, shape (m, 3, u).
-        right: Right-hand sides, shape (m, 3).
-
-    Returns:
-        Distances, shape (m,); None if half of the equations do not determine the unknowns.
-    """
+    """Return the distances (m,) of equations from their least trimmed squares fit, or None."""
     m, _, u = columns.shape
     majority, size = m // 2 + 1, -(-u // 3) + 1
     if majority <= size:

@@ -189,15 +189,7 @@ def standardize_mean_squares(mean_squares: Array, k: int, is_good: Array | None 
 
 
 def standardize_ratios(ratios: Array, k: int | Array) -> Array:
-    """Transform mean squares of residuals relative to the noise to standardized residuals t.
-
-    Args:
-        ratios: Mean square of the k residuals of each sample over the variance of good ones, shape (m,).
-        k: Number of residuals per sample, one for all or shape (m,).
-
-    Returns:
-        Standardized residuals of shape (m,).
-    """
+    """Transform mean squares of k residuals over the variance of good ones to standard normal t (m,)."""
     return (np.cbrt(ratios) - (1 - 2 / (9 * k))) / np.sqrt(2 / (9 * k))
 
 

@@ -126,16 +126,7 @@ class _ScoreTerms(NamedTuple):
 
 
 def _score_terms(points: Array, residual: Array, effect: Array) -> _ScoreTerms:
-    """Compute the terms of the score at each length; 0 where too few pairs are near.
-
-    Args:
-        points: Points whose distances are those of the configurations, (m, d).
-        residual: Whitened residuals, (k, m).
-        effect: Rows G of the samples, (r, k, m); none to use V = I.
-
-    Returns:
-        The terms, (l,), (l,) and (l, r, r).
-    """
+    """Compute the terms (l,), (l,), (l, r, r) of the score at each length; 0 where too few pairs are near."""
     n_columns, n_components, m = effect.shape
     excess, variance, sums, squares = np.zeros((4, len(LENGTHS)))
     quadratic = np.zeros((len(LENGTHS), n_columns, n_columns))

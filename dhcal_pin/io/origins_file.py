@@ -81,17 +81,9 @@ def _fixed_part(chain: Chain, link: str) -> tuple[Array, UrdfJoint | None]:
 
 
 def _changed_origin(joint: UrdfJoint, parent: Array, new: Array, old: Array) -> Array:
-    """Compute the origin of a joint so that it has a new pose in the moving joint before it.
+    """Compute the origin of a joint so that its pose in the moving joint before it becomes `new` (4, 4) [m].
 
-    Args:
-        joint: Joint of the URDF.
-        parent: Pose of its parent link in the moving joint before it, shape (4, 4) [m].
-        new: New pose of the joint in the moving joint before it, shape (4, 4) [m].
-        old: Its nominal pose, shape (4, 4) [m].
-
-    Returns:
-        Origin in the parent link, shape (4, 4) [m]. A translation or rotation that is unchanged is exactly
-        that of the file.
+    A translation or rotation that is unchanged is exactly that of the file.
     """
     origin = se3.inverse(parent) @ new
     if np.array_equal(new[:3, 3], old[:3, 3]):

@@ -146,15 +146,7 @@ def position_dilution(points: ArrayLike, anchors: ArrayLike) -> Array:
 
 
 def locate_point(points: ArrayLike, distances: ArrayLike) -> Array:
-    """Locate the point whose distances to given points are known, by linear least squares.
-
-    Args:
-        points: Known points, (m, 3) [m].
-        distances: Distances of the unknown point to them, (m,) [m].
-
-    Returns:
-        The unknown point, (3,) [m]; an initial value for anchors and centres.
-    """
+    """Locate the point (3,) with distances (m,) to known points (m, 3) [m], by linear least squares."""
     points, distances = np.asarray(points, float), np.asarray(distances, float)
     centre = points.mean(0)
     arms = points - centre

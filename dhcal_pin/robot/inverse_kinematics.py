@@ -161,15 +161,7 @@ def position_task(targets: Array) -> TaskError:
 
 
 def pose_task(targets: Array, length: float) -> TaskError:
-    """Create the task error of target poses.
-
-    Args:
-        targets: Poses of the tool, shape (m, 4, 4) [m].
-        length: Weight of rotations: one radian counts as much as this distance [m].
-
-    Returns:
-        Task error with 6 components [m].
-    """
+    """Create the task error, 6 components [m], of poses (m, 4, 4); a radian counts as `length` [m]."""
     scale = np.diag([1.0, 1.0, 1.0, length, length, length])
 
     def task_error(poses: Array, samples: Array) -> tuple[Array, Array]:

@@ -105,16 +105,7 @@ def joint_range(chain: Chain, angle: float = 0.0, length: float = 0.0) -> tuple[
 
 
 def limits_with_margin(chain: Chain, angle: float, length: float) -> tuple[Array, Array]:
-    """Return the joint limits less a margin.
-
-    Args:
-        chain: Kinematic chain.
-        angle: Margin to the limits of revolute joints [rad].
-        length: Margin to the limits of prismatic joints [m].
-
-    Returns:
-        Lowest and highest joint positions, each of shape (n,) [rad or m]; infinite without a limit.
-    """
+    """Return the joint limits, (n,) each, less a margin for revolute [rad] and prismatic [m] joints."""
     # The margin is at most a quarter of the range, so that half of it remains.
     margin = np.minimum(np.where(_is_prismatic(chain), length, angle), (chain.upper - chain.lower) / 4)
     return chain.lower + margin, chain.upper - margin
@@ -218,16 +209,10 @@ def scale_joint_units(chain: Chain, q: Array) -> Array:
 
 
 def shortest_tour(q: Array, detours: Array | None = None) -> Array:
-    """Find an order of configurations with little motion between successive ones, by 2-opt.
+    """Find an order (m,) of configurations (m, n) with little motion between successive ones, by 2-opt.
 
-    The search starts from the nearest-neighbour tour. The result is a local minimum.
-
-    Args:
-        q: Configurations in comparable units, shape (m, n).
-        detours: Lengths that are added to the distances between configurations, shape (m, m), symmetric.
-
-    Returns:
-        Order of the configurations, shape (m,).
+    The search starts from the nearest-neighbour tour; the result is a local minimum. The units must be
+    comparable. `detours` (m, m) are added to the distances.
     """
     count = len(q)
     distances = np.zeros((count + 1, count + 1))

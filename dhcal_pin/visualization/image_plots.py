@@ -17,18 +17,7 @@ if TYPE_CHECKING:
 def plot_reprojection(
     pixels: Array, errors: Array, size: tuple[int, int], magnification: float, ax: Axes | None = None
 ) -> Axes:
-    """Plot the errors of corners as lines over the image plane.
-
-    Args:
-        pixels: Measured corners, shape (m, 2) [px].
-        errors: Measured minus modelled corners, shape (m, 2) [px].
-        size: Width and height of the image [px].
-        magnification: Factor by which the errors are drawn larger.
-        ax: Axes to draw into; a new figure if None.
-
-    Returns:
-        The axes.
-    """
+    """Plot the errors (m, 2) of corners (m, 2) [px], magnified, as lines over the image plane."""
     ax = ax if ax is not None else plots.new_axes()[0]
     ends = pixels - magnification * errors
     lines = np.stack([pixels, ends, np.full_like(ends, np.nan)], 1).reshape(-1, 2)

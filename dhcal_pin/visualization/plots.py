@@ -841,16 +841,7 @@ def shown_joint_unit(is_prismatic: bool) -> tuple[float, str]:
 
 
 def plot_dots(ax: Axes, x: Array, y: Array, color: str, size: float, label: str) -> None:
-    """Plot dots.
-
-    Args:
-        ax: Axes to draw into.
-        x: Horizontal coordinates, shape (m,).
-        y: Vertical coordinates, shape (m,).
-        color: Colour.
-        size: Diameter [pt].
-        label: Text in the legend.
-    """
+    """Plot dots of a diameter `size` [pt]."""
     ax.plot(
         x,
         y,

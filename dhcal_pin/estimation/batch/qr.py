@@ -114,15 +114,7 @@ class TriangularSystemBatch:
         return np.sum(self.z**2, -1) - np.sum((change - self.z) ** 2, -1)
 
     def is_stationary(self, cost: Array, last_change: Array) -> Array:
-        """Check whether the undamped step of each problem is negligible, too.
-
-        Args:
-            cost: Costs at the current x, shape (b,).
-            last_change: Changes of the rows by the previous steps, shape (b,); zero if unknown.
-
-        Returns:
-            Flags of shape (b,).
-        """
+        """Check whether the undamped steps of the problems (b,) are negligible, too, at costs (b,)."""
         residual_norm, roundoff = np.sqrt(cost), self.roundoff
         # No step changes the rows by more than ‖z‖.
         out = step_is_negligible(np.linalg.norm(self.z, axis=1), residual_norm, last_change, roundoff)

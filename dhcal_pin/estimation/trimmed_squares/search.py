@@ -112,15 +112,7 @@ class LinearizedRows:
             return (np.linalg.pinv(information, hermitian=True) @ right[..., None])[..., 0]
 
     def total_information(self, weights: Array, scales: Array) -> Array:
-        """Compute the information of weighted samples and priors; see `solve`.
-
-        Args:
-            weights: Weights of the samples in each fit, shape (a, m).
-            scales: Noise scales of the classes in each fit, shape (a, c).
-
-        Returns:
-            Information matrices, shape (a, u, u).
-        """
+        """Compute the information (a, u, u) of samples with weights (a, m) and scales (a, c), and of priors."""
         u = len(self.prior_right)
         block_weights = weights[:, self.sample] / scales[:, self.noise_class] ** 2
         information = (block_weights @ self.gram).reshape(-1, u, u) + self.information
@@ -136,15 +128,7 @@ class LinearizedRows:
         return np.concatenate(out, 1)
 
     def noise_scales(self, squares: Array, inliers: Array | None = None) -> Array:
-        """Estimate the noise scale of each class by the median of its blocks.
-
-        Args:
-            squares: Sums of squared residuals of the blocks, shape (a, b).
-            inliers: Whether each sample counts, shape (a, m); all if None, and all of a class without any.
-
-        Returns:
-            Scales, shape (a, c).
-        """
+        """Estimate the noise scale (a, c) of each class by the median of the squares (a, b) of its blocks."""
         scales = np.ones((len(squares), len(self.is_estimated)))
         for i in np.flatnonzero(self.is_estimated):
             members = self.noise_class == i
@@ -175,15 +159,7 @@ class LinearizedRows:
         return np.add.reduceat(scaled[:, order], first, axis=1)
 
     def objective(self, squares: Array, is_chosen: Array) -> Array:
-        """Compute the objective of fits.
-
-        Args:
-            squares: Sums of squared residuals of the blocks, shape (a, b).
-            is_chosen: Whether each sample is among the h best, shape (a, m).
-
-        Returns:
-            Objective, shape (a,).
-        """
+        """Compute the objective (a,) from squares (a, b) of blocks and chosen samples (a, m)."""
         chosen, total = is_chosen[:, self.sample], np.zeros(len(squares))
         for i, is_estimated in enumerate(self.is_estimated):
             members = self.noise_class == i
