@@ -112,7 +112,7 @@ class LinearizedRows:
             return (np.linalg.pinv(information, hermitian=True) @ right[..., None])[..., 0]
 
     def total_information(self, weights: Array, scales: Array) -> Array:
-        """Compute the information (a, u, u) of samples with weights (a, m) and scales (a, c), and of priors."""
+        """Compute the information (a, u, u) of priors and samples with weights (a, m) and scales (a, c)."""
         u = len(self.prior_right)
         block_weights = weights[:, self.sample] / scales[:, self.noise_class] ** 2
         information = (block_weights @ self.gram).reshape(-1, u, u) + self.information
