@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -25,7 +26,8 @@ from .._typing import Array, Progress
 from ..estimation import robust
 from ..estimation.folds import Fold, Refit, factor_folds, solve_fold
 from ..estimation.problem import Problem
-from ..exceptions import InvalidArgumentError, NotObservableError
+from ..estimation.solver import minimize, next_iterate
+from ..exceptions import DhcalError, InvalidArgumentError, NotObservableError
 from ..measurements.base import Measurement
 from ..measurements.measured_region import MIN_SPREAD, MeasuredRegion, draw_joint_space
 from .evaluation import MIN_SAMPLES, Accuracy, Comparison, PairedErrors, Title, compute_errors, fit_nominal
@@ -40,6 +42,8 @@ from .partition import (
 # A fold does not determine the held-out errors if uncertain parameters contribute more to them than this, in
 # standard deviations of the measurements.
 MAX_PREDICTION_STD = 3.0
+# Largest number of iterations of a fold's own fit.
+MAX_REFIT_ITERATIONS = 100
 # A joint hardly moved if its spread in some of the samples is below this fraction of its spread in all.
 _MIN_SPREAD_RATIO = 0.1
 
@@ -108,6 +112,22 @@ class CrossValidation:
     accuracy: Accuracy
 
 
+def refit(fit: FittedModel, problem: Problem, start: Array) -> Array:
+    """Fit a part of the samples of `fit.problem` by the same method, from an approximate solution (p,).
+
+    If there are parameters without a prior, the fit starts from the nominal robot, as the values of
+    undetermined parameters in x contain information of all samples. If the calibration did not converge, the
+    fit stops after as many iterations.
+    """
+    nominal = np.zeros_like(fit.x)
+    if fit.converged and problem.weights.all():
+        return next_iterate(problem, minimize(problem, "lm", start, MAX_REFIT_ITERATIONS, loose=True))
+    if not fit.converged:
+        with suppress(DhcalError):  # method "gn" may diverge on few samples
+            return minimize(problem, fit.method, nominal, fit.iterations).x
+    return minimize(problem, "lm", nominal, MAX_REFIT_ITERATIONS).x
+
+
 def cross_validate(fit: FittedModel, folds: Sequence[Fold] | None = None) -> CrossValidation:
     """Measure how well the model of a calibration predicts samples that it is not fitted to.
 
@@ -123,7 +143,7 @@ def cross_validate(fit: FittedModel, folds: Sequence[Fold] | None = None) -> Cro
     """
     if folds is None:
         folds = blocked_folds(fit.data, groups=contact_groups(fit.problem, fit.x))
-    results = list(cross_validate_folds(fit.problem, fit.solution.x, fit.data, folds, fit.refit))
+    results = list(cross_validate_folds(fit.problem, fit.solution.x, fit.data, folds, partial(refit, fit)))
     return CrossValidation(
         tuple(Accuracy.from_errors(fold.errors) for fold in results),
         np.array([fold.rms for fold in results]),
@@ -174,7 +194,7 @@ def compare_folds(fit: FittedModel, folds: Sequence[Fold], title: Title) -> Fold
     after: list[dict[str, Array]] = []
     largest_std = 0.0
     for fold_after in cross_validate_folds(
-        fit.inlier_problem, fit.solution.x, data, folds, fit.refit, fit.shrinkage_factor
+        fit.inlier_problem, fit.solution.x, data, folds, partial(refit, fit), fit.shrinkage_factor
     ):
         after += fold_after.errors
         largest_std = max(largest_std, fold_after.prediction_std)

@@ -7,6 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
+from .._typing import Array
+from ..estimation import robust
 from ..measurements.measured_region import MeasuredRegion
 from ..plausibility.mixups import Diagnosis, diagnose_mixups
 from .cameras.board_size import BoardSize
@@ -74,6 +76,25 @@ class Evidence(FittedModel):
         None if the calibrated arm fits the images, without images, and with fewer than five configurations.
         """
         return self.hand_eye_fit.diagnosis if self.hand_eye_fit else None
+
+    @cached_property
+    def studentized_residuals(self) -> tuple[Array, ...]:
+        """Studentized residual of each fitted sample, one array of shape (m,) per measurement."""
+        data = [item.with_weights(1 / w) for item, w in zip(self.problem.data, self.weights, strict=True)]
+        return tuple(robust.studentized_residuals(self.problem, self.solution, data, self.weights))
+
+    @cached_property
+    def outliers(self) -> tuple[Array, ...]:
+        """Lines of the outliers of each fitted measurement; numbers from 1 for samples from Python.
+
+        Outliers are the samples that were rejected and those whose studentized residual is large.
+        """
+        return tuple(
+            item.rows[(residuals > robust.OUTLIER_THRESHOLD) | (weights <= robust.ZERO_WEIGHT)]
+            for item, residuals, weights in zip(
+                self.data, self.studentized_residuals, self.weights, strict=True
+            )
+        )
 
     @cached_property
     def diagnosis(self) -> Diagnosis:

@@ -21,7 +21,6 @@ Reference: D. J. C. MacKay, Bayesian interpolation, Neural Computation 4 (1992) 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -34,21 +33,14 @@ from ..estimation.error_model import ErrorModel, ErrorParameter
 from ..estimation.frame_gauge import separate_frames
 from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.qr import TriangularSystem
-from ..estimation.solver import SolverResult, bounded_step, minimize, next_iterate
+from ..estimation.solver import SolverResult
 from ..estimation.uncertainty import UNBOUNDED_TOL, Prediction, Uncertainty
-from ..exceptions import DhcalError
 from ..identifiability import observability
-from ..measurements.arguments import as_measurements
 from ..measurements.base import InstrumentParameter, Measurement
 from ..measurements.mounting import MountedRig
 from ..robot.chain import Chain
 from .cameras.sets import has_joint_values
-from .evaluation import (
-    Accuracy,
-    accuracy,
-    compute_errors,
-    fit_nominal,
-)
+from .evaluation import compute_errors, fit_nominal
 from .model_selection import Extension
 from .partition import different_configurations
 
@@ -58,8 +50,6 @@ CONTRADICTION_SIGMAS = 3.0
 CONFIDENCE = 0.975
 # Smallest scale of standard deviations, for residuals that are exactly zero.
 MIN_SCALE = 1e-9
-# Largest number of iterations of a fold's own fit.
-MAX_REFIT_ITERATIONS = 100
 # Rows left over by no more than this fraction of all count as none: rounding.
 MIN_FREEDOM_RATIO = 1e-6
 # Smallest share of the variance of correlated residuals that counts as an error of the model. Stated standard
@@ -164,12 +154,6 @@ class FittedModel:
     def n_inliers(self) -> int:
         """Number of fitted samples without rejected ones."""
         return sum(len(item.rows) for item in self.inliers)
-
-    @property
-    def sample_count(self) -> str:
-        """Number of samples that the fit used, such as "60 samples" or "57 of 60 samples"."""
-        used = "" if self.n_inliers == self.n_samples else f"{self.n_inliers} of "
-        return f"{used}{self.n_samples} samples"
 
     @cached_property
     def rank(self) -> int:
@@ -416,25 +400,6 @@ class FittedModel:
         }
         return {name: v for name, v in self.problem.instruments(self.x).items() if name not in unused}
 
-    @cached_property
-    def studentized_residuals(self) -> tuple[Array, ...]:
-        """Studentized residual of each fitted sample, one array of shape (m,) per measurement."""
-        data = [item.with_weights(1 / w) for item, w in zip(self.problem.data, self.weights, strict=True)]
-        return tuple(robust.studentized_residuals(self.problem, self.solution, data, self.weights))
-
-    @cached_property
-    def outliers(self) -> tuple[Array, ...]:
-        """Lines of the outliers of each fitted measurement; numbers from 1 for samples from Python.
-
-        Outliers are the samples that were rejected and those whose studentized residual is large.
-        """
-        return tuple(
-            item.rows[(residuals > robust.OUTLIER_THRESHOLD) | (weights <= robust.ZERO_WEIGHT)]
-            for item, residuals, weights in zip(
-                self.data, self.studentized_residuals, self.weights, strict=True
-            )
-        )
-
     @property
     def transferable_instruments(self) -> dict[str, float]:
         """Values of the instrument parameters that hold for other measurements, too, by name [m or rad]."""
@@ -446,74 +411,6 @@ class FittedModel:
         """Cameras and boards with their estimated poses and lenses; None without image coordinates."""
         rigs = (item.solved_rig(self.instruments) for item in self.data)
         return next((rig for rig in rigs if rig is not None), None)
-
-    @property
-    def pose_std(self) -> float:
-        """Largest standard deviation of the position of a camera or a board in its link [m].
-
-        It is that along the worst direction; 0 if all of these positions are known, or if they cannot be told
-        apart from an unknown base or tool.
-        """
-        if self.errors.only_frames():
-            return 0.0
-        index = {p.name: i for i, p in enumerate(self.parameters)}
-        largest = 0.0
-        for name in index:
-            entry, _, component = name.rpartition(".")
-            if component == "x" and entry.startswith(("camera_", "board_")):
-                position = [index[f"{entry}.{axis}"] for axis in "xyz"]
-                block = self.covariance[np.ix_(position, position)]
-                is_known = np.isfinite(block).all()
-                largest = max(largest, float(np.linalg.eigvalsh(block)[-1]) if is_known else np.inf)
-        return float(np.sqrt(largest))
-
-    def refit(self, problem: Problem, start: Array) -> Array:
-        """Fit some of the samples by the same method.
-
-        If there are parameters without a prior, the fit starts from the nominal robot, as the values of
-        undetermined parameters in x contain information of all samples. If this calibration did not converge,
-        the fit stops after as many iterations.
-
-        Args:
-            problem: `self.problem` with a part of its samples.
-            start: Approximate solution, shape (p,) [m or rad].
-
-        Returns:
-            Solution x, shape (p,) [m or rad].
-        """
-        nominal = np.zeros_like(self.x)
-        if self.converged and problem.weights.all():
-            return next_iterate(problem, minimize(problem, "lm", start, MAX_REFIT_ITERATIONS, loose=True))
-        if not self.converged:
-            with suppress(DhcalError):  # method "gn" may diverge on few samples
-                return minimize(problem, self.method, nominal, self.iterations).x
-        return minimize(problem, "lm", nominal, MAX_REFIT_ITERATIONS).x
-
-    def validate(self, data: Measurement | Sequence[Measurement]) -> Accuracy:
-        """Compute the accuracy of the calibrated chain on other measurements.
-
-        Args:
-            data: One measurement or several, in the frames of the fitted ones.
-
-        Returns:
-            Error statistics, which can also be indexed by the keys of the JSON document, such as
-            "position_rms_m" [m] and "orientation_rms_rad" [rad].
-        """
-        return accuracy(self.chain, as_measurements(data), self.instruments)
-
-    def is_converged(self, eps: float = 1e-6) -> bool:
-        """Check convergence with a fresh Gauss-Newton step from the solution.
-
-        Args:
-            eps: Largest RMS change of the whitened rows by that step, in standard deviations.
-
-        Returns:
-            Whether the step changes them by less.
-        """
-        system = linearize_and_factor(self.problem, self.solution.x, small_angle=False)
-        with_priors = system.with_priors(self.problem.weights, self.solution.x)
-        step = bounded_step(self.problem, with_priors, self.solution.x)
-        return float(np.linalg.norm(with_priors.r @ step)) <= eps * np.sqrt(max(1, self.n_samples))
 
 
 def _student_ratio(degrees_of_freedom: float) -> float:

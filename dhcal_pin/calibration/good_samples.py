@@ -146,7 +146,7 @@ def _looks_like_noise(problem: Problem, x: Array, groups: Array) -> bool:
 
 
 def _judge(problem: Problem, x: Array, rows: LinearizedRows, scales: Array, threshold: float) -> list[Array]:
-    """Weigh the samples of each measurement by a solution of the chosen rows: 1 if good, else ZERO_WEIGHT."""
+    """Judge all samples by a solution x (p+s,) of some: weight 1 for good ones, ZERO_WEIGHT for others."""
     weights = []
     for residual, classes in zip(whitened_residuals(problem, x), rows.row_classes, strict=True):
         residual = residual / scales[classes][:, None]

@@ -24,7 +24,7 @@ from .._typing import Array
 from ..estimation.robust import ZERO_WEIGHT
 from ..measurements.base import Measurement
 from .evaluation import fit_instrument_parameters
-from .fitted import FittedModel
+from .evidence import Evidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +113,7 @@ class ResidualTable:
         }
 
 
-def residual_table(fit: FittedModel) -> ResidualTable:
+def residual_table(fit: Evidence) -> ResidualTable:
     """Collect the residuals of a calibration."""
     data = [*fit.data, *fit.holdout]
     residuals = [*_fitted_residuals(fit), *_holdout_residuals(fit)]
@@ -154,7 +154,7 @@ def residual_table(fit: FittedModel) -> ResidualTable:
     )
 
 
-def _fitted_residuals(fit: FittedModel) -> Iterator[tuple[dict[str, Array], Array]]:
+def _fitted_residuals(fit: Evidence) -> Iterator[tuple[dict[str, Array], Array]]:
     """Yield the errors by group and the normalised residuals (m,) of each fitted measurement."""
     for item, weighted, weights in zip(fit.data, fit.problem.data, fit.weights, strict=True):
         frames = fit.chain.forward_kinematics(item.conditions())
@@ -163,7 +163,7 @@ def _fitted_residuals(fit: FittedModel) -> Iterator[tuple[dict[str, Array], Arra
         yield item.errors(frames, u), _root_mean_square(weighted.residual(frames, u)) / np.sqrt(weights)
 
 
-def _holdout_residuals(fit: FittedModel) -> Iterator[tuple[dict[str, Array], Array]]:
+def _holdout_residuals(fit: Evidence) -> Iterator[tuple[dict[str, Array], Array]]:
     """Yield the errors by group and the normalised residuals (m,) of each held-out measurement."""
     data = [item.initialized(fit.chain) for item in fit.holdout]
     values = fit_instrument_parameters(fit.chain, data, fit.instruments)
@@ -178,7 +178,7 @@ def _root_mean_square(residual: Array) -> Array:
     return np.sqrt(np.mean(residual**2, axis=0))
 
 
-def _with_fitted_sigma(fit: FittedModel, item: Measurement) -> Measurement:
+def _with_fitted_sigma(fit: Evidence, item: Measurement) -> Measurement:
     """Scale a held-out measurement as the fit scaled its file, or else its kind; by NaN without either."""
     if item.has_stated_sigma:
         return item
@@ -189,7 +189,7 @@ def _with_fitted_sigma(fit: FittedModel, item: Measurement) -> Measurement:
     return item.with_scaled_sigma(dict.fromkeys(item.residual_groups, np.nan))
 
 
-def _sigma_scales(fit: FittedModel, index: int) -> dict[str, float]:
+def _sigma_scales(fit: Evidence, index: int) -> dict[str, float]:
     """Return the factor by which the fit scaled the standard deviations of each residual group."""
     u = fit.problem.instrument_values_of(fit.data[index], fit.x)
     frames = fit.chain.forward_kinematics(fit.data[index].conditions())

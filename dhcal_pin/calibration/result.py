@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -10,14 +11,18 @@ import numpy as np
 from .. import formatting
 from .._typing import Array
 from ..estimation.initialization import fit_frames
-from ..estimation.problem import UnfactoredSystem, uses_normal_equations
+from ..estimation.problem import Problem, UnfactoredSystem, uses_normal_equations
+from ..estimation.solver import remaining_change
 from ..identifiability import explanations
+from ..measurements.arguments import as_measurements
 from ..measurements.base import Measurement
 from ..measurements.groups import ERROR_GROUPS, error_group
 from ..result_plots import ResultPlots
 from . import summary
+from .cameras.diagnosis import largest_position_std
+from .cross_validation import refit
 from .estimates import Estimate, make_estimates
-from .evaluation import compute_errors
+from .evaluation import Accuracy, accuracy, compute_errors
 from .evidence import Evidence
 from .residual_table import ResidualTable, residual_table
 from .reweighting import Fit
@@ -68,6 +73,58 @@ class Result(Evidence, ResultPlots):
             is_kept_nominal=True,
             decision=self.verdict,
         )
+
+    @property
+    def sample_count(self) -> str:
+        """Number of samples that the fit used, such as "60 samples" or "57 of 60 samples"."""
+        return summary.describe_sample_count(self.n_inliers, self.n_samples)
+
+    @property
+    def pose_std(self) -> float:
+        """Largest standard deviation of the position of a camera or a board in its link [m].
+
+        It is that along the worst direction; 0 if all of these positions are known, or if they cannot be told
+        apart from an unknown base or tool.
+        """
+        if self.errors.only_frames():
+            return 0.0
+        return largest_position_std([p.name for p in self.parameters], self.covariance)
+
+    def validate(self, data: Measurement | Sequence[Measurement]) -> Accuracy:
+        """Compute the accuracy of the calibrated chain on other measurements.
+
+        Args:
+            data: One measurement or several, in the frames of the fitted ones.
+
+        Returns:
+            Error statistics, which can also be indexed by the keys of the JSON document, such as
+            "position_rms_m" [m] and "orientation_rms_rad" [rad].
+        """
+        return accuracy(self.chain, as_measurements(data), self.instruments)
+
+    def refit(self, problem: Problem, start: Array) -> Array:
+        """Fit some of the samples by the same method, see `cross_validation.refit`.
+
+        Args:
+            problem: `self.problem` with a part of its samples.
+            start: Approximate solution, shape (p,) [m or rad].
+
+        Returns:
+            Solution x, shape (p,) [m or rad].
+        """
+        return refit(self, problem, start)
+
+    def is_converged(self, eps: float = 1e-6) -> bool:
+        """Check convergence with a fresh Gauss-Newton step from the solution.
+
+        Args:
+            eps: Largest RMS change of the whitened rows by that step, in standard deviations.
+
+        Returns:
+            Whether the step changes them by less.
+        """
+        change = remaining_change(self.problem, self.solution.x)
+        return change <= eps * np.sqrt(max(1, self.n_samples))
 
     @cached_property
     def residuals(self) -> ResidualTable:

@@ -202,6 +202,12 @@ def describe_samples(comparison: Comparison) -> str:
     return f"on {count} {comparison.title} {'sample' if count == 1 else 'samples'}"
 
 
+def describe_sample_count(n_used: int, n_samples: int) -> str:
+    """Describe the number of samples that a fit used, such as "60 samples" or "57 of 60 samples"."""
+    used = "" if n_used == n_samples else f"{n_used} of "
+    return f"{used}{n_samples} samples"
+
+
 def small_sample_note(comparison: Comparison) -> str:
     """Return a note if a comparison has too few samples for a reliable figure, else an empty text."""
     return "So few samples give no reliable figure." if comparison.n_samples < MIN_SAMPLES else ""

@@ -137,6 +137,12 @@ def next_iterate(problem: Problem, solution: SolverResult) -> Array:
     return solution.x + bounded_step(problem, system, solution.x)
 
 
+def remaining_change(problem: Problem, x: Array) -> float:
+    """Compute the norm of the change of the whitened rows by a fresh Gauss-Newton step from x (p,)."""
+    system = linearize_and_factor(problem, x, small_angle=False).with_priors(problem.weights, x)
+    return float(np.linalg.norm(system.r @ bounded_step(problem, system, x)))
+
+
 def _cost(problem: Problem, system: TriangularSystem, x: Array) -> float:
     """Compute the cost at x from the triangular system of the data there."""
     return system.cost + sum_of_squares(problem.weights * x)

@@ -171,15 +171,7 @@ class Information:
         return qr.row_space(np.asarray(np.linalg.qr(stacked, mode="r")))
 
     def predict_error(self, rows: Array, combinations: Array) -> float:
-        """Predict the RMS position error over a task after measurements.
-
-        Args:
-            rows: Whitened rows of the measurements, shape (n, k, p+s').
-            combinations: Result of `task_combinations`, shape (p+s', w).
-
-        Returns:
-            RMS position error [m].
-        """
+        """Predict the RMS position error [m] over a task after measurements with rows (n, k, p+s')."""
         sqrt_covariance = compute_sqrt_covariance(self.prior_factor, rows)
         return float(np.sqrt(np.sum((combinations.T @ sqrt_covariance) ** 2)))
 

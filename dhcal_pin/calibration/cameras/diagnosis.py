@@ -264,6 +264,20 @@ class HandEyeFit:
         return diagnose_hand_eye(self.fit, self.position_std, self.holdout)
 
 
+def largest_position_std(names: Sequence[str], covariance: Array) -> float:
+    """Return the largest standard deviation of the position of any camera or board in any direction [m]."""
+    index = {name: i for i, name in enumerate(names)}
+    largest = 0.0
+    for name in names:
+        entry, _, component = name.rpartition(".")
+        if component == "x" and entry.startswith(("camera_", "board_")):
+            position = [index[f"{entry}.{axis}"] for axis in "xyz"]
+            block = covariance[np.ix_(position, position)]
+            is_known = np.isfinite(block).all()
+            largest = max(largest, float(np.linalg.eigvalsh(block)[-1]) if is_known else np.inf)
+    return float(np.sqrt(largest))
+
+
 def diagnose_hand_eye(
     fit: Fit, position_std: float, holdout: Sequence[Measurement] = ()
 ) -> HandEyeDiagnosis | None:
