@@ -6,16 +6,19 @@ import os
 from collections.abc import Iterator
 from typing import Any
 
+# The workers of pytest share the processors, and NumPy reads this when it is loaded.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("MKL_NUM_THREADS", "1")
+# Otherwise every command that a test starts compiles the package anew.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 import pytest
 from pages import ARGUMENTS, CHROMIUM, VIEWPORT, Window, window_of
 from robots import missing, paper
 
 from dhcal_pin.robot.chain import Chain
 from dhcal_pin.robot.urdf import parse_urdf
-
-# The workers of pytest share the processors, and NumPy reads this when it is loaded.
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")
 
 # Benchmarks need rivals in environments of their own.
 collect_ignore_glob = ["bench_*.py"]
@@ -56,7 +59,7 @@ def mimicking() -> Chain:
 
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Any]:
-    if not os.path.exists(CHROMIUM):
+    if CHROMIUM is None:
         missing("Chromium")
     from playwright.sync_api import sync_playwright
 
@@ -77,3 +80,5 @@ def window(shared_window: Window) -> Iterator[Window]:
     shared_window.page.set_viewport_size(VIEWPORT)
     yield shared_window
     shared_window.check()
+    # A scene that stays open is drawn again and again while other tests run.
+    shared_window.page.goto("about:blank")
