@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from robots import ROOT, random_joints, random_table
+from slow_cases import some_slow
 
 from dhcal_pin import se3
 from dhcal_pin._kernels import kinematics, qr, types
@@ -318,7 +319,7 @@ print(json.dumps([fit.converged, fit.x.tolist(), fit.std.tolist()]))
 """
 
 
-@pytest.mark.parametrize("sets", ["dh", "dh,harmonics,curves"])
+@pytest.mark.parametrize("sets", some_slow(["dh", "dh,harmonics", "dh,harmonics,curves"], {1}))
 def test_calibration_without_compiled_kernels_gives_the_same_values(sets):
     places = Path(native.__file__).parents[2], ROOT / "tests"
     environ = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, map(Path.resolve, places)))}

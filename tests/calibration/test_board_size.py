@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from camera_setups import ARMS, simulate, wrong_arm
+from slow_cases import some_slow
 
 import dhcal_pin as dh
 from dhcal_pin.measurements import CameraCorners
@@ -25,7 +26,7 @@ def with_rig(images, **changes):
     return CameraCorners(images.q, images.values, images.corner, rig)
 
 
-@pytest.mark.parametrize(("seed", "size"), [(0, 1.1), (1, 0.97), (2, 0.98)])
+@pytest.mark.parametrize(("seed", "size"), some_slow([(0, 1.1), (1, 0.97), (2, 0.98)], {1, 2}))
 def test_a_wrong_size_of_the_board_is_not_taken_for_errors_of_the_arm(seed, size):
     arm, images = photograph(seed, 1e-3)
     (board,) = images.rig.boards

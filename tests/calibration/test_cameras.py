@@ -10,6 +10,7 @@ import pytest
 from camera_setups import ARMS, random_setup, simulate, wrong_arm
 from hand_eye_setups import faulty_setup
 from robots import URDF
+from slow_cases import some_slow
 
 import dhcal_pin as dh
 from dhcal_pin.calibration.cameras import seen_ranges_warning
@@ -89,8 +90,8 @@ def test_an_arm_that_is_wrong_by_3_mm_is_freed(name, is_on_wrist):
         ("ur10", 0, 0.25),
         ("panda", 5, 0.5),
         ("xarm7", 2, 0.25),
-        ("ur10", 120, 0.3),
-        ("panda", 109, 0.3),
+        pytest.param("ur10", 120, 0.3, marks=pytest.mark.slow),
+        pytest.param("panda", 109, 0.3, marks=pytest.mark.slow),
         pytest.param("ur10", 8, 0.4, marks=pytest.mark.slow),
         pytest.param("panda", 9, 0.3, marks=pytest.mark.slow),
         pytest.param("xarm7", 10, 0.6, marks=pytest.mark.slow),
@@ -113,10 +114,19 @@ def test_periodic_errors_and_compliance_do_not_free_the_arm(name, seed, spread):
     assert error_elsewhere(fit.chain, truth, 0) < 1.05 * error_elsewhere(chain, truth, 0)
 
 
-@pytest.mark.parametrize("intrinsics", ["fixed", "prior"])
 @pytest.mark.parametrize(
-    ("order", "what"),
-    [([0, 1, 3, 2], "cx and cy"), ([1, 0, 2, 3], "fx and fy"), ([1, 0, 3, 2], "fx and fy, and cx and cy")],
+    ("order", "what", "intrinsics"),
+    some_slow(
+        [
+            ([0, 1, 3, 2], "cx and cy", "fixed"),
+            ([1, 0, 2, 3], "fx and fy", "prior"),
+            ([1, 0, 3, 2], "fx and fy, and cx and cy", "fixed"),
+            ([0, 1, 3, 2], "cx and cy", "prior"),
+            ([1, 0, 2, 3], "fx and fy", "fixed"),
+            ([1, 0, 3, 2], "fx and fy, and cx and cy", "prior"),
+        ],
+        {0, 1, 2},
+    ),
 )
 def test_exchanged_axes_of_the_intrinsics_are_named(intrinsics, order, what):
     rng = np.random.default_rng(6)
@@ -147,7 +157,7 @@ def test_exchanged_axes_of_the_intrinsics_are_named(intrinsics, order, what):
         assert rms[0] == pytest.approx(rms[1], rel=1e-3)
 
 
-@pytest.mark.parametrize("is_on_wrist", [True, False])
+@pytest.mark.parametrize("is_on_wrist", some_slow([True, False], {0}))
 def test_exchanged_image_coordinates_are_named(is_on_wrist):
     """Rows and columns of an array of pixels are v and u; the hold-out images are exchanged, too."""
     rng, chain = np.random.default_rng(8), ARMS["ur10"]()

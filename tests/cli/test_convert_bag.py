@@ -39,7 +39,19 @@ def stops(arm, m=40):
 
 def parameters_of(run, path):
     """Identified parameters of a calibration of the nominal arm."""
-    args = ("calibrate", NOMINAL, path, "-o", "out.urdf", "--parameters", "dh,base,tool", "--json", "-")
+    args = (
+        "calibrate",
+        NOMINAL,
+        path,
+        "-o",
+        "out.urdf",
+        "--parameters",
+        "dh,base,tool",
+        "--extend",
+        "none",
+        "--json",
+        "-",
+    )
     document = json_of(run(*args))
     return np.array([row["value"] for row in document["parameters"]])
 

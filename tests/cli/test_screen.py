@@ -12,6 +12,7 @@ from command_line import CALIBRATE, positions_csv, stdout_of, unfolded
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from robots import URDF
+from slow_cases import some_slow
 
 from dhcal_pin.cli.screens.screen import HEIGHT, WIDTH, Block, Screen, cell_width, fold
 from dhcal_pin.formatting import Table
@@ -52,7 +53,7 @@ def test_calibrations_of_several_robots(run, robot_folder, arm):
     assert_fits(err)
 
 
-@pytest.mark.parametrize("n_files", [1, 40])
+@pytest.mark.parametrize("n_files", some_slow([1, 12, 40], {0, 1}))
 def test_long_paths_and_many_files(run, robot_folder, n_files):
     folder = Path(LONG_FOLDER)
     folder.mkdir(parents=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from robots import DATA, missing
+from slow_cases import some_slow
 
 from dhcal_pin import se3
 from dhcal_pin.cameras import Board, Camera
@@ -94,7 +95,7 @@ def projected(board, pose):
     return cv2.projectPoints(board.points, rotation, translation, matrix, CAMERA.values[4:])[0].reshape(-1, 2)
 
 
-@pytest.mark.parametrize(("blur", "noise"), [(0.7, 2.0), (1.2, 4.0)])
+@pytest.mark.parametrize(("blur", "noise"), some_slow([(0.7, 2.0), (1.2, 4.0)], {1}))
 @pytest.mark.parametrize("board", BOARDS, ids=lambda board: board.type)
 def test_corners_of_rendered_boards(board, blur, noise, tmp_path):
     rng, path, errors = np.random.default_rng(1), str(tmp_path / "board.png"), []

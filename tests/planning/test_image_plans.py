@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from slow_cases import some_slow
 
 from dhcal_pin import Chain, se3
 from dhcal_pin.calibration import calibrate
@@ -106,7 +107,9 @@ def opencv_view(arm: Chain, rig: MountedRig, q: np.ndarray) -> tuple[np.ndarray,
     return np.array(pixels), np.array(distances), np.array(angles)
 
 
-@pytest.mark.parametrize("name", ["ur10-wrist", "panda-fixed", "xarm7-fisheye", "talos_full_v2-head"])
+@pytest.mark.parametrize(
+    "name", some_slow(["ur10-wrist", "panda-fixed", "xarm7-fisheye", "talos_full_v2-head"], {0, 2})
+)
 def test_every_planned_pose_has_the_board_in_view(name):
     arm, rig = setup(name)
     images = PlannedImages(rig, distance=(0.2, 0.8), max_angle=np.deg2rad(50), margin=30.0)

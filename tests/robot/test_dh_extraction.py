@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from slow_cases import some_slow
 
 from dhcal_pin import se3
 from dhcal_pin.exceptions import DhcalError
@@ -124,12 +125,16 @@ def perturb(origins, rng):
     return origins @ se3.exp6(1e-3 * np.concatenate([v / size[0], w / size[1]], -1))
 
 
+COUNT = pytest.mark.parametrize("count", some_slow([150, 500], {0}))
+
+
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("hayati", [False, True])
-def test_tables_of_random_chains_give_their_poses(convention, hayati):
+@COUNT
+def test_tables_of_random_chains_give_their_poses(convention, hayati, count):
     rng = np.random.default_rng(1)
     errors = []
-    for _ in range(500):
+    for _ in range(count):
         origins, prismatic = random_chain(rng)
         q = rng.uniform(-3, 3, (5, len(prismatic)))
         found = extract(origins, prismatic, convention=convention, hayati=hayati)
@@ -138,11 +143,12 @@ def test_tables_of_random_chains_give_their_poses(convention, hayati):
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_tables_of_nearly_parallel_chains_give_their_poses(convention):
+@COUNT
+def test_tables_of_nearly_parallel_chains_give_their_poses(convention, count):
     """Tilts from rounding up to degrees, at every size, through every branch."""
     rng = np.random.default_rng(2)
     errors = []
-    for _ in range(500):
+    for _ in range(count):
         origins, prismatic = random_chain(rng)
         tilt = 10.0 ** rng.uniform(-16, -1, (len(origins), 1)) * rng.normal(size=(len(origins), 6))
         origins = origins @ se3.exp6(tilt)
