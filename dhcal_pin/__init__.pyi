@@ -45,9 +45,9 @@ from .paper.jacobian_check import crosscheck as crosscheck
 from .planning.planner import Plan as Plan
 from .planning.planner import plan as plan
 from .planning.views import PlannedImages as PlannedImages
+from .report.calibration_report import write_report as write_report
 from .report.certificate import write_certificate as write_certificate
-from .report.document import Provenance as Provenance
-from .report.html import write_report as write_report
+from .report.provenance import Provenance as Provenance
 from .robot.chain import Chain as Chain
 from .robot.chain import extract_dh_table as extract_dh_table
 from .robot.collision import Obstacle as Obstacle

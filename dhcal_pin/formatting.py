@@ -72,8 +72,37 @@ def format_quantity(value: float, unit: str, std: float = math.nan, small: bool 
 
 
 @dataclass(frozen=True)
+class Quantity:
+    """Value with its unit; its text is rounded according to its standard deviation.
+
+    Attributes:
+        value: Value in its unit.
+        unit: SI unit, such as "m".
+        std: Standard deviation of the value.
+        is_small: Whether it is a change or an error; angles are then shown in mrad.
+        has_unit: Whether the unit is shown; the title of a column may have it.
+    """
+
+    value: float
+    unit: str
+    std: float = math.nan
+    is_small: bool = False
+    has_unit: bool = True
+
+    @classmethod
+    def error(cls, value: float, unit: str) -> Quantity:
+        """Return an error, which is shown with two or three digits."""
+        return cls(value, unit, value / 10, is_small=True)
+
+    def __str__(self) -> str:
+        """Return the text of the value."""
+        text = format_quantity(self.value, self.unit, self.std, self.is_small)
+        return text if self.has_unit else text.removesuffix(SMALL_UNITS[self.unit][1])
+
+
+@dataclass(frozen=True)
 class Table:
-    """Table whose cells are texts; it can be rendered as HTML, Markdown or console text.
+    """Table of texts and quantities; it can be rendered as HTML, Markdown or console text.
 
     Attributes:
         header: Column titles.
@@ -83,9 +112,14 @@ class Table:
     """
 
     header: Sequence[str]
-    rows: Sequence[Sequence[str]]
+    rows: Sequence[Sequence[str | Quantity]]
     n_text_columns: int = 1
     caption: str = ""
+
+    @property
+    def texts(self) -> list[list[str]]:
+        """Texts of the cells, one list per row."""
+        return [list(map(str, row)) for row in self.rows]
 
 
 @cache
@@ -137,6 +171,6 @@ def markdown_table(table: Table) -> str:
     """Render a table as Markdown with numbers aligned to the right."""
     rules = [" --- " if i < table.n_text_columns else " ---: " for i in range(len(table.header))]
     header, *rows = (
-        "| " + " | ".join(map(escape_markdown, row)) + " |" for row in (table.header, *table.rows)
+        "| " + " | ".join(map(escape_markdown, row)) + " |" for row in (table.header, *table.texts)
     )
     return "\n".join([header, "|" + "|".join(rules) + "|", *rows])

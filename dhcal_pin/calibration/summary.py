@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from ..estimation.error_model import ErrorModel
-from ..formatting import SMALL_UNITS, Table, format_fixed, format_quantity, significant_decimals
+from ..formatting import SMALL_UNITS, Quantity, Table
 from ..measurements.groups import ERROR_GROUPS
 from .cross_validation import Generalization
 from .estimates import Estimate
-from .evaluation import MIN_SAMPLES, Comparison
+from .evaluation import MIN_SAMPLES, Comparison, ErrorStatistics
 
 # The headline gives the RMS without outliers if it is below this fraction of the RMS with them.
 OUTLIER_RMS_RATIO = 0.9
@@ -39,9 +39,9 @@ def estimate_table(estimates: Sequence[Estimate]) -> Table:
     rows = [
         [
             e.name,
-            format_quantity(e.nominal, e.unit, e.std),
-            format_quantity(e.value, e.unit, e.std),
-            format_quantity(e.change, e.unit, e.std, small=True),
+            Quantity(e.nominal, e.unit, e.std),
+            Quantity(e.value, e.unit, e.std),
+            Quantity(e.change, e.unit, e.std, is_small=True),
             e.certainty,
         ]
         for e in estimates
@@ -59,23 +59,36 @@ def definition_table(estimates: Sequence[Estimate]) -> Table:
     return Table(["frame", "parameters and their directions"], rows, n_text_columns=2)
 
 
+def largest_corrections(estimates: Sequence[Estimate]) -> list[Estimate]:
+    """Sort the corrections of the robot by their size, relative to the errors expected beforehand."""
+    changed = [e for e in estimates if e.category == "robot" and not e.fixed and e.change]
+    return sorted(changed, key=lambda e: -abs(e.change) / e.prior if e.prior else 0.0)
+
+
+def statistic(errors: ErrorStatistics, name: str = "rms") -> Quantity:
+    """Return a statistic of errors, rounded by the standard error of their RMS."""
+    return Quantity(getattr(errors, name), errors.unit, errors.rms_std, is_small=True)
+
+
+def before_and_after(comparison: Comparison, group: str) -> tuple[Quantity, Quantity]:
+    """Return the RMS errors of a group before and after a calibration."""
+    return statistic(comparison.before.groups[group]), statistic(comparison.after.groups[group])
+
+
 def accuracy_table(comparisons: Sequence[Comparison]) -> Table:
     """Make a table of the error statistics before and after a calibration, in mm and mrad."""
     rows = []
     for c in comparisons:
         for group, after in c.after.groups.items():
-            factor, unit = SMALL_UNITS[after.unit]
+            error = f"{ERROR_GROUPS[group].label},{SMALL_UNITS[after.unit][1]}"
             for state, side in (("before", c.before), ("after", c.after)):
-                statistics = side.groups[group]
-                decimals = significant_decimals(factor * statistics.rms_std)
-                values = [getattr(statistics, key) for key in STATISTIC_LABELS]
-                axes_rms = statistics.axes_rms or []
+                errors = side.groups[group]
+                values = [getattr(errors, key) for key in STATISTIC_LABELS]
+                axes_rms = errors.axes_rms or ()
                 # Image coordinates have two axes.
                 values += [*axes_rms, *[math.nan] * (3 - len(axes_rms))]
-                cells = [format_fixed(factor * value, decimals) for value in values]
-                rows.append(
-                    [f"{after.samples} {c.title}", f"{ERROR_GROUPS[group].label},{unit}", state, *cells]
-                )
+                cells = [replace(statistic(errors), value=value, has_unit=False) for value in values]
+                rows.append([f"{after.samples} {c.title}", error, state, *cells])
     axes = [f"{axis}, RMS" for axis in "xyz"]
     return Table(
         ["samples", "error", "calibration", *STATISTIC_LABELS.values(), *axes], rows, n_text_columns=3
@@ -109,16 +122,13 @@ def headline(comparisons: Sequence[Comparison]) -> Headline:
     group, after = next(iter(best.after.groups.items()))
     before = best.before.groups[group]
     best = replace(best, n_samples=after.samples)
-    before_text, after_text = (
-        format_quantity(side.rms, side.unit, side.rms_std, small=True) for side in (before, after)
-    )
+    before_text, after_text = map(str, before_and_after(best, group))
     text = (
         f"RMS {ERROR_GROUPS[group].label} {describe_samples(best)}: {before_text} before, {after_text} after"
     )
     clean = best.after_without_outliers.groups.get(group)
     if clean and clean.rms < OUTLIER_RMS_RATIO * after.rms:
-        clean_text = format_quantity(clean.rms, clean.unit, clean.rms_std, small=True)
-        text += f", {clean_text} without {_count_outliers(best.n_outliers)}"
+        text += f", {statistic(clean)} without {_count_outliers(best.n_outliers)}"
     text += f". {_count_outliers(best.n_rejected).capitalize()} rejected." if best.n_rejected else "."
     if best.title == "fitted":
         text = f"No hold-out samples. {text}"
@@ -143,25 +153,17 @@ def generalization_lines(
     if covered is not None and reached is not None:
         region, pronoun = f"Measured region ({format_share(covered)} of joint space)", "it"
         rest = f"; for {format_share(1 - reached)} of joint space not known"
-    unknown = "cannot be said, "
+
+    def accuracy(comparison: Comparison | None, reason: str, rest: str = "") -> str:
+        if comparison is None:
+            return f"cannot be said, {reason}."
+        before, after = before_and_after(comparison, next(iter(comparison.after.groups)))
+        return f"{before} before, {after} after{rest}."
+
     return (
-        f"{region}: "
-        + (_before_and_after(inside) if inside else unknown + generalization.cross_validated_reason)
-        + ".",
-        f"Beyond {pronoun}: "
-        + (_before_and_after(beyond) + rest if beyond else unknown + generalization.region_holdout_reason)
-        + ".",
+        f"{region}: {accuracy(inside, generalization.cross_validated_reason)}",
+        f"Beyond {pronoun}: {accuracy(beyond, generalization.region_holdout_reason, rest)}",
     )
-
-
-def _before_and_after(comparison: Comparison) -> str:
-    """Return the most important RMS error before and after."""
-    group, after = next(iter(comparison.after.groups.items()))
-    before_text, after_text = (
-        format_quantity(side.rms, side.unit, side.rms_std, small=True)
-        for side in (comparison.before.groups[group], after)
-    )
-    return f"{before_text} before, {after_text} after"
 
 
 def format_share(share: float) -> str:

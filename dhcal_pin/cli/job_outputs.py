@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from .._typing import PathLike
     from ..calibration.result import Result
-    from ..report.document import Provenance
+    from ..report.provenance import Provenance
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class Calibrated:
     @cached_property
     def report_contents(self) -> dict[PathLike, str | bytes]:
         """Contents of all reports, which have their figures in common."""
-        from ..report.html import report_files  # lazy import: only for reports
+        from ..report.calibration_report import report_files  # lazy import: only for reports
 
         return report_files(self.fit, self.reports, self.source)
 

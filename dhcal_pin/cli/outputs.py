@@ -11,7 +11,7 @@ from contextlib import suppress
 from .._typing import PathLike
 from ..exceptions import FileFormatError, InvalidArgumentError
 from ..io.sidecar import existing_sidecar
-from ..report.document import json_text
+from ..report.json_document import json_text
 from ..saving import defer_signals, is_stream, require_writable, write_files
 from .options import STDOUT
 

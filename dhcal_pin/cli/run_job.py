@@ -45,7 +45,8 @@ from ..measurements.mounting import mount_rig
 from ..measurements.position import require_common_reference_target
 from ..parallel import SERIAL, TaskExecutor
 from ..plausibility.hypotheses import mend
-from ..report.document import Provenance, content_digests, file_digests, result_to_dict, short_names
+from ..report.json_document import result_to_dict
+from ..report.provenance import Provenance, content_digests, file_digests, short_names
 from ..robot import urdf_edit
 from ..robot.chain import Chain
 from ..robot.correction_table import joint_corrections

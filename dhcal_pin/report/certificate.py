@@ -1,23 +1,21 @@
 """Certificate: one or two printed pages about a calibration, for quality records.
 
-`page/certificate.html` is the Jinja template. The user states as metadata what the
-calibration does not know: serial number, instrument, operator and date.
+The user states as metadata what the calibration does not know: serial number, instrument, operator and date.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
-from .. import formatting
 from .._typing import PathLike
-from ..calibration import summary
 from ..calibration.result import Result
 from ..exceptions import InvalidArgumentError
-from ..formatting import Table, format_quantity
 from ..saving import write_files
-from .context import measurement_names
-from .document import Provenance, short_names, versions
-from .html import check_html_ending
+from .calibration_report import calibration_document
+from .context import ReportContext
+from .html import check_html_ending, html_certificate
+from .provenance import Provenance, short_names, versions
 
 # Metadata that a quality record usually needs, in their order; others follow.
 META_LABELS = {
@@ -32,8 +30,6 @@ META_LABELS = {
 }
 # Metadata that every certificate shows, with a line to fill in by hand where they are not given.
 REQUIRED_META = ("serial", "instrument", "date", "operator")
-# Largest corrections that are listed.
-MAX_CORRECTIONS = 8
 
 
 def write_certificate(
@@ -70,49 +66,27 @@ def parse_meta(texts: Sequence[str]) -> dict[str, str]:
 
 def certificate_page(fit: Result, meta: Mapping[str, str], source: Provenance) -> str:
     """Render the certificate of a calibration."""
-    cross_validated = source.comparison
-    comparisons = (
-        fit.comparisons if cross_validated is None or fit.holdout else (cross_validated, *fit.comparisons)
-    )
-    head = summary.headline(comparisons)
-    template = formatting.html_templates().get_template("report/page/certificate.html")
-    return template.render(
-        title=f"Calibration certificate: {meta.get('robot') or fit.chain.model.name or 'robot'}",
-        facts=_facts(fit, meta),
-        verdict=fit.verdict,
-        headline=head.text,
-        generalization=summary.generalization_lines(fit.generalization, comparisons),
-        tables=[summary.accuracy_table(comparisons), _corrections(fit)],
-        records=_records(fit, source),
-    )
+    context = ReportContext(fit, source)
+    document = calibration_document(context, "certificate")
+    title = f"Calibration certificate: {meta.get('robot') or context.robot_name}"
+    facts = _facts({"robot": context.robot_name} | dict(meta))
+    return html_certificate(replace(document, title=title, facts=facts, records=_records(context)))
 
 
-def _facts(fit: Result, meta: Mapping[str, str]) -> list[tuple[str, str]]:
+def _facts(meta: Mapping[str, str]) -> list[tuple[str, str]]:
     """Return labels and values of the metadata; an empty value leaves a line to fill in."""
-    known = {"robot": fit.chain.model.name or "robot"} | dict(meta)
-    keys = [key for key in META_LABELS if key in known or key in REQUIRED_META]
-    others = [key for key in known if key not in META_LABELS]
-    return [(META_LABELS.get(key, key), known.get(key, "")) for key in (*keys, *others)]
+    keys = [key for key in META_LABELS if key in meta or key in REQUIRED_META]
+    others = [key for key in meta if key not in META_LABELS]
+    return [(META_LABELS.get(key, key), meta.get(key, "")) for key in (*keys, *others)]
 
 
-def _corrections(fit: Result) -> Table:
-    """Return the largest corrections of the robot, in standard deviations of their priors."""
-    changed = [e for e in fit.estimates if e.category == "robot" and not e.fixed and e.change]
-    changed.sort(key=lambda e: -abs(e.change) / e.prior if e.prior else 0.0)
-    rows = [
-        [e.name, e.frame, format_quantity(e.change, e.unit, e.std, small=True), e.certainty]
-        for e in changed[:MAX_CORRECTIONS]
-    ]
-    hidden = len(changed) - len(rows)
-    caption = "Largest corrections" + (f" ({hidden} more in the report)" if hidden > 0 else "")
-    header = ["parameter", "frame", "change", "standard deviation"]
-    return Table(header, rows, n_text_columns=2, caption=caption)
-
-
-def _records(fit: Result, source: Provenance) -> list[tuple[str, str]]:
+def _records(context: ReportContext) -> list[tuple[str, str]]:
     """Return what is needed to repeat the calibration: data, command, files with hashes, versions."""
-    names = measurement_names(source.names, fit.data)
-    counts = [f"{name}: {len(item.rows)} {item.kind}" for name, item in zip(names, fit.data, strict=True)]
+    fit, source = context.fit, context.source
+    counts = [
+        f"{name}: {len(item.rows)} {item.kind}"
+        for name, item in zip(context.data_names, fit.data, strict=True)
+    ]
     held_out = sum(len(item.rows) for item in fit.holdout)
     outliers = sum(len(rows) for rows in fit.outliers)
     records = [

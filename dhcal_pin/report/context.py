@@ -1,64 +1,57 @@
-"""Report context: a result, its provenance, and the diagnostics that are computed once."""
+"""Report context: a result, its provenance, and what several sections need, computed when it is used."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 from ..calibration import summary
 from ..calibration.evaluation import Comparison
 from ..calibration.result import Result
-from ..diagnostics.curves import JointCurve, fitted_coverage, joint_curves
+from ..diagnostics.curves import JointCurve, joint_curves
 from ..diagnostics.residuals import JointProfile, Outlier, find_outliers, joint_offset_profiles
 from ..diagnostics.workspace import WorkspacePrediction, predict_workspace
-from ..measurements.base import Measurement
-from ..robot.coverage import JointCoverage
-from .document import Provenance, short_names
+from .provenance import Provenance, measurement_names
 from .samples import Samples, result_samples
 
 
 @dataclass(frozen=True, eq=False)
 class ReportContext:
-    """A result with everything that the sections and figures of its report need.
+    """A result with everything that its sections and figures need.
 
     Attributes:
         fit: Result of the calibration.
         source: Files, settings and other facts that the result does not contain.
-        outliers: Outliers among the fitted samples.
-        joint_profiles: Residual joint errors over the range of each moving joint.
-        workspace: Predicted accuracy over the workspace.
-        coverage: Values of each revolute joint that the fitted samples visited.
-        joint_curves: Correction curves of the joints with harmonics.
-        samples: Fitted and held-out samples with their errors.
     """
 
     fit: Result
     source: Provenance
-    outliers: Sequence[Outlier]
-    joint_profiles: Sequence[JointProfile]
-    workspace: WorkspacePrediction
-    coverage: Sequence[JointCoverage]
-    joint_curves: Sequence[JointCurve]
-    samples: Samples
 
-    @classmethod
-    def from_result(cls, fit: Result, source: Provenance) -> ReportContext:
-        """Compute what the report of a result needs."""
-        workspace = predict_workspace(fit, fit.data)
-        return cls(
-            fit=fit,
-            source=source,
-            outliers=find_outliers(fit),
-            joint_profiles=joint_offset_profiles(fit),
-            workspace=workspace,
-            coverage=fitted_coverage(fit),
-            joint_curves=joint_curves(fit),
-            samples=result_samples(
-                fit,
-                measurement_names(source.names, fit.data),
-                measurement_names(source.holdout_names, fit.holdout),
-            ).limited(),
-        )
+    @cached_property
+    def outliers(self) -> Sequence[Outlier]:
+        """Outliers among the fitted samples."""
+        return find_outliers(self.fit)
+
+    @cached_property
+    def joint_profiles(self) -> Sequence[JointProfile]:
+        """Residual joint errors over the range of each moving joint."""
+        return joint_offset_profiles(self.fit)
+
+    @cached_property
+    def workspace(self) -> WorkspacePrediction:
+        """Predicted accuracy over the workspace."""
+        return predict_workspace(self.fit, self.fit.data)
+
+    @cached_property
+    def joint_curves(self) -> Sequence[JointCurve]:
+        """Correction curves of the joints with harmonics."""
+        return joint_curves(self.fit)
+
+    @cached_property
+    def samples(self) -> Samples:
+        """Fitted and held-out samples with their errors."""
+        return result_samples(self.fit, self.data_names, self.holdout_names).limited()
 
     @property
     def data_names(self) -> list[str]:
@@ -79,6 +72,11 @@ class ReportContext:
         return (cross_validated, *(c for c in own if c.title == "fitted"))
 
     @property
+    def headline(self) -> summary.Headline:
+        """The most important error, before and after."""
+        return summary.headline(self.comparisons)
+
+    @property
     def generalization_lines(self) -> tuple[str, ...]:
         """Accuracy within the measured region and beyond it, one line each."""
         return summary.generalization_lines(self.fit.generalization, self.comparisons)
@@ -87,11 +85,3 @@ class ReportContext:
     def robot_name(self) -> str:
         """Name of the robot."""
         return self.fit.chain.model.name or "robot"
-
-
-def measurement_names(paths: Sequence[str], data: Sequence[Measurement]) -> list[str]:
-    """Return short names of measurements."""
-    if len(paths) == len(data):
-        short = short_names(paths)
-        return [short[path] for path in paths]
-    return [f"{item.kind} measurements {i}" for i, item in enumerate(data, 1)]

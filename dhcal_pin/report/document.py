@@ -1,229 +1,218 @@
-"""JSON document of a calibration or validation, and the provenance of a result.
+"""Document: what a page, a text, a screen or a certificate shows, as data.
 
-The keys of the document are a contract with other programs. Lengths are in metres, angles in radians; NaN and
-infinity become null.
+A document has a head and sections. A section has sentences, a list, tables and figures. Cells of tables are
+texts or values with units (`formatting.Table`). `html`, `markdown` and `cli/screens/screen.py` render it, and
+know nothing of calibrations.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
-import math
-import os
-import re
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from importlib import metadata
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from .._typing import PathLike
-from ..calibration.cross_validation import Generalization
-from ..calibration.evaluation import Comparison, accuracy
-from ..calibration.result import Result
-from ..calibration.verdict import Verdict
-from ..estimation import qr
-from ..measurements.base import Measurement
-from ..robot.chain import Chain
+from ..formatting import Table
+from ..visualization.plots import PANEL
 
 
 @dataclass(frozen=True)
-class Provenance:
-    """Facts about a calibration that its result does not contain.
+class ShareBar:
+    """Bar of a fraction.
 
     Attributes:
-        command: Command line, without the paths of the outputs.
-        inputs: SHA-256 of each input file by path.
-        outputs: SHA-256 of each file of the calibrated robot by path.
-        names: File of each measurement of the fitted data; empty for data from Python.
-        holdout_names: File of each measurement of the hold-out data.
-        settings: Further choices as text, by name.
-        excluded_rows: Reasons why rows were not used, by file and row.
-        warnings: Warnings about the input data by file.
-        notes: What of the input data is not used, by file.
-        remarks: Sentences that are shown beside the headline.
-        hint: Improvement to expect from transmission errors, if they were not tried.
-        comparison: Cross-validated accuracy, if there are no hold-out samples.
+        share: Length of the bar, from 0 to 1.
     """
 
-    command: str = ""
-    inputs: Mapping[str, str] = field(default_factory=dict)
-    outputs: Mapping[str, str] = field(default_factory=dict)
-    names: Sequence[str] = ()
-    holdout_names: Sequence[str] = ()
-    settings: Mapping[str, str] = field(default_factory=dict)
-    excluded_rows: Mapping[str, Mapping[int, str]] = field(default_factory=dict)
-    warnings: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    notes: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    share: float
+
+
+@dataclass(frozen=True)
+class IntervalBar:
+    """Mark with an interval around it, on a scale from -1 to 1.
+
+    Attributes:
+        low: Lower end of the interval.
+        middle: Position of the mark.
+        high: Upper end of the interval.
+    """
+
+    low: float
+    middle: float
+    high: float
+
+
+@dataclass(frozen=True)
+class BarColumn:
+    """Column of bars beside the numbers of a table.
+
+    Attributes:
+        title: Title of the column.
+        bars: One bar per row; None leaves the cell empty.
+    """
+
+    title: str
+    bars: Sequence[ShareBar | IntervalBar | None]
+
+
+@dataclass(frozen=True)
+class RowGroup:
+    """Rows of a table that belong together.
+
+    Attributes:
+        title: Heading above the rows.
+        rows: Indices of the rows.
+    """
+
+    title: str
+    rows: Sequence[int]
+
+
+@dataclass(frozen=True)
+class BarTable(Table):
+    """Table with columns of bars and groups of rows, which only the HTML page shows.
+
+    Attributes:
+        bars: The additional columns.
+        groups: Groups of all rows; none if the rows are not grouped.
+        unchanged: Indices of rows that the page folds, as they report no change.
+    """
+
+    bars: Sequence[BarColumn] = ()
+    groups: Sequence[RowGroup] = ()
+    unchanged: Sequence[int] = ()
+
+
+@dataclass(frozen=True)
+class SamplePoints:
+    """Meaning of the coordinates of the dots of a figure.
+
+    A coordinate is "number", "joint:I" (position of joint I), "base:K" (component K of the tool position in
+    the base frame) or "error:GROUP".
+
+    Attributes:
+        x: Horizontal coordinate.
+        y: Vertical coordinate.
+    """
+
+    x: str
+    y: str
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One figure, which is drawn when the page is written.
+
+    Attributes:
+        key: Prefix of its identifiers, unique in the document.
+        caption: Text above the figure.
+        description: What the figure shows, in words, for screen readers.
+        plot: Function of `plots` with all its arguments except `ax`.
+        size: Width and height [px].
+        points: What the dots of samples show, so that a reader can select them; None without such dots.
+        role: Role of the samples, if the figure shows the samples of one role only.
+    """
+
+    key: str
+    caption: str
+    description: str
+    plot: Callable[..., object]
+    size: tuple[float, float] = PANEL
+    points: SamplePoints | None = None
+    role: str = ""
+
+
+@dataclass(frozen=True)
+class LegendEntry:
+    """Meaning of a colour.
+
+    Attributes:
+        text: What is drawn in this way.
+        color: Name of the colour in `plots.COLORS`.
+        mark: Shape of the sample: "area", "cell", "dashes", "dots" or "line".
+    """
+
+    text: str
+    color: str
+    mark: str
+
+
+@dataclass(frozen=True)
+class FigureGroup:
+    """Figures that belong together and share a legend.
+
+    Attributes:
+        panels: The figures.
+        title: Heading of the group; may be empty.
+        legend: Meaning of the colours.
+        layout: Columns of panels on a wide page: "narrow" (three) or "wide" (two).
+        scene: Page of a 3-D scene as `figures.packed_scene` returns it, shown on screens; the panels then
+            appear in print only.
+        scene_title: What the scene shows, for screen readers.
+    """
+
+    panels: Sequence[Panel]
+    title: str = ""
+    legend: Sequence[LegendEntry] = ()
+    layout: str = "narrow"
+    scene: str = ""
+    scene_title: str = "The robot before and after calibration, in three dimensions"
+
+
+@dataclass(frozen=True)
+class Section:
+    """Section of a document; one without content is not shown.
+
+    Attributes:
+        key: Identifier of the section on the page.
+        title: Heading.
+        sentences: Paragraphs.
+        items: List below the paragraphs.
+        tables: Tables below the list.
+        figures: Makes the figures, at the end of the section; called by renderings with figures.
+    """
+
+    key: str
+    title: str
+    sentences: Sequence[str] = ()
+    items: Sequence[str] = ()
+    tables: Sequence[Table] = ()
+    figures: Callable[[], Sequence[FigureGroup]] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Document:
+    """Head and sections of a document.
+
+    Attributes:
+        title: Title of the document.
+        sections: Sections.
+        heading: What the values are, as the heading of a page.
+        eyebrow: Line above the heading.
+        status: Verdict: "ok", "caution" or "refused"; empty if there is none.
+        reasons: Reasons of the verdict.
+        headline: The most important value as a sentence, for renderings without heading and values.
+        values: State ("before", "after" or empty), name and text of the most important values.
+        details: State, name and text of further values.
+        remarks: Paragraphs below the values.
+        note: How far the values can be trusted; the headline says so, too.
+        warnings: What a reader must know before relying on the document.
+        samples: Makes the samples that a reader can select on a page, as JSON-compatible values.
+        facts: Names and values of a certificate; a reader fills in those without a value by hand.
+        records: Names and values at the end of a certificate.
+    """
+
+    title: str
+    sections: Sequence[Section]
+    heading: str = ""
+    eyebrow: str = ""
+    status: str = ""
+    reasons: Sequence[str] = ()
+    headline: str = ""
+    values: Sequence[tuple[str, str, str]] = ()
+    details: Sequence[tuple[str, str, str]] = ()
     remarks: Sequence[str] = ()
-    hint: str = ""
-    comparison: Comparison | None = None
-
-
-def file_digests(paths: Sequence[PathLike]) -> dict[str, str]:
-    """Compute the SHA-256 of files."""
-    return {str(path): hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in paths}
-
-
-def content_digests(contents: Mapping[PathLike, str | bytes]) -> dict[str, str]:
-    """Compute the SHA-256 of files that are not written yet."""
-    return {
-        str(path): hashlib.sha256(content if isinstance(content, bytes) else content.encode()).hexdigest()
-        for path, content in contents.items()
-    }
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of the packages that compute results."""
-    return {name: metadata.version(name) for name in ("dhcal-pin", "pin", "numpy", "scipy")}
-
-
-def short_names(paths: Sequence[PathLike]) -> dict[str, str]:
-    """Shorten paths to as many of their last parts as make them unique.
-
-    >>> short_names(["a/front/hole.csv", "a/back/hole.csv", "arm.urdf"])
-    {'a/front/hole.csv': 'front/hole.csv', 'a/back/hole.csv': 'back/hole.csv', 'arm.urdf': 'arm.urdf'}
-    """
-    parts = {os.fspath(path): Path(path).parts for path in paths}
-
-    def shortest_unique_end(path: str) -> str:
-        for count in range(1, len(parts[path])):
-            end = parts[path][-count:]
-            if all(other[-count:] != end for name, other in parts.items() if name != path):
-                return "/".join(end)
-        return path
-
-    return {path: shortest_unique_end(path) for path in parts}
-
-
-# Keys of an accuracy and of a parameter; further values are under `comparisons` and `priors`.
-_ACCURACY = re.compile("(?!.*_axes_).+_(rms_m|max_m|rms_rad)|residual_(rms|max)|unit")
-_PARAMETER = "name unit nominal value std observability posterior_to_prior_std fixed frame direction".split()
-
-
-def _select_keys(content: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
-    return {key: content[key] for key in keys if key in content}
-
-
-def main_statistics(accuracy: Mapping[str, Any]) -> dict[str, Any]:
-    """Select RMS and largest errors."""
-    return {key: value for key, value in accuracy.items() if _ACCURACY.fullmatch(key)}
-
-
-def parameter_rows(fit: Result) -> list[dict[str, Any]]:
-    """Return the parameters as the JSON document lists them."""
-    return [_select_keys(asdict(estimate), _PARAMETER) for estimate in fit.estimates]
-
-
-def result_to_dict(
-    fit: Result,
-    files: Mapping[str, str],
-    inputs: Mapping[str, str],
-    outliers: Sequence[int] = (),
-    is_calibration: bool = True,
-) -> dict[str, Any]:
-    """Collect the JSON document of a calibration, or of a validation that fits base and tool."""
-    comparisons = {comparison.title: comparison for comparison in fit.comparisons}
-    fitted, holdout = comparisons["fitted"], comparisons.get("hold-out")
-    return {
-        "verdict": fit.verdict.to_dict(),
-        "converged": fit.converged,
-        "iterations": fit.iterations,
-        "method": fit.method,
-        "samples": fit.n_samples,
-        "samples_holdout": holdout.n_samples if holdout else 0,
-        "rank": fit.rank,
-        "parameters_total": len(fit.parameters),
-        "condition": fit.condition,
-        "singular_values": qr.singular_values(fit.solution.system.r).tolist(),
-        "before": main_statistics(fitted.before),
-        "after": main_statistics(fitted.after),
-        "holdout_before": main_statistics(holdout.before) if holdout else {},
-        "holdout_after": main_statistics(holdout.after) if holdout else {},
-        **generalization_to_dict(fit.generalization if is_calibration else None),
-        "comparisons": [comparison.to_dict() for comparison in fit.comparisons],
-        "parameters": parameter_rows(fit),
-        "priors": {estimate.name: estimate.prior for estimate in fit.estimates if not estimate.fixed},
-        "extension": fit.extension.to_dict() if fit.extension else None,
-        "camera_stages": [stage.to_dict() for stage in fit.camera_stages],
-        "hand_eye": fit.hand_eye.to_dict() if fit.hand_eye else None,
-        "shrinkage_factor": fit.shrinkage_factor,
-        "shrinkage_notes": fit.shrinkage_notes,
-        "unobservable": fit.unobservable,
-        "weakly_observable": fit.weakly_observable,
-        "observability_indices": fit.observability_indices,
-        "outliers": list(outliers),
-        "files": dict(files),
-        "versions": versions(),
-        "inputs": dict(inputs),
-    }
-
-
-def generalization_to_dict(generalization: Generalization | None) -> dict[str, Any]:
-    """Return the accuracy on configurations that are not fitted."""
-    names = ("cross_validated", "holdout_region")
-    comparisons: tuple[Comparison | None, ...] = (None, None)
-    reasons: tuple[str, ...] = ("", "")
-    shares: tuple[float | None, ...] = (None, None)
-    if generalization is not None:
-        comparisons = (generalization.cross_validated, generalization.region_holdout)
-        reasons = (generalization.cross_validated_reason, generalization.region_holdout_reason)
-        shares = (generalization.covered_share, generalization.reached_share)
-    out: dict[str, Any] = {}
-    for name, comparison, reason in zip(names, comparisons, reasons, strict=True):
-        out[f"{name}_before"] = main_statistics(comparison.before) if comparison else None
-        out[f"{name}_after"] = main_statistics(comparison.after) if comparison else None
-        out[f"{name}_reason"] = reason
-    return out | dict(zip(("covered_share", "reached_share"), shares, strict=True))
-
-
-def validation_to_dict(
-    chain: Chain, data: Sequence[Measurement], inputs: Mapping[str, str], known: Mapping[str, float]
-) -> dict[str, Any]:
-    """Collect the JSON document of a validation; it has the keys of a calibration."""
-    statistics = main_statistics(accuracy(chain, data, known))
-    return {
-        "verdict": Verdict("ok").to_dict(),
-        "converged": True,
-        "iterations": 0,
-        "method": "none",
-        "samples": sum(len(item.q) for item in data),
-        "samples_holdout": 0,
-        "rank": 0,
-        "parameters_total": 0,
-        "condition": 0.0,
-        "before": statistics,
-        "after": statistics,
-        "holdout_before": {},
-        "holdout_after": {},
-        **generalization_to_dict(None),
-        "parameters": [],
-        "unobservable": [],
-        "extension": None,
-        "shrinkage_factor": 1.0,
-        "shrinkage_notes": [],
-        "weakly_observable": [],
-        "observability_indices": {},
-        "outliers": [],
-        "outliers_by_file": {},
-        "files": {},
-        "versions": versions(),
-        "inputs": dict(inputs),
-    }
-
-
-def json_text(content: Any) -> str:
-    """Format a document as JSON; NaN and infinity become null."""
-
-    def clean(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: clean(item) for key, item in value.items()}
-        if isinstance(value, list | tuple):
-            return [clean(item) for item in value]
-        if isinstance(value, float) and not math.isfinite(value):
-            return None
-        return value
-
-    text = json.dumps(clean(content), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    # A file name need not be UTF-8. Python keeps its other bytes as surrogates, which become JSON escapes.
-    return text.encode(errors="backslashreplace").decode()
+    note: str = ""
+    warnings: Sequence[str] = ()
+    samples: Callable[[], Mapping[str, Any]] | None = None
+    facts: Sequence[tuple[str, str]] = ()
+    records: Sequence[tuple[str, str]] = ()

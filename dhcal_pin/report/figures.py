@@ -1,7 +1,6 @@
-"""Figures of the report: which plots of `visualization.plots` go into which section.
+"""Figures of sections: which plots of `visualization.plots` a section shows.
 
-A section names one function of this module. The function gets the `ReportContext` and returns the groups of
-figures of the section in their order on the page.
+A function gets the `ReportContext`, or samples, and returns groups of figures in their order on the page.
 """
 
 from __future__ import annotations
@@ -9,8 +8,7 @@ from __future__ import annotations
 import base64
 import math
 import zlib
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -23,12 +21,13 @@ from ..calibration.evaluation import compute_errors, error_norms
 from ..diagnostics.residuals import JointProfile
 from ..diagnostics.workspace import WorkspacePrediction
 from ..estimation import qr
-from ..formatting import format_quantity
+from ..formatting import Quantity
 from ..measurements.groups import ERROR_GROUPS, in_order
 from ..robot.chain import Chain
 from ..visualization import plots, scene
 from ..visualization.plots import SQUARE_PANEL, WIDE_PANEL
 from .context import ReportContext
+from .document import FigureGroup, LegendEntry, Panel, SamplePoints
 from .samples import ROLES, Samples, is_prismatic_joint
 
 # A joint whose errors are larger than this multiple of the joints' median gets a scale of its own. Errors
@@ -40,82 +39,6 @@ DRAWN_DISPLACEMENT = 0.05
 MAX_SCENE_TRIANGLES = 30_000
 # Script of a scene that is part of a report.
 SCENE_LINK = Path(__file__).with_name("page") / "scene_link.js"
-
-
-@dataclass(frozen=True)
-class SamplePoints:
-    """Meaning of the coordinates of the dots of a figure.
-
-    A coordinate is "number", "joint:I" (position of joint I), "base:K" (component K of the tool position in
-    the base frame) or "error:GROUP".
-
-    Attributes:
-        x: Horizontal coordinate.
-        y: Vertical coordinate.
-    """
-
-    x: str
-    y: str
-
-
-@dataclass(frozen=True)
-class Panel:
-    """One figure, which is drawn when the page is written.
-
-    Attributes:
-        key: Prefix of its identifiers, unique in the report.
-        caption: Text above the figure.
-        description: What the figure shows, in words, for screen readers.
-        plot: Function of `plots` with all its arguments except `ax`.
-        size: Width and height [px].
-        points: What the dots of samples show, so that a reader can select them; None without such dots.
-        role: Role of the samples, if the figure shows the samples of one role only.
-    """
-
-    key: str
-    caption: str
-    description: str
-    plot: Callable[..., object]
-    size: tuple[float, float] = plots.PANEL
-    points: SamplePoints | None = None
-    role: str = ""
-
-
-@dataclass(frozen=True)
-class LegendEntry:
-    """Meaning of a colour.
-
-    Attributes:
-        text: What is drawn in this way.
-        color: Name of the colour in `plots.COLORS`.
-        mark: Shape of the sample: "area", "cell", "dashes", "dots" or "line".
-    """
-
-    text: str
-    color: str
-    mark: str
-
-
-@dataclass(frozen=True)
-class FigureGroup:
-    """Figures that belong together and share a legend.
-
-    Attributes:
-        panels: The figures.
-        title: Heading of the group; may be empty.
-        legend: Meaning of the colours.
-        layout: Columns of panels on a wide page: "narrow" (three) or "wide" (two).
-        scene: Page of a 3-D scene as `packed_scene` returns it, shown on screens; the panels then appear in
-            print only.
-        scene_title: What the scene shows, for screen readers.
-    """
-
-    panels: Sequence[Panel]
-    title: str = ""
-    legend: Sequence[LegendEntry] = ()
-    layout: str = "narrow"
-    scene: str = ""
-    scene_title: str = "The robot before and after calibration, in three dimensions"
 
 
 def accuracy_figures(context: ReportContext) -> list[FigureGroup]:
@@ -146,7 +69,7 @@ def histogram_panels(group: str, errors: Mapping[str, tuple[Array, Array]]) -> l
     bins = plots.histogram_edges(*(np.concatenate(side) for side in zip(*errors.values(), strict=True)))
     panels = []
     for role, (before, after) in errors.items():
-        rms = [_shown(float(np.sqrt(np.mean(norms**2))), unit) for norms in (before, after)]
+        rms = [Quantity.error(float(np.sqrt(np.mean(norms**2))), unit) for norms in (before, after)]
         count = f"{len(after)} {role} samples"
         text = f"Histogram of the {quantity} of {count}: RMS {rms[0]} before, {rms[1]} after."
         caption = f"{_capitalized(quantity)}, {count}"
@@ -178,7 +101,7 @@ def _joint_offset_group(context: ReportContext) -> FigureGroup:
     panels = []
     for i, profile in enumerate(profiles):
         shown = {state: offsets[profile.name][state] for state in states}
-        worst = _shown(float(np.nanmax(np.abs(profile.after))), _offset_unit(profile))
+        worst = Quantity.error(float(np.nanmax(np.abs(profile.after))), _offset_unit(profile))
         text = (
             f"Residual error of {profile.name} over its position, with two standard errors; at most "
             f"{worst} after calibration."
@@ -235,7 +158,9 @@ def joint_curve_figures(context: ReportContext) -> list[FigureGroup]:
     panels = []
     for i, curve in enumerate(curves):
         coverage = curve.coverage
-        largest = _shown(float(np.max(np.abs(curve.correction[curve.is_measured]), initial=0.0)), "rad")
+        largest = Quantity.error(
+            float(np.max(np.abs(curve.correction[curve.is_measured]), initial=0.0)), "rad"
+        )
         text = (
             f"Correction of {coverage.joint} over its position, with its 95 % band; at most {largest} at the "
             f"measured joint values, which are {coverage.n_visited} of {coverage.n_in_range} bins."
@@ -292,7 +217,7 @@ def sample_group(samples: Samples) -> FigureGroup:
         quantity, unit = ERROR_GROUPS[group].label, ERROR_GROUPS[group].unit
         errors = np.concatenate([errors for _, errors in by_role.values()])
         caption = f"{_capitalized(quantity)} by sample"
-        largest = _shown(float(errors.max()), unit)
+        largest = Quantity.error(float(errors.max()), unit)
         state = _shown_state(samples, group)
         text = f"{_capitalized(quantity)} of {len(errors)} samples{state}; at most {largest}."
         plot = partial(plots.plot_errors_by_sample, by_role, quantity=quantity, unit=unit)
@@ -336,7 +261,7 @@ def workspace_maps(workspace: WorkspacePrediction, points: Array, errors: Array)
     if not finite.size:
         return []
     panels = []
-    median, p95 = (_shown(float(np.quantile(finite, q)), "m") for q in (0.5, 0.95))
+    median, p95 = (Quantity.error(float(np.quantile(finite, q)), "m") for q in (0.5, 0.95))
     # Both sorts of maps fit into the scale, except for a few large errors, which may be outliers.
     both = plots.std_levels(workspace.std), plots.std_levels(_without_largest(errors))
     levels = max(both, key=lambda edges: edges[-1])
@@ -351,7 +276,7 @@ def workspace_maps(workspace: WorkspacePrediction, points: Array, errors: Array)
         coordinates = SamplePoints(*(f"base:{'xyz'.index(axis)}" for axis in plane))
         panels.append(Panel(f"map-{plane}", f"Predicted, {view}", text, predicted, SQUARE_PANEL, coordinates))
         if len(errors):
-            rms = _shown(float(np.sqrt(np.mean(errors**2))), "m")
+            rms = Quantity.error(float(np.sqrt(np.mean(errors**2))), "m")
             text = f"Map of the measured position errors over {plane[0]} and {plane[1]}: RMS {rms}."
             measured = partial(plot, points, errors)
             panels.append(Panel(f"errors-{plane}", f"Measured error, {view}", text, measured, SQUARE_PANEL))
@@ -454,7 +379,3 @@ def observability_figures(context: ReportContext) -> list[FigureGroup]:
 
 def _capitalized(text: str) -> str:
     return text[:1].upper() + text[1:]
-
-
-def _shown(value: float, unit: str) -> str:
-    return format_quantity(value, unit, value / 10, small=True)

@@ -15,7 +15,7 @@ from ..cameras.rig import Camera
 from ..formatting import Table, format_fixed
 from ..visualization import image_plots
 from .context import ReportContext
-from .figures import FigureGroup, LegendEntry, Panel
+from .document import FigureGroup, LegendEntry, Panel, Section
 
 # Images of the table, and of the figures of single images: those with the largest errors.
 MAX_LISTED_IMAGES, MAX_DRAWN_IMAGES = 10, 6
@@ -62,9 +62,32 @@ def _rms(errors: Array) -> float:
     return float(np.sqrt(np.mean(np.sum(errors**2, 1))))
 
 
-def has_images(context: ReportContext) -> bool:
-    """Return whether a result comes from images."""
-    return any(item.rig is not None for item in context.fit.data)
+def image_section(context: ReportContext) -> Section | None:
+    """Describe stages, causes of the errors of left-out images, and the images with the largest errors."""
+    if not any(item.rig is not None for item in context.fit.data):
+        return None
+    stages, sentences, items = context.fit.camera_stages, [], []
+    tables: list[Table] = []
+    if stages:
+        sentences.append(
+            "Unknowns are freed in stages. Each stage is judged on images that its fit did not see: random "
+            "ones, and whole regions of joint space. An error in mm is the distance of a corner of the board "
+            "from the line of sight through its image."
+        )
+        items = [f"{stage.name}: {stage.reason}" for stage in stages if stage.reason]
+        tables.append(stage_table(stages))
+    hand_eye = context.fit.hand_eye
+    if hand_eye is not None:
+        likely = "" if hand_eye.is_noise else hand_eye.likely
+        sentences += [f"{hand_eye.error_sentence}{likely}", *hand_eye.image_sentences]
+        if hand_eye.trials:
+            sentences.append(
+                "The table of causes shows the error of left-out images if one thing more than the poses is "
+                "estimated."
+            )
+        tables.append(hand_eye.table)
+    tables.append(image_table(context))
+    return Section("images", "Images", sentences, items, tables, partial(image_figures, context))
 
 
 def stage_table(stages: Sequence[Stage]) -> Table:

@@ -9,18 +9,16 @@ from functools import partial
 import numpy as np
 
 from .. import se3
-from ..formatting import Table
 from ..planning.planner import Plan
 from ..planning.views import views_table
 from ..robot.chain import Chain
 from ..robot.coverage import joint_coverage
 from ..visualization import plots
 from . import figures
-from .document import short_names, versions
-from .figures import FigureGroup, Panel, SamplePoints
-from .html import Page, render_page
-from .samples import Samples
-from .sections import BarColumn, BarTable, Section, ShareBar, samples_section
+from .document import BarColumn, BarTable, Document, FigureGroup, Panel, SamplePoints, Section, ShareBar
+from .html import html_page
+from .provenance import origin_tables
+from .samples import Samples, samples_section
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +66,8 @@ def plan_page(report: PlanReport) -> str:
     )
     noise = plan.information.noise
     percent = 100 * (1 - plan.relative_error)
-    return render_page(
-        Page(
+    return html_page(
+        Document(
             title=f"Poses for {report.name}",
             heading=f"{count} poses to measure",
             sections=_sections(report, samples),
@@ -86,7 +84,7 @@ def plan_page(report: PlanReport) -> str:
                 *([("", "of a corner", f"{report.pixel_sigma:.3g} px")] if plan.views else []),
             ],
             remarks=[*report.moves, *plan.notes],
-            samples=samples,
+            samples=samples.page_data,
         )
     )
 
@@ -94,13 +92,6 @@ def plan_page(report: PlanReport) -> str:
 def _sections(report: PlanReport, samples: Samples) -> list[Section]:
     """Return the sections of the page."""
     plan = report.plan
-    size = (
-        f"Diminishing returns beyond {plan.recommended_size} poses (less than 1 % per ten)."
-        if plan.recommended_size
-        else f"No diminishing returns up to {plan.sizes[-1]} poses (still at least 1 % per ten)."
-    )
-    short = short_names(list(report.inputs))
-    digests = [[short[path], digest] for path, digest in report.inputs.items()]
     return [
         Section(
             "error",
@@ -108,7 +99,7 @@ def _sections(report: PlanReport, samples: Samples) -> list[Section]:
             [
                 "RMS position error over the task after the calibration, over the number of poses. Errors "
                 "that the model lacks come in addition.",
-                size,
+                size_sentence(plan),
             ],
             figures=partial(_curve_figures, plan),
         ),
@@ -121,15 +112,15 @@ def _sections(report: PlanReport, samples: Samples) -> list[Section]:
         *_views_sections(plan),
         Section("scene", "Robot and poses", figures=partial(_pose_figures, report, samples)),
         samples_section(samples, "Poses"),
-        Section(
-            "provenance",
-            "Provenance",
-            tables=[
-                Table(["file", "SHA-256"], digests, n_text_columns=2),
-                Table(["software", "version"], [list(pair) for pair in versions().items()], n_text_columns=2),
-            ],
-        ),
+        Section("provenance", "Provenance", tables=origin_tables(report.inputs)),
     ]
+
+
+def size_sentence(plan: Plan) -> str:
+    """Say beyond how many poses more of them help little."""
+    if plan.recommended_size:
+        return f"Diminishing returns beyond {plan.recommended_size} poses (less than 1 % per ten)."
+    return f"No diminishing returns up to {plan.sizes[-1]} poses (still at least 1 % per ten)."
 
 
 def _views_sections(plan: Plan) -> list[Section]:

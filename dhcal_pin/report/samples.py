@@ -17,15 +17,18 @@ import numpy as np
 from .. import se3
 from .._typing import Array
 from ..calibration.result import Result
-from ..formatting import SMALL_UNITS, UNITS
+from ..formatting import SMALL_UNITS, UNITS, Quantity, Table
 from ..io.tabular import csv_text
 from ..measurements.groups import ERROR_GROUPS, in_order
 from ..robot.chain import Chain
 from ..visualization.subsampling import evenly_spaced_indices
-from .document import parameter_rows
+from .document import Section
+from .json_document import parameter_rows
 
 # Largest number of samples that a page contains beside the outliers; more would make it large and slow.
 MAX_SAMPLES = 5000
+# Samples with the largest errors that the table of samples lists without scripts.
+MAX_LISTED_SAMPLES = 20
 # Decimals of numbers in the page: positions, angles and errors in SI units.
 _POSE_DECIMALS, _ERROR_DECIMALS, _MAP_DECIMALS = 12, 9, 5
 # Roles of samples, in the order of their legend.
@@ -117,6 +120,40 @@ class Samples:
             },
             "downloads": dict(self.downloads),
         }
+
+
+def samples_section(samples: Samples, title: str = "Samples") -> Section:
+    """List the samples with the largest errors; scripts of the page make it a list of all samples."""
+    groups = {
+        group: states["after"]
+        for group, states in samples.errors.items()
+        if np.isfinite(states["after"]).any()
+    }
+    largest = np.arange(len(samples))
+    text = f"The first {min(len(samples), MAX_LISTED_SAMPLES)} of {len(samples)}."
+    if groups:
+        first = next(iter(groups.values()))
+        largest = np.argsort(-np.nan_to_num(first, nan=-1.0), kind="stable")
+        label = ERROR_GROUPS[next(iter(groups))].label
+        text = f"The {min(len(samples), MAX_LISTED_SAMPLES)} samples with the largest {label}."
+    shown = largest[:MAX_LISTED_SAMPLES]
+    joints = samples.chain.joint_names
+    rows = [
+        [
+            samples.file[i],
+            str(samples.line[i]),
+            samples.role[i] + (", outlier" if samples.is_outlier[i] else ""),
+            *(
+                Quantity(float(samples.q[i, j]), "m" if is_prismatic_joint(samples.chain, j) else "rad")
+                for j in range(len(joints))
+            ),
+            *(Quantity.error(float(errors[i]), ERROR_GROUPS[group].unit) for group, errors in groups.items()),
+        ]
+        for i in shown
+    ]
+    header = ["file", "line", "set", *joints, *(ERROR_GROUPS[group].label for group in groups)]
+    sentences = [text, *filter(None, [samples.note])]
+    return Section("samples", title, sentences, tables=[Table(header, rows)] if rows else [])
 
 
 def is_prismatic_joint(chain: Chain, joint: int) -> bool:

@@ -1,8 +1,7 @@
-"""Sections of the report: sentences and tables, and the figures that belong to them.
+"""Sections of a calibration: functions that make them, and the table of what shows which.
 
-A new section is a function in this module that returns a `Section` and is listed in `report_sections`. If it
-has figures, a function in `figures.py` draws them. The HTML page shows all of it. Markdown has no figures and
-no bars.
+A new section is a function in this module and a row of `SECTIONS`. The function returns the section, or None
+if there is nothing to say. Its figures are made by another function, which only renderings with figures call.
 """
 
 from __future__ import annotations
@@ -10,164 +9,41 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
+from typing import Literal
 
 import numpy as np
 
-from .. import formatting
 from ..calibration import summary
 from ..calibration.cross_validation import Generalization
 from ..calibration.estimates import Estimate
 from ..calibration.model_selection import trial_table
-from ..diagnostics.curves import JointCurve, find_lattices
+from ..diagnostics.curves import JointCurve, find_lattices, fitted_coverage
 from ..diagnostics.residuals import median_sigmas
 from ..diagnostics.workspace import RELATIVE_TEXT
 from ..estimation import robust
-from ..formatting import Table, format_fixed, format_quantity
-from ..identifiability import label_unobservable
+from ..formatting import Quantity, Table, format_fixed
+from ..identifiability import EXPECTED, label_unobservable
 from ..io.origins_file import origin_table
 from ..measurements.groups import ERROR_GROUPS, error_group
 from ..robot.chain import BASE_FRAME
-from . import figures, images
+from . import figures, images, samples
 from .context import ReportContext
-from .document import short_names, versions
-from .figures import FigureGroup
-from .samples import Samples, is_prismatic_joint
+from .document import BarColumn, BarTable, IntervalBar, RowGroup, Section, ShareBar
+from .provenance import origin_tables
 
 # The page folds parameters that change by at most this multiple of their standard deviations and whose
 # standard deviations are at least this fraction of those before the measurement.
 MAX_ZERO_CHANGE, MIN_ZERO_RATIO = 0.01, 0.99
-# Samples with the largest errors that the table of samples lists without scripts.
-MAX_LISTED_SAMPLES = 20
 # A longer list of outliers is cut: the file as a whole is then more likely wrong than single rows.
 MAX_OUTLIERS = 40
 # Ranges of a joint that were not measured and are listed; the widest ones.
 MAX_GAPS = 3
+# Largest corrections that a certificate lists.
+MAX_CORRECTIONS = 8
 
-
-@dataclass(frozen=True)
-class ShareBar:
-    """Bar of a fraction.
-
-    Attributes:
-        share: Length of the bar, from 0 to 1.
-    """
-
-    share: float
-
-
-@dataclass(frozen=True)
-class IntervalBar:
-    """Mark with an interval around it, on a scale from -1 to 1.
-
-    Attributes:
-        low: Lower end of the interval.
-        middle: Position of the mark.
-        high: Upper end of the interval.
-    """
-
-    low: float
-    middle: float
-    high: float
-
-
-@dataclass(frozen=True)
-class BarColumn:
-    """Column of bars beside the numbers of a table.
-
-    Attributes:
-        title: Title of the column.
-        bars: One bar per row; None leaves the cell empty.
-    """
-
-    title: str
-    bars: Sequence[ShareBar | IntervalBar | None]
-
-
-@dataclass(frozen=True)
-class RowGroup:
-    """Rows of a table that belong together.
-
-    Attributes:
-        title: Heading above the rows.
-        rows: Indices of the rows.
-    """
-
-    title: str
-    rows: Sequence[int]
-
-
-@dataclass(frozen=True)
-class BarTable(Table):
-    """Table with columns of bars and groups of rows, which only the HTML page shows.
-
-    Attributes:
-        bars: The additional columns.
-        groups: Groups of all rows; none if the rows are not grouped.
-        unchanged: Indices of rows that the page folds, as they report no change.
-    """
-
-    bars: Sequence[BarColumn] = ()
-    groups: Sequence[RowGroup] = ()
-    unchanged: Sequence[int] = ()
-
-
-@dataclass(frozen=True)
-class Section:
-    """Section of the report.
-
-    Attributes:
-        key: Identifier of the section on the page.
-        title: Heading.
-        sentences: Paragraphs.
-        items: List below the paragraphs.
-        tables: Tables below the list.
-        figures: Draws the figures, at the end of the section; called for HTML only.
-    """
-
-    key: str
-    title: str
-    sentences: Sequence[str] = ()
-    items: Sequence[str] = ()
-    tables: Sequence[Table] = ()
-    figures: Callable[[], Sequence[FigureGroup]] | None = None
-
-
-def report_sections(context: ReportContext) -> list[Section]:
-    """Return all sections of the report below its headline."""
-    return [
-        _accuracy_section(context),
-        _image_section(context),
-        _residual_section(context),
-        _transmission_section(context),
-        _joint_section(context),
-        _workspace_section(context),
-        Section("scene", "Nominal and calibrated robot", figures=partial(figures.scene_figures, context)),
-        _parameter_section(context),
-        _observability_section(context),
-        _outlier_section(context),
-        samples_section(context.samples),
-        _provenance_section(context),
-    ]
-
-
-def warnings(context: ReportContext) -> list[str]:
-    """Return what a reader must know before relying on the report."""
-    fit, texts = context.fit, []
-    texts += summary.regressions(fit.errors, context.comparisons)
-    if not np.isfinite(fit.unit_weight_std):
-        texts.append(
-            f"{fit.sample_count} determine {fit.rank} directions in parameter space and leave no "
-            "redundancy; the measurement noise and the parameter uncertainties cannot be estimated."
-        )
-    if context.outliers:
-        count, n_rejected = len(context.outliers), max(c.n_rejected for c in fit.comparisons)
-        texts.append(
-            f"{count} {'outlier' if count == 1 else 'outliers'} among the samples, {n_rejected or 'none'} "
-            "rejected; see the section on outliers."
-        )
-    return texts
+Rendering = Literal["html", "markdown", "terminal", "certificate"]
 
 
 def _accuracy_section(context: ReportContext) -> Section:
@@ -214,40 +90,8 @@ def _region_sentence(generalization: Generalization) -> str:
     )
 
 
-def _image_section(context: ReportContext) -> Section:
-    key, title = "images", "Images"
-    if not images.has_images(context):
-        return Section(key, title)
-    stages, sentences, items = context.fit.camera_stages, [], []
-    tables: list[Table] = []
-    if stages:
-        sentences.append(
-            "Unknowns are freed in stages. Each stage is judged on images that its fit did not see: random "
-            "ones, and whole regions of joint space. An error in mm is the distance of a corner of the board "
-            "from the line of sight through its image."
-        )
-        items = [f"{stage.name}: {stage.reason}" for stage in stages if stage.reason]
-        tables.append(images.stage_table(stages))
-    hand_eye = context.fit.hand_eye
-    if hand_eye is not None:
-        likely = "" if hand_eye.is_noise else hand_eye.likely
-        sentences += [f"{hand_eye.error_sentence}{likely}", *hand_eye.image_sentences]
-        if hand_eye.trials:
-            sentences.append(
-                "The table of causes shows the error of left-out images if one thing more than the poses is "
-                "estimated."
-            )
-        tables.append(hand_eye.table)
-    tables.append(images.image_table(context))
-    return Section(key, title, sentences, items, tables, partial(images.image_figures, context))
-
-
 def _residual_section(context: ReportContext) -> Section:
-    key, title = "residuals", "Residual errors"
-    profiles = context.joint_profiles
-    if not profiles:
-        return Section(key, title, figures=partial(figures.residual_figures, context))
-    rows = []
+    rows, sentences, profiles = [], [], context.joint_profiles
     for profile in profiles:
         if not len(profile.centres):
             continue
@@ -257,45 +101,59 @@ def _residual_section(context: ReportContext) -> Section:
         values = (float(np.nanmax(np.abs(profile.before))), float(profile.after[worst]), std)
         position = f"{1e3 * centre:.0f} mm" if profile.is_prismatic else f"{np.degrees(centre):.0f}°"
         rows.append(
-            [profile.name, *(format_quantity(value, unit, std, small=True) for value in values), position]
+            [profile.name, *(Quantity(value, unit, std, is_small=True) for value in values), position]
         )
-    if not rows:
+    if rows:
+        role = "hold-out" if context.fit.holdout else "fitted"
+        text = (
+            "For each part of a joint's range, the table shows the error of that joint alone that best "
+            f"explains the residuals of the {role} samples. Scatter around zero is noise. A periodic pattern "
+            "indicates an unmodelled error such as gear eccentricity, joint elasticity or backlash."
+        )
+        if unknown := [profile.name for profile in profiles if not len(profile.centres)]:
+            text += (
+                f" No estimate for {', '.join(unknown)}: too few samples, or the joint hardly moves the tool."
+            )
+        sentences = [text]
+    elif profiles:
         sentences = ["There are too few samples to estimate joint errors over the range of the joints."]
-        return Section(key, title, sentences, figures=partial(figures.residual_figures, context))
-    role = "hold-out" if context.fit.holdout else "fitted"
-    text = (
-        "For each part of a joint's range, the table shows the error of that joint alone that best "
-        f"explains the residuals of the {role} samples. Scatter around zero is noise. A periodic pattern "
-        "indicates an unmodelled error such as gear eccentricity, joint elasticity or backlash."
+    return Section(
+        "residuals",
+        "Residual errors",
+        sentences,
+        tables=[Table(["joint", "largest before", "largest after", "std", "at"], rows)] if rows else [],
+        figures=partial(figures.residual_figures, context),
     )
-    if unknown := [profile.name for profile in profiles if not len(profile.centres)]:
-        text += f" No estimate for {', '.join(unknown)}: too few samples, or the joint hardly moves the tool."
-    table = Table(["joint", "largest before", "largest after", "std", "at"], rows)
-    return Section(key, title, [text], tables=[table], figures=partial(figures.residual_figures, context))
 
 
-def _transmission_section(context: ReportContext) -> Section:
-    key, title, extension = "transmission", "Transmission errors", context.fit.extension
+def _transmission_section(context: ReportContext) -> Section | None:
+    extension, hint = context.fit.extension, context.source.hint
     if extension is None or not context.fit.errors.has_arm:
-        hint = context.source.hint
-        return Section(key, title, [f"{hint[0].upper()}{hint[1:]}."] if hint else [])
-    text = (
-        "Each family is tried in addition to those added before. Errors are those of random left-out "
-        "samples, in standard deviations, without and with the family. A family is added if the evidence "
-        "rises and this error falls. The prior width is the standard deviation of greatest evidence."
-    )
-    tables = [trial_table(extension.trials)] if extension.trials else []
-    return Section(key, title, [*extension.sentences, *([text] if tables else [])], tables=tables)
+        sentences, tables = [f"{hint[0].upper()}{hint[1:]}."] if hint else [], []
+    else:
+        text = (
+            "Each family is tried in addition to those added before. Errors are those of random left-out "
+            "samples, in standard deviations, without and with the family. A family is added if the evidence "
+            "rises and this error falls. The prior width is the standard deviation of greatest evidence."
+        )
+        tables = [trial_table(extension.trials)] if extension.trials else []
+        sentences = [*extension.sentences, *([text] if tables else [])]
+    return Section("transmission", "Transmission errors", sentences, tables=tables)
 
 
-def _joint_section(context: ReportContext) -> Section:
+def _joint_section(context: ReportContext) -> Section | None:
     """Return the correction curves of the joints, or which joint values were measured if there are none."""
-    curves = {curve.coverage.joint: curve for curve in context.joint_curves}
-    coverage = context.coverage
+    coverage = fitted_coverage(context.fit)
+    if not coverage:
+        return None
     header = ["joint", "not measured", "bins visited"]
-    rows = [[c.joint, _format_gaps(c.gaps), f"{c.n_visited} of {c.n_in_range}"] for c in coverage]
+    rows: list[list[str | Quantity]] = [
+        [c.joint, _format_gaps(c.gaps), f"{c.n_visited} of {c.n_in_range}"] for c in coverage
+    ]
     bins = "A bin is 5° wide and counts as visited if one configuration lies in it."
-    if curves:
+    title, items = "Measured joint values", []
+    sentences = [f"Errors of a joint are extrapolated to joint values that were not measured. {bins}"]
+    if curves := {curve.coverage.joint: curve for curve in context.joint_curves}:
         title = "Joint correction curves"
         sentences = [
             "The angle to add to a joint value before it is commanded, as far as it depends on that joint "
@@ -307,23 +165,10 @@ def _joint_section(context: ReportContext) -> Section:
         header += ["largest correction", "std, measured", "std, other"]
         rows = [row + _curve_cells(curves.get(c.joint)) for row, c in zip(rows, coverage, strict=True)]
         items = [f"{text[:1].upper()}{text[1:]}." for text in find_lattices(context.fit)]
-    else:
-        items = []
-        title = "Measured joint values"
-        sentences = [
-            f"Errors of a joint are extrapolated to joint values that were not measured. {bins}",
-        ]
     bars = [BarColumn("share", [ShareBar(c.share) for c in coverage])]
     table = BarTable(header, rows, n_text_columns=2, bars=bars)
-    tables = [table] if rows else []
-    return Section(
-        "joints",
-        title,
-        sentences if rows else [],
-        items,
-        tables,
-        figures=partial(figures.joint_curve_figures, context),
-    )
+    draw = partial(figures.joint_curve_figures, context)
+    return Section("joints", title, sentences, items, [table], draw)
 
 
 def _format_gaps(gaps: Sequence[tuple[float, float]]) -> str:
@@ -337,26 +182,25 @@ def _format_gaps(gaps: Sequence[tuple[float, float]]) -> str:
     return ", ".join(texts) or "–"
 
 
-def _curve_cells(curve: JointCurve | None) -> list[str]:
+def _curve_cells(curve: JointCurve | None) -> list[str | Quantity]:
     """Return the largest correction of a joint, and the median std at measured and at other values."""
     if curve is None:
         return ["", "", ""]
     is_measured = curve.is_measured
-    cells = [_format_small(float(np.max(np.abs(curve.correction[is_measured]), initial=0.0)))]
-    for chosen in (is_measured, ~is_measured):
-        cells.append(_format_small(float(np.median(curve.std[chosen]))) if chosen.any() else "–")
-    return cells
+    largest = float(np.max(np.abs(curve.correction[is_measured]), initial=0.0))
+    medians = [
+        Quantity.error(float(np.median(curve.std[chosen])), "rad") if chosen.any() else "–"
+        for chosen in (is_measured, ~is_measured)
+    ]
+    return [Quantity.error(largest, "rad"), *medians]
 
 
-def _format_small(angle: float) -> str:
-    return format_quantity(angle, "rad", angle / 10, small=True)
-
-
-def _workspace_section(context: ReportContext) -> Section:
-    workspace, fit = context.workspace, context.fit
+def _workspace_section(context: ReportContext) -> Section | None:
+    fit = context.fit
     if not fit.errors.parameters or (fit.has_free_frames and not fit.errors.has_arm):
         # Nothing that matters to the tool is uncertain.
-        return Section("workspace", "Predicted accuracy in the workspace")
+        return None
+    workspace = context.workspace
     is_known = np.isfinite(workspace.std)
     rows = []
     for title, std in (
@@ -420,12 +264,12 @@ def _parameter_section(context: ReportContext) -> Section:
         rows = [
             [
                 *row,
-                "" if e.fixed else format_quantity(e.prior, e.unit, e.prior, small=True),
+                "" if e.fixed else Quantity(e.prior, e.unit, e.prior, is_small=True),
                 "" if e.fixed else f"{e.observability:.2f}",
             ]
             for row, e in zip(table.rows, estimates, strict=True)
         ]
-        header, *rows = [[text for i, text in enumerate(row) if i not in hidden] for row in [header, *rows]]
+        header, *rows = [[cell for i, cell in enumerate(row) if i not in hidden] for row in [header, *rows]]
         tables.append(
             BarTable(
                 header,
@@ -519,7 +363,7 @@ def _outlier_section(context: ReportContext) -> Section:
     names, rows = context.data_names, []
     for outlier in context.outliers[:MAX_OUTLIERS]:
         errors = ", ".join(
-            format_quantity(value, ERROR_GROUPS[group].unit, value / 10, small=True)
+            str(Quantity.error(value, ERROR_GROUPS[group].unit))
             for group, value in outlier.error_norms.items()
         )
         rows.append([names[outlier.item], str(outlier.row), errors, f"{outlier.score:.0f}"])
@@ -544,52 +388,18 @@ def _outlier_section(context: ReportContext) -> Section:
     return Section("outliers", "Outliers", [text], items, [table] if rows else [])
 
 
-def samples_section(samples: Samples, title: str = "Samples") -> Section:
-    """List the samples with the largest errors; scripts of the page make it a list of all samples."""
-    groups = {
-        group: states["after"]
-        for group, states in samples.errors.items()
-        if np.isfinite(states["after"]).any()
-    }
-    largest = np.arange(len(samples))
-    text = f"The first {min(len(samples), MAX_LISTED_SAMPLES)} of {len(samples)}."
-    if groups:
-        first = next(iter(groups.values()))
-        largest = np.argsort(-np.nan_to_num(first, nan=-1.0), kind="stable")
-        label = ERROR_GROUPS[next(iter(groups))].label
-        text = f"The {min(len(samples), MAX_LISTED_SAMPLES)} samples with the largest {label}."
-    shown = largest[:MAX_LISTED_SAMPLES]
-    joints = samples.chain.joint_names
-    rows = [
-        [
-            samples.file[i],
-            str(samples.line[i]),
-            samples.role[i] + (", outlier" if samples.is_outlier[i] else ""),
-            *(
-                format_quantity(
-                    float(samples.q[i, j]), "m" if is_prismatic_joint(samples.chain, j) else "rad"
-                )
-                for j in range(len(joints))
-            ),
-            *(
-                format_quantity(float(errors[i]), ERROR_GROUPS[group].unit, float(errors[i]) / 10, small=True)
-                for group, errors in groups.items()
-            ),
-        ]
-        for i in shown
-    ]
-    header = ["file", "line", "set", *joints, *(ERROR_GROUPS[group].label for group in groups)]
-    sentences = [text, *filter(None, [samples.note])]
-    return Section("samples", title, sentences, tables=[Table(header, rows)] if rows else [])
+def _sample_section(context: ReportContext) -> Section:
+    return samples.samples_section(context.samples)
+
+
+def _scene_section(context: ReportContext) -> Section:
+    draw = partial(figures.scene_figures, context)
+    return Section("scene", "Nominal and calibrated robot", figures=draw)
 
 
 def _provenance_section(context: ReportContext) -> Section:
-    tables = [
-        _data_table(context),
-        Table(["choice", "value"], _choices(context), n_text_columns=2),
-        _hash_table(context),
-        Table(["software", "version"], [list(pair) for pair in versions().items()], n_text_columns=2),
-    ]
+    choices = Table(["choice", "value"], _choices(context), n_text_columns=2)
+    tables = [_data_table(context), choices, *origin_tables(context.source.inputs)]
     return Section("provenance", "Provenance", tables=[table for table in tables if table.rows])
 
 
@@ -602,7 +412,7 @@ def _data_table(context: ReportContext) -> Table:
     for name, item, sigma in zip(context.data_names, fit.data, median_sigmas(fit), strict=True):
         origin = "stated" if item.has_stated_sigma else ("estimated" if fit.method == "lm" else "assumed")
         values = ", ".join(
-            f"{group} {format_quantity(value, ERROR_GROUPS[error_group(group)].unit, value, small=True)}"
+            f"{group} {Quantity(value, ERROR_GROUPS[error_group(group)].unit, value, is_small=True)}"
             for group, value in sigma.items()
         )
         rows.append(
@@ -641,32 +451,83 @@ def _choices(context: ReportContext) -> list[list[str]]:
     ]
 
 
-def _hash_table(context: ReportContext) -> Table:
-    short = short_names(list(context.source.inputs))
-    rows = [[short[path], digest] for path, digest in context.source.inputs.items()]
-    return Table(["file", "SHA-256"], rows, n_text_columns=2)
+# --- terminal and certificate ----------------------------------------------------------------------
 
 
-def markdown(context: ReportContext) -> str:
-    """Render the report as Markdown, without figures."""
-    head = summary.headline(context.comparisons)
-    verdict = context.fit.verdict
-    escape = formatting.escape_markdown
-    parts = [
-        f"# Calibration of {escape(context.robot_name)}",
-        f"**Verdict: {verdict.status}**",
-        *map(escape, verdict.reasons),
-        f"**{escape(head.text)}**",
-        *map(escape, context.source.remarks),
-        *map(escape, context.generalization_lines),
-        *map(escape, warnings(context)),
+def _numbers_section(context: ReportContext) -> Section:
+    """Return accuracy, joint origins and parameters as tables, below what was added to the geometry."""
+    fit = context.fit
+    tables = [
+        replace(summary.accuracy_table(fit.comparisons), caption="accuracy"),
+        replace(origin_table(fit.chain), caption="joint origins in the URDF, in m and rad"),
+        replace(summary.estimate_table(fit.estimates), caption="parameters"),
     ]
-    for section in report_sections(context):
-        blocks = [*map(escape, section.sentences)]
-        if section.items:
-            blocks.append("\n".join(f"- {escape(item)}" for item in section.items))
-        for table in section.tables:
-            blocks += [f"**{escape(table.caption)}**"] if table.caption else []
-            blocks.append(formatting.markdown_table(table))
-        parts += [f"## {section.title}", *blocks] if blocks else []
-    return "\n\n".join(parts) + "\n"
+    families = fit.extension.sentences if fit.extension and fit.errors.has_arm else []
+    return Section("numbers", "", families, tables=tables)
+
+
+def _definition_section(context: ReportContext) -> Section:
+    table = summary.definition_table(context.fit.estimates)
+    return Section("definitions", "", [summary.DEFINITION_TEXT], tables=[table])
+
+
+def _state_section(context: ReportContext) -> Section:
+    fit = context.fit
+    state = "converged" if fit.converged else "NOT converged"
+    sentences = [
+        f"{state} after {fit.iterations} iterations; {fit.sample_count}; "
+        f"rank {fit.rank} of {len(fit.parameters)}; condition {fit.condition:.3g}",
+        *(text for text in fit.unobservable if text.startswith(EXPECTED)),
+    ]
+    return Section("state", "", sentences)
+
+
+def _certificate_section(context: ReportContext) -> Section:
+    """Return the accuracy and the largest corrections."""
+    text = (
+        "“Before” is the nominal robot with base and tool fitted to the same measurements, if they are "
+        "unknown."
+    )
+    changed = summary.largest_corrections(context.fit.estimates)
+    rows = [
+        [e.name, e.frame, Quantity(e.change, e.unit, e.std, is_small=True), e.certainty]
+        for e in changed[:MAX_CORRECTIONS]
+    ]
+    n_hidden = len(changed) - len(rows)
+    caption = "Largest corrections" + (f" ({n_hidden} more in the report)" if n_hidden > 0 else "")
+    corrections = Table(["parameter", "frame", "change", "standard deviation"], rows, 2, caption)
+    tables = [summary.accuracy_table(context.comparisons), *([corrections] if rows else [])]
+    return Section("accuracy", "Accuracy before and after", [text], tables=tables)
+
+
+# --- table of the sections -------------------------------------------------------------------------
+
+
+_REPORT: Sequence[Rendering] = ("html", "markdown")
+
+# Functions of the sections in their order, and the renderings that show each. The terminal shows its sections
+# with --verbose.
+SECTIONS: Sequence[tuple[Callable[[ReportContext], Section | None], Sequence[Rendering]]] = (
+    (_accuracy_section, _REPORT),
+    (images.image_section, _REPORT),
+    (_residual_section, _REPORT),
+    (_transmission_section, _REPORT),
+    (_joint_section, _REPORT),
+    (_workspace_section, _REPORT),
+    (_scene_section, _REPORT),
+    (_parameter_section, _REPORT),
+    (_observability_section, _REPORT),
+    (_outlier_section, _REPORT),
+    (_sample_section, _REPORT),
+    (_provenance_section, _REPORT),
+    (_numbers_section, ("terminal",)),
+    (_definition_section, ("terminal",)),
+    (_state_section, ("terminal",)),
+    (_certificate_section, ("certificate",)),
+)
+
+
+def sections_of(context: ReportContext, rendering: Rendering) -> list[Section]:
+    """Return the sections that a rendering shows."""
+    made = (section(context) for section, renderings in SECTIONS if rendering in renderings)
+    return [section for section in made if section is not None]

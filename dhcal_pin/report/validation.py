@@ -10,19 +10,17 @@ import numpy as np
 
 from .._typing import Array
 from ..calibration.evaluation import Accuracy, compute_errors, error_norms
-from ..calibration.summary import STATISTIC_LABELS
-from ..formatting import Table, format_quantity
+from ..calibration.summary import STATISTIC_LABELS, statistic
+from ..formatting import Table
 from ..measurements.base import Measurement
 from ..measurements.groups import ERROR_GROUPS, in_order
 from ..robot.chain import Chain
 from ..visualization import scene
 from . import figures
-from .context import measurement_names
-from .document import short_names, versions
-from .figures import FigureGroup, LegendEntry
-from .html import Page, render_page
-from .samples import Samples, first_configurations, sample_numbers
-from .sections import Section, samples_section
+from .document import Document, FigureGroup, LegendEntry, Section
+from .html import html_page
+from .provenance import measurement_names, origin_tables
+from .samples import Samples, first_configurations, sample_numbers, samples_section
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,27 +57,29 @@ class Validation:
 def validation_page(validation: Validation) -> str:
     """Render the page of a validation."""
     samples = _samples(validation)
-    group, statistics = next(iter(list(validation.accuracies.values())[-1].groups.items()))
+    group, errors = next(iter(list(validation.accuracies.values())[-1].groups.items()))
     values = [
-        ("before" if i + 1 < len(validation.accuracies) else "after", f"{name}, RMS", _rms(accuracy, group))
+        (
+            "before" if i + 1 < len(validation.accuracies) else "after",
+            f"{name}, RMS",
+            str(statistic(accuracy.groups[group])),
+        )
         for i, (name, accuracy) in enumerate(validation.accuracies.items())
     ]
-    details = [
-        ("", STATISTIC_LABELS[key], _quantity(getattr(statistics, key), statistics.unit, statistics.rms_std))
-        for key in ("mean", "p95", "max")
-    ]
+    details = [("", STATISTIC_LABELS[key], str(statistic(errors, key))) for key in ("mean", "p95", "max")]
     label, count = ERROR_GROUPS[group].label, len(samples)
-    return render_page(
-        Page(
+    shown = samples.limited()
+    return html_page(
+        Document(
             title=f"Validation of {validation.name}",
             heading=f"{label.capitalize()} on {count} {'sample' if count == 1 else 'samples'}",
-            sections=_sections(validation, samples.limited()),
+            sections=_sections(validation, shown),
             eyebrow=f"Validation of {validation.name}",
             values=values,
             details=details,
             remarks=validation.remarks,
             warnings=validation.warnings,
-            samples=samples.limited(),
+            samples=shown.page_data,
         )
     )
 
@@ -143,7 +143,7 @@ def _accuracy_table(accuracies: Mapping[str, Accuracy]) -> Table:
         [
             name,
             ERROR_GROUPS[group].label,
-            *(_quantity(getattr(each, key), each.unit, each.rms_std) for key in STATISTIC_LABELS),
+            *(statistic(each, key) for key in STATISTIC_LABELS),
         ]
         for name, accuracy in accuracies.items()
         for group, each in accuracy.groups.items()
@@ -187,26 +187,7 @@ def _scene_figures(validation: Validation) -> list[FigureGroup]:
 
 
 def _provenance_tables(validation: Validation) -> list[Table]:
-    short = short_names(list(validation.inputs))
     names = measurement_names(validation.paths, validation.data)
-    return [
-        Table(
-            ["data", "kind", "samples"],
-            [
-                [name, item.kind, str(len(item.rows))]
-                for name, item in zip(names, validation.data, strict=True)
-            ],
-            n_text_columns=2,
-        ),
-        Table(["file", "SHA-256"], [[short[p], d] for p, d in validation.inputs.items()], n_text_columns=2),
-        Table(["software", "version"], [list(pair) for pair in versions().items()], n_text_columns=2),
-    ]
-
-
-def _rms(accuracy: Accuracy, group: str) -> str:
-    statistics = accuracy.groups[group]
-    return _quantity(statistics.rms, statistics.unit, statistics.rms_std)
-
-
-def _quantity(value: float, unit: str, std: float) -> str:
-    return format_quantity(value, unit, std, small=True)
+    rows = [[name, item.kind, str(len(item.rows))] for name, item in zip(names, validation.data, strict=True)]
+    data = Table(["data", "kind", "samples"], rows, n_text_columns=2)
+    return [data, *origin_tables(validation.inputs)]

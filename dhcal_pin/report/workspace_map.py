@@ -17,9 +17,9 @@ from ..estimation.uncertainty import Predictor
 from ..exceptions import InvalidArgumentError
 from ..io.tabular import csv_text
 from ..measurements.base import Measurement
+from .document import Document, Section
 from .figures import workspace_maps
-from .html import Page, render_page
-from .sections import Section
+from .html import html_page
 
 
 def check_map_ending(path: str) -> None:
@@ -41,7 +41,7 @@ def map_content(
     title = f"Predicted accuracy of {model.chain.model.name or 'the robot'}"
     if not np.concatenate([model.relative.sqrt_covariance, model.relative.unbounded_directions], 1).any():
         sentences = ["No parameter of the robot was estimated, so that no uncertainty of the tool follows."]
-        return render_page(Page(title, title, [Section("map", "", sentences)]))
+        return html_page(Document(title, [Section("map", "", sentences)], heading=title))
     if model.has_free_frames:
         sentences.append(RELATIVE_TEXT)
     q, errors = position_errors(model.chain, data, known)
@@ -57,7 +57,7 @@ def map_content(
         )
     points = (se3.inverse(model.chain.base) @ model.chain.poses(q))[:, :3, 3]
     draw = partial(workspace_maps, predict_workspace(model, data), points, errors)
-    return render_page(Page(title, title, [Section("map", "", sentences, figures=draw)]))
+    return html_page(Document(title, [Section("map", "", sentences, figures=draw)], heading=title))
 
 
 def map_text(workspace: WorkspaceMap) -> str:

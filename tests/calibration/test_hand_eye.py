@@ -11,7 +11,7 @@ from slow_cases import some_slow
 
 import dhcal_pin as dh
 from dhcal_pin.measurements import CameraCorners
-from dhcal_pin.report.document import json_text, result_to_dict
+from dhcal_pin.report.json_document import json_text, result_to_dict
 
 # Cause that should be named for each fault.
 CAUSES = {

@@ -26,8 +26,8 @@ from dhcal_pin.estimation.robust import (
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.measurements import Noise, Pose, Position, Wires
 from dhcal_pin.report.context import ReportContext
-from dhcal_pin.report.document import Provenance
 from dhcal_pin.report.figures import accuracy_figures
+from dhcal_pin.report.provenance import Provenance
 
 
 def with_outliers(kind, chain, seed, m=100, fraction=0.1):

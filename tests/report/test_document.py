@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 
-from dhcal_pin.report.document import json_text
+from dhcal_pin.report.json_document import json_text
 
 
 def test_json_has_no_nan_and_any_file_name():

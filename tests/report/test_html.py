@@ -18,9 +18,10 @@ from dhcal_pin.estimation import Priors
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.measurements import KINDS, Noise
 from dhcal_pin.report import Provenance, ReportContext, write_report
-from dhcal_pin.report.document import file_digests
+from dhcal_pin.report.calibration_report import calibration_document
 from dhcal_pin.report.html import html_page
-from dhcal_pin.report.sections import markdown
+from dhcal_pin.report.markdown import markdown
+from dhcal_pin.report.provenance import file_digests
 
 # Width of an A4 page between margins of 14 mm [CSS px].
 PRINTED = round((210 - 2 * 14) / 25.4 * 96)
@@ -55,14 +56,22 @@ class Texts(HTMLParser):
             self.texts.setdefault(self.open[-1], []).append(data.strip())
 
 
+def as_html(context: ReportContext) -> str:
+    return html_page(calibration_document(context, "html"))
+
+
+def as_markdown(context: ReportContext) -> str:
+    return markdown(calibration_document(context, "markdown"))
+
+
 def test_the_headline_is_the_error_on_hold_out_samples(fit, quick):
-    context = ReportContext.from_result(fit, Provenance())
+    context = ReportContext(fit, Provenance())
     holdout = accuracy(fit.chain, fit.holdout)["position_rms_m"]
-    page = Texts(html_page(context))
+    page = Texts(as_html(context))
     assert page.texts["h1"] == ["Position error on 12 hold-out samples"]
     before, after = page.texts["dd"][:2]
     assert float(after.split()[0]) == pytest.approx(1e3 * holdout, abs=0.051)
-    assert f"{before} before, {after} after." in markdown(context)
+    assert f"{before} before, {after} after." in as_markdown(context)
     assert len(page.ids) == len(set(page.ids))
     assert "12 hold-out" in fit._repr_html_()
     assert "on 12 hold-out samples" in fit._repr_html_()
@@ -70,8 +79,8 @@ def test_the_headline_is_the_error_on_hold_out_samples(fit, quick):
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_the_headline_warns_of_few_hold_out_samples(count, calibrated, quick):
-    context = ReportContext.from_result(calibrated(count / 40), Provenance())
-    page, text = Texts(html_page(context)), markdown(context)
+    context = ReportContext(calibrated(count / 40), Provenance())
+    page, text = Texts(as_html(context)), as_markdown(context)
     if count:
         assert page.texts["h1"] == ["Position error on 1 hold-out sample"]
         assert "So few samples give no reliable figure." in text
@@ -89,10 +98,10 @@ def test_every_kind_has_a_report_even_with_few_data(kind, sim_6dof, sim_6dof_act
     )
     for count, noise, priors in cases:
         data = KINDS[kind].simulate(sim_6dof_actual, rng.uniform(-1, 1, (count, 6)), noise, rng)
-        context = ReportContext.from_result(
+        context = ReportContext(
             calibrate(sim_6dof, data, "minimal,base,tool", priors=priors, max_iterations=5), Provenance()
         )
-        page, text = html_page(context), markdown(context)
+        page, text = as_html(context), as_markdown(context)
         Texts(page)
         for words in (page.split("<iframe")[0], text):
             assert not re.search(r"\b(nan|inf)\b", words), words

@@ -13,11 +13,12 @@ from dhcal_pin.calibration.evaluation import compute_errors
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import CameraCorners, Noise
 from dhcal_pin.report import Provenance, ReportContext
-from dhcal_pin.report.document import json_text, result_to_dict
+from dhcal_pin.report.calibration_report import calibration_document
 from dhcal_pin.report.figures import accuracy_figures
 from dhcal_pin.report.html import html_page
 from dhcal_pin.report.images import image_figures, image_table, stage_table
-from dhcal_pin.report.sections import report_sections
+from dhcal_pin.report.json_document import json_text, result_to_dict
+from dhcal_pin.report.sections import sections_of
 from dhcal_pin.visualization.image_plots import plot_reprojection
 
 
@@ -42,7 +43,7 @@ def test_stages_are_those_of_the_json(result):
 
 
 def test_images_with_the_largest_errors_are_listed(result, quick):
-    table = image_table(ReportContext.from_result(result, Provenance(names=["corners.csv"])))
+    table = image_table(ReportContext(result, Provenance(names=["corners.csv"])))
     shown = [float(row[6]) for row in table.rows]
     assert shown == sorted(shown, reverse=True)
     rms = []
@@ -55,7 +56,7 @@ def test_images_with_the_largest_errors_are_listed(result, quick):
 
 def test_histograms_show_the_errors_of_the_table(result, quick):
     """Cameras and boards of the nominal robot are those that fit it best."""
-    (group,) = accuracy_figures(ReportContext.from_result(result, Provenance(names=["corners.csv"])))
+    (group,) = accuracy_figures(ReportContext(result, Provenance(names=["corners.csv"])))
     texts = [panel.description for panel in group.panels]
     for comparison in result.comparisons:
         if comparison.title in ("hold-out", "fitted"):
@@ -68,7 +69,7 @@ def test_images_are_called_by_their_names(result, quick):
     """The names are those of the samples; images without one are numbered."""
     named = replace(result, data=tuple(with_names(item) for item in result.data))
     assert "image" not in result.residuals.to_columns()
-    context = ReportContext.from_result(named, Provenance(names=["corners.csv"]))
+    context = ReportContext(named, Provenance(names=["corners.csv"]))
     table = image_table(context)
     lines = {}
     for item in named.data:
@@ -93,8 +94,8 @@ def with_names(item):
 
 
 def test_page_shows_each_camera_and_the_worst_images(result, quick):
-    context = ReportContext.from_result(result, Provenance())
-    page = html_page(context)
+    context = ReportContext(result, Provenance())
+    page = html_page(calibration_document(context, "html"))
     assert '<section id="images"' in page
     for panel in (panel for group in image_figures(context) for panel in group.panels):
         assert f'aria-labelledby="{panel.key}-t' in page
@@ -102,12 +103,8 @@ def test_page_shows_each_camera_and_the_worst_images(result, quick):
 
 
 def test_results_without_images_have_no_such_section(fit, quick):
-    section = next(
-        s for s in report_sections(ReportContext.from_result(fit, Provenance())) if s.key == "images"
-    )
-    assert not (section.sentences)
-    assert not (section.tables)
-    assert not (section.figures)
+    sections = sections_of(ReportContext(fit, Provenance()), "html")
+    assert "images" not in [section.key for section in sections]
 
 
 def test_errors_are_drawn_from_the_measured_corner_to_the_modelled_one():

@@ -9,11 +9,18 @@ from dhcal_pin.calibration import calibrate
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import Noise, Pose, Position
 from dhcal_pin.report import Provenance, ReportContext
-from dhcal_pin.report.sections import Section, markdown, report_sections
+from dhcal_pin.report.calibration_report import calibration_document
+from dhcal_pin.report.document import Section
+from dhcal_pin.report.markdown import markdown
+from dhcal_pin.report.sections import sections_of
+
+
+def as_markdown(context: ReportContext) -> str:
+    return markdown(calibration_document(context, "markdown"))
 
 
 def test_sections_have_different_keys_and_titles(fit, quick):
-    sections = report_sections(ReportContext.from_result(fit, Provenance()))
+    sections = sections_of(ReportContext(fit, Provenance()), "html")
     assert all(isinstance(section, Section) for section in sections)
     assert len({section.key for section in sections}) == len({section.title for section in sections})
     assert {"accuracy", "residuals", "observability"} <= {section.key for section in sections}
@@ -26,7 +33,7 @@ def test_outliers_are_listed_with_file_row_and_size(sim_3dof, quick):
     source = Provenance(
         names=["in/laser.csv"], excluded_rows={"laser.csv": {3: "because"}}, notes={"laser.csv": ["x"]}
     )
-    text = markdown(ReportContext.from_result(calibrate(sim_3dof, data, "dh", loss="tukey"), source))
+    text = as_markdown(ReportContext(calibrate(sim_3dof, data, "dh", loss="tukey"), source))
     row = next(line for line in text.splitlines() if line.startswith("| laser.csv | 17 |"))
     assert float(row.split("|")[3].split()[0]) == pytest.approx(50, abs=1)
     assert "laser.csv, line 3: not used, because" in text
@@ -34,7 +41,7 @@ def test_outliers_are_listed_with_file_row_and_size(sim_3dof, quick):
 
 
 def joint_section(fit) -> Section:
-    sections = report_sections(ReportContext.from_result(fit, Provenance()))
+    sections = sections_of(ReportContext(fit, Provenance()), "html")
     return next(section for section in sections if section.key == "joints")
 
 
@@ -58,11 +65,11 @@ def test_joint_correction_curves_of_joints_with_harmonics(sim_6dof, quick):
     joint = sim_6dof.joint_names[1]
     names = [p.name for p in errors.parameters if p.name.startswith(f"{joint}.")]
     fit = calibrate(sim_6dof, data, "dh", free=names, extend="none")
-    context = ReportContext.from_result(fit, Provenance())
+    context = ReportContext(fit, Provenance())
     section = joint_section(fit)
     assert section.title == "Joint correction curves"
     (table,) = section.tables
-    filled = [row for row in table.rows if row[3]]
+    filled = [row for row in table.texts if row[3]]
     assert [row[0] for row in filled] == [joint]
     assert all(text.endswith(("mrad", "µrad")) for text in filled[0][3:])
     assert section.figures is not None
@@ -72,4 +79,4 @@ def test_joint_correction_curves_of_joints_with_harmonics(sim_6dof, quick):
     assert f"which are {filled[0][2]} bins" in panel.description
     ax = panel.plot()
     assert len(ax.patches) == len(context.joint_curves[0].coverage.gaps)
-    assert "Joint correction curves" in markdown(context)
+    assert "Joint correction curves" in as_markdown(context)

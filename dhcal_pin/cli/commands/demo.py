@@ -83,7 +83,9 @@ def run_demo(
         Block(excluded, "yellow", noun="excluded row of Table 5", rank=0, n_kept=0, has_space=True),
         Block([f"wrote into {folder}: {', '.join(names)}"], has_space=True),
     ]
-    console.show(Screen(blocks, [block for section in details for block in section.blocks()]), verbosity)
+    console.show(
+        Screen(blocks, lambda: [block for section in details for block in section.blocks()]), verbosity
+    )
     return document
 
 
@@ -123,8 +125,9 @@ def _write_results(
     """Write URDFs, JSON, summary, scene and report; return the JSON document."""
     from ...formatting import markdown_table  # lazy import, as the following: they load Pinocchio
     from ...io import shipped_file, urdf_files
-    from ...report import html
-    from ...report.document import Provenance, file_digests, json_text, result_to_dict
+    from ...report.calibration_report import report_files
+    from ...report.json_document import json_text, result_to_dict
+    from ...report.provenance import Provenance, file_digests
     from ...visualization import scene_html
     from ..outputs import write_outputs
 
@@ -158,7 +161,7 @@ def _write_results(
     contents: dict[PathLike, str | bytes | None] = {
         **urdf_files(experiment.fit.chain, files["urdf"]),
         files["nominal"]: experiment.chain.urdf.data,
-        **html.report_files(experiment.fit, [files["report"]], source),
+        **report_files(experiment.fit, [files["report"]], source),
         files["scene"]: scene_html(
             experiment.chain, experiment.fit, title="The paper's robot, before and after"
         ),

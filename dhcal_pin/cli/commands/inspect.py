@@ -30,7 +30,7 @@ def run(args: Namespace) -> int:
     from ...io import read_robot
     from ...io.rig_file import read_rig
     from ...measurements.mounting import mount_rig
-    from ...report.document import file_digests
+    from ...report.provenance import file_digests
     from ..outputs import existing_sidecars, require_writable_outputs, write_outputs
     from ..screens import console
     from ..screens.result_screens import inspection_screen

@@ -14,7 +14,7 @@ def run(args: Namespace) -> int:
     from ...io import read_robot  # lazy import, as the following: they are slow to load
     from ...planning import plan
     from ...programs import require_program_ending
-    from ...report.document import file_digests
+    from ...report.provenance import file_digests
     from ..output_table import chosen_files, file_contents, require_endings
     from ..outputs import require_writable_outputs, write_outputs
     from ..plan_input import input_paths, planned_kind, read_input

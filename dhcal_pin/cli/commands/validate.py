@@ -68,8 +68,9 @@ def run(args: Namespace) -> int:
         read_robot,
     )
     from ...measurements.position import require_common_reference_target
-    from ...report.document import file_digests, main_statistics, result_to_dict, validation_to_dict
     from ...report.html import check_html_ending
+    from ...report.json_document import main_statistics, result_to_dict, validation_to_dict
+    from ...report.provenance import file_digests
     from ...report.workspace_map import map_content
     from ..outputs import existing_sidecars, json_path, require_writable_outputs, write_outputs
     from ..screens import console

@@ -3,33 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
 from ...calibration.cameras import split_sets
-from ...calibration.estimates import Estimate
 from ...calibration.evaluation import Comparison
 from ...calibration.result import Result
 from ...calibration.summary import (
-    DEFINITION_TEXT,
-    accuracy_table,
-    definition_table,
-    estimate_table,
+    before_and_after,
     format_share,
     headline,
+    largest_corrections,
     regressions,
 )
 from ...calibration.verdict import Verdict
-from ...formatting import Table, format_quantity
+from ...formatting import Quantity, Table
 from ...identifiability import EXPECTED, label_unobservable
-from ...io import origin_table
 from ...measurements.base import Measurement
 from ...measurements.groups import ERROR_GROUPS
 from ...measurements.images.names import list_images
-from ...report.document import short_names
+from ...report.provenance import Provenance, short_names
 from ..job import Job
 from ..run_job import CalibrationOutcome
-from .screen import Block, Screen, list_first
+from .screen import Block, Screen, list_first, section_blocks
 
 # Number of corrections that are shown.
 N_CORRECTIONS = 5
@@ -70,7 +67,7 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
         Block([] if is_refused else [headline(fit.comparisons).text], "bold", has_space=True),
         *verdict_blocks(fit.verdict, job.force),
     ]
-    return Screen(blocks, _details(fit))
+    return Screen(blocks, partial(_details, fit))
 
 
 def verdict_blocks(verdict: Verdict, is_forced: bool) -> list[Block]:
@@ -209,20 +206,16 @@ def _accuracy_blocks(fit: Result) -> list[Block]:
     ]
 
 
-def _accuracy_rows(comparison: Comparison | None, place: str) -> Iterator[list[str]]:
+def _accuracy_rows(comparison: Comparison | None, place: str) -> Iterator[list[str | Quantity]]:
     """Make the rows of one comparison, one per group of errors."""
     if comparison is None:
         return
     for group, after in comparison.after.groups.items():
         is_region = comparison.title == "region hold-out"
         judged = "left-out regions" if is_region else f"{after.samples} {comparison.title}"
-        cells = [
-            format_quantity(side.rms, side.unit, side.rms_std, small=True)
-            for side in (comparison.before.groups[group], after)
-        ]
         errors = ERROR_GROUPS[group]
         name = errors.name if errors.is_vector else errors.label
-        yield [f"{name} {place}", judged, *cells]
+        yield [f"{name} {place}", judged, *before_and_after(comparison, group)]
 
 
 def _hand_eye_block(fit: Result) -> Block:
@@ -233,44 +226,19 @@ def _hand_eye_block(fit: Result) -> Block:
 
 
 def _correction_block(fit: Result) -> Block:
-    """Describe the largest corrections of the robot, relative to the errors expected beforehand."""
-    corrections = largest_corrections(fit) if fit.shrinkage_factor and not fit.verdict.is_refused else []
+    """Describe the largest corrections of the robot."""
+    is_shown = fit.shrinkage_factor and not fit.verdict.is_refused
     rows = [
-        [e.name, *(format_quantity(v, e.unit, e.std, small=True) for v in (e.change, e.std))]
-        for e in corrections
+        [e.name, *(Quantity(v, e.unit, e.std, is_small=True) for v in (e.change, e.std))]
+        for e in (largest_corrections(fit.estimates)[:N_CORRECTIONS] if is_shown else ())
     ]
     table = Table(["largest corrections", "change", "std"], rows)
     return Block(table, noun="correction", rank=5, n_kept=min(3, len(rows)), has_space=True)
 
 
-def largest_corrections(fit: Result) -> list[Estimate]:
-    """Choose the largest corrections of a robot."""
-    sizes = np.abs(fit.x) / fit.prior_std
-    estimates = fit.estimates[: len(sizes)]
-    order = [i for i in np.argsort(-sizes, kind="stable") if estimates[i].category == "robot" and sizes[i]]
-    return [estimates[i] for i in order[:N_CORRECTIONS]]
-
-
-# --- details ---------------------------------------------------------------------------------------
-
-
 def _details(fit: Result) -> list[Block]:
-    """Describe everything else: all parameters and where they are defined, accuracy, joint origins."""
-    state = "converged" if fit.converged else "NOT converged"
-    return [
-        Block(fit.extension.sentences if fit.extension and fit.errors.has_arm else []),
-        Block(accuracy_table(fit.comparisons), title="accuracy", has_space=True),
-        Block(origin_table(fit.chain), title="joint origins in the URDF, in m and rad", has_space=True),
-        Block(estimate_table(fit.estimates), title="parameters", has_space=True),
-        Block([DEFINITION_TEXT], has_space=True),
-        Block(definition_table(fit.estimates), has_space=True),
-        Block(
-            [
-                f"{state} after {fit.iterations} iterations; {fit.sample_count}; "
-                f"rank {fit.rank} of {len(fit.parameters)}; condition {fit.condition:.3g}",
-                *(text for text in fit.unobservable if text.startswith(EXPECTED)),
-            ],
-            has_space=True,
-        ),
-        Block([""]),
-    ]
+    """Return the sections of the document of a calibration that a terminal shows."""
+    from ...report.context import ReportContext  # lazy import, as the following: only for --verbose
+    from ...report.sections import sections_of
+
+    return [*section_blocks(sections_of(ReportContext(fit, Provenance()), "terminal")), Block([""])]

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...calibration.evaluation import Accuracy
-from ...calibration.summary import STATISTIC_LABELS
+from ...calibration.summary import STATISTIC_LABELS, statistic
 from ...diagnostics.inspection import FileInspection, column_table
-from ...formatting import Table, format_quantity
+from ...formatting import Table
 from ...io.tables import format_lines
 from ...measurements.groups import ERROR_GROUPS, in_order
 from ...planning.views import views_table
-from ...report.document import short_names
+from ...report.provenance import short_names
 from .screen import Block, Screen, list_first
 
 if TYPE_CHECKING:
@@ -69,11 +69,9 @@ def validation_screen(
     for group in in_order({group for each in accuracies.values() for group in each.groups}):
         columns = [each.groups[group] for each in accuracies.values() if group in each.groups]
         for key, label in STATISTIC_LABELS.items():
-            cells = [
-                format_quantity(getattr(column, key), column.unit, column.rms_std, small=True)
-                for column in columns
-            ]
-            rows += [[f"{ERROR_GROUPS[group].label}, {label}", *cells]] if cells else []
+            rows.append(
+                [f"{ERROR_GROUPS[group].label}, {label}", *(statistic(each, key) for each in columns)]
+            )
     blocks = [
         Block(Table(["error", *accuracies], rows), title=title, is_verdict=True),
         Block(remarks, noun="remark", rank=1, has_space=True),
@@ -120,7 +118,7 @@ def inspection_screen(robot: str, inspections: Sequence[FileInspection]) -> Scre
     blocks = [block for inspection in inspections for block in _inspection_blocks(inspection)]
     if len(inspections) == 1:
         return Screen([first, *blocks])
-    return Screen([first, *_overview(inspections)], blocks)
+    return Screen([first, *_overview(inspections)], lambda: blocks)
 
 
 def _overview(inspections: Sequence[FileInspection]) -> list[Block]:
@@ -224,6 +222,8 @@ def crosscheck_screen(robot: str, agreements: Sequence[Agreement]) -> Screen:
 
 def plan_screen(plan: Plan, moves: Sequence[str], files: Iterable[object]) -> Screen:
     """Describe the predicted error over the number of poses, and compare a plan with random poses."""
+    from ...report.plan import size_sentence  # lazy import: only this command needs it
+
     sizes, count = plan.sizes.tolist(), len(plan.q)
     random_errors = dict(zip(plan.random_sizes.tolist(), plan.random_errors.tolist(), strict=True))
     selected = {*random_errors, count, sizes[-1]}
@@ -241,11 +241,6 @@ def plan_screen(plan: Plan, moves: Sequence[str], files: Iterable[object]) -> Sc
     percent = round(100 * (1 - plan.relative_error))
     change = f"{abs(percent)} % {'lower' if percent > 0 else 'higher'}" if percent else "About the same"
     comparison = f"{change} predicted error {'than' if percent else 'as'} {count} random poses."
-    size = (
-        f"Diminishing returns beyond {plan.recommended_size} poses (less than 1 % per ten)."
-        if plan.recommended_size
-        else f"No diminishing returns up to {sizes[-1]} poses (still at least 1 % per ten)."
-    )
     curves = [
         [str(one.n_poses), f"{100 * one.filled_share:.0f} %", f"{1e6 * one.curve_std:.0f}"]
         for one in plan.curves
@@ -282,7 +277,7 @@ def plan_screen(plan: Plan, moves: Sequence[str], files: Iterable[object]) -> Sc
             notes_block(plan.notes),
             Block(moves, "" if is_free else "yellow", noun="remark on moves", rank=2),
             files_block(files),
-            Block([size], has_space=True),
+            Block([size_sentence(plan)], has_space=True),
             Block([comparison], "bold", is_verdict=True),
         ]
     )
@@ -378,5 +373,5 @@ def study_screen(
             Block(table(main), title=title, noun="setting", rank=0),
             files_block(files),
         ],
-        [Block(table(known), title=title)] if main != known else [],
+        lambda: [Block(table(known), title=title)] if main != known else [],
     )

@@ -8,13 +8,16 @@ first ones and the number of the others, which --verbose shows. This module does
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import zip_longest
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from ...formatting import Table
 from ...messages import escape_control_characters
+
+if TYPE_CHECKING:
+    from ...report.document import Section
 
 # Views of a screen: the verdict only, one screen, everything.
 Verbosity = Literal["quiet", "normal", "verbose"]
@@ -76,19 +79,31 @@ class Screen:
 
     Attributes:
         blocks: What is always shown, shortened to one screen unless everything is asked for.
-        details: What is shown above the blocks if everything is asked for.
+        details: Makes what is shown above the blocks if everything is asked for.
     """
 
     blocks: Sequence[Block]
-    details: Sequence[Block] = field(default=())
+    details: Callable[[], Sequence[Block]] = tuple
 
     def lines(self, verbosity: Verbosity, width: int | None = WIDTH) -> list[Line]:
         """Lay out the screen."""
         if verbosity == "quiet":
             return _full_lines([block for block in self.blocks if block.is_verdict], width)
         if verbosity == "verbose":
-            return _full_lines([*self.details, *self.blocks], width)
+            return _full_lines([*self.details(), *self.blocks], width)
         return _shortened_lines(self.blocks, min(width or WIDTH, WIDTH), HEIGHT)
+
+
+def section_blocks(sections: Sequence[Section]) -> list[Block]:
+    """Return the sentences, lists and tables of sections of a document; a terminal has no figures."""
+    blocks = []
+    for section in sections:
+        texts = [*section.sentences, *section.items]
+        blocks.append(Block([section.title, *texts] if section.title else texts, has_space=True))
+        for number, table in enumerate(section.tables):
+            follows_title = section.title and not texts and not number
+            blocks.append(Block(table, title=table.caption, has_space=not follows_title))
+    return blocks
 
 
 # --- blocks ----------------------------------------------------------------------------------------
@@ -225,7 +240,7 @@ def fold_table(table: Table, width: int | None) -> tuple[list[str], list[list[st
     """
     n_text = table.n_text_columns
     header = [escape_control_characters(name) for name in table.header]
-    rows = [[escape_control_characters(cell) for cell in row] for row in table.rows]
+    rows = [[escape_control_characters(cell) for cell in row] for row in table.texts]
     widths = [max(map(cell_width, column)) for column in zip(header, *rows, strict=True)]
     if width is None:
         return _header_lines(header, widths, n_text), [_row_lines(row, widths, n_text) for row in rows]

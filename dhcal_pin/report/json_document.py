@@ -1,0 +1,155 @@
+"""JSON document of a calibration or validation.
+
+The keys of the document are a contract with other programs. Lengths are in metres, angles in radians; NaN and
+infinity become null.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+from ..calibration.cross_validation import Generalization
+from ..calibration.evaluation import Comparison, accuracy
+from ..calibration.result import Result
+from ..calibration.verdict import Verdict
+from ..estimation import qr
+from ..measurements.base import Measurement
+from ..robot.chain import Chain
+from .provenance import versions
+
+# Keys of an accuracy and of a parameter; further values are under `comparisons` and `priors`.
+_ACCURACY = re.compile("(?!.*_axes_).+_(rms_m|max_m|rms_rad)|residual_(rms|max)|unit")
+_PARAMETER = "name unit nominal value std observability posterior_to_prior_std fixed frame direction".split()
+
+
+def _select_keys(content: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
+    return {key: content[key] for key in keys if key in content}
+
+
+def main_statistics(accuracy: Mapping[str, Any]) -> dict[str, Any]:
+    """Select RMS and largest errors."""
+    return {key: value for key, value in accuracy.items() if _ACCURACY.fullmatch(key)}
+
+
+def parameter_rows(fit: Result) -> list[dict[str, Any]]:
+    """Return the parameters as the JSON document lists them."""
+    return [_select_keys(asdict(estimate), _PARAMETER) for estimate in fit.estimates]
+
+
+def result_to_dict(
+    fit: Result,
+    files: Mapping[str, str],
+    inputs: Mapping[str, str],
+    outliers: Sequence[int] = (),
+    is_calibration: bool = True,
+) -> dict[str, Any]:
+    """Collect the JSON document of a calibration, or of a validation that fits base and tool."""
+    comparisons = {comparison.title: comparison for comparison in fit.comparisons}
+    fitted, holdout = comparisons["fitted"], comparisons.get("hold-out")
+    return {
+        "verdict": fit.verdict.to_dict(),
+        "converged": fit.converged,
+        "iterations": fit.iterations,
+        "method": fit.method,
+        "samples": fit.n_samples,
+        "samples_holdout": holdout.n_samples if holdout else 0,
+        "rank": fit.rank,
+        "parameters_total": len(fit.parameters),
+        "condition": fit.condition,
+        "singular_values": qr.singular_values(fit.solution.system.r).tolist(),
+        "before": main_statistics(fitted.before),
+        "after": main_statistics(fitted.after),
+        "holdout_before": main_statistics(holdout.before) if holdout else {},
+        "holdout_after": main_statistics(holdout.after) if holdout else {},
+        **generalization_to_dict(fit.generalization if is_calibration else None),
+        "comparisons": [comparison.to_dict() for comparison in fit.comparisons],
+        "parameters": parameter_rows(fit),
+        "priors": {estimate.name: estimate.prior for estimate in fit.estimates if not estimate.fixed},
+        "extension": fit.extension.to_dict() if fit.extension else None,
+        "camera_stages": [stage.to_dict() for stage in fit.camera_stages],
+        "hand_eye": fit.hand_eye.to_dict() if fit.hand_eye else None,
+        "shrinkage_factor": fit.shrinkage_factor,
+        "shrinkage_notes": fit.shrinkage_notes,
+        "unobservable": fit.unobservable,
+        "weakly_observable": fit.weakly_observable,
+        "observability_indices": fit.observability_indices,
+        "outliers": list(outliers),
+        "files": dict(files),
+        "versions": versions(),
+        "inputs": dict(inputs),
+    }
+
+
+def generalization_to_dict(generalization: Generalization | None) -> dict[str, Any]:
+    """Return the accuracy on configurations that are not fitted."""
+    names = ("cross_validated", "holdout_region")
+    comparisons: tuple[Comparison | None, ...] = (None, None)
+    reasons: tuple[str, ...] = ("", "")
+    shares: tuple[float | None, ...] = (None, None)
+    if generalization is not None:
+        comparisons = (generalization.cross_validated, generalization.region_holdout)
+        reasons = (generalization.cross_validated_reason, generalization.region_holdout_reason)
+        shares = (generalization.covered_share, generalization.reached_share)
+    out: dict[str, Any] = {}
+    for name, comparison, reason in zip(names, comparisons, reasons, strict=True):
+        out[f"{name}_before"] = main_statistics(comparison.before) if comparison else None
+        out[f"{name}_after"] = main_statistics(comparison.after) if comparison else None
+        out[f"{name}_reason"] = reason
+    return out | dict(zip(("covered_share", "reached_share"), shares, strict=True))
+
+
+def validation_to_dict(
+    chain: Chain, data: Sequence[Measurement], inputs: Mapping[str, str], known: Mapping[str, float]
+) -> dict[str, Any]:
+    """Collect the JSON document of a validation; it has the keys of a calibration."""
+    statistics = main_statistics(accuracy(chain, data, known))
+    return {
+        "verdict": Verdict("ok").to_dict(),
+        "converged": True,
+        "iterations": 0,
+        "method": "none",
+        "samples": sum(len(item.q) for item in data),
+        "samples_holdout": 0,
+        "rank": 0,
+        "parameters_total": 0,
+        "condition": 0.0,
+        "before": statistics,
+        "after": statistics,
+        "holdout_before": {},
+        "holdout_after": {},
+        **generalization_to_dict(None),
+        "parameters": [],
+        "unobservable": [],
+        "extension": None,
+        "shrinkage_factor": 1.0,
+        "shrinkage_notes": [],
+        "weakly_observable": [],
+        "observability_indices": {},
+        "outliers": [],
+        "outliers_by_file": {},
+        "files": {},
+        "versions": versions(),
+        "inputs": dict(inputs),
+    }
+
+
+def json_text(content: Any) -> str:
+    """Format a document as JSON; NaN and infinity become null."""
+
+    def clean(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: clean(item) for key, item in value.items()}
+        if isinstance(value, list | tuple):
+            return [clean(item) for item in value]
+        if isinstance(value, float) and not math.isfinite(value):
+            return None
+        return value
+
+    text = json.dumps(clean(content), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    # A file name need not be UTF-8. Python keeps its other bytes as surrogates, which become JSON escapes.
+    return text.encode(errors="backslashreplace").decode()
