@@ -61,6 +61,11 @@ def format_fixed(value: float, decimals: int) -> str:
     return f"{round(value, decimals) + 0.0:.{decimals}f}"
 
 
+def capitalized(text: str) -> str:
+    """Return a text with its first letter in upper case."""
+    return text[:1].upper() + text[1:]
+
+
 def format_quantity(value: float, unit: str, std: float = math.nan, small: bool = False) -> str:
     """Format a value with its unit, rounded according to its standard deviation."""
     if not math.isfinite(value):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from . import formatting
 from ._typing import Array
-from .calibration.summary import generalization_lines, headline
+from .calibration.summary import generalization_lines, headline, largest_corrections
 from .exceptions import InvalidArgumentError
 
 if TYPE_CHECKING:
@@ -233,10 +233,7 @@ class ResultPlots:
             f"{count} parameters from {fit.sample_count}; {fit.rank} combinations are identifiable; "
             f"{'converged' if fit.converged else 'NOT converged'} after {fit.iterations} iterations.",
         ]
-        largest = sorted(
-            (e for e in fit.estimates if e.category == "robot" and not e.fixed and e.change),
-            key=lambda e: -abs(e.change) * e.posterior_to_prior_std / e.std if e.std else 0.0,
-        )[:5]
+        largest = largest_corrections(fit.estimates, fit.x, fit.prior_std)[:5]
         if largest:
             texts = [
                 f"{e.name} {formatting.format_quantity(e.change, e.unit, e.std, small=True)}" for e in largest

@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from dhcal_pin.formatting import Table, escape_markdown, format_quantity, html_table, markdown_table
+from dhcal_pin.formatting import Quantity, Table, escape_markdown, format_quantity, html_table, markdown_table
 
 
 @pytest.mark.parametrize(
@@ -33,6 +33,15 @@ def test_rates_and_pure_numbers():
     assert format_quantity(1.2346e-5, "rad/Nm", 1e-7) == "12.35 µrad/Nm"
     assert format_quantity(-2.5e-3, "rad/rad", 4e-4, small=True) == "-2.5 mrad/rad"
     assert format_quantity(-0.00125, "1", 1e-5) == "-0.00125"
+
+
+def test_cells_are_texts_or_quantities():
+    """Each rendering makes its text of them; a title may have the unit."""
+    cells = ["a", Quantity(-0.0147, "m", 1e-4), Quantity(2e-3, "rad", 1e-5, is_small=True, has_unit=False)]
+    table = Table(["name", "length", "angle, mrad"], [[*cells, Quantity.error(np.nan, "px")]])
+    assert table.texts == [["a", "-14.70 mm", "2.000", "–"]]
+    assert markdown_table(table).endswith("| a | -14.70 mm | 2.000 | – |")
+    assert '<td class="number">−14.70 mm</td>' in html_table(table)
 
 
 HOSTILE = (

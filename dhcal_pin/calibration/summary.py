@@ -10,8 +10,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
+from .._typing import Array
 from ..estimation.error_model import ErrorModel
 from ..formatting import SMALL_UNITS, Quantity, Table
+from ..identifiability import label_unobservable
 from ..measurements.groups import ERROR_GROUPS
 from .cross_validation import Generalization
 from .estimates import Estimate
@@ -59,10 +63,19 @@ def definition_table(estimates: Sequence[Estimate]) -> Table:
     return Table(["frame", "parameters and their directions"], rows, n_text_columns=2)
 
 
-def largest_corrections(estimates: Sequence[Estimate]) -> list[Estimate]:
-    """Sort the corrections of the robot by their size, relative to the errors expected beforehand."""
-    changed = [e for e in estimates if e.category == "robot" and not e.fixed and e.change]
-    return sorted(changed, key=lambda e: -abs(e.change) / e.prior if e.prior else 0.0)
+def parameter_notes(unobservable: Sequence[str], weakly_observable: Sequence[str]) -> list[str]:
+    """List the parameters that are not or poorly identified."""
+    return [
+        *map(label_unobservable, unobservable),
+        *(f"poorly identified: {text}" for text in weakly_observable),
+    ]
+
+
+def largest_corrections(estimates: Sequence[Estimate], x: Array, prior_std: Array) -> list[Estimate]:
+    """Sort the corrections x of the robot by their size, relative to the errors expected beforehand."""
+    sizes = np.abs(x) / prior_std
+    order = np.argsort(-sizes, kind="stable")
+    return [estimates[i] for i in order if estimates[i].category == "robot" and estimates[i].change]
 
 
 def statistic(errors: ErrorStatistics, name: str = "rms") -> Quantity:
@@ -138,6 +151,18 @@ def headline(comparisons: Sequence[Comparison]) -> Headline:
     return Headline(text, before_text, after_text, reduction, group, best)
 
 
+def judged_regions(
+    generalization: Generalization, comparisons: Sequence[Comparison]
+) -> tuple[tuple[Comparison | None, str], tuple[Comparison | None, str]]:
+    """Return the accuracy within the measured region and beyond it, each with the reason if there is none."""
+    has_holdout = comparisons[0].title == "hold-out"
+    inside = comparisons[0] if has_holdout else generalization.cross_validated
+    return (
+        (inside, generalization.cross_validated_reason),
+        (generalization.region_holdout, generalization.region_holdout_reason),
+    )
+
+
 def generalization_lines(
     generalization: Generalization, comparisons: Sequence[Comparison]
 ) -> tuple[str, str]:
@@ -145,24 +170,22 @@ def generalization_lines(
 
     Where joint values have no meaning, the lines speak of the measured poses, and state no shares.
     """
-    inside, beyond = generalization.cross_validated, generalization.region_holdout
-    if comparisons[0].title == "hold-out":
-        inside = comparisons[0]
+    inside, beyond = judged_regions(generalization, comparisons)
     covered, reached = generalization.covered_share, generalization.reached_share
     region, pronoun, rest = "Among the measured poses", "them", ""
     if covered is not None and reached is not None:
         region, pronoun = f"Measured region ({format_share(covered)} of joint space)", "it"
         rest = f"; for {format_share(1 - reached)} of joint space not known"
 
-    def accuracy(comparison: Comparison | None, reason: str, rest: str = "") -> str:
+    def describe(comparison: Comparison | None, reason: str, rest: str = "") -> str:
         if comparison is None:
             return f"cannot be said, {reason}."
         before, after = before_and_after(comparison, next(iter(comparison.after.groups)))
         return f"{before} before, {after} after{rest}."
 
     return (
-        f"{region}: {accuracy(inside, generalization.cross_validated_reason)}",
-        f"Beyond {pronoun}: {accuracy(beyond, generalization.region_holdout_reason, rest)}",
+        f"{region}: {describe(*inside)}",
+        f"Beyond {pronoun}: {describe(*beyond, rest)}",
     )
 
 

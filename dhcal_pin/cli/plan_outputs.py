@@ -17,7 +17,7 @@ from ..io.robot import robot_name
 from ..planning.planner import Plan
 from ..planning.views import CameraViews
 from ..programs import Program, Stop, program_text
-from ..report.document import versions
+from ..report.provenance import versions
 from ..robot.chain import Chain
 from .output_table import Output, chosen_files, paths_by_name
 

@@ -13,6 +13,7 @@ from ..calibration import summary
 from ..calibration.result import Result
 from ..calibration.summary import STATISTIC_LABELS, Headline, statistic
 from ..exceptions import InvalidArgumentError
+from ..formatting import capitalized
 from ..measurements.groups import ERROR_GROUPS
 from ..saving import write_files
 from .context import ReportContext
@@ -51,11 +52,10 @@ def report_files(fit: Result, paths: Sequence[PathLike], source: Provenance) -> 
 
 def calibration_document(context: ReportContext, rendering: Rendering) -> Document:
     """Make the document of a calibration with the sections that a rendering shows."""
-    head = context.headline
+    head = summary.headline(context.comparisons)
     best, verdict = head.comparison, context.fit.verdict
     if best.title != "fitted":
-        label = ERROR_GROUPS[head.group].label
-        heading = f"{label[:1].upper()}{label[1:]} {summary.describe_samples(best)}"
+        heading = f"{capitalized(ERROR_GROUPS[head.group].label)} {summary.describe_samples(best)}"
         note = summary.small_sample_note(best)
     else:
         heading = "No hold-out measurements"
@@ -68,6 +68,7 @@ def calibration_document(context: ReportContext, rendering: Rendering) -> Docume
     if best.before.groups[head.group].rms:
         change = "smaller" if head.percent_reduction >= 0 else "larger"
         values.append(("", change, f"{abs(head.percent_reduction):.0f} %"))
+    regions = summary.generalization_lines(context.fit.generalization, context.comparisons)
     title = f"Calibration of {context.robot_name}"
     return Document(
         title=title,
@@ -79,7 +80,7 @@ def calibration_document(context: ReportContext, rendering: Rendering) -> Docume
         headline=head.text,
         values=values,
         details=_details(head),
-        remarks=[*context.source.remarks, *context.generalization_lines],
+        remarks=[*context.source.remarks, *regions],
         note=note,
         warnings=_warnings(context),
         samples=lambda: context.samples.page_data(),

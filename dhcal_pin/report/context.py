@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from ..calibration import summary
 from ..calibration.evaluation import Comparison
 from ..calibration.result import Result
 from ..diagnostics.curves import JointCurve, joint_curves
@@ -70,16 +69,6 @@ class ReportContext:
         if cross_validated is None or self.fit.holdout:
             return own
         return (cross_validated, *(c for c in own if c.title == "fitted"))
-
-    @property
-    def headline(self) -> summary.Headline:
-        """The most important error, before and after."""
-        return summary.headline(self.comparisons)
-
-    @property
-    def generalization_lines(self) -> tuple[str, ...]:
-        """Accuracy within the measured region and beyond it, one line each."""
-        return summary.generalization_lines(self.fit.generalization, self.comparisons)
 
     @property
     def robot_name(self) -> str:

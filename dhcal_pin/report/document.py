@@ -8,22 +8,11 @@ know nothing of calibrations.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from ..formatting import Table
 from ..visualization.plots import PANEL
-
-
-@dataclass(frozen=True)
-class ShareBar:
-    """Bar of a fraction.
-
-    Attributes:
-        share: Length of the bar, from 0 to 1.
-    """
-
-    share: float
 
 
 @dataclass(frozen=True)
@@ -42,60 +31,18 @@ class IntervalBar:
 
 
 @dataclass(frozen=True)
-class BarColumn:
-    """Column of bars beside the numbers of a table.
-
-    Attributes:
-        title: Title of the column.
-        bars: One bar per row; None leaves the cell empty.
-    """
-
-    title: str
-    bars: Sequence[ShareBar | IntervalBar | None]
-
-
-@dataclass(frozen=True)
-class RowGroup:
-    """Rows of a table that belong together.
-
-    Attributes:
-        title: Heading above the rows.
-        rows: Indices of the rows.
-    """
-
-    title: str
-    rows: Sequence[int]
-
-
-@dataclass(frozen=True)
 class BarTable(Table):
     """Table with columns of bars and groups of rows, which only the HTML page shows.
 
     Attributes:
-        bars: The additional columns.
-        groups: Groups of all rows; none if the rows are not grouped.
+        bars: Additional columns by title, with one bar per row: a share from 0 to 1, an interval, or None.
+        groups: Indices of the rows of each group by its heading; none if the rows are not grouped.
         unchanged: Indices of rows that the page folds, as they report no change.
     """
 
-    bars: Sequence[BarColumn] = ()
-    groups: Sequence[RowGroup] = ()
+    bars: Mapping[str, Sequence[float | IntervalBar | None]] = field(default_factory=dict)
+    groups: Mapping[str, Sequence[int]] = field(default_factory=dict)
     unchanged: Sequence[int] = ()
-
-
-@dataclass(frozen=True)
-class SamplePoints:
-    """Meaning of the coordinates of the dots of a figure.
-
-    A coordinate is "number", "joint:I" (position of joint I), "base:K" (component K of the tool position in
-    the base frame) or "error:GROUP".
-
-    Attributes:
-        x: Horizontal coordinate.
-        y: Vertical coordinate.
-    """
-
-    x: str
-    y: str
 
 
 @dataclass(frozen=True)
@@ -108,7 +55,9 @@ class Panel:
         description: What the figure shows, in words, for screen readers.
         plot: Function of `plots` with all its arguments except `ax`.
         size: Width and height [px].
-        points: What the dots of samples show, so that a reader can select them; None without such dots.
+        points: Horizontal and vertical coordinate of the dots of samples, so that a reader can select them:
+            "number", "joint:I" (position of joint I), "base:K" (component K of the tool position in the base
+            frame) or "error:GROUP"; empty without such dots.
         role: Role of the samples, if the figure shows the samples of one role only.
     """
 
@@ -117,7 +66,7 @@ class Panel:
     description: str
     plot: Callable[..., object]
     size: tuple[float, float] = PANEL
-    points: SamplePoints | None = None
+    points: tuple[str, ...] = ()
     role: str = ""
 
 

@@ -18,16 +18,15 @@ import numpy as np
 from .. import se3
 from .._typing import Array
 from ..calibration.evaluation import compute_errors, error_norms
-from ..diagnostics.residuals import JointProfile
 from ..diagnostics.workspace import WorkspacePrediction
 from ..estimation import qr
-from ..formatting import Quantity
+from ..formatting import Quantity, capitalized
 from ..measurements.groups import ERROR_GROUPS, in_order
 from ..robot.chain import Chain
 from ..visualization import plots, scene
 from ..visualization.plots import SQUARE_PANEL, WIDE_PANEL
 from .context import ReportContext
-from .document import FigureGroup, LegendEntry, Panel, SamplePoints
+from .document import FigureGroup, LegendEntry, Panel
 from .samples import ROLES, Samples, is_prismatic_joint
 
 # A joint whose errors are larger than this multiple of the joints' median gets a scale of its own. Errors
@@ -72,7 +71,7 @@ def histogram_panels(group: str, errors: Mapping[str, tuple[Array, Array]]) -> l
         rms = [Quantity.error(float(np.sqrt(np.mean(norms**2))), unit) for norms in (before, after)]
         count = f"{len(after)} {role} samples"
         text = f"Histogram of the {quantity} of {count}: RMS {rms[0]} before, {rms[1]} after."
-        caption = f"{_capitalized(quantity)}, {count}"
+        caption = f"{capitalized(quantity)}, {count}"
         plot = partial(plots.plot_error_histogram, before, after, quantity=quantity, unit=unit, bins=bins)
         panels.append(Panel(f"histogram-{role}-{group}", caption, text, plot, WIDE_PANEL, role=role))
     return panels
@@ -80,12 +79,13 @@ def histogram_panels(group: str, errors: Mapping[str, tuple[Array, Array]]) -> l
 
 def residual_figures(context: ReportContext) -> list[FigureGroup]:
     """Draw the residual error of each joint, and the errors over the joint positions and over the samples."""
-    groups = [
-        _joint_offset_group(context),
-        joint_error_group(context.samples),
-        sample_group(context.samples),
-    ]
-    return [group for group in groups if group.panels]
+    group = _joint_offset_group(context)
+    return [*([group] if group.panels else []), *sample_figures(context.samples)]
+
+
+def sample_figures(samples: Samples) -> list[FigureGroup]:
+    """Draw the errors of samples over the joint positions and in the order of their files."""
+    return [group for group in (_joint_error_group(samples), _sample_group(samples)) if group.panels]
 
 
 def _joint_offset_group(context: ReportContext) -> FigureGroup:
@@ -98,10 +98,14 @@ def _joint_offset_group(context: ReportContext) -> FigureGroup:
         for state in ("before", "after")
     }
     states = ["before", "after"] if largest["before"] <= MAX_SCALE_RATIO * largest["after"] else ["after"]
+    sizes = {p.name: max(_largest_offset(*offsets[p.name][state]) for state in states) for p in profiles}
     panels = []
     for i, profile in enumerate(profiles):
+        of_type = [sizes[p.name] for p in profiles if p.is_prismatic == profile.is_prismatic]
         shown = {state: offsets[profile.name][state] for state in states}
-        worst = Quantity.error(float(np.nanmax(np.abs(profile.after))), _offset_unit(profile))
+        worst = Quantity.error(
+            float(np.nanmax(np.abs(profile.after))), "m" if profile.is_prismatic else "rad"
+        )
         text = (
             f"Residual error of {profile.name} over its position, with two standard errors; at most "
             f"{worst} after calibration."
@@ -112,7 +116,7 @@ def _joint_offset_group(context: ReportContext) -> FigureGroup:
             shown,
             joint=profile.name,
             is_prismatic=profile.is_prismatic,
-            limit=_offset_limit(profile, profiles, states, offsets),
+            limit=_offset_limit(sizes[profile.name], of_type),
         )
         panels.append(Panel(f"offset-{i}", profile.name, text, plot))
     marks = {"before": "dashes", "after": "line"}
@@ -128,24 +132,10 @@ def _largest_offset(value: Array, std: Array) -> float:
     return float(np.nanmax(np.abs(value) + 2 * std, initial=0.0))
 
 
-def _offset_limit(
-    profile: JointProfile,
-    profiles: Sequence[JointProfile],
-    states: Sequence[str],
-    offsets: dict[str, dict[str, tuple[Array, Array]]],
-) -> float:
+def _offset_limit(largest: float, all_largest: Sequence[float]) -> float:
     """Return the common scale of the joints of one type; a joint with much larger errors gets its own."""
-    largest = {
-        p.name: max(_largest_offset(*offsets[p.name][state]) for state in states)
-        for p in profiles
-        if p.is_prismatic == profile.is_prismatic
-    }
-    typical = MAX_SCALE_RATIO * float(np.median(list(largest.values())))
-    return max(largest[profile.name], *(value for value in largest.values() if value <= typical))
-
-
-def _offset_unit(profile: JointProfile) -> str:
-    return "m" if profile.is_prismatic else "rad"
+    typical = MAX_SCALE_RATIO * float(np.median(all_largest))
+    return max(largest, *(value for value in all_largest if value <= typical))
 
 
 def joint_curve_figures(context: ReportContext) -> list[FigureGroup]:
@@ -183,7 +173,7 @@ def joint_curve_figures(context: ReportContext) -> list[FigureGroup]:
     return [FigureGroup(panels, legend=legend, layout="wide")]
 
 
-def joint_error_group(samples: Samples) -> FigureGroup:
+def _joint_error_group(samples: Samples) -> FigureGroup:
     """Draw the errors of samples over the positions of the joints."""
     group = next(iter(samples.errors))
     quantity, errors, panels = ERROR_GROUPS[group].label, samples.errors[group]["after"], []
@@ -199,14 +189,14 @@ def joint_error_group(samples: Samples) -> FigureGroup:
             quantity=quantity,
             unit=ERROR_GROUPS[group].unit,
         )
-        text = f"{_capitalized(quantity)} of the samples{state} over the position of {joint}."
-        points = SamplePoints(f"joint:{i}", f"error:{group}")
+        text = f"{capitalized(quantity)} of the samples{state} over the position of {joint}."
+        points = (f"joint:{i}", f"error:{group}")
         panels.append(Panel(f"joint-{i}", joint, text, plot, points=points))
     legend = [LegendEntry("sample", "sample", "dots"), LegendEntry("median", "text", "line")]
-    return FigureGroup(panels, f"{_capitalized(quantity)} over joint position", legend)
+    return FigureGroup(panels, f"{capitalized(quantity)} over joint position", legend)
 
 
-def sample_group(samples: Samples) -> FigureGroup:
+def _sample_group(samples: Samples) -> FigureGroup:
     """Draw the errors of samples in the order of their files."""
     panels, roles = [], {}
     for group in samples.errors:
@@ -216,12 +206,12 @@ def sample_group(samples: Samples) -> FigureGroup:
         roles |= dict.fromkeys(by_role)
         quantity, unit = ERROR_GROUPS[group].label, ERROR_GROUPS[group].unit
         errors = np.concatenate([errors for _, errors in by_role.values()])
-        caption = f"{_capitalized(quantity)} by sample"
+        caption = f"{capitalized(quantity)} by sample"
         largest = Quantity.error(float(errors.max()), unit)
         state = _shown_state(samples, group)
-        text = f"{_capitalized(quantity)} of {len(errors)} samples{state}; at most {largest}."
+        text = f"{capitalized(quantity)} of {len(errors)} samples{state}; at most {largest}."
         plot = partial(plots.plot_errors_by_sample, by_role, quantity=quantity, unit=unit)
-        points = SamplePoints("number", f"error:{group}")
+        points = ("number", f"error:{group}")
         panels.append(Panel(f"sample-{group}", caption, text, plot, WIDE_PANEL, points))
     legend = [LegendEntry(role, plots.sample_color(role, "hold-out" in roles), "dots") for role in roles]
     return FigureGroup(panels, "Errors in the order of the files", legend, "wide")
@@ -273,8 +263,8 @@ def workspace_maps(workspace: WorkspacePrediction, points: Array, errors: Array)
             f"median {median}, 95th percentile {p95}."
         )
         predicted = partial(plot, workspace.points, workspace.std, measured=workspace.measured)
-        coordinates = SamplePoints(*(f"base:{'xyz'.index(axis)}" for axis in plane))
-        panels.append(Panel(f"map-{plane}", f"Predicted, {view}", text, predicted, SQUARE_PANEL, coordinates))
+        caption = f"Predicted, {view}"
+        panels.append(Panel(f"map-{plane}", caption, text, predicted, SQUARE_PANEL, plane_points(plane)))
         if len(errors):
             rms = Quantity.error(float(np.sqrt(np.mean(errors**2))), "m")
             text = f"Map of the measured position errors over {plane[0]} and {plane[1]}: RMS {rms}."
@@ -290,6 +280,11 @@ def workspace_maps(workspace: WorkspacePrediction, points: Array, errors: Array)
     if len(workspace.measured):
         legend.append(LegendEntry("measured samples", "measured", "dots"))
     return [FigureGroup(panels, legend=legend, layout="wide")]
+
+
+def plane_points(plane: str) -> tuple[str, ...]:
+    """Return the coordinates of samples in a plane of the base frame, such as "xy"."""
+    return tuple(f"base:{'xyz'.index(axis)}" for axis in plane)
 
 
 def _without_largest(errors: Array) -> Array:
@@ -375,7 +370,3 @@ def observability_figures(context: ReportContext) -> list[FigureGroup]:
     )
     plot = partial(plots.plot_singular_values, values, rank)
     return [FigureGroup([Panel("singular-values", "Singular values", text, plot)])]
-
-
-def _capitalized(text: str) -> str:
-    return text[:1].upper() + text[1:]

@@ -10,7 +10,6 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
 
 from ..calibration.cross_validation import Generalization
@@ -27,10 +26,6 @@ _ACCURACY = re.compile("(?!.*_axes_).+_(rms_m|max_m|rms_rad)|residual_(rms|max)|
 _PARAMETER = "name unit nominal value std observability posterior_to_prior_std fixed frame direction".split()
 
 
-def _select_keys(content: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
-    return {key: content[key] for key in keys if key in content}
-
-
 def main_statistics(accuracy: Mapping[str, Any]) -> dict[str, Any]:
     """Select RMS and largest errors."""
     return {key: value for key, value in accuracy.items() if _ACCURACY.fullmatch(key)}
@@ -38,7 +33,7 @@ def main_statistics(accuracy: Mapping[str, Any]) -> dict[str, Any]:
 
 def parameter_rows(fit: Result) -> list[dict[str, Any]]:
     """Return the parameters as the JSON document lists them."""
-    return [_select_keys(asdict(estimate), _PARAMETER) for estimate in fit.estimates]
+    return [{key: getattr(estimate, key) for key in _PARAMETER} for estimate in fit.estimates]
 
 
 def result_to_dict(
@@ -85,22 +80,15 @@ def result_to_dict(
     }
 
 
-def generalization_to_dict(generalization: Generalization | None) -> dict[str, Any]:
+def generalization_to_dict(known: Generalization | None) -> dict[str, Any]:
     """Return the accuracy on configurations that are not fitted."""
-    names = ("cross_validated", "holdout_region")
-    comparisons: tuple[Comparison | None, ...] = (None, None)
-    reasons: tuple[str, ...] = ("", "")
-    shares: tuple[float | None, ...] = (None, None)
-    if generalization is not None:
-        comparisons = (generalization.cross_validated, generalization.region_holdout)
-        reasons = (generalization.cross_validated_reason, generalization.region_holdout_reason)
-        shares = (generalization.covered_share, generalization.reached_share)
     out: dict[str, Any] = {}
-    for name, comparison, reason in zip(names, comparisons, reasons, strict=True):
-        out[f"{name}_before"] = main_statistics(comparison.before) if comparison else None
-        out[f"{name}_after"] = main_statistics(comparison.after) if comparison else None
-        out[f"{name}_reason"] = reason
-    return out | dict(zip(("covered_share", "reached_share"), shares, strict=True))
+    for key, name in (("cross_validated", "cross_validated"), ("holdout_region", "region_holdout")):
+        comparison: Comparison | None = getattr(known, name, None)
+        out[f"{key}_before"] = main_statistics(comparison.before) if comparison else None
+        out[f"{key}_after"] = main_statistics(comparison.after) if comparison else None
+        out[f"{key}_reason"] = getattr(known, f"{name}_reason", "")
+    return out | {name: getattr(known, name, None) for name in ("covered_share", "reached_share")}
 
 
 def validation_to_dict(

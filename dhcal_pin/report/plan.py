@@ -15,7 +15,7 @@ from ..robot.chain import Chain
 from ..robot.coverage import joint_coverage
 from ..visualization import plots
 from . import figures
-from .document import BarColumn, BarTable, Document, FigureGroup, Panel, SamplePoints, Section, ShareBar
+from .document import BarTable, Document, FigureGroup, Panel, Section
 from .html import html_page
 from .provenance import origin_tables
 from .samples import Samples, samples_section
@@ -162,8 +162,8 @@ def _coverage_table(report: PlanReport) -> BarTable:
         factor, unit, decimals = (np.degrees(1.0), "°", 1) if one else (1e3, " mm", 1)
         bins = f"{one.n_visited} of {one.n_in_range}" if one else ""
         rows.append([joint, *(f"{factor * value:.{decimals}f}{unit}" for value in (low, high)), bins])
-        bars.append(ShareBar(one.share) if one else None)
-    return BarTable(["joint", "lowest", "highest", "bins visited"], rows, bars=[BarColumn("share", bars)])
+        bars.append(one.share if one else None)
+    return BarTable(["joint", "lowest", "highest", "bins visited"], rows, bars={"share": bars})
 
 
 def _pose_figures(report: PlanReport, samples: Samples) -> list[FigureGroup]:
@@ -173,7 +173,7 @@ def _pose_figures(report: PlanReport, samples: Samples) -> list[FigureGroup]:
     for plane, view in (("xy", "from above"), ("xz", "from the side")):
         plot = partial(plots.plot_arms, {}, plane=plane, samples=poses[:, :3, 3])
         text = f"Tool positions of {len(samples)} poses over {plane[0]} and {plane[1]} in the base frame."
-        points = SamplePoints(*(f"base:{'xyz'.index(axis)}" for axis in plane))
+        points = figures.plane_points(plane)
         panels.append(Panel(f"poses-{plane}", f"Tool, {view}", text, plot, plots.SQUARE_PANEL, points))
     title = "The robot and the poses to measure, in three dimensions"
     return [

@@ -9,7 +9,7 @@ Shapes: N samples in the order of their files and lines, n joints.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from .._typing import Array
 from ..calibration.result import Result
 from ..formatting import SMALL_UNITS, UNITS, Quantity, Table
 from ..io.tabular import csv_text
+from ..measurements.base import Measurement
 from ..measurements.groups import ERROR_GROUPS, in_order
 from ..robot.chain import Chain
 from ..visualization.subsampling import evenly_spaced_indices
@@ -74,22 +75,18 @@ class Samples:
             return self
         chosen = np.union1d(evenly_spaced_indices(len(self), MAX_SAMPLES), np.flatnonzero(self.is_outlier))
         note = f"The page contains {len(chosen)} of the {len(self)} samples; --residuals writes all of them."
-        errors = {
-            group: {state: values[chosen] for state, values in states.items()}
+        downloads = {name: text for name, text in self.downloads.items() if name != "residuals.csv"}
+        return replace(self.take(chosen), downloads=downloads, note=note)
+
+    def take(self, chosen: Array) -> Samples:
+        """Return the samples of some indices."""
+        names = ("file", "line", "number", "role", "is_outlier", "q")
+        values: dict[str, Any] = {name: getattr(self, name)[chosen] for name in names}
+        values["errors"] = {
+            group: {state: norms[chosen] for state, norms in states.items()}
             for group, states in self.errors.items()
         }
-        return Samples(
-            chain=self.chain,
-            file=self.file[chosen],
-            line=self.line[chosen],
-            number=self.number[chosen],
-            role=self.role[chosen],
-            is_outlier=self.is_outlier[chosen],
-            q=self.q[chosen],
-            errors=errors,
-            downloads={name: text for name, text in self.downloads.items() if name != "residuals.csv"},
-            note=note,
-        )
+        return replace(self, **values)
 
     def page_data(self) -> dict[str, Any]:
         """Return what the scripts of the page read, as JSON-compatible values."""
@@ -102,8 +99,15 @@ class Samples:
         tool[has_pose, 3:] = se3.log3(poses[:, :3, :3])
         base[has_pose] = (se3.inverse(self.chain.base) @ poses)[:, :3, 3]
         return {
-            "joints": _joints(self.chain),
-            "groups": _groups(self.errors),
+            "joints": [
+                {"name": name} | _shown_unit(*UNITS[joint_unit(self.chain, i)])
+                for i, name in enumerate(self.chain.joint_names)
+            ],
+            "groups": [
+                {"key": group, "label": ERROR_GROUPS[group].label}
+                | _shown_unit(*SMALL_UNITS[ERROR_GROUPS[group].unit])
+                for group in self.errors
+            ],
             "files": files.tolist(),
             "file": file_index.tolist(),
             "line": self.line.tolist(),
@@ -143,10 +147,7 @@ def samples_section(samples: Samples, title: str = "Samples") -> Section:
             samples.file[i],
             str(samples.line[i]),
             samples.role[i] + (", outlier" if samples.is_outlier[i] else ""),
-            *(
-                Quantity(float(samples.q[i, j]), "m" if is_prismatic_joint(samples.chain, j) else "rad")
-                for j in range(len(joints))
-            ),
+            *(Quantity(float(samples.q[i, j]), joint_unit(samples.chain, j)) for j in range(len(joints))),
             *(Quantity.error(float(errors[i]), ERROR_GROUPS[group].unit) for group, errors in groups.items()),
         ]
         for i in shown
@@ -161,24 +162,14 @@ def is_prismatic_joint(chain: Chain, joint: int) -> bool:
     return bool(chain.prismatic[np.flatnonzero(chain.mimic_matrix[:, joint])[0]])
 
 
-def _joints(chain: Chain) -> list[dict[str, Any]]:
-    """Return name and shown unit of each joint."""
-    joints = []
-    for i, name in enumerate(chain.joint_names):
-        factor, unit = UNITS["m" if is_prismatic_joint(chain, i) else "rad"]
-        joints.append({"name": name, "factor": factor, "unit": unit.strip()})
-    return joints
+def joint_unit(chain: Chain, joint: int) -> str:
+    """Return the SI unit of an independent joint of a chain."""
+    return "m" if is_prismatic_joint(chain, joint) else "rad"
 
 
-def _groups(errors: Mapping[str, object]) -> list[dict[str, Any]]:
-    """Return key, label and shown unit of each group of errors."""
-    groups = []
-    for group in errors:
-        factor, unit = SMALL_UNITS[ERROR_GROUPS[group].unit]
-        groups.append(
-            {"key": group, "label": ERROR_GROUPS[group].label, "factor": factor, "unit": unit.strip()}
-        )
-    return groups
+def _shown_unit(factor: float, unit: str) -> dict[str, Any]:
+    """Return a factor from SI units, and the unit, as the scripts read them."""
+    return {"factor": factor, "unit": unit.strip()}
 
 
 def _columns(values: Array, decimals: int) -> list[list[float | None]]:
@@ -191,45 +182,51 @@ def _values(values: Array, decimals: int) -> list[float | None]:
     return [value if np.isfinite(value) else None for value in rounded.tolist()]
 
 
-def first_configurations(data: Sequence[Any], n_joints: int) -> Array:
-    """Return the first configuration of each sample of measurements."""
-    parts = [
-        item.q if item.configurations_per_row else np.full((len(item.rows), n_joints), np.nan)
-        for item in data
-    ]
-    return np.concatenate([np.empty((0, n_joints)), *parts])
-
-
-def sample_numbers(names: Sequence[str], data: Sequence[Any]) -> Array:
-    """Number the samples of files in a row: a file begins after the last line of the file before it."""
+def measured_samples(
+    chain: Chain,
+    names: Sequence[str],
+    data: Sequence[Measurement],
+    norms: Mapping[str, Mapping[str, Array]],
+) -> Samples:
+    """Collect the samples of measurements, whose files are named; `norms` are by state and group."""
     last_rows: dict[str, int] = {}
     for name, item in zip(names, data, strict=True):
         last_rows[name] = max(last_rows.get(name, 0), int(item.rows.max()))
+    # The samples of a file are numbered after the last line of the file before it.
     starts = dict(zip(last_rows, np.cumsum([0, *last_rows.values()]).tolist(), strict=False))
-    return np.concatenate([starts[name] + item.rows for name, item in zip(names, data, strict=True)])
+    counts = [len(item.rows) for item in data]
+    file, line = np.repeat(np.array(names, object), counts), np.concatenate([item.rows for item in data])
+    without = [np.nan] * chain.n_joints
+    q = [item.q if item.configurations_per_row else [without] * len(item.rows) for item in data]
+    return Samples(
+        chain=chain,
+        file=file,
+        line=line,
+        number=np.array([starts[name] for name in file]) + line,
+        role=np.full(len(line), "measured"),
+        is_outlier=np.zeros(len(line), bool),
+        q=np.concatenate(q),
+        errors={
+            group: {state: by_group[group] for state, by_group in norms.items()}
+            for group in in_order(norms["after"])
+        },
+    )
 
 
 def result_samples(fit: Result, data_names: Sequence[str], holdout_names: Sequence[str]) -> Samples:
-    """Collect the samples of a calibration."""
-    data, names = [*fit.data, *fit.holdout], [*data_names, *holdout_names]
-    table = fit.residuals
-    order = table.file_order
-    file = np.repeat(np.array(names, object), [len(item.rows) for item in data])[order]
-    errors = {
-        group: {"before": before[order], "after": after[order]}
-        for group, (before, after) in fit.error_norms.items()
+    """Collect the samples of a calibration, in the order of their files and lines."""
+    table, names, data = fit.residuals, [*data_names, *holdout_names], [*fit.data, *fit.holdout]
+    norms = {
+        state: {group: pair[i] for group, pair in fit.error_norms.items()}
+        for i, state in enumerate(("before", "after"))
     }
-    return Samples(
-        chain=fit.chain,
-        file=file,
-        line=table.line[order],
-        number=sample_numbers(names, data)[order],
-        role=np.where(table.is_holdout, "hold-out", "fitted")[order],
-        is_outlier=table.is_outlier[order],
-        q=first_configurations(data, fit.chain.n_joints)[order],
-        errors={group: errors[group] for group in in_order(errors)},
-        downloads={"residuals.csv": residuals_text(fit, file), "parameters.csv": parameters_text(fit)},
-    )
+    samples = replace(
+        measured_samples(fit.chain, names, data, norms),
+        role=np.where(table.is_holdout, "hold-out", "fitted"),
+        is_outlier=table.is_outlier,
+    ).take(table.file_order)
+    texts = {"residuals.csv": residuals_text(fit, samples.file), "parameters.csv": parameters_text(fit)}
+    return replace(samples, downloads=texts)
 
 
 def residuals_text(fit: Result, names: Array) -> str:

@@ -23,14 +23,14 @@ from ..diagnostics.curves import JointCurve, find_lattices, fitted_coverage
 from ..diagnostics.residuals import median_sigmas
 from ..diagnostics.workspace import RELATIVE_TEXT
 from ..estimation import robust
-from ..formatting import Quantity, Table, format_fixed
-from ..identifiability import EXPECTED, label_unobservable
+from ..formatting import Quantity, Table, capitalized, format_fixed
+from ..identifiability import EXPECTED
 from ..io.origins_file import origin_table
 from ..measurements.groups import ERROR_GROUPS, error_group
 from ..robot.chain import BASE_FRAME
 from . import figures, images, samples
 from .context import ReportContext
-from .document import BarColumn, BarTable, IntervalBar, RowGroup, Section, ShareBar
+from .document import BarTable, IntervalBar, Section
 from .provenance import origin_tables
 
 # The page folds parameters that change by at most this multiple of their standard deviations and whose
@@ -126,10 +126,10 @@ def _residual_section(context: ReportContext) -> Section:
     )
 
 
-def _transmission_section(context: ReportContext) -> Section | None:
+def _transmission_section(context: ReportContext) -> Section:
     extension, hint = context.fit.extension, context.source.hint
     if extension is None or not context.fit.errors.has_arm:
-        sentences, tables = [f"{hint[0].upper()}{hint[1:]}."] if hint else [], []
+        sentences, tables = [f"{capitalized(hint)}."] if hint else [], []
     else:
         text = (
             "Each family is tried in addition to those added before. Errors are those of random left-out "
@@ -164,8 +164,8 @@ def _joint_section(context: ReportContext) -> Section | None:
         ]
         header += ["largest correction", "std, measured", "std, other"]
         rows = [row + _curve_cells(curves.get(c.joint)) for row, c in zip(rows, coverage, strict=True)]
-        items = [f"{text[:1].upper()}{text[1:]}." for text in find_lattices(context.fit)]
-    bars = [BarColumn("share", [ShareBar(c.share) for c in coverage])]
+        items = [f"{capitalized(text)}." for text in find_lattices(context.fit)]
+    bars = {"share": [c.share for c in coverage]}
     table = BarTable(header, rows, n_text_columns=2, bars=bars)
     draw = partial(figures.joint_curve_figures, context)
     return Section("joints", title, sentences, items, [table], draw)
@@ -295,7 +295,7 @@ def _parameter_section(context: ReportContext) -> Section:
     return Section("parameters", "Parameters", [text, summary.DEFINITION_TEXT, note], tables=tables)
 
 
-def _estimate_groups(estimates: Sequence[Estimate]) -> list[RowGroup]:
+def _estimate_groups(estimates: Sequence[Estimate]) -> dict[str, list[int]]:
     """Group the rows of parameters by the joint, frame or instrument that their names begin with."""
     rows: dict[str, list[int]] = {}
     for i, e in enumerate(estimates):
@@ -303,7 +303,7 @@ def _estimate_groups(estimates: Sequence[Estimate]) -> list[RowGroup]:
         # Names of Denavit-Hartenberg parameters end with the number of their row.
         row = re.search(r"\d+$", e.name)
         rows.setdefault(owner if dot else f"DH row {row[0]}" if row else "other", []).append(i)
-    return [RowGroup(title, numbers) for title, numbers in rows.items()]
+    return rows
 
 
 def _is_unchanged(e: Estimate) -> bool:
@@ -313,7 +313,7 @@ def _is_unchanged(e: Estimate) -> bool:
     return abs(e.change) <= MAX_ZERO_CHANGE * e.std and e.posterior_to_prior_std >= MIN_ZERO_RATIO
 
 
-def _estimate_bars(estimates: Sequence[Estimate]) -> list[BarColumn]:
+def _estimate_bars(estimates: Sequence[Estimate]) -> dict[str, list[float | IntervalBar | None]]:
     """Return bars of the change with two standard deviations (one scale per unit) and of observability."""
     scale: dict[str, float] = {}
     for e in estimates:
@@ -329,9 +329,10 @@ def _estimate_bars(estimates: Sequence[Estimate]) -> list[BarColumn]:
         relative = (value / scale[e.unit] if scale[e.unit] > 0 else 0.0 for value in ends)
         return IntervalBar(*(max(-1.0, min(1.0, value)) for value in relative))
 
-    columns = [BarColumn("change ± 2 std", [interval(e) for e in estimates])] if scale else []
-    shares = [None if e.fixed else ShareBar(e.observability) for e in estimates]
-    return [*columns, BarColumn("0 to 1", shares)]
+    columns: dict[str, list[float | IntervalBar | None]] = {}
+    if scale:
+        columns["change ± 2 std"] = [interval(e) for e in estimates]
+    return columns | {"0 to 1": [None if e.fixed else e.observability for e in estimates]}
 
 
 def _observability_section(context: ReportContext) -> Section:
@@ -347,16 +348,10 @@ def _observability_section(context: ReportContext) -> Section:
         sentences.append(f"Fixed at their nominal values and not assessed: {', '.join(fixed)}.")
     items = [
         *fit.shrinkage_notes,
-        *(label_unobservable(text) for text in fit.unobservable),
-        *(f"poorly identified: {text}" for text in fit.weakly_observable),
+        *summary.parameter_notes(fit.unobservable, fit.weakly_observable),
     ]
-    return Section(
-        "observability",
-        "Observability",
-        sentences,
-        items,
-        figures=partial(figures.observability_figures, context),
-    )
+    draw = partial(figures.observability_figures, context)
+    return Section("observability", "Observability", sentences, items, figures=draw)
 
 
 def _outlier_section(context: ReportContext) -> Section:
@@ -488,7 +483,8 @@ def _certificate_section(context: ReportContext) -> Section:
         "“Before” is the nominal robot with base and tool fitted to the same measurements, if they are "
         "unknown."
     )
-    changed = summary.largest_corrections(context.fit.estimates)
+    fit = context.fit
+    changed = summary.largest_corrections(fit.estimates, fit.x, fit.prior_std)
     rows = [
         [e.name, e.frame, Quantity(e.change, e.unit, e.std, is_small=True), e.certainty]
         for e in changed[:MAX_CORRECTIONS]

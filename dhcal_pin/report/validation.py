@@ -13,14 +13,14 @@ from ..calibration.evaluation import Accuracy, compute_errors, error_norms
 from ..calibration.summary import STATISTIC_LABELS, statistic
 from ..formatting import Table
 from ..measurements.base import Measurement
-from ..measurements.groups import ERROR_GROUPS, in_order
+from ..measurements.groups import ERROR_GROUPS
 from ..robot.chain import Chain
 from ..visualization import scene
 from . import figures
 from .document import Document, FigureGroup, LegendEntry, Section
 from .html import html_page
 from .provenance import measurement_names, origin_tables
-from .samples import Samples, first_configurations, sample_numbers, samples_section
+from .samples import Samples, measured_samples, samples_section
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,24 +87,10 @@ def validation_page(validation: Validation) -> str:
 def _samples(validation: Validation) -> Samples:
     """Collect the samples of a validation."""
     data, chain = validation.data, validation.chain
-    names = measurement_names(validation.paths, data)
-    counts = [len(item.rows) for item in data]
-    errors = {"after": _norms(chain, data, validation.known)}
+    norms = {"after": _norms(chain, data, validation.known)}
     if validation.reference:
-        errors = {"before": _norms(validation.reference[0], data, validation.reference[1])} | errors
-    return Samples(
-        chain=chain,
-        file=np.repeat(np.array(names, object), counts),
-        line=np.concatenate([item.rows for item in data]),
-        number=sample_numbers(names, data),
-        role=np.full(sum(counts), "measured"),
-        is_outlier=np.zeros(sum(counts), bool),
-        q=first_configurations(data, chain.n_joints),
-        errors={
-            group: {state: norms[group] for state, norms in errors.items()}
-            for group in in_order(errors["after"])
-        },
-    )
+        norms = {"before": _norms(validation.reference[0], data, validation.reference[1])} | norms
+    return measured_samples(chain, measurement_names(validation.paths, data), data, norms)
 
 
 def _norms(chain: Chain, data: Sequence[Measurement], known: Mapping[str, float]) -> dict[str, Array]:
@@ -129,7 +115,7 @@ def _sections(validation: Validation, samples: Samples) -> list[Section]:
             tables=[_accuracy_table(validation.accuracies)],
             figures=partial(_histograms, samples),
         ),
-        Section("residuals", "Residual errors", figures=partial(_residual_figures, samples)),
+        Section("residuals", "Residual errors", figures=partial(figures.sample_figures, samples)),
         Section("scene", "Robot and measurements", figures=partial(_scene_figures, validation)),
         samples_section(samples),
         Section("notes", "Data that are not used", items=validation.notes),
@@ -164,11 +150,6 @@ def _histograms(samples: Samples) -> list[FigureGroup]:
         LegendEntry(text, state, "area") for state, text in (("before", "nominal"), ("after", "calibrated"))
     ]
     return [FigureGroup(panels, legend=legend, layout="wide")] if panels else []
-
-
-def _residual_figures(samples: Samples) -> list[FigureGroup]:
-    groups = [figures.joint_error_group(samples), figures.sample_group(samples)]
-    return [group for group in groups if group.panels]
 
 
 def _scene_figures(validation: Validation) -> list[FigureGroup]:

@@ -38,10 +38,9 @@ def map_content(
         "Standard deviation of the tool position that follows from the uncertainty of the parameters, for "
         "configurations drawn within the joint limits. Unmodelled errors come in addition."
     ]
-    title = f"Predicted accuracy of {model.chain.model.name or 'the robot'}"
     if not np.concatenate([model.relative.sqrt_covariance, model.relative.unbounded_directions], 1).any():
-        sentences = ["No parameter of the robot was estimated, so that no uncertainty of the tool follows."]
-        return html_page(Document(title, [Section("map", "", sentences)], heading=title))
+        text = "No parameter of the robot was estimated, so that no uncertainty of the tool follows."
+        return _map_page(model, Section("map", "", [text]))
     if model.has_free_frames:
         sentences.append(RELATIVE_TEXT)
     q, errors = position_errors(model.chain, data, known)
@@ -57,7 +56,12 @@ def map_content(
         )
     points = (se3.inverse(model.chain.base) @ model.chain.poses(q))[:, :3, 3]
     draw = partial(workspace_maps, predict_workspace(model, data), points, errors)
-    return html_page(Document(title, [Section("map", "", sentences, figures=draw)], heading=title))
+    return _map_page(model, Section("map", "", sentences, figures=draw))
+
+
+def _map_page(model: Predictor, section: Section) -> str:
+    title = f"Predicted accuracy of {model.chain.model.name or 'the robot'}"
+    return html_page(Document(title, [section], heading=title))
 
 
 def map_text(workspace: WorkspaceMap) -> str:

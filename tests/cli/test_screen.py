@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from robots import URDF
 from slow_cases import some_slow
 
-from dhcal_pin.cli.screens.screen import HEIGHT, WIDTH, Block, Screen, cell_width, fold
+from dhcal_pin.cli.screens.screen import HEIGHT, WIDTH, Block, Screen, cell_width, fold, section_blocks
 from dhcal_pin.formatting import Table
 from dhcal_pin.measurements import KINDS
+from dhcal_pin.report.document import Section
 
 ARMS = ("experiment.dh.toml", "sim_6dof.dh.toml", "scara.urdf", "planar_2r.urdf")
 # Folders and names that are much longer than a line.
@@ -212,3 +213,15 @@ def test_images_of_a_right_and_of_a_wrong_arm(run, robot_folder, errors, is_kept
     verbose = run(*command, "--verbose")[2]
     assert "x, RMS" in verbose
     assert "error at the board" in verbose
+
+
+def test_sections_of_a_document_on_a_terminal():
+    table = Table(["name", "value"], [["a", "1 mm"]], caption="caption")
+    sections = [
+        Section("a", "Title", ["A sentence."], ["an item"], [table], figures=lambda: pytest.fail("drawn")),
+        Section("b", "Other", tables=[Table(["name"], [["b"]])]),
+    ]
+    lines = [line.text for line in Screen([], lambda: section_blocks(sections)).lines("verbose")]
+    expected = ["Title", "A sentence.", "an item", "", "caption", "name  value", "a      1 mm"]
+    assert lines == [*expected, "", "Other", "name", "b"]
+    assert Screen([], lambda: pytest.fail("made")).lines("normal") == []

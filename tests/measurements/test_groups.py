@@ -78,7 +78,7 @@ def test_texts_and_tables_state_the_angle_in_milliradians(fit, tmp_path):
 
 def test_terminal_states_the_angle_in_milliradians(fit):
     screen = validation_screen("arm", {"calibrated": fit.comparisons[-1].after}, [], [], {}, {})
-    cells = {row[0]: row[1] for row in screen.blocks[0].content.rows}
+    cells = {row[0]: row[1] for row in screen.blocks[0].content.texts}
     assert cells["bearing error, RMS"].endswith(" mrad")
     assert float(cells["bearing error, RMS"].split()[0]) == pytest.approx(1e3 * NOISE, rel=0.3)
 

@@ -14,12 +14,14 @@ from ...calibration.summary import (
     before_and_after,
     format_share,
     headline,
+    judged_regions,
     largest_corrections,
+    parameter_notes,
     regressions,
 )
 from ...calibration.verdict import Verdict
 from ...formatting import Quantity, Table
-from ...identifiability import EXPECTED, label_unobservable
+from ...identifiability import EXPECTED
 from ...measurements.base import Measurement
 from ...measurements.groups import ERROR_GROUPS
 from ...measurements.images.names import list_images
@@ -40,14 +42,8 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
     names = short_names([job.robot, *outcome.n_rows])
     is_refused = fit.verdict.is_refused
     # The parameters of a refused robot have no meaning.
-    unidentified = (
-        []
-        if is_refused
-        else [
-            *(label_unobservable(text) for text in fit.unobservable if not text.startswith(EXPECTED)),
-            *(f"poorly identified: {text}" for text in fit.weakly_observable),
-        ]
-    )
+    unidentified = [] if is_refused else parameter_notes(fit.unobservable, fit.weakly_observable)
+    unidentified = [text for text in unidentified if not text.startswith(EXPECTED)]
     warnings = [f"{names[p]}: warning: {text}" for p, texts in outcome.warnings.items() for text in texts]
     notes = [f"note: {names[p]}: {text}" for p, texts in outcome.notes.items() for text in texts]
     hints = [f"hint: {outcome.hint}"] if outcome.hint else []
@@ -56,7 +52,7 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
         Block(_robot_lines(fit, names[job.robot], outcome.document["settings"]["parameters"])),
         Block(_data_lines(outcome, names), noun="file", rank=7),
         *_accuracy_blocks(fit),
-        _hand_eye_block(fit),
+        Block(fit.hand_eye.table if fit.hand_eye else [], noun="cause", rank=2, n_kept=4, has_space=True),
         _correction_block(fit),
         Block(unidentified, "yellow", noun="note on parameters", rank=0, n_kept=0, has_space=True),
         Block(notes, noun="note on the files", rank=1),
@@ -173,43 +169,32 @@ def _count_outliers(rows: list[int], item: Measurement) -> str:
 
 def _accuracy_blocks(fit: Result) -> list[Block]:
     """Describe the accuracy within the measured region and outside it, before and after."""
-    known = fit.generalization
-    inside = fit.comparisons[0] if fit.comparisons[0].title == "hold-out" else known.cross_validated
-    covered, reached = known.covered_share, known.reached_share
-    region = "in the measured region", "outside of it"
+    covered, reached = fit.generalization.covered_share, fit.generalization.reached_share
+    places, rows, sentences = ("in the measured region", "outside of it"), [], []
     if covered is None or reached is None:
-        region = "among the measured poses", "outside of them"
-    rows = [*_accuracy_rows(inside, region[0]), *_accuracy_rows(known.region_holdout, region[1])]
-    sentences = [
-        f"Accuracy {place}: cannot be said, {reason}."
-        for comparison, place, reason in (
-            (inside, region[0], known.cross_validated_reason),
-            (known.region_holdout, region[1], known.region_holdout_reason),
-        )
-        if comparison is None
-    ]
+        places = ("among the measured poses", "outside of them")
+    for place, (comparison, reason) in zip(
+        places, judged_regions(fit.generalization, fit.comparisons), strict=True
+    ):
+        if comparison:
+            rows += _accuracy_rows(comparison, place)
+        else:
+            sentences.append(f"Accuracy {place}: cannot be said, {reason}.")
     if rows and covered is not None and reached is not None:
         sentences.append(
             f"Measured region: {format_share(covered)} of joint space. "
             f"Accuracy unknown: {format_share(1 - reached)} of joint space."
         )
+    table = Table(["RMS error", "judged on", "before", "after"], rows, 2)
     return [
-        Block(
-            Table(["RMS error", "judged on", "before", "after"], rows, 2),
-            noun="figure",
-            rank=7,
-            n_kept=len(rows),
-            has_space=True,
-        ),
+        Block(table, noun="figure", rank=7, n_kept=len(rows), has_space=True),
         Block(sentences),
         Block(regressions(fit.errors, fit.comparisons), "yellow"),
     ]
 
 
-def _accuracy_rows(comparison: Comparison | None, place: str) -> Iterator[list[str | Quantity]]:
+def _accuracy_rows(comparison: Comparison, place: str) -> Iterator[list[str | Quantity]]:
     """Make the rows of one comparison, one per group of errors."""
-    if comparison is None:
-        return
     for group, after in comparison.after.groups.items():
         is_region = comparison.title == "region hold-out"
         judged = "left-out regions" if is_region else f"{after.samples} {comparison.title}"
@@ -218,19 +203,13 @@ def _accuracy_rows(comparison: Comparison | None, place: str) -> Iterator[list[s
         yield [f"{name} {place}", judged, *before_and_after(comparison, group)]
 
 
-def _hand_eye_block(fit: Result) -> Block:
-    """Describe the error of a hand-eye calibration, and what each possible cause explains of it."""
-    if fit.hand_eye is None:
-        return Block([])
-    return Block(fit.hand_eye.table, noun="cause", rank=2, n_kept=4, has_space=True)
-
-
 def _correction_block(fit: Result) -> Block:
     """Describe the largest corrections of the robot."""
     is_shown = fit.shrinkage_factor and not fit.verdict.is_refused
+    corrections = largest_corrections(fit.estimates, fit.x, fit.prior_std)[:N_CORRECTIONS]
     rows = [
         [e.name, *(Quantity(v, e.unit, e.std, is_small=True) for v in (e.change, e.std))]
-        for e in (largest_corrections(fit.estimates)[:N_CORRECTIONS] if is_shown else ())
+        for e in (corrections if is_shown else ())
     ]
     table = Table(["largest corrections", "change", "std"], rows)
     return Block(table, noun="correction", rank=5, n_kept=min(3, len(rows)), has_space=True)
