@@ -332,7 +332,8 @@ def _estimate_bars(estimates: Sequence[Estimate]) -> dict[str, list[float | Inte
     columns: dict[str, list[float | IntervalBar | None]] = {}
     if scale:
         columns["change ± 2 std"] = [interval(e) for e in estimates]
-    return columns | {"0 to 1": [None if e.fixed else e.observability for e in estimates]}
+    columns["0 to 1"] = [None if e.fixed else e.observability for e in estimates]
+    return columns
 
 
 def _observability_section(context: ReportContext) -> Section:

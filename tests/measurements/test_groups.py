@@ -68,7 +68,7 @@ def test_json_states_the_angle_in_radians(fit):
 
 
 def test_texts_and_tables_state_the_angle_in_milliradians(fit, tmp_path):
-    rows = [row for row in accuracy_table(fit.comparisons).rows if "bearing" in row[1]]
+    rows = [row for row in accuracy_table(fit.comparisons).texts if "bearing" in row[1]]
     assert {row[1] for row in rows} == {"bearing error, mrad"}
     alone = headline([fit.comparisons[-1]])
     assert alone.group == "position"

@@ -36,22 +36,22 @@ def result(sim_6dof):
 def test_stages_are_those_of_the_json(result):
     table = stage_table(result.camera_stages)
     stages = json.loads(json_text(result_to_dict(result, {}, {})))["camera_stages"]
-    assert [row[0] for row in table.rows] == [stage["stage"] for stage in stages]
-    for row, stage in zip(table.rows, stages, strict=True):
+    assert [row[0] for row in table.texts] == [stage["stage"] for stage in stages]
+    for row, stage in zip(table.texts, stages, strict=True):
         assert float(row[3]) == pytest.approx(stage["fitted"]["residual_rms_px"], rel=0.01)
         assert float(row[8]) == pytest.approx(1e3 * stage["by_region"]["board_rms_m"], rel=0.01)
 
 
 def test_images_with_the_largest_errors_are_listed(result, quick):
     table = image_table(ReportContext(result, Provenance(names=["corners.csv"])))
-    shown = [float(row[6]) for row in table.rows]
+    shown = [float(row[6]) for row in table.texts]
     assert shown == sorted(shown, reverse=True)
     rms = []
     for item in (*result.data, *result.holdout):
         squares = compute_errors(result.chain, [item], result.instruments)[0]["pixels"] ** 2
         rms += [np.sqrt(squares[item.image == i].sum(1).mean()) for i in range(item.n_images)]
     np.testing.assert_allclose(shown, sorted(rms, reverse=True)[: len(shown)], rtol=0.01)
-    assert all(row[1].startswith("corners.csv, ") for row in table.rows if row[3] == "fitted")
+    assert all(row[1].startswith("corners.csv, ") for row in table.texts if row[3] == "fitted")
 
 
 def test_histograms_show_the_errors_of_the_table(result, quick):
@@ -76,10 +76,10 @@ def test_images_are_called_by_their_names(result, quick):
         for i, label in enumerate(item.image_labels):
             rows = item.rows[item.image == i]
             lines[label] = f"{rows.min()}-{rows.max()}"
-    fitted = [row for row in table.rows if row[3] == "fitted"]
+    fitted = [row for row in table.texts if row[3] == "fitted"]
     assert fitted
     assert all(row[1].endswith(f", {lines[row[0]]}") for row in fitted)
-    assert all(row[0].isdecimal() for row in table.rows if row[3] == "hold-out")
+    assert all(row[0].isdecimal() for row in table.texts if row[3] == "hold-out")
     titles = [panel.caption for group in image_figures(context) for panel in group.panels]
     assert any(title.startswith(f"Image {fitted[0][0]}: ") for title in titles)
     columns = named.residuals.file_columns()

@@ -50,11 +50,11 @@ def test_joint_values_that_were_measured(fit, quick):
     assert section.title == "Measured joint values"
     (table,) = section.tables
     assert list(table.header) == ["joint", "not measured", "bins visited"]
-    assert [row[0] for row in table.rows] == list(fit.chain.joint_names)
+    assert [row[0] for row in table.texts] == list(fit.chain.joint_names)
     # The values are between -86° and 86°; the table lists the widest gaps.
-    assert all(row[1].startswith("−180° to −8") or "−180° to −7" in row[1] for row in table.rows)
+    assert all(row[1].startswith("−180° to −8") or "−180° to −7" in row[1] for row in table.texts)
     counts = [len(set(np.rint(np.rad2deg(fit.data[0].q[:, i]) / 5))) for i in range(6)]
-    assert [row[2] for row in table.rows] == [f"{count} of 72" for count in counts]
+    assert [row[2] for row in table.texts] == [f"{count} of 72" for count in counts]
 
 
 def test_joint_correction_curves_of_joints_with_harmonics(sim_6dof, quick):
