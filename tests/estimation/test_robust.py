@@ -168,7 +168,7 @@ def test_statistics_of_a_fit_exclude_rejected_samples(sim_6dof, sim_6dof_actual)
     assert (judged.n_samples, judged.n_rejected) == (57, 3)
     assert judged.after["position_rms_m"] < 1.3 * expected.after["position_rms_m"]
     assert "3 outliers rejected." in headline(fit.comparisons).text
-    figures = accuracy_figures(ReportContext.from_result(fit, Provenance()))[0]
+    figures = accuracy_figures(ReportContext(fit, Provenance()))[0]
     assert figures.panels[0].caption == "Position error, 57 fitted samples"
     held = calibrate(sim_6dof, clean, "dh", holdout=[dirty]).comparisons[0]
     assert (held.n_samples, held.n_outliers) == (60, 3)
