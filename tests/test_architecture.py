@@ -153,7 +153,7 @@ def test_kinds_of_measurements_state_what_they_can():
         ):
             continue
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            tested: list[ast.AST] = []
+            tested: list[ast.expr] = []
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("isinstance", "issubclass"):
                 tested = node.args[1:]
             elif isinstance(node, ast.MatchClass):

@@ -298,17 +298,23 @@ def _joints_digest(urdf: Urdf, tip: str) -> str:
 def _read_transmission(chain: Chain, joints: TomlTable | None, thermal: TomlTable | None) -> Transmission:
     """Read the tables [joint.NAME] and [thermal]; joints and links that are not on the chain are ignored."""
     coefficients = np.zeros(n_coefficients(*chain.mimic_matrix.shape))
-    for name in joints.keys() if joints is not None else ():
-        joint = joints.table(name)
+    if joints is not None:
+        _read_joints(chain, joints, coefficients)
+    if thermal is not None:
+        _read_links(chain, thermal, coefficients)
+    return Transmission(coefficients, chain.loads)
+
+
+def _read_joints(chain: Chain, table: TomlTable, coefficients: Array) -> None:
+    """Read the tables of all joints into the coefficients of a transmission, shape (c,)."""
+    for name in table.keys():
+        joint = table.table(name)
         if name in chain.joint_names:
             _read_joint(chain, chain.joint_names.index(name), joint, coefficients)
         elif name not in _joints_off_path(chain):
             raise UnknownNameError(
-                f"{joints.where}: unknown joint {name!r}; choose from {', '.join(chain.joint_names)}"
+                f"{table.where}: unknown joint {name!r}; choose from {', '.join(chain.joint_names)}"
             )
-    if thermal is not None:
-        _read_links(chain, thermal, coefficients)
-    return Transmission(coefficients, chain.loads)
 
 
 def _read_links(chain: Chain, table: TomlTable, coefficients: Array) -> None:

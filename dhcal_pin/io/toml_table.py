@@ -320,7 +320,9 @@ def vector(size: int, at_most: float = MAX_NUMBER, description: str = "", **opti
 
 
 # Keys of a pose.
-POSE_KEYS = dict.fromkeys(("xyz_m", "rotvec_rad"), vector(3, _MAX_POSE_VALUE, default=(0.0, 0.0, 0.0)))
+POSE_KEYS: Mapping[str, Key] = dict.fromkeys(
+    ("xyz_m", "rotvec_rad"), vector(3, _MAX_POSE_VALUE, default=(0.0, 0.0, 0.0))
+)
 
 
 def pose_of(values: Mapping[str, Any]) -> Array:

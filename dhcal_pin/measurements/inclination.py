@@ -301,6 +301,7 @@ class Inclination(Measurement):
         products = np.einsum("jkm,lm->jkl", to_link, item._axes[2])
         singular = np.linalg.svd(products.swapaxes(0, 1).reshape(3, 9))[0].T
         up = np.concatenate([chain.base[None, :3, 2], singular, -singular])
+        sensor, agreement = np.empty(0), np.empty(0)
         for _ in range(_N_STEPS):
             sensor = se3.nearest_rotation(np.einsum("jkl,nk->njl", products, up))
             up = np.einsum("jkl,njl->nk", products, sensor)

@@ -18,7 +18,7 @@ from dhcal_pin.exceptions import InvalidArgumentError, UnknownNameError
 from dhcal_pin.identifiability.residual_correlation import design_effect
 from dhcal_pin.io import measurement_text
 from dhcal_pin.measurements import Measurement, Noise, Pose, Position
-from dhcal_pin.robot import Chain
+from dhcal_pin.robot import Chain, Conditions
 from dhcal_pin.robot.error_families import FAMILIES, ErrorFamily
 
 
@@ -133,7 +133,7 @@ def with_curves(seed: int, m: int, noise: float = 5e-5) -> tuple[Chain, Chain, P
 
 def joint_errors(chain: Chain, q: np.ndarray) -> np.ndarray:
     """Return the errors of the joints at commanded positions q, shape (n, m)."""
-    return chain.actual_positions(q.T)[0] - q.T
+    return chain.actual_positions(Conditions(q))[0] - q.T
 
 
 @pytest.mark.parametrize("has_fine_lines", [True, False])

@@ -13,7 +13,7 @@ from dhcal_pin.diagnostics import find_lattices, fitted_coverage, joint_curves
 from dhcal_pin.diagnostics.curves import CURVE_VALUES
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import Noise, Pose
-from dhcal_pin.robot import Chain
+from dhcal_pin.robot import Chain, Conditions
 
 SETS = "minimal,base,tool,harmonics,curves"
 NOISE = Noise(2e-5, 2e-5)
@@ -39,7 +39,7 @@ def joint_error(chain: Chain, joint: int, values: np.ndarray) -> np.ndarray:
     """Return actual minus commanded values of one joint, the others at zero."""
     q = np.zeros((chain.n_joints, len(values)))
     q[joint] = values
-    return chain.actual_positions(q)[0][joint] - values
+    return chain.actual_positions(Conditions(q.T))[0][joint] - values
 
 
 def test_correction_is_what_the_calibrated_joint_misses(example):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -194,7 +195,7 @@ def test_files_and_sidecar_preserve_conditions_and_coefficients(arm, tmp_path):
     assert sidecar["thermal"]["reference_degc"] == arm.reference_temperature
 
 
-def text(arm: Chain, **columns: list[object]) -> str:
+def text(arm: Chain, **columns: Sequence[object]) -> str:
     """A file of positions with further columns."""
     q = np.random.default_rng(7).uniform(-2, 2, (3, 6))
     positions = arm.poses(q)[:, :3, 3]
@@ -209,11 +210,14 @@ def test_rows_with_a_time_are_in_order(arm, tmp_path):
     (tmp_path / "data.csv").write_text(text(arm, **{"time[ms]": [0, 500, 1500]}))
     recorded = read_measurements(tmp_path / "data.csv", arm).recorded
     assert recorded is not None
+    assert recorded.time is not None
+    assert recorded.approach is not None
     np.testing.assert_allclose(recorded.time, [0, 0.5, 1.5])
     np.testing.assert_array_equal(recorded.approach[1:], np.sign(np.diff(recorded.q, axis=0)))
     (tmp_path / "data.csv").write_text("# rows: in order\n" + text(arm))
     recorded = read_measurements(tmp_path / "data.csv", arm).recorded
     assert recorded is not None
+    assert recorded.order is not None
     assert recorded.order.tolist() == [0, 1, 2]
     (tmp_path / "data.csv").write_text(text(arm))
     assert read_measurements(tmp_path / "data.csv", arm).recorded is None

@@ -221,11 +221,12 @@ WEIGHTS = re.sub(
 def driven(chain: Chain, seed: int) -> Chain:
     """With every error that its joints can have."""
     rng = np.random.default_rng(seed)
-    coefficients = rng.uniform(1, 3, n_coefficients(chain.n_joints))
-    linear, harmonics, compliance = split_coefficients(coefficients, chain.n_joints)
+    coefficients = rng.uniform(1, 3, n_coefficients(*chain.mimic_matrix.shape))
+    linear, harmonics, joint_terms, link_terms = split_coefficients(coefficients, chain.n_joints)
     linear *= 2e-3
     harmonics *= 1e-4 * ~chain.is_prismatic
-    compliance *= 1e-4 * ~chain.is_prismatic
+    joint_terms *= 1e-4 * ~chain.is_prismatic
+    link_terms *= 1e-5
     return chain.with_transmission(Transmission(coefficients, chain.loads))
 
 
