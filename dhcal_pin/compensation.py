@@ -26,10 +26,12 @@ from . import se3
 from ._typing import Array
 from .exceptions import InvalidArgumentError
 from .robot.chain import Chain
+from .robot.conditions import Conditions
 from .robot.inverse_kinematics import (
     REACHED_TOL,
     TaskError,
     characteristic_length,
+    correct_for_conditions,
     pose_task,
     position_task,
     solve_ik,
@@ -95,6 +97,7 @@ def compensate(
     targets: ArrayLike,
     near: ArrayLike | None = None,
     progress: Callable[[int], None] | None = None,
+    conditions: Conditions | None = None,
 ) -> Compensation:
     """Solve targets on the calibrated robot and correct them for a controller with the nominal model.
 
@@ -110,6 +113,8 @@ def compensate(
         near: Joint positions near which solutions are preferred, shape (n,) or (m, n) [rad or m]; by default
             the middle of the limits, or zero without limits.
         progress: Function that is called with the number of targets done.
+        conditions: Directions of approach, temperatures and payloads at the m targets, whose joint positions
+            are not used; without them joints have no direction, and links the lengths of the model.
 
     Returns:
         Joint positions, corrected targets and status of each target.
@@ -135,12 +140,32 @@ def compensate(
         if progress is not None:
             progress(min(first + _CHUNK_SIZE, len(targets)))
     q, status, residual_error = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
+    if conditions is not None:
+        q, status, residual_error = _with_conditions(
+            calibrated, targets, q, status, residual_error, conditions
+        )
     reached = np.flatnonzero(status == OK)
     poses = np.full((len(q), 4, 4), np.nan)
     poses[reached] = nominal.poses(q[reached])
     is_singular = _is_near_singular(nominal, calibrated, targets[reached], q[reached])
     status[reached[is_singular]] = SINGULAR
     return Compensation(q, poses, tuple(status.tolist()), residual_error)
+
+
+def _with_conditions(
+    chain: Chain, targets: Array, q: Array, status: Array, residual_error: Array, conditions: Conditions
+) -> tuple[Array, Array, Array]:
+    """Correct the solved targets for their conditions; return q, status and errors of all targets."""
+    solved = np.flatnonzero(status == OK)
+    goals = targets[solved]
+    task = _task_error(chain, goals)
+    corrected, poses = correct_for_conditions(chain, task, q[solved], conditions[solved])
+    q, status, residual_error = q.copy(), status.copy(), residual_error.copy()
+    q[solved], residual_error[solved] = corrected, _pose_error(poses, goals)
+    within_limits = np.all((corrected >= chain.lower) & (corrected <= chain.upper), 1)
+    status[solved[~within_limits]] = LIMITS
+    status[solved[np.any(residual_error[solved] > REACHED_TOL, 1)]] = OUT
+    return q, status, residual_error
 
 
 def _validated_targets(targets: ArrayLike) -> Array:
@@ -263,9 +288,13 @@ def _search_points(poses: Array, with_rotations: bool, length: float) -> Array:
 
 def _tool_error(chain: Chain, q: Array, targets: Array) -> Array:
     """Return distances [m] and angles [rad] between tool and targets, shape (m, 2)."""
-    poses = chain.poses(q)
+    return _pose_error(chain.poses(q), targets)
+
+
+def _pose_error(poses: Array, targets: Array) -> Array:
+    """Return distances [m] and angles [rad] between poses and targets, shape (m, 2)."""
     if targets.ndim == 2:
-        return np.stack([np.linalg.norm(poses[:, :3, 3] - targets, axis=1), np.zeros(len(q))], 1)
+        return np.stack([np.linalg.norm(poses[:, :3, 3] - targets, axis=1), np.zeros(len(poses))], 1)
     rotation = se3.log3(poses[:, :3, :3] @ np.swapaxes(targets[:, :3, :3], 1, 2))
     return np.stack(
         [np.linalg.norm(poses[:, :3, 3] - targets[:, :3, 3], axis=1), np.linalg.norm(rotation, axis=1)], 1

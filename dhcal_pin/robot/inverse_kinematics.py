@@ -24,6 +24,7 @@ from .. import se3
 from .._typing import Array
 from ..exceptions import ConvergenceError
 from .chain import Chain
+from .conditions import Conditions
 
 # Function from tool poses, shape (r, 4, 4), and sample numbers, shape (r,), to task errors, shape (r, k) [m],
 # and their derivatives by the tool twist [v, ω] in axes of the measuring frame, shape (r, k, 6), or by v, (r,
@@ -44,6 +45,9 @@ _ERROR_TOL = 1e-14
 
 # Minimum characteristic length, for chains without links such as a wrist [m].
 _MIN_LENGTH = 0.05
+
+# Steps of the correction for conditions: the changes are small, and their square is below rounding errors.
+_N_CORRECTIONS = 6
 
 # A sample is abandoned if its error has not shrunk to this ratio within this number of steps.
 _MAX_STALLED_STEPS, _MIN_PROGRESS_RATIO = 10, 0.99
@@ -143,6 +147,20 @@ def _errors_and_jacobians(
     poses, tool_jacobians = tool_pose_and_jacobian(chain, q)
     errors, by_twist = task_error(poses, samples)
     return errors, by_twist @ tool_jacobians[:, : by_twist.shape[-1]]
+
+
+def correct_for_conditions(
+    chain: Chain, task_error: TaskError, q: Array, conditions: Conditions
+) -> tuple[Array, Array]:
+    """Correct solutions without conditions for those of each sample, by Newton's method; see `solve_ik`."""
+    q, samples = q.copy(), np.arange(len(q))
+    for _ in range(_N_CORRECTIONS):
+        frames = chain.forward_kinematics(replace(conditions, q=q))
+        errors, by_twist = task_error(frames.poses(), samples)
+        jacobians = by_twist @ chain.joint_jacobian(frames).transpose(2, 1, 0)[:, : by_twist.shape[-1]]
+        q += _damped_step(jacobians, errors, np.full(len(q), _MIN_DAMPING))
+    poses = chain.forward_kinematics(replace(conditions, q=q)).poses()
+    return q, poses
 
 
 def _damped_step(jacobians: Array, errors: Array, damping: Array) -> Array:

@@ -297,3 +297,41 @@ def test_kinds_that_move_the_joints_cannot_be_simulated_with_conditions(arm):
     rng = np.random.default_rng(9)
     with pytest.raises(DhcalError, match="point: cannot be simulated with conditions"):
         dh.measurements.KINDS["point"].simulate(arm, drawn(arm, 8, rng), Noise(), rng)
+
+
+# --- compensation ----------------------------------------------------------------------------------
+
+
+def test_compensated_targets_are_reached_under_their_conditions(arm):
+    rng = np.random.default_rng(10)
+    truth = with_errors(with_errors(arm, "backlash", 2e-3, rng), "thermal", 2e-5, rng)
+    conditions = drawn(arm, 12, rng)
+    wanted = truth.poses(0.5 * conditions.q)
+    found = dh.compensate(arm, truth, wanted, 0.5 * conditions.q, conditions=conditions)
+    reached = np.flatnonzero(found.reached)
+    assert len(reached) >= 10
+    there = Conditions(found.q, approach=conditions.approach, temperature=conditions.temperature)[reached]
+    np.testing.assert_allclose(truth.poses(there), wanted[reached], atol=1e-9)
+    # Without its conditions a solution misses its target.
+    assert np.abs(truth.poses(found.q[reached])[:, :3, 3] - wanted[reached, :3, 3]).max() > 1e-4
+
+
+def test_targets_in_a_file_have_conditions(arm, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    truth = with_errors(arm, "backlash", 2e-3, np.random.default_rng(11))
+    write_urdf(truth, tmp_path / "truth.urdf")
+    robot = str(robot_file("ur_description/urdf/ur10_robot.urdf"))
+    # Targets are in the base link, and the tip reaches them.
+    free = truth.with_base_and_tool(np.eye(4), np.eye(4))
+    wanted = arm.poses(np.random.default_rng(7).uniform(-2, 2, (3, 6)))[:, :3, 3]
+    for direction in (-1, 1):
+        names = [f"approach_{name}" for name in arm.joint_names]
+        (tmp_path / "targets.csv").write_text(text(arm, **{name: [direction] * 3 for name in names}))
+        command = ["compensate", robot, "truth.urdf", "targets.csv", "--tip", "tool0", "-o", "out.csv"]
+        assert main([*command, "--quiet"]) == 0
+        lines = (tmp_path / "out.csv").read_text().splitlines()[1:]
+        q = np.array([line.split(",")[:6] for line in lines], float)
+        reached = free.poses(Conditions(q, approach=np.full(q.shape, float(direction))))[:, :3, 3]
+        np.testing.assert_allclose(reached, wanted, atol=1e-8)
+        assert np.abs(free.poses(q)[:, :3, 3] - wanted).max() > 1e-4
+    capsys.readouterr()

@@ -80,7 +80,7 @@ def run(args: Namespace) -> int:
     nominal, calibrated = read_robots(args)
     targets = read_targets(args.targets, calibrated)
     with console.progress_bar("compensating", len(targets.values)) as progress:
-        result = compensate(nominal, calibrated, targets.values, targets.near, progress)
+        result = compensate(nominal, calibrated, targets.values, targets.near, progress, targets.conditions)
     contents = {args.output: corrected_text(result, calibrated, targets, args.joint_units)}
     for path in args.export:
         contents[path] = program_text(_program(result, nominal), path)

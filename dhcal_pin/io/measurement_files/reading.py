@@ -170,7 +170,7 @@ def parse_measurements(
         tips = parse_values(measured, Pose)
         data = data.replace(q=solve_tool_poses(table, chain, tips), has_joint_values=False)
         values |= tips
-    data = _with_conditions(data, table, chain)
+    data = with_conditions(data, table, chain)
     is_holdout = _parse_holdout_mask(table)
     return MeasurementFile(
         source=table.source,
@@ -262,7 +262,7 @@ def _present_conditions(table: DataTable, chain: Chain) -> dict[str, list[Column
     }
 
 
-def _with_conditions(data: Measurement, table: DataTable, chain: Chain) -> Measurement:
+def with_conditions(data: Measurement, table: DataTable, chain: Chain) -> Measurement:
     """Return the samples with their conditions; rows with a time are in the order of measurement."""
     present = _present_conditions(table, chain)
     values: dict[str, Array] = {}

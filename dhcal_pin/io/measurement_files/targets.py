@@ -12,6 +12,7 @@ from ...exceptions import FileFormatError
 from ...measurements.pose import Pose
 from ...measurements.position import Position
 from ...robot.chain import Chain
+from ...robot.conditions import Conditions
 from ..tables import read_table
 from .columns import check_columns, check_joint_names, find_kind, value_table
 from .reading import (
@@ -21,6 +22,7 @@ from .reading import (
     open_measurement_table,
     parse_joint_positions,
     parse_values,
+    with_conditions,
 )
 
 
@@ -36,6 +38,7 @@ class TargetPoses:
         units: Unit that each column was written in.
         lines: Line of each target in the file, shape (m,).
         notes: Sentences on what of the file is not used.
+        conditions: Conditions at the targets; None without columns of conditions.
     """
 
     source: str
@@ -44,6 +47,7 @@ class TargetPoses:
     units: Mapping[str, str]
     lines: Array
     notes: tuple[str, ...] = ()
+    conditions: Conditions | None = None
 
 
 def read_targets(path: PathLike, chain: Chain) -> TargetPoses:
@@ -75,8 +79,9 @@ def read_targets(path: PathLike, chain: Chain) -> TargetPoses:
     placeholder = np.zeros((len(table.lines), chain.n_joints))
     data = build_measurement(table, kind, [placeholder], parse_values(measured, kind), chain)
     values = data.poses if isinstance(data, Pose) else data.positions()
+    conditions = with_conditions(data, table, chain).recorded
     notes = (*table.notes, *ignored_columns_note(ignored))
-    return TargetPoses(table.source, values, near, column_units(table), data.rows, notes)
+    return TargetPoses(table.source, values, near, column_units(table), data.rows, notes, conditions)
 
 
 def read_configurations(path: PathLike, chain: Chain, columns: PathLike | None = None) -> Array:
