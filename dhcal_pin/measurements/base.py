@@ -451,9 +451,9 @@ class Measurement(ABC):
         return data.replace(recorded=data.recorded or conditions) if conditions.names else data
 
     @classmethod
-    @abstractmethod
     def _simulate(cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator) -> Self:
-        """Return measurements at given conditions."""
+        """Return measurements at given conditions; kinds that can be simulated define it."""
+        raise NotImplementedError
 
     # ------------------------------------------------------------------------------------------- files
     @classmethod

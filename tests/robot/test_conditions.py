@@ -335,3 +335,32 @@ def test_targets_in_a_file_have_conditions(arm, tmp_path, monkeypatch, capsys):
         np.testing.assert_allclose(reached, wanted, atol=1e-8)
         assert np.abs(free.poses(q)[:, :3, 3] - wanted).max() > 1e-4
     capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    ("family", "size", "column"), [("backlash", 2e-3, "approach"), ("thermal", 3e-5, "temp")]
+)
+def test_simulate_draws_the_conditions_that_the_robot_depends_on(
+    arm, family, size, column, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    write_urdf(with_errors(arm, family, size, np.random.default_rng(12)), tmp_path / "truth.urdf")
+    robot = str(robot_file("ur_description/urdf/ur10_robot.urdf"))
+    command = [
+        "simulate",
+        robot,
+        "--tip",
+        "tool0",
+        "--truth",
+        "truth.urdf",
+        "-m",
+        "100",
+        "--kind",
+        "position",
+    ]
+    assert main([*command, "--kind", "position", "--noise", "0.02mm", "-o", "data.csv"]) == 0
+    header = (tmp_path / "data.csv").read_text().splitlines()[1]
+    assert column in header
+    assert main(["calibrate", robot, "data.csv", "--tip", "tool0", "-o", "out.urdf", "--json", "r.json"]) == 0
+    assert family in json.loads((tmp_path / "r.json").read_text())["extension"]["families"]
+    capsys.readouterr()

@@ -11,9 +11,11 @@ from ...exceptions import InvalidArgumentError, UnknownNameError
 from ..options import NON_NEGATIVE_INTEGER, POSITIVE_INTEGER, ROBOT, add_urdf_options
 
 if TYPE_CHECKING:
-    from ..._typing import PathLike
-    from ...robot import Chain
+    from ..._typing import Array, PathLike
+    from ...robot import Chain, Conditions
 
+# Largest difference of simulated temperatures from the reference temperature [K].
+MAX_RISE = 10.0
 EXAMPLE = "dhcal simulate arm.dh.toml --truth actual.dh.toml -m 50 --noise 0.1mm,0.01deg -o data.csv"
 
 
@@ -34,7 +36,11 @@ def add_arguments(parser: ArgumentParser) -> None:
         "-o", "--output", metavar="data.csv", required=True, help="measurement CSV file to write"
     )
     parser.add_argument(
-        "--truth", metavar="T.urdf", type=ROBOT["type"], help="robot with errors (default: ROBOT)"
+        "--truth",
+        metavar="T.urdf",
+        type=ROBOT["type"],
+        help="robot with errors (default: ROBOT); if its sidecar has backlash or thermal growth, directions "
+        "of approach or temperatures are drawn and written",
     )
     parser.add_argument(
         "--errors",
@@ -95,7 +101,7 @@ def run(args: Namespace) -> int:
         truth = _with_random_errors(nominal, *parse_noise(args.errors, "--errors"), args.seed)
     rng = np.random.default_rng(args.seed)
     q = rng.uniform(*joint_range(nominal), (args.samples, nominal.n_joints))
-    data = KINDS[args.kind].simulate(truth, q, noise, rng)
+    data = KINDS[args.kind].simulate(truth, _conditions(truth, q, args.seed), noise, rng)
     errors = f" with random errors {args.errors}" if args.errors else ""
     comment = (
         f"simulated {args.kind} of {args.truth or args.robot}{errors}, noise {args.noise}, seed {args.seed}"
@@ -108,6 +114,22 @@ def run(args: Namespace) -> int:
     write_outputs(contents)
     console.show(Screen([files_block([str(path) for path in contents])]), args.verbosity)
     return 0
+
+
+def _conditions(truth: Chain, q: Array, seed: int) -> Conditions:
+    """Return joint positions, with random directions and temperatures if the robot depends on them."""
+    import numpy as np  # lazy import, as the following: they are slow to load
+
+    from ...robot import Conditions
+    from ...robot.error_families import BACKLASH, JOINT_TERMS
+
+    rng, transmission = np.random.default_rng([seed, 2]), truth.transmission
+    approach = temperature = None
+    if transmission is not None and transmission.joint_terms[list(JOINT_TERMS).index(BACKLASH)].any():
+        approach = rng.choice([-1.0, 1.0], q.shape)
+    if transmission is not None and transmission.link_terms.any():
+        temperature = truth.reference_temperature + rng.uniform(-MAX_RISE, MAX_RISE, len(q))
+    return Conditions(q, approach=approach, temperature=temperature)
 
 
 def _length_of_pixels(noise: str) -> str:
