@@ -23,7 +23,7 @@ PIXELS = {"px": 1.0}
 # Units per second, per kilogram, and of temperatures.
 TIMES = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9, "min": 1 / 60, "h": 1 / 3600}
 MASSES = {"kg": 1.0, "g": 1e3}
-TEMPERATURES = {"degC": 1.0}
+TEMPERATURES = {"degC": 1.0, "°C": 1.0}
 # Units allowed for each content type of a column.
 UNITS: Mapping[str, Mapping[str, float]] = {
     "length": LENGTHS,

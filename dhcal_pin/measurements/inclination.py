@@ -274,7 +274,7 @@ class Inclination(Measurement):
         """Return the derivatives (5, 2, m) of the whitened model by sensor and gravity."""
         h, to_sensor, _, by_tilt = self._model(frames, u)
         by_sensor = se3.skew(h.T) @ _right_jacobian(u[:3])
-        by_gravity = np.einsum("ijm,js->mis", to_sensor, by_tilt)
+        by_gravity = np.einsum("ijm,jt->mit", to_sensor, by_tilt)
         return np.einsum("rim,mis->srm", self._derivative(h), np.concatenate([by_sensor, by_gravity], 2))
 
     def small_angle(self, frames: FrameBatch, u: Array) -> tuple[Array, ObservationMatrix]:

@@ -95,7 +95,7 @@ NOTED_FORMS = {
         lambda: write(
             "data.csv", with_columns(["temperature[°C]", ["21.5"] * 20], ["No.", [str(i) for i in range(20)]])
         ),
-        "columns 'temperature', 'No.' ignored",
+        "column 'No.' ignored",
     ),
     "index without a name": (
         lambda: write("data.csv", frame().to_csv()),

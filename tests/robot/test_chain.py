@@ -204,7 +204,7 @@ def test_wrong_arguments_are_refused(sim_6dof, method, arguments, message):
 
 
 def test_a_transmission_of_another_chain_is_refused(sim_6dof, sim_3dof):
-    with pytest.raises(InvalidArgumentError, match=r"shape \(396,\); expected \(810,\)"):
+    with pytest.raises(InvalidArgumentError, match=r"shape \(403,\); expected \(823,\)"):
         sim_6dof.with_transmission(Transmission.zero(sim_3dof.loads))
     assert sim_6dof.with_payload(Payload(1.0)).payload == Payload(1.0)
 

@@ -249,7 +249,7 @@ def test_rows_with_a_time_are_in_order(arm, tmp_path):
             {"approach_elbow": [1, 1, 1]},
             "column 'approach_elbow' is not a condition; the conditions are time[s],",
         ),
-        ({"temprature[degC]": [20, 20, 20]}, "did you mean 'temperature'?"),
+        ({"temperatur[degC]": [20, 20, 20]}, "did you mean 'temperature'?"),
     ],
 )
 def test_wrong_conditions_are_named_in_one_line(arm, columns, words, tmp_path, monkeypatch, capsys):
